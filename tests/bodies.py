@@ -8,9 +8,9 @@ import casadi as ca
 import numpy as np
 
 from wholearm.common.arrays import Array
-from wholearm.free_simulation.play import play
-from wholearm.free_simulation.state import Run
-from wholearm.free_simulation.system import Pair, Structure, System
+from wholearm.free_simulation.free_events import play
+from wholearm.free_simulation.state import FreeRun
+from wholearm.free_simulation.system import ContactPair, Structure, System
 from wholearm.results.torque import TorqueProfile
 from wholearm.scene.model import Scales
 
@@ -37,7 +37,7 @@ def make_body(
         for i, (a, b) in enumerate(corners):
             x, y = z[0] + c * a - s * b, z[1] + s * a + c * b
             gap, slip = nx * x + ny * y - distance, ny * x - nx * y
-            pairs.append(Pair(f"v{i}-line{k}", gap, slip))
+            pairs.append(ContactPair(f"v{i}-line{k}", gap, slip))
     none = np.zeros(3)
     structure = Structure(z, ca.SX.sym("geometry", 0), tuple(pairs), (), (False, False, True))
     return System(
@@ -54,10 +54,10 @@ def make_body(
 
 def simulate(
     system: System, z: Sequence[float], v: Sequence[float], until: float, restitution: float = 0.0
-) -> Run:
+) -> FreeRun:
     """Let a system go without torques."""
     torque = TorqueProfile(np.array([0.0, until]), np.zeros((1, 2, 1)))
-    run = Run(system, torque, np.array(z, float), np.array(v, float), restitution)
+    run = FreeRun(system, torque, np.array(z, float), np.array(v, float), restitution)
     play(run, 1e-9 * system.scales.length)
     return run
 
@@ -67,7 +67,7 @@ def rotate(angle: float, points: Array) -> Array:
     return np.asarray(points @ np.array([[c, s], [-s, c]]), dtype=float)
 
 
-def measure_energy(run: Run) -> float:
+def measure_energy(run: FreeRun) -> float:
     """What the balance of energy leaves at the end, over the sum of all that is in it."""
     first, last, n = run.records[0].y, run.records[-1].y, run.system.n
     impact = run.records[-1].impact - run.records[0].impact

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from wholearm.common.arrays import Array
+from wholearm.free_simulation.free_simulate import simulate_free
 from wholearm.free_simulation.hand import measure_gaps
 from wholearm.free_simulation.result import FreeSimulation
-from wholearm.free_simulation.simulate import simulate_free
 from wholearm.problem.definition import Problem
 from wholearm.results.torque import TorqueProfile
 from wholearm.scene.model import Finger, Friction, Scene

@@ -17,11 +17,11 @@ from wholearm.common.shortfalls import Parameter
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning import advice
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.path_domain.explain import FRICTION
-from wholearm.planning.path_domain.plan import plan_curves
-from wholearm.planning.time_domain import explain
-from wholearm.planning.time_domain.explain import change_limit
-from wholearm.planning.time_domain.plan import plan_phases
+from wholearm.planning.path_domain.path_explain import FRICTION
+from wholearm.planning.path_domain.path_plan import plan_curves
+from wholearm.planning.time_domain import time_explain as explain
+from wholearm.planning.time_domain.time_explain import change_limit
+from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.definition import Problem
 
 INTERVALS = 15

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from wholearm.common.shortfalls import Change, Parameter, Place, Shortfall
+from wholearm.common.shortfalls import Change, LimitPlace, Parameter, Shortfall
 from wholearm.planning.advice import (
     bracket,
     describe_changes,
@@ -90,7 +90,7 @@ def test_changes_in_words() -> None:
 
 
 def test_shortfalls_are_ranked() -> None:
-    late, early = Place(2, 0.1, "t = 0.1000 s, phase 2"), Place(1, 0.0, "t = 0.0000 s")
+    late, early = LimitPlace(2, 0.1, "t = 0.1000 s, phase 2"), LimitPlace(1, 0.0, "t = 0.0000 s")
     limit = "torque limit of finger 1 = 2 N m"
     small = Shortfall("torque", "finger 1", limit, 0.4, "N m", late, 0.2)
     limit = "c_n of v3-finger1 >= epsilon = 0.05 N"

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from wholearm.common import archive
-from wholearm.common.archive import read_arrays
+from wholearm.common import files as archive
 from wholearm.common.errors import InputError
+from wholearm.common.files import read_arrays
 
 
 def _write(path: Path, members: dict[str, bytes]) -> str:

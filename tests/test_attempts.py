@@ -14,13 +14,13 @@ from wholearm.geometry.path_guess import find_end
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.time_domain import attempts as attempts_module
-from wholearm.planning.time_domain import plan as time_plan
+from wholearm.planning.time_domain import time_plan
 from wholearm.planning.time_domain.attempts import GRADUAL, NEAREST, Attempt, Attempts
-from wholearm.planning.time_domain.plan import plan_phases
-from wholearm.planning.time_domain.search import Search, Solution
+from wholearm.planning.time_domain.initial_path import PacedWay
+from wholearm.planning.time_domain.search import TimeSearch, TimeSolution
 from wholearm.planning.time_domain.stage import Stage
-from wholearm.planning.time_domain.staging import guess_stages
-from wholearm.planning.time_domain.way_guess import PacedWay
+from wholearm.planning.time_domain.stages import guess_stages
+from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.definition import End, Problem
 
 OPTIONS = PlanOptions(time_intervals=12, transcription="time")
@@ -29,7 +29,7 @@ AHEAD = [PACE.format("one to an end of the phases further on", falls) for falls 
 
 
 def list_attempts(problem: Problem, count: int, patient: bool = True) -> Attempts:
-    search = Search.of(problem, OPTIONS)
+    search = TimeSearch.of(problem, OPTIONS)
     return Attempts(problem, problem.phases[:count], problem.start, search, None, patient)
 
 
@@ -91,7 +91,7 @@ def test_an_end_that_is_known_is_first_looked_for_straight() -> None:
     pins = (("x", float(goal[0])),)
     pinned = replace(phase, until=replace(phase.until, pins=pins), end=End.REST)
     for own, given in ((replace(phase, end=End.REST), goal), (pinned, None)):
-        search = Search.of(problem, OPTIONS)
+        search = TimeSearch.of(problem, OPTIONS)
         attempts = Attempts(problem, [own], start, search, None, True)
         names = [attempt.name for attempt in attempts.begin(given)]
         assert names[-1] == nearest and len(names) <= 2
@@ -113,10 +113,10 @@ def tried(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> li
     """Names of attempts in the order in which they are made; one leads to a plan."""
     names, good = list[str](), request.param
 
-    def pretend(search: Search, attempt: Attempt) -> Solution:
+    def pretend(search: TimeSearch, attempt: Attempt) -> TimeSolution:
         names.append(attempt.name)
         nlp, success = search.build(attempt.stages), attempt.name == good
-        return Solution(attempt.stages, 1.0, 0.0, "Ipopt stopped", success, nlp, {})
+        return TimeSolution(attempt.stages, 1.0, 0.0, "Ipopt stopped", success, nlp, {})
 
     monkeypatch.setattr(time_plan, "solve_attempt", pretend)
     monkeypatch.setattr(time_plan, "find_short", lambda *_: (None, []))

@@ -17,7 +17,7 @@ from wholearm.benchmark.kernels import (
     find_kernel,
     perturb_scenes,
 )
-from wholearm.benchmark.pool import Answer
+from wholearm.benchmark.pool import CaseAnswer
 from wholearm.benchmark.study import Case
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
@@ -69,8 +69,8 @@ def test_answers_come_from_the_environment() -> None:
 def test_the_command_stores_answers_and_fails_where_they_differ(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def answer_all(_: object, cases: list[Case], *__: object) -> list[Answer]:
-        return [Answer(case, "done", dict(GOOD), "", 0.0, 0.0, 0.0) for case in cases]
+    def answer_all(_: object, cases: list[Case], *__: object) -> list[CaseAnswer]:
+        return [CaseAnswer(case, "done", dict(GOOD), "", 0.0, 0.0, 0.0) for case in cases]
 
     monkeypatch.setattr("wholearm.benchmark.study.run_tasks", answer_all)
     stored, table = tmp_path / "answers.json", tmp_path / "table.md"

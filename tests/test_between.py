@@ -18,24 +18,24 @@ from wholearm.mechanics.dynamics import Directions
 from wholearm.mechanics.limits import CONE, PRESS, make_limits
 from wholearm.planning.options import CLEARANCE, PlanOptions
 from wholearm.planning.plan import solve
-from wholearm.planning.time_domain import enforcing
-from wholearm.planning.time_domain.between import (
+from wholearm.planning.time_domain import tightening as enforcing
+from wholearm.planning.time_domain.collocation import make_scheme
+from wholearm.planning.time_domain.intersample import (
     GRAZE,
     MISS,
-    Limits,
+    IntersampleLimits,
     Raised,
     check_between,
     find_misses,
     monitor_missed,
     raise_bounds,
 )
-from wholearm.planning.time_domain.collocation import make_scheme
-from wholearm.planning.time_domain.enforcing import enforce_between
-from wholearm.planning.time_domain.motion import StageMotion, TimeMotion, make_motions
-from wholearm.planning.time_domain.nlp import bound_unknowns
-from wholearm.planning.time_domain.plan import plan_phases, try_phases
-from wholearm.planning.time_domain.search import Search, Solution
+from wholearm.planning.time_domain.search import TimeSearch, TimeSolution
 from wholearm.planning.time_domain.stage import Stage
+from wholearm.planning.time_domain.tightening import enforce_between
+from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion, make_motions
+from wholearm.planning.time_domain.time_nlp import bound_unknowns
+from wholearm.planning.time_domain.time_plan import plan_phases, try_phases
 from wholearm.results.trajectory import Trajectory
 
 EPSILON = 0.05
@@ -47,7 +47,7 @@ def as_stage(motion: StageMotion, **fields: object) -> Stage:
     return replace(stage, **fields)  # type: ignore[arg-type]
 
 
-def in_newtons(stage: Stage, misses: Limits, kind: str) -> Array:
+def in_newtons(stage: Stage, misses: IntersampleLimits, kind: str) -> Array:
     """Misses of one kind of limits of forces, shape (K, n)."""
     limits = make_limits(stage.formation, EPSILON)
     return (
@@ -56,7 +56,7 @@ def in_newtons(stage: Stage, misses: Limits, kind: str) -> Array:
     )
 
 
-def check(stage: Stage, motion: StageMotion, *least: float) -> Limits:
+def check(stage: Stage, motion: StageMotion, *least: float) -> IntersampleLimits:
     return find_misses(stage, check_between(stage, motion), *least)
 
 
@@ -148,15 +148,17 @@ def test_released_contacts_have_to_be_clear_in_the_second_half() -> None:
 def test_limits_rise_by_more_than_they_are_missed() -> None:
     motion = heaved()
     stage = as_stage(motion, monitored=(0, 1))
-    plain = Limits.none(stage)
+    plain = IntersampleLimits.none(stage)
     assert [table.shape[1] for table in plain] == [8, 2, 4] and plain.worst == 0.0
-    missed = Limits(*(table + k * 1e-3 for k, table in enumerate(plain)))
+    missed = IntersampleLimits(*(table + k * 1e-3 for k, table in enumerate(plain)))
     once = Raised.none(stage).further(missed)
     for miss, added in zip(missed, once.limits, strict=True):
         assert (added >= miss).all() and (added <= 2 * miss).all()
     # Where a third of what was added has been of use, three times as much is needed; forces have
     # a price, so that they go on as before.
-    left = Limits(*(miss - added / 3 for miss, added in zip(missed, once.added, strict=True)))
+    left = IntersampleLimits(
+        *(miss - added / 3 for miss, added in zip(missed, once.added, strict=True))
+    )
     twice = once.further(left)
     assert twice.added.held == pytest.approx(1.5 * left.held)
     assert twice.added.gap == pytest.approx(3 * left.gap)
@@ -165,20 +167,22 @@ def test_limits_rise_by_more_than_they_are_missed() -> None:
         assert whole == pytest.approx(first + then)
 
 
-class Creeping(Search):
+class Creeping(TimeSearch):
     """Tightening that makes what the first interval misses a tenth less, however often."""
 
     rounds = 0
 
-    def run(self, *given: Any) -> Solution:
+    def run(self, *given: Any) -> TimeSolution:
         self.rounds += 1
         return solve_at_points()
 
-    def solve(self, stages: list[Stage], before: Solution | None = None, most: int = 0) -> Solution:
+    def solve(
+        self, stages: list[Stage], before: TimeSolution | None = None, most: int = 0
+    ) -> TimeSolution:
         return solve_at_points()._replace(stages=stages)
 
-    def miss(self, _: Search, solution: Solution, __: object) -> list[Limits]:
-        missed = [Limits.none(stage) for stage in solution.stages]
+    def miss(self, _: TimeSearch, solution: TimeSolution, __: object) -> list[IntersampleLimits]:
+        missed = [IntersampleLimits.none(stage) for stage in solution.stages]
         if solution.stages[0].intervals == solve_at_points().stages[0].intervals:
             missed[0].held[0, 0] = 100 * MISS * 0.9**self.rounds
         return missed
@@ -189,7 +193,7 @@ def test_tightening_that_creeps_gives_way_to_finer_intervals(
 ) -> None:
     """Where limits are missed, and nowhere else."""
     loose = solve_at_points()
-    search = Creeping(**vars(Search.of(landing(), PlanOptions(time_intervals=6))))
+    search = Creeping(**vars(TimeSearch.of(landing(), PlanOptions(time_intervals=6))))
     monkeypatch.setattr(enforcing, "list_misses", search.miss)
     for name in ("price_misses", "list_gains"):
         monkeypatch.setattr(enforcing, name, lambda *_: [np.zeros(1)])
@@ -203,13 +207,13 @@ def test_tightening_that_creeps_gives_way_to_finer_intervals(
 
 
 @lru_cache(maxsize=1)
-def solve_at_points() -> Solution:
+def solve_at_points() -> TimeSolution:
     """The heptagon's landing on few intervals, with limits at the points alone."""
     problem = landing()
     start = trace_phases(problem)[-1].end
     options = PlanOptions(time_intervals=6)
     begun = try_phases(problem, problem.phases[4:], start, options, further=9)
-    assert begun is not None and isinstance(begun[0].solution, Solution)
+    assert begun is not None and isinstance(begun[0].solution, TimeSolution)
     return begun[0].solution
 
 
@@ -235,7 +239,7 @@ def test_raised_rates_are_bounds_of_contacts_and_joints() -> None:
     k = next(i for i, stage in enumerate(stages) if stage.formation.n_constraints < 4)
     tables = []
     for rise in (0.0, 0.5):
-        limits = [Limits.none(stage) for stage in stages]
+        limits = [IntersampleLimits.none(stage) for stage in stages]
         limits[k].sense[:] = rise
         bounds = bound_unknowns(nlp, stages, SCHEME)
         tables.append((*bounds, raise_bounds(nlp, stages, limits, bounds)[0]))

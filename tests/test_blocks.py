@@ -9,14 +9,14 @@ import pytest
 
 from shipped import HEPTAGON, TWICE, problem_of
 from wholearm.common.errors import InfeasibleError
-from wholearm.common.shortfalls import Place, Shortfall
+from wholearm.common.shortfalls import LimitPlace, Shortfall
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning import blocks
 from wholearm.planning.block_plan import Planning
 from wholearm.planning.blocks import plan_alone
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.stops import Plans
-from wholearm.planning.time_domain import impacts
+from wholearm.planning.time_domain import time_impacts as impacts
 
 
 def planning_of(problem: Any) -> Planning:
@@ -80,7 +80,7 @@ def test_what_is_far_from_possible_later_stops_planning_before(
     problem, begun = problem_of(HEPTAGON), list[tuple[int, bool, bool]]()
     curves, options = trace_phases(problem), PlanOptions(intervals=20)
     known = plan_along()
-    place = Place(3, 0.0, "there")
+    place = LimitPlace(3, 0.0, "there")
     short = Shortfall("press", "v1-palm", "c_n", 1.0, "N", place, share * blocks.CLEAR)
 
     def plan_with_impacts(*of: Any, **others: Any) -> Any:

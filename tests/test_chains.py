@@ -12,16 +12,16 @@ from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phases
 from wholearm.problem.definition import End
 from wholearm.problem.goal import Goal
-from wholearm.search.chart import Chart
+from wholearm.search.border_limits import sketch, survey
+from wholearm.search.edges import Link, cut_curve, time_parts
 from wholearm.search.goals import is_at
-from wholearm.search.ground import sketch, survey
-from wholearm.search.links import Link, cut_curve, time_parts
 from wholearm.search.places import make_place
+from wholearm.search.roadmap import Roadmap
 
 
 def test_a_chain_of_impacts_is_bounded_as_its_plan_takes() -> None:
     problem = problem_of(IMPACTS)
-    chart, phases = Chart(problem, 0.1), problem.phases[:3]
+    chart, phases = Roadmap(problem, 0.1), problem.phases[:3]
     until = [str(phase.until) for phase in phases]
     (own,) = (
         link
@@ -48,7 +48,7 @@ def test_a_chain_of_impacts_is_bounded_as_its_plan_takes() -> None:
 
 def test_no_chain_leads_through_an_impact_that_is_not_possible() -> None:
     problem = problem_of(HEPTAGON)
-    chart = Chart(problem, 0.1)
+    chart = Roadmap(problem, 0.1)
     place = make_place(problem.scene, problem.start)
     # With little friction there the impact onto v3-finger1 would tip edge 0 off the palm.
     assert [
@@ -58,7 +58,7 @@ def test_no_chain_leads_through_an_impact_that_is_not_possible() -> None:
 
 def test_chains_are_followed_a_border_at_a_time_to_where_all_of_them_lead() -> None:
     problem, goal = problem_of(IMPACTS), Goal(flush=1)
-    chart = Chart(problem, 0.1)
+    chart = Roadmap(problem, 0.1)
     place = make_place(problem.scene, problem.start)
     waiting, steps = list(chart.set_out(place, goal)), set()
     while waiting:
@@ -72,7 +72,7 @@ def test_chains_are_followed_a_border_at_a_time_to_where_all_of_them_lead() -> N
 
 def test_parts_of_a_border_take_as_long_together_as_one_by_one() -> None:
     problem = problem_of(IMPACTS)
-    chart, shares = Chart(problem, 0.1), np.array([0.2, 0.5, 0.8])
+    chart, shares = Roadmap(problem, 0.1), np.array([0.2, 0.5, 0.8])
     for border in chart.trace(make_place(problem.scene, problem.start)):
         times = time_parts(border, shares)
         for share, took in zip(shares, times, strict=True):
@@ -85,7 +85,7 @@ def test_parts_of_a_border_take_as_long_together_as_one_by_one() -> None:
 
 def test_a_border_is_kept_without_what_is_seen_of_it() -> None:
     problem = problem_of(IMPACTS)
-    border = Chart(problem, 0.1).trace(make_place(problem.scene, problem.start))[0]
+    border = Roadmap(problem, 0.1).trace(make_place(problem.scene, problem.start))[0]
     seen = border.ground
     kept = pickle.loads(pickle.dumps(border))
     assert "ground" not in kept.__dict__
@@ -94,7 +94,7 @@ def test_a_border_is_kept_without_what_is_seen_of_it() -> None:
 
 def test_a_landing_is_led_to_where_the_goal_is() -> None:
     problem, goal = problem_of(LANDING), Goal(flush=1, x=0.022)
-    chart, curves = Chart(problem, 0.1), trace_phases(problem)
+    chart, curves = Roadmap(problem, 0.1), trace_phases(problem)
     place = make_place(problem.scene, curves[3].end)
     contacts = set(problem.phases[4].formation.contacts)
     ((index, border),) = (

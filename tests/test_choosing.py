@@ -12,30 +12,30 @@ import pytest
 from shipped import HEPTAGON, problem_of
 from wholearm.planning.options import PlanOptions
 from wholearm.problem.definition import Until
-from wholearm.search import choosing
+from wholearm.search import route_choice as choosing
+from wholearm.search.astar import RoadmapRoute, SearchRule
 from wholearm.search.candidates import Lost
-from wholearm.search.choosing import Chooser
-from wholearm.search.find import Route, Rule
-from wholearm.search.links import Link, Step
+from wholearm.search.edges import EdgeStep, Link
 from wholearm.search.places import make_place
+from wholearm.search.route_choice import Chooser
 
 PROBLEM = problem_of(HEPTAGON)
 PLACE = make_place(PROBLEM.scene, PROBLEM.start)
 
 
 def make_link(duration: float) -> Link:
-    steps = (Step(PLACE.contacts, Until(coordinate="x", value=duration)),)
+    steps = (EdgeStep(PLACE.contacts, Until(coordinate="x", value=duration)),)
     return Link(PLACE, PLACE, steps, duration)
 
 
 class Found:
     """A search that finds some routes, each once, as long as they are within its limit."""
 
-    def __init__(self, routes: Sequence[Route]) -> None:
+    def __init__(self, routes: Sequence[RoadmapRoute]) -> None:
         self.chart = SimpleNamespace(measured={}, others={}, joined={}, plans={}, polished=set())
         self.limit, self.waiting = math.inf, list(routes)
 
-    def run(self, rule: Rule) -> Iterator[Route]:
+    def run(self, rule: SearchRule) -> Iterator[RoadmapRoute]:
         for route in list(self.waiting):
             if route.duration <= self.limit:
                 self.waiting.remove(route)
@@ -46,7 +46,7 @@ def test_what_has_no_plan_neither_bounds_nor_is_tried_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     one, lost, good = (make_link(duration) for duration in (0.1, 0.2, 0.9))
-    routes = [Route((one, lost)), Route((lost, one, one)), Route((good, one))]
+    routes = [RoadmapRoute((one, lost)), RoadmapRoute((lost, one, one)), RoadmapRoute((good, one))]
     planned = list[Any]()
 
     def join(problem: Any, links: Any, *rest: Any) -> Any:

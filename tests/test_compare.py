@@ -12,13 +12,13 @@ import pytest
 from shipped import HEPTAGON, problem_of
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
-from wholearm.comparison.compare import compare
+from wholearm.comparison.metrics import compare
 from wholearm.figures.comparison import draw_comparison
 from wholearm.problem.definition import Problem
 from wholearm.problem.keys import name_keys
 from wholearm.problem.table import change_table
-from wholearm.results.narrow import save
-from wholearm.results.origin import describe_origin
+from wholearm.results.adopt import save
+from wholearm.results.provenance import describe_origin
 from wholearm.results.torque import TorqueProfile, read_notes, read_torque_csv
 from wholearm.results.trajectory_file import load_trajectory
 from wholearm.simulation.simulate import simulate

@@ -8,7 +8,7 @@ from wholearm.free_simulation.contact_problem import (
     BACK,
     FORTH,
     STICKS,
-    Answer,
+    ContactAnswer,
     ContactProblem,
     list_answers,
     solve,
@@ -34,7 +34,7 @@ def draw(rng: np.random.Generator, mu: float) -> ContactProblem:
     )
 
 
-def check(p: ContactProblem, answer: Answer) -> None:
+def check(p: ContactProblem, answer: ContactAnswer) -> None:
     """Coulomb's law and complementarity, from the forces alone."""
     change = p.lift * (p.G.T @ answer.c_n + p.T.T @ answer.f)
     r_n, r_t = p.b_n + p.A @ change, p.b_t + p.T @ change

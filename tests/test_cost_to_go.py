@@ -8,7 +8,7 @@ from wholearm.geometry.cost_to_go import CostToGo
 from wholearm.geometry.tracing import trace_phase, trace_phases
 from wholearm.mechanics.metric import metric_weights
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.path_domain.plan import plan_path
+from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.problem.definition import Problem
 
 

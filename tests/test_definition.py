@@ -16,11 +16,11 @@ from plane import finger_gap, place_corners
 from shipped import HEPTAGON, problem_of
 from wholearm.common.errors import InputError
 from wholearm.geometry.path_guess import load
-from wholearm.mapping.walk import format_until
+from wholearm.mapping.legs import format_until
 from wholearm.problem.definition import End, Problem
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.problem.table import write_table
-from wholearm.results.narrow import save
+from wholearm.results.adopt import save
 from wholearm.scene.ranges import find_unit_hint
 
 TEXT = HEPTAGON.read_text(encoding="utf-8")

@@ -6,13 +6,13 @@ import pytest
 from shipped import HEPTAGON, plan_of, problem_of
 from wholearm.engines.departure import Departure, compare, find_pairs
 from wholearm.engines.shapes import list_pairs
-from wholearm.engines.stretch import Run, list_stretches
+from wholearm.engines.stretch import EngineRun, list_stretches
 
 ROWS = 201
 PHASE = 1
 
 
-def follow() -> Run:
+def follow() -> EngineRun:
     """The second phase as planned, with the planned forces."""
     problem, plan = problem_of(HEPTAGON), plan_of(HEPTAGON)
     motion, stretch = plan.motions[PHASE], list_stretches(plan, False)[PHASE]
@@ -21,10 +21,10 @@ def follow() -> Run:
     press = np.zeros((ROWS - 1, len(names)))
     for k, name in enumerate(motion.contacts):
         press[:, names.index(name)] = planned.c_n[1:, k]
-    return Run(stretch.start + t, planned.z, planned.z_dot, names, press)
+    return EngineRun(stretch.start + t, planned.z, planned.z_dot, names, press)
 
 
-def judge(run: Run) -> Departure:
+def judge(run: EngineRun) -> Departure:
     problem, plan = problem_of(HEPTAGON), plan_of(HEPTAGON)
     return compare(problem, plan, list_stretches(plan, False)[PHASE], run, 1e-3)
 

@@ -25,7 +25,7 @@ from wholearm.mechanics.dynamics import (
 )
 from wholearm.problem.read import build_problem
 from wholearm.scene.model import Friction, Scene
-from wholearm.verification.reduced import reduce_to_first_joint
+from wholearm.verification.minimal_coordinates import reduce_to_first_joint
 
 FRICTIONLESS = Friction(0.0, 0.0, 0.0)
 

@@ -19,6 +19,7 @@ from plane import (
 )
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
+from wholearm.contacts.contact_limits import build_clearance, build_limits
 from wholearm.contacts.elemental import (
     Contact,
     build_features,
@@ -26,7 +27,6 @@ from wholearm.contacts.elemental import (
     candidate_contacts,
     parse_contact,
 )
-from wholearm.contacts.limits import build_clearance, build_limits
 from wholearm.problem.definition import Problem
 from wholearm.scene.model import Scene
 

@@ -11,16 +11,16 @@ from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.time_domain.ending import GAIN, choose_end, keep_apart
-from wholearm.planning.time_domain.search import Search, Solution
-from wholearm.planning.time_domain.staging import guess_stages
+from wholearm.planning.time_domain.attempts import GAIN, choose_end, keep_apart
+from wholearm.planning.time_domain.search import TimeSearch, TimeSolution
+from wholearm.planning.time_domain.stages import guess_stages
 
 
 @lru_cache(maxsize=2)
-def landed(intervals: int = 8) -> tuple[Search, Solution]:
+def landed(intervals: int = 8) -> tuple[TimeSearch, TimeSolution]:
     """The landing alone: where along the palm it ends is left open."""
     problem = landing()
-    search = Search.of(problem, PlanOptions())
+    search = TimeSearch.of(problem, PlanOptions())
     start = trace_phases(problem)[-1].end
     stages = guess_stages(problem, problem.phases[4:], start, search.scheme, intervals, 2.0)
     return search, search.solve(stages)

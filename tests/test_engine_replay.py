@@ -13,11 +13,17 @@ import pytest
 from shipped import HEPTAGON, plan_of, problem_of
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
-from wholearm.engines.closed import play_policy
 from wholearm.engines.departure import Departure
-from wholearm.engines.drive import Drive
+from wholearm.engines.engine_replay import (
+    EngineReport,
+    Level,
+    list_settings,
+    replay_in,
+    require_engine,
+)
+from wholearm.engines.feedback import play_policy
 from wholearm.engines.mjcf import write_mjcf
-from wholearm.engines.replay import EngineReport, Level, list_settings, replay_in, require_engine
+from wholearm.engines.pressing import EngineDrive
 from wholearm.engines.stretch import Setting, list_stretches
 from wholearm.planning.plan import solve
 from wholearm.planning.result import Plan
@@ -25,8 +31,8 @@ from wholearm.policy.closed_loop import ClosedLoop
 from wholearm.policy.make import make_policy
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem
-from wholearm.results.narrow import require_same_phases
-from wholearm.search.route import find_route
+from wholearm.results.adopt import require_same_phases
+from wholearm.search.find_route import find_route
 from wholearm.verification.verify import verify
 
 EXTRAS = {"mujoco": "mujoco", "drake": "pydrake"}
@@ -84,7 +90,7 @@ def test_torques_of_a_policy_are_held_and_late() -> None:
 
     scene, h, still = slide()[0].scene, 1e-4, np.zeros(2)
     loop = Loop()
-    drive = Drive(scene, loop, h)
+    drive = EngineDrive(scene, loop, h)
     tau = [drive.step(k * h, still, still).tolist() for k in range(30)]
     assert loop.times == pytest.approx([0.0, 1e-3, 2e-3])
     assert [own[0] for own in tau] == pytest.approx([0.0] * 14 + [1.0] * 10 + [2.0] * 6)

@@ -12,13 +12,13 @@ from typing import Any
 import pytest
 
 from shipped import HEPTAGON
+from wholearm.common.command_options import read_options
 from wholearm.common.errors import InputError
 from wholearm.common.fields import NONNEGATIVE, Range, declare, key, keys_of, read_keys
-from wholearm.common.options import read_options
 from wholearm.problem import keys, read
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem, read_problem
-from wholearm.results.narrow import save
+from wholearm.results.adopt import save
 from wholearm.scene.model import Finger
 
 STIFF = Range(1e-3, 2.0, lambda _, own: own.torque_limit, "times the torque limit")

@@ -21,8 +21,8 @@ from wholearm.contacts.closing import close_finger, close_fingers, contact_table
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.mapping.borders import NOWHERE, Window, label_cells
+from wholearm.mapping.formation_list import list_formations
 from wholearm.mapping.formation_map import CROSSED, Border, FormationMap, build_map, choose_window
-from wholearm.mapping.route import list_formations
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.scene.model import Scene

@@ -20,8 +20,8 @@ from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, SimulationError
 from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation
+from wholearm.free_simulation.free_simulate import simulate_free, simulate_phases
 from wholearm.free_simulation.hand import build_system, measure_gaps
-from wholearm.free_simulation.simulate import simulate_free, simulate_phases
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import read_problem
 from wholearm.results.torque import TorqueProfile

@@ -10,7 +10,7 @@ from scipy.integrate import quad
 
 from bodies import G, make_body, measure_energy, rotate, simulate
 from wholearm.common.arrays import Array
-from wholearm.free_simulation.state import Run
+from wholearm.free_simulation.state import FreeRun
 from wholearm.free_simulation.system import System
 from wholearm.simulation.events import EventKind
 
@@ -24,7 +24,7 @@ def make_block(b: float = 0.1, h: float = 0.1, mu: float = 0.3, slope: float = 0
     return make_body(corners, mu=mu, inertia=(b**2 + h**2) / 3, weight=weight)
 
 
-def list_times(run: Run, kind: EventKind) -> Array:
+def list_times(run: FreeRun, kind: EventKind) -> Array:
     return np.array([event.time for event in run.events if event.kind is kind])
 
 

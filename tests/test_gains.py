@@ -7,8 +7,8 @@ from scipy.optimize import linprog, minimize
 from timed import plan_landing, total
 from wholearm.common.arrays import Array
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.time_domain.gains import find_least
-from wholearm.planning.time_domain.refinement import spread_halvings
+from wholearm.planning.time_domain.tightening import find_least
+from wholearm.planning.time_domain.time_mesh import spread_halvings
 
 
 def draw(rng: np.random.Generator, count: int) -> tuple[Array, Array, Array]:

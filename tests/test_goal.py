@@ -10,7 +10,7 @@ import pytest
 
 from shipped import HEPTAGON, plan_of, problem_of
 from wholearm.common.errors import InputError
-from wholearm.comparison.compare import compare
+from wholearm.comparison.metrics import compare
 from wholearm.mapping.formation_map import choose_window
 from wholearm.problem.definition import Problem
 from wholearm.problem.goal import Goal

@@ -16,15 +16,20 @@ from wholearm.geometry.path_guess import list_ends
 from wholearm.mechanics.metric import metric_weights
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
-from wholearm.planning.time_domain.attempts import Attempts
+from wholearm.planning.time_domain.attempts import (
+    MOST,
+    ONSETS,
+    Attempts,
+    find_modes,
+    split_by_senses,
+)
 from wholearm.planning.time_domain.equations import least_rates, least_senses
-from wholearm.planning.time_domain.gradual import MOST, ONSETS, find_modes, split_by_senses
-from wholearm.planning.time_domain.kernels import goal_kernel
-from wholearm.planning.time_domain.modes import mode_of
-from wholearm.planning.time_domain.nlp import bound_unknowns
-from wholearm.planning.time_domain.refinement import bisect_intervals
-from wholearm.planning.time_domain.search import Search, Solution
+from wholearm.planning.time_domain.search import TimeSearch, TimeSolution
 from wholearm.planning.time_domain.stage import Stage
+from wholearm.planning.time_domain.stage_kernels import goal_kernel
+from wholearm.planning.time_domain.stage_modes import mode_of
+from wholearm.planning.time_domain.time_mesh import bisect_intervals
+from wholearm.planning.time_domain.time_nlp import bound_unknowns
 from wholearm.problem.definition import Phase, Problem
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.verification.verify import verify
@@ -52,13 +57,13 @@ SMALL = 0.005
 """How much the link turns back and forth, so little that all that is not tied to it goes on."""
 
 
-def turned(rates: Polynomial | Chebyshev) -> tuple[Search, Stage]:
+def turned(rates: Polynomial | Chebyshev) -> tuple[TimeSearch, Stage]:
     """The triangle turns on and on; the link, and its vertex, goes at such rates back and forth.
 
     No forces are looked for: every motion of two freedoms is one of the contacts.
     """
     problem, phase, z = corner()
-    search = Search.of(problem, PlanOptions())
+    search = TimeSearch.of(problem, PlanOptions())
     (stage, *_) = Attempts(problem, [phase], z, search, None, True).first.stages
     (stage,) = bisect_intervals([stage], search.scheme, [np.full(stage.intervals, 2)])
     part, formation = stage.guess, stage.formation
@@ -117,17 +122,19 @@ def test_pieces_move_one_way_and_make_up_the_stage() -> None:
         assert pieces[-1].until is not None and all(own.until is None for own in pieces[:-1])
 
 
-class Given(Search):
+class Given(TimeSearch):
     """A search whose solutions are all one motion."""
 
     motion: Stage
     onsets: list[float]
 
-    def solve(self, stages: list[Stage], before: Solution | None = None, most: int = 0) -> Solution:
+    def solve(
+        self, stages: list[Stage], before: TimeSolution | None = None, most: int = 0
+    ) -> TimeSolution:
         (stage,) = stages
         self.onsets.append(stage.onset)
         found = [replace(stage, guess=self.motion.guess)]
-        return Solution(found, 1.0, 0.0, "", True, None, {})  # type: ignore[arg-type]
+        return TimeSolution(found, 1.0, 0.0, "", True, None, {})  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -202,7 +209,7 @@ def test_the_second_contact_of_a_vertex_need_not_move() -> None:
 def test_what_ends_a_phase_is_not_reached_before() -> None:
     """A motion that first passes its end would be over there."""
     problem, phase = with_phase("triangle", "v1-palm v1-finger1 v0-finger2", {"phi_deg": -12.0})
-    search = Search.of(problem, PlanOptions())
+    search = TimeSearch.of(problem, PlanOptions())
     (stage,) = Attempts(problem, [phase], corner()[2], search, None, True).first.stages
     row, value, side = 2, np.radians(-12.0), -1.0
     assert stage.ahead is not None

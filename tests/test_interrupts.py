@@ -15,9 +15,9 @@ import pytest
 from shipped import HEPTAGON
 from signalled import STARTED, interrupt
 from wholearm.cli.route import hasten
-from wholearm.common import interrupts
+from wholearm.common import signals as interrupts
 from wholearm.common.files import together, write_whole
-from wholearm.common.interrupts import check, guard, held
+from wholearm.common.signals import check, guard, held
 from wholearm.solvers.ipopt import STOPPED, Solver
 
 BOTH = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda n: n.name)
@@ -166,7 +166,7 @@ def test_a_command_in_another_thread_leaves_signals_alone() -> None:
 SWALLOWS = """
 import sys, tempfile, time
 from wholearm.common.files import write_whole
-from wholearm.common.interrupts import guard
+from wholearm.common.signals import guard
 
 def write(stream):
     stream.write(b"half")

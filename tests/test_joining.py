@@ -15,15 +15,14 @@ from wholearm.planning.options import PlanOptions
 from wholearm.planning.result import Plan
 from wholearm.problem.definition import Until
 from wholearm.problem.goal import Goal
-from wholearm.search import joining
+from wholearm.search import edge_plans as joining
+from wholearm.search.astar import RouteSearch
 from wholearm.search.candidates import Lost
-from wholearm.search.chart import Chart
-from wholearm.search.find import Search
-from wholearm.search.joining import Aside, join_route
-from wholearm.search.linking import Kept, PlannedLink, key_steps
-from wholearm.search.links import Link, Step
-from wholearm.search.measure import Measured
+from wholearm.search.edge_plans import Aside, Kept, PlannedLink, join_route, key_steps
+from wholearm.search.edges import EdgeStep, Link
+from wholearm.search.feasibility import Measured
 from wholearm.search.places import make_place
+from wholearm.search.roadmap import Roadmap
 
 # Where plans come from does not depend on how accurate they are.
 OPTIONS = PlanOptions(accuracy=0.1, replay=False)
@@ -38,7 +37,9 @@ def join(links: tuple[Link, ...], kept: Kept, jobs: int, aside: Aside[int] | Non
 
 def test_links_planned_at_the_same_time_make_the_same_plan() -> None:
     problem = problem_of(HEPTAGON)
-    search = Search(Chart(problem, 0.1), make_place(problem.scene, problem.start), Goal(flush=6))
+    search = RouteSearch(
+        Roadmap(problem, 0.1), make_place(problem.scene, problem.start), Goal(flush=6)
+    )
     route = next(search.run())
     assert len(route.links) > 1
     kept: Kept = {}
@@ -59,8 +60,8 @@ PROBLEM = problem_of(HEPTAGON)
 PLACE, PHASE = make_place(PROBLEM.scene, PROBLEM.start), PROBLEM.phases[0]
 
 
-def make_steps(x: float) -> tuple[Step, ...]:
-    return (Step(PLACE.contacts, Until(coordinate="x", value=x)),)
+def make_steps(x: float) -> tuple[EdgeStep, ...]:
+    return (EdgeStep(PLACE.contacts, Until(coordinate="x", value=x)),)
 
 
 class Still(BlockPlan):
@@ -74,7 +75,7 @@ class Still(BlockPlan):
 class Plans(dict[Any, Any]):
     """Plans of every link, but of those with some steps, and what has been asked for."""
 
-    def __init__(self, without: tuple[Step, ...] = ()) -> None:
+    def __init__(self, without: tuple[EdgeStep, ...] = ()) -> None:
         super().__init__()
         self.without, self.asked = key_steps(without), list[Any]()
 

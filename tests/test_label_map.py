@@ -4,7 +4,7 @@ import numpy as np
 
 from plane import convex_polygon, make_scene
 from wholearm.mapping.borders import NOWHERE, label_cells
-from wholearm.search.label_map import map_labels
+from wholearm.search.roadmap import map_labels
 
 
 def test_places_of_the_grid_have_their_labels_however_often_the_object_has_turned() -> None:

@@ -10,8 +10,7 @@ from wholearm.common.errors import InputError
 from wholearm.contacts.closing import close_fingers, contact_table
 from wholearm.contacts.formation import Formation
 from wholearm.mapping.borders import NOWHERE, flush_track, label_cells
-from wholearm.mapping.legs import split_leg
-from wholearm.mapping.nearby import tolerance
+from wholearm.mapping.legs import split_leg, tolerance
 from wholearm.problem.definition import Problem
 
 PHI = np.radians(-35.0)

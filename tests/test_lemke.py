@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wholearm.free_simulation.lemke import solve_lcp
+from wholearm.free_simulation.contact_problem import solve_lcp
 
 
 def test_one_unknown() -> None:

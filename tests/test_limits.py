@@ -26,15 +26,15 @@ from wholearm.mechanics.limits import (
     make_limits,
 )
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.path_domain.data import prepare
-from wholearm.planning.path_domain.motion import PathMotion
-from wholearm.planning.path_domain.plan import plan_path
-from wholearm.planning.time_domain.between import MISS, check_between, find_misses
-from wholearm.planning.time_domain.explain import change_limit, list_shortfalls
-from wholearm.planning.time_domain.motion import TimeMotion
-from wholearm.planning.time_domain.plan import plan_phases
-from wholearm.planning.time_domain.search import Search
+from wholearm.planning.path_domain.path_data import prepare
+from wholearm.planning.path_domain.path_motion import PathMotion
+from wholearm.planning.path_domain.path_plan import plan_path
+from wholearm.planning.time_domain.intersample import MISS, check_between, find_misses
+from wholearm.planning.time_domain.search import TimeSearch
 from wholearm.planning.time_domain.stage import Stage
+from wholearm.planning.time_domain.time_explain import change_limit, list_shortfalls
+from wholearm.planning.time_domain.time_motion import TimeMotion
+from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.definition import Problem
 from wholearm.scene.model import Friction
 
@@ -201,7 +201,7 @@ def test_another_limit_is_short_and_gives_way(heptagon: Problem, curves: tuple[C
     # What that motion is short of with the limits as they are: what was added to the torque.
     own = [stage for stage in kept.stages if isinstance(stage, Stage)]
     stages = [replace(stage, formation=phases[0].formation) for stage in own]
-    scheme = Search.of(problem, COARSE).scheme
+    scheme = TimeSearch.of(problem, COARSE).scheme
     short = {one.limit: one.amount for one in list_shortfalls(problem, stages, scheme)}
     torque = "torque limit of finger 1 = 0.5 N m"
     assert {torque, "motor curve of finger 1"} <= set(short)

@@ -8,9 +8,8 @@ import pytest
 from planned import plan
 from wholearm.results.torque import TorqueProfile
 from wholearm.simulation.simulate import simulate
-from wholearm.verification.look_closer import choose_times
 from wholearm.verification.verdict import Allowance
-from wholearm.verification.verify import verify
+from wholearm.verification.verify import choose_times, verify
 
 
 def test_rows_of_a_plan_and_both_ends_of_phases_are_looked_at() -> None:

@@ -14,15 +14,19 @@ from wholearm.geometry.tracing import trace_phase, trace_phases
 from wholearm.mechanics.dynamics import Directions, inverse
 from wholearm.mechanics.limits import make_limits
 from wholearm.planning.lower_bound import lower_bound
-from wholearm.planning.lower_bound.dual import find_least
-from wholearm.planning.lower_bound.lower_bound import LowerBound, bound_least_time, look_along
-from wholearm.planning.lower_bound.rows import GIVE, Rows, evaluate_rows
-from wholearm.planning.lower_bound.sweep import NoMotionError, find_fastest
+from wholearm.planning.lower_bound.lower_bound import (
+    LowerBound,
+    bound_least_time,
+    find_least,
+    look_along,
+)
+from wholearm.planning.lower_bound.rows import GIVE, PathLimitRows, evaluate_rows
+from wholearm.planning.lower_bound.speed_sweep import NoMotionError, find_fastest
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.impact_sequence import make_sequence
-from wholearm.planning.path_domain.misses import MISS
-from wholearm.planning.path_domain.plan import plan_path
+from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.path_domain.sequence_plan import plan_sequence
+from wholearm.planning.path_domain.violations import MISS
 from wholearm.problem.read import build_problem
 
 EPSILON = 0.05
@@ -78,7 +82,7 @@ def test_rows_that_say_the_same_are_told_apart_by_their_order(largest: bool) -> 
     noise = 1 + 1e-14 * rng.uniform(-1, 1, one.shape)
     # The last one is farther away by a millionth.
     farther = np.array([1.0, 1.0, 1.0 + 1e-6])
-    rows = Rows(-sign * a, -b, v, one * noise + 5.0, np.full(50, np.inf))
+    rows = PathLimitRows(-sign * a, -b, v, one * noise + 5.0, np.full(50, np.inf))
     found = rows._replace(one=rows.one * farther).extreme(np.ones(50), largest)
     np.testing.assert_array_equal(found.row, 0)
     nearer = rows._replace(one=rows.one * (2 - farther)).extreme(np.ones(50), largest)
@@ -96,7 +100,7 @@ def test_no_motion_has_no_bound() -> None:
 def test_a_motion_has_to_be_as_fast_as_the_end_asks_for(cap: float) -> None:
     """At the end s'' is -2, so that rest is reached over 1 m from b = 4, which the cap forbids."""
     sides, none = np.tile([1.0, -1.0], (2, 1)), np.zeros((2, 2))
-    rows = Rows(sides, none, none, np.array([[10.0, 10.0], [2.0, -2.0]]), np.full(2, cap))
+    rows = PathLimitRows(sides, none, none, np.array([[10.0, 10.0], [2.0, -2.0]]), np.full(2, cap))
     given = rows, np.ones(2), np.full(2, 0.5), np.array([np.inf, cap, np.inf]), None
     if cap < 4.0:
         with pytest.raises(NoMotionError):

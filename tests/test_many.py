@@ -3,9 +3,8 @@ from __future__ import annotations
 import numpy as np
 
 from shipped import HEPTAGON, chart, problem_of
-from wholearm.contacts.closing import contact_table
+from wholearm.contacts.closing import contact_table, evaluate_each, group_alike
 from wholearm.contacts.formation import Formation
-from wholearm.contacts.many import evaluate_each, group_alike
 
 
 def test_rows_are_those_of_each_formation() -> None:

@@ -17,7 +17,7 @@ from crossing import hexagon
 from shipped import HEPTAGON
 from wholearm import plots
 from wholearm.cli.command import main
-from wholearm.figures.formation_map import draw_map
+from wholearm.figures.map_figure import draw_map
 from wholearm.figures.map_lines import place_discs
 from wholearm.mapping.borders import Window
 from wholearm.mapping.formation_map import FormationMap, build_map

@@ -5,8 +5,8 @@ import pytest
 
 import wholearm
 from wholearm.simulation.layout import STATE
-from wholearm.simulation.mode_equations import share_mechanics
-from wholearm.simulation.modes import Grips, Mode, Rows, respond
+from wholearm.simulation.modes import Grips, Mode, ModeRows, respond
+from wholearm.simulation.stepper import share_mechanics
 
 
 @pytest.mark.parametrize("grips", [Grips(), Grips(contacts=((1,),)), Grips(joints=(0,))])
@@ -36,7 +36,7 @@ def test_rates_are_those_of_the_formations_own_rows(grips: Grips) -> None:
         turn = 1e-7 * v
         ahead, back = (formation.evaluate((state[:5] + k * turn)[None], v[None]) for k in (1, -1))
         bends = (ahead.A_t[0] - back.A_t[0]) @ v / 2e-7
-        rows = Rows(known.A[0], known.A_t[0], known.A_dot_v[0], bends)
+        rows = ModeRows(known.A[0], known.A_t[0], known.A_dot_v[0], bends)
         response = respond(mode, signs, rows, v)
         assert response is not None
         load = np.array([1.0, *tau])

@@ -6,8 +6,8 @@ import pytest
 from timed import tables
 from wholearm.common.arrays import Array
 from wholearm.planning.time_domain.collocation import Scheme, make_scheme
-from wholearm.planning.time_domain.mesh import bisect, resample
 from wholearm.planning.time_domain.stage import StagePoints
+from wholearm.planning.time_domain.time_mesh import bisect, resample
 
 SCHEMES = [("radau", 2), ("radau", 4), ("legendre", 3)]
 

@@ -18,15 +18,14 @@ from wholearm.contacts.formation import find_touching
 from wholearm.mechanics.dynamics import Directions
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
-from wholearm.planning.time_domain.enforcing import MOST
-from wholearm.planning.time_domain.mode_search import improve
-from wholearm.planning.time_domain.modes import Mode, in_mode, link, mode_of
-from wholearm.planning.time_domain.motion import TimeMotion
-from wholearm.planning.time_domain.moves import WORTH
-from wholearm.planning.time_domain.plan import plan_phases
-from wholearm.planning.time_domain.search import Search, Solution
+from wholearm.planning.time_domain.mode_search import WORTH, improve
+from wholearm.planning.time_domain.search import TimeSearch, TimeSolution
 from wholearm.planning.time_domain.stage import Stage
-from wholearm.planning.time_domain.staging import guess_stages
+from wholearm.planning.time_domain.stage_modes import StageMode, in_mode, link, mode_of
+from wholearm.planning.time_domain.stages import guess_stages
+from wholearm.planning.time_domain.tightening import MOST
+from wholearm.planning.time_domain.time_motion import TimeMotion
+from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.definition import End, Problem, Until
 from wholearm.verification.verdict import DEPARTURE
 from wholearm.verification.verify import verify
@@ -34,8 +33,8 @@ from wholearm.verification.verify import verify
 OPTIONS = PlanOptions(time_intervals=10)
 
 
-def outlined(problem: Problem, count: int = 10) -> tuple[Search, list[Stage]]:
-    search = Search.of(problem, OPTIONS)
+def outlined(problem: Problem, count: int = 10) -> tuple[TimeSearch, list[Stage]]:
+    search = TimeSearch.of(problem, OPTIONS)
     start = problem.start
     return search, guess_stages(problem, problem.phases, start, search.scheme, count, 2.0)
 
@@ -56,7 +55,7 @@ def alphabet() -> dict[str, Stage]:
     (stage,) = outlined(raised(), 4)[1]
     signs = {"a": (1, -1, -1), "b": (1, 1, -1), "c": (1, -1, 1), "d": (1, 1, 1), "r": (0, -1, -1)}
     return {
-        name: in_mode(stage, Mode((float(palm), 1.0, 1.0, float(one), float(two))))
+        name: in_mode(stage, StageMode((float(palm), 1.0, 1.0, float(one), float(two))))
         for name, (palm, one, two) in signs.items()
     }
 
@@ -66,18 +65,20 @@ def word_of(stages: list[Stage]) -> str:
     return "".join(names[mode_of(stage)] for stage in stages)
 
 
-class Priced(Search):
+class Priced(TimeSearch):
     """A search whose solves cost what a table says, and fail for sequences that it leaves out."""
 
     costs: Mapping[str, float]
     asked: list[str]
 
-    def solve(self, stages: list[Stage], before: Solution | None = None, most: int = 0) -> Solution:
+    def solve(
+        self, stages: list[Stage], before: TimeSolution | None = None, most: int = 0
+    ) -> TimeSolution:
         self.asked.append(word_of(stages))
         return self.answer(stages, self.costs.get(self.asked[-1], math.inf))
 
-    def answer(self, stages: list[Stage], cost: float) -> Solution:
-        return Solution(stages, cost, 0.0, "", math.isfinite(cost), None, {})  # type: ignore[arg-type]
+    def answer(self, stages: list[Stage], cost: float) -> TimeSolution:
+        return TimeSolution(stages, cost, 0.0, "", math.isfinite(cost), None, {})  # type: ignore[arg-type]
 
 
 LESS, MORE = 1 - 2 * WORTH, 1 + 2 * WORTH
@@ -127,7 +128,9 @@ def test_modes_change_for_as_long_as_that_gains(
     own = Priced(**vars(outlined(raised(), 4)[0]))
     own.costs, own.asked = costs, []
 
-    def list_moves(search: Search, solution: Solution, leaning: bool = False) -> list[list[Stage]]:
+    def list_moves(
+        search: TimeSearch, solution: TimeSolution, leaning: bool = False
+    ) -> list[list[Stage]]:
         words = moves.get(word_of(solution.stages) + "*" * leaning, "").split()
         return [[alphabet()[name] for name in word] for word in words]
 

@@ -11,9 +11,10 @@ from timed import landing
 from wholearm.contacts.formation import Formation
 from wholearm.mechanics.dynamics import Directions, split_forces
 from wholearm.planning.time_domain.collocation import make_scheme
-from wholearm.planning.time_domain.modes import (
+from wholearm.planning.time_domain.stage import Stage
+from wholearm.planning.time_domain.stage_modes import (
     LEAST_INTERVALS,
-    Mode,
+    StageMode,
     drop,
     in_mode,
     link,
@@ -23,7 +24,6 @@ from wholearm.planning.time_domain.modes import (
     sign_sequence,
     split,
 )
-from wholearm.planning.time_domain.stage import Stage
 from wholearm.problem.definition import Until
 
 SCHEME = make_scheme("radau", 3)
@@ -37,7 +37,7 @@ def make_stage(names: str, count: int = 8, phase: int = 0, **fields: object) -> 
     return Stage(phase, formation, directions, guess, **fields)  # type: ignore[arg-type]
 
 
-def turned(stage: Stage, *rows: int) -> Mode:
+def turned(stage: Stage, *rows: int) -> StageMode:
     return mode_of(stage).changed(rows, -1.0)
 
 
@@ -121,6 +121,6 @@ def test_releasing_earlier_hands_a_stage_to_the_next_phase() -> None:
 
 def test_formations_in_other_modes_are_of_the_same_scene() -> None:
     stage = make_stage("v1-palm v4-finger1")
-    rolling = in_mode(stage, Mode((0.0, 1.0, 1.0, 1.0)))
+    rolling = in_mode(stage, StageMode((0.0, 1.0, 1.0, 1.0)))
     assert isinstance(rolling.formation, Formation)
     assert rolling.formation.scene is stage.formation.scene

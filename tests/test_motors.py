@@ -17,9 +17,9 @@ from wholearm.problem.table import describe_scene
 from wholearm.results.torque import TorqueProfile, read_torque_csv
 from wholearm.results.torque_table import read_rows
 from wholearm.simulation.events import EventKind, OutcomeKind
-from wholearm.simulation.statics import balances
+from wholearm.simulation.sticking import balances
 from wholearm.simulation.tolerances import find_tolerances
-from wholearm.verification.motors import describe_motors, find_commands
+from wholearm.verification.margins import describe_motors, find_commands
 
 
 @pytest.fixture(scope="module")

@@ -8,10 +8,10 @@ import pytest
 from test_modes import SCHEME, make_stage, turned
 from wholearm.common.arrays import Array
 from wholearm.contacts.formation import Formation
-from wholearm.planning.time_domain.mesh import resample
-from wholearm.planning.time_domain.modes import drop, in_mode, link, merge, mode_of, split
-from wholearm.planning.time_domain.moves import list_moves
+from wholearm.planning.time_domain.mode_search import list_moves
 from wholearm.planning.time_domain.stage import Stage, StagePoints
+from wholearm.planning.time_domain.stage_modes import drop, in_mode, link, merge, mode_of, split
+from wholearm.planning.time_domain.time_mesh import resample
 
 THREE = "v1-palm v4-finger1 v6-finger2"
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 
 from test_legs import PHI, on_border
-from wholearm.mapping.nearby import choose_leg, describe_miss, find_miss, tolerance
+from wholearm.mapping.legs import choose_leg, describe_miss, find_miss, tolerance
 from wholearm.problem.definition import Problem
 
 

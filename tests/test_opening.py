@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 
 from shipped import HEPTAGON, HEXAGON, problem_of
-from wholearm.common.pulse import OutOfTime
 from wholearm.common.shortfalls import Change, Parameter
+from wholearm.common.signals import OutOfTime
 from wholearm.contacts.closing import close_fingers
 from wholearm.planning.options import PlanOptions
 from wholearm.problem.goal import Goal
 from wholearm.problem.read import build_problem
-from wholearm.search.chart import Chart
-from wholearm.search.find import Search
-from wholearm.search.gates import Opening, list_cut, list_gates, list_openings, look_through
-from wholearm.search.links import Link
-from wholearm.search.opening import choose_opening, explain, find_hand, find_opening, list_hands
+from wholearm.search.astar import RouteSearch
+from wholearm.search.cuts import Opening, list_cut, list_gates, list_openings, look_through
+from wholearm.search.edges import Link
+from wholearm.search.find_route import choose_opening, explain, find_hand, find_opening, list_hands
 from wholearm.search.places import make_place
 from wholearm.search.result import describe_block
+from wholearm.search.roadmap import Roadmap
 
 TORQUE = Parameter("torque limit of finger 1", 2.0, "N m", 1, "fingers.1.torque_limit")
 EPSILON = Parameter("epsilon", 0.05, "N", -1, "epsilon")
@@ -61,7 +61,7 @@ def test_a_number_is_changed_no_further_than_its_way_needs(
 def test_what_is_advised_opens_the_way() -> None:
     """On a rough palm the slide cannot begin; with the friction that is named it can."""
     goal, rough = Goal(flush=0, x=0.03), problem_of(HEPTAGON).with_(friction_palm=1.5)
-    own = Search(Chart(rough, 0.1), make_place(rough.scene, rough.start), goal)
+    own = RouteSearch(Roadmap(rough, 0.1), make_place(rough.scene, rough.start), goal)
     assert not list(own.run())
     # All that leads on from what is reached is in the cut, and nothing that ends where it was.
     assert all(blocked.stop.key not in own.reached for blocked in list_cut(own))
@@ -77,7 +77,7 @@ def test_what_is_advised_opens_the_way() -> None:
     assert text.startswith(f"with {change} the goal is reached, in about ")
     eased = rough.with_({"friction.palm": change.value})
     assert next(
-        Search(Chart(eased, 0.1), make_place(eased.scene, eased.start), goal).run()
+        RouteSearch(Roadmap(eased, 0.1), make_place(eased.scene, eased.start), goal).run()
     ).duration == pytest.approx(float(text.split()[-2]), rel=0.05)
     said = describe_block(own, [], text, lambda blocked: explain(rough, PlanOptions(), blocked))
     assert "blocked; v0-palm" in said and said.endswith(text) and " N short; " in said
@@ -107,8 +107,8 @@ def test_fingers_that_cross_on_the_way_are_mounted_elsewhere(
     table = {key: own for key, own in problem_of(HEXAGON).table.items() if key != "phases"}
     crossing = build_problem({**table, "goal": {"flush": 0, "x": -0.01}}).with_(length=0.18)
     (goal,), place = crossing.goals, make_place(crossing.scene, crossing.start)
-    own, told = Search(Chart(crossing, 0.1), place, goal), list[str]()
-    monkeypatch.setattr("wholearm.search.opening.HANDS", (0.95,))
+    own, told = RouteSearch(Roadmap(crossing, 0.1), place, goal), list[str]()
+    monkeypatch.setattr("wholearm.search.find_route.HANDS", (0.95,))
     text, (change,) = find_hand(own, crossing, PlanOptions(), 0.0, told.append)
     assert text.startswith(f"with {change} the goal is reached") and f"{change}" in told[0]
     assert change.values == {"fingers.1.base[1]": 0.076, "fingers.2.base[1]": -0.076}

@@ -9,17 +9,17 @@ from numpy.typing import NDArray
 from plane import with_speed_limit
 from wholearm.common.arrays import Array
 from wholearm.common.errors import JammingError
-from wholearm.common.minima import find_minima
+from wholearm.common.quadrature import find_minima
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.mechanics.dynamics import PathForces, inverse
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.path_domain.data import PhaseData, choose_sampling, prepare
 from wholearm.planning.path_domain.elements import Profile
-from wholearm.planning.path_domain.fitting import fit_torque
-from wholearm.planning.path_domain.mesh import Mesh
-from wholearm.planning.path_domain.motion import directions_of
-from wholearm.planning.path_domain.plan import plan_path
+from wholearm.planning.path_domain.interpolation import fit_torque
+from wholearm.planning.path_domain.path_data import PhaseData, choose_sampling, prepare
+from wholearm.planning.path_domain.path_mesh import Mesh
+from wholearm.planning.path_domain.path_motion import directions_of
+from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.scene.model import Friction, Scene
 
 PHASES = range(5)

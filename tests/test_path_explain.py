@@ -15,11 +15,11 @@ from wholearm.common.errors import InfeasibleError, SolverError, WholearmError
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.path_domain.data import prepare
-from wholearm.planning.path_domain.explain import change_curve
 from wholearm.planning.path_domain.impact_sequence import make_sequence
-from wholearm.planning.path_domain.mesh import Mesh
-from wholearm.planning.path_domain.plan import plan_path
+from wholearm.planning.path_domain.path_data import prepare
+from wholearm.planning.path_domain.path_explain import change_curve
+from wholearm.planning.path_domain.path_mesh import Mesh
+from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.path_domain.sequence_plan import plan_sequence
 from wholearm.planning.plan import solve
 

@@ -17,8 +17,8 @@ from wholearm.geometry.explore import close_contacts
 from wholearm.geometry.path_guess import guess_curve, guess_onwards, guess_phase, load
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.path_domain.plan import plan_path
-from wholearm.planning.time_domain.plan import plan_phases
+from wholearm.planning.path_domain.path_plan import plan_path
+from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.definition import End, Phase, Problem, Until
 
 CLOSED = 1e-9

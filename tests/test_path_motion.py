@@ -21,8 +21,8 @@ from wholearm.planning.path_domain.elements import (
     find_basis,
     lay_out,
 )
-from wholearm.planning.path_domain.mesh import Mesh
-from wholearm.planning.path_domain.motion import PathMotion
+from wholearm.planning.path_domain.path_mesh import Mesh
+from wholearm.planning.path_domain.path_motion import PathMotion
 
 SEEDS = range(4)
 

@@ -12,7 +12,6 @@ from toys import LIMIT, Toy, constant, find_time_growing, find_time_viscous, ine
 from wholearm.common.arrays import Array
 from wholearm.geometry.curve import Curve
 from wholearm.planning.options import CHOICES, Objective
-from wholearm.planning.path_domain.data import PhaseData, prepare
 from wholearm.planning.path_domain.elements import (
     DEGREE,
     FROM_REST,
@@ -22,9 +21,10 @@ from wholearm.planning.path_domain.elements import (
     find_basis,
 )
 from wholearm.planning.path_domain.first_guess import guess
-from wholearm.planning.path_domain.mesh import Mesh
-from wholearm.planning.path_domain.motion import PathMotion
-from wholearm.planning.path_domain.nlp import (
+from wholearm.planning.path_domain.path_data import PhaseData, prepare
+from wholearm.planning.path_domain.path_mesh import Mesh
+from wholearm.planning.path_domain.path_motion import PathMotion
+from wholearm.planning.path_domain.path_nlp import (
     PathNLP,
     Tightening,
     Units,
@@ -34,7 +34,7 @@ from wholearm.planning.path_domain.nlp import (
     parameters,
     unpack,
 )
-from wholearm.planning.path_domain.solving import move_multipliers
+from wholearm.planning.path_domain.refine import move_multipliers
 from wholearm.planning.path_domain.terms import LimitShape
 
 EPSILON = 0.05

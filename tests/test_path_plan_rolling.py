@@ -15,8 +15,8 @@ from wholearm.geometry.curve import Curve
 from wholearm.mechanics.dynamics import split_forces
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.path_domain.motion import PathMotion
-from wholearm.planning.path_domain.plan import plan_curves, plan_path
+from wholearm.planning.path_domain.path_motion import PathMotion
+from wholearm.planning.path_domain.path_plan import plan_curves, plan_path
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.results.trajectory import Samples
 from wholearm.scene.model import Friction, Scene

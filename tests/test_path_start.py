@@ -7,14 +7,14 @@ import pytest
 from wholearm.geometry.curve import Curve
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
 from wholearm.planning.options import Objective, PlanOptions
-from wholearm.planning.path_domain.data import PhaseData, join, prepare
-from wholearm.planning.path_domain.fastest import Fastest, Narrow, find_fastest
 from wholearm.planning.path_domain.first_guess import guess
-from wholearm.planning.path_domain.mesh import Mesh
-from wholearm.planning.path_domain.motion import PathMotion
-from wholearm.planning.path_domain.nlp import build_path_nlp, pack, parameters
-from wholearm.planning.path_domain.plan import plan_path
-from wholearm.planning.path_domain.start import start_at
+from wholearm.planning.path_domain.path_data import PhaseData, join, prepare
+from wholearm.planning.path_domain.path_mesh import Mesh
+from wholearm.planning.path_domain.path_motion import PathMotion
+from wholearm.planning.path_domain.path_nlp import build_path_nlp, pack, parameters
+from wholearm.planning.path_domain.path_plan import plan_path
+from wholearm.planning.path_domain.refine import start_at
+from wholearm.planning.path_domain.speed_profile import Fastest, Narrow, find_fastest
 from wholearm.planning.path_domain.terms import LimitShape
 
 EPSILON = 0.05

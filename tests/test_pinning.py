@@ -13,15 +13,14 @@ from planned import plan_landing
 from shipped import HEPTAGON, problem_of
 from timed import landing
 from wholearm.common.errors import InfeasibleError, InputError
-from wholearm.common.shortfalls import Place, Shortfall
+from wholearm.common.shortfalls import LimitPlace, Shortfall
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.time_domain import explain
-from wholearm.planning.time_domain.pinning import NEARER, Approach, refuse_pinned
-from wholearm.planning.time_domain.plan import plan_phases
-from wholearm.planning.time_domain.search import Search, Solution
+from wholearm.planning.time_domain import time_explain as explain
+from wholearm.planning.time_domain.search import TimeSearch, TimeSolution
 from wholearm.planning.time_domain.stage import Stage
-from wholearm.planning.time_domain.staging import guess_stages
+from wholearm.planning.time_domain.stages import guess_stages
+from wholearm.planning.time_domain.time_plan import NEARER, ContinuedEnd, plan_phases, refuse_pinned
 from wholearm.problem.definition import Problem
 from wholearm.simulation.simulate import simulate
 from wholearm.verification.verdict import Allowance, describe_ends
@@ -61,15 +60,15 @@ def test_where_no_plan_ends_it_is_said_what_motions_nearer_to_it_are_short_of(
     """All the way is asked for first, and then less of it: until a motion is found at all."""
     problem, options = pin(landing(), 5, ("x", 0.0145)), PlanOptions(time_intervals=6)
     start, phases = trace_phases(problem)[-1].end, problem.phases[4:]
-    search = Search.of(problem, options, None, None, math.inf, True)
+    search = TimeSearch.of(problem, options, None, None, math.inf, True)
     stages = guess_stages(problem, phases, start, search.scheme, 6, 2.0)
-    nearest = Solution(stages, 1.0, 0.0, "", True, search.build(stages), {})
+    nearest = TimeSolution(stages, 1.0, 0.0, "", True, search.build(stages), {})
     free = guess_stages(landing(), landing().phases[4:], start, search.scheme, 6, 2.0)
     ends = {stage.phase: stage.guess.nodes[-1, 0] for stage in free}
-    lack = Shortfall("torque", "finger 2", "torque limit", 1.0, "N m", Place(6, 0.1, ""), 0.5)
+    lack = Shortfall("torque", "finger 2", "torque limit", 1.0, "N m", LimitPlace(6, 0.1, ""), 0.5)
     asked = list[float]()
 
-    def solve_elastic(_: Search, own: list[Stage]) -> list[Stage] | None:
+    def solve_elastic(_: TimeSearch, own: list[Stage]) -> list[Stage] | None:
         until = own[-1].until
         assert until is not None
         asked.append(until.pins[0][1] * problem.scene.scales.length)
@@ -78,7 +77,7 @@ def test_where_no_plan_ends_it_is_said_what_motions_nearer_to_it_are_short_of(
     monkeypatch.setattr(explain, "solve_elastic", solve_elastic)
     monkeypatch.setattr(explain, "list_shortfalls", lambda _, own, __: [lack] if own else [])
     with pytest.raises(InfeasibleError, match=r"ends at x = .* mm, .* at the nearest") as caught:
-        refuse_pinned(search, problem, phases, Approach(None, nearest, ends, 0.2))
+        refuse_pinned(search, problem, phases, ContinuedEnd(None, nearest, ends, 0.2))
     assert caught.value.shortfalls == (lack,)
     begin = ends[5][0] * problem.scene.scales.length
     assert abs(begin - 0.0145) > 1e-3

@@ -15,13 +15,12 @@ from thrown import shove
 from tipping import tipped
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError, InputError
-from wholearm.planning.durations import share_again
+from wholearm.planning.blocks import share_again
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
-from wholearm.planning.time_domain import impacts as time_impacts
-from wholearm.planning.time_domain import plan as time_plan
-from wholearm.planning.time_domain.motion import TimeMotion
+from wholearm.planning.time_domain import time_impacts, time_plan
+from wholearm.planning.time_domain.time_motion import TimeMotion
 from wholearm.problem.definition import Problem
 from wholearm.results.trajectory import Samples, Trajectory
 from wholearm.results.trajectory_file import load_trajectory

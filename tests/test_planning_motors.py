@@ -11,8 +11,8 @@ import pytest
 
 from wholearm.common.errors import InfeasibleError, SolverError
 from wholearm.planning.block_plan import Planning
-from wholearm.planning.motors import explain_motors
 from wholearm.planning.options import PlanOptions
+from wholearm.planning.rate_limits import explain_motors
 from wholearm.planning.stops import Plans
 from wholearm.problem.definition import Phase, Problem
 

@@ -23,7 +23,7 @@ import wholearm
 from wholearm import plots
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
-from wholearm.figures.data import choose_snapshots, find_steps
+from wholearm.figures.plot_data import choose_snapshots, find_steps
 from wholearm.figures.style import WIDTH
 from wholearm.problem.definition import Problem
 from wholearm.results.torque import TorqueProfile

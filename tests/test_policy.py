@@ -18,23 +18,18 @@ import wholearm
 from shipped import HEPTAGON, IMPACTS, LANDING, SQUARE, plan_of, problem_of
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
-from wholearm.free_simulation.simulate import simulate_free
+from wholearm.free_simulation.free_simulate import simulate_free
 from wholearm.geometry.tracing import trace_phase
 from wholearm.planning.result import Plan
-from wholearm.policy.curve_law import CurveLaw
-from wholearm.policy.make import hold_end, make_policy
-from wholearm.policy.motion_law import MotionLaw
-from wholearm.policy.pace import Pace
-from wholearm.policy.policy import Policy
+from wholearm.policy.curve_law import CurveLaw, LoopSettings, MotionLaw, Sensing, choose_squeeze
+from wholearm.policy.make import SAME, hold_end, make_policy
+from wholearm.policy.playback import Policy
 from wholearm.policy.regulator import RATE, Linear, follow, regulate
-from wholearm.policy.replan import SAME
-from wholearm.policy.retime import eliminate, retime
-from wholearm.policy.sensing import Sensing
-from wholearm.policy.squeeze import choose_squeeze
+from wholearm.policy.retiming import eliminate, retime
 from wholearm.problem.definition import Problem
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Trajectory
-from wholearm.verification.policy import verify_policy
+from wholearm.verification.policy_check import verify_policy
 
 
 @pytest.fixture(scope="module")
@@ -230,7 +225,7 @@ def test_gains_are_those_of_the_riccati_equation() -> None:
 
 
 def test_joints_are_led_along_a_motion() -> None:
-    pace = Pace(1e-3, 0.0, 1e-3, 1e-3, 3e-3, 1.0, (5.0, 5.0))
+    pace = LoopSettings(1e-3, 0.0, 1e-3, 1e-3, 3e-3, 1.0, (5.0, 5.0))
     t = np.linspace(0.0, 0.2, 201)
     theta = np.column_stack([1 - np.cos(5 * np.pi * t), 0 * t])
     rates = np.column_stack([5 * np.pi * np.sin(5 * np.pi * t), 0 * t])
@@ -275,7 +270,7 @@ def test_files(tmp_path: Path, problem: Problem, plan: Plan, policy: Policy) -> 
     assert loaded.step(theta, rates) == policy.step(theta, rates)
     # The loop needs neither CasADi nor SciPy.
     code = (
-        "import sys; from wholearm.policy.policy import Policy; "
+        "import sys; from wholearm.policy.playback import Policy; "
         f"p = Policy.load({str(path)!r}); p.reset(); p.step({theta}, {rates}); "
         "assert not {'casadi', 'scipy'} & set(sys.modules)"
     )
@@ -338,7 +333,7 @@ def test_contacts_of_a_policy_may_open_as_far_as_is_asked_for(
         return SimpleNamespace(ok=ok, failures=["opens"] * len(losses), phases=phases)
 
     monkeypatch.setattr("wholearm.policy.make.make_policy", lambda *_, **__: policy)
-    monkeypatch.setattr("wholearm.verification.policy.verify_policy", report)
+    monkeypatch.setattr("wholearm.verification.policy_check.verify_policy", report)
     given = ["policy", str(tmp_path / "plan.npz"), "-o", str(tmp_path / "p.npz")]
     assert main(given) == 1
     said = capsys.readouterr().err

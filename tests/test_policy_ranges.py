@@ -13,13 +13,12 @@ from wholearm.common.errors import InputError
 from wholearm.geometry.tracing import trace_phase
 from wholearm.mechanics.dynamics import build_forward
 from wholearm.policy.corners import list_scenes
-from wholearm.policy.make import make_policy
-from wholearm.policy.widest import find_widest
-from wholearm.policy.within import find_within, retime_within
+from wholearm.policy.make import find_widest, make_policy
+from wholearm.policy.range_margins import find_within, retime_within
 from wholearm.problem.definition import Problem
 from wholearm.results.trajectory import Trajectory
-from wholearm.robustness.trial import make_trial
-from wholearm.robustness.uncertainty import Uncertainty
+from wholearm.robustness.error_model import Uncertainty
+from wholearm.robustness.sample_run import make_trial
 
 RANGES = {"mass": 0.1, "inertia": 0.1, "friction": 0.2, "start_x": 5e-4} | dict.fromkeys(
     ("geometry", "gain", "delay"), 0.0

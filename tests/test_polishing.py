@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from wholearm.search.measure import Measured
-from wholearm.search.polishing import FINEST, STEPS, Found, Leaving, Way
+from wholearm.search.feasibility import Measured
+from wholearm.search.refinement import FINEST, STEPS, Found, Leaving, RefinedPath
 
 
 def plan_of(duration: float) -> Measured:
@@ -15,9 +15,9 @@ class Cell:
 
     def __init__(self, best: int, end: int, moving: float | None = None, saved: float = 0) -> None:
         self.best, self.end, self.moving, self.saved = best, end, moving, saved
-        self.tried: list[Way] = []
+        self.tried: list[RefinedPath] = []
 
-    def __call__(self, way: Way) -> Found:
+    def __call__(self, way: RefinedPath) -> Found:
         assert way not in self.tried
         self.tried.append(way)
         if way.move is None:
@@ -37,17 +37,17 @@ def test_a_border_is_left_where_that_is_best(best: int, end: int) -> None:
     found, *others = cell.leave()
     assert found.duration == pytest.approx(1, abs=1e-9)
     assert all(own.duration >= found.duration for own in others)
-    assert Way(0) not in cell.tried
+    assert RefinedPath(0) not in cell.tried
 
 
 def test_a_border_that_no_other_place_is_better_for_may_be_left_in_motion() -> None:
     cell = Cell(-1, -20, moving=0.9)
     found, *others = cell.leave()
-    assert cell.tried == [Way(-STEPS[0]), Way(STEPS[0]), Way(None)]
+    assert cell.tried == [RefinedPath(-STEPS[0]), RefinedPath(STEPS[0]), RefinedPath(None)]
     assert found.duration == 0.9 and len(others) == 3
     # Where another place is better, that is gone on with.
     other = Cell(-7, -20, moving=0.9)
-    assert other.leave()[0].duration == pytest.approx(1) and Way(None) not in other.tried
+    assert other.leave()[0].duration == pytest.approx(1) and RefinedPath(None) not in other.tried
 
 
 def test_another_guess_goes_on_from_the_best_place() -> None:

@@ -10,7 +10,6 @@ import pytest
 
 from timed import landing
 from tipping import box
-from wholearm.benchmark.precision.check import check_plan
 from wholearm.benchmark.precision.phases import Instance, keep_curves, list_instances
 from wholearm.benchmark.precision.planners import (
     LEAST_TIME,
@@ -20,8 +19,9 @@ from wholearm.benchmark.precision.planners import (
     is_installed,
     run_planner,
 )
+from wholearm.benchmark.precision.precision_study import METHODS, STUDY
+from wholearm.benchmark.precision.reference_check import check_plan
 from wholearm.benchmark.precision.runs import SOLVED, Median
-from wholearm.benchmark.precision.study import METHODS, STUDY
 from wholearm.benchmark.precision.tables import Medians, draw_medians, format_report
 from wholearm.cli.command import main
 from wholearm.problem.definition import End, Problem

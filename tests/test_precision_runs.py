@@ -5,7 +5,7 @@ import math
 import pytest
 
 from wholearm.benchmark.precision.runs import SHIFT, SHORT, SOLVED, Median, find_mean, measure
-from wholearm.benchmark.precision.tables import Comparison, Medians, find_times
+from wholearm.benchmark.precision.tables import Medians, PeerComparison, find_times
 
 FINE = Median(0.5, 0.3, (-3e-7,))
 MEDIANS: Medians = {
@@ -30,7 +30,7 @@ def test_medians_keep_the_worst_error_and_the_first_failure() -> None:
 
 
 def test_the_soonest_setting_counts_and_failures_never_do() -> None:
-    own = Comparison("study", "title", "a, b", (1e-3, 1e-6), False, None)
+    own = PeerComparison("study", "title", "a, b", (1e-3, 1e-6), False, None)
     assert find_times(MEDIANS, "a, b", own, 1e-3) == {"phase 1": 0.1, "phase 2": math.inf}
     assert find_times(MEDIANS, "a, b", own, 1e-6) == {"phase 1": 0.3, "phase 2": math.inf}
     built = own._replace(building=True)

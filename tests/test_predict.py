@@ -17,10 +17,18 @@ from wholearm.common.errors import InputError
 from wholearm.contacts.cones import force_limit_rows
 from wholearm.mechanics.dynamics import force_rows
 from wholearm.problem.definition import Problem
-from wholearm.quasistatic.predict import OWN, find_torques, make_torques, predict
 from wholearm.quasistatic.prediction import Prediction, Survival
-from wholearm.quasistatic.road import Road, make_road
-from wholearm.quasistatic.survival import Least, Pace, find_break
+from wholearm.quasistatic.slow_speeds import (
+    OWN,
+    Least,
+    Pace,
+    Road,
+    find_break,
+    find_torques,
+    make_road,
+    make_torques,
+    predict,
+)
 from wholearm.results.torque import TorqueProfile
 from wholearm.simulation.events import EventKind, Simulation
 from wholearm.simulation.simulate import simulate

@@ -9,14 +9,14 @@ from shipped import SQUARE, problem_of
 from wholearm.contacts.closing import contact_table
 from wholearm.contacts.explicit import measure_gap, place
 from wholearm.mapping.borders import label_cells
-from wholearm.search.places import Place, list_formations_at, make_place, unit_steps
-from wholearm.search.rays import BESIDE, Rays, shoot
+from wholearm.search.places import RoadmapPlace, list_formations_at, make_place, unit_steps
+from wholearm.search.roadmap import BESIDE, Rays, shoot
 
 PARTS = 50
 
 
 @cache
-def around_the_start() -> tuple[Place, Rays]:
+def around_the_start() -> tuple[RoadmapPlace, Rays]:
     problem = problem_of(SQUARE)
     own = make_place(problem.scene, problem.start)
     return own, shoot([own], problem.epsilon)

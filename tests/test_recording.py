@@ -13,7 +13,7 @@ from shipped import HEPTAGON, problem_of
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError, SimulationError
 from wholearm.figures import plots
-from wholearm.results.narrow import narrow, save
+from wholearm.results.adopt import narrow, save
 from wholearm.results.torque import TorqueProfile, read_torque_csv
 from wholearm.results.trajectory import Trajectory
 from wholearm.results.trajectory_file import load_trajectory

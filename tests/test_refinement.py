@@ -7,8 +7,8 @@ import pytest
 
 from timed import plan_landing, stages_of, tables
 from wholearm.planning.time_domain.collocation import make_scheme
-from wholearm.planning.time_domain.motion import StageMotion
-from wholearm.planning.time_domain.refinement import (
+from wholearm.planning.time_domain.stage import Stage
+from wholearm.planning.time_domain.time_mesh import (
     AT_ONCE,
     DEAR,
     DEFECT,
@@ -18,7 +18,7 @@ from wholearm.planning.time_domain.refinement import (
     count_halvings,
     monitor_violated,
 )
-from wholearm.planning.time_domain.stage import Stage
+from wholearm.planning.time_domain.time_motion import StageMotion
 
 SCHEME = make_scheme("radau", 3)
 

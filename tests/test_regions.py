@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from wholearm.figures.regions import choose_tints, find_room, split
+from wholearm.figures.map_lines import choose_tints, find_room, split
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wholearm.common.errors import InputError
-from wholearm.common.require import require_number, require_vector
+from wholearm.common.errors import InputError, require_number, require_vector
 
 
 @pytest.mark.parametrize("value", [3, 3.0, np.float32(3), np.int64(3)])

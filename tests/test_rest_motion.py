@@ -9,8 +9,8 @@ from timed import landing
 from wholearm.benchmark.stress.slow_motion import list_others, rest_margin
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phases
-from wholearm.planning.time_domain.own_units import in_own_units, scale_state
 from wholearm.planning.time_domain.resting import find_block
+from wholearm.planning.time_domain.units import in_own_units, scale_state
 
 
 @pytest.mark.parametrize("ends", [False, True])

@@ -8,14 +8,14 @@ from timed import landing, plan_landing
 from wholearm.common.errors import InfeasibleError
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.time_domain.own_units import in_own_units, scale_state
-from wholearm.planning.time_domain.plan import plan_phases
 from wholearm.planning.time_domain.resting import (
     find_block,
     list_headings,
     list_ways,
     pushes_one_way,
 )
+from wholearm.planning.time_domain.time_plan import plan_phases
+from wholearm.planning.time_domain.units import in_own_units, scale_state
 from wholearm.problem.read import build_problem, read_problem
 
 COARSE = PlanOptions(time_intervals=4)

@@ -12,7 +12,7 @@ import pytest
 from shipped import HEPTAGON, IMPACTS, problem_of
 from wholearm.common.errors import InputError
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.path_domain.nlp import build_path_nlp
+from wholearm.planning.path_domain.path_nlp import build_path_nlp
 from wholearm.planning.plan import solve
 from wholearm.planning.plan_report import describe_plan
 from wholearm.planning.result import Plan, Status

@@ -18,17 +18,16 @@ from wholearm.mechanics.dynamics import Directions, build_forward, inverse
 from wholearm.mechanics.metric import metric_weights
 from wholearm.mechanics.wedging import find_static_torques
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.path_domain.motion import directions_of
-from wholearm.planning.path_domain.plan import plan_path
-from wholearm.planning.path_domain.widest import find_widest
+from wholearm.planning.path_domain.path_motion import directions_of
+from wholearm.planning.path_domain.path_plan import plan_path
+from wholearm.planning.path_domain.range_factor import find_widest
 from wholearm.planning.phase_plan import PhasePlan
-from wholearm.planning.robust.rows import Guide
-from wholearm.planning.robust.start import list_holds, measure_holds
-from wholearm.planning.time_domain.plan import plan_phases
+from wholearm.planning.robust.robust_rows import Guide, list_holds, measure_holds
+from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.definition import Problem
 from wholearm.problem.uncertainty import NAMES, PARAMETERS
 from wholearm.results.trajectory import Motion, Samples
-from wholearm.robustness.uncertainty import change_problem
+from wholearm.robustness.error_model import change_problem
 from wholearm.sensitivity.slopes import find_force_slopes, find_slopes_at
 
 FOLDER = Path(__file__).parents[1] / "problems"

@@ -14,13 +14,12 @@ import pytest
 import wholearm
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
-from wholearm.figures.robustness import draw_robustness
+from wholearm.figures.robustness_figure import draw_robustness
 from wholearm.planning.result import Plan
 from wholearm.problem.definition import Problem
-from wholearm.robustness.sensitivity import measure_sensitivities
-from wholearm.robustness.study import Robustness, assess_robustness
-from wholearm.robustness.trial import Trial, Window, make_trial
-from wholearm.robustness.uncertainty import Uncertainty, change_problem
+from wholearm.robustness.error_model import Uncertainty, change_problem
+from wholearm.robustness.sample_run import TimeWindow, Trial, make_trial
+from wholearm.robustness.sampling import Robustness, assess_robustness, measure_sensitivities
 from wholearm.simulation.events import EventKind
 
 PROBLEM = Path(__file__).parents[1] / "problems" / "heptagon_four_contacts.toml"
@@ -196,7 +195,7 @@ def test_a_plan_of_other_phases_is_refused(plan: Plan) -> None:
 
 
 def follow(
-    stretches: list[tuple[str, float, float]], windows: tuple[Window, ...]
+    stretches: list[tuple[str, float, float]], windows: tuple[TimeWindow, ...]
 ) -> dict[str, Any]:
     """The verdict on a motion of 1 s in which contacts press as given."""
     names = tuple(dict.fromkeys(name for window in windows for name in window.contacts))
@@ -220,8 +219,8 @@ def follow(
     return trial.judge(simulation)
 
 
-ONE = (Window(1, 1.0, ("a", "b"), "c"),)
-TWO = (Window(1, 0.5, ("a", "b"), "c"), Window(2, 1.0, ("b", "c"), ""))
+ONE = (TimeWindow(1, 1.0, ("a", "b"), "c"),)
+TWO = (TimeWindow(1, 0.5, ("a", "b"), "c"), TimeWindow(2, 1.0, ("b", "c"), ""))
 
 
 @pytest.mark.parametrize(
@@ -246,7 +245,7 @@ TWO = (Window(1, 0.5, ("a", "b"), "c"), Window(2, 1.0, ("b", "c"), ""))
 )
 def test_contacts_have_to_press_while_their_phase_lasts(
     stretches: list[tuple[str, float, float]],
-    windows: tuple[Window, ...],
+    windows: tuple[TimeWindow, ...],
     lost: tuple[str, int, float] | None,
 ) -> None:
     record = follow(stretches, windows)

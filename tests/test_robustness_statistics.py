@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from wholearm.robustness.statistics import Z, count_share
+from wholearm.robustness.sampling import Z, count_share
 
 
 @pytest.mark.parametrize("count, total", [(1, 7), (50, 100), (998, 1000)])

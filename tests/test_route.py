@@ -15,7 +15,7 @@ from shipped import FOLDER, HEPTAGON, problem_of
 from wholearm.common.errors import InputError
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.path_guess import guess_phase
-from wholearm.mapping.route import Route, format_route, list_formations
+from wholearm.mapping.formation_list import Route, format_route, list_formations
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem
 

@@ -12,7 +12,7 @@ import pytest
 from shipped import HEPTAGON, problem_of
 from wholearm.cli.command import main
 from wholearm.common.errors import InfeasibleError, InputError, SolverError
-from wholearm.common.interrupts import guard, yielding
+from wholearm.common.signals import guard, yielding
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phase
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
@@ -21,16 +21,19 @@ from wholearm.planning.saved import load_plan
 from wholearm.problem.definition import Phase, Problem
 from wholearm.problem.goal import Goal
 from wholearm.problem.read import build_problem
+from wholearm.search.astar import RoadmapRoute, RouteSearch
 from wholearm.search.bounds import bound_borders
-from wholearm.search.cells import cross, go_to
-from wholearm.search.chart import Chart
-from wholearm.search.choosing import Chooser
-from wholearm.search.find import Route, Search
+from wholearm.search.find_route import (
+    find_route,
+    load_chart,
+    require_folder,
+    require_reach,
+    store_chart,
+)
 from wholearm.search.places import list_formations_at, make_place
-from wholearm.search.reach import require_reach
 from wholearm.search.result import describe_block
-from wholearm.search.route import find_route
-from wholearm.search.store import load_chart, require_folder, store_chart
+from wholearm.search.roadmap import Roadmap, cross, go_to
+from wholearm.search.route_choice import Chooser
 from wholearm.verification.verify import verify
 
 TABLE = {k: v for k, v in tomllib.loads(HEPTAGON.read_text()).items() if k != "phases"}
@@ -41,17 +44,17 @@ def read(goal: dict[str, Any], **changes: Any) -> Problem:
 
 
 @cache
-def chart() -> Chart:
-    return Chart(problem_of(HEPTAGON), 0.1)
+def chart() -> Roadmap:
+    return Roadmap(problem_of(HEPTAGON), 0.1)
 
 
-def search(goal: Goal) -> Search:
+def search(goal: Goal) -> RouteSearch:
     problem = problem_of(HEPTAGON)
-    return Search(chart(), make_place(problem.scene, problem.start), goal)
+    return RouteSearch(chart(), make_place(problem.scene, problem.start), goal)
 
 
 @cache
-def to_edge_6() -> tuple[Search, Route]:
+def to_edge_6() -> tuple[RouteSearch, RoadmapRoute]:
     own = search(Goal(flush=6))
     return own, next(own.run())
 
@@ -130,7 +133,7 @@ def test_charts_are_kept_in_files(tmp_path: Path) -> None:
     known = load_chart(folder, "one")
     assert known is not None and load_chart(folder, "other") is None
     problem = problem_of(HEPTAGON)
-    own = Search(known, make_place(problem.scene, problem.start), Goal(flush=6))
+    own = RouteSearch(known, make_place(problem.scene, problem.start), Goal(flush=6))
     again = next(own.run())
     assert again.signature == route.signature and again.duration == route.duration
     (file,) = folder.iterdir()
@@ -145,7 +148,7 @@ def test_charts_are_kept_in_files(tmp_path: Path) -> None:
 def test_what_blocks_is_said() -> None:
     # With next to no torque nothing moves.
     weak = problem_of(HEPTAGON).with_(torque_limit=0.02)
-    own = Search(Chart(weak, 0.1), make_place(weak.scene, weak.start), Goal(flush=6))
+    own = RouteSearch(Roadmap(weak, 0.1), make_place(weak.scene, weak.start), Goal(flush=6))
     assert not list(own.run()) and own.settled == 1
     text = describe_block(own, [], "")
     assert text.startswith("nothing leads from x = 45 mm, phi = -1.984 deg to edge 6 on the palm")
@@ -191,7 +194,7 @@ def test_python_and_time_limits_end_a_search(monkeypatch: pytest.MonkeyPatch) ->
 
     with pytest.raises(SolverError, match="time limit is over, and there is no plan yet"):
         find_route(read({"flush": 6}), time_limit=1e-9)
-    monkeypatch.setattr("wholearm.search.choosing.join_route", interrupt)
+    monkeypatch.setattr("wholearm.search.route_choice.join_route", interrupt)
     with pytest.raises(KeyboardInterrupt):
         find_route(read({"flush": 6}))
 
@@ -207,7 +210,7 @@ def test_a_route_whose_planning_is_interrupted_is_still_there(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("wholearm.search.choosing.join_route", interrupt)
+        patch.setattr("wholearm.search.route_choice.join_route", interrupt)
         with pytest.raises(KeyboardInterrupt):
             chooser.plan(1, print)
     assert chooser.found == [route] and not chooser.made
@@ -230,7 +233,7 @@ def test_route_prints_phases_that_load(tmp_path: Path, capsys: pytest.CaptureFix
     assert phase["until"] == load_plan(plan).problem.table["phases"][0]["until"]
     assert f"wrote {plan}" in capsys.readouterr().out
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("wholearm.search.route.store_chart", fail)
+        patch.setattr("wholearm.search.find_route.store_chart", fail)
         assert main(["route", str(path), "--cache", str(found)]) == 0
     said = capsys.readouterr()
     assert tomllib.loads(said.out)["phases"] == [phase]

@@ -11,14 +11,15 @@ from planned import change, plan, plan_landing
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, JammingError, ReplayError, SolverError
 from wholearm.geometry.tracing import trace_phases
-from wholearm.planning import blocks, self_check
+from wholearm.planning import blocks
+from wholearm.planning import replay_check as self_check
 from wholearm.planning.block_plan import Planning
 from wholearm.planning.blocks import plan_blocks, refine_block
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
-from wholearm.planning.self_check import (
+from wholearm.planning.replay_check import (
     RESIDUAL,
-    Check,
+    ReplayCheck,
     check_plan,
     find_residual,
     replay_plan,
@@ -139,7 +140,7 @@ class Replayed:
         self.last = planning
         return replace(plan()[1])
 
-    def check(self, *_: object) -> list[Check]:
+    def check(self, *_: object) -> list[ReplayCheck]:
         """By a strict allowance, and by the usual one."""
         error = JammingError("v1-palm jams in phase 2 at t = 0.1 s")
         error.phase = 2

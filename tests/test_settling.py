@@ -16,23 +16,21 @@ from shipped import HEPTAGON, problem_of, solved
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.contacts.formation import Formation
-from wholearm.free_simulation.simulate import simulate_free
+from wholearm.free_simulation.free_simulate import simulate_free
 from wholearm.mechanics.arrival import DRIVE, Standstill, find_hold, maximise_margin
-from wholearm.planning import shares
+from wholearm.planning import dwell as shares
+from wholearm.planning.dwell import DwellEnd, list_touching, settle_plans
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan_report import describe_plan
 from wholearm.planning.result import Plan
 from wholearm.planning.saved import load_plan, write_meta
-from wholearm.planning.settling import End, list_touching, settle_plans
 from wholearm.planning.stops import Plans
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import place_start
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import assemble
-from wholearm.simulation.closing import close_contacts
-from wholearm.simulation.starting import RestDirection
-from wholearm.simulation.statics import balances
-from wholearm.simulation.sticking import find_rest
+from wholearm.simulation.start_modes import RestDirection
+from wholearm.simulation.sticking import balances, close_contacts, find_rest
 from wholearm.verification.verify import verify
 
 HELD = (0.019, 0.01, 0.01, 0.01, 0.0)
@@ -141,9 +139,9 @@ def test_shares_are_those_of_the_way_that_ends_best(monkeypatch: pytest.MonkeyPa
     problem = plain.problem.with_({"settle": "10 %", "phases[3].settle": 0.002})
     motions = plain.trajectory.motions
     plans = [PhasePlan(motion, plain.trajectory.torque, 0.0) for motion in motions]
-    tried, chosen = list[list[float]](), list[Sequence[End | None]]()
+    tried, chosen = list[list[float]](), list[Sequence[DwellEnd | None]]()
 
-    def measure(_: Problem, __: Plans, ends: Sequence[End | None]) -> float:
+    def measure(_: Problem, __: Plans, ends: Sequence[DwellEnd | None]) -> float:
         tried.append([0.0 if end is None else end.time for end in ends])
         chosen.append(ends)
         return problem.gap * (4.0, 3.9, 1.2, 1.1, 2.0, last)[len(tried) - 1]

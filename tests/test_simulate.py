@@ -21,11 +21,10 @@ from wholearm.mechanics.dynamics import Directions
 from wholearm.problem.definition import Phase, Problem, Until
 from wholearm.results.torque import TorqueProfile
 from wholearm.scene.model import Finger, Friction, Scene
-from wholearm.simulation import within
+from wholearm.simulation import simulate as within
 from wholearm.simulation.events import EventKind, Glimpses, OutcomeKind, Simulation
 from wholearm.simulation.simulate import simulate
-from wholearm.simulation.statics import balances
-from wholearm.simulation.sticking import Collapse, find_rest
+from wholearm.simulation.sticking import Collapse, balances, find_rest
 
 
 def pick(index: int) -> tuple[Problem, CosineMotion]:

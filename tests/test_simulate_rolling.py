@@ -16,8 +16,7 @@ from wholearm.problem.definition import End, Phase, Problem, Until
 from wholearm.results.trajectory import Samples
 from wholearm.scene.model import Friction, Scene
 from wholearm.simulation.events import EventKind, OutcomeKind
-from wholearm.simulation.simulate import simulate
-from wholearm.simulation.transitions import project_velocity
+from wholearm.simulation.simulate import project_velocity, simulate
 
 
 def test_replay_keeps_the_vertex_where_it_is() -> None:

@@ -17,7 +17,7 @@ from wholearm.problem.definition import Problem
 from wholearm.results.torque import TorqueProfile
 from wholearm.simulation.events import EventKind, OutcomeKind, Simulation
 from wholearm.simulation.simulate import simulate
-from wholearm.simulation.statics import balances
+from wholearm.simulation.sticking import balances
 
 CHANGES = (EventKind.STICK, EventKind.SLIP, EventKind.REVERSAL)
 

@@ -15,7 +15,7 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem
 from wholearm.simulation.simulate import simulate
-from wholearm.simulation.starting import Departure, Touching
+from wholearm.simulation.start_modes import StartDeparture, Touching
 from wholearm.simulation.sticking import find_rest
 
 
@@ -65,7 +65,7 @@ def test_two_freedoms_start_from_a_pointed_tip(until: str) -> None:
     assert touching.opens(back) and touching.opens(onwards)
     departs = rest.wait(np.array([[-0.05], [-0.2]]), -1.0)
     right = until == "e5-tip2"
-    assert (isinstance(departs, Departure) and departs.heading[0] > 0) == right
+    assert (isinstance(departs, StartDeparture) and departs.heading[0] > 0) == right
 
 
 def test_a_link_that_is_free_may_graze_what_starts_to_move() -> None:
@@ -84,7 +84,7 @@ def test_a_link_that_is_free_may_graze_what_starts_to_move() -> None:
     for closing, starts in (-1e-3, True), (2e-5, True), (1.0, False):
         load = even - np.array([closing / lever, 0.0])
         begun = rest.wait(load[:, None], -1.0)
-        assert (isinstance(begun, Departure) and begun.x == -1.0) == starts
+        assert (isinstance(begun, StartDeparture) and begun.x == -1.0) == starts
 
 
 def test_a_pointed_tip_on_an_edge_turns_onto_it_with_its_link() -> None:

@@ -23,10 +23,9 @@ from wholearm.problem.definition import End, Phase, Problem, Until
 from wholearm.problem.read import build_problem
 from wholearm.results.torque import TorqueProfile
 from wholearm.simulation.events import EventKind, OutcomeKind
-from wholearm.simulation.simulate import simulate
-from wholearm.simulation.starting import Departure
+from wholearm.simulation.simulate import project_velocity, simulate
+from wholearm.simulation.start_modes import StartDeparture
 from wholearm.simulation.sticking import find_rest
-from wholearm.simulation.transitions import project_velocity
 from wholearm.verification.verify import verify
 
 RELEASE = 0.5
@@ -266,7 +265,7 @@ def test_start_with_two_freedoms() -> None:
     while seen < 3:
         tau = np.array([1.0, -1.0]) * rng.uniform(0.0, 2.0, size=2)
         change_of_state = rest.wait(tau[:, None], -1.0)
-        if not isinstance(change_of_state, Departure):
+        if not isinstance(change_of_state, StartDeparture):
             continue
         directions = change_of_state.directions
         if not all(map(np.all, directions)):

@@ -5,7 +5,7 @@ import argparse
 import pytest
 
 from shipped import FOLDER
-from wholearm.benchmark.skip import STUDY, Pair, list_pairs, spend
+from wholearm.benchmark.skip import STUDY, SkipPair, list_pairs, spend
 from wholearm.benchmark.study import Row
 
 INTERVALS, TIME_INTERVALS, POINTS, CONTACTS = 12, 4, 3, 4
@@ -14,7 +14,7 @@ ABSENT = ("friction of joints", "speed limits that never bind")
 
 
 @pytest.fixture(scope="module")
-def pairs() -> dict[str, Pair]:
+def pairs() -> dict[str, SkipPair]:
     every = list_pairs(
         str(FOLDER), intervals=INTERVALS, time_intervals=TIME_INTERVALS, mode_search=False
     )
@@ -35,13 +35,15 @@ def assert_bare(cost: Row, contacts: int, rolling: int) -> None:
 
 
 @pytest.mark.parametrize("part", ["friction of contacts", *ABSENT])
-def test_friction_and_limits_are_free_along_curves(pairs: dict[str, Pair], part: str) -> None:
+def test_friction_and_limits_are_free_along_curves(pairs: dict[str, SkipPair], part: str) -> None:
     pair = pairs[f"{part}, along curves"]
     for case in (pair.without, pair.having):
         assert_bare(spend(case), CONTACTS, 0)
 
 
-def test_over_time_friction_adds_a_sense_for_each_contact_and_point(pairs: dict[str, Pair]) -> None:
+def test_over_time_friction_adds_a_sense_for_each_contact_and_point(
+    pairs: dict[str, SkipPair],
+) -> None:
     own = [pairs[f"{part}, over time"] for part in ("friction of contacts", *ABSENT)]
     full, smooth, free, limited = (
         spend(case) for case in (own[0].having, own[0].without, own[1].without, own[2].having)
@@ -55,7 +57,7 @@ def test_over_time_friction_adds_a_sense_for_each_contact_and_point(pairs: dict[
 
 
 def test_a_rolling_contact_has_two_rows_more_than_a_sliding_one_along_a_curve(
-    pairs: dict[str, Pair],
+    pairs: dict[str, SkipPair],
 ) -> None:
     tip = pairs["a second freedom"].without
     (phase,) = tip.problem.phases
@@ -63,7 +65,7 @@ def test_a_rolling_contact_has_two_rows_more_than_a_sliding_one_along_a_curve(
     assert_bare(spend(tip), 3, 1)
 
 
-def test_phases_that_stop_are_problems_of_their_own(pairs: dict[str, Pair]) -> None:
+def test_phases_that_stop_are_problems_of_their_own(pairs: dict[str, SkipPair]) -> None:
     pair = pairs["a transition at speed"]
     # Both phases, an interval of no length between them, and no more: without the ends of one.
     stopping, going = (spend(case) for case in (pair.without, pair.having))
@@ -72,7 +74,7 @@ def test_phases_that_stop_are_problems_of_their_own(pairs: dict[str, Pair]) -> N
     assert going["unknowns"] > stopping["unknowns"]
 
 
-def test_the_table_has_a_row_for_each_part(pairs: dict[str, Pair]) -> None:
+def test_the_table_has_a_row_for_each_part(pairs: dict[str, SkipPair]) -> None:
     pair = pairs["a figure"]
     rows = [
         {"case": ["anywhere", pair.part, having, 0], **spend(plan)}

@@ -7,7 +7,7 @@ import pytest
 from plane import make_formation, make_scene
 from test_elemental import KITE, NAMES, STEP, configurations, measure_gap
 from wholearm.contacts.elemental import build_features
-from wholearm.contacts.slip import build_slip
+from wholearm.contacts.formation import build_slip
 from wholearm.scene.model import Scene
 
 

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from wholearm.benchmark.stress.event_tracing import follow, resample
 from wholearm.benchmark.stress.slow_motion import fast_margin, inertia_ratio, slow_margin
-from wholearm.benchmark.stress.tracing import follow, resample
 from wholearm.common.arrays import Array
 from wholearm.geometry.curve import Curve
 from wholearm.mechanics.dynamics import Directions, reduced_inertia
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.path_domain.plan import plan_path
+from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.problem.definition import Phase, Problem
 from wholearm.scene.model import Friction, Scene
 

@@ -13,10 +13,10 @@ from tipping import roll, tilting
 from wholearm.geometry.path_guess import guess_phase
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.time_domain.collocation import make_scheme
-from wholearm.planning.time_domain.modes import LEAST_INTERVALS
-from wholearm.planning.time_domain.own_units import in_own_units
 from wholearm.planning.time_domain.stage import Stage
-from wholearm.planning.time_domain.staging import guess_stages
+from wholearm.planning.time_domain.stage_modes import LEAST_INTERVALS
+from wholearm.planning.time_domain.stages import guess_stages
+from wholearm.planning.time_domain.units import in_own_units
 from wholearm.problem.definition import End, Until
 
 SCHEME = make_scheme("radau", 3)

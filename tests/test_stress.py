@@ -13,7 +13,7 @@ import pytest
 
 from wholearm.benchmark.stress.damage import BASE, change_tree, draw_mutant, look, run_file, to_toml
 from wholearm.benchmark.stress.scenes import draw_case
-from wholearm.benchmark.stress.study import STUDY, compare_values
+from wholearm.benchmark.stress.stress_study import STUDY, compare_values
 from wholearm.cli.command import main
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from shipped import HEPTAGON
-from wholearm.benchmark.stress.tracing import follow, resample, slides
+from wholearm.benchmark.stress.event_tracing import follow, resample, slides
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.path_guess import load
 from wholearm.geometry.tracing import trace_phases

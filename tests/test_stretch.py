@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from shipped import HEPTAGON, plan_of, problem_of
-from wholearm.engines.applied import apply_friction
-from wholearm.engines.between import find_between
-from wholearm.engines.stretch import list_steps, list_stretches
+from wholearm.engines.stretch import apply_friction, find_between, list_steps, list_stretches
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory_file import load_trajectory
 

@@ -5,17 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wholearm.planning.lower_bound.rows import Rows
-from wholearm.search.sweep import find_durations
+from wholearm.planning.lower_bound.rows import PathLimitRows
+from wholearm.search.travel_times import find_durations
 
 LENGTH, COUNT = 2.0, 64
 
 
-def push() -> tuple[Rows, tuple[np.ndarray, np.ndarray]]:
+def push() -> tuple[PathLimitRows, tuple[np.ndarray, np.ndarray]]:
     """|s''| <= 1 along a way."""
     shape = (1, COUNT, 2)
     a = np.broadcast_to([1.0, -1.0], shape).copy()
-    rows = Rows(a, np.zeros(shape), np.zeros(shape), np.ones(shape), np.full((1, COUNT), np.inf))
+    rows = PathLimitRows(
+        a, np.zeros(shape), np.zeros(shape), np.ones(shape), np.full((1, COUNT), np.inf)
+    )
     return rows, (np.full(COUNT, LENGTH / COUNT), np.full(COUNT, 0.5))
 
 

@@ -13,17 +13,20 @@ from refused import advising, ask_shoved
 from thrown import shove
 from tipping import box
 from wholearm.common.errors import InfeasibleError, SolverError
-from wholearm.common.shortfalls import Parameter, Place, Shortfall
+from wholearm.common.shortfalls import LimitPlace, Parameter, Shortfall
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.limits import EPSILON
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.path_domain.plan import plan_path
+from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
-from wholearm.planning.time_domain import explain as time_explain
+from wholearm.planning.time_domain import time_explain
 from wholearm.planning.time_domain.attempts import Attempts
 from wholearm.planning.time_domain.collocation import make_scheme
-from wholearm.planning.time_domain.explain import (
+from wholearm.planning.time_domain.search import TimeSearch
+from wholearm.planning.time_domain.stage import Stage
+from wholearm.planning.time_domain.stages import guess_stages
+from wholearm.planning.time_domain.time_explain import (
     change_limit,
     explain,
     is_met,
@@ -31,11 +34,8 @@ from wholearm.planning.time_domain.explain import (
     refuse,
     solve_elastic,
 )
-from wholearm.planning.time_domain.motion import TimeMotion
-from wholearm.planning.time_domain.plan import plan_phases
-from wholearm.planning.time_domain.search import Search
-from wholearm.planning.time_domain.stage import Stage
-from wholearm.planning.time_domain.staging import guess_stages
+from wholearm.planning.time_domain.time_motion import TimeMotion
+from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import read_problem
 
@@ -56,8 +56,8 @@ def why_not(plan: Callable[[], object]) -> str:
     return str(caught.value)
 
 
-def search(problem: Problem) -> Search:
-    return Search.of(problem, COARSE)
+def search(problem: Problem) -> TimeSearch:
+    return TimeSearch.of(problem, COARSE)
 
 
 PENTAGON = """
@@ -136,7 +136,7 @@ def test_a_force_that_weight_limits_has_its_closed_form() -> None:
 def test_only_limits_that_a_motion_meets_hold_it_back() -> None:
     problem, _ = shove()
     stage, limit = outline(problem), problem.scene.fingers[0].torque_limit
-    place = Place(1, 0.0, "there")
+    place = LimitPlace(1, 0.0, "there")
     torque = Parameter("torque limit of finger 1", limit, "N m", 1, TORQUE)
     epsilon = Parameter("epsilon", problem.epsilon, "N", -1, EPSILON)
     for share in (0.5, 1.0):
@@ -251,7 +251,7 @@ def test_failures_that_no_limit_explains_are_the_solvers() -> None:
     assert all(name in text for name in problem.phases[0].formation.names)
     assert text.endswith("intervals per phase (--time-intervals)") and "\n" not in text
     slide, own = box(), replace(COARSE, transcription="time")
-    failed = explain(Search.of(slide, own), slide, slide.phases[:1], [], "Failed", None)
+    failed = explain(TimeSearch.of(slide, own), slide, slide.phases[:1], [], "Failed", None)
     assert "leave out --transcription time" in str(failed)
 
 

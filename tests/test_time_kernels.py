@@ -14,10 +14,11 @@ from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.mechanics.dynamics import split_forces
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.time_domain import kernels
+from wholearm.planning.time_domain import stage_kernels as kernels
 from wholearm.planning.time_domain.assembly import Kernel
 from wholearm.planning.time_domain.collocation import blend, make_scheme
-from wholearm.planning.time_domain.kernels import (
+from wholearm.planning.time_domain.search import TimeSearch
+from wholearm.planning.time_domain.stage_kernels import (
     bend_kernel,
     collocation_kernel,
     effort_kernel,
@@ -30,8 +31,7 @@ from wholearm.planning.time_domain.kernels import (
     opening_kernel,
     point_kernel,
 )
-from wholearm.planning.time_domain.search import Search
-from wholearm.planning.time_domain.staging import guess_stages
+from wholearm.planning.time_domain.stages import guess_stages
 from wholearm.problem.definition import Problem, Until
 from wholearm.results.trajectory import Samples
 from wholearm.scene.model import Scene
@@ -306,7 +306,7 @@ def test_limits_are_no_part_of_kernels(heptagon: Problem, monkeypatch: pytest.Mo
     assert point_kernel(other, 2) is not point_kernel(before, 2)
 
     def build(problem: Problem) -> None:
-        search = Search.of(problem, PlanOptions())
+        search = TimeSearch.of(problem, PlanOptions())
         given = problem, problem.phases[:1], problem.start, search.scheme
         assert search.build(guess_stages(*given, 4, 2.0)).solver is not None
 

@@ -12,7 +12,7 @@ from tipping import roll
 from wholearm.common.arrays import Array
 from wholearm.mechanics.dynamics import Directions
 from wholearm.planning.time_domain.collocation import make_scheme
-from wholearm.planning.time_domain.layout import (
+from wholearm.planning.time_domain.nlp_layout import (
     MARGIN,
     STATE,
     StageLayout,

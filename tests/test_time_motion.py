@@ -12,7 +12,7 @@ from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.mechanics.dynamics import Directions
 from wholearm.planning.time_domain.collocation import make_scheme
-from wholearm.planning.time_domain.motion import StageMotion, TimeMotion
+from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion
 
 
 @pytest.fixture(scope="module")

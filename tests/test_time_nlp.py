@@ -20,13 +20,13 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions
 from wholearm.mechanics.metric import metric_weights
 from wholearm.planning.options import CLEARANCE, OPENING, Objective
-from wholearm.planning.time_domain.between import Limits, raise_bounds
 from wholearm.planning.time_domain.collocation import Scheme, make_scheme
 from wholearm.planning.time_domain.equations import SLIDING, least_rates
-from wholearm.planning.time_domain.layout import MARGIN, V, pack
-from wholearm.planning.time_domain.limits import Target
-from wholearm.planning.time_domain.nlp import SHORTEST, TimeNLP, bound_unknowns, build_time_nlp
+from wholearm.planning.time_domain.intersample import IntersampleLimits, raise_bounds
+from wholearm.planning.time_domain.nlp_layout import MARGIN, V, pack
 from wholearm.planning.time_domain.stage import Stage, StagePoints
+from wholearm.planning.time_domain.time_limits import Target
+from wholearm.planning.time_domain.time_nlp import SHORTEST, TimeNLP, bound_unknowns, build_time_nlp
 
 PHASE = 3
 """Of the heptagon, without a reversal."""
@@ -116,7 +116,7 @@ def test_a_known_motion_keeps_the_limits(name: str, degree: int) -> None:
     nlp = build([stage], scheme)
     x = packed(nlp, [stage])
     low_x, high_x = bound_unknowns(nlp, [stage], scheme)
-    low, _ = raise_bounds(nlp, [stage], [Limits.none(stage)], (low_x, high_x))
+    low, _ = raise_bounds(nlp, [stage], [IntersampleLimits.none(stage)], (low_x, high_x))
     nlp.rows.bounds[0][:] = low
     _, inequalities = misses(nlp, x)
     # Slip and joint speeds start from nothing.
@@ -153,7 +153,7 @@ def test_raised_limits_are_missed_by_as_much(name: str) -> None:
     nlp = build([stage], scheme)
     x = packed(nlp, [stage])
     low_x, high_x = bound_unknowns(nlp, [stage], scheme)
-    limits = Limits.none(stage)
+    limits = IntersampleLimits.none(stage)
     least = stage.guess.forces[3, :, 1].min()
     limits.held[3, 1] = (least + 0.25 - 0.05) / stage.formation.scene.scales.force
     low, _ = raise_bounds(nlp, [stage], [limits], (low_x, high_x))
@@ -188,7 +188,7 @@ def test_the_margin_raises_what_forces_have_to_exceed(name: str) -> None:
     scheme, stage = make_scheme(name, 3), driven(name, 3, 8)
     nlp = build([stage], scheme, Objective.MARGIN)
     low_x, high_x = bound_unknowns(nlp, [stage], scheme)
-    low, _ = raise_bounds(nlp, [stage], [Limits.none(stage)], (low_x, high_x))
+    low, _ = raise_bounds(nlp, [stage], [IntersampleLimits.none(stage)], (low_x, high_x))
     assert not np.isfinite(low_x[nlp.layouts[0].forces]).any()
     # The polynomial through the points may pass a little below them at the ends of an interval.
     room = stage.guess.forces.min() - 0.05

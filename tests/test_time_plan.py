@@ -30,9 +30,9 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
-from wholearm.planning.time_domain.motion import StageMotion, TimeMotion
-from wholearm.planning.time_domain.plan import plan_phases
-from wholearm.planning.time_domain.search import Search, Solution
+from wholearm.planning.time_domain.search import TimeSearch, TimeSolution
+from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion
+from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.definition import Problem
 from wholearm.results.trajectory import Trajectory
 from wholearm.verification.verify import verify
@@ -346,14 +346,14 @@ def test_a_margin_below_epsilon_is_planned_again_from_the_least_time(
     def plan() -> PhasePlan[TimeMotion]:
         return plan_phases(problem, problem.phases, problem.start, options, allowed)[0]
 
-    usual, solve_once, goals = plan(), Search.solve, list[Objective]()
+    usual, solve_once, goals = plan(), TimeSearch.solve, list[Objective]()
 
-    def press_too_little(search: Search, *given: Any, **named: Any) -> Solution:
+    def press_too_little(search: TimeSearch, *given: Any, **named: Any) -> TimeSolution:
         goals.append(search.goal)
         solution = solve_once(search, *given, **named)
         return solution._replace(margin=-1.0) if len(goals) == 1 else solution
 
-    monkeypatch.setattr(Search, "solve", press_too_little)
+    monkeypatch.setattr(TimeSearch, "solve", press_too_little)
     assert plan().value == pytest.approx(usual.value, rel=1e-3)
     assert goals[:2] == [Objective.MARGIN, Objective.TIME] and usual.value > problem.epsilon
 

@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 
 from wholearm.planning.time_domain.assembly import Kernel, build_kernel
-from wholearm.planning.time_domain.rows import Rows
+from wholearm.planning.time_domain.nlp_layout import NlpRows
 
 
 def product() -> Kernel:
@@ -13,7 +13,7 @@ def product() -> Kernel:
 
 
 def test_rows_are_numbered_in_the_order_in_which_they_come() -> None:
-    rows = Rows()
+    rows = NlpRows()
     first, second, third = rows.linear(2, 3), rows.nonlinear(4), rows.linear(1)
     np.testing.assert_array_equal(first, [[0, 1, 2], [3, 4, 5]])
     np.testing.assert_array_equal(second, [6, 7, 8, 9])
@@ -22,7 +22,7 @@ def test_rows_are_numbered_in_the_order_in_which_they_come() -> None:
 
 
 def test_rows_are_equations_unless_bounds_are_given() -> None:
-    rows = Rows()
+    rows = NlpRows()
     rows.linear(2)
     rows.nonlinear(2, 2, low=[[1.0, 2.0]], high=np.inf)
     rows.linear(2, low=[5.0, 6.0], high=7.0)
@@ -32,7 +32,7 @@ def test_rows_are_equations_unless_bounds_are_given() -> None:
 
 
 def test_entries_are_spread_over_rows_and_columns() -> None:
-    rows = Rows()
+    rows = NlpRows()
     own = rows.linear(2, 3)
     rows.add_entries(own, np.array([[7], [8]]), [1.0, 2.0, 3.0])
     rows.add_entries(own[1], 9, -1.0)
@@ -45,7 +45,7 @@ def test_entries_are_spread_over_rows_and_columns() -> None:
 
 
 def test_kernels_are_repeated_and_charged() -> None:
-    rows, kernel = Rows(), product()
+    rows, kernel = NlpRows(), product()
     columns, given = np.array([[0, 1], [2, 3]]), np.array([[2.0], [3.0]])
     own = rows.nonlinear(2, 1)
     rows.add_copies(kernel, columns, own, given)

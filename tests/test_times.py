@@ -11,10 +11,10 @@ from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_curve, trace_phases
 from wholearm.mapping.formation_map import Border
 from wholearm.planning.lower_bound.lower_bound import look_along
-from wholearm.planning.lower_bound.sweep import NoMotionError
+from wholearm.planning.lower_bound.speed_sweep import NoMotionError
 from wholearm.problem.definition import Until
 from wholearm.search import times
-from wholearm.search.links import cut_curve
+from wholearm.search.edges import cut_curve
 from wholearm.search.times import time_borders
 
 

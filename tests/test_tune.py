@@ -14,9 +14,8 @@ from wholearm.cli.command import main
 from wholearm.common.errors import InputError
 from wholearm.results.torque import read_notes
 from wholearm.simulation.events import Event, EventKind
-from wholearm.tuning.passage import split_passages
-from wholearm.tuning.rule import FACTOR
-from wholearm.tuning.trial import Bench, Outcome, Step, make_rows
+from wholearm.tuning.trial import Bench, TrialOutcome, TuningStep, make_rows, split_passages
+from wholearm.tuning.tuner import FACTOR
 
 
 def build_box() -> wholearm.Problem:
@@ -64,10 +63,10 @@ def test_torques_are_quasistatic_ones_in_steps_of_ten_percent() -> None:
     drives = [trial for trial in phase.trials if len(trial.steps) == 1]
     raised = [trial.steps[0].tau[0] for trial in drives]
     assert np.array(raised[1:]) == pytest.approx(FACTOR * np.array(raised[:-1]))
-    slides = [trial for trial in drives if trial.outcome is Outcome.ARRIVES]
+    slides = [trial for trial in drives if trial.outcome is TrialOutcome.ARRIVES]
     times = [trial.time for trial in slides]
     assert times == sorted(times, reverse=True), "more torque brings it there sooner"
-    assert drives[0].outcome is Outcome.RESTS, "quasistatic torques set nothing in motion"
+    assert drives[0].outcome is TrialOutcome.RESTS, "quasistatic torques set nothing in motion"
 
 
 def test_the_table_is_what_was_judged(tmp_path: Path) -> None:
@@ -91,7 +90,7 @@ def test_constant_torques_do_not_come_to_rest() -> None:
 
 
 def test_steps_hold_until_the_next() -> None:
-    rows = make_rows([Step(0.0, (1.0, -1.0)), Step(0.5, (2.0, 0.0))], 2.0)
+    rows = make_rows([TuningStep(0.0, (1.0, -1.0)), TuningStep(0.5, (2.0, 0.0))], 2.0)
     assert rows.tolist() == [[0, 1, -1], [0.5, 1, -1], [0.5, 2, 0], [2, 2, 0]]
 
 
@@ -131,8 +130,8 @@ def test_a_contact_that_never_presses_is_lost() -> None:
     (passage,) = split_passages(problem)
     bench = Bench(problem, passage, problem.start)
     # The left finger is pulled away.
-    trial = bench.run([Step(0.0, (0.1, 0.2))])
-    assert trial.outcome is Outcome.LOSES and trial.contact == "v3-finger2"
+    trial = bench.run([TuningStep(0.0, (0.1, 0.2))])
+    assert trial.outcome is TrialOutcome.LOSES and trial.contact == "v3-finger2"
     assert trial.time == 0.0
 
 

@@ -13,10 +13,10 @@ from wholearm.common.arrays import Array
 from wholearm.problem.definition import Problem
 from wholearm.results.report import Report
 from wholearm.results.torque import TorqueProfile
-from wholearm.results.tuning import Loss
+from wholearm.results.tuning_advice import Loss
 from wholearm.simulation.events import EventKind, Simulation
 from wholearm.simulation.simulate import simulate
-from wholearm.verification.tuning import find_approach
+from wholearm.verification.torque_advice import find_approach
 from wholearm.verification.verify import verify
 
 EARLY = 1 - 1e-6

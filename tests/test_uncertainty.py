@@ -12,7 +12,7 @@ from wholearm.problem.definition import Problem
 from wholearm.problem.read import read_problem
 from wholearm.problem.uncertainty import NAMES, PARAMETERS
 from wholearm.results.torque import TorqueProfile
-from wholearm.robustness.uncertainty import Uncertainty, change_problem, change_torques
+from wholearm.robustness.error_model import Uncertainty, change_problem, change_torques
 
 PROBLEM = Path(__file__).parents[1] / "problems" / "heptagon_four_contacts.toml"
 

@@ -15,10 +15,10 @@ from wholearm.common.errors import AmbiguityError
 from wholearm.contacts.closing import contact_table
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phases
-from wholearm.mapping.quasistatic import check_border
+from wholearm.mapping.formation_map import check_border
 from wholearm.mechanics.uniqueness import find_minors
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.path_domain.plan import plan_curves
+from wholearm.planning.path_domain.path_plan import plan_curves
 from wholearm.scene.model import Friction, Scene
 
 

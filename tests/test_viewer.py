@@ -21,10 +21,9 @@ from wholearm.figures.style import choose_styles
 from wholearm.mapping.template import write_template
 from wholearm.viewer import page
 from wholearm.viewer.chart import describe_map
-from wholearm.viewer.motion import describe_motion, place_pushes
+from wholearm.viewer.motion_data import describe_motion, place_pushes
 from wholearm.viewer.movie import FRAMES, Movie, write_movie
-from wholearm.viewer.report import build_report
-from wholearm.viewer.tables import list_joints, list_phases
+from wholearm.viewer.report_page import build_report, list_joints, list_phases
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
@@ -235,7 +234,9 @@ def test_a_gallery_shows_every_problem(tmp_path: Path, capsys: pytest.CaptureFix
 
 def test_a_report_needs_no_matplotlib() -> None:
     # That alone would take as long as the map.
-    told = "import sys, wholearm.viewer.report; print({'matplotlib', 'scipy'} & {*sys.modules})"
+    told = (
+        "import sys, wholearm.viewer.report_page; print({'matplotlib', 'scipy'} & {*sys.modules})"
+    )
     done = subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, timeout=60)
     assert done.stdout.strip() == "set()", done.stdout + done.stderr
 

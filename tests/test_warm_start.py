@@ -11,34 +11,35 @@ from timed import landing
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.time_domain.collocation import make_scheme
-from wholearm.planning.time_domain.layout import pack
-from wholearm.planning.time_domain.own_units import in_own_units
-from wholearm.planning.time_domain.plan import try_phases
-from wholearm.planning.time_domain.refinement import bisect_intervals
-from wholearm.planning.time_domain.search import Search, Solution
-from wholearm.planning.time_domain.stage import Stage
-from wholearm.planning.time_domain.warm_start import (
+from wholearm.planning.time_domain.nlp_layout import pack
+from wholearm.planning.time_domain.search import (
+    TimeSearch,
+    TimeSolution,
     carry_multipliers,
     find_costate,
     first_multipliers,
 )
+from wholearm.planning.time_domain.stage import Stage
+from wholearm.planning.time_domain.time_mesh import bisect_intervals
+from wholearm.planning.time_domain.time_plan import try_phases
+from wholearm.planning.time_domain.units import in_own_units
 from wholearm.problem.definition import Problem
 
 SCHEME = make_scheme("radau", 3)
 
 
-def search_for(objective: str) -> Search:
-    return Search.of(landing(), PlanOptions(objective=objective))
+def search_for(objective: str) -> TimeSearch:
+    return TimeSearch.of(landing(), PlanOptions(objective=objective))
 
 
 @lru_cache(maxsize=2)
-def coarse(objective: str) -> Solution:
+def coarse(objective: str) -> TimeSolution:
     """The heptagon's landing on few intervals, with limits at the points alone."""
     problem = landing()
     start = trace_phases(problem)[-1].end
     options = PlanOptions(objective=objective, time_intervals=8)
     begun = try_phases(problem, problem.phases[4:], start, options, further=9)
-    assert begun is not None and isinstance(begun[0].solution, Solution)
+    assert begun is not None and isinstance(begun[0].solution, TimeSolution)
     return begun[0].solution
 
 
@@ -118,7 +119,7 @@ def test_friction_is_worth_what_a_little_less_of_it_saves(contact: str) -> None:
     values = list[float]()
     for problem in (landing(), other):
         stages = replace_scene(solution.stages, in_own_units(problem))
-        nlp = Search.of(problem, least).build(stages)
+        nlp = TimeSearch.of(problem, least).build(stages)
         x = pack([stage.guess for stage in stages], nlp.layouts, 0.0)
         g = nlp.solver.function.get_function("nlp_g")(x, [])
         values.append(float(solution.multipliers["lam_g0"] @ g.full()[:, 0]))

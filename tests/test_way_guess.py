@@ -8,16 +8,21 @@ import numpy as np
 import pytest
 
 from shipped import HEPTAGON
+from wholearm.benchmark.stress.event_tracing import weights
 from wholearm.benchmark.stress.slow_motion import fast_margin
-from wholearm.benchmark.stress.tracing import weights
 from wholearm.common.errors import InfeasibleError
 from wholearm.geometry.path_guess import connect, guess_phase
 from wholearm.mechanics.limits import PRESS, TORQUE
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.time_domain.explain import refuse_ways
-from wholearm.planning.time_domain.plan import plan_phases
-from wholearm.planning.time_domain.way_guess import SURE, list_goals, list_ways, split_way
-from wholearm.planning.time_domain.way_pace import WayForces
+from wholearm.planning.time_domain.initial_path import (
+    SURE,
+    WayForces,
+    list_goals,
+    list_ways,
+    split_way,
+)
+from wholearm.planning.time_domain.time_explain import refuse_ways
+from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem, read_problem
 

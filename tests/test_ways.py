@@ -6,7 +6,7 @@ import pytest
 from shipped import SQUARE, problem_of
 from test_rays import around_the_start
 from wholearm.contacts.closing import first_contact
-from wholearm.search.ways import can_set_out, time_ways
+from wholearm.search.cell_paths import can_set_out, time_ways
 
 
 def test_no_way_is_faster_with_more_to_press() -> None:

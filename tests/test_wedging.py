@@ -10,8 +10,8 @@ from shipped import BOX, HEPTAGON, IMPACTS, plan_of, problem_of
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.wedging import find_static_torques
 from wholearm.results.torque import TorqueProfile
-from wholearm.simulation.statics import balances
-from wholearm.verification.sureness import find_wedged
+from wholearm.simulation.sticking import balances
+from wholearm.verification.force_uniqueness import find_wedged
 
 
 @pytest.mark.parametrize("path", [BOX, IMPACTS], ids=lambda path: path.stem)

@@ -21,9 +21,9 @@ from wholearm.mechanics.dynamics import Directions
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.time_domain.collocation import Scheme
-from wholearm.planning.time_domain.motion import StageMotion, TimeMotion
-from wholearm.planning.time_domain.plan import plan_phases
 from wholearm.planning.time_domain.stage import StagePoints
+from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion
+from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.definition import Problem
 
 

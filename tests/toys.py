@@ -21,10 +21,9 @@ from wholearm.geometry.curve import Curve, Segment
 from wholearm.mechanics.dynamics import Directions, PathForces
 from wholearm.planning.lower_bound import rows
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.path_domain import data as path_data
-from wholearm.planning.path_domain import plan as path_plan
-from wholearm.planning.path_domain.motion import PathMotion
-from wholearm.planning.path_domain.plan import plan_path
+from wholearm.planning.path_domain import path_data, path_plan
+from wholearm.planning.path_domain.path_motion import PathMotion
+from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.scene.model import Scales
 

@@ -25,49 +25,49 @@ if TYPE_CHECKING:
         WholearmError,
     )
     from .common.shortfalls import Change, Shortfall
-    from .comparison.compare import compare
+    from .comparison.metrics import compare
     from .comparison.side_by_side import Comparison
     from .contacts.elemental import Contact
     from .contacts.formation import Formation
-    from .engines.closed import PolicyReport, play_policy
+    from .engines.engine_replay import EngineReport, replay_in
+    from .engines.feedback import PolicyReport, play_policy
     from .engines.mjcf import write_mjcf
-    from .engines.replay import EngineReport, replay_in
     from .figures import plots
-    from .figures.formation_map import draw_map
+    from .figures.map_figure import draw_map
+    from .free_simulation.free_simulate import simulate_free
     from .free_simulation.result import FreeSimulation
-    from .free_simulation.simulate import simulate_free
     from .geometry.path_guess import load
+    from .mapping.formation_list import format_route, list_formations
     from .mapping.formation_map import FormationMap, build_map
-    from .mapping.route import format_route, list_formations
     from .planning.options import Objective, PlanOptions
     from .planning.result import Plan, Status
     from .planning.saved import load_plan
     from .policy.make import make_policy
-    from .policy.policy import Policy
+    from .policy.playback import Policy
     from .problem.definition import End, Phase, Problem, Until
     from .problem.goal import Goal
     from .problem.read import place_start, read_formation, read_until
-    from .quasistatic.predict import predict
     from .quasistatic.prediction import Prediction
-    from .results.narrow import save
+    from .quasistatic.slow_speeds import predict
+    from .results.adopt import save
     from .results.report import Report
     from .results.torque import TorqueProfile, read_torque_csv
     from .results.trajectory import Trajectory
     from .results.trajectory_file import load_trajectory
-    from .robustness.study import Robustness, assess_robustness
-    from .robustness.uncertainty import Uncertainty
+    from .robustness.error_model import Uncertainty
+    from .robustness.sampling import Robustness, assess_robustness
     from .scene.model import Finger, Friction, Scene
     from .scene.polygon import Polygon
+    from .search.find_route import find_route
     from .search.result import Answer
-    from .search.route import find_route
     from .search.solve import solve
     from .simulation.events import Simulation
     from .simulation.simulate import simulate
     from .tuning.result import Tuning
-    from .tuning.tune import tune
+    from .tuning.tuner import tune
     from .verification.free import verify_free
     from .verification.free_report import FreeReport
-    from .verification.policy import verify_policy
+    from .verification.policy_check import verify_policy
     from .verification.verify import verify
 
 __version__ = "0.1.0"
@@ -79,7 +79,7 @@ _HOMES = {
     "Comparison": "comparison.side_by_side",
     "Contact": "contacts.elemental",
     "End": "problem.definition",
-    "EngineReport": "engines.replay",
+    "EngineReport": "engines.engine_replay",
     "Finger": "scene.model",
     "Formation": "contacts.formation",
     "FormationMap": "mapping.formation_map",
@@ -94,14 +94,14 @@ _HOMES = {
     "Phase": "problem.definition",
     "Plan": "planning.result",
     "PlanOptions": "planning.options",
-    "Policy": "policy.policy",
-    "PolicyReport": "engines.closed",
+    "Policy": "policy.playback",
+    "PolicyReport": "engines.feedback",
     "Polygon": "scene.polygon",
     "Prediction": "quasistatic.prediction",
     "Problem": "problem.definition",
     "ReplayError": "common.errors",
     "Report": "results.report",
-    "Robustness": "robustness.study",
+    "Robustness": "robustness.sampling",
     "Scene": "scene.model",
     "Shortfall": "common.shortfalls",
     "Simulation": "simulation.events",
@@ -111,35 +111,35 @@ _HOMES = {
     "TorqueProfile": "results.torque",
     "Trajectory": "results.trajectory",
     "Tuning": "tuning.result",
-    "Uncertainty": "robustness.uncertainty",
+    "Uncertainty": "robustness.error_model",
     "Until": "problem.definition",
     "WholearmError": "common.errors",
-    "assess_robustness": "robustness.study",
+    "assess_robustness": "robustness.sampling",
     "build_map": "mapping.formation_map",
-    "compare": "comparison.compare",
-    "draw_map": "figures.formation_map",
-    "find_route": "search.route",
-    "format_route": "mapping.route",
-    "list_formations": "mapping.route",
+    "compare": "comparison.metrics",
+    "draw_map": "figures.map_figure",
+    "find_route": "search.find_route",
+    "format_route": "mapping.formation_list",
+    "list_formations": "mapping.formation_list",
     "load": "geometry.path_guess",
     "load_plan": "planning.saved",
     "load_trajectory": "results.trajectory_file",
     "make_policy": "policy.make",
     "place_start": "problem.read",
-    "play_policy": "engines.closed",
-    "predict": "quasistatic.predict",
+    "play_policy": "engines.feedback",
+    "predict": "quasistatic.slow_speeds",
     "read_formation": "problem.read",
     "read_torque_csv": "results.torque",
     "read_until": "problem.read",
-    "replay_in": "engines.replay",
-    "save": "results.narrow",
+    "replay_in": "engines.engine_replay",
+    "save": "results.adopt",
     "simulate": "simulation.simulate",
-    "simulate_free": "free_simulation.simulate",
+    "simulate_free": "free_simulation.free_simulate",
     "solve": "search.solve",
-    "tune": "tuning.tune",
+    "tune": "tuning.tuner",
     "verify": "verification.verify",
     "verify_free": "verification.free",
-    "verify_policy": "verification.policy",
+    "verify_policy": "verification.policy_check",
     "write_mjcf": "engines.mjcf",
 }
 

@@ -8,7 +8,7 @@ import sys
 import threading
 from collections.abc import Sequence
 
-from .common.interrupts import ENDED, end_children, guard
+from .common.signals import ENDED, end_children, guard
 
 
 def start(arguments: Sequence[str] | None = None) -> int:

@@ -23,7 +23,7 @@ import numpy as np
 import wholearm
 from wholearm import Plan, Problem
 
-from ..search.route import forget_charts
+from ..search.find_route import forget_charts
 from .kernels import list_modes
 from .queries import draw_leg, draw_query
 from .stress.damage import BASE, to_toml

@@ -21,7 +21,7 @@ from ..planning.plan import solve
 from ..problem.definition import Problem
 from ..simulation.runge_kutta import NODES
 from ..simulation.simulate import simulate
-from ..solvers.ipopt import Run, record_runs
+from ..solvers.ipopt import IpoptRun, record_runs
 from .study import Case, Row, Study
 
 BANDS = {"iterations": 1.25, "evaluations of the replay": 1.1, "panels of curves": 1.25}
@@ -79,10 +79,9 @@ def count(problem: Problem) -> Counts:
 
     Returns
     -------
-    dict
-        By names such as "phase 5-6 of 6: rows"; `BANDS` has those that rounding has a part in.
+    dict  by names such as "phase 5-6 of 6: rows"; `BANDS` has those that rounding has a part in
     """
-    firsts: dict[str, Run] = {}
+    firsts: dict[str, IpoptRun] = {}
     block, begun = "", 0
 
     with record_runs() as runs:
@@ -125,8 +124,7 @@ def read_stored(path: str) -> dict[str, Counts]:
 
     Raises
     ------
-    InputError
-        If the file cannot be read, or is not a table of whole numbers.
+    InputError  if the file cannot be read, or is not a table of whole numbers
     """
     table = read_json(path, "--update writes it anew")
     rows = table.values() if isinstance(table, Mapping) else [None]

@@ -106,20 +106,11 @@ SUPPORTED = re.compile(r"^Core: (\w+)", re.M)
 
 
 class Environment(NamedTuple):
-    """Where problems are planned.
+    """Where problems are planned."""
 
-    Attributes
-    ----------
-    python : str
-        An interpreter that has the package.
-    kernel : str
-        Of OpenBLAS; empty for the processor's own.
-    seed : int
-        Of the changes to the numbers of scenes in the last bits; zero leaves them as they are.
-    """
-
-    python: str = sys.executable
-    kernel: str = ""
+    python: str = sys.executable  # an interpreter that has the package
+    kernel: str = ""  # of OpenBLAS; empty for the processor's own
+    # of the changes to the numbers of scenes in the last bits; zero leaves them as they are
     seed: int = 0
 
     def run(self, arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
@@ -154,9 +145,8 @@ def answer(path: str, objective: str) -> dict[str, Any]:
 
     Returns
     -------
-    dict
-        ``value`` of the objective, None without a plan; ``modes``, a list for each phase; ``fault``
-        says why there is no plan that holds, and is empty where there is one.
+    dict  ``value`` of the objective, None without a plan; ``modes``, a list for each phase;
+          ``fault`` says why there is no plan that holds, and is empty where there is one
     """
     from ..common.errors import WholearmError
     from ..geometry.path_guess import load

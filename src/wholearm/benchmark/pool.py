@@ -29,31 +29,19 @@ Limit = Callable[[Any], float]
 """Processor time that a task may take [s]."""
 
 
-class Answer(NamedTuple):
-    """What came of a task.
-
-    Attributes
-    ----------
-    task : object
-    ended : {"done", "raised", "late", "died"}
-        Whether it returned, raised an exception, was stopped at its time bound or lost its process.
-    result : object
-        What was returned, or the traceback, or the signal or status that the process ended with.
-    printed : str
-        What it wrote to stdout and stderr, libraries included.
-    elapsed, seconds : float
-        By the wall clock, and processor time of the worker.
-    memory : float, [MB]
-        By which the task has raised the worker's peak of memory.
-    """
+class CaseAnswer(NamedTuple):
+    """What came of a task."""
 
     task: Any
+    # {"done", "raised", "late", "died"}: whether it returned, raised an exception, was stopped at
+    # its time bound or lost its process
     ended: str
+    # what was returned, or the traceback, or the signal or status that the process ended with
     result: Any
-    printed: str
-    elapsed: float
+    printed: str  # what it wrote to stdout and stderr, libraries included
+    elapsed: float  # elapsed, seconds: by the wall clock, and processor time of the worker
     seconds: float = math.nan
-    memory: float = math.nan
+    memory: float = math.nan  # [MB]: by which the task has raised the worker's peak of memory
 
 
 class _Worker:
@@ -110,26 +98,19 @@ def run_tasks(
     kind: Callable[[Any], Any] = lambda task: task,
     strict: bool = True,
     alone: bool = False,
-) -> Iterator[Answer]:
+) -> Iterator[CaseAnswer]:
     """Run tasks in worker processes and give their answers as they come.
 
     Parameters
     ----------
-    run : callable
-        A function of a module: workers import it by name.
-    tasks : sequence
-        What `run` is called with; has to be picklable.
-    jobs : int
-        Number of workers.
-    limit : callable
-        Processor time that a task may take [s]. By the wall clock it may take `PATIENCE` times
-        that.
-    kind : callable, optional
-        Of a task: one worker runs those of one kind, as far as others have something else to do.
-    strict : bool
-        Whether warnings are errors in there.
-    alone : bool
-        Whether each task has a process of its own, where nothing is kept from others.
+    run     a function of a module: workers import it by name
+    tasks   what `run` is called with; has to be picklable
+    jobs    number of workers
+    limit   processor time that a task may take [s]. By the wall clock it may take `PATIENCE` times
+            that.
+    kind    of a task: one worker runs those of one kind, as far as others have something else to do
+    strict  whether warnings are errors in there
+    alone   whether each task has a process of its own, where nothing is kept from others
     """
     context = Spawning()
     waiting = _Queue(tasks, kind)
@@ -156,19 +137,19 @@ def run_tasks(
             worker.stop()
 
 
-def _look(worker: _Worker, bound: float) -> Answer | None:
+def _look(worker: _Worker, bound: float) -> CaseAnswer | None:
     """The answer of a worker, if it has one or can have none any more."""
     seconds = time.monotonic() - worker.started
     try:
         if worker.pipe.poll():
             ended, result, printed, *spent = worker.pipe.recv()
-            return Answer(worker.task, ended, result, printed, seconds, *spent)
+            return CaseAnswer(worker.task, ended, result, printed, seconds, *spent)
     except (EOFError, OSError):
         worker.process.join()
         code = worker.process.exitcode
-        return Answer(worker.task, "late" if code == -_CPU else "died", code, "", seconds)
+        return CaseAnswer(worker.task, "late" if code == -_CPU else "died", code, "", seconds)
     if seconds > PATIENCE * bound:
-        return Answer(worker.task, "late", None, "", seconds)
+        return CaseAnswer(worker.task, "late", None, "", seconds)
     return None
 
 

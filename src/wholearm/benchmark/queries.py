@@ -21,11 +21,11 @@ import numpy as np
 
 from ..common.errors import InfeasibleError, InputError, WholearmError
 from ..common.fields import Range
-from ..mapping.route import format_route, list_formations
+from ..mapping.formation_list import format_route, list_formations
 from ..problem.definition import Problem
 from ..problem.goal import Goal
 from ..problem.read import build_problem, place_start, read_problem
-from ..search.route import find_route, forget_charts
+from ..search.find_route import find_route, forget_charts
 from ..verification.verify import verify
 from .stress.scenes import Table
 from .study import Case, Row, Study
@@ -174,24 +174,15 @@ def _move_goal(problem: Problem) -> Problem:
 Stops = list[tuple[float, float]]
 
 
-class Leg(NamedTuple):
-    """A leg as a problem.
+class QueryLeg(NamedTuple):
+    """A leg as a problem."""
 
-    Attributes
-    ----------
-    name : str
-        Of the scene.
-    problem : Problem
-    stops : list of (float, float)
-        Where its phases stop, (x, phi) [m, rad].
-    """
-
-    name: str
+    name: str  # of the scene
     problem: Problem
-    stops: Stops
+    stops: Stops  # where its phases stop, (x, phi) [m, rad]
 
 
-def draw_leg(seed: int, number: int, folder: Path) -> Leg | None:
+def draw_leg(seed: int, number: int, folder: Path) -> QueryLeg | None:
     """Draw a leg of a shipped scene; None if no route of `TRIES` can be listed."""
     rng = np.random.default_rng([seed, number])
     name = SHIPPED[number % len(SHIPPED)]
@@ -212,7 +203,7 @@ def draw_leg(seed: int, number: int, folder: Path) -> Leg | None:
             continue
         if any(phase.formation.n_constraints == 3 for phase in problem.phases):
             stops = [(float(part.stop[0]), float(part.stop[1])) for part in route]
-            return Leg(name, problem, stops)
+            return QueryLeg(name, problem, stops)
     return None
 
 

@@ -78,33 +78,24 @@ class Skip(Study):
 STUDY = Skip()
 
 
-class Plan(NamedTuple):
-    """A problem to plan, and how.
-
-    Attributes
-    ----------
-    problem : Problem
-    options : dict
-        Of `solve`.
-    draw : bool
-        Whether the plan is drawn as well.
-    """
+class SkipPlan(NamedTuple):
+    """A problem to plan, and how."""
 
     problem: Problem
-    options: dict[str, Any]
-    draw: bool = False
+    options: dict[str, Any]  # of `solve`
+    draw: bool = False  # whether the plan is drawn as well
 
 
 @dataclass(frozen=True)
-class Pair:
+class SkipPair:
     """A part of the model, and the same phases without it and with it."""
 
     part: str
-    without: Plan
-    having: Plan
+    without: SkipPlan
+    having: SkipPlan
 
 
-def list_pairs(folder: str, **options: Any) -> list[Pair]:
+def list_pairs(folder: str, **options: Any) -> list[SkipPair]:
     """Every part with two problems made of those in a folder; `options` are those of `solve`."""
     whole, box, joined = (
         load(str(Path(folder) / f"{name}.toml"))
@@ -114,7 +105,11 @@ def list_pairs(folder: str, **options: Any) -> list[Pair]:
     tip = _pick(box, 1, 2)
     path, over_time = options, options | {"transcription": "time"}
     pairs = [
-        Pair(f"{part}, {where}", Plan(slide.with_(absent), own), Plan(slide.with_(present), own))
+        SkipPair(
+            f"{part}, {where}",
+            SkipPlan(slide.with_(absent), own),
+            SkipPlan(slide.with_(present), own),
+        )
         for where, own in (("along curves", path), ("over time", over_time))
         for part, absent, present in (
             ("friction of contacts", {"friction": 0.0}, {}),
@@ -134,11 +129,13 @@ def list_pairs(folder: str, **options: Any) -> list[Pair]:
     stop = replace(run, phases=(replace(run.phases[0], end=End.REST), *run.phases[1:]))
     return [
         *pairs,
-        Pair("a rolling contact, over time", Plan(slipping, over_time), Plan(tip, over_time)),
-        Pair("a second freedom", Plan(tip, path), Plan(slipping, path)),
-        Pair("a transition at speed", Plan(stop, path), Plan(run, path)),
-        Pair("an idle finger, over time", Plan(both, over_time), Plan(idle, over_time)),
-        Pair("a figure", Plan(slide, path), Plan(slide, path, draw=True)),
+        SkipPair(
+            "a rolling contact, over time", SkipPlan(slipping, over_time), SkipPlan(tip, over_time)
+        ),
+        SkipPair("a second freedom", SkipPlan(tip, path), SkipPlan(slipping, path)),
+        SkipPair("a transition at speed", SkipPlan(stop, path), SkipPlan(run, path)),
+        SkipPair("an idle finger, over time", SkipPlan(both, over_time), SkipPlan(idle, over_time)),
+        SkipPair("a figure", SkipPlan(slide, path), SkipPlan(slide, path, draw=True)),
     ]
 
 
@@ -150,7 +147,7 @@ def _pick(problem: Problem, first: int, stop: int) -> Problem:
     return replace(problem, start=start, phases=tuple(phases))
 
 
-def spend(plan: Plan) -> Row:
+def spend(plan: SkipPlan) -> Row:
     """Sizes of the first NLP of a plan, and processor time outside and inside the solver [ms]."""
     started = time.process_time()
     with record_runs() as runs:

@@ -23,7 +23,7 @@ from .. import __version__
 from ..common.fields import Range
 from ..common.files import make_folder, together, write_text
 from ..common.journal import Journal
-from .pool import Answer, run_tasks
+from .pool import CaseAnswer, run_tasks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -41,7 +41,7 @@ PACKAGES = ("casadi", "numpy", "scipy")
 FAILED = {"raised": "traceback", "late": "time limit", "died": "crash"}
 
 
-class Report(NamedTuple):
+class StudyReport(NamedTuple):
     """What a study has found: its text, what must not be, and the files it has written."""
 
     text: str
@@ -54,24 +54,14 @@ class Study:
 
     Attributes
     ----------
-    name : str
-        Of its files: ``bench_NAME.jsonl``, ``.md`` and ``.csv``.
-    title : str
-        Of the table.
-    keeps : bool
-        Whether records are kept, and the table is written.
-    folder : str
-        Where, if the command line does not say.
-    of_code : bool
-        Whether records count for the source code and the machine alone that they were made with.
-    timed, alone : bool
-        Whether cases are run one at a time, and each in a process of its own.
-    strict : bool
-        Whether warnings are errors.
-    columns : tuple of str
-        Entries of rows that are written as CSV; none for no such file.
-    packages : tuple of str
-        Further ones whose versions are stated.
+    name          of its files: ``bench_NAME.jsonl``, ``.md`` and ``.csv``
+    title         of the table
+    keeps         whether records are kept, and the table is written
+    folder        where, if the command line does not say
+    of_code       whether records count for the source code and the machine alone that they were
+                  made with
+    timed, alone  whether cases are run one at a time, and each in a process of its own
+    strict        whether warnings are errors
     """
 
     name = ""
@@ -82,8 +72,8 @@ class Study:
     timed = False
     alone = False
     strict = False
-    columns: tuple[str, ...] = ()
-    packages: tuple[str, ...] = ()
+    columns: tuple[str, ...] = ()  # entries of rows that are written as CSV; none for no such file
+    packages: tuple[str, ...] = ()  # further ones whose versions are stated
 
     def add_options(self, parser: argparse.ArgumentParser) -> None:
         """Add what the command line takes beside the options that every study has."""
@@ -143,13 +133,13 @@ def add_common(parser: argparse.ArgumentParser, study: Study) -> None:
 
 def run_study(
     study: Study, options: argparse.Namespace, progress: Callable[[str], None] = lambda text: None
-) -> Report:
+) -> StudyReport:
     """Run a study, or what is left of it, and write its table."""
     cases = list(dict.fromkeys(study.list_cases(options)))
     if not study.keeps:
         known = {_key(row["case"]): row for row in _run(study, cases, cases, options, progress)}
         text, findings = _report(study, [known[case] for case in cases], options)
-        return Report(text, findings, [])
+        return StudyReport(text, findings, [])
     make_folder(options.output)
     stem = os.path.join(options.output, f"bench_{study.name}")
     stamp = {"study": study.name, "version": __version__, **study.stamp(options)}
@@ -177,7 +167,7 @@ def run_study(
 
             written.append(f"{stem}.png")
             save(figure, written[-1])
-    return Report(text, findings, written)
+    return StudyReport(text, findings, written)
 
 
 def _report(
@@ -256,7 +246,7 @@ def _run(
             report(f"{text}, {found} with findings, {ahead:.0f} min left")
 
 
-def _record(answer: Answer) -> Row:
+def _record(answer: CaseAnswer) -> Row:
     own = dict(answer.result) if answer.ended == "done" else {}
     if answer.ended != "done":
         text = str(answer.result or "").strip()[-1500:]

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import NoReturn
 
+from ..common.command_options import read_options
 from ..common.errors import InputError
 from ..common.fields import Range
-from ..common.options import read_options
-from ..mechanics.keys import MARGIN
+from ..mechanics.margin_key import MARGIN
 from ..planning.options import PLANNER
 from .help import TOPICS
 

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ..common.errors import InputError, WholearmError, name_source
-from ..common.interrupts import guard
+from ..common.signals import guard
 from .arguments import COMMANDS, Parser, name_simulator
 from .bench import add_bench
 from .map import protect
@@ -28,7 +28,7 @@ from .route import find
 if TYPE_CHECKING:
     from ..planning.result import Plan
     from ..planning.table_check import TorqueTable
-    from ..policy.policy import Policy
+    from ..policy.playback import Policy
     from ..problem.definition import Problem
     from ..results.report import Report
     from ..results.torque import TorqueProfile
@@ -235,7 +235,7 @@ def _read_policy(options: argparse.Namespace, torques: Trajectory | TorqueProfil
     """The policy that is to carry out a plan, if one is given."""
     if options.policy is None:
         return None
-    from ..policy.policy import Policy
+    from ..policy.playback import Policy
     from ..results.torque import TorqueProfile
 
     if isinstance(torques, TorqueProfile):
@@ -256,7 +256,7 @@ def _simulate_free(
         from ..verification.free import verify_free
 
         return verify_free(problem, torques, progress=show_progress(), **given)
-    from ..verification.policy import verify_policy
+    from ..verification.policy_check import verify_policy
 
     return verify_policy(problem, torques, policy, **given)
 

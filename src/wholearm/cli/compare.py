@@ -11,7 +11,7 @@ from .progress import show_progress
 def compare(options: argparse.Namespace) -> int:
     """Replay what is given, print the tables, and draw the margins."""
     from ..common.files import require_writable
-    from ..comparison.compare import compare as run
+    from ..comparison.metrics import compare as run
     from ..geometry.path_guess import load
 
     if options.output is not None:

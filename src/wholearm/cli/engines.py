@@ -43,7 +43,7 @@ def export(options: argparse.Namespace) -> int:
 
 def replay(options: argparse.Namespace) -> int:
     """Replay a plan, and print the report."""
-    from ..engines.replay import ENGINES, replay_in, require_engine
+    from ..engines.engine_replay import ENGINES, replay_in, require_engine
     from ..problem.read import read_problem
 
     require_engine(options.engine)
@@ -79,8 +79,8 @@ def _play_policy(
     setting: Setting,
     departure: float | None,
 ) -> int:
-    from ..engines.closed import ALLOWED, play_policy
-    from ..policy.policy import Policy
+    from ..engines.feedback import ALLOWED, play_policy
+    from ..policy.playback import Policy
 
     if options.refine:
         raise InputError("", "--refine", "is for plans by the clock, not with --policy")
@@ -105,7 +105,7 @@ def _load_plan(path: str, problem: Problem) -> tuple[Problem, Trajectory]:
     """A plan, and the problem whose phases it has."""
     from ..common.files import require_ending
     from ..problem.read import adopt_phases
-    from ..results.narrow import require_same_phases
+    from ..results.adopt import require_same_phases
     from ..results.trajectory_file import load_trajectory
 
     if require_ending(path, ".npz", ".csv") == ".csv":

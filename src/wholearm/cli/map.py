@@ -23,7 +23,7 @@ def draw(options: argparse.Namespace) -> int:
     if route:
         from math import radians
 
-        from ..mapping.route import format_route, list_formations
+        from ..mapping.formation_list import format_route, list_formations
 
         poses = [(x, radians(angle)) for x, angle in route]
         print(format_route(list_formations(read_problem(options.problem), *poses)), end="")
@@ -35,7 +35,7 @@ def draw(options: argparse.Namespace) -> int:
 def _draw_map(options: argparse.Namespace, phi: tuple[float, float] | None) -> int:
     from ..common.files import require_writable
     from ..figures import plots
-    from ..figures.formation_map import draw_map
+    from ..figures.map_figure import draw_map
     from ..mapping.formation_map import build_map, choose_window
     from ..problem.read import read_problem
     from ..results.trajectory_file import load_trajectory
@@ -61,7 +61,7 @@ def _draw_map(options: argparse.Namespace, phi: tuple[float, float] | None) -> i
 
 
 def _read_pair(text: str, key: str, allowed: str) -> tuple[float, float]:
-    from ..common.require import require_number
+    from ..common.errors import require_number
 
     parts = text.split(",")
     try:

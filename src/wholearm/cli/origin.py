@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from ..common.errors import name_source
 
 if TYPE_CHECKING:
-    from ..policy.policy import Policy
+    from ..policy.playback import Policy
     from ..problem.definition import Problem
     from ..results.trajectory import Trajectory
 
@@ -22,23 +22,18 @@ def tell_origin(
 
     Parameters
     ----------
-    problem : Problem
-    plan, policy : tuple
-        The file and what is in it.
-    silent : bool
-        Leave printing to the caller.
+    plan, policy  the file and what is in it
+    silent        leave printing to the caller
 
     Returns
     -------
-    dict
-        The lines as `notes`, for JSON; empty if there are none.
+    dict  the lines as `notes`, for JSON; empty if there are none
 
     Raises
     ------
-    InputError
-        If one of them makes no sense for the problem; names its file.
+    InputError  if one of them makes no sense for the problem; names its file
     """
-    from ..results.origin import describe_origin
+    from ..results.provenance import describe_origin
 
     given = [("plan", plan[0], plan[1].meta)]
     if policy is not None:

@@ -24,11 +24,10 @@ def policy(options: argparse.Namespace) -> int:
     from ..common.errors import ReplayError
     from ..common.files import require_ending, require_writable
     from ..planning.plan import solve
-    from ..policy.make import make_policy
-    from ..policy.widest import find_widest
+    from ..policy.make import find_widest, make_policy
     from ..problem.read import read_own_problem
     from ..results.trajectory_file import load_trajectory
-    from ..verification.policy import verify_policy
+    from ..verification.policy_check import verify_policy
 
     stem = os.path.splitext(os.path.basename(options.plan))[0]
     output = options.output or f"{stem}_policy.npz"

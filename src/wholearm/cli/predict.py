@@ -16,8 +16,8 @@ def predict(options: argparse.Namespace) -> int:
     """Predict, print, and write what is asked for."""
     from ..common.files import require_ending, require_writable
     from ..problem.read import read_problem
-    from ..quasistatic.predict import make_torques
-    from ..quasistatic.predict import predict as run
+    from ..quasistatic.slow_speeds import make_torques
+    from ..quasistatic.slow_speeds import predict as run
 
     for path in filter(None, (options.output, options.torques)):
         require_writable(path)
@@ -33,12 +33,12 @@ def predict(options: argparse.Namespace) -> int:
         read_problem(options.problem), squeeze=options.squeeze, progress=show_progress()
     )
     if options.output is not None:
-        from ..figures.prediction import draw_prediction
+        from ..figures.prediction_figure import draw_prediction
 
         plots.save(draw_prediction(prediction), options.output)
     status = print_result(options, prediction)
     if options.torques is not None:
-        from ..results.narrow import save
+        from ..results.adopt import save
 
         save(make_torques(prediction, options.speed or _SPEED), options.torques)
     name_files(options, options.output, options.torques)

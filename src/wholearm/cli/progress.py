@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from ..common.pulse import listen
+from ..common.signals import listen
 
 EVERY = 10.0
 """Time between lines where stderr is no terminal [s]."""

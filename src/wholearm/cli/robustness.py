@@ -18,16 +18,16 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from ..problem.definition import Problem
-    from ..robustness.uncertainty import Uncertainty
+    from ..robustness.error_model import Uncertainty
 
 
 def robustness(options: argparse.Namespace) -> int:
     """Replay samples, and print what becomes of them."""
     from ..common.files import require_ending, require_writable
-    from ..policy.policy import Policy
+    from ..policy.playback import Policy
     from ..problem.read import adopt_phases, read_problem
     from ..results.trajectory_file import load_trajectory
-    from ..robustness.study import assess_robustness
+    from ..robustness.sampling import assess_robustness
 
     output = options.output or _name_output(options)
     require_writable(output)
@@ -61,7 +61,7 @@ def robustness(options: argparse.Namespace) -> int:
         progress=show_progress(),
     )
     if options.figure is not None:
-        from ..figures.robustness import draw_robustness
+        from ..figures.robustness_figure import draw_robustness
 
         plots.save(draw_robustness(study), options.figure)
     status = print_result(options, study, notes)
@@ -81,7 +81,7 @@ def _name_output(options: argparse.Namespace) -> str:
 def _read_ranges(options: argparse.Namespace, problem: Problem) -> Uncertainty:
     """The ranges of the problem or their defaults, and what is given in their place."""
     from ..problem.uncertainty import spread_widths
-    from ..robustness.uncertainty import Uncertainty
+    from ..robustness.error_model import Uncertainty
 
     widths: dict[str, float] = {}
     for text in options.vary:
@@ -101,6 +101,6 @@ def _choose_executor(options: argparse.Namespace) -> Callable[[], Executor] | No
         from ..robustness.cluster import connect
 
         return partial(connect, options.scheduler)
-    from ..robustness.study import use_processes
+    from ..robustness.sampling import use_processes
 
     return partial(use_processes, options.jobs)

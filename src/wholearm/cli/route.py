@@ -57,7 +57,7 @@ def find(
     """Find a route, with a progress line."""
     from ..common.errors import WholearmError
     from ..common.workers import count_cores
-    from ..search.route import find_route_with
+    from ..search.find_route import find_route_with
 
     count = min(MOST_JOBS, count_cores()) if jobs is None else jobs
     try:
@@ -79,7 +79,7 @@ def _warn(message: Warning | str, *_: object, **__: object) -> None:
 
 def hasten() -> None:
     """Say that the best route so far is being planned; raises where the command was terminated."""
-    from ..common.interrupts import check
+    from ..common.signals import check
 
     # After SIGTERM nothing is planned any more.
     check()
@@ -89,7 +89,7 @@ def hasten() -> None:
 
 def _draw(answer: Answer, output: str) -> None:
     from ..figures import plots
-    from ..figures.formation_map import draw_map
+    from ..figures.map_figure import draw_map
     from ..mapping.formation_map import build_map, choose_window
 
     problem = answer.problem

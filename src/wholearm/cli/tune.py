@@ -12,7 +12,7 @@ def tune(options: argparse.Namespace) -> int:
     """Tune, print what became of each phase, and write the torques if they hold."""
     from ..common.files import require_ending, require_writable, write_text
     from ..geometry.path_guess import load
-    from ..tuning.tune import tune as run
+    from ..tuning.tuner import tune as run
 
     if options.output is not None:
         require_writable(options.output)

@@ -37,7 +37,7 @@ def animate(options: argparse.Namespace) -> int:
         ghost = overlay(options.simulate, trajectory).trajectory if options.simulate else None
         if ending == ".html":
             from ..viewer import page
-            from ..viewer.motion import describe_motion
+            from ..viewer.motion_data import describe_motion
 
             motion = describe_motion(trajectory, problem, ghost) | {"speed": options.speed}
             player = page.write_player(motion)
@@ -58,7 +58,7 @@ def report(options: argparse.Namespace) -> int:
 
     from ..common.files import require_ending, require_writable, write_text
     from ..problem.read import read_problem
-    from ..viewer.report import build_report
+    from ..viewer.report_page import build_report
 
     stem = os.path.splitext(os.path.basename(options.problem))[0]
     output = options.output or f"{stem}.html"

@@ -23,8 +23,7 @@ class Batch:
 
     Parameters
     ----------
-    function : casadi.Function
-        Inputs are column vectors, outputs dense.
+    function  inputs are column vectors, outputs dense
     """
 
     def __init__(self, function: Expression) -> None:
@@ -49,8 +48,7 @@ class Batch:
 
         Parameters
         ----------
-        *arguments : ndarray, shape (n, rows)
-            One per input.
+        *arguments : (n, rows)  one per input
 
         Returns
         -------
@@ -75,8 +73,7 @@ class Batch:
 
         Parameters
         ----------
-        *point : ndarray, shape (rows,)
-            One per input.
+        *point : (rows,)  one per input
 
         Returns
         -------

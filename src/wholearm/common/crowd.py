@@ -28,21 +28,16 @@ def run_all(
 
     Parameters
     ----------
-    run : callable
-        Of a module, as workers import it by name.
-    tasks : iterable
-        Arguments of `run`; have to be picklable.
-    start : callable
-        Makes an executor. It is called again when its workers have died; what they have not
-        answered is given to the next one, task by task until it is known who was the reason.
-    ahead : int
-        Tasks that are under way at most.
+    run    of a module, as workers import it by name
+    tasks  arguments of `run`; have to be picklable
+    start  makes an executor. It is called again when its workers have died; what they have not
+           answered is given to the next one, task by task until it is known who was the reason.
+    ahead  tasks that are under way at most
 
     Yields
     ------
-    task, answer
-        The answer is an exception, not raised, where `run` raised it, and `DiedError` where the
-        workers died of the task.
+    task, answer  the answer is an exception, not raised, where `run` raised it, and `DiedError`
+                  where the workers died of the task
     """
     waiting, deaths = iter(tasks), 0
     # What workers died with is run alone, so that it is known which task they die of.

@@ -20,24 +20,15 @@ SCALES = {"mm": 1e3, "mm/s": 1e3, "ms": 1e3, "deg": 180 / math.pi, "%": 1e2}
 
 
 class Table(NamedTuple):
-    """Rows of values under columns.
+    """Rows of values under columns."""
 
-    Attributes
-    ----------
-    columns : sequence of str
-        ``"name [unit]:format"``: numbers in SI units, written in that unit (`SCALES`) and format,
-        flush right. Without a format cells are text, flush left.
-    rows : sequence of sequence
-        Numbers, several of them for one cell, or text; None and NaN are written as a dash.
-    title : str
-    most : int or None
-        Most rows that are rendered as text; the others are counted.
-    """
-
+    # ``"name [unit]:format"``: numbers in SI units, written in that unit (`SCALES`) and format,
+    # flush right. Without a format cells are text, flush left.
     columns: Sequence[str]
+    # numbers, several of them for one cell, or text; None and NaN are written as a dash
     rows: Sequence[Sequence[Any]]
     title: str = ""
-    most: int | None = None
+    most: int | None = None  # most rows that are rendered as text; the others are counted
 
     @staticmethod
     def of(items: Iterable[Any], columns: Mapping[str, str], title: str = "") -> Table:
@@ -105,22 +96,14 @@ class Table(NamedTuple):
 
 
 class Document(NamedTuple):
-    """What a result says.
+    """What a result says."""
 
-    Attributes
-    ----------
-    title : str
-        What it is about.
-    verdict, reason : str
-        Whether that holds, in a word, and the sentence behind it; empty where nothing is judged.
-    parts : sequence of (str or Table)
-        Lines, and tables with what they are called, in the order of reading; empty ones are left
-        out.
-    """
-
-    title: str
+    title: str  # what it is about
+    # verdict, reason: whether that holds, in a word, and the sentence behind it; empty where
+    # nothing is judged
     verdict: str = ""
     reason: str = ""
+    # lines, and tables with what they are called, in the order of reading; empty ones are left out
     parts: Sequence[str | Table] = ()
 
     @property
@@ -184,15 +167,9 @@ class Drawn(Brief):
 
 
 class Result(Brief):
-    """A result that says what it is by its `document`; rendering is the same for all.
+    """A result that says what it is by its `document`; rendering is the same for all."""
 
-    Attributes
-    ----------
-    derived : tuple of str
-        Properties that plain values have beside the fields.
-    """
-
-    derived: tuple[str, ...] = ()
+    derived: tuple[str, ...] = ()  # properties that plain values have beside the fields
 
     @property
     def document(self) -> Document:

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from numbers import Real
+from typing import TYPE_CHECKING, Any
 
 from .shortfalls import Change, Shortfall
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from .arrays import Array
+
 
 LONGEST = 1000
 """Characters of a message beyond which its middle is left out."""
@@ -17,8 +25,8 @@ class WholearmError(Exception):
 
     Attributes
     ----------
-    exit_status : int
-        Exit status of the command line: 1 when the task cannot be done, 2 when the input is bad.
+    exit_status  exit status of the command line: 1 when the task cannot be done, 2 when the input
+                 is bad
     """
 
     exit_status = 1
@@ -29,12 +37,9 @@ class InputError(WholearmError):
 
     Parameters
     ----------
-    source : str
-        File (or other origin) of the input.
-    key : str
-        Dotted key, array or column at fault; empty for the input as a whole.
-    problem : str
-        What was given and what is allowed.
+    source   file (or other origin) of the input
+    key      dotted key, array or column at fault; empty for the input as a whole
+    problem  what was given and what is allowed
     """
 
     exit_status = 2
@@ -72,12 +77,9 @@ class InfeasibleError(WholearmError):
 
     Attributes
     ----------
-    shortfalls : tuple of Shortfall
-        What the motion that misses limits least is short of, the worst first.
-    changes : tuple of Change
-        Changes of a single parameter with which a plan was found.
-    motion : Trajectory or None
-        That motion, of the phases without a plan, where there is one.
+    shortfalls  what the motion that misses limits least is short of, the worst first
+    changes     changes of a single parameter with which a plan was found
+    motion      that motion, of the phases without a plan, where there is one
     """
 
     def __init__(
@@ -101,26 +103,15 @@ class SolverError(WholearmError):
 
 
 class _PhaseError(WholearmError):
-    """An error that a simulation may end with.
+    """An error that a simulation may end with."""
 
-    Attributes
-    ----------
-    phase : int or None
-        Number of the phase that was simulated.
-    """
-
-    phase: int | None = None
+    phase: int | None = None  # number of the phase that was simulated
 
 
 class JammingError(_PhaseError):
-    """Friction makes the reduced inertia vanish or turn negative: no forward dynamics.
+    """Friction makes the reduced inertia vanish or turn negative: no forward dynamics."""
 
-    Attributes
-    ----------
-    changes : tuple of Change
-        Changes of a single coefficient of friction with which a plan was found.
-    """
-
+    # changes of a single coefficient of friction with which a plan was found
     changes: tuple[Change, ...] = ()
 
 
@@ -130,3 +121,50 @@ class AmbiguityError(JammingError):
 
 class SimulationError(_PhaseError):
     """The forward simulation cannot go on (step size underflow, inconsistent start)."""
+
+
+def require_number(
+    value: object, key: str, *, positive: bool = False, nonnegative: bool = False
+) -> float:
+    """Return `value` as a finite float, or raise `InputError` naming `key`."""
+    allowed = "a positive number" if positive else "a number >= 0" if nonnegative else "a number"
+    real = isinstance(value, Real)
+    try:
+        result = float(value) if real and not isinstance(value, bool) else math.nan  # type: ignore[arg-type]
+    except OverflowError:
+        result = math.inf
+    if not math.isfinite(result):
+        raise InputError("", key, f"{value!r} is not {allowed} (finite)")
+    if (positive and result <= 0) or (nonnegative and result < 0):
+        raise InputError("", key, f"{value!r} is not {allowed}")
+    return result
+
+
+def read_share(value: str, key: str) -> float:
+    """What a text such as "10 %" says, as a fraction, or raise `InputError` naming `key`."""
+    number, sign, rest = value.partition("%")
+    try:
+        share = float(number) / 100 if sign and not rest.strip() else math.nan
+    except ValueError:
+        share = math.nan
+    if not 1e-4 <= share <= 1:
+        raise InputError("", key, f'{value!r} given; allowed as a share is "0.01 %" to "100 %"')
+    return share
+
+
+def require_vector(value: object, key: str, size: int) -> Array:
+    """Return `value` as a read-only float array of `size` finite numbers, or raise `InputError`."""
+    import numpy as np
+
+    if not isinstance(value, list | tuple | np.ndarray) or len(value) != size:
+        raise InputError("", key, f"{value!r} is not a list of {size} numbers")
+    return frozen([require_number(item, key) for item in value])
+
+
+def frozen(value: ArrayLike) -> Array:
+    """Return a read-only float array."""
+    import numpy as np
+
+    array = np.array(value, dtype=float)
+    array.setflags(write=False)
+    return array

@@ -16,8 +16,7 @@ from functools import partial
 from numbers import Real
 from typing import Any, TypeVar
 
-from .errors import InputError
-from .require import require_number, require_vector
+from .errors import InputError, require_number, require_vector
 
 T = TypeVar("T")
 REQUIRED: Any = object()
@@ -27,7 +26,7 @@ Schema = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Kind:
+class FieldKind:
     """What a value may be: its reader, which takes value and key and raises, and its schema."""
 
     read: Callable[[Any, str], Any]
@@ -36,22 +35,13 @@ class Kind:
 
 @dataclass(frozen=True)
 class Range:
-    """Numbers from `low` to `high`, both included; whole ones only if `low` is an integer.
+    """Numbers from `low` to `high`, both included; whole ones only if `low` is an integer."""
 
-    Attributes
-    ----------
-    low, high : float
-        As multiples of the scale, where there is one.
-    scale : callable, optional
-        Of the scene and of what has the number; None where the range does not count.
-    of : str
-        What messages call the scale; ``{time}`` stands for the scene's time.
-    """
-
-    low: float
+    low: float  # low, high: as multiples of the scale, where there is one
     high: float
+    # of the scene and of what has the number; None where the range does not count
     scale: Callable[[Any, Any], float | None] | None = None
-    of: str = ""
+    of: str = ""  # what messages call the scale; ``{time}`` stands for the scene's time
 
     @property
     def whole(self) -> bool:
@@ -120,7 +110,7 @@ class Range:
                 raise InputError("", key, f"{value:g} given; allowed are {text}{what}")
 
 
-def choice(*words: str) -> Kind:
+def choice(*words: str) -> FieldKind:
     """One of several words, or the member of an enumeration that has it."""
 
     def read(given: Any, key: str) -> Any:
@@ -129,7 +119,7 @@ def choice(*words: str) -> Kind:
             raise InputError("", key, f"{given!r} given; allowed are {allowed}")
         return given
 
-    return Kind(read, {"enum": list(words)})
+    return FieldKind(read, {"enum": list(words)})
 
 
 def _read_boolean(given: Any, key: str) -> bool:
@@ -149,48 +139,34 @@ def refer(name: str) -> Schema:
     return {"$ref": f"#/definitions/{name}"}
 
 
-def leave(schema: Schema) -> Kind:
+def leave(schema: Schema) -> FieldKind:
     """What has a reader of its own."""
-    return Kind(lambda given, _: given, schema)
+    return FieldKind(lambda given, _: given, schema)
 
 
 SHARE = Range(0.0, 1.0)
-NUMBER = Kind(require_number, {"type": "number"})
-POSITIVE = Kind(partial(require_number, positive=True), {"type": "number", "exclusiveMinimum": 0})
-NONNEGATIVE = Kind(partial(require_number, nonnegative=True), {"type": "number", "minimum": 0})
-COEFFICIENT = Kind(NONNEGATIVE.read, refer("coefficient"))
-POINT = Kind(partial(require_vector, size=2), refer("point"))
-BOOLEAN = Kind(_read_boolean, {"type": "boolean"})
-TEXT = Kind(_read_text, {"type": "string"})
+NUMBER = FieldKind(require_number, {"type": "number"})
+POSITIVE = FieldKind(
+    partial(require_number, positive=True), {"type": "number", "exclusiveMinimum": 0}
+)
+NONNEGATIVE = FieldKind(partial(require_number, nonnegative=True), {"type": "number", "minimum": 0})
+COEFFICIENT = FieldKind(NONNEGATIVE.read, refer("coefficient"))
+POINT = FieldKind(partial(require_vector, size=2), refer("point"))
+BOOLEAN = FieldKind(_read_boolean, {"type": "boolean"})
+TEXT = FieldKind(_read_text, {"type": "string"})
 
 
 @dataclass(frozen=True)
 class Field:
-    """A value that a user may give.
-
-    Attributes
-    ----------
-    name : str
-    text : str
-        What it is, with its unit in brackets.
-    kind : Kind or Range
-    scale : str
-        Unit of the scene, of `Scales`, that it counts in.
-    ranges : tuple of Range
-        Which it has to be in, relative to the scene.
-    default : object
-        REQUIRED where a value has to be given.
-    attribute : str
-        Of the dataclass that keeps it, if it is not the name.
-    """
+    """A value that a user may give."""
 
     name: str
-    text: str = ""
-    kind: Kind | Range = NUMBER
-    scale: str = ""
-    ranges: tuple[Range, ...] = ()
-    default: Any = REQUIRED
-    attribute: str = ""
+    text: str = ""  # what it is, with its unit in brackets
+    kind: FieldKind | Range = NUMBER
+    scale: str = ""  # unit of the scene, of `Scales`, that it counts in
+    ranges: tuple[Range, ...] = ()  # which it has to be in, relative to the scene
+    default: Any = REQUIRED  # REQUIRED where a value has to be given
+    attribute: str = ""  # of the dataclass that keeps it, if it is not the name
 
     @property
     def required(self) -> bool:
@@ -250,7 +226,7 @@ class Field:
 def key(
     name: str,
     text: str = "",
-    kind: Kind | Range = NUMBER,
+    kind: FieldKind | Range = NUMBER,
     scale: str = "",
     *ranges: Range,
     **more: Any,

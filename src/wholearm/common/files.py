@@ -5,14 +5,21 @@ from __future__ import annotations
 import json
 import os
 import threading
-from collections.abc import Callable, Iterator
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import numpy as np
+
 from .errors import InputError
-from .interrupts import held, on_end
+from .signals import held, on_end
+
+LARGEST = 2**28
+"""Largest array that is read [byte]: a million rows of everything take less."""
 
 
 def require_writable(path: str | os.PathLike[str]) -> None:
@@ -20,8 +27,7 @@ def require_writable(path: str | os.PathLike[str]) -> None:
 
     Raises
     ------
-    InputError
-        If it is a folder, or its folder does not exist or cannot be written to.
+    InputError  if it is a folder, or its folder does not exist or cannot be written to
     """
     target = os.fspath(path)
     folder = os.path.dirname(os.path.realpath(target))
@@ -39,8 +45,7 @@ def require_ending(path: str | os.PathLike[str], *allowed: str) -> str:
 
     Raises
     ------
-    InputError
-        If it is none of those that are allowed.
+    InputError  if it is none of those that are allowed
     """
     ending = os.path.splitext(path)[1].lower()
     if ending not in allowed and not _is_special(os.fspath(path)):
@@ -54,16 +59,13 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object
 
     Parameters
     ----------
-    path : path-like
-        Where the file is to appear; an existing file is replaced, and what is not a file (a
-        device, a pipe) is written to.
-    write : callable
-        Receives the open binary file.
+    path   where the file is to appear; an existing file is replaced, and what is not a file (a
+           device, a pipe) is written to
+    write  receives the open binary file
 
     Raises
     ------
-    InputError
-        If the file cannot be written.
+    InputError  if the file cannot be written
     """
     target = os.fspath(path)
     try:
@@ -105,8 +107,7 @@ def read_json(path: str, hint: str = "") -> Any:
 
     Raises
     ------
-    InputError
-        If the file cannot be read, with a `hint` at what to do.
+    InputError  if the file cannot be read, with a `hint` at what to do
     """
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
@@ -120,8 +121,7 @@ def make_folder(path: str) -> None:
 
     Raises
     ------
-    InputError
-        If it cannot be made.
+    InputError  if it cannot be made
     """
     try:
         os.makedirs(path, exist_ok=True)
@@ -167,6 +167,83 @@ def _remove_all() -> None:
 
 _parts: set[str] = set()
 """Temporary files that exist now."""
+
+
 _staged: ContextVar[list[tuple[str, str]] | None] = ContextVar("staged", default=None)
 """Temporary files and where they are to appear, inside `together`."""
+
+
 on_end(_remove_all)
+
+
+def read_arrays(path: str | os.PathLike[str], names: Iterable[str]) -> dict[str, Any]:
+    """Read the named arrays of an archive, as far as it has them.
+
+    Nothing is unpickled, and no array takes more memory than its bytes in the file.
+
+    Raises
+    ------
+    InputError  if the file cannot be read, is no archive of arrays, or claims what it does not hold
+    """
+    source = str(path)
+    try:
+        with open(path, "rb") as stream:
+            if stream.read(6) == b"\x93NUMPY":
+                raise InputError(source, "", "is not a trajectory file: one array, no archive")
+            stream.seek(0)
+            return _read_archive(source, stream, names)
+    except OSError as error:
+        raise InputError(source, "", f"cannot be read: {error.strerror or error}") from None
+    except (
+        ValueError,
+        EOFError,
+        MemoryError,
+        RuntimeError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
+        raise InputError(source, "", f"is not a trajectory file: {error}") from None
+
+
+def _read_archive(source: str, stream: BinaryIO, names: Iterable[str]) -> dict[str, Any]:
+    arrays = {}
+    with zipfile.ZipFile(stream) as archive:
+        known = {info.filename: info for info in archive.infolist()}
+        for name in names:
+            info = known.get(f"{name}.npy")
+            if info is None:
+                continue
+            if info.file_size > LARGEST:
+                problem = f"holds {info.file_size} bytes; allowed are up to {LARGEST}"
+                raise InputError(source, name, problem)
+            with archive.open(info) as member:
+                content = member.read()
+            arrays[name] = _read_array(source, name, content)
+    return arrays
+
+
+def _read_array(source: str, name: str, content: bytes) -> Any:
+    """The array whose ``.npy`` file has the given bytes."""
+    import io
+
+    stream = io.BytesIO(content)
+    shape, _, kind = _read_header(stream)
+    if kind.hasobject:
+        raise InputError(source, name, "holds Python objects; numbers or text are needed")
+    count = 1
+    for size in shape:
+        count *= size
+    claimed, given = count * kind.itemsize, len(content) - stream.tell()
+    if min(shape, default=0) < 0 or claimed != given:
+        raise InputError(source, name, f"claims {claimed} bytes of {shape} and holds {given}")
+    stream.seek(0)
+    return np.lib.format.read_array(stream, allow_pickle=False)
+
+
+def _read_header(stream: BinaryIO) -> tuple[tuple[int, ...], bool, Any]:
+    version = np.lib.format.read_magic(stream)
+    if version == (1, 0):
+        return np.lib.format.read_array_header_1_0(stream)
+    if version == (2, 0):
+        return np.lib.format.read_array_header_2_0(stream)
+    raise ValueError(f"version {version} of the array format is unknown")

@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 import os
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, BinaryIO
+from itertools import islice
+from typing import Any, BinaryIO, NamedTuple
 
-from .differences import describe_differences, find_differences
 from .errors import InputError
-from .interrupts import held
+from .signals import held
 
+_SHOWN = 3
+"""Differences that are written out; the others are counted."""
 try:
     import fcntl
 except ImportError:  # not on Windows
@@ -27,19 +29,14 @@ class Journal:
 
     Parameters
     ----------
-    path : str
-    stamp : dict
-        What the records belong to; `study` is its kind.
-    fresh : bool
-        Begin the file anew, whatever it holds.
-    again : bool
-        Drop records with findings, so that their tasks are run again.
+    stamp  what the records belong to; `study` is its kind
+    fresh  begin the file anew, whatever it holds
+    again  drop records with findings, so that their tasks are run again
 
     Raises
     ------
-    InputError
-        If the file holds something else, another study of the same kind included, or is being
-        written by another run, or cannot be written.
+    InputError  if the file holds something else, another study of the same kind included, or is
+                being written by another run, or cannot be written
     """
 
     def __init__(
@@ -76,8 +73,7 @@ class Journal:
 
         Raises
         ------
-        InputError
-            If it cannot be written.
+        InputError  if it cannot be written
         """
         self.records.append(record)
         try:
@@ -141,8 +137,7 @@ def locked(folder: str) -> Iterator[None]:
 
     Raises
     ------
-    InputError
-        If another run has it.
+    InputError  if another run has it
     """
     descriptor = os.open(folder, os.O_RDONLY)
     try:
@@ -174,3 +169,54 @@ def _parse(line: bytes) -> dict[str, Any] | None:
     except ValueError:
         return None
     return record if isinstance(record, dict) else None
+
+
+class Difference(NamedTuple):
+    """A key with two values, as text; `nothing` where one table does not have it."""
+
+    key: str
+    one: str
+    other: str
+
+
+def find_differences(
+    one: Any, other: Any, free: tuple[str, ...] = (), key: str = ""
+) -> Iterator[Difference]:
+    """The keys in which two nested tables differ, in their order.
+
+    Parameters
+    ----------
+    one, other  mappings, lists, and what they hold
+    free        names, at any depth, in which they may differ; only at the top if they begin with a
+                dot
+    key         of the tables themselves
+    """
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        for name in dict.fromkeys([*one, *other]):
+            if name in free or (not key and f".{name}" in free):
+                continue
+            inner = f"{key}.{name}" if key else str(name)
+            yield from find_differences(one.get(name), other.get(name), free, inner)
+    elif isinstance(one, list | tuple) and isinstance(other, list | tuple):
+        if len(one) != len(other):
+            yield Difference(key, f"{len(one)} entries", f"{len(other)}")
+            return
+        for k, pair in enumerate(zip(one, other, strict=True), start=1):
+            yield from find_differences(*pair, free, f"{key}[{k}]")
+    elif one != other:
+        yield Difference(key, _write(one), _write(other))
+
+
+def _write(value: Any) -> str:
+    text = "nothing" if value is None else repr(value)
+    if isinstance(value, float):
+        text = f"{value:.12g}"
+    return text if len(text) <= 40 else f"{text[:37]}..."
+
+
+def describe_differences(found: Iterator[Difference], one: str, other: str) -> str:
+    """The first differences in words; `one` and `other` say where the values stand."""
+    shown = list(islice(found, _SHOWN))
+    rest = sum(1 for _ in found)
+    parts = [f"{own.key} ({own.one} {one}, {own.other} {other})" for own in shown]
+    return ", ".join(parts) + (f", and {rest} more" if rest else "")

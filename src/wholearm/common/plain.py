@@ -39,8 +39,7 @@ def restore(kind: Any, value: Any) -> Any:
 
     Raises
     ------
-    TypeError, ValueError, AttributeError
-        If it is none of this type.
+    TypeError, ValueError, AttributeError  if it is none of this type
     """
     origin, parts = get_origin(kind), get_args(kind)
     if type(None) in parts:

@@ -16,10 +16,8 @@ def jacobi_nodes(count: int, alpha: int = 0, beta: int = 0) -> Array:
 
     Parameters
     ----------
-    count : int
-        Degree n of the polynomial; zero gives no nodes.
-    alpha, beta : int
-        Exponents of the weight (1 - x)^alpha (1 + x)^beta, not negative.
+    count        degree n of the polynomial; zero gives no nodes
+    alpha, beta  exponents of the weight (1 - x)^alpha (1 + x)^beta, not negative
     """
     k, total = np.arange(count), alpha + beta
     diagonal = (beta**2 - alpha**2) / np.maximum((2 * k + total) * (2 * k + total + 2), 1)
@@ -28,3 +26,12 @@ def jacobi_nodes(count: int, alpha: int = 0, beta: int = 0) -> Array:
     squares = 4 * k * (k + alpha) * (k + beta) * (k + total)
     squares = squares / ((2 * k + total) ** 2 * (2 * k + total + 1) * (2 * k + total - 1))
     return np.linalg.eigvalsh(np.diag(diagonal) + np.diag(np.sqrt(squares), -1))
+
+
+def find_minima(values: Array) -> Array:
+    """Least value along the middle axis of evenly spaced values, also between them (parabolas)."""
+    before, here, after = values[:, :-2], values[:, 1:-1], values[:, 2:]
+    bend = before - 2 * here + after
+    inside = (here <= before) & (here <= after) & (bend > 0)
+    dip = np.divide((after - before) ** 2, 8 * bend, out=np.zeros_like(here), where=inside)
+    return np.asarray(np.minimum((here - dip).min(axis=1), values[:, [0, -1]].min(axis=1)))

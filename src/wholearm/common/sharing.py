@@ -108,10 +108,8 @@ class Store(Generic[_T]):
 
     Parameters
     ----------
-    build : callable
-        Makes the value of an owner.
-    identify : callable
-        Owners for which this is equal share one value.
+    build     makes the value of an owner
+    identify  owners for which this is equal share one value
     """
 
     def __init__(self, build: Callable[[Any], _T], identify: Callable[[Any], Hashable]) -> None:

@@ -6,28 +6,14 @@ from typing import NamedTuple
 
 
 class Parameter(NamedTuple):
-    """A number that sets limits, and may be changed to let a motion be planned.
-
-    Attributes
-    ----------
-    name : str
-    value : float
-        As it is.
-    unit : str
-    sign : int
-        1 if limits give way as it grows, -1 if as it falls (not below zero).
-    key : str
-        Key of it in a problem, for `Problem.with_`; `duration` is an option.
-    mirrored : str
-        Key of what has minus this value, such as the base of the other finger.
-    """
+    """A number that sets limits, and may be changed to let a motion be planned."""
 
     name: str
-    value: float
+    value: float  # as it is
     unit: str
-    sign: int
-    key: str = ""
-    mirrored: str = ""
+    sign: int  # 1 if limits give way as it grows, -1 if as it falls (not below zero)
+    key: str = ""  # key of it in a problem, for `Problem.with_`; `duration` is an option
+    mirrored: str = ""  # key of what has minus this value, such as the base of the other finger
 
     @property
     def is_speed(self) -> bool:
@@ -53,51 +39,24 @@ class Change(NamedTuple):
         return f"{own.name} = {value} instead of {own.value:g}"
 
 
-class Place(NamedTuple):
-    """Where in a motion something is.
+class LimitPlace(NamedTuple):
+    """Where in a motion something is."""
 
-    Attributes
-    ----------
-    phase : int
-        Number of the phase.
-    time : float, [s]
-        From the start of the first of the phases that have no plan.
-    text : str
-        Both in words, or the pose.
-    """
-
-    phase: int
-    time: float
-    text: str
+    phase: int  # number of the phase
+    time: float  # [s]: from the start of the first of the phases that have no plan
+    text: str  # both in words, or the pose
 
 
 class Shortfall(NamedTuple):
-    """A limit that cannot be kept.
+    """A limit that cannot be kept."""
 
-    Attributes
-    ----------
-    kind : str
-        What it limits: `press`, `cone`, `torque`, `speed`.
-    part : str
-        The contact or finger concerned.
-    limit : str
-        The limit in words, with its value.
-    amount : float
-        By how much it is missed at worst.
-    unit : str
-    place : Place
-        Where that is.
-    share : float
-        The amount over what is much for such a limit, which shortfalls are ranked by.
-    """
-
-    kind: str
-    part: str
-    limit: str
-    amount: float
+    kind: str  # what it limits: `press`, `cone`, `torque`, `speed`
+    part: str  # the contact or finger concerned
+    limit: str  # the limit in words, with its value
+    amount: float  # by how much it is missed at worst
     unit: str
-    place: Place
-    share: float
+    place: LimitPlace  # where that is
+    share: float  # the amount over what is much for such a limit, which shortfalls are ranked by
 
     def __str__(self) -> str:
         return f"{self.limit} is {self.amount:.3g} {self.unit} short at {self.place.text}"

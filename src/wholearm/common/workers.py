@@ -24,7 +24,7 @@ from multiprocessing.context import SpawnContext, SpawnProcess
 from multiprocessing.process import BaseProcess
 from typing import Any, NamedTuple, TypeVar
 
-from .interrupts import WATCHER
+from .signals import WATCHER
 
 _T = TypeVar("_T")
 Task = Callable[[], _T]
@@ -53,12 +53,9 @@ def share(tasks: Sequence[Task[_T]], jobs: int, known: Sequence[object] = ()) ->
 
     Parameters
     ----------
-    tasks : sequence of callable
-        Without arguments. What they return has to be picklable.
-    jobs : int
-        Most processes, this one included.
-    known : sequence of object
-        What results may refer to: they then have these very objects.
+    tasks  without arguments. What they return has to be picklable.
+    jobs   most processes, this one included
+    known  what results may refer to: they then have these very objects
     """
     global _sharing
     count = min(jobs, len(tasks)) - 1

@@ -13,53 +13,28 @@ from ..results.trajectory import Trajectory
 
 @dataclass(frozen=True, eq=False)
 class Contender:
-    """What one plan or one table of torques does.
+    """What one plan or one table of torques does."""
 
-    Attributes
-    ----------
-    name : str
-        The file: without its folder where that is enough.
-    ok : bool
-        Whether every contact held and the goal was reached.
-    reason : str
-        The sentence behind that.
-    duration : float, [s]
-        Until the goal is reached, or of the torques where it is not.
-    effort : float, [(N m)^2 s]
-        Integral of tau^T tau.
-    peaks : tuple of float, [N m]
-        Largest torque of each joint.
-    simulations : int or None
-        How many it took to find it, if that is known.
-    margin : float or None, [N]
-        Least margin of a normal force over epsilon in the replay, of `contact` in `phase`.
-    lost : float or None, [J]
-        Energy lost to friction and impacts.
-    lasts, margins : tuple of float, [s] and [N]
-        Durations of the phases that were entered, and the least margin of each; NaN where unknown.
-    report : Report or None
-        None where the replay could not go on.
-    problem : Problem or None
-        With the phases that it goes through.
-    planned : Trajectory or None
-        The motion that was given; None for torques alone.
-    """
-
-    name: str
-    ok: bool
-    reason: str
-    duration: float
-    effort: float
-    peaks: tuple[float, float]
-    simulations: int | None
+    name: str  # the file: without its folder where that is enough
+    ok: bool  # whether every contact held and the goal was reached
+    reason: str  # the sentence behind that
+    duration: float  # [s]: until the goal is reached, or of the torques where it is not
+    effort: float  # [(N m)^2 s]: integral of tau^T tau
+    peaks: tuple[float, float]  # [N m]: largest torque of each joint
+    simulations: int | None  # how many it took to find it, if that is known
+    # [N]: least margin of a normal force over epsilon in the replay, of `contact` in `phase`
     margin: float | None = None
     contact: str = ""
     phase: int = 0
-    lost: float | None = None
+    lost: float | None = None  # [J]: energy lost to friction and impacts
+    # lasts, margins [s] and [N]: durations of the phases that were entered, and the least margin of
+    # each; NaN where unknown
     lasts: tuple[float, ...] = ()
     margins: tuple[float, ...] = ()
-    report: Report | None = field(default=None, repr=False)
+    report: Report | None = field(default=None, repr=False)  # none where the replay could not go on
+    # with the phases that it goes through
     problem: Problem | None = field(default=None, repr=False)
+    # the motion that was given; None for torques alone
     planned: Trajectory | None = field(default=None, repr=False)
 
     @property
@@ -75,18 +50,10 @@ class Contender:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison(Result):
-    """Plans and torques for one problem.
+    """Plans and torques for one problem."""
 
-    Attributes
-    ----------
-    name : str
-        The problem's.
-    epsilon : float, [N]
-    contenders : tuple of Contender
-    """
-
-    name: str
-    epsilon: float
+    name: str  # the problem's
+    epsilon: float  # [N]
     contenders: tuple[Contender, ...]
 
     @property

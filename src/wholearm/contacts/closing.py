@@ -8,7 +8,8 @@ Contacts are counted as in `contact_table`: those with the palm, with finger 1 a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -22,41 +23,32 @@ from .elemental import Contact, candidate_contacts
 from .formation import Formation, Kinematics
 from .links import FINGERS_TOUCH, evaluate_finger_gap
 
+_PLACES = 1000
+"""Places along x that are tried."""
 Numbers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
-
 TOO_SHORT, JOINT_COVERED, FINGERS_CROSS = 1, 2, 3
 """Reasons why a finger cannot close: it reaches no part of the object; its joint is in the object
 or right above it, so that the link overlaps the object before it closes; the other finger is closed
 in its way."""
-
-
 AROUND = 3
 """Neighbouring vertices that are looked at where a finger closes."""
 LEVEL = 1e-12
 """How far below a joint the object is still level with it, over the link's length."""
-
-
 CHUNK = 4096
 """Poses that are closed at a time, so that they stay in the cache."""
 
 
-class Closed(NamedTuple):
-    """Hand and object closed at n poses.
+class ClosedFinger(NamedTuple):
+    """Hand and object closed at n poses."""
 
-    Attributes
-    ----------
-    z : ndarray, shape (n, 5), [m, m, rad, rad, rad]
-        Configurations; NaN joint angles where a finger cannot close.
-    touched : ndarray of int, shape (n, 2)
-        What each finger touches first, as an index into `contact_table`; -1 where it cannot close.
-    obstacle : ndarray of int, shape (n, 2)
-        0, or why a finger cannot close: `TOO_SHORT`, `JOINT_COVERED` or, for both fingers,
-        `FINGERS_CROSS`.
-    """
-
+    # (n, 5) [m, m, rad, rad, rad]: configurations; NaN joint angles where a finger cannot close
     z: Array
+    # (n, 2): what each finger touches first, as an index into `contact_table`; -1 where it cannot
+    # close
     touched: Numbers
+    # (n, 2): 0, or why a finger cannot close: `TOO_SHORT`, `JOINT_COVERED` or, for both fingers,
+    # `FINGERS_CROSS`
     obstacle: Numbers
 
 
@@ -112,16 +104,16 @@ def lower(scene: Scene, phi: Array) -> tuple[Array, Numbers]:
     return -heights.min(axis=1), vertex
 
 
-def close_fingers(scene: Scene, x: Array, phi: Array) -> Closed:
+def close_fingers(scene: Scene, x: Array, phi: Array) -> ClosedFinger:
     """Lower the object and close both fingers at n poses, `x` [m] and `phi` [rad] of shape (n,)."""
     if len(x) <= CHUNK:
         return _close_fingers(scene, x, phi)
     cuts = range(0, len(x), CHUNK)
     parts = [_close_fingers(scene, x[k : k + CHUNK], phi[k : k + CHUNK]) for k in cuts]
-    return Closed(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+    return ClosedFinger(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
 
-def _close_fingers(scene: Scene, x: Array, phi: Array) -> Closed:
+def _close_fingers(scene: Scene, x: Array, phi: Array) -> ClosedFinger:
     y, _ = lower(scene, phi)
     z = np.column_stack([x, y, phi, np.empty((len(x), 2))])
     touched = np.empty((len(x), 2), dtype=np.int64)
@@ -133,10 +125,10 @@ def _close_fingers(scene: Scene, x: Array, phi: Array) -> Closed:
         touched[:, finger] = np.where(closed, first_contact(scene, finger) + feature, -1)
     if scene.fingers_collide:
         obstacle[evaluate_finger_gap(scene, z) < 0] = FINGERS_CROSS
-    return Closed(z, touched, obstacle)
+    return ClosedFinger(z, touched, obstacle)
 
 
-def describe_obstacle(closed: Closed) -> str:
+def describe_obstacle(closed: ClosedFinger) -> str:
     """Why the first of some poses cannot be closed, in words; empty where it can."""
     text = ""
     for number, obstacle in enumerate(closed.obstacle[0].tolist(), start=1):
@@ -160,8 +152,8 @@ def close_finger(scene: Scene, q: Array, finger: int) -> float:
 
     Raises
     ------
-    InputError
-        If the finger reaches no part of the object, or its joint is in the object or too near.
+    InputError  if the finger reaches no part of the object, or its joint is in the object or too
+                near
     """
     link = scene.fingers[finger]
     angle, _, (obstacle,) = _close_finger(scene, finger, *np.asarray(q)[:3, None])
@@ -215,10 +207,8 @@ def find_nearby(scene: Scene, finger: int, x: Array, y: Array, phi: Array) -> tu
 
     Returns
     -------
-    first : ndarray of int, shape (n,)
-        First of `AROUND` neighbouring vertices, one of which it is or is next to.
-    clear : ndarray of bool, shape (n,)
-        Whether this holds: the joint is outside of the object and not above any of it.
+    first : (n,)  first of `AROUND` neighbouring vertices, one of which it is or is next to
+    clear : (n,)  whether this holds: the joint is outside of the object and not above any of it
     """
     link, body = scene.fingers[finger], scene.polygon.vertices
     count, radius = len(body), link.radius
@@ -270,14 +260,12 @@ def _touch(link: Finger, finger: int, corners: Array) -> tuple[Array, Numbers]:
 
     Parameters
     ----------
-    corners : ndarray, shape (n, m + 1, 2)
-        From the joint; the last one is the end of the last edge only.
+    corners : (n, m + 1, 2)  from the joint; the last one is the end of the last edge only
 
     Returns
     -------
-    angle : ndarray, shape (n,)
-    feature : ndarray of int, shape (n,)
-        Of m sides, m edges and m arcs; -1 where it reaches none.
+    angle : (n,)
+    feature : (n,)  of m sides, m edges and m arcs; -1 where it reaches none
     """
     following, corners = corners[:, 1:], corners[:, :-1]
     sign = 1.0 if finger == 0 else -1.0
@@ -338,3 +326,65 @@ def _distance(corners: Array) -> Array:
     nearest = corners + part[..., None] * runs
     distance = np.hypot(nearest[..., 0], nearest[..., 1]).min(axis=1)
     return np.asarray(np.where((cross >= 0).all(axis=1), 0.0, distance))
+
+
+def evaluate_each(scene: Scene, labels: Numbers, z: Array, v: Array | None = None) -> Kinematics:
+    """Rows of n formations of contacts that slide, each at a configuration of its own.
+
+    Parameters
+    ----------
+    labels : (n, n_c)  contacts, as indices into `closing.contact_table`
+    z, v : (n, 5)      configurations, and the velocities for A' v, `z` if left out
+    """
+    v = z if v is None else v
+    C, A_dot_v = np.empty((2, *labels.shape))
+    A, A_t = np.empty((2, *labels.shape, 5))
+    for index in np.unique(labels).tolist():
+        rows, places = np.nonzero(labels == index)
+        own = evaluate_contacts(scene, [index], z[rows], v[rows])
+        C[rows, places], A_dot_v[rows, places] = own.C[:, 0], own.A_dot_v[:, 0]
+        A[rows, places], A_t[rows, places] = own.A[:, 0], own.A_t[:, 0]
+    return Kinematics(C, A, A_t, A_dot_v, A, A_dot_v)
+
+
+def group_alike(scene: Scene, labels: Numbers) -> Iterator[tuple[Formation, Flags]]:
+    """Groups of formations with the same friction at each contact, one of which stands for all.
+
+    All else that the mechanics takes of a formation is in its rows.
+    """
+    table = contact_table(scene)
+    fingers = np.array([-1 if own.finger is None else own.finger for own in table])[labels]
+    for kind in np.unique(fingers, axis=0):
+        rows = (fingers == kind).all(axis=1)
+        contacts = tuple(table[k] for k in labels[int(rows.argmax())].tolist())
+        yield Formation(scene, contacts), rows
+
+
+def name_reach(scene: Scene, phi: float) -> str:
+    """For which x [m] both fingers close, and not into each other, as part of a message."""
+    size = float(np.hypot(*scene.polygon.vertices.T).max())
+    reach = [size + finger.length + finger.radius for finger in scene.fingers]
+    bases = [float(np.asarray(finger.base)[0]) for finger in scene.fingers]
+    low = max(base - own for base, own in zip(bases, reach, strict=True))
+    high = min(base + own for base, own in zip(bases, reach, strict=True))
+    x = np.linspace(low, max(low, high), _PLACES)
+    closes = (close_fingers(scene, x, np.full(len(x), phi)).obstacle == 0).all(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], closes.astype(int), [0]])))
+    spans = [
+        _round(float(x[first]), float(x[end - 1]))
+        for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+        if end - first > 1
+    ]
+    if not spans:
+        return "at that angle the hand closes at no x"
+    every = " and ".join(f"from {first:g} to {last:g}" for first, last in spans)
+    return f"at that angle the hand closes for x {every}"
+
+
+def _round(low: float, high: float) -> tuple[float, float]:
+    """Ends of a span in few digits, inside of it."""
+    digits = 2 - math.floor(math.log10(high - low))
+    step = 10.0**-digits
+    return round(math.ceil(low / step) * step, digits), round(
+        math.floor(high / step) * step, digits
+    )

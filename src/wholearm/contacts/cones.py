@@ -22,16 +22,13 @@ def find_weakest(formation: Formation, held: Array) -> tuple[int, float, float |
 
     Parameters
     ----------
-    held : ndarray, shape (n_c + 2 R,), [N]
-        H c.
+    held : (n_c + 2 R,) [N]  h c
 
     Returns
     -------
-    row : int
-        The contact.
-    c_n : float, [N]
-    c_t : float or None, [N]
-        If it slips.
+    row        the contact
+    c_n : [N]
+    c_t : [N]  if it slips
     """
     count, rolls = formation.n_contacts, formation.n_rolling
     row = int(held[:count].argmin())
@@ -47,8 +44,7 @@ def slip_margins(formation: Formation, c_n: Array, c_t: Array) -> Array:
 
     Parameters
     ----------
-    c_n, c_t : ndarray, shape (..., n_c), [N]
-        Of every contact.
+    c_n, c_t : (..., n_c) [N]  of every contact
     """
     rolling = list(formation.rolling_rows)
     return np.asarray(formation.friction[rolling] * c_n[..., rolling] - np.abs(c_t[..., rolling]))

@@ -41,24 +41,12 @@ _PATTERN = re.compile(r"(v|e)(0|[1-9][0-9]*)-(palm|finger([12])|tip([12]))")
 
 @dataclass(frozen=True)
 class Contact:
-    """An elemental contact between a feature of the object and a part of the hand.
+    """An elemental contact between a feature of the object and a part of the hand."""
 
-    Attributes
-    ----------
-    feature : {"v", "e"}
-        A vertex or an edge of the object.
-    index : int
-        Which vertex or edge.
-    surface : {"palm", "finger", "tip"}
-        The palm, the side of a link or the tip of a link.
-    finger : int or None
-        0 for finger 1, 1 for finger 2, None for the palm.
-    """
-
-    feature: str
-    index: int
-    surface: str
-    finger: int | None = None
+    feature: str  # {"v", "e"}: a vertex or an edge of the object
+    index: int  # which vertex or edge
+    surface: str  # {"palm", "finger", "tip"}: the palm, the side of a link or the tip of a link
+    finger: int | None = None  # 0 for finger 1, 1 for finger 2, None for the palm
 
     @property
     def name(self) -> str:
@@ -82,94 +70,59 @@ class Contact:
 
 
 class LinkFeatures(NamedTuple):
-    """One link against the whole object, as expressions of z.
+    """One link against the whole object, as expressions of z."""
 
-    Attributes
-    ----------
-    base, tip, normal : expression, shape (2,)
-        Joint [m], centre of the tip [m], and the normal of the link's touching side.
-    vertex_gap, vertex_run : expression, shape (1, n_v), [m]
-        C-function of each vertex with the side, and how far along the link the vertex is.
-    other_gap : list of expression, [m]
-        The largest `edge_gap` of all other edges, for each edge.
-    edge_gap, edge_run : expression, shape (1, n_v), [m]
-        C-function of the tip with each edge, and how far along the edge the tip is.
-    arc_gap, arc_run : expression, shape (1, n_v), [m]
-        C-function of each vertex with the tip's arc, and how far beyond the tip's centre it is.
-    vertex_beyond, edge_beyond : expression, shape (1, n_v), [m]
-        How far each vertex is beyond the ends of the link, and the tip beyond those of each edge.
-    """
-
+    # base, tip, normal (2,): joint [m], centre of the tip [m], and the normal of the link's
+    # touching side
     base: Expression
     tip: Expression
     normal: Expression
+    # vertex_gap, vertex_run (1, n_v) [m]: C-function of each vertex with the side, and how far
+    # along the link the vertex is
     vertex_gap: Expression
     vertex_run: Expression
-    other_gap: list[Expression]
+    other_gap: list[Expression]  # [m]: the largest `edge_gap` of all other edges, for each edge
+    # edge_gap, edge_run (1, n_v) [m]: C-function of the tip with each edge, and how far along the
+    # edge the tip is
     edge_gap: Expression
     edge_run: Expression
+    # arc_gap, arc_run (1, n_v) [m]: C-function of each vertex with the tip's arc, and how far
+    # beyond the tip's centre it is
     arc_gap: Expression
     arc_run: Expression
+    # vertex_beyond, edge_beyond (1, n_v) [m]: how far each vertex is beyond the ends of the link,
+    # and the tip beyond those of each edge
     vertex_beyond: Expression
     edge_beyond: Expression
 
 
 class Features(NamedTuple):
-    """A scene as expressions of its own symbol z: what every contact picks its rows from.
+    """A scene as expressions of its own symbol z: what every contact picks its rows from."""
 
-    Attributes
-    ----------
-    z : SX symbol, shape (5,)
-    vertices : expression, shape (2, n_v), [m]
-        World positions of the vertices.
-    edge_normals : expression, shape (2, n_v)
-        Normals of the edges into the object.
-    edge_lengths : ndarray, shape (n_v,), [m]
-    links : tuple of LinkFeatures
-        Finger 1, finger 2.
-    """
-
-    z: Expression
-    vertices: Expression
-    edge_normals: Expression
-    edge_lengths: Array
-    links: tuple[LinkFeatures, LinkFeatures]
+    z: Expression  # (5,)
+    vertices: Expression  # (2, n_v) [m]: world positions of the vertices
+    edge_normals: Expression  # (2, n_v): normals of the edges into the object
+    edge_lengths: Array  # (n_v,) [m]
+    links: tuple[LinkFeatures, LinkFeatures]  # finger 1, finger 2
 
 
 class Geometry(NamedTuple):
-    """A contact as expressions of z.
+    """A contact as expressions of z."""
 
-    Attributes
-    ----------
-    gap : scalar expression, [m]
-        The C-function.
-    point, normal : expression, shape (2,), [m], [-]
-        Where the contact is, and its normal into the object.
-    """
-
-    gap: Expression
+    gap: Expression  # [m]: the C-function
+    # point, normal (2,) [m], [-]: where the contact is, and its normal into the object
     point: Expression
     normal: Expression
 
 
 class GapLimit(NamedTuple):
-    """A quantity that is positive while a contact formation is valid.
+    """A quantity that is positive while a contact formation is valid."""
 
-    Attributes
-    ----------
-    value : scalar expression, [m]
-    text : str
-        What has happened when it is zero.
-    gained : Contact or None
-        The contact that is gained there, if any.
-    also : tuple of Contact
-        Others that may be gained there: a pointed tip at a vertex may go on along either edge,
-        or along the link.
-    """
-
-    value: Expression
-    text: str
-    gained: Contact | None = None
+    value: Expression  # [m]
+    text: str  # what has happened when it is zero
+    gained: Contact | None = None  # the contact that is gained there, if any
+    # others that may be gained there: a pointed tip at a vertex may go on along either edge, or
+    # along the link
     also: tuple[Contact, ...] = ()
 
     def gains(self, contact: Contact | None) -> bool:
@@ -182,8 +135,7 @@ def parse_contact(name: object, scene: Scene) -> Contact:
 
     Raises
     ------
-    InputError
-        If there is no such contact on this object and hand; lists what is allowed.
+    InputError  if there is no such contact on this object and hand; lists what is allowed
     """
     count = scene.polygon.n_vertices
     match = _PATTERN.fullmatch(name) if isinstance(name, str) else None

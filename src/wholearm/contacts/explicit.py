@@ -25,38 +25,23 @@ SIDE, EDGE, ARC = 0, 1, 2
 """What of a link and an object touch: its side a vertex, its tip an edge, its tip a vertex."""
 
 
-class Motion(NamedTuple):
-    """Straight ways at n places.
+class ExplicitMotion(NamedTuple):
+    """Straight ways at n places."""
 
-    Attributes
-    ----------
-    z, z_u, z_uu : ndarray, shape (n, 5)
-        Configurations, and their first and second derivatives along the ways.
-    kinematics : Kinematics
-        Rows of the three contacts, with A' z_u.
-    """
-
+    # z, z_u, z_uu (n, 5): configurations, and their first and second derivatives along the ways
     z: Array
     z_u: Array
     z_uu: Array
-    kinematics: Kinematics
+    kinematics: Kinematics  # rows of the three contacts, with A' z_u
 
 
 class _Touch(NamedTuple):
-    """Poses at which a finger touches in one manner; vectors are in the world, from its joint.
+    """Poses at which a finger touches in one manner; vectors are in the world, from its joint."""
 
-    Attributes
-    ----------
-    rows : ndarray of int
-        Which of the poses.
-    kind : int
-    arm, corner, outward : ndarray, shape (n, 2)
-        The vertex from the centroid and from the joint; for an edge, the one where it begins, and
-        its outward normal.
-    """
-
-    rows: Numbers
+    rows: Numbers  # which of the poses
     kind: int
+    # arm, corner, outward (n, 2): the vertex from the centroid and from the joint; for an edge, the
+    # one where it begins, and its outward normal
     arm: Array
     corner: Array
     outward: Array
@@ -67,9 +52,8 @@ def place(scene: Scene, labels: Numbers, poses: Array) -> Array:
 
     Parameters
     ----------
-    scene : Scene
-    labels : ndarray of int, shape (n, 3)
-    poses : ndarray, shape (n, 2), [m, rad]
+    labels : (n, 3)
+    poses : (n, 2) [m, rad]
     """
     z = np.full((len(poses), 5), np.nan)
     z[:, [0, 2]] = poses
@@ -93,15 +77,13 @@ def place(scene: Scene, labels: Numbers, poses: Array) -> Array:
     return z
 
 
-def move(scene: Scene, labels: Numbers, poses: Array, ways: Array) -> Motion:
+def move(scene: Scene, labels: Numbers, poses: Array, ways: Array) -> ExplicitMotion:
     """Rates along straight ways at n poses.
 
     Parameters
     ----------
-    scene : Scene
-    labels : ndarray of int, shape (n, 3)
-    poses, ways : ndarray, shape (n, 2)
-        (x, phi) and (x', phi').
+    labels : (n, 3)
+    poses, ways : (n, 2)  (x, phi) and (x', phi')
     """
     z = place(scene, labels, poses)
     z_u, z_uu = np.zeros_like(z), np.zeros_like(z)
@@ -137,7 +119,7 @@ def move(scene: Scene, labels: Numbers, poses: Array, ways: Array) -> Motion:
                 bent = _bend(own, link.radius, tip, normal, z_u[at], rate)
                 z_uu[at, joint] = -(bent + held[:, 1] * z_uu[at, 1]) / held[:, joint]
             bend[at, 1 + finger] = bent
-    return Motion(z, z_u, z_uu, Kinematics(0 * bend, A, A_t, bend, A, bend))
+    return ExplicitMotion(z, z_u, z_uu, Kinematics(0 * bend, A, A_t, bend, A, bend))
 
 
 def measure_gap(scene: Scene, contacts: Numbers, z: Array) -> Array:

@@ -29,39 +29,19 @@ from ..common.arrays import Array, Expression
 from ..common.batch import Batch
 from ..common.sharing import Keeper, Store, exclusive, kept_property
 from ..scene.model import Scene
-from .elemental import (
-    Contact,
-    GapLimit,
-    build_features,
-    build_gap,
-    build_rows,
-    candidate_contacts,
-)
-from .limits import build_clearance, list_limits
-from .slip import build_slip
+from .contact_limits import build_clearance, list_limits
+from .elemental import Contact, GapLimit, build_features, build_gap, build_rows, candidate_contacts
 
 
 class Kinematics(NamedTuple):
-    """A formation at n configurations.
+    """A formation at n configurations."""
 
-    Attributes
-    ----------
-    C : ndarray, shape (n, n_c), [m]
-    A, A_t : ndarray, shape (n, n_c, 5)
-    A_dot_v : ndarray, shape (n, n_c)
-        A' v for the velocities v that were given, so that A z'' = -A' z'.
-    P : ndarray, shape (n, n_c + R, 5)
-        Constraint rows [A; A_t(rolling)]; A itself where nothing rolls.
-    P_dot_v : ndarray, shape (n, n_c + R)
-        P' v; A' v itself where nothing rolls.
-    """
-
-    C: Array
-    A: Array
+    C: Array  # (n, n_c) [m]
+    A: Array  # A, A_t (n, n_c, 5):
     A_t: Array
-    A_dot_v: Array
-    P: Array
-    P_dot_v: Array
+    A_dot_v: Array  # (n, n_c): A' v for the velocities v that were given, so that A z'' = -A' z'
+    P: Array  # (n, n_c + R, 5): constraint rows [A; A_t(rolling)]; A itself where nothing rolls
+    P_dot_v: Array  # (n, n_c + R): P' v; A' v itself where nothing rolls
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,11 +50,8 @@ class Formation(Keeper):
 
     Parameters
     ----------
-    scene : Scene
-    contacts : tuple of Contact
-        In the order of every array over contacts.
-    rolling : tuple of Contact
-        Those of the contacts that roll; the others slide.
+    contacts  in the order of every array over contacts
+    rolling   those of the contacts that roll; the others slide
     """
 
     scene: Scene
@@ -195,8 +172,7 @@ class Formation(Keeper):
 
         Parameters
         ----------
-        z, v : ndarray, shape (n, 5)
-            Configurations, and the velocities for A' v.
+        z, v : (n, 5)  configurations, and the velocities for A' v
         """
         C, A, A_t, A_dot_v = self._batch(z, v)
         P, P_dot_v = A, A_dot_v
@@ -296,10 +272,40 @@ def _build_limit_function(formation: Formation) -> Expression:
 
 
 _FUNCTIONS = Store(_build_function, lambda own: (own.scene.shape, own.contacts))
+
+
 _ROLL_FUNCTIONS = Store(
     _build_roll_function, lambda own: (own.scene.shape, own.contacts, own.rolling)
 )
+
+
 _LIMIT_FUNCTIONS = Store(
     _build_limit_function,
     lambda own: (own.scene.shape, own.scene.fingers_collide, own.contacts),
 )
+
+
+def build_slip(contact: Contact, scene: Scene) -> Expression:
+    """Return the slip coordinate of `contact` [m], an expression of the features' symbol z.
+
+    Its time derivative is v_t for as long as the contact touches: how far the object has slid along
+    t on the palm or the link. What a contact has to keep when it rolls is a constant, therefore:
+
+    * vertex on the palm: x of the vertex;
+    * vertex on the side of a link: how far along the link it is, positive towards the tip for
+      finger 1, whose tangent is the link's axis, and towards the joint for finger 2;
+    * tip on an edge: less how far along the edge the tip is, less the arc on which it has rolled;
+    * vertex on the arc of a tip: less the arc from the link's axis to the vertex.
+    """
+    features = build_features(scene)
+    if contact.finger is None:
+        return features.vertices[0, contact.index]
+    i, link, z = contact.index, features.links[contact.finger], features.z
+    radius = scene.fingers[contact.finger].radius
+    side = 1.0 if contact.finger == 0 else -1.0
+    if contact.surface == "finger":
+        return side * link.vertex_run[i]
+    if contact.feature == "e":
+        return -link.edge_run[i] - radius * (z[2] - z[3 + contact.finger])
+    across = side * (link.vertex_gap[i] + radius)
+    return -radius * ca.atan2(across, link.arc_run[i])

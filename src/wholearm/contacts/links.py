@@ -97,9 +97,7 @@ def evaluate_finger_gap(scene: Scene, z: Array) -> Array:
 
     Parameters
     ----------
-    scene : Scene
-    z : ndarray, shape (n, 5)
-        NaN where a joint angle is unknown, which makes the gap NaN.
+    z : (n, 5)  naN where a joint angle is unknown, which makes the gap NaN
     """
     numbers = np.concatenate([[*np.asarray(link.base), link.length] for link in scene.fingers])
     numbers = np.broadcast_to(numbers, (len(z), 6))

@@ -34,9 +34,8 @@ def build_far_side(scene: Scene, finger: int, vertex: int, apart: Expression | N
 
     Parameters
     ----------
-    apart : expression, optional, [m]
-        Gap between the whole link and the object, where nothing else says on which side of the
-        link the object is.
+    apart : [m]  gap between the whole link and the object, where nothing else says on which side of
+                 the link the object is
     """
     link, part = build_features(scene).links[finger], scene.fingers[finger]
     gap = -link.vertex_gap[vertex] - 2 * part.radius

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..common.arrays import Array
 from ..problem.definition import Phase, Problem
 from ..results.trajectory import Samples, Trajectory
-from .stretch import Run, Stretch
+from .stretch import EngineRun, EngineStretch
 
 OPEN = 0.1
 """Gap at which a contact is open, over the departure that is allowed."""
@@ -46,28 +46,19 @@ class Force(NamedTuple):
 
 
 class Departure(NamedTuple):
-    """A stretch, compared with the plan.
+    """A stretch, compared with the plan."""
 
-    Attributes
-    ----------
-    t, position, angle : ndarray, shape (n,), [s], [m] and [rad]
-        Error of the object's pose over time, from the start of the plan.
-    forces : tuple of Force
-    time : float or None, [s]
-        When it is beyond what is allowed.
-    reason : str
-        What made it depart; empty where it does not.
-    """
-
+    # t, position, angle (n,) [s], [m] and [rad]: error of the object's pose over time, from the
+    # start of the plan
     t: Array
     position: Array
     angle: Array
     forces: tuple[Force, ...]
-    time: float | None
-    reason: str
+    time: float | None  # [s]: when it is beyond what is allowed
+    reason: str  # what made it depart; empty where it does not
 
 
-class _Change(NamedTuple):
+class _PressChange(NamedTuple):
     """A contact that is not as planned, from when until when [s]."""
 
     start: float
@@ -87,20 +78,15 @@ class _Part(NamedTuple):
 def compare(
     problem: Problem,
     plan: Trajectory,
-    stretch: Stretch,
-    run: Run,
+    stretch: EngineStretch,
+    run: EngineRun,
     allowed: float,
 ) -> Departure:
     """Compare a replay with the plan.
 
     Parameters
     ----------
-    problem : Problem
-    plan : Trajectory
-    stretch : Stretch
-    run : Run
-    allowed : float
-        Largest error of the position over the scene's length, and of the angle in rad.
+    allowed  largest error of the position over the scene's length, and of the angle in rad
     """
     length = problem.scene.scales.length
     parts = _divide(problem, plan, stretch, run)
@@ -117,7 +103,7 @@ def compare(
     return Departure(run.t, position, angle, forces, time, _choose_reason(changes, time))
 
 
-def _choose_reason(changes: list[_Change], time: float) -> str:
+def _choose_reason(changes: list[_PressChange], time: float) -> str:
     """The first change that lasts until the replay departs, or else the last one before."""
     before = [each for each in changes if each.start <= time]
     lasting = [each for each in before if each.stop >= time]
@@ -127,7 +113,9 @@ def _choose_reason(changes: list[_Change], time: float) -> str:
     return f"{reason.what} at t = {reason.start:.5g} s"
 
 
-def _divide(problem: Problem, plan: Trajectory, stretch: Stretch, run: Run) -> list[_Part]:
+def _divide(
+    problem: Problem, plan: Trajectory, stretch: EngineStretch, run: EngineRun
+) -> list[_Part]:
     """The phases of a stretch; the row at which one ends is its own."""
     starts, parts = plan.phase_starts, []
     owner = np.searchsorted(starts[1:-1], run.t, side="left")
@@ -150,12 +138,12 @@ def find_pairs(contact: str, corners: int) -> tuple[str, ...]:
     return (f"{corner}-finger{finger}", *edges)
 
 
-def _find_columns(contact: str, part: _Part, run: Run) -> list[int]:
+def _find_columns(contact: str, part: _Part, run: EngineRun) -> list[int]:
     pairs = find_pairs(contact, part.phase.formation.scene.polygon.n_vertices)
     return [run.pairs.index(name) for name in pairs]
 
 
-def _average(plan: Trajectory, part: _Part, run: Run) -> list[Force]:
+def _average(plan: Trajectory, part: _Part, run: EngineRun) -> list[Force]:
     """Planned and found normal forces of a phase, averaged over its time.
 
     That is until the contact that ends the phase presses: its gap closes at a speed that vanishes,
@@ -177,7 +165,9 @@ def _average(plan: Trajectory, part: _Part, run: Run) -> list[Force]:
     return [Force(part.phase.number, *row) for row in rows]
 
 
-def _list_changes(problem: Problem, part: _Part, run: Run, reach: float) -> Iterator[_Change]:
+def _list_changes(
+    problem: Problem, part: _Part, run: EngineRun, reach: float
+) -> Iterator[_PressChange]:
     """When the contacts of a phase are not as planned, and how."""
     scales, formation, rows = problem.scene.scales, part.phase.formation, part.rows
     own = formation.evaluate(run.z[rows], run.z_dot[rows])
@@ -200,8 +190,8 @@ def _list_changes(problem: Problem, part: _Part, run: Run, reach: float) -> Iter
         yield from _find_runs(times, hits, f"{run.pairs[column]} presses, which is not planned,")
 
 
-def _find_runs(t: Array, happens: NDArray[np.bool_], what: str) -> Iterator[_Change]:
+def _find_runs(t: Array, happens: NDArray[np.bool_], what: str) -> Iterator[_PressChange]:
     """Times from when until when something happens."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], happens, [False]]).astype(int)))
     for first, last in zip(edges[::2], edges[1::2] - 1, strict=True):
-        yield _Change(float(t[first]), float(t[last]), what)
+        yield _PressChange(float(t[first]), float(t[last]), what)

@@ -15,10 +15,9 @@ from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from ..scene.model import Scene
 from .departure import find_pairs
-from .drive import Drive
-from .pressing import press_in
+from .pressing import EngineDrive, press_in
 from .shapes import LINKS, OBJECT, PALM, Pair, Shape, find_rounding, list_pairs, list_shapes
-from .stretch import Run, Setting, Steps, Stretch, list_steps
+from .stretch import EngineRun, EngineStretch, Setting, Steps, list_steps
 
 SINKING = 6e-3
 """How far the scene's force presses a contact in, over the scene's length and the step."""
@@ -33,20 +32,19 @@ _ROUGH = 1e12
 
 
 def play(
-    problem: Problem, stretch: Stretch, torque: TorqueProfile | ClosedLoop, setting: Setting
-) -> Run:
+    problem: Problem, stretch: EngineStretch, torque: TorqueProfile | ClosedLoop, setting: Setting
+) -> EngineRun:
     """Replay a stretch in Drake; an `Engine`.
 
     Raises
     ------
-    ImportError
-        If Drake is not installed.
+    ImportError  if Drake is not installed
     """
     from pydrake.systems.analysis import Simulator
 
     steps, drive = list_steps(problem, stretch, torque, setting.step), None
     if isinstance(torque, ClosedLoop):
-        drive = Drive(problem.scene, torque, _EVERY * steps.h)
+        drive = EngineDrive(problem.scene, torque, _EVERY * steps.h)
     setting = setting._replace(step=steps.h / problem.scene.scales.time)
     with _quiet():
         diagram, plant, pairs = _build(problem.scene, steps, setting, drive is None)
@@ -82,7 +80,7 @@ def play(
             break
     places, speeds = (np.array(part) for part in zip(*states, strict=True))
     t = stretch.start + steps.h * np.array([0, *steps.ends[: len(press)]])
-    return Run(t, places, speeds, names, np.array(press))
+    return EngineRun(t, places, speeds, names, np.array(press))
 
 
 @contextmanager
@@ -205,7 +203,7 @@ def _share_friction(pair: Pair) -> tuple[tuple[str, float], tuple[str, float]]:
     return (pair.first, _ROUGH), (pair.second, pair.friction / 2)
 
 
-def _press(problem: Problem, stretch: Stretch, setting: Setting) -> Array:
+def _press(problem: Problem, stretch: EngineStretch, setting: Setting) -> Array:
     """The planned start, with contacts pressed in."""
     corners, stiffness = problem.scene.polygon.n_vertices, _find_stiffness(problem.scene, setting)
     shares = {name: len(find_pairs(name, corners)) for name in stretch.c_n}

@@ -14,13 +14,24 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..problem.definition import Problem
-from ..results.narrow import Moved, adopt_motion
+from ..results.adopt import Moved, adopt_motion
+from ..results.torque_table import place_rows
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
-from .clock import add_clock
-from .elements import add
 from .shapes import LINKS, OBJECT, PALM, find_rounding, list_pairs, list_shapes
+from .stretch import apply_friction
 
+SHARE = 1e-6
+"""Weight of a joint's angle in its tendon, over the scene's time; that of the clock is 1."""
+DRIVE = 1e9
+"""Force that drives the clock, over what all springs may exert."""
+BEND = 1e-3
+"""Largest error of the ramps, relative to the largest torque."""
+RISE = 1e-6
+"""Least time from row to row, over the time step."""
+CLOCK = "clock"
+HIDDEN = {"group": 3}
+"""Group of joints and actuators for which MuJoCo's viewer has no sliders, unless asked for."""
 STEP = 1.6e-4
 """Time step, over the scene's time: 1e-5 s in the scenes of `problems/`."""
 
@@ -30,21 +41,14 @@ class Softness(NamedTuple):
 
     Sliding in a convex model of contact parts the surfaces at a rate that falls with the time
     constant of friction and with the impedance; where they part for long, forces come too late.
-
-    Attributes
-    ----------
-    press, rub : float
-        Time constants of gap and sliding speed, as of critically damped springs, in time steps.
-    impedance : float
-        Share of the unconstrained motion that a contact takes away.
-    ratio : float
-        Impedance of friction over that of the gap.
     """
 
+    # press, rub: time constants of gap and sliding speed, as of critically damped springs, in time
+    # steps
     press: float = 7.5
     rub: float = 300.0
-    impedance: float = 0.01
-    ratio: float = 100.0
+    impedance: float = 0.01  # share of the unconstrained motion that a contact takes away
+    ratio: float = 100.0  # impedance of friction over that of the gap
 
     def scale(self, factor: float) -> Softness:
         """The same with other time constants."""
@@ -62,17 +66,13 @@ def write_mjcf(
 
     Parameters
     ----------
-    problem : Problem
-    plan : Plan or Trajectory, optional
-        Its torques are part of the model, and each of its phases has a keyframe at its start.
-    step : float, optional, [s]
-        `STEP` of the scene's time when left out.
-    softness : Softness, optional
+    plan        its torques are part of the model, and each of its phases has a keyframe at its
+                start
+    step : [s]  `STEP` of the scene's time when left out
 
     Raises
     ------
-    InputError
-        If a link has no thickness.
+    InputError  if a link has no thickness
     """
     scene, home = problem.scene, problem.start
     if plan is not None:
@@ -182,3 +182,70 @@ def _add_pairs(contact: Element, scene: Scene, step: float, softness: Softness) 
             solreffriction=[softness.rub * step, 1.0],
             solimp=[softness.impedance, softness.impedance, 1.0],
         )
+
+
+def list_ramps(scene: Scene, plan: Trajectory, step: float) -> tuple[Array, Array]:
+    """Rows of applied torque in increasing time: shape (n,) [s] and (n, 2) [N m].
+
+    At the start of a time step the lines between rows are at the average over that step, so that
+    torques that jump within one have the right effect.
+    """
+    rows = place_rows(apply_friction(scene, plan), BEND)
+    t, again = rows[:, 0] - step / 2, np.flatnonzero(np.diff(rows[:, 0]) <= 0)
+    t[again] -= step / 2
+    t[again + 1] += step / 2
+    # Rows that are nearer to a step than that keep their order.
+    t = np.maximum.accumulate(t) + RISE * step * np.arange(len(t))
+    return t, rows[:, 1:]
+
+
+def add_clock(root: Element, scene: Scene, plan: Trajectory, step: float) -> None:
+    """Add clock, tendons, springs, and a keyframe for the start and for each phase."""
+    t, tau = list_ramps(scene, plan, step)
+    share = SHARE * scene.scales.time
+    rises = np.diff(tau, axis=0) / share
+    drive = DRIVE * (np.abs(rises).sum() + np.abs(tau[0]).sum() / share + scene.scales.force)
+    body = add(_find(root, "worldbody"), "body", name=CLOCK)
+    add(body, "inertial", pos=[0, 0, 0], mass=scene.scales.mass, diaginertia=[1, 1, 1])
+    add(body, "joint", name=CLOCK, type="slide", axis=[0, 0, 1], damping=drive, **HIDDEN)
+    tendons, springs = add(root, "tendon"), _find(root, "actuator")
+    spring = {"gainprm": [0], "biastype": "affine", **HIDDEN}
+    add(springs, "general", name=CLOCK, joint=CLOCK, biasprm=[drive, 0, 0], **spring)
+    for k, name in enumerate(("torque1", "torque2")):
+        tendon = add(tendons, "fixed", name=name)
+        add(tendon, "joint", joint=CLOCK, coef=1)
+        add(tendon, "joint", joint=f"theta{k + 1}", coef=share)
+        first = [tau[0, k] / share, 0, 0]
+        add(springs, "general", name=f"{name}-start", tendon=name, biasprm=first, **spring)
+        for row in np.flatnonzero(rises[:, k]):
+            rise, slope = rises[row, k], rises[row, k] / (t[row + 1] - t[row])
+            ramp = {"biasprm": [-slope * t[row], slope, 0], "forcerange": sorted((0.0, rise))}
+            add(springs, "general", name=f"{name}-{row}", tendon=name, **ramp, **spring)
+    _add_keys(_find(root, "keyframe"), plan)
+
+
+def _add_keys(keys: Element, plan: Trajectory) -> None:
+    """Keyframes with positions, velocities and the clock."""
+    starts = plan.phase_starts[:-1]
+    rows = [int(np.flatnonzero(plan.phase == index)[0]) for index in range(len(starts))]
+    names = ["home", *(f"phase{number}" for number in range(1, len(starts) + 1))]
+    for name, row in zip(names, [0, *rows], strict=True):
+        t = plan.t[row]
+        add(keys, "key", name=name, time=t, qpos=[*plan.z[row], t], qvel=[*plan.z_dot[row], 1.0])
+
+
+def _find(root: Element, tag: str) -> Element:
+    found = root.find(tag)
+    assert found is not None
+    return found
+
+
+def add(parent: Element, tag: str, **attributes: object) -> Element:
+    """Add an element to another; numbers are written with all their digits."""
+    texts = {
+        key: value
+        if isinstance(value, str)
+        else " ".join(format(x, ".17g") for x in np.ravel(np.array(value, dtype=float)))
+        for key, value in attributes.items()
+    }
+    return ElementTree.SubElement(parent, tag, texts)

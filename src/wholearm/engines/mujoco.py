@@ -12,30 +12,28 @@ from ..policy.closed_loop import ClosedLoop
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from .departure import find_pairs
-from .drive import Drive
 from .mjcf import Softness, write_mjcf
-from .pressing import press_in
+from .pressing import EngineDrive, press_in
 from .shapes import list_pairs
-from .stretch import Run, Setting, Stretch, list_steps
+from .stretch import EngineRun, EngineStretch, Setting, list_steps
 
 _LITTLE = 1e-6
 """Depth at which contacts are looked at, over the scene's length."""
 
 
 def play(
-    problem: Problem, stretch: Stretch, torque: TorqueProfile | ClosedLoop, setting: Setting
-) -> Run:
+    problem: Problem, stretch: EngineStretch, torque: TorqueProfile | ClosedLoop, setting: Setting
+) -> EngineRun:
     """Replay a stretch in MuJoCo; an `Engine`.
 
     Raises
     ------
-    ImportError
-        If MuJoCo is not installed.
+    ImportError  if MuJoCo is not installed
     """
     import mujoco
 
     steps = list_steps(problem, stretch, torque, setting.step)
-    drive = Drive(problem.scene, torque, steps.h) if isinstance(torque, ClosedLoop) else None
+    drive = EngineDrive(problem.scene, torque, steps.h) if isinstance(torque, ClosedLoop) else None
     text = write_mjcf(problem, step=steps.h, softness=Softness().scale(setting.softness))
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
@@ -66,7 +64,7 @@ def play(
     mujoco.set_mju_user_warning(None)
     z, z_dot = (np.array(part) for part in zip(*states, strict=True))
     t = stretch.start + steps.h * np.array([0, *steps.ends[: len(press)]])
-    return Run(t, z, z_dot, names, np.array(press))
+    return EngineRun(t, z, z_dot, names, np.array(press))
 
 
 def _ignore(_: str) -> None:
@@ -86,7 +84,7 @@ def _number_pairs(model: Any, problem: Problem) -> NDArray[np.int64]:
 
 
 def _press(
-    problem: Problem, stretch: Stretch, model: Any, data: Any, numbers: NDArray[np.int64]
+    problem: Problem, stretch: EngineStretch, model: Any, data: Any, numbers: NDArray[np.int64]
 ) -> Array:
     """The planned start, with contacts pressed in.
 

@@ -38,21 +38,14 @@ PALM = "palm"
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A ball or a capsule on a body.
-
-    Attributes
-    ----------
-    name, body : str
-    points : ndarray, shape (1, 2) or (2, 2), [m]
-        Centre, or both ends of the axis; of the object relative to its centroid at phi = 0, of a
-        link relative to its joint at theta = 0.
-    radius : float, [m]
-    """
+    """A ball or a capsule on a body."""
 
     name: str
     body: str
+    # (1, 2) or (2, 2) [m]: centre, or both ends of the axis; of the object relative to its centroid
+    # at phi = 0, of a link relative to its joint at theta = 0
     points: Array
-    radius: float
+    radius: float  # [m]
 
 
 @dataclass(frozen=True)
@@ -79,8 +72,7 @@ def list_shapes(scene: Scene) -> list[Shape]:
 
     Raises
     ------
-    InputError
-        If a link has no thickness: what sinks into it would come out on the other side.
+    InputError  if a link has no thickness: what sinks into it would come out on the other side
     """
     r, corners = find_rounding(scene), scene.polygon.vertices
     after = np.roll(corners, -1, axis=0)

@@ -7,12 +7,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..common.arrays import Array
+from ..common.arrays import Array, sort_unique
+from ..common.errors import WholearmError
 from ..policy.closed_loop import ClosedLoop
 from ..problem.definition import Problem
+from ..problem.read import read_own_problem
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
+from ..scene.model import Scene
+from ..simulation.simulate import simulate
 
+SAME = 1e-4
+"""Largest difference between plan and replay, over the scene's length and in rad."""
+LATE = 1e-3
+"""Largest difference of the times at which phases end, over the scene's time: an end at rest is
+reached so slowly that little in place is much in time."""
+_ROWS = 400
+"""Instants of each phase at which the replay is known, besides its steps."""
+_INSTANTS = 2000
+"""Instants of each phase at which the sign of a joint's speed is looked at."""
 ROWS = 200
 """About how many times a phase is looked at."""
 FEWEST = 5000
@@ -23,27 +36,16 @@ _LEAST = 1e-3
 """First of these instants after the start, in steps."""
 
 
-class Stretch(NamedTuple):
-    """A part of a plan that is replayed on its own: one phase, or all.
+class EngineStretch(NamedTuple):
+    """A part of a plan that is replayed on its own: one phase, or all."""
 
-    Attributes
-    ----------
-    phases : tuple of int
-        Indices of its phases, from 0.
-    start, stop : float, [s]
-    z, z_dot, z_ddot : ndarray, shape (5,)
-        The planned motion at its start.
-    c_n : mapping
-        Planned normal forces at its start by contacts [N].
-    """
-
-    phases: tuple[int, ...]
-    start: float
+    phases: tuple[int, ...]  # indices of its phases, from 0
+    start: float  # start, stop [s]:
     stop: float
-    z: Array
+    z: Array  # z, z_dot, z_ddot (5,): the planned motion at its start
     z_dot: Array
     z_ddot: Array
-    c_n: Mapping[str, float]
+    c_n: Mapping[str, float]  # planned normal forces at its start by contacts [N]
 
     @property
     def numbers(self) -> list[int]:
@@ -62,17 +64,10 @@ class Stretch(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """How finely an engine computes.
+    """How finely an engine computes."""
 
-    Attributes
-    ----------
-    step : float
-        Time step, over the scene's time.
-    softness : float
-        Softness of contacts, over the engine's default, which is in proportion to the step.
-    """
-
-    step: float
+    step: float  # time step, over the scene's time
+    # softness of contacts, over the engine's default, which is in proportion to the step
     softness: float = 1.0
 
 
@@ -82,50 +77,32 @@ class Steps(NamedTuple):
     Engines change the velocity by the forces at a position, and then the position by the new
     velocity. That is of second order in h where velocities are taken for those of half a step
     before: at the start, and for the torques.
-
-    Attributes
-    ----------
-    h : float, [s]
-    v : ndarray, shape (5,)
-        Velocity half a step before the start.
-    tau : ndarray, shape (n, 2), [N m]
-        Applied torques, averaged from half a step before to half a step after each position.
-    ends : ndarray of int, shape (rows,)
-        Numbers of steps after which there is a row, increasing; the last is n.
     """
 
-    h: float
-    v: Array
+    h: float  # [s]
+    v: Array  # (5,): velocity half a step before the start
+    # (n, 2) [N m]: applied torques, averaged from half a step before to half a step after each
+    # position
     tau: Array
+    # (rows,): numbers of steps after which there is a row, increasing; the last is n
     ends: list[int]
 
 
-class Run(NamedTuple):
-    """A stretch in an engine.
+class EngineRun(NamedTuple):
+    """A stretch in an engine."""
 
-    Attributes
-    ----------
-    t : ndarray, shape (rows + 1,), [s]
-        From the start of the plan.
-    z, z_dot : ndarray, shape (rows + 1, 5)
-    pairs : tuple of str
-        Pairs of shapes, see `shapes.list_pairs`.
-    press : ndarray, shape (rows, n_pairs), [N]
-        Normal forces, averaged between rows.
-    """
-
-    t: Array
-    z: Array
+    t: Array  # (rows + 1,) [s]: from the start of the plan
+    z: Array  # z, z_dot (rows + 1, 5):
     z_dot: Array
-    pairs: tuple[str, ...]
-    press: Array
+    pairs: tuple[str, ...]  # pairs of shapes, see `shapes.list_pairs`
+    press: Array  # (rows, n_pairs) [N]: normal forces, averaged between rows
 
 
-Engine = Callable[[Problem, Stretch, TorqueProfile | ClosedLoop, Setting], Run]
+Engine = Callable[[Problem, EngineStretch, TorqueProfile | ClosedLoop, Setting], EngineRun]
 """Replays a stretch under the torques that are applied, or by feedback until the motion is over."""
 
 
-def list_stretches(plan: Trajectory, whole: bool) -> list[Stretch]:
+def list_stretches(plan: Trajectory, whole: bool) -> list[EngineStretch]:
     """The whole plan, or its phases, each from its planned start."""
     starts, count = plan.phase_starts, len(plan.motions)
     found = []
@@ -136,12 +113,12 @@ def list_stretches(plan: Trajectory, whole: bool) -> list[Stretch]:
         known = at.c_n[int(np.argmax(np.isfinite(at.c_n).all(axis=1)))]
         forces = dict(zip(motion.contacts, np.nan_to_num(known).tolist(), strict=True))
         state = at.z[0], at.z_dot[0], at.z_ddot[0]
-        found.append(Stretch(own, float(start), float(stop), *state, forces))
+        found.append(EngineStretch(own, float(start), float(stop), *state, forces))
     return found
 
 
 def list_steps(
-    problem: Problem, stretch: Stretch, torque: TorqueProfile | ClosedLoop, step: float
+    problem: Problem, stretch: EngineStretch, torque: TorqueProfile | ClosedLoop, step: float
 ) -> Steps:
     """Even steps that fit a stretch, none longer than `step` times the scene's time.
 
@@ -164,3 +141,48 @@ def _average(torque: TorqueProfile, start: float, h: float, count: int) -> Array
     places = (np.arange(count * _LOOKS) + 0.5) * (h / _LOOKS) - h / 2
     places = start + np.maximum(places, _LEAST * h)
     return np.asarray(torque.at(places).reshape(count, _LOOKS, 2).mean(axis=1))
+
+
+def apply_friction(scene: Scene, plan: Trajectory) -> TorqueProfile:
+    """The torques of a plan less D sgn(theta') of its own joint velocities, with its steps."""
+    torque = plan.torque
+    cuts = sort_unique(np.concatenate([torque.breaks, *_find_reversals(plan)]))
+    cuts = cuts[np.append(True, np.diff(cuts) > 1e-12 * torque.duration)]
+    cuts[-1] = torque.breaks[-1]
+    turns = np.sign(plan.at((cuts[1:] + cuts[:-1]) / 2).z_dot[:, 3:]) * scene.dry[3:]
+
+    def evaluate(t: Array) -> Array:
+        piece = np.searchsorted(cuts, t, side="right") - 1
+        return np.asarray(torque.at(t) - turns[piece])
+
+    return TorqueProfile.fit(cuts, evaluate, torque.coefficients.shape[2] - 1)
+
+
+def _find_reversals(plan: Trajectory) -> list[Array]:
+    """Instants at which a joint turns back within a phase, for each phase and joint [s]."""
+    found = []
+    for start, motion in zip(plan.phase_starts[:-1], plan.motions, strict=True):
+        t = np.linspace(0.0, motion.duration, _INSTANTS)
+        for speed in motion.evaluate(t).z_dot[:, 3:].T:
+            back = np.flatnonzero(speed[1:-2] * speed[2:-1] < 0) + 1
+            share = speed[back] / (speed[back] - speed[back + 1])
+            found.append(start + t[back] + share * (t[back + 1] - t[back]))
+    return found
+
+
+def find_between(plan: Trajectory) -> Trajectory:
+    """The replay of a plan in its own problem, or the plan itself where that is not the same."""
+    starts = plan.phase_starts
+    times = np.linspace(starts[:-1], starts[1:], _ROWS)
+    try:
+        problem = read_own_problem(plan.meta)
+        replay = simulate(problem, plan.torque, times=times.ravel()).trajectory
+    except WholearmError:
+        return plan
+    if len(replay.motions) != len(plan.motions):
+        return plan
+    late = np.abs(replay.phase_starts - starts).max()
+    inside = np.clip(plan.t, 0.0, replay.duration)
+    error = np.abs(replay.at(inside).z - plan.z) / [*2 * [problem.scene.scales.length], 1, 1, 1]
+    same = late < LATE * problem.scene.scales.time and error.max() < SAME
+    return replay if same else plan

@@ -19,7 +19,7 @@ from ..contacts.elemental import parse_contact
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
-from .data import cone_shares, find_steps, sample_torques
+from .plot_data import cone_shares, find_steps, sample_torques
 from .style import (
     BAND,
     FINGERS,

@@ -16,13 +16,12 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from ..common.errors import InputError
+from ..common.errors import InputError, require_number
 from ..common.files import write_whole
-from ..common.require import require_number
 from ..common.sharing import exclusive
 from ..contacts.links import evaluate_finger_gap
 from ..problem.read import read_own_problem
-from ..results.narrow import Torques, narrow
+from ..results.adopt import Torques, narrow
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
 from .curves import (
@@ -72,26 +71,21 @@ def force_margins(
 
     Parameters
     ----------
-    what : Plan, Simulation, Report or Trajectory
-        Planned, replayed or loaded; its `meta` must hold the problem's tables.
-    simulation : Simulation, optional
-        A replay of the same torques, drawn over it with dotted lines; its contacts must be those of
-        the trajectory, in that order.
-    width : float, [in]
-        Of the figure, 3 to 40. Below 7 legends stand at the foot.
-    motion : bool
-        Whether to draw the object's pose, and the joints' angles and speeds, too.
+    what          planned, replayed or loaded; its `meta` must hold the problem's tables
+    simulation    a replay of the same torques, drawn over it with dotted lines; its contacts must
+                  be those of the trajectory, in that order
+    width : [in]  of the figure, 3 to 40. Below 7 legends stand at the foot.
+    motion        whether to draw the object's pose, and the joints' angles and speeds, too
 
     Returns
     -------
-    Figure
-        Axes in the order: snapshots from left to right, margins, torques, the friction cones
-        if a contact rolls, and pose, angles and speeds.
+    Figure  axes in the order: snapshots from left to right, margins, torques, the friction cones if
+            a contact rolls, and pose, angles and speeds
 
     Raises
     ------
-    InputError
-        If its `meta` lacks the problem, torques alone are given, or the width is out of its range.
+    InputError  if its `meta` lacks the problem, torques alone are given, or the width is out of its
+                range
     """
     _, trajectory = narrow(what)
     if trajectory is None:

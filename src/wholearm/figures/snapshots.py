@@ -22,7 +22,7 @@ from ..common.sharing import exclusive
 from ..contacts.elemental import build_features, build_geometry, parse_contact
 from ..results.trajectory import Trajectory
 from ..scene.model import Finger, Scene
-from .data import choose_snapshots
+from .plot_data import choose_snapshots
 from .style import FINGERS, INK, PALM, STRIP, Sheet, Styles, count_decimals, write
 
 NUMBER = 8.0
@@ -97,10 +97,8 @@ def choose_numbers(
 
     Parameters
     ----------
-    vertices : ndarray, shape (n, 2), [points]
-    first : sequence of int
-    lowest : float
-        Least height of the middle of a number [points].
+    vertices : (n, 2) [points]
+    lowest                      least height of the middle of a number [points]
 
     Returns
     -------
@@ -167,24 +165,13 @@ def trace_link(finger: Finger, angle: float) -> Array:
 
 
 class Strip(NamedTuple):
-    """Snapshots side by side, in as many rows as they need, all at one scale.
+    """Snapshots side by side, in as many rows as they need, all at one scale."""
 
-    Attributes
-    ----------
-    rows : tuple of tuple of int
-        Samples of the trajectory, from left to right.
-    boxes : dict of int to ndarray, shape (2, 2), [m]
-        Lower left and upper right corner of what is seen at each.
-    low, high : float, [m]
-        Lower and upper end of every picture.
-    scale : float, [in/m]
-    """
-
-    rows: tuple[tuple[int, ...], ...]
-    boxes: dict[int, Array]
-    low: float
+    rows: tuple[tuple[int, ...], ...]  # samples of the trajectory, from left to right
+    boxes: dict[int, Array]  # (2, 2) [m]: lower left and upper right corner of what is seen at each
+    low: float  # low, high [m]: lower and upper end of every picture
     high: float
-    scale: float
+    scale: float  # [in/m]
 
     @property
     def height(self) -> float:

@@ -57,14 +57,9 @@ STRIP = 1.75
 
 
 class Sheet(NamedTuple):
-    """The paper of a figure.
+    """The paper of a figure."""
 
-    Attributes
-    ----------
-    width, height : float, [in]
-    """
-
-    width: float
+    width: float  # width, height [in]:
     height: float
 
     def inset(self, left: float, bottom: float, width: float, height: float) -> Any:

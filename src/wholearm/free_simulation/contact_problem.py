@@ -30,8 +30,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
-from .lemke import solve_lcp
 
+PIVOTS = (1e-8, 1e-11)
+"""Least pivot, for rows of M of the size of one: rounding of redundant rows is below the first, and
+what is not solved with it is tried with the other."""
+GOOD = 1e-10
+"""Residual with which an attempt is the last one, relative to the largest entry of q."""
+TIE = 1e-12
+"""Difference of ratios that counts as none, relative to the largest entry of q."""
+TURNS = 60
+"""Most pivots for each unknown."""
 RESIDUAL = 1e-8
 """Largest residual of a solution, relative to the largest rate without contacts."""
 EDGE = 1e-9
@@ -42,40 +50,22 @@ SAME = 1e-6
 """Difference of rates that counts as none, relative to the largest rate without contacts."""
 SINGULAR = 1e-9
 """Determinant of a scaled system that counts as zero."""
-
-
 APART, STICKS, FORTH, BACK = range(4)
 """Modes of a contact; of a joint all but the first. One without friction that presses sticks."""
 
 
 @dataclass(frozen=True, eq=False)
 class ContactProblem:
-    """k contacts, s of whatever stands still and may stick, n coordinates.
+    """k contacts, s of whatever stands still and may stick, n coordinates."""
 
-    Attributes
-    ----------
-    lift : ndarray, shape (n,)
-        Diagonal of M^-1.
-    A, G : ndarray, shape (k, n)
-    b_n : ndarray, shape (k,)
-        Normal rates without forces.
-    T : ndarray, shape (s, n)
-    b_t : ndarray, shape (s,)
-        Sliding rates without forces.
-    owner : ndarray of int, shape (s,)
-        The contact whose normal force bounds friction; -1 for a joint.
-    mu, bound : ndarray, shape (s,)
-        abs(f) <= mu c_n + bound.
-    """
-
-    lift: Array
-    A: Array
+    lift: Array  # (n,): diagonal of M^-1
+    A: Array  # A, G (k, n):
     G: Array
-    b_n: Array
-    T: Array
-    b_t: Array
-    owner: NDArray[np.int64]
-    mu: Array
+    b_n: Array  # (k,): normal rates without forces
+    T: Array  # (s, n)
+    b_t: Array  # (s,): sliding rates without forces
+    owner: NDArray[np.int64]  # (s,): the contact whose normal force bounds friction; -1 for a joint
+    mu: Array  # mu, bound (s,): abs(f) <= mu c_n + bound
     bound: Array
 
     @cached_property
@@ -104,42 +94,27 @@ class ContactProblem:
         return bool(np.linalg.eigvalsh(K + K.T)[0] > SINGULAR)
 
 
-class Answer(NamedTuple):
-    """One solution.
+class ContactAnswer(NamedTuple):
+    """One solution."""
 
-    Attributes
-    ----------
-    c_n : ndarray, shape (k,)
-    f : ndarray, shape (s,)
-    r_n, r_t : ndarray, shape (k,) and (s,)
-    shares : ndarray, shape (s,)
-        Friction over the most that it may be.
-    way : ndarray, shape (s,)
-        +1 or -1 where friction is at its bound and gives way in that direction, 0 where it holds.
-    change : ndarray, shape (n,)
-        M^-1 (G^T c_n + T^T f).
-    residual : float
-        Relative; see `RESIDUAL`.
-    """
-
-    c_n: Array
-    f: Array
-    r_n: Array
+    c_n: Array  # (k,)
+    f: Array  # (s,)
+    r_n: Array  # r_n, r_t (k,) and (s,):
     r_t: Array
-    shares: Array
+    shares: Array  # (s,): friction over the most that it may be
+    # (s,): +1 or -1 where friction is at its bound and gives way in that direction, 0 where it
+    # holds
     way: Array
-    change: Array
-    residual: float
+    change: Array  # (n,): M^-1 (G^T c_n + T^T f)
+    residual: float  # relative; see `RESIDUAL`
 
 
-def solve(problem: ContactProblem, presses: Sequence[bool] = ()) -> Answer | None:
+def solve(problem: ContactProblem, presses: Sequence[bool] = ()) -> ContactAnswer | None:
     """Solve by exchanges of contacts where that ends for sure, or by Lemke's method.
 
     Parameters
     ----------
-    problem : ContactProblem
-    presses : sequence of bool, length k
-        Contacts to begin with.
+    presses  contacts to begin with
 
     Returns
     -------
@@ -150,7 +125,7 @@ def solve(problem: ContactProblem, presses: Sequence[bool] = ()) -> Answer | Non
     return found or _solve_by_lemke(problem)
 
 
-def _exchange(p: ContactProblem, presses: Sequence[bool]) -> Answer | None:
+def _exchange(p: ContactProblem, presses: Sequence[bool]) -> ContactAnswer | None:
     """Let go what pulls and take what closes: all at once, and one by one where that circles.
 
     Exchanging the first one that is wrong ends for every P-matrix; see K. G. Murty, "Note on a
@@ -176,7 +151,7 @@ def _exchange(p: ContactProblem, presses: Sequence[bool]) -> Answer | None:
     return None
 
 
-def _solve_by_lemke(p: ContactProblem) -> Answer | None:
+def _solve_by_lemke(p: ContactProblem) -> ContactAnswer | None:
     s_n, s_t, K, q = p.scaled
     k, s = len(s_n), len(s_t)
     held = (p.owner >= 0).nonzero()[0]
@@ -197,12 +172,12 @@ def _solve_by_lemke(p: ContactProblem) -> Answer | None:
     return read(p, s_n * z[:k], s_t * (z[k:plus] - z[plus:minus]), found.residual / size)
 
 
-def read(problem: ContactProblem, c_n: Array, f: Array, residual: float = 0.0) -> Answer:
+def read(problem: ContactProblem, c_n: Array, f: Array, residual: float = 0.0) -> ContactAnswer:
     """What given forces do."""
     p = problem
     if not len(f):
         change = p.lift * (c_n @ p.G)
-        return Answer(c_n, f, p.b_n + p.A @ change, f, f, f, change, residual)
+        return ContactAnswer(c_n, f, p.b_n + p.A @ change, f, f, f, change, residual)
     change = p.lift * (c_n @ p.G + f @ p.T)
     most = _bound(p, c_n)
     # Friction whose bound is zero by c_n has nothing to give, whichever way.
@@ -210,17 +185,17 @@ def read(problem: ContactProblem, c_n: Array, f: Array, residual: float = 0.0) -
     r_t = p.b_t + p.T @ change
     way = np.where(edge, np.where(f != 0, -np.sign(f), np.sign(r_t)), 0.0)
     shares = np.abs(f) / np.maximum(most, np.finfo(float).tiny)
-    return Answer(c_n, f, p.b_n + p.A @ change, r_t, shares, way, change, residual)
+    return ContactAnswer(c_n, f, p.b_n + p.A @ change, r_t, shares, way, change, residual)
 
 
-def is_clear(problem: ContactProblem, answer: Answer, least: float) -> bool:
+def is_clear(problem: ContactProblem, answer: ContactAnswer, least: float) -> bool:
     """Whether each contact presses or parts by more than a share of the largest rate."""
     s_n, _, _, q = problem.scaled
     most = least * float(np.abs(q).max(initial=0.0))
     return bool((np.maximum(answer.c_n / s_n, answer.r_n * s_n) > most).all())
 
 
-def list_answers(problem: ContactProblem) -> list[Answer] | None:
+def list_answers(problem: ContactProblem) -> list[ContactAnswer] | None:
     """Every solution with other rates than the others; None where that is too much to look through.
 
     Each contact is apart, or presses and sticks or slides either way; each joint is held or turns.
@@ -229,7 +204,7 @@ def list_answers(problem: ContactProblem) -> list[Answer] | None:
     return None if combinations is None else _try(problem, combinations)
 
 
-def try_modes(problem: ContactProblem, choice: Sequence[int]) -> Answer | None:
+def try_modes(problem: ContactProblem, choice: Sequence[int]) -> ContactAnswer | None:
     """The solution with given modes of contacts, then joints, if they are consistent."""
     sizes = len(problem.b_n), len(problem.lift), tuple(problem.owner.tolist())
     combinations = _combine(*sizes, tuple(choice))
@@ -238,17 +213,10 @@ def try_modes(problem: ContactProblem, choice: Sequence[int]) -> Answer | None:
 
 
 class _Combinations(NamedTuple):
-    """Modes to try.
+    """Modes to try."""
 
-    Attributes
-    ----------
-    ways : ndarray, shape (m, s)
-        Which way what may stick gives way, 0 where it does not.
-    groups : tuple
-        Rows with as many conditions, and the forces that these are for, shape (r,) and (r, count).
-    """
-
-    ways: Array
+    ways: Array  # (m, s): which way what may stick gives way, 0 where it does not
+    # rows with as many conditions, and the forces that these are for, shape (r,) and (r, count)
     groups: tuple[tuple[NDArray[np.int64], NDArray[np.int64]], ...]
 
 
@@ -283,7 +251,7 @@ def _combine(
     return _Combinations(ways, tuple(groups))
 
 
-def _try(p: ContactProblem, combinations: _Combinations) -> list[Answer]:
+def _try(p: ContactProblem, combinations: _Combinations) -> list[ContactAnswer]:
     """Solve with each of some modes, and return what is consistent, each motion once."""
     s_n, s_t, K, q = p.scaled
     ways, groups = combinations
@@ -314,7 +282,7 @@ def _try(p: ContactProblem, combinations: _Combinations) -> list[Answer]:
 
 def _pick(
     p: ContactProblem, forces: Array, scaled: tuple[Array, Array, Array, Array], size: float
-) -> list[Answer]:
+) -> list[ContactAnswer]:
     """Those of the forces that solve the problem, each motion once."""
     s_n, s_t, K, q = scaled
     k = len(s_n)
@@ -343,3 +311,95 @@ def _bound(p: ContactProblem, c_n: Array) -> Array:
     most = p.bound.copy()
     most[own] += p.mu[own] * c_n[p.owner[own]]
     return most
+
+
+class ContactSolution(NamedTuple):
+    """What the method found."""
+
+    z: Array  # z, w (n,):
+    w: Array
+    # largest violation of z >= 0, w >= 0, z w = 0 and w = M z + q; infinite on a ray
+    residual: float
+
+
+def solve_lcp(M: Array, q: Array) -> ContactSolution:
+    """Solve one problem.
+
+    Parameters
+    ----------
+    M : (n, n)  scaled so that its entries are of the size of one
+    q : (n,)
+    """
+    n = len(q)
+    size = float(np.abs(q).max(initial=0.0))
+    if n == 0 or (q >= 0).all():
+        return ContactSolution(np.zeros(n), q.copy(), 0.0)
+    found = []
+    for least in PIVOTS:
+        found.append(_pivot(M, q, size, least))
+        if found[-1].residual <= GOOD * size:
+            break
+    return min(found, key=lambda one: one.residual)
+
+
+def _pivot(M: Array, q: Array, size: float, least: float) -> ContactSolution:
+    """Go from basis to basis until the artificial unknown is out."""
+    n = len(q)
+    # Columns: the right-hand side, w, z and the artificial z_0.
+    table = np.empty((n, 2 * n + 2))
+    table[:, 0], table[:, 1 : n + 1], table[:, n + 1 : -1] = q / size, np.eye(n), -M
+    table[:, -1] = -1.0
+    basis = np.arange(1, n + 1)
+    row, entering = _choose(table, np.arange(n), -np.ones(n)), 2 * n + 1
+    for _ in range(TURNS * n):
+        leaving = int(basis[row])
+        table[row] /= table[row, entering]
+        factors = table[:, entering].copy()
+        factors[row] = 0.0
+        table -= factors[:, None] * table[row]
+        basis[row] = entering
+        if leaving == 2 * n + 1:
+            return _read(M, q, basis)
+        entering = leaving + n if leaving <= n else leaving - n
+        column = table[:, entering]
+        rising = (column > least).nonzero()[0]
+        if not len(rising):
+            break
+        # The artificial unknown goes as soon as it may: its level is what is missing.
+        ratios = table[rising, 0] / column[rising]
+        low = rising[ratios <= ratios.min() + TIE]
+        last = low[basis[low] == 2 * n + 1]
+        row = int(last[0]) if len(last) else _choose(table, rising, column[rising])
+    return ContactSolution(np.full(n, np.nan), np.full(n, np.nan), np.inf)
+
+
+def _choose(table: Array, rows: NDArray[np.int64], pivots: Array) -> int:
+    """The row with the lexicographically least ratio to its pivot.
+
+    For the first pivot the column is negative, so that the ratios are those of what falls most.
+    """
+    sizes = np.abs(pivots)
+    ratios = table[rows, 0] / sizes
+    least = (ratios == ratios.min()).nonzero()[0]
+    if len(least) > 1:
+        chosen = rows[least]
+        ties = table[chosen, 1 : len(table) + 1] / sizes[least, None]
+        return int(chosen[np.lexsort(ties.T[::-1])[0]])
+    return int(rows[least[0]])
+
+
+def _read(M: Array, q: Array, basis: NDArray[np.int64]) -> ContactSolution:
+    """The solution of a complementary basis, solved anew from the problem itself."""
+    n = len(q)
+    chosen = basis[basis > n] - n - 1
+    z = np.zeros(n)
+    if len(chosen):
+        try:
+            z[chosen] = np.linalg.solve(M[np.ix_(chosen, chosen)], -q[chosen])
+        except np.linalg.LinAlgError:
+            z[chosen] = np.linalg.lstsq(M[np.ix_(chosen, chosen)], -q[chosen])[0]
+    w = M @ z + q
+    wrong = [np.abs(w[chosen]), -z, -w, np.zeros(1)]
+    residual = float(max(part.max(initial=0.0) for part in wrong))
+    w[chosen] = 0.0
+    return ContactSolution(np.maximum(z, 0.0), np.maximum(w, 0.0), residual)

@@ -31,7 +31,7 @@ from ..contacts.elemental import build_features, rotate_quarter
 from ..contacts.links import build_finger_gap
 from ..contacts.obstacles import build_apart
 from ..scene.model import Scene
-from .system import Pair, Structure, System
+from .system import ContactPair, Structure, System
 
 
 class _Link(NamedTuple):
@@ -89,8 +89,7 @@ def is_apart(system: System, z: Array, touching: float) -> bool:
 
     Parameters
     ----------
-    touching : float, [m]
-        Overlap that counts as none.
+    touching : [m]  overlap that counts as none
     """
     gaps = dict(zip(system.names, system.measure(z[None])[0][0] >= -touching, strict=True))
 
@@ -118,7 +117,7 @@ def measure_gaps(scene: Scene, z: Array) -> Array:
 
     Parameters
     ----------
-    z : ndarray, shape (n, 5)
+    z : (n, 5)
     """
     features = build_features(scene)
     gaps = [ca.mmin(features.vertices[1, :]), *(build_apart(scene, k) for k in range(2))]
@@ -160,15 +159,15 @@ def _place(count: int, rounded: tuple[bool, ...]) -> _Bodies:
     return _Bodies(z, geometry, vertices, along, lengths, (links[0], links[1]))
 
 
-def _list_palm(bodies: _Bodies) -> list[Pair]:
+def _list_palm(bodies: _Bodies) -> list[ContactPair]:
     p = bodies.vertices
     return [
-        Pair(f"v{i}-palm", p[1, i], p[0, i], text=f"v{i} touches the palm")
+        ContactPair(f"v{i}-palm", p[1, i], p[0, i], text=f"v{i} touches the palm")
         for i in range(p.shape[1])
     ]
 
 
-def _list_sides(bodies: _Bodies, finger: int) -> list[Pair]:
+def _list_sides(bodies: _Bodies, finger: int) -> list[ContactPair]:
     """Vertices against both sides of a link."""
     link, k, side = bodies.links[finger], finger + 1, 1.0 if finger == 0 else -1.0
     # What touches a side between its ends has the whole object on that side, by convexity.
@@ -181,11 +180,11 @@ def _list_sides(bodies: _Bodies, finger: int) -> list[Pair]:
             ranges = (run, link.length - run, way * middle)
             text = f"v{i} touches {text}finger {k}"
             gap = way * level - link.radius
-            pairs.append(Pair(f"v{i}-{name}{k}", gap, way * side * run, ranges, text))
+            pairs.append(ContactPair(f"v{i}-{name}{k}", gap, way * side * run, ranges, text))
     return pairs
 
 
-def _list_ends(bodies: _Bodies, finger: int, rounded: bool) -> list[Pair]:
+def _list_ends(bodies: _Bodies, finger: int, rounded: bool) -> list[ContactPair]:
     """Vertices and edges against the tip of a link and the circle about its joint."""
     link, k, count = bodies.links[finger], finger + 1, bodies.vertices.shape[1]
     normals = ca.vertcat(-bodies.along[1, :], bodies.along[0, :])
@@ -197,7 +196,7 @@ def _list_ends(bodies: _Bodies, finger: int, rounded: bool) -> list[Pair]:
             slip = -runs[i] - link.radius * (bodies.z[2] - link.theta)
             text = f"e{i} touches the {name} of finger {k}"
             edge: tuple[Expression, ...] = (runs[i], bodies.lengths[i] - runs[i])
-            pairs.append(Pair(f"e{i}-{name}{k}", gaps[i], slip, edge, text))
+            pairs.append(ContactPair(f"e{i}-{name}{k}", gaps[i], slip, edge, text))
             if not rounded:
                 continue
             away, before = -far[:, i], (i - 1) % count
@@ -206,11 +205,11 @@ def _list_ends(bodies: _Bodies, finger: int, rounded: bool) -> list[Pair]:
             slip = -link.radius * ca.atan2(across, ahead)
             gap = ca.sqrt(ca.sumsqr(away)) - link.radius
             text = f"v{i} touches the {name} of finger {k}"
-            pairs.append(Pair(f"v{i}-{name}{k}", gap, slip, ranges, text))
+            pairs.append(ContactPair(f"v{i}-{name}{k}", gap, slip, ranges, text))
     return pairs
 
 
-def _list_link_pairs(bodies: _Bodies, rounded: bool) -> list[Pair]:
+def _list_link_pairs(bodies: _Bodies, rounded: bool) -> list[ContactPair]:
     """Tips and joints of either link against the other link."""
     links, pairs = bodies.links, []
     thick = links[0].radius + links[1].radius
@@ -236,5 +235,5 @@ def _list_link_pairs(bodies: _Bodies, rounded: bool) -> list[Pair]:
     return pairs
 
 
-def _slide(name: str, gap: Expression, ranges: tuple[Expression, ...]) -> Pair:
-    return Pair(name, gap, ca.SX(0), ranges, "finger 1 touches finger 2")
+def _slide(name: str, gap: Expression, ranges: tuple[Expression, ...]) -> ContactPair:
+    return ContactPair(name, gap, ca.SX(0), ranges, "finger 1 touches finger 2")

@@ -16,31 +16,22 @@ from ..common.errors import InputError
 from ..contacts.elemental import parse_contact
 from ..problem.definition import Problem
 from ..simulation.events import Energies, EventKind, Outcome, OutcomeKind, Simulation
-from .state import Record, Run
+from .state import FreeRun, Record
 
 
-class Stretch(NamedTuple):
-    """Some time in which a contact presses.
-
-    Attributes
-    ----------
-    contact : str
-    start, stop : float, [s]
-    least : float, [N]
-        Its least c_n then; NaN where everything rests, as forces are indeterminate there.
-    time : float, [s]
-        When.
-    """
+class FreeStretch(NamedTuple):
+    """Some time in which a contact presses."""
 
     contact: str
-    start: float
+    start: float  # start, stop [s]:
     stop: float
+    # [N]: its least c_n then; NaN where everything rests, as forces are indeterminate there
     least: float
-    time: float
+    time: float  # [s]: when
 
 
 def list_pauses(
-    stretches: Sequence[Stretch], contact: str, start: float, stop: float
+    stretches: Sequence[FreeStretch], contact: str, start: float, stop: float
 ) -> list[tuple[float, float]]:
     """When a contact does not press between two times [s], in their order."""
     pauses, at = [], start
@@ -61,17 +52,11 @@ class FreeSimulation(Simulation):
     torques without one there is one phase. Beside the problem's, `contacts` has others that
     pressed; forces are NaN where a contact does not press, and at rest. An event is there twice,
     as forces may step. `missed_by` is NaN.
-
-    Attributes
-    ----------
-    stretches : tuple of Stretch
-        When each pair of features pressed, by the order of their start.
-    residual : float
-        Largest residual of a contact problem, relative to its largest rate.
     """
 
-    stretches: tuple[Stretch, ...]
-    residual: float
+    # when each pair of features pressed, by the order of their start
+    stretches: tuple[FreeStretch, ...]
+    residual: float  # largest residual of a contact problem, relative to its largest rate
 
     def show(self, contacts: Sequence[str]) -> FreeSimulation:
         """The same with other columns of forces, NaN where a contact never pressed."""
@@ -83,7 +68,7 @@ class FreeSimulation(Simulation):
         return replace(self, contacts=tuple(contacts), c_n=forces[0], c_t=forces[1])
 
 
-def collect(run: Run, problem: Problem, starts: Sequence[float]) -> FreeSimulation:
+def collect(run: FreeRun, problem: Problem, starts: Sequence[float]) -> FreeSimulation:
     """Put together what a run has recorded; `starts` says when phases begin by the clock [s]."""
     rows, n, names = run.records, run.system.n, run.system.names
     y, t = np.array([row.y for row in rows]), np.array([row.t for row in rows])
@@ -157,9 +142,9 @@ def _is_named(name: str, problem: Problem) -> bool:
 
 def _list_stretches(
     groups: Sequence[Sequence[Record]], names: Sequence[str]
-) -> tuple[Stretch, ...]:
+) -> tuple[FreeStretch, ...]:
     """When each pair pressed, without a pause; each group of records has the same pairs."""
-    found: list[Stretch] = []
+    found: list[FreeStretch] = []
     for pair in dict.fromkeys(pair for group in groups for pair in group[0].kept):
         for presses, own in groupby(groups, lambda group: pair in group[0].kept):  # noqa: B023
             if presses:
@@ -168,5 +153,5 @@ def _list_stretches(
                 known = np.flatnonzero(c_n == c_n)
                 at = int(known[c_n[known].argmin()]) if len(known) else 0
                 ends = rows[0].t, rows[-1].t
-                found.append(Stretch(names[pair], *ends, float(c_n[at]), rows[at].t))
+                found.append(FreeStretch(names[pair], *ends, float(c_n[at]), rows[at].t))
     return tuple(sorted(found, key=lambda stretch: (stretch.start, stretch.contact)))

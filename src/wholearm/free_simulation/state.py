@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..common.arrays import Array
+from ..common.errors import SimulationError, require_number
 from ..results.torque import TorqueProfile
 from ..simulation.events import Event, EventKind
-from .feedback import Feedback
-from .stepper import LOSSES, Modes, Stepper, build_stepper
+from .free_stepper import LOSSES, FreeStepper, Modes, build_stepper
 from .system import System
 
+SAME = 1e-9
+"""Distance of two instants that counts as none, relative to the period."""
 CLOSED = 1e-10
 """Gap that counts as closed at an event, relative to the scene's length."""
 SUNK = 1e-6
@@ -66,25 +69,20 @@ def _find_steps(before: Array, after: Array, unit: float) -> NDArray[np.bool_]:
     return np.asarray(np.abs(jumps).max(axis=1) > TORQUE_STEP * unit)
 
 
-class Run:
+class FreeRun:
     """A free simulation under way.
 
     Attributes
     ----------
-    t : float, [s]
-    y : ndarray, shape (2 n + LOSSES,)
-    modes : Modes
-        What keeps which contacts at present.
-    armed : ndarray of bool, shape (N,)
-        Pairs that have been apart, so that their closing is an event.
-    unique : bool
-        Whether the present modes were the only answer for sure when they were chosen.
-    impact : float, [J]
-        Energy lost to impacts so far.
-    watches : dict
-        What is looked at with each of the modes so far.
-    rub : ndarray, shape (k,)
-        c_t over c_n of the present kept pairs, zero where they stick.
+    t : [s]
+    y : (2 n + LOSSES,)
+    modes                what keeps which contacts at present
+    armed : (N,)         pairs that have been apart, so that their closing is an event
+    unique               whether the present modes were the only answer for sure when they were
+                         chosen
+    impact : [J]         energy lost to impacts so far
+    watches              what is looked at with each of the modes so far
+    rub : (k,)           c_t over c_n of the present kept pairs, zero where they stick
     """
 
     def __init__(
@@ -200,7 +198,7 @@ class Run:
         self.y[self.system.n : 2 * self.system.n] = v
         self.impact += float(before - self.system.stored(self.z, self.v))
 
-    def load(self) -> Stepper:
+    def load(self) -> FreeStepper:
         """The steps of the present modes, with their inputs set to the present state."""
         system, modes = self.system, self.modes
         degree = self.torque.coefficients.shape[2] - 1
@@ -220,14 +218,14 @@ class Run:
         self.feed(s)
         return s
 
-    def feed(self, s: Stepper) -> None:
+    def feed(self, s: FreeStepper) -> None:
         """Hand the present state and torques to the steps."""
         inputs, at = s.inputs, s.at
         inputs[at.y], inputs[at.t] = self.y, self.t
         inputs[at.piece] = self.torque.breaks[self.piece : self.piece + 2]
         inputs[at.torque] = self.torque.coefficients[self.piece].ravel()
 
-    def stay(self, s: Stepper) -> None:
+    def stay(self, s: FreeStepper) -> None:
         """Keep from here on what sticks and is held."""
         if self.modes.stuck or self.modes.held:
             stuck = self.system.evaluate_slip(self.z, self.modes.stuck)
@@ -238,7 +236,7 @@ class Run:
         text = f"{text} at t = {self.t:.6g} s"
         self.events.append(Event(self.t, 0, kind, text, contact, value))
 
-    def record(self, s: Stepper | None, out: Array | None = None) -> None:
+    def record(self, s: FreeStepper | None, out: Array | None = None) -> None:
         """Record the present instant, with a stepper's outputs, which are kept; without at rest."""
         n = self.system.n
         if s is None or out is None:
@@ -253,3 +251,80 @@ class Run:
             c_t[kept.index(pair)] = out[to.f.start + place]
         row = (out[to.acceleration], out[to.tau], kept, c_n, c_t)
         self.records.append(Record(self.t, out[to.y], *row, self.impact))
+
+
+@runtime_checkable
+class Law(Protocol):
+    """Torques as a function of what a controller measures."""
+
+    @property
+    def period(self) -> float:
+        """Time between two samples [s]."""
+
+    @property
+    def delay(self) -> float:
+        """Time after which a sample takes effect; the first one does at once [s]."""
+
+    def held(
+        self, t: float, theta: Array, theta_dot: Array, forces: Mapping[str, float]
+    ) -> ArrayLike:
+        """The torques that follow from a state.
+
+        Parameters
+        ----------
+        t : [s]
+        theta, theta_dot : (2,) [rad, rad/s]
+        forces   c_n of the contacts that press, by name, just before `t`; NaN at rest. Empty at the
+                 start [N].
+
+        Returns
+        -------
+        array_like, shape (2,)
+            [N m]
+        """
+
+
+class Feedback:
+    """The torques of a law, known up to the present.
+
+    Parameters
+    ----------
+    until : [s]
+
+    Attributes
+    ----------
+    torque  a constant for each piece; those that have not begun are zero
+    """
+
+    def __init__(self, law: Law, until: float) -> None:
+        self.law = law
+        period = require_number(law.period, "period", positive=True)
+        delay = require_number(law.delay, "delay", nonnegative=True)
+        ticks = period * np.arange(int(np.ceil(until / period - SAME)))
+        times = np.sort(np.concatenate([ticks, ticks[1:] + delay]))
+        times = times[times < until - SAME * period]
+        times = times[np.diff(times, prepend=-np.inf) > SAME * period]
+        self._samples = np.zeros((len(ticks), 2))
+        # Rounding must not put an instant before its own sample.
+        self._latest = np.floor(times / period + SAME).astype(int)
+        self._source = np.floor((times - delay) / period + SAME).astype(int).clip(0)
+        self.torque = TorqueProfile(np.append(times, until), np.zeros((len(times), 2, 1)))
+
+    def begin(
+        self, piece: int, theta: Array, theta_dot: Array, forces: Mapping[str, float]
+    ) -> None:
+        """Take a sample where one is due at the start of a piece, and set the piece's torques.
+
+        Raises
+        ------
+        SimulationError  if the law gives no two numbers
+        """
+        latest = self._latest[piece]
+        if piece == 0 or latest > self._latest[piece - 1]:
+            t = float(self.torque.breaks[piece])
+            tau = np.asarray(self.law.held(t, theta, theta_dot, forces), dtype=float)
+            if tau.shape != (2,) or not np.isfinite(tau).all():
+                given = f"{tau.tolist()} at t = {t:.6g} s; two finite numbers are needed"
+                raise SimulationError(f"the law of the torques gives {given}")
+            self._samples[latest] = tau
+        self.torque.coefficients[piece, :, 0] = self._samples[self._source[piece]]

@@ -27,66 +27,35 @@ _ANYWHERE = 1e9
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
-    """Two features that may touch.
-
-    Attributes
-    ----------
-    name : str
-    gap : scalar expression of z, [m]
-        Positive when apart.
-    slip : scalar expression of z, [m]
-        Its rate is the sliding velocity v_t while they touch.
-    ranges : tuple of scalar expressions, [m]
-        All positive where the two face each other; the gap means nothing elsewhere.
-    text : str
-        What has happened when the gap closes, in words.
-    """
+class ContactPair:
+    """Two features that may touch."""
 
     name: str
-    gap: Expression
-    slip: Expression
+    gap: Expression  # [m]: positive when apart
+    slip: Expression  # [m]: its rate is the sliding velocity v_t while they touch
+    # [m]: all positive where the two face each other; the gap means nothing elsewhere
     ranges: tuple[Expression, ...] = ()
-    text: str = ""
+    text: str = ""  # what has happened when the gap closes, in words
 
 
-class Rows(NamedTuple):
-    """Pairs at one state: A z' = 0 and A_t z' = 0 keep them closed and stuck.
+class ContactRows(NamedTuple):
+    """Pairs at one state: A z' = 0 and A_t z' = 0 keep them closed and stuck."""
 
-    Attributes
-    ----------
-    A, A_t : ndarray, shape (m, n)
-    bend, bend_t : ndarray, shape (m,)
-        A' z' and A_t' z'.
-    """
-
-    A: Array
+    A: Array  # A, A_t (m, n):
     A_t: Array
-    bend: Array
+    bend: Array  # bend, bend_t (m,): A' z' and A_t' z'
     bend_t: Array
 
 
 @dataclass(frozen=True, eq=False)
 class Structure(Keeper):
-    """Coordinates and features of bodies of any size and weight.
+    """Coordinates and features of bodies of any size and weight."""
 
-    Attributes
-    ----------
-    z : SX symbol, shape (n,)
-    geometry : SX symbol, shape (g,)
-        Numbers that gaps and slip coordinates depend on besides.
-    pairs : tuple of Pair
-    driven : tuple of int
-        Coordinates that the two torques act on; empty where there are none.
-    turns : tuple of bool, length n
-        Which coordinates are angles.
-    """
-
-    z: Expression
-    geometry: Expression
-    pairs: tuple[Pair, ...]
-    driven: tuple[int, ...]
-    turns: tuple[bool, ...]
+    z: Expression  # (n,)
+    geometry: Expression  # (g,): numbers that gaps and slip coordinates depend on besides
+    pairs: tuple[ContactPair, ...]
+    driven: tuple[int, ...]  # coordinates that the two torques act on; empty where there are none
+    turns: tuple[bool, ...]  # which coordinates are angles
 
     @property
     def n(self) -> int:
@@ -133,32 +102,17 @@ def _build_rows(structure: Structure, chosen: tuple[int, ...]) -> Batch:
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """A structure with its numbers.
-
-    Attributes
-    ----------
-    structure : Structure
-    geometry : ndarray, shape (g,)
-    mass : ndarray, shape (n,)
-        Diagonal of M.
-    applied : ndarray, shape (n,)
-        Gravity as a force on z.
-    viscous, dry : ndarray, shape (n,)
-        Friction of the coordinates themselves: B, and the largest dry one.
-    friction : ndarray, shape (N,)
-        Coulomb's coefficient of each pair.
-    scales : Scales
-        Units that tolerances count in.
-    """
+    """A structure with its numbers."""
 
     structure: Structure
-    geometry: Array
-    mass: Array
-    applied: Array
+    geometry: Array  # (g,)
+    mass: Array  # (n,): diagonal of M
+    applied: Array  # (n,): gravity as a force on z
+    # viscous, dry (n,): friction of the coordinates themselves: B, and the largest dry one
     viscous: Array
     dry: Array
-    friction: Array
-    scales: Scales
+    friction: Array  # (N,): Coulomb's coefficient of each pair
+    scales: Scales  # units that tolerances count in
 
     @cached_property
     def n(self) -> int:
@@ -186,10 +140,10 @@ class System:
         """Units of the friction of coordinates, shape (n,) [N, N m]."""
         return np.where(self.structure.turns, self.scales.torque, self.scales.force)
 
-    def evaluate(self, z: Array, v: Array, chosen: Sequence[int]) -> Rows:
+    def evaluate(self, z: Array, v: Array, chosen: Sequence[int]) -> ContactRows:
         """Rows of some pairs at one state."""
         n, found = self.n, self._evaluate(z, v, chosen)
-        return Rows(found[:, :n], found[:, n : 2 * n], found[:, 2 * n], found[:, 2 * n + 1])
+        return ContactRows(found[:, :n], found[:, n : 2 * n], found[:, 2 * n], found[:, 2 * n + 1])
 
     def evaluate_slip(self, z: Array, chosen: Sequence[int]) -> Array:
         """Slip coordinates of some pairs, shape (m,) [m]."""
@@ -210,7 +164,7 @@ class System:
 
         Parameters
         ----------
-        z : ndarray, shape (m, n)
+        z : (m, n)
         """
         geometry = np.broadcast_to(self.geometry, (len(z), len(self.geometry)))
         both = self.structure.gaps(z, geometry)[0]

@@ -22,18 +22,11 @@ _STEP = 1e-2
 
 @dataclass(frozen=True, eq=False)
 class CostToGo:
-    """The cost of the phases that follow, the first of them with one freedom.
+    """The cost of the phases that follow, the first of them with one freedom."""
 
-    Attributes
-    ----------
-    phase : Phase
-        The first of them. Its curve is where the motion before it may end.
-    value : callable
-        Their least cost from a configuration z, shape (5,). Raises a `WholearmError` without a
-        plan from there.
-    """
-
-    phase: Phase
+    phase: Phase  # the first of them. Its curve is where the motion before it may end.
+    # their least cost from a configuration z, shape (5,). Raises a `WholearmError` without a plan
+    # from there.
     value: Callable[[Array], float]
 
     def expand(self, z: Array) -> tuple[float, Array]:

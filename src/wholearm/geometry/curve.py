@@ -40,18 +40,10 @@ class CurvePoint(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """A stretch of a curve, as the polynomial through its nodes.
+    """A stretch of a curve, as the polynomial through its nodes."""
 
-    Attributes
-    ----------
-    s : ndarray, shape (n,), [m]
-        Arc lengths of the nodes, increasing.
-    z, z_s : ndarray, shape (n, 5)
-        Configurations and unit tangents there.
-    """
-
-    s: Array
-    z: Array
+    s: Array  # (n,) [m]: arc lengths of the nodes, increasing
+    z: Array  # z, z_s (n, 5): configurations and unit tangents there
     z_s: Array
 
     @cached_property
@@ -76,46 +68,25 @@ class Panel:
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """A stretch of a curve without a reversal.
+    """A stretch of a curve without a reversal."""
 
-    Attributes
-    ----------
-    start, stop : float, [m]
-        Arc lengths of its ends.
-    Xi : ndarray, shape (n_c,)
-        Sliding directions of the contacts for motion along +s, zero for rolling ones.
-    sigma : ndarray, shape (2,)
-        Directions of the joints for motion along +s.
-    """
-
-    start: float
+    start: float  # start, stop [m]: arc lengths of its ends
     stop: float
+    # (n_c,): sliding directions of the contacts for motion along +s, zero for rolling ones
     Xi: Array
-    sigma: Array
+    sigma: Array  # (2,): directions of the joints for motion along +s
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """The curve z(s) of a one-freedom formation, for s from 0 to `length`.
-
-    Attributes
-    ----------
-    formation : Formation
-    panels : tuple of Panel
-    length : float, [m]
-    ending : str
-        What happens at the end, in words.
-    reached : bool
-        Whether that is what the curve was traced for.
-    speed_ratio : float
-        Arc length per unit of the parameter s, hence the length of its tangents.
-    """
+    """The curve z(s) of a one-freedom formation, for s from 0 to `length`."""
 
     formation: Formation
     panels: tuple[Panel, ...]
-    length: float
-    ending: str
-    reached: bool
+    length: float  # [m]
+    ending: str  # what happens at the end, in words
+    reached: bool  # whether that is what the curve was traced for
+    # arc length per unit of the parameter s, hence the length of its tangents
     speed_ratio: float = 1.0
 
     def evaluate(self, s: Array) -> CurvePoint:

@@ -29,21 +29,11 @@ Fixed = tuple[tuple[int, float], ...]
 
 @dataclass(frozen=True, eq=False)
 class Ending:
-    """What has to hold where a phase ends.
+    """What has to hold where a phase ends."""
 
-    Attributes
-    ----------
-    formation : Formation
-        Contacts that are closed.
-    fixed : tuple of (int, float)
-        Rows of z and the values that they have to take.
-    active : tuple of int
-        Limits of the formation that are met exactly.
-    """
-
-    formation: Formation
-    fixed: Fixed = ()
-    active: tuple[int, ...] = ()
+    formation: Formation  # contacts that are closed
+    fixed: Fixed = ()  # rows of z and the values that they have to take
+    active: tuple[int, ...] = ()  # limits of the formation that are met exactly
 
     def measure(self, z: Array) -> Array:
         """How far configurations with the phase's own contacts closed are from the end [m]."""
@@ -64,13 +54,9 @@ def explore(formation: Formation, z: Array, slip: Array, ends: list[Ending]) -> 
 
     Parameters
     ----------
-    formation : Formation
-    z : ndarray, shape (5,)
-        Where the phase starts.
-    slip : ndarray, shape (R,), [m]
-        Slip coordinates that rolling contacts keep.
-    ends : list of Ending
-        Any of these will do.
+    z : (5,)         where the phase starts
+    slip : (R,) [m]  slip coordinates that rolling contacts keep
+    ends             any of these will do
     """
     parts = [contact.finger for contact in formation.contacts]
     if len(parts) != 3 or set(parts) != {None, 0, 1} or formation.rolling:
@@ -143,15 +129,10 @@ def close_all(
 
     Parameters
     ----------
-    formation : Formation
-    z : ndarray, shape (n, 5)
-        Where to start.
-    slip : ndarray, shape (R,), [m]
-        Slip coordinates that rolling contacts keep.
-    fixed : tuple of (int, float)
-        Rows of z and the values that they have to take.
-    active : tuple of int
-        Limits of the formation that are met exactly.
+    z : (n, 5)       where to start
+    slip : (R,) [m]  slip coordinates that rolling contacts keep
+    fixed            rows of z and the values that they have to take
+    active           limits of the formation that are met exactly
     """
     metric, rho = metric_weights(formation.scene), formation.scene.scales.length
     sizes = np.full(formation.n_constraints, rho)

@@ -10,8 +10,8 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.errors import InputError, name_source
 from ..common.sharing import exclusive
+from ..contacts.contact_limits import build_limits
 from ..contacts.formation import Formation
-from ..contacts.limits import build_limits
 from ..mechanics.dynamics import Directions
 from ..mechanics.metric import metric_weights
 from ..problem.definition import Phase, Problem
@@ -38,8 +38,7 @@ def load(path: str) -> Problem:
 
     Raises
     ------
-    InputError
-        If the file is malformed, a formation does not touch, or an `until` is never reached.
+    InputError  if the file is malformed, a formation does not touch, or an `until` is never reached
     """
     problem = read_problem(path)
     check_phases(problem)
@@ -51,8 +50,7 @@ def check_phases(problem: Problem) -> None:
 
     Raises
     ------
-    InputError
-        If a formation does not touch, or an `until` is never reached.
+    InputError  if a formation does not touch, or an `until` is never reached
     """
     curves = trace_phases(problem)
     z = curves[-1].end if curves else problem.start
@@ -70,21 +68,12 @@ def find_end(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class PathGuess:
-    """A stretch of a phase without a reversal, as configurations along it.
-
-    Attributes
-    ----------
-    formation : Formation
-    z : ndarray, shape (n, 5)
-        With all contacts closed, evenly spread.
-    directions : Directions
-    turns : tuple of int
-        Rows of (contacts, joints) whose rate is zero at the end of the stretch, where it reverses.
-    """
+    """A stretch of a phase without a reversal, as configurations along it."""
 
     formation: Formation
-    z: Array
+    z: Array  # (n, 5): with all contacts closed, evenly spread
     directions: Directions
+    # rows of (contacts, joints) whose rate is zero at the end of the stretch, where it reverses
     turns: tuple[int, ...] = ()
 
     @property
@@ -118,17 +107,13 @@ def guess_phase(
 
     Parameters
     ----------
-    phase : Phase
-    z : ndarray, shape (5,)
-    later : sequence of Phase
-        What follows, which says where a phase that ends by a release is heading.
-    release_at : float
-        The share of the curve at which a release is.
+    z : (5,)
+    later       what follows, which says where a phase that ends by a release is heading
+    release_at  the share of the curve at which a release is
 
     Raises
     ------
-    InputError
-        If the contacts do not touch at `z`, leave no freedom, or the end cannot be reached.
+    InputError  if the contacts do not touch at `z`, leave no freedom, or the end cannot be reached
     """
     formation = phase.formation
     require_touching(phase, z)
@@ -265,12 +250,10 @@ def connect(
 
     Parameters
     ----------
-    formation : Formation
-    start, goal : ndarray, shape (5,)
-    bends : (float, float)
-        How far it bends to one side in one arc and in two, over its length; with two freedoms.
-    heading : ndarray, shape (5,), optional
-        Which way it sets out, if not straight to the goal.
+    start, goal : (5,)
+    bends               how far it bends to one side in one arc and in two, over its length; with
+                        two freedoms
+    heading : (5,)      which way it sets out, if not straight to the goal
     """
     slip = formation.evaluate_slip(start[None])[0]
     aside = _find_side(formation, start, goal) if any(bends) else np.zeros(5)

@@ -14,15 +14,16 @@ label changes are found by bisection. What is left are the pieces that are borde
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from ..common.arrays import Array
 from ..contacts.closing import (
-    Closed,
+    ClosedFinger,
     Flags,
     Numbers,
     close_fingers,
@@ -33,6 +34,10 @@ from ..contacts.closing import (
 from ..contacts.elemental import Contact
 from ..scene.model import Scene
 
+PARTS, DIVISIONS = 16, 13
+"""An interval in which the label changes is cut into so many parts, so often: to rounding."""
+CROWDED = 8
+"""Most changes that are told apart between two neighbouring places."""
 SAME_ANGLE, ROUNDING = 1e-7, 1e-11
 """Differences [rad] below which a closed finger that touches one of a border's contacts, and one
 that touches anything, is where the border has it: at the ends of a link angles lose digits."""
@@ -77,47 +82,28 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A curve in the (x, phi) plane on which a border may lie.
+    """A curve in the (x, phi) plane on which a border may lie."""
 
-    Attributes
-    ----------
-    pose : callable
-        Parameter of shape (n,) to (x, phi), each of shape (n,), NaN where there is none.
-    label : callable
-        (x, phi) and the hand closed there to labels, shape (n, 6): indices of two contacts each
-        with palm, finger 1 and finger 2, `NOWHERE` for the second where there is one contact only,
-        and for all six where the place is no border.
-    places : ndarray, shape (n,)
-        Parameters to sample at, increasing.
-    step : float, [m]
-        Longest step in x between neighbouring points of what is drawn.
-    flush : tuple (int or None, int), or None
-        The finger (None for the palm) and the edge that lies flush on it; None where a contact
-        only changes its name.
-    """
-
+    # parameter of shape (n,) to (x, phi), each of shape (n,), NaN where there is none
     pose: Callable[[Array], tuple[Array, Array]]
-    label: Callable[[Array, Array, Closed], Numbers]
-    places: Array
-    step: float
+    # (x, phi) and the hand closed there to labels, shape (n, 6): indices of two contacts each with
+    # palm, finger 1 and finger 2, `NOWHERE` for the second where there is one contact only, and for
+    # all six where the place is no border
+    label: Callable[[Array, Array, ClosedFinger], Numbers]
+    places: Array  # (n,): parameters to sample at, increasing
+    step: float  # [m]: longest step in x between neighbouring points of what is drawn
+    # the finger (None for the palm) and the edge that lies flush on it; None where a contact only
+    # changes its name
     flush: tuple[int | None, int] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A stretch of a track with one set of contacts.
-
-    Attributes
-    ----------
-    track : Track
-    places : ndarray, shape (n,)
-        Parameters of its points, increasing, ends included.
-    label : ndarray of int, shape (6,)
-    """
+    """A stretch of a track with one set of contacts."""
 
     track: Track
-    places: Array
-    label: Numbers
+    places: Array  # (n,): parameters of its points, increasing, ends included
+    label: Numbers  # (6,)
 
 
 def label_cells(scene: Scene, x: Array, phi: Array) -> Numbers:
@@ -125,7 +111,7 @@ def label_cells(scene: Scene, x: Array, phi: Array) -> Numbers:
     return label_closed(close_fingers(scene, x, phi), lower(scene, phi)[1])
 
 
-def label_closed(closed: Closed, vertex: int | Numbers) -> Numbers:
+def label_closed(closed: ClosedFinger, vertex: int | Numbers) -> Numbers:
     """Labels of closed poses with `vertex` on the palm, shape (n, 6)."""
     labels = np.full((len(closed.z), 6), NOWHERE)
     labels[:, 0] = vertex
@@ -154,7 +140,7 @@ def palm_track(scene: Scene, edge: int, phi: float, places: Array) -> Track:
     def pose(x: Array) -> tuple[Array, Array]:
         return x, np.full_like(x, phi)
 
-    def label(x: Array, phi: Array, closed: Closed) -> Numbers:
+    def label(x: Array, phi: Array, closed: ClosedFinger) -> Numbers:
         labels = label_closed(closed, edge)
         labels[labels[:, 0] != NOWHERE, 1] = after
         return labels
@@ -176,7 +162,7 @@ def flush_track(scene: Scene, finger: int, edge: int, vertex: int, places: Array
             across = (link.radius - m[:, 1] * (base[1] - corner[:, 1])) / m[:, 0]
         return base[0] - corner[:, 0] - across, phi
 
-    def label(x: Array, phi: Array, closed: Closed) -> Numbers:
+    def label(x: Array, phi: Array, closed: ClosedFinger) -> Numbers:
         corners, m = _corners_at(scene, phi, vertex, near, far), _outward(scene, edge, phi)
         corners[..., 0] += x
         sign = 1.0 if finger == 0 else -1.0
@@ -237,7 +223,7 @@ def _circle_track(
             across = np.sqrt(distance**2 - (place[:, 1] - base[1]) ** 2)
         return base[0] - place[:, 0] + branch * across, phi
 
-    def label(x: Array, phi: Array, closed: Closed) -> Numbers:
+    def label(x: Array, phi: Array, closed: ClosedFinger) -> Numbers:
         labels = label_closed(closed, vertex)
         place = centre(phi) + np.column_stack([x, np.zeros_like(x)]) - base
         angle = np.arctan2(place[:, 1], place[:, 0])
@@ -287,7 +273,7 @@ def _outward(scene: Scene, edge: int, phi: Array) -> Array:
     return np.column_stack([np.cos(heading), np.sin(heading)])
 
 
-def _is_closed(closed: Closed, finger: int, angle: Array, pair: Numbers) -> Flags:
+def _is_closed(closed: ClosedFinger, finger: int, angle: Array, pair: Numbers) -> Flags:
     """Whether a closed finger is at `angle`, where it would touch a pair of contacts."""
     with np.errstate(invalid="ignore"):
         off = np.abs(np.mod(closed.z[:, 3 + finger] - angle + np.pi, 2 * np.pi) - np.pi)
@@ -298,3 +284,127 @@ def _is_closed(closed: Closed, finger: int, angle: Array, pair: Numbers) -> Flag
 def name_contacts(table: tuple[Contact, ...], label: Numbers) -> tuple[Contact, ...]:
     """The contacts of one label."""
     return tuple(table[int(index)] for index in label if index != NOWHERE)
+
+
+class _Tracks(NamedTuple):
+    """Tracks that are looked at together: closing fingers at few poses takes as long as at many."""
+
+    scene: Scene
+    tracks: Sequence[Track]
+    window: Window | None
+
+    def label(self, owners: Numbers, places: Array) -> Numbers:
+        """Labels, shape (n, 6), of places on tracks; the tracks' indices `owners` increase."""
+        x, phi = np.empty((2, len(places)))
+        groups = [slice(a, b) for a, b in pairwise(np.searchsorted(owners, _list_ends(owners)))]
+        for own in groups:
+            x[own], phi[own] = self.tracks[owners[own.start]].pose(places[own])
+        inside = np.isfinite(x)
+        if self.window is not None:
+            inside &= (x >= self.window.x[0]) & (x <= self.window.x[1])
+        labels = np.full((len(places), 6), NOWHERE)
+        closed = close_fingers(self.scene, x[inside], phi[inside])
+        rows = np.cumsum(inside) - 1
+        for own in groups:
+            (within,) = np.nonzero(inside[own])
+            if len(within):
+                at = own.start + within
+                part = ClosedFinger(*(values[rows[at]] for values in closed))
+                labels[at] = self.tracks[owners[own.start]].label(x[at], phi[at], part)
+        return labels
+
+
+def cut(scene: Scene, tracks: Sequence[Track], window: Window | None = None) -> list[Piece]:
+    """Cut tracks into pieces with one label each, in the order of tracks and their parameters.
+
+    Parameters
+    ----------
+    window  leave out what is outside of it
+    """
+    every = _Tracks(scene, tracks, window)
+    sizes = [len(track.places) for track in tracks]
+    owners = np.repeat(np.arange(len(tracks)), sizes)
+    places = np.concatenate([track.places for track in tracks]) if tracks else np.empty(0)
+    labels = every.label(owners, places)
+    changes = _find_changes(every, owners, places, labels)
+    pieces, first = [], 0
+    for index, (track, size) in enumerate(zip(tracks, sizes, strict=True)):
+        own, first = slice(first, first + size), first + size
+        if (labels[own] == NOWHERE).all():
+            continue
+        start, held = float(places[own][0]), labels[own][0]
+        parts = []
+        for before, after, following in changes.get(index, ()):
+            parts.append((start, before, held))
+            start, held = after, following
+        parts.append((start, float(places[own][-1]), held))
+        pieces += [
+            Piece(track, _fill(track, low, high), label)
+            for low, high, label in parts
+            if label[0] != NOWHERE and high > low
+        ]
+    return pieces
+
+
+def _list_ends(owners: Numbers) -> Numbers:
+    """Each owner once, and one beyond the last."""
+    return np.append(
+        owners[np.flatnonzero(np.diff(owners, prepend=-1))], np.iinfo(owners.dtype).max
+    )
+
+
+def _find_changes(
+    every: _Tracks, owners: Numbers, places: Array, labels: Numbers
+) -> dict[int, list[tuple[float, float, Numbers]]]:
+    """Where labels change, by track, in the order of its parameter.
+
+    The last place with the old one, the first with the new, and the new.
+    """
+    within = owners[1:] == owners[:-1]
+    changed = np.flatnonzero(_differ(labels[1:], labels[:-1]) & within)
+    low, high, old, last = (
+        places[changed],
+        places[changed + 1],
+        labels[changed],
+        labels[changed + 1],
+    )
+    owner = owners[changed]
+    found: dict[int, list[tuple[float, float, Numbers]]] = {}
+    for _ in range(CROWDED):
+        if not len(low):
+            break
+        stop = high
+        for _ in range(DIVISIONS):
+            inner = low[:, None] + (high - low)[:, None] * np.arange(1, PARTS) / PARTS
+            seen = every.label(np.repeat(owner, PARTS - 1), inner.ravel())
+            same = (seen.reshape(*inner.shape, -1) == old[:, None]).all(axis=2)
+            first = np.where(same.all(axis=1), PARTS - 1, same.argmin(axis=1))
+            ends = np.column_stack([low, inner, high])
+            rows = np.arange(len(ends))
+            low, high = ends[rows, first], ends[rows, first + 1]
+        new = every.label(owner, high)
+        for index, change in zip(
+            owner.tolist(), zip(low.tolist(), high.tolist(), new, strict=True), strict=True
+        ):
+            found.setdefault(index, []).append(change)
+        # A second change may hide behind the first.
+        more = _differ(new, last) & (high < stop)
+        low, high, old, last = high[more], stop[more], new[more], last[more]
+        owner = owner[more]
+    return {index: sorted(own, key=lambda change: change[0]) for index, own in found.items()}
+
+
+def _differ(labels: Numbers, others: Numbers) -> Flags:
+    return np.asarray((labels != others).any(axis=1))
+
+
+def _fill(track: Track, low: float, high: float) -> Array:
+    """Places from `low` to `high`, close enough together to draw the curve."""
+    inner = track.places[(track.places > low) & (track.places < high)]
+    places = np.array([low, *inner, high])
+    for _ in range(8):
+        wide = np.flatnonzero(np.abs(np.diff(track.pose(places)[0])) > track.step)
+        if not len(wide):
+            break
+        places = np.sort(np.append(places, (places[wide] + places[wide + 1]) / 2))
+    return places

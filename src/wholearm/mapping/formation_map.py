@@ -21,18 +21,41 @@ from ..contacts.closing import (
     close_fingers,
     contact_table,
     evaluate_contacts,
+    evaluate_each,
+    group_alike,
+    lower,
 )
 from ..contacts.elemental import Contact
-from ..mechanics.keys import UNIQUENESS
-from ..mechanics.uniqueness import UNIQUENESS_MARGIN
+from ..contacts.formation import Formation, Kinematics
+from ..mechanics.dynamics import Directions, force_rows, inverse
+from ..mechanics.margin_key import UNIQUENESS
+from ..mechanics.metric import metric_weights
+from ..mechanics.uniqueness import UNIQUENESS_MARGIN, find_minors
 from ..problem.definition import Problem
+from ..quasistatic.squeeze import Squeezing
 from ..scene.model import Scene
-from .borders import NOWHERE, Piece, Window, label_cells, list_tracks, name_contacts
-from .pieces import cut
-from .quasistatic import check_border, check_cell
-from .route import Stretch, list_formations
-from .window import choose_window, label_grid
+from .borders import (
+    NOWHERE,
+    Piece,
+    Window,
+    cut,
+    label_cells,
+    label_closed,
+    list_tracks,
+    name_contacts,
+)
+from .formation_list import Stretch, list_formations, trace_problem
 
+BEYOND = np.radians(6.0)
+"""Reach of the window beyond the flush angles next to the plan [rad]."""
+BESIDE = 0.25
+"""The same over half the distance of these angles, at most."""
+WAYS = ("+x", "-x", "+phi", "-phi")
+"""Directions of travel inside a cell."""
+REGULAR = 1e-9
+"""Least ratio of singular values of A at which contacts count as independent; least determinant of
+their wrenches, in radii of gyration, likewise."""
+_WAYS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 Flush = tuple[int | None, int]
 """A finger (None for the palm) and an edge that lies flush on it."""
 SAMPLES = 100
@@ -47,36 +70,21 @@ SAME_PLACE = 3e-5
 
 @dataclass(frozen=True, eq=False)
 class Border:
-    """A stretch of a cell border with one contact formation.
+    """A stretch of a cell border with one contact formation."""
 
-    Attributes
-    ----------
-    contacts : tuple of Contact
-        The four that touch.
-    flush : tuple (int or None, int), or None
-        The finger (None for the palm) and the edge that lies flush on it. None where a contact
-        passes from the side of a link to its tip or along the tip: there two names stand for one
-        contact and nothing holds the motion to the border.
-    along : {"x", "phi"}
-        The coordinate that increases along the border.
-    points : ndarray, shape (n, 2), [m, rad]
-        x and phi.
-    z : ndarray, shape (n, 5)
-        Configurations there.
-    forth, back : ndarray of bool, shape (n,)
-        Whether a quasistatic motion is possible with the coordinate increasing, and decreasing;
-        all False where nothing is flush.
-    ambiguous : ndarray of bool, shape (n,)
-        Whether it would be, one way or the other, if contact forces were the only ones.
-    """
-
-    contacts: tuple[Contact, ...]
+    contacts: tuple[Contact, ...]  # the four that touch
+    # the finger (None for the palm) and the edge that lies flush on it. None where a contact passes
+    # from the side of a link to its tip or along the tip: there two names stand for one contact and
+    # nothing holds the motion to the border.
     flush: Flush | None
-    along: str
-    points: Array
-    z: Array
+    along: str  # {"x", "phi"}: the coordinate that increases along the border
+    points: Array  # (n, 2) [m, rad]: x and phi
+    z: Array  # (n, 5): configurations there
+    # forth, back (n,): whether a quasistatic motion is possible with the coordinate increasing, and
+    # decreasing; all False where nothing is flush
     forth: Flags
     back: Flags
+    # (n,): whether it would be, one way or the other, if contact forces were the only ones
     ambiguous: Flags
 
     @property
@@ -87,59 +95,34 @@ class Border:
 
 @dataclass(frozen=True, eq=False)
 class Crossing:
-    """A place where borders meet and five or more contacts touch.
+    """A place where borders meet and five or more contacts touch."""
 
-    Attributes
-    ----------
-    point : ndarray, shape (2,), [m, rad]
-        x and phi.
-    z : ndarray, shape (5,)
-    contacts : tuple of Contact
-    flush : tuple
-        What lies flush on the borders that meet, as in `Border`. With two or more, five contacts
-        press at places of their own; with one, a contact changes its name on a border.
-    """
-
-    point: Array
-    z: Array
+    point: Array  # (2,) [m, rad]: x and phi
+    z: Array  # (5,)
     contacts: tuple[Contact, ...]
+    # what lies flush on the borders that meet, as in `Border`. With two or more, five contacts
+    # press at places of their own; with one, a contact changes its name on a border.
     flush: tuple[Flush, ...]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FormationMap(Drawn):
-    """The cells, borders and crossings of a window of the (x, phi) plane.
-
-    Attributes
-    ----------
-    problem : Problem
-    x, phi : ndarray, shape (n_x,) and (n_phi,), [m] and [rad]
-        Grid.
-    cell : ndarray of int, shape (n_phi, n_x)
-        Index into `formations`; -1 and -2 where finger 1 and 2 is too short, -3 and -4 where the
-        joint of finger 1 and 2 is in the object, `CROSSED` where the fingers would overlap.
-    formations : tuple of tuple of Contact
-        The three contacts of each cell.
-    borders : tuple of Border
-    crossings : tuple of Crossing
-    places : ndarray, shape (m, 2), [m, rad]
-        Where directions inside cells were checked.
-    possible : ndarray of bool, shape (m, 4)
-        Whether a quasistatic motion is possible there with x increasing, x decreasing, phi
-        increasing and phi decreasing while the other stays.
-    ambiguous : ndarray of bool, shape (m,)
-        Whether one more of these would be possible, if contact forces were the only ones.
-    """
+    """The cells, borders and crossings of a window of the (x, phi) plane."""
 
     problem: Problem
-    x: Array
+    x: Array  # x, phi (n_x,) and (n_phi,) [m] and [rad]: grid
     phi: Array
+    # (n_phi, n_x): index into `formations`; -1 and -2 where finger 1 and 2 is too short, -3 and -4
+    # where the joint of finger 1 and 2 is in the object, `CROSSED` where the fingers would overlap
     cell: Numbers
-    formations: tuple[tuple[Contact, ...], ...]
+    formations: tuple[tuple[Contact, ...], ...]  # the three contacts of each cell
     borders: tuple[Border, ...]
     crossings: tuple[Crossing, ...]
-    places: Array
+    places: Array  # (m, 2) [m, rad]: where directions inside cells were checked
+    # (m, 4): whether a quasistatic motion is possible there with x increasing, x decreasing, phi
+    # increasing and phi decreasing while the other stays
     possible: Flags
+    # (m,): whether one more of these would be possible, if contact forces were the only ones
     ambiguous: Flags
 
     @property
@@ -163,23 +146,17 @@ def build_map(
 
     Parameters
     ----------
-    problem : Problem
-        Its phases only say which part of the plane is of interest.
-    resolution : int
-        Points of the grid each way, at least 10. Borders do not depend on it.
-    window : Window, optional
-        The part of the plane; by default all x at which both fingers reach the object, and phi
-        from the flush angle below the plan to that above it.
-    progress : callable, optional
-        Receives a line of text now and then.
-    uniqueness_margin : float
-        Where the uniqueness margin of contact forces (`mechanics.uniqueness`) is less, motion is
-        ambiguous.
+    problem            its phases only say which part of the plane is of interest
+    resolution         points of the grid each way, at least 10. Borders do not depend on it.
+    window             the part of the plane; by default all x at which both fingers reach the
+                       object, and phi from the flush angle below the plan to that above it
+    progress           receives a line of text now and then
+    uniqueness_margin  where the uniqueness margin of contact forces (`mechanics.uniqueness`) is
+                       less, motion is ambiguous
 
     Raises
     ------
-    InputError
-        If a number is out of its range or nothing in the window can be reached.
+    InputError  if a number is out of its range or nothing in the window can be reached
     """
     if resolution < 10:
         raise InputError("", "resolution", f"{resolution!r} given; allowed is 10 or more")
@@ -305,3 +282,179 @@ __all__ = [
     "choose_window",
     "list_formations",
 ]
+
+
+def check_border(
+    scene: Scene,
+    epsilon: float,
+    label: Numbers,
+    z: Array,
+    coordinate: int | Numbers,
+    uniqueness_margin: float = UNIQUENESS_MARGIN,
+) -> tuple[Flags, Flags, Flags]:
+    """Whether a quasistatic motion along a border is possible, each way.
+
+    Parameters
+    ----------
+    epsilon : [N]             least normal force
+    label : (4,) or (n, 4)    the four contacts, as indices into `closing.contact_table`: one
+                              border's, or each place's
+    z : (n, 5)                configurations on borders
+    coordinate : (n,) {0, 2}  x or phi, whichever increases along the border
+    uniqueness_margin         least uniqueness margin, as of `find_minors`
+
+    Returns
+    -------
+    forth, back : (n,)  for travel with the coordinate increasing, and decreasing
+    ambiguous : (n,)    whether it would be, one way or the other, if contact forces were the only
+                        ones
+    """
+    labels = np.broadcast_to(label, (len(z), 4))
+    kinematics = evaluate_each(scene, labels, z)
+    weights = np.sqrt(metric_weights(scene))
+    _, sizes, rows = np.linalg.svd(kinematics.A / weights)
+    z_s = rows[:, -1] / weights
+    along = z_s[np.arange(len(z)), coordinate]
+    z_s *= np.where(along < 0, -1.0, 1.0)[:, None]
+    regular = sizes[:, -1] > REGULAR * sizes[:, 0]
+    held, unique = (np.zeros((2, len(z)), dtype=bool) for _ in range(2))
+    for formation, mine in group_alike(scene, labels):
+        (own,) = np.nonzero(mine & regular)
+        part = Kinematics(*(array[own] for array in kinematics))
+        for row, sole, way in zip(held, unique, (z_s[own], -z_s[own]), strict=True):
+            row[own] = _check_path(formation, part, epsilon, z[own], way)
+            sole[own[row[own]]] = _are_unique(formation, part, way, row[own], uniqueness_margin)
+    return held[0] & unique[0], held[1] & unique[1], np.any(held & ~unique, axis=0)
+
+
+def check_cell(
+    scene: Scene,
+    epsilon: float,
+    label: Numbers,
+    z: Array,
+    uniqueness_margin: float = UNIQUENESS_MARGIN,
+) -> tuple[Flags, Flags]:
+    """Whether a quasistatic motion from inside a cell is possible towards each of `WAYS`.
+
+    Parameters
+    ----------
+    epsilon : [N]           least normal force
+    label : (3,) or (n, 3)  the three contacts, as indices into `closing.contact_table`: palm,
+                            finger 1, finger 2
+    z : (n, 5)              configurations in cells
+    uniqueness_margin       as of `check_border`
+
+    Returns
+    -------
+    possible : (n, 4)
+    ambiguous : (n,)   whether one more of them would be, if contact forces were the only ones
+    """
+    labels = np.broadcast_to(label, (len(z), 3))
+    kinematics = evaluate_each(scene, labels, z)
+    held, unique = (np.zeros((len(z), len(WAYS)), dtype=bool) for _ in range(2))
+    rows = np.zeros((2, 5))
+    rows[[0, 1], [0, 2]] = 1.0
+    matrix = np.concatenate([kinematics.A, np.broadcast_to(rows, (len(z), 2, 5))], axis=1)
+    regular = np.abs(np.linalg.det(matrix)) > REGULAR * scene.scales.length**2
+    part = Kinematics(*(array[regular] for array in kinematics))
+    for formation, _ in group_alike(scene, labels):
+        for k, way in enumerate(_WAYS):
+            right = np.zeros((regular.sum(), 5, 1))
+            right[:, 3:, 0] = way
+            z_s = np.linalg.solve(matrix[regular], right)[..., 0]
+            held[regular, k] = _check_balance(formation, part, epsilon, z_s)
+            own = _are_unique(formation, part, z_s, held[regular, k], uniqueness_margin)
+            unique[held[:, k], k] = own
+    return held & unique, np.any(held & ~unique, axis=1)
+
+
+def _check_path(
+    formation: Formation, kinematics: Kinematics, epsilon: float, z: Array, z_s: Array
+) -> Flags:
+    directions = Directions.of(kinematics, z_s)
+    forces = inverse(formation, z, z_s, np.zeros_like(z_s), directions, kinematics)
+    squeezing, still = Squeezing.of(formation, forces, z_s[:, 3:]), np.zeros(len(z))
+    low, high = squeezing.find_span(still, still, epsilon)
+    return np.asarray(low <= high)
+
+
+def _check_balance(
+    formation: Formation, kinematics: Kinematics, epsilon: float, z_s: Array
+) -> Flags:
+    scene, directions = formation.scene, Directions.of(kinematics, z_s)
+    G = force_rows(formation, kinematics, directions)
+    wrench = G[:, :, :3].transpose(0, 2, 1)
+    regular = np.abs(np.linalg.det(wrench)) > REGULAR * scene.scales.length
+    wrench[~regular] = np.eye(3)
+    right = np.broadcast_to(-scene.applied_force[:3, None], (len(G), 3, 1))
+    c_n = np.linalg.solve(wrench, right)[..., 0]
+    tau = scene.dry[3:] * directions.sigma - np.einsum("nij,ni->nj", G[:, :, 3:], c_n)
+    held = (c_n >= epsilon).all(axis=1) & (np.abs(tau) <= scene.torque_limit).all(axis=1)
+    return np.asarray(held & regular)
+
+
+def _are_unique(
+    formation: Formation, kinematics: Kinematics, z_s: Array, rows: Flags, uniqueness_margin: float
+) -> Flags:
+    """Whether contact forces of travel along `z_s` are the only ones, at those of the `rows`."""
+    part = Kinematics(*(array[rows] for array in kinematics))
+    Xi = Directions.of(part, z_s[rows]).Xi
+    return np.asarray(find_minors(formation, part, Xi).ratios >= uniqueness_margin)
+
+
+@exclusive
+def choose_window(problem: Problem, phi_deg: tuple[float, float] | None = None) -> Window:
+    """All x that both fingers reach, and phi one flush angle beyond what the phases cover.
+
+    Parameters
+    ----------
+    phi_deg : [deg]  take this range of phi instead
+
+    Raises
+    ------
+    InputError  if both fingers reach the object nowhere
+    """
+    scene = problem.scene
+    low, high = _cover_phases(problem) if phi_deg is None else np.radians(phi_deg).tolist()
+    size = float(np.hypot(*scene.polygon.vertices.T).max())
+    reach = [size + f.length + f.radius for f in scene.fingers]
+    bases = [float(np.asarray(f.base)[0]) for f in scene.fingers]
+    left = max(base - r for base, r in zip(bases, reach, strict=True))
+    right = min(base + r for base, r in zip(bases, reach, strict=True))
+    grid = np.linspace(left, max(left, right), 60)
+    _, obstacle = label_grid(scene, grid, np.linspace(low, high, 60))
+    reached = grid[(obstacle == 0).any(axis=0)]
+    if not len(reached):
+        raise InputError(problem.source, "fingers", "nowhere do both reach the object")
+    step = grid[1] - grid[0]
+    return Window((float(reached[0] - step), float(reached[-1] + step)), (low, high))
+
+
+def _cover_phases(problem: Problem) -> tuple[float, float]:
+    """Range of phi [rad] that reaches a little beyond the flush angles next to the phases."""
+    angles = [float(problem.start[2])]
+    angles += [float(phi) for path in trace_problem(problem) for phi in path[[0, -1], 1]]
+    for phase in problem.phases:
+        if phase.until.coordinate == "phi" and phase.until.value is not None:
+            angles.append(phase.until.value)
+    angles += [goal.find_angle(problem.scene, angles[-1]) for goal in problem.goals]
+    low, high = min(angles), max(angles)
+    around = Window((0.0, 0.0), (low - 2 * np.pi, high + 2 * np.pi)).flush_angles(problem.scene)
+    flush = np.array([angle for angle, _ in around])
+    # What is flush at an end of the plan is not yet the next edge.
+    before, after = float(flush[flush < low - 1e-6].max()), float(flush[flush > high + 1e-6].min())
+    # The next edge but one is not of interest, however many there are.
+    beyond = min(BEYOND, BESIDE * (after - before) / 2)
+    return before - beyond, after + beyond
+
+
+def label_grid(scene: Scene, x: Array, phi: Array) -> tuple[Numbers, Numbers]:
+    """Labels (n_phi, n_x, 6) and obstacles (n_phi, n_x), 0 or as in `FormationMap.cell`."""
+    x, phi = (part.ravel() for part in np.meshgrid(x, phi))
+    closed = close_fingers(scene, x, phi)
+    labels = label_closed(closed, lower(scene, phi)[1])
+    both = closed.obstacle
+    codes = np.where(both > 0, 2 * both - 1 + np.array([0, 1]), 0)
+    obstacle = np.where(codes[:, 0] > 0, codes[:, 0], codes[:, 1])
+    shape = (len(np.unique(phi)), -1)
+    return labels.reshape(*shape, 6), obstacle.reshape(shape)

@@ -8,11 +8,10 @@ import tomllib
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import InputError
-from ..common.require import require_number
+from ..common.errors import InputError, require_number
 from ..problem.read import build_problem
 from ..scene.polygon import Polygon
-from .route import format_route, list_formations
+from .formation_list import format_route, list_formations
 
 _MOST = 50
 """Corners of a polygon that a file still shows well."""
@@ -38,19 +37,14 @@ def write_template(
 
     Parameters
     ----------
-    name : str
-    corners : int
-    size : float, [m]
-        From the centroid to the corners.
-    mass : float, [kg]
-        By default that of a plate as thick and heavy as those in `problems/`.
-    vertices : ndarray, shape (n, 2), [m], optional
-        Corners, anticlockwise, in place of those of a regular polygon; they say the size, too.
+    size : [m]             from the centroid to the corners
+    mass : [kg]            by default that of a plate as thick and heavy as those in `problems/`
+    vertices : (n, 2) [m]  corners, anticlockwise, in place of those of a regular polygon; they say
+                           the size, too
 
     Raises
     ------
-    InputError
-        If a number is out of its range.
+    InputError  if a number is out of its range
     """
     given = vertices is not None
     if vertices is not None:

@@ -55,65 +55,35 @@ _FAR = 1e3
 """Largest margin that is looked for, over what is ample."""
 
 
-class Way(NamedTuple):
-    """A way in which a formation at rest may begin to move; rows are for (1, tau_1, tau_2).
+class ArrivalPath(NamedTuple):
+    """A way in which a formation at rest may begin to move; rows are for (1, tau_1, tau_2)."""
 
-    Attributes
-    ----------
-    acceleration : ndarray, shape (5, 3)
-        z''.
-    c_n : ndarray, shape (n_c, 3), [N]
-    consistent : ndarray, shape (k, 3)
-        Accelerations of sliding contacts and of joints the way that their friction assumes, over
-        the scene's; none with one freedom, where `heading` says it all.
-    heading : ndarray, shape (5,), or None
-        With one freedom, where to, of length one in the metric M5.
-    """
-
-    acceleration: Array
-    c_n: Array
+    acceleration: Array  # (5, 3): z''
+    c_n: Array  # (n_c, 3) [N]
+    # (k, 3): accelerations of sliding contacts and of joints the way that their friction assumes,
+    # over the scene's; none with one freedom, where `heading` says it all
     consistent: Array
-    heading: Array | None
+    heading: Array | None  # (5,): with one freedom, where to, of length one in the metric M5
 
 
 class Standstill(NamedTuple):
-    """Where a motion stops.
+    """Where a motion stops."""
 
-    Attributes
-    ----------
-    z : ndarray, shape (5,)
-    formation : Formation
-        That it stops in.
-    gained : Contact or None
-        What it stops at.
-    touching : Formation
-        All that touches.
-    """
-
-    z: Array
-    formation: Formation
-    gained: Contact | None
-    touching: Formation
+    z: Array  # (5,)
+    formation: Formation  # that it stops in
+    gained: Contact | None  # what it stops at
+    touching: Formation  # all that touches
 
 
 class Hold(NamedTuple):
-    """Constant torques for a standstill.
+    """Constant torques for a standstill."""
 
-    Attributes
-    ----------
-    tau : ndarray, shape (2,), [N m]
-    margin : float
-        The least of the margins, over what is ample.
-    speed : float, [m/s]
-        At most, with which the contact is reached from rest, if all others stay closed till then;
-        zero where nothing has to close, or no torques would drive the formation on.
-    parts : tuple of str
-        Contacts that would have to pull in the impact of that arrival: they part for a moment.
-    """
-
-    tau: Array
-    margin: float
+    tau: Array  # (2,) [N m]
+    margin: float  # the least of the margins, over what is ample
+    # [m/s]: at most, with which the contact is reached from rest, if all others stay closed till
+    # then; zero where nothing has to close, or no torques would drive the formation on
     speed: float = 0.0
+    # contacts that would have to pull in the impact of that arrival: they part for a moment
     parts: tuple[str, ...] = ()
 
 
@@ -125,13 +95,9 @@ def find_hold(place: Standstill, epsilon: float, gap: float, time: float) -> Hol
 
     Parameters
     ----------
-    place : Standstill
-    epsilon : float, [N]
-        Least normal force.
-    gap : float, [m]
-        By how much the contact may be open.
-    time : float, [s]
-        For how long it is held.
+    epsilon : [N]  least normal force
+    gap : [m]      by how much the contact may be open
+    time : [s]     for how long it is held
 
     Returns
     -------
@@ -173,7 +139,7 @@ def _list_holding(place: Standstill, epsilon: float) -> Array:
     return np.vstack([balance, *away])
 
 
-def _drive(scene: Scene, way: Way) -> Array:
+def _drive(scene: Scene, way: ArrivalPath) -> Array:
     """How strongly a way with one freedom accelerates, over what is ample, shape (3,)."""
     assert way.heading is not None
     drive = (way.heading * scene.mass_diagonal) @ way.acceleration
@@ -242,9 +208,7 @@ def find_parting(place: Standstill, v: Array) -> tuple[str, ...]:
 
     Parameters
     ----------
-    place : Standstill
-    v : ndarray, shape (5,)
-        Velocity z' just before.
+    v : (5,)  velocity z' just before
     """
     try:
         impact = compute_impact(place.formation, place.touching, place.z, v)
@@ -253,7 +217,7 @@ def find_parting(place: Standstill, v: Array) -> tuple[str, ...]:
     return tuple(h.name for h in impact.violations if h.kind is ViolationKind.PULL)
 
 
-def list_ways(formation: Formation, z: Array) -> Iterator[Way]:
+def list_ways(formation: Formation, z: Array) -> Iterator[ArrivalPath]:
     """Every way in which a formation at rest at `z`, shape (5,), may begin to move."""
     scene, n_c = formation.scene, formation.n_contacts
     kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
@@ -279,7 +243,7 @@ def list_ways(formation: Formation, z: Array) -> Iterator[Way]:
         acceleration = inverse_mass[:, None] * (applied + G.T @ c)
         assumed = signs[:, None] * (rates @ acceleration) / _CREEP
         consistent = assumed[signs != 0] if heading is None else np.zeros((0, 3))
-        yield Way(acceleration, c[:n_c], consistent, heading)
+        yield ArrivalPath(acceleration, c[:n_c], consistent, heading)
 
 
 def _list_signs(
@@ -308,11 +272,8 @@ def maximise_margin(
 
     Parameters
     ----------
-    scene : Scene
-    rows : ndarray, shape (k, 3)
-        Margins are rows @ (1, tau_1, tau_2).
-    bounds : ndarray, shape (l, 3), optional
-        What has to be positive, too, without a margin.
+    rows : (k, 3)    margins are rows @ (1, tau_1, tau_2)
+    bounds : (l, 3)  what has to be positive, too, without a margin
     """
     limits, unit = scene.torque_limit, scene.scales.torque
     box = [[limit, *(-side * axis)] for limit, axis in zip(limits, np.eye(2), strict=True)

@@ -33,18 +33,10 @@ from ..contacts.formation import Formation, Kinematics
 
 
 class Directions(NamedTuple):
-    """Signs that friction depends on.
+    """Signs that friction depends on."""
 
-    Attributes
-    ----------
-    Xi : ndarray, shape (n_c,)
-        Sliding directions of the contacts; those of rolling ones do not count.
-    sigma : ndarray, shape (2,)
-        Directions of the joints.
-    """
-
-    Xi: Array
-    sigma: Array
+    Xi: Array  # (n_c,): sliding directions of the contacts; those of rolling ones do not count
+    sigma: Array  # (2,): directions of the joints
 
     @staticmethod
     def of(kinematics: Kinematics, v: Array) -> Directions:
@@ -118,10 +110,8 @@ def split_forces(formation: Formation, c: Array, Xi: Array) -> tuple[Array, Arra
 
     Parameters
     ----------
-    c : ndarray, shape (..., n_c + R), [N]
-        Contact forces [c_n; c_t(rolling)].
-    Xi : ndarray, shape (..., n_c)
-        Sliding directions.
+    c : (..., n_c + R) [N]  contact forces [c_n; c_t(rolling)]
+    Xi : (..., n_c)         sliding directions
     """
     n_c = formation.n_contacts
     c_n = c[..., :n_c]
@@ -161,12 +151,9 @@ def inverse(
 
     Parameters
     ----------
-    z, z_s, z_ss : ndarray, shape (n, 5)
-        The curve: z' = z_s s' and z'' = z_s s'' + z_ss s'^2.
-    directions : Directions
-        Signs for motion along +s, one for all places or one row for each.
-    kinematics : Kinematics, optional
-        The formation at `z`, where it is known already.
+    z, z_s, z_ss : (n, 5)  the curve: z' = z_s s' and z'' = z_s s'' + z_ss s'^2
+    directions             signs for motion along +s, one for all places or one row for each
+    kinematics             the formation at `z`, where it is known already
     """
     scene = formation.scene
     kinematics = kinematics or formation.evaluate(z, z_s)

@@ -51,20 +51,12 @@ class ViolationKind(Enum):
 
 
 class ImpactViolation(NamedTuple):
-    """One reason why an impact is not possible.
-
-    Attributes
-    ----------
-    kind : ViolationKind
-    name : str
-        The contact, or what would happen.
-    value : float
-        Its impulse or margin to slipping [N s], or rate [m/s]; the reduced inertia over that
-        without friction.
-    """
+    """One reason why an impact is not possible."""
 
     kind: ViolationKind
-    name: str
+    name: str  # the contact, or what would happen
+    # its impulse or margin to slipping [N s], or rate [m/s]; the reduced inertia over that without
+    # friction
     value: float
 
     def describe(self, per: str = "") -> str:
@@ -82,26 +74,15 @@ class ImpactViolation(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Impact:
-    """What an impact does to a velocity.
+    """What an impact does to a velocity."""
 
-    Attributes
-    ----------
-    formation : Formation
-        The new one.
-    v : ndarray, shape (5,)
-        v+, in m/s and rad/s; NaN if the formation jams.
-    p : ndarray, shape (n_c + R,), [N s]
-        Impulses of the contacts: normal, then tangential of rolling ones. NaN likewise.
-    Xi : ndarray, shape (n_c,)
-        Sliding directions that friction assumes, zero for rolling contacts.
-    violations : tuple of ImpactViolation
-        Why it is not possible, the worst first; empty if it is.
-    """
-
-    formation: Formation
-    v: Array
+    formation: Formation  # the new one
+    v: Array  # (5,): v+, in m/s and rad/s; NaN if the formation jams
+    # (n_c + R,) [N s]: impulses of the contacts: normal, then tangential of rolling ones. NaN
+    # likewise.
     p: Array
-    Xi: Array
+    Xi: Array  # (n_c,): sliding directions that friction assumes, zero for rolling contacts
+    # why it is not possible, the worst first; empty if it is
     violations: tuple[ImpactViolation, ...]
 
     @property
@@ -121,10 +102,8 @@ def compute_impact(before: Formation, after: Formation, z: Array, v: Array) -> I
 
     Parameters
     ----------
-    before, after : Formation
-        What the motion comes from and what it goes on with, all contacts closed.
-    z, v : ndarray, shape (5,)
-        Configuration, and velocity z' just before.
+    before, after  what the motion comes from and what it goes on with, all contacts closed
+    z, v : (5,)    configuration, and velocity z' just before
     """
     kinematics = after.evaluate(z[None], v[None])
     P, A_t = kinematics.P[0], kinematics.A_t[0]
@@ -178,12 +157,11 @@ def solve_impulses(mass: Array, rows: Array, force_rows: Array, v: Array) -> tup
 
     Parameters
     ----------
-    mass : ndarray, shape (5,)
-        Diagonal of M5.
-    rows, force_rows : ndarray, shape (r, 5)
-        Constraints on the velocity after, and where the impulse of each acts: G = A without
-        friction, and then v+ is the nearest velocity in the metric M5.
-    v : ndarray, shape (5,)
+    mass : (5,)                diagonal of M5
+    rows, force_rows : (r, 5)  constraints on the velocity after, and where the impulse of each
+                               acts: G = A without friction, and then v+ is the nearest velocity in
+                               the metric M5
+    v : (5,)
     """
     lift = force_rows.T / mass[:, None]
     p = -np.linalg.solve(rows @ lift, rows @ v)

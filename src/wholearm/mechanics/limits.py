@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from ..common.arrays import Array
 from ..common.shortfalls import Parameter
 from ..contacts.cones import force_limit_rows
 from ..contacts.formation import Formation
+from .dynamics import PathForces
 
 PRESS, CONE, TORQUE, SPEED = "press", "cone", "torque", "speed"
 """Kinds of limits: least normal forces, friction cones, torques and speeds of the joints."""
@@ -33,42 +35,19 @@ EPSILON = "epsilon"
 
 @dataclass(frozen=True, eq=False)
 class MotionLimit:
-    """One limit, low <= rows y <= high, with y = (c, tau, theta').
+    """One limit, low <= rows y <= high, with y = (c, tau, theta')."""
 
-    Attributes
-    ----------
-    kind : str
-        What finds it in a `LimitSet`.
-    part : str
-        The contact or finger that it is about.
-    text : str
-        The limit in words, with its value.
-    unit : str
-        Of its rows.
-    rows : ndarray, shape (r, n_c + R + 4)
-    low, high : ndarray, shape (r,)
-        Infinite where there is none.
-    scale : float
-        What is much for it: shortfalls and misses count in this.
-    parameter : Parameter
-        The single number whose change relaxes it.
-    weight : ndarray, shape (r,)
-        By how much its bounds give way per unit of that.
-    drags : bool
-        Whether its forces depend on the speed itself, and not only on its square.
-    """
-
-    kind: str
-    part: str
-    text: str
-    unit: str
-    rows: Array
-    low: Array
+    kind: str  # what finds it in a `LimitSet`
+    part: str  # the contact or finger that it is about
+    text: str  # the limit in words, with its value
+    unit: str  # of its rows
+    rows: Array  # (r, n_c + R + 4)
+    low: Array  # low, high (r,): infinite where there is none
     high: Array
-    scale: float
-    parameter: Parameter
-    weight: Array
-    drags: bool = False
+    scale: float  # what is much for it: shortfalls and misses count in this
+    parameter: Parameter  # the single number whose change relaxes it
+    weight: Array  # (r,): by how much its bounds give way per unit of that
+    drags: bool = False  # whether its forces depend on the speed itself, and not only on its square
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,3 +193,49 @@ def _make_joint_limits(formation: Formation, _: float) -> list[MotionLimit]:
 
 MAKERS: list[Maker] = [_make_force_limits, _make_joint_limits]
 """Functions that make the limits of a formation."""
+
+
+class SideTerms(NamedTuple):
+    """Slack of one-sided limits at n places, rest + b bend + s' drag + a rate + squeeze press.
+
+    With b = s'^2 and a = s''; each of shape (n, n_sides), over what is much for a side.
+    """
+
+    rest: Array
+    bend: Array
+    drag: Array
+    rate: Array
+    press: Array
+
+    @staticmethod
+    def of(limits: LimitSet, forces: PathForces, rates: Array) -> SideTerms:
+        """The sides of some limits.
+
+        Parameters
+        ----------
+        forces          at n places
+        rates : (n, 2)  d theta / ds there
+        """
+        of_c, of_tau, of_rates = (part.T for part in limits.columns)
+        rows, signs, bounds = limits.sides
+        scale = signs / limits.scales[rows]
+
+        def measure(values: Array) -> Array:
+            return np.asarray(values[:, rows] * scale)
+
+        return SideTerms(
+            measure(forces.C0 @ of_c + forces.T0 @ of_tau) - bounds * scale,
+            measure(forces.Cb @ of_c + forces.Tb @ of_tau),
+            measure(forces.Cv @ of_c + forces.Tv @ of_tau + rates @ of_rates),
+            measure(forces.Ca @ of_c + forces.Ta @ of_tau),
+            measure(forces.Cl @ of_c + forces.Tl @ of_tau),
+        )
+
+    def pick(self, rows: Any) -> SideTerms:
+        """Some of the places."""
+        return SideTerms(*(part[rows] for part in self))
+
+    def at(self, a: Array, b: Array) -> Array:
+        """The slack without squeeze, for accelerations and squares of speeds of shape (n,)."""
+        a, b = a[:, None], b[:, None]
+        return np.asarray(self.rest + self.bend * b + self.drag * np.sqrt(b) + self.rate * a)

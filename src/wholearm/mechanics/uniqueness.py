@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..contacts.formation import Formation, Kinematics
-from .keys import UNIQUENESS
+from .margin_key import UNIQUENESS
 
 UNIQUENESS_MARGIN: float = UNIQUENESS.default
 _INDEPENDENT = 1e-12
@@ -47,24 +47,13 @@ def describe_uniqueness(ratio: float, contacts: str, place: str, least: float) -
 
 
 class Minors(NamedTuple):
-    """The least ratio of a principal minor to that without friction, at n places.
+    """The least ratio of a principal minor to that without friction, at n places."""
 
-    Attributes
-    ----------
-    ratios : ndarray, shape (n,)
-        1 where friction makes no difference; forces are not unique at zero and below.
-    choices : ndarray of int, shape (n,)
-        Whose minor it is, among `modes`.
-    modes : list of tuple of str
-        Choices of contacts: the mode of each, empty for those left out.
-    names : tuple of str
-        Of all contacts.
-    """
-
+    # (n,): 1 where friction makes no difference; forces are not unique at zero and below
     ratios: Array
-    choices: NDArray[np.int64]
-    modes: list[tuple[str, ...]]
-    names: tuple[str, ...]
+    choices: NDArray[np.int64]  # (n,): whose minor it is, among `modes`
+    modes: list[tuple[str, ...]]  # choices of contacts: the mode of each, empty for those left out
+    names: tuple[str, ...]  # of all contacts
 
     def find_least(self) -> tuple[float, str, int]:
         """The least ratio of all places, its contacts, and at which place it is."""
@@ -75,18 +64,11 @@ class Minors(NamedTuple):
 
 
 class _Choices(NamedTuple):
-    """Choices of contacts and modes with as many constraints each.
+    """Choices of contacts and modes with as many constraints each."""
 
-    Attributes
-    ----------
-    modes : tuple of tuple of str
-        Mode of each contact, empty for those left out.
-    rows, forces : ndarray of int, shape (m, k)
-        Of each choice the constraints, as rows of [A; A_t], and the forces, as rows of
-        [A - U Xi A_t; A; A_t; A - U A_t; A + U A_t].
-    """
-
-    modes: tuple[tuple[str, ...], ...]
+    modes: tuple[tuple[str, ...], ...]  # mode of each contact, empty for those left out
+    # rows, forces (m, k): of each choice the constraints, as rows of [A; A_t], and the forces, as
+    # rows of [A - U Xi A_t; A; A_t; A - U A_t; A + U A_t]
     rows: NDArray[np.int64]
     forces: NDArray[np.int64]
 
@@ -98,12 +80,9 @@ def find_minors(
 
     Parameters
     ----------
-    formation : Formation
-    kinematics : Kinematics
-    Xi : ndarray, shape (n_c,) or (n, n_c)
-        Sliding directions.
-    sticking : tuple of int
-        Contacts that do not slide there, besides those that the formation lets roll.
+    Xi : (n_c,) or (n, n_c)  sliding directions
+    sticking                 contacts that do not slide there, besides those that the formation lets
+                             roll
     """
     held, friction = {*formation.rolling_rows, *sticking}, formation.friction
     kinds = tuple((k in held, own > 0) for k, own in enumerate(friction.tolist()))

@@ -34,17 +34,10 @@ _TINY = 1e-9
 
 
 class StaticTorques(NamedTuple):
-    """The polygon normals @ tau <= bounds, with normals of length one.
+    """The polygon normals @ tau <= bounds, with normals of length one."""
 
-    Attributes
-    ----------
-    normals : ndarray, shape (m, 2)
-    bounds : ndarray, shape (m,), [N m]
-        A single one of minus infinity where nothing can be held.
-    """
-
-    normals: Array
-    bounds: Array
+    normals: Array  # (m, 2)
+    bounds: Array  # (m,) [N m]: a single one of minus infinity where nothing can be held
 
     def measure(self, tau: Array) -> Array:
         """How far torques, shape (n, 2), are beyond the polygon; negative inside, (n,) [N m]."""

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 from ..common.arrays import Array
 from ..common.errors import InfeasibleError, InputError, JammingError, SolverError
 from ..common.plain import plain
-from ..common.shortfalls import Change, Parameter, Place, Shortfall
+from ..common.shortfalls import Change, LimitPlace, Parameter, Shortfall
 from ..contacts.formation import Formation
 from ..mechanics.limits import LimitSet
 from ..results.torque import TorqueProfile
@@ -60,17 +60,14 @@ class Advice(NamedTuple):
 
 
 def list_shortfalls(
-    limits: LimitSet, values: Array, locate: Callable[[int], Place]
+    limits: LimitSet, values: Array, locate: Callable[[int], LimitPlace]
 ) -> list[Shortfall]:
     """What a motion is short of, each limit where it is worst.
 
     Parameters
     ----------
-    limits : LimitSet
-    values : ndarray, shape (n, m)
-        What the limits are of at n places of the motion.
-    locate : callable
-        Says where the k-th place is.
+    values : (n, m)  what the limits are of at n places of the motion
+    locate           says where the k-th place is
     """
     short = limits.fold(-limits.find_slack(values))
     found = []
@@ -126,16 +123,12 @@ def advise(
 
     Parameters
     ----------
-    text : str
-        What cannot be kept.
-    parameters : iterable of Parameter
-        What may be changed.
-    find_value : callable
-        As of `find_changes`; NaN where it cannot tell.
-    replan : callable or None
-        Plans with another value of a parameter, or raises; without it no change is looked for.
-    seconds : float, [s]
-        Processor time after which no further change is tried.
+    text           what cannot be kept
+    parameters     what may be changed
+    find_value     as of `find_changes`; NaN where it cannot tell
+    replan         plans with another value of a parameter, or raises; without it no change is
+                   looked for
+    seconds : [s]  processor time after which no further change is tried
     """
     if replan is None or _unadvised.get():
         return Advice(text, ())
@@ -201,12 +194,9 @@ def find_changes(
 
     Parameters
     ----------
-    parameters : iterable of Parameter
-    find_value : callable
-        The value of a parameter at which its limits just let the others be kept, or None if none
-        does.
-    can_plan : callable
-        Whether there is a plan with this value of a parameter.
+    find_value  the value of a parameter at which its limits just let the others be kept, or None if
+                none does
+    can_plan    whether there is a plan with this value of a parameter
 
     Returns
     -------

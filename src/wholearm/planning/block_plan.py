@@ -24,32 +24,15 @@ FINEST = 64
 
 @dataclass(frozen=True, eq=False)
 class BlockPlan:
-    """A block as it is planned.
-
-    Attributes
-    ----------
-    phases : tuple of Phase
-    start : ndarray, shape (5,)
-        Where it starts.
-    finer : int
-        How often its intervals are doubled, or `PLAIN` or `BEGUN`.
-    duration : float or None, [s]
-        Its longest duration, for the objective `margin`.
-    fastest : list of PhasePlan
-        Plans of least duration from this start, if they were made for it.
-    plans : list of PhasePlan
-        One for each of its phases.
-    chain : ImpactSequence or None
-        Its curves; None if it is planned in the time domain.
-    """
+    """A block as it is planned."""
 
     phases: tuple[Phase, ...]
-    start: Array
-    finer: int
-    duration: float | None
-    fastest: Plans
-    plans: Plans
-    chain: ImpactSequence | None
+    start: Array  # (5,): where it starts
+    finer: int  # how often its intervals are doubled, or `PLAIN` or `BEGUN`
+    duration: float | None  # [s]: its longest duration, for the objective `margin`
+    fastest: Plans  # plans of least duration from this start, if they were made for it
+    plans: Plans  # one for each of its phases
+    chain: ImpactSequence | None  # its curves; None if it is planned in the time domain
 
     @property
     def end(self) -> Array:
@@ -76,41 +59,27 @@ class BlockPlan:
 
 @dataclass(frozen=True, eq=False)
 class Planning:
-    """The plans of all phases of a problem.
-
-    Attributes
-    ----------
-    problem : Problem
-    curves : tuple of Curve
-        Those of the first phases: as far as geometry alone says where phases end.
-    options : PlanOptions
-    blocks : tuple of BlockPlan
-    shares, allowed : list of float or None, [s]
-        The longest duration of each phase, for the objective `margin`: in proportion to plans of
-        least duration, and as used, where a block turned out to start from somewhere else.
-    least : list of PhasePlan
-        Those plans of least duration; empty for other objectives.
-    pinned : bool
-        Whether blocks end where those plans do.
-    ahead : bool
-        Whether blocks end with regard to what follows them. Plans that durations are shared out
-        by do not, as blocks for the objective `margin` cannot.
-    sketches : bool
-        Whether least times of what follows a block are those of a sweep, where it ends by them.
-    more : dict, [N]
-        By how much normal forces of blocks, by their indices, have to exceed epsilon, if at all.
-    """
+    """The plans of all phases of a problem."""
 
     problem: Problem
+    # those of the first phases: as far as geometry alone says where phases end
     curves: tuple[Curve, ...]
     options: PlanOptions
     blocks: tuple[BlockPlan, ...]
+    # shares, allowed [s]: the longest duration of each phase, for the objective `margin`: in
+    # proportion to plans of least duration, and as used, where a block turned out to start from
+    # somewhere else
     shares: list[float | None]
     allowed: list[float | None]
+    # those plans of least duration; empty for other objectives
     least: Plans = field(default_factory=list)
-    pinned: bool = False
+    pinned: bool = False  # whether blocks end where those plans do
+    # whether blocks end with regard to what follows them. Plans that durations are shared out by do
+    # not, as blocks for the objective `margin` cannot.
     ahead: bool = True
+    # whether least times of what follows a block are those of a sweep, where it ends by them
     sketches: bool = False
+    # [N]: by how much normal forces of blocks, by their indices, have to exceed epsilon, if at all
     more: dict[int, float] = field(default_factory=dict)
 
     @property
@@ -124,7 +93,7 @@ class Planning:
         plans, phases = self.plans, self.problem.phases
         if not self.problem.is_settled:
             return Settled(plans, (None,) * len(phases))
-        from .settling import settle_plans
+        from .dwell import settle_plans
 
         return settle_plans(self.problem, plans)
 

@@ -14,13 +14,8 @@ from typing import Any
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import (
-    InfeasibleError,
-    InputError,
-    SolverError,
-    WholearmError,
-    name_source,
-)
+from ..common.errors import InfeasibleError, InputError, SolverError, WholearmError, name_source
+from ..common.shortfalls import Change, Parameter
 from ..geometry.cost_to_go import CostToGo
 from ..geometry.curve import Curve
 from ..geometry.tracing import trace_phase
@@ -29,17 +24,18 @@ from ..problem.definition import Phase, Problem
 from ..results.trajectory import Motion
 from ..scene.model import Scene
 from ..solvers.statistics import charge
-from .ahead import look_ahead
 from .block_plan import BEGUN, FINEST, PLAIN, BlockPlan, Planning
-from .durations import share_again, share_duration
-from .motors import explain_motors, require_steps
+from .lower_bound.lower_bound import look_along
+from .lower_bound.speed_sweep import NoMotionError
 from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence, make_sequence
 from .path_domain.sequence_plan import plan_sequence, plan_slowly
-from .phase_plan import add_up
-from .splitting import leads_on, runs_along_curves, split_blocks
-from .stops import Plans
+from .phase_plan import PhasePlan, add_up
+from .rate_limits import explain_motors, free_torques, require_steps
+from .stops import Plans, leads_on, runs_along_curves, split_blocks
 
+SKETCH = 24
+"""Intervals on which what follows a block is looked at where it is only sketched."""
 CLEAR = 0.05
 """Least shortfall, over what is much for a limit, that no better plan of phases before mends."""
 COARSE = 80
@@ -64,17 +60,12 @@ def plan_blocks(
 
     Parameters
     ----------
-    problem : Problem
-    curves : tuple of Curve
-        Those of its first phases, as `trace_phases` finds them.
-    options : PlanOptions
-    report : callable
-        Told in a few words what is being done.
+    curves  those of its first phases, as `trace_phases` finds them
+    report  told in a few words what is being done
 
     Raises
     ------
-    InputError, InfeasibleError, JammingError, SolverError
-        If there is no plan.
+    InputError, InfeasibleError, JammingError, SolverError  if there is no plan
     """
     with name_source(problem.source):
         require_steps(problem, options)
@@ -154,8 +145,7 @@ def _begin_each(planning: Planning, report: Callable[[str], None]) -> Planning:
 
     Raises
     ------
-    InfeasibleError
-        If a block surely has no plan, wherever exactly the one before it ends.
+    InfeasibleError  if a block surely has no plan, wherever exactly the one before it ends
     """
     blocks, begun = split_blocks(planning.problem), planning
     over_time = [not runs_along_curves(own, planning.options) for own in blocks]
@@ -258,7 +248,7 @@ def plan_block(
     problem, known = planning.problem, planning.curves
     allowed = [None] * len(problem.phases) if allowed is None else allowed
     if not runs_along_curves(block, options):
-        from .time_domain.impacts import plan_with_impacts
+        from .time_domain.time_impacts import plan_with_impacts
 
         def plan(duration: float | None) -> Plans:
             pinned = planning.pinned or leads_on(problem, block, options)
@@ -271,7 +261,7 @@ def plan_block(
         with charge(block[0].number):
             try:
                 if problem.scene.has_slow_motors:
-                    from .pauses import plan_with_pauses
+                    from .pause_junctions import plan_with_pauses
 
                     return plan_with_pauses(planning, block, plan, add_up(block, allowed)), None
                 return plan(add_up(block, allowed)), None
@@ -285,7 +275,7 @@ def plan_block(
     chain = make_sequence(block, curves)
     parts = chain.split()
     if problem.scene.has_slow_motors:
-        from .pauses import find_beside
+        from .pause_junctions import find_beside
 
         beside = find_beside(planning, block, chain.curves[-1].end, options)
         longest = [add_up(part.phases, allowed) for part in parts]
@@ -329,3 +319,87 @@ def _distance(scene: Scene, one: Array, other: Array) -> float:
 def _starts_off(scene: Scene, motion: Motion, z: Array) -> bool:
     """Whether a motion starts somewhere else than at `z`."""
     return _distance(scene, motion.evaluate(np.zeros(1)).z[0], z) > APART
+
+
+def look_ahead(
+    planning: Planning,
+    block: Sequence[Phase],
+    options: PlanOptions,
+    plan_block: Callable[..., tuple[Plans, ImpactSequence | None]],
+) -> CostToGo | None:
+    """What follows a block in the time domain, if that decides where on a curve it should end."""
+    # How much more what follows costs from farther away is nearly the same, and known soon.
+    problem, options = free_torques(planning.problem, options)
+    planning, index = replace(planning, problem=problem), block[-1].index + 1
+    if runs_along_curves(block, options) or index == len(problem.phases):
+        return None
+    phase, ending = problem.phases[index], block[-1]
+    until = ending.until.contact
+    gained = set(phase.formation.contacts) - set(ending.formation.contacts)
+    following = next(own for own in split_blocks(problem) if own[0] is phase)
+    if (
+        options.goal is Objective.MARGIN
+        or until is None
+        or ending.until.pins
+        or gained != {until}
+        or not runs_along_curves(following, options)
+    ):
+        return None
+
+    def value(z: Array) -> float:
+        if planning.sketches and options.goal is Objective.TIME:
+            return _sketch(phase, z, problem.epsilon)
+        return sum(plan.value for plan in plan_block(planning, following, z, options)[0])
+
+    return CostToGo(phase, value)
+
+
+def _sketch(phase: Phase, z: Array, epsilon: float) -> float:
+    """About the least time of a phase along its curve from `z` [s]."""
+    try:
+        return look_along((trace_phase(phase, z),), epsilon, SKETCH)
+    except NoMotionError:
+        raise SolverError(f"phase {phase.number}: no motion keeps the limits") from None
+
+
+def share_again(
+    allowed: list[float | None],
+    block: Sequence[Phase],
+    least: Sequence[PhasePlan[Motion]],
+    fastest: Sequence[PhasePlan[Motion]],
+) -> None:
+    """Give a block its share for another least duration, at the cost of the phases after it."""
+    later = range(block[-1].index + 1, len(allowed))
+    rest = sum(allowed[k] or 0.0 for k in later)
+    if not rest:
+        return
+    gain = 0.0
+    for phase, plan in zip(block, fastest, strict=True):
+        own = allowed[phase.index]
+        if own is not None:
+            ratio = plan.motion.duration / least[phase.index].motion.duration
+            gain += own * (ratio - 1)
+            allowed[phase.index] = own * ratio
+    for k in later:
+        own = allowed[k]
+        allowed[k] = None if own is None else own * (1 - gain / rest)
+
+
+def share_duration(
+    least: Sequence[PhasePlan[Motion]], duration: float | None
+) -> list[float | None]:
+    """Longest duration of each phase [s]: the whole, shared in proportion to the least times."""
+    times = [plan.motion.duration for plan in least]
+    total = 2 * sum(times) if duration is None else duration
+    if total <= sum(times):
+        from .advice import describe_changes, round_outwards
+
+        # The least-time plan shows it; a little more leaves something to choose.
+        own = Parameter("duration", total, "s", 1, "duration")
+        enough = Change(own, round_outwards(1.005 * sum(times), 1))
+        raise InfeasibleError(
+            f"duration = {total:g} s is not longer than the least time, {sum(times):.6g} s; "
+            f"{describe_changes([enough])}",
+            changes=[enough],
+        )
+    return [total / sum(times) * own for own in times]

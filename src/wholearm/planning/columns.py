@@ -46,8 +46,7 @@ class Columns:
 
         Raises
         ------
-        ValueError
-            If a block is missing, unknown or of another size.
+        ValueError  if a block is missing, unknown or of another size
         """
         tables = {name: np.asarray(block) for name, block in blocks.items()}
         self._check({name: table.shape[-1] for name, table in tables.items()})

@@ -28,27 +28,13 @@ PER_SPEED = " per m/s"
 
 @dataclass(frozen=True, eq=False)
 class BlockImpact:
-    """An impact between two phases of a block, for unit speed before it.
+    """An impact between two phases of a block, for unit speed before it."""
 
-    Attributes
-    ----------
-    before : int
-        Index in the block of the phase that it ends.
-    impact : Impact
-        Velocities per m/s, hence without unit and in rad/m; impulses in N s per m/s.
-    ratio : float
-        Speed after over speed before.
-    reason : str
-        Why the motion stops there instead; empty if it passes at speed.
-    speed : float, [m/s]
-        Before the impact; zero at a stop.
-    """
-
-    before: int
-    impact: Impact
-    ratio: float
-    reason: str
-    speed: float
+    before: int  # index in the block of the phase that it ends
+    impact: Impact  # velocities per m/s, hence without unit and in rad/m; impulses in N s per m/s
+    ratio: float  # speed after over speed before
+    reason: str  # why the motion stops there instead; empty if it passes at speed
+    speed: float  # [m/s]: before the impact; zero at a stop
 
     @property
     def passed(self) -> bool:
@@ -69,18 +55,11 @@ def assess_impacts(
 
     Parameters
     ----------
-    block : sequence of Phase
-    impacts : sequence of BlockImpact
-        All that the block asks for.
-    plans : sequence of PhasePlan
-        Of the block.
-    plan_part : callable
-        See `PlanPart`.
-    options : PlanOptions
-    allowed : sequence of float or None, [s]
-        Longest duration of each phase of the problem, for the objective `margin`.
-    report : callable
-        Told in a few words what is being done.
+    impacts        all that the block asks for
+    plans          of the block
+    plan_part      see `PlanPart`
+    allowed : [s]  longest duration of each phase of the problem, for the objective `margin`
+    report         told in a few words what is being done
     """
     stops = [0, *(own.before + 1 for own in impacts if not own.passed), len(block)]
     found = []

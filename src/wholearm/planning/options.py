@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
+from ..common.command_options import read_options
 from ..common.errors import InputError
 from ..common.fields import declare, read_keys
-from ..common.options import read_options
-from ..mechanics.keys import UNIQUENESS
+from ..mechanics.margin_key import UNIQUENESS
 
 
 class Objective(Enum):
@@ -70,8 +70,7 @@ class PlanOptions:
 
     Raises
     ------
-    InputError
-        If an option is out of its range.
+    InputError  if an option is out of its range
     """
 
     objective: Objective | str = Objective.TIME

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Generic, NamedTuple, TypeVar
 
 from ..problem.definition import Phase
-from ..results.settling import Settling
+from ..results.dwell_record import Settling
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion
 from .options import Objective
@@ -17,41 +17,24 @@ M_co = TypeVar("M_co", bound=Motion, covariant=True)
 
 
 class PhasePlan(NamedTuple, Generic[M_co]):
-    """The plan of one phase.
-
-    Attributes
-    ----------
-    motion : Motion
-    torque : TorqueProfile
-        From the start of the phase.
-    value : float
-        The phase's share of the objective: s, (N m)^2 s or N.
-    sequences : int
-        Sequences of contact modes that were tried, of phases in one NLP booked to the first; none
-        along curves.
-    complete : bool
-        Whether the search for contact modes has tried all that promised to be better.
-    attempt : str
-        Name of the guess that led to it; none along curves.
-    stages : sequence
-        The stages that it was solved on, in the scene's own units; none along curves.
-    error : float
-        Estimate of how far the value of all phases in one NLP is from their best, relative to it.
-    solution : object
-        What the solver has found, of the first of the phases in one NLP that are only begun.
-    unheld : float
-        Its value with torques that are not held over control periods, if they are.
-    """
+    """The plan of one phase."""
 
     motion: M_co
-    torque: TorqueProfile
-    value: float
+    torque: TorqueProfile  # from the start of the phase
+    value: float  # the phase's share of the objective: s, (N m)^2 s or N
+    # sequences of contact modes that were tried, of phases in one NLP booked to the first; none
+    # along curves
     sequences: int = 0
+    # whether the search for contact modes has tried all that promised to be better
     complete: bool = True
-    attempt: str = ""
+    attempt: str = ""  # name of the guess that led to it; none along curves
+    # the stages that it was solved on, in the scene's own units; none along curves
     stages: Sequence[object] = ()
+    # estimate of how far the value of all phases in one NLP is from their best, relative to it
     error: float = math.nan
+    # what the solver has found, of the first of the phases in one NLP that are only begun
     solution: object = None
+    # its value with torques that are not held over control periods, if they are
     unheld: float = math.nan
 
 
@@ -64,21 +47,11 @@ class Settled(NamedTuple):
 
 @dataclass
 class Tried:
-    """What a search for contact modes has done.
+    """What a search for contact modes has done."""
 
-    Attributes
-    ----------
-    sequences : int
-        Of modes that were tried.
-    complete : bool
-        Whether none was left to try.
-    iterations : int
-        Of the solver.
-    """
-
-    sequences: int = 1
-    complete: bool = True
-    iterations: int = 0
+    sequences: int = 1  # of modes that were tried
+    complete: bool = True  # whether none was left to try
+    iterations: int = 0  # of the solver
 
 
 def add_up(phases: Sequence[Phase], allowed: Sequence[float | None]) -> float | None:

@@ -7,24 +7,27 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from .. import __version__
-from ..common.errors import InfeasibleError, SolverError
+from ..common.errors import AmbiguityError, InfeasibleError, SolverError
 from ..common.plain import plain
-from ..common.pulse import OutOfTime, Reporter, limited
 from ..common.sharing import exclusive
-from ..geometry.curve import Curve
+from ..common.signals import OutOfTime, Reporter, limited
+from ..geometry.curve import Curve, describe_pose
 from ..geometry.tracing import trace_phases
+from ..mechanics.uniqueness import describe_uniqueness
 from ..problem.check import require_phases
 from ..problem.definition import Problem
+from ..results.report import UniquenessMargin
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory, assemble
 from ..results.transition import Transition
 from ..solvers.statistics import Ledger, open_ledger
+from ..verification.force_uniqueness import find_uniqueness_margin, find_wedged
 from .block_plan import Planning
 from .blocks import plan_blocks
 from .impacts import assess_impacts
@@ -33,10 +36,13 @@ from .path_domain import sequence_plan
 from .phase_plan import combine
 from .result import Plan, PlannedPhase, Status, Timings
 from .saved import write_meta
-from .sureness import Sureness, check_sureness
 
 if TYPE_CHECKING:
-    from .self_check import Checked
+    from .replay_check import Checked
+
+
+_STILL = 1e-9
+"""Speed of a plan that is rest but for rounding, relative to the scene's."""
 
 
 def solve(
@@ -64,16 +70,14 @@ def solve(
 
     Returns
     -------
-    Plan
-        Its motions satisfy the equations of motion at any instant.
+    Plan  its motions satisfy the equations of motion at any instant
 
     Raises
     ------
-    InputError
-        If an option is out of its range or the problem's phases cannot be traced.
-    InfeasibleError, JammingError, SolverError, ReplayError
-        If there is no plan, or none that holds in its replay; names phase, limit, place and time.
-        A SolverError says what was being done when the time was over.
+    InputError  if an option is out of its range or the problem's phases cannot be traced
+    InfeasibleError, JammingError, SolverError, ReplayError  if there is no plan, or none that holds
+        in its replay; names phase, limit, place and time. A SolverError says what was being done
+        when the time was over.
     """
     own = PlanOptions(objective=objective, **options)
     return solve_with(problem, own, progress, time_limit)
@@ -124,22 +128,17 @@ def finish_plan(
 
     Parameters
     ----------
-    planning : Planning
-    report : callable
-        Told in a few words what is being done.
-    ledger : Ledger
-        What solving has cost so far, and what is booked from here on.
-    begun : (float, float), [s]
-        When tracing the phases began and ended, by `time.perf_counter`.
-    checked : Checked, optional
-        The trajectory of the planning and what its replay has shown, if that is known.
+    report       told in a few words what is being done
+    ledger       what solving has cost so far, and what is booked from here on
+    begun : [s]  when tracing the phases began and ended, by `time.perf_counter`
+    checked      the trajectory of the planning and what its replay has shown, if that is known
     """
     problem, options = planning.problem, planning.options
     trajectory, figures = checked.trajectory if checked else assemble_plan(planning), None
     sure = check_sureness(problem, trajectory, options.uniqueness_margin)
     planned = time.perf_counter()
     if options.replay:
-        from .self_check import replay_plan
+        from .replay_check import replay_plan
 
         first = trajectory
         given = planning, trajectory, assemble_plan, report, checked
@@ -254,7 +253,7 @@ def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transitio
         if len(block.phases) == 1:
             continue
         if block.chain is None:
-            from .time_domain.impacts import list_impacts, plan_parts_of
+            from .time_domain.time_impacts import list_impacts, plan_parts_of
 
             impacts = list_impacts(block.phases, block.plans)
             plan_part = plan_parts_of(planning.problem, block.phases)
@@ -263,4 +262,34 @@ def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transitio
             plan_part = sequence_plan.plan_parts_of(block.chain, planning.problem.epsilon)
         given = block.phases, impacts, block.plans, plan_part
         found += assess_impacts(*given, planning.options, planning.allowed, report)
+    return found
+
+
+class Sureness(NamedTuple):
+    """The uniqueness margin of a phase, and for how long it may stay wedged; see `PlannedPhase`."""
+
+    uniqueness_margin: UniquenessMargin | None
+    wedged: float | None
+
+
+def check_sureness(problem: Problem, trajectory: Trajectory, least: float) -> list[Sureness]:
+    """Measure every phase of a plan.
+
+    Parameters
+    ----------
+    least  least uniqueness margin (`mechanics.uniqueness`)
+
+    Raises
+    ------
+    AmbiguityError  if a phase has a lesser one
+    """
+    found = []
+    for phase in problem.phases:
+        rows = np.flatnonzero(trajectory.phase == phase.index)
+        margin = find_uniqueness_margin(phase, trajectory, rows)
+        if margin is not None and margin.value < least:
+            place = describe_pose(trajectory.z[np.searchsorted(trajectory.t, margin.time)])
+            text = describe_uniqueness(margin.value, margin.contacts, place, least)
+            raise AmbiguityError(f"phase {phase.number}: {text}")
+        found.append(Sureness(margin, find_wedged(problem, phase, trajectory, rows, _STILL)))
     return found

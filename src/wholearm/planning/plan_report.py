@@ -22,11 +22,8 @@ def describe_plan(plan: Plan, output: str = "", table: Mapping[str, Any] | None 
 
     Parameters
     ----------
-    plan : Plan
-    output : str
-        The trajectory file, if one is written.
-    table : mapping, optional
-        Name and figures of the torque table, if one is written; see `planning.table_check`.
+    output  the trajectory file, if one is written
+    table   name and figures of the torque table, if one is written; see `planning.table_check`
     """
     figure = f"{plan.value:.6f}" if abs(plan.value) >= 1e-2 else f"{plan.value:.6g}"
     value = f"{plan.status.value}: {plan.options.goal.value} = {figure} {plan.unit}"

@@ -15,11 +15,10 @@ from .block_plan import Planning
 from .blocks import plan_blocks
 from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence
-from .path_domain.motion import PathMotion
-from .path_domain.widest import find_widest
+from .path_domain.path_motion import PathMotion
+from .path_domain.range_factor import find_widest
 from .phase_plan import combine
-from .robust.rows import Guide
-from .robust.start import list_holds, measure_holds
+from .robust.robust_rows import Guide, list_holds, measure_holds
 
 WIDEST = 0.95
 """Largest relative range that is tried."""

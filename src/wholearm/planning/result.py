@@ -15,11 +15,11 @@ from numpy.typing import ArrayLike
 from ..common.document import Document, Drawn, Result
 from ..problem.definition import Problem
 from ..results.certificate import Certificate
-from ..results.modes import ModeSpan
+from ..results.dwell_record import Settling
+from ..results.mode_names import ModeSpan
 from ..results.range_figures import RangeFigures
 from ..results.replay_figures import ReplayFigures
 from ..results.report import UniquenessMargin
-from ..results.settling import Settling
 from ..results.trajectory import Samples, Trajectory
 from ..results.transition import Transition
 from ..solvers.statistics import SolverStatistics
@@ -47,71 +47,41 @@ class Status(Enum):
 
 
 class PlannedPhase(NamedTuple):
-    """One phase of a plan.
+    """One phase of a plan."""
 
-    Attributes
-    ----------
-    number : int
-        From 1.
-    value : float
-        Its share of the objective: s, (N m)^2 s or N.
-    duration : float, [s]
-    rolling : tuple of str
-        Contacts that the problem lets roll.
-    modes : tuple of ModeSpan
-        Contact modes in the time domain; none along a curve.
-    sequences : int
-        Sequences of modes that were tried; of phases planned as one booked to the first.
-    complete : bool
-        Whether every sequence of modes that promised to be better was tried.
-    attempt : str
-        The guess that it was found from, in the time domain.
-    error : float
-        Estimate of how far the value of the phases planned as one with this one is from their best,
-        relative to it.
-    statistics : SolverStatistics
-        Everything that was solved for this phase, or for phases planned as one from this one on:
-        for the plan itself and on the way to it, for its refinement and to assess its impacts.
-    uniqueness_margin : UniquenessMargin or None
-        Of its contact forces; None in files of earlier versions.
-    wedged : float or None, [s]
-        For how long friction could hold everything at rest; None if it does not begin so.
-    settling : Settling or None
-        How its end is held, if it is to be; `duration` includes that.
-    unheld : float or None
-        `value` with torques that are not held over control periods, if they are.
-    """
-
-    number: int
-    value: float
-    duration: float
-    rolling: tuple[str, ...]
-    modes: tuple[ModeSpan, ...]
+    number: int  # from 1
+    value: float  # its share of the objective: s, (N m)^2 s or N
+    duration: float  # [s]
+    rolling: tuple[str, ...]  # contacts that the problem lets roll
+    modes: tuple[ModeSpan, ...]  # contact modes in the time domain; none along a curve
+    # sequences of modes that were tried; of phases planned as one booked to the first
     sequences: int
-    complete: bool
-    attempt: str
+    complete: bool  # whether every sequence of modes that promised to be better was tried
+    attempt: str  # the guess that it was found from, in the time domain
+    # estimate of how far the value of the phases planned as one with this one is from their best,
+    # relative to it
     error: float
+    # everything that was solved for this phase, or for phases planned as one from this one on: for
+    # the plan itself and on the way to it, for its refinement and to assess its impacts
     statistics: SolverStatistics
+    # of its contact forces; None in files of earlier versions
     uniqueness_margin: UniquenessMargin | None = None
+    # [s]: for how long friction could hold everything at rest; None if it does not begin so
     wedged: float | None = None
+    # how its end is held, if it is to be; `duration` includes that
     settling: Settling | None = None
+    # `value` with torques that are not held over control periods, if they are
     unheld: float | None = None
 
 
 class Timings(NamedTuple):
-    """Seconds that planning took.
+    """Seconds that planning took."""
 
-    Attributes
-    ----------
-    trace, plan, replay, assess : float
-        Tracing curves; everything up to the first plan; its replay, with what that made plan again,
-        which is in `plan` where a search has replayed the parts of a route; what impacts save.
-    build, solve : float
-        Building NLPs and solving them, in all of these.
-    """
-
+    # trace, plan, replay, assess: tracing curves; everything up to the first plan; its replay, with
+    # what that made plan again, which is in `plan` where a search has replayed the parts of a
+    # route; what impacts save
     trace: float
-    build: float
+    build: float  # build, solve: building NLPs and solving them, in all of these
     solve: float
     plan: float
     replay: float
@@ -120,43 +90,21 @@ class Timings(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Plan(Drawn, Result):
-    """A planned motion with what it was asked and what is known about it.
-
-    Attributes
-    ----------
-    problem : Problem
-    options : PlanOptions
-    status : Status
-    value : float
-        Of the objective, in `unit`.
-    trajectory : Trajectory
-        The motion. Its `meta` says the same as the plan in plain values, for files.
-    phases : tuple of PlannedPhase
-    transitions : tuple of Transition
-        Impacts that the problem asks for.
-    replay : ReplayFigures or None
-        None if the plan was not replayed.
-    timings : Timings
-    versions : mapping of str
-        Of this package and those that it plans with.
-    certificate : Certificate or None
-        Lower bounds of the durations, if they were asked for.
-    ranges : RangeFigures or None
-        What ranges cost, for a robust plan.
-    """
+    """A planned motion with what it was asked and what is known about it."""
 
     problem: Problem
     options: PlanOptions
     status: Status
-    value: float
+    value: float  # of the objective, in `unit`
+    # the motion. Its `meta` says the same as the plan in plain values, for files.
     trajectory: Trajectory = field(repr=False)
     phases: tuple[PlannedPhase, ...]
-    transitions: tuple[Transition, ...]
-    replay: ReplayFigures | None
+    transitions: tuple[Transition, ...]  # impacts that the problem asks for
+    replay: ReplayFigures | None  # none if the plan was not replayed
     timings: Timings
-    versions: Mapping[str, str]
-    certificate: Certificate | None = None
-    ranges: RangeFigures | None = None
+    versions: Mapping[str, str]  # of this package and those that it plans with
+    certificate: Certificate | None = None  # lower bounds of the durations, if they were asked for
+    ranges: RangeFigures | None = None  # what ranges cost, for a robust plan
 
     @property
     def headline(self) -> str:

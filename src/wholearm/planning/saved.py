@@ -86,8 +86,7 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
 
     Raises
     ------
-    InputError
-        If the file cannot be read, or is no plan: a replay, or one without its problem.
+    InputError  if the file cannot be read, or is no plan: a replay, or one without its problem
     """
     trajectory = load_trajectory(path)
     source = str(path)

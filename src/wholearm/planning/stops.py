@@ -10,6 +10,8 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import InfeasibleError
+from ..geometry.tracing import runs_on_curve
+from ..problem.definition import End, Phase, Problem
 from ..results.trajectory import Motion
 from .options import Objective, PlanOptions
 from .phase_plan import PhasePlan
@@ -31,23 +33,17 @@ def plan_stops(
 
     Parameters
     ----------
-    plan_part : callable
-        See `PlanPart`.
-    bounds : sequence of int
-        Indices in the block of the phases that start at rest, and what follows the last one.
-    z : ndarray, shape (5,)
-        Where the first of them starts.
-    options : PlanOptions
-    duration : float, optional, [s]
-        Longest duration in all, for the objective `margin`: parts between stops share it in
-        proportion to their least times.
+    plan_part       see `PlanPart`
+    bounds          indices in the block of the phases that start at rest, and what follows the last
+                    one
+    z : (5,)        where the first of them starts
+    duration : [s]  longest duration in all, for the objective `margin`: parts between stops share
+                    it in proportion to their least times
 
     Raises
     ------
-    InfeasibleError
-        If a part has no plan, or the duration is shorter than the least time.
-    SolverError
-        If the solver stops without an answer.
+    InfeasibleError  if a part has no plan, or the duration is shorter than the least time
+    SolverError      if the solver stops without an answer
     """
     parts = list(pairwise(bounds))
     allowed = [duration] * len(parts)
@@ -85,3 +81,39 @@ def end_of(plan: PhasePlan[Motion]) -> tuple[Array, Array]:
     """Configuration z and velocity z' at the end of a phase, shape (5,) each."""
     samples = plan.motion.evaluate(np.array([plan.motion.duration]))
     return samples.z[0], samples.z_dot[0]
+
+
+def split_blocks(problem: Problem) -> list[tuple[Phase, ...]]:
+    """Phases that have to be planned together: those joined smoothly or by impacts."""
+    blocks: list[tuple[Phase, ...]] = []
+    block: tuple[Phase, ...] = ()
+    for phase in problem.phases:
+        block = (*block, phase)
+        if phase.end is End.REST:
+            blocks.append(block)
+            block = ()
+    return blocks
+
+
+def runs_along_curves(block: Sequence[Phase], options: PlanOptions) -> bool:
+    """Whether phases are planned along their curves: a single one, or several that slide."""
+    if options.transcription != "auto":
+        return False
+    if len(block) == 1:
+        return runs_on_curve(block[0])
+    return all(
+        phase.formation.n_constraints == 4
+        and not phase.formation.rolling
+        and not phase.until.is_release
+        for phase in block
+    )
+
+
+def leads_on(problem: Problem, block: Sequence[Phase], options: PlanOptions) -> bool:
+    """Whether what follows a block in the time domain is planned there, too.
+
+    Where it can begin is then known of the plans of least duration alone.
+    """
+    following = problem.phases[block[-1].index + 1 :]
+    own = next((part for part in split_blocks(problem) if part[0] in following), None)
+    return own is not None and not runs_along_curves(own, options)

@@ -14,7 +14,7 @@ from ..problem.definition import Problem
 from ..results.report import Report
 from ..results.torque_table import ERROR, format_rows, place_rows, read_rows, sample_rows
 from ..results.trajectory import Trajectory
-from ..verification.motors import describe_motors, find_commands
+from ..verification.margins import describe_motors, find_commands
 from ..verification.verdict import Allowance, find_least_force
 from ..verification.verify import judge, observe
 
@@ -25,23 +25,14 @@ ATTEMPTS = 3
 
 
 class TorqueTable(NamedTuple):
-    """Rows of torques, and what their replay does.
+    """Rows of torques, and what their replay does."""
 
-    Attributes
-    ----------
-    rows : ndarray, shape (n, 3), [s, N m, N m]
-        t, tau_1 and tau_2; a time given twice is a step.
-    figures : dict
-        Plain values: number of rows, rate and interpolation of samples, and from the replay whether
-        it holds, why, and the arrival and the least normal force of each phase beside those of the
-        plan.
-    commands : ndarray, shape (n, 2), or None, [N m]
-        What motors that lag are told at these times.
-    """
-
-    rows: Array
+    rows: Array  # (n, 3) [s, N m, N m]: t, tau_1 and tau_2; a time given twice is a step
+    # plain values: number of rows, rate and interpolation of samples, and from the replay whether
+    # it holds, why, and the arrival and the least normal force of each phase beside those of the
+    # plan
     figures: dict[str, Any]
-    commands: Array | None = None
+    commands: Array | None = None  # (n, 2) [N m]: what motors that lag are told at these times
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the rows as CSV."""
@@ -59,17 +50,13 @@ def make_table(problem: Problem, trajectory: Trajectory, replay: bool = True) ->
 
     Parameters
     ----------
-    problem : Problem
-    trajectory : Trajectory
-    replay : bool
-        Whether to replay them.
+    replay  whether to replay them
 
     Raises
     ------
-    ReplayError
-        If the replay of the table loses a contact or misses the goal, however dense its rows are.
-    JammingError, SimulationError
-        If the simulation cannot go on.
+    ReplayError                    if the replay of the table loses a contact or misses the goal,
+                                   however dense its rows are
+    JammingError, SimulationError  if the simulation cannot go on
     """
     slow = problem.scene.has_slow_motors
     rate_limit = problem.scene.torque_rate_limit if slow else None
@@ -114,8 +101,7 @@ def sample_table(
 
     Raises
     ------
-    InputError
-        If the rate or the interpolation is not one that is allowed.
+    InputError  if the rate or the interpolation is not one that is allowed
     """
     rows = sample_rows(trajectory.torque, rate, interpolation)
     commands = _list_commands(problem, trajectory, rows)

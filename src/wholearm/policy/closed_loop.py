@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ..common.arrays import Array
-from .policy import Policy
+from .playback import Policy
 
 ROOM = 1.0
 """Time that a simulation goes on after the policy's own, over that."""
@@ -18,19 +18,14 @@ class ClosedLoop:
 
     Parameters
     ----------
-    policy : Policy
-        It is copied: many may be under way.
-    phase : int
-        Number of the phase to begin with.
-    delay : float, optional, [s]
-        Of the torques; the policy's if left out.
-    gains : tuple of two float
-        What the torques are over those that are asked for.
+    policy       it is copied: many may be under way
+    phase        number of the phase to begin with
+    delay : [s]  of the torques; the policy's if left out
+    gains        what the torques are over those that are asked for
 
     Attributes
     ----------
-    began : dict of int to float
-        When each phase began, by its number [s].
+    began  when each phase began, by its number [s]
     """
 
     def __init__(

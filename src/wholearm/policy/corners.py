@@ -42,20 +42,11 @@ Motion = tuple[Array, Array, Array]
 
 
 class Corners(NamedTuple):
-    """Limits at n places in k corners, of (1, b, s', a, squeeze) that torques are for.
+    """Limits at n places in k corners, of (1, b, s', a, squeeze) that torques are for."""
 
-    Attributes
-    ----------
-    rows : ndarray, shape (k, n, m, 5)
-    moves : ndarray, shape (k, n, 5)
-        The acceleration s'' there.
-    swings : ndarray, shape (p, n, m, 5)
-        What each of the other ranges changes.
-    """
-
-    rows: Array
-    moves: Array
-    swings: Array
+    rows: Array  # (k, n, m, 5)
+    moves: Array  # (k, n, 5): the acceleration s'' there
+    swings: Array  # (p, n, m, 5): what each of the other ranges changes
 
     def pick(self, motion: Motion) -> Array:
         """The limits in the corner that is worst for a motion, shape (n, m, 5)."""
@@ -93,12 +84,10 @@ def find_corners(
 
     Parameters
     ----------
-    formation, point, side
-        Where and which way contacts slide.
-    torques : tuple of ndarray, shape (n, 2, 5)
-        Those that are asked for, those of a little earlier, and how they change along the curve.
-    widths : mapping of str to float
-        Half widths of ranges, by name.
+    formation, point, side  where and which way contacts slide
+    torques : (n, 2, 5)     those that are asked for, those of a little earlier, and how they change
+                            along the curve
+    widths                  half widths of ranges, by name
     """
     rows, moves = list[Array](), list[Array]()
     for scene in list_scenes(formation.scene, widths):
@@ -137,9 +126,8 @@ def respond(forces: PathForces, torque: Array) -> tuple[Array, Array]:
 
     Parameters
     ----------
-    forces : PathForces
-        What holds.
-    torque : ndarray, shape (n, 2, 5)
+    forces              what holds
+    torque : (n, 2, 5)
     """
     lacking = torque.copy()
     lacking[:, :, :3] -= np.stack([forces.T0, forces.Tb, forces.Tv], axis=2)

@@ -19,14 +19,23 @@ Plain numbers and lists are several times as fast as arrays that are as short as
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
-from math import sqrt
-from typing import Any
+from math import ceil, isfinite, sqrt
+from typing import Any, NamedTuple
 
-from .pace import Pace
-from .sensing import Sensing
-from .squeeze import choose_squeeze, find_motion
-
+SAME = 1e-12
+"""Difference of levels that is none."""
+SMOOTH = 0.3
+"""Part of a bias that the last sample makes up."""
+FELT = 0.1
+"""Force with which a contact presses, over the mean of all."""
+FEW = 0.2
+"""Least force that is aimed at, over the mean of all: a part of less is no measure."""
+SHARE = 0.3
+"""Part of the torque limits that feedback adds at most."""
+END_INTEGRAL = 30.0
+"""Gain on the integral of what the angles are off at the end, over that on the angles [1/s]."""
 LEVEL, PART = 1.0, 0.5
 """Level of limits below which feedback gives way, in reserves: at most the first, and at most the
 second times that of the reference, which may have less."""
@@ -71,8 +80,6 @@ BARRED = 0.1
 SOON, AHEAD, FAR = 0.02, 0.05, 0.3
 """How far beyond the end a contact is surely made, in the way at touching speed in these times [s]:
 one that does not stop the joints, one that is there at the beginning, one that stops them."""
-
-
 Rows = list[list[float]]
 
 
@@ -81,26 +88,21 @@ class CurveLaw:
 
     Parameters
     ----------
-    tables : mapping of str to ndarray
-        `s`, (n,); `theta`, (n, 2); `b`, (n,), at nodes; `levels`, (n - 1, 2, m, 5), and `torque`,
-        (n - 1, 2, 2, 5), at both ends of the intervals; `push`, (2,); `passes`, (1,), not zero
-        where the end is passed at speed; `keeps`, (1,), not zero where `push` is held until the
-        next law begins; `arrival`, (k, 5), levels of all contacts where they are made.
-    pace : Pace
+    tables  `s`, (n,); `theta`, (n, 2); `b`, (n,), at nodes; `levels`, (n - 1, 2, m, 5), and
+            `torque`, (n - 1, 2, 2, 5), at both ends of the intervals; `push`, (2,); `passes`, (1,),
+            not zero where the end is passed at speed; `keeps`, (1,), not zero where `push` is held
+            until the next law begins; `arrival`, (k, 5), levels of all contacts where they are made
 
     Attributes
     ----------
-    over, pushes : bool
-        Whether the next phase may begin, and whether the contact is being pressed.
-    after : CurveLaw or None
-        The law of the next phase, if it is along a curve.
-    s, v, level : float
-        Place and speed along the curve, and the least level, at the last step.
+    over, pushes  whether the next phase may begin, and whether the contact is being pressed
+    after         the law of the next phase, if it is along a curve
+    s, v, level   place and speed along the curve, and the least level, at the last step
     """
 
     count, passed = 1, 0
 
-    def __init__(self, tables: Mapping[str, Any], pace: Pace) -> None:
+    def __init__(self, tables: Mapping[str, Any], pace: LoopSettings) -> None:
         self.passes = bool(tables["passes"][0])
         self.pace, self.nodes = pace, tables["s"].tolist()
         self.length = self.nodes[-1]
@@ -348,3 +350,238 @@ def _split(table: Any, most: float | None = None) -> tuple[list[Rows], list[Rows
     pairs = zip(first, rises, counts, strict=True)
     kept = [(rows[own].tolist(), rise[own].tolist()) for rows, rise, own in pairs]
     return [rows for rows, _ in kept], [rise for _, rise in kept]
+
+
+class LoopSettings(NamedTuple):
+    """What the laws of all phases have in common."""
+
+    period: float  # [s]: of the control loop
+    delay: float  # [s]: time from measuring to when torques take effect, as far as it is known
+    touch: float  # [m/s]: speed s' at which contacts are made
+    still: float  # [m/s]: speed s' that counts as none
+    dwell: float  # [s]: how long the joints stand still before the next phase begins
+    most: float  # [m/s^2]: largest a of the integral
+    limit: tuple[float, float]  # [N m]: of the torques
+
+
+class MotionLaw:
+    """The law of phases that pass into one another in motion.
+
+    Parameters
+    ----------
+    tables  `starts`, (m,), of the phases [s]; `step`, (1,), of the samples that follow [s];
+            `theta`, `rates`, `tau`, (n, 2); `gain`, (n, 2, 4), torques over what angles and speeds
+            are off, the last ones for when the end is held; `push`, (2,); `still`, (1,), the joint
+            speed that counts as none [rad/s]; `ways`, (f, 2), what the joints show of displacements
+            that contacts leave at the end, orthonormal
+
+    Attributes
+    ----------
+    over    whether the next phase may begin
+    passed  how many of the phases have been passed
+    """
+
+    passes = False
+
+    def __init__(self, tables: Mapping[str, Any], pace: LoopSettings) -> None:
+        self.pace, self.starts = pace, tables["starts"].tolist()
+        self.every, self.still = float(tables["step"][0]), float(tables["still"][0])
+        self.theta, self.rates = tables["theta"].tolist(), tables["rates"].tolist()
+        self.tau, self.gain = tables["tau"].tolist(), tables["gain"].tolist()
+        self.push = tuple(tables["push"].tolist())
+        self.ways = tables["ways"].tolist()
+        self.end = self.every * (len(self.theta) - 1)
+        self.begin()
+
+    @property
+    def count(self) -> int:
+        """Number of phases."""
+        return len(self.starts)
+
+    def begin(self, at_end: bool = False) -> None:
+        """Start anew, at the beginning or at the end."""
+        self.clock = self.end if at_end else 0.0
+        self.passed = len(self.starts) - 1 if at_end else 0
+        self.over, self.rested = False, 0.0
+        self.settled, self.left = False, [0.0] * len(self.ways)
+
+    def step(
+        self, theta: Sequence[float], rates: Sequence[float], forces: Mapping[str, float] | None
+    ) -> tuple[float, float]:
+        """Torques for joint angles and speeds [N m]."""
+        pace, now = self.pace, self.clock
+        self.clock = now + pace.period
+        last = self.passed + 1
+        if last < len(self.starts) and now >= self.starts[last] - 0.5 * pace.period:
+            self.passed = last
+        if now >= self.end:
+            stands = max(abs(rates[0]), abs(rates[1])) < self.still
+            self.rested = self.rested + pace.period if stands else 0.0
+            self.over = self.rested > pace.dwell + pace.delay
+            self.settled = self.settled or self.over
+        lead = pace.delay + 0.5 * pace.period
+        k, share = self._locate(now)
+        (p, q), (u, w) = self.theta[k], self.theta[k + 1]
+        (f, g), (c, d) = self.rates[k], self.rates[k + 1]
+        fast_one = rates[0] - f - share * (c - f)
+        fast_two = rates[1] - g - share * (d - g)
+        one = theta[0] - p - share * (u - p) + lead * fast_one
+        two = theta[1] - q - share * (w - q) + lead * fast_two
+        k, share = self._locate(now + lead)
+        found = []
+        if self.settled:
+            one, two = self._find_left(one, two)
+        for row in (0, 1):
+            first, after = self.tau[k][row], self.tau[k + 1][row]
+            if now >= self.end:
+                first = after = self.push[row]
+            a, b, c, d = self.gain[-1 if now >= self.end else k][row]
+            feedback = a * one + b * two + c * fast_one + d * fast_two
+            most = pace.limit[row]
+            feedback = min(max(feedback, -SHARE * most), SHARE * most)
+            tau = first + share * (after - first) - feedback
+            found.append(min(max(tau, -most), most))
+        return found[0], found[1]
+
+    def _find_left(self, one: float, two: float) -> tuple[float, float]:
+        """What is left of angles that are off, and what it adds up to until it is gone."""
+        found_one = found_two = 0.0
+        for k, (p, q) in enumerate(self.ways):
+            off = p * one + q * two
+            self.left[k] += END_INTEGRAL * self.pace.period * off
+            found_one += p * (off + self.left[k])
+            found_two += q * (off + self.left[k])
+        return found_one, found_two
+
+    def _locate(self, t: float) -> tuple[int, float]:
+        """Sample before a time, and the share of the way to the next one."""
+        place = min(t, self.end) / self.every
+        k = min(int(place), len(self.theta) - 2)
+        return k, min(place - k, 1.0)
+
+
+class Sensing:
+    """Biases of the forces of a phase's contacts.
+
+    Parameters
+    ----------
+    names                       contacts, in the order of the table
+    gained                      the contact that the phase ends with, if it does
+    table : (n, 2, n_c, 5) [N]  forces at both ends of intervals, of 1, s'^2, s', a and the squeeze
+    late                        delay of the torques, in periods
+    """
+
+    def __init__(self, names: Sequence[str], gained: str, table: Any, late: float) -> None:
+        self.names, self.gained = tuple(names), gained
+        self.first = table[:, 0].tolist()
+        self.rises = (table[:, 1] - table[:, 0]).tolist()
+        self.lag = max(ceil(late - 1e-9), 1)
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget what was measured."""
+        self.bias = [0.0] * len(self.names)
+        self.expected: deque[list[float]] = deque(maxlen=self.lag)
+        self.heard, self.felt = False, 0
+
+    @property
+    def feels(self) -> bool:
+        """Whether the gained contact presses, in two samples one after the other."""
+        return self.felt > 1
+
+    def measure(self, forces: Mapping[str, float] | None) -> None:
+        """Take a sample; contacts that are not in it, or not a number, have no sensor."""
+        self.heard = bool(forces)
+        if not forces or len(self.expected) < self.lag:
+            return
+        mean = sum(self.expected[0]) / len(self.names)
+        presses = forces.get(self.gained, 0.0) > FELT * mean
+        self.felt = self.felt + 1 if presses else 0
+        for k, (name, known) in enumerate(zip(self.names, self.expected[0], strict=True)):
+            force = forces.get(name)
+            if force is not None and isfinite(force):
+                self.bias[k] += SMOOTH * (force - known - self.bias[k])
+
+    def shift(
+        self,
+        place: tuple[int, float, float, float, float],
+        low: float,
+        high: float,
+    ) -> float:
+        """Change of the squeeze, from `low` to `high`.
+
+        `place` has the interval, the share of it, s', a and the squeeze that the law asks for.
+        """
+        j, share, v, a, squeeze = place
+        plain, press = [], []
+        for (c, cb, _, ca, cl), (d, db, _, da, dl) in zip(
+            self.first[j], self.rises[j], strict=True
+        ):
+            by = cl + share * dl
+            force = c + share * d + (cb + share * db) * v * v + (ca + share * da) * a
+            plain.append(force + by * squeeze)
+            press.append(by)
+        least = FEW * sum(abs(own) for own in plain) / len(plain)
+        sizes = [max(own, least) or 1.0 for own in plain]
+        parts = [(own + off) / size for own, off, size in zip(plain, self.bias, sizes, strict=True)]
+        rates = [own / size for own, size in zip(press, sizes, strict=True)]
+        change = min(max(self._choose(parts, rates), low), high)
+        self.expected.append([own + by * change for own, by in zip(plain, press, strict=True)])
+        return change
+
+    def _choose(self, parts: list[float], rates: list[float]) -> float:
+        """The least change with which all parts are 1, or the one with the largest least part."""
+        low, high = -1e30, 1e30
+        for part, rate in zip(parts, rates, strict=True):
+            if rate > 0.0:
+                low = max(low, (1.0 - part) / rate)
+            elif rate < 0.0:
+                high = min(high, (1.0 - part) / rate)
+        if low <= high:
+            return min(max(0.0, low), high)
+        return choose_squeeze(parts, [0.0] * len(parts), rates, 0.0)[1]
+
+
+def choose_squeeze(
+    base: Sequence[float], rates: Sequence[float], press: Sequence[float], a: float
+) -> tuple[float, float]:
+    """The largest least level of limits base + rates a + press squeeze, and its squeeze.
+
+    Of two limits that the squeeze moves to and fro, no squeeze has a larger least level than where
+    they meet. The limit that is least there takes the place of one of them, until it is one.
+    """
+    lines = [(p + rate * a, q) for p, rate, q in zip(base, rates, press, strict=True)]
+    ups, downs = [own for own in lines if own[1] > 0.0], [own for own in lines if own[1] < 0.0]
+    flat = min([p for p, q in lines if q == 0.0], default=1e30)
+    if not ups or not downs:
+        return flat, 0.0
+    # Begun with those that meet where the squeeze is what it would be without either.
+    (p, q), (u, w) = min(ups), min(downs)
+    level, squeeze = 1e30, 0.0
+    while True:
+        meets = (u * q - p * w) / (q - w)
+        if meets >= level:
+            break
+        level, squeeze = meets, (u - p) / (q - w)
+        least = level
+        for c, d in lines:
+            value = c + d * squeeze
+            if value < least:
+                least, last = value, (c, d)
+        if least > level - SAME * (1.0 + abs(level)):
+            break
+        if last[1] > 0.0:
+            p, q = last
+        elif last[1] < 0.0:
+            u, w = last
+        else:
+            break
+    return min(level, flat), squeeze
+
+
+def find_motion(torque: Sequence[Sequence[float]], tau: Sequence[float]) -> tuple[float, float]:
+    """Acceleration and squeeze that torques lead to at rest, from rows of torques."""
+    (one, _, _, c, d), (two, _, _, e, f) = torque
+    first, second = tau[0] - one, tau[1] - two
+    size = c * f - d * e
+    return (first * f - second * d) / size, (second * c - first * e) / size

@@ -20,7 +20,7 @@ from ..mechanics.limits import CONE, PRESS, LimitSet, make_limits
 from ..problem.uncertainty import change_scene
 from ..scene.model import Scene
 from .corners import respond
-from .squeeze import choose_squeeze
+from .curve_law import choose_squeeze
 
 DOUBTS = {"mass": 0.05, "inertia": 0.05} | {
     f"friction_{part}": 0.1 for part in ("palm", "finger1", "finger2")
@@ -40,33 +40,20 @@ NEVER = 1e9
 """Level of a limit that does not count."""
 
 
-class Rows(NamedTuple):
-    """Torques and limits at n places of a curve.
+class CurveLimitRows(NamedTuple):
+    """Torques and limits at n places of a curve."""
 
-    Attributes
-    ----------
-    s : ndarray, shape (n,), [m]
-    torque : ndarray, shape (n, 2, 5), [N m]
-    slack : ndarray, shape (n, m, 5), [N, N m]
-        How far forces and torques are from their limits: those of forces with friction as it is
-        before, then as it is after the nearest reversal, which is the same but near one.
-    unit : ndarray, shape (n, m), [N, N m]
-        What is in reserve at level 1.
-    presses : int
-        How many of the m are of forces.
-    ends : ndarray, shape (k, n_c, 5), [N]
-        Normal forces at the last place, in each corner of ranges if they are known.
-    scenes : tuple of Scene
-        The scenes of these corners.
-    """
-
-    s: Array
-    torque: Array
+    s: Array  # (n,) [m]
+    torque: Array  # (n, 2, 5) [N m]
+    # (n, m, 5) [N, N m]: how far forces and torques are from their limits: those of forces with
+    # friction as it is before, then as it is after the nearest reversal, which is the same but near
+    # one
     slack: Array
-    unit: Array
-    presses: int
+    unit: Array  # (n, m) [N, N m]: what is in reserve at level 1
+    presses: int  # how many of the m are of forces
+    # (k, n_c, 5) [N]: normal forces at the last place, in each corner of ranges if they are known
     ends: Array
-    scenes: tuple[Scene, ...]
+    scenes: tuple[Scene, ...]  # the scenes of these corners
 
     @property
     def levels(self) -> Array:
@@ -74,7 +61,7 @@ class Rows(NamedTuple):
         return np.asarray(self.slack / self.unit[..., None])
 
 
-def make_rows(curve: Curve, s: Array, motion: tuple[Array, Array, Array]) -> Rows:
+def make_rows(curve: Curve, s: Array, motion: tuple[Array, Array, Array]) -> CurveLimitRows:
     """Rows at places of a curve, with reserves for a motion (a, b, lambda) there."""
     formation, point, speed = curve.formation, curve.evaluate(s), np.sqrt(motion[1])
     mean, *sides = turn(curve, s, speed * NEAR)
@@ -100,7 +87,7 @@ def make_rows(curve: Curve, s: Array, motion: tuple[Array, Array, Array]) -> Row
     count = 2 * len(limits.low)
     ends, scenes = slack[0][-1:, : formation.n_contacts], (formation.scene,)
     table = np.concatenate(slack, axis=1)
-    return Rows(s, torque, table, np.concatenate(unit, axis=1), count, ends, scenes)
+    return CurveLimitRows(s, torque, table, np.concatenate(unit, axis=1), count, ends, scenes)
 
 
 def leave_one(levels: Array) -> Array:
@@ -112,18 +99,18 @@ def leave_one(levels: Array) -> Array:
     return found
 
 
-def find_squeeze(rows: Rows, a: Array, b: Array) -> Array:
+def find_squeeze(rows: CurveLimitRows, a: Array, b: Array) -> Array:
     """The squeeze with the largest least level for a motion, shape (n,)."""
     pairs = zip(_measure_base(rows, a, b).tolist(), rows.levels[:, :, 4].tolist(), strict=True)
     return np.array([choose_squeeze(base, [0.0] * len(base), by, 0.0)[1] for base, by in pairs])
 
 
-def measure_levels(rows: Rows, a: Array, b: Array) -> Array:
+def measure_levels(rows: CurveLimitRows, a: Array, b: Array) -> Array:
     """Levels of all limits for a motion with that squeeze, shape (n, m)."""
     return _measure_base(rows, a, b) + rows.levels[:, :, 4] * find_squeeze(rows, a, b)[:, None]
 
 
-def _measure_base(rows: Rows, a: Array, b: Array) -> Array:
+def _measure_base(rows: CurveLimitRows, a: Array, b: Array) -> Array:
     known = np.column_stack([np.ones(len(a)), b, np.sqrt(b), a])
     return np.asarray(np.einsum("nmi,ni->nm", rows.levels[:, :, :4], known))
 

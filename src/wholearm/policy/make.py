@@ -2,29 +2,57 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import InputError
-from ..common.require import require_number
+from ..common.errors import InputError, WholearmError, require_number
+from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
+from ..geometry.curve import Curve
 from ..geometry.tracing import runs_on_curve
 from ..mechanics.arrival import Standstill, find_hold
+from ..mechanics.dynamics import Directions, force_rows, inverse
+from ..mechanics.limits import PRESS, TORQUE, SideTerms, make_limits
 from ..mechanics.metric import metric_weights
-from ..problem.definition import End, Phase, Problem
-from ..results.narrow import Moved, adopt_motion
-from ..results.trajectory import Trajectory
-from .curve_rows import find_forces, leave_one
-from .pace import Pace
-from .policy import Policy
-from .push import find_arrival, find_push, find_still
-from .reference import TOUCH, Piece, Reserve, trace_pieces
-from .regulator import RATE, end_within, follow
-from .replan import Planner, replan
+from ..problem.definition import ROWS, End, Phase, Problem
+from ..problem.uncertainty import PARAMETERS
+from ..results.adopt import Moved, adopt_motion
+from ..results.torque import TorqueProfile
+from ..results.trajectory import Motion, Trajectory, assemble
+from .curve_law import LoopSettings, choose_squeeze
+from .curve_rows import CurveLimitRows, find_forces, leave_one
+from .playback import Policy
+from .range_margins import WIDEST
+from .reference_motion import TOUCH, ReferencePiece, Reserve, trace_pieces
+from .regulator import RATE, ROOM, end_within, follow
 
+WIDEST_FACTOR = 64.0
+"""Largest factor that is tried."""
+SHARES = (1.0, 0.5, 0.25)
+"""Parts of the reserve that are tried, the largest first."""
+SLOWER = 1.5
+"""Duration over the plan's from which on a motion costs more than its reserve is worth."""
+SAME = 1e-5
+"""How far ends may be from the plan's to count as the same, over the scene's length and in rad."""
+Planner = Callable[[Problem], Trajectory]
+"""Makes a plan of a problem."""
+ENOUGH = 5.0
+"""Reserves beyond which more normal force is not asked for."""
+LEAST = 0.3
+"""Fewest reserves with which a contact counts as pressed."""
+DRIVE = 0.15
+"""Least acceleration with which a contact that is still open is closed, over the scene's unit."""
+BRAKE = 0.3
+"""Deceleration along the next curve for each reserve, over the scene's unit: the contact that is
+gained need not be in the way of the motion."""
+FRICTION = (0.7, 1.0, 1.2)
+"""Parts of all friction with which the torques have to balance."""
+FULL = 0.98
+"""Part of the torque limits that is used."""
 STILL = 1e-3
 """Speed along curves that counts as none, over the scene's."""
 USUAL = 2.5
@@ -55,29 +83,23 @@ def make_policy(
 
     Parameters
     ----------
-    problem : Problem
-    plan : Plan or Trajectory
-    reserve : float, optional
-        How much normal force is kept in reserve along the way. Where the plan was made for ranges
-        of numbers, or the problem has them: for so many times these ranges (1). Otherwise in what
-        numbers that are 5 % (masses), 10 % (friction) and 1 % (torques) off take away, one by one
-        and summed as squares (2.5). Where the plan leaves less, the motion is slower; with 0 it is
-        the plan's.
-    period : float, [s]
-        Of the control loop.
-    delay : float, [s]
-        Time from measuring to when torques take effect, as far as it is known.
-    torque_limit : float, optional, [N m]
-        Of both fingers, if it is not the problem's: what a plan leaves to feedback, where it was
-        made with less than the hand has.
-    planner : callable, optional
-        Makes a trajectory of a problem: phases with more freedoms are planned anew with it, where
-        the plan leaves no reserve, unless `reserve` is 0; as they are if it is left out.
+    reserve               how much normal force is kept in reserve along the way. Where the plan was
+                          made for ranges of numbers, or the problem has them: for so many times
+                          these ranges (1). Otherwise in what numbers that are 5 % (masses), 10 %
+                          (friction) and 1 % (torques) off take away, one by one and summed as
+                          squares (2.5). Where the plan leaves less, the motion is slower; with 0 it
+                          is the plan's.
+    period : [s]          of the control loop
+    delay : [s]           time from measuring to when torques take effect, as far as it is known
+    torque_limit : [N m]  of both fingers, if it is not the problem's: what a plan leaves to
+                          feedback, where it was made with less than the hand has
+    planner               makes a trajectory of a problem: phases with more freedoms are planned
+                          anew with it, where the plan leaves no reserve, unless `reserve` is 0; as
+                          they are if it is left out
 
     Raises
     ------
-    InputError
-        If a number is out of its range, or the plan is of another problem.
+    InputError  if a number is out of its range, or the plan is of another problem
     """
     problem, plan = adopt_motion(problem, plan)
     ranges = find_ranges(problem, plan)
@@ -93,7 +115,7 @@ def make_policy(
         limit = [require_number(torque_limit, "torque_limit", positive=True)] * 2
     speeds = TOUCH * scales.speed, STILL * scales.speed
     most = MOST * scales.acceleration
-    pace = Pace(period, delay, *speeds, DWELL, most, (limit[0], limit[1]))
+    pace = LoopSettings(period, delay, *speeds, DWELL, most, (limit[0], limit[1]))
     blocks = split(problem.phases)
     curves = [len(own) == 1 and runs_on_curve(own[0]) for own in blocks]
     starts = plan.phase_starts
@@ -143,7 +165,11 @@ def split(phases: Sequence[Phase]) -> list[tuple[Phase, ...]]:
 
 
 def _end(
-    problem: Problem, phase: Phase, plan: Trajectory, piece: Piece, after: Piece | None
+    problem: Problem,
+    phase: Phase,
+    plan: Trajectory,
+    piece: ReferencePiece,
+    after: ReferencePiece | None,
 ) -> Array:
     """Torques at the end of a curve: those that the plan holds there, if it does."""
     last = int(np.flatnonzero(plan.phase == phase.index)[-1])
@@ -209,7 +235,7 @@ def _list_ways(problem: Problem, phase: Phase, z: Array) -> Array:
     return np.asarray(basis.T[sizes > SHOWN * (1.0 / units[3])])
 
 
-def _tabulate(piece: Piece, phase: Phase, push: Array) -> dict[str, Array]:
+def _tabulate(piece: ReferencePiece, phase: Phase, push: Array) -> dict[str, Array]:
     """Arrays of `CurveLaw`."""
     rows, levels, contact = piece.rows, piece.rows.levels, phase.until.contact
     arrival, dry = np.zeros((0, 5)), phase.formation.scene.dry[3:]
@@ -235,3 +261,249 @@ def find_ranges(problem: Problem, plan: Trajectory) -> Mapping[str, float] | Non
     if figures:
         return dict(figures["radii"])
     return None if problem.uncertainty is None else problem.ranges
+
+
+def find_arrival(curve: Curve, gained: Contact, rows: CurveLimitRows) -> Array:
+    """Levels of all contacts, the gained one too, that balance at the end of a curve, (k, 5).
+
+    Affine as torques are there; there are none where forces at rest are not the only ones.
+    """
+    formation = curve.formation
+    both = Formation(formation.scene, (*formation.contacts, gained), formation.rolling)
+    reserves = rows.unit[-1, : formation.n_contacts]
+    reserves, found = np.append(reserves, reserves.max()), [np.zeros((0, 5))]
+    for own in _list_balances(curve, both, rows):
+        forces = own[: both.n_contacts, 1:] @ rows.torque[-1]
+        forces[:, 0] += own[: both.n_contacts, 0]
+        found.append(forces / reserves[:, None])
+    return np.vstack(found)
+
+
+def find_push(
+    curve: Curve, gained: Contact, rows: CurveLimitRows, after: CurveLimitRows | None
+) -> Array | None:
+    """Torques that balance at rest with the gained contact and drive on without it, shape (2,).
+
+    They are those for which the least normal force of all contacts is largest, in reserves; in the
+    balance friction is as it was in the motion. None where no torques do all of it, or forces at
+    rest are not the only ones.
+
+    Parameters
+    ----------
+    rows   along the curve
+    after  along the next one
+    """
+    formation, scene = curve.formation, curve.formation.scene
+    both = Formation(scene, (*formation.contacts, gained), formation.rolling)
+    balances = _list_balances(curve, both, rows)
+    if not balances:
+        return None
+    count, unit = both.n_contacts, scene.scales.acceleration
+    reserves = rows.unit[-1, : formation.n_contacts]
+    reserves = np.append(reserves, reserves.max())
+    # Rows of (1, tau, level) >= 0: forces with all contacts, a without the gained one, forces then.
+    to_motion = _invert(rows.torque[-1])
+    forces = rows.ends.reshape(-1, 5)
+    open_forces = forces[:, 3:] @ to_motion
+    open_forces[:, 0] += forces[:, 0]
+    open_reserves = np.tile(reserves[:-1], len(rows.ends))
+    found = [
+        *(np.column_stack([own[:count], -reserves]) for own in balances),
+        np.append(to_motion[0] - [DRIVE * unit, 0.0, 0.0], 0.0)[None],
+        np.column_stack([open_forces, -open_reserves]),
+    ]
+    # Where no torques do all of it, the next motion may be in the way.
+    tables = [found]
+    if after is not None:
+        tables.insert(0, [*found, np.append(-_invert(after.torque[0])[0], -BRAKE * unit)[None]])
+    for own in tables:
+        tau = _find_best(np.vstack(own), scene.torque_limit)
+        if tau is not None:
+            return tau
+    return None
+
+
+def _find_best(rows: Array, limit: Array) -> Array | None:
+    """Torques with the largest level, and least effort among them; rows (1, tau, level) >= 0."""
+    from scipy.optimize import linprog
+
+    # Effort, the largest torque over its limit, decides among equally good ones.
+    most = FULL * limit
+    table = np.pad(rows, ((0, 0), (0, 1)))
+    efforts = np.zeros((4, 5))
+    efforts[:, 1:3] = np.vstack([np.diag(1 / most), np.diag(-1 / most)])
+    efforts[:, 4] = 1.0
+    table = np.vstack([table, efforts])
+    bounds = [*((-own, own) for own in most), (LEAST, ENOUGH), (0.0, 1.0)]
+    answer = linprog([0, 0, -1, 1], A_ub=-table[:, 1:], b_ub=table[:, 0], bounds=bounds)
+    return np.asarray(answer.x[:2]) if answer.status == 0 else None
+
+
+def _list_balances(curve: Curve, both: Formation, rows: CurveLimitRows) -> list[Array]:
+    """Balances with friction, or scenes, that may be; none where forces are not the only ones."""
+    if both.n_constraints != 5:
+        return []
+    try:
+        found = [_balance(curve, both, part) for part in FRICTION]
+        scenes = [own for own in rows.scenes if own != curve.formation.scene]
+        return found + [_balance(curve, replace(both, scene=own), 1.0) for own in scenes]
+    except np.linalg.LinAlgError:
+        return []
+
+
+def _balance(curve: Curve, both: Formation, part: float) -> Array:
+    """Forces of five constraints at the end of a curve, at rest, of (1, tau), shape (5, 3).
+
+    With a part of all friction.
+    """
+    scene, last = curve.formation.scene, curve.segments[-1]
+    point = curve.evaluate(np.array([curve.length]))
+    kinematics = both.evaluate(point.z, point.z_s)
+    slides = np.sign(kinematics.A_t[0] @ point.z_s[0])
+    Xi = np.append(last.Xi, slides[-1])[None]
+    G = force_rows(both, kinematics, Directions(part * Xi, last.sigma[None]))[0]
+    known = np.zeros((5, 3))
+    known[:, 0] = -scene.applied_force
+    known[3:, 0] += scene.dry[3:] * last.sigma
+    known[3:, 1:] = -np.eye(2)
+    return np.asarray(np.linalg.solve(G.T, known))
+
+
+def _invert(torque: Array) -> Array:
+    """Acceleration and squeeze at rest of (1, tau), shape (2, 3), from rows of torques, (2, 5)."""
+    back = np.linalg.inv(torque[:, 3:])
+    return np.column_stack([-back @ torque[:, 0], back])
+
+
+def find_still(curve: Curve) -> Array:
+    """Torques that hold the end of a curve at rest, in the middle of what friction bears, (2,)."""
+    formation, point = curve.formation, curve.evaluate(np.array([curve.length]))
+    still = Directions(np.zeros((1, formation.n_contacts)), np.zeros((1, 2)))
+    forces = inverse(formation, *point[:3], still, point.kinematics)
+    limits = make_limits(formation, 0.0).only(PRESS, TORQUE)
+    sides = SideTerms.of(limits, forces, point.z_s[:, 3:])
+    base, press = sides.rest[0].tolist(), sides.press[0].tolist()
+    _, squeeze = choose_squeeze(base, [0.0] * len(base), press, 0.0)
+    return np.asarray((forces.T0 + squeeze * forces.Tl)[0])
+
+
+def replan(
+    planner: Planner,
+    problem: Problem,
+    blocks: Sequence[tuple[Phase, ...]],
+    curves: Sequence[bool],
+    plan: Trajectory,
+) -> Trajectory:
+    """A plan in which blocks that are not along curves have a reserve where there is one."""
+    motions, k = list(plan.motions), 0
+    while k < len(blocks):
+        after = k + 1
+        if not curves[k] and _lacks(problem, blocks[k], plan):
+            for share in SHARES:
+                found = _detour(planner, problem, blocks[k:], curves[k:], plan, share)
+                if found is not None:
+                    new, after = found[0], k + found[1]
+                    first = blocks[k][0].index
+                    motions[first : first + len(new)] = new
+                    break
+        k = after
+    if all(new is old for new, old in zip(motions, plan.motions, strict=True)):
+        return plan
+    samples = int(np.bincount(plan.phase).max())
+    still = TorqueProfile(np.array([0.0, plan.duration]), np.zeros((1, 2, 1)))
+    rows = assemble(motions, still, plan.meta, samples)
+    return replace(rows, torque=TorqueProfile.join_rows(rows.t, rows.tau))
+
+
+def _lacks(problem: Problem, phases: Sequence[Phase], plan: Trajectory) -> bool:
+    """Whether phases of a plan leave less than the reserve of a normal force or a torque."""
+    own = (plan.phase >= phases[0].index) & (plan.phase <= phases[-1].index)
+    scene = problem.scene
+    most = (np.abs(plan.tau[own]) / scene.torque_limit).max()
+    least = np.nanmin(plan.c_n[own]) / scene.scales.force
+    return bool(min(least, 1 - most) < 0.99 * ROOM)
+
+
+def _detour(
+    planner: Planner,
+    problem: Problem,
+    blocks: Sequence[tuple[Phase, ...]],
+    curves: Sequence[bool],
+    plan: Trajectory,
+    share: float,
+) -> tuple[list[Motion], int] | None:
+    """Motions with a part of the reserve until the plan is met again, and of how many blocks."""
+    starts, found = plan.phase_starts, list[Motion]()
+    z = plan.z[np.flatnonzero(plan.phase == blocks[0][0].index)[0]]
+    blocks = [*blocks[:-1], (*blocks[-1][:-1], _pin(blocks[-1][-1], plan.z[-1]))]
+    for count, (own, curve) in enumerate(zip(blocks, curves, strict=True), start=1):
+        part = _solve(planner, problem, own, z, 0.0 if curve else share)
+        lasts = starts[own[-1].index + 1] - starts[own[0].index]
+        if part is None or (not curve and part.duration > SLOWER * lasts):
+            return None
+        found += part.motions
+        z = part.z[-1]
+        away = np.abs(z - plan.z[np.flatnonzero(plan.phase == own[-1].index)[-1]])
+        away[:2] /= problem.scene.scales.length
+        if away.max() < SAME:
+            return found, count
+    return None
+
+
+def _solve(
+    planner: Planner, problem: Problem, phases: Sequence[Phase], z: Array, share: float
+) -> Trajectory | None:
+    """Phases from a configuration at rest, with a part of the reserve."""
+    scene, room = problem.scene, share * ROOM
+    one, two = (replace(own, torque_limit=(1 - room) * own.torque_limit) for own in scene.fingers)
+    own = replace(
+        problem,
+        start=z,
+        epsilon=max(problem.epsilon, room * scene.scales.force),
+        scene=replace(scene, fingers=(one, two)),
+        phases=tuple(replace(phase, index=k) for k, phase in enumerate(phases)),
+    )
+    try:
+        return planner(own)
+    except WholearmError:
+        return None
+
+
+def _pin(phase: Phase, z: Array) -> Phase:
+    """The phase with the pose of z, shape (5,), pinned where its end leaves it open."""
+    until = phase.until
+    given = {row for row, _ in until.poses}
+    gained = until.contact is not None
+    freedoms = len(z) - len(phase.formation.contacts) - gained - len(given)
+    names = [name for name in ("x", "phi") if ROWS[name] not in given][: max(freedoms, 0)]
+    pins = tuple((name, float(z[ROWS[name]])) for name in names)
+    return replace(phase, until=replace(until, pins=until.pins + pins))
+
+
+def find_widest(problem: Problem, plan: Trajectory, delay: float) -> dict[int, float]:
+    """The largest factor on the ranges of each phase along a curve, by its number.
+
+    It is at most `WIDEST_FACTOR`, and ends where a relative range would reach
+    `range_margins.WIDEST`. Its error is that of `range_margins.retime_within`.
+
+    Parameters
+    ----------
+    delay : [s]  of the torques, as far as it is known
+
+    Raises
+    ------
+    InputError  if neither plan nor problem have ranges
+    """
+    ranges = find_ranges(problem, plan)
+    if ranges is None:
+        raise InputError("", "uncertainty", "is missing; without ranges none is the widest")
+    relative = max(ranges.get(own.name, 0.0) for own in PARAMETERS if not own.unit)
+    most = min(WIDEST / relative, WIDEST_FACTOR) if relative > 0 else WIDEST_FACTOR
+    blocks = split(problem.phases)
+    along = [own[0] if len(own) == 1 and runs_on_curve(own[0]) else None for own in blocks]
+    pieces = trace_pieces(problem, along, plan, Reserve(most, ranges, delay))
+    return {
+        phase.number: most * piece.share
+        for phase, piece in zip(along, pieces, strict=True)
+        if phase is not None and piece is not None
+    }

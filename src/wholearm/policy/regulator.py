@@ -56,7 +56,7 @@ class Linear(NamedTuple):
     cost: Array
 
 
-class Stretch(NamedTuple):
+class RegulatedStretch(NamedTuple):
     """A stretch of a plan with the same contact modes, at n instants.
 
     `forces` are along the plan as a curve whose parameter is its time; the squeeze is the plan's.
@@ -111,7 +111,7 @@ def follow(problem: Problem, phases: tuple[Phase, ...], plan: Trajectory, t: Arr
     return Followed(b, tau, regulate(found, float(t[1] - t[0]) / np.sqrt(b)))
 
 
-def _find_room(problem: Problem, parts: list[Stretch], b: float) -> float:
+def _find_room(problem: Problem, parts: list[RegulatedStretch], b: float) -> float:
     """What a motion leaves of normal forces and torques, over what is enough."""
     scene = problem.scene
     unit, limit = ROOM * scene.scales.force, scene.torque_limit
@@ -120,7 +120,7 @@ def _find_room(problem: Problem, parts: list[Stretch], b: float) -> float:
     return float(min(room))
 
 
-def _stretch(formation: Formation, plan: Trajectory, t: Array) -> Stretch:
+def _stretch(formation: Formation, plan: Trajectory, t: Array) -> RegulatedStretch:
     """A stretch of a plan."""
     samples = plan.at(t)
     z, v = samples.z, samples.z_dot
@@ -135,7 +135,7 @@ def _stretch(formation: Formation, plan: Trajectory, t: Array) -> Stretch:
     rolls = [columns[row] for row in formation.rolling_rows]
     c = np.hstack([samples.c_n[:, columns], samples.c_t[:, rolls]])
     squeeze = np.einsum("ni,ni->n", c, forces.Cl)
-    return Stretch(formation, z, v, directions, forces, np.asarray(squeeze))
+    return RegulatedStretch(formation, z, v, directions, forces, np.asarray(squeeze))
 
 
 def _split_modes(phase: Phase, plan: Trajectory, t: Array) -> list[tuple[Formation, Array]]:
@@ -155,7 +155,7 @@ def _split_modes(phase: Phase, plan: Trajectory, t: Array) -> list[tuple[Formati
     return found
 
 
-def _linearise(problem: Problem, part: Stretch, b: float) -> list[Linear]:
+def _linearise(problem: Problem, part: RegulatedStretch, b: float) -> list[Linear]:
     """A stretch at a speed, linearised."""
     formation, scales, n = part.formation, problem.scene.scales, len(part.z)
     z, v, tau = part.z, part.z_dot * np.sqrt(b), part.find_torques(b)

@@ -10,13 +10,12 @@ from itertools import zip_longest
 
 import numpy as np
 
-from ..common.errors import InputError
+from ..common.errors import InputError, require_number, require_vector
 from ..common.fields import keys_of
-from ..common.require import require_number, require_vector
 from ..common.sharing import exclusive
+from ..contacts.closing import name_reach
 from ..contacts.formation import Formation, describe, find_touching
 from ..contacts.links import evaluate_finger_gap
-from ..contacts.reach import name_reach
 from ..scene.model import Scene
 from ..scene.ranges import TURN, check_place, check_ranges
 from .definition import ROWS, End, Phase, Problem
@@ -30,8 +29,7 @@ def check_problem(problem: Problem) -> None:
 
     Raises
     ------
-    InputError
-        For the first thing that is wrong.
+    InputError  for the first thing that is wrong
     """
     check_ranges(problem.scene)
     for attribute, own in keys_of(Problem).items():
@@ -65,8 +63,7 @@ def require_phases(problem: Problem) -> None:
 
     Raises
     ------
-    InputError
-        If the problem has no phases.
+    InputError  if the problem has no phases
     """
     if not problem.phases:
         text = "is missing, and so is [goal], from which wholearm finds them; "
@@ -130,8 +127,7 @@ def check_coordinate(scene: Scene, coordinate: str, given: float, key: str) -> N
 
     Raises
     ------
-    InputError
-        If there is no such coordinate, or its value is out of its range.
+    InputError  if there is no such coordinate, or its value is out of its range
     """
     if coordinate not in ROWS:
         raise InputError("", key, f"{coordinate!r} given; allowed are 'x' and 'phi'")

@@ -9,9 +9,8 @@ from enum import Enum
 from typing import Any
 
 from ..common.arrays import Array
-from ..common.errors import InputError, name_source
-from ..common.fields import NONNEGATIVE, POSITIVE, TEXT, Kind, choice, declare, key, leave
-from ..common.require import read_share
+from ..common.errors import InputError, name_source, read_share
+from ..common.fields import NONNEGATIVE, POSITIVE, TEXT, FieldKind, choice, declare, key, leave
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..scene.model import Scene
@@ -45,7 +44,7 @@ def _name_contact(more: str = "") -> dict[str, str]:
 
 CONTACT = _name_contact()
 """JSON Schema of the name of a contact."""
-DWELL = Kind(
+DWELL = FieldKind(
     lambda given, key: (read_share if isinstance(given, str) else NONNEGATIVE.read)(given, key),
     {"anyOf": [NONNEGATIVE.schema, {"type": "string", "pattern": "^[^%]+%\\s*$"}]},
 )
@@ -56,25 +55,16 @@ DWELL = Kind(
 class Until:
     """What ends a phase: a contact gained, a coordinate of the pose reached, or a release.
 
-    Attributes
-    ----------
-    contact : Contact or None
-        The contact that is gained.
-    coordinate : {"", "x", "phi"}
-        The coordinate, when there is one.
-    value : float or None, [m] or [rad]
-    pins : tuple of (str, float), [m] or [rad]
-        Coordinates of the pose, and the values that they have there, too.
-
     Notes
     -----
     With neither contact nor coordinate the phase ends where the planner chooses, by releasing the
     contacts that the next phase does not have.
     """
 
-    contact: Contact | None = None
-    coordinate: str = ""
-    value: float | None = None
+    contact: Contact | None = None  # the contact that is gained
+    coordinate: str = ""  # {"", "x", "phi"}: the coordinate, when there is one
+    value: float | None = None  # [m] or [rad]
+    # [m] or [rad]: coordinates of the pose, and the values that they have there, too
     pins: tuple[tuple[str, float], ...] = ()
 
     @property
@@ -132,18 +122,10 @@ class Until:
 )
 @dataclass(frozen=True, eq=False)
 class Phase:
-    """A stretch of the motion on one contact formation.
+    """A stretch of the motion on one contact formation."""
 
-    Attributes
-    ----------
-    index : int
-        From 0; messages and files count from 1.
-    formation : Formation
-        Of its contacts.
-    """
-
-    index: int
-    formation: Formation
+    index: int  # from 0; messages and files count from 1
+    formation: Formation  # of its contacts
     until: Until
     end: End = End.REST
     settle: float | None = None
@@ -175,30 +157,9 @@ class Phase:
 class Problem:
     """A manipulation to plan.
 
-    Attributes
-    ----------
-    scene : Scene
-    start : ndarray, shape (5,)
-        Configuration z at the start, with the fingers closed; see `place_start`.
-    phases : tuple of Phase
-        None of them for a map, or where there are goals; replays need one or more.
-    source : str
-        The file this was read from.
-    table : mapping
-        The contents of that file, which trajectory files carry along; in step with the rest. Empty
-        where no file can say it: the start has no edge flush on the palm.
-    uncertainty : mapping or None
-        Half widths of the ranges of what is not known exactly, by name; those that are left out
-        have their defaults, see `problem.uncertainty`. None where the problem does not say.
-    checked : bool
-        Whether it is known to be like one from a file; otherwise it is checked when it is made.
-    goals : tuple of Goal
-        Where the object shall come to lie, one after the other, in place of phases.
-
     Raises
     ------
-    InputError
-        If a value is not allowed; names the key that it has in a file.
+    InputError  if a value is not allowed; names the key that it has in a file
 
     Notes
     -----
@@ -209,14 +170,21 @@ class Problem:
     name: str
     scene: Scene
     epsilon: float
-    start: Array
+    start: Array  # (5,): configuration z at the start, with the fingers closed; see `place_start`
+    # none of them for a map, or where there are goals; replays need one or more
     phases: tuple[Phase, ...]
-    source: str = ""
+    source: str = ""  # the file this was read from
+    # the contents of that file, which trajectory files carry along; in step with the rest. Empty
+    # where no file can say it: the start has no edge flush on the palm.
     table: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    # half widths of the ranges of what is not known exactly, by name; those that are left out have
+    # their defaults, see `problem.uncertainty`. None where the problem does not say.
     uncertainty: Mapping[str, float] | None = None
+    # whether it is known to be like one from a file; otherwise it is checked when it is made
     checked: bool = field(default=False, repr=False)
     settle: float | str = 0.0
     settle_gap: float | None = None
+    # where the object shall come to lie, one after the other, in place of phases
     goals: tuple[Goal, ...] = ()
 
     def __post_init__(self) -> None:
@@ -251,8 +219,7 @@ class Problem:
 
         Raises
         ------
-        InputError
-            If a name is unknown, a value is not allowed, or the problem has no table.
+        InputError  if a name is unknown, a value is not allowed, or the problem has no table
         """
         if not self.table:
             raise InputError(self.source, "", "the problem has no table that could be changed")

@@ -7,9 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ..common.errors import InputError
+from ..common.errors import InputError, require_number
 from ..common.fields import NUMBER, declare, key, leave
-from ..common.require import require_number
 from ..scene.model import Scene
 from ..scene.ranges import PLACE, TURN, check_place
 
@@ -62,8 +61,7 @@ def check_goal(scene: Scene, goal: Goal, key: str) -> None:
 
     Raises
     ------
-    InputError
-        If it is not one.
+    InputError  if it is not one
     """
     if (goal.flush is None) == (goal.phi is None):
         both = "flush and phi_deg are both" if goal.phi is not None else "neither flush nor phi_deg"
@@ -85,8 +83,7 @@ def read_goals(table: Mapping[str, Any]) -> tuple[Goal, ...]:
 
     Raises
     ------
-    InputError
-        If what is given is neither a table nor a list of tables, or a key is unknown.
+    InputError  if what is given is neither a table nor a list of tables, or a key is unknown
     """
     given = table.get("goal", [])
     several = isinstance(given, list)

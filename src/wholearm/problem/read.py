@@ -14,14 +14,12 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import InputError, name_source
+from ..common.errors import InputError, name_source, require_number
 from ..common.fields import collect_keys
-from ..common.require import require_number
 from ..common.sharing import exclusive
-from ..contacts.closing import close_finger, place_flush
+from ..contacts.closing import close_finger, name_reach, place_flush
 from ..contacts.elemental import Contact, parse_contact
 from ..contacts.formation import Formation
-from ..contacts.reach import name_reach
 from ..scene.model import Finger, Friction, Scene
 from ..scene.polygon import Polygon
 from ..scene.ranges import TURN, check_place, check_ranges
@@ -43,8 +41,7 @@ def read_problem(path: str) -> Problem:
 
     Raises
     ------
-    InputError
-        If the file cannot be read or anything in it is malformed.
+    InputError  if the file cannot be read or anything in it is malformed
     """
     try:
         with open(path, "rb") as stream:
@@ -69,8 +66,7 @@ def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
 
     Raises
     ------
-    InputError
-        If anything in it is malformed; names `source`.
+    InputError  if anything in it is malformed; names `source`
     """
     with name_source(source):
         return _build_problem(table, source)
@@ -103,8 +99,7 @@ def read_own_problem(meta: Mapping[str, Any], source: str = "") -> Problem:
 
     Raises
     ------
-    InputError
-        If there is none, or it is malformed; names `source`, the file of the trajectory.
+    InputError  if there is none, or it is malformed; names `source`, the file of the trajectory
     """
     table = meta.get("problem")
     if not isinstance(table, Mapping) or not table:
@@ -122,18 +117,13 @@ def adopt_phases(problem: Problem, meta: Mapping[str, Any], q: Array, source: st
 
     Parameters
     ----------
-    problem : Problem
-    meta : mapping
-        Of the plan.
-    q : ndarray, shape (3,), [m, m, rad]
-        Where the plan ends.
-    source : str
-        The plan's file.
+    meta                  of the plan
+    q : (3,) [m, m, rad]  where the plan ends
+    source                the plan's file
 
     Raises
     ------
-    InputError
-        If the plan does not hold its problem, or ends elsewhere than at the last goal.
+    InputError  if the plan does not hold its problem, or ends elsewhere than at the last goal
     """
     if not problem.goals:
         return problem
@@ -171,16 +161,12 @@ def place_start(scene: Scene, flush: int, x: float) -> Array:
 
     Parameters
     ----------
-    scene : Scene
-    flush : int
-        The edge.
-    x : float, [m]
-        Of the object's centroid.
+    flush    the edge
+    x : [m]  of the object's centroid
 
     Raises
     ------
-    InputError
-        If `x` is out of its range, or a finger does not reach the object.
+    InputError  if `x` is out of its range, or a finger does not reach the object
     """
     check_place(scene, "start.x", x)
     q = place_flush(scene, flush, x)
@@ -214,8 +200,7 @@ def read_formation(scene: Scene, names: Sequence[object]) -> Formation:
 
     Raises
     ------
-    InputError
-        If there is no such contact.
+    InputError  if there is no such contact
     """
     stems = [n.removesuffix(ROLLING) if isinstance(n, str) else n for n in names]
     contacts = tuple(_parse_name(stem, scene) for stem in stems)
@@ -240,8 +225,7 @@ def read_until(scene: Scene, given: object) -> Until:
 
     Raises
     ------
-    InputError
-        If it is none of these.
+    InputError  if it is none of these
     """
     if isinstance(given, str):
         return Until(contact=parse_contact(given, scene))

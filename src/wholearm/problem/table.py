@@ -31,18 +31,14 @@ def change_table(
 
     Parameters
     ----------
-    table : mapping
-        The nested tables of a problem file.
-    changes : mapping
-        New values by short name, or by a dotted key as messages write it, such as
-        ``phases[2].until``. None removes a key.
-    names : mapping
-        Short names and their dotted keys, see `name_keys`.
+    table    the nested tables of a problem file
+    changes  new values by short name, or by a dotted key as messages write it, such as
+             ``phases[2].until``. None removes a key.
+    names    short names and their dotted keys, see `name_keys`
 
     Raises
     ------
-    InputError
-        If a name is unknown, or a dotted key leads through something that is no table.
+    InputError  if a name is unknown, or a dotted key leads through something that is no table
     """
     changed: dict[str, Any] = copy.deepcopy(dict(table))
     for name, value in changes.items():

@@ -7,10 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..common.errors import InputError
+from ..common.errors import InputError, require_number
 from ..common.fields import NONNEGATIVE, Field, leave
 from ..common.fields import key as declare_key
-from ..common.require import require_number
 from ..scene.model import Friction, Scene
 
 LENGTH = 1 / 30
@@ -51,10 +50,8 @@ def read_widths(
 
     Parameters
     ----------
-    given, label
-        As for `spread_widths`.
-    length : float, [m]
-        The scene's, which defaults of lengths are in proportion to.
+    given, label  as for `spread_widths`
+    length : [m]  the scene's, which defaults of lengths are in proportion to
     """
     defaults = {own.name: own.default * (length if own.unit == "m" else 1) for own in PARAMETERS}
     return defaults | spread_widths(given, label)
@@ -67,16 +64,13 @@ def spread_widths(given: Mapping[str, object], label: str) -> dict[str, float]:
 
     Parameters
     ----------
-    given : mapping
-        By name of the parameter, or of a group.
-    label : str
-        What messages call a range, with a place for its name.
+    given  by name of the parameter, or of a group
+    label  what messages call a range, with a place for its name
 
     Raises
     ------
-    InputError
-        If a name is unknown, or a width is not a number from zero to what makes sense: below one
-        for relative ones.
+    InputError  if a name is unknown, or a width is not a number from zero to what makes sense:
+                below one for relative ones
     """
     widths = dict[str, float]()
     for name, value in sorted(given.items(), key=lambda item: item[0] not in GROUPS):
@@ -95,15 +89,12 @@ def change_scene(scene: Scene, changes: Mapping[str, float]) -> Scene:
 
     Parameters
     ----------
-    scene : Scene
-    changes : mapping of str to float
-        By name of the parameter: relative, or in the parameter's unit. Those of torques and of the
-        start do nothing here.
+    changes  by name of the parameter: relative, or in the parameter's unit. Those of torques and of
+             the start do nothing here.
 
     Raises
     ------
-    InputError
-        If a number makes no sense any more.
+    InputError  if a number makes no sense any more
     """
 
     def change(name: str) -> float:

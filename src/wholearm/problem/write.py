@@ -18,9 +18,8 @@ def save_problem(problem: Problem, path: str | os.PathLike[str]) -> None:
 
     Raises
     ------
-    InputError
-        If the file cannot be written, or the problem starts where no file can say: with no edge
-        flush on the palm, or a finger that does not touch.
+    InputError  if the file cannot be written, or the problem starts where no file can say: with no
+                edge flush on the palm, or a finger that does not touch
     """
     require_ending(path, ".toml")
     if not problem.table:

@@ -24,22 +24,13 @@ class Place(NamedTuple):
 
 
 class Weakest(NamedTuple):
-    """What gives way first.
+    """What gives way first."""
 
-    Attributes
-    ----------
-    contacts : tuple of str
-        One, or two of which either does with another squeeze; none where it is no contact.
-    others : tuple of str
-        Torques or speeds of fingers that keep it from pressing more.
-    place : Place
-    force : float or None, [N]
-        The least normal force there; None where other limits than those of forces are missed.
-    """
-
+    # one, or two of which either does with another squeeze; none where it is no contact
     contacts: tuple[str, ...]
-    others: tuple[str, ...]
+    others: tuple[str, ...]  # torques or speeds of fingers that keep it from pressing more
     place: Place
+    # [N]: the least normal force there; None where other limits than those of forces are missed
     force: float | None
 
     @property
@@ -50,97 +41,56 @@ class Weakest(NamedTuple):
 
 
 class Survival(NamedTuple):
-    """Up to which speed one kind of motion keeps every contact.
+    """Up to which speed one kind of motion keeps every contact."""
 
-    Attributes
-    ----------
-    motion : str
-        "steady": at one speed throughout, with the best squeeze at each place; "rest to rest",
-        "from rest", "to rest": as a cosine of time, or with constant acceleration, likewise; "own
-        torques": at one speed, under the torques of the quasistatic motion.
-    speed : float or None, [m/s]
-        Along the phase, its largest, from which on a contact presses with less than epsilon. Zero
-        where one does near rest, None where none does.
-    duration : float or None, [s]
-        Of the phase at that speed.
-    lost : float or None, [m/s]
-        Likewise, from which on a contact is lost.
-    again : float or None, [m/s]
-        Where that is zero, the speed from which on contacts are kept after all.
-    first : Weakest
-        What gives way at `speed`.
-    """
-
+    # "steady": at one speed throughout, with the best squeeze at each place; "rest to rest", "from
+    # rest", "to rest": as a cosine of time, or with constant acceleration, likewise; "own torques":
+    # at one speed, under the torques of the quasistatic motion
     motion: str
+    # [m/s]: along the phase, its largest, from which on a contact presses with less than epsilon.
+    # Zero where one does near rest, None where none does.
     speed: float | None
-    duration: float | None
-    lost: float | None
+    duration: float | None  # [s]: of the phase at that speed
+    lost: float | None  # [m/s]: likewise, from which on a contact is lost
+    # [m/s]: where that is zero, the speed from which on contacts are kept after all
     again: float | None
-    first: Weakest
+    first: Weakest  # what gives way at `speed`
 
 
 class QuasistaticTorques(NamedTuple):
-    """Torques that balance a quasistatic motion, at n places of a phase.
+    """Torques that balance a quasistatic motion, at n places of a phase."""
 
-    Attributes
-    ----------
-    s : ndarray, shape (n,), [m]
-    z : ndarray, shape (n, 5)
-    tau : ndarray, shape (n, 2), [N m]
-    c_n : ndarray, shape (n, n_c), [N]
-    """
-
-    s: Array
-    z: Array
-    tau: Array
-    c_n: Array
+    s: Array  # (n,) [m]
+    z: Array  # (n, 5)
+    tau: Array  # (n, 2) [N m]
+    c_n: Array  # (n, n_c) [N]
 
 
 class Curves(NamedTuple):
-    """The least normal force over speed.
+    """The least normal force over speed."""
 
-    Attributes
-    ----------
-    speed : ndarray, shape (n,), [m/s]
-    force : dict of ndarray, shape (n,), [N]
-        By the names of motions; minus infinity where other limits are missed.
-    """
-
-    speed: Array
+    speed: Array  # (n,) [m/s]
+    # (n,) [N]: by the names of motions; minus infinity where other limits are missed
     force: dict[str, Array]
 
 
 @dataclass(frozen=True, eq=False)
 class PhasePrediction:
-    """One phase.
-
-    Attributes
-    ----------
-    number : int
-    contacts : tuple of str
-    until : str
-    path : {"curve", "line", "left out"}
-        Whether it is looked at along its curve, or along a straight line in (x, phi).
-    length : float, [m]
-    slow : Weakest or None
-        What presses least in the quasistatic motion with the best squeeze; None if left out.
-    kept : tuple of (Place, Place)
-        Stretches where the quasistatic motion keeps every contact.
-    survivals : tuple of Survival
-    torques : QuasistaticTorques or None
-        None where torques do not balance everywhere.
-    curves : Curves or None
-    """
+    """One phase."""
 
     number: int
     contacts: tuple[str, ...]
     until: str
+    # {"curve", "line", "left out"}: whether it is looked at along its curve, or along a straight
+    # line in (x, phi)
     path: str
-    length: float
+    length: float  # [m]
+    # what presses least in the quasistatic motion with the best squeeze; None if left out
     slow: Weakest | None = None
+    # stretches where the quasistatic motion keeps every contact
     kept: tuple[tuple[Place, Place], ...] = ()
     survivals: tuple[Survival, ...] = ()
-    torques: QuasistaticTorques | None = None
+    torques: QuasistaticTorques | None = None  # none where torques do not balance everywhere
     curves: Curves | None = None
 
     derived = ("is_kept",)
@@ -153,17 +103,10 @@ class PhasePrediction:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Prediction(Result):
-    """What is predicted of a problem.
-
-    Attributes
-    ----------
-    name : str
-    epsilon : float, [N]
-    phases : tuple of PhasePrediction
-    """
+    """What is predicted of a problem."""
 
     name: str
-    epsilon: float
+    epsilon: float  # [N]
     phases: tuple[PhasePrediction, ...]
 
     @property

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from ..common.arrays import Array
 from ..contacts.formation import Formation
 from ..mechanics.dynamics import PathForces
-from ..mechanics.limits import CONE, PRESS, LimitSet, make_limits
-from ..mechanics.sides import SideTerms
+from ..mechanics.limits import CONE, PRESS, LimitSet, SideTerms, make_limits
 
 _FAR = 1e6
 """Squeeze that stands for an infinite one, over the scene's force."""
@@ -27,34 +26,21 @@ _TIED = 1e-9
 
 
 class Grasp(NamedTuple):
-    """What presses least at n places, with the best squeeze.
+    """What presses least at n places, with the best squeeze."""
 
-    Attributes
-    ----------
-    least : ndarray, shape (n,), [N]
-        The largest epsilon that all contacts keep; minus infinity where other limits are missed
-        whatever the squeeze.
-    squeeze : ndarray, shape (n,), [N]
-    owners : ndarray of int, shape (n, 2)
-        Limits, as indices into the set, that keep it from being larger, those of contacts first.
-    """
-
+    # (n,) [N]: the largest epsilon that all contacts keep; minus infinity where other limits are
+    # missed whatever the squeeze
     least: Array
-    squeeze: Array
+    squeeze: Array  # (n,) [N]
+    # (n, 2): limits, as indices into the set, that keep it from being larger, those of contacts
+    # first
     owners: NDArray[np.int64]
 
 
 class Squeezing(NamedTuple):
-    """Limits at n places of a curve as functions of the squeeze.
+    """Limits at n places of a curve as functions of the squeeze."""
 
-    Attributes
-    ----------
-    limits : LimitSet
-        For an epsilon of zero.
-    terms : SideTerms
-    """
-
-    limits: LimitSet
+    limits: LimitSet  # for an epsilon of zero
     terms: SideTerms
 
     @staticmethod

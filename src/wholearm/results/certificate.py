@@ -7,27 +7,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class TimeBound:
-    """A lower bound of the time of phases that are planned together.
+    """A lower bound of the time of phases that are planned together."""
 
-    Attributes
-    ----------
-    phases : tuple of int
-        Their numbers.
-    duration : float, [s]
-        What the plan takes for them.
-    bound : float or None, [s]
-        No motion along their curves takes less; None where nothing is known.
-    error : float or None, [s]
-        Estimate of the bound's own error, which it is lowered by.
-    reason : str
-        Why there is no bound, or empty.
-    """
-
-    phases: tuple[int, ...]
-    duration: float
-    bound: float | None
-    error: float | None
-    reason: str = ""
+    phases: tuple[int, ...]  # their numbers
+    duration: float  # [s]: what the plan takes for them
+    bound: float | None  # [s]: no motion along their curves takes less; None where nothing is known
+    error: float | None  # [s]: estimate of the bound's own error, which it is lowered by
+    reason: str = ""  # why there is no bound, or empty
 
     derived = ("gap",)
 

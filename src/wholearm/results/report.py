@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from ..common.document import Document, Result, Table, fixed
-from .narrow import Moved
+from .adopt import Moved
 from .trajectory import Trajectory
-from .tuning import TuningHelp
+from .tuning_advice import TuningHelp
 
 _UNIQUENESS = {
     "number": "phase:d", "uniqueness_margin.value": "uniqueness margin:.4f",
@@ -42,42 +42,22 @@ _ENERGIES = (
 
 
 class ContactMargin(NamedTuple):
-    """The least normal force of one contact in one phase.
-
-    Attributes
-    ----------
-    contact : str
-    least : float, [N]
-        NaN if the contact was never seen moving.
-    time : float, [s]
-        When.
-    margin : float, [N]
-        least - epsilon.
-    """
+    """The least normal force of one contact in one phase."""
 
     contact: str
-    least: float
-    time: float
-    margin: float
+    least: float  # [N]: naN if the contact was never seen moving
+    time: float  # [s]: when
+    margin: float  # [N]: least - epsilon
 
 
 class UniquenessMargin(NamedTuple):
-    """Least uniqueness margin of contact forces in one phase (`mechanics.uniqueness`).
+    """Least uniqueness margin of contact forces in one phase (`mechanics.uniqueness`)."""
 
-    Attributes
-    ----------
-    value : float
-        Principal minor of the contact matrix K over that without friction: 1 without friction,
-        and contact forces are the only ones where it is positive.
-    contacts : str
-        Whose minor it is, with the modes of those that do not slide.
-    time : float, [s]
-        When.
-    """
-
+    # principal minor of the contact matrix K over that without friction: 1 without friction, and
+    # contact forces are the only ones where it is positive
     value: float
-    contacts: str
-    time: float
+    contacts: str  # whose minor it is, with the modes of those that do not slide
+    time: float  # [s]: when
 
 
 class LeastImpulse(NamedTuple):
@@ -88,148 +68,75 @@ class LeastImpulse(NamedTuple):
 
 
 class SlipMargin(NamedTuple):
-    """The least margin to slipping of one rolling contact in one phase.
-
-    Attributes
-    ----------
-    contact : str
-    least : float, [N]
-        Of mu c_n - |c_t|; NaN if the contact was never seen moving.
-    time : float, [s]
-        When.
-    """
+    """The least margin to slipping of one rolling contact in one phase."""
 
     contact: str
-    least: float
-    time: float
+    least: float  # [N]: of mu c_n - |c_t|; NaN if the contact was never seen moving
+    time: float  # [s]: when
 
 
 class FingerGap(NamedTuple):
-    """The least gap between the two links.
+    """The least gap between the two links."""
 
-    Attributes
-    ----------
-    least : float, [m]
-        Negative where they overlap.
-    time : float, [s]
-        When.
-    """
-
-    least: float
-    time: float
+    least: float  # [m]: negative where they overlap
+    time: float  # [s]: when
 
 
 class Deviation(NamedTuple):
-    """Largest difference between planned and simulated state.
+    """Largest difference between planned and simulated state."""
 
-    Attributes
-    ----------
-    position : float, [m]
-        Of the coordinates x and y.
-    angle : float, [rad]
-        Of phi and the joint angles.
-    time : float, [s]
-        When the larger of the two was, positions counting over the scene's length.
-    """
-
-    position: float
-    angle: float
-    time: float
+    position: float  # [m]: of the coordinates x and y
+    angle: float  # [rad]: of phi and the joint angles
+    time: float  # [s]: when the larger of the two was, positions counting over the scene's length
 
 
 class PhaseReport(NamedTuple):
-    """One phase of the replay.
+    """One phase of the replay."""
 
-    Attributes
-    ----------
-    number : int
-        From 1.
-    until : str
-        What ends the phase.
-    end : str
-        How it passes into the next one: at rest, smoothly or with an impact.
-    start : float, [s]
-    contacts : tuple of ContactMargin
-    rolling : tuple of SlipMargin
-        Of the contacts that roll.
-    arrival : float or None, [s]
-        When its end was reached, None if it was not.
-    arrival_rate : float or None, [m/s or rad/s]
-        How fast the distance to the end was closing then; None for a release.
-    end_speed : float or None, [m/s]
-        The largest speed left at an end at rest, angular ones times the scene's length; None where
-        the phase ends otherwise, or was not ended.
-    impact : LeastImpulse or None
-        None if there was no impact; one that is planned for may have been a stop.
-    end_deviation, deviation : Deviation or None
-        From the plan, at the end of the phase and at worst; None without a plan.
-    uniqueness_margin : UniquenessMargin or None
-        None if nothing was seen moving.
-    wedged : float or None, [s]
-        For how long friction could have held everything at rest; None if it did not begin so.
-    """
-
-    number: int
-    until: str
-    end: str
-    start: float
+    number: int  # from 1
+    until: str  # what ends the phase
+    end: str  # how it passes into the next one: at rest, smoothly or with an impact
+    start: float  # [s]
     contacts: tuple[ContactMargin, ...]
-    rolling: tuple[SlipMargin, ...]
-    arrival: float | None
+    rolling: tuple[SlipMargin, ...]  # of the contacts that roll
+    arrival: float | None  # [s]: when its end was reached, None if it was not
+    # [m/s or rad/s]: how fast the distance to the end was closing then; None for a release
     arrival_rate: float | None
+    # [m/s]: the largest speed left at an end at rest, angular ones times the scene's length; None
+    # where the phase ends otherwise, or was not ended
     end_speed: float | None
+    # none if there was no impact; one that is planned for may have been a stop
     impact: LeastImpulse | None
+    # end_deviation, deviation: from the plan, at the end of the phase and at worst; None without a
+    # plan
     end_deviation: Deviation | None
     deviation: Deviation | None
-    uniqueness_margin: UniquenessMargin | None = None
+    uniqueness_margin: UniquenessMargin | None = None  # none if nothing was seen moving
+    # [s]: for how long friction could have held everything at rest; None if it did not begin so
     wedged: float | None = None
 
 
 class ModeChange(NamedTuple):
-    """A contact or joint that goes on in another mode while the rest moves.
+    """A contact or joint that goes on in another mode while the rest moves."""
 
-    Attributes
-    ----------
-    time : float, [s]
-    phase : int
-        Number of the phase.
-    what : str
-        The contact or joint.
-    kind : {"sticks", "slips", "reverses"}
-    """
-
-    time: float
-    phase: int
-    what: str
-    kind: str
+    time: float  # [s]
+    phase: int  # number of the phase
+    what: str  # the contact or joint
+    kind: str  # {"sticks", "slips", "reverses"}
 
 
 class ReducedState(NamedTuple):
-    """Phi_1 theta_1'' + Phi_2 theta_1' + Phi_3 = 0, the paper's Eqs. (10)-(16), at one instant.
+    """Phi_1 theta_1'' + Phi_2 theta_1' + Phi_3 = 0, the paper's Eqs. (10)-(16), at one instant."""
 
-    Attributes
-    ----------
-    time : float, [s]
-    phase : int
-        Number of the phase.
-    Phi_1 : float, [kg m^2]
-        Inertia at the first joint; its sign depends on what friction makes of the elimination.
-    Phi_2 : float, [N m s]
-        Velocity terms over theta_1'.
-    Phi_3 : float, [N m]
-        Gravity, dry friction and torques.
-    theta_1_dot : float, [rad/s]
-    theta_1_ddot : float, [rad/s^2]
-        As the replay has it.
-    """
-
-    time: float
-    phase: int
+    time: float  # [s]
+    phase: int  # number of the phase
+    # [kg m^2]: inertia at the first joint; its sign depends on what friction makes of the
+    # elimination
     Phi_1: float
-    Phi_2: float
-    Phi_3: float
-    theta_1_dot: float
-    theta_1_ddot: float
+    Phi_2: float  # [N m s]: velocity terms over theta_1'
+    Phi_3: float  # [N m]: gravity, dry friction and torques
+    theta_1_dot: float  # [rad/s]
+    theta_1_ddot: float  # [rad/s^2]: as the replay has it
 
     @property
     def residual(self) -> float:
@@ -245,89 +152,45 @@ class Failure(NamedTuple):
 
 
 class EnergyBalance(NamedTuple):
-    """Energies of the whole replay [J]: work = kinetic + potential + losses + residual.
+    """Energies of the whole replay [J]: work = kinetic + potential + losses + residual."""
 
-    Attributes
-    ----------
-    work : float
-        Of the torques.
-    kinetic, potential : float
-        Changes.
-    viscous, dry, contact, impact : float
-        Losses: viscous and dry joint friction, sliding, contacts gained at a speed.
-    residual : float
-        What the equations leave unexplained.
-    relative : float
-        The residual over the sum of all magnitudes.
-    """
-
-    work: float
-    kinetic: float
+    work: float  # of the torques
+    kinetic: float  # kinetic, potential: changes
     potential: float
+    # viscous, dry, contact, impact: losses: viscous and dry joint friction, sliding, contacts
+    # gained at a speed
     viscous: float
     dry: float
     contact: float
     impact: float
-    residual: float
-    relative: float
+    residual: float  # what the equations leave unexplained
+    relative: float  # the residual over the sum of all magnitudes
 
 
 @dataclass(frozen=True, repr=False)
 class Report(Result):
-    """What a replay of torques showed.
+    """What a replay of torques showed."""
 
-    Attributes
-    ----------
-    name : str
-        The problem's.
-    epsilon : float, [N]
-    outcome : str
-        How the replay ended, in one sentence.
-    reached : bool
-        Whether the goal was reached.
-    missed_by : float, [m or rad]
-        Distance to the end of the last phase entered, NaN if that is a release.
-    failures : tuple of str
-        Why the torques are not good, the most important first, empty if they are.
-    failed_phase : int or None
-        Number of the phase that the first of them is about.
-    warnings : tuple of str
-        What is not asked for but worth knowing.
-    phases : tuple of PhaseReport
-        Those entered.
-    energy : EnergyBalance
-    finger_gap : FingerGap or None
-        None if the fingers lie in different planes.
-    tolerance : float
-    steps : int
-        Of the simulation.
-    changes : tuple of ModeChange
-        In the order of time.
-    reduced : tuple of ReducedState
-        The paper's scalar equation along the replay, if that was asked for.
-    help : TuningHelp
-        What helps to tune the torques.
-    replay : Simulation or None
-        What is reported on.
-    """
-
-    name: str
-    epsilon: float
-    outcome: str
-    reached: bool
+    name: str  # the problem's
+    epsilon: float  # [N]
+    outcome: str  # how the replay ended, in one sentence
+    reached: bool  # whether the goal was reached
+    # [m or rad]: distance to the end of the last phase entered, NaN if that is a release
     missed_by: float
+    # why the torques are not good, the most important first, empty if they are
     failures: tuple[str, ...]
-    failed_phase: int | None
-    warnings: tuple[str, ...]
-    phases: tuple[PhaseReport, ...]
+    failed_phase: int | None  # number of the phase that the first of them is about
+    warnings: tuple[str, ...]  # what is not asked for but worth knowing
+    phases: tuple[PhaseReport, ...]  # those entered
     energy: EnergyBalance
-    finger_gap: FingerGap | None
+    finger_gap: FingerGap | None  # none if the fingers lie in different planes
     tolerance: float
-    steps: int
-    changes: tuple[ModeChange, ...] = ()
+    steps: int  # of the simulation
+    changes: tuple[ModeChange, ...] = ()  # in the order of time
+    # the paper's scalar equation along the replay, if that was asked for
     reduced: tuple[ReducedState, ...] = ()
-    help: TuningHelp = field(default_factory=TuningHelp)
-    replay: Moved | None = field(default=None, repr=False, compare=False)
+    help: TuningHelp = field(default_factory=TuningHelp)  # what helps to tune the torques
+    replay: Moved | None = field(default=None, repr=False, compare=False)  # what is reported on
 
     derived = ("ok", "exit_status", "reason")
 

@@ -44,12 +44,9 @@ def interpolate_quintic(
 
     Parameters
     ----------
-    h, run : ndarray, shape (n,), [s]
-        Time between the two knots, and since the first of them.
-    knots : sequence of three ndarrays, shape (m, 5)
-        z, z' and z'' at all knots.
-    left : ndarray of int, shape (n,)
-        The first of the two knots.
+    h, run : (n,) [s]  time between the two knots, and since the first of them
+    knots : (m, 5)     z, z' and z'' at all knots
+    left : (n,)        the first of the two knots
     """
     h, x = h[:, None], (run / h)[:, None]
     z, v, a = knots

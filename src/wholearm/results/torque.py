@@ -20,17 +20,12 @@ MOST = 1e30
 
 @dataclass(frozen=True, eq=False)
 class TorqueProfile:
-    """Piecewise-polynomial joint torques.
+    """Piecewise-polynomial joint torques."""
 
-    Attributes
-    ----------
-    breaks : ndarray, shape (k + 1,), [s]
-        Strictly increasing. The torque may step at a break and is smooth between two.
-    coefficients : ndarray, shape (k, 2, d + 1), [N m]
-        Ascending powers of x in [-1, 1], x = (2 t - t_k - t_k+1) / (t_k+1 - t_k) on piece k.
-    """
-
+    # (k + 1,) [s]: strictly increasing. The torque may step at a break and is smooth between two.
     breaks: Array
+    # (k, 2, d + 1) [N m]: ascending powers of x in [-1, 1], x = (2 t - t_k - t_k+1) / (t_k+1 - t_k)
+    # on piece k
     coefficients: Array
 
     def __repr__(self) -> str:
@@ -109,9 +104,8 @@ class TorqueProfile:
 
         Parameters
         ----------
-        t : ndarray, shape (n,), [s]
-            Never decreasing, and increasing somewhere.
-        tau : ndarray, shape (n, 2), [N m]
+        t : (n,) [s]        never decreasing, and increasing somewhere
+        tau : (n, 2) [N m]
         """
         pieces = np.flatnonzero(np.diff(t) > 0)
         middle, half = (tau[pieces] + tau[pieces + 1]) / 2, (tau[pieces + 1] - tau[pieces]) / 2
@@ -142,9 +136,8 @@ def read_torque_csv(path: str) -> TorqueProfile:
 
     Raises
     ------
-    InputError
-        If the file cannot be read, a column is missing, a value is not a finite number, or the
-        times do not start at 0 and increase.
+    InputError  if the file cannot be read, a column is missing, a value is not a finite number, or
+                the times do not start at 0 and increase
     """
     try:
         with open(path, newline="", encoding="utf-8-sig") as stream:
@@ -188,8 +181,7 @@ def read_notes(path: str) -> dict[str, str]:
 
     Raises
     ------
-    InputError
-        If the file cannot be read.
+    InputError  if the file cannot be read
     """
     try:
         with open(path, encoding="utf-8-sig") as stream:

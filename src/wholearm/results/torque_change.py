@@ -32,25 +32,16 @@ _DEGREE = 6
 
 @dataclass(frozen=True, eq=False)
 class TorqueChange:
-    """How torques change.
+    """How torques change."""
 
-    Attributes
-    ----------
-    before, after : ndarray, shape (2,), [N m]
-    times : ndarray, shape (n + 1,), [s]
-        From 0 on.
-    levels, rates : ndarray, shape (n + 1,) and (n,), [-], [1/s]
-        sigma at these times, and its rate of change just after them.
-    decays : ndarray, shape (n,), [1/s]
-        How fast that decays.
-    """
-
-    before: Array
+    before: Array  # before, after (2,) [N m]:
     after: Array
-    times: Array
+    times: Array  # (n + 1,) [s]: from 0 on
+    # levels, rates (n + 1,) and (n,) [-], [1/s]: sigma at these times, and its rate of change just
+    # after them
     levels: Array
     rates: Array
-    decays: Array
+    decays: Array  # (n,) [1/s]: how fast that decays
 
     @property
     def duration(self) -> float:

@@ -12,8 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import InputError
-from ..common.require import require_number
+from ..common.errors import InputError, require_number
 from .torque import COLUMNS, TorqueProfile
 
 ERROR = 1e-5
@@ -39,11 +38,8 @@ def place_rows(
 
     Parameters
     ----------
-    torque : TorqueProfile
-    error : float
-        What the lines may miss, relative to the largest torque.
-    rate_limit : ndarray, shape (2,), optional, [N m/s]
-        Largest rates, which lines keep if the torques do.
+    error                      what the lines may miss, relative to the largest torque
+    rate_limit : (2,) [N m/s]  largest rates, which lines keep if the torques do
     """
     peak = np.abs(_sample(torque.coefficients)).max(axis=(0, 1))
     largest = float(peak.max())
@@ -76,9 +72,8 @@ def sample_rows(torque: TorqueProfile, rate: float, interpolation: str) -> Array
 
     Raises
     ------
-    InputError
-        If the rate is not a positive number or gives fewer than two samples, or the interpolation
-        is another one.
+    InputError  if the rate is not a positive number or gives fewer than two samples, or the
+                interpolation is another one
     """
     rate = require_sampling(rate, interpolation)
     start, count = torque.breaks[0], torque.duration * rate
@@ -99,8 +94,7 @@ def require_sampling(rate: object, interpolation: str) -> float:
 
     Raises
     ------
-    InputError
-        If they are not.
+    InputError  if they are not
     """
     if interpolation not in INTERPOLATIONS:
         allowed = " and ".join(INTERPOLATIONS)

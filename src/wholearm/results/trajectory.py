@@ -17,22 +17,13 @@ from .torque import TorqueProfile
 
 
 class Samples(NamedTuple):
-    """A motion at n instants, on one contact formation.
+    """A motion at n instants, on one contact formation."""
 
-    Attributes
-    ----------
-    z, z_dot, z_ddot : ndarray, shape (n, 5)
-        Degrees of freedom (q, theta) and their derivatives.
-    tau : ndarray, shape (n, 2), [N m]
-    c_n, c_t : ndarray, shape (n, n_c), [N]
-        In the order of the formation's contacts.
-    """
-
-    z: Array
+    z: Array  # z, z_dot, z_ddot (n, 5): degrees of freedom (q, theta) and their derivatives
     z_dot: Array
     z_ddot: Array
-    tau: Array
-    c_n: Array
+    tau: Array  # (n, 2) [N m]
+    c_n: Array  # c_n, c_t (n, n_c) [N]: in the order of the formation's contacts
     c_t: Array
 
 
@@ -53,47 +44,32 @@ class Motion(Protocol):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Trajectory(Drawn):
-    """A planned motion: samples for files and plots, motions for any instant.
+    """A planned motion: samples for files and plots, motions for any instant."""
 
-    Attributes
-    ----------
-    t : ndarray, shape (n,), [s]
-        Even within each phase of a plan; a phase boundary is there twice, since torques and forces
-        step, and so is where a phase is at its end and is held there. In a replay any other step
-        is, too.
-    q, theta : ndarray, shape (n, 3) and (n, 2), [m, m, rad] and [rad]
-    q_dot, theta_dot, q_ddot, theta_ddot : ndarray
-        First and second derivatives with respect to time.
-    tau : ndarray, shape (n, 2), [N m]
-    contacts : tuple of str, length m
-        Every contact of the plan.
-    c_n, c_t : ndarray, shape (n, m), [N]
-        NaN where a contact is not in the formation, or at rest, where forces are not determined.
-    phase : ndarray of int, shape (n,)
-        Index of the phase, from 0.
-    torque : TorqueProfile
-        The torques at any instant, exact between samples, with every step at a break.
-    motions : tuple of Motion
-        One per phase. Those of a planned trajectory satisfy the equations of motion at any
-        instant; those of a loaded one interpolate the samples.
-    meta : dict
-        Status, epsilon and the problem, and of a plan everything else that `Plan` says.
-    """
-
+    # (n,) [s]: even within each phase of a plan; a phase boundary is there twice, since torques and
+    # forces step, and so is where a phase is at its end and is held there. In a replay any other
+    # step is, too.
     t: Array
-    q: Array
+    q: Array  # q, theta (n, 3) and (n, 2) [m, m, rad] and [rad]:
     theta: Array
+    # q_dot, theta_dot, q_ddot, theta_ddot: first and second derivatives with respect to time
     q_dot: Array
     theta_dot: Array
     q_ddot: Array
     theta_ddot: Array
-    tau: Array
-    contacts: tuple[str, ...]
+    tau: Array  # (n, 2) [N m]
+    contacts: tuple[str, ...]  # every contact of the plan
+    # c_n, c_t (n, m) [N]: naN where a contact is not in the formation, or at rest, where forces are
+    # not determined
     c_n: Array
     c_t: Array
-    phase: NDArray[np.int64]
+    phase: NDArray[np.int64]  # (n,): index of the phase, from 0
+    # the torques at any instant, exact between samples, with every step at a break
     torque: TorqueProfile
+    # one per phase. Those of a planned trajectory satisfy the equations of motion at any instant;
+    # those of a loaded one interpolate the samples.
     motions: tuple[Motion, ...]
+    # status, epsilon and the problem, and of a plan everything else that `Plan` says
     meta: Mapping[str, Any]
 
     @property
@@ -156,8 +132,7 @@ class Trajectory(Drawn):
 
         Raises
         ------
-        ValueError
-            If one of the times is outside the trajectory.
+        ValueError  if one of the times is outside the trajectory
         """
         times, starts = np.atleast_1d(np.asarray(t, dtype=float)), self.phase_starts
         inside = (times >= starts[0]) & (times <= starts[-1])
@@ -182,8 +157,7 @@ class Trajectory(Drawn):
 
         Raises
         ------
-        InputError
-            If the file cannot be written.
+        InputError  if the file cannot be written
         """
         from .trajectory_file import write_trajectory
 
@@ -196,8 +170,7 @@ class Trajectory(Drawn):
 
         Raises
         ------
-        InputError
-            If the file cannot be written.
+        InputError  if the file cannot be written
         """
         from .torque_table import format_rows, place_rows
 
@@ -209,7 +182,7 @@ def assemble(
     motions: Sequence[Motion], torque: TorqueProfile, meta: Mapping[str, Any], samples: int
 ) -> Trajectory:
     """Sample motions that follow one another, `samples` rows to a phase and two to its held end."""
-    from .settling import SettledMotion
+    from .dwell_record import SettledMotion
 
     contacts = tuple(dict.fromkeys(name for motion in motions for name in motion.contacts))
     rows, times, forces, start = [], [], [], 0.0

@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ..common.archive import read_arrays
 from ..common.errors import InputError
-from ..common.files import require_ending, write_whole
+from ..common.files import read_arrays, require_ending, write_whole
 from ..common.plain import restore
-from .modes import ModeSpan
+from .mode_names import ModeSpan
 from .sampled import sample_phases
 from .torque import MOST, TorqueProfile
 from .trajectory import Trajectory
@@ -42,8 +41,7 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
 
     Raises
     ------
-    InputError
-        If the file cannot be read, or an array is missing or of the wrong shape.
+    InputError  if the file cannot be read, or an array is missing or of the wrong shape
     """
     source = str(path)
     extra = {"contacts": (), "torque_breaks": (), "torque_coefficients": (2, -1)}

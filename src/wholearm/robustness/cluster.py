@@ -12,15 +12,12 @@ def connect(address: str, patience: float = 10.0) -> Executor:
 
     Parameters
     ----------
-    address : str
-        Such as ``tcp://10.0.0.1:8786``.
-    patience : float, [s]
-        How long to wait for an answer.
+    address         such as ``tcp://10.0.0.1:8786``
+    patience : [s]  how long to wait for an answer
 
     Raises
     ------
-    InputError
-        If Dask is not installed, or no scheduler answers there.
+    InputError  if Dask is not installed, or no scheduler answers there
     """
     try:
         from distributed import Client

@@ -146,21 +146,12 @@ class Friction:
 
 
 class Scales(NamedTuple):
-    """The scene's own units, which every tolerance is relative to.
+    """The scene's own units, which every tolerance is relative to."""
 
-    Attributes
-    ----------
-    length : float, [m]
-        Radius of gyration of the object.
-    mass : float, [kg]
-        Of the object.
-    force : float, [N]
-        Weight of the object; next to nothing, or without gravity, a hundredth of what the weaker
-        finger can press with at its tip.
-    """
-
-    length: float
-    mass: float
+    length: float  # [m]: radius of gyration of the object
+    mass: float  # [kg]: of the object
+    # [N]: weight of the object; next to nothing, or without gravity, a hundredth of what the weaker
+    # finger can press with at its tip
     force: float
 
     @property
@@ -226,21 +217,13 @@ class Scales(NamedTuple):
 class Scene:
     """Everything that does not move by plan: object, both fingers, friction and gravity.
 
-    Attributes
-    ----------
-    polygon : Polygon
-    fingers : (Finger, Finger)
-        The right one, then the left one.
-    friction : Friction
-
     Raises
     ------
-    InputError
-        If finger 1 is not to the right of finger 2, or a value is not of its type.
+    InputError  if finger 1 is not to the right of finger 2, or a value is not of its type
     """
 
     polygon: Polygon
-    fingers: tuple[Finger, Finger]
+    fingers: tuple[Finger, Finger]  # the right one, then the left one
     friction: Friction
     gravity: float = 9.81
     fingers_collide: bool = True

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.arrays import Array
-from ..common.errors import InputError
-from ..common.fields import POINT, POSITIVE, Kind, declare, key, read_keys
-from ..common.require import frozen
+from ..common.errors import InputError, frozen
+from ..common.fields import POINT, POSITIVE, FieldKind, declare, key, read_keys
 from .ranges import INERTIA, MASS
 
 SIZES = (1e-4, 1e3)
@@ -35,7 +34,7 @@ def _read_corners(given: object, key: str) -> Array:
     return frozen([POINT.read(point, f"{key}[{k}]") for k, point in enumerate(given)])
 
 
-CORNERS = Kind(
+CORNERS = FieldKind(
     _read_corners,
     {"type": "array", "minItems": 3, "maxItems": MOST_VERTICES, "items": POINT.schema},
 )
@@ -59,31 +58,23 @@ CORNERS = Kind(
 class Polygon:
     """The object: a rigid convex polygon.
 
-    Attributes
-    ----------
-    vertices : ndarray, shape (n_v, 2), [m]
-        Corners relative to the centroid, in the orientation phi = 0.
-    centroid : ndarray, shape (2,), [m]
-        The centroid in the frame of `points`.
-    uniform_inertia : float, [kg m^2]
-        What the inertia about the centroid would be for uniform density.
-    size : float, [m]
-        Largest distance between two corners.
-
     Raises
     ------
-    InputError
-        If the corners are not those of a convex anticlockwise polygon, or a number is not positive;
-        if the polygon is too small, too large or too slender, or has too short an edge.
+    InputError  if the corners are not those of a convex anticlockwise polygon, or a number is not
+                positive; if the polygon is too small, too large or too slender, or has too short an
+                edge
     """
 
     points: ArrayLike
     mass: float
     inertia: float | None = None
+    # (n_v, 2) [m]: corners relative to the centroid, in the orientation phi = 0
     vertices: Array = field(init=False, repr=False)
+    # (2,) [m]: the centroid in the frame of `points`
     centroid: Array = field(init=False, repr=False)
+    # [kg m^2]: what the inertia about the centroid would be for uniform density
     uniform_inertia: float = field(init=False, repr=False)
-    size: float = field(init=False, repr=False)
+    size: float = field(init=False, repr=False)  # [m]: largest distance between two corners
 
     def __post_init__(self) -> None:
         read_keys(self, "object.")

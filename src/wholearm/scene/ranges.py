@@ -85,8 +85,8 @@ def check_ranges(scene: Scene) -> None:
 
     Raises
     ------
-    InputError
-        For the first that is out of its range; names the key, what is given and what is allowed.
+    InputError  for the first that is out of its range; names the key, what is given and what is
+                allowed
     """
     parts: list[list[tuple[str, Any]]] = [
         [("object.", scene.polygon)],

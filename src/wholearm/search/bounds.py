@@ -7,11 +7,11 @@ import math
 from itertools import count
 from typing import NamedTuple
 
-from ..common.pulse import beat
-from .find import Search
+from ..common.signals import beat
+from .astar import RouteSearch
+from .edges import ROUGHLY, Link
 from .goals import is_at
-from .links import ROUGHLY, Link
-from .places import Key, Place
+from .places import Key, RoadmapPlace
 
 MOST = 240
 """Most places that are settled to bound routes from below."""
@@ -21,17 +21,11 @@ class BorderBound(NamedTuple):
     """A lower bound of what routes take that follow borders.
 
     Where these meet they stop, or go on at speed where the law of impacts lets them.
-
-    Attributes
-    ----------
-    value : float, [s]
-        No such route takes less.
-    complete : bool
-        Whether it is that of a route, or larger than what was asked for; otherwise more would
-        have had to be looked at.
     """
 
-    value: float
+    value: float  # [s]: no such route takes less
+    # whether it is that of a route, or larger than what was asked for; otherwise more would have
+    # had to be looked at
     complete: bool
 
     def up_to(self, enough: float) -> BorderBound:
@@ -39,7 +33,7 @@ class BorderBound(NamedTuple):
         return self if self.value < enough else BorderBound(enough, True)
 
 
-def bound_borders(search: Search, enough: float = math.inf) -> BorderBound:
+def bound_borders(search: RouteSearch, enough: float = math.inf) -> BorderBound:
     """Bound every route along borders from below, up to `enough` [s].
 
     Links have their bounds on a coarse grid, until those of the shortest route are all refined.
@@ -53,11 +47,11 @@ def bound_borders(search: Search, enough: float = math.inf) -> BorderBound:
 
 
 def _find_shortest(
-    search: Search, enough: float, refined: set[Link], known: dict[Key, list[Link]]
+    search: RouteSearch, enough: float, refined: set[Link], known: dict[Key, list[Link]]
 ) -> tuple[BorderBound, tuple[Link, ...]]:
     """The shortest route along borders by bounds of its links, and these; none from `enough` on."""
     number, settled = count(), set[Key]()
-    queue: list[tuple[float, int, Place, tuple[Link, ...]]] = [
+    queue: list[tuple[float, int, RoadmapPlace, tuple[Link, ...]]] = [
         (0.0, next(number), search.start, ())
     ]
     while queue:

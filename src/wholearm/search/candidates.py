@@ -12,35 +12,24 @@ from ..planning.options import PlanOptions
 from ..planning.plan import solve_with
 from ..planning.result import Plan
 from ..problem.definition import Problem
-from .find import Route
-from .links import Link
-from .measure import SINGULAR
+from .astar import RoadmapRoute
+from .edges import Link
+from .feasibility import SINGULAR
 
 
 @dataclass(frozen=True, eq=False)
-class Failure:
-    """A route that has no plan after all.
+class FailedCandidate:
+    """A route that has no plan after all."""
 
-    Attributes
-    ----------
-    route : Route
-    reason : str
-    """
-
-    route: Route
+    route: RoadmapRoute
     reason: str
 
 
 class Lost(str):
-    """Why a route has no plan, with the links for which that is so on every route.
+    """Why a route has no plan, with the links for which that is so on every route."""
 
-    Attributes
-    ----------
-    links : tuple of Link
-        The one that has no plan, or whose plan does not hold, behind the one that lands where it
-        starts, if any.
-    """
-
+    # the one that has no plan, or whose plan does not hold, behind the one that lands where it
+    # starts, if any
     links: tuple[Link, ...] = ()
 
     @classmethod

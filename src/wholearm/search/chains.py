@@ -15,7 +15,7 @@ from ..contacts.formation import Formation
 from ..mechanics.metric import metric_weights
 from ..planning.path_domain.impact_sequence import BEND, compute_curve_impact
 from ..problem.definition import End, Phase, Until
-from .links import Blocked, Border, Link, Step, link_along
+from .edges import Blocked, BorderEdge, EdgeStep, Link, link_along
 
 LONGEST = 6
 """Most borders that are passed in one go."""
@@ -23,24 +23,15 @@ LONGEST = 6
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """Borders that are followed whole and left in motion, and one after them.
+    """Borders that are followed whole and left in motion, and one after them."""
 
-    Attributes
-    ----------
-    steps : tuple of Step
-        Phases along those that are followed whole.
-    borders : tuple of Border
-        These, and the last one.
-    ratios : tuple of float
-        Speed ratios of all borders, with which the speed is the same on both sides of a join.
-    """
-
-    steps: tuple[Step, ...]
-    borders: tuple[Border, ...]
+    steps: tuple[EdgeStep, ...]  # phases along those that are followed whole
+    borders: tuple[BorderEdge, ...]  # these, and the last one
+    # speed ratios of all borders, with which the speed is the same on both sides of a join
     ratios: tuple[float, ...]
 
     @classmethod
-    def of(cls, border: Border) -> Chain:
+    def of(cls, border: BorderEdge) -> Chain:
         """A border that others may follow."""
         return cls((), (border,), (1.0,))
 
@@ -50,7 +41,7 @@ class Chain:
         contacts, held = set(formation.contacts), set(last.formation.contacts)
         return last.gained in contacts and contacts <= {*held, last.gained}
 
-    def extend(self, following: Border) -> Chain | None:
+    def extend(self, following: BorderEdge) -> Chain | None:
         """The chain with another border passed into in motion; None where that is not possible."""
         last, gained = self.borders[-1], self.borders[-1].gained
         if not self.can_enter(following.formation):
@@ -61,13 +52,13 @@ class Chain:
             join = compute_curve_impact(phase, last.curve, following.curve)
             if join.possible and np.isfinite(join.ratio):
                 return Chain(
-                    (*self.steps, Step(last.formation.contacts, phase.until, end)),
+                    (*self.steps, EdgeStep(last.formation.contacts, phase.until, end)),
                     (*self.borders, following),
                     (*self.ratios, self.ratios[-1] * join.ratio),
                 )
         return None
 
-    def link(self, step: Step, last: Border) -> Link | Blocked:
+    def link(self, step: EdgeStep, last: BorderEdge) -> Link | Blocked:
         """The link along the chain, at rest at the end of the last border or of a part of it."""
         borders, steps = (*self.borders[:-1], last), (*self.steps, step)
         return link_along(borders, self.ratios, steps, last.stop)
@@ -77,11 +68,11 @@ class Chain:
         last = self.borders[-1]
         if last.gained is None:
             return None
-        step = Step(last.formation.contacts, Until(contact=last.gained))
+        step = EdgeStep(last.formation.contacts, Until(contact=last.gained))
         return self.link(step, last)
 
 
-def _goes_on(before: Border, after: Border) -> bool:
+def _goes_on(before: BorderEdge, after: BorderEdge) -> bool:
     """Whether a border goes on about along the tangent of the one before."""
     metric, ends = metric_weights(after.formation.scene), np.array([before.curve.length, 0.0])
     (v,), (heading,) = (

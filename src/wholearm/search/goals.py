@@ -12,20 +12,20 @@ from ..geometry.tracing import HELD
 from ..problem.definition import Until
 from ..problem.goal import Goal
 from ..scene.model import Scene
-from .places import Place, unit_steps
+from .places import RoadmapPlace, unit_steps
 
 ACROSS = np.linspace(-1.5, 1.5, 13)
 """Where a goal that leaves x open is looked for inside a cell, in radii of gyration."""
 
 
-def is_flush(place: Place, edge: int) -> bool:
+def is_flush(place: RoadmapPlace, edge: int) -> bool:
     """Whether an edge lies on the palm."""
     count = place.scene.polygon.n_vertices
     palm = {c.index for c in place.contacts if c.finger is None}
     return {edge, (edge + 1) % count} <= palm
 
 
-def is_at(place: Place, goal: Goal) -> bool:
+def is_at(place: RoadmapPlace, goal: Goal) -> bool:
     """Whether a place is a goal."""
     scene = place.scene
     if goal.x is not None and abs(place.z[0] - goal.x) > HELD * scene.scales.length:
@@ -95,7 +95,7 @@ def list_poses(scene: Scene, z: Array, goal: Goal) -> Array:
     return np.column_stack([x, np.full(len(x), goal.phi)])
 
 
-def measure_turn(place: Place, goal: Goal) -> float:
+def measure_turn(place: RoadmapPlace, goal: Goal) -> float:
     """How far the object has still to turn, at least [rad]."""
     angle = goal.find_angle(place.scene, float(place.z[2]))
     return math.fabs(angle - float(place.z[2]))

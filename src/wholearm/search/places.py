@@ -24,23 +24,13 @@ Key = tuple[tuple[str, ...], int, int]
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
-    """A configuration at rest.
-
-    Attributes
-    ----------
-    scene : Scene
-    z : ndarray, shape (5,)
-    contacts : tuple of Contact
-        All that touch.
-    landed : bool
-        Whether it is about where a motion through a cell lands: not a crossing.
-    """
+class RoadmapPlace:
+    """A configuration at rest."""
 
     scene: Scene
-    z: Array
-    contacts: tuple[Contact, ...]
-    landed: bool = False
+    z: Array  # (5,)
+    contacts: tuple[Contact, ...]  # all that touch
+    landed: bool = False  # whether it is about where a motion through a cell lands: not a crossing
 
     @property
     def key(self) -> Key:
@@ -53,12 +43,12 @@ class Place:
         return describe_pose(self.z)
 
 
-def make_place(scene: Scene, z: Array, landed: bool = False) -> Place:
+def make_place(scene: Scene, z: Array, landed: bool = False) -> RoadmapPlace:
     """The place of a configuration, with what touches there."""
-    return Place(scene, z, find_touching(scene, z), landed)
+    return RoadmapPlace(scene, z, find_touching(scene, z), landed)
 
 
-def settle(place: Place) -> Place | None:
+def settle(place: RoadmapPlace) -> RoadmapPlace | None:
     """A place with all of its contacts closed exactly; None where they do not close."""
     # In the order in which formations at the place have them, whose functions it shares.
     own = sorted(place.contacts, key=lambda c: -1 if c.finger is None else c.finger)
@@ -67,7 +57,7 @@ def settle(place: Place) -> Place | None:
     return None if z is None else replace(place, z=z)
 
 
-def list_formations_at(place: Place, count: int) -> Iterator[Formation]:
+def list_formations_at(place: RoadmapPlace, count: int) -> Iterator[Formation]:
     """Formations of three or four contacts that touch at a place: palm and both fingers are there.
 
     Of four, two are the ends of an edge that lies flush; two names of one contact are none.

@@ -8,16 +8,16 @@ from typing import Any
 
 from ..common.document import Document, Result, Table
 from ..contacts.formation import describe
-from ..mapping.walk import format_until
+from ..mapping.legs import format_until
 from ..planning.options import Objective
 from ..planning.result import Plan
 from ..problem.definition import End, Problem
+from .astar import EAGER, RoadmapRoute, RouteSearch
 from .bounds import BorderBound
-from .candidates import Failure
+from .candidates import FailedCandidate
 from .chains import LONGEST
-from .find import EAGER, Route, Search
-from .gates import list_cut
-from .links import Blocked, describe_steps
+from .cuts import list_cut
+from .edges import Blocked, describe_steps
 
 LISTED, FAILED = 2, 1
 """Most reasons that a message names, and most of them of routes without a plan."""
@@ -31,17 +31,10 @@ NOT_CONSIDERED = (
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Alternative(Result):
-    """A route with its plan.
-
-    Attributes
-    ----------
-    plan : Plan
-    problem : Problem
-        Its phases are the route.
-    """
+    """A route with its plan."""
 
     plan: Plan
-    problem: Problem
+    problem: Problem  # its phases are the route
 
     @property
     def headline(self) -> str:
@@ -75,32 +68,19 @@ class Answer(Alternative):
 
     Attributes
     ----------
-    plan : Plan
-    problem : Problem
-        The problem with phases in place of its goals.
-    route : Route
-        To the last goal.
-    bound : BorderBound or None
-        What every route along borders takes at least; None with several goals, and where the
-        search was interrupted.
-    alternatives : tuple of Alternative
-    failures : tuple of Failure
-        Routes that were planned, or tried, in vain.
-    blocked : tuple of Blocked
-        Borders that no motion can follow.
-    settled : int
-        Places that were looked at.
-    complete : bool
-        Whether the search ended by itself.
+    plan
+    problem  the problem with phases in place of its goals
     """
 
-    route: Route
+    route: RoadmapRoute  # to the last goal
+    # what every route along borders takes at least; None with several goals, and where the search
+    # was interrupted
     bound: BorderBound | None
     alternatives: tuple[Alternative, ...]
-    failures: tuple[Failure, ...]
-    blocked: tuple[Blocked, ...]
-    settled: int
-    complete: bool
+    failures: tuple[FailedCandidate, ...]  # routes that were planned, or tried, in vain
+    blocked: tuple[Blocked, ...]  # borders that no motion can follow
+    settled: int  # places that were looked at
+    complete: bool  # whether the search ended by itself
 
     @property
     def gap(self) -> float | None:
@@ -179,8 +159,8 @@ def format_phases(problem: Problem) -> str:
 
 
 def describe_block(
-    search: Search,
-    failures: Sequence[Failure],
+    search: RouteSearch,
+    failures: Sequence[FailedCandidate],
     opening: str = "",
     explain: Callable[[Blocked], str] = lambda own: own.reason,
 ) -> str:

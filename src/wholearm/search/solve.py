@@ -14,7 +14,7 @@ from ..problem.definition import Problem
 def solve(problem: Problem, objective: str = "time", **options: Any) -> Plan:
     """Plan along the formations that a problem names, or that lead to its goals."""
     if problem.goals:
-        from .route import find_route
+        from .find_route import find_route
 
         return find_route(problem, objective, **options).plan
     return planning.solve(problem, objective, **options)

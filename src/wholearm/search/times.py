@@ -7,18 +7,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..common.arrays import Array
-from ..contacts.closing import contact_table
+from ..contacts.closing import contact_table, evaluate_each, group_alike
 from ..contacts.formation import Kinematics
-from ..contacts.many import evaluate_each, group_alike
 from ..geometry.curve import solve_tangent
 from ..mapping.formation_map import Border
 from ..mechanics.dynamics import Directions, inverse, reduced_inertia
 from ..mechanics.limits import make_limits
 from ..mechanics.metric import metric_weights
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN, find_minors
-from ..planning.lower_bound.rows import Rows, limit
+from ..planning.lower_bound.rows import PathLimitRows, limit
 from ..problem.definition import Problem
-from .sweep import find_durations
+from .travel_times import find_durations
 
 NODES = 24
 """Intervals of a border."""
@@ -31,10 +30,8 @@ def time_borders(problem: Problem, borders: Sequence[Border]) -> Array:
 
     Parameters
     ----------
-    problem : Problem
-        Whose scene and epsilon count.
-    borders : sequence of Border
-        With something flush.
+    problem  whose scene and epsilon count
+    borders  with something flush
 
     Returns
     -------
@@ -51,7 +48,7 @@ def time_borders(problem: Problem, borders: Sequence[Border]) -> Array:
     return times.reshape(-1, 2)
 
 
-def _follow(problem: Problem, borders: Sequence[Border], places: Array) -> Rows:
+def _follow(problem: Problem, borders: Sequence[Border], places: Array) -> PathLimitRows:
     """Limits at places of borders, each forth and back, by the share of it that is behind."""
     scene, weights = problem.scene, metric_weights(problem.scene)
     count, table = len(places), contact_table(scene)
@@ -65,7 +62,7 @@ def _follow(problem: Problem, borders: Sequence[Border], places: Array) -> Rows:
     at = evaluate_each(scene, labels, z, way)
     z_s, z_ss = solve_tangent(at.P, at.P_dot_v, way, weights)
     tangent, curvature = length * z_s, length**2 * z_ss
-    found = [np.empty(0)] * len(Rows._fields)
+    found = [np.empty(0)] * len(PathLimitRows._fields)
     for formation, mine in group_alike(scene, labels):
         part = Kinematics(*(array[mine] for array in at))
         every = make_limits(formation, problem.epsilon)
@@ -86,7 +83,7 @@ def _follow(problem: Problem, borders: Sequence[Border], places: Array) -> Rows:
                 if not found[k].size:
                     found[k] = np.empty((len(borders), 2, *split.shape[1:]))
                 found[k][chosen, back] = split[:, ::-1] if back else split
-    return Rows(*(own.reshape(-1, *own.shape[2:]) for own in found))
+    return PathLimitRows(*(own.reshape(-1, *own.shape[2:]) for own in found))
 
 
 def _interpolate(

@@ -62,15 +62,10 @@ def find_force_slopes(
 
     Parameters
     ----------
-    formation : Formation
-    point : CurvePoint
-    directions : Directions
-        One row for each place.
-    forces : PathForces
-        Of the formation there.
-    names : sequence of str
-        Of the numbers, as in `problem.uncertainty`: relative ones, or lengths in m. `start_x`
-        is how far the object is along the curve. `delay` has no derivative.
+    directions  one row for each place
+    forces      of the formation there
+    names       of the numbers, as in `problem.uncertainty`: relative ones, or lengths in m.
+                `start_x` is how far the object is along the curve. `delay` has no derivative.
 
     Returns
     -------
@@ -134,29 +129,17 @@ def find_slopes_at(
 
 
 class _State(NamedTuple):
-    """A formation at n places, with coefficients (..., COUNT) of its motion.
-
-    Attributes
-    ----------
-    formation : Formation
-    z, z_s : ndarray, shape (n, 5)
-        Places and tangents, z' = z_s s'.
-    kinematics : Kinematics
-    directions : Directions
-    c, tau, acceleration : ndarray, shape (n, ..., COUNT)
-    along : tuple of ndarray, shape (n, 5) each
-        By how much places and tangents change with `start_x`.
-    """
+    """A formation at n places, with coefficients (..., COUNT) of its motion."""
 
     formation: Formation
-    z: Array
+    z: Array  # z, z_s (n, 5): places and tangents, z' = z_s s'
     z_s: Array
     kinematics: Kinematics
     directions: Directions
-    c: Array
+    c: Array  # c, tau, acceleration (n, ..., COUNT):
     tau: Array
     acceleration: Array
-    along: tuple[Array, Array]
+    along: tuple[Array, Array]  # (n, 5): by how much places and tangents change with `start_x`
 
     def find_slopes(self, names: Sequence[str]) -> Array:
         """Derivatives of the contact forces, shape (n, n_c + R, len(names), COUNT)."""

@@ -5,19 +5,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..common.document import Drawn
+from ..common.errors import SimulationError
 from ..mechanics.dynamics import energy
 from ..problem.definition import Phase, Problem
+from ..results.sampled import sample_phases
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from .layout import Outputs
 from .runge_kutta import GLIMPSES, NODES
+
+REPLAYED = "replayed"
+"""Status in the `meta` of such a trajectory."""
 
 
 class EventKind(Enum):
@@ -63,32 +68,18 @@ class EventKind(Enum):
 
 
 class Event(NamedTuple):
-    """Something that happens at an instant.
+    """Something that happens at an instant."""
 
-    Attributes
-    ----------
-    time : float, [s]
-    phase : int
-        Index of the phase, from 0.
-    kind : EventKind
-    text : str
-        What has happened, in words.
-    contact : str
-        The contact or joint concerned, empty if it is the object or none.
-    value : float
-        Arrival: rate at which the distance to the phase's end closes [m/s or rad/s]; contact lost
-        and release: the c_n that the contact would need [N]; slip of a contact that the phase lets
-        roll: its margin mu c_n - |c_t| [N];
-        impact: the least impulse, that of `contact` [N s]; end: the distance to the phase's end [m
-        or rad], NaN if that is a release; NaN otherwise. Where no contacts are told, impact: the
-        speed at which the gap closed [m/s].
-    """
-
-    time: float
-    phase: int
+    time: float  # [s]
+    phase: int  # index of the phase, from 0
     kind: EventKind
-    text: str
-    contact: str = ""
+    text: str  # what has happened, in words
+    contact: str = ""  # the contact or joint concerned, empty if it is the object or none
+    # arrival: rate at which the distance to the phase's end closes [m/s or rad/s]; contact lost and
+    # release: the c_n that the contact would need [N]; slip of a contact that the phase lets roll:
+    # its margin mu c_n - |c_t| [N]; impact: the least impulse, that of `contact` [N s]; end: the
+    # distance to the phase's end [m or rad], NaN if that is a release; NaN otherwise. Where no
+    # contacts are told, impact: the speed at which the gap closed [m/s].
     value: float = float("nan")
 
 
@@ -119,26 +110,15 @@ class Outcome(NamedTuple):
 
 
 class Energies(NamedTuple):
-    """Energies at n instants, each of shape (n,) [J].
+    """Energies at n instants, each of shape (n,) [J]."""
 
-    Attributes
-    ----------
-    stored : ndarray
-        Kinetic and potential energy.
-    work : ndarray
-        Work of the torques so far.
-    viscous, dry, contact : ndarray
-        Lost so far to viscous and dry joint friction and to sliding.
-    impact : ndarray
-        Lost so far where a contact gained stopped the motion, or part of it.
-    """
-
-    stored: Array
-    work: Array
+    stored: Array  # kinetic and potential energy
+    work: Array  # work of the torques so far
+    # viscous, dry, contact: lost so far to viscous and dry joint friction and to sliding
     viscous: Array
     dry: Array
     contact: Array
-    impact: Array
+    impact: Array  # lost so far where a contact gained stopped the motion, or part of it
 
     @property
     def residual(self) -> Array:
@@ -148,19 +128,11 @@ class Energies(NamedTuple):
 
 
 class Glimpses(NamedTuple):
-    """Normal forces within steps, as good as the stages of Runge-Kutta steps know the state.
+    """Normal forces within steps, as good as the stages of Runge-Kutta steps know the state."""
 
-    Attributes
-    ----------
-    t : ndarray, shape (k,), [s]
-    phase : ndarray of int, shape (k,)
-    c_n : ndarray, shape (k, m), [N]
-        NaN where a contact is not in the formation.
-    """
-
-    t: Array
-    phase: NDArray[np.int64]
-    c_n: Array
+    t: Array  # (k,) [s]
+    phase: NDArray[np.int64]  # (k,)
+    c_n: Array  # (k, m) [N]: naN where a contact is not in the formation
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -168,47 +140,28 @@ class Simulation(Drawn):
     """A simulated motion, at every accepted step and every instant asked for.
 
     A phase boundary and a step of the torques are there twice, since forces jump.
-
-    Attributes
-    ----------
-    t : ndarray, shape (n,), [s]
-    z, z_dot, z_ddot : ndarray, shape (n, 5)
-    tau : ndarray, shape (n, 2), [N m]
-    phase : ndarray of int, shape (n,)
-        Index of the phase, from 0.
-    contacts : tuple of str, length m
-        Every contact of the problem.
-    c_n, c_t : ndarray, shape (n, m), [N]
-        NaN where a contact is not in the formation, and at rest, where forces are indeterminate.
-    problem : Problem
-    torque : TorqueProfile
-        What was simulated.
-    events : tuple of Event
-    energies : Energies
-    outcome : Outcome
-    missed_by : float, [m or rad]
-        Distance to the end of the last phase entered; zero when the goal is reached, and NaN if
-        that phase ends by a release.
-    steps, rejected : int
-        Accepted and rejected Runge-Kutta steps.
     """
 
-    t: Array
-    z: Array
+    t: Array  # (n,) [s]
+    z: Array  # z, z_dot, z_ddot (n, 5):
     z_dot: Array
     z_ddot: Array
-    tau: Array
-    phase: NDArray[np.int64]
-    contacts: tuple[str, ...]
+    tau: Array  # (n, 2) [N m]
+    phase: NDArray[np.int64]  # (n,): index of the phase, from 0
+    contacts: tuple[str, ...]  # every contact of the problem
+    # c_n, c_t (n, m) [N]: naN where a contact is not in the formation, and at rest, where forces
+    # are indeterminate
     c_n: Array
     c_t: Array
     problem: Problem = field(repr=False)
-    torque: TorqueProfile = field(repr=False)
+    torque: TorqueProfile = field(repr=False)  # what was simulated
     events: tuple[Event, ...]
     energies: Energies
     outcome: Outcome
+    # [m or rad]: distance to the end of the last phase entered; zero when the goal is reached, and
+    # NaN if that phase ends by a release
     missed_by: float
-    steps: int
+    steps: int  # steps, rejected: accepted and rejected Runge-Kutta steps
     rejected: int
 
     @property
@@ -219,8 +172,6 @@ class Simulation(Drawn):
     @property
     def trajectory(self) -> Trajectory:
         """The simulated motion as a trajectory, to be saved and drawn like a plan."""
-        from .recording import make_trajectory
-
         return make_trajectory(self)
 
     def find(self, kind: EventKind) -> tuple[Event, ...]:
@@ -232,8 +183,7 @@ class Simulation(Drawn):
 
         Raises
         ------
-        ValueError
-            If `t` was not among the instants asked for and no step ends there.
+        ValueError  if `t` was not among the instants asked for and no step ends there
         """
         index = int(np.searchsorted(self.t, t, side="right")) - 1
         if index < 0 or self.t[index] != t:
@@ -242,50 +192,26 @@ class Simulation(Drawn):
 
 
 class Step(NamedTuple):
-    """A step that has been made.
+    """A step that has been made."""
 
-    Attributes
-    ----------
-    t, h : float, [s]
-        Its start and length.
-    inputs : ndarray
-        Its packed inputs.
-    row : ndarray
-        Its packed outputs.
-    impact : float, [J]
-        Energy lost to impacts so far.
-    arrives : bool
-        Whether it ends where the phase ends, which it has passed by rounding.
-    """
-
-    t: float
+    t: float  # t, h [s]: its start and length
     h: float
-    inputs: Array
-    row: Array
-    impact: float
-    arrives: bool
+    inputs: Array  # its packed inputs
+    row: Array  # its packed outputs
+    impact: float  # [J]: energy lost to impacts so far
+    arrives: bool  # whether it ends where the phase ends, which it has passed by rounding
 
 
 class Section(NamedTuple):
-    """What is recorded while one phase is simulated, row by row.
-
-    Attributes
-    ----------
-    phase : Phase
-    to : Outputs
-        Layout of the rows.
-    times, rows, impacts : list
-        Instants [s], packed outputs, and the energy lost to impacts so far [J].
-    steps : list of Step
-        Those that may be looked into.
-    """
+    """What is recorded while one phase is simulated, row by row."""
 
     phase: Phase
-    to: Outputs
+    to: Outputs  # layout of the rows
+    # times, rows, impacts: instants [s], packed outputs, and the energy lost to impacts so far [J]
     times: list[float]
     rows: list[Array]
     impacts: list[float]
-    steps: list[Step]
+    steps: list[Step]  # those that may be looked into
 
 
 def collect(
@@ -354,3 +280,52 @@ def list_glimpses(problem: Problem, sections: Sequence[Section]) -> Glimpses:
         c_n[:, where] = seen.reshape(len(t), len(own))
         columns.append((t, np.full(len(t), section.phase.index), c_n))
     return Glimpses(*(np.concatenate(column) for column in zip(*columns, strict=True)))
+
+
+def make_trajectory(simulation: Simulation) -> Trajectory:
+    """The motion of a simulation with every recorded instant, for files and figures.
+
+    A phase that is entered in its last instant only is left out.
+
+    Raises
+    ------
+    SimulationError  if the simulation ended where it started, so that there is no motion
+    """
+    rows, problem = _choose_rows(simulation), simulation.problem
+    if not len(rows):
+        raise SimulationError(f"there is no motion to keep: {simulation.outcome.text}")
+    z, z_dot, z_ddot = (getattr(simulation, name)[rows] for name in ("z", "z_dot", "z_ddot"))
+    arrays: dict[str, Any] = {
+        name: getattr(simulation, name)[rows] for name in ("t", "tau", "c_n", "c_t", "phase")
+    }
+    arrays |= {"q": z[:, :3], "q_dot": z_dot[:, :3], "q_ddot": z_ddot[:, :3]}
+    arrays |= {"theta": z[:, 3:], "theta_dot": z_dot[:, 3:], "theta_ddot": z_ddot[:, 3:]}
+    motions = sample_phases(arrays, simulation.contacts)
+    rolling = [phase.formation.rolling for phase in problem.phases[: len(motions)]]
+    meta = {
+        "status": REPLAYED,
+        "outcome": simulation.outcome.text,
+        "name": problem.name,
+        "epsilon": problem.epsilon,
+        "rolling": [[contact.name for contact in own] for own in rolling],
+        "phase_durations": [motion.duration for motion in motions],
+        "problem": problem.table,
+    }
+    return Trajectory(
+        **arrays, contacts=simulation.contacts, torque=simulation.torque, motions=motions, meta=meta
+    )
+
+
+def _choose_rows(simulation: Simulation) -> NDArray[np.int64]:
+    """Rows whose times increase in each phase, but for one repetition where forces step."""
+    chosen: list[int] = []
+    for index in range(int(simulation.phase[-1]) + 1):
+        own = np.flatnonzero(simulation.phase == index)
+        t = simulation.t[own]
+        before, after = np.append(True, np.diff(t) > 0), np.append(np.diff(t) > 0, True)
+        # At the end of a phase what comes before the last step stands for its last instant.
+        kept = own[before | (after & (t < t[-1]))]
+        if len(kept) < 2:
+            break
+        chosen += kept.tolist()
+    return np.array(chosen, dtype=np.int64)

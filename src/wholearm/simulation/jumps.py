@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ..problem.definition import End
-from .choosing import choose_mode, note_change
 from .events import EventKind, Outcome
-from .locate import find_first
 from .replay import Replay
-from .stepper import Stepper
+from .root_finding import find_first
+from .sliding_signs import choose_mode, note_change
+from .stepper import ModeStepper
 from .tolerances import REACHED, SETTLING, SLOW, is_slower, measure_units
 
 _FAR = 100.0
@@ -22,50 +22,27 @@ lever arms make the change of a contact's sliding a few times that of the veloci
 
 
 class Arrival(NamedTuple):
-    """The end of a phase is reached.
+    """The end of a phase is reached."""
 
-    Attributes
-    ----------
-    rate : float, [m/s or rad/s]
-        How fast the distance to the phase's end closes.
-    window : float, [s]
-        If the next break of the torques is no further off, the arrival belongs to it.
-    strikes : bool
-        Whether it takes an impact to go on.
-    left : float, [s]
-        Time in which a motion whose deceleration fades would have come to rest.
-    """
-
-    rate: float
+    rate: float  # [m/s or rad/s]: how fast the distance to the phase's end closes
+    # [s]: if the next break of the torques is no further off, the arrival belongs to it
     window: float
-    strikes: bool = False
+    strikes: bool = False  # whether it takes an impact to go on
+    # [s]: time in which a motion whose deceleration fades would have come to rest
     left: float = 0.0
 
 
 class Released(NamedTuple):
-    """The contacts that the next phase does not have are let go.
+    """The contacts that the next phase does not have are let go."""
 
-    Attributes
-    ----------
-    c_n : float, [N]
-        The least that the old formation would need of them.
-    """
-
-    c_n: float
+    c_n: float  # [N]: the least that the old formation would need of them
 
 
 class Switched(NamedTuple):
-    """A contact comes to rest, or slips, as the next phase has it.
-
-    Attributes
-    ----------
-    contact : str
-    way : float
-        Direction in which it slips; 0 if it comes to rest.
-    """
+    """A contact comes to rest, or slips, as the next phase has it."""
 
     contact: str
-    way: float = 0.0
+    way: float = 0.0  # direction in which it slips; 0 if it comes to rest
 
 
 class Rested:
@@ -82,13 +59,9 @@ def look_again(
 
     Parameters
     ----------
-    run : Replay
-    turned : sequence of int
-        Contacts and then joints that have just come to rest.
-    time : float, optional, [s]
-        When that was, if not at present.
-    enters : bool
-        Whether a formation has just been entered.
+    turned      contacts and then joints that have just come to rest
+    time : [s]  when that was, if not at present
+    enters      whether a formation has just been entered
     """
     stuck = run.stuck
     if _decide(run, turned, time=time, enters=enters):
@@ -201,13 +174,13 @@ def let_slip(run: Replay, events: Sequence[int]) -> Ending | None:
     return look_again(run, [k - s.rows.slide.start for k in events if k in _turning(s)])
 
 
-def _measure_reserves(s: Stepper) -> list[float]:
+def _measure_reserves(s: ModeStepper) -> list[float]:
     """What friction still has to give for each of what it holds [N, N m]."""
     cones = s.outputs[s.to.events][s.rows.cone].reshape(2, -1)
     return [float(least) for least in cones.min(axis=0)]
 
 
-def find_slipping(s: Stepper) -> list[int]:
+def find_slipping(s: ModeStepper) -> list[int]:
     """Which contacts that the phase lets roll are out of their cones."""
     reserves = _measure_reserves(s) if s.mode.holders else []
     slack = -s.slack[s.rows.cone.start]
@@ -333,7 +306,7 @@ def _cross(run: Replay, stop: float) -> None:
     run.drop()
 
 
-def _turning(s: Stepper) -> range:
+def _turning(s: ModeStepper) -> range:
     """Rows of the event values that change sign at a reversal."""
     return range(s.rows.slide.start, s.rows.joint.stop)
 

@@ -11,116 +11,60 @@ MOVING = 10
 
 
 class Inputs(NamedTuple):
-    """Where each input of a step is in its packed vector.
+    """Where each input of a step is in its packed vector."""
 
-    Attributes
-    ----------
-    y : slice
-        State, shape (STATE,).
-    t, h, tolerance : int
-        Time and step [s]; largest error of z and z' over the step, in units of the scene.
-    Xi, sigma : slice
-        Directions of sliding and of the joints, zero for what is held.
-    kept : slice
-        Slip coordinates of rolling and stuck contacts [m], then angles of held joints [rad].
-    heading : slice
-        Velocity at the start of the step, scaled to one in the metric M5 (or the impending one).
-    piece : slice
-        Start and end of the torque's piece [s].
-    torque : slice
-        Its coefficients, joint by joint, as in `TorqueProfile`.
-    size : int
-    """
-
-    y: slice
+    y: slice  # state, shape (STATE,)
+    # t, h, tolerance: time and step [s]; largest error of z and z' over the step, in units of the
+    # scene
     t: int
     h: int
     tolerance: int
-    Xi: slice
+    Xi: slice  # Xi, sigma: directions of sliding and of the joints, zero for what is held
     sigma: slice
+    # slip coordinates of rolling and stuck contacts [m], then angles of held joints [rad]
     kept: slice
+    # velocity at the start of the step, scaled to one in the metric M5 (or the impending one)
     heading: slice
-    piece: slice
-    torque: slice
+    piece: slice  # start and end of the torque's piece [s]
+    torque: slice  # its coefficients, joint by joint, as in `TorqueProfile`
     size: int
 
 
 class Outputs(NamedTuple):
-    """Where each output of a step is in its packed vector; all but `error` hold at its end.
+    """Where each output of a step is in its packed vector; all but `error` hold at its end."""
 
-    Attributes
-    ----------
-    y : slice
-        State, shape (STATE,).
-    acceleration : slice
-        z'', shape (5,).
-    c_n, c_t : slice
-        Forces [N].
-    tau : slice
-        Torques [N m].
-    heading : slice
-        The velocity scaled to one in the metric M5.
-    ratio : int
-        Reduced inertia over that without friction.
-    error : int
-        Estimated error over the tolerance; accept at 1 and below.
-    worst : int
-        Least of the event values plus their slacks: below zero something has happened.
-    dip : int
-        Least c_n and reserve of friction at the stages within the step, in units of the scene.
-    glimpses : slice
-        c_n at the stages of `GLIMPSES`, one after the other [N]; zero without a step.
-    until_rate : int
-        Time derivative of the distance to the phase's end.
-    events : slice
-        Values that are positive until something happens; see `EventRows`.
-    size : int
-    """
-
-    y: slice
-    acceleration: slice
-    c_n: slice
+    y: slice  # state, shape (STATE,)
+    acceleration: slice  # z'', shape (5,)
+    c_n: slice  # c_n, c_t: forces [N]
     c_t: slice
-    tau: slice
-    heading: slice
-    ratio: int
-    error: int
-    worst: int
+    tau: slice  # torques [N m]
+    heading: slice  # the velocity scaled to one in the metric M5
+    ratio: int  # reduced inertia over that without friction
+    error: int  # estimated error over the tolerance; accept at 1 and below
+    worst: int  # least of the event values plus their slacks: below zero something has happened
+    # least c_n and reserve of friction at the stages within the step, in units of the scene
     dip: int
-    glimpses: slice
-    until_rate: int
-    events: slice
+    glimpses: slice  # c_n at the stages of `GLIMPSES`, one after the other [N]; zero without a step
+    until_rate: int  # time derivative of the distance to the phase's end
+    events: slice  # values that are positive until something happens; see `EventRows`
     size: int
 
 
 class EventRows(NamedTuple):
-    """Where each kind of event value is among `Outputs.events`.
+    """Where each kind of event value is among `Outputs.events`."""
 
-    Attributes
-    ----------
-    force : slice
-        c_n [N].
-    cone : slice
-        What friction still has to give where it holds (`Mode.holders`): mu c_n - c_t of contacts
-        [N] and D - f of joints [N m], then the same with the other sign.
-    slide, joint : slice
-        Sliding velocities times Xi [m/s], joint speeds times sigma [rad/s].
-    limit : slice
-        The formation's limits [m]; that of the contact to be gained counts as `until` instead.
-    until : int
-        Distance to the end of the phase [m or rad]; one if that is a release.
-    speed : int
-        Speed along the heading, in the metric M5; one with more than one freedom, where contacts
-        and joints come to rest one by one.
-    size : int
-    """
-
-    force: slice
+    force: slice  # c_n [N]
+    # what friction still has to give where it holds (`Mode.holders`): mu c_n - c_t of contacts [N]
+    # and D - f of joints [N m], then the same with the other sign
     cone: slice
+    # slide, joint: sliding velocities times Xi [m/s], joint speeds times sigma [rad/s]
     slide: slice
     joint: slice
+    # the formation's limits [m]; that of the contact to be gained counts as `until` instead
     limit: slice
-    until: int
+    until: int  # distance to the end of the phase [m or rad]; one if that is a release
+    # speed along the heading, in the metric M5; one with more than one freedom, where contacts and
+    # joints come to rest one by one
     speed: int
     size: int
 

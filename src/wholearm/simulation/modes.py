@@ -36,18 +36,11 @@ FIXED = 1e-7
 
 @dataclass(frozen=True)
 class Grips:
-    """What friction holds although the phase lets it slide or turn.
+    """What friction holds although the phase lets it slide or turn."""
 
-    Attributes
-    ----------
-    contacts : tuple of tuple of int
-        Contacts that stick, those of a flush edge together.
-    joints : tuple of int
-        Joints that are held.
-    """
-
+    # contacts that stick, those of a flush edge together
     contacts: tuple[tuple[int, ...], ...] = ()
-    joints: tuple[int, ...] = ()
+    joints: tuple[int, ...] = ()  # joints that are held
 
     def __len__(self) -> int:
         return len(self.contacts) + len(self.joints)
@@ -58,18 +51,10 @@ FREE = Grips()
 
 
 class Unit(NamedTuple):
-    """What slides or turns, and sticks or is held, as one.
+    """What slides or turns, and sticks or is held, as one."""
 
-    Attributes
-    ----------
-    rows : tuple of int
-        Among the contacts and then the joints.
-    grips : bool
-        Whether there is friction to hold it.
-    """
-
-    rows: tuple[int, ...]
-    grips: bool
+    rows: tuple[int, ...]  # among the contacts and then the joints
+    grips: bool  # whether there is friction to hold it
 
 
 @lru_cache(maxsize=64)
@@ -198,52 +183,33 @@ def share_mode(formation: Formation, grips: Grips = FREE) -> Mode:
     return Mode(formation, grips)
 
 
-class Rows(NamedTuple):
-    """Constraint rows at one state.
+class ModeRows(NamedTuple):
+    """Constraint rows at one state."""
 
-    Attributes
-    ----------
-    A, A_t : ndarray, shape (n_c, 5)
-    A_dot_v, A_t_dot_v : ndarray, shape (n_c,)
-    """
-
-    A: Array
+    A: Array  # A, A_t (n_c, 5):
     A_t: Array
-    A_dot_v: Array
+    A_dot_v: Array  # A_dot_v, A_t_dot_v (n_c,):
     A_t_dot_v: Array
 
 
 class Response(NamedTuple):
-    """How a mode answers to torques; quantities are rows @ (1, tau_1, tau_2).
+    """How a mode answers to torques; quantities are rows @ (1, tau_1, tau_2)."""
 
-    Attributes
-    ----------
-    acceleration : ndarray, shape (5, 3)
-    rates : ndarray, shape (n_c + 2, 3)
-        Accelerations of the contacts' sliding and of the joints.
-    force_limits : ndarray, shape (n_c + 2 K, 3), [N, N m]
-        What has to be positive for everything to hold, H c + h.
-    ratio : float
-        Reduced inertia over that without friction; jammed at zero and below.
-    """
-
-    acceleration: Array
-    rates: Array
+    acceleration: Array  # (5, 3)
+    rates: Array  # (n_c + 2, 3): accelerations of the contacts' sliding and of the joints
+    # (n_c + 2 K, 3) [N, N m]: what has to be positive for everything to hold, H c + h
     force_limits: Array
-    ratio: float
+    ratio: float  # reduced inertia over that without friction; jammed at zero and below
 
 
-def respond(mode: Mode, signs: Array, rows: Rows, v: Array) -> Response | None:
+def respond(mode: Mode, signs: Array, rows: ModeRows, v: Array) -> Response | None:
     """Solve the equations of motion; None if the constraints are not independent.
 
     Parameters
     ----------
-    signs : ndarray, shape (n_c + 2,)
-        Directions of contacts and joints, zero for what is held or rolls.
-    rows : Rows
-        At the state.
-    v : ndarray, shape (5,)
-        Its velocity.
+    signs : (n_c + 2,)  directions of contacts and joints, zero for what is held or rolls
+    rows                at the state
+    v : (5,)            its velocity
     """
     formation, scene = mode.formation, mode.formation.scene
     count, rolling = formation.n_contacts, list(mode.rolled.rolling_rows)
@@ -285,7 +251,7 @@ def find_fixed(mode: Mode, A: Array, A_t: Array) -> NDArray[np.bool_]:
 
     Parameters
     ----------
-    A, A_t : ndarray, shape (n_c, 5)
+    A, A_t : (n_c, 5)
     """
     joints = np.eye(5)[3:]
     root = np.sqrt(mode.formation.scene.mass_diagonal)

@@ -15,7 +15,7 @@ from ..results.torque import TorqueProfile
 from .events import Event, EventKind, Outcome, OutcomeKind, Section
 from .layout import STATE
 from .modes import FREE, Grips
-from .stepper import Stepper, build_stepper
+from .stepper import ModeStepper, build_stepper
 from .tolerances import find_tolerances
 
 
@@ -24,48 +24,31 @@ class Replay:
 
     Attributes
     ----------
-    t : float, [s]
-    y : ndarray, shape (STATE,)
-        z, z', then work, viscous, dry and contact losses.
-    h : float, [s]
-        The step to try next.
-    piece : int
-        Piece of the torques.
-    phase : Phase
-    stepper : Stepper
-        Of the phase's formation.
-    limits : list of str
-        What has happened when each of the stepper's limits is zero.
-    releasable : tuple of str
-        The contacts whose release ends the phase.
-    resting, slipping : frozenset of int
-        The contacts that come to rest, all of them, or slip, one of them, where the phase ends.
-    has_slid : bool
-        Whether those that come to rest have slid in the phase.
-    ways : dict
-        Directions in which contacts, by name, have just begun to slip.
-    side : float
-        Sign of (coordinate - value) before the end of the phase, if that is a coordinate's value.
-    tolerances : Tolerances
-        Those of the scene.
-    until_unit : float, [m or rad]
-        Unit of the distance to the end of the phase.
-    passes : bool
-        Whether a motion may pass the end of the phase at any speed, without an impact.
-    moving : bool
-        Whether the motion goes on into the phase that is entered.
-    left : Formation or None
-        That of the last phase which has ended at rest.
-    wanted : list of float
-        Instants at which steps have to end; infinity is last.
-    stuck : set of int
-        Contacts, then joints, of the phase's formation that stay while the rest moves.
+    t : [s]
+    y : (STATE,)             z, z', then work, viscous, dry and contact losses
+    h : [s]                  the step to try next
+    piece                    piece of the torques
+    has_slid                 whether those that come to rest have slid in the phase
+    ways                     directions in which contacts, by name, have just begun to slip
+    side                     sign of (coordinate - value) before the end of the phase, if that is a
+                             coordinate's value
+    tolerances               those of the scene
+    until_unit : [m or rad]  unit of the distance to the end of the phase
+    passes                   whether a motion may pass the end of the phase at any speed, without an
+                             impact
+    moving                   whether the motion goes on into the phase that is entered
+    left                     that of the last phase which has ended at rest
+    wanted                   instants at which steps have to end; infinity is last
+    stuck                    contacts, then joints, of the phase's formation that stay while the
+                             rest moves
     """
 
-    stepper: Stepper
+    stepper: ModeStepper  # of the phase's formation
     phase: Phase
-    limits: list[str]
-    releasable: tuple[str, ...]
+    limits: list[str]  # what has happened when each of the stepper's limits is zero
+    releasable: tuple[str, ...]  # the contacts whose release ends the phase
+    # resting, slipping: the contacts that come to rest, all of them, or slip, one of them, where
+    # the phase ends
     resting: frozenset[int]
     slipping: frozenset[int]
 
@@ -103,7 +86,7 @@ class Replay:
         self.ways: dict[str, float] = {}
         self.decided = (-math.inf, 0)
         self.sections: list[Section] = []
-        self.steppers: list[Stepper] = []
+        self.steppers: list[ModeStepper] = []
         self.events: list[Event] = []
         self.steps = self.rejected = 0
 

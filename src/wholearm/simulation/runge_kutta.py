@@ -102,18 +102,15 @@ def build_step(
 
     Parameters
     ----------
-    rate : callable
-        Right-hand side on expressions, shape (n,).
-    y : expression, shape (n,)
-    t, h : scalar expression, [s]
-        Start and length of the step.
-    moving : int
-        The others are integrals along the motion of so many, which stages need not have.
+    rate        right-hand side on expressions, shape (n,)
+    y : (n,)
+    t, h : [s]  start and length of the step
+    moving      the others are integrals along the motion of so many, which stages need not have
 
     Returns
     -------
-    end, fifth, third : expression, shape (n,), (moving,) and (moving,)
-        The state at t + h, and the errors of the embedded formulas of order 5 and 3.
+    end, fifth, third : (n,), (moving,) and (moving,)  the state at t + h, and the errors of the
+        embedded formulas of order 5 and 3
     """
     stages, last = _build_combinations(y.shape[0], moving)
     rates: list[Expression] = []

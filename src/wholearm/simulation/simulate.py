@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,25 +28,73 @@ from numpy.typing import ArrayLike
 from ..common.arrays import Array, sort_unique
 from ..common.errors import InputError, JammingError, SimulationError
 from ..common.sharing import exclusive
+from ..contacts.contact_limits import takes_over
+from ..contacts.formation import Formation
+from ..mechanics.impact import ViolationKind, compute_impact, solve_impulses
 from ..problem.check import require_phases
 from ..problem.definition import End, Phase, Problem
-from ..results.narrow import Torques, adopt_torques
-from .events import EventKind, Glimpses, Outcome, OutcomeKind, Simulation, collect, list_glimpses
-from .jumps import Arrival, Ending, Released, Rested, Switched, is_there
-from .moving import move
+from ..results.adopt import Torques, adopt_torques
+from .events import (
+    EventKind,
+    Glimpses,
+    Outcome,
+    OutcomeKind,
+    Section,
+    Simulation,
+    Step,
+    collect,
+    list_glimpses,
+)
+from .jumps import (
+    Arrival,
+    Ending,
+    Released,
+    Rested,
+    Switched,
+    coast_to_step,
+    come_to_rest,
+    find_slipping,
+    is_there,
+    let_go,
+    let_slip,
+    look_again,
+    steps_within,
+    turn,
+)
+from .modes import find_fixed, find_grips, list_units, share_mode
 from .replay import Replay
-from .starting import Departure
-from .statics import balances
-from .sticking import Collapse, Rest, find_rest
-from .transitions import collide, enter, go_on, set_off
-from .within import look_within
+from .root_finding import find_first
+from .runge_kutta import ORDER
+from .sliding_signs import measure_rates
+from .start_modes import StartDeparture
+from .stepper import ModeStepper, open_limits
+from .sticking import Collapse, Rest, balances, close_contacts, find_rest
+from .tolerances import (
+    CREEPING,
+    PASSED,
+    REACHED,
+    ROUNDING_LIMIT,
+    SETTLING,
+    SHORTEST_STEP,
+    SLOW,
+    STANDING,
+    is_slower,
+    measure_units,
+    measure_until,
+)
 
+_OUTCOMES = {
+    ViolationKind.PULL: OutcomeKind.CONTACT_LOST,
+    ViolationKind.SLIP: OutcomeKind.SLIPS,
+    ViolationKind.CLOSING: OutcomeKind.LIMIT_REACHED,
+    ViolationKind.HELD: OutcomeKind.HELD,
+}
+_GROWTH = 40.0
+"""Largest growth of a step: at order 8 an error of 1e-13 of the tolerance allows it."""
 _HELD_AT = 5
 """Places of a piece of the torques at which they have to hold the object."""
-
 ROUNDS = 8
 """Most simulations, each with more steps that end where something showed within those before."""
-
 Closer = Callable[[Simulation, Glimpses, int], ArrayLike]
 """Gives, from what is known and the number of looks so far, instants to look at too, or none."""
 
@@ -64,35 +113,26 @@ def simulate(
 
     Parameters
     ----------
-    problem : Problem
-    torque : TorqueProfile
-    tolerance : float
-        Largest error of each step, in z and z', over those or over the scene's length, 1 rad, speed
-        and angular speed (`Scene.scales`) where these are more.
-    times : array_like, shape (n,), optional, [s]
-        Instants at which the state is wanted; steps end there. Those outside the torques' time
-        are left out.
-    closer : callable, optional
-        Takes the simulation, glimpses of forces within its steps and the number of looks so far,
-        from 0, and gives instants within steps that are to be seen, too, shape (n,) [s], until it
-        gives none. That changes no step, unless something shows there that ends of steps do not.
-    progress : callable, optional
-        Receives a line at the start of each phase.
+    tolerance         largest error of each step, in z and z', over those or over the scene's
+                      length, 1 rad, speed and angular speed (`Scene.scales`) where these are more
+    times : (n,) [s]  instants at which the state is wanted; steps end there. Those outside the
+                      torques' time are left out.
+    closer            takes the simulation, glimpses of forces within its steps and the number of
+                      looks so far, from 0, and gives instants within steps that are to be seen,
+                      too, shape (n,) [s], until it gives none. That changes no step, unless
+                      something shows there that ends of steps do not.
+    progress          receives a line at the start of each phase
 
     Returns
     -------
-    Simulation
-        Whatever happens to the object: a lost contact is an outcome, not an error.
+    Simulation  whatever happens to the object: a lost contact is an outcome, not an error
 
     Raises
     ------
-    InputError
-        If `tolerance` is not a number from 1e-14 to 1e-2, or a time is not finite.
-    JammingError
-        If friction makes the reduced inertia vanish or turn negative.
-    SimulationError
-        If a formation does not close at its start, or the step size underflows. Both errors say in
-        which phase.
+    InputError       if `tolerance` is not a number from 1e-14 to 1e-2, or a time is not finite
+    JammingError     if friction makes the reduced inertia vanish or turn negative
+    SimulationError  if a formation does not close at its start, or the step size underflows. Both
+                     errors say in which phase.
     """
     problem, profile, _ = adopt_torques(problem, torque)
     require_phases(problem)
@@ -153,14 +193,14 @@ def _simulate(run: Replay, progress: Callable[[str], None] | None) -> tuple[Outc
 def _play(run: Replay, phase: Phase, following: Phase | None) -> Outcome | None:
     """Simulate one phase; None if its end is reached."""
     enter(run, phase, following)
-    ending: Departure | Ending = Rested()
+    ending: StartDeparture | Ending = Rested()
     if run.moving:
         ending = go_on(run) or move(run)
     brief = 0
     while True:
         if isinstance(ending, Rested):
             ending = _rest(run)
-        if isinstance(ending, Departure):
+        if isinstance(ending, StartDeparture):
             started = run.t
             run.note(EventKind.START, f"the object starts to move {run.when()}")
             set_off(run, ending)
@@ -229,7 +269,7 @@ def _switch(run: Replay, switch: Switched) -> None:
     run.moving = True
 
 
-def _rest(run: Replay) -> Departure | Arrival | Released | Switched | Outcome:
+def _rest(run: Replay) -> StartDeparture | Arrival | Released | Switched | Outcome:
     """Wait at rest until the formation can start, the goal is near or something gives way."""
     y = run.y
     before = run.stored
@@ -246,12 +286,12 @@ def _rest(run: Replay) -> Departure | Arrival | Released | Switched | Outcome:
         if run.t >= run.held_until:
             x = run.fraction(run.t)
             change = rest.wait(run.coefficients[run.piece], x)
-            if isinstance(change, Departure) and change.x <= x:
+            if isinstance(change, StartDeparture) and change.x <= x:
                 return change
             if not sticks:
                 run.note(EventKind.STICK, f"the object sticks {run.when()}")
             sticks = True
-            if isinstance(change, Departure):
+            if isinstance(change, StartDeparture):
                 _advance(run, run.time(change.x))
                 return change
             if isinstance(change, Collapse) and not _settles(run, change) and not _touches(run):
@@ -320,3 +360,420 @@ def _collect(run: Replay, outcome: Outcome, missed_by: float) -> Simulation:
 
 
 __all__ = ["simulate"]
+
+
+def move(run: Replay) -> Ending:
+    """Integrate until the motion rests, arrives, releases its contacts or fails."""
+    start = run.stepper.outputs.copy()
+    run.h = min(run.h, run.tolerances.first_step)
+    while True:
+        outputs, to = run.stepper.outputs, run.stepper.to
+        while run.wanted[run.next_wanted] <= run.t:
+            run.next_wanted += 1
+        target = min(run.breaks[run.piece + 1], run.wanted[run.next_wanted])
+        h, whole = _try_step(run, target)
+        arrives = bool(outputs[to.worst] < 0)
+        if arrives and not (whole and _is_at_end(run, target)):
+            ending = _stop_at_event(run, start, h)
+            if ending is not None:
+                return ending
+            start = run.stepper.outputs.copy()
+            continue
+        start = _accept(run, target if whole else run.t + h, arrives)
+        if whole and target == run.breaks[run.piece + 1]:
+            ending = _pass_break(run)
+            if ending is not None:
+                return ending
+            start = run.stepper.outputs.copy()
+
+
+def _accept(run: Replay, t: float, arrives: bool = False) -> Array:
+    """Take the step just made, to time `t`; `arrives`: the end of the phase is passed by rounding.
+
+    It is kept, so that more can be seen of what lies within it.
+    """
+    begin, inputs = run.t, run.stepper.inputs.copy()
+    row = run.accept(t)
+    run.sections[-1].steps.append(Step(begin, t - begin, inputs, row, run.impact, arrives))
+    return row
+
+
+def _try_step(run: Replay, target: float) -> tuple[float, bool]:
+    """Find a step within the tolerance; returns its length and whether it ends at `target`."""
+    s = run.stepper
+    inputs, outputs, at, to = s.inputs, s.outputs, s.at, s.to
+    remaining = target - run.t
+    while True:
+        whole = run.h >= 0.999 * remaining
+        h = remaining if whole else min(run.h, remaining / 2)
+        inputs[at.t], inputs[at.h] = run.t, h
+        s.step()
+        error = outputs[to.error]
+        brief = h <= run.tolerances.settling / 10
+        sudden = outputs[to.dip] < -1e-6 and outputs[to.worst] >= 0 and not brief
+        if error <= 1 and not sudden:
+            grown = h * min(_GROWTH, 0.9 * max(error, 1e-300) ** (-1 / ORDER))
+            run.h = grown if h == run.h else max(run.h, grown)
+            run.steps += 1
+            return h, whole
+        run.rejected += 1
+        factor = 0.9 * error ** (-1 / ORDER) if error > 1 else 0.2
+        run.h = h * (0.5 if error <= 1 else max(0.2, factor))
+        if run.h < max(run.tolerances.shortest_step, SHORTEST_STEP * abs(run.t)):
+            run.fail_to_step(float(outputs[to.ratio]))
+
+
+def _is_at_end(run: Replay, t: float) -> bool:
+    """Whether the step just tried ends at the end of the phase, and at a torque break.
+
+    By rounding a planned motion ends a little beyond the end of its phase, or has just turned back.
+    It has to be at rest there, or to reach a contact softly; a coordinate, or the end of a
+    contact's range, is passed at any speed, just then, and an impact comes at any, with the step of
+    the torques that goes with it, or as they end. A motion that is about to stop instead may step
+    its torques before it is there.
+    """
+    s = run.stepper
+    if t != run.breaks[run.piece + 1] or not is_there(run) or _comes_later(run):
+        return False
+    speed = abs(_measure_rate(run))
+    if run.passes:
+        speed = 0.0 if _is_passing(run) else math.inf
+    elif run.phase.end is End.IMPACT and _strikes(run):
+        coming = run.piece + 1
+        speed = 0.0 if coming >= len(run.steps_at) or run.steps_at[coming] else speed
+    elif run.phase.end is not End.SMOOTH and s.formation.n_constraints < 4:
+        units = measure_units(run.problem.scene)[5:]
+        speed = float(np.abs(s.outputs[s.to.y][5:10] / units).max())
+    pressing = s.outputs[s.to.events][s.rows.force]
+    return speed < SLOW and bool(pressing.min() >= -run.tolerances.force) and not find_slipping(s)
+
+
+def _is_passing(run: Replay) -> bool:
+    """Whether a motion that passes the end of a phase is there but for rounding of the time."""
+    distance = abs(run.value(run.stepper.rows.until)) / run.until_unit
+    return distance <= SETTLING * abs(_measure_rate(run))
+
+
+def _comes_later(run: Replay) -> bool:
+    """Whether a motion whose deceleration fades still comes nearer, at a break that is not its end.
+
+    It is slow, and near the end of its phase, long before it is there. What slow motors do not make
+    step may have breaks anywhere, as tables of torques do. What comes within the time for which
+    a formation is held at rest may as well be there.
+    """
+    coming = run.piece + 1
+    if not run.problem.scene.has_slow_motors or run.phase.end is not End.REST:
+        return False
+    if coming + 1 >= len(run.breaks) or run.steps_at[coming]:
+        return False
+    late = 2 * _time_to_stop(run) > run.tolerances.rest_window
+    return late and _measure_rate(run) < -CREEPING
+
+
+def _pass_break(run: Replay) -> Ending | None:
+    """Go on to the next piece of the torques."""
+    s = run.stepper
+    if _is_at_end(run, run.t):
+        rate, strikes = -float(s.outputs[s.to.until_rate]), _strikes(run)
+        # Before a step that is still to come, the torques are those of the phase that ends.
+        stepped = run.next_piece()
+        window = run.tolerances.settling if stepped else run.tolerances.rest_window
+        return Arrival(rate, window, strikes)
+    if run.t >= run.breaks[-1]:
+        return run.run_out()
+    if not run.next_piece():
+        return None
+    run.note(EventKind.TORQUE_STEP, f"the torques step {run.when()}")
+    return look_again(run)
+
+
+def _stop_at_event(run: Replay, start: Array, h: float) -> Ending | None:
+    """End the step at the first event within it; None if the motion goes on."""
+    s = run.stepper
+    rows = s.rows
+    kinds = find_first(run, start, h)
+    _accept(run, run.t + float(s.inputs[s.at.h]))
+    if rows.until in kinds:
+        return _pass_on(run) if run.phase.end is End.SMOOTH or _strikes(run) else _reach(run)
+    if rows.speed in kinds:
+        return come_to_rest(run)
+    pulling = [k for k in kinds if k < rows.force.stop]
+    if pulling:
+        return let_go(run, pulling)
+    if any(rows.cone.start <= k < rows.cone.stop for k in kinds):
+        return let_slip(run, kinds)
+    for k in kinds:
+        if rows.limit.start <= k < rows.limit.stop:
+            text = f"{run.limits[k - rows.limit.start]} {run.when()}"
+            run.note(EventKind.LIMIT, text)
+            return Outcome(OutcomeKind.LIMIT_REACHED, text)
+    return turn(run, kinds)
+
+
+def _reach(run: Replay) -> Arrival:
+    """The end of the phase is reached while moving."""
+    s = run.stepper
+    rate = -float(s.outputs[s.to.until_rate])
+    # A planned motion that comes this early by its error would have stopped v / a later.
+    stopping = 2 * _time_to_stop(run)
+    left = min(stopping, run.tolerances.longest_window) if stopping < math.inf else 0.0
+    slow = abs(_measure_rate(run)) < SLOW
+    return Arrival(rate, max(left, run.tolerances.settling) if slow else left, left=left)
+
+
+def _measure_rate(run: Replay) -> float:
+    """Time derivative of the distance to the end of the phase, in units of the scene."""
+    s = run.stepper
+    return float(s.outputs[s.to.until_rate]) / run.until_unit * run.problem.scene.scales.time
+
+
+def _time_to_stop(run: Replay) -> float:
+    """Time in which the motion would stop at its present deceleration [s]."""
+    s = run.stepper
+    heading = run.problem.scene.mass_diagonal * s.outputs[s.to.heading]
+    slowing = -float(heading @ s.outputs[s.to.acceleration])
+    speed = float(heading @ s.outputs[s.to.y][5:10])
+    return speed / slowing if slowing > 0 else math.inf
+
+
+def _strikes(run: Replay) -> bool:
+    """Whether the phase ends with an impact here, and not at rest but for an error of the motion.
+
+    Where impulses do not allow an impact a planned motion stops instead.
+    """
+    rate, time = -_measure_rate(run), _time_to_stop(run) / run.problem.scene.scales.time
+    stops = rate < SLOW or rate * time / 2 < REACHED
+    return run.phase.end is End.IMPACT and not stops
+
+
+def _pass_on(run: Replay) -> Arrival:
+    """The end of a phase is reached that the motion passes.
+
+    If a planned motion comes early by its error, the torques of the next formation have still to
+    come. Until then the old one's contacts go on, while the gap dips below zero by that error.
+    """
+    s = run.stepper
+    s.inputs[s.at.t] = run.t
+    rate, settling = -float(s.outputs[s.to.until_rate]), run.tolerances.settling
+    window = settling
+    strikes = run.phase.end is End.IMPACT
+    if run.passes and rate > 0:
+        # A motion that is off by rounding comes the earlier the slower it is.
+        early = PASSED * run.until_unit / rate
+        window = min(max(early, settling), run.tolerances.longest_window)
+    elif run.phase.until.contact is not None and not strikes:
+        run.step_to(settling)
+        slowing = (float(s.outputs[s.to.until_rate]) + rate) / settling
+        if slowing > 0:
+            window = min(max(2 * rate / slowing, settling), run.tolerances.longest_window)
+    if steps_within(run, window):
+        coast_to_step(run, hide=False)
+    return Arrival(rate, window, strikes)
+
+
+def enter(run: Replay, phase: Phase, following: Phase | None) -> None:
+    """Take the formation of `phase`; what it does not let the motion keep is lost to impact."""
+    run.phase = phase
+    before = run.stored
+    run.y[:5] = _close(run, phase.formation)
+    if run.moving:
+        run.y[5:10] = project_velocity(phase.formation, run.y[:5], run.y[5:10])
+        run.moving = not is_slower(run.problem.scene, run.y[5:10], STANDING)
+    if not run.moving:
+        run.y[5:10] = 0.0
+    run.impact += before - run.stored
+    until, run.side = phase.until, 1.0
+    if until.value is not None:
+        run.side = math.copysign(1.0, run.y[0 if until.coordinate == "x" else 2] - until.value)
+    run.stuck = set()
+    run.until_unit = measure_until(run.problem.scene, until)
+    run.passes = _is_passed(phase)
+    run.take()
+    run.limits = [limit.text for limit in open_limits(phase.formation, until)]
+    run.releasable = find_releasable(phase, following)
+    run.resting, run.slipping = find_switching(phase, following)
+    run.has_slid = False
+
+
+def _is_passed(phase: Phase) -> bool:
+    """Whether a motion may pass the end of a phase at any speed, without an impact.
+
+    A contact can be gained so where it goes on for another one, and softly elsewhere.
+    """
+    gained, own = phase.until.contact, phase.formation
+    smooth = phase.end is End.SMOOTH
+    return smooth and (gained is None or takes_over(gained, own.scene, own.contacts))
+
+
+def _close(run: Replay, formation: Formation) -> Array:
+    """The present configuration with every contact of a formation closed."""
+    try:
+        return close_contacts(formation, run.y[:5], 10 * REACHED * run.problem.scene.scales.length)
+    except SimulationError as error:
+        raise SimulationError(f"{error} {run.where()}") from None
+
+
+def collide(run: Replay, following: Phase) -> Outcome | None:
+    """Throw the velocity onto the next formation; what ends the motion if that is not possible."""
+    z = _close(run, following.formation)
+    impact = compute_impact(run.phase.formation, following.formation, z, run.y[5:10])
+    name, least = impact.least
+    names = following.formation.names
+    normal = impact.p[: len(names)]
+    impulses = ", ".join(f"{p:.4g} on {n}" for n, p in zip(names, normal, strict=True))
+    run.note(EventKind.IMPACT, f"impact {run.when()}, in N s {impulses}", name, least)
+    if impact.violations:
+        worst = impact.violations[0]
+        text = f"{worst.describe()} in the impact {run.when()}"
+        if worst.kind is ViolationKind.JAM:
+            raise JammingError(text)
+        return Outcome(_OUTCOMES[worst.kind], text)
+    before = run.stored
+    run.y[5:10] = impact.v
+    run.impact += before - run.stored
+    return None
+
+
+def find_releasable(phase: Phase, following: Phase | None) -> tuple[str, ...]:
+    """Names of the contacts whose release ends the phase."""
+    if phase.end is End.REST or following is None or not phase.until.is_release:
+        return ()
+    kept = following.formation.names
+    return tuple(name for name in phase.formation.names if name not in kept)
+
+
+def find_switching(phase: Phase, following: Phase | None) -> tuple[frozenset[int], frozenset[int]]:
+    """Contacts that come to rest, as they roll in the next phase, and that slip, as they slide.
+
+    A phase without an `until` ends there; if it lets a contact go, then where that happens.
+    """
+    if phase.end is End.REST or following is None or not phase.until.is_release:
+        return frozenset(), frozenset()
+    own, coming = ({c.name for c in p.formation.rolling} for p in (phase, following))
+    names, kept = phase.formation.names, following.formation.names
+    rests = {k for k, name in enumerate(names) if name in coming - own}
+    slips = {k for k, name in enumerate(names) if name in own - coming and name in kept}
+    return frozenset() if set(names) - set(kept) else frozenset(rests), frozenset(slips)
+
+
+def project_velocity(formation: Formation, z: Array, v: Array) -> Array:
+    """Velocity nearest to `v` in the metric M5 that keeps every constraint, shape (5,)."""
+    P = formation.evaluate(z[None], v[None]).P[0]
+    return solve_impulses(formation.scene.mass_diagonal, P, P, v)[0]
+
+
+def set_off(run: Replay, departure: StartDeparture) -> None:
+    """Give the stepper the directions of a motion that starts from rest."""
+    formation = run.phase.formation
+    grips = find_grips(formation, np.concatenate(departure.directions))
+    if formation.n_constraints < 4:
+        rows = formation.evaluate(run.y[None, :5], run.y[None, 5:10])
+        fixed = find_fixed(share_mode(formation, grips), rows.A[0], rows.A_t[0])
+        run.stuck = {row for u in list_units(formation) for row in u.rows if u.grips and fixed[row]}
+    if grips != run.stepper.mode.grips:
+        run.take(grips)
+    s = run.stepper
+    s.inputs[s.at.Xi], s.inputs[s.at.sigma] = departure.directions
+    s.inputs[s.at.heading] = departure.heading
+    run.record()
+
+
+def go_on(run: Replay) -> Ending | None:
+    """Give the stepper the directions of the present velocity; what ends the motion at once.
+
+    Friction decides for what does not slide or turn here; with one freedom that takes the first
+    direction that does not jam, as it has to go one way just after.
+    """
+    s = run.stepper
+    y, formation = run.y, run.phase.formation
+    s.inputs[s.at.y], s.inputs[s.at.t] = y, run.t
+    v = y[5:10]
+    mass = formation.scene.mass_diagonal
+    s.inputs[s.at.heading] = v / np.sqrt(mass @ v**2)
+    rates = np.concatenate([formation.evaluate(y[None, :5], v[None]).A_t[0] @ v, v[3:]])
+    signs = np.where(rates < 0, -1.0, 1.0)
+    for row, name in enumerate(formation.names):
+        signs[row] = run.ways.get(name, signs[row])
+    run.ways = {}
+    signs[[row for row in range(len(signs)) if row not in _list_rows(formation)]] = 0.0
+    _point(run, signs)
+    if s.is_free:
+        return look_again(run, enters=True)
+    slow = STANDING * measure_rates(run.problem.scene, formation.n_contacts)
+    still = np.flatnonzero((np.abs(rates) < slow) & (signs != 0)).tolist()
+    for choice in product((1.0, -1.0), repeat=len(still)):
+        tried = signs.copy()
+        tried[still] *= choice
+        _point(run, tried)
+        if s.outputs[s.to.ratio] > 0:
+            break
+    else:
+        _point(run, signs)
+    return look_again(run)
+
+
+def _list_rows(formation: Formation) -> set[int]:
+    """Contacts and joints that may slide or turn."""
+    return {row for unit in list_units(formation) for row in unit.rows}
+
+
+def _point(run: Replay, signs: Array) -> None:
+    """Look with the given directions of contacts and joints, shape (n_c + 2,)."""
+    s = run.stepper
+    s.inputs[s.at.Xi], s.inputs[s.at.sigma] = signs[:-2], signs[-2:]
+    s.look()
+
+
+def look_within(run: Replay, times: Array) -> list[float]:
+    """Record the states at increasing instants, shape (n,) [s], within steps that have been made.
+
+    Instants that lie within none are left out.
+
+    Returns
+    -------
+    list of float, [s]
+        Where something has happened that the steps missed.
+    """
+    missed: list[float] = []
+    for section, stepper in zip(run.sections, run.steppers, strict=True):
+        if not section.steps:
+            continue
+        at, slack = stepper.at, _measure_slack(run, section, stepper)
+        begins = np.array([step.t for step in section.steps])
+        owners = np.searchsorted(begins, times, side="left") - 1
+        for time, owner in zip(times.tolist(), owners.tolist(), strict=True):
+            step = section.steps[max(owner, 0)]
+            h = time - step.t
+            if owner < 0 or h >= step.h:
+                continue
+            stepper.inputs[:] = step.inputs
+            stepper.inputs[at.h] = h
+            stepper.step()
+            section.times.append(time)
+            section.rows.append(stepper.outputs.copy())
+            section.impacts.append(step.impact)
+            if shows(step, stepper, slack):
+                missed.append(time)
+    return missed
+
+
+def _measure_slack(run: Replay, section: Section, stepper: ModeStepper) -> Array:
+    """How far below zero each event value counts as rounding within a step."""
+    rows, slack, scales = stepper.rows, stepper.slack.copy(), run.problem.scene.scales
+    slack[rows.slide] = slack[rows.speed] = STANDING * scales.speed
+    slack[rows.speed] *= scales.mass**0.5
+    slack[rows.joint] = STANDING / scales.time
+    slack[rows.until] = ROUNDING_LIMIT * measure_until(run.problem.scene, section.phase.until)
+    return slack
+
+
+def shows(step: Step, stepper: ModeStepper, slack: Array) -> bool:
+    """Whether something happens in a step up to the place just looked at.
+
+    One that ends with the phase may have passed its end, and turned back.
+    """
+    short = stepper.outputs[stepper.to.events] + slack < 0
+    if step.arrives:
+        rows = stepper.rows
+        short[rows.until] = short[rows.speed] = short[rows.slide] = short[rows.joint] = False
+    return bool(short.any())

@@ -6,6 +6,7 @@ from, is one CasADi function of one packed vector, so that a step costs one call
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -16,68 +17,41 @@ from ..common.arrays import Array, Expression
 from ..contacts.elemental import GapLimit, build_features, build_gap
 from ..contacts.formation import Formation
 from ..problem.definition import Until
+from ..scene.model import Scene
 from .layout import MOVING, STATE, EventRows, Inputs, Outputs, lay_out
-from .mode_equations import Mechanics, share_mechanics
 from .modes import FREE, Grips, Mode
-from .runge_kutta import GLIMPSES, build_step
-from .tolerances import find_tolerances
+from .runge_kutta import GLIMPSES, build_error, build_step
+from .tolerances import ROUNDING_FORCE, find_tolerances, measure_units
 
 
 class Compiled(NamedTuple):
-    """What all steppers of a formation share.
-
-    Attributes
-    ----------
-    mode : Mode
-    at, to : Inputs, Outputs
-        Layouts of the packed vectors.
-    rows : EventRows
-    slack : ndarray, shape (n_events,)
-        How far below zero each event value counts as rounding.
-    step, look : casadi.Function
-        Of the packed inputs.
-    """
+    """What all steppers of a formation share."""
 
     mode: Mode
-    at: Inputs
+    at: Inputs  # at, to: layouts of the packed vectors
     to: Outputs
     rows: EventRows
-    slack: Array
-    step: Expression
+    slack: Array  # (n_events,): how far below zero each event value counts as rounding
+    step: Expression  # step, look: of the packed inputs
     look: Expression
 
 
-class Stepper(NamedTuple):
+class ModeStepper(NamedTuple):
     """The compiled steps of one formation, with what sticks and is held in it.
 
     Calling `step` or `look` reads `inputs` and overwrites `outputs`. Each simulation has its own.
-
-    Attributes
-    ----------
-    mode : Mode
-    inputs, outputs : ndarray
-        Packed vectors.
-    at, to : Inputs, Outputs
-        Their layouts.
-    rows : EventRows
-    slack : ndarray, shape (n_events,)
-        How far below zero each event value counts as rounding.
-    step, look : callable
-        A step of length h; the same outputs at the state given, without a step.
-    buffers : list
-        What has to live as long as these.
     """
 
     mode: Mode
-    inputs: Array
+    inputs: Array  # inputs, outputs: packed vectors
     outputs: Array
-    at: Inputs
+    at: Inputs  # at, to: their layouts
     to: Outputs
     rows: EventRows
-    slack: Array
-    step: Any
+    slack: Array  # (n_events,): how far below zero each event value counts as rounding
+    step: Any  # step, look: a step of length h; the same outputs at the state given, without a step
     look: Any
-    buffers: Any
+    buffers: Any  # what has to live as long as these
 
     @property
     def formation(self) -> Formation:
@@ -92,20 +66,15 @@ class Stepper(NamedTuple):
 
 def build_stepper(
     formation: Formation, until: Until, side: float, degree: int, grips: Grips = FREE
-) -> Stepper:
+) -> ModeStepper:
     """Return the steps of a formation for torques of a polynomial degree, compiled when first used.
 
     Parameters
     ----------
-    formation : Formation
-    until : Until
-        What ends the phase.
-    side : float
-        +1 or -1: the sign of (coordinate - value) before the end, when `until` is a coordinate.
-    degree : int
-        Of the torque's polynomials.
-    grips : Grips
-        What friction holds meanwhile.
+    until   what ends the phase
+    side    +1 or -1: the sign of (coordinate - value) before the end, when `until` is a coordinate
+    degree  of the torque's polynomials
+    grips   what friction holds meanwhile
     """
     c = _compile(formation, until, side, degree, grips)
     inputs, results = np.zeros(c.at.size), np.zeros(c.to.size)
@@ -115,7 +84,7 @@ def build_stepper(
         buffer.set_res(0, results.data)
     step, look = (call for _, call in buffers)
     known = c.mode, inputs, results, c.at, c.to, c.rows, c.slack
-    return Stepper(*known, step, look, buffers)
+    return ModeStepper(*known, step, look, buffers)
 
 
 class _Equations:
@@ -228,3 +197,161 @@ def _project(mode: Mode, mechanics: Mechanics, y: Expression, kept: Expression) 
     _, P, _, _ = mode.build_constraints(z, v)
     v = v - mechanics.correct(P, P @ v)
     return ca.vertcat(z, v, y[10:])
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What the equations of motion depend on besides the constraint rows."""
+
+    scene: Scene
+    friction: tuple[float, ...]  # of each contact
+    rolling: tuple[int, ...]  # contacts that the phase lets roll
+    grips: Grips
+    degree: int  # of the torque's polynomials
+    mode: Mode = field(compare=False)  # one of this kind
+
+
+class Mechanics(NamedTuple):
+    """CasADi functions of the constraint rows: P, P' v and A_t."""
+
+    at: Inputs  # layout of the packed inputs
+    # (z and z', time, packed, rows) -> rates of the state, the least that holds it in units of the
+    # scene, and c_n
+    stage: Expression
+    # (state, time, packed, rows) -> outputs up to the ratio, events before and after the limits,
+    # and the least of these events with their slacks
+    report: Expression
+    # (P, r) -> M5^-1 P^T (P M5^-1 P^T)^-1 r, the shortest change of z that makes P change by r
+    correct: Expression
+    error: Expression  # (fifth, third, packed) -> error of a step over the tolerance
+    # (n_events before the limits,): how far below zero each of these counts as rounding
+    slack: Array
+    stall: float  # likewise for the speed
+
+
+def share_mechanics(mode: Mode, degree: int) -> Mechanics:
+    """Return the equations of motion of a mode, for torques of a polynomial degree."""
+    formation = mode.formation
+    friction = tuple(formation.friction.tolist())
+    kind = Kind(formation.scene, friction, formation.rolling_rows, mode.grips, degree, mode)
+    return _build_mechanics(kind)
+
+
+@lru_cache(maxsize=32)
+def _build_mechanics(kind: Kind) -> Mechanics:
+    return _Model(kind).build()
+
+
+class _Model:
+    """Right-hand side and events of a kind of modes, as expressions of the packed inputs."""
+
+    def __init__(self, kind: Kind) -> None:
+        self.mode = mode = kind.mode
+        count, held = len(kind.friction), len(mode.holders)
+        self.at = Inputs(
+            *lay_out(STATE, None, None, None, count, 2, held, 5, 2, 2 * kind.degree + 2)
+        )
+        self.packed = packed = ca.SX.sym("packed", self.at.size)
+        self.Xi, self.sigma = packed[self.at.Xi], packed[self.at.sigma]
+        self.y, self.t = ca.SX.sym("state", STATE), ca.SX.sym("time")
+        n = mode.n_constraints
+        self.rows = [ca.SX.sym("P", n, 5), ca.SX.sym("bend", n), ca.SX.sym("A_t", count, 5)]
+
+    def build(self) -> Mechanics:
+        """All of its functions."""
+        scene = self.mode.formation.scene
+        tolerances = find_tolerances(scene)
+        stall = tolerances.speed * scene.scales.mass**0.5
+        slack = np.concatenate(
+            [
+                ROUNDING_FORCE * self.mode.force_limit_units,
+                np.full(self.mode.formation.n_contacts, tolerances.speed),
+                np.full(2, tolerances.turning),
+            ]
+        )
+        inputs = [self.t, self.packed, *self.rows]
+        rates, c, v_t, tau, K, P = self._move()
+        held, c_n = self._hold(c), c[: self.mode.formation.n_contacts]
+        least = ca.mmin(held / self.mode.force_limit_units)
+        report = self._report(rates, c, v_t, tau, K, P, held, slack, stall)
+        return Mechanics(
+            self.at,
+            ca.Function("stage", [self.y[:MOVING], *inputs], [rates, least, c_n]),
+            ca.Function("report", [self.y, *inputs], report),
+            self._build_correction(),
+            self._build_error(),
+            slack,
+            stall,
+        )
+
+    def _hold(self, c: Expression) -> Expression:
+        """What has to be positive for everything to hold, from the forces c."""
+        H, h = self.mode.force_limit_rows
+        return ca.sparsify(ca.DM(H)) @ c + ca.DM(h)
+
+    def _torque(self) -> Expression:
+        """Torques at the time, shape (2,)."""
+        start, stop = self.packed[self.at.piece][0], self.packed[self.at.piece][1]
+        x = (2 * self.t - start - stop) / (stop - start)
+        coefficients = ca.reshape(self.packed[self.at.torque], -1, 2)
+        value = coefficients[-1, :]
+        for power in range(coefficients.shape[0] - 2, -1, -1):
+            value = value * x + coefficients[power, :]
+        return value.T
+
+    def _move(self) -> list[Expression]:
+        """Rates of the state, c, v_t, tau, K and P at (z, z') = y[:10]."""
+        mode, scene = self.mode, self.mode.formation.scene
+        v = self.y[5:10]
+        P, bend, A_t = self.rows
+        tau = self._torque()
+        inverse_mass = ca.DM(1 / scene.mass_diagonal)
+        G = mode.build_force_rows(P, A_t, self.Xi)
+        viscous = ca.DM(scene.viscous[3:]) * v[3:]
+        dry = ca.DM(scene.dry[3:]) * self.sigma
+        applied = ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, tau - viscous - dry)
+        K = P @ (inverse_mass * G.T)
+        c = ca.solve(K, -bend - P @ (inverse_mass * applied))
+        acceleration = inverse_mass * (applied + G.T @ c)
+        v_t = A_t @ v
+        drag = ca.DM(mode.rolled.sliding_friction) * self.Xi * c[: mode.formation.n_contacts]
+        powers = [ca.dot(force, v[3:]) for force in (tau, viscous, dry)]
+        powers.append(ca.dot(drag, v_t))
+        return [ca.vertcat(v, acceleration, *powers), c, v_t, tau, K, P]
+
+    def _report(
+        self,
+        rates: Expression,
+        c: Expression,
+        v_t: Expression,
+        tau: Expression,
+        K: Expression,
+        P: Expression,
+        held: Expression,
+        slack: Array,
+        stall: float,
+    ) -> list[Expression]:
+        mode, mass = self.mode, self.mode.formation.scene.mass_diagonal
+        y, v, before = self.y, self.y[5:10], self.packed[self.at.heading]
+        frictionless = P @ (ca.DM(1 / mass) * P.T)
+        size = ca.sqrt(ca.dot(v, ca.DM(mass) * v))
+        heading = ca.if_else(size > 0, v / ca.fmax(size, 1e-300), before)
+        speed = ca.dot(before, ca.DM(mass) * v) if mode.n_constraints >= 4 else ca.SX(1)
+        c_n, c_t = c[: mode.formation.n_contacts], mode.build_tangential(c, self.Xi)
+        ratio = ca.det(K) / ca.det(frictionless)
+        outputs = ca.vertcat(y, rates[5:10], c_n, c_t, tau, heading, ratio)
+        events = ca.vertcat(held, self.Xi * v_t, self.sigma * v[3:])
+        least = ca.fmin(ca.mmin(events + ca.DM(slack)), speed + stall)
+        return [ca.densify(part) for part in (outputs, events, speed, least)]
+
+    def _build_correction(self) -> Expression:
+        P, r = self.rows[0], ca.SX.sym("r", self.mode.n_constraints)
+        lift = ca.DM(1 / self.mode.formation.scene.mass_diagonal) * P.T
+        return ca.Function("correct", [P, r], [ca.densify(lift @ ca.solve(P @ lift, r))])
+
+    def _build_error(self) -> Expression:
+        fifth, third = ca.SX.sym("fifth", MOVING), ca.SX.sym("third", MOVING)
+        units = ca.DM(measure_units(self.mode.formation.scene))
+        start, tolerance = self.packed[self.at.y][:MOVING], self.packed[self.at.tolerance]
+        error = build_error(fifth, third, start, units, tolerance)
+        return ca.Function("error", [fifth, third, self.packed], [error])

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
-from typing import NamedTuple
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,13 +25,16 @@ from ..contacts.cones import find_weakest
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, Kinematics
 from ..mechanics.dynamics import Directions
-from .closing import close_contacts
-from .locate import find_root
+from ..scene.model import Scene
 from .modes import Mode, share_mode
-from .starting import Departure, RestDirection, Way, find_patterns, respond_at_rest
-from .statics import balances, find_pulls, measure_lack
+from .root_finding import find_root
+from .start_modes import RestDirection, StartDeparture, StartPath, find_patterns, respond_at_rest
 from .tolerances import find_tolerances, measure_units
 
+BALANCED = 1e-6
+"""Pull that counts as none, relative to the scene's force: the accuracy of the linear programme."""
+_CLOSED = 3e-15
+"""Gap that counts as rounding, relative to the scene's length."""
 _AHEAD = 1e-5
 """Distance ahead along the free direction at which signs and gaps are found, in units of the
 scene."""
@@ -45,63 +48,40 @@ where changes are that close nothing is decided but by rounding."""
 
 
 class Collapse(NamedTuple):
-    """No forces balance any more at `x` of a piece, and no way holds every contact.
-
-    Attributes
-    ----------
-    x : float
-    contact : str
-        The contact that would have to pull most, or that slips.
-    c_n : float, [N]
-    jammed : bool
-        Whether friction jams one of the ways.
-    c_t : float or None, [N]
-        Of a rolling contact that slips, although it presses with `c_n`.
-    """
+    """No forces balance any more at `x` of a piece, and no way holds every contact."""
 
     x: float
-    contact: str
-    c_n: float
-    jammed: bool
-    c_t: float | None = None
+    contact: str  # the contact that would have to pull most, or that slips
+    c_n: float  # [N]
+    jammed: bool  # whether friction jams one of the ways
+    c_t: float | None = None  # [N]: of a rolling contact that slips, although it presses with `c_n`
 
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """A formation at rest at a configuration.
-
-    Attributes
-    ----------
-    formation : Formation
-    z : ndarray, shape (5,)
-    ways : tuple of Way
-        The ways it could move with nothing held: two with one freedom, every choice of directions
-        with more.
-    touching : tuple of Contact
-        Every contact that touches, in the formation or not.
-    near : ndarray of bool, shape (n_limits,)
-        Which limits of the formation are zero here.
-    """
+    """A formation at rest at a configuration."""
 
     formation: Formation
-    z: Array
-    ways: tuple[Way, ...]
-    touching: tuple[Contact, ...]
-    near: NDArray[np.bool_]
+    z: Array  # (5,)
+    # the ways it could move with nothing held: two with one freedom, every choice of directions
+    # with more
+    ways: tuple[StartPath, ...]
+    touching: tuple[Contact, ...]  # every contact that touches, in the formation or not
+    near: NDArray[np.bool_]  # (n_limits,): which limits of the formation are zero here
 
     @cached_property
-    def all_ways(self) -> tuple[Way, ...]:
+    def all_ways(self) -> tuple[StartPath, ...]:
         """The ways it could move, with those in which friction holds some contact or joint."""
         return tuple(self._find_ways())
 
     @cached_property
-    def _held(self) -> tuple[list[Way], Iterator[Way]]:
+    def _held(self) -> tuple[list[StartPath], Iterator[StartPath]]:
         """Ways in which friction holds something: those found so far, and those still to find."""
         if self.formation.n_constraints >= 4:
             return [], iter(())
         return [], find_patterns(self.formation, self.z, self.near, held=True)
 
-    def _find_ways(self) -> Iterator[Way]:
+    def _find_ways(self) -> Iterator[StartPath]:
         """Yield the ways it could move as they are wanted, since most are never looked at."""
         found, others = self._held
         yield from self.ways
@@ -110,15 +90,13 @@ class Rest:
             found.append(way)
             yield way
 
-    def wait(self, coefficients: Array, x: float) -> Departure | Collapse | None:
+    def wait(self, coefficients: Array, x: float) -> StartDeparture | Collapse | None:
         """Find what ends the rest on one piece of the torques, from `x` on.
 
         Parameters
         ----------
-        coefficients : ndarray, shape (2, d + 1), [N m]
-            Torques in ascending powers of x in [-1, 1].
-        x : float
-            Where to begin.
+        coefficients : (2, d + 1) [N m]  torques in ascending powers of x in [-1, 1]
+        x  where to begin
 
         Returns
         -------
@@ -249,8 +227,7 @@ def find_rest(formation: Formation, z: Array) -> Rest:
 
     Raises
     ------
-    SimulationError
-        If the contacts depend on one another, or leave no freedom.
+    SimulationError  if the contacts depend on one another, or leave no freedom
     """
     root = np.sqrt(formation.scene.mass_diagonal)
     kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
@@ -343,3 +320,123 @@ def _roots(polynomial: Array) -> list[float]:
         return []
     roots = np.roots(polynomial[significant[-1] :: -1])
     return [float(root.real) for root in roots if abs(root.imag) < 1e-9]
+
+
+def close_contacts(
+    formation: Formation, z: Array, within: float = np.inf, slip: Array | None = None
+) -> Array:
+    """Nearest configuration, in the metric M5, with every contact of the formation closed.
+
+    Parameters
+    ----------
+    z : (5,)
+    within : [m]     largest gap to close
+    slip : (R,) [m]  slip coordinates to give to rolling contacts; without them these start to roll
+                     where they are
+
+    Raises
+    ------
+    SimulationError  if a gap is larger, or the contacts cannot be closed from `z`
+    """
+    inverse_mass = 1 / formation.scene.mass_diagonal
+    closed = _CLOSED * formation.scene.scales.length
+    for _ in range(8):
+        kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
+        gaps, rows = kinematics.C[0], kinematics.A[0]
+        worst = int(np.abs(gaps).argmax())
+        if np.abs(gaps[worst]) > within:
+            raise SimulationError(
+                f"{formation.names[worst]}, with a gap of {gaps[worst]:.3g} m, does not touch"
+            )
+        slid = np.zeros(0) if slip is None else formation.evaluate_slip(z[None])[0] - slip
+        if np.abs(gaps[worst]) < closed and (np.abs(slid) < closed).all():
+            break
+        rows = rows if slip is None else kinematics.P[0]
+        lift = inverse_mass[:, None] * rows.T
+        try:
+            z = z - lift @ np.linalg.solve(rows @ lift, np.concatenate([gaps, slid]))
+        except np.linalg.LinAlgError:
+            raise SimulationError(f"{' '.join(formation.names)} depend on one another") from None
+    if not np.abs(gaps[worst]) < formation.scene.touching * 1e-3:
+        raise SimulationError(
+            f"{formation.names[worst]}, with a gap of {gaps[worst]:.3g} m, cannot be closed"
+        )
+    return z
+
+
+def balances(scene: Scene, contacts: tuple[Contact, ...], z: Array, tau: Array) -> bool:
+    """Whether contact forces inside the friction cones balance gravity and torques at rest."""
+    return measure_lack(scene, contacts, z, tau)[0] <= 0
+
+
+def measure_lack(
+    scene: Scene, contacts: tuple[Contact, ...], z: Array, tau: Array
+) -> tuple[float, Array]:
+    """How much pull is needed beyond what counts as none, and its rise with the torques.
+
+    See `find_pulls`. The sum of the pulls is convex in the torques: elsewhere it is at least what
+    the rise, from the dual solution, makes of it.
+
+    Returns
+    -------
+    lack : [N]         infinite if none balance
+    rise : (2,) [1/m]
+    """
+    answer, scales = _solve(scene, contacts, z, tau), scene.scales
+    if answer.status:
+        return np.inf, np.zeros(2)
+    lack = scales.force * (answer.fun - BALANCED)
+    return float(lack), -np.asarray(answer.eqlin.marginals)[3:] / scales.length
+
+
+def find_pulls(scene: Scene, contacts: tuple[Contact, ...], z: Array, tau: Array) -> Array:
+    """Least pulls with which contact forces balance gravity and torques at rest.
+
+    A linear programme in c_n >= 0, c_t within U c_n, dry joint friction within D and a pull p >= 0
+    of each contact: least sum of p with g + S (tau - friction) + A^T (c_n - p) + A_t^T c_t = 0.
+
+    Parameters
+    ----------
+    contacts          all that touch
+    z : (5,)
+    tau : (2,) [N m]
+
+    Returns
+    -------
+    ndarray, shape (n,), [N]
+        Pull of each contact, infinite if none balance; all zero if no contact has to pull.
+    """
+    answer, n_c = _solve(scene, contacts, z, tau), len(contacts)
+    return scene.scales.force * answer.x[-n_c:] if answer.status == 0 else np.full(n_c, np.inf)
+
+
+def _solve(scene: Scene, contacts: tuple[Contact, ...], z: Array, tau: Array) -> Any:
+    """Solve the linear programme of `find_pulls`, with forces in the scene's force."""
+    from scipy.optimize import linprog
+
+    touching, scales = _formation(scene, contacts), scene.scales
+    # Forces count in the scene's force, torques in its torque.
+    units = np.array([1.0, 1.0, *[scales.length] * 3])
+    kinematics = touching.evaluate(z[None], np.zeros((1, 5)))
+    n_c = touching.n_contacts
+    normal, tangential = ((rows / units).T for rows in (kinematics.A[0], kinematics.A_t[0]))
+    joints = np.eye(5)[:, 3:]
+    balance = np.hstack([normal, tangential, -joints, -normal])
+    load = (scene.applied_force + joints @ tau) / (scales.force * units)
+    cone, unit, none = -np.diag(touching.friction), np.eye(n_c), np.zeros((n_c, 2 + n_c))
+    within = np.vstack([np.hstack([cone, sign * unit, none]) for sign in (1.0, -1.0)])
+    free, pressing = [(None, None)] * n_c, [(0.0, None)] * n_c
+    return linprog(
+        np.repeat([0.0, 1.0], [2 * n_c + 2, n_c]),
+        A_ub=within,
+        b_ub=np.zeros(2 * n_c),
+        A_eq=balance,
+        b_eq=-load,
+        bounds=[*pressing, *free, *((-d, d) for d in scene.dry[3:] / scales.torque), *pressing],
+        method="highs",
+    )
+
+
+@lru_cache(maxsize=64)
+def _formation(scene: Scene, contacts: tuple[Contact, ...]) -> Formation:
+    return Formation(scene, contacts)

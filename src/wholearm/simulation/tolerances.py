@@ -58,36 +58,22 @@ CLOSING = 1e-7
 
 
 class Tolerances(NamedTuple):
-    """Tolerances of a scene in SI units; see the constants of the same names.
+    """Tolerances of a scene in SI units; see the constants of the same names."""
 
-    Attributes
-    ----------
-    force, torque : float, [N], [N m]
-        Rounding.
-    speed, turning : float, [m/s], [rad/s]
-        Rounding.
-    limit, short : float, [m]
-    settling, rest_window, longest_window, first_step, shortest_step : float, [s]
-    torque_step : float, [N m]
-    drive : float, [kg^(1/2) m/s^2]
-        `STILL`, in the metric M5.
-    still, still_joint, closing : float, [m/s^2], [rad/s^2], [m/s^2]
-    """
-
-    force: float
+    force: float  # force, torque [N], [N m]: rounding
     torque: float
-    speed: float
+    speed: float  # speed, turning [m/s], [rad/s]: rounding
     turning: float
-    limit: float
+    limit: float  # limit, short [m]:
     short: float
-    settling: float
+    settling: float  # settling, rest_window, longest_window, first_step, shortest_step [s]:
     rest_window: float
     longest_window: float
     first_step: float
     shortest_step: float
-    torque_step: float
-    drive: float
-    still: float
+    torque_step: float  # [N m]
+    drive: float  # [kg^(1/2) m/s^2]: `STILL`, in the metric M5
+    still: float  # still, still_joint, closing [m/s^2], [rad/s^2], [m/s^2]:
     still_joint: float
     closing: float
 

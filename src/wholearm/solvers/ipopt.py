@@ -11,8 +11,7 @@ import casadi as ca
 import numpy as np
 
 from ..common.arrays import Expression
-from ..common.interrupts import check
-from ..common.pulse import beat
+from ..common.signals import beat, check
 from .statistics import SolverStatistics, book
 
 STOPPED = "User_Requested_Stop"
@@ -73,34 +72,26 @@ def build_solver(
     return solver
 
 
-class Run(NamedTuple):
-    """One run of a solver.
-
-    Attributes
-    ----------
-    unknowns, rows : int
-    jacobian_nonzeros, hessian_nonzeros : int
-        Of the rows, and of the upper triangle of the Lagrangian's Hessian.
-    iterations : int
-    seconds : float, [s]
-        Processor time.
-    """
+class IpoptRun(NamedTuple):
+    """One run of a solver."""
 
     unknowns: int
     rows: int
+    # jacobian_nonzeros, hessian_nonzeros: of the rows, and of the upper triangle of the
+    # Lagrangian's Hessian
     jacobian_nonzeros: int
     hessian_nonzeros: int
     iterations: int
-    seconds: float
+    seconds: float  # [s]: processor time
 
 
-_RECORDS: list[list[Run]] = []
+_RECORDS: list[list[IpoptRun]] = []
 
 
 @contextmanager
-def record_runs() -> Iterator[list[Run]]:
+def record_runs() -> Iterator[list[IpoptRun]]:
     """Collect the runs of all solvers until the end of a `with` statement."""
-    runs: list[Run] = []
+    runs: list[IpoptRun] = []
     _RECORDS.append(runs)
     try:
         yield runs
@@ -119,8 +110,7 @@ class Solver:
 
         Raises
         ------
-        KeyboardInterrupt
-            If a signal stopped the solver, or the time is over (`OutOfTime`).
+        KeyboardInterrupt  if a signal stopped the solver, or the time is over (`OutOfTime`)
         """
         beat()
         # CasADi takes lists in three times as fast as arrays.
@@ -142,11 +132,11 @@ class Solver:
         statistics: dict[str, Any] = self.function.stats()
         return statistics
 
-    def _describe_run(self, stats: dict[str, Any]) -> Run:
+    def _describe_run(self, stats: dict[str, Any]) -> IpoptRun:
         jacobian, hessian = (
             self.function.get_function(f"nlp_{key}") for key in ("jac_g", "hess_l")
         )
-        return Run(
+        return IpoptRun(
             self.function.size1_in("x0"),
             self.function.size1_in("lbg"),
             jacobian.nnz_out(jacobian.n_out() - 1),

@@ -14,20 +14,11 @@ from dataclasses import dataclass, fields
 
 @dataclass(frozen=True)
 class SolverStatistics:
-    """What solving has cost.
+    """What solving has cost."""
 
-    Attributes
-    ----------
-    iterations : int
-        Of Ipopt.
-    solves : int
-        How often it ran.
-    build_time, solve_time : float, [s]
-        Of building NLPs that were not at hand yet, and of Ipopt.
-    """
-
-    iterations: int = 0
-    solves: int = 0
+    iterations: int = 0  # of Ipopt
+    solves: int = 0  # how often it ran
+    # build_time, solve_time [s]: of building NLPs that were not at hand yet, and of Ipopt
     build_time: float = 0.0
     solve_time: float = 0.0
 

@@ -10,56 +10,32 @@ from ..common.document import Document, Result, Table
 from ..results.torque import TorqueProfile
 from ..results.torque_table import format_rows, read_rows
 from ..verification.free_report import FreeReport
-from .passage import name_numbers
-from .trial import Step, Trial
+from .trial import TuningStep, TuningTrial, name_numbers
 
 
 @dataclass(frozen=True, eq=False)
 class PhaseTuning:
-    """One phase, or several that are carried in one motion.
+    """One phase, or several that are carried in one motion."""
 
-    Attributes
-    ----------
-    number, last : int
-        The first phase's and the last one's.
-    until : str
-    acting : int
-        Number of the finger behind the motion; 0 if the phase was not tuned.
-    quasistatic : tuple of float, [N m]
-        Torques that balance the slow motion at its start: both torques are these in steps of 10 %.
-    raised : int or None
-        How many times the acting torque was raised to drive the object; None if that did not help.
-    braked : int or None
-        Likewise while braking, lowered if negative; None without a brake.
-    supported : int
-        How many times the supporting torque is raised while braking, lowered if negative.
-    steps : tuple of Step
-        The torques, since the start of the phase, the last ones holding the object at its end.
-    duration : float, [s]
-        Until its end is reached.
-    rate : float, [m/s or rad/s]
-        How fast that closes then.
-    least : float, [N]
-        The least normal force, of `weakest`.
-    weakest : str
-    trials : tuple of Trial
-    simulations : int
-    """
-
-    number: int
+    number: int  # number, last: the first phase's and the last one's
     last: int
     until: str
-    acting: int = 0
+    acting: int = 0  # number of the finger behind the motion; 0 if the phase was not tuned
+    # [N m]: torques that balance the slow motion at its start: both torques are these in steps of
+    # 10 %
     quasistatic: tuple[float, float] = (math.nan, math.nan)
+    # how many times the acting torque was raised to drive the object; None if that did not help
     raised: int | None = None
-    braked: int | None = None
+    braked: int | None = None  # likewise while braking, lowered if negative; None without a brake
+    # how many times the supporting torque is raised while braking, lowered if negative
     supported: int = 0
-    steps: tuple[Step, ...] = ()
-    duration: float = math.nan
-    rate: float = math.nan
-    least: float = math.nan
+    # the torques, since the start of the phase, the last ones holding the object at its end
+    steps: tuple[TuningStep, ...] = ()
+    duration: float = math.nan  # [s]: until its end is reached
+    rate: float = math.nan  # [m/s or rad/s]: how fast that closes then
+    least: float = math.nan  # [N]: the least normal force, of `weakest`
     weakest: str = ""
-    trials: tuple[Trial, ...] = ()
+    trials: tuple[TuningTrial, ...] = ()
     simulations: int = 0
 
     @property
@@ -80,27 +56,15 @@ class PhaseTuning:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Tuning(Result):
-    """Torques tuned by the 10 % rule.
+    """Torques tuned by the 10 % rule."""
 
-    Attributes
-    ----------
-    name : str
-        The problem's.
-    phases : tuple of PhaseTuning
-        Up to the first that does not succeed.
-    rows : ndarray, shape (n, 3), or None
-        The table of t and both torques, a repeated time being a step; None if a phase failed.
-    report : FreeReport or None
-        Of the whole, simulated without telling which contacts hold.
-    reason : str
-        The one sentence behind the verdict.
-    """
-
-    name: str
-    phases: tuple[PhaseTuning, ...]
+    name: str  # the problem's
+    phases: tuple[PhaseTuning, ...]  # up to the first that does not succeed
+    # (n, 3): the table of t and both torques, a repeated time being a step; None if a phase failed
     rows: Array | None = field(repr=False)
+    # of the whole, simulated without telling which contacts hold
     report: FreeReport | None = field(repr=False)
-    reason: str
+    reason: str  # the one sentence behind the verdict
 
     derived = ("ok", "exit_status", "reason", "simulations", "duration")
 
@@ -129,8 +93,7 @@ class Tuning(Result):
 
         Raises
         ------
-        ValueError
-            If there are none.
+        ValueError  if there are none
         """
         if self.rows is None:
             raise ValueError("no torques were found")

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
 
 from ..common.arrays import Array
+from ..contacts.elemental import Contact
+from ..free_simulation.free_simulate import simulate_free
 from ..free_simulation.hand import build_system
 from ..free_simulation.result import FreeSimulation, list_pauses
-from ..free_simulation.simulate import simulate_free
-from ..free_simulation.state import Run
-from ..problem.definition import Problem
+from ..free_simulation.state import FreeRun
+from ..problem.definition import End, Phase, Problem, Until
 from ..results.torque_table import read_rows
+from ..simulation.events import Event, EventKind
 from ..verification.free import find_losses
 from ..verification.verdict import DEPARTURE
-from .passage import Passage
 
+_GAINS = (EventKind.GAINED, EventKind.IMPACT, EventKind.PASS)
 LASTS = 40.0
 """How long a trial goes on after its last step of the torques, relative to the scene's time."""
 _BACK = 1e-6
@@ -28,7 +31,7 @@ _NUDGE = 1e-6
 """Time over which a rate is a difference, relative to the scene's."""
 
 
-class Outcome(Enum):
+class TrialOutcome(Enum):
     """What a trial comes to."""
 
     RESTS = "rests"
@@ -41,62 +44,35 @@ class Outcome(Enum):
     """The object is still on its way when the trial is over."""
 
 
-class Step(NamedTuple):
-    """Torques that hold from an instant on.
+class TuningStep(NamedTuple):
+    """Torques that hold from an instant on."""
 
-    Attributes
-    ----------
-    time : float, [s]
-        Since the start of the phase, or of all.
-    tau : tuple of float, [N m]
-    """
-
-    time: float
-    tau: tuple[float, float]
+    time: float  # [s]: since the start of the phase, or of all
+    tau: tuple[float, float]  # [N m]
 
 
-class Trial(NamedTuple):
-    """What torques of a phase do.
+class TuningTrial(NamedTuple):
+    """What torques of a phase do."""
 
-    Attributes
-    ----------
-    steps : tuple of Step
-        The torques.
-    outcome : Outcome
-    time : float, [s]
-        When it came to that, since the start of the phase.
-    contact : str
-        The one that is lost, empty if none is.
-    rate : float, [m/s or rad/s]
-        How fast the end of the phase closes at that time.
-    slowing : float, [m/s^2 or rad/s^2]
-        By how much that becomes less then.
-    short : float, [m or rad]
-        How far away the end was when it was nearest; infinite before the last of several phases.
-    least : float, [N]
-        The least normal force until then, of `weakest`; infinite if nothing moved.
-    weakest : str
-    z : ndarray, shape (5,)
-        Where it was then.
-    """
-
-    steps: tuple[Step, ...]
-    outcome: Outcome
-    time: float
-    contact: str
-    rate: float
-    slowing: float
+    steps: tuple[TuningStep, ...]  # the torques
+    outcome: TrialOutcome
+    time: float  # [s]: when it came to that, since the start of the phase
+    contact: str  # the one that is lost, empty if none is
+    rate: float  # [m/s or rad/s]: how fast the end of the phase closes at that time
+    slowing: float  # [m/s^2 or rad/s^2]: by how much that becomes less then
+    # [m or rad]: how far away the end was when it was nearest; infinite before the last of several
+    # phases
     short: float
-    least: float
+    least: float  # [N]: the least normal force until then, of `weakest`; infinite if nothing moved
     weakest: str
-    z: Array
+    z: Array  # (5,): where it was then
 
     def to_text(self) -> str:
         """The outcome in words."""
         text = self.outcome.value
-        if self.outcome is Outcome.LOSES:
+        if self.outcome is TrialOutcome.LOSES:
             return f"{text} {self.contact} at t = {self.time:.5g} s"
-        if self.outcome is Outcome.ARRIVES:
+        if self.outcome is TrialOutcome.ARRIVES:
             return f"{text} at t = {self.time:.5g} s, closing at {self.rate:.3g}"
         if self.short == math.inf:
             return f"{text} before the last of these phases"
@@ -104,27 +80,15 @@ class Trial(NamedTuple):
 
 
 class Landing(NamedTuple):
-    """What becomes of a phase whose end is reached.
+    """What becomes of a phase whose end is reached."""
 
-    Attributes
-    ----------
-    z : ndarray, shape (5,)
-        Where it is held.
-    rests : bool
-        Whether everything rests there in the end.
-    parted : float, [s]
-        For how long a contact of the phase, or of the next, parts meanwhile.
-    contact : str
-        That contact.
-    """
-
-    z: Array
-    rests: bool
-    parted: float
-    contact: str
+    z: Array  # (5,): where it is held
+    rests: bool  # whether everything rests there in the end
+    parted: float  # [s]: for how long a contact of the phase, or of the next, parts meanwhile
+    contact: str  # that contact
 
 
-def make_rows(steps: Sequence[Step], end: float) -> Array:
+def make_rows(steps: Sequence[TuningStep], end: float) -> Array:
     """A table of t and both torques, shape (n, 3), that steps from one constant to the next."""
     t = np.repeat([*(step.time for step in steps), end], 2)[1:-1]
     return np.column_stack([t, np.repeat([step.tau for step in steps], 2, axis=0)])
@@ -135,18 +99,13 @@ class Bench:
 
     Parameters
     ----------
-    problem : Problem
-    passage : Passage
-    z : ndarray, shape (5,)
-        Where it starts, at rest.
+    z : (5,)  where it starts, at rest
 
     Attributes
     ----------
-    trials : list of Trial
-    simulations : int
-        Trials, and landings.
-    way : float, [m or rad]
-        How far away the end is.
+    trials
+    simulations       trials, and landings
+    way : [m or rad]  how far away the end is
     """
 
     def __init__(self, problem: Problem, passage: Passage, z: Array) -> None:
@@ -159,7 +118,7 @@ class Bench:
         self.value = math.nan if until.value is None else until.value
         self.sign = float(np.sign(z[self.column] - self.value))
         self.way = float(self.measure(z[None])[0])
-        self.trials: list[Trial] = []
+        self.trials: list[TuningTrial] = []
         self.simulations = 0
 
     @property
@@ -177,7 +136,7 @@ class Bench:
         gaps, ranges = self.system.measure(z)
         return np.asarray(-ranges[:, self.pair] if self.passage.passed else gaps[:, self.pair])
 
-    def run(self, steps: Sequence[Step]) -> Trial:
+    def run(self, steps: Sequence[TuningStep]) -> TuningTrial:
         """Simulate torques until the end of the passage, or what keeps it from coming."""
         end = steps[-1].time + LASTS * self.problem.scene.scales.time
         found = simulate_free(
@@ -190,16 +149,13 @@ class Bench:
         self.trials.append(self._judge(tuple(steps), found))
         return self.trials[-1]
 
-    def land(self, steps: Sequence[Step], arrival: float, pause: float) -> Landing:
+    def land(self, steps: Sequence[TuningStep], arrival: float, pause: float) -> Landing:
         """Simulate torques that hold the object at the end of the passage.
 
         Parameters
         ----------
-        steps : sequence of Step
-        arrival : float, [s]
-            When the end is reached.
-        pause : float, [s]
-            How long it is held.
+        arrival : [s]  when the end is reached
+        pause : [s]    how long it is held
         """
         self.simulations += 1
         end, passage = arrival + pause, self.passage
@@ -219,7 +175,7 @@ class Bench:
         rests = not found.z_dot[-1].any() and found.t[-1] == end
         return Landing(found.z[-1], rests, parted[worst], worst)
 
-    def _is_over(self, run: Run) -> bool:
+    def _is_over(self, run: FreeRun) -> bool:
         if run.t == 0:
             return False
         ends, loss = self.passage.follow(run.events)
@@ -230,7 +186,7 @@ class Bench:
         gap = float(self.measure(run.z[None])[0])
         return gap > (1 + _BACK) * self.way or (self.pair is None and gap <= 0)
 
-    def _judge(self, steps: tuple[Step, ...], found: FreeSimulation) -> Trial:
+    def _judge(self, steps: tuple[TuningStep, ...], found: FreeSimulation) -> TuningTrial:
         gaps = self.measure(found.z)
         ends, lost = self.passage.follow(found.events)
         arrival = ends[-1] if len(ends) == len(self.passage.phases) else math.inf
@@ -246,16 +202,16 @@ class Bench:
         least, weakest, row = self._find_least(found, ends, at)
         short = float(gaps[: at + 1][found.t[: at + 1] >= begun].min(initial=math.inf))
         if losses:
-            outcome = Outcome.LOSES
+            outcome = TrialOutcome.LOSES
         elif least < self.problem.epsilon:
-            outcome, contact, time = Outcome.LOSES, weakest, float(found.t[row])
+            outcome, contact, time = TrialOutcome.LOSES, weakest, float(found.t[row])
         elif arrival == stop:
-            outcome = Outcome.ARRIVES
+            outcome = TrialOutcome.ARRIVES
         else:
             rests = turn == stop or not found.z_dot[at].any()
-            outcome = Outcome.RESTS if rests else Outcome.LASTS
+            outcome = TrialOutcome.RESTS if rests else TrialOutcome.LASTS
         rate, slowing, z = self._close(found, time, at)
-        return Trial(steps, outcome, time, contact, rate, slowing, short, least, weakest, z)
+        return TuningTrial(steps, outcome, time, contact, rate, slowing, short, least, weakest, z)
 
     def _find_last(self, ends: Sequence[float]) -> float:
         """When the last phase begins [s], infinite if it does not."""
@@ -325,3 +281,100 @@ class Bench:
             return (back - on) / (2 * step), 0.0, z
         rows = self.system.evaluate(z, v, [self.pair])
         return -float(rows.A[0] @ v), float(rows.A[0] @ a + rows.bend[0]), z
+
+
+@dataclass(frozen=True, eq=False)
+class Passage:
+    """Phases that are carried in one motion."""
+
+    phases: tuple[Phase, ...]
+    after: Phase | None  # the one that follows; None after the last
+
+    @property
+    def until(self) -> Until:
+        """What ends it."""
+        return self.phases[-1].until
+
+    @property
+    def title(self) -> str:
+        """The numbers of its phases, for people."""
+        return name_numbers(self.phases[0].number, self.phases[-1].number)
+
+    @property
+    def passed(self) -> str:
+        """The contact that goes on as the one which ends it, empty if none does."""
+        return _find_predecessor(self.phases[-1], self.after)
+
+    def list_pressed(self, index: int) -> list[str]:
+        """The contacts of a phase that press to its end: without those that it releases."""
+        phase, after = self.phases[index], (*self.phases[1:], self.after)[index]
+        leaving = _list_leaving(phase, after) if phase.until.is_release else set()
+        return [name for name in phase.formation.names if name not in leaving]
+
+    def follow(self, events: Sequence[Event]) -> tuple[list[float], Event | None]:
+        """When its phases end [s], as far as they do, and the first loss of a contact before."""
+        ends: list[float] = []
+        following = (*self.phases[1:], self.after)
+        for event in events:
+            phase, after = self.phases[len(ends)], following[len(ends)]
+            if _is_end(phase, after, event):
+                ends.append(event.time)
+                if len(ends) == len(self.phases):
+                    break
+            elif event.kind is EventKind.CONTACT_LOST and event.contact in phase.formation.names:
+                return ends, event
+        return ends, None
+
+
+def split_passages(problem: Problem) -> list[Passage]:
+    """The phases of a problem, those together that are carried in one motion."""
+    found: list[Passage] = []
+    own: list[Phase] = []
+    for phase, after in zip(problem.phases, (*problem.phases[1:], None), strict=True):
+        own.append(phase)
+        moves = after is not None and bool(_find_predecessor(phase, after))
+        if after is None or (phase.end is End.REST and not moves):
+            found.append(Passage(tuple(own), after))
+            own = []
+    return found
+
+
+def name_numbers(first: int, last: int) -> str:
+    """Numbers of phases, such as 3 or 9-11."""
+    return f"{first}" if first == last else f"{first}-{last}"
+
+
+def _is_end(phase: Phase, after: Phase | None, event: Event) -> bool:
+    """Whether an event ends a phase; a coordinate that does is none."""
+    until = phase.until
+    if until.contact is not None:
+        return event.kind in _GAINS and event.contact == until.contact.name
+    gone = event.kind is EventKind.CONTACT_LOST
+    return until.is_release and gone and event.contact in _list_leaving(phase, after)
+
+
+def _list_leaving(phase: Phase, after: Phase | None) -> set[str]:
+    kept = () if after is None else after.formation.names
+    return set(phase.formation.names) - set(kept)
+
+
+def _find_predecessor(phase: Phase, after: Phase | None) -> str:
+    gained = phase.until.contact
+    if gained is None or gained.finger is None:
+        return ""
+    count = phase.formation.scene.polygon.n_vertices
+    kept = () if after is None else after.formation.contacts
+    for contact in phase.formation.contacts:
+        near = contact.finger == gained.finger and contact not in kept
+        if near and (_adjoins(contact, gained, count) or _adjoins(gained, contact, count)):
+            return contact.name
+    return ""
+
+
+def _adjoins(first: Contact, second: Contact, count: int) -> bool:
+    """Whether a vertex on the arc of a tip is next to a contact with its side, or with an edge."""
+    if (first.feature, first.surface) != ("v", "tip"):
+        return False
+    if second.surface == "finger":
+        return first.index == second.index
+    return second.feature == "e" and first.index in (second.index, (second.index + 1) % count)

@@ -12,19 +12,18 @@ from typing import Any
 
 import numpy as np
 
-from ..common.errors import InputError
-from ..common.require import require_number
+from ..common.errors import InputError, require_number
 from ..common.sharing import exclusive
+from ..free_simulation.free_simulate import simulate_free, simulate_phases
 from ..free_simulation.hand import build_system
 from ..free_simulation.result import FreeSimulation, list_pauses
-from ..free_simulation.simulate import simulate_free, simulate_phases
 from ..geometry.curve import describe_pose
 from ..problem.definition import Phase, Problem
-from ..results.narrow import Torques, adopt_torques
+from ..results.adopt import Torques, adopt_torques
 from ..results.report import Deviation
 from ..results.trajectory import Trajectory
 from ..simulation.events import EventKind, OutcomeKind
-from .free_report import FreePhase, FreeReport, Loss
+from .free_report import FreePhase, FreeReport, LostContact
 from .verdict import DEPARTURE
 
 _TOLD = (EventKind.AMBIGUOUS, EventKind.INCONSISTENT)
@@ -44,24 +43,18 @@ def verify_free(
 
     Parameters
     ----------
-    problem : Problem
-    what : Plan, Trajectory or TorqueProfile
-    tolerance : float
-        Of the simulation.
-    departure : float
-        How far the end of a phase may be from the plan, as of `verify`, and how far contacts of a
-        phase may open, over the scene's length: bounces by less are events, but no failure.
-    restitution : float
-        Poisson's coefficient of impacts.
-    progress : callable
-        Told what is simulated.
+    tolerance    of the simulation
+    departure    how far the end of a phase may be from the plan, as of `verify`, and how far
+                 contacts of a phase may open, over the scene's length: bounces by less are events,
+                 but no failure
+    restitution  poisson's coefficient of impacts
+    progress     told what is simulated
 
     Raises
     ------
-    InputError
-        If the trajectory has other contacts than the problem, or a number is out of its range.
-    SimulationError
-        If bodies overlap at the start.
+    InputError       if the trajectory has other contacts than the problem, or a number is out of
+                     its range
+    SimulationError  if bodies overlap at the start
     """
     problem, torque, plan = adopt_torques(problem, what)
     allowed = require_number(departure, "departure", positive=True)
@@ -200,7 +193,7 @@ def find_losses(
     start: float,
     stop: float,
     allowed: float,
-) -> list[Loss]:
+) -> list[LostContact]:
     """Contacts of a phase that open by more than is allowed, over the scene's length."""
     system, found = build_system(problem.scene), []
     for name in phase.formation.names:
@@ -208,6 +201,6 @@ def find_losses(
             rows = np.flatnonzero((simulation.t >= first) & (simulation.t <= after))
             gaps = system.measure(simulation.z[rows])[0][:, system.names.index(name)]
             if gaps.max(initial=0.0) > allowed * problem.scene.scales.length:
-                found.append(Loss(name, first, float(gaps.max())))
+                found.append(LostContact(name, first, float(gaps.max())))
                 break
     return sorted(found, key=lambda loss: loss.time)

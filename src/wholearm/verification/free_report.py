@@ -14,7 +14,7 @@ MOST = 60
 """Most events that the text lists; `to_dict` has all."""
 
 
-class Loss(NamedTuple):
+class LostContact(NamedTuple):
     """A contact of a phase that opens, when it stops pressing [s], and by how much it opens [m]."""
 
     contact: str
@@ -23,54 +23,29 @@ class Loss(NamedTuple):
 
 
 class FreePhase(NamedTuple):
-    """A phase in a free simulation.
+    """A phase in a free simulation."""
 
-    Attributes
-    ----------
-    number : int
-        From 1.
-    start, stop : float, [s]
-    reached : bool
-        Whether its end came.
-    losses : tuple of Loss
-        Contacts of the phase that opened by more than a bounce, by time.
-    deviation : Deviation or None
-        From the plan at its end; None without a plan.
-    """
-
-    number: int
-    start: float
+    number: int  # from 1
+    start: float  # start, stop [s]:
     stop: float
-    reached: bool
-    losses: tuple[Loss, ...]
-    deviation: Deviation | None
+    reached: bool  # whether its end came
+    losses: tuple[
+        LostContact, ...
+    ]  # contacts of the phase that opened by more than a bounce, by time
+    deviation: Deviation | None  # from the plan at its end; None without a plan
 
 
 @dataclass(frozen=True, repr=False)
 class FreeReport(Result):
-    """What a simulation without assumptions showed.
+    """What a simulation without assumptions showed."""
 
-    Attributes
-    ----------
-    name : str
-        The problem's.
-    whole : FreeSimulation
-        From the exact start to the end of the torques.
-    alone : tuple of FreePhase
-        Phases of a plan, each from its planned start; empty for torques alone.
-    phases : tuple of FreePhase
-        Of the whole: by the clock of a plan, or by what happens.
-    failures : tuple of str
-        Why the torques are not good; of a plan this is about `alone`.
-    warnings : tuple of str
-        Where the laws of contact allowed several motions, or none with finite forces.
-    """
-
-    name: str
-    whole: FreeSimulation = field(repr=False)
+    name: str  # the problem's
+    whole: FreeSimulation = field(repr=False)  # from the exact start to the end of the torques
+    # phases of a plan, each from its planned start; empty for torques alone
     alone: tuple[FreePhase, ...]
-    phases: tuple[FreePhase, ...]
-    failures: tuple[str, ...]
+    phases: tuple[FreePhase, ...]  # of the whole: by the clock of a plan, or by what happens
+    failures: tuple[str, ...]  # why the torques are not good; of a plan this is about `alone`
+    # where the laws of contact allowed several motions, or none with finite forces
     warnings: tuple[str, ...]
 
     @property

@@ -19,32 +19,27 @@ from ..scene.model import Scene
 from ..simulation.events import EventKind, Simulation
 from ..simulation.tolerances import SETTLING
 
+HURRIED = 1e-3
+"""Largest relative miss of a torque's rate, or of a command, that is not reported."""
+STEPPED = 1e-5
+"""Largest step of a torque that is none, over its limit."""
+_LOOKS = 33
+"""Instants of each piece of the torques that are looked at."""
 SHORTEST = 2 * SETTLING
 """Interval below which forces may jump, and rounding spoils a parabola, relative to the scene's
 time."""
-
 MISSED = 1e-6
 """Miss of a limit, over what is much for it, from which on it is reported."""
 
 
 class Parabolas(NamedTuple):
-    """Parabolas through three successive samples each whose vertex lies between the outer ones.
+    """Parabolas through three successive samples each whose vertex lies between the outer ones."""
 
-    Attributes
-    ----------
-    start, stop, time : ndarray, shape (n,), [s]
-        The outer samples, and the vertex.
-    lowest : ndarray, shape (n,)
-        Value there.
-    dips : ndarray of bool, shape (n,)
-        Whether the middle sample is the least of the three.
-    """
-
-    start: Array
+    start: Array  # start, stop, time (n,) [s]: the outer samples, and the vertex
     stop: Array
     time: Array
-    lowest: Array
-    dips: NDArray[np.bool_]
+    lowest: Array  # (n,): value there
+    dips: NDArray[np.bool_]  # (n,): whether the middle sample is the least of the three
 
 
 def list_normal_forces(
@@ -148,13 +143,11 @@ def find_lowest(
 
     Parameters
     ----------
-    t, values, breaks, shortest
-        As of `fit_parabolas`.
+    t, values, breaks, shortest  as of `fit_parabolas`
 
     Returns
     -------
-    least, time : float
-        NaN if no value is known.
+    least, time  naN if no value is known
     """
     if np.isnan(values).all():
         return math.nan, math.nan
@@ -174,14 +167,10 @@ def fit_parabolas(t: Array, values: Array, breaks: Array, shortest: float = 0.0)
 
     Parameters
     ----------
-    t : ndarray, shape (n,), [s]
-        Never decreasing; a jump is there twice.
-    values : ndarray, shape (n,)
-        NaN where unknown.
-    breaks : ndarray, [s]
-        Where the function may have a kink: no parabola has one inside.
-    shortest : float, [s]
-        Interval below which the function may jump.
+    t : (n,) [s]    never decreasing; a jump is there twice
+    values : (n,)   naN where unknown
+    breaks : [s]    where the function may have a kink: no parabola has one inside
+    shortest : [s]  interval below which the function may jump
     """
     left, right = np.diff(t)[:-1], np.diff(t)[1:]
     smooth = (left > shortest) & (right > shortest) & ~_is_among(t[1:-1], breaks)
@@ -204,3 +193,51 @@ def _is_among(t: Array, breaks: Array) -> NDArray[np.bool_]:
     """Whether each of `t` is one of the increasing `breaks`."""
     near = np.minimum(np.searchsorted(breaks, t), len(breaks) - 1)
     return np.asarray(breaks[near] == t)
+
+
+def find_commands(torque: TorqueProfile, lag: Array) -> TorqueProfile:
+    """Commands that motors with some lags, shape (2,) [s], make torques of: tau + lag tau'."""
+    order = np.arange(torque.coefficients.shape[2])
+    slopes = np.zeros_like(torque.coefficients)
+    slopes[..., :-1] = torque.coefficients[..., 1:] * order[1:]
+    slopes *= (2 / np.diff(torque.breaks))[:, None, None]
+    return TorqueProfile(torque.breaks, torque.coefficients + lag[:, None] * slopes)
+
+
+def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float, str]]:
+    """What motors cannot follow, with the time of the worst place of each kind [s]."""
+    scene = problem.scene
+    if not scene.has_slow_motors:
+        return []
+    x = np.linspace(-1, 1, _LOOKS)[:, None] ** np.arange(torque.coefficients.shape[2])
+    values = torque.coefficients @ x.T
+    ones = find_commands(torque, np.ones(2)).coefficients @ x.T
+    rates, commands = ones - values, values + scene.actuator_lag[:, None] * (ones - values)
+    steps = np.abs(values[1:, :, 0] - values[:-1, :, -1])
+    found = list[tuple[float, str]]()
+    limits = zip(scene.torque_limit, scene.torque_rate_limit, scene.actuator_lag, strict=True)
+    for joint, (limit, fastest, lag) in enumerate(limits):
+        name = f"tau_{joint + 1}"
+        if np.isinf(fastest) and not lag:
+            continue
+        worst = int(steps[:, joint].argmax()) if len(steps) else 0
+        if len(steps) and steps[worst, joint] > STEPPED * limit:
+            t = float(torque.breaks[worst + 1])
+            text = f"{name} steps by {steps[worst, joint]:.3g} N m at t = {t:.5g} s"
+            why = (
+                f"its rate limit is {fastest:g} N m/s" if np.isfinite(fastest) else "its motor lags"
+            )
+            found.append((t, f"{text}, where {why}"))
+        kinds = (
+            (rates[:, joint], fastest, "changes at {:.4g} N m/s, above its rate limit {:g} N m/s"),
+            (commands[:, joint], limit, "takes a command of {:.4g} N m, above its limit {:g} N m"),
+        )
+        for of, most, text in kinds:
+            size = np.abs(of)
+            piece, look = np.unravel_index(int(size.argmax()), size.shape)
+            if size[piece, look] > most * (1 + HURRIED):
+                start, stop = torque.breaks[[piece, piece + 1]]
+                t = float(start + (stop - start) * look / (_LOOKS - 1))
+                said = text.format(size[piece, look], most)
+                found.append((t, f"{name} {said}, at t = {t:.5g} s"))
+    return found

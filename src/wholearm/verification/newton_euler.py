@@ -41,28 +41,17 @@ BODIES = (
 
 
 class Balance(NamedTuple):
-    """What the equations of motion miss at n instants.
+    """What the equations of motion miss at n instants."""
 
-    Attributes
-    ----------
-    forces : ndarray, shape (n, 5)
-        Left over in each of `BODIES`, relative to the scene's force or torque.
-    gaps : ndarray, shape (n, n_c)
-        Of the contacts, relative to the scene's length.
-    rates : ndarray, shape (n, n_c)
-        Normal velocities of the contacts, and of rolling ones the larger of normal and tangential
-        velocity, relative to the scene's speed.
-    against : ndarray of bool, shape (n, n_c + 2)
-        Where contacts slide and joints turn against the sense that the motion's friction assumes.
-    names : tuple of str
-        Of the contacts.
-    """
-
-    forces: Array
-    gaps: Array
+    forces: Array  # (n, 5): left over in each of `BODIES`, relative to the scene's force or torque
+    gaps: Array  # (n, n_c): of the contacts, relative to the scene's length
+    # (n, n_c): normal velocities of the contacts, and of rolling ones the larger of normal and
+    # tangential velocity, relative to the scene's speed
     rates: Array
+    # (n, n_c + 2): where contacts slide and joints turn against the sense that the motion's
+    # friction assumes
     against: NDArray[np.bool_]
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # of the contacts
 
     def find_worst(self) -> tuple[float, int, str]:
         """The largest of all numbers, at which instant, and what it is of in words."""
@@ -90,7 +79,7 @@ class Balance(NamedTuple):
         return sizes[worst], row, text
 
 
-class _Touch(NamedTuple):
+class _ContactForce(NamedTuple):
     """A contact at n instants: its point and normal, shape (n, 2), and gap, shape (n,) [m]."""
 
     point: Array
@@ -109,13 +98,9 @@ def balance(
 
     Parameters
     ----------
-    scene : Scene
-    contacts, rolling : sequence of Contact
-        In the order of the samples' forces; those of them that roll.
-    samples : Samples
-    still : float
-        Speed that counts as none, relative to the scene's speed; angular speeds count times the
-        scene's length.
+    contacts, rolling  in the order of the samples' forces; those of them that roll
+    still              speed that counts as none, relative to the scene's speed; angular speeds
+                       count times the scene's length
     """
     z, v, scales, body = samples.z, samples.z_dot, scene.scales, scene.polygon
     slow = still * scales.speed
@@ -160,36 +145,36 @@ def balance(
     return Balance(left, gaps / scales.length, rates / scales.speed, against, names)
 
 
-def _lever(scene: Scene, contact: Contact, touch: _Touch) -> Array:
+def _lever(scene: Scene, contact: Contact, touch: _ContactForce) -> Array:
     """From the joint of the link that a contact is on to its point, shape (n, 2) [m]."""
     base = (0.0, 0.0) if contact.finger is None else scene.fingers[contact.finger].base
     return np.asarray(touch.point - np.asarray(base))
 
 
-def _touch(scene: Scene, contact: Contact, z: Array) -> _Touch:
+def _touch(scene: Scene, contact: Contact, z: Array) -> _ContactForce:
     """Where a contact touches at n configurations."""
     corners = scene.polygon.vertices
     count = len(corners)
     vertex = z[:, :2] + _rotate(z[:, 2], corners[contact.index])
     if contact.finger is None:
-        return _Touch(vertex, np.tile([0.0, 1.0], (len(z), 1)), vertex[:, 1])
+        return _ContactForce(vertex, np.tile([0.0, 1.0], (len(z), 1)), vertex[:, 1])
     link = scene.fingers[contact.finger]
     heading = z[:, 3 + contact.finger]
     along = np.stack([np.cos(heading), np.sin(heading)], axis=1)
     if contact.surface == "finger":
         normal = _quarter(along) if contact.finger == 0 else -_quarter(along)
         gap = ((vertex - np.asarray(link.base)) * normal).sum(axis=1) - link.radius
-        return _Touch(vertex, normal, gap)
+        return _ContactForce(vertex, normal, gap)
     tip = np.asarray(link.base) + link.length * along
     if contact.feature == "v":
         offset = vertex - tip
         distance = np.linalg.norm(offset, axis=1)
-        return _Touch(vertex, offset / distance[:, None], distance - link.radius)
+        return _ContactForce(vertex, offset / distance[:, None], distance - link.radius)
     run = _rotate(z[:, 2], corners[(contact.index + 1) % count] - corners[contact.index])
     # The corners go round anticlockwise, so the inside is to the left of an edge.
     normal = _quarter(run / np.linalg.norm(run, axis=1)[:, None])
     gap = -((tip - vertex) * normal).sum(axis=1) - link.radius
-    return _Touch(tip + link.radius * normal, normal, gap)
+    return _ContactForce(tip + link.radius * normal, normal, gap)
 
 
 def _rotate(angle: Array, vector: Array) -> Array:

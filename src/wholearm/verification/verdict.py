@@ -15,7 +15,7 @@ from ..common.arrays import Array
 from ..common.fields import POSITIVE, declare, key, read_keys
 from ..contacts.links import FINGERS_TOUCH
 from ..geometry.curve import describe_pose
-from ..mechanics.keys import UNIQUENESS
+from ..mechanics.margin_key import UNIQUENESS
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN, describe_uniqueness
 from ..problem.definition import End, Problem
 from ..results.report import ContactMargin, Deviation, Failure, FingerGap, PhaseReport
@@ -50,27 +50,18 @@ OVERLAP = 3e-5
 class Allowance:
     """What a replay may differ by from what is asked and still hold.
 
-    Attributes
-    ----------
-    departure : float
-        Distance from the plan, over the scene's length for positions and in rad for angles.
-    rest_speed : float
-        Speed where a phase ends at rest, over the scene's speed; angular speeds count times the
-        scene's length.
-    stray : float
-        How far normal forces of a plan may fall below epsilon, over epsilon.
-    uniqueness_margin : float
-        Least uniqueness margin of contact forces (`mechanics.uniqueness`).
-
     Raises
     ------
-    InputError
-        If one of the first three is not positive, or the last is 1 or more.
+    InputError  if one of the first three is not positive, or the last is 1 or more
     """
 
+    # distance from the plan, over the scene's length for positions and in rad for angles
     departure: float = DEPARTURE
+    # speed where a phase ends at rest, over the scene's speed; angular speeds count times the
+    # scene's length
     rest_speed: float = REST_SPEED
-    stray: float = STRAY
+    stray: float = STRAY  # how far normal forces of a plan may fall below epsilon, over epsilon
+    # least uniqueness margin of contact forces (`mechanics.uniqueness`)
     uniqueness_margin: float = UNIQUENESS_MARGIN
 
     def __post_init__(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -11,9 +12,10 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.errors import InputError
 from ..common.sharing import exclusive
+from ..contacts.links import evaluate_finger_gap
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN
 from ..problem.definition import End, Phase, Problem
-from ..results.narrow import Torques, adopt_torques
+from ..results.adopt import Torques, adopt_torques
 from ..results.report import (
     Deviation,
     EnergyBalance,
@@ -27,18 +29,21 @@ from ..results.report import (
 )
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
-from ..simulation.events import Event, EventKind, Simulation
-from ..simulation.simulate import simulate
-from .look_closer import choose_times, make_closer
+from ..simulation.events import Event, EventKind, Glimpses, Simulation
+from ..simulation.simulate import Closer, simulate
+from .force_uniqueness import find_departure, find_uniqueness_margin, find_wedged
 from .margins import (
     MISSED,
+    SHORTEST,
     describe_misses,
+    describe_motors,
     find_finger_gap,
+    fit_parabolas,
     list_contact_margins,
+    list_normal_forces,
     list_slip_margins,
+    list_slips,
 )
-from .motors import describe_motors
-from .sureness import find_departure, find_uniqueness_margin, find_wedged
 from .verdict import (
     DEPARTURE,
     REST_SPEED,
@@ -53,30 +58,28 @@ from .verdict import (
     measure_speed,
 )
 
+ROWS = 20
+"""About how many rows of each phase of a trajectory its replay is compared with; without one, about
+how many even parts of each phase are looked at."""
+POINTS = 8
+"""Instants around what seems to be a dip."""
+LOOKS = 3
+"""How often what the looks before leave open is looked at closer."""
+WORTH = 1e-7
+"""How far below all that is known a dip has to seem, relative to the scene's force or length."""
+Dips = list[tuple[float, float]]
+"""Where something seems to dip, from start to end [s]."""
 _ENDS = (EventKind.ARRIVAL, EventKind.RELEASE)
 _CHANGES = {EventKind.STICK: "sticks", EventKind.SLIP: "slips", EventKind.REVERSAL: "reverses"}
 
 
 class Observation(NamedTuple):
-    """A replay, and what was seen of it, whatever is allowed.
-
-    Attributes
-    ----------
-    problem : Problem
-    torque : TorqueProfile
-    plan : Trajectory or None
-        What it is compared with.
-    tolerance : float
-        Of the simulation.
-    simulation : Simulation
-    phases : tuple of PhaseReport
-    gap : FingerGap or None
-    """
+    """A replay, and what was seen of it, whatever is allowed."""
 
     problem: Problem
     torque: TorqueProfile
-    plan: Trajectory | None
-    tolerance: float
+    plan: Trajectory | None  # what it is compared with
+    tolerance: float  # of the simulation
     simulation: Simulation
     phases: tuple[PhaseReport, ...]
     gap: FingerGap | None
@@ -101,27 +104,21 @@ def verify(
 
     Parameters
     ----------
-    problem : Problem
-    what : Plan, Trajectory or TorqueProfile
-    tolerance : float
-        Of the simulation.
-    departure : float
-        How far the replay may be from the trajectory: positions relative to the scene's length
-        (the object's radius of gyration), angles in rad.
-    rest_speed : float
-        Speed at the end of a phase that passes for rest, relative to the scene's speed (the root
-        of length times gravity); angular speeds count times the scene's length.
-    uniqueness_margin : float
-        Least uniqueness margin of contact forces (`mechanics.uniqueness`).
-    reduced : bool
-        Whether to list the paper's scalar equation of motion along phases with four constraints.
+    tolerance          of the simulation
+    departure          how far the replay may be from the trajectory: positions relative to the
+                       scene's length (the object's radius of gyration), angles in rad
+    rest_speed         speed at the end of a phase that passes for rest, relative to the scene's
+                       speed (the root of length times gravity); angular speeds count times the
+                       scene's length
+    uniqueness_margin  least uniqueness margin of contact forces (`mechanics.uniqueness`)
+    reduced            whether to list the paper's scalar equation of motion along phases with four
+                       constraints
 
     Raises
     ------
-    InputError
-        If the trajectory has other contacts than the problem, or a number is out of its range.
-    JammingError, SimulationError
-        If the simulation cannot go on.
+    InputError                     if the trajectory has other contacts than the problem, or a
+                                   number is out of its range
+    JammingError, SimulationError  if the simulation cannot go on
     """
     problem, torque, plan = adopt_torques(problem, what)
     allowance = Allowance(departure, rest_speed, uniqueness_margin=uniqueness_margin)
@@ -136,7 +133,7 @@ def verify(
 
 def _help(seen: Observation, report: Report, allowance: Allowance) -> Report:
     """The report with what helps to tune the torques."""
-    from .tuning import find_help
+    from .torque_advice import find_help
 
     found = find_help(seen.problem, seen.simulation, seen.phases, allowance)
     return replace(report, help=found)
@@ -153,19 +150,13 @@ def observe(
 
     Parameters
     ----------
-    problem : Problem
-    torque : TorqueProfile
-    plan : Trajectory or None
-        What to compare the replay with.
-    tolerance : float
-        Of the simulation.
-    sure : bool
-        Whether to see if contact forces are the only ones, and starts sure.
+    plan       what to compare the replay with
+    tolerance  of the simulation
+    sure       whether to see if contact forces are the only ones, and starts sure
 
     Raises
     ------
-    JammingError, SimulationError
-        If the simulation cannot go on.
+    JammingError, SimulationError  if the simulation cannot go on
     """
     times, closer = choose_times(problem, torque, plan), make_closer(problem, torque.breaks)
     simulation = simulate(problem, torque, tolerance=tolerance, times=times, closer=closer)
@@ -225,7 +216,7 @@ def judge(seen: Observation, allowance: Allowance, reduced: bool = False) -> Rep
 
 
 def _list_reduced(problem: Problem, simulation: Simulation) -> tuple[ReducedState, ...]:
-    from .reduced import list_reduced_states
+    from .minimal_coordinates import list_reduced_states
 
     return list_reduced_states(problem, simulation)
 
@@ -348,3 +339,86 @@ def _balance(problem: Problem, simulation: Simulation) -> EnergyBalance:
 
 
 __all__ = ["Report", "verify"]
+
+
+def choose_times(problem: Problem, torque: TorqueProfile, plan: Trajectory | None) -> Array:
+    """Instants to look at first: rows of a plan, or even ones; steps show what is in between."""
+    if plan is None:
+        return np.linspace(torque.breaks[0], torque.breaks[-1], ROWS * len(problem.phases) + 1)
+    owned = (np.flatnonzero(plan.phase == index) for index in range(len(plan.motions)))
+    picked = (own[np.linspace(0, len(own) - 1, ROWS + 1).astype(int)] for own in owned)
+    return np.concatenate([plan.t[rows] for rows in picked])
+
+
+class Series(NamedTuple):
+    """What a replay has shown in a phase of a force, a margin or a gap."""
+
+    name: str
+    t: Array  # t, values (n,) [s], [N or m]: at recorded instants
+    values: Array
+    more_t: Array  # more_t, more (k,): by glimpses, in any order
+    more: Array
+    breaks: Array  # [s]: where it may have a kink
+    shortest: float  # [s]: interval below which it may jump
+    worth: float  # [N or m]: how far below the least value a dip has to seem
+
+    def find_dips(self) -> Dips:
+        """Places where it seems to be lower than anywhere recorded, with and without glimpses."""
+        t, values = np.append(self.t, self.more_t), np.append(self.values, self.more)
+        order = np.argsort(t, kind="stable")
+        return [*self._fit(t[order], values[order]), *self._fit(self.t, self.values)]
+
+    def narrow(self, dip: tuple[float, float]) -> Dips:
+        """Places within a dip where it still seems so by what is recorded."""
+        within = slice(*np.searchsorted(self.t, [dip[0], np.nextafter(dip[1], np.inf)]))
+        return self._fit(self.t[within], self.values[within])
+
+    def _fit(self, t: Array, values: Array) -> Dips:
+        found = fit_parabolas(t, values, self.breaks, self.shortest)
+        least = np.nanmin(self.values, initial=np.inf) - self.worth
+        low = np.flatnonzero(found.lowest < least).tolist()
+        return [(float(found.start[k]), float(found.stop[k])) for k in low]
+
+
+def make_closer(problem: Problem, breaks: Array) -> Closer:
+    """What looks closer at a replay where a force, a margin to slipping or a gap seems to dip.
+
+    Parameters
+    ----------
+    breaks : [s]  those of its torques
+    """
+    left: dict[tuple[int, str], Dips] = {}
+
+    def look(simulation: Simulation, glimpses: Glimpses, looks: int) -> Array:
+        before, phases = left.copy(), problem.phases[: int(simulation.phase[-1]) + 1]
+        left.clear()
+        for phase in phases if looks < LOOKS else ():
+            if looks and not any(index == phase.index for index, _ in before):
+                continue
+            for one in _list_series(problem, simulation, glimpses, phase, breaks):
+                key = phase.index, one.name
+                known = before.get(key, [])
+                dips = [d for dip in known for d in one.narrow(dip)] if looks else one.find_dips()
+                left.update({key: dips} if dips else {})
+        every = [np.linspace(*dip, POINTS + 2)[1:-1] for dips in left.values() for dip in dips]
+        return np.concatenate([np.zeros(0), *every])
+
+    return look
+
+
+def _list_series(
+    problem: Problem, simulation: Simulation, glimpses: Glimpses, phase: Phase, breaks: Array
+) -> Iterator[Series]:
+    """All that may dip in a phase; margins and gaps have no jumps, and hardly a kink."""
+    scales, rows = problem.scene.scales, np.flatnonzero(simulation.phase == phase.index)
+    t, none, shortest = simulation.t[rows], np.zeros(0), SHORTEST * scales.time
+    own = np.flatnonzero(glimpses.phase == phase.index)
+    worth = WORTH * scales.force
+    for name, values in list_normal_forces(problem, simulation, phase, rows).items():
+        more = glimpses.c_n[own, simulation.contacts.index(name)]
+        yield Series(name, t, values, glimpses.t[own], more, breaks, shortest, worth)
+    for name, values in list_slips(simulation, phase, rows).items():
+        yield Series(f"{name} rolling", t, values, none, none, t[:1], shortest, worth)
+    if problem.scene.fingers_collide:
+        gaps = evaluate_finger_gap(problem.scene, simulation.z[rows])
+        yield Series("gap", t, gaps, none, none, t[:1], shortest, WORTH * scales.length)

@@ -31,8 +31,7 @@ def write_gallery(
 
     Raises
     ------
-    WholearmError
-        If a problem cannot be read or planned; the page is written only if all are.
+    WholearmError  if a problem cannot be read or planned; the page is written only if all are
     """
     folder = os.path.splitext(page)[0]
     make_folder(folder)

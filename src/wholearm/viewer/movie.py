@@ -20,9 +20,8 @@ from matplotlib.patches import Polygon, Rectangle
 from PIL import Image, ImageColor
 
 from ..common.arrays import Array
-from ..common.errors import InputError
+from ..common.errors import InputError, require_number
 from ..common.files import write_whole
-from ..common.require import require_number
 from ..common.sharing import exclusive
 from ..contacts.elemental import parse_contact
 from ..figures.curves import draw_margins, draw_phases, draw_torques
@@ -44,7 +43,7 @@ from ..figures.style import (
 )
 from ..problem.definition import Problem
 from ..results.trajectory import Trajectory
-from .motion import place_pushes
+from .motion_data import place_pushes
 
 FRAMES = 25
 """Frames in a second of the movie."""
@@ -228,19 +227,13 @@ class Movie:
 
     Parameters
     ----------
-    problem : Problem
-    trajectory : Trajectory
-    ghost : Trajectory, optional
-        A replay, drawn behind.
-    speed : float
-        How fast the motion passes, over real time.
-    resolution : int
-        Dots per inch; it is 8 inches wide.
+    ghost       a replay, drawn behind
+    speed       how fast the motion passes, over real time
+    resolution  dots per inch; it is 8 inches wide
 
     Raises
     ------
-    InputError
-        If `speed` is not positive, or makes the movie longer than two minutes.
+    InputError  if `speed` is not positive, or makes the movie longer than two minutes
     """
 
     def __init__(
@@ -311,8 +304,7 @@ def write_movie(
 
     Raises
     ------
-    InputError
-        If there is no ffmpeg for an MP4, or the file cannot be written.
+    InputError  if there is no ffmpeg for an MP4, or the file cannot be written
     """
     pictures = _count(movie, progress)
     if str(path).lower().endswith(".gif"):

@@ -17,9 +17,7 @@ def build_page(title: str, parts: Iterable[str]) -> str:
 
     Parameters
     ----------
-    title : str
-    parts : iterable of str
-        As the other functions of this module make them.
+    parts  as the other functions of this module make them
     """
     style, script = (_read(name) for name in ("viewer.css", "viewer.js"))
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
@@ -44,7 +42,7 @@ def fold(content: str, title: str) -> str:
 
 
 def write_player(motion: dict[str, Any]) -> str:
-    """A motion to play; see `motion.describe_motion`."""
+    """A motion to play; see `motion_data.describe_motion`."""
     return f'<div class="{PLAYER}">{_embed(motion)}</div>'
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ...common.arrays import Array
 from ...mechanics.dynamics import PathForces, inverse
 from ...mechanics.limits import make_limits
-from ...planning.path_domain.motion import directions_of
+from ...planning.path_domain.path_motion import directions_of
 from ...results.torque import TorqueProfile
 from .phases import (
     NO_PLAN,
@@ -31,7 +31,7 @@ TORQUE_NODES = 5
 """Instants in an interval that its torque's polynomial goes through."""
 
 
-class _Rows:
+class _PeerRows:
     """Limits at places of a curve, as constant + a s'' + b s'^2 + q squeeze >= 0."""
 
     def __init__(self, instance: Instance, s: Array, owner: NDArray[np.int64]) -> None:
@@ -89,7 +89,7 @@ def build_toppra(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
         grid = np.append(grid[near], part.stop + APART * length * np.array([-1.0, 1.0]))
         grid.sort()
     stops = [part.stop for part in instance.curve.segments[:-1]]
-    a, b, constant = _Rows(instance, grid, np.searchsorted(stops, grid)).eliminate()
+    a, b, constant = _PeerRows(instance, grid, np.searchsorted(stops, grid)).eliminate()
     below, zero = -np.eye(a.shape[1]), np.zeros(a.shape[1])
 
     class Limits(LinearConstraint):  # type: ignore[misc]
@@ -139,7 +139,9 @@ def _make_plan(instance: Instance, grid: Array, speeds: Array) -> PeerPlan:
     a = np.diff(b) / (2 * steps)
     times = np.append(0.0, np.cumsum(2 * steps / (speeds[1:] + speeds[:-1])))
     owner = np.searchsorted(stops, (grid[1:] + grid[:-1]) / 2)
-    ends = [_Rows(instance, grid[p], owner).middle(a, b[p]) for p in (slice(-1), slice(1, None))]
+    ends = [
+        _PeerRows(instance, grid[p], owner).middle(a, b[p]) for p in (slice(-1), slice(1, None))
+    ]
 
     def torque(t: Array) -> Array:
         k = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(a) - 1)
@@ -147,7 +149,7 @@ def _make_plan(instance: Instance, grid: Array, speeds: Array) -> PeerPlan:
         run = np.clip(local * (speeds[k] + a[k] * local / 2), 0.0, steps[k])
         part = run / steps[k]
         squeeze = ends[0][k] * (1 - part) + ends[1][k] * part
-        forces: PathForces = _Rows(instance, grid[k] + run, owner[k]).forces
+        forces: PathForces = _PeerRows(instance, grid[k] + run, owner[k]).forces
         return forces.tau(a[k], (speeds[k] + a[k] * local) ** 2, squeeze)
 
     profile = TorqueProfile.fit(times, torque, TORQUE_NODES - 1)

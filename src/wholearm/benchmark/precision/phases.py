@@ -20,10 +20,10 @@ from ...contacts.formation import Formation
 from ...geometry.curve import Curve, Segment
 from ...geometry.tracing import trace_phases
 from ...mechanics.dynamics import build_force_rows
-from ...planning.path_domain.data import prepare
 from ...planning.path_domain.first_guess import guess
-from ...planning.path_domain.mesh import Mesh
-from ...planning.path_domain.motion import PathMotion
+from ...planning.path_domain.path_data import prepare
+from ...planning.path_domain.path_mesh import Mesh
+from ...planning.path_domain.path_motion import PathMotion
 from ...problem.definition import End, Problem
 from ...problem.read import read_problem
 from ...results.torque import TorqueProfile
@@ -31,19 +31,10 @@ from ...results.trajectory import Samples
 
 
 class Instance(NamedTuple):
-    """One phase from rest to rest.
+    """One phase from rest to rest."""
 
-    Attributes
-    ----------
-    name : str
-        Of the file, and the number of the phase.
-    problem : Problem
-        Of that phase alone.
-    curve : Curve
-    """
-
-    name: str
-    problem: Problem
+    name: str  # of the file, and the number of the phase
+    problem: Problem  # of that phase alone
     curve: Curve
 
 
@@ -107,46 +98,25 @@ OPTIMUM = "Solve_Succeeded"
 
 
 class PeerPlan(NamedTuple):
-    """What a planner has found for one phase.
+    """What a planner has found for one phase."""
 
-    Attributes
-    ----------
-    status : str
-        `OPTIMUM`, or why there is no plan.
-    duration : float, [s]
-    torque : TorqueProfile
-    marks : tuple of float, [s]
-        When directions reverse.
-    """
-
-    status: str
-    duration: float
+    status: str  # `OPTIMUM`, or why there is no plan
+    duration: float  # [s]
     torque: TorqueProfile
-    marks: tuple[float, ...]
+    marks: tuple[float, ...]  # [s]: when directions reverse
 
 
 NO_PLAN = PeerPlan("", 1.0, TorqueProfile(np.array([0.0, 1.0]), np.zeros((1, 2, 1))), ())
 """What there is where nothing was found."""
 
 
-class Stretch(NamedTuple):
-    """A stretch of a phase without a reversal, as peers plan it.
-
-    Attributes
-    ----------
-    part : Segment
-    share : float
-        Of the curve's length.
-    target : float
-        Coordinate `progress` at its end.
-    progress : int
-        Coordinate of the object that runs along the phase: x, or phi where it turns.
-    """
+class PhaseStretch(NamedTuple):
+    """A stretch of a phase without a reversal, as peers plan it."""
 
     part: Segment
-    share: float
-    target: float
-    progress: int
+    share: float  # of the curve's length
+    target: float  # coordinate `progress` at its end
+    progress: int  # coordinate of the object that runs along the phase: x, or phi where it turns
 
 
 def build_plant(formation: Formation) -> Expression:
@@ -163,12 +133,12 @@ def build_plant(formation: Formation) -> Expression:
     return ca.Function("plant", [z, v, tau, c_n, Xi, sigma], [acceleration, missed])
 
 
-def list_stretches(curve: Curve) -> list[Stretch]:
+def list_stretches(curve: Curve) -> list[PhaseStretch]:
     """The stretches of a phase."""
     ends = curve.evaluate(np.array([0.0, *(part.stop for part in curve.segments)])).z
     progress = 2 if abs(ends[-1] - ends[0])[2] > 1e-6 else 0
     return [
-        Stretch(part, (part.stop - part.start) / curve.length, float(end[progress]), progress)
+        PhaseStretch(part, (part.stop - part.start) / curve.length, float(end[progress]), progress)
         for part, end in zip(curve.segments, ends[1:], strict=True)
     ]
 
@@ -193,6 +163,6 @@ def sample_slow_motion(instance: Instance, counts: list[int]) -> list[tuple[Arra
     return found
 
 
-def count_intervals(stretches: list[Stretch], intervals: int, least: int = 4) -> list[int]:
+def count_intervals(stretches: list[PhaseStretch], intervals: int, least: int = 4) -> list[int]:
     """About so many intervals, shared among the stretches of a phase."""
     return [max(least, round(intervals * stretch.share)) for stretch in stretches]

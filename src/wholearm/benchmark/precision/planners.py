@@ -12,16 +12,16 @@ import numpy as np
 
 from ...planning.lower_bound.lower_bound import bound_least_time
 from ...planning.options import Objective, PlanOptions
-from ...planning.path_domain.data import prepare
-from ...planning.path_domain.mesh import Mesh
-from ...planning.path_domain.nlp import build_path_nlp
-from ...planning.path_domain.plan import plan_path
+from ...planning.path_domain.path_data import prepare
+from ...planning.path_domain.path_mesh import Mesh
+from ...planning.path_domain.path_nlp import build_path_nlp
+from ...planning.path_domain.path_plan import plan_path
 from ...planning.path_domain.terms import LimitShape
 from ...planning.phase_plan import PhasePlan
-from ...planning.time_domain.plan import plan_phases
-from .check import check_plan
+from ...planning.time_domain.time_plan import plan_phases
 from .peers import build_toppra, build_yapss
 from .phases import OPTIMUM, Instance, PeerPlan, list_instances, list_stretches, pick
+from .reference_check import check_plan
 from .runs import Median, measure
 
 LEAST_TIME, NO_DRAG = "least time", "least time without viscous friction"
@@ -33,25 +33,13 @@ NEAR = 1e-7
 
 
 class Planner(NamedTuple):
-    """A planner.
+    """A planner."""
 
-    Attributes
-    ----------
-    settings : str
-        What it is told besides the number of intervals.
-    build : callable
-        Takes an instance and a setting; gives what solves it.
-    choices : tuple of str
-        Settings that are measured.
-    module : str
-        What has to be installed, if anything.
-    studies : tuple of str
-    """
-
-    settings: str
+    settings: str  # what it is told besides the number of intervals
+    # takes an instance and a setting; gives what solves it
     build: Callable[[Instance, str], Callable[[], PeerPlan]]
-    choices: tuple[str, ...]
-    module: str = ""
+    choices: tuple[str, ...]  # settings that are measured
+    module: str = ""  # what has to be installed, if anything
     studies: tuple[str, ...] = (LEAST_TIME,)
 
 

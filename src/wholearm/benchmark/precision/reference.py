@@ -155,44 +155,23 @@ Extended = Any
 
 
 class Span(NamedTuple):
-    """A stretch of time within one piece of the torques, without a reversal.
+    """A stretch of time within one piece of the torques, without a reversal."""
 
-    Attributes
-    ----------
-    start, stop : float, [s]
-    piece : int
-        Of the torques.
-    Xi, sigma : ndarray, shape (n_c,) and (2,)
-        Directions of sliding and of the joints.
-    """
-
-    start: float
+    start: float  # start, stop [s]:
     stop: float
-    piece: int
-    Xi: Array
+    piece: int  # of the torques
+    Xi: Array  # Xi, sigma (n_c,) and (2,): directions of sliding and of the joints
     sigma: Array
 
 
 class Course(NamedTuple):
-    """One phase with torques, and where it gets to.
+    """One phase with torques, and where it gets to."""
 
-    Attributes
-    ----------
-    problem : Problem
-        Of that phase alone.
-    torque : TorqueProfile
-    spans : tuple of Span
-    end : ndarray, shape (10,)
-        State (z, z') when the torques end.
-    own_error : float
-        Of that state, relative to the scene.
-    """
-
-    problem: Problem
+    problem: Problem  # of that phase alone
     torque: TorqueProfile
     spans: tuple[Span, ...]
-    end: Array
-    own_error: float
+    end: Array  # (10,): state (z, z') when the torques end
+    own_error: float  # of that state, relative to the scene
 
 
 def find_course(problem: Problem, torque: TorqueProfile, curve: Curve, reversals: Array) -> Course:

@@ -25,23 +25,14 @@ _Answer = TypeVar("_Answer")
 
 
 class Median(NamedTuple):
-    """The runs of one setting: medians of their times [s], and the worst of the rest.
+    """The runs of one setting: medians of their times [s], and the worst of the rest."""
 
-    Attributes
-    ----------
-    build, solve : float, [s]
-        Time to build, and to simulate or solve.
-    errors : tuple of float
-        Of the state, relative to the scene; of plans those of the phase time, of the replayed end
-        state, and the worst violation of a limit between nodes.
-    outcome : str
-        `SOLVED`, or what failed.
-    """
-
-    build: float
+    build: float  # build, solve [s]: time to build, and to simulate or solve
     solve: float
+    # of the state, relative to the scene; of plans those of the phase time, of the replayed end
+    # state, and the worst violation of a limit between nodes
     errors: tuple[float, ...]
-    outcome: str = SOLVED
+    outcome: str = SOLVED  # `SOLVED`, or what failed
 
     def reaches(self, target: float, count: int | None = None) -> bool:
         """Whether it is solved and its errors, or the first few of them, are below a target."""

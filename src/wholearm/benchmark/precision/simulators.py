@@ -17,11 +17,11 @@ from ...common.arrays import Array, Expression
 from ...geometry.curve import Curve
 from ...mechanics.dynamics import build_forward
 from ...planning.options import PlanOptions
-from ...planning.path_domain.data import prepare
 from ...planning.path_domain.first_guess import guess
-from ...planning.path_domain.mesh import Mesh
-from ...planning.path_domain.motion import PathMotion
-from ...planning.path_domain.plan import plan_path
+from ...planning.path_domain.path_data import prepare
+from ...planning.path_domain.path_mesh import Mesh
+from ...planning.path_domain.path_motion import PathMotion
+from ...planning.path_domain.path_plan import plan_path
 from ...results.torque import TorqueProfile
 from ...simulation.simulate import simulate
 from .phases import Instance, list_instances, pick
@@ -47,18 +47,10 @@ Runner = Callable[[], Array]
 
 
 class Simulator(NamedTuple):
-    """A simulator.
+    """A simulator."""
 
-    Attributes
-    ----------
-    settings : str
-        What it is told besides the tolerance.
-    build : callable
-        Takes a course and a tolerance; gives what runs it.
-    """
-
-    settings: str
-    build: Callable[[Course, float], Runner]
+    settings: str  # what it is told besides the tolerance
+    build: Callable[[Course, float], Runner]  # takes a course and a tolerance; gives what runs it
 
 
 def build_own(course: Course, tolerance: float) -> Runner:

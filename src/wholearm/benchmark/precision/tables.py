@@ -26,35 +26,25 @@ SMALLEST = 1e-16
 """Error that is drawn for none at all."""
 
 
-class Comparison(NamedTuple):
-    """What one table compares.
-
-    Attributes
-    ----------
-    study, title : str
-    ours : str
-        Method that others are compared with.
-    targets : tuple of float
-        Errors that run times are compared at.
-    building : bool
-        Whether the time to build counts.
-    errors : int or None
-        How many of the errors have to be below a target; None for all.
-    """
+class PeerComparison(NamedTuple):
+    """What one table compares."""
 
     study: str
     title: str
-    ours: str
-    targets: tuple[float, ...]
-    building: bool
-    errors: int | None
+    ours: str  # method that others are compared with
+    targets: tuple[float, ...]  # errors that run times are compared at
+    building: bool  # whether the time to build counts
+    errors: int | None  # how many of the errors have to be below a target; None for all
 
 
 _TIMES, _ALL = "by the error of the phase time", "by all three errors"
 COMPARISONS = (
-    *(Comparison(own, own, "wholearm", (1e-6, 1e-9, 1e-11), False, None) for own in (FEW, MANY)),
     *(
-        Comparison(own, f"{own}, {which}", "wholearm, curve", (1e-2, 1e-3, 1e-4), True, count)
+        PeerComparison(own, own, "wholearm", (1e-6, 1e-9, 1e-11), False, None)
+        for own in (FEW, MANY)
+    ),
+    *(
+        PeerComparison(own, f"{own}, {which}", "wholearm, curve", (1e-2, 1e-3, 1e-4), True, count)
         for own in (LEAST_TIME, NO_DRAG)
         for count, which in ((1, "by the error of the phase time"), (None, "by all three errors"))
     ),
@@ -101,7 +91,9 @@ def format_report(medians: Medians, limit: float) -> str:
     return "\n".join([*lines, ""])
 
 
-def find_times(medians: Medians, method: str, own: Comparison, target: float) -> dict[str, float]:
+def find_times(
+    medians: Medians, method: str, own: PeerComparison, target: float
+) -> dict[str, float]:
     """Times in which a method reaches an error on each phase that it has runs on [s].
 
     Infinite where it does not.
@@ -121,7 +113,7 @@ def list_methods(medians: Medians, study: str) -> list[str]:
     return [name for name in SIMULATORS | PLANNERS if name in given]
 
 
-def _format_targets(medians: Medians, own: Comparison, limit: float) -> list[str]:
+def _format_targets(medians: Medians, own: PeerComparison, limit: float) -> list[str]:
     """Times to reach errors, and how many times as long as ours that is."""
     methods = list_methods(medians, own.study)
     if own.ours not in methods:

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from ...common.arrays import Array
 from ...problem.definition import Phase, Until
 from ...scene.model import Scene
+from .event_tracing import weights
 from .newton import clearances, locate
 from .slow_motion import fast_margin, rest_margin
-from .tracing import weights
 
 PLACES = 40
 """Configurations along a curve."""
@@ -48,26 +48,13 @@ Flags = NDArray[np.bool_]
 
 
 class Best(NamedTuple):
-    """The best of many curves.
+    """The best of many curves."""
 
-    Attributes
-    ----------
-    margin : float
-        As of `fast_margin`, without and with friction of slow contacts in their cones.
-    loose : float
-    z : ndarray, shape (PLACES, 5)
-        The curve that has the margin `margin`.
-    curves : int
-        Curves that were looked at.
-    ends : int
-        Places of the end that were looked at.
-    """
-
-    margin: float
+    margin: float  # as of `fast_margin`, without and with friction of slow contacts in their cones
     loose: float
-    z: Array
-    curves: int
-    ends: int
+    z: Array  # (PLACES, 5): the curve that has the margin `margin`
+    curves: int  # curves that were looked at
+    ends: int  # places of the end that were looked at
 
 
 def list_ends(scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]) -> Array:

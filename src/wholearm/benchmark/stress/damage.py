@@ -75,23 +75,12 @@ METAS = (
 
 
 class Mutant(NamedTuple):
-    """A file with something wrong in it.
+    """A file with something wrong in it."""
 
-    Attributes
-    ----------
-    kind : {"problem", "torque", "trajectory"}
-    what : str
-        What was done.
-    ending : str
-        Of the file's name.
-    content : bytes or None
-        None stands for a folder.
-    """
-
-    kind: str
-    what: str
-    ending: str
-    content: bytes | None
+    kind: str  # {"problem", "torque", "trajectory"}
+    what: str  # what was done
+    ending: str  # of the file's name
+    content: bytes | None  # none stands for a folder
 
 
 @lru_cache(maxsize=1)

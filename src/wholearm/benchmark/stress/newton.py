@@ -17,27 +17,18 @@ from ...scene.polygon import cross_product
 
 
 class Touch(NamedTuple):
-    """A contact at n configurations.
+    """A contact at n configurations."""
 
-    Attributes
-    ----------
-    gap : ndarray, shape (n,), [m]
-    low, high : ndarray, shape (n,), [m]
-        How far the contact is inside both ends of the feature that it slides on; infinite where
-        the feature has no end of its own.
-    normal, tangent : ndarray, shape (n, 5)
-        Rows that give the rate of separation and of sliding from z', and the force on z from c_n
-        and c_t.
-    friction : float
-        Coefficient mu.
-    """
-
-    gap: Array
+    gap: Array  # (n,) [m]
+    # low, high (n,) [m]: how far the contact is inside both ends of the feature that it slides on;
+    # infinite where the feature has no end of its own
     low: Array
     high: Array
+    # normal, tangent (n, 5): rows that give the rate of separation and of sliding from z', and the
+    # force on z from c_n and c_t
     normal: Array
     tangent: Array
-    friction: float
+    friction: float  # coefficient mu
 
 
 def place_object(scene: Scene, z: Array) -> Array:
@@ -116,12 +107,9 @@ def balance(
 
     Parameters
     ----------
-    touches : list of Touch
-    motion : (ndarray, ndarray), shape (n, 5)
-        z' and z''.
-    tau : ndarray, shape (n, 2), [N m]
-    forces : ndarray, shape (2, n, n_c), [N]
-        c_n and c_t.
+    motion : (n, 5)           z' and z''
+    tau : (n, 2) [N m]
+    forces : (2, n, n_c) [N]  c_n and c_t
     """
     z_dot, z_ddot = motion
     rest = scene.mass_diagonal * z_ddot + scene.viscous * z_dot + scene.dry * np.sign(z_dot)

@@ -14,8 +14,8 @@ from ...planning.plan import solve
 from ...problem.definition import End, Phase, Problem
 from ...scene.model import Scene
 from .cell_curves import best_end, find_best, list_ends
+from .event_tracing import Trace, follow, resample, weights
 from .slow_motion import fast_margin, inertia_ratio, rest_margin, slow_margin
-from .tracing import Trace, follow, resample, weights
 
 PLACES = 60
 """Places along a curve at which limits are looked at."""
@@ -33,16 +33,10 @@ HELD = 1e-3
 
 
 class Verdict(NamedTuple):
-    """What a second look says about a refusal.
+    """What a second look says about a refusal."""
 
-    Attributes
-    ----------
-    kind : {"confirmed", "refuted", "close", "open"}
-        No motion exists; one does; it depends on rounding or on the discretisation; or there is no
-        second argument.
-    reason : str
-    """
-
+    # {"confirmed", "refuted", "close", "open"}: no motion exists; one does; it depends on rounding
+    # or on the discretisation; or there is no second argument
     kind: str
     reason: str
 

@@ -21,10 +21,9 @@ from ...common.arrays import Array
 from ...common.errors import InputError
 from ...contacts.closing import close_finger, close_fingers, place_flush
 from ...contacts.formation import Formation, find_touching
-from ...mapping.borders import NOWHERE, Piece, Window, flush_track, label_cells, palm_track
-from ...mapping.nearby import tolerance
-from ...mapping.pieces import cut
-from ...mapping.route import Stretch, format_route, list_formations
+from ...mapping.borders import NOWHERE, Piece, Window, cut, flush_track, label_cells, palm_track
+from ...mapping.formation_list import Stretch, format_route, list_formations
+from ...mapping.legs import tolerance
 from ...problem.definition import Phase, Problem
 from ...problem.read import build_problem
 from ...scene.model import Finger, Friction, Scene
@@ -223,24 +222,12 @@ SCENES = 6
 
 @dataclass(frozen=True)
 class Case:
-    """A problem of the study.
+    """A problem of the study."""
 
-    Attributes
-    ----------
-    number : int
-        Within its seed.
-    kind : str
-        What is special about it.
-    table : dict
-        The contents of a problem file.
-    stops : list of (x, phi), [m, rad]
-        Where its phases end according to the map.
-    """
-
-    number: int
-    kind: str
-    table: Table
-    stops: list[tuple[float, float]]
+    number: int  # within its seed
+    kind: str  # what is special about it
+    table: Table  # the contents of a problem file
+    stops: list[tuple[float, float]]  # [m, rad]: where its phases end according to the map
 
 
 @lru_cache(maxsize=2)

@@ -34,8 +34,8 @@ from ...common.arrays import Array
 from ...contacts.closing import Numbers
 from ...problem.definition import Phase
 from ...scene.model import Scene
+from .event_tracing import slides
 from .newton import Touch, locate
-from .tracing import slides
 
 Bounds = list[tuple[float | None, float | None]]
 
@@ -50,22 +50,13 @@ class Forces(NamedTuple):
 
     With forces over the scene's weight, torques over their limits and lengths over the radius of
     gyration. v stands for sqrt(b).
-
-    Attributes
-    ----------
-    equal, equal_to : ndarray, shape (n, 3, k) and (n, 3)
-        Newton's and Euler's laws of the object.
-    rows, least : ndarray, shape (n, m, k) and (n, m)
-        Limits.
-    share : ndarray, shape (m,)
-        What a margin of 1 takes from each limit.
     """
 
-    equal: Array
+    equal: Array  # equal, equal_to (n, 3, k) and (n, 3): Newton's and Euler's laws of the object
     equal_to: Array
-    rows: Array
+    rows: Array  # rows, least (n, m, k) and (n, m): limits
     least: Array
-    share: Array
+    share: Array  # (m,): what a margin of 1 takes from each limit
 
 
 def slow_margin(
@@ -96,13 +87,10 @@ def fast_margin(
 
     Parameters
     ----------
-    curve : (s, z, z_s)
-        As of `tracing.resample`.
-    rests : (bool, bool)
-        Whether the motion is at rest at the start and at the end of the curve.
-    loose : float
-        Rate of sliding over that of the whole motion below which a contact may also roll, or slide
-        the other way, on a curve nearby: its friction may then be any in its cone.
+    curve  as of `event_tracing.resample`
+    rests  whether the motion is at rest at the start and at the end of the curve
+    loose  rate of sliding over that of the whole motion below which a contact may also roll, or
+           slide the other way, on a curve nearby: its friction may then be any in its cone
     """
     s, z, z_s = curve
     size, speed = scene.scales.length, scene.scales.speed
@@ -348,14 +336,12 @@ def rest_margin(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: bool
 
     Parameters
     ----------
-    ends : bool
-        Whether the motion ends there: then things moved against their accelerations.
+    ends  whether the motion ends there: then things moved against their accelerations
 
     Returns
     -------
-    float
-        Of normal forces over the weight and of torques over their limits, at most 1; NaN with other
-        than one or two freedoms.
+    float  of normal forces over the weight and of torques over their limits, at most 1; NaN with
+           other than one or two freedoms
     """
     touches = [locate(scene, name, z[None]) for name in phase.formation.names]
     rolling = phase.formation.rolling_rows
@@ -442,10 +428,9 @@ def _solve(
 
     Parameters
     ----------
-    N : ndarray, shape (5, f)
-        Accelerations that keep the contacts.
-    rates : (slip, signs, apart)
-        Rates of contacts and joints, shape (n_c + 2, f), their signs, and rates of other gaps.
+    N : (5, f)  accelerations that keep the contacts
+    rates       rates of contacts and joints, shape (n_c + 2, f), their signs, and rates of other
+                gaps
     """
     slip, signs, apart = rates
     force, f, n_c = scene.scales.force, N.shape[1], len(touches)

@@ -11,15 +11,18 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...common.arrays import Array
 from ...geometry.curve import Curve
-from .costate import find_costate
-from .dual import evaluate, find_least
-from .rows import Rows
-from .sweep import NoMotionError, Sweep, add_up, find_fastest, find_steady
-from .way import Grid, Way
+from .path_terms import PathGrid, PathTerms
+from .rows import Extreme, PathLimitRows
+from .speed_sweep import NoMotionError, Sweep, SweepMode, add_up, find_fastest, find_steady
 
+_NEAR = 6
+"""Intervals from a switch within which a row that it turns about is looked for."""
+_STIFF = 4.0
+"""Growth in an interval from which on the trapezoidal rule is left for the exponential one."""
 _TOLERANCE = 3e-8
 """What the bound may lose, and its error, relative to the time."""
 GRID_INTERVALS = 100
@@ -33,25 +36,16 @@ _MOST = 1500
 """Most intervals."""
 _SAFETY = 2.0
 """Factor on the difference of two rules of quadrature; where limits take turns both err alike."""
-
 _RULES = tuple(np.polynomial.legendre.leggauss(count) for count in (2, 3))
 _PLACES = np.concatenate([[0.0, 0.5, 1.0], *((1 + nodes) / 2 for nodes, _ in _RULES)])
 """Left end, middle, right end and the nodes of both rules in an interval."""
 
 
 class LowerBound(NamedTuple):
-    """A lower bound of the least time.
+    """A lower bound of the least time."""
 
-    Attributes
-    ----------
-    value : float, [s]
-        The bound, less the estimate of its error.
-    error : float, [s]
-        That estimate: of the quadrature, by rules of two orders.
-    """
-
-    value: float
-    error: float
+    value: float  # [s]: the bound, less the estimate of its error
+    error: float  # [s]: that estimate: of the quadrature, by rules of two orders
 
 
 class _Round(NamedTuple):
@@ -68,12 +62,11 @@ def bound_least_time(curves: Sequence[Curve], epsilon: float) -> LowerBound | No
 
     Parameters
     ----------
-    curves : sequence of Curve
-        With such speed ratios that the speed is the same on both sides of where two of them meet.
-    epsilon : float, [N]
-        Least normal force.
+    curves         with such speed ratios that the speed is the same on both sides of where two of
+                   them meet
+    epsilon : [N]  least normal force
     """
-    way = Way(curves, epsilon)
+    way = PathTerms(curves, epsilon)
     grid, near, found, tries = way.make_grid(GRID_INTERVALS), None, None, 0
     for _ in range(_ROUNDS):
         try:
@@ -106,7 +99,7 @@ def bound_roughly(curves: Sequence[Curve], epsilon: float, intervals: int) -> fl
 
     Zero where no motion is found on that grid.
     """
-    way = Way(curves, epsilon)
+    way = PathTerms(curves, epsilon)
     try:
         return _bound(way, way.make_grid(intervals), None).bound.value
     except NoMotionError:
@@ -120,10 +113,9 @@ def look_along(curves: Sequence[Curve], epsilon: float, intervals: int) -> float
 
     Raises
     ------
-    NoMotionError
-        If there is no motion on that grid.
+    NoMotionError  if there is no motion on that grid
     """
-    way = Way(curves, epsilon)
+    way = PathTerms(curves, epsilon)
     grid = way.make_grid(intervals)
     ends, angles = way.place(grid.angles), (grid.angles[1:] + grid.angles[:-1]) / 2
     rows = way.evaluate(angles[:, None], grid.owners).pick((slice(None), 0))
@@ -141,7 +133,7 @@ def _join_caps(left: Array, right: Array) -> Array:
     return np.asarray(np.minimum(np.append(left, np.inf), np.append(np.inf, right)))
 
 
-def _bound(way: Way, grid: Grid, near: Array | None) -> _Round:
+def _bound(way: PathTerms, grid: PathGrid, near: Array | None) -> _Round:
     """The bound on a grid; `near` is what b in its intervals is about."""
     h = np.diff(grid.angles)[:, None]
     angles = grid.angles[:-1, None] + _PLACES * h
@@ -159,7 +151,7 @@ def _bound(way: Way, grid: Grid, near: Array | None) -> _Round:
     shape = len(h), len(_PLACES) - 3
     p, slope = (part.ravel() for part in costate.interpolate(way, grid, _PLACES[3:]))
     inner = rows.pick((slice(None), slice(3, None)))
-    inner = Rows(*(part.reshape(shape[0] * shape[1], *part.shape[2:]) for part in inner))
+    inner = PathLimitRows(*(part.reshape(shape[0] * shape[1], *part.shape[2:]) for part in inner))
     least = find_least(inner, p, slope)
     excess = evaluate(inner, p, slope, b[:, 3:].ravel()) - least
     stretch = way.length / 2 * np.sin(angles[:, 3:])
@@ -184,3 +176,227 @@ def _bound(way: Way, grid: Grid, near: Array | None) -> _Round:
     estimate = _SAFETY * float(error.sum())
     value = max(0.0, total - estimate) if np.isfinite(total) else 0.0
     return _Round(LowerBound(value, estimate), losses, motion, add_up(motion.b, np.diff(s)))
+
+
+class Costate(NamedTuple):
+    """y = p sin(angle) at the two ends of each interval, and its slopes there, (N, 2) each."""
+
+    y: Array
+    slopes: Array
+
+    def interpolate(self, way: PathTerms, grid: PathGrid, fractions: Array) -> tuple[Array, Array]:
+        """The costate p and p' = dp/ds at `fractions` of every interval, shape (N, n)."""
+        t, h = fractions, np.diff(grid.angles)[:, None]
+        (start, stop), (first, last) = self.y.T[..., None], h * self.slopes.T[..., None]
+        rise = stop - start
+        bow = first + last - 2 * rise
+        y = start + t * (first + t * (rise - first - bow + t * bow))
+        y_t = first + t * (2 * (rise - first - bow) + 3 * t * bow)
+        # No sign but those at the ends: only one side of a is extreme there.
+        wrong = ((y > 0) & (self.y.max(axis=1) <= 0)[:, None]) | (
+            (y < 0) & (self.y.min(axis=1) >= 0)[:, None]
+        )
+        plain = wrong.any(axis=1)
+        y[plain], y_t[plain] = (start + t * rise)[plain], rise[plain]
+        angles = grid.angles[:-1, None] + t * h
+        sine = np.sin(angles)
+        p_angle = (y_t / h - y / np.tan(angles)) / sine
+        return y / sine, p_angle / (way.length / 2 * sine)
+
+    def jumps(self, grid: PathGrid) -> Array:
+        """By how much p falls at each inner node, shape (N - 1,)."""
+        return np.asarray((self.y[:-1, 1] - self.y[1:, 0]) / np.sin(grid.angles[1:-1]))
+
+
+def find_costate(
+    way: PathTerms, grid: PathGrid, left: PathLimitRows, right: PathLimitRows, found: Sweep
+) -> Costate:
+    """The costate of a motion, from the limits at the left and right ends of intervals."""
+    b, modes = found.b, found.modes.copy()
+    pushes, brakes = (
+        (left.extreme(b[:-1], largest), right.extreme(b[1:], largest)) for largest in (True, False)
+    )
+    y = np.zeros((len(modes), 2))
+    for k in np.flatnonzero(modes == SweepMode.SWITCH).tolist():
+        pushed, braked = float(pushes[0].a[k]), float(brakes[1].a[k])
+        turn = _find_turn(left, right, int(brakes[1].row[k]), k)
+        if turn is not None:
+            low, high = min(k, turn[0]), max(k, turn[0])
+            modes[low : high + 1] = SweepMode.PUSH
+            modes[turn[0] + 1 : high + 1] = SweepMode.BRAKE
+            modes[turn[0]] = SweepMode.SWITCH
+        index = k if turn is None else turn[0]
+        y[index] = _switch(way, grid, left, right, b, (pushed, braked), index, turn)
+    rates, forces = _linearise(way, grid, b, modes, pushes, brakes)
+    ends = float(pushes[0].a[0]), float(brakes[1].a[-1])
+    _integrate(way, grid, modes, rates, forces, ends, y)
+    slopes = np.where((modes == SweepMode.HELD)[:, None], 0.0, forces + rates * y)
+    # At rest only the value is known.
+    secant = np.diff(y, axis=1)[:, 0] / np.diff(grid.angles)
+    slopes[0, 0] = 2 * secant[0] - slopes[0, 1]
+    slopes[-1, 1] = 2 * secant[-1] - slopes[-1, 0]
+    return Costate(y, slopes)
+
+
+def _find_turn(
+    left: PathLimitRows, right: PathLimitRows, row: int, k: int
+) -> tuple[int, int] | None:
+    """The interval near k in which a row turns from a bound above a to one below, and that row.
+
+    There the motion runs along that row on both sides, and the costate is zero where it turns.
+    """
+    near = np.arange(max(k - _NEAR, 0), min(k + _NEAR + 1, len(left.cap)))
+    turns = near[(left.a[near, row] < 0) & (right.a[near, row] >= 0)]
+    return (int(turns[np.abs(turns - k).argmin()]), row) if len(turns) else None
+
+
+def _switch(
+    way: PathTerms,
+    grid: PathGrid,
+    left: PathLimitRows,
+    right: PathLimitRows,
+    b: Array,
+    extremes: tuple[float, float],
+    k: int,
+    turn: tuple[int, int] | None,
+) -> Array:
+    """The costate, y, at both ends of the interval k with a switch, shape (2,)."""
+    start, stop = way.place(grid.angles[k : k + 2])
+    (before, after), h = b[k : k + 2], stop - start
+    if turn is None:
+        pushed, braked = extremes
+        x = np.clip((after - before - 2 * braked * h) / (2 * (pushed - braked)), 0.0, h)
+        rate = 0.5 * max(before + 2 * pushed * x, before, after) ** -1.5
+    else:
+        row, most = turn[1], max(before, after)
+        x = h * left.a[k, row] / (left.a[k, row] - right.a[k, row])
+        pull = left.b[k, row] + left.v[k, row] / (2 * np.sqrt(most))
+        rate = 0.5 * most**-1.5 / (1 - 2 * pull * h / (right.a[k, row] - left.a[k, row]))
+    return np.asarray(rate * np.array([x, x - h]) * np.sin(grid.angles[k : k + 2]))
+
+
+def _linearise(
+    way: PathTerms,
+    grid: PathGrid,
+    b: Array,
+    modes: NDArray[np.int64],
+    pushes: tuple[Extreme, Extreme],
+    brakes: tuple[Extreme, Extreme],
+) -> tuple[Array, Array]:
+    """Rates and forces of dy/dangle = force + rate y at both ends of the intervals, (N, 2) each."""
+    slope, switches = np.zeros((len(modes), 2)), modes == SweepMode.SWITCH
+    for mode, extremes, switched in ((SweepMode.PUSH, pushes, 0), (SweepMode.BRAKE, brakes, 1)):
+        for end in range(2):
+            used = (modes == mode) | (switches if end == switched else False)
+            slope[used, end] = extremes[end].slope[used]
+    angles = np.column_stack([grid.angles[:-1], grid.angles[1:]])
+    speed = np.sqrt(np.column_stack([b[:-1], b[1:]]))
+    inner = speed > 0
+    sine, stretch = np.sin(angles), way.length / 2 * np.sin(angles)
+    force = np.zeros(slope.shape)
+    force[inner] = -(stretch * sine)[inner] / (2 * speed[inner] ** 3)
+    rate = np.zeros(slope.shape)
+    rate[inner] = 1 / np.tan(angles[inner]) - 2 * slope[inner] * stretch[inner]
+    return rate, force
+
+
+def _integrate(
+    way: PathTerms,
+    grid: PathGrid,
+    modes: NDArray[np.int64],
+    rates: Array,
+    forces: Array,
+    ends: tuple[float, float],
+    y: Array,
+) -> None:
+    """Follow y from switches and held stretches, back where pushed and forth where braked."""
+    h, last = np.diff(grid.angles), len(modes) - 1
+    at_rest = [np.sign(a) / (2 * abs(a) * np.sqrt(abs(a) * way.length / 2)) for a in ends]
+    for mode, order, near, far in (
+        (SweepMode.PUSH, range(last, -1, -1), 1, 0),
+        (SweepMode.BRAKE, range(last + 1), 0, 1),
+    ):
+        step = far - near
+        for k in order:
+            if modes[k] != mode:
+                continue
+            beside = k - step
+            goes_on = 0 <= beside <= last and modes[beside] in (mode, SweepMode.SWITCH)
+            y[k, near] = y[beside, far] if goes_on else 0.0
+            if k == (last if far else 0):
+                y[k, far] = at_rest[far]
+            else:
+                y[k, far] = _follow(
+                    float(y[k, near]), step * h[k], forces[k, [near, far]], rates[k, [near, far]]
+                )
+
+
+def _follow(y: float, h: float, force: Array, rate: Array) -> float:
+    """One step of y' = force + rate y from the first to the second of two places."""
+    if np.abs(rate * h).max() < _STIFF:
+        return float((y + h / 2 * (force.sum() + rate[0] * y)) / (1 - h / 2 * rate[1]))
+    growth = float(np.clip(h * rate.mean(), -60, 60))
+    return float(y * np.exp(growth) + h * force.mean() * np.expm1(growth) / growth)
+
+
+def find_least(rows: PathLimitRows, p: Array, slope: Array) -> Array:
+    """H at n places, from p and p' there."""
+    least = _find_least(rows, p, slope)
+    lost = np.flatnonzero(~np.isfinite(least))
+    if len(lost):
+        own = rows.pick(lost)
+        own = own._replace(cap=own.highest())
+        least[lost] = _find_least(own, p[lost], slope[lost])
+    return least
+
+
+def evaluate(rows: PathLimitRows, p: Array, slope: Array, b: Array) -> Array:
+    """The integrand at n places for a motion with some b and the best a."""
+    share, rest = _weigh(rows, p), rows.rest(b)
+    push = np.where(share < 0, share * rest, -np.inf).max(axis=1)
+    return np.asarray(1 / np.sqrt(b) - slope * b + np.where(p == 0, 0.0, push))
+
+
+def _find_least(rows: PathLimitRows, p: Array, slope: Array) -> Array:
+    share, cap = _weigh(rows, p), rows.cap[:, None]
+    with np.errstate(over="ignore", invalid="ignore"):
+        least = _minimise(share * rows.b - slope[:, None], share * rows.v, cap) + share * rows.one
+    least = np.where((share < 0) & ~np.isnan(least), least, -np.inf).max(axis=1)
+    alone = _minimise(-slope[:, None], np.zeros((len(p), 1)), cap)[:, 0]
+    return np.where(p == 0, alone, least)
+
+
+def _weigh(rows: PathLimitRows, p: Array) -> Array:
+    """What a row's rest counts in the integrand if it alone bounds p a; 0 if it cannot."""
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        share = 2 * p[:, None] / rows.a
+        return np.where((share < 0) & np.isfinite(share), share, 0.0)
+
+
+def _minimise(c: Array, g: Array, cap: Array) -> Array:
+    """Least 1/v + g v + c v^2 over 0 < v <= sqrt(cap).
+
+    The derivative vanishes where x = 1/v has x^3 = g x + 2 c. The largest root is the minimum, or
+    there is none and the largest v is best.
+    """
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        root = np.cbrt(2 * np.maximum(c, 0))
+        if g.any():
+            # Newton's method falls monotonically from above the largest root.
+            x = np.where(g > 0, root + np.sqrt(np.abs(g)), np.minimum(root, root**3 / np.abs(g)))
+            for _ in range(12):
+                x = x - (x**3 - g * x - 2 * c) / (3 * x**2 - g)
+            root = np.where(g == 0, root, x)
+        v = np.sqrt(cap)
+        inner = np.where(root > 0, np.minimum(1 / root, v), v)
+        values = [
+            np.where(np.isfinite(own), 1 / own + g * own + c * own**2, _far(c, g))
+            for own in (inner, v)
+        ]
+        return np.where(c > 0, values[0], np.minimum(*values))
+
+
+def _far(c: Array, g: Array) -> Array:
+    """Limit of 1/v + g v + c v^2 for a large v."""
+    first = np.where(c == 0, g, c)
+    return np.where(first == 0, 0.0, np.copysign(np.inf, first))

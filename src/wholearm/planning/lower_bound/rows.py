@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from ...common.arrays import Array
 from ...geometry.curve import Curve, CurvePoint
 from ...mechanics.dynamics import Directions, PathForces, inverse
-from ...mechanics.limits import SPEED, LimitSet, make_limits
-from ...mechanics.sides import SideTerms
+from ...mechanics.limits import SPEED, LimitSet, SideTerms, make_limits
 
 GIVE = 2.5e-7
 """By how much limits give way, over what is much for each: a plan may miss as much of them."""
@@ -33,7 +32,7 @@ class Extreme(NamedTuple):
     row: NDArray[np.int64]
 
 
-class Rows(NamedTuple):
+class PathLimitRows(NamedTuple):
     """Limits a_i a + b_i b + v_i v + one_i >= 0 and b <= cap at places of a curve.
 
     Arrays of shape (..., m), and (...) for `cap` [m^2/s^2], which is infinite without speed limits.
@@ -45,9 +44,9 @@ class Rows(NamedTuple):
     one: Array
     cap: Array
 
-    def pick(self, index: Any) -> Rows:
+    def pick(self, index: Any) -> PathLimitRows:
         """Return the places that `index` selects."""
-        return Rows(*(part[index] for part in self))
+        return PathLimitRows(*(part[index] for part in self))
 
     def rest(self, b: Array) -> Array:
         """What the rows are but for their part in a, shape (..., m), at each b."""
@@ -82,22 +81,23 @@ class Rows(NamedTuple):
         return np.asarray(np.minimum(largest**2, self.cap))
 
 
-def evaluate_rows(curve: Curve, epsilon: float, s: Array, segment: NDArray[np.int64]) -> Rows:
+def evaluate_rows(
+    curve: Curve, epsilon: float, s: Array, segment: NDArray[np.int64]
+) -> PathLimitRows:
     """Limits at n places of a curve, each taken as part of a segment; see `GIVE`.
 
     Parameters
     ----------
-    curve : Curve
-    epsilon : float, [N]
-    s : ndarray, shape (n,)
-    segment : ndarray of int, shape (n,)
+    epsilon : [N]
+    s : (n,)
+    segment : (n,)
     """
     return limit_along(curve, epsilon, curve.evaluate(s), segment)
 
 
 def limit_along(
     curve: Curve, epsilon: float, point: CurvePoint, segment: NDArray[np.int64]
-) -> Rows:
+) -> PathLimitRows:
     """Limits at n places of a curve that have been evaluated; see `evaluate_rows`."""
     signs = ([getattr(part, name) for part in curve.segments] for name in ("Xi", "sigma"))
     directions = Directions(*(np.array(sign)[segment] for sign in signs))
@@ -105,20 +105,16 @@ def limit_along(
     return limit(make_limits(curve.formation, epsilon), forces, point.z_s[:, 3:])
 
 
-def limit(every: LimitSet, forces: PathForces, rates: Array) -> Rows:
+def limit(every: LimitSet, forces: PathForces, rates: Array) -> PathLimitRows:
     """Limits at n places of curves or of other ways, from the forces that motions along them take.
 
     Parameters
     ----------
-    every : LimitSet
-    forces : PathForces
-    rates : ndarray, shape (n, 2)
-        d theta / ds.
+    rates : (n, 2)  d theta / ds
 
     Returns
     -------
-    Rows
-        Without the squeeze, which three contacts do not have.
+    Rows  without the squeeze, which three contacts do not have
     """
     terms = SideTerms.of(every.without(SPEED), forces, rates)
     cap = np.full(len(rates), np.inf)
@@ -129,10 +125,12 @@ def limit(every: LimitSet, forces: PathForces, rates: Array) -> Rows:
     one = terms.rest + GIVE
     if terms.press.any():
         return eliminate(terms.press, terms.rate, terms.bend, terms.drag, one, cap)
-    return Rows(terms.rate, terms.bend, terms.drag, one, cap)
+    return PathLimitRows(terms.rate, terms.bend, terms.drag, one, cap)
 
 
-def eliminate(squeeze: Array, a: Array, b: Array, v: Array, one: Array, cap: Array) -> Rows:
+def eliminate(
+    squeeze: Array, a: Array, b: Array, v: Array, one: Array, cap: Array
+) -> PathLimitRows:
     """Rows without the squeeze, one for each pair of limits, of limits with it, (n, k) each.
 
     Pairs are in the order of `numpy.triu_indices(k, 1)`.
@@ -147,4 +145,4 @@ def eliminate(squeeze: Array, a: Array, b: Array, v: Array, one: Array, cap: Arr
     def combine(of_limits: Array) -> Array:
         return np.asarray((first * of_limits[:, i] + second * of_limits[:, j]) / size)
 
-    return Rows(combine(a), combine(b), combine(v), np.where(left, combine(one), 1.0), cap)
+    return PathLimitRows(combine(a), combine(b), combine(v), np.where(left, combine(one), 1.0), cap)

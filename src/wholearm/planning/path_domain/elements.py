@@ -33,27 +33,18 @@ SIGNS = np.array([1.0, 1.0, -1.0, 1.0, -1.0])
 
 
 class Basis(NamedTuple):
-    """What nodal values of each kind of element mean.
+    """What nodal values of each kind of element mean."""
 
-    Attributes
-    ----------
-    y : ndarray, shape (5, p + 1)
-        The nodes, from 0 to 1; for `TO_REST` and `TO_HOLD` from 1 to 0.
-    to_powers : ndarray, shape (5, p + 1, p + 1)
-        Coefficients of the powers of y of a polynomial from its values at the nodes.
-    links : ndarray, shape (5, p, p + 1)
-        By how much b rises from each node to the next, over the element's length, for s'' at the
-        nodes.
-    weights : ndarray, shape (p + 1,)
-        Of Lobatto's quadrature over y.
-    modes : ndarray, shape (p + 1, p + 1)
-        Coefficients of Legendre polynomials from values at the nodes of an element amid a motion.
-    """
-
-    y: Array
+    y: Array  # (5, p + 1): the nodes, from 0 to 1; for `TO_REST` and `TO_HOLD` from 1 to 0
+    # (5, p + 1, p + 1): coefficients of the powers of y of a polynomial from its values at the
+    # nodes
     to_powers: Array
+    # (5, p, p + 1): by how much b rises from each node to the next, over the element's length, for
+    # s'' at the nodes
     links: Array
-    weights: Array
+    weights: Array  # (p + 1,): of Lobatto's quadrature over y
+    # (p + 1, p + 1): coefficients of Legendre polynomials from values at the nodes of an element
+    # amid a motion
     modes: Array
 
 
@@ -77,26 +68,16 @@ def find_basis(degree: int = DEGREE) -> Basis:
 
 
 class Grid(NamedTuple):
-    """Nodes on a curve.
+    """Nodes on a curve."""
 
-    Attributes
-    ----------
-    s : ndarray, shape (N + 1,), [m]
-        Those of one element after the other, never decreasing: equal where two elements meet.
-    segment : ndarray of int, shape (N + 1,)
-        The segment of the curve that each node's forces belong to.
-    rests : tuple of bool
-        Whether the motion starts and ends at rest.
-    held : bool
-        Whether it does so without acceleration.
-    bends : ndarray or None
-        The c of each element, shape (E,), for elements of the kind `INSIDE`; None for zeros.
-    """
-
+    # (N + 1,) [m]: those of one element after the other, never decreasing: equal where two elements
+    # meet
     s: Array
+    # (N + 1,): the segment of the curve that each node's forces belong to
     segment: NDArray[np.int64]
-    rests: tuple[bool, bool] = (True, True)
-    held: bool = False
+    rests: tuple[bool, bool] = (True, True)  # whether the motion starts and ends at rest
+    held: bool = False  # whether it does so without acceleration
+    # the c of each element, shape (E,), for elements of the kind `INSIDE`; None for zeros
     bends: Array | None = None
 
     @property
@@ -240,9 +221,7 @@ class Elements:
 
     Parameters
     ----------
-    grid : Grid
-    profile : Profile
-        At its nodes.
+    profile  at its nodes
     """
 
     def __init__(self, grid: Grid, profile: Profile) -> None:

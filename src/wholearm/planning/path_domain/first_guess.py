@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from ...common.arrays import Array
-from .data import PhaseData
 from .elements import Profile
-from .motor_data import exceeds_rates
-from .nlp import Units
+from .path_data import PhaseData
+from .path_nlp import Units
+from .rate_terms import exceeds_rates
 
 _SLOW = -12
 """Height of the slowest guess, as a power of two times that of a fall."""

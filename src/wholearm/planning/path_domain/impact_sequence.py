@@ -27,21 +27,11 @@ BEND = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class CurveImpact:
-    """An impact between two curves, or none if they join smoothly, for unit speed along the first.
+    """Impact between two curves, or none if they join smoothly, for unit speed along the first."""
 
-    Attributes
-    ----------
-    phase : Phase
-        The one that it ends.
-    impact : Impact
-        Velocities per m/s, hence without unit and in rad/m; impulses in N s per m/s.
-    ratio : float
-        Speed along the second curve; negative if the motion would turn back.
-    """
-
-    phase: Phase
-    impact: Impact
-    ratio: float
+    phase: Phase  # the one that it ends
+    impact: Impact  # velocities per m/s, hence without unit and in rad/m; impulses in N s per m/s
+    ratio: float  # speed along the second curve; negative if the motion would turn back
 
     @property
     def possible(self) -> bool:
@@ -72,20 +62,11 @@ def compute_curve_impact(phase: Phase, before: Curve, after: Curve) -> CurveImpa
 
 @dataclass(frozen=True, eq=False)
 class ImpactSequence:
-    """One-freedom phases, each but the last ended by an impact or smoothly.
-
-    Attributes
-    ----------
-    phases : tuple of Phase
-    curves : tuple of Curve
-        Parametrised by arc length.
-    impacts : tuple of CurveImpact
-        Between one curve and the next.
-    """
+    """One-freedom phases, each but the last ended by an impact or smoothly."""
 
     phases: tuple[Phase, ...]
-    curves: tuple[Curve, ...]
-    impacts: tuple[CurveImpact, ...]
+    curves: tuple[Curve, ...]  # parametrised by arc length
+    impacts: tuple[CurveImpact, ...]  # between one curve and the next
 
     def part(self, start: int, stop: int) -> ImpactSequence:
         """Phases `start` to `stop`, without the latter."""

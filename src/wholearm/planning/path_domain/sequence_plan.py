@@ -16,9 +16,9 @@ from ..options import PlanOptions
 from ..phase_plan import PhasePlan
 from ..stops import PlanPart, Plans, end_of
 from .impact_sequence import ImpactSequence
-from .joint import Joint, add_pause, choose_joint
-from .motion import PathMotion
-from .plan import plan_curves
+from .junction import Joint, add_pause, choose_joint
+from .path_motion import PathMotion
+from .path_plan import plan_curves
 from .task import Pins
 
 
@@ -34,15 +34,11 @@ def plan_sequence(
 
     Parameters
     ----------
-    sequence : ImpactSequence
-    epsilon : float, [N]
-    options : PlanOptions
-    duration : float, optional, [s]
-        Longest duration of all, for the objective `margin`; the phases share it as is best.
-    explained : bool
-        Whether to find out why there is no plan.
-    pins : tuple of float or None, [N]
-        The squeeze at both ends, where it is given.
+    epsilon : [N]
+    duration : [s]  longest duration of all, for the objective `margin`; the phases share it as is
+                    best
+    explained       whether to find out why there is no plan
+    pins : [N]      the squeeze at both ends, where it is given
     """
     phases = [phase.number for phase in sequence.phases]
     curves = sequence.continuous_curves
@@ -60,14 +56,11 @@ def plan_slowly(
 
     Parameters
     ----------
-    parts : sequence of ImpactSequence
-    beside : tuple
-        The curves before and after all of them, or where these are planned over time, the torques
-        that the former end with, and the formation of the latter; None where there is nothing.
-    epsilon : float, [N]
-    options : PlanOptions
-    durations : sequence of float or None, [s]
-        The longest duration of each, for the objective `margin`.
+    beside           the curves before and after all of them, or where these are planned over time,
+                     the torques that the former end with, and the formation of the latter; None
+                     where there is nothing
+    epsilon : [N]
+    durations : [s]  the longest duration of each, for the objective `margin`
     """
     plans: Plans = []
     firsts: list[Curve | Formation | None] = [*(part.curves[0] for part in parts[1:]), beside[1]]

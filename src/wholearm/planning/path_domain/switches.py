@@ -8,16 +8,16 @@ what it loses at the other.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
-from ..lower_bound.rows import Rows
-from .corners import LimitSides
-from .data import PhaseData
+from ...mechanics.limits import PRESS, SideTerms
+from ..lower_bound.rows import PathLimitRows, eliminate
 from .elements import DEGREE, Elements, Profile
+from .path_data import PhaseData, Places
 
 _PICARD = 4
 """Rounds in which speeds and extremes of s'' are made to agree."""
@@ -47,11 +47,8 @@ def find_switches(data: PhaseData, profile: Profile, margin: float) -> list[Swit
 
     Parameters
     ----------
-    data : PhaseData
-    profile : Profile
-        At its nodes, roughly that of a plan.
-    margin : float, [N]
-        Least margin of normal forces over epsilon.
+    profile       at its nodes, roughly that of a plan
+    margin : [N]  least margin of normal forces over epsilon
     """
     sights = Sights.of(data, margin)
     here = Elements(data.grid, profile).at(sights.fractions)
@@ -63,30 +60,14 @@ def find_switches(data: PhaseData, profile: Profile, margin: float) -> list[Swit
 
 
 class Sights(NamedTuple):
-    """Places of curves at which limits are looked at.
+    """Places of curves at which limits are looked at."""
 
-    Attributes
-    ----------
-    fractions : ndarray
-        Of every interval inside elements.
-    s : ndarray, shape (n,), [m]
-        Interval by interval.
-    sides : LimitSides
-        Of limits there.
-    rows : Rows
-        The same without the squeeze.
-    segment : ndarray of int, shape (n,)
-        Of the curves.
-    length : float, [m]
-        Of the curves.
-    """
-
-    fractions: Array
-    s: Array
-    sides: LimitSides
-    rows: Rows
-    segment: NDArray[np.int64]
-    length: float
+    fractions: Array  # of every interval inside elements
+    s: Array  # (n,) [m]: interval by interval
+    sides: LimitSides  # of limits there
+    rows: PathLimitRows  # the same without the squeeze
+    segment: NDArray[np.int64]  # (n,): of the curves
+    length: float  # [m]: of the curves
 
     @staticmethod
     def of(data: PhaseData, margin: float) -> Sights:
@@ -124,31 +105,16 @@ class Sights(NamedTuple):
 
 
 class _Looks(NamedTuple):
-    """What limits allow at n places along a curve where they leave a choice.
+    """What limits allow at n places along a curve where they leave a choice."""
 
-    Attributes
-    ----------
-    s : ndarray, [m]
-    b : ndarray, [m^2/s^2]
-        Of the motion there.
-    sides : LimitSides
-    rows : Rows
-    at_high, at_low : ndarray of int
-        Which of them set the largest and the least s''.
-    share : ndarray
-        How far s'' is from its largest, over the range that limits allow.
-    element : ndarray of int
-        That each place belongs to.
-    """
-
-    s: Array
-    b: Array
+    s: Array  # [m]
+    b: Array  # [m^2/s^2]: of the motion there
     sides: LimitSides
-    rows: Rows
-    at_high: NDArray[np.int64]
+    rows: PathLimitRows
+    at_high: NDArray[np.int64]  # at_high, at_low: which of them set the largest and the least s''
     at_low: NDArray[np.int64]
-    share: Array
-    element: NDArray[np.int64]
+    share: Array  # how far s'' is from its largest, over the range that limits allow
+    element: NDArray[np.int64]  # that each place belongs to
 
     @property
     def rises(self) -> NDArray[np.bool_]:
@@ -232,3 +198,60 @@ class _Looks(NamedTuple):
             return None
         k = int(passed[0])
         return float(s[k] + steps[k] * ahead[k] / (ahead[k] - ahead[k + 1]))
+
+
+class LimitSides(NamedTuple):
+    """Sides of limits, slack = rest + b bend + s' drag + a rate + squeeze press, at n places.
+
+    Each of shape (n, n_sides), over what is much for a side. `cap` is the b that speed limits
+    allow, shape (n,) [m^2/s^2].
+    """
+
+    rest: Array
+    bend: Array
+    drag: Array
+    rate: Array
+    press: Array
+    cap: Array
+
+    @staticmethod
+    def of(data: PhaseData, places: Places, margin: float) -> LimitSides:
+        """The sides of the limits of phases, for a margin of normal forces over epsilon [N]."""
+        terms = SideTerms.of(data.limits, places.forces, places.rates)
+        rows = data.limits.sides[0]
+        pressing = np.isin(rows, data.limits.of(PRESS))
+        rest = terms.rest - margin * pressing / data.spans
+        return LimitSides(rest, *terms[1:], data.largest_b(places))
+
+    def pick(self, rows: Any) -> LimitSides:
+        """Some of the places."""
+        return LimitSides(*(part[rows] for part in self))
+
+    def eliminate(self) -> PathLimitRows:
+        """Limits without the squeeze, one for each pair of sides."""
+        return eliminate(self.press, self.rate, self.bend, self.drag, self.rest, self.cap)
+
+    def at(self, b: Array) -> Array:
+        """What sides are at rest and without squeeze, for squares of speeds, shape (n,)."""
+        return np.asarray(self.rest + self.bend * b[:, None] + self.drag * np.sqrt(b)[:, None])
+
+    def find_slack(self, profile: Profile) -> Array:
+        """Slack of each side for a motion, shape (n, n_sides)."""
+        a, b, squeeze = (part[:, None] for part in profile)
+        return np.asarray(self.at(b[:, 0]) + a * self.rate + squeeze * self.press)
+
+    def pair(self, row: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The sides that a row without the squeeze is of, shape (..., 2)."""
+        pairs = np.stack(np.triu_indices(self.rest.shape[1], 1), axis=1)
+        return np.asarray(pairs[row])
+
+    def meet(
+        self, b: Array, sides: NDArray[np.int64], slack: float | Array = 0.0
+    ) -> tuple[Array, Array]:
+        """The s'' and the squeeze at which two sides, (n, 2) or (2,), have some slack, (n, 2)."""
+        k = np.arange(len(b))[:, None]
+        rest, rate, press = (part[k, sides] for part in (self.at(b), self.rate, self.press))
+        (one, other), (r1, r2), (p1, p2) = (rest - slack).T, rate.T, press.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            det = r1 * p2 - r2 * p1
+            return (other * p1 - one * p2) / det, (one * r2 - other * r1) / det

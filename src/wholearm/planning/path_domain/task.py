@@ -8,21 +8,25 @@ from functools import cached_property
 
 import numpy as np
 
-from ...geometry.curve import Curve
+from ...common.errors import AmbiguityError
+from ...geometry.curve import Curve, describe_pose
+from ...mechanics.dynamics import Directions, reduced_inertia
+from ...mechanics.uniqueness import describe_uniqueness, find_minors
 from ..advice import name_phases
 from ..options import Objective, PlanOptions
-from ..robust.rows import Guide, Spread, spread
-from .data import PhaseData, join, prepare
+from ..robust.robust_rows import Guide, Spread, spread
 from .elements import DEGREE
-from .mesh import SOFT, START, Mesh, find_ends
-from .misses import MISS
-from .motor_terms import QUICK, MotorShape
-from .nlp import PathNLP, build_path_nlp
-from .sure_start import SureStart
+from .path_data import PhaseData, join, prepare
+from .path_mesh import SOFT, START, Mesh, find_ends
+from .path_nlp import PathNLP, build_path_nlp
+from .rate_terms import QUICK, MotorShape
 from .switches import Switch
 from .terms import LimitShape
-from .unique import require_unique
+from .unique_start import SureStart
+from .violations import MISS
 
+LOOKS = 17
+"""Places of a stretch without reversals at which contact forces are looked at."""
 Pins = tuple[float | None, float | None]
 """Squeezes at the start and the end of a motion, where they are given [N]."""
 EARLY = 1e-5
@@ -83,7 +87,7 @@ class Task:
         return max(-(-intervals // DEGREE), 3)
 
     def require_unique(self) -> None:
-        """Require contact forces to be the only ones; see `unique.require_unique`."""
+        """Require contact forces to be the only ones; see `task.require_unique`."""
         for curve, phase in zip(self.curves, self.phases, strict=True):
             require_unique(curve, self.options.uniqueness_margin, phase)
 
@@ -131,3 +135,32 @@ class Task:
             grid = mesh.make_grid(curve, elements, (k == 0, k == last), self.is_held)
             found.append(prepare(curve, self.epsilon, grid, self.phases[k], self.spreads[k]))
         return found
+
+
+def require_unique(curve: Curve, least: float, phase: int) -> None:
+    """Require contact forces to be the only ones along a curve.
+
+    Parameters
+    ----------
+    least  least uniqueness margin (`mechanics.uniqueness`)
+    phase  its number, for messages
+
+    Raises
+    ------
+    AmbiguityError  if one is less; where friction jams the curve, `path_data.prepare` raises
+    """
+    formation, segments = curve.formation, curve.segments
+    if not formation.friction.any():
+        return
+    s = np.concatenate([np.linspace(own.start, own.stop, LOOKS) for own in segments])
+    point = curve.evaluate(s)
+    Xi = np.repeat([own.Xi for own in segments], LOOKS, axis=0)
+    still = (formation.sliding_friction > 0) & (Xi == 0).all(axis=0)
+    sticking = tuple(np.flatnonzero(still).tolist())
+    ratio, names, row = find_minors(formation, point.kinematics, Xi, sticking).find_least()
+    if ratio >= least:
+        return
+    sigma = np.repeat([own.sigma for own in segments], LOOKS, axis=0)
+    if reduced_inertia(formation, point.kinematics, Directions(Xi, sigma)).min() > 0:
+        text = describe_uniqueness(ratio, names, describe_pose(point.z[row]), least)
+        raise AmbiguityError(f"phase {phase}: {text}")

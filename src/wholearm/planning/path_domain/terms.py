@@ -27,7 +27,7 @@ from ...mechanics.limits import PRESS, TORQUE, LimitSet
 from ..columns import Columns, Symbols
 from ..options import Objective
 from .elements import DEGREE, FROM_REST, INSIDE, POWERS, SIGNS, find_basis
-from .motor_terms import QUICK, MotorShape, find_first_slopes, list_kinds, write_motor_rows
+from .rate_terms import QUICK, MotorShape, find_first_slopes, list_kinds, write_motor_rows
 
 CHAINED = (Objective.MARGIN, Objective.RELAX)
 """Objectives with one more unknown, which every node has a copy of."""
@@ -49,21 +49,13 @@ rest not constant."""
 
 
 class LimitShape(NamedTuple):
-    """What an NLP has to know of limits, whatever they are of.
+    """What an NLP has to know of limits, whatever they are of."""
 
-    Attributes
-    ----------
-    rows : int
-        Number m of rows.
-    sides : tuple of (int, float)
-        Row and sign of each side, in the order of `LimitSet.sides`.
-    presses, torques, fast : tuple of int
-        Rows of the least normal forces and of the torques, and those that know of the speed.
-    motors : MotorShape
-    """
-
-    rows: int
+    rows: int  # number m of rows
+    # row and sign of each side, in the order of `LimitSet.sides`
     sides: tuple[tuple[int, float], ...]
+    # presses, torques, fast: rows of the least normal forces and of the torques, and those that
+    # know of the speed
     presses: tuple[int, ...]
     torques: tuple[int, ...]
     fast: tuple[int, ...]
@@ -86,29 +78,22 @@ class LimitShape(NamedTuple):
 
 
 class NLPColumns(NamedTuple):
-    """What the vectors of an NLP consist of.
+    """What the vectors of an NLP consist of."""
 
-    Attributes
-    ----------
-    node : Columns
-        Unknowns of each node: b over its size (none at the two ends), a, squeeze, and what the
-        objective adds:
-        shortfalls of the limits for `elastic`, the least margin, or the relaxation for `relax`.
-    p : Columns
-        The speeds at the `ends`; the `steps`; the `weight` of time; what the unit of squeeze counts
-        for where it is kept `calm`; column by column, coefficients of the limits at the nodes but
-        for the constant ones, which are part of the bounds; for `effort` and slow motors the
-        constant torques; for `effort` the weight of each joint; for `relax` by how much each limit
-        gives way with the relaxation, and b's coefficients in the speed limit; for slow motors one
-        over their largest rates, their lags, the bends of elements and the `sizes` of b.
-    g : Columns
-        The N of b' = 2 a; those that `chain` the margin or the relaxation; node by node the
-        `limits`, side by side where they
-        are soft, and the speed for `relax`; the `duration` for `margin`; the rows of motors.
-    """
-
+    # unknowns of each node: b over its size (none at the two ends), a, squeeze, and what the
+    # objective adds: shortfalls of the limits for `elastic`, the least margin, or the relaxation
+    # for `relax`
     node: Columns
+    # the speeds at the `ends`; the `steps`; the `weight` of time; what the unit of squeeze counts
+    # for where it is kept `calm`; column by column, coefficients of the limits at the nodes but for
+    # the constant ones, which are part of the bounds; for `effort` and slow motors the constant
+    # torques; for `effort` the weight of each joint; for `relax` by how much each limit gives way
+    # with the relaxation, and b's coefficients in the speed limit; for slow motors one over their
+    # largest rates, their lags, the bends of elements and the `sizes` of b
     p: Columns
+    # the N of b' = 2 a; those that `chain` the margin or the relaxation; node by node the `limits`,
+    # side by side where they are soft, and the speed for `relax`; the `duration` for `margin`; the
+    # rows of motors
     g: Columns
 
 
@@ -139,8 +124,7 @@ def write_terms(shape: LimitShape, intervals: int, objective: Objective) -> dict
 
     Returns
     -------
-    dict
-        Expressions of x, p, f and g.
+    dict  expressions of x, p, f and g
     """
     n, columns = intervals + 1, list_columns(shape, intervals, objective)
     given = columns.p.make_symbols()

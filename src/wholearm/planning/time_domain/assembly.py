@@ -23,24 +23,13 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Kernel:
-    """An expression y(x, p) with derivatives, as CasADi functions of (x, p) and multipliers.
+    """An expression y(x, p) with derivatives, as CasADi functions of (x, p) and multipliers."""
 
-    Attributes
-    ----------
-    function : casadi.Function
-        (x, p) -> y.
-    jacobian : casadi.Function
-        (x, p) -> the entries dy_i / dx_j at `jacobian_at`.
-    hessian : casadi.Function
-        (x, p, lam) -> the entries of the Hessian of lam^T y at `hessian_at`, i <= j.
-    jacobian_at, hessian_at : ndarray of int, shape (2, n)
-        Row and column of each entry.
-    """
-
-    function: Expression
-    jacobian: Expression
+    function: Expression  # (x, p) -> y
+    jacobian: Expression  # (x, p) -> the entries dy_i / dx_j at `jacobian_at`
+    # (x, p, lam) -> the entries of the Hessian of lam^T y at `hessian_at`, i <= j
     hessian: Expression
-    jacobian_at: Indices
+    jacobian_at: Indices  # jacobian_at, hessian_at (2, n): row and column of each entry
     hessian_at: Indices
 
     @property
@@ -69,22 +58,13 @@ def _entries(matrix: Expression) -> Expression:
 
 
 class Block(NamedTuple):
-    """Copies of a kernel.
-
-    Attributes
-    ----------
-    kernel : Kernel
-    columns : ndarray of int, shape (n, n_x)
-        The unknowns that are each copy's x, no one twice.
-    rows : ndarray of int, shape (n, n_y)
-        The constraints that are each copy's y; shape (n, 0) if y is a share of the cost.
-    parameters : ndarray, shape (n, n_p)
-    """
+    """Copies of a kernel."""
 
     kernel: Kernel
-    columns: Indices
+    columns: Indices  # (n, n_x): the unknowns that are each copy's x, no one twice
+    # (n, n_y): the constraints that are each copy's y; shape (n, 0) if y is a share of the cost
     rows: Indices
-    parameters: Array
+    parameters: Array  # (n, n_p)
 
 
 class Triplets(NamedTuple):
@@ -96,17 +76,10 @@ class Triplets(NamedTuple):
 
 
 class Assembled(NamedTuple):
-    """An NLP ready for a solver.
+    """An NLP ready for a solver."""
 
-    Attributes
-    ----------
-    nlp : dict
-        Expressions of x, f and g.
-    derivatives : dict
-        The functions `jac_g` and `hess_lag`, as options of CasADi's solvers.
-    """
-
-    nlp: dict[str, Expression]
+    nlp: dict[str, Expression]  # expressions of x, f and g
+    # the functions `jac_g` and `hess_lag`, as options of CasADi's solvers
     derivatives: dict[str, Expression]
 
 
@@ -117,15 +90,11 @@ def assemble_nlp(
 
     Parameters
     ----------
-    size : int
-        Number of unknowns.
-    linear : Triplets
-        Entries of the linear constraints.
-    n_linear : ndarray of int
-        Rows that are linear, with or without entries. Every other row belongs to one block.
-    blocks : sequence of Block
-    cost : ndarray, shape (size,)
-        Linear part of the cost.
+    size            number of unknowns
+    linear          entries of the linear constraints
+    n_linear        rows that are linear, with or without entries. Every other row belongs to one
+                    block.
+    cost : (size,)  linear part of the cost
     """
     x = ca.MX.sym("x", size)
     p = ca.MX.sym("p", 0)

@@ -13,29 +13,15 @@ from ...common.quadrature import jacobi_nodes
 
 
 class Scheme(NamedTuple):
-    """A collocation scheme on [0, 1].
-
-    Attributes
-    ----------
-    name : str
-    points : ndarray, shape (d,)
-        Increasing.
-    integrals : ndarray, shape (d, d)
-        Row j integrates, from 0 to point j, the polynomial through values at the points.
-    weights : ndarray, shape (d,)
-        The same from 0 to 1.
-    order : int
-        Of the error at the end of an interval.
-    controls : int
-        Number of control points of the torques in an interval.
-    """
+    """A collocation scheme on [0, 1]."""
 
     name: str
-    points: Array
+    points: Array  # (d,): increasing
+    # (d, d): row j integrates, from 0 to point j, the polynomial through values at the points
     integrals: Array
-    weights: Array
-    order: int
-    controls: int
+    weights: Array  # (d,): the same from 0 to 1
+    order: int  # of the error at the end of an interval
+    controls: int  # number of control points of the torques in an interval
 
     @property
     def degree(self) -> int:
@@ -84,10 +70,8 @@ def make_scheme(name: str, degree: int, controls: int = 2) -> Scheme:
     Parameters
     ----------
     name : {"radau", "legendre"}
-    degree : int
-        Number of points d.
-    controls : int, optional
-        Of torques that are linear by default.
+    degree                        number of points d
+    controls                      of torques that are linear by default
 
     Notes
     -----

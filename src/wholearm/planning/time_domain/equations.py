@@ -10,7 +10,9 @@ from ...common.arrays import Array
 from ...geometry.curve import find_tied, tangent_basis
 from .assembly import Indices
 from .collocation import Scheme, blend
-from .kernels import (
+from .nlp_layout import MARGIN, NlpRows, StageLayout, V, Z
+from .stage import Stage
+from .stage_kernels import (
     collocation_kernel,
     end_kernel,
     goal_kernel,
@@ -19,11 +21,8 @@ from .kernels import (
     opening_kernel,
     point_kernel,
 )
-from .layout import MARGIN, StageLayout, V, Z
-from .limits import LimitRows, Target, add_limits
-from .motors import MotorRows, add_motors, join_motors
-from .rows import Rows
-from .stage import Stage
+from .time_limits import LimitRows, Target, add_limits
+from .time_rate_limits import MotorRows, add_motors, join_motors
 
 SLIDING = 1e-5
 """Least sliding, over the radius of gyration, and least speed of a joint, in the scene's unit of
@@ -32,41 +31,19 @@ time: what does not move at all would have no sense."""
 
 @dataclass(frozen=True, eq=False)
 class StageRows:
-    """Rows of one stage, interval by interval.
+    """Rows of one stage, interval by interval."""
 
-    Attributes
-    ----------
-    chain : ndarray of int, shape (K, m)
-        How a margin goes on, and contacts at the end of an interval, if no point is there.
-    states : ndarray of int, shape (K, 2, rungs, f)
-        Collocation of z and of z', along the columns of `bases`.
-    bases : ndarray, shape (K, 5, f)
-        The tangent space of each interval.
-    shares : ndarray of int
-        What keeps the lengths of intervals to one another.
-    points : ndarray of int, shape (K, d, m)
-        What holds at the points.
-    balance : ndarray of int, shape (K, d, 5)
-        Of these, the equations of motion.
-    senses : ndarray of int, shape (K, d, n_rubbing)
-        And the senses of contacts that slide with friction.
-    limits : LimitRows
-    monitor_rows : ndarray of int, shape (K, d, m)
-        Limits of the formation.
-    motors : MotorRows or None
-        If motors are not quick.
-    """
-
+    # (K, m): how a margin goes on, and contacts at the end of an interval, if no point is there
     chain: Indices
-    states: Indices
-    bases: Array
-    shares: Indices
-    points: Indices
-    balance: Indices
-    senses: Indices
+    states: Indices  # (K, 2, rungs, f): collocation of z and of z', along the columns of `bases`
+    bases: Array  # (K, 5, f): the tangent space of each interval
+    shares: Indices  # what keeps the lengths of intervals to one another
+    points: Indices  # (K, d, m): what holds at the points
+    balance: Indices  # (K, d, 5): of these, the equations of motion
+    senses: Indices  # (K, d, n_rubbing): and the senses of contacts that slide with friction
     limits: LimitRows
-    monitor_rows: Indices
-    motors: MotorRows | None
+    monitor_rows: Indices  # (K, d, m): limits of the formation
+    motors: MotorRows | None  # if motors are not quick
 
     @property
     def even(self) -> tuple[Indices, ...]:
@@ -75,7 +52,7 @@ class StageRows:
 
 
 def add_stage(
-    rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool, target: Target
+    rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool, target: Target
 ) -> StageRows:
     """What holds in a stage."""
     formation = stage.formation
@@ -143,7 +120,7 @@ def _stops(stage: Stage) -> bool:
 
 
 def _collocate(
-    rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme
+    rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme
 ) -> tuple[Indices, Array]:
     """Collocate z and z' along the tangent space, and the bases of that."""
     middles = stage.guess.z[:, scheme.degree // 2]
@@ -167,7 +144,7 @@ def _collocate(
     return np.stack(collected, axis=1), bases
 
 
-def _share(rows: Rows, stage: Stage, layout: StageLayout) -> Indices:
+def _share(rows: NlpRows, stage: Stage, layout: StageLayout) -> Indices:
     """Intervals keep their shares of the stage, unless they are parts of control periods."""
     if stage.periods:
         return np.zeros(0, dtype=np.int64)
@@ -180,7 +157,7 @@ def _share(rows: Rows, stage: Stage, layout: StageLayout) -> Indices:
 
 
 def _balance(
-    rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool
+    rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool
 ) -> tuple[Indices, Indices, Indices]:
     """The equations of motion, constraints and senses at every point, shape (K, d, n).
 
@@ -252,7 +229,7 @@ def find_still(stage: Stage, last: bool) -> set[int]:
     return {*stage.turns, *rolls}
 
 
-def _add_monitor_rows(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:
+def _add_monitor_rows(rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:
     """Keep limits positive, but for the one that is reached at the end, shape (K, d, m)."""
     formation, (K, d) = stage.formation, layout.z.shape[:2]
     if not stage.monitored:
@@ -270,7 +247,7 @@ def _add_monitor_rows(rows: Rows, stage: Stage, layout: StageLayout, scheme: Sch
 
 
 def join_stages(
-    rows: Rows,
+    rows: NlpRows,
     pair: tuple[Stage, Stage],
     layouts: tuple[StageLayout, StageLayout],
     scheme: Scheme,

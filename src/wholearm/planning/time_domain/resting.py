@@ -38,42 +38,32 @@ _LEVEL = 1e-6
 """Slope of a limit, in radii of gyration, below which no motion changes it."""
 
 
-class Blocked(NamedTuple):
-    """No motion begins.
+class BlockedStart(NamedTuple):
+    """No motion begins."""
 
-    Attributes
-    ----------
-    contact : str
-        The contact that has to pull most, in the mode in which that is least; empty if torques
-        alone are in the way.
-    short : float
-        By how much c_n is short of epsilon there at least.
-    """
-
+    # the contact that has to pull most, in the mode in which that is least; empty if torques alone
+    # are in the way
     contact: str
-    short: float
+    short: float  # by how much c_n is short of epsilon there at least
 
 
 def find_block(
     formation: Formation, z: Array, epsilon: float, ends: bool = False
-) -> Blocked | None:
+) -> BlockedStart | None:
     """Say why no motion begins from rest at `z`, or ends there; None if one may.
 
     Formations with more than two freedoms always may.
 
     Parameters
     ----------
-    formation : Formation
-    z : ndarray, shape (5,)
-    epsilon : float
-    ends : bool
-        Whether the motion ends at rest at `z`: then it moved against its acceleration.
+    z : (5,)
+    ends      whether the motion ends at rest at `z`: then it moved against its acceleration
     """
     modes = _list_modes(formation, z, epsilon, ends)
     if not modes or any(mode.moves() for mode in modes):
         return None
     shorts = [short for mode in modes if (short := mode.find_short()) is not None]
-    return min(shorts, key=lambda short: short.short, default=Blocked("", 0.0))
+    return min(shorts, key=lambda short: short.short, default=BlockedStart("", 0.0))
 
 
 def find_change(
@@ -83,11 +73,9 @@ def find_change(
 
     Parameters
     ----------
-    finger : int or None
-        Whose torque limit, of which the least value is sought; None for epsilon, of which the
-        largest is.
-    formation, z, epsilon, ends
-        As of `find_block`.
+    finger                       whose torque limit, of which the least value is sought; None for
+                                 epsilon, of which the largest is
+    formation, z, epsilon, ends  as of `find_block`
 
     Returns
     -------
@@ -246,7 +234,7 @@ class _Programme:
         # What is not decided, or has no bound, counts as possible.
         return bool(answer.status not in (0, 2) or (answer.status == 0 and -answer.fun > MOVES))
 
-    def find_short(self) -> Blocked | None:
+    def find_short(self) -> BlockedStart | None:
         """What the normal forces lack to move with a speed of 1, the largest made least."""
         own = slice(self.f, self.f + self.n_c)
         wide = np.hstack([self.rows, np.zeros((len(self.rows), 1))])
@@ -254,7 +242,7 @@ class _Programme:
         if answer is None:
             return None
         worst = int(np.argmin(answer[own]))
-        return Blocked(self.names[worst], float(answer[-1]))
+        return BlockedStart(self.names[worst], float(answer[-1]))
 
     def find_heading(self) -> tuple[float, Array] | None:
         """The largest least c_n with a speed of `BEGINS`, over epsilon, and which way that is."""
@@ -294,9 +282,8 @@ class _Programme:
 
         Parameters
         ----------
-        rows, most : ndarray, shape (n, size + 1) and (n,)
-        more : (rows, most)
-            Further ones, that take the place of the bounds of the unknowns `own`.
+        rows, most : (n, size + 1) and (n,)
+        more  further ones, that take the place of the bounds of the unknowns `own`
         """
         from scipy.optimize import linprog
 

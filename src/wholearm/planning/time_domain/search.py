@@ -15,17 +15,22 @@ from ...geometry.cost_to_go import CostToGo
 from ...problem.definition import Problem
 from ..options import Objective, PlanOptions
 from ..phase_plan import Tried
-from .between import Limits, raise_bounds
+from .assembly import Indices
 from .collocation import Scheme, make_scheme
-from .layout import MARGIN, pack, unpack
-from .limits import Target
-from .mesh import with_controls
-from .nlp import TimeNLP, bound_unknowns, build_time_nlp
-from .own_units import in_own_units, scale_options, unit_lengths, unit_of
-from .refinement import adopt, monitor_violated
-from .stage import Stage
-from .warm_start import FIRST_SIZE, Multipliers, carry_multipliers, first_multipliers
+from .equations import StageRows
+from .intersample import IntersampleLimits, raise_bounds
+from .nlp_layout import MARGIN, pack, unpack
+from .stage import Stage, StagePoints
+from .time_limits import Target
+from .time_mesh import adopt, monitor_violated, with_controls
+from .time_nlp import TimeNLP, bound_unknowns, build_time_nlp
+from .time_rate_limits import MotorRows
+from .units import in_own_units, scale_options, unit_lengths, unit_of
 
+FIRST_SIZE = 1e-2
+"""Multipliers of a first guess."""
+Multipliers = dict[str, Array]
+"""Of the unknowns' bounds, `lam_x0`, and of the rows, `lam_g0`."""
 _ITERATIONS = {Objective.ELASTIC: 90, Objective.RELAX: 50}
 """Most iterations of one solve, if not 150."""
 _SLOWER = 2
@@ -41,38 +46,20 @@ class Price(NamedTuple):
     origin: Array
 
 
-class Solution(NamedTuple):
-    """Stages with what the solver found as their guess.
-
-    Attributes
-    ----------
-    stages : list of Stage
-    cost : float
-        Objective.
-    margin : float
-        Least c_n over epsilon, if that is an unknown.
-    status : str
-        How it ended, in words.
-    success : bool
-    nlp : TimeNLP
-        What was solved.
-    multipliers : dict
-        What it ended with.
-    error : float
-        Estimate of what better torques would gain, over the cost; not known of all.
-    free : Solution or None
-        What it has come from, with torques that are not held over control periods.
-    """
+class TimeSolution(NamedTuple):
+    """Stages with what the solver found as their guess."""
 
     stages: list[Stage]
-    cost: float
-    margin: float
-    status: str
+    cost: float  # objective
+    margin: float  # least c_n over epsilon, if that is an unknown
+    status: str  # how it ended, in words
     success: bool
-    nlp: TimeNLP
-    multipliers: Multipliers
+    nlp: TimeNLP  # what was solved
+    multipliers: Multipliers  # what it ended with
+    # estimate of what better torques would gain, over the cost; not known of all
     error: float = math.nan
-    free: Solution | None = None
+    # what it has come from, with torques that are not held over control periods
+    free: TimeSolution | None = None
 
     @property
     def end(self) -> Array:
@@ -105,43 +92,25 @@ class Solution(NamedTuple):
 
 
 @dataclass
-class Search:
+class TimeSearch:
     """A search for a plan: what stays the same from solve to solve, and what it has cost.
 
     It works in the scene's own units.
-
-    Attributes
-    ----------
-    problem : Problem
-    options : PlanOptions
-    scheme : Scheme
-    duration : float or None
-        Longest duration, for the objective `margin`.
-    goal : Objective
-    relaxation : Parameter or None
-        What gives way, for the objective `relax`.
-    to_go : callable or None
-        What follows costs from where stages end, and its gradient, each by the objective.
-    price : Price or None
-    ample : float
-        Least normal force from which on more decides nothing, for the objective `margin`.
-    only_begins : bool
-        Whether plans may miss limits between points.
-    tried : Tried
-        Shared by all searches for one plan.
     """
 
     problem: Problem
     options: PlanOptions
     scheme: Scheme
-    duration: float | None
+    duration: float | None  # longest duration, for the objective `margin`
     goal: Objective
-    relaxation: Parameter | None = None
+    relaxation: Parameter | None = None  # what gives way, for the objective `relax`
+    # what follows costs from where stages end, and its gradient, each by the objective
     to_go: Callable[[Array], tuple[float, Array]] | None = None
     price: Price | None = None
+    # least normal force from which on more decides nothing, for the objective `margin`
     ample: float = math.inf
-    only_begins: bool = False
-    tried: Tried = field(default_factory=Tried)
+    only_begins: bool = False  # whether plans may miss limits between points
+    tried: Tried = field(default_factory=Tried)  # shared by all searches for one plan
 
     @staticmethod
     def of(
@@ -151,7 +120,7 @@ class Search:
         to_go: CostToGo | None = None,
         ample: float = math.inf,
         only_begins: bool = False,
-    ) -> Search:
+    ) -> TimeSearch:
         """A search for what `plan_phases` is given, in SI units."""
         scales = problem.scene.scales
         lengths, unit = unit_lengths(scales), unit_of(options.goal, scales)
@@ -161,7 +130,7 @@ class Search:
             value, gradient = to_go.expand(z * lengths)
             return value / unit, gradient * lengths / unit
 
-        return Search(
+        return TimeSearch(
             in_own_units(problem),
             scale_options(options, scales),
             make_scheme(options.scheme, options.degree, options.degree),
@@ -172,7 +141,7 @@ class Search:
             only_begins=only_begins,
         )
 
-    def aiming(self, goal: Objective, relaxation: Parameter | None = None) -> Search:
+    def aiming(self, goal: Objective, relaxation: Parameter | None = None) -> TimeSearch:
         """The same search with another objective.
 
         Where limits give way torques are linear: others might keep them at the points alone.
@@ -191,7 +160,7 @@ class Search:
         """What it costs to end at `z`, shape (5,)."""
         return float(self.price.gradient @ (z - self.price.origin)) if self.price else 0.0
 
-    def has_ample(self, solution: Solution) -> bool:
+    def has_ample(self, solution: TimeSolution) -> bool:
         """Whether c_n is as large as another phase allows anyway, for the objective `margin`."""
         return self.goal is Objective.MARGIN and solution.margin > self.most_margin
 
@@ -203,15 +172,14 @@ class Search:
     def solve(
         self,
         stages: list[Stage],
-        before: Solution | None = None,
+        before: TimeSolution | None = None,
         most: int = 150,
-    ) -> Solution:
+    ) -> TimeSolution:
         """Solve from the stages' guesses, until no limit is broken at the points.
 
         Parameters
         ----------
-        most : int
-            Most iterations.
+        most  most iterations
         """
         controls = self.scheme.controls
         if stages[0].guess.tau.shape[1] != controls:
@@ -223,7 +191,7 @@ class Search:
                 multipliers = carry_multipliers(
                     before.multipliers, before.nlp, nlp, self.scheme, before.stages, stages
                 )
-            plain = [Limits.none(stage) for stage in stages]
+            plain = [IntersampleLimits.none(stage) for stage in stages]
             margin = before.margin if before else 0.0
             solution = self.run(nlp, stages, plain, multipliers, margin)
             monitoring = monitor_violated(solution.stages) if solution.success else None
@@ -244,10 +212,10 @@ class Search:
         self,
         nlp: TimeNLP,
         stages: Sequence[Stage],
-        limits: Sequence[Limits],
+        limits: Sequence[IntersampleLimits],
         multipliers: Multipliers | None,
         margin: float,
-    ) -> Solution:
+    ) -> TimeSolution:
         """Run the solver once."""
         low, high = bound_unknowns(nlp, stages, self.scheme)
         low_g, high_g = raise_bounds(nlp, stages, limits, (low, high))
@@ -258,7 +226,7 @@ class Search:
             high[nlp.layouts[-1].nodes[-1, MARGIN]] = _CAP * self.most_margin
         if (low > high).any():
             status = "limits that hold between points too leave nothing"
-            return Solution(list(stages), np.inf, 0.0, status, False, nlp, {})
+            return TimeSolution(list(stages), np.inf, 0.0, status, False, nlp, {})
         solver = nlp.first_solver if multipliers is None else nlp.solver
         result = solver(
             x0=pack([stage.guess for stage in stages], nlp.layouts, margin),
@@ -272,7 +240,7 @@ class Search:
         self.tried.iterations += stats["iter_count"]
         x, cost = result["x"].full()[:, 0], float(result["f"])
         cost -= float(self.price.gradient @ self.price.origin) if self.price else 0.0
-        return Solution(
+        return TimeSolution(
             adopt(stages, unpack(x, nlp.layouts)),
             cost,
             -cost if self.goal is Objective.MARGIN else 0.0,
@@ -281,3 +249,92 @@ class Search:
             nlp,
             {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")},
         )
+
+
+def first_multipliers(
+    bounds: Sequence[Array], row_bounds: Sequence[Array], size: float = FIRST_SIZE
+) -> Multipliers:
+    """Multipliers of one size for all inequalities.
+
+    Parameters
+    ----------
+    bounds, row_bounds  lower and upper bounds of unknowns and rows
+    """
+    (low, high), (low_g, high_g) = bounds, row_bounds
+    bounded = np.isfinite(high).astype(float) - np.isfinite(low)
+    return {"lam_x0": size * bounded, "lam_g0": np.where(high_g > low_g, -size, 0.0)}
+
+
+def carry_multipliers(
+    multipliers: Multipliers,
+    old: TimeNLP,
+    new: TimeNLP,
+    scheme: Scheme,
+    old_stages: Sequence[Stage],
+    new_stages: Sequence[Stage],
+) -> Multipliers:
+    """Multipliers of the same stages on other intervals.
+
+    What is said at points goes with the length of an interval, as the sum over time matters. Those
+    of collocation are costates, which are continuous.
+    """
+    on_x, on_g = multipliers["lam_x0"], multipliers["lam_g0"]
+    lam_x, lam_g = np.zeros(new.layouts[-1].stop), np.zeros(len(new.rows.bounds[0]))
+    once = [_list_once(nlp) for nlp in (new, old)]
+    if len(once[0]) == len(once[1]):
+        lam_g[once[0]] = on_g[once[1]]
+    for k, (before, after) in enumerate(zip(old_stages, new_stages, strict=True)):
+        part, finer = before.guess, after.guess
+        middles = finer.breaks[:-1] + finer.fractions / 2
+        parent = np.searchsorted(part.breaks, middles, side="right") - 1
+        share = finer.fractions / part.fractions[parent]
+        for name in ("tau", "v", "forces"):
+            mine, theirs = getattr(new.layouts[k], name), getattr(old.layouts[k], name)
+            values = on_x[theirs[parent]]
+            lam_x[mine] = values * share.reshape(-1, *[1] * (values.ndim - 1))
+        rows, known = new.rows_of[k], old.rows_of[k]
+        for mine, theirs in zip(rows.even, known.even, strict=True):
+            values = on_g[theirs[parent]]
+            lam_g[mine] = values * share.reshape(-1, *[1] * (values.ndim - 1))
+        if rows.motors is not None and known.motors is not None:
+            _carry_motors(lam_g, on_g, (known.motors, rows.motors), (part, finer), parent)
+        costate = find_costate(known, on_g, scheme)[parent]
+        places = (finer.places(scheme.points) - part.breaks[parent, None]) / part.fractions[
+            parent, None
+        ]
+        moved = np.stack(
+            [scheme.interpolate(x) @ own for x, own in zip(places, costate, strict=True)]
+        )
+        along = np.einsum("kdf,ksjd->ksjf", rows.bases, moved * scheme.weights[:, None])
+        lam_g[rows.states] = np.linalg.pinv(scheme.rungs.T) @ along
+    return {"lam_x0": lam_x, "lam_g0": lam_g}
+
+
+def find_costate(rows: StageRows, on_g: Array, scheme: Scheme) -> Array:
+    """What z and z' at the points are worth, by the multipliers of rows, shape (K, 2, d, 5)."""
+    shares = scheme.rungs.T @ on_g[rows.states] / scheme.weights[:, None]
+    return np.asarray(np.einsum("kdf,ksjf->ksjd", rows.bases, shares))
+
+
+def _carry_motors(
+    lam_g: Array,
+    on_g: Array,
+    rows: tuple[MotorRows, MotorRows],
+    parts: tuple[StagePoints, StagePoints],
+    parent: Indices,
+) -> None:
+    """Multipliers of rates and commands, and of torques that go on: their costate."""
+    known, own = rows
+    lam_g[own.rates], lam_g[own.commands] = on_g[known.rates[parent]], on_g[known.commands[parent]]
+    old, new = (part.breaks[1:-1] for part in parts)
+    if len(old):
+        for joint in range(2):
+            lam_g[own.joins[:, joint]] = np.interp(new, old, on_g[known.joins[:, joint]])
+
+
+def _list_once(nlp: TimeNLP) -> Indices:
+    """Rows that are there once, and not in each interval."""
+    own = [part.ravel() for r in nlp.rows_of for part in (*r.even, r.states, r.shares)]
+    slow = [r.motors for r in nlp.rows_of if r.motors is not None]
+    own += [part.ravel() for m in slow for part in (m.joins, m.rates, m.commands)]
+    return np.delete(np.arange(len(nlp.rows.bounds[0])), np.concatenate(own))

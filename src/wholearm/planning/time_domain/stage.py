@@ -15,34 +15,19 @@ from ..options import CLEARANCE, OPENING
 
 
 class StagePoints(NamedTuple):
-    """Motion and forces of a stage in K intervals with d points each.
+    """Motion and forces of a stage in K intervals with d points each."""
 
-    Attributes
-    ----------
-    duration : float, [s]
-    fractions : ndarray, shape (K,)
-        Share of the duration that each interval has.
-    nodes : ndarray, shape (K + 1, 2, 5)
-        z and z' at the start of each interval and at the end of the last.
-    z, v, a : ndarray, shape (K, d, 5)
-        z, z' and z'' at the collocation points.
-    forces : ndarray, shape (K, d, n_c + R), [N]
-        c_n of all contacts, then c_t of the rolling ones.
-    tau : ndarray, shape (K, m, 2), [N m]
-        Control points of each interval: torques are polynomials of degree m - 1 there.
-    impulses : ndarray, shape (n_c + R,) of the next stage, or (0,), [N s]
-        Of the impact with which the stage ends, if it does.
-    """
-
-    duration: float
-    fractions: Array
-    nodes: Array
-    z: Array
+    duration: float  # [s]
+    fractions: Array  # (K,): share of the duration that each interval has
+    nodes: Array  # (K + 1, 2, 5): z and z' at the start of each interval and at the end of the last
+    z: Array  # z, v, a (K, d, 5): z, z' and z'' at the collocation points
     v: Array
     a: Array
-    forces: Array
+    forces: Array  # (K, d, n_c + R) [N]: c_n of all contacts, then c_t of the rolling ones
+    # (K, m, 2) [N m]: control points of each interval: torques are polynomials of degree m - 1
+    # there
     tau: Array
-    impulses: Array
+    impulses: Array  # (n_c + R,) [N s]: of the impact with which the stage ends, if it does
 
     @property
     def breaks(self) -> Array:
@@ -58,71 +43,39 @@ class StagePoints(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """A stretch on one formation with fixed directions of friction.
+    """A stretch on one formation with fixed directions of friction."""
 
-    Attributes
-    ----------
-    phase : int
-        Index of the phase it belongs to.
-    formation : Formation
-    directions : Directions
-    guess : StagePoints
-        Where the search starts; its intervals are those of the NLP.
-    until : Until or None
-        What is reached at the end; None if the stage ends by a reversal or a release.
-    turns : tuple of int
-        Rows of (contacts, joints) whose rate is zero at the end.
-    gained : Formation or None
-        The next stage's formation where that has a constraint more, which is gained softly.
-    fading : tuple of (int, float)
-        Contacts that the next stage lets go, with 0, or lets slip, with their direction then.
-    growing : tuple of int
-        Contacts that the stage before does not have.
-    ends_in_impact : bool
-        Whether an impact leads to the next stage.
-    monitored : tuple of int
-        Limits of the formation that are kept positive at every point.
-    released : tuple of int
-        Limits of the contacts that were let go where the phase began.
-    opens : bool
-        Whether they are let go at the start of this stage.
-    opening : float
-        Least acceleration with which the gaps of contacts that are let go open, over gravity.
-    clearance : float
-        What these gaps are at least after a third of the first stage, over the radius of gyration.
-    apart : tuple of int
-        Monitored limits that are as clear at the end: what comes next ends by closing them.
-    ahead : (int, float, float) or None
-        Row of z, the value that it has where the phase ends, and from which side it comes there:
-        reached before, that would be the end.
-    stop : ndarray or None, shape (5,)
-        Where the last stage ends, if that is given: with two freedoms its end leaves one open.
-    periods : tuple of int
-        The control period of its phase that each interval is part of, if torques are held.
-    onset : float
-        Rate of contacts and joints, in the scene's unit, at which three quarters of their friction
-        has set in, against whatever way they move; nothing if friction has the given directions.
-    """
-
-    phase: int
+    phase: int  # index of the phase it belongs to
     formation: Formation
     directions: Directions
-    guess: StagePoints
+    guess: StagePoints  # where the search starts; its intervals are those of the NLP
+    # what is reached at the end; None if the stage ends by a reversal or a release
     until: Until | None = None
-    turns: tuple[int, ...] = ()
+    turns: tuple[int, ...] = ()  # rows of (contacts, joints) whose rate is zero at the end
+    # the next stage's formation where that has a constraint more, which is gained softly
     gained: Formation | None = None
+    # contacts that the next stage lets go, with 0, or lets slip, with their direction then
     fading: tuple[tuple[int, float], ...] = ()
-    growing: tuple[int, ...] = ()
-    ends_in_impact: bool = False
-    monitored: tuple[int, ...] = ()
-    released: tuple[int, ...] = ()
-    opens: bool = False
+    growing: tuple[int, ...] = ()  # contacts that the stage before does not have
+    ends_in_impact: bool = False  # whether an impact leads to the next stage
+    monitored: tuple[int, ...] = ()  # limits of the formation that are kept positive at every point
+    released: tuple[int, ...] = ()  # limits of the contacts that were let go where the phase began
+    opens: bool = False  # whether they are let go at the start of this stage
+    # least acceleration with which the gaps of contacts that are let go open, over gravity
     opening: float = OPENING
+    # what these gaps are at least after a third of the first stage, over the radius of gyration
     clearance: float = CLEARANCE
+    # monitored limits that are as clear at the end: what comes next ends by closing them
     apart: tuple[int, ...] = ()
+    # row of z, the value that it has where the phase ends, and from which side it comes there:
+    # reached before, that would be the end
     ahead: tuple[int, float, float] | None = None
+    # (5,): where the last stage ends, if that is given: with two freedoms its end leaves one open
     stop: Array | None = None
+    # the control period of its phase that each interval is part of, if torques are held
     periods: tuple[int, ...] = ()
+    # rate of contacts and joints, in the scene's unit, at which three quarters of their friction
+    # has set in, against whatever way they move; nothing if friction has the given directions
     onset: float = 0.0
 
     @property
@@ -150,8 +103,7 @@ class Stage:
 
         Parameters
         ----------
-        z, v : ndarray, shape (n, 5)
-            Configurations and velocities.
+        z, v : (n, 5)  configurations and velocities
         """
         slip = np.einsum("nij,nj->ni", self.formation.evaluate(z, v).A_t, v)
         rates = np.hstack([slip / self.formation.scene.polygon.gyration_radius, v[:, 3:]])

@@ -1,0 +1,223 @@
+"""A second way to follow the curve of a phase: small steps and plain overlap tests.
+
+It knows neither C-functions nor limits of formations. The motion ends where a contact leaves the
+feature that it slides on, where two bodies run into each other, or at the phase's `until`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ...common.arrays import Array
+from ...problem.definition import Phase, Until
+from ...scene.model import Scene
+from .newton import clearances, locate
+
+STEP = 0.02
+"""Length of a step over the radius of gyration."""
+LONGEST = 60.0
+"""Longest curve, over the radius of gyration: several turns of the object."""
+OVERLAP = 1e-6
+"""Overlap over the radius of gyration from which on two bodies count as running into each other."""
+MET = 1e-5
+"""Distance over the radius of gyration (or angle) that counts as having reached `until`."""
+
+
+class Trace(NamedTuple):
+    """A curve of configurations that keep a phase's contacts closed."""
+
+    z: Array  # (n, 5)
+    ending: str  # what ends it
+    reached: bool  # whether that is the phase's `until`
+
+
+def follow(scene: Scene, phase: Phase, z: Array) -> tuple[Trace, Trace]:
+    """Follow a phase's contacts from `z`, shape (5,), both ways."""
+    tangent = _tangents(scene, phase, z[None])[0]
+    return _march(scene, phase, z, tangent), _march(scene, phase, z, -tangent)
+
+
+def weights(scene: Scene) -> Array:
+    """Diagonal of the metric, shape (5,): an angle counts as it moves the object's rim [1, m^2]."""
+    return np.array([1.0, 1.0, *[scene.polygon.gyration_radius**2] * 3])
+
+
+def rates(scene: Scene, phase: Phase, z: Array) -> tuple[Array, Array]:
+    """Gaps, shape (n, n_c), and rows of the constraints, (n, n_c + R, 5), at configurations."""
+    touches = [locate(scene, name, z) for name in phase.formation.names]
+    rolling = [touches[row] for row in phase.formation.rolling_rows]
+    rows = [touch.normal for touch in touches] + [touch.tangent for touch in rolling]
+    return np.stack([touch.gap for touch in touches], axis=1), np.stack(rows, axis=1)
+
+
+def _tangents(scene: Scene, phase: Phase, z: Array) -> Array:
+    """Unit tangents at n configurations, shape (n, 5)."""
+    scale = np.sqrt(weights(scene))
+    rows = rates(scene, phase, z)[1] / scale
+    return np.asarray(np.linalg.svd(rows)[2][:, -1] / scale)
+
+
+def close(scene: Scene, phase: Phase, z: Array, before: Array) -> Array | None:
+    """Nearest configuration to `z` that keeps the contacts, coming from `before`; None if none.
+
+    What rolls keeps its place: the slip between the two is taken out, to the second order.
+    """
+    scale, size = np.sqrt(weights(scene)), scene.polygon.gyration_radius
+    count = phase.formation.n_contacts
+    for _ in range(20):
+        gaps, rows = rates(scene, phase, np.array([z, (z + before) / 2]))
+        slip = rows[1, count:] @ (z - before)
+        miss = np.concatenate([gaps[0], slip])
+        step = -np.linalg.pinv(rows[0] / scale, rcond=1e-10) @ miss / scale
+        z = z + step
+        change = np.abs(step * scale).max()
+        if change < 1e-13 * size:
+            break
+        if change > size:
+            return None
+    return z if np.abs(rates(scene, phase, z[None])[0]).max() < 1e-9 * size else None
+
+
+def _march(scene: Scene, phase: Phase, z: Array, tangent: Array) -> Trace:
+    size, scale = scene.polygon.gyration_radius, weights(scene)
+    points, step = [z], STEP * size
+    overlap_at_start = _overlaps(scene, phase, z)
+    while step * len(points) < LONGEST * size:
+        following = close(scene, phase, z + step * tangent, z)
+        if following is None:
+            return Trace(np.array(points), "the contacts become dependent", False)
+        names = _overlaps(scene, phase, following) - (overlap_at_start if len(points) < 2 else {""})
+        passed = _passes(scene, phase.until, z, following)
+        if names or passed:
+            return _end(scene, phase, points, following)
+        way = following - z
+        z = following
+        points.append(z)
+        new = _tangents(scene, phase, z[None])[0]
+        tangent = new * math.copysign(1.0, float((new * scale) @ way))
+    return Trace(np.array(points), "nothing happens", False)
+
+
+def _end(scene: Scene, phase: Phase, points: list[Array], beyond: Array) -> Trace:
+    """Bisect for the first event between the last point and one beyond it."""
+    last, low, high = points[-1], 0.0, 1.0
+    here = last
+    for _ in range(40):
+        middle = (low + high) / 2
+        z = close(scene, phase, last + middle * (beyond - last), last)
+        stops = z is None or bool(_overlaps(scene, phase, z))
+        if z is not None and not stops:
+            stops = _passes(scene, phase.until, last, z)
+        if stops:
+            high = middle
+        else:
+            low, here = middle, z if z is not None else here
+    met = _meets(scene, phase.until, here)
+    after = close(scene, phase, last + high * (beyond - last), last)
+    names = set() if after is None else _overlaps(scene, phase, after)
+    text = str(phase.until) if met else ", ".join(sorted(names)) or "the contacts become dependent"
+    return Trace(np.array([*points, here]), text, met)
+
+
+def _overlaps(scene: Scene, phase: Phase, z: Array) -> set[str]:
+    """Names of the bodies that are inside each other at `z`, and of contacts that left."""
+    least = OVERLAP * scene.polygon.gyration_radius
+    names = {name for name, gap in clearances(scene, z[None]).items() if gap[0] < -least}
+    for name in phase.formation.names:
+        touch = locate(scene, name, z[None])
+        if min(touch.low[0], touch.high[0]) < -least:
+            names.add(f"{name} leaves")
+    return names
+
+
+def _distance(scene: Scene, until: Until, z: Array) -> float:
+    if until.contact is not None:
+        return float(locate(scene, until.contact.name, z[None]).gap[0])
+    if until.value is None:
+        return 1.0
+    return float(z[0 if until.coordinate == "x" else 2] - until.value)
+
+
+def _passes(scene: Scene, until: Until, before: Array, after: Array) -> bool:
+    """Whether a coordinate passes the value that ends the phase."""
+    if until.value is None:
+        return False
+    return _distance(scene, until, before) * _distance(scene, until, after) < 0
+
+
+def _meets(scene: Scene, until: Until, z: Array) -> bool:
+    size = scene.polygon.gyration_radius
+    near = MET * (1.0 if until.coordinate == "phi" else size)
+    if abs(_distance(scene, until, z)) > near:
+        return False
+    if until.contact is None:
+        return until.value is not None
+    touch = locate(scene, until.contact.name, z[None])
+    return bool(min(touch.low[0], touch.high[0]) > -near)
+
+
+def resample(scene: Scene, phase: Phase, trace: Trace, count: int) -> tuple[Array, Array, Array]:
+    """The curve at even places, and also where a contact or a joint turns.
+
+    Returns
+    -------
+    s : (n,) [m]     arc length
+    z, z_s : (n, 5)  configurations, and unit tangents along the way
+    """
+    scale = weights(scene)
+    runs = np.sqrt(np.diff(trace.z, axis=0) ** 2 @ scale)
+    keep = np.append(True, runs > 1e-9 * scene.polygon.gyration_radius)
+    points, runs = trace.z[keep], runs[keep[1:]]
+    s = np.append(0.0, np.cumsum(runs))
+    where = np.linspace(0.0, s[-1], count)
+    z = [points[0]]
+    for place in where[1:-1]:
+        k = min(int(np.searchsorted(s, place, side="right")) - 1, len(runs) - 1)
+        guess = points[k] + (place - s[k]) / runs[k] * (points[k + 1] - points[k])
+        z.append(_or(close(scene, phase, guess, points[k]), guess))
+    z.append(points[-1])
+    z_s = _orient(scene, phase, np.array(z))
+    turning = _turns(scene, phase, np.array(z), z_s)
+    for k in reversed(np.flatnonzero(turning)):
+        z[k + 1 : k + 1] = [_find_turn(scene, phase, z[k], z[k + 1])]
+    grid = np.array(z)
+    runs = np.sqrt(np.diff(grid, axis=0) ** 2 @ scale)
+    return np.append(0.0, np.cumsum(runs)), grid, _orient(scene, phase, grid)
+
+
+def _or(first: Array | None, second: Array) -> Array:
+    return second if first is None else first
+
+
+def _orient(scene: Scene, phase: Phase, z: Array) -> Array:
+    tangents, ahead = _tangents(scene, phase, z), np.gradient(z, axis=0)
+    agree = (tangents * ahead) @ weights(scene)
+    return np.asarray(tangents * np.where(agree < 0, -1.0, 1.0)[:, None])
+
+
+def slides(scene: Scene, phase: Phase, z: Array, z_s: Array) -> Array:
+    """Rates of sliding of the contacts and of the joints along z_s, shape (n, n_c + 2)."""
+    rows = [(locate(scene, n, z).tangent * z_s).sum(axis=1) for n in phase.formation.names]
+    return np.column_stack([*rows, z_s[:, 3:]])
+
+
+def _turns(scene: Scene, phase: Phase, z: Array, z_s: Array) -> Array:
+    rates = slides(scene, phase, z, z_s)
+    return np.asarray((rates[1:] * rates[:-1] < 0).any(axis=1))
+
+
+def _find_turn(scene: Scene, phase: Phase, first: Array, last: Array) -> Array:
+    """Bisect for the first place between two where a rate changes its sign."""
+    low, high, here = 0.0, 1.0, first
+    for _ in range(30):
+        middle = (low + high) / 2
+        z = _or(close(scene, phase, first + middle * (last - first), first), first)
+        pair = np.array([first, z, last])
+        if _turns(scene, phase, pair[:2], _orient(scene, phase, pair)[:2])[0]:
+            high = middle
+        else:
+            low, here = middle, z
+    return here

@@ -1,0 +1,358 @@
+"""The stress study: generated scenes, changed problems and damaged files, counted by kind.
+
+Every plan is replayed and checked by Newton's and Euler's laws written out anew; every refusal is
+looked at by arguments that share nothing with the planner.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import os
+import traceback
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import product
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...common.errors import InputError, SolverError, WholearmError
+from ...common.fields import Range
+from ...common.files import make_folder, write_text
+from ...geometry.path_guess import check_phases, load
+from ...planning.plan import solve
+from ...problem.definition import Problem
+from ...problem.read import build_problem, read_problem
+from ...results.trajectory import Trajectory
+from ...verification.verify import verify
+from ..study import Case, Row, Study
+from .damage import run_file, to_toml
+from .plan_check import check_plan
+from .refusals import judge
+from .scenes import Case as Scene
+from .scenes import draw_case
+
+OBJECTIVES = ("time", "effort", "margin")
+LIMITS = {"scene": 30.0, "file": 20.0, "problem": 60.0}
+"""Processor time that a scene and an objective (two plans), a file and a problem may take [s]."""
+NOISE = 1e-10
+"""Relative change of the masses that must not change an answer."""
+SAME = 1e-6
+"""Relative difference of two values that rounding may make."""
+TRIALS = {"noise": 8, "change": 20}
+"""Times that noise is added to the masses, and that masses, friction, drag and limits change."""
+SPREAD = 0.1
+"""Largest relative change."""
+_FINGER = ("inertia", "viscous", "dry", "torque_limit")
+
+Finding = tuple[str, str]
+"""The kind of something that must not happen, and a text."""
+KINDS = (
+    "traceback", "warning", "list that does not load", "plan refuted by replay",
+    "plan refuted by residual", "refusal where a motion exists", "no answer",
+    "optimum that differs under noise", "check that failed", "no plan for a shipped problem",
+    "unclear end",
+)  # fmt: skip
+"""Kinds of findings that are counted; each count has to be zero."""
+
+
+class Stress(Study):
+    """Generated scenes, damaged files, and shipped problems with other numbers."""
+
+    name, title, strict = "stress", "Stress study", True
+
+    def add_options(self, parser: argparse.ArgumentParser) -> None:
+        """How much of each."""
+        read, many = Range(0, 10**7).parse, Range(0, 2**63).parse
+        parser.add_argument("--scenes", type=read, default=1000, help="generated scenes (1000)")
+        parser.add_argument("--files", type=read, default=0, help="damaged files (0)")
+        text = "problem files to plan with noise, and with other masses and forces"
+        parser.add_argument("--problems", nargs="+", default=[], metavar="FILE", help=text)
+        parser.add_argument("--seed", type=many, default=0, help="of everything drawn (0)")
+        text = "run scene K alone, and write its problem file"
+        parser.add_argument("--only", type=read, metavar="K", help=text)
+
+    def stamp(self, options: argparse.Namespace) -> dict[str, Any]:
+        """Records are of one seed."""
+        return {"seed": options.seed}
+
+    def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
+        """Scenes, files, and problems: all of these once before any comes again."""
+        seed, only = options.seed, options.only
+        for path in options.problems:
+            load(path)
+        if only is not None:
+            make_folder(options.output)
+            path = os.path.join(options.output, f"stress_{seed}_{only}.toml")
+            write_text(path, to_toml(draw_case(seed, only).table))
+        numbers = range(options.scenes) if only is None else [only]
+        yield from product(["scene"], [seed], numbers, OBJECTIVES)
+        if only is None:
+            yield from product(["file"], [seed], range(options.files))
+            for number in range(max(TRIALS.values())):
+                kinds = [what for what, count in TRIALS.items() if number < count]
+                for what, path in product(kinds, options.problems):
+                    yield from product(["problem"], [path], OBJECTIVES, [what], [number])
+
+    def limit(self, case: Case) -> float:
+        """By the kind of the case."""
+        return LIMITS[case[0]]
+
+    def group(self, case: Case) -> Any:
+        """A worker that goes on with a scene need not draw it again."""
+        return case[:3] if case[0] == "scene" else case
+
+    def run(self, case: Case) -> Row:
+        """Run one case."""
+        kind, *given = case
+        if kind == "scene":
+            return run_scene(*given)
+        return run_file(*given) if kind == "file" else run_trial(*given)
+
+    def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
+        """Tables of each part, and every finding."""
+        found = [(" ".join(map(str, row["case"])), *own) for row in rows for own in row["findings"]]
+        found += [
+            (" ".join(map(str, row["case"])), "warning", f"printed: {row['printed']}")
+            for row in rows
+            if "printed" in row
+        ]
+        found += compare_values([row for row in rows if row["case"][0] == "problem"])
+        lines = []
+        for kind, title, describe in (
+            ("scene", "Generated scenes", _describe_scenes),
+            ("file", "Damaged files", _describe_files),
+            ("problem", "Problems with noise and with other masses and forces", _describe_trials),
+        ):
+            mine = [row for row in rows if row["case"][0] == kind]
+            if mine:
+                lines += [f"## {title}", "", *describe(mine), ""]
+        counted = Counter(kind for _, kind, _ in found)
+        lines += ["| finding | number |", "|---|---:|"]
+        lines += [f"| {kind} | {counted[kind]} |" for kind in dict.fromkeys([*KINDS, *counted])]
+        return "\n".join(lines), [f"{where}: {kind}: {text}" for where, kind, text in found]
+
+
+STUDY = Stress()
+
+
+class StressAnswer(NamedTuple):
+    """What the planner said about a problem and an objective."""
+
+    outcome: str  # {"planned", "refused", "failed"}
+    value: float | None
+    text: str  # of the refusal or failure
+    findings: list[Finding]
+    verdict: str = ""  # kind of the second look at a refusal
+
+
+def run_scene(seed: int, number: int, objective: str) -> Row:
+    """Plan a generated scene, with and without noise, and look again at what is said of it."""
+    scene = draw_case(seed, number)
+    problem, refusal = _load(scene.table)
+    if problem is None or refusal is not None:
+        return {"kind": scene.kind, **_refuse_list(scene, problem, refusal)._asdict()}
+    answer = _plan(problem, objective, scene)
+    noisy, _ = _load(add_noise(scene.table, np.random.default_rng(number)))
+    again = StressAnswer("failed", None, "", []) if noisy is None else _plan(noisy, objective)
+    findings = [*answer.findings, *_compare(answer, again)]
+    return {"kind": scene.kind, **answer._replace(findings=findings)._asdict()}
+
+
+def _load(table: dict[str, Any]) -> tuple[Problem | None, Exception | None]:
+    problem = None
+    try:
+        problem = build_problem(table)
+        check_phases(problem)
+    except Exception as error:
+        return problem, error
+    return problem, None
+
+
+def _refuse_list(scene: Scene, problem: Problem | None, error: Exception | None) -> StressAnswer:
+    """Why a problem did not load, and whether that is right."""
+    if not isinstance(error, InputError):
+        return _fail(error)
+    verdict, reason = ("open", "") if problem is None else _judge(problem, error, scene)
+    findings = _list_findings(verdict, f"{error} ({reason})")
+    if scene.kind.endswith("from the map"):
+        findings = [("list that does not load", f"{error} ({verdict}: {reason})")]
+    return StressAnswer("refused", None, str(error), findings, verdict)
+
+
+def _plan(problem: Problem, objective: str, scene: Scene | None = None) -> StressAnswer:
+    """Plan; with a scene, replay and check the plan, or judge the refusal."""
+    try:
+        plan = solve(problem, objective)
+    except SolverError as error:
+        return StressAnswer("failed", None, str(error), [("no answer", str(error))])
+    except WholearmError as error:
+        verdict, reason = ("", "") if scene is None else _judge(problem, error, scene)
+        findings = _list_findings(verdict, f"{error} ({reason})")
+        return StressAnswer("refused", None, str(error), findings, verdict)
+    except Exception as error:
+        return _fail(error)
+    findings = [] if scene is None else _check(problem, plan.trajectory)
+    return StressAnswer("planned", plan.value, "", findings)
+
+
+def _fail(error: Exception | None) -> StressAnswer:
+    """An exception that nobody meant to raise."""
+    kind = "warning" if isinstance(error, Warning) else "traceback"
+    text = "".join(traceback.format_exception(error)[-4:]).strip()
+    return StressAnswer("failed", None, repr(error), [(kind, text)])
+
+
+def _check(problem: Problem, plan: Trajectory) -> list[Finding]:
+    """What a replay, and equations of motion written out anew, have against a plan."""
+    findings: list[Finding] = []
+    try:
+        failures = verify(problem, plan).failures
+        findings += [("plan refuted by replay", text) for text in failures[:1]]
+    except WholearmError as error:
+        findings.append(("plan refuted by replay", str(error)))
+    except Exception as error:
+        findings += _fail(error).findings
+    try:
+        found = check_plan(problem, plan)
+        findings += [("plan refuted by residual", "; ".join(found[:3]))] if found else []
+    except Exception as error:
+        findings.append(("check that failed", _fail(error).findings[0][1]))
+    return findings
+
+
+def _judge(problem: Problem, error: WholearmError, scene: Scene) -> tuple[str, str]:
+    try:
+        return judge(problem, error, scene.stops)
+    except Exception as failure:
+        return "failed", _fail(failure).findings[0][1]
+
+
+def _list_findings(verdict: str, text: str) -> list[Finding]:
+    """What a second look at a refusal finds."""
+    kinds = {"refuted": "refusal where a motion exists", "failed": "check that failed"}
+    return [(kinds[verdict], text)] if verdict in kinds else []
+
+
+def _compare(one: StressAnswer, other: StressAnswer) -> list[Finding]:
+    """What noise changed in an answer."""
+    kind = "optimum that differs under noise"
+    if one.outcome != other.outcome:
+        text = f"{one.outcome}, with noise {other.outcome} {other.text or one.text}"
+        return [(kind, text)] if "failed" not in (one.outcome, other.outcome) else []
+    if one.value is None or other.value is None:
+        return []
+    if abs(one.value - other.value) <= SAME * abs(one.value):
+        return []
+    return [(kind, f"{one.value:.9g} and {other.value:.9g}")]
+
+
+def add_noise(table: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]:
+    """A problem file's table with noise in the object's mass and the joints' inertias."""
+    changed = copy.deepcopy(dict(table))
+    for part in (changed["object"], *changed["fingers"].values()):
+        for key in ("mass", "inertia"):
+            if key in part:
+                part[key] *= 1 + NOISE * float(rng.uniform(-1, 1))
+    return changed
+
+
+def change_numbers(
+    table: Mapping[str, Any], largest: float, rng: np.random.Generator
+) -> dict[str, Any]:
+    """Masses, friction, drag and torque limits changed by up to `largest`, by dotted keys."""
+    friction = table["friction"]
+    places: list[tuple[str, Mapping[str, Any], Iterable[str]]] = [
+        ("object", table["object"], ("mass",)),
+        *((f"fingers.{k}", own, _FINGER) for k, own in table["fingers"].items()),
+        ("friction", friction, friction),
+    ]
+    return {
+        f"{where}.{key}": own[key] * (1 + largest * float(rng.uniform(-1, 1)))
+        for where, own, keys in places
+        for key in keys
+        if key in own
+    }
+
+
+def run_trial(path: str, objective: str, what: str, number: int) -> Row:
+    """Plan, replay and check a shipped problem with other numbers."""
+    value, findings = None, list[Finding]()
+    given, rng = read_problem(path), np.random.default_rng(number)
+    try:
+        if what == "noise":
+            problem = build_problem(add_noise(dict(given.table), rng), path)
+        else:
+            problem = given.with_(change_numbers(given.table, SPREAD, rng))
+        check_phases(problem)
+        plan = solve(problem, objective)
+        value, findings = plan.value, _check(problem, plan.trajectory)
+    except WholearmError as error:
+        findings = [("no plan for a shipped problem", str(error))]
+    except Exception as error:
+        findings = _fail(error).findings
+    return {"value": value, "findings": findings}
+
+
+def compare_values(rows: Iterable[Row]) -> list[tuple[str, str, str]]:
+    """Optima of one problem and objective that differ under noise."""
+    groups: dict[str, list[float]] = {}
+    for row in rows:
+        _, path, objective, what, _ = row["case"]
+        if what == "noise" and row["value"] is not None:
+            groups.setdefault(f"{path}, {objective}", []).append(row["value"])
+    found = []
+    for name, values in groups.items():
+        apart = (max(values) - min(values)) / max(map(abs, values))
+        if apart > SAME:
+            text = f"{min(values):.9g} to {max(values):.9g}, {apart:.2g} apart"
+            found.append((name, "optimum that differs under noise", text))
+    return found
+
+
+def _describe_scenes(rows: Sequence[Row]) -> list[str]:
+    verdicts = [row["verdict"] or "not judged" for row in rows if row["outcome"] == "refused"]
+    seconds = np.array([row["seconds"] for row in rows])
+    middle, most = np.percentile(seconds, [50, 95])
+    text = f"median {middle:.2f} s, 95 % within {most:.2f} s, longest {seconds.max():.2f} s"
+    lines = [
+        "| | |",
+        "|---|---|",
+        f"| scenes | {len({row['case'][2] for row in rows})} |",
+        f"| answers, one for each objective | {_count(row['outcome'] for row in rows)} |",
+        f"| refusals, looked at a second time | {_count(verdicts)} |",
+        f"| processor time of an answer, planned twice and checked | {text} |",
+        "",
+        "| kind of scene | planned | refused | failed |",
+        "|---|---:|---:|---:|",
+    ]
+    for kind in sorted({row["kind"] for row in rows}):
+        own = Counter(row["outcome"] for row in rows if row["kind"] == kind)
+        lines.append(f"| {kind} | {own['planned']} | {own['refused']} | {own['failed']} |")
+    return lines
+
+
+def _describe_files(rows: Sequence[Row]) -> list[str]:
+    lines = ["| files | number | exit status |", "|---|---:|---|"]
+    for kind in sorted({row["kind"] for row in rows}):
+        mine = [str(row["status"]) for row in rows if row["kind"] == kind]
+        lines.append(f"| {kind} | {len(mine)} | {_count(mine)} |")
+    return lines
+
+
+def _describe_trials(rows: Sequence[Row]) -> list[str]:
+    lines = ["| problem | objective | trials | without a finding | values apart under noise |"]
+    lines.append("|---|---|---:|---:|---:|")
+    for path, objective in dict.fromkeys(tuple(row["case"][1:3]) for row in rows):
+        mine = [row for row in rows if row["case"][1:3] == [path, objective]]
+        good = sum(not row["findings"] for row in mine)
+        values = [row["value"] for row in mine if row["case"][3] == "noise" and row["value"]]
+        apart = f"{(max(values) - min(values)) / max(map(abs, values)):.1e}" if values else ""
+        name = os.path.basename(path)
+        lines.append(f"| {name} | {objective} | {len(mine)} | {good} | {apart} |")
+    return lines
+
+
+def _count(names: Iterable[str]) -> str:
+    return ", ".join(f"{number} {name}" for name, number in sorted(Counter(names).items()))

@@ -1,0 +1,130 @@
+"""Replay plans and torques for one problem, and put side by side what they do."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..common.errors import InputError, JammingError, SimulationError, name_source
+from ..common.files import require_ending
+from ..problem.check import require_phases
+from ..problem.definition import Problem
+from ..problem.read import adopt_phases
+from ..results.provenance import require_made_for
+from ..results.report import Report
+from ..results.torque import TorqueProfile, read_notes, read_torque_csv
+from ..results.trajectory import Trajectory
+from ..results.trajectory_file import load_trajectory
+from ..verification.verdict import find_least_force
+from ..verification.verify import verify
+from .side_by_side import Comparison, Contender
+
+SIMULATIONS = "simulations"
+"""Key of a comment of torques, and of the `meta` of a trajectory, with how many it took."""
+
+
+def compare(
+    problem: Problem, paths: Sequence[str], progress: Callable[[str], None] | None = None
+) -> Comparison:
+    """Replay trajectory files (.npz) and torques (.csv) for a problem, and compare them.
+
+    Parameters
+    ----------
+    progress  told which of them is replayed
+
+    Raises
+    ------
+    InputError  if a file cannot be read, or a trajectory is one of another problem; names the file
+    """
+    short = [os.path.basename(path) for path in paths]
+    names = short if len({*short}) == len(short) else paths
+    contenders = []
+    for name, path in zip(names, paths, strict=True):
+        if progress is not None:
+            progress(f"replaying {name}")
+        own, what, simulations = _read(problem, str(path))
+        planned = what if isinstance(what, Trajectory) else None
+        judged = _judge(name, own, what, simulations)
+        contenders.append(replace(judged, problem=own, planned=planned))
+    return Comparison(problem.name, problem.epsilon, tuple(contenders))
+
+
+def _read(problem: Problem, path: str) -> tuple[Problem, Trajectory | TorqueProfile, int | None]:
+    """Torques or a trajectory that fits the problem, and how many simulations it took.
+
+    Goals of the problem give way to the phases that a trajectory has found.
+    """
+    if require_ending(path, ".npz", ".csv") == ".csv":
+        noted = read_notes(path).get(SIMULATIONS)
+        if noted is not None and not noted.isdecimal():
+            raise InputError(path, SIMULATIONS, f"{noted!r} given; a whole number is needed")
+        require_phases(problem)
+        return problem, read_torque_csv(path), None if noted is None else int(noted)
+    trajectory = load_trajectory(path)
+    problem = adopt_phases(problem, trajectory.meta, trajectory.q[-1], path)
+    with name_source(path):
+        require_made_for(problem, trajectory.meta)
+    replay = trajectory.meta.get("replay")
+    known = (replay or {}).get(SIMULATIONS, trajectory.meta.get(SIMULATIONS))
+    return problem, trajectory, known if isinstance(known, int) else None
+
+
+def _judge(
+    name: str, problem: Problem, what: Trajectory | TorqueProfile, simulations: int | None
+) -> Contender:
+    """What one of them does."""
+    torque = what if isinstance(what, TorqueProfile) else what.torque
+    limits = np.abs(_find_peaks(torque))
+    peaks = (float(limits[0]), float(limits[1]))
+    effort = torque.integrate_squares()
+    try:
+        report = verify(problem, what)
+    except (JammingError, SimulationError) as error:
+        return Contender(name, False, str(error), torque.duration, effort, peaks, simulations)
+    return _collect(name, report, torque, effort, peaks, simulations)
+
+
+def _collect(
+    name: str,
+    report: Report,
+    torque: TorqueProfile,
+    effort: float,
+    peaks: tuple[float, float],
+    simulations: int | None,
+) -> Contender:
+    found = [(find_least_force(phase), phase) for phase in report.phases]
+    known = [(least, phase.number) for least, phase in found if least is not None]
+    least = min(known, key=lambda pair: pair[0].least, default=None)
+    energy = report.energy
+    lasts = [
+        math.nan if phase.arrival is None else phase.arrival - phase.start
+        for phase in report.phases
+    ]
+    end = report.phases[-1].arrival if report.reached else None
+    return Contender(
+        name,
+        report.ok,
+        report.reason,
+        torque.duration if end is None else end,
+        effort,
+        peaks,
+        simulations,
+        None if least is None else least[0].margin,
+        "" if least is None else least[0].contact,
+        0 if least is None else least[1],
+        energy.viscous + energy.dry + energy.contact + energy.impact,
+        tuple(lasts),
+        tuple(math.nan if own is None else own.margin for own, _ in found),
+        report,
+    )
+
+
+def _find_peaks(torque: TorqueProfile) -> Array:
+    """Largest torque of each joint, shape (2,) [N m]."""
+    powers = np.linspace(-1, 1, 17)[:, None] ** np.arange(torque.coefficients.shape[2])
+    return np.asarray(np.abs(torque.coefficients @ powers.T).max(axis=(0, 2)))

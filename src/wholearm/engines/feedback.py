@@ -1,0 +1,167 @@
+"""Policies in physics engines: torques by feedback, and where the motion ends."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..common.document import Document, Result, Table
+from ..common.errors import InputError
+from ..policy.closed_loop import ROOM, ClosedLoop
+from ..policy.playback import Policy
+from ..problem.definition import Problem
+from ..results.adopt import Moved, adopt_motion
+from ..results.trajectory import Trajectory
+from .departure import find_pairs
+from .engine_replay import ENGINES, require_engine
+from .stretch import EngineRun, EngineStretch, Setting, find_between, list_stretches
+
+ALLOWED = 1e-2
+"""How far from the plan's a motion may end, over the scene's length and in rad: in soft contacts
+the shipped plans end at most 2e-3 away."""
+
+
+class StretchEnd(NamedTuple):
+    """A stretch that a policy carries out in an engine."""
+
+    stretch: EngineStretch
+    duration: float  # [s]: until the joints stand still at the end
+    over: bool  # whether they do
+    position: float  # position, angle [m] and [rad]: how far from the plan's the pose ends
+    angle: float
+    # the planned contact that opens most, from when its phase begins until the next contact
+    contact: str
+    gap: float  # [m]: by how much
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PolicyReport(Result):
+    """What a policy does in an engine; `allowed` is over the scene's length and in rad."""
+
+    problem: Problem
+    title: str
+    allowed: float
+    arrivals: tuple[StretchEnd, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether every stretch ends, and where it is to end."""
+        return all(self.find_failure(own) is None for own in self.arrivals)
+
+    def find_failure(self, own: StretchEnd) -> str | None:
+        """What is wrong with a stretch."""
+        far = max(own.position / self.problem.scene.scales.length, own.angle)
+        if not far <= self.allowed:
+            text = f"{own.position * 1e3:.3g} mm and {math.degrees(own.angle):.3g} degrees"
+            return f"phase {own.stretch.name} ends {text} away from the plan"
+        if not own.over:
+            return f"phase {own.stretch.name} does not end within {own.duration:.4g} s"
+        return None
+
+    @property
+    def document(self) -> Document:
+        """Durations beside those of the plan, and where stretches end."""
+        columns = {
+            "stretch.name": "phase:d", "stretch.duration": "plan [s]:.6f",
+            "duration": "policy [s]:.6f", "position": "end off [mm]:.4f", "angle": "[deg]:.4f",
+            "gap": "largest gap [mm]:.4f", "contact": "",
+        }  # fmt: skip
+        failures = [self.find_failure(own) or "" for own in self.arrivals]
+        title = f"{self.problem.name} in {self.title}, by the policy"
+        verdict, table = "ok" if self.ok else "FAILS", Table.of(self.arrivals, columns)
+        return Document(title, verdict, parts=[*failures, table])
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The report for machines, in m, rad and s."""
+        stretches = [{"phases": own.stretch.numbers, **own._asdict()} for own in self.arrivals]
+        for own in stretches:
+            del own["stretch"]
+        values = {"problem": self.problem.name, "engine": self.title, "ok": self.ok}
+        return {**values, "allowed": self.allowed, "stretches": stretches}
+
+
+def play_policy(
+    engine: str,
+    problem: Problem,
+    plan: Trajectory | Moved,
+    policy: Policy,
+    *,
+    whole: bool = False,
+    setting: Setting | None = None,
+    allowed: float = ALLOWED,
+    progress: Callable[[str], None] | None = None,
+) -> PolicyReport:
+    """Let a policy move the hand in an engine that is not told which contacts hold.
+
+    Parameters
+    ----------
+    engine : {"mujoco", "drake"}
+    plan                          where phases start and end
+    whole                         from the start to the end; otherwise phase by phase, from rest
+                                  where each is planned to start, but for those that impacts or
+                                  their own motion lead into
+    setting, allowed, progress    as of `replay_in`
+
+    Raises
+    ------
+    InputError  if the engine is unknown or not installed, or the policy is of other phases
+    """
+    problem, plan = adopt_motion(problem, plan)
+    play = require_engine(engine)
+    if policy.count != len(problem.phases):
+        given = f"{policy.count} given; the problem has {len(problem.phases)}"
+        raise InputError("", "phases of the policy", given)
+    known = ENGINES[engine]
+    setting = known.setting if setting is None else setting
+    arrivals = []
+    for stretch in _join(list_stretches(find_between(plan), False), policy, whole):
+        if progress is not None:
+            progress(f"phase {stretch.name} in {known.title}")
+        last = stretch.phases[-1] + 1
+        loop = ClosedLoop(policy.cut(last), stretch.phases[0] + 1)
+        until = stretch.start + (1 + ROOM) * loop.find_duration(last)
+        run = play(problem, stretch._replace(stop=until), loop, setting)
+        arrivals.append(_judge(problem, plan, stretch, loop, run))
+    title = f"{known.title} {version(engine)}"
+    return PolicyReport(problem, title, allowed, tuple(arrivals))
+
+
+def _join(parts: list[EngineStretch], policy: Policy, whole: bool) -> list[EngineStretch]:
+    """Stretches at rest in the beginning, one after another; or all as one."""
+    begins = [1] if whole else policy.resting
+    found = []
+    for first, after in zip(begins, [*begins[1:], len(parts) + 1], strict=True):
+        own, still = parts[first - 1], np.zeros(5)
+        phases, stop = tuple(range(first - 1, after - 1)), parts[after - 2].stop
+        found.append(own._replace(phases=phases, stop=stop, z_dot=still, z_ddot=still))
+    return found
+
+
+def _judge(
+    problem: Problem, plan: Trajectory, stretch: EngineStretch, loop: ClosedLoop, run: EngineRun
+) -> StretchEnd:
+    """Where a run ends, and which planned contact opens most on the way."""
+    goal = plan.z[np.flatnonzero(plan.phase == stretch.phases[-1])[-1]]
+    away, t = np.abs(run.z[-1] - goal), run.t - stretch.start
+    position, angle = float(np.hypot(*away[:2])), float(away[2])
+    begins = [loop.began.get(index + 1, np.inf) for index in stretch.phases]
+    contact, gap = "", 0.0
+    for index, start, stop in zip(stretch.phases, begins, [*begins[1:], np.inf], strict=True):
+        phase = problem.phases[index]
+        rows = np.flatnonzero((t >= start) & (t < stop))
+        gaps = phase.formation.evaluate(run.z[rows], run.z_dot[rows]).C
+        if phase.until.contact is not None:
+            pairs = find_pairs(phase.until.contact.name, problem.scene.polygon.n_vertices)
+            columns = [run.pairs.index(name) for name in pairs]
+            made = (run.press[np.maximum(rows - 1, 0)][:, columns] > 0).any(axis=1)
+            gaps = gaps[: int(np.argmax(np.append(made, True)))]
+        if gaps.size and gaps.max() > gap:
+            gap = float(gaps.max())
+            contact = phase.formation.names[int(gaps.max(axis=0).argmax())]
+    return StretchEnd(stretch, float(t[-1]), loop.over, position, angle, contact, gap)

@@ -1,0 +1,179 @@
+"""Free simulation of a hand: joint torques in, motion, contacts and events out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..common.arrays import Array
+from ..common.errors import InputError, SimulationError, require_number
+from ..common.sharing import exclusive
+from ..problem.definition import Problem
+from ..results.adopt import Torques, adopt_torques
+from ..results.torque import TorqueProfile
+from ..results.trajectory import Trajectory
+from ..simulation.tolerances import SLOW, is_slower
+from .free_events import play
+from .free_stepper import Modes
+from .hand import build_system, is_apart, measure_gaps
+from .result import FreeSimulation, collect
+from .state import Feedback, FreeRun, Law
+
+
+class PhaseRun(NamedTuple):
+    """Phases that are simulated from a planned start at rest, to the next one."""
+
+    first: int  # first, last: indices of the phases
+    last: int
+    simulation: FreeSimulation
+
+
+@exclusive
+def simulate_free(
+    problem: Problem,
+    what: Torques | Law,
+    *,
+    start: ArrayLike | None = None,
+    until: float | None = None,
+    restitution: float = 0.0,
+    tolerance: float = 1e-9,
+    halt: Callable[[FreeRun], bool] | None = None,
+) -> FreeSimulation:
+    """Simulate torques without being told which contacts hold, also after one is lost.
+
+    Parameters
+    ----------
+    problem                its phases count only for the clock of a plan
+    start : (5,) or (10,)  z, and z' if it is not at rest; the problem's start if left out. What is
+                           closer than what counts as touching is moved onto its contact.
+    until : [s]            the end, if not that of the torques; those of their end hold after it. A
+                           law needs one.
+    restitution            poisson's coefficient, 0 for plastic impacts to 1
+    tolerance              as of `simulate`
+    halt                   asked at every event, with the run, whether that is enough
+
+    Raises
+    ------
+    InputError       if a number is out of its range
+    SimulationError  if features overlap at the start, or a law gives no two numbers
+    """
+    state = _require_start(problem, start)
+    rate = require_number(restitution, "restitution", nonnegative=True)
+    if rate > 1:
+        raise InputError("", "restitution", f"{restitution!r} is not between 0 and 1")
+    if not 1e-14 <= tolerance <= 1e-2:
+        raise InputError("", "tolerance", f"{tolerance!r} is not between 1e-14 and 1e-2")
+    end = None if until is None else require_number(until, "until", positive=True)
+    if isinstance(what, Law):
+        if end is None:
+            raise InputError("", "until", "none given; a law of torques needs an end")
+        feedback = Feedback(what, end)
+        return _simulate(problem, feedback, state, [0.0], None, rate, tolerance, halt)
+    problem, profile, plan = adopt_torques(problem, what)
+    profile = profile if end is None else profile.cut(0.0, end)
+    starts = [0.0] if plan is None else plan.phase_starts[:-1].tolist()
+    hint = None if plan is None or start is not None else _recall(problem, plan, 0)
+    return _simulate(problem, profile, state, starts, hint, rate, tolerance, halt)
+
+
+@exclusive
+def simulate_phases(
+    problem: Problem,
+    plan: Trajectory,
+    *,
+    restitution: float = 0.0,
+    tolerance: float = 1e-9,
+    progress: Callable[[str], None] | None = None,
+) -> tuple[PhaseRun, ...]:
+    """Simulate the phases of a plan one by one, each from its planned start.
+
+    Phases that pass into one another in motion, by the plan's velocities, are simulated together.
+
+    Parameters
+    ----------
+    problem, restitution, tolerance  as of `simulate_free`
+    progress  told which phase is simulated
+    """
+    starts, found = plan.phase_starts, []
+    rows = [int(row) for row in np.flatnonzero(np.diff(plan.phase, prepend=-1))]
+    rests = [is_slower(problem.scene, plan.z_dot[row], SLOW) for row in rows] + [True]
+    first = 0
+    for last in range(len(rows)):
+        if not rests[last + 1]:
+            continue
+        if progress is not None:
+            progress(f"simulating phase {problem.phases[first].number} of {len(rows)}")
+        profile = plan.torque.cut(float(starts[first]), float(starts[last + 1]))
+        row = rows[first]
+        state = np.concatenate([plan.z[row], plan.z_dot[row]])
+        hint = _recall(problem, plan, row)
+        clock = starts[first : last + 1].tolist()
+        simulation = _simulate(problem, profile, state, clock, hint, restitution, tolerance)
+        found.append(PhaseRun(first, last, simulation))
+        first = last + 1
+    return tuple(found)
+
+
+def _simulate(
+    problem: Problem,
+    profile: TorqueProfile | Feedback,
+    state: Array,
+    starts: list[float],
+    hint: Modes | None,
+    restitution: float,
+    tolerance: float,
+    halt: Callable[[FreeRun], bool] | None = None,
+) -> FreeSimulation:
+    z, v = np.split(state, 2)
+    system = build_system(problem.scene)
+    if not is_apart(system, z, problem.scene.touching):
+        _require_apart(problem, z)
+    run = FreeRun(system, profile, z, v, restitution, tolerance, hint)
+    play(run, problem.scene.touching, halt)
+    return collect(run, problem, starts)
+
+
+def _recall(problem: Problem, plan: Trajectory, row: int) -> Modes:
+    """Contact modes with which a plan begins: the last answer, where there are several."""
+    system = build_system(problem.scene)
+    names = [name for name, c in zip(plan.contacts, plan.c_n[row], strict=True) if c == c]
+    kept = sorted(system.names.index(name) for name in names)
+    z, v, a = plan.z[row], plan.z_dot[row], plan.z_ddot[row]
+    rows = system.evaluate(z, v, kept)
+    ahead = 1e-3 * system.scales.time
+    slides = np.sign(rows.A_t @ v + ahead * (rows.A_t @ a + rows.bend_t))
+    phase = problem.phases[int(plan.phase[row])]
+    rolls = [system.names[pair] in {c.name for c in phase.formation.rolling} for pair in kept]
+    Xi = np.where(rolls, 0.0, slides)
+    turns = np.sign(v + ahead * a) * (system.dry > 0)
+    stuck = tuple(pair for pair, one in zip(kept, rolls, strict=True) if one)
+    return Modes(tuple(kept), stuck, (), tuple(Xi.tolist()), tuple(turns.tolist()))
+
+
+def _require_start(problem: Problem, start: ArrayLike | None) -> Array:
+    if start is None:
+        return np.concatenate([problem.start, np.zeros(5)])
+    try:
+        state = np.asarray(start, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError("", "start", "does not hold numbers") from None
+    if state.shape not in ((5,), (10,)) or not np.isfinite(state).all():
+        raise InputError(
+            "", "start", f"shape {state.shape} given; 5 or 10 finite numbers are needed"
+        )
+    return np.concatenate([state, np.zeros(10 - len(state))])
+
+
+def _require_apart(problem: Problem, z: Array) -> None:
+    """Check that nothing overlaps at the start by more than what counts as touching."""
+    depths = -measure_gaps(problem.scene, z[None])[0]
+    which = int(depths.argmax())
+    if depths[which] > 10 * problem.scene.touching:
+        pair = ("palm and object", "finger 1 and object", "finger 2 and object", "both fingers")
+        raise SimulationError(f"{pair[which]} overlap by {depths[which]:.3g} m at the start")
+
+
+__all__ = ["PhaseRun", "SimulationError", "simulate_free", "simulate_phases"]

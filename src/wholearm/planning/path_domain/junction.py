@@ -1,0 +1,243 @@
+"""Torques where one phase ends at rest and the next one begins, for motors that are not quick.
+
+A motion begins and ends with torques that hold the object on the verge of it: with no acceleration
+and the friction of its directions. There the squeeze is free, so these torques are a line for the
+phase that ends and another one for the phase that begins. Those nearest to each other in time are
+taken, and torques go straight from the ones to the others while everything rests. The former have
+to hold the object in the formation that begins, too; then so do all in between, as forces that
+balance and are within their cones make a convex set.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ...common.arrays import Array
+from ...common.errors import InfeasibleError
+from ...contacts.formation import Formation
+from ...geometry.curve import Curve
+from ...mechanics.wedging import find_static_torques
+from ...results.mode_names import ModeSpan
+from ...results.torque import TorqueProfile
+from ...results.torque_change import TorqueChange, change_torques, find_change_times
+from ...results.trajectory import Motion, Samples
+from ..options import Objective, PlanOptions
+from ..phase_plan import PhasePlan
+from .first_guess import find_squeeze_range
+from .path_data import PhaseData, prepare
+from .path_mesh import Mesh
+
+_PLACES = 129
+"""Squeezes that are looked at on each side of a joint."""
+_WIDEST = 40.0
+"""Largest range of them, over the scene's force."""
+_INSIDE = 0.01
+"""Part of the range at both of its ends that is left out."""
+_ELEMENTS = 3
+"""Elements of a grid of which only the ends count."""
+_VERGE = 1e-6
+"""Distance over the scene's torque beyond those that friction can hold, that is rounding."""
+
+
+class Joint(NamedTuple):
+    """Squeezes [N] and torques, shape (2,) [N m], of both sides, and the pause between [s].
+
+    Squeezes are NaN of what is planned over time.
+    """
+
+    ends: float
+    begins: float
+    before: Array
+    after: Array
+    pause: float
+
+
+def choose_joint(
+    ending: Curve | Array, beginning: Curve | Formation, z: Array, epsilon: float, phase: int
+) -> Joint:
+    """The torques that change in the least time where phase number `phase` begins.
+
+    Parameters
+    ----------
+    ending : (2,) [N m]  what ends there, or the torques that it ends with if it is planned over
+                         time
+    beginning            what begins there, or its formation if it is planned over time: then the
+                         torques to end with are those that friction holds most firmly in it
+    z : (5,)
+
+    Notes
+    -----
+    Where none of the torques hold the object in the formation that begins, contacts that it does
+    not have any more help to hold it until the motion begins.
+
+    Raises
+    ------
+    InfeasibleError  if no torques hold the object at the end of the one phase, or at the start of
+                     the other
+    """
+    before, ends = (
+        _list_torques(ending, epsilon, phase - 1, -1)
+        if isinstance(ending, Curve)
+        else (ending[None], np.full(1, np.nan))
+    )
+    formation = beginning.formation if isinstance(beginning, Curve) else beginning
+    scene, static = formation.scene, find_static_torques([formation], z)
+    beyond = static.measure(before)
+    held = beyond <= _VERGE * scene.scales.torque
+    if not held.any():
+        held = beyond <= beyond.min()
+    if not isinstance(beginning, Curve):
+        firmest = int(beyond.argmin())
+        tau = before[firmest]
+        return Joint(float(ends[firmest]), np.nan, tau, tau, 0.0)
+    after, begins = _list_torques(beginning, epsilon, phase, 0)
+    times = find_change_times(scene, before[held][:, None], after[None])
+    p, q = np.unravel_index(int(times.argmin()), times.shape)
+    given = float(ends[held][p]), float(begins[q]), before[held][p], after[q]
+    return Joint(*given, float(times[p, q]))
+
+
+def _list_torques(curve: Curve, epsilon: float, phase: int, place: int) -> tuple[Array, Array]:
+    """Torques at an end of a curve on the verge of motion, (n, 2) [N m], and squeezes, (n,) [N]."""
+    data = prepare(curve, epsilon, Mesh().make_grid(curve, _ELEMENTS, held=True), phase)
+    low, high = require_hold(data, phase, place)
+    high = min(high, low + _WIDEST * curve.formation.scene.scales.force)
+    share = np.linspace(_INSIDE, 1 - _INSIDE, _PLACES)
+    squeezes = low + share * (high - low)
+    forces = data.nodes.forces
+    return forces.T0[place] + np.outer(squeezes, forces.Tl[place]), squeezes
+
+
+def require_hold(data: PhaseData, phase: int, place: int) -> tuple[float, float]:
+    """The range of squeezes that hold the object at an end of a phase [N].
+
+    Raises
+    ------
+    InfeasibleError  if there is none
+    """
+    low, high = (float(bound[place]) for bound in find_squeeze_range(data, 0.0))
+    if low <= high:
+        return low, high
+    where = "end" if place else "start"
+    raise InfeasibleError(
+        f"phase {phase}: torques may not step, and within the limits none hold the object at rest "
+        f"at its {where}, on the verge of the motion; leave out torque_rate_limit and actuator_lag"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class PausedMotion:
+    """A motion that begins after a pause at rest, in which torques and forces change."""
+
+    motion: Motion
+    change: TorqueChange
+    forces: Array  # (2, n_c) [N]: c_n and c_t before it; NaN if other contacts may share in them
+
+    @property
+    def pause(self) -> float:
+        """How long the pause lasts [s]."""
+        return self.change.duration
+
+    @property
+    def duration(self) -> float:
+        """How long the phase lasts [s]."""
+        return self.pause + self.motion.duration
+
+    @property
+    def contacts(self) -> tuple[str, ...]:
+        """Names of the phase's contacts."""
+        return self.motion.contacts
+
+    @property
+    def modes(self) -> tuple[ModeSpan, ...]:
+        """Its contact modes, if it is planned over time: the first begin with the pause."""
+        own = getattr(self.motion, "modes", ())
+        late = (span._replace(start=span.start + self.pause) for span in own)
+        late = (span._replace(stop=span.stop + self.pause) for span in late)
+        return tuple(s._replace(start=0.0) if k == 0 else s for k, s in enumerate(late))
+
+    def evaluate(self, t: Array) -> Samples:
+        """Samples at times `t` from the start of the phase, shape (n,) [s]."""
+        t = np.asarray(t, dtype=float)
+        found = self.motion.evaluate(np.maximum(t - self.pause, 0.0))
+        left = np.where(t < self.pause, 1 - self.change.share(t), 0.0)[:, None]
+        first = self.change.before, *self.forces
+        mixed = (
+            np.where(left > 0, left * own + (1 - left) * now, now)
+            for own, now in zip(first, found[3:], strict=True)
+        )
+        return Samples(*found[:3], *mixed)
+
+
+def add_pause(
+    plan: PhasePlan[Motion], joint: Joint, formation: Formation, z: Array, options: PlanOptions
+) -> PhasePlan[Motion]:
+    """The plan of a phase that begins at `z`, with the pause before it."""
+    if not joint.pause:
+        return plan
+    forces = find_static_forces(formation, z, joint.before)
+    change = change_torques(formation.scene, joint.before, joint.after)
+    ramp = change.torque
+    value = {
+        Objective.TIME: plan.value + joint.pause,
+        Objective.EFFORT: plan.value + ramp.integrate_squares() + options.time_weight * joint.pause,
+        Objective.MARGIN: float(np.fmin(plan.value, forces[0].min())),
+    }[options.goal]
+    motion = PausedMotion(plan.motion, change, forces)
+    torque = TorqueProfile.chain([ramp, plan.torque])
+    return plan._replace(motion=motion, torque=torque, value=value)
+
+
+def begin_from(plan: PhasePlan[Motion], formation: Formation, before: Array) -> PhasePlan[Motion]:
+    """The plan of a phase with other torques before it, shape (2,) [N m], and the pause from them.
+
+    Its value stays as it is.
+    """
+    motion, torque = plan.motion, plan.torque
+    if isinstance(motion, PausedMotion):
+        torque = TorqueProfile.chain([torque.cut(motion.pause, float(torque.breaks[-1]))])
+        motion = motion.motion
+    after = torque.at(np.zeros(1))[0]
+    change = change_torques(formation.scene, before, after)
+    if change.duration:
+        # What touches beside the phase's contacts may hold the object, too, until it moves.
+        forces = np.full((2, formation.n_contacts), np.nan)
+        motion = PausedMotion(motion, change, forces)
+        torque = TorqueProfile.chain([change.torque, torque])
+    return plan._replace(motion=motion, torque=torque)
+
+
+def find_static_forces(formation: Formation, z: Array, tau: Array) -> Array:
+    """Contact forces that hold a formation at rest with the largest least c_n, (2, n_c) [N].
+
+    NaN where none do, as others that still touch help to hold it.
+    """
+    from scipy.optimize import linprog
+
+    scene, n_c = formation.scene, formation.n_contacts
+    units = np.array([1.0, 1.0, *[scene.scales.length] * 3])
+    kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
+    normal, tangential = ((rows / units).T for rows in (kinematics.A[0], kinematics.A_t[0]))
+    joints = np.eye(5)[:, 3:]
+    load = (scene.applied_force + joints @ tau) / (scene.scales.force * units)
+    columns = np.hstack([normal, tangential, -joints, np.zeros((5, 1))])
+    cone, one, none = -np.diag(formation.friction), np.eye(n_c), np.zeros((n_c, 3))
+    rows = [np.hstack([cone, sign * one, none]) for sign in (1.0, -1.0)]
+    rows.append(np.hstack([-one, np.zeros((n_c, n_c + 2)), np.ones((n_c, 1))]))
+    free = [(None, None)]
+    dry = [(-d, d) for d in scene.dry[3:] / scene.scales.torque]
+    answer = linprog(
+        np.append(np.zeros(2 * n_c + 2), -1.0),
+        A_ub=np.vstack(rows),
+        b_ub=np.zeros(3 * n_c),
+        A_eq=columns,
+        b_eq=-load,
+        bounds=[*free * (2 * n_c), *dry, *free],
+        method="highs",
+    )
+    if answer.status:
+        return np.full((2, n_c), np.nan)
+    return np.asarray(scene.scales.force * answer.x[: 2 * n_c].reshape(2, n_c))

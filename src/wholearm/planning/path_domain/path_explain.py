@@ -1,0 +1,293 @@
+"""Why phases along curves have no plan, and which single limit would have to give way.
+
+All limits are made soft and their shortfalls ranked. Then each limit alone is relaxed as little as
+the others allow, and a plan with that limit is asked for: only what was planned is advised.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ...common.arrays import Array
+from ...common.errors import InfeasibleError, JammingError, SolverError, WholearmError
+from ...common.shortfalls import LimitPlace, Parameter, Shortfall
+from ...contacts.formation import Formation
+from ...geometry.curve import Curve, describe_pose
+from ...mechanics.limits import EPSILON
+from ...results.trajectory import Trajectory
+from ..advice import (
+    advise,
+    assemble_least,
+    bracket,
+    change_scene,
+    describe_shortfalls,
+    list_shortfalls,
+    name_phases,
+    rank_shortfalls,
+    succeeds,
+)
+from ..options import Objective
+from .elements import Profile
+from .interpolation import fit_torque
+from .junction import require_hold
+from .path_data import PhaseData, cut, join
+from .path_motion import PathMotion
+from .path_nlp import (
+    Relaxation,
+    Tightening,
+    Units,
+    build_path_nlp,
+    make_bounds,
+    pack,
+    parameters,
+    unpack,
+)
+from .speed_profile import is_hopeless
+from .task import Task
+from .terms import LimitShape
+
+_TRIED = (2.0, 10.0, 100.0)
+"""Factors on the rates of motors with which a plan is looked for."""
+_ROUGH = 4.0
+"""Largest factor on the friction of a rolling contact."""
+_TORQUE = 15.0
+"""Unit of the torques' shortfalls, over the scene's torque: as bad as one of its force."""
+_FORCE = 5.0
+"""Largest unit of force when a limit is relaxed, over the scene's."""
+FRICTION = "friction"
+"""Beginning of the keys of frictions."""
+Replan = Callable[[Sequence[Curve], float], object]
+"""Plans the phases along curves with a least normal force [N]; raises if there is no plan."""
+
+
+def explain(
+    parts: Sequence[PhaseData],
+    profile: Profile,
+    units: Units,
+    phases: Sequence[int],
+    stopped: str,
+    replan: Replan,
+) -> InfeasibleError | SolverError:
+    """Say why phases have no plan and what would change that.
+
+    Parameters
+    ----------
+    profile  a guess of the motion through all of them
+    phases   their numbers
+    stopped  how the solver ended, in words
+    """
+    data = join(parts)
+    torque = _TORQUE * data.curve.formation.scene.scales.torque
+    units = units._replace(torque=np.full(2, torque))
+    elastic = _solve_elastic(data, profile, units)
+    if elastic is None:
+        return SolverError(stopped)
+    shortfalls = [
+        short
+        for part, own, phase in zip(parts, cut(parts, elastic), phases, strict=True)
+        for short in _list_shortfalls(part, own, phase, len(phases) > 1)
+    ]
+    if not shortfalls:
+        text = f"{stopped} although limits can be kept; try other --intervals or --accuracy"
+        return SolverError(text)
+    units = _quicken(data, units)
+    may_change = [*data.speeds.parameters, *data.limits.parameters]
+    if len(parts) == 1:
+        # Where impacts join phases, their velocities depend on friction too.
+        may_change += list_frictions(data.curve.formation)
+    curves = [part.curve for part in parts]
+
+    def find_value(parameter: Parameter) -> float | None:
+        if parameter.key.startswith(FRICTION):
+            return _search_friction(parameter, partial(change, parameter))
+        return _relax(data, elastic, units, parameter)
+
+    def change(parameter: Parameter, value: float) -> object:
+        return _replan_with(curves, data.epsilon, replan, parameter, value)
+
+    ranked = rank_shortfalls(shortfalls)
+    text = f"{name_phases(phases, 'infeasible')}: {describe_shortfalls(ranked)}"
+    advice = advise(text, may_change, find_value, change)
+    motion = _make_trajectory(parts, cut(parts, elastic))
+    return InfeasibleError(advice.text, ranked, advice.changes, motion)
+
+
+def _make_trajectory(parts: Sequence[PhaseData], profiles: Sequence[Profile]) -> Trajectory | None:
+    """The motion that misses limits least; None if it takes for ever."""
+    pairs = zip(parts, profiles, strict=True)
+    motions = [PathMotion(part.curve, part.grid, own) for part, own in pairs]
+    try:
+        torques = [fit_torque(part, own)[0] for part, own in zip(parts, motions, strict=True)]
+    except SolverError:
+        return None
+    return assemble_least(motions, torques, [part.curve.formation for part in parts])
+
+
+def explain_jam(curve: Curve, epsilon: float, jam: JammingError, replan: Replan) -> JammingError:
+    """Add to an error which single friction would let a phase be planned."""
+
+    def find_value(parameter: Parameter) -> float | None:
+        lower = parameter.sign < 0
+        return _search_friction(parameter, partial(change, parameter)) if lower else None
+
+    def change(parameter: Parameter, value: float) -> object:
+        return _replan_with([curve], epsilon, replan, parameter, value)
+
+    advice = advise(str(jam), list_frictions(curve.formation), find_value, change)
+    error = type(jam)(advice.text)
+    error.changes = advice.changes
+    return error
+
+
+def _replan_with(
+    curves: Sequence[Curve], epsilon: float, replan: Replan, parameter: Parameter, value: float
+) -> object:
+    if parameter.key == EPSILON:
+        return replan(curves, value)
+    return replan([change_curve(curve, parameter.key, value) for curve in curves], epsilon)
+
+
+def change_curve(curve: Curve, key: str, value: float) -> Curve:
+    """The curve with another parameter of the hand."""
+    formation = curve.formation
+    return replace(
+        curve, formation=replace(formation, scene=change_scene(formation.scene, key, value))
+    )
+
+
+def list_frictions(formation: Formation) -> list[Parameter]:
+    """Friction of what is touched: to be lowered, and where a contact rolls to be raised."""
+    parts = dict.fromkeys(contact.finger for contact in formation.contacts)
+    rolls = {contact.finger for contact in formation.rolling}
+    found = []
+    for finger in parts:
+        name = "palm" if finger is None else f"finger {finger + 1}"
+        key, value = f"{FRICTION}.{name.replace(' ', '')}", formation.scene.friction.of(finger)
+        signs = (-1, 1) if finger in rolls else (-1,)
+        found += [Parameter(f"friction of {name}", value, "", sign, key) for sign in signs]
+    return found
+
+
+def _search_friction(parameter: Parameter, plan: Callable[[float], object]) -> float | None:
+    """A coefficient that can be planned with, lower or higher than the given one."""
+    farthest = 0.0 if parameter.sign < 0 else _ROUGH * parameter.value
+    return bracket(parameter, farthest, lambda value: succeeds(partial(plan, value)))
+
+
+def _quicken(data: PhaseData, units: Units) -> Units:
+    """Units for motions as quick as a fall, with forces that a hand may have.
+
+    In units of a slow motion, or of an absurd epsilon, the small costs that choose among equals
+    would outweigh what is relaxed.
+    """
+    length, scales = float(data.grid.s[-1]), data.curve.formation.scene.scales
+    fall = float(np.sqrt(length / scales.acceleration))
+    return units._replace(time=min(units.time, fall), force=min(units.force, _FORCE * scales.force))
+
+
+def _solve_elastic(data: PhaseData, profile: Profile, units: Units) -> Profile | None:
+    """The motion with the least shortfalls when every limit is soft."""
+    short = np.maximum(_find_shortfalls(data, profile), 0.0) + 0.05 * data.limits.scales
+    found = _solve_soft(data, profile, units, short / units.of(data.limits), None)
+    return found[0] if found else None
+
+
+def _relax(data: PhaseData, profile: Profile, units: Units, parameter: Parameter) -> float | None:
+    """The value at which one parameter just lets all others be kept, if there is one."""
+    if is_hopeless(data, parameter):
+        return None
+    step = units.force if parameter.unit == "N" else parameter.value
+    short = _find_shortfalls(data, profile).max(axis=0)
+    weights = step * data.limits.weigh(parameter)
+    needed = np.divide(short, weights, out=np.zeros_like(short), where=weights > 0)
+    relaxation = Relaxation(parameter, step)
+    begun = max(1.0, 1.5 * float(needed.max()))
+    found = _solve_soft(data, profile, units, begun, relaxation)
+    return relaxation.move(found[1]) if found else None
+
+
+def _solve_soft(
+    data: PhaseData,
+    profile: Profile,
+    units: Units,
+    extra: float | Array,
+    relaxation: Relaxation | None,
+) -> tuple[Profile, float] | None:
+    """Solve with limits that give way, from a profile and how far they do so there."""
+    goal = Objective.RELAX if relaxation else Objective.ELASTIC
+    nlp = build_path_nlp(LimitShape.of(data.limits), len(data.grid.s) - 1, goal)
+    result = nlp.solver(
+        x0=pack(nlp, profile, units, extra),
+        p=parameters(nlp, data, units, 1.0, relaxation),
+        **make_bounds(nlp, data, units, Tightening.none(data, None), relaxation),
+    )
+    if not nlp.solver.stats()["success"]:
+        return None
+    return unpack(nlp, data.grid, result["x"].full()[:, 0], units)
+
+
+def _find_shortfalls(data: PhaseData, profile: Profile) -> Array:
+    """By how much limits are missed at the nodes, shape (n, m) [N, N m]."""
+    return data.limits.fold(-data.slack(data.nodes, profile))
+
+
+def _list_shortfalls(
+    data: PhaseData, profile: Profile, phase: int, several: bool
+) -> list[Shortfall]:
+    times = PathMotion(data.curve, data.grid, profile).times
+    z = data.curve.evaluate(data.grid.s).z
+
+    def locate(node: int) -> LimitPlace:
+        text = f"t = {times[node]:.4f} s ({describe_pose(z[node])})"
+        return LimitPlace(phase, float(times[node]), text + (f", phase {phase}" if several else ""))
+
+    return list_shortfalls(data.limits, data.evaluate(data.nodes, profile), locate)
+
+
+def explain_motors(
+    task: Task, parts: Sequence[PhaseData], reason: str, plan: Callable[..., Any]
+) -> WholearmError:
+    """The error for phases that `plan`, which is `plan_curves`, has found no plan for.
+
+    It is that of quick motors if these have none either. Otherwise quicker ones are tried.
+    """
+    given = task.epsilon, task.options, task.phases, task.duration
+    try:
+        require_hold(parts[0], task.phases[0], 0)
+        require_hold(parts[-1], task.phases[-1], -1)
+        plan([_raise_rate_limits(curve, np.inf) for curve in task.curves], *given)
+    except WholearmError as error:
+        return error
+    for factor in _TRIED:
+        try:
+            plan([_raise_rate_limits(own, factor) for own in task.curves], *given, False, task.pins)
+        except WholearmError:
+            continue
+        change = f"feasible with motors {factor:g} times as quick"
+        break
+    else:
+        change = "a plan was found for motors without limits"
+    text = (
+        "torques may not change as quickly as they would have to (torque_rate_limit, actuator_lag)"
+    )
+    return InfeasibleError(f"{name_phases(task.phases, 'infeasible')}: {text}; {change}; {reason}")
+
+
+def _raise_rate_limits(curve: Curve, factor: float) -> Curve:
+    """The curve in a scene whose motors are quicker by a factor."""
+    formation, scene = curve.formation, curve.formation.scene
+    right, left = (
+        replace(
+            finger,
+            torque_rate_limit=finger.torque_rate_limit * factor,
+            actuator_lag=finger.actuator_lag / factor,
+        )
+        for finger in scene.fingers
+    )
+    scene = replace(scene, fingers=(right, left))
+    return replace(curve, formation=replace(formation, scene=scene))

@@ -1,0 +1,195 @@
+"""Motion along a curve: speed and squeeze at the nodes of a grid, the rest at any instant.
+
+Inside an element a = s'' and the squeeze are polynomials, and so is b = s'^2; s(t) follows by
+quadrature of 1 / s'. z, tau and the contact forces follow from s, s' and s'' by inverse dynamics,
+hence the equations of motion hold at every instant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
+
+from ...common.arrays import Array
+from ...geometry.curve import Curve
+from ...mechanics.dynamics import Directions, inverse, split_forces
+from ...results.trajectory import Samples
+from .elements import DEGREE, Elements, Grid, Profile
+
+_POINTS = 12
+"""Gauss points for the time in an interval between nodes."""
+_STALLED = 100.0
+"""Speed that the ends of an interval suggest over the one inside at which a motion stalls."""
+_TINY = 1e-100
+"""Least speed [m/s] that is divided by."""
+_NEWTON = 5
+"""Steps of Newton's method from a time to a place: rates of time differ little in an interval."""
+
+
+def _integrals() -> tuple[Array, Array]:
+    """Gauss points x, and what takes values there to Legendre coefficients of the integral.
+
+    Of the polynomial through them, from -1 to x.
+    """
+    x, weights = legendre.leggauss(_POINTS)
+    to_modes = legendre.legvander(x, _POINTS - 1) * weights[:, None]
+    to_modes *= (2 * np.arange(_POINTS) + 1) / 2
+    return x, np.asarray(legendre.legint(to_modes, lbnd=-1, axis=1), dtype=float)
+
+
+_GAUSS = _integrals()
+
+
+@dataclass(frozen=True, eq=False)
+class PathMotion:
+    """A phase on a curve as a function of time; it satisfies the equations of motion exactly."""
+
+    curve: Curve
+    grid: Grid
+    profile: Profile  # at the nodes
+
+    @cached_property
+    def elements(self) -> Elements:
+        """The polynomials of the motion."""
+        return Elements(self.grid, self.profile)
+
+    @cached_property
+    def times(self) -> Array:
+        """When each node is passed, shape (N + 1,) [s]."""
+        spans = np.zeros(len(self.grid.steps))
+        spans[self.grid.nonempty] = self.durations(np.ones(1))[:, 0]
+        return np.concatenate([[0.0], np.cumsum(spans)])
+
+    @cached_property
+    def _ends(self) -> tuple[Array, Array]:
+        """Speeds at both ends of the intervals inside elements."""
+        speed, k = np.sqrt(self.profile.b), self.grid.nonempty
+        return speed[k], speed[k + 1]
+
+    @cached_property
+    def _slowness(self) -> Array:
+        """What the speed would be were s'' constant, over what it is, at Gauss points of w, (n, m).
+
+        w is in which that speed is linear, in each interval inside elements.
+        """
+        k, (v0, v1) = self.grid.nonempty, (speed[:, None] for speed in self._ends)
+        w = (1 + _GAUSS[0]) / 2
+        done, left = _share(v0, v1, w)
+        every = np.repeat(k, len(w))
+        y = self.elements.find_y(every, done.ravel(), left.ravel())
+        plain = v0 * (1 - w) + v1 * w
+        if self.grid.held:
+            cubic, ahead, rise = self.elements.find_cubic(every, np.tile(w, len(k)))
+            y = np.where(cubic, ahead, y)
+            length = np.diff(self.grid.edges)[every // (DEGREE + 1), 0]
+            mean = np.repeat(self.grid.steps[k] / np.maximum(v0 + v1, _TINY)[:, 0], len(w))
+            own = 1.5 * np.abs(rise) * length * ahead**2 / mean
+            plain = np.where(cubic.reshape(done.shape), own.reshape(done.shape), plain)
+        speed = self.elements.evaluate(every, y)[1].reshape(done.shape)
+        return np.asarray(plain / np.maximum(speed, np.maximum(plain / _STALLED, _TINY)))
+
+    @property
+    def stalls(self) -> bool:
+        """Whether the motion all but stops between two nodes."""
+        v0, v1 = self._ends
+        return bool((v0 + v1 <= _TINY).any() or self._slowness.max() >= _STALLED)
+
+    @cached_property
+    def _clock(self) -> Array:
+        """Legendre coefficients of the time since the start of each such interval, (n, m + 1).
+
+        They are of w, from -1 to 1.
+        """
+        v0, v1 = self._ends
+        mean = self.grid.steps[self.grid.nonempty] / np.maximum(v0 + v1, _TINY)
+        return np.asarray(mean[:, None] * (self._slowness @ _GAUSS[1]))
+
+    def durations(self, fractions: Array) -> Array:
+        """Time from the start of each interval inside elements to a fraction of it, (n, m) [s]."""
+        v0, v1 = (speed[:, None] for speed in self._ends)
+        here = np.sqrt(v0**2 * (1 - fractions) + v1**2 * fractions)
+        w = fractions * (v0 + v1) / np.maximum(v0 + here, _TINY)
+        w = self._find_cubic_share(fractions, w)
+        powers = legendre.legvander(2 * w - 1, _POINTS)
+        return np.asarray(np.einsum("nmp,np->nm", powers, self._clock))
+
+    def _find_cubic_share(self, fractions: Array, w: Array) -> Array:
+        """`w` at fractions of every interval, but the part of y's rise where s is cubic in y."""
+        if not self.grid.held:
+            return w
+        k, count = self.grid.nonempty, len(fractions)
+        every, done = np.repeat(k, count), np.tile(fractions, len(k))
+        cubic, start, rise = self.elements.find_cubic(every, np.zeros(len(every)))
+        here = self.elements.find_y(every, done, 1 - done)
+        share = np.clip((here - start) / rise, 0.0, 1.0)
+        return np.where(cubic, share, w.ravel()).reshape(w.shape)
+
+    @property
+    def duration(self) -> float:
+        """How long the phase lasts [s]."""
+        return float(self.times[-1])
+
+    @property
+    def contacts(self) -> tuple[str, ...]:
+        """Names of the phase's contacts."""
+        return self.curve.formation.names
+
+    def locate(self, t: Array) -> tuple[Array, NDArray[np.int64], Profile]:
+        """Arc length [m], segment and profile at times `t`, each of shape (n,)."""
+        nonempty = self.grid.nonempty
+        n = np.clip(np.searchsorted(self.times[nonempty], t, side="right") - 1, 0, None)
+        k = nonempty[n]
+        local = np.clip(t, 0.0, self.duration) - self.times[k]
+        w, clock = local / (self.times[k + 1] - self.times[k]), self._clock[n]
+        slope = legendre.legder(clock, axis=1)
+        for _ in range(_NEWTON):
+            x = 2 * w - 1
+            late = np.einsum("np,np->n", legendre.legvander(x, _POINTS), clock) - local
+            rate = 2 * np.einsum("np,np->n", legendre.legvander(x, _POINTS - 1), slope)
+            w = np.clip(w - late / rate, 0.0, 1.0)
+        v0, v1 = (speed[n] for speed in self._ends)
+        done, left = _share(v0, v1, w)
+        y = self.elements.find_y(k, done, left)
+        if self.grid.held:
+            cubic, ahead, rise = self.elements.find_cubic(k, w)
+            start = ahead - w * rise
+            way = (ahead**3 - start**3) / ((start + rise) ** 3 - start**3)
+            done, y = np.where(cubic, way, done), np.where(cubic, ahead, y)
+        here, _ = self.elements.evaluate(k, y)
+        s = self.grid.s[k] + done * self.grid.steps[k]
+        return s, self.grid.segment[k], here
+
+    def evaluate(self, t: Array) -> Samples:
+        """Samples at times `t` from the start of the phase, shape (n,) [s]."""
+        s, segment, (a, b, squeeze) = self.locate(np.asarray(t, dtype=float))
+        point = self.curve.evaluate(s)
+        directions = directions_of(self.curve, segment)
+        formation = self.curve.formation
+        forces = inverse(formation, *point[:3], directions, point.kinematics)
+        c_n, c_t = split_forces(formation, forces.c(a, b, squeeze), directions.Xi)
+        return Samples(
+            point.z,
+            point.z_s * np.sqrt(b)[:, None],
+            point.z_s * a[:, None] + point.z_ss * b[:, None],
+            forces.tau(a, b, squeeze),
+            c_n,
+            c_t,
+        )
+
+
+def _share(v0: Array, v1: Array, w: Array) -> tuple[Array, Array]:
+    """Which parts of the way are done and left where the speed is at w between two, from 0 to 1."""
+    total = np.maximum(v0 + v1, _TINY)
+    done = w * (v0 * (2 - w) + v1 * w) / total
+    return done, (1 - w) * (v1 * (1 + w) + v0 * (1 - w)) / total
+
+
+def directions_of(curve: Curve, segment: NDArray[np.int64]) -> Directions:
+    """Directions at n places, given the segment that each belongs to."""
+    Xi = np.array([part.Xi for part in curve.segments])
+    sigma = np.array([part.sigma for part in curve.segments])
+    return Directions(Xi[segment], sigma[segment])

@@ -1,0 +1,280 @@
+"""The planning NLP of one-freedom phases in the path domain: building, bounds, packing.
+
+`terms` has its expressions. Built once for some contacts, intervals and an objective,
+it serves every phase: grid, coefficients and limits are its parameters and bounds. Phases that
+impacts join have an interval of length zero between them (`chain`).
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.arrays import Array, Expression
+from ...common.shortfalls import Parameter
+from ...mechanics.limits import LimitSet
+from ...solvers.ipopt import build_solver
+from ...solvers.statistics import SolverStatistics, book
+from ..options import Objective
+from .elements import Grid, Profile, follow
+from .path_data import PhaseData
+from .terms import CHAINED, LEAST_B, SOFT, LimitShape, NLPColumns, list_columns, write_terms
+from .unique_start import SureStart
+
+
+class Units(NamedTuple):
+    """Units of the NLP, in which its numbers are near 1 whatever the scene's size and mass are."""
+
+    length: float  # [m]
+    time: float  # [s]
+    force: float  # [N]
+    torque: Array  # (2,) [N m]: of each joint
+    power: float  # [(N m)^2]: of the effort's integrand
+    press: float  # [N]: what the hand can press with: a squeeze so large is nothing to be avoided
+
+    @property
+    def profile(self) -> Array:
+        """Units of (b, a, squeeze), shape (3,)."""
+        speed = self.length / self.time
+        return np.array([speed**2, speed / self.time, self.force])
+
+    def of(self, limits: LimitSet) -> Array:
+        """Units of each row of limits, shape (m,)."""
+        of_torque = np.abs(limits.columns[1])
+        return np.where(of_torque.any(axis=1), of_torque @ self.torque, self.force)
+
+
+class Relaxation(NamedTuple):
+    """Which number gives way, and by how much when the relaxation of the NLP grows by 1."""
+
+    parameter: Parameter
+    step: float  # in its unit; that of a speed is of its square, relatively
+
+    def move(self, relaxed: float) -> float:
+        """The parameter when relaxed so far."""
+        value, sign = self.parameter.value, self.parameter.sign
+        if self.parameter.is_speed:
+            return float(value * (1 + relaxed) ** 0.5)
+        return float(value + sign * self.step * relaxed)
+
+
+class Tightening(NamedTuple):
+    """By how much limits at the nodes are tightened so that they hold between nodes too."""
+
+    limits: Array  # (N + 1, n_sides) [N, N m]: of each side of the limits
+    speed_share: Array  # (N + 1,): factor on the largest b
+    duration: float | None  # [s]: longest duration, if there is one
+    missed: Array  # (N + 1, n_sides) [N, N m]: the part of `limits` beyond what was slack anyway
+    # (N + 1, 2, 2): factors on the largest rates of torques, and on the largest commands
+    motors: Array
+
+    @staticmethod
+    def none(data: PhaseData, duration: float | None) -> Tightening:
+        """Limits as they are."""
+        count = len(data.grid.s)
+        limits = np.zeros((count, len(data.spans)))
+        return Tightening(limits, np.ones(count), duration, limits, np.ones((count, 2, 2)))
+
+    def ease(self, spare: Array) -> Tightening:
+        """Tighten less, by what limits are from being missed about each node."""
+        eased = np.minimum(self.missed, spare)
+        return self._replace(limits=self.limits - eased, missed=self.missed - eased)
+
+    def by(
+        self, reach: Array, limits: Array, speed_share: Array, late: float, motors: Array
+    ) -> Tightening:
+        """Tighten further: limits by so much, b, duration and motors by a relative amount.
+
+        Limits are first raised to `reach`, as what is slack already would not feel the rest.
+        """
+        duration = None if self.duration is None else self.duration * (1 - late)
+        raised = np.maximum(self.limits, reach) + limits
+        share = self.speed_share * (1 - speed_share)
+        missed, quick = self.missed + limits, self.motors * (1 - motors)
+        return Tightening(raised, share, duration, missed, quick)
+
+
+@dataclass(frozen=True, eq=False)
+class PathNLP:
+    """A built NLP."""
+
+    solver: Expression  # takes x0, p, bounds and multipliers; see `build_path_nlp` for their order
+    shape: LimitShape
+    intervals: int
+    columns: NLPColumns
+    objective: Objective
+
+    @cached_property
+    def free(self) -> NDArray[np.bool_]:
+        """Which entries of the (N + 1, columns) array of unknowns are not b at an end."""
+        mask = np.ones((self.intervals + 1, self.columns.node.count), dtype=bool)
+        mask[[0, -1], self.columns.node["b"]] = False
+        return mask
+
+
+@lru_cache(maxsize=16)
+def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> PathNLP:
+    """Build the NLP for every phase with limits of a shape; see `terms`."""
+    started = time.perf_counter()
+    nlp = write_terms(shape, intervals, objective)
+    book(SolverStatistics(build_time=time.perf_counter() - started))
+    # Started from nowhere near their optimum, these need the more robust strategy.
+    strategy: dict[str, Any]
+    strategy = {"mu_strategy": "monotone"} if objective in SOFT else {"mu_oracle": "probing"}
+    if shape.motors.slow:
+        # Next to rest slopes of the time are large, by which it would count for little.
+        strategy |= {"nlp_scaling_method": "none"}
+    solver = build_solver("path_nlp", nlp, 1e-9, max_iter=300, **strategy)
+    columns = list_columns(shape, intervals, objective)
+    return PathNLP(solver, shape, intervals, columns, objective)
+
+
+def parameters(
+    nlp: PathNLP,
+    data: PhaseData,
+    units: Units,
+    time_weight: float,
+    relaxation: Relaxation | None = None,
+) -> Array:
+    """Parameters of the NLP, in its units."""
+    terms, unit, (b_unit, a_unit, force) = data.find_terms(), units.of(data.limits), units.profile
+    blocks = {
+        "a": terms.a * a_unit / unit,
+        "b": terms.b * b_unit / unit,
+        "squeeze": terms.squeeze * force / unit,
+        "speed": (terms.speed * np.sqrt(b_unit) / unit)[:, nlp.shape.fast],
+    }
+    torque, motors = unit[list(nlp.shape.torques)], nlp.shape.motors
+    if nlp.objective is Objective.EFFORT or motors.slow:
+        blocks["torque"] = data.nodes.forces.T0 / torque
+    if nlp.objective is Objective.EFFORT:
+        blocks["joints"] = torque**2 / units.power
+    if motors.slow:
+        scene, (rates, commands) = data.curve.formation.scene, map(list, motors)
+        blocks["quick"] = (torque / units.time / data.rate_limit)[rates]
+        blocks["lags"] = scene.actuator_lag[commands] / units.time
+        blocks |= {"bends": data.grid.bends, "sizes": data.grid.sizes}
+    if relaxation is not None:
+        parameter, step = relaxation
+        gives = data.limits.weigh(parameter) * step / unit
+        blocks["gives"] = np.append(gives, parameter.is_speed)
+        blocks["rates"] = data.relative_rates(data.nodes, parameter) ** 2 * b_unit
+    return np.asarray(
+        nlp.columns.p.join(
+            ends=np.zeros(2),
+            steps=data.grid.steps / units.length,
+            weight=[time_weight / units.power],
+            calm=[force / units.press],
+            **{name: block.ravel("F") for name, block in blocks.items()},
+        )
+    )
+
+
+def make_bounds(
+    nlp: PathNLP,
+    data: PhaseData,
+    units: Units,
+    tightening: Tightening,
+    relaxation: Relaxation | None = None,
+    start: SureStart | None = None,
+    pins: tuple[float | None, float | None] = (None, None),
+) -> dict[str, Array]:
+    """Bounds of the NLP, with every limit tightened."""
+    tight, speed_share, duration, *_ = tightening
+    n, node = len(data.grid.s), nlp.columns.node
+    low, high = np.full((n, node.count), -np.inf), np.full((n, node.count), np.inf)
+    b_max = data.largest_b(data.nodes, relaxation.parameter if relaxation else None)
+    # Next to rest b goes with the way: of the least s'' it is twice as much.
+    s, length = data.grid.s, data.grid.s[-1]
+    low[:, 0] = LEAST_B * np.minimum(s, length - s) / length
+    high[:, 0] = np.maximum(b_max * speed_share / units.profile[0], 2 * LEAST_B)
+    if data.grid.held:
+        low[:, 0], high[:, 0] = LEAST_B, high[:, 0] / data.grid.sizes
+    # From rest and to rest, with no way back.
+    if nlp.shape.motors.slow:
+        low[[0, -1], node["a"]] = high[[0, -1], node["a"]] = 0.0
+    else:
+        low[0, node["a"]], high[-1, node["a"]] = LEAST_B, -LEAST_B
+    if start is not None:
+        _, a_unit, force = units.profile
+        low[0, node["a"]] = max(start.least_a / a_unit, LEAST_B)
+        low[0, node["squeeze"]], high[0, node["squeeze"]] = start.low / force, start.high / force
+    for place, pin in zip((0, -1), pins, strict=True):
+        if pin is not None:
+            low[place, node["squeeze"]] = high[place, node["squeeze"]] = pin / units.profile[2]
+    low[:, node["extra"]] = -np.inf if nlp.objective is Objective.MARGIN else 0.0
+    rows, signs, bounds = data.limits.sides
+    # The constant part of what limits are of is on this side.
+    sides = (bounds + signs * tight - data.find_terms().constant[:, rows]) / units.of(data.limits)[
+        rows
+    ]
+    side = np.arange(len(rows)) if nlp.objective in SOFT else rows
+    width = nlp.columns.g.sizes["limits"] // n
+    rows_low, rows_high = np.full((n, width), -np.inf), np.full((n, width), np.inf)
+    rows_low[:, side[signs > 0]] = sides[:, signs > 0]
+    rows_high[:, side[signs < 0]] = sides[:, signs < 0]
+    if nlp.objective is Objective.RELAX:
+        rows_high[:, -1] = 1.0
+    late = nlp.columns.g.sizes["duration"]
+    equal = np.zeros(nlp.columns.g["limits"].start)
+    longest = np.full(late, (duration or np.inf) / units.time)
+    quick_low, quick_high = _bound_motors(nlp, data, units, tightening.motors)
+    return {
+        "lbx": low[nlp.free],
+        "ubx": high[nlp.free],
+        "lbg": np.concatenate([equal, rows_low.ravel(), np.full(late, -np.inf), quick_low]),
+        "ubg": np.concatenate([equal, rows_high.ravel(), longest, quick_high]),
+    }
+
+
+def _bound_motors(
+    nlp: PathNLP, data: PhaseData, units: Units, shares: Array
+) -> tuple[Array, Array]:
+    """Bounds of the rows of `motor_terms`."""
+    rates, commands = map(list, nlp.shape.motors)
+    sizes, torque = nlp.columns.g.sizes, units.of(data.limits)[list(nlp.shape.torques)]
+    most = shares[:, 1] * data.torque_limit / torque
+    within = np.concatenate([shares[:, 0, rates].ravel("F"), most[:, commands].ravel("F")])
+    joins, begins = np.zeros(sizes["joins"]), np.full(sizes["begins"] // 2, LEAST_B)
+    low = np.concatenate([-within, joins, begins, -np.inf * begins])
+    return low, np.concatenate([within, joins, np.inf * begins, -begins])
+
+
+def pack(
+    nlp: PathNLP,
+    profile: Profile,
+    units: Units,
+    extra: float | Array,
+    sizes: Array | float = 1.0,
+) -> Array:
+    """Unknowns of the NLP, in its units, from a profile and what its objective adds.
+
+    That is the least margin [N], the relaxation, or shortfalls in the units of the limits. With
+    the `sizes` of b on its grid.
+    """
+    table = np.empty(nlp.free.shape)
+    table[:, nlp.columns.node["extra"]] = extra / _margin_unit(nlp, units)
+    table[:, :3] = np.column_stack([profile.b, profile.a, profile.squeeze]) / units.profile
+    table[:, 0] /= sizes
+    return np.asarray(table[nlp.free])
+
+
+def _margin_unit(nlp: PathNLP, units: Units) -> float:
+    return units.force if nlp.objective is Objective.MARGIN else 1.0
+
+
+def unpack(nlp: PathNLP, grid: Grid, x: Array, units: Units) -> tuple[Profile, float]:
+    """Profile of a solution, and the least margin [N] or the relaxation if that is an unknown.
+
+    b is integrated again from a, so that b' = 2 a holds to rounding and not to Ipopt's tolerance.
+    """
+    table = np.zeros(nlp.free.shape)
+    table[nlp.free] = x
+    a, squeeze = table[:, 1] * units.profile[1], table[:, 2] * units.profile[2]
+    margin = x[-1] * _margin_unit(nlp, units) if nlp.objective in CHAINED else 0.0
+    return follow(grid, a, squeeze), float(margin)

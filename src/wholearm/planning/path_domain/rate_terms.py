@@ -1,0 +1,200 @@
+"""Rows of the planning NLP for motors that are not infinitely quick.
+
+With the local variable y of an element (`elements`), d tau / dt = (d tau / dy) (dy / dt). At the
+nodes d tau / dy is that of the polynomial through the torques there, and dy / dt the pace over the
+element's length. Where two elements meet the torques are the same: there, and where a direction
+reverses, s'' and the squeeze take the steps that friction takes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import casadi as ca
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from ...common.arrays import Array, Expression
+from ...scene.model import Scene
+from .elements import (
+    DEGREE,
+    FROM_HOLD,
+    FROM_REST,
+    INSIDE,
+    SIGNS,
+    TO_HOLD,
+    TO_REST,
+    Elements,
+    Profile,
+    find_basis,
+)
+from .interpolation import PLACES
+from .path_data import PhaseData
+from .path_motion import PathMotion
+
+if TYPE_CHECKING:
+    from ..columns import Symbols
+
+
+_LOOKS = 21
+"""Instants of each interval at which rates are looked at."""
+_NODES = DEGREE + 1
+
+
+class MotorShape(NamedTuple):
+    """Joints whose torques have a largest rate, and those whose torques follow a command."""
+
+    rates: tuple[int, ...] = ()
+    commands: tuple[int, ...] = ()
+
+    @staticmethod
+    def of(scene: Scene) -> MotorShape:
+        """The shape of a scene's motors."""
+        if not scene.has_slow_motors:
+            return QUICK
+        limited, lags = np.isfinite(scene.torque_rate_limit), scene.actuator_lag > 0
+        return MotorShape(*(tuple(np.flatnonzero(own).tolist()) for own in (limited, lags)))
+
+    @property
+    def slow(self) -> tuple[int, ...]:
+        """Joints whose torques may not step."""
+        return tuple(sorted({*self.rates, *self.commands}))
+
+    def list_sizes(self, intervals: int) -> dict[str, int]:
+        """Numbers of rows of each kind."""
+        n, joints = intervals + 1, len(self.slow)
+        return {
+            "rates": n * len(self.rates),
+            "commands": n * len(self.commands),
+            "joins": (n // _NODES - 1) * joints,
+            "begins": 2 * bool(joints),
+        }
+
+
+QUICK = MotorShape()
+"""Motors whose torques may step."""
+
+
+def list_kinds(count: int, held: bool) -> list[int]:
+    """Kinds of so many elements from rest to rest."""
+    start, stop = (FROM_HOLD, TO_HOLD) if held else (FROM_REST, TO_REST)
+    return [start, *[INSIDE] * (count - 2), stop]
+
+
+def find_first_slopes(a: Expression) -> tuple[Expression, Expression]:
+    """How s'' grows with y where the motion starts and where it ends, measured from there."""
+    basis = find_basis()
+    start = ca.DM(basis.to_powers[FROM_HOLD][1]).T @ a[:_NODES]
+    return start, ca.DM(basis.to_powers[TO_HOLD][1]).T @ a[-_NODES:]
+
+
+def write_motor_rows(
+    shape: MotorShape,
+    given: Symbols,
+    torques: Expression,
+    a: Expression,
+    paces: Expression,
+    lengths: Expression,
+) -> dict[str, Expression]:
+    """Rows of each kind of `MotorShape.list_sizes`.
+
+    Parameters
+    ----------
+    given             of the parameters `quick`, one over each largest rate, and `lags`
+    torques : (n, 2)
+    a : (n,)
+    paces, lengths : (p + 1, E), (1, E)  dy/dt times the element's length, and that
+    """
+    if not shape.slow:
+        none = ca.SX(0, 1)
+        return {"rates": none, "commands": none, "joins": none, "begins": none}
+    rates = {joint: _differentiate(torques[:, joint], paces, lengths) for joint in shape.slow}
+    rows = [given.quick[k] * rates[joint] for k, joint in enumerate(shape.rates)]
+    lagged = [
+        torques[:, joint] + given.lags[k] * rates[joint] for k, joint in enumerate(shape.commands)
+    ]
+    joins = [torques[_NODES::_NODES, j] - torques[DEGREE:-1:_NODES, j] for j in shape.slow]
+    return {
+        "rates": ca.vertcat(ca.SX(0, 1), *rows),
+        "commands": ca.vertcat(ca.SX(0, 1), *lagged),
+        "joins": ca.vertcat(*joins),
+        "begins": ca.vertcat(*find_first_slopes(a)),
+    }
+
+
+def _differentiate(values: Expression, paces: Expression, lengths: Expression) -> Expression:
+    """Time derivative at the nodes of what has these values there, shape (n,)."""
+    table, count = ca.reshape(values, _NODES, -1), lengths.numel()
+    slopes = [ca.DM(slope) for slope in list_slopes()]
+    columns = [slopes[kind] @ table[:, e] for e, kind in enumerate(list_kinds(count, True))]
+    return ca.vec(ca.horzcat(*columns) * paces / ca.repmat(lengths, _NODES, 1))
+
+
+def list_slopes() -> list[Array]:
+    """What takes values at the nodes of each kind of element to their slopes over y there.
+
+    Over 1 - y where y falls with time.
+    """
+    basis, powers = find_basis(), np.arange(_NODES)
+    slopes = []
+    for sign, y, to_powers in zip(SIGNS, basis.y, basis.to_powers, strict=True):
+        rises = powers * y[:, None] ** np.maximum(powers - 1, 0)
+        slopes.append(sign * rises @ to_powers)
+    return slopes
+
+
+def find_torques(
+    data: PhaseData, profile: Profile, motions: Sequence[PathMotion]
+) -> tuple[Array, Array]:
+    """Torques and their rates, shape (n_solid, looks, 2) [N m, N m/s], at evenly spaced instants.
+
+    Of the polynomials in time through torques within each interval.
+    """
+    checks = data.sampling.checks
+    every = (len(checks) - 1) // (PLACES - 1)
+    picked = np.arange(len(checks)) % every == 0
+    fractions, count = checks[picked], len(data.nonempty)
+    places = data.checks.pick(np.tile(picked, count))
+    values = places.forces.tau(*data.interpolate(profile, fractions)).reshape(count, -1, 2)
+    spans = np.concatenate([motion.durations(fractions) for motion in motions])
+    degree, lasts = len(fractions) - 1, np.maximum(spans[:, -1], np.finfo(float).tiny)
+    through = chebyshev.chebvander(2 * spans / lasts[:, None] - 1, degree)
+    # Where two places fall on one instant no polynomial goes through both.
+    modes = np.linalg.solve(through + 1e-300, values)
+    looks = np.linspace(-1, 1, _LOOKS)
+    slopes = chebyshev.chebder(np.eye(degree + 1), axis=0)
+    torques = chebyshev.chebvander(looks, degree) @ modes
+    rates = chebyshev.chebvander(looks, degree - 1) @ slopes @ modes
+    return np.asarray(torques), np.asarray(rates * (2 / lasts)[:, None, None])
+
+
+def find_hurry(data: PhaseData, profile: Profile, motions: Sequence[PathMotion]) -> Array:
+    """By how much rates and commands are beyond their limits in each interval, relatively.
+
+    Shape (n_solid, 2, 2): of rates, then of commands, of each joint.
+    """
+    scene = data.curve.formation.scene
+    if not data.grid.held:
+        return np.zeros((len(data.nonempty), 2, 2))
+    torques, rates = find_torques(data, profile, motions)
+    rate = np.abs(rates).max(axis=1) / data.rate_limit
+    lags = scene.actuator_lag
+    command = np.abs(torques + lags * rates).max(axis=1) / data.torque_limit
+    return np.asarray(np.maximum(np.stack([rate, command * (lags > 0)], axis=1) - 1, 0.0))
+
+
+def exceeds_rates(data: PhaseData, profile: Profile) -> bool:
+    """Whether torques change too fast, or commands are too large, at the nodes of a motion."""
+    scene = data.curve.formation.scene
+    if not data.grid.held:
+        return False
+    grid, nodes = data.grid, DEGREE + 1
+    kinds, stretch = grid.kinds, Elements(grid, profile).stretch
+    speed = np.sqrt(profile.b).reshape(-1, nodes)
+    pace = speed / np.maximum(stretch, 1e-6) / np.diff(grid.edges)
+    tau = data.nodes.forces.tau(*profile).reshape(-1, nodes, 2)
+    rates = np.stack(list_slopes())[kinds] @ tau * pace[..., None]
+    command = np.abs(tau + scene.actuator_lag * rates)
+    quick = (np.abs(rates) > data.rate_limit).any()
+    return bool(quick or (command * (scene.actuator_lag > 0) > data.torque_limit).any())

@@ -1,0 +1,301 @@
+"""What `solve` checks of its own plan, and how it refines what does not hold.
+
+The plan is replayed in the simulator, which is told the torques and nothing else, and the equations
+of motion are written out anew for its samples (`verification.newton_euler`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..common.errors import (
+    InfeasibleError,
+    JammingError,
+    ReplayError,
+    SimulationError,
+    SolverError,
+)
+from ..problem.definition import Problem
+from ..results.replay_figures import LeastForce, ReplayedPhase, ReplayFigures
+from ..results.report import Report
+from ..results.trajectory import Samples, Trajectory, assemble
+from ..scene.model import Scales
+from ..verification.newton_euler import balance
+from ..verification.verdict import Allowance, find_least_force, measure_departure
+from ..verification.verify import judge, observe
+from .block_plan import PLAIN, BlockPlan, Planning
+from .blocks import plan_alone, press_more, refine_block
+
+REFINEMENTS = 3
+"""Most doublings of the intervals of a block."""
+ROUGH = 2
+"""Most doublings in the time domain, before contact modes are left as they come: a plan that hangs
+on a contact that comes to rest need not hold, however fine it is."""
+STRICT = 0.5
+"""Share of what `verify` allows that a plan may use, if another plan is to be had."""
+DIP = 2e-3
+"""Largest shortfall of a normal force, over the scene's force, that pressing more is to mend."""
+SPARE = 2.0
+"""How much more a plan is then to press, over that shortfall."""
+RESIDUAL = 1e-8
+"""Largest residual of the equations of motion, relative to the scene's force or torque, length or
+speed: rounding leaves 1e-13."""
+DENSE = 201
+"""Rows per phase for the equations of motion, if the trajectory has not half as many."""
+
+
+class Residual(NamedTuple):
+    """What the equations of motion miss at worst."""
+
+    size: float  # relative to the scene's force or torque, length or speed
+    phase: int  # number of the phase
+    text: str  # where, and of what
+
+
+class ReplayCheck(NamedTuple):
+    """A plan's own replay and its residual."""
+
+    # what the replay has shown, or what it has ended with, since it cannot go on
+    report: Report | JammingError | SimulationError
+    residual: Residual
+
+    @property
+    def failure(self) -> tuple[int, str] | None:
+        """Number of the phase that fails, and the reason; None if the plan holds."""
+        if self.residual.size > RESIDUAL:
+            return self.residual.phase, self.residual.text
+        if not isinstance(self.report, Report):
+            return self.report.phase or 1, str(self.report)
+        if self.report.ok:
+            return None
+        assert self.report.failed_phase is not None
+        return self.report.failed_phase, self.report.reason
+
+    def find_culprit(self, scales: Scales, allowance: Allowance, durations: Array) -> int:
+        """Number of the phase to refine: the first that departs or does not stop, or that fails.
+
+        What is left of the speed at a stop must not carry the phase that follows away, either.
+
+        Parameters
+        ----------
+        durations : (n_phases,) [s]
+        """
+        assert self.failure is not None
+        following = dict(enumerate(durations[1:].tolist(), start=1))
+        for phase in self.report.phases if isinstance(self.report, Report) else ():
+            departs = (
+                phase.deviation is not None
+                and measure_departure(phase.deviation, scales.length) > allowance.departure
+            )
+            speed = phase.end_speed or 0.0
+            carried = speed * following.get(phase.number, 0.0)
+            fast = speed > allowance.rest_speed * scales.speed
+            if departs or fast or carried > allowance.departure * scales.length:
+                return min(phase.number, self.failure[0])
+        return self.failure[0]
+
+
+class Checked(NamedTuple):
+    """What the replay of a planning has shown."""
+
+    trajectory: Trajectory
+    strictly: ReplayCheck  # with some of what `verify` allows to spare
+    usually: ReplayCheck  # by what it allows
+    scales: Scales
+
+    @staticmethod
+    def of(problem: Problem, trajectory: Trajectory) -> Checked:
+        """Replay a trajectory."""
+        usual, strict = Allowance(), Allowance().scale(STRICT)
+        strictly, usually = check_plan(problem, trajectory, strict, usual)
+        return Checked(trajectory, strictly, usually, problem.scene.scales)
+
+    @property
+    def culprit(self) -> int | None:
+        """Number of the phase to plan anew; None if the plan holds."""
+        if self.strictly.failure is None:
+            return None
+        durations = np.diff(self.trajectory.phase_starts)
+        return self.strictly.find_culprit(self.scales, Allowance().scale(STRICT), durations)
+
+
+def replay_plan(
+    planning: Planning,
+    trajectory: Trajectory,
+    build: Callable[[Planning], Trajectory],
+    report: Callable[[str], None],
+    checked: Checked | None = None,
+) -> tuple[Planning, Trajectory, ReplayFigures]:
+    """Replay a plan, refine the blocks that do not hold, and return what does, with its figures.
+
+    Parameters
+    ----------
+    trajectory  that of `planning`
+    build       gives the trajectory of another planning
+    report      told in a few words what is being done
+    checked     what the first replay has shown, if it is known. Then it is enough that it is
+                accepted.
+
+    Raises
+    ------
+    ReplayError  if a block does not hold with finer intervals either
+    """
+    problem = planning.problem
+    simulations, known = 0, None
+    while True:
+        simulations += 1
+        if checked is None:
+            report("replaying the plan")
+            found = Checked.of(problem, trajectory)
+        else:
+            usually = checked.usually
+            found = checked if usually.failure else checked._replace(strictly=usually)
+        checked, check, accepted = None, found.strictly, found.usually
+        if check.failure is None:
+            break
+        if accepted.failure is None:
+            known = planning, trajectory, accepted
+        number = found.culprit
+        assert number is not None
+        better = _improve(planning, number, accepted.failure is not None, report)
+        if better is None and accepted.failure is not None:
+            better = _press_more(planning, number, accepted, report)
+        if better is None and known is not None:
+            planning, trajectory, check = known
+            break
+        if better is None:
+            block = planning.blocks[planning.find_block(number)]
+            raise ReplayError(_describe(block, number, accepted))
+        planning, trajectory = better, build(better)
+    return planning, trajectory, _collect_figures(planning, check, simulations)
+
+
+def _improve(
+    planning: Planning, number: int, fails: bool, report: Callable[[str], None]
+) -> Planning | None:
+    """Another plan of the block with phase `number`, if any; `fails`: the plan is not accepted."""
+    alone = plan_alone(planning, report) if fails else None
+    if alone is not None:
+        # Short phases that a landing leaves magnify what is left of the speed at its stop.
+        return alone
+    index = planning.find_block(number)
+    block, refined = planning.blocks[index], None
+    most = (REFINEMENTS if block.chain else ROUGH) if fails else 1
+    if PLAIN != block.finer < most and not block.is_finest:
+        refined = _refine(planning, index, report)
+    if refined is None and fails and block.has_searched and block.finer != PLAIN:
+        refined = _refine(planning, index, report, plain=True)
+    return refined
+
+
+def _press_more(
+    planning: Planning, number: int, check: ReplayCheck, report: Callable[[str], None]
+) -> Planning | None:
+    """A plan of the block with phase `number` in whose replay c_n may fall by what it does now.
+
+    Where a contact slides the other way a replay may stick for an instant, with another force.
+    """
+    index, problem = planning.find_block(number), planning.problem
+    if not isinstance(check.report, Report) or index in planning.more:
+        return None
+    block, force = planning.blocks[index], problem.scene.scales.force
+    own = [
+        phase for phase in check.report.phases if problem.phases[phase.number - 1] in block.phases
+    ]
+    short = -min((c.margin for phase in own for c in phase.contacts), default=0.0)
+    if not 0.0 < short < DIP * force:
+        return None
+    try:
+        return press_more(planning, index, SPARE * short, report)
+    except (InfeasibleError, SolverError):
+        return None
+
+
+def check_plan(
+    problem: Problem, trajectory: Trajectory, *allowances: Allowance
+) -> list[ReplayCheck]:
+    """Replay a plan, and see what its samples leave of the equations of motion.
+
+    Returns
+    -------
+    list of Check
+        By each of the allowances.
+    """
+    residual = find_residual(problem, trajectory)
+    try:
+        seen = observe(problem, trajectory.torque, trajectory)
+    except (JammingError, SimulationError) as error:
+        return [ReplayCheck(error, residual) for _ in allowances]
+    return [ReplayCheck(judge(seen, allowance), residual) for allowance in allowances]
+
+
+def find_residual(problem: Problem, trajectory: Trajectory) -> Residual:
+    """What the samples of a trajectory leave of the equations of motion, at worst."""
+    if len(trajectory.t) < DENSE / 2 * len(trajectory.motions):
+        trajectory = assemble(trajectory.motions, trajectory.torque, {}, DENSE)
+    worst = Residual(0.0, 1, "")
+    for phase in problem.phases:
+        # Where it is held at its end forces are not determined.
+        rows = (trajectory.phase == phase.index) & ~trajectory.held
+        formation, motion = phase.formation, trajectory.motions[phase.index]
+        columns = [trajectory.contacts.index(name) for name in motion.contacts]
+        contacts = {contact.name: contact for contact in formation.contacts}
+        samples = Samples(
+            trajectory.z[rows],
+            trajectory.z_dot[rows],
+            trajectory.z_ddot[rows],
+            trajectory.tau[rows],
+            trajectory.c_n[rows][:, columns],
+            trajectory.c_t[rows][:, columns],
+        )
+        own = [contacts[name] for name in motion.contacts]
+        left = balance(problem.scene, own, formation.rolling, samples)
+        size, row, text = left.find_worst()
+        if not size <= worst.size:
+            when = f"at t = {trajectory.t[rows][row]:.5g} s, phase {phase.number}"
+            worst = Residual(size, phase.number, f"{text} {when}")
+    return worst
+
+
+def _refine(
+    planning: Planning, index: int, report: Callable[[str], None], plain: bool = False
+) -> Planning | None:
+    """The planning with another plan of a block; None if there is none."""
+    try:
+        return refine_block(planning, index, report, plain)
+    except (InfeasibleError, SolverError):
+        return None
+
+
+def _describe(block: BlockPlan, number: int, check: ReplayCheck) -> str:
+    """The error for a plan that does not hold, from phase `number` of a block on."""
+    assert check.failure is not None
+    reason = check.failure[1]
+    finer = f", with {2**block.finer} times the intervals" if block.finer > 0 else ""
+    return (
+        f"the plan of phase {number} does not hold in its replay{finer}: {reason}; other intervals "
+        "or another objective may do, and --no-replay (replay=False) leaves the check out"
+    )
+
+
+def _collect_figures(planning: Planning, check: ReplayCheck, simulations: int) -> ReplayFigures:
+    """What a plan keeps of its replay."""
+    assert isinstance(check.report, Report)
+    found = [(find_least_force(phase), phase.number) for phase in check.report.phases]
+    known = [(least, number) for least, number in found if least is not None]
+    least, number = min(known, key=lambda pair: pair[0].least)
+    return ReplayFigures(
+        LeastForce(least.least, least.contact, number, least.time),
+        tuple(
+            ReplayedPhase(own.arrival, own.end_speed, own.end_deviation, own.deviation)
+            for own in check.report.phases
+        ),
+        check.residual.size,
+        tuple(block.finer for block in planning.blocks for _ in block.phases),
+        check.report.steps,
+        simulations,
+    )

@@ -1,0 +1,231 @@
+"""What a motion in the time domain misses between its collocation points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.arrays import Array
+from ...common.quadrature import find_minima
+from ...mechanics.limits import PRESS, LimitSet, make_limits
+from ...results.trajectory import Samples
+from .equations import SLIDING, least_senses
+from .nlp_layout import StageLayout
+from .stage import Stage
+from .time_limits import LimitRows, bound_by_limits
+from .time_motion import StageMotion
+from .time_nlp import TimeNLP
+from .time_rate_limits import find_relieved
+
+MISS = 2.5e-7
+"""Largest miss of a force limit between points, over the weight of the object."""
+GRAZE = 3e-7
+"""Deepest overlap between points, over the radius of gyration."""
+FALTER = 0.1
+"""Deepest fall of a rate below half of the least one between points, over the least one: friction
+might hold in a replay what turns there for an instant."""
+CHECKS = 25
+"""Places per interval at which limits are checked."""
+_OVER = 1.5
+"""Factor on the miss by which a limit is tightened at first."""
+_AMPLE = 1e3
+"""Slack, over what is much for a limit, of what does not count."""
+_MOST = (_OVER, 4.0, 4.0)
+"""The same at most, of forces, gaps and senses, where tightening has made the miss little less:
+forces have a price."""
+
+
+class IntersampleLimits(NamedTuple):
+    """Amounts by which limits of one stage are missed or raised, never negative."""
+
+    # (K, n_sides): of each side of the limits of forces, torques and speeds, over what is much for
+    # it
+    held: Array
+    gap: Array  # (K, n_monitored)
+    sense: Array  # (K, n_c + 2): of the rates of contacts and joints; nothing of rolling contacts
+
+    @staticmethod
+    def none(stage: Stage) -> IntersampleLimits:
+        """Nothing is raised."""
+        formation = stage.formation
+        sides = len(make_limits(formation, 0.0).sides[0])
+        widths = (sides, len(stage.monitored), formation.n_contacts + 2)
+        return IntersampleLimits(*(np.zeros((stage.intervals, width)) for width in widths))
+
+    @property
+    def worst(self) -> float:
+        """The largest, over what is allowed."""
+        return float(self._over.max(initial=0.0))
+
+    def list_missed(self) -> NDArray[np.bool_]:
+        """Which intervals miss more than is allowed, shape (K,)."""
+        return np.asarray(self._over > 1.0)
+
+    @property
+    def _over(self) -> Array:
+        """The largest of each interval, over what is allowed, shape (K,)."""
+        allowed = (MISS, GRAZE, FALTER * SLIDING)
+        parts = (t.max(axis=1, initial=0.0) / a for t, a in zip(self, allowed, strict=True))
+        return np.asarray(np.max(list(parts), axis=0))
+
+
+class Raised(NamedTuple):
+    """What limits of one stage are raised by, and what has led to that."""
+
+    limits: IntersampleLimits  # by how much they are raised
+    missed: IntersampleLimits  # by how much they were missed before they were raised last
+    added: IntersampleLimits  # by how much they were raised then
+
+    @staticmethod
+    def none(stage: Stage) -> Raised:
+        """Nothing is raised."""
+        return Raised(*(3 * [IntersampleLimits.none(stage)]))
+
+    def further(self, misses: IntersampleLimits) -> Raised:
+        """Raised by more than the misses, as much as the last time has shown to be needed."""
+        limits, added = list[Array](), list[Array]()
+        for raised, before, last, miss, most in zip(*self, misses, _MOST, strict=True):
+            # What was raised before has made the miss less by this share of it.
+            share = np.divide(before - miss, last, out=np.ones_like(miss), where=last > 0)
+            added.append(miss * np.clip(1 / np.maximum(share, 1 / most), _OVER, most))
+            limits.append(raised + added[-1])
+        return Raised(IntersampleLimits(*limits), misses, IntersampleLimits(*added))
+
+
+class CheckPlaces(NamedTuple):
+    """A stage at `CHECKS` places of each of its K intervals, one after the other."""
+
+    places: Array  # (K CHECKS,): shares of the duration
+    samples: Samples  # motion and forces there
+    limits: Array  # (K CHECKS, n_limits) [m]: values of every limit of the formation
+
+
+def check_between(stage: Stage, motion: StageMotion) -> CheckPlaces:
+    """Motion, forces and limits of a stage at the checks between its points."""
+    places = stage.guess.places(np.linspace(1e-9, 1 - 1e-9, CHECKS)).ravel()
+    samples = motion.evaluate(places * motion.duration)
+    return CheckPlaces(places, samples, stage.formation.evaluate_limits(samples.z))
+
+
+def find_misses(
+    stage: Stage,
+    check: CheckPlaces,
+    epsilon: float,
+    margin: float = 0.0,
+    swings: Array | float = 0.0,
+) -> IntersampleLimits:
+    """By how much limits are missed in each interval, at worst.
+
+    Parameters
+    ----------
+    epsilon, margin               least c_n, and what c_n but no friction cone has to exceed it by
+    swings : (K CHECKS, n_sides)  what each side has to exceed its bound by too, over what is much
+                                  for it
+    """
+    samples, limits = check.samples, make_limits(stage.formation, epsilon)
+    clear = stage.list_clearances(check.places, after=1 / 2) / 2
+    # What a stage is short of where it starts, no bound within it can mend.
+    values = check.limits[:, list(stage.monitored)]
+    values = values - np.minimum(values[:1], 0.0)
+    relieved = np.repeat(np.where(find_relieved(stage, limits), _AMPLE, 0.0), CHECKS, axis=0)
+    tables = (
+        _find_slack(stage, limits, samples, margin) - swings + relieved,
+        values - clear,
+        _measure_senses(stage, samples) - 0.5 * least_senses(stage, check.places),
+    )
+    shape = (stage.intervals, CHECKS)
+    slack = (find_minima(table.reshape(*shape, table.shape[1])) for table in tables)
+    return IntersampleLimits(*(np.maximum(-part, 0.0) for part in slack))
+
+
+def _find_slack(stage: Stage, limits: LimitSet, samples: Samples, margin: float) -> Array:
+    """How far each side of the limits is from being missed, over what is much, shape (n, n_sides).
+
+    Torques alone are linear between places where they are bounded, and miss nothing.
+    """
+    c = [samples.c_n, samples.c_t[:, list(stage.formation.rolling_rows)]]
+    values = np.hstack([*c, samples.tau, samples.z_dot[:, 3:]]) @ limits.rows.T
+    values[:, limits.of(PRESS)] -= margin
+    slack = limits.find_slack(values) / limits.scales[limits.sides[0]]
+    of_c, _, of_rates = limits.columns
+    bent = np.flatnonzero(of_c.any(axis=1) | of_rates.any(axis=1))
+    slack[:, ~np.isin(limits.sides[0], bent)] = 0.0
+    return slack
+
+
+def _measure_senses(stage: Stage, samples: Samples) -> Array:
+    """Rates in a stage's directions, shape (n, n_c + 2); 1 for contacts that do not rub."""
+    senses, formation = stage.measure_senses(samples.z, samples.z_dot), stage.formation
+    senses[:, np.delete(np.arange(formation.n_contacts), formation.rubbing_rows)] = 1.0
+    return senses
+
+
+def monitor_missed(stages: Sequence[Stage], checks: Sequence[CheckPlaces]) -> list[Stage] | None:
+    """Stages that also monitor the limits which are broken between points; None if none is."""
+    changed = []
+    for stage, check in zip(stages, checks, strict=True):
+        values = check.limits.reshape(stage.intervals, CHECKS, -1)
+        deepest = -GRAZE * stage.formation.scene.scales.length
+        broken = np.flatnonzero(find_minima(values).min(axis=0) < deepest).tolist()
+        changed.append(replace(stage, monitored=tuple(sorted({*stage.monitored, *broken}))))
+    news = [one.monitored != other.monitored for one, other in zip(changed, stages, strict=True)]
+    return changed if any(news) else None
+
+
+def raise_bounds(
+    nlp: TimeNLP,
+    stages: Sequence[Stage],
+    limits: Sequence[IntersampleLimits],
+    bounds: tuple[Array, Array],
+) -> tuple[Array, Array]:
+    """Bounds of the NLP's rows; raises `bounds`, those of its unknowns, in place."""
+    low, high = nlp.rows.bounds
+    low_x, high_x = bounds
+    for k, (stage, raised) in enumerate(zip(stages, limits, strict=True)):
+        own, layout = nlp.rows_of[k], nlp.layouts[k]
+        kept = own.limits.limits
+        rows, signs, values = kept.sides
+        more = raised.held * kept.scales[rows]
+        # What passes from or to no force keeps that alone.
+        more = np.where(find_relieved(stage, kept), -signs * values, more)
+        pressed = own.limits.pressed
+        floor = values[pressed] + more[:, pressed]
+        # Where rows hold c_n at the points too, its own bounds must not.
+        if own.limits.alone:
+            low_x[layout.forces[..., : stage.formation.n_contacts]] = floor[:, None]
+        low[own.limits.presses] = floor[:, None]
+        others = own.limits.sides
+        low[own.limits.others] = ((signs * values)[others] + more[:, others])[:, None]
+        for held in (layout.begin, layout.finish):
+            low_x[held[: stage.formation.n_contacts]] = values[pressed][: len(held)]
+        _free_equal(stage, own.limits, layout, (low_x, low))
+        bound_by_limits(own.limits, layout, bounds, more)
+        low[own.monitor_rows] += raised.gap[:, None]
+        low[own.senses] += raised.sense[:, None, list(stage.formation.rubbing_rows)]
+        for joint, sigma in enumerate(stage.directions.sigma):
+            rates, faster = layout.v[..., 3 + joint], raised.sense[:, -2 + joint, None]
+            low_x[rates] += faster * (sigma > 0)
+            high_x[rates] -= faster * (sigma < 0)
+    return low, high
+
+
+def _free_equal(
+    stage: Stage, rows: LimitRows, layout: StageLayout, lows: tuple[Array, Array]
+) -> None:
+    """Take bounds away, in place, where equations say what a force is."""
+    if not stage.formation.scene.has_slow_motors:
+        return
+    low_x, low = lows
+    for contact, slips in stage.fading:
+        if slips:
+            names = [rows.limits.limits[k].part for k in rows.limits.owners]
+            own = [names[k] == stage.formation.names[contact] for k in rows.limits.sides[0]]
+            low[rows.others[-1, -1, np.array(own)[rows.sides]]] = -np.inf
+        else:
+            low_x[layout.forces[-1, -1, contact]] = -np.inf
+            low[rows.presses[-1, 1:2, contact]] = -np.inf
+    low[rows.presses[0, 0, list(stage.growing)]] = -np.inf

@@ -1,0 +1,221 @@
+"""Modes of stages: which way each contact slides and each joint turns, and what rolls.
+
+A sequence of stages is linked by what their modes say of the places between them: a contact that
+slides the other way in the next stage, or rolls there, has come to rest, and so has a joint that
+turns the other way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from ...contacts.elemental import Contact
+from ...contacts.formation import Formation
+from ...mechanics.dynamics import Directions, split_forces
+from ...scene.model import Scene
+from .collocation import Scheme
+from .stage import Stage, StagePoints
+from .stage_kernels import new_rows
+from .time_mesh import resample
+
+LEAST_INTERVALS = 3
+"""Fewest intervals of a stage."""
+
+
+class StageMode(NamedTuple):
+    """How the contacts and joints of a stage move."""
+
+    # directions in which contacts slide and joints turn, by rows of (contacts, joints); zero for
+    # what rolls
+    signs: tuple[float, ...]
+
+    def changed(self, rows: Sequence[int], sign: float) -> StageMode:
+        """The mode with another direction of rows, that of the first one; others turn with it."""
+        turn = sign * self.signs[rows[0]]
+        return StageMode(
+            tuple((turn * s or sign) if k in rows else s for k, s in enumerate(self.signs))
+        )
+
+
+def mode_of(stage: Stage) -> StageMode:
+    """The mode of a stage."""
+    signs = np.concatenate(stage.directions)
+    signs[list(stage.formation.rolling_rows)] = 0.0
+    return StageMode(tuple(signs.tolist()))
+
+
+def sign_sequence(stages: Sequence[Stage]) -> tuple[tuple[int, StageMode], ...]:
+    """What tells sequences of modes apart: the phase and the mode of each stage."""
+    return tuple((stage.phase, mode_of(stage)) for stage in stages)
+
+
+@lru_cache(maxsize=64)
+def _roll(scene: Scene, contacts: tuple[Contact, ...], rows: tuple[int, ...]) -> Formation:
+    """A formation by its rolling contacts; always the same object, since kernels are kept by it."""
+    return Formation(scene, contacts, tuple(contacts[k] for k in rows))
+
+
+def in_mode(stage: Stage, mode: StageMode) -> Stage:
+    """A stage in another mode; the tangential forces of what rolls are those that it has."""
+    if mode == mode_of(stage):
+        return stage
+    formation, part = stage.formation, stage.guess
+    n_c = formation.n_contacts
+    signs = np.array(mode.signs)
+    rows = tuple(k for k in range(n_c) if signs[k] == 0)
+    # Without a direction there is none that friction could push against.
+    directions = Directions(np.where(signs[:n_c] == 0, 1.0, signs[:n_c]), signs[n_c:])
+    if rows != formation.rolling_rows:
+        c_n, c_t = split_forces(formation, part.forces, stage.directions.Xi)
+        part = part._replace(forces=np.concatenate([c_n, c_t[..., list(rows)]], axis=-1))
+        formation = _roll(formation.scene, formation.contacts, rows)
+    return replace(stage, formation=formation, directions=directions, guess=part)
+
+
+def link(stages: Sequence[Stage]) -> list[Stage]:
+    """Stages of which each ends as its mode and that of the next one ask for."""
+    linked = list[Stage]()
+    for stage, coming in zip(stages, [*stages[1:], None], strict=True):
+        turns: tuple[int, ...] = ()
+        gained, fading = None, tuple[tuple[int, float], ...]()
+        growing = find_fresh(linked[-1], stage) if linked and not linked[-1].ends_in_impact else ()
+        if coming is not None and not stage.ends_in_impact:
+            turns, fading = find_turns(stage, coming), find_passing(stage, coming)
+            fresh = new_rows(stage.formation, coming.formation)
+            gained = coming.formation if fresh else None
+        linked.append(replace(stage, gained=gained, growing=growing, fading=fading, turns=turns))
+    return linked
+
+
+def find_turns(stage: Stage, coming: Stage) -> tuple[int, ...]:
+    """Rows of (contacts, joints) of a stage that move the other way in the next one."""
+    formation = stage.formation
+    after = dict(zip(coming.formation.names, mode_of(coming).signs, strict=False))
+    own = mode_of(stage).signs
+    turns = [k for k, name in enumerate(formation.names) if own[k] * after.get(name, 0.0) < 0]
+    n_c = formation.n_contacts
+    joints = coming.directions.sigma
+    turns += [n_c + k for k in range(2) if stage.directions.sigma[k] * joints[k] < 0]
+    return tuple(turns)
+
+
+def find_passing(stage: Stage, coming: Stage) -> tuple[tuple[int, float], ...]:
+    """Contacts that a stage lets go at its end, with 0, or lets slip, with their direction then."""
+    formation, passing = stage.formation, list[tuple[int, float]]()
+    for k, contact in enumerate(formation.contacts):
+        if contact not in coming.formation.contacts:
+            passing.append((k, 0.0))
+        elif contact in formation.rolling and contact not in coming.formation.rolling:
+            row = coming.formation.contacts.index(contact)
+            passing.append((k, float(coming.directions.Xi[row])))
+    return tuple(passing)
+
+
+def find_fresh(stage: Stage, coming: Stage) -> tuple[int, ...]:
+    """Contacts of the coming stage that a stage does not have."""
+    known = stage.formation.contacts
+    return tuple(k for k, c in enumerate(coming.formation.contacts) if c not in known)
+
+
+def split(stage: Stage, scheme: Scheme, begin: int, stop: int, mode: StageMode) -> list[Stage]:
+    """Pieces of a stage, of which the intervals `begin` to `stop` are in another mode.
+
+    They have to be linked again.
+    """
+    own = mode_of(stage)
+    pieces: list[Stage] = []
+    for first, last, signs in ((0, begin, own), (begin, stop, mode), (stop, stage.intervals, own)):
+        if last > first:
+            guess = _cut(stage.guess, scheme, first, last)
+            opens = stage.opens and not pieces
+            piece = replace(stage, guess=guess, until=None, ends_in_impact=False, opens=opens)
+            pieces.append(in_mode(piece, signs))
+    pieces[-1] = replace(pieces[-1], until=stage.until, ends_in_impact=stage.ends_in_impact)
+    return pieces
+
+
+def merge(stages: Sequence[Stage]) -> list[Stage]:
+    """Stages of which those that follow one another in one mode and phase are one."""
+    merged: list[Stage] = [stages[0]]
+    for stage in stages[1:]:
+        before = merged[-1]
+        if (before.phase, mode_of(before)) != (stage.phase, mode_of(stage)):
+            merged.append(stage)
+            continue
+        monitored = tuple(sorted({*before.monitored, *stage.monitored}))
+        guess = _join(before.guess, stage.guess)
+        merged[-1] = replace(stage, guess=guess, opens=before.opens, monitored=monitored)
+    return merged
+
+
+def release_earlier(stages: Sequence[Stage], index: int) -> list[Stage] | None:
+    """Stages of which one belongs to the next phase, or None if that cannot be.
+
+    It has to be the last but not the only one of a phase that ends by a release. Where torques must
+    not step what is let go earlier goes on next to the contact: nothing is gained.
+    """
+    stage = stages[index]
+    if stage.formation.scene.has_slow_motors:
+        return None
+    coming = stages[index + 1] if index + 1 < len(stages) else None
+    before = stages[index - 1] if index else None
+    if coming is None or before is None or before.phase != stage.phase:
+        return None
+    if coming.phase == stage.phase or not coming.opens or stage.until is not None:
+        return None
+    names = stage.formation.names
+    if not set(coming.formation.names) < set(names) or coming.formation.rolling:
+        return None
+    rows = [names.index(name) for name in coming.formation.names]
+    Xi, sigma = stage.directions
+    guess = stage.guess._replace(forces=stage.guess.forces[..., rows])
+    directions = Directions(Xi[rows], sigma)
+    moved = replace(coming, directions=directions, guess=guess, until=None, ends_in_impact=False)
+    return [*stages[:index], moved, replace(coming, opens=False), *stages[index + 2 :]]
+
+
+def drop(stages: Sequence[Stage], index: int) -> list[Stage] | None:
+    """Stages without one of them, or None if it is all that its phase has."""
+    stage = stages[index]
+    others = [k for k, other in enumerate(stages) if other.phase == stage.phase and k != index]
+    if not others:
+        return None
+    left = list(stages)
+    if stage.opens:
+        left[index + 1] = replace(stages[index + 1], opens=True)
+    if index > 0 and (index - 1 in others) and (index + 1 not in others):
+        # The last one of its phase: the one before ends the phase.
+        impulses = stage.guess.impulses
+        guess = stages[index - 1].guess._replace(impulses=impulses)
+        before = replace(
+            stages[index - 1], guess=guess, until=stage.until, ends_in_impact=stage.ends_in_impact
+        )
+        left[index - 1] = before
+    del left[index]
+    return left
+
+
+def _join(first: StagePoints, second: StagePoints) -> StagePoints:
+    """Two stretches of one stage as one."""
+    total = first.duration + second.duration
+    shares = (first.duration / total, second.duration / total)
+    fractions = np.concatenate([first.fractions * shares[0], second.fractions * shares[1]])
+    nodes = np.concatenate([first.nodes[:-1], second.nodes])
+    z, v, a, forces, tau = (
+        np.concatenate(pair) for pair in zip(first[3:8], second[3:8], strict=True)
+    )
+    return StagePoints(total, fractions, nodes, z, v, a, forces, tau, second.impulses)
+
+
+def _cut(part: StagePoints, scheme: Scheme, begin: int, stop: int) -> StagePoints:
+    """Intervals `begin` to `stop`, on at least the least number of them."""
+    breaks = part.breaks[begin : stop + 1]
+    shares = (breaks - breaks[0]) / (breaks[-1] - breaks[0])
+    while len(shares) - 1 < LEAST_INTERVALS:
+        shares = np.sort(np.append(shares, (shares[1:] + shares[:-1]) / 2))
+    return resample(part, scheme, shares, float(breaks[0]), float(breaks[-1]))

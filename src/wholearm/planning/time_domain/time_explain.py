@@ -1,0 +1,321 @@
+"""Why phases have no plan in the time domain, and which single limit would have to give way."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ...common.errors import InfeasibleError, SolverError
+from ...common.shortfalls import LimitPlace, Parameter, Shortfall
+from ...geometry.curve import describe_pose
+from ...geometry.path_guess import count_freedoms
+from ...mechanics.limits import EPSILON, PRESS, make_limits
+from ...problem.definition import Phase, Problem
+from ...results.trajectory import Trajectory
+from ...scene.model import Scales
+from .. import advice
+from ..advice import (
+    advise,
+    assemble_least,
+    change_scene,
+    describe_shortfalls,
+    keep_worst,
+    name_phases,
+    rank_shortfalls,
+)
+from ..options import Objective, PlanOptions
+from ..stops import runs_along_curves
+from .collocation import Scheme, blend
+from .initial_path import PacedWay
+from .search import TimeSearch
+from .stage import Stage, StagePoints
+from .time_motion import TimeMotion, make_motions
+from .units import to_si
+
+MISSED = 0.02
+"""Least share by which limits are missed along a way that is no way."""
+MET = 0.98
+"""Share of a limit from which on a motion meets it."""
+ADVICE = 0.6
+"""Processor time [s] after which no further change of a limit is tried."""
+Replan = Callable[[Problem], object]
+"""Plans the same phases of another problem; raises if there is no plan."""
+
+
+def solve_elastic(search: TimeSearch, stages: Sequence[Stage]) -> list[Stage] | None:
+    """The motion with the least shortfalls when every limit is soft, or None."""
+    solution = search.aiming(Objective.ELASTIC).solve(list(stages))
+    return solution.stages if solution.success else None
+
+
+def refuse(
+    search: TimeSearch,
+    problem: Problem,
+    phases: Sequence[Phase],
+    stages: Sequence[Stage],
+    replan: Replan | None,
+) -> None:
+    """Raise an error if no motion can begin from rest at the start, or come to rest at the end.
+
+    The end counts where it is one point: where a single phase with one freedom leads. `replan` is
+    as for `explain`.
+
+    Raises
+    ------
+    InfeasibleError  with the contact that would have to pull, and what single change would do
+    """
+    from .resting import find_block, find_change
+
+    epsilon, last = search.problem.epsilon, stages[-1]
+    stage, node, phase = stages[0], 0, phases[0]
+    blocked = find_block(stage.formation, stage.guess.nodes[0, 0], epsilon)
+    say = "from rest at its start, {}, no motion begins in any contact mode"
+    alone = len(phases) == 1 and not phase.until.is_release
+    if blocked is None and alone and count_freedoms(last.formation, last.guess.nodes[-1, 0]) == 1:
+        stage, node = last, -1
+        blocked = find_block(last.formation, last.guess.nodes[-1, 0], epsilon, ends=True)
+        say = "at its end, {}, no motion comes to rest in any contact mode"
+    if blocked is None:
+        _refuse_pushed(problem, phases[0], stages if alone else ())
+        if problem.scene.has_slow_motors:
+            _refuse_unheld(problem, phases[0], stages[0], 0)
+            if alone and (last.formation.n_constraints == 4 or phase.until.pins):
+                _refuse_unheld(problem, phases[0], last, -1)
+        return
+    where = describe_pose(to_si(stage, problem).guess.nodes[node, 0])
+    text = f"phase {phase.number} is infeasible: {say.format(where)}"
+    shortfalls = list[Shortfall]()
+    if blocked.contact:
+        amount = blocked.short * problem.scene.scales.force
+        limit = f"c_n of {blocked.contact} >= epsilon = {problem.epsilon:g} N"
+        text += f": {limit} is {amount:.3g} N short at best"
+        place = LimitPlace(phase.number, math.nan, where)
+        given = (PRESS, blocked.contact, limit, amount, "N", place, blocked.short)
+        shortfalls = [Shortfall(*given)]
+    else:
+        text += " within the torque limits"
+    ends, z = node == -1, stage.guess.nodes[node, 0]
+
+    def find_value(parameter: Parameter) -> float | None:
+        if parameter.is_speed:
+            return None
+        finger = None if parameter.key == EPSILON else int(parameter.key.split(".")[1]) - 1
+        value = find_change(stage.formation, z, epsilon, finger, ends)
+        return _unit_of(parameter, problem.scene.scales) * value if value else None
+
+    raise _advise(problem, phase, text, find_value, replan, shortfalls)
+
+
+def _refuse_pushed(problem: Problem, phase: Phase, stages: Sequence[Stage]) -> None:
+    """Raise an error if what touches pushes the object one way, all along the guess to its end."""
+    from .resting import pushes_one_way
+
+    if not stages or stages[0].formation.n_constraints > 2:
+        return
+    z = np.concatenate([stage.guess.z.reshape(-1, 5) for stage in stages])
+    if pushes_one_way(stages[0].formation, z):
+        names = " ".join(stages[0].formation.names)
+        where = describe_pose(to_si(stages[-1], problem).guess.nodes[-1, 0])
+        raise InfeasibleError(
+            f"phase {phase.number} is infeasible: {names} can only push the object one way, with "
+            f"whatever friction, so that it does not come to rest at its end, {where}"
+        )
+
+
+def _refuse_unheld(problem: Problem, phase: Phase, stage: Stage, node: int) -> None:
+    """Raise an error if torques that may not step cannot hold the object at rest at an end."""
+    from ...mechanics.wedging import find_static_torques
+
+    z, limit = to_si(stage, problem).guess.nodes[node, 0], problem.scene.torque_limit
+    held = find_static_torques([phase.formation], z)
+    if not held.is_empty(limit):
+        return
+    most = "however large" if held.is_empty(np.full(2, np.inf)) else "within their limits"
+    raise InfeasibleError(
+        f"phase {phase.number} is infeasible: torques may not step (torque_rate_limit, "
+        f"actuator_lag), so that they have to hold the object at rest at its "
+        f"{'end' if node else 'start'}, {describe_pose(z)}; {' '.join(phase.formation.names)} with "
+        f"their friction can be held there by no torques, {most}; end the phase where they can "
+        "(wholearm predict shows where), or leave out torque_rate_limit and actuator_lag"
+    )
+
+
+def explain(
+    search: TimeSearch,
+    problem: Problem,
+    phases: Sequence[Phase],
+    short: Sequence[list[Stage]],
+    status: str,
+    replan: Replan | None,
+) -> InfeasibleError | SolverError:
+    """Say why phases have no plan and what would change that.
+
+    Parameters
+    ----------
+    problem  in SI units
+    short    what `solve_elastic` found from different guesses, where that is short of something
+    status   how the solver ended, in words
+    replan   when left out, no change is looked for
+    """
+    numbers = [phase.number for phase in phases]
+    if not short:
+        names = " and ".join(" ".join(phase.formation.names) for phase in phases)
+        text = f"no plan for {name_phases(numbers)} ({names}, until {phases[-1].until}): {status}"
+        usual = search.options.transcription == "time" and not problem.scene.control_period
+        if usual and runs_along_curves(phases, PlanOptions()):
+            return SolverError(f"{text}; leave out --transcription time, which plans along curves")
+        return SolverError(f"{text}; try another number of intervals per phase (--time-intervals)")
+
+    def sum_up(stages: list[Stage]) -> float:
+        return sum(
+            shortfall.amount for shortfall in list_shortfalls(problem, stages, search.scheme)
+        )
+
+    elastic = min(short, key=sum_up)
+
+    ranked = rank_shortfalls(list_shortfalls(problem, elastic, search.scheme))
+    solved = [to_si(stage, problem).guess for stage in elastic]
+
+    def find_value(parameter: Parameter) -> float | None:
+        if not is_met(parameter, solved, ranked):
+            return np.nan
+        aim = search.aiming(Objective.RELAX, parameter)
+        solution = aim.solve(elastic)
+        # A limit that may be tighter is not what keeps the others from being kept.
+        if not solution.success or solution.cost < 0.0:
+            return np.nan
+        unit = _unit_of(parameter, problem.scene.scales)
+        return parameter.value + parameter.sign * unit * solution.cost
+
+    text = f"{name_phases(numbers, 'infeasible')}: {describe_shortfalls(ranked)}"
+    error = _advise(problem, phases[0], text, find_value, replan, ranked)
+    error.motion = _make_trajectory(problem, phases, search, elastic)
+    return error
+
+
+def is_met(
+    parameter: Parameter, motion: Sequence[StagePoints], shortfalls: Sequence[Shortfall]
+) -> bool:
+    """Whether the motion that misses limits least is held back by the limit of a parameter.
+
+    Epsilon is what holds it back if no normal force is short of more than that.
+    """
+    if parameter.key == EPSILON:
+        return all(own.amount < parameter.value for own in shortfalls if own.kind == PRESS)
+    finger = int(parameter.key.split(".")[1]) - 1
+    tables = [part.v[..., 3:] if parameter.is_speed else part.tau for part in motion]
+    most = max(float(np.abs(table[..., finger]).max()) for table in tables)
+    return most > MET * parameter.value
+
+
+def refuse_ways(problem: Problem, phase: Phase, ways: Sequence[PacedWay]) -> None:
+    """Raise an error if on every way to the end of a phase a limit is missed at any speed.
+
+    Where no motion with least shortfalls is found either, the way that misses least says why.
+
+    Raises
+    ------
+    InfeasibleError  with the limit that is missed there
+    """
+    if not ways or (best := max(ways, key=lambda way: way.margin)).margin > -MISSED:
+        return
+    critical = best.forces.find_critical()
+    limits = make_limits(phase.formation, problem.epsilon).limits
+    limit = next(own for own in limits if (own.kind, own.part) == critical)
+    place = LimitPlace(phase.number, math.nan, "the best of them")
+    given = (*critical, limit.text, -best.margin * limit.scale, limit.unit, place, -best.margin)
+    shortfall = Shortfall(*given)
+    raise InfeasibleError(
+        f"phase {phase.number} is infeasible along all ways to its end that were looked at, "
+        f"straight ones and bent ones, at any speed: {shortfall}",
+        [shortfall],
+    )
+
+
+def _make_trajectory(
+    problem: Problem, phases: Sequence[Phase], search: TimeSearch, stages: Sequence[Stage]
+) -> Trajectory:
+    """The motion of stages."""
+    solved = [to_si(stage, problem) for stage in stages]
+    pieces = make_motions(solved, search.scheme)
+    motions = [
+        TimeMotion([p for p, own in zip(pieces, solved, strict=True) if own.phase == phase.index])
+        for phase in phases
+    ]
+    return assemble_least(motions, [own.torque for own in motions], [p.formation for p in phases])
+
+
+def _unit_of(parameter: Parameter, scales: Scales) -> float:
+    """What one of a parameter is in SI units, of one in the scene's own."""
+    units = {"N": scales.force, "N m": scales.torque, "rad/s": 1 / scales.time}
+    return units[parameter.unit]
+
+
+def _advise(
+    problem: Problem,
+    phase: Phase,
+    text: str,
+    find_value: Callable[[Parameter], float | None],
+    replan: Replan | None,
+    shortfalls: Sequence[Shortfall],
+) -> InfeasibleError:
+    """The error with `text` and what single change of a limit would make a plan possible.
+
+    Parameters
+    ----------
+    phase       one of those that have no plan
+    find_value  as for `planning.advice.advise`
+    replan      without it no change is looked for
+    shortfalls  what `text` tells of, as data
+    """
+
+    def change(parameter: Parameter, value: float) -> object:
+        assert replan is not None
+        return replan(change_limit(problem, parameter.key, value))
+
+    parameters = make_limits(phase.formation, problem.epsilon).parameters
+    found = advise(text, parameters, find_value, change if replan else None, ADVICE)
+    return InfeasibleError(found.text, shortfalls, found.changes)
+
+
+def list_shortfalls(problem: Problem, stages: Sequence[Stage], scheme: Scheme) -> list[Shortfall]:
+    """What the motion of stages is short of, each limit where it is worst.
+
+    Parameters
+    ----------
+    problem  in SI units, as the answers are; the stages are in the scene's own
+    """
+    found, passed = list[Shortfall](), 0.0
+    for own in stages:
+        stage = to_si(own, problem)
+        found += _list_of_stage(problem, stage, scheme, passed)
+        passed += stage.guess.duration
+    return keep_worst(found)
+
+
+def _list_of_stage(
+    problem: Problem, stage: Stage, scheme: Scheme, passed: float
+) -> list[Shortfall]:
+    """Shortfalls at the points, and of torques at both ends of intervals."""
+    limits, part = make_limits(stage.formation, problem.epsilon), stage.guess
+    pick = np.array([0, *range(scheme.degree), scheme.degree - 1])
+    at = np.concatenate([[0.0], scheme.points, [1.0]])
+    tau = blend(at, part.tau.shape[1]) @ part.tau
+    y = np.concatenate([part.forces[:, pick], tau, part.v[:, pick, 3:]], axis=2)
+    middles = passed + part.duration * (part.breaks[:-1] + part.fractions / 2)
+
+    def locate(row: int) -> LimitPlace:
+        t, phase = float(middles[row // len(pick)]), stage.phase + 1
+        return LimitPlace(phase, t, f"t = {t:.4f} s, phase {phase}")
+
+    return advice.list_shortfalls(limits, (y @ limits.rows.T).reshape(-1, len(limits.low)), locate)
+
+
+def change_limit(problem: Problem, key: str, value: float) -> Problem:
+    """The problem with another value of a parameter of its limits."""
+    if key == EPSILON:
+        return replace(problem, epsilon=value)
+    return replace(problem, scene=change_scene(problem.scene, key, value))

@@ -1,0 +1,270 @@
+"""Motion of a phase planned in the time domain, at any instant."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from ...common.arrays import Array
+from ...common.batch import Batch
+from ...common.sharing import Store
+from ...contacts.elemental import Contact
+from ...contacts.formation import Formation
+from ...mechanics.dynamics import Directions, build_forward, split_forces
+from ...mechanics.metric import metric_weights
+from ...results.mode_names import ROLLS, ModeSpan
+from ...results.torque import TorqueProfile
+from ...results.trajectory import Samples
+from .collocation import Scheme, blend
+from .stage import Stage, StagePoints
+
+_NODES = 8
+"""Places per interval at which the equations of motion are solved."""
+_SWEEPS = 6
+"""Times that accelerations are improved. Each gains one to two digits."""
+_FORWARDS = Store(
+    lambda formation: Batch(build_forward(formation)), lambda formation: formation.equations
+)
+"""Forward dynamics of formations."""
+
+
+class MotionResponse(NamedTuple):
+    """A motion at n instants, and how it changes with its torques, by which all is affine."""
+
+    z: Array  # z, v (n, 5):
+    v: Array
+    y: Array  # (n, m): (c, tau, theta'), of which there are limits
+    y_by_torque: Array  # y_by_torque, a_by_torque (n, m, 2) and (n, 5, 2): slopes of y and z''
+    a_by_torque: Array
+
+
+@dataclass(frozen=True, eq=False)
+class StageMotion:
+    """One stage as a function of time.
+
+    tau is a polynomial in each interval. z is what it leads to from the interval's start, pulled
+    onto the contacts, and z' its derivative; z'' and the forces follow by forward dynamics. So the
+    equations of motion and the contacts hold at any instant.
+    """
+
+    formation: Formation
+    directions: Directions
+    scheme: Scheme
+    points: StagePoints
+    slip: Array  # (R,) [m]: slip coordinates of the rolling contacts
+
+    @property
+    def duration(self) -> float:
+        """How long the stage lasts [s]."""
+        return self.points.duration
+
+    @property
+    def breaks(self) -> Array:
+        """When each interval starts, and when the last one ends [s]."""
+        return self.duration * self.points.breaks
+
+    @cached_property
+    def torque(self) -> TorqueProfile:
+        """Torque from the start of the stage, a polynomial in each interval."""
+        controls = self.points.tau.shape[1]
+        at = np.linspace(0.0, 1.0, controls)
+        values = blend(at, controls) @ self.points.tau
+        return TorqueProfile(self.breaks, _fit(2 * at - 1, values))
+
+    @property
+    def _forward(self) -> Batch:
+        return _FORWARDS(self.formation)
+
+    @property
+    def _pieces(self) -> Array:
+        """Powers of x in [-1, 1] that give z over each interval, shape (K, 5, n)."""
+        return self._integrated[0]
+
+    @property
+    def defects(self) -> Array:
+        """By how much collocation misses z and z' at the end of each interval, shape (K, 2, 5)."""
+        return self._integrated[1]
+
+    @cached_property
+    def _integrated(self) -> tuple[Array, Array]:
+        """The pieces and the defects.
+
+        The accelerations at an interval's points are integrated twice from its start, and those
+        that follow there by forward dynamics again, until they are one motion (Picard iteration).
+        It diverges where B h / J is large: such intervals keep the accelerations whose residual
+        is the least. What is left at the end, the error of collocation, is distributed over the
+        interval.
+        """
+        nodes, half = self.points.nodes, np.diff(self.breaks)[:, None, None] / 2
+        z, v = nodes[:, 0], nodes[:, 1]
+        x = -np.cos(np.pi * np.arange(_NODES) / (_NODES - 1))
+        powers = x[:, None] ** np.arange(_NODES + 2)
+        torque = self.torque.coefficients
+        tau = np.einsum("kjd,nd->knj", torque, powers[:, : torque.shape[2]])
+        count = len(half)
+        signs = [np.broadcast_to(part, (count * _NODES, len(part))) for part in self.directions]
+        a = np.zeros((count, 5, _NODES))
+        a[..., : len(self.scheme.points)] = _fit(2 * self.scheme.points - 1, self.points.a)
+        weights = np.sqrt(metric_weights(self.formation.scene))[:, None]
+        kept, least = a, np.full((count, 1, 1), np.inf)
+        for _ in range(_SWEEPS):
+            velocity = _integrate(a, half, v[:-1])
+            place = _integrate(velocity, half, z[:-1])
+            state = (
+                np.einsum("kjd,nd->knj", part, powers[:, : part.shape[2]]).reshape(-1, 5)
+                for part in (place, velocity)
+            )
+            forces = self._forward(*state, tau.reshape(-1, 2), *signs)
+            found = _fit(x, forces[0][..., 0].reshape(count, _NODES, 5))
+            residual = np.abs(weights * (found - a)).max(axis=(1, 2), keepdims=True)
+            nearer = residual < least
+            kept, least = np.where(nearer, a, kept), np.where(nearer, residual, 0.0)
+            a = np.where(nearer, found, kept)
+        velocity = _integrate(a, half, v[:-1])
+        place = _integrate(velocity, half, z[:-1])
+        miss = (z[1:] - place.sum(axis=2))[..., None], (v[1:] - velocity.sum(axis=2))[..., None]
+        place[..., :4] += miss[0] * [0.5, 0.75, 0.0, -0.25]
+        place[..., :4] += half * miss[1] * [-0.25, -0.25, 0.25, 0.25]
+        return place, np.concatenate(miss, axis=2).transpose(0, 2, 1)
+
+    def _interpolate(self, t: Array) -> tuple[Array, Array]:
+        """Z and its derivative by the polynomial of each interval."""
+        breaks = self.breaks
+        piece = np.clip(np.searchsorted(breaks, t, side="right") - 1, 0, len(breaks) - 2)
+        half = np.diff(breaks)[piece] / 2
+        x = (t - breaks[piece]) / half - 1
+        places = self._pieces[piece]
+        rates = np.polynomial.polynomial.polyder(places, axis=2) / half[:, None, None]
+        powers = x[:, None] ** np.arange(places.shape[2])
+        z = np.einsum("njd,nd->nj", places, powers)
+        return z, np.einsum("njd,nd->nj", rates, powers[:, :-1])
+
+    def evaluate(self, t: Array) -> Samples:
+        """Samples at times `t` from the start of the stage, shape (n,) [s]."""
+        formation = self.formation
+        z, v = self._interpolate(t)
+        metric = metric_weights(formation.scene)
+        for _ in range(3):
+            kinematics = formation.evaluate(z, v)
+            gaps = np.hstack([kinematics.C, formation.evaluate_slip(z) - self.slip])
+            z = z - _lift(kinematics.P, metric, gaps)
+        kinematics = formation.evaluate(z, v)
+        v = v - _lift(kinematics.P, metric, np.einsum("nij,nj->ni", kinematics.P, v))
+        tau = self.torque.at(t)
+        Xi, sigma = (np.broadcast_to(part, (len(t), len(part))) for part in self.directions)
+        a, c, _ = self._forward(z, v, tau, Xi, sigma)
+        c_n, c_t = split_forces(formation, c[..., 0], Xi)
+        return Samples(z, v, a[..., 0], tau, c_n, c_t)
+
+    def respond(self, t: Array) -> MotionResponse:
+        """State, forces and accelerations at times `t`, and how these change with torques."""
+        at = self.evaluate(t)
+        signs = [np.broadcast_to(part, (len(t), len(part))) for part in self.directions]
+        found = [
+            self._forward(at.z, at.z_dot, at.tau + step, *signs)[:2]
+            for step in (np.zeros(2), *np.eye(2))
+        ]
+        a, c = (np.stack([own[k][..., 0] for own in found], axis=-1) for k in range(2))
+        y = np.hstack([c[..., 0], at.tau, at.z_dot[:, 3:]])
+        by_torque = np.zeros((*y.shape, 2))
+        by_torque[:, : c.shape[1]] = c[..., 1:] - c[..., :1]
+        by_torque[:, c.shape[1] : -2] = np.eye(2)
+        return MotionResponse(at.z, at.z_dot, y, by_torque, a[..., 1:] - a[..., :1])
+
+
+def _fit(x: Array, values: Array) -> Array:
+    """Powers of the polynomials through values, shape (K, n, 5), at `x`, shape (n,): (K, 5, n)."""
+    invert = np.linalg.inv(x[:, None] ** np.arange(len(x)))
+    return np.asarray(np.einsum("dn,knj->kjd", invert, values))
+
+
+def _integrate(powers: Array, scale: Array, start: Array) -> Array:
+    """Integral from x = -1, times `scale`, of polynomials (K, 5, n), from `start`, (K, 5)."""
+    integral = scale * np.polynomial.polynomial.polyint(powers, lbnd=-1, axis=2)
+    integral[..., 0] += start
+    return np.asarray(integral)
+
+
+def _lift(P: Array, metric: Array, residual: Array) -> Array:
+    """Shortest changes of z, shape (n, 5), that change the constraints by `residual`, (n, n_p)."""
+    weighted = (P / metric).transpose(0, 2, 1)
+    return np.asarray((weighted @ np.linalg.solve(P @ weighted, residual[..., None]))[..., 0])
+
+
+@dataclass(frozen=True, eq=False)
+class TimeMotion:
+    """A phase of one or more stages as a function of time."""
+
+    stages: Sequence[StageMotion]
+
+    @property
+    def duration(self) -> float:
+        """How long the phase lasts [s]."""
+        return float(self.starts[-1])
+
+    @cached_property
+    def starts(self) -> Array:
+        """When each stage starts, and when the last one ends [s]."""
+        return np.concatenate([[0.0], np.cumsum([stage.duration for stage in self.stages])])
+
+    @property
+    def contacts(self) -> tuple[str, ...]:
+        """Names of the phase's contacts."""
+        return self.stages[0].formation.names
+
+    @property
+    def torque(self) -> TorqueProfile:
+        """Torque from the start of the phase."""
+        return TorqueProfile.chain([stage.torque for stage in self.stages])
+
+    @property
+    def modes(self) -> tuple[ModeSpan, ...]:
+        """What slides and turns which way and what rolls in each stage, from when to when."""
+        found = []
+        for stage, start in zip(self.stages, self.starts[:-1].tolist(), strict=True):
+            formation, (Xi, sigma) = stage.formation, stage.directions
+            rolls = formation.rolling_rows
+            contacts = {
+                name: ROLLS if k in rolls else "+" if Xi[k] > 0 else "-"
+                for k, name in enumerate(formation.names)
+            }
+            joints = tuple("+" if sign > 0 else "-" for sign in sigma)
+            found.append(ModeSpan(start, start + stage.duration, contacts, joints))
+        return tuple(found)
+
+    def evaluate(self, t: Array) -> Samples:
+        """Samples at times `t` from the start of the phase, shape (n,) [s]."""
+        t = np.asarray(t, dtype=float)
+        owner = np.clip(np.searchsorted(self.starts, t, side="right") - 1, 0, len(self.stages) - 1)
+        tables: list[Array] = []
+        for index, stage in enumerate(self.stages):
+            mine = owner == index
+            if not mine.any():
+                continue
+            part = stage.evaluate(t[mine] - self.starts[index])
+            if not tables:
+                tables = [np.empty((len(t), table.shape[1])) for table in part]
+            for table, values in zip(tables, part, strict=True):
+                table[mine] = values
+        return Samples(*tables)
+
+
+def make_motions(stages: Sequence[Stage], scheme: Scheme) -> list[StageMotion]:
+    """The stages' guesses as functions of time."""
+    motions: list[StageMotion] = []
+    kept: dict[Contact, float] = {}
+    phase = -1
+    for stage in stages:
+        formation = stage.formation
+        slip = formation.evaluate_slip(stage.guess.nodes[0, :1])[0]
+        rolling = [formation.contacts[row] for row in formation.rolling_rows]
+        # What has rolled in this phase before keeps where it is.
+        before = kept if stage.phase == phase else {}
+        kept = {c: before.get(c, s) for c, s in zip(rolling, slip.tolist(), strict=True)}
+        slip, phase = np.array([kept[c] for c in rolling]), stage.phase
+        motions.append(StageMotion(formation, stage.directions, scheme, stage.guess, slip))
+    return motions

@@ -1,0 +1,491 @@
+"""Whether quasistatic motions keep every contact, and up to which speed that lasts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.arrays import Array
+from ..common.errors import InfeasibleError, name_source, require_number
+from ..common.fields import SHARE
+from ..common.sharing import exclusive
+from ..contacts.formation import Formation, Kinematics
+from ..geometry.curve import Curve
+from ..geometry.path_guess import RELEASE_AT, count_freedoms, find_end, guess_phase
+from ..geometry.tracing import trace_phase
+from ..mechanics.dynamics import (
+    Directions,
+    PathForces,
+    force_rows,
+    inverse,
+    reduced_inertia,
+    split_forces,
+)
+from ..mechanics.limits import CONE, PRESS, SPEED
+from ..mechanics.metric import metric_weights
+from ..problem.check import require_phases
+from ..problem.definition import End, Phase, Problem
+from ..results.torque import TorqueProfile
+from .prediction import (
+    Curves,
+    PhasePrediction,
+    Place,
+    Prediction,
+    QuasistaticTorques,
+    Survival,
+    Weakest,
+)
+from .squeeze import Squeezing
+
+PLACES = 241
+"""About how many places of a phase are looked at."""
+_NEWTON = 20
+"""Most steps that close contacts."""
+_CLOSED = 1e-11
+"""Step that counts as none, in radii of gyration or radians."""
+_SCALED_SPEEDS = np.geomspace(1e-2, 1e2, 49)
+"""Speeds at which a break is looked for, over the scene's speed."""
+_HALVINGS = 24
+"""Steps of bisection."""
+SQUEEZE = 0.5
+"""How hard quasistatic torques squeeze: as hard as needs be at 0, as contacts press most at 1."""
+OWN = "own torques"
+"""Name of the motion under the torques of the quasistatic one."""
+_SPEEDS = 61
+"""Speeds of a curve."""
+_SHOWN = 1.4
+"""Largest speed of curves over the largest at which something breaks; its cube for the least."""
+_ROWS = 8
+"""Every so many places of a phase quasistatic torques are kept."""
+
+
+@exclusive
+def predict(
+    problem: Problem,
+    *,
+    squeeze: float = SQUEEZE,
+    progress: Callable[[str], None] | None = None,
+) -> Prediction:
+    """Predict quasistatic motions along the phases of a problem, and at which speed they break.
+
+    Parameters
+    ----------
+    squeeze   how hard quasistatic torques squeeze, from 0, the least torques that keep epsilon, to
+              1, those with which what presses least in the phase presses most. They are the least
+              torques that keep a normal force that far between.
+    progress  told which phase is looked at
+
+    Raises
+    ------
+    InputError  if the phases cannot be carried out geometrically, or a number is out of its range
+    """
+    require_phases(problem)
+    share = SHARE.read(squeeze, "squeeze")
+    found: list[PhasePrediction] = []
+    z, moving = problem.start, False
+    with name_source(problem.source):
+        for phase in problem.phases:
+            if progress is not None:
+                progress(f"predicting phase {phase.number} of {len(problem.phases)}")
+            later = problem.phases[phase.index + 1 :]
+            road = make_road(phase, z, later)
+            rests = not moving, phase.end is End.REST
+            found.append(_predict_phase(problem, phase, road, rests, share))
+            z = find_end(phase, z, later) if road is None else road.z[-1]
+            moving = phase.end is not End.REST
+    return Prediction(problem.name, problem.epsilon, tuple(found))
+
+
+def make_torques(prediction: Prediction, speed: float) -> TorqueProfile:
+    """Quasistatic torques of all phases over time, as if each were run through at a mean speed.
+
+    They balance friction, and set nothing in motion: hand tuning starts from there.
+
+    Parameters
+    ----------
+    speed : [m/s]  along the phases
+
+    Raises
+    ------
+    InfeasibleError  if a phase has no quasistatic torques
+    """
+    speed, start = require_number(speed, "speed", positive=True), 0.0
+    times, rows = [], []
+    for phase in prediction.phases:
+        if phase.torques is None:
+            raise InfeasibleError(
+                f"no quasistatic torques to write: phase {phase.number} is not kept all along"
+            )
+        times.append(start + phase.torques.s / speed)
+        rows.append(phase.torques.tau)
+        start = float(times[-1][-1])
+    t, tau = np.concatenate(times), np.vstack(rows)
+    # Where a direction reverses and where phases meet the torques step.
+    kept = np.append(True, np.diff(t) > 0) | np.append(np.diff(t) > 0, True)
+    return TorqueProfile.join_rows(t[kept], tau[kept])
+
+
+def _predict_phase(
+    problem: Problem, phase: Phase, road: Road | None, rests: tuple[bool, bool], share: float
+) -> PhasePrediction:
+    names, until = phase.formation.names, str(phase.until)
+    if road is None:
+        return PhasePrediction(phase.number, names, until, "left out", math.nan)
+    paced = ("moving", "to rest", "from rest", "rest to rest")[2 * rests[0] + rests[1]]
+    looks = {
+        "steady": (look_along(road, Pace.steady(road)), road.length),
+        paced: (look_along(road, pace := Pace.between(road, rests)), pace.way),
+    }
+    torques = find_torques(road, problem.epsilon, share)
+    if torques is not None:
+        looks[OWN] = (look_under(road, torques.tau), road.length)
+    unit = problem.scene.scales.speed
+    survivals = tuple(
+        _survive(road, name, look, way, problem.epsilon, unit)
+        for name, (look, way) in looks.items()
+    )
+    zero = np.zeros_like(road.s)
+    grasp = road.squeezing.find_best(zero, zero)
+    held = (grasp.least >= problem.epsilon) & (road.inertia > 0)
+    return PhasePrediction(
+        number=phase.number,
+        contacts=names,
+        until=until,
+        path="line" if road.curve is None else "curve",
+        length=road.length,
+        slow=_name(road, looks["steady"][0](0.0)),
+        kept=_list_stretches(road, held),
+        survivals=survivals,
+        torques=None if torques is None else _thin_out(road, torques),
+        curves=_draw(survivals, looks, unit),
+    )
+
+
+def find_torques(road: Road, epsilon: float, share: float) -> QuasistaticTorques | None:
+    """Torques that balance a quasistatic motion at all places of a road; None if some have none.
+
+    Parameters
+    ----------
+    epsilon : [N]
+    share          how hard they squeeze; see `predict`
+    """
+    zero = np.zeros_like(road.s)
+    best = road.squeezing.find_best(zero, zero)
+    if not (best.least >= epsilon).all() or not (road.inertia > 0).all():
+        return None
+    wanted = epsilon + share * float(best.least.min() - epsilon)
+    low, high = road.squeezing.find_span(zero, zero, wanted)
+    forces, size = road.forces, (road.forces.Tl**2).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        lightest = -(forces.T0 * forces.Tl).sum(axis=1) / size
+    # At the largest least force the span is one point, but for rounding.
+    middle = np.where(low <= high, np.clip(lightest, low, high), best.squeeze)
+    squeeze = np.where(size > 0, middle, 0.0)
+    c = forces.c(zero, zero, squeeze)
+    c_n, _ = split_forces(road.phase.formation, c, road.directions.Xi)
+    return QuasistaticTorques(road.s, road.z, forces.tau(zero, zero, squeeze), c_n)
+
+
+def _thin_out(road: Road, torques: QuasistaticTorques) -> QuasistaticTorques:
+    """Fewer places, with both ends and both sides of every reversal."""
+    ends = np.diff(road.s) == 0
+    kept = np.append(True, ends) | np.append(ends, True)
+    kept[::_ROWS] = True
+    return QuasistaticTorques(*(part[kept] for part in torques))
+
+
+def _survive(
+    road: Road, name: str, look: Look, way: float, epsilon: float, unit: float
+) -> Survival:
+    thin = find_break(look, epsilon, unit)
+    lost = find_break(look, 0.0, unit, thin.speed if math.isfinite(thin.speed) else 0.0)
+    speed = None if math.isinf(thin.speed) else thin.speed
+    return Survival(
+        motion=name,
+        speed=speed,
+        duration=way / speed if speed else None,
+        lost=None if math.isinf(lost.speed) else lost.speed,
+        again=_find_again(thin),
+        first=_name(road, thin.least),
+    )
+
+
+def _find_again(found: Break) -> float | None:
+    return found.again if found.speed == 0 and math.isfinite(found.again) else None
+
+
+def _name(road: Road, least: Least) -> Weakest:
+    limits = [road.squeezing.limits.limits[k] for k in least.limits]
+    contacts = dict.fromkeys(limit.part for limit in limits if limit.kind in (PRESS, CONE))
+    kinds = dict.fromkeys(limit.kind for limit in limits if limit.kind not in (PRESS, CONE))
+    others = (
+        f"{kind} of {' and '.join(dict.fromkeys(own.part for own in limits if own.kind == kind))}"
+        for kind in kinds
+    )
+    force = least.force if math.isfinite(least.force) else None
+    return Weakest(tuple(contacts), tuple(others), _place(road, least.place), force)
+
+
+def _place(road: Road, row: int) -> Place:
+    return Place(float(road.s[row]), float(road.z[row, 0]), float(road.z[row, 2]))
+
+
+def _list_stretches(road: Road, held: NDArray[np.bool_]) -> tuple[tuple[Place, Place], ...]:
+    """Stretches of places that are held, by both of their ends."""
+    steps = np.flatnonzero(np.diff(np.concatenate([[0], held.astype(int), [0]])))
+    pairs = steps.reshape(-1, 2)
+    return tuple((_place(road, a), _place(road, b - 1)) for a, b in pairs.tolist())
+
+
+def _draw(
+    survivals: tuple[Survival, ...], looks: dict[str, tuple[Look, float]], unit: float
+) -> Curves:
+    """Least forces over speed, about those at which something breaks."""
+    every = [speed for own in survivals for speed in (own.speed, own.lost, own.again) if speed]
+    ends = (min(every) / _SHOWN**3, _SHOWN * max(every)) if every else (0.1 * unit, 10 * unit)
+    speeds = np.geomspace(*ends, _SPEEDS)
+    forces = {
+        name: np.array([look(speed).force for speed in speeds.tolist()])
+        for name, (look, _) in looks.items()
+    }
+    return Curves(speeds, forces)
+
+
+class Least(NamedTuple):
+    """What presses least along a phase at one speed."""
+
+    # [N]: the least normal force, or for a rolling contact the epsilon that its cone leaves; minus
+    # infinity where other limits are missed whatever the squeeze
+    force: float
+    place: int  # row of the road
+    limits: tuple[int, ...]  # what keeps it from being more, as indices into the limits of the road
+
+
+Look = Callable[[float], Least]
+"""What presses least at a speed [m/s]."""
+
+
+class Break(NamedTuple):
+    """The speed up to which contacts press with some force [N]."""
+
+    speed: float  # [m/s]: zero where they do not at any speed near rest; infinite if they do at any
+    least: Least  # what is there at a speed just above, or at that of zero
+    # [m/s]: where it is zero, the speed from which on they press; infinite if there is none
+    again: float
+
+
+class Pace(NamedTuple):
+    """A motion along a phase whose largest speed is one: a = s'' and b = s'^2, shape (n,) each."""
+
+    a: Array  # (n,) [1/m]
+    b: Array  # (n,)
+    way: float  # [m]: duration times the largest speed
+
+    @staticmethod
+    def steady(road: Road) -> Pace:
+        """At one speed throughout."""
+        return Pace(np.zeros_like(road.s), np.ones_like(road.s), road.length)
+
+    @staticmethod
+    def between(road: Road, rests: tuple[bool, bool]) -> Pace:
+        """From rest or not, to rest or not: a cosine of time from rest to rest.
+
+        With one end at rest s'' is constant, with none the speed is.
+        """
+        x, length = road.s / road.length, road.length
+        if rests == (True, True):
+            return Pace(2 * (1 - 2 * x) / length, 4 * x * (1 - x), np.pi / 2 * length)
+        if not any(rests):
+            return Pace.steady(road)
+        sign = 1.0 if rests[0] else -1.0
+        return Pace(np.full_like(x, sign / (2 * length)), x if rests[0] else 1 - x, 2 * length)
+
+
+def look_along(road: Road, pace: Pace) -> Look:
+    """What presses least along a road with the best squeeze at each place."""
+
+    def look(speed: float) -> Least:
+        grasp = road.squeezing.find_best(speed**2 * pace.a, speed**2 * pace.b)
+        least = np.where(road.inertia > 0, grasp.least, -np.inf)
+        place = int(least.argmin())
+        owners = grasp.owners[place].tolist() if road.inertia[place] > 0 else []
+        return Least(float(least[place]), place, tuple(owners))
+
+    return look
+
+
+def look_under(road: Road, tau: Array) -> Look:
+    """What presses least under given torques, shape (n, 2) [N m], at a steady speed."""
+    limits = road.squeezing.limits
+    of_c, _, of_rates = limits.columns
+    owners, soft = limits.owners, limits.of("press", "cone")
+    weights = np.concatenate([limit.weight for limit in limits.limits])
+    fast = limits.of(SPEED)
+
+    def look(speed: float) -> Least:
+        c = road.press_under(tau, speed)
+        force = (c @ of_c.T)[:, soft] / weights[soft]
+        rates = np.abs(speed * road.z_s[:, 3:] @ of_rates[fast].T)
+        over = (rates > limits.high[fast]).any(axis=1)
+        force[over] = -np.inf
+        place, row = np.unravel_index(int(force.argmin()), force.shape)
+        return Least(float(force[place, row]), int(place), (int(owners[soft[row]]),))
+
+    return look
+
+
+def find_break(look: Look, wanted: float, unit: float, above: float = 0.0) -> Break:
+    """The least speed at which less than a `wanted` force [N] is left.
+
+    Parameters
+    ----------
+    wanted : [N]
+    unit : [m/s]   the scene's speed
+    above : [m/s]  speed up to which more than that is known to be left, if it is at rest
+    """
+    start, low = look(0.0), above
+    holds = start.force >= wanted
+    for high in (unit * _SCALED_SPEEDS[unit * _SCALED_SPEEDS > above]).tolist():
+        least = look(high)
+        if (least.force >= wanted) != holds:
+            break
+        low = high
+    else:
+        return Break(np.inf, start, 0.0) if holds else Break(0.0, start, np.inf)
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        found = look(middle)
+        if (found.force >= wanted) == holds:
+            low = middle
+        else:
+            high, least = middle, found
+    return Break(high, least, 0.0) if holds else Break(0.0, start, high)
+
+
+@dataclass(frozen=True, eq=False)
+class Road:
+    """Places along a phase, and what limits are of there."""
+
+    phase: Phase
+    curve: Curve | None  # none along a straight line
+    # (n,) [m]: arc lengths in the metric of curves; where a direction reverses a place is there
+    # twice
+    s: Array
+    z: Array  # z, z_s, z_ss (n, 5):
+    z_s: Array
+    z_ss: Array
+    directions: Directions  # one row for each place
+    forces: PathForces
+    squeezing: Squeezing
+    kinematics: Kinematics  # of the formation, for the velocity z_s
+    # (n,): reduced inertia over that without friction: motions jam at zero and below
+    inertia: Array
+
+    @property
+    def length(self) -> float:
+        """Length of the phase [m]."""
+        return float(self.s[-1])
+
+    def press_under(self, tau: Array, speed: float) -> Array:
+        """Contact forces [c_n; c_t(rolling)] under torques `tau`, (n, 2), at a speed, (n, n_c + R).
+
+        Whatever acceleration these give: K c = -P' z' - P M5^-1 (g + S tau - b).
+        """
+        scene = self.phase.formation.scene
+        at, inverse_mass = self.kinematics, 1 / scene.mass_diagonal
+        G = force_rows(self.phase.formation, at, self.directions)
+        load = scene.applied_force - speed * scene.viscous * self.z_s
+        load[:, 3:] += tau - scene.dry[3:] * self.directions.sigma
+        drop = at.P * inverse_mass
+        right = -(speed**2) * at.P_dot_v - np.einsum("nij,nj->ni", drop, load)
+        return np.asarray(np.linalg.solve(drop @ G.transpose(0, 2, 1), right[..., None])[..., 0])
+
+
+def make_road(phase: Phase, z: Array, later: Sequence[Phase]) -> Road | None:
+    """The places of a phase that starts at `z`, shape (5,); None with other than 1 or 2 freedoms.
+
+    Raises
+    ------
+    InputError  if the contacts do not touch at `z`, or the end cannot be reached
+    """
+    formation = phase.formation
+    if formation.n_constraints == 4 and count_freedoms(formation, z) == 1:
+        curve = trace_phase(phase, z, later)
+        if phase.until.is_release:
+            curve = replace(curve, length=RELEASE_AT * curve.length)
+        s, signs = _spread(curve)
+        point = curve.evaluate(s)
+        directions = Directions(signs[:, :-2], signs[:, -2:])
+        return _measure(phase, curve, s, point[:3], point.kinematics, directions)
+    if formation.n_constraints != 3 or count_freedoms(formation, z) != 2:
+        return None
+    goal = guess_phase(phase, z, later)[-1].z[-1]
+    s, *line, kinematics = _straighten(formation, z, goal)
+    slip = np.einsum("nij,nj->ni", kinematics.A_t, line[1])
+    directions = Directions(np.sign(slip), np.sign(line[1][:, 3:]))
+    return _measure(phase, None, s, line, kinematics, directions)
+
+
+def _spread(curve: Curve) -> tuple[Array, Array]:
+    """Places along a curve, both ends of each segment, and directions of contacts and joints."""
+    places, signs = [], []
+    for part in curve.segments:
+        count = max(5, round(PLACES * (part.stop - part.start) / curve.length))
+        # Denser at the ends, where motions start and stop.
+        turn = (1 - np.cos(np.linspace(0.0, np.pi, count))) / 2
+        places.append(part.start + turn * (part.stop - part.start))
+        signs.append(np.tile(np.concatenate([part.Xi, part.sigma]), (count, 1)))
+    return np.concatenate(places), np.vstack(signs)
+
+
+def _measure(
+    phase: Phase,
+    curve: Curve | None,
+    s: Array,
+    line: Sequence[Array],
+    kinematics: Kinematics,
+    directions: Directions,
+) -> Road:
+    z, z_s, z_ss = line
+    forces = inverse(phase.formation, z, z_s, z_ss, directions, kinematics)
+    squeezing = Squeezing.of(phase.formation, forces, z_s[:, 3:])
+    inertia = reduced_inertia(phase.formation, kinematics, directions)
+    return Road(phase, curve, s, z, z_s, z_ss, directions, forces, squeezing, kinematics, inertia)
+
+
+def _straighten(
+    formation: Formation, start: Array, goal: Array
+) -> tuple[Array, Array, Array, Array, Kinematics]:
+    """Arc lengths, z, z_s and z_ss along a straight line in (x, phi), and the formation there."""
+    u = (1 - np.cos(np.linspace(0.0, np.pi, PLACES))) / 2
+    way = goal - start
+    z, slip = start + u[:, None] * way, formation.evaluate_slip(start[None])[0]
+    pose = np.zeros((PLACES, 2, 5))
+    pose[:, [0, 1], [0, 2]] = 1.0
+    wanted, metric = z[:, [0, 2]].copy(), metric_weights(formation.scene)
+    none, rows = np.zeros_like(z), formation.n_constraints
+    for _ in range(_NEWTON):
+        at = formation.evaluate(z, none)
+        off = np.hstack([at.C, formation.evaluate_slip(z) - slip, z[:, [0, 2]] - wanted])
+        change = np.linalg.solve(np.concatenate([at.P, pose], axis=1), off[..., None])[..., 0]
+        z = z - change
+        if np.abs(change * np.sqrt(metric)).max() < _CLOSED * formation.scene.scales.length:
+            break
+    matrix = np.concatenate([formation.evaluate(z, none).P, pose], axis=1)
+    right = np.zeros((PLACES, 5, 1))
+    right[:, rows:, 0] = way[[0, 2]]
+    z_u = np.linalg.solve(matrix, right)[..., 0]
+    at = formation.evaluate(z, z_u)
+    right = np.zeros((PLACES, 5, 1))
+    right[:, :rows, 0] = -at.P_dot_v
+    z_uu = np.linalg.solve(matrix, right)[..., 0]
+    speed = np.sqrt(z_u**2 @ metric)[:, None]
+    bend = ((z_u * z_uu) @ metric)[:, None] / speed**2
+    steps = np.diff(u) * (speed[1:, 0] + speed[:-1, 0]) / 2
+    s = np.concatenate([[0.0], np.cumsum(steps)])
+    return s, z, z_u / speed, (z_uu - bend * z_u) / speed**2, formation.evaluate(z, z_u / speed)

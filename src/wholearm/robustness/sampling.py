@@ -1,0 +1,424 @@
+"""A study of samples: run, kept as they come, and counted."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import cached_property, partial
+from multiprocessing import parent_process
+from multiprocessing.connection import wait
+from threading import Thread
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from .. import __version__
+from ..common.arrays import Array
+from ..common.crowd import DiedError, run_all
+from ..common.document import Document, Result, Table
+from ..common.errors import InputError, SimulationError
+from ..common.fields import Range
+from ..common.journal import Journal
+from ..common.workers import Spawning
+from ..free_simulation.result import FreeSimulation
+from ..policy.playback import Policy
+from ..problem.definition import Problem
+from ..results.adopt import Torques, adopt_motion, require_same_phases
+from .error_model import Uncertainty, change_torques
+from .sample_run import TimeWindow, Trial, make_trial
+
+Z = 1.959963984540054
+"""Standard normal quantile of 0.975."""
+STEP = 1e-3
+"""Step of the differences, over the half width of a range."""
+APART = 0.01
+"""How far from events the instant is at which a force is looked at, over the duration: where a
+contact slides the other way forces step, at another time when numbers are off."""
+Task = tuple[int, tuple[float, ...]]
+"""Number and values of a sample."""
+SAMPLES = Range(1, 10**6)
+"""Samples of a study."""
+DRAWN = 200
+"""Samples whose paths are kept, for figures."""
+_ROWS = 8
+"""Contacts lost first that the text lists; the others are counted."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Robustness(Result):
+    """What a plan bears."""
+
+    trial: Trial
+    samples: Array  # (n, len(varied) + 1): as `Uncertainty.draw` gives them
+    seed: int
+    records: tuple[dict[str, Any], ...]  # as `Trial.run` gives them, in the order of the samples
+    known: int = 0  # samples that the file has, these included; 0 without a file
+
+    @cached_property
+    def nominal(self) -> dict[str, Any]:
+        """The record without anything that is off."""
+        return self.trial.change({})
+
+    @cached_property
+    def sensitivities(self) -> Sensitivities:
+        """What the least normal force of the motion depends on; nothing with a policy."""
+        if self.trial.policy is not None:
+            return Sensitivities("", math.nan, math.nan, ())
+        return measure_sensitivities(self.trial)
+
+    @property
+    def headline(self) -> str:
+        """What it is, in a line."""
+        count = len(self.records)
+        return f"{count} samples, goal reached {self.reached}, contacts kept {self.kept}"
+
+    @property
+    def reached(self) -> Share:
+        """How many reach the goal, as near as the uncertainty says."""
+        return count_share(sum(own["reached"] for own in self.records), len(self.records))
+
+    @property
+    def kept(self) -> Share:
+        """How many reach it and keep all planned contacts."""
+        good = sum(own["reached"] and own["kept"] for own in self.records)
+        return count_share(good, len(self.records))
+
+    @property
+    def first_lost(self) -> dict[str, Share]:
+        """Which contact goes first, by number of the phase and name, the most frequent first."""
+        names = Counter(_name_loss(own) for own in self.records if own["lost"])
+        return {name: count_share(n, len(self.records)) for name, n in names.most_common()}
+
+    @property
+    def document(self) -> Document:
+        """How many samples reach the goal, what is lost first, and what matters most."""
+        trial, count, least = self.trial, len(self.records), self.sensitivities
+        phases = [window.phase for window in trial.windows]
+        place = "whole plan" if len(phases) > 1 else f"phase {phases[0]}"
+        many = f"{count} of {self.known}" if self.known > count else f"{count}"
+        near = 1e3 * trial.uncertainty.find_distance(trial.problem.scene)
+        off = f"{near:.3g} mm and {math.degrees(trial.uncertainty.angle):.3g} deg"
+        shares = [(f"goal reached within {off}", str(self.reached))]
+        shares.append(("and all planned contacts kept", str(self.kept)))
+        lost = [(name, str(share)) for name, share in self.first_lost.items()]
+        rest = sum(share.hits for share in list(self.first_lost.values())[_ROWS:])
+        others = [(f"{len(lost) - _ROWS} others", f"{rest} times")] if lost[_ROWS:] else []
+        ended = Counter(record["ended"] for record in self.records if record["ended"])
+        rows = []
+        for own in least.of:
+            width = f"{own.width:g} {own.unit}" if own.unit else f"{100 * own.width:g} %"
+            slope = f"{own.slope:.5g} N{'/' + own.unit if own.unit else ''}"
+            slope = slope if own.slope == own.slope else "a contact is lost at once"
+            rows.append((own.name, width, slope, own.over_range))
+        heads = ["parameter", "range (+-)", "d(least c_n)/d:.5g", "over the range [N]:.4g"]
+        missed = "" if self.nominal["reached"] else _name_miss(self.nominal)
+        place_of = f" on {least.contact} at t = {least.time:.4g} s"
+        return Document(
+            f"{trial.problem.name}, {place}",
+            reason=f"{many} samples, seed {self.seed}",
+            parts=[
+                Table(["", "share of the samples"], shares),
+                f"without anything off the goal is missed too: by {missed}" if missed else "",
+                Table(["contact lost first", "share of the samples"], lost[:_ROWS] + others),
+                *(f"{count} ended early: {text}" for text, count in ended.most_common(3)),
+                f"least c_n: {least.c_n:.4g} N{place_of}" if least.contact else "",
+                Table(heads, rows),
+            ],
+        )
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Counts, shares and sensitivities, as JSON has them."""
+        trial, least = self.trial, self.sensitivities
+        keys = ("parameter", "unit", "range", "slope")
+        return {
+            "problem": trial.problem.name,
+            "phases": [window.phase for window in trial.windows],
+            "samples": len(self.records),
+            "seed": self.seed,
+            "ranges": trial.uncertainty.widths,
+            "sample_rate": trial.uncertainty.sample_rate,
+            "reached": _list_share(self.reached),
+            "kept": _list_share(self.kept),
+            "first_lost": {name: _list_share(share) for name, share in self.first_lost.items()},
+            "least_c_n": {"contact": least.contact, "time": least.time, "c_n": least.c_n},
+            "sensitivities": [dict(zip(keys, own, strict=True)) for own in least.of],
+            "nominal": {key: own for key, own in self.nominal.items() if key != "path"},
+        }
+
+
+def _name_miss(record: dict[str, Any]) -> str:
+    if "distance" not in record:
+        return str(record["ended"])
+    return f"{1e3 * record['distance']:.3g} mm and {math.degrees(record['angle']):.3g} deg"
+
+
+def _list_share(share: Share) -> dict[str, float]:
+    return {"count": share.hits, "share": share.value, "low": share.low, "high": share.high}
+
+
+def _name_loss(record: dict[str, Any]) -> str:
+    phase = record.get("phase")
+    return record["lost"] if phase is None else f"{record['lost']} in phase {phase}"
+
+
+def assess_robustness(
+    problem: Problem,
+    plan: Torques,
+    *,
+    samples: int = 1000,
+    seed: int = 0,
+    uncertainty: Uncertainty | None = None,
+    phase: int | None = None,
+    policy: Policy | None = None,
+    path: str | os.PathLike[str] | None = None,
+    fresh: bool = False,
+    start: Callable[[], Executor] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Robustness:
+    """Replay a plan with numbers that are off, free of assumptions, and count what becomes of it.
+
+    Parameters
+    ----------
+    samples      more than the file has add a Latin hypercube of the rest; of fewer the first are
+                 counted
+    seed         of the samples, a Latin hypercube of all ranges
+    uncertainty  the ranges; those of the problem, or their defaults, if left out
+    phase        number of the only phase that is tried, from its planned start at rest
+    policy       what carries the plan out, by feedback from the joints
+    path         file to which results are written one by one. A study that is there already goes on
+                 where it was stopped, and ends the same to the last bit, unless it is to be
+                 `fresh`.
+    fresh        begin the file anew, whatever it holds
+    start        makes a `concurrent.futures.Executor`, anew when its workers have died; processes
+                 on all cores if left out
+
+    Raises
+    ------
+    InputError  if the plan has no such phase, or the file holds another study or anything else, is
+                being written by another run, or cannot be written
+    """
+    problem, trajectory = adopt_motion(problem, plan)
+    SAMPLES.read(samples, "samples")
+    require_same_phases(problem, trajectory)
+    own = uncertainty or Uncertainty(problem.ranges)
+    trial = make_trial(problem, trajectory, own, phase, policy)
+    journal = None if path is None else Journal(os.fspath(path), _stamp(trial, seed), fresh)
+    with journal or nullcontext():
+        kept = [] if journal is None else journal.records
+        sizes = [record["samples"] for record in kept if "samples" in record]
+        known = {record["sample"]: record for record in kept if "sample" in record}
+        if samples > sum(sizes):
+            sizes.append(samples - sum(sizes))
+            if journal is not None:
+                journal.add({"samples": sizes[-1]})
+        found = {k: record for k, record in known.items() if k < samples}
+        drawn = _draw(own, sizes, seed)[:samples]
+        tasks = ((k, tuple(drawn[k].tolist())) for k in range(samples) if k not in found)
+        good = sum(record["reached"] for record in found.values())
+        for record in list_records(trial, tasks, start or use_processes):
+            found[record["sample"]] = record
+            good += record["reached"]
+            if journal is not None:
+                journal.add(record)
+            if progress is not None:
+                progress(f"{len(found)} of {samples} samples, {good} reach the goal")
+    records = tuple(found[number] for number in range(samples))
+    known_now = 0 if journal is None else len({*known, *found})
+    return Robustness(trial, drawn, seed, records, known_now)
+
+
+def _draw(uncertainty: Uncertainty, sizes: Sequence[int], seed: int) -> Array:
+    """Latin hypercubes one after another: a study has one more each time that it is enlarged."""
+    starts = [sum(sizes[:k]) for k in range(len(sizes))]
+    parts = zip(starts, sizes, strict=True)
+    return np.vstack([uncertainty.draw(n, (seed, k) if k else seed) for k, n in parts])
+
+
+class Runs(Protocol):
+    """What runs a sample, here or in another process."""
+
+    def run(self, sample: Array) -> dict[str, Any]:
+        """What becomes of a sample, as plain values; as of `Trial`."""
+
+
+def list_records(
+    trial: Runs, tasks: Iterable[Task], start: Callable[[], Executor]
+) -> Iterator[dict[str, Any]]:
+    """Records as they come; a sample that workers die of has one that says so."""
+    for (number, _), answer in run_all(partial(_run, trial), tasks, start):
+        if isinstance(answer, DiedError):
+            answer = {"ended": str(answer), "reached": False, "kept": False, "lost": "worker"}
+        elif isinstance(answer, Exception):
+            raise answer
+        yield {"sample": number, **answer}
+
+
+def _run(trial: Runs, task: Task) -> dict[str, Any]:
+    number, sample = task
+    record = trial.run(np.array(sample))
+    if number >= DRAWN:
+        record.pop("path", None)
+    return record
+
+
+def use_processes(jobs: int | None = None) -> Executor:
+    """Processes of one thread each, on all cores or as many as `jobs` says."""
+    return ProcessPoolExecutor(jobs or os.cpu_count(), Spawning(), _end_with_parent)
+
+
+def _end_with_parent() -> None:
+    """Have this process end when the one that started it is killed, and can tell it no more."""
+    parent = parent_process()
+    if parent is not None:
+
+        def watch() -> None:
+            wait([parent.sentinel])
+            os._exit(1)
+
+        Thread(target=watch, daemon=True).start()
+
+
+def _stamp(trial: Trial, seed: int) -> dict[str, Any]:
+    """What records belong to: another plan, range or version makes them another study's."""
+    policy = trial.policy
+    known = [] if policy is None else [own for t in policy.tables for own in t.values()]
+    return {
+        "study": "robustness",
+        "version": __version__,
+        "problem": trial.problem.table,
+        "plan": _digest([trial.torque.breaks, trial.torque.coefficients, trial.state]),
+        "policy": None if policy is None else _digest(known),
+        "pace": None if policy is None else policy.pace._asdict(),
+        "sensor": policy is not None and policy.sensor,
+        "phases": [own.phase for own in trial.windows],
+        "widths": trial.uncertainty.widths,
+        "sample_rate": trial.uncertainty.sample_rate,
+        "tolerance": trial.uncertainty.tolerance,
+        "goal": [trial.uncertainty.distance, trial.uncertainty.angle],
+        "seed": seed,
+    }
+
+
+def _digest(arrays: Iterable[Array]) -> str:
+    data = b"".join(np.ascontiguousarray(part).tobytes() for part in arrays)
+    return hashlib.sha256(data).hexdigest()[:12]
+
+
+class Sensitivity(NamedTuple):
+    """Of one normal force, by central differences of free simulations."""
+
+    name: str  # name, unit: the parameter, and the unit of its range; empty for a relative one
+    unit: str
+    width: float  # half width of its range
+    # dc_n/d(parameter) [N per unit]; NaN where the contact is lost even for such a step
+    slope: float
+
+    @property
+    def over_range(self) -> float:
+        """What the half width changes, to first order [N]."""
+        return self.slope * self.width
+
+
+class Sensitivities(NamedTuple):
+    """The least normal force of a motion, and what it depends on."""
+
+    contact: str
+    time: float  # [s]: when it is least, away from where forces step
+    c_n: float  # [N]
+    of: tuple[Sensitivity, ...]  # the largest over its range first
+
+
+def measure_sensitivities(trial: Trial) -> Sensitivities:
+    """Sensitivities of the least planned normal force to every parameter with a range.
+
+    The least value of a smooth force changes like the force where it is least, whenever that is.
+    """
+    contact, time, least = find_least(trial.simulate({}, trial.torque), trial.windows)
+    found = []
+    for own in trial.uncertainty.varied if contact else ():
+        width = trial.uncertainty.widths[own.name]
+        step = STEP * width
+        ends = (0.0, step) if own.name == "delay" else (-step, step)
+        forces = [_find_force(trial, own.name, value, contact, time) for value in ends]
+        slope = (forces[1] - forces[0]) / (ends[1] - ends[0])
+        found.append(Sensitivity(own.name, own.unit, width, slope))
+    known = [own for own in found if own.slope == own.slope]
+    unknown = [own for own in found if own.slope != own.slope]
+    known.sort(key=lambda own: -abs(own.over_range))
+    return Sensitivities(contact, time, least, (*known, *unknown))
+
+
+def find_least(
+    simulation: FreeSimulation, windows: tuple[TimeWindow, ...]
+) -> tuple[str, float, float]:
+    """The planned contact that presses least, when, and its c_n; none has no name."""
+    t = simulation.t
+    events = np.array([0.0, t[-1], *(own.time for own in simulation.events)])
+    apart = np.abs(t[:, None] - events).min(axis=1) > APART * t[-1]
+    found, start = ("", math.nan, math.nan), 0.0
+    for window in windows:
+        for name in window.contacts:
+            c_n = simulation.c_n[:, simulation.contacts.index(name)]
+            here = np.flatnonzero(apart & (t > start) & (t < window.stop) & (c_n == c_n))
+            if len(here):
+                row = here[c_n[here].argmin()]
+                if not c_n[row] >= found[2]:
+                    found = (name, float(t[row]), float(c_n[row]))
+        start = window.stop
+    return found
+
+
+def _find_force(trial: Trial, name: str, change: float, contact: str, time: float) -> float:
+    """A contact's c_n at an instant, by the clock of the torques; NaN where it is lost."""
+    late = change if name == "delay" else 0.0
+    torque = change_torques(trial.torque, {name: change}).cut(0.0, time + late)
+    try:
+        simulation = trial.simulate({name: change}, torque)
+    except (InputError, SimulationError):
+        return math.nan
+    return float(simulation.c_n[-1, simulation.contacts.index(contact)])
+
+
+@dataclass(frozen=True)
+class Share:
+    """How many of how many, with Wilson's interval of 95 % for the probability.
+
+    References
+    ----------
+    E. B. Wilson, "Probable inference, the law of succession, and statistical inference", 1927.
+    """
+
+    hits: int
+    total: int
+    low: float
+    high: float
+
+    @property
+    def value(self) -> float:
+        """The share itself; NaN of none."""
+        return self.hits / self.total if self.total else math.nan
+
+    def __str__(self) -> str:
+        if not self.total:
+            return "none"
+        percent = [f"{100 * value:.1f}" for value in (self.value, self.low, self.high)]
+        return f"{percent[0]} % ({self.hits} of {self.total}, 95 %: {percent[1]} to {percent[2]} %)"
+
+
+def count_share(count: int, total: int) -> Share:
+    """A share with its interval: the probabilities p with |count/total - p| <= Z sigma(p)."""
+    if not total:
+        return Share(0, 0, 0.0, 1.0)
+    share, spread = count / total, Z**2 / total
+    centre = (share + spread / 2) / (1 + spread)
+    half = math.sqrt(share * (1 - share) * spread + spread**2 / 4) / (1 + spread)
+    # At the ends the interval begins and ends exactly there, but for rounding.
+    low = centre - half if count else 0.0
+    return Share(count, total, low, centre + half if count < total else 1.0)

@@ -1,0 +1,106 @@
+"""Links through cells planned for themselves: on few intervals, to see whether and how they go."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ..common.errors import WholearmError
+from ..contacts.formation import Formation
+from ..geometry.explore import STILL
+from ..geometry.path_guess import find_end
+from ..geometry.tracing import trace_phase
+from ..mechanics.metric import metric_weights
+from ..planning.lower_bound.lower_bound import look_along
+from ..planning.lower_bound.speed_sweep import NoMotionError
+from ..planning.options import Objective, PlanOptions
+from ..planning.phase_plan import PhasePlan
+from ..planning.time_domain.time_motion import TimeMotion
+from ..problem.definition import End, Phase, Problem, Until
+from .border_limits import INTERVALS
+from .edges import EdgeStep, Link
+from .places import settle
+
+ROUGH = 1e-2
+"""Accuracy of plans of which only matters about how long they take."""
+SINGULAR = "its contacts depend on each other"
+"""Why there is no plan where the equations of motion have no single solution."""
+
+
+class Measured(NamedTuple):
+    """What came of planning a link through a cell for itself."""
+
+    duration: float  # [s]
+    steps: tuple[EdgeStep, ...]  # its phases, in the way that was planned
+    # plans of those in the cell, and of the border that is left in motion, on few intervals
+    begun: list[PhasePlan[TimeMotion]]
+
+
+def make_phases(problem: Problem, steps: Sequence[EdgeStep], index: int = 0) -> list[Phase]:
+    """Steps as phases, the first of them with an index."""
+    return [
+        Phase(index + k, Formation(problem.scene, step.contacts), step.until, step.end)
+        for k, step in enumerate(steps)
+    ]
+
+
+def measure_link(
+    problem: Problem,
+    link: Link,
+    steps: tuple[EdgeStep, ...],
+    options: PlanOptions,
+    further: int = 0,
+    straight: bool = True,
+    hurried: bool = False,
+) -> Measured | str:
+    """Plan a link through a cell for itself, on few intervals.
+
+    Parameters
+    ----------
+    steps     its own, or others that lead the same way
+    further   guesses beyond the first ones, if these lead nowhere
+    straight  whether a cell is first guessed to be crossed straight, or to the nearest end of the
+              phase
+    hurried   whether there is one guess alone
+
+    Returns
+    -------
+    Measured, or why there is no plan.
+    """
+    from ..planning.time_domain.time_plan import try_phases
+
+    rough = replace(options, objective=Objective.TIME, duration=None, accuracy=ROUGH)
+    phases, z, spent = make_phases(problem, steps), link.start.z, 0.0
+    try:
+        own = replace(problem, goals=(), phases=tuple(phases))
+        if len(phases) > 1 and phases[0].end is End.REST:
+            curve = trace_phase(phases[0], z)
+            spent = look_along((curve,), problem.epsilon, INTERVALS)
+            z, phases = curve.end, phases[1:]
+        goal = settle(link.stop) if len(phases) == 1 else None
+        if goal is None:
+            goal = replace(link.stop, z=find_end(phases[0], z, phases[1:]))
+        moved = metric_weights(problem.scene) @ (goal.z - z) ** 2
+        if moved < (STILL * problem.scene.scales.length) ** 2:
+            return f"{phases[0].until} holds already where it starts"
+        alone = len(phases) == 1
+        towards = goal.z if straight and alone else None
+        plans = try_phases(own, phases, z, rough, towards, further if alone else 0, hurried)
+    except NoMotionError:
+        return "no motion keeps its limits along the border"
+    except WholearmError as error:
+        return str(error)
+    except np.linalg.LinAlgError:
+        return SINGULAR
+    if plans is None:
+        return "no guess leads to a plan"
+    return Measured(spent + sum(plan.motion.duration for plan in plans), steps, plans)
+
+
+def leave_in_motion(steps: tuple[EdgeStep, ...]) -> tuple[EdgeStep, ...]:
+    """Phases that leave a border in motion, at a place that the planner chooses."""
+    first, *rest = steps
+    return (EdgeStep(first.contacts, Until(), End.SMOOTH), *rest)

@@ -1,0 +1,268 @@
+"""Whether what comes to rest in a moving formation sticks, turns back or goes on: Coulomb's law.
+
+Where a sliding speed or a joint's speed is zero, friction is whatever is consistent: a contact may
+slide either way if it then accelerates that way, or stick if its c_t stays in the cone; a joint
+likewise. Each combination for everything that stands still is one linear system, and the contacts
+have to press. Each is judged a moment later, by what its accelerations and forces lead to until
+then, so that a force that leaves its cone is told from one that comes back into it.
+
+Where friction is moderate exactly one combination is consistent. The first one is taken that is so
+by more than rounding. What has just come to rest tries to turn back, then to stick, then to go on;
+all else tries to go on as it does, and what friction holds, if its cone is just reached, to slip.
+If none is clear the best one is taken.
+
+Where what is stuck lets something else not move either, as a finger that leans on a stuck object,
+that has no independent constraint. Its friction is indeterminate, and may be taken as that of
+either direction: some such choice is consistent for as long as any friction is, since what friction
+has left elsewhere is a monotonic function of each. It counts as stuck, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.arrays import Array
+from ..common.errors import JammingError
+from ..contacts.formation import Formation
+from ..scene.model import Scene
+from .events import EventKind
+from .modes import Mode, ModeRows, Response, Unit, find_fixed, find_grips, list_units, respond
+from .replay import Replay
+from .tolerances import STANDING, is_slower
+
+CLEAR = 1e-8
+"""Least margin of a clear decision, relative to the scene's forces, torques or accelerations."""
+TRIES = 50
+"""Most decisions in a row without any time passing."""
+
+
+class Choice(NamedTuple):
+    """A combination of directions, and how far it is from being inconsistent."""
+
+    signs: Array  # (n_c + 2,): directions of contacts and joints, zero for what is held or rolls
+    # (n_c + 2,): whether each is held, or cannot move for what else is held
+    fixed: NDArray[np.bool_]
+    # least of the relative accelerations along the directions and reserves of friction
+    margin: float
+    pressing: float  # least c_n over the scene's force
+
+
+def choose_mode(
+    run: Replay, turned: Sequence[int] = (), *, time: float | None = None, enters: bool = False
+) -> bool:
+    """Let friction decide for everything that stands still; whether the motion has ended.
+
+    Parameters
+    ----------
+    turned      contacts, then joints, whose speed has just come to zero
+    time : [s]  when that was, if not at present
+    enters      whether the directions so far are a guess, as a formation is entered
+    """
+    s = run.stepper
+    formation, scene = run.phase.formation, run.problem.scene
+    signs = np.concatenate([s.inputs[s.at.Xi], s.inputs[s.at.sigma]])
+    s.inputs[s.at.y], s.inputs[s.at.t] = run.y, run.t
+    s.look()
+    speeds = np.abs(s.outputs[s.to.events][s.rows.slide.start : s.rows.joint.stop])
+    units = list_units(formation)
+    slow = STANDING * measure_rates(scene, formation.n_contacts)
+    still = [
+        unit
+        for unit in units
+        if set(unit.rows) & set(turned)
+        or (unit.grips and (speeds[list(unit.rows)] < slow[list(unit.rows)]).any())
+    ]
+    if not still:
+        return False
+    if is_slower(scene, run.y[5:10], STANDING):
+        return True
+    run.count_decision(TRIES)
+    orders = [_list_options(run, unit, float(signs[unit.rows[0]]), turned) for unit in still]
+    choice = _choose(run, signs, still, orders)
+    _take(run, choice.signs, still)
+    for unit in still:
+        row = unit.rows[0]
+        before = 0.0 if row in run.stuck else float(signs[row])
+        after = float(choice.signs[row]) if not choice.fixed[row] else 0.0
+        changes = before != after and not (enters and after) and unit.grips
+        for row in unit.rows if changes else ():
+            note_change(run, row, before, after, run.t if time is None else time)
+        run.stuck = (run.stuck - set(unit.rows)) | set(() if after else unit.rows)
+    return False
+
+
+def measure_rates(scene: Scene, count: int) -> Array:
+    """The scene's speed for `count` contacts, then that of joints, shape (count + 2,)."""
+    scales = scene.scales
+    return np.repeat([scales.speed, 1 / scales.time], [count, 2])
+
+
+def note_change(run: Replay, row: int, before: float, after: float, time: float) -> None:
+    """Record that a contact or joint sticks, slips or turns back."""
+    formation = run.phase.formation
+    contact = row < formation.n_contacts
+    name = formation.names[row] if contact else f"joint {row - formation.n_contacts + 1}"
+    when = f"at t = {time:.5g} s, phase {run.phase.number}"
+    if after == 0:
+        kind, text = EventKind.STICK, f"{name} sticks" if contact else f"friction holds {name}"
+    elif before == 0:
+        kind, text = EventKind.SLIP, f"{name} slips" if contact else f"{name} starts to turn"
+    else:
+        verb = "slides" if contact else "turns"
+        kind, text = EventKind.REVERSAL, f"{name} {verb} the other way"
+    run.note(kind, f"{text} {when}", name, time=time)
+
+
+def _list_options(
+    run: Replay, unit: Unit, present: float, turned: Sequence[int]
+) -> tuple[float, ...]:
+    """Directions to try for one unit, in the order in which the first clear one is taken."""
+    if present != 0:
+        first = -present if set(unit.rows) & set(turned) else present
+        return (first, 0.0, -first) if unit.grips else (first, -first)
+    s = run.stepper
+    holder = s.mode.holders.index(unit.rows)
+    low, high = s.outputs[s.to.events][s.rows.cone].reshape(2, -1)[:, holder]
+    way = 1.0 if high < low else -1.0
+    # Friction is at the edge of its cone and opposes the slip to come.
+    edge = min(low, high) < s.slack[s.rows.cone.start + holder]
+    return (way, -way, 0.0) if edge else (0.0, way, -way)
+
+
+def _choose(
+    run: Replay, signs: Array, still: Sequence[Unit], orders: Sequence[tuple[float, ...]]
+) -> Choice:
+    """The directions of the first clear combination, or of the best.
+
+    Raises
+    ------
+    JammingError  if no combination is consistent, and it is not that a contact would have to pull
+    """
+    judge = _Judge(run, still)
+    found: list[Choice] = []
+    for options in product(*orders):
+        tried = signs.copy()
+        for unit, sign in zip(still, options, strict=True):
+            tried[list(unit.rows)] = sign
+        choice = judge.judge(tried)
+        if choice is None:
+            continue
+        if choice.margin > CLEAR and choice.pressing > -CLEAR:
+            return choice
+        found.append(choice)
+    pressing = [choice for choice in found if choice.pressing > -CLEAR]
+    best = max(pressing, key=lambda choice: choice.margin, default=None)
+    if best is not None and best.margin > -CLEAR:
+        return best
+    # A contact is about to be lost, and its forces say which.
+    pulling = [choice for choice in found if choice.pressing <= -CLEAR]
+    if pulling:
+        return max(pulling, key=lambda choice: choice.margin)
+    if judge.worst <= 0:
+        run.fail_to_step(judge.worst)
+    names = " ".join(run.phase.formation.names)
+    raise JammingError(
+        f"{names} jams {run.where()}: no combination of sliding and sticking is consistent"
+    )
+
+
+class _Judge:
+    """Looks at combinations of directions at the present state."""
+
+    def __init__(self, run: Replay, still: Sequence[Unit]) -> None:
+        self.formation, self.still = run.phase.formation, still
+        self.scene = run.problem.scene
+        self.h = run.tolerances.settling
+        self.z, self.v = run.y[:5].copy(), run.y[5:10].copy()
+        self.load, self.later = (np.array([1.0, *run.torque(t)]) for t in (run.t, run.t + self.h))
+        self.rows = evaluate_rows(self.formation, self.z, self.v)
+        self.worst = 1.0
+
+    def judge(self, signs: Array) -> Choice | None:
+        """Judge one combination; None if it jams or leaves its forces open."""
+        mode = Mode(self.formation, find_grips(self.formation, signs))
+        if mode.n_constraints > 4:
+            return None
+        now = self._respond(mode, signs, self.rows, self.v)
+        if now is None:
+            return None
+        acceleration = now.acceleration @ self.load
+        v = self.v + self.h * acceleration
+        z = self.z + self.h * (self.v + v) / 2
+        then = self._respond(mode, signs, evaluate_rows(self.formation, z, v), v)
+        if then is None:
+            return None
+        return self._measure(mode, signs, now, then)
+
+    def _respond(self, mode: Mode, signs: Array, rows: ModeRows, v: Array) -> Response | None:
+        response = respond(mode, signs, rows, v)
+        if response is not None and not response.ratio > 0:
+            self.worst = min(self.worst, response.ratio)
+            return None
+        return response
+
+    def _measure(self, mode: Mode, signs: Array, now: Response, then: Response) -> Choice:
+        """Compare accelerations with directions, and what friction gives with what it can give."""
+        scales, count = self.scene.scales, self.formation.n_contacts
+        gained = (now.rates @ self.load + then.rates @ self.later) / 2
+        gained = signs * gained / (measure_rates(self.scene, count) / scales.time)
+        fixed = find_fixed(mode, self.rows.A, self.rows.A_t)
+        force_limits = then.force_limits @ self.later
+        cones = force_limits[count:].reshape(2, -1).min(axis=0)
+        margins = [np.inf]
+        for unit in self.still:
+            row = unit.rows[0]
+            if signs[row] == 0:
+                force = scales.force if row < count else scales.torque
+                margins.append(cones[mode.holders.index(unit.rows)] / force)
+            elif abs(gained[row]) > CLEAR:
+                margins.append(gained[row])
+        return Choice(
+            signs, fixed, float(min(margins)), float(force_limits[:count].min() / scales.force)
+        )
+
+
+def evaluate_rows(formation: Formation, z: Array, v: Array) -> ModeRows:
+    """Constraint rows of a formation at one state."""
+    kinematics = _roll_all(formation).evaluate(z[None], v[None])
+    normal, tangential = np.split(kinematics.P_dot_v[0], 2)
+    return ModeRows(kinematics.A[0], kinematics.A_t[0], normal, tangential)
+
+
+@lru_cache(maxsize=64)
+def _roll_all(formation: Formation) -> Formation:
+    return replace(formation, rolling=formation.contacts)
+
+
+def _take(run: Replay, signs: Array, still: Sequence[Unit]) -> None:
+    """Go on with the directions chosen; rounding of speeds against them is taken away."""
+    formation = run.phase.formation
+    count, v = formation.n_contacts, run.y[5:10]
+    kinematics = formation.evaluate(run.y[None, :5], v[None])
+    gradients = np.vstack([kinematics.A_t[0], np.eye(5)[3:]])
+    wrong = [
+        unit.rows[0]
+        for unit in still
+        if signs[unit.rows[0]] == 0 or signs[unit.rows[0]] * (gradients[unit.rows[0]] @ v) < 0
+    ]
+    root = np.sqrt(formation.scene.mass_diagonal)
+    before = run.stored
+    rows = np.vstack([kinematics.P[0], gradients[wrong]]) / root
+    rows /= np.linalg.norm(rows, axis=1)[:, None]
+    run.y[5:10] -= np.linalg.lstsq(rows, rows @ (root * v))[0] / root
+    run.impact += before - run.stored
+    grips = find_grips(formation, signs)
+    if grips != run.stepper.mode.grips:
+        run.take(grips)
+    s = run.stepper
+    s.inputs[s.at.Xi], s.inputs[s.at.sigma] = signs[:count], signs[count:]
+    v = run.y[5:10]
+    s.inputs[s.at.y], s.inputs[s.at.t] = run.y, run.t
+    s.inputs[s.at.heading] = v / np.sqrt(root**2 @ v**2)

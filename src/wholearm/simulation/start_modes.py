@@ -1,0 +1,287 @@
+"""The ways in which a formation at rest could start to move.
+
+With one freedom these are the two ways along the free direction. With more, each choice of the
+directions in which contacts slide and joints turn, and of what sticks and is held, makes the
+accelerations affine in the torques. A choice is consistent if contacts and joints then accelerate
+in those directions, friction can hold the others, every contact presses, and nothing that touches
+closes further. Choices in which nothing is held are tried first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.arrays import Array
+from ..contacts.formation import Formation, Kinematics
+from ..mechanics.dynamics import Directions
+from .modes import Mode, ModeRows, Response, find_grips, list_units, respond, share_mode
+from .tolerances import ROUNDING_FORCE, Tolerances, find_tolerances, measure_units
+
+_STEP = 3e-5
+"""Step of the difference quotient, in units of the scene."""
+_KINK = 1e-2
+"""Rise of a limit both ways, over the step, from which it has a kink and no gradient."""
+_GRAZE = 1e-3
+"""Acceleration with which a gap may close, over those of sliding and turning in all: planned
+motions that graze a link between their nodes do. How far it then closes is looked at on the way."""
+
+
+class StartDeparture(NamedTuple):
+    """The formation starts to move, or goes on, at `x` in [-1, 1] of a piece of the torques."""
+
+    x: float
+    heading: Array  # (5,): where to, of length one in the metric M5
+    directions: Directions
+
+
+class StartPath(Protocol):
+    """One way in which a formation at rest could start to move."""
+
+    @property
+    def directions(self) -> Directions:
+        """Directions of contacts and joints, zero for what friction holds."""
+
+    @property
+    def force_limits(self) -> Array:
+        """Rows with H c = force_limits @ (1, tau_1, tau_2), positive where the contacts hold.
+
+        Shape (n_c + 2 R, 3) [N]; the first n_c are the normal forces.
+        """
+
+    @property
+    def ratio(self) -> float:
+        """Reduced inertia over that without friction; jammed at zero and below."""
+
+    @property
+    def margins(self) -> list[tuple[Array, float]]:
+        """Rows r and offsets d with r @ (1, tau_1, tau_2) + d >= 0 while it moves this way."""
+
+    def drive(self, tau: Array) -> float:
+        """How strongly it accelerates this way, in the metric M5."""
+
+    def slides(self, tau: Array) -> bool:
+        """Whether it accelerates this way, if every contact can press or pull."""
+
+    def moves(self, tau: Array) -> bool:
+        """Whether the formation starts to move this way under torques `tau`, shape (2,)."""
+
+    def depart(self, x: float, tau: Array) -> StartDeparture:
+        """Start this way at `x` of a piece, where the torques are `tau`."""
+
+
+class RestDirection(NamedTuple):
+    """One way in which a formation at rest could move."""
+
+    heading: Array  # (5,): the direction, of length one in the metric M5
+    directions: Directions  # the friction that opposes it
+    acceleration: Array  # (3,): acceleration along `heading` is acceleration @ (1, tau_1, tau_2)
+    # (n_c + 2 R, 3): likewise what has to be positive for the contacts to hold, H c [N]
+    # (`contacts.cones`)
+    force_limits: Array
+    ratio: float  # reduced inertia over that without friction; jammed at zero and below
+    closes: bool  # whether it would push features that touch already into one another
+    tolerances: Tolerances
+
+    @property
+    def margins(self) -> list[tuple[Array, float]]:
+        """Rows r and offsets d with r @ (1, tau_1, tau_2) + d >= 0 while it moves this way."""
+        rounding = self.tolerances
+        force_limits = [(row, rounding.force) for row in self.force_limits]
+        return [(self.acceleration, -rounding.drive), *force_limits]
+
+    def drive(self, tau: Array) -> float:
+        """How strongly it accelerates this way, in the metric M5."""
+        return float(self.acceleration @ [1.0, *tau])
+
+    def slides(self, tau: Array) -> bool:
+        """Whether it accelerates this way, if every contact can press or pull."""
+        return self.drive(tau) > self.tolerances.drive and not self.closes
+
+    def moves(self, tau: Array) -> bool:
+        """Whether the formation starts to move this way under torques `tau`, shape (2,)."""
+        keeps = float((self.force_limits @ [1.0, *tau]).min()) >= -self.tolerances.force
+        return self.ratio > 0 and keeps and self.slides(tau)
+
+    def depart(self, x: float, tau: Array) -> StartDeparture:
+        """Start this way at `x` of a piece; the torques do not matter."""
+        return StartDeparture(x, self.heading, self.directions)
+
+
+class Slack(NamedTuple):
+    """What counts as rounding in the rows of a pattern of the same names."""
+
+    drive: float
+    slips: Array
+    grips: Array
+    force_limits: Array
+    openings: Array
+
+
+class Touching:
+    """What touches at a configuration `z` but is not in the formation: the limits `near` zero.
+
+    Attributes
+    ----------
+    gradient : (k, 5)  of those that have one. Where a pointed tip is at a vertex the gap of an edge
+                       has none.
+    """
+
+    def __init__(self, formation: Formation, z: Array, near: NDArray[np.bool_]) -> None:
+        self.formation, self.z = formation, z
+        self.units = measure_units(formation.scene)[:5]
+        self.gradient, self.kinked = np.zeros((0, 5)), np.zeros(0, dtype=np.int64)
+        if not near.any():
+            return
+        ahead = _STEP * self.units
+        values = formation.evaluate_limits(z + np.vstack([np.diag(ahead), -np.diag(ahead)]))
+        values = (values - formation.evaluate_limits(z[None]))[:, near]
+        rises = (values[:5] + values[5:]).max(axis=0)
+        kinked = rises > _KINK * _STEP * formation.scene.scales.length
+        self.kinked = np.flatnonzero(near)[kinked]
+        self.gradient = (values[:5] - values[5:])[:, ~kinked].T / (2 * ahead)
+
+    def opens(self, acceleration: Array) -> bool:
+        """Whether what has a kink does not close along an acceleration, shape (5,)."""
+        if not len(self.kinked):
+            return True
+        step = _STEP / np.abs(acceleration / self.units).max()
+        places = self.z + np.array([[0.0], [step]]) * acceleration
+        here, ahead = self.formation.evaluate_limits(places)[:, self.kinked]
+        closing = _GRAZE * _STEP * self.formation.scene.scales.length
+        return bool((ahead - here >= -closing).all())
+
+
+class ModeChoice(NamedTuple):
+    """A choice of directions; quantities at rest are rows @ (1, tau_1, tau_2)."""
+
+    directions: Directions  # zero for what friction holds
+    mass: Array  # (5,): diagonal of M5
+    acceleration: Array  # (5, 3): z''
+    # (n_c + 2 R, 3) [N]: what has to be positive for the contacts to hold, H c (`contacts.cones`)
+    force_limits: Array
+    # (n_c + 2, 3): accelerations of the contacts' sliding and of the joints, along `directions`
+    slips: Array
+    # (2 k, 3) [N, N m]: what has to be positive for friction to hold what has no direction
+    grips: Array
+    # (k, 3) [m/s^2]: accelerations of the gaps of what touches but is not in the formation, plus
+    # what counts as grazing
+    openings: Array
+    ratio: float
+    slack: Slack
+    touching: Touching
+
+    @property
+    def margins(self) -> list[tuple[Array, float]]:
+        """Rows r and offsets d with r @ (1, tau_1, tau_2) + d >= 0 while it moves this way."""
+        kinds = (
+            (self.slips, self.slack.slips),
+            (self.openings, self.slack.openings),
+            (self.force_limits, self.slack.force_limits),
+            (self.grips, self.slack.grips),
+        )
+        pairs = (pair for kind in kinds for pair in zip(*kind, strict=True))
+        return [(row, float(offset)) for row, offset in pairs]
+
+    def drive(self, tau: Array) -> float:
+        """How strongly it accelerates, in the metric M5."""
+        acceleration = self.acceleration @ [1.0, *tau]
+        return float(np.sqrt(self.mass @ acceleration**2))
+
+    def slides(self, tau: Array) -> bool:
+        """Whether contacts and joints accelerate in their directions and nothing closes."""
+        load, slack = [1.0, *tau], self.slack
+        return (
+            self.ratio > 0
+            and self.drive(tau) > slack.drive
+            and bool((self.slips @ load >= -slack.slips).all())
+            and bool((self.grips @ load >= -slack.grips).all())
+            and bool((self.openings @ load >= -slack.openings).all())
+            and self.touching.opens(self.acceleration @ load)
+        )
+
+    def moves(self, tau: Array) -> bool:
+        """Whether it slides this way and every contact presses."""
+        return bool(
+            (self.force_limits @ [1.0, *tau] >= -self.slack.force_limits).all()
+        ) and self.slides(tau)
+
+    def depart(self, x: float, tau: Array) -> StartDeparture:
+        """Start this way at `x` of a piece, where the torques are `tau`."""
+        heading = self.acceleration @ [1.0, *tau] / self.drive(tau)
+        return StartDeparture(x, heading, self.directions)
+
+
+def find_patterns(
+    formation: Formation, z: Array, near: NDArray[np.bool_], held: bool
+) -> Iterator[ModeChoice]:
+    """Yield every choice of directions at a configuration at rest; contacts that roll have none.
+
+    Parameters
+    ----------
+    z : (5,)
+    near : (n_limits,)  which limits of the formation are zero at `z`
+    held                whether to yield those in which friction holds something, the least first,
+                        or the others
+    """
+    kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
+    touching = Touching(formation, z, near)
+    units = list_units(formation)
+    choices = [(1.0, -1.0, 0.0) if held and unit.grips else (1.0, -1.0) for unit in units]
+    for options in sorted(product(*choices), key=lambda options: options.count(0.0)):
+        count = options.count(0.0)
+        if (count > 0) != held or formation.n_constraints + count > 4:
+            continue
+        signs = np.zeros(formation.n_contacts + 2)
+        for unit, sign in zip(units, options, strict=True):
+            signs[list(unit.rows)] = sign
+        grips = find_grips(formation, signs)
+        mode = share_mode(formation, grips)
+        pattern = _build_pattern(mode, signs, kinematics, touching)
+        if pattern is not None:
+            yield pattern
+
+
+def respond_at_rest(mode: Mode, signs: Array, kinematics: Kinematics) -> Response | None:
+    """How a mode at rest answers to torques; None if its forces are not determined."""
+    none = np.zeros(mode.formation.n_contacts)
+    rows = ModeRows(kinematics.A[0], kinematics.A_t[0], none, none)
+    return respond(mode, signs, rows, np.zeros(5))
+
+
+def _build_pattern(
+    mode: Mode, signs: Array, kinematics: Kinematics, touching: Touching
+) -> ModeChoice | None:
+    formation, count = mode.formation, mode.formation.n_contacts
+    response = respond_at_rest(mode, signs, kinematics)
+    if response is None:
+        return None
+    declared = np.array([mode.declares(k) for k in range(len(mode.holders))] * 2, dtype=bool)
+    cones, cone_units = response.force_limits[count:], mode.force_limit_units[count:]
+    tolerances, length = find_tolerances(formation.scene), formation.scene.scales.length
+    slips = signs[:, None] * response.rates
+    graze = _GRAZE * np.repeat([1.0, length], [count, 2]) @ slips
+    units = np.concatenate([mode.force_limit_units[:count], cone_units[declared]])
+    slack = Slack(
+        drive=tolerances.drive,
+        slips=np.repeat([tolerances.still, tolerances.still_joint], [count, 2]),
+        grips=ROUNDING_FORCE * cone_units[~declared],
+        force_limits=ROUNDING_FORCE * units,
+        openings=np.full(len(touching.gradient), tolerances.closing),
+    )
+    return ModeChoice(
+        directions=Directions(signs[:count], signs[count:]),
+        mass=formation.scene.mass_diagonal,
+        acceleration=response.acceleration,
+        force_limits=np.vstack([response.force_limits[:count], cones[declared]]),
+        slips=slips,
+        grips=cones[~declared],
+        openings=touching.gradient @ response.acceleration + graze,
+        ratio=response.ratio,
+        slack=slack,
+        touching=touching,
+    )

@@ -1,0 +1,597 @@
+"""Tune the torques of a problem, from rest to rest, by the 10 % rule."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..common.errors import InputError, name_source
+from ..common.fields import SHARE
+from ..common.sharing import exclusive
+from ..problem.check import require_phases
+from ..problem.definition import End, Phase, Problem, Until
+from ..quasistatic.slow_speeds import SQUEEZE, find_torques, make_road
+from ..results.torque_table import read_rows
+from ..simulation.tolerances import REST_WINDOW
+from ..verification.free import verify_free
+from .result import PhaseTuning, Tuning
+from .trial import Bench, Passage, TrialOutcome, TuningStep, TuningTrial, make_rows, split_passages
+
+FACTOR = 1.1
+"""What raises a torque by 10 %; lowering divides by it, so that each torque comes again."""
+SLOW = 3e-5
+"""Speed at which the end of a phase may be reached by a brake, relative to the scene's: contacts
+part for less than a moment then."""
+_ROUGH = 50.0
+"""How much faster than that an end is reached while brakes are compared."""
+_RAISED = 60
+"""Most times a torque is raised or lowered: a factor of 300."""
+_SUPPORT = 3
+"""So many times the supporting torque is raised at once, by a third, as each needs searches."""
+ENOUGH = 600
+"""Simulations from one start after which no further drive, brake or support is tried."""
+_SUPPORTED = 13
+"""It is raised fewer times than this."""
+_SOONER = 0.02
+"""Share of the time by which another 10 % has to bring the end sooner."""
+_COARSE = 2
+"""So many times the acting torque is lowered at once while it brakes too little."""
+_PLACES = 16
+"""Instants to brake at that are looked at, where each of them lets the object arrive."""
+_CLOSER = 45
+"""Most steps to the one at which it arrives most slowly, by golden sections."""
+_GOLDEN = (3 - math.sqrt(5)) / 2
+_MISSES = 2
+"""So many torques that stop nothing end that, once one has."""
+_SEARCH = 24
+"""Most trials that look for the instant to brake."""
+_NARROW = 1e-3
+"""Share of the time in which the end is either reached at speed or not at all: what starts the
+motion again, or lets it turn back, is not a matter of when to brake."""
+_FAR, _FAST = 0.02, 0.1
+"""Shares of the way and of the drive's speed that are much for that."""
+_SOON = 1e-3
+"""Share of a drive's time: where the end is reached with a brake that early it is none."""
+_LOSSES = 4
+"""Most of them that may lose a contact."""
+PAUSE = 0.2
+"""How long the object is held at the end of each phase, relative to the scene's time."""
+MOST_STOPS = 7
+"""Stops of a phase that may be allowed at most: halves of halves of halves."""
+_LOWERED = 6
+"""How many times the acting torque is lowered for that, less one."""
+
+
+@exclusive
+def tune(
+    problem: Problem,
+    *,
+    brake: bool = False,
+    stops: int = 0,
+    squeeze: float = SQUEEZE,
+    share: float = 1.0,
+    progress: Callable[[str], None] | None = None,
+) -> Tuning:
+    """Tune torques from the quasistatic ones, in steps of 10 %, by free simulations.
+
+    Each phase has constant torques. That of the finger behind the motion is raised until the
+    object slides to the end of the phase, and further for speed until a contact is lost; then it
+    is lowered by 10 %. Phases that pass into one another in motion are tuned as one.
+
+    Parameters
+    ----------
+    brake     whether each phase may have one more step of its torques, which stops it at its end
+    stops     how often a phase that does not succeed with a brake may stop on its way, 0 to 7:
+              halfway, then again in the halves that do not succeed
+    squeeze   how hard the quasistatic torques squeeze; as of `predict`
+    share     which of the raises that reach the end of a phase is taken, from the first, 0, to the
+              last that keeps every contact, 1
+    progress  shown each trial, in words
+
+    Raises
+    ------
+    InputError  if the phases cannot be carried out geometrically, or a number is out of its range
+    """
+    require_phases(problem)
+    squeeze, share = SHARE.read(squeeze, "squeeze"), SHARE.read(share, "share")
+    _require_stops(stops, brake)
+    found: list[PhaseTuning] = []
+    steps: list[TuningStep] = []
+    z, clock = problem.start, 0.0
+    with name_source(problem.source):
+        for passage in split_passages(problem):
+            setting = _Setting(problem, passage, brake, squeeze, share, progress or _ignore)
+            parts, end, reason = _carry(setting, z, stops)
+            found += parts
+            if end is None:
+                title = parts[-1].title
+                reason = f"phase{'s' if '-' in title else ''} {title}: {reason}"
+                return Tuning(problem.name, tuple(found), None, None, reason)
+            for own in parts:
+                steps += [step._replace(time=clock + step.time) for step in own.steps]
+                clock += own.duration + setting.pause
+            z = end
+    rows = make_rows(steps, clock)
+    report = verify_free(problem, read_rows(rows))
+    return Tuning(problem.name, tuple(found), rows, report, report.reason)
+
+
+def _require_stops(stops: int, brake: bool) -> None:
+    if isinstance(stops, bool) or not isinstance(stops, int) or not 0 <= stops <= MOST_STOPS:
+        raise InputError("", "stops", f"{stops!r} given; allowed are 0 to {MOST_STOPS}")
+    if stops and not brake:
+        raise InputError("", "stops", f"{stops} given without a brake; allowed then is 0")
+
+
+def _ignore(text: str) -> None:
+    """Where nobody looks."""
+
+
+def _carry(setting: _Setting, z: Array, stops: int) -> tuple[list[PhaseTuning], Array | None, str]:
+    """Tune a passage from rest at `z`, with stops on the way where that does not succeed."""
+    own, end, reason = setting.tune(z)
+    halves = setting.halve(z) if end is None and stops else None
+    if halves is None:
+        return [own], end, reason
+    first, z_middle, why = _carry(halves[0], z, (stops - 1) // 2)
+    spent = own.simulations
+    first[0] = replace(first[0], simulations=first[0].simulations + spent)
+    if z_middle is None:
+        return first, None, why
+    second, end, reason = _carry(halves[1], z_middle, stops - len(first))
+    return [*first, *second], end, reason
+
+
+class _Balance(NamedTuple):
+    """What a quasistatic motion needs along a passage."""
+
+    tau: Array  # (n, 2) [N m]
+    acting: int  # the finger behind the motion: the index of the torque that works most
+
+
+_Attempt = tuple[PhaseTuning, Array | None, str]
+"""What tuning came to, where it ends at rest if it does, and why not."""
+
+
+class _Setting(NamedTuple):
+    """A passage, and how it is tuned."""
+
+    problem: Problem
+    passage: Passage
+    brake: bool
+    squeeze: float
+    share: float
+    tell: Callable[[str], None]
+
+    @property
+    def pause(self) -> float:
+        """How long the object is held at the end [s]."""
+        return PAUSE * self.problem.scene.scales.time
+
+    def halve(self, z: Array) -> tuple[_Setting, _Setting] | None:
+        """Both halves of the way from `z`, the first until x or phi is what it is there."""
+        phases, roads = self.passage.phases, []
+        for phase in phases:
+            road = make_road(phase, z, self.problem.phases[phase.index + 1 :])
+            if road is None:
+                return None
+            roads.append(road)
+            z = road.z[-1]
+        ends = np.cumsum([road.length for road in roads])
+        k = int(np.searchsorted(ends, ends[-1] / 2))
+        road, left = roads[k], ends[k] - ends[-1] / 2
+        middle = road.z[int(np.searchsorted(road.s, road.length - left))]
+        way = abs(middle - road.z[0])
+        turns = way[2] * self.problem.scene.scales.length > way[0]
+        name, value = ("phi", middle[2]) if turns else ("x", middle[0])
+        until = Until(coordinate=name, value=float(value))
+        part = replace(phases[k], until=until, end=End.REST)
+        first = Passage((*phases[:k], part), phases[k])
+        second = Passage(phases[k:], self.passage.after)
+        return self._replace(passage=first), self._replace(passage=second)
+
+    def tune(self, z: Array) -> _Attempt:
+        """Tune it from rest at `z`; where it ends at rest, or why it does not."""
+        phases = self.passage.phases
+        own = PhaseTuning(phases[0].number, phases[-1].number, str(self.passage.until))
+        if any(phase.until.value is not None for phase in phases[:-1]):
+            return (
+                own,
+                None,
+                "a coordinate is passed in motion; the rule tunes phases to rest",
+            )
+        found = self._balance(phases, z)
+        if found is None:
+            return (
+                own,
+                None,
+                "no quasistatic motion keeps every contact, where tuning would start",
+            )
+        bench = Bench(self.problem, self.passage, z)
+        first = self._tune_by(found.acting, own, bench, found)
+        if first[1] is not None or first[0].raised is not None:
+            return first
+        # No torque of that finger reaches the end.
+        second = self._tune_by(1 - found.acting, own, bench, found)
+        return first if second[1] is None else second
+
+    def _tune_by(self, acting: int, own: PhaseTuning, bench: Bench, balance: _Balance) -> _Attempt:
+        """Tune it by the torque of one finger, with supporting torques until one serves."""
+        title = f"phase {self.passage.title} of {len(self.problem.phases)}, finger {acting + 1}"
+        best: _Attempt | None = None
+        for tau in list_starts(balance.tau, acting):
+            rule = TuningRule(
+                bench,
+                tau,
+                balance.tau[-1],
+                acting,
+                lambda text: self.tell(f"{title}: {text}"),
+            )
+            found = self._tune_from(rule, replace(own, acting=acting + 1))
+            if found[1] is not None:
+                return found
+            if best is None or best[0].raised is None:
+                best = found
+            if rule.is_enough:
+                break
+        assert best is not None
+        return best
+
+    def _tune_from(self, rule: TuningRule, own: PhaseTuning) -> _Attempt:
+        """Tune it from certain torques."""
+        own, bench = replace(own, quasistatic=rule.scale(0)), rule.bench
+        drives = rule.drive()
+        drives = drives[: 1 + round(self.share * (len(drives) - 1))]
+        if not drives:
+            return self._sum_up(own, bench, bench.trials[-1]), None, _explain(bench)
+        if not self.brake:
+            return self._arrive(own, rule, drives)
+        stopped = rule.brake(drives)
+        if stopped is None:
+            text = "no torque in steps of 10 % brings it to rest at its end: a trial "
+            own = replace(self._sum_up(own, bench, drives[-1].trial), raised=drives[-1].raised)
+            return own, None, text + bench.trials[-1].to_text()
+        drive, brake = stopped
+        own = replace(own, raised=drive.raised, braked=brake.raised, supported=brake.supported)
+        return self._hold(own, rule, brake.trial)
+
+    def _arrive(
+        self, own: PhaseTuning, rule: TuningRule, drives: Sequence[TuningDrive]
+    ) -> _Attempt:
+        """The fastest drive that is held where it arrives; the slowest arrives most gently."""
+        kept: _Attempt | None = None
+        for drive in drives:
+            last = self._hold(replace(own, raised=drive.raised), rule, drive.trial)
+            if last[1] is None:
+                return last if kept is None else kept
+            kept = last
+        assert kept is not None
+        return kept
+
+    def _hold(self, own: PhaseTuning, rule: TuningRule, trial: TuningTrial) -> _Attempt:
+        """Hold the object where a trial has arrived: as it is, or lowered for the next phase."""
+        own = replace(self._sum_up(own, rule.bench, trial), steps=trial.steps)
+        reason, until = "", self.passage.until
+        for tau in self._list_holds(rule, trial):
+            steps = trial.steps if tau is None else (*trial.steps, TuningStep(trial.time, tau))
+            landing = rule.bench.land(steps, trial.time, self.pause)
+            own = replace(own, steps=steps, simulations=rule.bench.simulations)
+            rate = f"{until} is reached at {trial.rate:.3g}"
+            rate += " rad/s" if rule.bench.is_angle else " m/s"
+            rate += f" at t = {trial.time:.5g} s, and "
+            if landing.parted > REST_WINDOW * self.problem.scene.scales.time:
+                reason = f"{rate}{landing.contact} parts for {1e3 * landing.parted:.3g} ms"
+            elif not landing.rests:
+                reason = f"{rate}the object does not come to rest there"
+            else:
+                return own, landing.z, ""
+        return own, None, reason
+
+    def _list_holds(self, rule: TuningRule, trial: TuningTrial) -> list[tuple[float, float] | None]:
+        """What may hold the object: what it arrives with, or quasistatic torques lowered.
+
+        Those are of the next phase, or of the end of the last one; then those it arrives with, the
+        acting one lowered, and the supporting one more so.
+        """
+        after = self.passage.after
+        acting, (first, second) = rule.acting, (float(tau) for tau in rule.last)
+        if after is not None:
+            found = self._balance((after,), trial.z)
+            if found is None:
+                return [None]
+            acting, (first, second) = found.acting, (float(tau) for tau in found.tau[0])
+        lowered = [
+            (first / FACTOR**n, second) if acting == 0 else (first, second / FACTOR**n)
+            for n in range(1, _LOWERED)
+        ]
+        if after is None:
+            arrived = np.array(trial.steps[-1].tau)
+            arrived[1 - acting] /= FACTOR**_LOWERED
+            held = [tuple((arrived / FACTOR ** (_LOWERED * n)).tolist()) for n in range(3)]
+            return [None, *lowered, *held]
+        return [None, *lowered]
+
+    def _balance(self, phases: Sequence[Phase], z: Array) -> _Balance | None:
+        """What balances a quasistatic motion from `z`, as far as one keeps every contact."""
+        tau: list[Array] = []
+        work: list[Array] = []
+        for phase in phases:
+            road = make_road(phase, z, self.problem.phases[phase.index + 1 :])
+            if road is None:
+                break
+            found = find_torques(road, self.problem.epsilon, self.squeeze)
+            if found is None:
+                break
+            tau.append(found.tau)
+            work.append(found.tau * road.z_s[:, 3:])
+            z = road.z[-1]
+        if not tau:
+            return None
+        return _Balance(np.vstack(tau), int(np.vstack(work).mean(axis=0).argmax()))
+
+    def _sum_up(self, own: PhaseTuning, bench: Bench, trial: TuningTrial) -> PhaseTuning:
+        return replace(
+            own,
+            duration=trial.time,
+            rate=trial.rate,
+            least=trial.least,
+            weakest=trial.weakest,
+            trials=tuple(bench.trials),
+            simulations=bench.simulations,
+        )
+
+
+def _explain(bench: Bench) -> str:
+    """Why no torque drives the object to the end of a phase."""
+    nearest = min(bench.trials, key=lambda trial: trial.short)
+    last = bench.trials[-1]
+    text = f"no constant torques reach {bench.passage.until}: the nearest trial {nearest.to_text()}"
+    if last.outcome is TrialOutcome.LOSES:
+        return f"{text}, and raised {len(bench.trials) - 1} times it {last.to_text()}"
+    return f"{text}, up to the torque limit"
+
+
+class TuningDrive(NamedTuple):
+    """What sets the object in motion until the end of the phase."""
+
+    raised: int  # how many times the acting torque was raised
+    trial: TuningTrial
+
+
+class Brake(NamedTuple):
+    """What stops it there."""
+
+    # how many times the acting torque is raised from the quasistatic one; lowered if negative
+    raised: int
+    supported: int  # how many times the supporting torque is raised; lowered if negative
+    trial: TuningTrial
+
+
+class TuningRule:
+    """The rule at work on one phase.
+
+    Parameters
+    ----------
+    tau : (2,) [N m]   quasistatic torques that are raised and lowered
+    last : (2,) [N m]  those at the end of the phase
+    acting             index of the acting finger
+    tell               shown each trial, in words
+    """
+
+    def __init__(
+        self,
+        bench: Bench,
+        tau: Array,
+        last: Array,
+        acting: int,
+        tell: Callable[[str], None],
+    ) -> None:
+        self.bench, self.acting, self.tell = bench, acting, tell
+        self.tau, self.last = tau, last
+        self.limit = bench.problem.scene.torque_limit
+        scales = bench.problem.scene.scales
+        self.slow = SLOW * scales.speed / (scales.length if bench.is_angle else 1.0)
+        self.time = scales.time
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether there have been so many simulations that no other torques are tried."""
+        return self.bench.simulations > ENOUGH
+
+    @property
+    def is_free(self) -> bool:
+        """Whether the object has two freedoms where it arrives."""
+        return self.bench.passage.phases[-1].formation.n_constraints < 4
+
+    def scale(self, acting: int, supporting: int = 0) -> tuple[float, float]:
+        """The torques raised so many times, lowered where negative."""
+        powers = [supporting, supporting]
+        powers[self.acting] = acting
+        first, second = (float(tau) * FACTOR**n for tau, n in zip(self.tau, powers, strict=True))
+        return first, second
+
+    def drive(self) -> list[TuningDrive]:
+        """Raise the acting torque until a contact is lost; those that reach the end, by torque.
+
+        The last trial says what was lost, or that the object did not slide.
+        """
+        found = []
+        for raised in range(_RAISED):
+            tau = self.scale(raised)
+            if self.is_enough:
+                break
+            if abs(tau[self.acting]) > self.limit[self.acting]:
+                break
+            trial = self._run([TuningStep(0.0, tau)], f"raised {raised} times")
+            if trial.outcome is TrialOutcome.ARRIVES:
+                found.append(TuningDrive(raised, trial))
+            elif trial.outcome is TrialOutcome.LOSES:
+                break
+        return found
+
+    def brake(self, drives: Sequence[TuningDrive]) -> tuple[TuningDrive, Brake] | None:
+        """Stop a drive at the end of the phase, the fastest that lets itself be stopped.
+
+        The acting torque is lowered to less than the slowest drive's and than balances the object
+        at the end. Where no such torque stops any drive there without losing a contact the
+        supporting one becomes that of the end, and then is raised, too.
+        """
+        count = len(drives)
+        chosen = [drives[k] for k in sorted({count - 1, count // 2, count // 4, 0}, reverse=True)]
+        first = min(drives[0].raised - 1, self._count_steps(self.acting))
+        last = self._count_steps(1 - self.acting)
+        # With two freedoms either torque sets the object in motion again, if it is too much there.
+        likely = [last, 0] if self.is_free else [0, last]
+        for supported in dict.fromkeys([*likely, *range(_SUPPORT, _SUPPORTED, _SUPPORT)]):
+            if abs(self.scale(0, supported)[1 - self.acting]) > self.limit[1 - self.acting]:
+                continue
+            for drive in chosen:
+                if self.is_enough:
+                    return None
+                found = self._lower(drive.trial, first, supported)
+                if found is not None:
+                    return drive, found
+        return None
+
+    def _count_steps(self, finger: int) -> int:
+        """How many times a torque is raised, lowered if negative, until it is that of the end."""
+        share = float(self.last[finger] / self.tau[finger]) if self.tau[finger] else 1.0
+        return math.floor(math.log(max(share, FACTOR**-_RAISED)) / math.log(FACTOR))
+
+    def _lower(self, drive: TuningTrial, first: int, supported: int) -> Brake | None:
+        """Lower the acting torque while that brings the end sooner; None if nothing stops there."""
+        best: Brake | None = None
+        raised, missed = first, 0
+        while raised > -_RAISED and missed < _MISSES and not self.is_enough:
+            steps = [*drive.steps, TuningStep(0.0, self.scale(raised, supported))]
+            trial = self._place(steps, drive, best and best.trial, _ROUGH * self.slow)
+            if trial is None:
+                if best is None and self.bench.trials[-1].outcome is TrialOutcome.LOSES:
+                    break
+                missed += best is not None
+                raised -= _COARSE
+                continue
+            if best and trial.time > (1 - _SOONER) * best.trial.time:
+                break
+            best = Brake(raised, supported, trial)
+            if trial.rate < self.slow:
+                return best
+            raised -= 1
+        if best is None:
+            return None
+        last = self._place(list(best.trial.steps), drive, best.trial, self.slow)
+        return None if last is None else best._replace(trial=last)
+
+    def _place(
+        self, steps: list[TuningStep], drive: TuningTrial, near: TuningTrial | None, slow: float
+    ) -> TuningTrial | None:
+        """Find the instant from which on the last step brings the object to the end slowly.
+
+        Where a weaker brake, or nearly the same instant, is known the search begins near it.
+        """
+        low, high = 0.0, drive.time
+        below, above = self.bench.way, self._overshoot(drive, slow)
+        at, side, losses = 0.5 * high, 0, 0
+        short, rate = self.bench.way, drive.rate
+        if near is not None and slow == self.slow:
+            at, high, above = (
+                near.steps[-1].time * (1 - 1e-4),
+                near.steps[-1].time,
+                self._overshoot(near, slow),
+            )
+        elif near is not None:
+            at = min(1.02 * near.steps[-1].time, 0.5 * (near.steps[-1].time + high))
+        for count in range(_SEARCH):
+            steps = [*steps[:-1], steps[-1]._replace(time=at)]
+            trial = self._run(steps, f"brake at {at:.5g} s")
+            if trial.outcome is TrialOutcome.ARRIVES:
+                if trial.rate < slow:
+                    return trial
+                if at < _SOON * drive.time:
+                    return self._graze(steps, drive) if self.is_free else None
+                high, above, rate = at, self._overshoot(trial, slow), trial.rate
+                below /= 2 if side < 0 else 1
+                side = -1
+            else:
+                losses += trial.outcome is TrialOutcome.LOSES
+                if losses > _LOSSES:
+                    return None
+                low, short = at, trial.short
+                # How far it is through several phases is not known.
+                below = above if short == math.inf else max(short, 1e-12 * self.bench.way)
+                above /= 2 if side > 0 else 1
+                side = 1
+            jumps = short > _FAR * self.bench.way and rate > _FAST * drive.rate
+            if jumps and high - low < _NARROW * high:
+                return None
+            share = below / (below + above) if count % 4 != 3 else 0.5
+            at = low + (high - low) * min(max(share, 0.02), 0.98)
+            if high - low < 1e-12 * high:
+                return None
+        return None
+
+    def _graze(self, steps: list[TuningStep], drive: TuningTrial) -> TuningTrial | None:
+        """Find the instant to brake at which the end is just touched, on a way that always arrives.
+
+        With two freedoms the object may turn back before the end, and come there later another way:
+        how fast it arrives has a kink where it just touches, and falls to zero there.
+        """
+
+        def run(at: float) -> tuple[float, TuningTrial]:
+            again = [*steps[:-1], steps[-1]._replace(time=at)]
+            trial = self._run(again, f"brake at {at:.5g} s")
+            return trial.rate if trial.outcome is TrialOutcome.ARRIVES else math.inf, trial
+
+        grid = [drive.time * (k + 1) / (_PLACES + 1) for k in range(_PLACES)]
+        found = [run(at) for at in grid]
+        k = min(range(1, _PLACES - 1), key=lambda k: found[k][0])
+        low, at, high = grid[k - 1 : k + 2]
+        rate, best = found[k]
+        if rate > min(found[k - 1][0], found[k + 1][0]):
+            return None
+        for count in range(_CLOSER):
+            if rate < self.slow:
+                return best
+            if count == _PLACES and rate > 2 * _ROUGH * self.slow:
+                return None
+            left = at - low > high - at
+            other = at - _GOLDEN * (at - low) if left else at + _GOLDEN * (high - at)
+            new, trial = run(other)
+            if new < rate:
+                low, high = (low, at) if left else (at, high)
+                at, rate, best = other, new, trial
+            else:
+                low, high = (other, high) if left else (low, other)
+        return None
+
+    def _overshoot(self, trial: TuningTrial, slow: float) -> float:
+        """How far beyond the end the object would come to rest, less the wanted speed's part."""
+        slowing = max(trial.slowing, 0.1 * trial.rate / self.time)
+        return (trial.rate**2 - (0.5 * slow) ** 2) / (2 * slowing)
+
+    def _run(self, steps: list[TuningStep], text: str) -> TuningTrial:
+        trial = self.bench.run(steps)
+        self.tell(f"{text}: {trial.to_text()}")
+        return trial
+
+
+def list_starts(tau: Array, acting: int) -> list[Array]:
+    """Torques to begin with, of quasistatic ones along the way, shape (n, 2) [N m].
+
+    Those at the start; then with the supporting one where it presses most, or between the two. The
+    right finger presses anticlockwise, the left one clockwise.
+    """
+    start, other = float(tau[0, 1 - acting]), 1 - acting
+    hard = float(tau[:, 0].max() if acting else tau[:, 1].min())
+    values = list(dict.fromkeys([start, hard]))
+    if start and hard / start > 1:
+        count = math.ceil(math.log(hard / start) / math.log(FACTOR) / _SUPPORT)
+        values += [start * FACTOR ** (_SUPPORT * n) for n in range(1, count)]
+    found = np.tile(tau[0], (len(values), 1))
+    found[:, other] = values
+    return list(found)

@@ -1,0 +1,100 @@
+"""Whether contact forces of a motion are the only ones, and whether it surely leaves rest."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..contacts.formation import Kinematics
+from ..mechanics.uniqueness import find_minors
+from ..mechanics.wedging import SURE, find_static_torques
+from ..problem.definition import Phase, Problem
+from ..results.report import UniquenessMargin
+from ..results.torque import TorqueProfile
+from ..results.trajectory import Trajectory
+from ..simulation.events import EventKind, Simulation
+from .verdict import measure_speed
+
+PLACES = 33
+"""Instants of a phase at which uniqueness margins are looked at, and at which torques are."""
+_LEANS = 1 - 1e-6
+"""Share of U c_n from which on a tangential force is that of sliding."""
+
+
+def find_uniqueness_margin(
+    phase: Phase, motion: Trajectory | Simulation, rows: NDArray[np.int64]
+) -> UniquenessMargin | None:
+    """The least uniqueness margin in a phase; None if nothing moved.
+
+    Tangential forces tell which way a contact slides; one that leans on no side of its cone sticks.
+
+    Parameters
+    ----------
+    rows  its rows in the phase
+    """
+    formation, rows = phase.formation, rows[:: -(-len(rows) // PLACES)]
+    columns = [motion.contacts.index(name) for name in formation.names]
+    known = ~np.isnan(motion.c_n[rows][:, columns]).any(axis=1)
+    rows = rows[known]
+    if not len(rows):
+        return None
+    c_n, c_t = (forces[rows][:, columns] for forces in (motion.c_n, motion.c_t))
+    slides = np.abs(c_t) >= _LEANS * formation.friction * np.abs(c_n)
+    Xi = -np.sign(c_t * c_n)
+    kinematics = formation.evaluate(motion.z[rows], motion.z_dot[rows])
+    found = []
+    for pattern in np.unique(slides, axis=0):
+        own = np.flatnonzero((slides == pattern).all(axis=1))
+        part = Kinematics(*(array[own] for array in kinematics))
+        sticking = tuple(np.flatnonzero(~pattern).tolist())
+        ratio, names, row = find_minors(formation, part, Xi[own], sticking).find_least()
+        found.append(UniquenessMargin(ratio, names, float(motion.t[rows[own[row]]])))
+    return min(found)
+
+
+def find_departure(simulation: Simulation, torque: TorqueProfile, index: int) -> float:
+    """When the torques set a phase in motion: the last break before it starts, if it does [s]."""
+    starts = [e.time for e in simulation.find(EventKind.START) if e.phase == index]
+    known = [b for b in torque.breaks.tolist() if starts and b <= starts[0]]
+    return max(known, default=-math.inf)
+
+
+def find_wedged(
+    problem: Problem,
+    phase: Phase,
+    motion: Trajectory | Simulation,
+    rows: NDArray[np.int64],
+    slow: float,
+    start: float = -np.inf,
+) -> float | None:
+    """For how long a phase that begins at rest may stay so, wedged by friction [s]; else None.
+
+    That is until the torques are such that no contact forces within their cones, of all that
+    touches, balance them and gravity: see `mechanics.wedging`.
+
+    Parameters
+    ----------
+    rows         its rows in the phase
+    slow         speed that passes for rest, relative to the scene's
+    start : [s]  since when the phase is to move, if its rows begin with the time for which it is
+                 held
+    """
+    scene, touching = problem.scene, [phase.formation]
+    if phase.index:
+        if measure_speed(scene, motion.z_dot[rows[0]]) > slow * scene.scales.speed:
+            return None
+        touching.append(problem.phases[phase.index - 1].formation)
+    static = find_static_torques(touching, motion.z[rows[0]])
+    start, stop = max(start, float(motion.t[rows[0]])), float(motion.t[rows[-1]])
+    t = np.linspace(start, stop, 4 * PLACES)
+    # At its end the torques are those of the next phase.
+    beyond = static.measure(motion.torque.at(t[:-1])) - SURE * scene.scales.torque
+    free = np.flatnonzero(beyond > 0)
+    if not len(free):
+        return float(stop - start)
+    if free[0] == 0:
+        return 0.0
+    before, after = beyond[free[0] - 1], beyond[free[0]]
+    return float((free[0] - after / (after - before)) * (t[1] - t[0]))

@@ -1,0 +1,448 @@
+"""What helps to tune torques by hand, from a replay: what would mend losses, and how near it came.
+
+A loss is looked at in the state in which it happens: there z'' and c are affine in the torques. A
+change of the torques that mends it is one from that instant on; made earlier, it changes the motion
+up to there as well.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import combinations, product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.arrays import Array
+from ..contacts.formation import Formation
+from ..mechanics.limits import CONE, PRESS, LimitSet, make_limits
+from ..problem.definition import Phase, Problem
+from ..results.report import PhaseReport
+from ..results.tuning_advice import Approach, ForceAt, Loss, TorqueAdvice, TuningHelp
+from ..simulation.events import EventKind, Simulation
+from ..simulation.modes import find_grips, list_units, respond, share_mode
+from ..simulation.sliding_signs import evaluate_rows, measure_rates
+from ..simulation.start_modes import StartPath
+from ..simulation.sticking import find_rest
+from .margins import find_lowest
+from .verdict import Allowance
+
+KEPT = 1e-9
+"""Shortfall of a limit that counts as none, over what is much for it."""
+FLAT = 1e-9
+"""What a limit's slack changes with a torque below which it does not depend on it, in what is much
+for each."""
+SLOW = 1e-6
+"""Speed below which the direction of friction is looked for, relative to the scene's speed."""
+_TORQUES = ((0,), (1,), (0, 1))
+"""Which torques change: one alone, or both."""
+_KINDS = {EventKind.CONTACT_LOST: "lost", EventKind.SLIP: "slips"}
+LEAST = 1e-3
+"""Least normal force to aim at, over the scene's force, where epsilon is less."""
+TURNED = 1e-6
+"""Speed from which on a motion counts as going one way, relative to the scene's speed."""
+
+
+def find_help(
+    problem: Problem, simulation: Simulation, phases: tuple[PhaseReport, ...], allowance: Allowance
+) -> TuningHelp:
+    """What helps to mend a replay: losses with changes of the torques, and how near it came."""
+    events = [
+        (event.phase, event.contact, _KINDS[event.kind], event.time)
+        for event in simulation.events
+        if _is_loss(problem, event.kind, event.phase, event.contact)
+    ]
+    ended = {event[:2] for event in events}
+    allowed = allowance.measure_stray(problem)
+    events += [
+        (phase.number - 1, margin.contact, "thin", margin.time)
+        for phase in phases
+        for margin in phase.contacts
+        if margin.margin < -allowed and (phase.number - 1, margin.contact) not in ended
+    ]
+    losses = (_look_at(problem, simulation, *event) for event in events)
+    approach = None if simulation.outcome.reached else find_approach(problem, simulation)
+    return TuningHelp(tuple(loss for loss in losses if loss is not None), approach)
+
+
+def _is_loss(problem: Problem, kind: EventKind, phase: int, contact: str) -> bool:
+    rolling = {own.name for own in problem.phases[phase].formation.rolling}
+    return kind is EventKind.CONTACT_LOST or (kind is EventKind.SLIP and contact in rolling)
+
+
+def _look_at(
+    problem: Problem, simulation: Simulation, index: int, contact: str, kind: str, time: float
+) -> Loss | None:
+    """A loss with what would mend it; None if the phase does not have the contact."""
+    phase = problem.phases[index]
+    formation = phase.formation
+    if contact not in formation.names:
+        return None
+    row = _find_row(simulation, index, contact, kind, time)
+    z, v, tau = simulation.z[row], simulation.z_dot[row], simulation.tau[row]
+    epsilon = max(problem.epsilon, LEAST * problem.scene.scales.force)
+    way = _measure_way(phase, z[None], v[None])
+    columns = [simulation.contacts.index(name) for name in formation.names]
+    rests = bool(np.isnan(simulation.c_n[row, columns]).all())
+    if rests:
+        ways = list_ways(formation, z)
+        instant = find_worst(formation, ways, z, tau)
+        gradient = None if way is None else way[1][0]
+        changes = find_resting_changes(formation, ways, epsilon, z, tau, gradient)
+    else:
+        instant = find_moving(formation, z, v, tau, simulation.z_ddot[row])
+        changes = () if instant is None else list_changes(instant, epsilon, contact, tau)
+    load = np.array([1.0, *tau])
+    forces: tuple[ForceAt, ...] = ()
+    closing: tuple[float, ...] = ()
+    if instant is not None:
+        forces = tuple(
+            ForceAt(name, float(c_n @ load), float(c_t @ load), (float(c_n[1]), float(c_n[2])))
+            for name, c_n, c_t in zip(formation.names, instant.c_n, instant.c_t, strict=True)
+        )
+    if instant is not None and way is not None:
+        rows = -way[1][0] @ instant.acceleration
+        closing = (float(rows @ load - way[2][0]), float(rows[1]), float(rows[2]))
+    when = float(simulation.t[row])
+    return Loss(phase.number, contact, kind, when, rests, forces, closing, changes)
+
+
+def list_changes(
+    instant: Instant, epsilon: float, contact: str, tau: Array
+) -> tuple[TorqueAdvice, ...]:
+    """Changes of the torques of a motion that mend a contact, and what else lets go with it."""
+    formation = instant.formation
+    much, load = formation.scene.scales.torque, np.array([1.0, *tau])
+    limits, bare = make_limits(formation, epsilon), make_limits(formation, 0.0)
+    forces = (PRESS, CONE)
+    own = [limit.part == contact and limit.kind in forces for limit in limits.limits]
+    missed = np.array(own)[limits.owners][limits.sides[0]]
+    gone = instant.find_sides(bare) @ load < -KEPT * limits.scales[limits.sides[0]]
+    missed |= gone & np.isin(limits.sides[0], limits.of(*forces))
+    return find_changes(limits, instant.find_sides(limits), missed, tau, much)
+
+
+def _find_row(simulation: Simulation, index: int, contact: str, kind: str, time: float) -> int:
+    """The row of a loss: the last one up to its time, or where the least force was seen."""
+    rows = np.flatnonzero(simulation.phase == index)
+    if kind == "thin":
+        forces = simulation.c_n[rows, simulation.contacts.index(contact)]
+        return int(rows[np.nanargmin(forces)])
+    return int(rows[simulation.t[rows] <= time][-1])
+
+
+def find_approach(problem: Problem, simulation: Simulation) -> Approach | None:
+    """How near the last phase entered has come to its end; None if it ends by a release."""
+    phase, scales = problem.phases[int(simulation.phase[-1])], problem.scene.scales
+    rows = np.flatnonzero(simulation.phase == phase.index)
+    t, v = simulation.t[rows], simulation.z_dot[rows]
+    way = _measure_way(phase, simulation.z[rows], v)
+    if way is None:
+        return None
+    is_angle = phase.until.coordinate == "phi"
+    distance, gradient, _ = way
+    rates = -np.einsum("ni,ni->n", gradient, v)
+    least, time = find_lowest(t, distance, simulation.torque.breaks)
+    going = np.flatnonzero(np.abs(rates) > TURNED * (1 / scales.time if is_angle else scales.speed))
+    turns = going[np.flatnonzero(np.diff(np.sign(rates[going])))]
+    return Approach(
+        phase=phase.number,
+        until=str(phase.until),
+        distance=max(least, 0.0),
+        unit="rad" if is_angle else "m",
+        time=time,
+        rate=float(np.interp(time, t, rates)) + 0.0,
+        turns=tuple(float(t[row]) for row in turns),
+    )
+
+
+def _measure_way(phase: Phase, z: Array, v: Array) -> tuple[Array, Array, Array] | None:
+    """Distance to the end of a phase at n states, its gradient, (n, 5), and its bend, (n,).
+
+    The bend is what the velocity alone adds to its second derivative, towards the end.
+    """
+    until = phase.until
+    if until.is_release:
+        return None
+    if until.contact is not None:
+        at = Formation(phase.formation.scene, (until.contact,)).evaluate(z, v)
+        return at.C[:, 0], at.A[:, 0], at.P_dot_v[:, 0]
+    column = 0 if until.coordinate == "x" else 2
+    assert until.value is not None
+    offset = z[:, column] - until.value
+    side = math.copysign(1.0, offset[0])
+    gradient = np.zeros((len(z), 5))
+    gradient[:, column] = side
+    return side * offset, gradient, np.zeros(len(z))
+
+
+def list_ways(formation: Formation, z: Array) -> Sequence[StartPath]:
+    """The ways in which a formation at rest at `z` could begin to move."""
+    return find_rest(formation, z).all_ways
+
+
+def find_worst(
+    formation: Formation, ways: Sequence[StartPath], z: Array, tau: Array
+) -> Instant | None:
+    """Forces as torques begin a motion in the way that holds worst; None if they begin none."""
+    load = np.array([1.0, *tau])
+    free = [way for way in ways if way.slides(tau)]
+    if not free:
+        return None
+    return _answer(formation, z, min(free, key=lambda way: float((way.force_limits @ load).min())))
+
+
+def find_resting_changes(
+    formation: Formation,
+    ways: Sequence[StartPath],
+    epsilon: float,
+    z: Array,
+    tau: Array,
+    gradient: Array | None,
+) -> tuple[TorqueAdvice, ...]:
+    """Least changes of each torque alone, or else of both, that let it keep its contacts.
+
+    With them it begins to move towards the end of its phase, or if that cannot be it rests.
+
+    Parameters
+    ----------
+    ways              see `list_ways`
+    epsilon : [N]
+    z : (5,)
+    tau : (2,) [N m]
+    gradient : (5,)   of the distance to the end of the phase, if that is known
+    """
+    moved = [_move(formation, way, epsilon, z, tau, gradient) for way in ways]
+    found: list[TorqueAdvice] = []
+    for k, free in enumerate(_TORQUES):
+        known = [change for own in moved if (change := own[k]) is not None]
+        if len(free) == 2 and found:
+            break
+        held = None if known else _hold(formation, epsilon, z, tau, free)
+        if known:
+            found.append(tell(min(known, key=np.linalg.norm), tau))
+        elif held is not None:
+            found.append(tell(held, tau, holds=True))
+    return tuple(sorted(found, key=lambda change: (change.holds, np.hypot(*change.change))))
+
+
+def _answer(formation: Formation, z: Array, way: StartPath) -> Instant | None:
+    return answer(formation, z, np.zeros(5), np.concatenate(way.directions))
+
+
+def _move(
+    formation: Formation,
+    way: StartPath,
+    epsilon: float,
+    z: Array,
+    tau: Array,
+    gradient: Array | None,
+) -> list[Array | None]:
+    """Least changes of one torque, the other and both with which it begins to move one way."""
+    instant, much = _answer(formation, z, way), formation.scene.scales.torque
+    if instant is None:
+        return [None] * len(_TORQUES)
+    limits = make_limits(formation, epsilon)
+    rows = [row + np.array([offset, 0.0, 0.0]) for row, offset in way.margins]
+    rows += [] if gradient is None else [-gradient @ instant.acceleration]
+    sizes = np.abs(rows) @ [1.0, much, much]
+    scale = np.concatenate([limits.scales[limits.sides[0]], np.where(sizes > 0, sizes, 1.0)])
+    sides = np.vstack([instant.find_sides(limits), *rows])
+    slack, slope = normalise(sides, scale, tau, much)
+    tried = (change_one(slack, slope, 0), change_one(slack, slope, 1), change_both(slack, slope))
+
+    def keep(change: Array | None) -> Array | None:
+        if change is None or (slack + slope @ change < -KEPT).any():
+            return None
+        return much * change if way.moves(tau + much * change) else None
+
+    return [keep(change) for change in tried]
+
+
+def _hold(
+    formation: Formation, epsilon: float, z: Array, tau: Array, free: tuple[int, ...]
+) -> Array | None:
+    """The change of the torques `free` with the least sum of sizes that holds it at rest.
+
+    A linear programme in c_n >= epsilon, c_t within U c_n, dry joint friction within D and the
+    torques, with g + S (tau - friction) + A^T c_n + A_t^T c_t = 0.
+    """
+    from scipy.optimize import linprog
+
+    scene, n_c = formation.scene, formation.n_contacts
+    scales = scene.scales
+    units = np.array([1.0, 1.0, *[scales.length] * 3])
+    at = formation.evaluate(z[None], np.zeros((1, 5)))
+    joints = np.eye(5)[:, 3:]
+    # Unknowns are c_n, c_t, dry friction, and what each torque rises and falls by.
+    balance = [(at.A[0] / units).T, (at.A_t[0] / units).T, -joints, joints, -joints]
+    load = (scene.applied_force + joints @ tau) / (scales.force * units)
+    cone, unit, none = -np.diag(formation.friction), np.eye(n_c), np.zeros((n_c, 6))
+    within = [np.hstack([cone, sign * unit, none]) for sign in (1.0, -1.0)]
+    room = [np.maximum(scene.torque_limit + side * tau, 0.0) for side in (-1.0, 1.0)]
+    spare = np.where([k in free for k in (0, 1)], np.array(room) / scales.torque, 0.0)
+    answered = linprog(
+        np.repeat([0.0, 1.0], [2 * n_c + 2, 4]),
+        A_ub=np.vstack(within),
+        b_ub=np.zeros(2 * n_c),
+        A_eq=np.hstack(balance),
+        b_eq=-load,
+        bounds=[
+            *[(epsilon / scales.force, None)] * n_c,
+            *[(None, None)] * n_c,
+            *((-most, most) for most in scene.dry[3:] / scales.torque),
+            *((0.0, most) for most in spare.ravel()),
+        ],
+        method="highs",
+    )
+    if answered.status != 0:
+        return None
+    rise, fall = answered.x[-4:-2], answered.x[-2:]
+    return np.asarray(scales.torque * (rise - fall))
+
+
+class Instant(NamedTuple):
+    """Forces and accelerations at one state; each is rows @ (1, tau_1, tau_2)."""
+
+    formation: Formation
+    z: Array  # z, v (5,):
+    v: Array
+    acceleration: Array  # (5, 3)
+    # c_n, c_t (n_c, 3) [N]: naN for c_t of a flush edge that friction holds although it may slide:
+    # it is not determined
+    c_n: Array
+    c_t: Array
+
+    def find_sides(self, limits: LimitSet) -> Array:
+        """Slack of one-sided limits, rows @ (1, tau_1, tau_2), shape (n_sides, 3)."""
+        c = np.vstack([self.c_n, self.c_t[list(self.formation.rolling_rows)]])
+        of_c, of_tau, of_rates = limits.columns
+        values = of_c @ c
+        values[:, 1:] += of_tau
+        values[:, 0] += of_rates @ self.v[3:]
+        rows, signs, bounds = limits.sides
+        sides = np.asarray(signs[:, None] * values[rows])
+        sides[:, 0] -= signs * bounds
+        return sides
+
+
+def find_moving(
+    formation: Formation, z: Array, v: Array, tau: Array, acceleration: Array
+) -> Instant | None:
+    """The instant of a motion; where something stands still, with the friction that it had.
+
+    That is the friction with which torques `tau` give the recorded `acceleration`, shape (5,).
+    """
+    scene, rows = formation.scene, evaluate_rows(formation, z, v)
+    speeds = np.concatenate([rows.A_t @ v, v[3:]])
+    slow = np.abs(speeds) < SLOW * measure_rates(scene, formation.n_contacts)
+    signs = np.sign(speeds)
+    signs[list(formation.rolling_rows)] = 0.0
+    still = [unit for unit in list_units(formation) if slow[list(unit.rows)].all()]
+    holds = formation.n_constraints < 4
+    options = [(1.0, -1.0, 0.0) if holds and unit.grips else (1.0, -1.0) for unit in still]
+    found: list[tuple[float, Instant]] = []
+    for choice in product(*options):
+        for unit, sign in zip(still, choice, strict=True):
+            signs[list(unit.rows)] = sign
+        instant = answer(formation, z, v, signs)
+        if instant is not None:
+            misfit = instant.acceleration @ [1.0, *tau] - acceleration
+            found.append((float(scene.mass_diagonal @ misfit**2), instant))
+    return min(found, key=lambda pair: pair[0])[1] if found else None
+
+
+def answer(formation: Formation, z: Array, v: Array, signs: Array) -> Instant | None:
+    """The instant at a state with the friction of `signs`, shape (n_c + 2,).
+
+    Signs are zero for what rolls or friction holds. None if forces are not determined.
+    """
+    mode = share_mode(formation, find_grips(formation, signs))
+    response = respond(mode, signs, evaluate_rows(formation, z, v), v)
+    if response is None:
+        return None
+    count, held = formation.n_contacts, len(mode.holders)
+    c_n, cones = response.force_limits[:count], response.force_limits[count:]
+    c_t = -(mode.rolled.sliding_friction * signs[:count])[:, None] * c_n
+    for k, rows in enumerate(mode.holders):
+        if rows[0] < count:
+            # The sides of a cone are mu c_n - c_t and mu c_n + c_t.
+            c_t[list(rows)] = (cones[held + k] - cones[k]) / 2 if len(rows) == 1 else np.nan
+    return Instant(formation, z, v, response.acceleration, c_n, c_t)
+
+
+def find_changes(
+    limits: LimitSet, sides: Array, missed: NDArray[np.bool_], tau: Array, much: float
+) -> tuple[TorqueAdvice, ...]:
+    """Least changes of each torque alone that mend some limits, and of both where those spoil some.
+
+    Other limits have to be kept; what they miss already they must not miss by more.
+
+    Parameters
+    ----------
+    sides : (n_sides, 3)  slack of its one-sided limits is sides @ (1, tau_1, tau_2)
+    missed : (n_sides,)   which sides are to be mended
+    tau : (2,) [N m]
+    much : [N m]          what is much for a torque
+    """
+    owners = limits.owners[limits.sides[0]]
+    scale = limits.scales[limits.sides[0]]
+    slack, slope = normalise(sides, scale, tau, much)
+    slack = np.where(missed, slack, np.maximum(slack, 0.0))
+
+    def describe(change: Array) -> TorqueAdvice:
+        short = -(slack + slope @ change)
+        worst, but = int(short.argmax()), ""
+        if short[worst] > KEPT:
+            limit = limits.limits[owners[worst]]
+            but = f"{limit.text} is {short[worst] * scale[worst]:.3g} {limit.unit} short"
+        return tell(much * change, tau, but)
+
+    singles = [change_one(slack, slope, joint) for joint in range(2)]
+    found = [describe(one) for one in singles if one is not None]
+    both = change_both(slack, slope) if all(change.but for change in found) else None
+    found += [] if both is None else [describe(both)]
+    return tuple(sorted(found, key=lambda change: (bool(change.but), np.hypot(*change.change))))
+
+
+def normalise(sides: Array, scale: Array, tau: Array, much: float) -> tuple[Array, Array]:
+    """Slack under torques `tau` and its slope, (n,) and (n, 2), in what is much for each."""
+    slack = sides @ np.array([1.0, *tau]) / scale
+    return np.asarray(slack), sides[:, 1:] * (much / scale)[:, None]
+
+
+def tell(change: Array, tau: Array, but: str = "", holds: bool = False) -> TorqueAdvice:
+    """A change of torques `tau`, shape (2,) [N m]."""
+    (first, second), (one, other) = change.tolist(), (tau + change).tolist()
+    return TorqueAdvice((first, second), (one, other), but, holds)
+
+
+def change_one(slack: Array, slope: Array, joint: int) -> Array | None:
+    """The least change of one torque with which slack + slope @ change >= 0 where slack < 0.
+
+    None if there is none; others than these may then be missed.
+    """
+    short = slack < 0
+    slack, along = slack[short], slope[short, joint]
+    if (np.abs(along) < FLAT).any() or ((along > 0).any() and (along < 0).any()):
+        return None
+    change = np.zeros(2)
+    steps = -slack / along
+    change[joint] = steps[np.abs(steps).argmax()] if len(steps) else 0.0
+    return change
+
+
+def change_both(slack: Array, slope: Array) -> Array | None:
+    """The shortest change with slack + slope @ change >= 0: on a side, or in a corner of two."""
+    sizes = np.linalg.norm(slope, axis=1)
+    steep = sizes > FLAT
+    normal, reach = slope[steep] / sizes[steep, None], slack[steep] / sizes[steep]
+    found = [-own * normal[k] for k, own in enumerate(reach)]
+    for i, j in combinations(range(len(reach)), 2):
+        pair = normal[[i, j]]
+        if abs(np.linalg.det(pair)) > FLAT:
+            found.append(np.linalg.solve(pair, -reach[[i, j]]))
+    kept = [change for change in found if (slack + slope @ change >= -KEPT).all()]
+    return min(kept, key=np.linalg.norm, default=None)

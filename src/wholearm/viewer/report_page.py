@@ -1,0 +1,138 @@
+"""A report of a problem and its plans in one page."""
+
+from __future__ import annotations
+
+import math
+import platform
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from ..common.document import Document, Table, fixed, show
+from ..comparison.metrics import compare
+from ..comparison.side_by_side import Contender
+from ..mapping.formation_map import FormationMap, build_map, choose_window
+from ..problem.definition import Problem
+from ..results.trajectory import Trajectory
+from . import page
+from .chart import describe_map
+from .motion_data import describe_motion
+
+_SAMPLES = 8000
+"""Of all motions in a page, which they leave at some 3 MB."""
+_RESOLUTION = 90
+"""Grid of the map: its borders are exact, only cells are drawn by it."""
+
+
+def build_report(
+    problem: Problem,
+    paths: Sequence[str],
+    text: str = "",
+    progress: Callable[[str], None] = lambda text: None,
+    chart: FormationMap | None = None,
+) -> str:
+    """Put plans and torques for a problem, replayed, into one page of HTML.
+
+    Parameters
+    ----------
+    paths     trajectory files (.npz) and torques (.csv)
+    text      the problem file as it stands
+    progress  called with what is being done
+    chart     the map of the problem, if it is there already
+
+    Raises
+    ------
+    InputError  if a file cannot be read, or is one of another problem; names the file
+    """
+    comparison = compare(problem, paths, progress)
+    parts = [comparison.summary.to_html()]
+    for contender in comparison.contenders:
+        progress(f"writing {contender.name}")
+        parts += _describe(contender, _SAMPLES // len(comparison.contenders))
+    first = next((own.planned for own in comparison.contenders if own.planned is not None), None)
+    progress("map")
+    chart = chart or build_map(problem, _RESOLUTION, choose_window(problem, None))
+    parts += [
+        page.write_heading("Contact formations"),
+        page.write_chart(*describe_map(chart, first)),
+    ]
+    parts += [
+        page.write_heading("Problem"),
+        page.write_text(text or str(problem), "the problem file"),
+    ]
+    parts += [Document(_name_versions()).to_html()]
+    return page.build_page(problem.name, parts)
+
+
+def _describe(contender: Contender, most: int) -> list[str]:
+    """The section of one plan or table of torques: player, verdict, phases and joints.
+
+    Of its motion `most` samples are taken, about.
+    """
+    problem, planned = contender.problem, contender.planned
+    parts = [page.write_heading(contender.name)]
+    parts.append(Document("", contender.verdict, contender.reason).to_html())
+    replayed = None if contender.report is None else contender.report.trajectory
+    shown = planned or replayed
+    if shown is None or problem is None:
+        return parts
+    ghost = replayed if planned is not None else None
+    parts.append(page.write_player(describe_motion(shown, problem, ghost, most)))
+    timings = shown.meta.get("timings")
+    # Routes are planned from parts that are replayed before: then nothing is left of a step.
+    known = timings.items() if isinstance(timings, dict) else ()
+    took = [(str(name), value) for name, value in known if value and value >= 1e-3]
+    tables = [list_phases(problem, shown), list_joints(shown)]
+    tables.append(Table(["planning took", "[s]:.4g"], took))
+    parts.append(Document("", parts=tables).to_html())
+    if contender.report is not None:
+        parts.append(page.fold(contender.report.document.to_html(), "what verify says"))
+    return parts
+
+
+def _name_versions() -> str:
+    from .. import __version__
+
+    return f"wholearm {__version__}, Python {platform.python_version()}, {platform.machine()}"
+
+
+def list_phases(problem: Problem, trajectory: Trajectory) -> Table:
+    """A row for each phase that the motion enters."""
+    rows = []
+    for index in np.unique(trajectory.phase):
+        phase, own = problem.phases[index], trajectory.phase == index
+        t, c_n = trajectory.t[own], trajectory.c_n[own]
+        least, name = math.nan, ""
+        if np.isfinite(c_n).any():
+            least = float(np.nanmin(c_n))
+            name = trajectory.contacts[int(np.nanargmin(c_n)) % c_n.shape[1]]
+        contacts = " ".join(contact.name for contact in phase.formation.contacts)
+        text = contacts, str(phase.until), phase.end.value
+        rows.append((index + 1, *text, t[-1] - t[0], least, name))
+    force = fixed(problem.epsilon or 0.05)
+    heads = ["phase:d", "contacts", "until", "end", "duration [s]:.6f", f"least c_n [N]:{force}"]
+    return Table([*heads, "of"], rows)
+
+
+def list_joints(trajectory: Trajectory) -> Table:
+    """A row for each place where a phase passes into the next one."""
+    rows, planar = [], np.hypot(*trajectory.q_dot[:, :2].T)
+    force = fixed(min(float(np.nanmax(trajectory.c_n, initial=0.0)), 10.0), 5)
+    speed = fixed(min(float(planar.max()), 0.5), 4)
+    torque = fixed(min(float(np.abs(trajectory.tau).max()), 2.0), 5)
+    for after in np.flatnonzero(np.diff(trajectory.phase)) + 1:
+        sides = [after - 1, after]
+        forces = [
+            f"{name}: {show(before, force)} \u2192 {show(later, force)}"
+            for name, before, later in zip(trajectory.contacts, *trajectory.c_n[sides], strict=True)
+            if math.isfinite(before) or math.isfinite(later)
+        ]
+        x, _, phi = trajectory.q[after]
+        place = trajectory.t[after], x, phi
+        torques = trajectory.tau[sides].T.ravel()
+        number = trajectory.phase[after - 1] + 1
+        rows.append((number, ", ".join(forces), *place, *planar[sides], *torques))
+    heads = ["after phase:d", "c_n before \u2192 after [N]", "t [s]:.6f", "x [mm]:z.3f"]
+    heads += ["phi [deg]:z.3f", f"speed before [m/s]:{speed}", f"after:{speed}"]
+    heads += [f"tau1 before [N m]:{torque}", f"after:{torque}"]
+    return Table([*heads, f"tau2 before:{torque}", f"after:{torque}"], rows)
