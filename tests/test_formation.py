@@ -421,3 +421,14 @@ def test_limits_are_expressions_of_the_scene_that_they_belong_to() -> None:
         given = np.array([0.01, 0.05, 0.1, 1.2, 2.0])
         found = formation.evaluate_limits(given[None])[0]
         np.testing.assert_allclose(function(given).full()[:, 0], found, rtol=0, atol=1e-13)
+
+
+def test_limits_outlive_the_scene_that_built_them() -> None:
+    corners = [[0.0, 0.0], [0.083, 0.0], [0.0, 0.071]]  # no other test's
+    first, second = (make_formation(make_scene(corners), "v1-finger1 v2-finger2") for _ in range(2))
+    assert len(first.limits) == len(second.limits) > 0
+    del first
+    gc.collect()
+    values = ca.vertcat(*(limit.value for limit in second.limits))
+    function = ca.Function("limits", [build_features(second.scene).z], [values])
+    assert np.isfinite(np.array(function(np.ones(5)))).all()

@@ -25,6 +25,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import accumulate
 from typing import NamedTuple
 
@@ -174,16 +175,18 @@ def candidate_contacts(scene: Scene, finger: int | None) -> list[Contact]:
 
 
 def build_features(scene: Scene) -> Features:
-    """Return the scene's features as expressions, the same for scenes of one shape.
-
-    Expressions of different contacts only fit together if they share one symbol z, so the features
-    are kept for as long as the scene lives.
-    """
+    """Return the scene's features as expressions of z, the same for scenes of one shape."""
     return _FEATURES(scene)
 
 
+@lru_cache(maxsize=1)
+def _make_configuration() -> Expression:
+    """The symbol z of all scenes: limits that scenes share outlive the scene that built them."""
+    return ca.SX.sym("z", 5)
+
+
 def _build_features(scene: Scene) -> Features:
-    z = ca.SX.sym("z", 5)
+    z = _make_configuration()
     body = scene.polygon.vertices
     run = np.roll(body, -1, axis=0) - body
     lengths = np.hypot(run[:, 0], run[:, 1])
