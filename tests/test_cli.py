@@ -388,11 +388,7 @@ def test_unreadable_problems(
 @pytest.mark.parametrize("option", ["-o", "--torques"])
 @pytest.mark.parametrize(
     "target, words",
-    [
-        ("absent/out", "no folder "),
-        (".", "is a folder"),
-        ("file/out", "is not a folder"),
-    ],
+    [("absent/out", "no folder "), (".", "is a folder"), ("file/out", "is not a folder")],
 )
 def test_unwritable_outputs(
     folder: Path, capsys: pytest.CaptureFixture[str], option: str, target: str, words: str
@@ -426,10 +422,7 @@ def test_output_that_is_a_device(folder: Path) -> None:
         (["solve"], "problem"),
         (["solve", str(HEPTAGON), "--speed", "3"], "unrecognized arguments: --speed 3"),
         (["solve", str(HEPTAGON), "--intervals", "ten"], "'ten' given; allowed are whole numbers"),
-        (
-            ["solve", str(HEPTAGON), "--intervals", "5"],
-            "--intervals: 5 given; allowed are whole",
-        ),
+        (["solve", str(HEPTAGON), "--intervals", "5"], "--intervals: 5 given; allowed are whole"),
         (["solve", str(HEPTAGON), "--objective", "fun"], "objective: 'fun' given; allowed are"),
         (["solve", str(HEPTAGON), "--duration", "1"], "duration: is for the objective margin"),
         (["solve", str(HEPTAGON), "--time-weight", "nan"], "--time-weight: nan given; allowed are"),
@@ -620,11 +613,7 @@ def run_in_shell(command: str, redirection: str) -> tuple[int, str]:
     [
         (">&-", 0, ""),
         ("2>&-", 0, ""),
-        (
-            "> /dev/full",
-            1,
-            "cannot be written: No space left on device\n",
-        ),
+        ("> /dev/full", 1, "cannot be written: No space left on device\n"),
     ],
 )
 def test_output_that_cannot_be_written_is_no_traceback(

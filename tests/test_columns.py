@@ -11,11 +11,7 @@ COLUMNS = Columns(z=5, h=1, tau=4)
 
 def test_blocks_follow_one_another() -> None:
     assert COLUMNS.count == 10
-    assert [COLUMNS[name] for name in ("z", "h", "tau")] == [
-        slice(0, 5),
-        slice(5, 6),
-        slice(6, 10),
-    ]
+    assert [COLUMNS[name] for name in ("z", "h", "tau")] == [slice(0, 5), slice(5, 6), slice(6, 10)]
 
 
 def test_blocks_are_joined_by_name_whatever_their_order() -> None:

@@ -21,11 +21,7 @@ from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.contacts.closing import close_finger, place_flush
 from wholearm.contacts.elemental import build_features, parse_contact
-from wholearm.contacts.formation import (
-    Formation,
-    describe,
-    find_touching,
-)
+from wholearm.contacts.formation import Formation, describe, find_touching
 from wholearm.problem.definition import Problem
 from wholearm.scene.model import Friction, Scene
 

@@ -46,10 +46,7 @@ def test_counts_of_one_phase_are_those_of_theory() -> None:
             ["p: iterations has grown from 79 to 100 (allowed: 99)"],
         ),
         ({"iterations": 100}, ["p: a: rows = 10 is new; --update stores it"]),
-        (
-            {"a: rows": 10, "iterations": 100, "b: rows": 3},
-            ["p: b: rows is not counted any more"],
-        ),
+        ({"a: rows": 10, "iterations": 100, "b: rows": 3}, ["p: b: rows is not counted any more"]),
     ],
 )
 def test_what_has_grown_is_named(stored: dict[str, int], texts: list[str]) -> None:

@@ -17,14 +17,7 @@ from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics import limits as limits_module
-from wholearm.mechanics.limits import (
-    CONE,
-    PRESS,
-    SPEED,
-    TORQUE,
-    MotionLimit,
-    make_limits,
-)
+from wholearm.mechanics.limits import CONE, PRESS, SPEED, TORQUE, MotionLimit, make_limits
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.path_data import prepare
 from wholearm.planning.path_domain.path_motion import PathMotion

@@ -6,13 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from plane import (
-    convex_polygon,
-    finger_gap,
-    make_formation,
-    make_scene,
-    rotate,
-)
+from plane import convex_polygon, finger_gap, make_formation, make_scene, rotate
 from wholearm.common.arrays import Array
 from wholearm.contacts.elemental import build_features, parse_contact
 from wholearm.contacts.formation import Formation

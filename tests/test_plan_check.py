@@ -53,11 +53,7 @@ def test_a_good_plan_passes(heptagon: Problem, trajectory: Trajectory) -> None:
     ],
 )
 def test_what_is_altered_is_named(
-    heptagon: Problem,
-    trajectory: Trajectory,
-    field: str,
-    change: Array | float,
-    words: str,
+    heptagon: Problem, trajectory: Trajectory, field: str, change: Array | float, words: str
 ) -> None:
     motions = list(trajectory.motions)
     motions[3] = Altered(motions[3], field, change)

@@ -30,12 +30,7 @@ from wholearm.results.torque import TorqueProfile
 FILES = (str(Path(__file__).parents[1] / "problems" / "heptagon_four_contacts.toml"),)
 LEAST = {LEAST_TIME: 0.0666298, NO_DRAG: 0.0663431}
 """Least times of the fourth phase, within 1e-5."""
-TRIED = {
-    "wholearm, curve": "1e-3",
-    "wholearm, time": "8 x 3",
-    "yapss": "20",
-    "toppra": "100",
-}
+TRIED = {"wholearm, curve": "1e-3", "wholearm, time": "8 x 3", "yapss": "20", "toppra": "100"}
 
 
 @lru_cache

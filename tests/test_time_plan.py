@@ -167,8 +167,7 @@ def test_rolling_contacts_are_planned_like_along_the_curve() -> None:
 
 
 @pytest.mark.parametrize(
-    "throw, name",
-    [(shove, "radau"), (heave, "radau"), (heave, "legendre"), (lift, "radau")],
+    "throw, name", [(shove, "radau"), (heave, "radau"), (heave, "legendre"), (lift, "radau")]
 )
 def test_what_moves_by_itself_takes_its_time(
     throw: Callable[[], tuple[Problem, float]], name: str
@@ -207,10 +206,7 @@ def test_what_moves_by_itself_takes_its_time(
         assert phi[-1] == pytest.approx(problem.phases[1].until.value, abs=1e-8)
 
 
-@pytest.mark.parametrize(
-    "throw, objective",
-    [(shove, "margin"), (heave, "effort")],
-)
+@pytest.mark.parametrize("throw, objective", [(shove, "margin"), (heave, "effort")])
 def test_one_and_two_contacts_are_planned_for_every_objective(
     throw: Callable[[], tuple[Problem, float]], objective: str
 ) -> None:

@@ -129,8 +129,7 @@ def test_a_movie_has_a_speed_that_can_be_shown(speed: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("output", "words"),
-    [("plan.avi", "'.avi' given"), ("none/plan.gif", "none")],
+    ("output", "words"), [("plan.avi", "'.avi' given"), ("none/plan.gif", "none")]
 )
 def test_animate_refuses_what_it_cannot_write(
     output: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
