@@ -208,15 +208,6 @@ def test_a_report_says_what_happens_contact_by_contact() -> None:
     assert first.start == 0.0 and first.least > 0
 
 
-def test_the_motion_is_a_trajectory() -> None:
-    whole = checked().whole
-    trajectory = whole.trajectory
-    assert trajectory.contacts[: len(begin()[1].contacts)] == begin()[1].contacts
-    assert trajectory.duration == pytest.approx(0.8)
-    shown = whole.show(begin()[1].contacts[::-1])
-    assert shown.c_n[:, -1] == pytest.approx(whole.c_n[:, 0], nan_ok=True)
-
-
 def test_torques_alone_are_followed_by_what_happens() -> None:
     problem, trajectory = begin()
 
@@ -230,14 +221,6 @@ def test_torques_alone_are_followed_by_what_happens() -> None:
     # The simulation goes on after the first loss.
     assert report.whole.t[-1] == pytest.approx(0.8)
     assert report.whole.outcome.kind is OutcomeKind.ENDED
-
-
-def test_the_end_and_the_start_may_be_others() -> None:
-    problem, torque, z = pinch(0.3)
-    run = simulate_free(problem, torque, until=12.5)
-    assert run.t[-1] == 12.5 and run.tau[-1] == pytest.approx([0.3, -0.3])
-    thrown = simulate_free(problem, torque, start=[*z, 0, 1.0, 0, 0, 0], until=0.01)
-    assert thrown.z_dot[-1, 1] < 1.0 - 0.01 * 9.81 and thrown.z[-1, 1] > z[1]
 
 
 @pytest.mark.parametrize(

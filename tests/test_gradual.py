@@ -23,7 +23,6 @@ from wholearm.planning.time_domain.attempts import (
     find_modes,
     split_by_senses,
 )
-from wholearm.planning.time_domain.equations import least_rates, least_senses
 from wholearm.planning.time_domain.search import TimeSearch, TimeSolution
 from wholearm.planning.time_domain.stage import Stage
 from wholearm.planning.time_domain.stage_kernels import goal_kernel
@@ -194,16 +193,6 @@ def test_where_the_last_stage_stops_may_be_given() -> None:
     for before, after in zip(free.rows.bounds, held.rows.bounds, strict=True):
         assert len(after) == len(before) + 2
         assert np.setdiff1d(after, before) == pytest.approx(np.sort(there))
-
-
-def test_the_second_contact_of_a_vertex_need_not_move() -> None:
-    """Its rate has a zero where the link stands across, however fast the vertex moves."""
-    _, stage = turned(Polynomial([1.0]))
-    places = np.linspace(0.1, 0.9, 9)
-    least = least_senses(stage, places)
-    assert least.shape == (9, 5) and (least[:, 1] == 0.0).all()
-    assert (least[:, [0, 2, 3, 4]] == least_rates(stage, places)[:, None]).all()
-    assert least[:, 0].min() > 0.0
 
 
 def test_what_ends_a_phase_is_not_reached_before() -> None:

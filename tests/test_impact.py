@@ -180,15 +180,6 @@ def test_without_friction_it_is_the_nearest_velocity(rough: ImpactSequence) -> N
             assert energy_of(after.scene, other - v) > least
 
 
-def test_impulses_grow_with_the_speed(rough: ImpactSequence) -> None:
-    for before, after, z, v in arrivals(rough):
-        one, three = (compute_impact(before, after, z, speed * v) for speed in (1.0, 3.0))
-        np.testing.assert_allclose(three.v, 3 * one.v, rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(three.p, 3 * one.p, rtol=1e-12, atol=1e-12)
-        kinds = [[(h.kind, h.name) for h in impact.violations] for impact in (one, three)]
-        assert kinds[0] == kinds[1]
-
-
 # A square that comes down on its right lower corner, r away from its centroid: one impulse.
 
 
@@ -306,14 +297,6 @@ def test_the_sliding_directions_are_found_among_all(rough: ImpactSequence) -> No
 # Curves that impacts join.
 
 
-def test_a_chain_ends_where_an_impact_is_not_possible(rough: ImpactSequence) -> None:
-    assert [join.possible for join in rough.impacts] == [True, True, False, False]
-    parts = rough.split()
-    assert [[phase.number for phase in part.phases] for part in parts] == [[1, 2, 3], [4], [5]]
-    assert [len(part.impacts) for part in parts] == [2, 0, 0]
-    assert all(len(part.curves) == len(part.phases) for part in parts)
-
-
 def test_paces_make_the_speed_continuous(rough: ImpactSequence) -> None:
     """A velocity of z_s on one curve becomes z_s on the next."""
     part = rough.split()[0]
@@ -327,15 +310,6 @@ def test_paces_make_the_speed_continuous(rough: ImpactSequence) -> None:
         check_momenta(
             replace(join.impact, v=v_after, p=before.speed_ratio * join.impact.p), before.end, v
         )
-
-
-def test_backwards_is_not_possible(rough: ImpactSequence) -> None:
-    """Run the other way, the second curve is left as it was come to."""
-    one, two = rough.curves[1], rough.curves[2]
-    join = make_sequence(rough.phases[1:3], (one, two)).impacts[0]
-    turned = replace(join, ratio=-join.ratio)
-    assert join.possible and not turned.possible
-    assert turned.reason == "phase 3 would be run backwards" and join.reason == ""
 
 
 def test_a_curve_at_another_pace(rough: ImpactSequence) -> None:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from plane import SQUARE, make_formation, make_scene
-from refused import advising, edited, plan, read_advice
 from tipping import roll
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError
@@ -217,19 +216,3 @@ def test_speed_limits_hold_between_collocation_points(
     rates = np.abs(over.motion.evaluate(t).z_dot[:, 4])
     assert 0.999 * fastest < rates.max() < fastest * (1 + 1e-6)
     assert over.value == pytest.approx(along.value, rel=0.02) and along.value > 1.02 * plain.value
-
-
-def test_a_speed_limit_gives_way_over_time_as_along_a_curve() -> None:
-    limits = {"epsilon": 0.6, "speed limit of finger 1": 0.3}
-    problem, name = edited(limits), "speed limit of finger 1"
-    start, found = trace_phases(problem)[1].end, list[float]()
-    for over_time in (False, True):
-        only = advising(lambda own: own.name == name)
-        with only, pytest.raises(InfeasibleError, match="phase 3 is infeasible: ") as caught:
-            if over_time:
-                plan_phases(problem, problem.phases[2:3], start, COARSE)
-            plan(problem, 3)
-        found.append(read_advice(str(caught.value))[name])
-    # With what is advised there is a plan; over time torques are linear over a sixth of the phase.
-    plan(edited(limits | {name: found[0]}), 3, explained=False)
-    assert found[1] == pytest.approx(found[0], rel=0.1)

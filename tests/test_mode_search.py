@@ -10,11 +10,10 @@ import pytest
 
 import wholearm.planning.time_domain.attempts as attempts
 import wholearm.planning.time_domain.mode_search as mode_search
-from plane import make_formation, measure_gaps, measure_slip
-from thrown import parting, raised
+from plane import measure_slip
+from thrown import raised
 from timed import instants
 from tipping import roll, tilting
-from wholearm.contacts.formation import find_touching
 from wholearm.mechanics.dynamics import Directions
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
@@ -171,22 +170,6 @@ def test_what_may_slide_or_roll_is_faster_than_what_has_to_roll() -> None:
     assert plan.duration < 0.95 * bound.duration
     report = verify(problem, plan)
     assert report.ok, report.to_text()
-
-
-def test_a_first_phase_lets_go_what_touches_at_the_start() -> None:
-    problem = parting()
-    (phase,) = problem.phases
-    touching = find_touching(problem.scene, problem.start)
-    (left,) = {c.name for c in touching} - set(phase.formation.names)
-    plan = solve(problem, transcription="time", time_intervals=8).trajectory
-    report = verify(problem, plan)
-    assert report.ok, report.to_text()
-    motion = plan.motions[0]
-    samples = motion.evaluate(np.linspace(0.0, motion.duration, 50))
-    gap = measure_gaps(make_formation(problem.scene, left), samples.z)[:, 0]
-    assert abs(gap[0]) < 1e-9
-    # It opens at once and does not touch again [m].
-    assert (gap[1:] > 1e-6).all()
 
 
 def test_a_contact_slides_in_one_phase_and_rolls_in_the_next() -> None:

@@ -15,7 +15,6 @@ from wholearm import InputError, Plan, Problem, simulate, solve, verify
 from wholearm.planning.table_check import make_table
 from wholearm.problem.table import describe_scene
 from wholearm.results.torque import TorqueProfile, read_torque_csv
-from wholearm.results.torque_table import read_rows
 from wholearm.simulation.events import EventKind, OutcomeKind
 from wholearm.simulation.sticking import balances
 from wholearm.simulation.tolerances import find_tolerances
@@ -95,13 +94,6 @@ def test_breaks_just_before_the_end_of_a_phase_do_not_end_it(slow: tuple[Problem
     assert found.outcome.kind is OutcomeKind.GOAL_REACHED
     came = next(event.time for event in found.events if event.kind is EventKind.ARRIVAL)
     assert came == pytest.approx(first, abs=find_tolerances(problem.scene).rest_window)
-
-
-def test_a_table_of_slow_torques_is_one_that_motors_can_follow(slow: tuple[Problem, Plan]) -> None:
-    problem, plan = slow
-    table = make_table(problem, plan.trajectory)
-    assert table.figures["replay"]["ok"]
-    assert describe_motors(problem, read_rows(table.rows)) == []
 
 
 def test_a_phase_that_ends_early_keeps_its_torques_until_it_was_to_end(

@@ -180,12 +180,6 @@ def test_a_robust_plan_keeps_epsilon_in_every_corner(
     assert own[1].value < own[0].value < 1.1 * own[1].value
 
 
-def test_no_ranges_cost_nothing(curve: Curve) -> None:
-    tiny = PlanOptions(ranges=dict.fromkeys(RADII, 1e-9), accuracy=1e-3)
-    plain = plan_path(curve, EPSILON, replace(tiny, ranges={}), 1)
-    assert plan_path(curve, EPSILON, tiny, 1).value == pytest.approx(plain.value, rel=2e-3)
-
-
 @pytest.mark.parametrize(
     "given, text",
     [

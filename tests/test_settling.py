@@ -248,10 +248,3 @@ def test_wrong_keys_are_named(changes: dict[str, object], key: str, allowed: str
     with pytest.raises(InputError, match=allowed) as raised:
         problem_of(HEPTAGON).with_(changes)
     assert raised.value.key == key
-
-
-def test_a_problem_without_the_key_is_planned_as_always() -> None:
-    plan = solved(HEPTAGON)
-    assert all(phase.settling is None for phase in plan.phases)
-    assert isinstance(plan.problem, Problem) and "settle" not in plan.problem.table
-    assert plan.meta["settling"] == [None] * 5

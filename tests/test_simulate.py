@@ -22,7 +22,7 @@ from wholearm.problem.definition import Phase, Problem, Until
 from wholearm.results.torque import TorqueProfile
 from wholearm.scene.model import Finger, Friction, Scene
 from wholearm.simulation import simulate as within
-from wholearm.simulation.events import EventKind, Glimpses, OutcomeKind, Simulation
+from wholearm.simulation.events import EventKind, OutcomeKind
 from wholearm.simulation.simulate import simulate
 from wholearm.simulation.sticking import Collapse, balances, find_rest
 
@@ -182,18 +182,6 @@ def test_baseline_agrees_with_the_dynamics(names: tuple[str, ...]) -> None:
             assert np.allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max())
 
 
-def test_states_do_not_depend_on_the_times_asked_for() -> None:
-    problem, trajectory = plan()
-    torque = trajectory.torque
-    rng = np.random.default_rng(1)
-    few = simulate(problem, torque, times=[0.55, 1.9])
-    many = simulate(problem, torque, times=[0.55, 1.9, *rng.uniform(0, 2, 200)])
-    for t in (0.55, 1.9):
-        assert np.allclose(few.at(t), many.at(t), atol=1e-9, rtol=0)
-    with pytest.raises(ValueError, match="not recorded"):
-        few.at(0.1234)
-
-
 def test_looks_are_as_good_as_steps_and_end_none() -> None:
     problem, motion = pick(1)
     torque = motion.fit(1, 24)
@@ -211,21 +199,6 @@ def test_looks_are_as_good_as_steps_and_end_none() -> None:
             for run in (looked, reference)
         )
         assert np.allclose(own, exact, rtol=0, atol=bound * (1 + np.nanmax(np.abs(exact))))
-
-
-def test_glimpses_of_forces_are_nearly_those_of_looks() -> None:
-    problem, trajectory = plan()
-    kept: list[Glimpses] = []
-
-    def look(_: Simulation, glimpses: Glimpses, looks: int) -> Array:
-        kept.append(Glimpses(glimpses.t[::40], glimpses.phase[::40], glimpses.c_n[::40]))
-        return kept[0].t[: 0 if looks else None]
-
-    looked = simulate(problem, trajectory.torque, closer=look)
-    glimpses, force = kept[0], problem.scene.scales.force
-    rows = [np.flatnonzero(looked.t == t)[0] for t in glimpses.t]
-    assert (looked.phase[rows] == glimpses.phase).all()
-    np.testing.assert_allclose(looked.c_n[rows], glimpses.c_n, rtol=0, atol=1e-4 * force)
 
 
 def test_what_happens_between_the_ends_of_steps_is_not_missed(
@@ -284,24 +257,6 @@ def test_starts_when_a_ramp_overcomes_friction() -> None:
 
     assert 0.05 < start < 0.4
     assert acceleration(start - 1e-6) < 0 < acceleration(start + 1e-6)
-
-
-def test_a_contact_pulled_at_rest_is_lost() -> None:
-    problem, _ = plan()
-    simulation = simulate(problem, constant((-0.2, 0.2)))
-    assert simulation.outcome.kind is OutcomeKind.CONTACT_LOST
-    assert "finger" in simulation.events[-1].contact
-    assert simulation.events[-1].time == 0.0
-    assert simulation.events[-1].value < 0
-
-
-def test_balance_at_rest() -> None:
-    problem, _ = plan()
-    contacts = problem.phases[0].formation.contacts
-    assert balances(problem.scene, contacts, problem.start, np.zeros(2))
-    # Fingers that open by less than their dry friction stay; by more, they do not.
-    assert balances(problem.scene, contacts, problem.start, np.array([-0.0099, 0.0099]))
-    assert not balances(problem.scene, contacts, problem.start, np.array([-0.0101, 0.0]))
 
 
 @pytest.mark.parametrize("bend", [0.0, 0.004])
@@ -388,20 +343,6 @@ def test_overshoot_arrives_at_a_speed() -> None:
     assert np.abs(energies.residual).max() < 1e-9 * energies.work.max()
 
 
-def test_short_of_the_goal_it_comes_to_rest() -> None:
-    problem, trajectory = plan()
-
-    def brake_more(starts: Array, c: Array) -> Array:
-        c[(starts > 0.3) & (starts < 0.4 - 1e-9)] *= 1.05
-        return c
-
-    simulation = simulate(problem, change(trajectory.torque, brake_more))
-    event = simulation.find(EventKind.REST)[0]
-    row = int(np.flatnonzero(simulation.t == event.time)[-1])
-    assert event.phase == 0 and event.time < 0.4
-    assert not simulation.z_dot[row].any()
-
-
 def test_another_limit_ends_the_motion() -> None:
     problem, motion = pick(1)
     phase = Phase(0, problem.phases[0].formation, Until(coordinate="x", value=-1.0))
@@ -426,17 +367,6 @@ def test_fingers_that_touch_end_the_motion(solid: bool) -> None:
     assert simulation.outcome.text.startswith("finger 1 touches finger 2 at t = ")
     assert simulation.outcome.text.endswith("phase 3")
     assert abs(gaps[-1]) < 2e-6 and gaps[:-1].min() > -1e-9
-
-
-def test_until_may_be_a_coordinate() -> None:
-    problem, motion = pick(1)
-    middle = float(motion.evaluate(np.array([0.2])).z[0, 0])
-    phase = Phase(0, problem.phases[0].formation, Until(coordinate="x", value=middle))
-    simulation = simulate(dataclasses.replace(problem, phases=(phase,)), motion.fit(40, 7))
-    assert simulation.outcome.reached
-    assert simulation.t[-1] == pytest.approx(0.2, abs=1e-9)
-    samples = motion.evaluate(np.array([0.2]))
-    assert simulation.events[-1].value == pytest.approx(abs(samples.z_dot[0, 0]), abs=1e-8)
 
 
 def test_jamming_is_an_error_that_names_phase_and_time() -> None:
@@ -477,16 +407,3 @@ def test_bad_tolerance(tolerance: float) -> None:
     problem, trajectory = plan()
     with pytest.raises(InputError, match="tolerance"):
         simulate(problem, trajectory.torque, tolerance=tolerance)
-
-
-def test_bad_times() -> None:
-    problem, trajectory = plan()
-    with pytest.raises(InputError, match="times"):
-        simulate(problem, trajectory.torque, times=[0.0, math.nan])
-
-
-def test_progress_is_reported() -> None:
-    problem, trajectory = plan()
-    seen: list[str] = []
-    simulate(problem, trajectory.torque, progress=seen.append)
-    assert seen == [f"simulating phase {k} of 5" for k in range(1, 6)]

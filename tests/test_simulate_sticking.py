@@ -155,25 +155,6 @@ def test_time_stepping_agrees_while_a_box_is_pushed_and_sticks() -> None:
     assert errors[2] < 0.65 * errors[1] < 0.42 * errors[0] < 0.02 * abs(moved)
 
 
-def test_a_tipped_box_sticks_slips_and_sticks_again() -> None:
-    """A box that falls over a vertex, which sticks, and slides either way, as it must."""
-    problem = falling(0.36, 0.2)
-    (phase,) = problem.phases
-    slides = dataclasses.replace(phase.formation, rolling=())
-    free = dataclasses.replace(problem, phases=(dataclasses.replace(phase, formation=slides),))
-    torque = constant((-0.01, 0.01), 1.0)
-    simulation = simulate(free, torque, tolerance=1e-12)
-    kinds = [kind for kind, _ in list_changes(simulation)]
-    assert kinds[:2] == ["slip", "stick"] or kinds[:2] == ["slip", "reversal"]
-    assert_balanced(simulation)
-    stop, errors = float(simulation.t[-1]) - 1e-3, []
-    end = simulate(free, torque, tolerance=1e-12, times=[stop]).at(stop)
-    for n in (200, 400):
-        z, _ = march(slides, free.start, np.zeros(5), lambda t: np.array([-0.01, 0.01]), stop, n)
-        errors.append(float(np.abs(z[-1] - end[:5]).max()))
-    assert errors[1] < 0.65 * errors[0] < 0.01
-
-
 @pytest.mark.parametrize("soft", [False, True])
 @pytest.mark.parametrize("off", [3e-9, -3e-9])
 def test_a_planned_stop_and_start_are_kept_though_rounding_disturbs_them(

@@ -85,35 +85,3 @@ def test_a_link_that_is_free_may_graze_what_starts_to_move() -> None:
         load = even - np.array([closing / lever, 0.0])
         begun = rest.wait(load[:, None], -1.0)
         assert (isinstance(begun, StartDeparture) and begun.x == -1.0) == starts
-
-
-def test_a_pointed_tip_on_an_edge_turns_onto_it_with_its_link() -> None:
-    """v0 comes to the link where the edge lies flush on it, far from where the tip is at v0."""
-    fingers = {
-        "1": {"base": [0.565, 0.047], "length": 0.64, "torque_limit": 2.7},
-        "2": {"base": [-0.218, -0.12], "length": 0.525, "torque_limit": 0.7},
-    }
-    same = {"radius": 0.0, "inertia": 1e-4, "viscous": 0.0, "dry": 0.0}
-    corners = [[-0.252, 0.033], [0.098, -0.235], [0.154, 0.202]]
-    phase = {"contacts": ["v0-palm", "v1-palm", "v2-finger1", "e2-tip2"], "until": "v0-finger2"}
-    table = {
-        "name": "flush",
-        "epsilon": 0.007,
-        "object": {"vertices": corners, "mass": 0.1},
-        "fingers": {key: finger | same for key, finger in fingers.items()},
-        "friction": {"palm": 0.009, "finger1": 0.08, "finger2": 0.04},
-        "start": {"flush": 0, "x": 0.316},
-        "phases": [phase],
-    }
-    problem = build_problem(table)
-    curve = trace_phases(problem)[0]
-    motion = CosineMotion(curve, 0.4, choose_squeeze(curve, 0.4, 0.2, 2.0))
-    simulation = simulate(problem, join([motion.fit(20, 7)]))
-    assert simulation.outcome.reached
-    x, y, phi, _, theta = simulation.z[-1]
-    c, s = np.cos(phi), np.sin(phi)
-    vertex = [x, y] + np.array([[c, -s], [s, c]]) @ problem.scene.polygon.vertices[0]
-    along = np.array([np.cos(theta), np.sin(theta)])
-    arm = vertex - problem.scene.fingers[1].base
-    assert along[0] * arm[1] - along[1] * arm[0] == pytest.approx(0.0, abs=1e-8)
-    assert 0.525 - along @ arm > 0.3

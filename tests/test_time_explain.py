@@ -225,23 +225,6 @@ def test_cones_of_rolling_contacts_can_be_short(side: float) -> None:
     assert found.amount == pytest.approx(0.7 - mu * (1 - problem.epsilon)) and found.unit == "N"
 
 
-@pytest.mark.parametrize("index, key", [(0, TORQUE), (1, TORQUE.replace("1", "2")), (2, EPSILON)])
-def test_a_changed_limit_is_the_only_change(index: int, key: str) -> None:
-    problem = box()
-    changed = change_limit(problem, key, 0.123)
-    limits = np.append(problem.scene.torque_limit, problem.epsilon)
-    limits[index] = 0.123
-    assert np.append(changed.scene.torque_limit, changed.epsilon) == pytest.approx(limits)
-    for before, after in zip(problem.phases, changed.phases, strict=True):
-        assert after.formation.scene is changed.scene
-        assert after.formation.contacts == before.formation.contacts
-        assert after.formation.rolling == before.formation.rolling
-        assert (after.index, after.until, after.end) == (before.index, before.until, before.end)
-    np.testing.assert_array_equal(changed.start, problem.start)
-    for name in ("mass_diagonal", "viscous", "dry", "speed_limit", "applied_force"):
-        np.testing.assert_array_equal(getattr(changed.scene, name), getattr(problem.scene, name))
-
-
 def test_failures_that_no_limit_explains_are_the_solvers() -> None:
     problem, _ = shove()
     failed = explain(search(problem), problem, problem.phases, [], "Restoration_Failed", None)

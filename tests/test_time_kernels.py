@@ -11,7 +11,6 @@ from tipping import roll
 from wholearm.common.arrays import Array
 from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation
-from wholearm.geometry.curve import Curve
 from wholearm.mechanics.dynamics import split_forces
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.time_domain import stage_kernels as kernels
@@ -175,12 +174,6 @@ def test_ends_are_where_gaps_coordinates_and_rates_vanish(
     np.testing.assert_allclose(call(kernel, [z, w]), expected, atol=1e-6)
 
 
-def test_an_end_without_conditions_has_no_kernel() -> None:
-    formation = FORMATIONS[2]
-    assert goal_kernel(formation, None, (), None) is None
-    assert goal_kernel(formation, Until(), (), None) is None
-
-
 def test_gaps_open_with_their_second_derivative() -> None:
     rng = np.random.default_rng(5)
     formation = FORMATIONS[2]
@@ -279,20 +272,6 @@ def test_impacts_balance_the_momentum_of_every_body(rolls: tuple[str, ...]) -> N
         rows = list(after.rolling_rows)
         grip = after.friction[rows] * p_n[rows]
         np.testing.assert_allclose(cones, [*(grip - p_t[rows]), *(grip + p_t[rows])], atol=1e-14)
-
-
-@every
-def test_kernels_have_a_row_for_each_condition(formation: Formation) -> None:
-    n_p, rolls = formation.n_constraints, formation.n_rolling
-    assert point_kernel(formation, 2).outputs == 3 * n_p + 5 + formation.n_contacts - rolls
-    before = make_formation(formation.scene, "v2-palm")
-    assert impact_kernel(before, formation).outputs == 5 + n_p + 1 + 2 * rolls
-
-
-def test_kernels_of_a_formation_are_built_once(curves: tuple[Curve, ...]) -> None:
-    formation = curves[0].formation
-    assert point_kernel(formation, 2) is point_kernel(formation, 2)
-    assert monitor_kernel(formation, (0, 1)) is not monitor_kernel(formation, (1, 0))
 
 
 def test_limits_are_no_part_of_kernels(heptagon: Problem, monkeypatch: pytest.MonkeyPatch) -> None:

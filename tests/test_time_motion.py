@@ -5,9 +5,9 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from plane import measure_gaps, measure_slip, unbalance
+from plane import measure_gaps, unbalance
 from planned import CosineMotion
-from timed import drive, fastest_landing, instants, integrate
+from timed import drive, fastest_landing, instants
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.mechanics.dynamics import Directions
@@ -122,15 +122,6 @@ def test_a_phase_is_its_stages_one_after_the_other(motions: list[TimeMotion]) ->
             np.testing.assert_array_equal(got, given[np.argsort(np.argsort(shuffled))])
 
 
-def test_friction_opposes_sliding(stages: list[StageMotion]) -> None:
-    for stage in stages:
-        samples = stage.evaluate(instants(stage, 8))
-        slip = measure_slip(stage.formation, samples.z, samples.z_dot)
-        power = samples.c_t * slip
-        # Near a reversal slip is known to the error of collocation, 1e-5 of the largest.
-        assert power.max() < 1e-4 * np.abs(power).max()
-
-
 @lru_cache(maxsize=16)
 def drive_and_return(curve: Curve, name: str, degree: int, count: int) -> tuple[float, float]:
     """What a motion that is known misses in z and in c_n when only its points are given."""
@@ -154,12 +145,3 @@ def test_a_known_motion_is_given_back(curves: tuple[Curve, ...], name: str, degr
     # Torques are known exactly, so what they lead to is, whatever the points were.
     place, force = drive_and_return(curves[3], name, degree, 12)
     assert place < 1e-9 and force < 1e-5
-
-
-def test_forward_integration_of_the_torques_reaches_the_end(stages: list[StageMotion]) -> None:
-    for stage in stages:
-        z, v = integrate(stage, *stage.points.nodes[0])
-        # What planned and simulated states may differ by at the end of a phase [m, rad].
-        np.testing.assert_allclose(z, stage.points.nodes[-1, 0], atol=1e-5)
-        fastest = np.abs(stage.points.v).max()
-        np.testing.assert_allclose(v, stage.points.nodes[-1, 1], atol=1e-4 * fastest)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from plane import make_formation, measure_gaps, with_speed_limit
+from plane import make_formation, measure_gaps
 from planned import CosineMotion
 from shipped import HEPTAGON
 from timed import drive
@@ -21,12 +21,11 @@ from wholearm.mechanics.dynamics import Directions
 from wholearm.mechanics.metric import metric_weights
 from wholearm.planning.options import CLEARANCE, OPENING, Objective
 from wholearm.planning.time_domain.collocation import Scheme, make_scheme
-from wholearm.planning.time_domain.equations import SLIDING, least_rates
 from wholearm.planning.time_domain.intersample import IntersampleLimits, raise_bounds
 from wholearm.planning.time_domain.nlp_layout import MARGIN, V, pack
 from wholearm.planning.time_domain.stage import Stage, StagePoints
 from wholearm.planning.time_domain.time_limits import Target
-from wholearm.planning.time_domain.time_nlp import SHORTEST, TimeNLP, bound_unknowns, build_time_nlp
+from wholearm.planning.time_domain.time_nlp import TimeNLP, bound_unknowns, build_time_nlp
 
 PHASE = 3
 """Of the heptagon, without a reversal."""
@@ -275,36 +274,6 @@ def test_derivatives_of_the_whole_are_its_differences() -> None:
     np.testing.assert_allclose(change, bend, atol=1e-6 * np.abs(bend).max())
 
 
-@pytest.mark.parametrize("scheme_name", ["radau", "legendre"])
-def test_unknowns_are_bounded(scheme_name: str) -> None:
-    scheme = make_scheme(scheme_name, 3)
-    first, second = cut(driven(scheme_name, 3, 8), 3)
-    first = replace(
-        first, ends_in_impact=True, guess=first.guess._replace(impulses=np.zeros(4)), turns=(5,)
-    )
-    stages = [first, second]
-    nlp = build(stages, scheme)
-    low, high = bound_unknowns(nlp, stages, scheme)
-    limit = np.tile(curve().formation.scene.torque_limit, 2)
-    for stage, layout in zip(stages, nlp.layouts, strict=True):
-        np.testing.assert_array_equal(low[layout.h], SHORTEST)
-        assert not np.isfinite(high[layout.h]).any()
-        for k in range(stage.intervals):
-            np.testing.assert_array_equal(low[layout.tau[k]], -limit)
-            np.testing.assert_array_equal(high[layout.tau[k]], limit)
-        assert not np.isfinite(low[layout.z]).any() and not np.isfinite(high[layout.a]).any()
-        for joint, sigma in enumerate(stage.directions.sigma):
-            free = np.isinf(low[layout.v[..., 3 + joint]]) & np.isinf(
-                high[layout.v[..., 3 + joint]]
-            )
-            # What stands still at a point has no sense there: at the end of the motion, or turning.
-            still = scheme.ends and (stage is second or joint == 1)
-            assert free.sum() == int(still) and bool(free[-1, -1]) == still
-            one = (low if sigma > 0 else high)[layout.v[0, 0, 3 + joint]]
-            assert one == 0.0
-    np.testing.assert_array_equal(low[nlp.layouts[0].impulses], 0.0)
-
-
 @pytest.mark.parametrize("contacts", [3, 4])
 def test_where_both_joints_turn_everything_stops_and_that_is_said_once(contacts: int) -> None:
     scheme = make_scheme("radau", 3)
@@ -322,28 +291,6 @@ def test_where_both_joints_turn_everything_stops_and_that_is_said_once(contacts:
     end = nlp.layouts[0].v[-1, -1, 3:]
     assert np.isinf(low[end]).all() and np.isinf(high[end]).all()
     assert np.isinf(nlp.rows.bounds[0][nlp.rows_of[0].senses[-1, -1]]).all()
-
-
-def test_what_two_freedoms_leave_must_not_stand_still() -> None:
-    scheme = make_scheme("radau", 3)
-    one, two = driven("radau", 3, 8, 4), driven("radau", 3, 8, 3)
-    assert not least_rates(one, one.guess.places(scheme.points)).any()
-    rates = least_rates(two, two.guess.places(scheme.points))
-    assert rates.max() == SLIDING and rates[-1, -1] == 0.0 and (rates.ravel()[:-1] > 0).all()
-    # Even in time, from both ends.
-    places = two.guess.places(scheme.points)
-    np.testing.assert_allclose(rates, SLIDING * np.clip(8 * np.minimum(places, 1 - places), 0, 1))
-
-
-def test_speed_limits_hold_at_every_point() -> None:
-    scheme, stage = make_scheme("radau", 3), driven("radau", 3, 8)
-    fastest = np.abs(stage.guess.v[..., 3:]).max(axis=(0, 1))
-    for share, kept in ((1.01, True), (0.99, False)):
-        slow = with_speed_limit(curve(), (share * fastest[0], np.inf)).formation
-        limited = replace(stage, formation=slow)
-        nlp = build([limited], scheme)
-        x, (low, high) = packed(nlp, [stage]), bound_unknowns(nlp, [limited], scheme)
-        assert bool(max((low - x).max(), (x - high).max()) < 1e-9) is kept
 
 
 @pytest.mark.parametrize("name", ["radau", "legendre"])

@@ -284,13 +284,6 @@ def test_the_object_lands_at_rest_on_its_next_edge(motions: list[TimeMotion]) ->
     assert heights[0] > heights[1] > 0
 
 
-def test_phases_are_joined_while_moving(motions: list[TimeMotion]) -> None:
-    before, after = (motion.stages for motion in motions)
-    end, start = before[-1].points.nodes[-1], after[0].points.nodes[0]
-    np.testing.assert_allclose(start, end, atol=1e-7)
-    assert np.abs(end[1]).max() > 1.0
-
-
 def test_the_torques_alone_carry_the_object_to_its_goal(stages: list[StageMotion]) -> None:
     z, v = stages[0].points.nodes[0]
     for stage in stages:
@@ -365,11 +358,3 @@ def test_plans_are_the_same_every_time() -> None:
         for before, after in zip(tables(one.points), tables(again.points), strict=True):
             size = np.abs(before).max(initial=0.0)
             np.testing.assert_allclose(after, before, rtol=0, atol=1e-9 * size)
-
-
-def test_guesses_in_the_time_domain_start_where_curves_end() -> None:
-    problem = landing()
-    start = trace_phases(problem)[-1].end
-    plans = plan_landing(time_intervals=COARSE)
-    np.testing.assert_allclose(plans[0].motion.stages[0].points.nodes[0, 0], start, atol=1e-9)
-    np.testing.assert_allclose(plans[0].motion.stages[0].points.nodes[0, 1], 0.0, atol=1e-9)
