@@ -110,8 +110,3 @@ def test_bracket_comes_near_to_the_edge(sign: int, farthest: float, edge: float)
     assert abs(value - edge) <= abs(farthest - 0.5) / 30
     assert bracket(limit, farthest, lambda _: False) is None
     assert bracket(limit, 0.5, lambda _: True) is None
-
-
-def test_a_change_without_a_unit() -> None:
-    change = Change(Parameter("friction of palm", 0.5, "", -1), 0.2)
-    assert str(change) == "friction of palm = 0.2 instead of 0.5"

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import gc
-
 import casadi as ca
 import numpy as np
 import pytest
@@ -46,15 +44,3 @@ def test_strided_arguments() -> None:
     expected = batch(wide[::2, ::2].copy(), wide[::-2, 4:].copy())
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-def test_function_may_go_out_of_scope() -> None:
-    batch = Batch(build_function())
-    gc.collect()
-    outer, _ = batch(np.full((1, 3), 2.0), np.full((1, 2), 3.0))
-    np.testing.assert_array_equal(outer, np.full((1, 3, 2), 7.0))
-
-
-def test_number_of_arguments_is_checked() -> None:
-    with pytest.raises(ValueError, match="zip"):
-        Batch(build_function())(np.zeros((1, 3)))

@@ -28,13 +28,11 @@ from wholearm.planning.time_domain.intersample import (
     check_between,
     find_misses,
     monitor_missed,
-    raise_bounds,
 )
 from wholearm.planning.time_domain.search import TimeSearch, TimeSolution
 from wholearm.planning.time_domain.stage import Stage
 from wholearm.planning.time_domain.tightening import enforce_between
 from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion, make_motions
-from wholearm.planning.time_domain.time_nlp import bound_unknowns
 from wholearm.planning.time_domain.time_plan import plan_phases, try_phases
 from wholearm.results.trajectory import Trajectory
 
@@ -233,27 +231,6 @@ def test_rates_against_the_directions_of_a_stage_are_missed() -> None:
         np.testing.assert_allclose(missed, largest.clip(0.0), atol=2e-3 * senses.max())
 
 
-def test_raised_rates_are_bounds_of_contacts_and_joints() -> None:
-    solution = solve_at_points()
-    stages, nlp = solution.stages, solution.nlp
-    k = next(i for i, stage in enumerate(stages) if stage.formation.n_constraints < 4)
-    tables = []
-    for rise in (0.0, 0.5):
-        limits = [IntersampleLimits.none(stage) for stage in stages]
-        limits[k].sense[:] = rise
-        bounds = bound_unknowns(nlp, stages, SCHEME)
-        tables.append((*bounds, raise_bounds(nlp, stages, limits, bounds)[0]))
-    (low, high, rows), (low_up, high_up, rows_up) = tables
-    own = nlp.rows_of[k].points[:, :, -stages[k].formation.n_contacts :]
-    known = np.isfinite(rows[own])
-    assert known.sum() > 10
-    np.testing.assert_allclose(rows_up[own][known] - rows[own][known], 0.5)
-    for joint, sigma in enumerate(stages[k].directions.sigma):
-        column = nlp.layouts[k].v[:-1, :, 3 + joint]
-        plain, raised = (low, low_up) if sigma > 0 else (-high, -high_up)
-        np.testing.assert_allclose(raised[column] - plain[column], 0.5)
-
-
 @lru_cache(maxsize=1)
 def make_way_twice() -> tuple[Trajectory, Trajectory]:
     """Plans of least effort with fingers that pass each other, and with solid ones."""
@@ -293,17 +270,3 @@ def test_what_is_broken_between_points_is_watched() -> None:
         found = monitor_missed(stages, checks)
         assert {k for stage in found or stages for k in stage.monitored} == set(monitored)
         assert (found is None) == (monitored == ())
-
-
-def test_what_is_short_where_a_stage_starts_is_no_miss_of_its_own() -> None:
-    solution = solve_at_points()
-    stage, motion = solution.stages[0], make_motions(solution.stages, SCHEME)[0]
-    seen = check_between(stage, motion)
-    deep = 10 * GRAZE * stage.formation.scene.scales.length
-    lower = np.full_like(seen.limits, deep)
-    lower[0] = -deep
-    row = (0, *stage.monitored)[-1]
-    monitoring = replace(stage, monitored=(row,), released=())
-    assert find_misses(monitoring, seen._replace(limits=lower), EPSILON).gap.max() == 0.0
-    lower[5] = -4 * deep
-    assert find_misses(monitoring, seen._replace(limits=lower), EPSILON).gap.max() > 2 * deep

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
-
 import numpy as np
 import pytest
 
@@ -81,15 +79,6 @@ def test_parts_of_a_border_take_as_long_together_as_one_by_one() -> None:
             alone = ground.closed or ground.begins or ground.ends or sketch([ground])
             assert np.isfinite(took) == (not isinstance(alone, str))
             assert isinstance(alone, str) or took == pytest.approx(alone, rel=0.02)
-
-
-def test_a_border_is_kept_without_what_is_seen_of_it() -> None:
-    problem = problem_of(IMPACTS)
-    border = Roadmap(problem, 0.1).trace(make_place(problem.scene, problem.start))[0]
-    seen = border.ground
-    kept = pickle.loads(pickle.dumps(border))
-    assert "ground" not in kept.__dict__
-    np.testing.assert_allclose(kept.ground.rows.one, seen.rows.one, rtol=1e-9, atol=1e-12)
 
 
 def test_a_landing_is_led_to_where_the_goal_is() -> None:

@@ -17,12 +17,10 @@ import numpy as np
 import pytest
 
 import wholearm
-from shipped import BOX, HEPTAGON, IMPACTS, plan_of, solved
-from tipping import scale, tipped
+from shipped import HEPTAGON, IMPACTS, solved
 from wholearm.cli.command import build_parser, main
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan_report import describe_plan
-from wholearm.results.torque_table import format_rows, place_rows
 from wholearm.results.trajectory import Trajectory
 from wholearm.results.trajectory_file import load_trajectory
 
@@ -214,20 +212,6 @@ def test_solve_lists_the_impacts(folder: Path, capsys: pytest.CaptureFixture[str
     assert "least impulse [N s]" in capsys.readouterr().out
 
 
-def test_an_impulse_that_pulls_has_exit_status_1(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Torques that the rough finger would make good, on the smooth one."""
-    plan_of(IMPACTS, "effort").save("a.npz")
-    text = IMPACTS.read_text(encoding="utf-8").replace("finger1 = 0.4", "finger1 = 0.33")
-    Path("smooth.toml").write_text(text)
-    assert main(["verify", "smooth.toml", "a.npz"]) == 1
-    assert re.search(
-        r"impulse on v1-palm would be -\S+ N s in the impact at t = \S+ s, phase 2",
-        capsys.readouterr().out,
-    )
-
-
 def test_files_of_an_earlier_run_are_left_and_named(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -238,16 +222,6 @@ def test_files_of_an_earlier_run_are_left_and_named(
     assert stale == "wholearm: a.npz: left as it was, from an earlier run"
     assert "duration = 0.001 s" in reason
     assert Path("a.npz").read_bytes() == b"old" and not Path("a.csv").exists()
-
-
-def test_a_phase_is_planned_in_the_time_domain_when_asked(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = write_problem(folder, keep(1))
-    options = ["-o", "a.npz", "--transcription", "time", "--time-intervals", "4"]
-    assert main(["solve", path, *options]) == 0
-    assert load_trajectory("a.npz").meta["transcription"] == "time"
-    assert main(["verify", path, "a.npz"]) == 0
 
 
 @pytest.mark.parametrize("objective", ["time", "effort", "margin"])
@@ -401,13 +375,6 @@ def test_unwritable_outputs(
     assert Path("file").read_text() == "kept"
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_output_in_a_read_only_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (folder / "locked").mkdir(mode=0o500)
-    message = fails(capsys, 2, "solve", str(HEPTAGON), "-o", "locked/a.npz")
-    assert "cannot be written: no permission" in message
-
-
 def test_output_that_is_a_device(folder: Path) -> None:
     path = write_problem(folder, keep(1))
     assert main(["solve", path, "-o", os.devnull, "--intervals", "20"]) == 0
@@ -443,20 +410,6 @@ def test_bad_arguments(
     assert list(folder.iterdir()) == []
 
 
-def test_a_duration_below_the_least_time(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["solve", str(HEPTAGON), "--objective", "margin", "--duration", "0.3"]
-    message = fails(capsys, 1, *arguments)
-    assert "duration = 0.3 s is not longer than the least time, 0.49" in message
-    assert "; feasible with duration = 0.50" in message
-    assert list(folder.iterdir()) == []
-
-
-def test_verify_a_plan(planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["verify", str(HEPTAGON), str(planned / "plan.npz")]) == 0
-    out, err = capsys.readouterr()
-    assert err == "" and "v5-finger2" in out
-
-
 def test_verify_torques_as_json(planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["verify", str(HEPTAGON), str(planned / "torques.csv"), "--json"]
     assert main([*command, "--tolerance", "1e-8"]) == 0
@@ -473,33 +426,6 @@ def test_verify_names_a_missed_goal(folder: Path, capsys: pytest.CaptureFixture[
     out, err = capsys.readouterr()
     assert err == "" and "FAILED: " in out
     assert "the torques end at t = 0.5 s, phase 1, 0.0236 m short of v3-finger1" in out
-
-
-def test_verify_names_a_slip(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    starts = tipped().phase_starts
-    torque = scale(0, 0.95, starts[1], starts[2])
-    Path("weak.csv").write_text(format_rows(place_rows(torque)))
-    assert main(["verify", str(BOX), "weak.csv"]) == 1
-    out, err = capsys.readouterr()
-    assert err == "" and "FAILED: " in out and "v1-palm slips: |c_t| = " in out
-
-
-BAD_TORQUES = {
-    "missing column": ("t,tau1\n0,0\n1,0\n", "tau2: column is missing; t,tau1 given"),
-    "empty": ("", "t: column is missing; an empty file given"),
-    "no rows": ("t,tau1,tau2\n", "t: 0 rows given"),
-    "text": ("t,tau1,tau2\n0,0,0\n1,x,0\n", "tau1: 'x' on line 3 is not a finite number"),
-    "nan": ("t,tau1,tau2\n0,0,0\n1,0,nan\n", "tau2: 'nan' on line 3"),
-    "backwards": ("t,tau1,tau2\n0,0,0\n1,0,0\n0.5,0,0\n", "t: time goes back from 1 to 0.5 s"),
-}
-
-
-@pytest.mark.parametrize("case", BAD_TORQUES)
-def test_bad_torque_files(folder: Path, capsys: pytest.CaptureFixture[str], case: str) -> None:
-    text, words = BAD_TORQUES[case]
-    Path("bad.csv").write_text(text)
-    message = fails(capsys, 2, "verify", str(HEPTAGON), "bad.csv")
-    assert message.startswith(f"bad.csv: {words}")
 
 
 @pytest.mark.parametrize(
@@ -550,15 +476,6 @@ def test_interrupting_leaves_nothing(
     assert main(["solve", str(HEPTAGON)]) == 130
     assert capsys.readouterr().err == "wholearm: interrupted\n"
     assert list(folder.iterdir()) == []
-
-
-def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main(["--help"])
-    assert caught.value.code == 0
-    out = capsys.readouterr().out
-    assert all(f"    {verb} " in out for verb in ("solve", "verify", "plot", "bench"))
-    assert build_parser().prog == "wholearm"
 
 
 def run(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:

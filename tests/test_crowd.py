@@ -56,10 +56,6 @@ def test_tasks_are_given_a_few_at_a_time() -> None:
     assert len(given) <= 5 + 4
 
 
-def test_no_tasks_are_no_answers() -> None:
-    assert list(run_all(square, [], partial(ThreadPoolExecutor, 1))) == []
-
-
 class Breaking(Executor):
     """Runs tasks at once, and breaks with every one that is deadly, as a pool of processes does."""
 

@@ -341,21 +341,6 @@ def test_unreadable_file(tmp_path: Path, name: str) -> None:
     assert caught.value.source == str(tmp_path / name)
 
 
-def test_never_reached_says_what_stops_it_both_ways(tmp_path: Path) -> None:
-    path = tmp_path / "bad.toml"
-    path.write_text(TEXT.replace('until = "v6-finger2"', 'until = "v2-palm"'), encoding="utf-8")
-    with pytest.raises(InputError) as caught:
-        load(str(path))
-    assert "v6 touches finger 2 at x = -19.91 mm" in caught.value.problem
-    assert "v2 touches finger 1 at x = 16.68 mm" in caught.value.problem
-
-
-@pytest.mark.parametrize("solid", [None, True, False])
-def test_fingers_may_lie_in_different_planes(solid: bool | None) -> None:
-    problem = read_edited(lambda table: solid is None or put("fingers_collide", solid)(table))
-    assert problem.scene.fingers_collide is (solid is not False)
-
-
 def test_a_hand_that_is_crossed_at_the_start_is_refused() -> None:
     """Long links close over an object in the middle, unless they pass each other."""
 

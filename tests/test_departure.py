@@ -65,12 +65,6 @@ def test_a_contact_that_is_not_planned_is_the_reason() -> None:
     assert judge(run).reason.startswith("v6-finger2 presses, which is not planned, at t = ")
 
 
-def test_a_replay_that_is_no_number_departs() -> None:
-    run = follow()
-    run.z[50:] = np.nan
-    assert judge(run).time == pytest.approx(run.t[50])
-
-
 def test_a_vertex_on_a_tip_ends_two_edges() -> None:
     assert find_pairs("v4-tip1", 6) == ("v4-finger1", "e3-tip1", "e4-tip1")
     assert find_pairs("v0-tip2", 6) == ("v0-finger2", "e5-tip2", "e0-tip2")

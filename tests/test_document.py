@@ -128,11 +128,6 @@ def test_long_tables_are_cut_as_text_and_have_a_rule_as_markdown() -> None:
     assert len(lines) == 2 + 5
 
 
-def test_empty_parts_are_left_out() -> None:
-    assert Document("", parts=["", Table(["a"], [])]).to_text() == ""
-    assert Document("head", parts=[Table(["a"], []), "line"]).to_text() == "head\nline"
-
-
 def test_numbers_are_written_with_significant_digits() -> None:
     assert show(0.0123456, fixed(0.05)) == "0.0123" and show(-1e-9, fixed(0.05)) == "0.0000"
     assert show(None, ".1f") == show(math.nan, ".1f") == "-"

@@ -7,11 +7,11 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from plane import SQUARE, cross, make_formation, make_scene, rotate
+from plane import SQUARE, cross, make_formation, make_scene
 from pushed import forward
 from wholearm.common.arrays import Array
 from wholearm.contacts.closing import close_finger
-from wholearm.contacts.elemental import Contact, build_features, build_geometry
+from wholearm.contacts.elemental import build_features, build_geometry
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
@@ -118,17 +118,6 @@ def test_every_body_obeys_newton_and_euler(curves: tuple[Curve, ...]) -> None:
         assert np.abs(residual).max() < 1e-12 * (1 + np.abs(c_n).max())
 
 
-def test_moving_backwards_reverses_every_sign(curves: tuple[Curve, ...]) -> None:
-    for curve, s, directions in states(curves, 1):
-        z, z_s, _ = (part[0] for part in curve.evaluate(np.array([s]))[:3])
-        backwards = Directions(-directions.Xi, -directions.sigma)
-        z_ddot, c_n = forward(curve.formation, z, -0.3 * z_s, np.array([0.5, -0.5]), backwards)
-        residual = newton_euler_residual(
-            curve.formation, z, -0.3 * z_s, z_ddot, np.array([0.5, -0.5]), c_n
-        )
-        assert np.abs(residual).max() < 1e-12 * (1 + np.abs(c_n).max())
-
-
 def test_accelerations_keep_the_contacts(curves: tuple[Curve, ...]) -> None:
     for curve, s, directions in states(curves, 2):
         z, z_s, _ = (part[0] for part in curve.evaluate(np.array([s]))[:3])
@@ -159,42 +148,6 @@ def test_power_balance(curves: tuple[Curve, ...]) -> None:
         lost += scene.viscous @ v**2 + scene.dry @ np.abs(v)
         power = tau @ v[3:] - lost
         assert (after - before) / (2 * h) == pytest.approx(power, abs=1e-8 * (1 + abs(power)))
-
-
-def test_friction_opposes_sliding(curves: tuple[Curve, ...]) -> None:
-    """A contact that presses takes power from the motion, one that pulls would give it some.
-
-    The velocities of both bodies at the contact points are measured by finite differences.
-    """
-    rng, signs, h = np.random.default_rng(15), set(), 1e-6
-    for curve, s, directions in states(curves, 2):
-        formation = curve.formation
-        z, z_s = (part[0] for part in curve.evaluate(np.array([s]))[:2])
-        v, tau = 0.3 * z_s, rng.uniform(-1, 1, 2)
-        _, c = forward(formation, z, v, tau, directions)
-        c_n, c_t = split_forces(formation, c, directions.Xi)
-        points, normals = contact_frames(formation, z)
-        for k, contact in enumerate(formation.contacts):
-            ahead, behind = (
-                move_point(contact, formation.scene, points[k], z, e * v) for e in (h, -h)
-            )
-            slip = (ahead - behind) @ [normals[k, 1], -normals[k, 0]] / (2 * h)
-            # Where a contact all but turns, differences do not tell the sign.
-            if abs(slip) > 1e-6:
-                assert c_t[k] * slip * np.sign(c_n[k]) < 0
-                assert abs(c_t[k]) == pytest.approx(formation.friction[k] * abs(c_n[k]), rel=1e-12)
-                signs |= {(contact.surface, float(np.sign(slip)))}
-    assert {("palm", 1.0), ("palm", -1.0), ("finger", 1.0), ("finger", -1.0)} <= signs
-
-
-def move_point(contact: Contact, scene: Scene, point: Array, z: Array, step: Array) -> Array:
-    """How much farther the object's point moves than the hand's, over a small step of z."""
-    turned = step[2] * np.array([-(point - z[:2])[1], (point - z[:2])[0]])
-    of_hand = np.zeros(2)
-    if contact.finger is not None:
-        arm = point - np.asarray(scene.fingers[contact.finger].base)
-        of_hand = rotate(step[3 + contact.finger], arm) - arm
-    return np.asarray(step[:2] + turned - of_hand)
 
 
 def standing() -> tuple[Formation, Array]:
@@ -261,33 +214,6 @@ def test_squeeze_moves_no_body(curves: tuple[Curve, ...]) -> None:
             tau, c_n = forces.tau(a, b, squeeze)[0], forces.c(a, b, squeeze)[0]
             residual = newton_euler_residual(curve.formation, z[0], v, z_ddot, tau, c_n)
             assert np.abs(residual).max() < 1e-12 * (1 + np.abs(c_n).max())
-
-
-def test_forces_are_the_same_one_by_one(curves: tuple[Curve, ...]) -> None:
-    """Many places at once, each with its own directions, on both sides of a reversal."""
-    curve = curves[0]
-    point = curve.evaluate(curve.length * np.array([0.1, 0.3, 0.9]))
-    parts = [curve.segments[k] for k in (0, 0, 1)]
-    many = Directions(np.array([p.Xi for p in parts]), np.array([p.sigma for p in parts]))
-    z, z_s, z_ss, kinematics = point
-    together = inverse(curve.formation, z, z_s, z_ss, many, kinematics)
-    for i, part in enumerate(parts):
-        one_place = slice(i, i + 1)
-        directions = Directions(part.Xi, part.sigma)
-        alone = inverse(curve.formation, z[one_place], z_s[one_place], z_ss[one_place], directions)
-        for row, one in zip(together, alone, strict=True):
-            np.testing.assert_allclose(row[i], one[0], rtol=1e-11, atol=1e-12)
-
-
-def test_reduced_inertia_is_one_without_friction(curves: tuple[Curve, ...]) -> None:
-    for curve in curves:
-        formation = Formation(
-            replace(curve.formation.scene, friction=FRICTIONLESS), curve.formation.contacts
-        )
-        z = curve.evaluate(np.linspace(0, curve.length, 5)).z
-        kinematics = formation.evaluate(z, z)
-        ratio = reduced_inertia(formation, kinematics, Directions(np.ones(4), np.ones(2)))
-        np.testing.assert_allclose(ratio, 1.0, rtol=1e-12)
 
 
 def test_reduced_inertia_has_the_sign_of_the_mass_along_the_motion(

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -27,7 +26,6 @@ from wholearm.contacts.elemental import (
     candidate_contacts,
     parse_contact,
 )
-from wholearm.problem.definition import Problem
 from wholearm.scene.model import Scene
 
 KITE = [[-0.04, -0.03], [0.02, -0.035], [0.045, 0.01], [0.0, 0.05], [-0.045, 0.02]]
@@ -209,28 +207,11 @@ def test_vertex_at_the_ends_of_the_tip_arc(scene: Scene, heading: float | None, 
     assert limit_values(scene, "v2-tip1", z)[text] == pytest.approx(0, abs=1e-13)
 
 
-def test_palm_has_no_ends(scene: Scene) -> None:
-    assert build_limits(parse_contact("v0-palm", scene), scene) == []
-
-
 def test_names_round_trip(scene: Scene) -> None:
     contacts = [c for part in (None, 0, 1) for c in candidate_contacts(scene, part)]
     assert len(set(contacts)) == 5 + 2 * 15
     assert [parse_contact(contact.name, scene) for contact in contacts] == contacts
     assert [str(contact) for contact in contacts] == [contact.name for contact in contacts]
-
-
-@pytest.mark.parametrize(
-    "name, corner, part",
-    [
-        ("v3-palm", "v3", "the palm"),
-        ("v3-finger1", "v3", "finger 1"),
-        ("e2-tip2", "e2", "the tip of finger 2"),
-    ],
-)
-def test_words(scene: Scene, name: str, corner: str, part: str) -> None:
-    contact = parse_contact(name, scene)
-    assert (contact.corner, contact.part) == (corner, part)
 
 
 @pytest.mark.parametrize(
@@ -252,17 +233,6 @@ def test_pointed_tip_has_no_arc() -> None:
     assert len(candidate_contacts(pointed, 0)) == 10
     with pytest.raises(InputError, match=r"fingers\.1\.radius is 0"):
         parse_contact("v1-tip1", pointed)
-
-
-def test_features_last_as_long_as_their_scene(heptagon: Problem) -> None:
-    first = build_features(heptagon.scene)
-    right, left = heptagon.scene.fingers
-    others = [
-        replace(heptagon.scene, fingers=(replace(right, length=0.1 + k / 500), left))
-        for k in range(60)
-    ]
-    assert len({id(build_features(scene)) for scene in others}) == len(others)
-    assert build_features(heptagon.scene) is first
 
 
 @pytest.mark.parametrize("count", [3, 4, 9])

@@ -42,11 +42,6 @@ def test_an_end_is_moved_to_where_what_follows_costs_less() -> None:
     assert max(gains) > GAIN
 
 
-def test_without_a_cost_to_go_nothing_changes() -> None:
-    search, alone = landed()
-    assert choose_end(search, alone) == (search, alone)
-
-
 def test_an_end_from_where_nothing_follows_is_kept() -> None:
     search, alone = landed()
 

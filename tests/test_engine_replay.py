@@ -14,13 +14,7 @@ from shipped import HEPTAGON, plan_of, problem_of
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
 from wholearm.engines.departure import Departure
-from wholearm.engines.engine_replay import (
-    EngineReport,
-    Level,
-    list_settings,
-    replay_in,
-    require_engine,
-)
+from wholearm.engines.engine_replay import EngineReport, Level, replay_in, require_engine
 from wholearm.engines.feedback import play_policy
 from wholearm.engines.mjcf import write_mjcf
 from wholearm.engines.pressing import EngineDrive
@@ -156,16 +150,6 @@ def test_what_departs_with_some_settings_only_has_not_converged() -> None:
         levels = tuple(Level(COARSE, (own,)) for own in (lost, finer))
         report = EngineReport(problem, "MuJoCo", 3e-3, (stretch,), levels)
         assert report.exit_status == 1 and f": {verdict}: " in report.to_text().splitlines()[0]
-
-
-def test_settings_get_finer() -> None:
-    assert list_settings(Setting(1.0), 2) == [
-        Setting(1.0),
-        Setting(0.5),
-        Setting(0.25),
-        Setting(0.5, 2.0),
-        Setting(0.25, 4.0),
-    ]
 
 
 def test_an_engine_that_is_installed_in_part_is_said_to_be(

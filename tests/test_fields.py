@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import copy
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -147,16 +146,3 @@ def test_options_and_arguments_have_the_same_ranges() -> None:
         Given(scheme="gauss")
     with pytest.raises(InputError, match="replay: 0 given; allowed are true and false"):
         Given(replay=0)  # type: ignore[arg-type]
-
-
-def test_help_says_text_and_default() -> None:
-    parser = argparse.ArgumentParser()
-    for option in OPTIONS.values():
-        option.add(parser)
-    text = " ".join(parser.format_help().split())
-    assert "--share SHARE of the way, which is a number (0.5)" in text
-    assert "--robust [FACTOR] within ranges (0)" in text
-
-
-def test_the_schema_is_json() -> None:
-    assert json.loads(json.dumps(keys.build_schema())) == keys.build_schema()

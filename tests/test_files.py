@@ -22,31 +22,12 @@ def test_writes_the_whole_file_and_nothing_else(tmp_path: Path) -> None:
     assert (tmp_path / "out.txt").read_bytes() == b"content"
 
 
-def test_nothing_appears_when_the_writer_fails(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError, match="stopped"):
-        write_whole(tmp_path / "out.txt", fail_halfway)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_old_file_survives_a_failed_writer(tmp_path: Path) -> None:
     target = tmp_path / "out.txt"
     target.write_bytes(b"old")
     with pytest.raises(RuntimeError, match="stopped"):
         write_whole(target, fail_halfway)
     assert target.read_bytes() == b"old" and list(tmp_path.iterdir()) == [target]
-
-
-def test_old_file_is_whole_while_the_new_one_is_written(tmp_path: Path) -> None:
-    target = tmp_path / "out.txt"
-    target.write_bytes(b"old")
-
-    def write(stream: BinaryIO) -> None:
-        stream.write(b"new")
-        stream.flush()
-        assert target.read_bytes() == b"old"
-
-    write_whole(target, write)
-    assert target.read_bytes() == b"new"
 
 
 def test_a_full_disk_is_reported(tmp_path: Path) -> None:
@@ -105,11 +86,3 @@ def test_checked_before_the_work(tmp_path: Path, name: str) -> None:
     with pytest.raises(InputError, match="cannot be written") as caught:
         require_writable(tmp_path / name)
     assert caught.value.source == str(tmp_path / name)
-
-
-@pytest.mark.parametrize("name", ["new.txt", "file.txt"])
-def test_a_check_writes_nothing(tmp_path: Path, name: str) -> None:
-    (tmp_path / "file.txt").write_bytes(b"old")
-    require_writable(tmp_path / name)
-    assert [path.name for path in tmp_path.iterdir()] == ["file.txt"]
-    assert (tmp_path / "file.txt").read_bytes() == b"old"

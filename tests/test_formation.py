@@ -21,9 +21,9 @@ from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.contacts.closing import close_finger, place_flush
 from wholearm.contacts.elemental import build_features, parse_contact
-from wholearm.contacts.formation import Formation, describe, find_touching
+from wholearm.contacts.formation import Formation, find_touching
 from wholearm.problem.definition import Problem
-from wholearm.scene.model import Friction, Scene
+from wholearm.scene.model import Scene
 
 # Distances of metres-sized coordinates in double precision.
 ROUNDING = 1e-14
@@ -33,14 +33,6 @@ def sweep(finger: int, last: float, count: int = 1500) -> Array:
     """Joint angles from pointing straight down, outside, up to `last`."""
     first = -np.pi / 2 if finger == 0 else 3 * np.pi / 2
     return np.linspace(first, last, count)
-
-
-def touching_kinds(scene: Scene, z: Array, finger: int) -> set[str]:
-    return {
-        f"{contact.feature}-{contact.surface}"
-        for contact in find_touching(scene, z)
-        if contact.finger == finger
-    }
 
 
 def random_pose(rng: np.random.Generator, scene: Scene) -> Array:
@@ -83,24 +75,6 @@ def test_closing_starts_from_straight_down(finger: int) -> None:
     assert abs(angle - sweep(finger, angle)[0]) < np.pi / 4
 
 
-def test_every_way_of_touching_is_met() -> None:
-    """The poses of the test above include a side, a tip on an edge and a vertex on the arc."""
-    rng = np.random.default_rng(7)
-    met: set[str] = set()
-    for trial in range(120):
-        points = convex_polygon(rng, 5)
-        length = rng.uniform(0.08, 0.2)
-        scene = make_scene(points, length=length, radius=0.01, base=0.13, depth=-0.025)
-        q = random_pose(rng, scene)
-        try:
-            angles = [close_finger(scene, q, finger) for finger in (0, 1)]
-        except InputError:
-            continue
-        kinds = touching_kinds(scene, np.array([*q, *angles]), trial % 2)
-        met |= kinds
-    assert met == {"v-finger", "e-tip", "v-tip"}
-
-
 @pytest.mark.parametrize(
     "height, angle_kind", [(0.05, "v-finger"), (0.1575, "e-tip"), (0.154, "v-tip")]
 )
@@ -118,13 +92,6 @@ def test_touching_names_the_kind(height: float, angle_kind: str) -> None:
         z = np.array([*(np.array([0.08, 0.12]) + away - [0.03, -0.03]), 0.0, *[np.pi / 2] * 2])
         names = {"v1-tip1"}
     assert {c.name for c in find_touching(scene, z) if c.finger == 0} == names
-
-
-def test_touching_a_flush_link_and_the_palm() -> None:
-    scene = make_scene(SQUARE, base=0.08, depth=0.0, length=0.12)
-    z = np.array([0.045, 0.03, 0.0, np.pi / 2, np.pi / 2])
-    names = [contact.name for contact in find_touching(scene, z)]
-    assert names == ["v0-palm", "v1-palm", "v1-finger1", "v2-finger1"]
 
 
 def test_a_corner_behind_the_joint_does_not_touch() -> None:
@@ -195,14 +162,6 @@ def test_many_configurations_are_evaluated_one_by_one(heptagon: Problem, count: 
     np.testing.assert_array_equal(gap, together.C[:, 2])
 
 
-def test_formation_knows_its_contacts_and_friction() -> None:
-    scene = replace(make_scene(SQUARE), friction=Friction(0.1, 0.2, 0.3))
-    formation = make_formation(scene, "v0-palm v1-finger1 e2-tip2")
-    assert formation.n_contacts == 3
-    assert formation.names == ("v0-palm", "v1-finger1", "e2-tip2")
-    assert formation.friction == pytest.approx([0.1, 0.2, 0.3])
-
-
 ROLLING = ["v0-palm", "v2-finger1", "v3-finger2", "e1-tip1", "v2-tip1"]
 
 
@@ -222,16 +181,6 @@ def test_a_rolling_contact_adds_its_tangential_row(name: str) -> None:
     ahead, behind = (formation.evaluate(z + step * speed, speed).P for step in (v, -v))
     expected = np.einsum("nij,nj->ni", (ahead - behind) / (2 * v), speed)
     np.testing.assert_allclose(here.P_dot_v, expected, atol=1e-8)
-
-
-def test_without_rolling_contacts_constraints_are_the_normal_rows() -> None:
-    formation = make_formation(make_scene(SQUARE), "v0-palm v2-finger1")
-    z = np.random.default_rng(9).uniform(0.1, 1.0, (3, 5))
-    kinematics = formation.evaluate(z, z)
-    assert kinematics.P is kinematics.A and kinematics.P_dot_v.shape == (3, 2)
-    np.testing.assert_array_equal(kinematics.P_dot_v, kinematics.A_dot_v)
-    assert formation.evaluate_slip(z).shape == (3, 0) and formation.rolling_rows == ()
-    assert [part.shape for part in formation.roll_function(z[0], z[0])] == [(0, 1), (0, 1)]
 
 
 def test_slip_coordinates_are_in_the_order_of_the_contacts() -> None:
@@ -260,7 +209,6 @@ def limits_at(scene: Scene, names: str, z: Array) -> dict[str, float]:
 
 UPRIGHT = np.pi / 2
 WIDE = make_scene(SQUARE, base=0.08, depth=0.0, length=0.12)
-LOW = make_scene(SQUARE, base=0.08, depth=0.0, length=0.04)
 TALL = make_scene(SQUARE, base=0.08, depth=0.0, length=0.06)
 SHORT = make_scene(SQUARE, base=0.08, depth=0.0, length=0.02)
 STANDING = np.array([0.045, 0.03, 0.0, UPRIGHT, UPRIGHT])
@@ -376,12 +324,6 @@ def test_object_may_hang_over_the_back_of_a_tip(finger: int) -> None:
     assert (formation.evaluate_limits(z[None])[0] > 0.01).all()
 
 
-def test_describe() -> None:
-    contacts = [parse_contact(name, WIDE) for name in ("v1-palm", "e0-tip1")]
-    assert describe(contacts) == "e0-tip1 v1-palm"
-    assert describe([]) == "nothing"
-
-
 def test_a_joint_right_above_the_object_is_refused() -> None:
     """A link closes from pointing down, which overlaps an object below its joint."""
     flat = [[-0.12, 0.0], [0.12, 0.0], [0.12, 0.02], [-0.12, 0.02]]
@@ -392,31 +334,6 @@ def test_a_joint_right_above_the_object_is_refused() -> None:
         assert caught.value.key == "fingers.1.base"
     beside = close_finger(scene, np.array([-0.06, 0.01, 0.0]), 0)
     assert abs(finger_gap(scene, np.array([-0.06, 0.01, 0.0]), 0, beside)[0]) < 1e-12
-
-
-def test_limits_are_expressions_of_the_scene_that_they_belong_to() -> None:
-    """Whichever scenes of the same shape have come and gone."""
-
-    def hold(torque: float) -> Formation:
-        scene = make_scene(SQUARE, base=0.0813)
-        right, left = scene.fingers
-        scene = replace(scene, fingers=(replace(right, torque_limit=torque), left))
-        return make_formation(scene, "v0-palm v2-finger1")
-
-    first = hold(1.0)
-    assert first.limits
-    second = hold(2.0)
-    assert second.limits
-    del first
-    gc.collect()
-    third = hold(3.0)
-    for formation in (second, third):
-        z = build_features(formation.scene).z
-        values = [limit.value for limit in formation.limits]
-        function = ca.Function("limits", [z], [ca.vertcat(*values)])
-        given = np.array([0.01, 0.05, 0.1, 1.2, 2.0])
-        found = formation.evaluate_limits(given[None])[0]
-        np.testing.assert_allclose(function(given).full()[:, 0], found, rtol=0, atol=1e-13)
 
 
 def test_limits_outlive_the_scene_that_built_them() -> None:

@@ -437,13 +437,6 @@ def test_map_needs_a_sound_grid_and_some_reach(heptagon: Problem) -> None:
     assert lines and all(line.startswith("map: ") for line in lines)
 
 
-def test_command_lists_phases(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["map", str(HEPTAGON), "--list", "0.045,-1.98", "-.0637,-1.98"]) == 0
-    assert tomllib.loads(capsys.readouterr().out)["phases"] == TABLE["phases"][:3]
-    assert main(["map", str(HEPTAGON), "--list", "-0.05,-1.98", "0.03,-1.98"]) == 0
-    assert "x = 0.03" in capsys.readouterr().out
-
-
 def test_phases_are_listed_for_a_problem_without_any(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -31,12 +31,6 @@ def test_exponents_are_those_of_powers_where_small_sizes_cost_the_same() -> None
         assert fit_exponent(sizes, costs) == pytest.approx(power)
 
 
-def test_sizes_reach_what_is_asked() -> None:
-    assert {grows: max(sizes) for grows, sizes in SIZES.items()} == {
-        "intervals": 3200, "phases": 50, "vertices": 100
-    }  # fmt: skip
-
-
 def test_the_table_has_every_measurement_and_exponent() -> None:
     text = STUDY.report(make_rows(), argparse.Namespace())[0]
     rows = iter(line for line in text.splitlines() if " [s] | " in line)

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from types import ModuleType
 
 import pytest
 
@@ -23,17 +22,6 @@ def test_every_name_is_there(name: str) -> None:
     # And the same object when asked again.
     assert getattr(wholearm, name) is getattr(wholearm, name)
     assert name in dir(wholearm)
-
-
-def test_names_come_from_their_modules() -> None:
-    from wholearm.geometry.path_guess import load
-    from wholearm.results.trajectory import Trajectory
-    from wholearm.search.solve import solve
-
-    assert wholearm.load is load and wholearm.solve is solve
-    assert wholearm.Trajectory is Trajectory
-    assert callable(wholearm.verify) and callable(wholearm.simulate)
-    assert isinstance(wholearm.plots, ModuleType) and callable(wholearm.plots.force_margins)
 
 
 def test_unknown_attribute() -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from shipped import HEPTAGON
-from signalled import STARTED, interrupt
+from signalled import interrupt
 from wholearm.cli.route import hasten
 from wholearm.common import signals as interrupts
 from wholearm.common.files import together, write_whole
@@ -255,10 +255,3 @@ class Stopped:
 def test_a_solver_that_an_interrupt_stops_raises_it() -> None:
     with pytest.raises(KeyboardInterrupt):
         Solver(Stopped())(x0=0.0)
-
-
-def test_the_interpreter_is_up_before_signals_are_sent() -> None:
-    command = [sys.executable, "-c", STARTED, "--version"]
-    run = subprocess.run(command, capture_output=True, text=True)
-    assert (run.returncode, run.stdout.splitlines()[0]) == (0, "ready")
-    assert interrupts.PATIENCE < 1.0

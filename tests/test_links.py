@@ -87,17 +87,6 @@ def test_crossed_the_gap_is_minus_the_least_push_that_parts(seed: int) -> None:
     assert deep > 10
 
 
-def test_the_gap_is_continuous_through_the_crossing() -> None:
-    """A degree changes it by no more than the tip moves, while the links pass each other."""
-    scene = make_scene(SQUARE)
-    z = np.zeros((3601, 5))
-    z[:, 3], z[:, 4] = np.linspace(np.pi / 2, 3.0, len(z)), np.linspace(np.pi / 2, 0.4, len(z))
-    gap = evaluate_finger_gap(scene, z)
-    moved = sum(link.length * np.abs(np.diff(z[:, 3 + k])) for k, link in enumerate(scene.fingers))
-    assert (np.abs(np.diff(gap)) <= moved + ROUNDING).all()
-    assert gap[0] == pytest.approx(0.15, abs=1e-13) and gap[-1] < -0.02
-
-
 def test_apart_the_gradient_is_that_of_differences_and_continuous() -> None:
     scene, step = make_scene(SQUARE, lengths=(0.18, 0.13)), 1e-6
     z = random_angles(3)
@@ -152,7 +141,3 @@ def test_fingers_in_different_planes_pass_each_other() -> None:
     scene = replace(make_scene(SQUARE), fingers_collide=False)
     formation = make_formation(scene, "v0-palm v1-palm")
     assert FINGERS_TOUCH not in [limit.text for limit in formation.limits]
-
-
-def test_nothing_is_evaluated_for_no_configurations() -> None:
-    assert evaluate_finger_gap(make_scene(SQUARE), np.zeros((0, 5))).shape == (0,)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shipped import HEPTAGON, IMPACTS, problem_of
+from shipped import IMPACTS, problem_of
 from toys import LIMIT, Toy, constant, find_time_growing, find_time_viscous, inertia
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phase, trace_phases
@@ -20,13 +20,12 @@ from wholearm.planning.lower_bound.lower_bound import (
     find_least,
     look_along,
 )
-from wholearm.planning.lower_bound.rows import GIVE, PathLimitRows, evaluate_rows
+from wholearm.planning.lower_bound.rows import PathLimitRows, evaluate_rows
 from wholearm.planning.lower_bound.speed_sweep import NoMotionError, find_fastest
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.impact_sequence import make_sequence
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.path_domain.sequence_plan import plan_sequence
-from wholearm.planning.path_domain.violations import MISS
 from wholearm.problem.read import build_problem
 
 EPSILON = 0.05
@@ -151,21 +150,6 @@ def test_plans_of_a_chain_come_near_the_bound() -> None:
     assert found is not None
     plans = plan_sequence(chain, EPSILON, PlanOptions(intervals=80))
     assert -1e-7 < sum(plan.value for plan in plans) / found.value - 1 < 5e-4
-
-
-def test_limits_give_way_by_what_a_plan_may_miss() -> None:
-    assert GIVE >= MISS
-
-
-def test_a_faster_hand_has_a_lower_bound() -> None:
-    problem = problem_of(HEPTAGON)
-    values = []
-    for limit in (1.8, 2.0, 2.5):
-        curve = trace_phases(problem.with_(torque_limit=limit))[1]
-        found = bound_least_time([curve], EPSILON)
-        assert found is not None
-        values.append(found.value)
-    assert (np.diff(values) < -1e-3).all()
 
 
 def test_the_bound_shares_nothing_with_the_nlp() -> None:

@@ -18,7 +18,6 @@ from shipped import HEPTAGON
 from wholearm import plots
 from wholearm.cli.command import main
 from wholearm.figures.map_figure import draw_map
-from wholearm.figures.map_lines import place_discs
 from wholearm.mapping.borders import Window
 from wholearm.mapping.formation_map import FormationMap, build_map
 from wholearm.problem.definition import Problem
@@ -79,15 +78,6 @@ def test_directed_lines_are_where_motion_is_possible(figure: Figure, chart: Form
         for segment in by_colour[colour].get_segments():
             for point in np.asarray(segment)[:: len(segment) // 3 + 1]:
                 assert (np.abs(places - point) < slack).all(axis=1).any()
-
-
-def test_numbers_of_phases_do_not_hide_each_other() -> None:
-    low, high = np.zeros(2), np.array([600.0, 400.0])
-    ends = np.array([[[2.0, 200.0], [5.0 + k, 200.0]] for k in range(9)])
-    places = place_discs(list(ends), 16.0, low, high)
-    apart = np.hypot(*(places[:, None] - places).transpose(2, 0, 1))
-    assert apart[~np.eye(9, dtype=bool)].min() >= 16.0
-    assert (places >= 8.0).all()
 
 
 def test_nothing_is_clipped_and_labels_do_not_overlap(figure: Figure) -> None:

@@ -98,10 +98,3 @@ def test_halved_intervals_hold_the_same_motion(name: str, degree: int) -> None:
         np.testing.assert_allclose(finer.forces[k], table @ part.forces[parent], atol=1e-11)
         ends = np.array([[1 - start, start], [1 - start - width, start + width]])
         np.testing.assert_allclose(finer.tau[k], ends @ part.tau[parent], atol=1e-12)
-
-
-@pytest.mark.parametrize("name, degree", SCHEMES)
-def test_nothing_changes_where_no_interval_is_marked(name: str, degree: int) -> None:
-    scheme = make_scheme(name, degree)
-    part = Course(degree).sample(scheme, np.linspace(0.0, 1.0, 6))
-    check(bisect(part, scheme, np.zeros(5, dtype=int)), part)

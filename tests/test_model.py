@@ -52,22 +52,12 @@ def test_bad_friction(key: str, value: Any) -> None:
     assert caught.value.key == f"friction.{key}"
 
 
-def test_friction_by_part() -> None:
-    friction = Friction(0.1, 0.2, 0.3)
-    assert [friction.of(part) for part in (None, 0, 1)] == pytest.approx([0.1, 0.2, 0.3])
-
-
 @pytest.mark.parametrize("right", [-0.081, -0.2])
 def test_swapped_fingers(right: float) -> None:
     scene = make_scene()
     with pytest.raises(InputError, match="not to the right") as caught:
         replace(scene, fingers=(make_finger([right, 0.0]), scene.fingers[1]))
     assert caught.value.key == "fingers.1.base"
-
-
-def test_bad_gravity() -> None:
-    with pytest.raises(InputError, match="gravity"):
-        replace(make_scene(), gravity=-9.81)
 
 
 def test_scene_vectors_follow_the_order_of_z() -> None:

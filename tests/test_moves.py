@@ -122,17 +122,6 @@ def test_a_joint_that_is_held_back_is_let_turn_the_other_way(
     assert all(0.0 not in way for way in ways)
 
 
-def test_an_interval_held_back_at_two_points_is_held_back() -> None:
-    """However quick the joint is at its third one."""
-    stage = hold_back(make_stage(THREE), 0, 2, 4)
-    v = stage.guess.v.copy()
-    v[2:4, 0, 3] = 0.5
-    stage = replace(stage, guess=stage.guess._replace(v=v))
-    found = list(list_moves([stage], SCHEME, own_formations([stage]), 0.05))
-    row = stage.formation.n_contacts
-    assert [[mode_of(part).signs[row] for part in stages] for stages in found] == [[1, -1, 1]]
-
-
 def test_what_is_held_back_on_both_sides_of_a_change_turns_on_both() -> None:
     """On one side alone it would have to come to rest where the stages meet."""
     first, last = hold_back(make_stage(THREE), 0, 5, 8), hold_back(make_stage(THREE), 0, 0, 3)

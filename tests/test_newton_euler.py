@@ -65,19 +65,6 @@ def test_virtual_power() -> None:
     assert not found.against.any()
 
 
-def test_gaps_open_as_their_differences_say() -> None:
-    formation = make_formation(scene_of(), CONTACTS)
-    samples = random_samples(formation)
-    h = 1e-6
-    ahead, behind = (
-        check(formation, samples._replace(z=samples.z + step * samples.z_dot)).gaps
-        for step in (h, -h)
-    )
-    scales = formation.scene.scales
-    slope = (ahead - behind) * scales.length / (2 * h)
-    np.testing.assert_allclose(check(formation, samples).rates * scales.speed, slope, atol=1e-8)
-
-
 def phases_of(problem: Problem, trajectory: Trajectory) -> list[tuple[Formation, Samples]]:
     found = []
     for phase, motion in zip(problem.phases, trajectory.motions, strict=True):

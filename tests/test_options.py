@@ -19,20 +19,6 @@ def test_objectives_are_given_by_name_or_as_members(choice: str) -> None:
     assert choice in CHOICES
 
 
-def test_numbers_are_kept() -> None:
-    options = PlanOptions("margin", intervals=10, time_weight=3, duration=2, samples=2)
-    assert (options.intervals, options.time_weight, options.duration) == (10, 3.0, 2.0)
-    assert isinstance(options.time_weight, float) and isinstance(options.duration, float)
-
-
-@pytest.mark.parametrize("transcription", ["auto", "time"])
-@pytest.mark.parametrize("degree", [2, 6])
-def test_the_grid_in_the_time_domain_is_kept(transcription: str, degree: int) -> None:
-    options = PlanOptions(transcription=transcription, time_intervals=4, degree=degree)
-    kept = (options.transcription, options.time_intervals, options.degree)
-    assert kept == (transcription, 4, degree)
-
-
 @pytest.mark.parametrize(
     "key, given",
     [

@@ -1,16 +1,12 @@
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from plane import with_speed_limit
 from wholearm.common.arrays import Array
-from wholearm.common.errors import JammingError
 from wholearm.common.quadrature import find_minima
-from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.mechanics.dynamics import PathForces, inverse
 from wholearm.planning.options import PlanOptions
@@ -20,7 +16,6 @@ from wholearm.planning.path_domain.path_data import PhaseData, choose_sampling, 
 from wholearm.planning.path_domain.path_mesh import Mesh
 from wholearm.planning.path_domain.path_motion import directions_of
 from wholearm.planning.path_domain.path_plan import plan_path
-from wholearm.scene.model import Friction, Scene
 
 PHASES = range(5)
 EPSILON = 0.05
@@ -66,16 +61,6 @@ def test_forces_between_nodes_are_carried_there(
     nodes = direct_forces(curves[phase], data.grid.s, data.grid.segment)
     for found, exact in zip(data.nodes.forces, nodes, strict=True):
         np.testing.assert_allclose(found, exact, rtol=0, atol=1e-13 * np.abs(exact).max())
-
-
-def test_looks_are_dense_enough(curves: tuple[Curve, ...]) -> None:
-    for intervals, least in ((12, 33), (40, 33), (80, 15), (800, 15)):
-        data = prepare(curves[0], EPSILON, Mesh().make_grid(curves[0], intervals // 4), 1)
-        angles = np.arccos(1 - 2 * data.sampling.checks) / np.pi
-        for places in (data.sampling.knots, angles):
-            assert places[0] == 0.0 and places[-1] == pytest.approx(1.0)
-            np.testing.assert_allclose(np.diff(places), 1 / (len(places) - 1), rtol=1e-12)
-        assert len(data.sampling.checks) >= least
 
 
 def test_least_values_between_looks() -> None:
@@ -156,15 +141,6 @@ def test_spread_is_exact_at_nodes_and_between(curves: tuple[Curve, ...]) -> None
     np.testing.assert_allclose(slope, 2 * middle, rtol=0, atol=1e-6)
 
 
-def test_beside_takes_the_larger_neighbour(curves: tuple[Curve, ...]) -> None:
-    data = prepare(curves[0], EPSILON, Mesh().make_grid(curves[0], 8), 1)
-    inside = np.random.default_rng(4).uniform(0, 1, (len(data.nonempty), 3))
-    nodes = data.spread_to_nodes(inside)
-    for node in range(len(data.grid.s)):
-        near = [inside[i] for i, k in enumerate(data.nonempty) if node in (k, k + 1)]
-        np.testing.assert_array_equal(nodes[node], np.max(near, axis=0))
-
-
 def test_speed_limits_bound_b(curves: tuple[Curve, ...]) -> None:
     free = prepare(curves[1], EPSILON, Mesh().make_grid(curves[1], 5), 1)
     assert np.isposinf(free.largest_b(free.nodes)).all()
@@ -207,14 +183,6 @@ def test_effort_is_the_integral_of_squared_torque(curves: tuple[Curve, ...], pha
     t = motion.times[:-1, None] + h * (x + 1) / 2
     power = (motion.evaluate(t.ravel()).tau ** 2).sum(axis=1).reshape(t.shape)
     assert squares == pytest.approx((h / 2 * weights * power).sum(), rel=1e-7)
-
-
-def test_jamming_is_named(curves: tuple[Curve, ...]) -> None:
-    scene = curves[0].formation.scene
-    rough = Scene(scene.polygon, scene.fingers, Friction(1.5, 1.5, 1.5), scene.gravity)
-    curve = replace(curves[0], formation=Formation(rough, curves[0].formation.contacts))
-    with pytest.raises(JammingError, match=r"phase 7: v0-palm v1-palm .* jams at x = .* inertia -"):
-        prepare(curve, EPSILON, Mesh().make_grid(curve, 5), 7)
 
 
 @pytest.mark.parametrize("nodes", [11, 81])

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,11 +16,9 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.impact_sequence import make_sequence
 from wholearm.planning.path_domain.path_data import prepare
-from wholearm.planning.path_domain.path_explain import change_curve
 from wholearm.planning.path_domain.path_mesh import Mesh
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.path_domain.sequence_plan import plan_sequence
-from wholearm.planning.plan import solve
 
 LIMITS = ("torque limit of finger 1", "torque limit of finger 2", "epsilon")
 
@@ -164,25 +161,3 @@ def test_too_short_a_duration_is_named(curves: tuple[Curve, ...]) -> None:
     # Both solves are good to 1e-6.
     assert least * (1 - 1e-6) < advised["duration"] < 1.03 * least
     assert plan_path(curves[0], 0.05, options, 1, advised["duration"]).value > 0.05 * (1 - 1e-6)
-
-
-def test_a_duration_for_all_phases_is_advised() -> None:
-    problem = edited({})
-    problem = replace(problem, phases=problem.phases[:2])
-    with pytest.raises(InfeasibleError, match=r"^duration = 0\.1 s is not longer") as caught:
-        solve(problem, objective="margin", duration=0.1, intervals=20)
-    value = read_advice(str(caught.value))["duration"]
-    longer = solve(problem, objective="margin", duration=value, intervals=20, replay=False)
-    assert longer.duration <= value * (1 + 1e-6)
-
-
-def test_changing_one_limit_leaves_everything_else(curves: tuple[Curve, ...]) -> None:
-    curve = curves[0]
-    other = change_curve(curve, "fingers.2.torque_limit", 3.5)
-    scene, changed = curve.formation.scene, other.formation.scene
-    assert changed.torque_limit == pytest.approx([2.0, 3.5])
-    assert scene.torque_limit == pytest.approx([2.0, 2.0])
-    slower = change_curve(curve, "fingers.1.speed_limit", 3.0)
-    assert slower.formation.scene.speed_limit == pytest.approx([3.0, np.inf])
-    assert changed.fingers[0] is scene.fingers[0] and changed.polygon is scene.polygon
-    assert other.formation.names == curve.formation.names and other.panels is curve.panels

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
 
 from wholearm.common.arrays import Array
 from wholearm.geometry.curve import Curve, Segment
@@ -16,7 +15,6 @@ from wholearm.planning.path_domain.elements import (
     FROM_REST,
     INSIDE,
     TO_REST,
-    Elements,
     Profile,
     find_basis,
     lay_out,
@@ -84,24 +82,6 @@ def test_motion_integrates_its_acceleration(seed: int) -> None:
         assert place == pytest.approx(motion.grid.s[k + 1], abs=1e-10 * length)
         top = math.sqrt(motion.profile.b.max())
         assert speed == pytest.approx(math.sqrt(motion.profile.b[k + 1]), abs=1e-9 * top)
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_b_between_nodes_is_the_integral_of_a(seed: int) -> None:
-    motion = random_motion(seed)
-    grid, fractions = motion.grid, np.linspace(0.0, 1.0, 5)
-    b = Elements(grid, motion.profile).at(fractions).b.reshape(-1, 5)
-    for row, k in zip(b, grid.nonempty.tolist(), strict=True):
-        start, step = grid.s[k], grid.steps[k]
-        for fraction, value in zip(fractions[1:], row[1:], strict=True):
-            rise = quad(
-                lambda u, k=k, s=start, h=step * fraction: (
-                    2 * h * float(acceleration(motion, k // (DEGREE + 1), np.array(s + h * u)))
-                ),
-                0,
-                1,
-            )[0]
-            assert value - row[0] == pytest.approx(rise, abs=1e-7 * motion.profile.b.max())
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -20,7 +20,6 @@ from wholearm.planning.path_domain.elements import (
     Profile,
     find_basis,
 )
-from wholearm.planning.path_domain.first_guess import guess
 from wholearm.planning.path_domain.path_data import PhaseData, prepare
 from wholearm.planning.path_domain.path_mesh import Mesh
 from wholearm.planning.path_domain.path_motion import PathMotion
@@ -231,16 +230,6 @@ def test_multipliers_move_between_grids(data: PhaseData, objective: Objective) -
     assert moved["lam_x0"].shape == (finer.solver.function.size1_in("x0"),)
 
 
-def test_one_build_serves_every_phase(curves: tuple[Curve, ...]) -> None:
-    nlp = build_path_nlp(SHAPE, INTERVALS, Objective.TIME)
-    assert build_path_nlp(SHAPE, INTERVALS, Objective.TIME) is nlp
-    assert build_path_nlp(SHAPE, INTERVALS, Objective.EFFORT) is not nlp
-    for curve in curves:
-        data = prepare(curve, EPSILON, Mesh().make_grid(curve, ELEMENTS), 1)
-        _, units = guess(data)
-        assert len(parameters(nlp, data, units, 1.0)) == nlp.solver.function.size1_in("p")
-
-
 @pytest.mark.parametrize("objective", Objective)
 def test_building_stays_linear(objective: Objective) -> None:
     """No unknown in more than a few rows, and no more than one row with many unknowns.
@@ -253,14 +242,6 @@ def test_building_stays_linear(objective: Objective) -> None:
     rows, columns = (np.array(part) for part in pattern.get_triplet())
     assert np.bincount(columns).max() <= 14
     assert (np.bincount(rows) > 8).sum() <= (objective is Objective.MARGIN)
-
-
-def test_effort_is_not_symbolic_in_the_data() -> None:
-    """The same expression graph for every phase: no number of a scene is built in."""
-    oracle = build_path_nlp(SHAPE, INTERVALS, Objective.EFFORT).solver.function.oracle()
-    x, p = oracle.sx_in()
-    free = ca.symvar(ca.vertcat(*oracle(x, p)))
-    assert len(free) == x.numel() + p.numel()
 
 
 # Best motions in closed form: a point driven along a line of 1 m.
@@ -317,13 +298,6 @@ def test_joint_speed_limit_makes_a_trapezoid(speed: float) -> None:
     assert np.sqrt(b.max()) <= speed * (1 + 5e-7)
     cruise = np.abs(t - exact / 2) < 0.4 * (1 / speed - speed / LIMIT)
     np.testing.assert_allclose(np.sqrt(b[cruise]), speed, rtol=2e-3)
-
-
-def test_a_speed_limit_out_of_reach_changes_nothing() -> None:
-    free, bounded = (
-        Toy(constant(1.0), speed_limit=(limit, np.inf)).plan().value for limit in (np.inf, 1.6)
-    )
-    assert bounded == pytest.approx(free, rel=1e-6)
 
 
 @pytest.mark.parametrize("duration", [2.5, 3.0, 8.0])

@@ -180,12 +180,6 @@ def count_swings(values: Array, size: float) -> int:
     return swings
 
 
-def test_swings_are_counted() -> None:
-    t = np.linspace(0, 10 * np.pi, 1001)
-    assert count_swings(np.sin(t), 0.1) == 10 and count_swings(np.sin(t), 2.5) == 0
-    assert count_swings(t, 0.1) == 0
-
-
 @pytest.mark.parametrize("objective", OBJECTIVES)
 @pytest.mark.parametrize("phase", PHASES)
 def test_torques_do_not_jitter(phase: int, objective: str) -> None:

@@ -2,8 +2,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -197,20 +195,6 @@ def test_margins_are_the_trajectory_with_breaks_at_phases(
         assert np.isnan(values[added][1::2]).all()
 
 
-def test_forces_step_at_phases_and_reversals_only(planned: Trajectory) -> None:
-    steps = find_steps(planned)
-    boundaries = np.flatnonzero(np.diff(planned.phase)) + 1
-    assert set(boundaries) <= set(steps)
-    # Nothing right beside a boundary, whose torque steps are the boundary's own.
-    assert not set(boundaries + 1) & set(steps) and not set(boundaries - 1) & set(steps)
-    reversed_at = np.flatnonzero((planned.c_t[1:] * planned.c_t[:-1] < 0).any(axis=1)) + 1
-    assert len(reversed_at) and set(reversed_at) <= set(steps)
-    # What is drawn through is no jump: it shrinks with the samples' distance.
-    plain = np.setdiff1d(np.arange(1, len(planned.t)), steps)
-    change = np.abs(planned.c_n[plain] - planned.c_n[plain - 1])
-    assert np.nanmedian(change) < 0.1
-
-
 def test_zero_line_and_limits_are_there(
     figure: Figure, planned: Trajectory, problem: Problem
 ) -> None:
@@ -225,12 +209,6 @@ def test_zero_line_and_limits_are_there(
             assert line.is_dashed()
 
 
-def test_unequal_limits_are_drawn_each(axes: Axes, planned: Trajectory) -> None:
-    plots.draw_torques(axes, planned.torque, np.array([2.0, 3.0]))
-    assert sorted(y for y in levels(axes) if y) == [-3.0, -2.0, 2.0, 3.0]
-    assert axes.get_ylim()[1] > 3.0
-
-
 def test_every_contact_is_named_and_styled_alike(figure: Figure, planned: Trajectory) -> None:
     margins = figure.axes[-2]
     legend = margins.get_legend()
@@ -239,11 +217,6 @@ def test_every_contact_is_named_and_styled_alike(figure: Figure, planned: Trajec
     for axes, phase in zip(figure.axes[:6], [0, 1, 2, 3, 4, 4], strict=True):
         for name in planned.motions[phase].contacts:
             assert line_of(axes, name).get_markerfacecolor() == line_of(margins, name).get_color()
-
-
-def test_styles_differ_for_two_dozen_contacts() -> None:
-    styles = plots.choose_styles([f"v{i}-palm" for i in range(24)])
-    assert len(set(styles.values())) == 24
 
 
 def test_torque_lines_have_both_ends_of_every_step(axes: Axes) -> None:
@@ -293,26 +266,6 @@ def test_snapshot_is_to_scale(axes: Axes, planned: Trajectory, problem: Problem,
     assert numbers == [str(i) for i in range(7)]
 
 
-def test_touching_vertices_lie_on_the_links_outline(planned: Trajectory, problem: Problem) -> None:
-    for row in (0, 320, len(planned.t) - 1):
-        z = planned.z[row]
-        names = [name for name in planned.motions[planned.phase[row]].contacts if "finger" in name]
-        for name, point in zip(names, plots.place_contacts(problem.scene, z, names), strict=True):
-            finger = int(name[-1]) - 1
-            outline = plots.trace_link(problem.scene.fingers[finger], z[3 + finger])
-            run = np.roll(outline, -1, axis=0) - outline
-            part = ((point - outline) * run).sum(axis=1) / np.maximum((run**2).sum(axis=1), 1e-30)
-            nearest = outline + np.clip(part, 0, 1)[:, None] * run
-            assert np.hypot(*(nearest - point).T).min() < 1e-7
-
-
-def test_tip_contacts_are_marked_on_the_tips_surface(problem: Problem) -> None:
-    point = plots.place_contacts(problem.scene, problem.start, ["e3-tip1"])[0]
-    finger, angle = problem.scene.fingers[0], problem.start[3]
-    tip = np.asarray(finger.base) + finger.length * np.array([np.cos(angle), np.sin(angle)])
-    assert np.hypot(*(point - tip)) == pytest.approx(finger.radius)
-
-
 def test_snapshots_are_at_least_six_and_one_of_every_phase(planned: Trajectory) -> None:
     for phases in ([0], [0, 1], [0, 1, 2], [0, 1, 2, 3], list(range(5)), [0, 1] * 5):
         trajectory = repeat(planned, phases)
@@ -326,10 +279,6 @@ def test_snapshots_are_at_least_six_and_one_of_every_phase(planned: Trajectory) 
 
 def test_text_is_inside_and_apart(figure: Figure) -> None:
     check_layout(figure)
-
-
-def test_text_is_inside_and_apart_for_longer_plans(planned: Trajectory) -> None:
-    check_layout(plots.force_margins(repeat(planned, [0, 1, 2, 3, 4] * 2)))
 
 
 @pytest.mark.parametrize("width", [3.5, 7.0])
@@ -380,23 +329,6 @@ def test_simulation_is_drawn_over_the_plan(planned: Trajectory) -> None:
     check_layout(figure)
 
 
-@pytest.mark.parametrize(("epsilon", "largest"), [(0.0, 3.0), (0.05, 9.9), (2.0, 40.0), (5.0, 1e4)])
-def test_scale_shows_zero_and_the_largest_margin(
-    axes: Axes, planned: Trajectory, epsilon: float, largest: float
-) -> None:
-    c_n = epsilon + (planned.c_n - 0.05) * largest / (np.nanmax(planned.c_n) - 0.05)
-    scaled = dataclasses.replace(planned, c_n=c_n)
-    plots.draw_margins(axes, scaled, epsilon, plots.choose_styles(planned.contacts))
-    axes.figure.canvas.draw()
-    low, high = axes.get_ylim()
-    assert low < min(-epsilon, 0.0) and high > largest
-    zero, top = axes.transData.transform([(0, 0), (0, largest)])[:, 1]
-    assert 0.05 < (zero - axes.bbox.y0) / axes.bbox.height < 0.5 < top / axes.bbox.y1
-    labels = [tick.get_text() for tick in axes.get_yticklabels()]
-    assert "0" in labels
-    assert all(re.fullmatch("\u2212?[0-9.]+", label) for label in labels)
-
-
 def test_save_writes_the_format_of_the_ending_and_the_same_bytes(
     planned: Trajectory, tmp_path: Path
 ) -> None:
@@ -425,12 +357,6 @@ def test_save_refuses_other_endings(figure: Figure, tmp_path: Path, name: str) -
         plots.save(figure, tmp_path / name)
     assert name in str(caught.value)
     assert not list(tmp_path.iterdir())
-
-
-def test_save_names_the_place_that_cannot_be_written(figure: Figure, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="cannot be written") as caught:
-        plots.save(figure, tmp_path / "none" / "a.png")
-    assert os.path.join("none", "a.png") in str(caught.value)
 
 
 def test_trajectory_without_its_problem_is_refused(planned: Trajectory) -> None:
@@ -481,28 +407,3 @@ def test_friction_cones_have_a_panel_of_their_own(figure: Figure) -> None:
     assert np.nanmax(np.abs(shares)) < 1 and levels(cones) == [-1.0, 1.0, 0.0]
     margin_line = line_of(margins, "v1-palm")
     assert line_of(cones, "v1-palm").get_color() == margin_line.get_color()
-
-
-def test_rolling_friction_passes_zero_without_a_step() -> None:
-    plan = tipping.tipped()
-    column = plan.contacts.index("v1-palm")
-    c_t = np.where(plan.phase == 1, plan.c_t[:, column], np.nan)
-    passes = np.flatnonzero(c_t[1:] * c_t[:-1] < 0) + 1
-    assert len(passes) and not set(passes) & set(find_steps(plan))
-
-
-def test_simulation_is_drawn_over_a_plan_that_rolls() -> None:
-    plan = tipping.tipped()
-    simulation = wholearm.simulate(tipping.box(), plan.torque)
-    drawn = plots.force_margins(plan, simulation=simulation)
-    check_layout(drawn)
-    dotted = [
-        line for line in drawn.axes[-1].lines if line.get_linestyle() == ":" or line.is_dashed()
-    ]
-    column = plan.contacts.index("v1-palm")
-    rows = simulation.phase == 1
-    share = simulation.c_t[rows, column] / (tipping.PALM * simulation.c_n[rows, column])
-    curves = [data_of(line)[1] for line in dotted if len(data_of(line)[0]) == len(simulation.t)]
-    (curve,) = [values for values in curves if not np.isnan(values).all()]
-    np.testing.assert_allclose(curve[rows], share, rtol=1e-12)
-    assert np.isnan(curve[~rows]).all()

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import re
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,7 +22,7 @@ from wholearm.planning.result import Plan
 from wholearm.policy.curve_law import CurveLaw, LoopSettings, MotionLaw, Sensing, choose_squeeze
 from wholearm.policy.make import SAME, hold_end, make_policy
 from wholearm.policy.playback import Policy
-from wholearm.policy.regulator import RATE, Linear, follow, regulate
+from wholearm.policy.regulator import RATE, Linear, regulate
 from wholearm.policy.retiming import eliminate, retime
 from wholearm.problem.definition import Problem
 from wholearm.results.torque import TorqueProfile
@@ -316,32 +314,6 @@ def test_no_policy_is_written_that_does_not_carry_out_its_plan(
     assert any("opens by" in text for text in Policy.load(output).about["failures"])
 
 
-def test_contacts_of_a_policy_may_open_as_far_as_is_asked_for(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    plan: Plan,
-    policy: Policy,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    plan.save(tmp_path / "plan.npz")
-    gap = 0.004 * plan.problem.scene.scales.length
-
-    def report(*_: object, departure: float = 1e-3) -> SimpleNamespace:
-        ok = gap < departure * plan.problem.scene.scales.length
-        losses = () if ok else (SimpleNamespace(gap=gap),)
-        phases = [SimpleNamespace(losses=losses)]
-        return SimpleNamespace(ok=ok, failures=["opens"] * len(losses), phases=phases)
-
-    monkeypatch.setattr("wholearm.policy.make.make_policy", lambda *_, **__: policy)
-    monkeypatch.setattr("wholearm.verification.policy_check.verify_policy", report)
-    given = ["policy", str(tmp_path / "plan.npz"), "-o", str(tmp_path / "p.npz")]
-    assert main(given) == 1
-    said = capsys.readouterr().err
-    match = re.search(r"; --departure (\S+) allows that; ", said)
-    assert match and 0.004 < float(match[1]) < 0.005, said
-    assert main([*given, "--departure", match[1]]) == 0
-
-
 def test_an_end_without_a_gained_contact_is_held(problem: Problem) -> None:
     phases = [{**problem.table["phases"][0], "until": {"x": 0.01}}]
     own = problem.with_({"phases": phases})
@@ -373,13 +345,3 @@ def test_a_landing_without_a_reserve_is_planned_anew() -> None:
     assert law.theta[-1] == pytest.approx(plan.z[-1, 3:], abs=SAME)
     report = verify_policy(problem, plan, policy)
     assert report.ok, report.failures
-
-
-def test_what_is_followed_ends_with_its_own_contacts() -> None:
-    problem, plan = problem_of(HEPTAGON), plan_of(HEPTAGON)
-    # The second phase lets go of a contact that the first one presses to its end.
-    first, second = (set(phase.formation.names) for phase in problem.phases[:2])
-    assert first - second
-    t = np.linspace(0.0, plan.phase_starts[1], 20)
-    found = follow(problem, problem.phases[:1], plan, t)
-    assert np.isfinite(found.gains).all() and np.isfinite(found.tau).all()

@@ -164,8 +164,3 @@ def test_polygons_beyond_all_reason(points: Any, text: str) -> None:
     with pytest.raises(InputError, match=text) as caught:
         Polygon(points, 1.0)
     assert caught.value.key.startswith("object.vertices")
-
-
-def test_needles_and_discs_are_polygons() -> None:
-    assert Polygon([[0.0, 0.0], [1.0, 0.0], [0.5, 1.1e-3]], 1.0).size == pytest.approx(1.0)
-    assert Polygon(regular(500, 1e-4), 1.0).n_vertices == 500

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -19,7 +18,6 @@ from wholearm.benchmark.precision.planners import (
     is_installed,
     run_planner,
 )
-from wholearm.benchmark.precision.precision_study import METHODS, STUDY
 from wholearm.benchmark.precision.reference_check import check_plan
 from wholearm.benchmark.precision.runs import SOLVED, Median
 from wholearm.benchmark.precision.tables import Medians, draw_medians, format_report
@@ -69,20 +67,6 @@ def test_what_a_replay_does_not_keep_is_no_solution() -> None:
     lost = check_plan(phase(4), plan._replace(torque=TorqueProfile(plan.torque.breaks, none)))
     assert "contact is lost" in lost.outcome and lost.violation > 0.02
     assert check_plan(phase(4), plan._replace(status="stopped")).outcome == "stopped"
-
-
-def list_methods(study: str, **given: object) -> set[str]:
-    options = {"problems": str(Path(FILES[0]).parent), "part": None, "peers": METHODS, "limit": 1.0}
-    cases = STUDY.list_cases(argparse.Namespace(**(options | given)))
-    return {case[2] for case in cases if case[0] == study}
-
-
-def test_peers_that_are_missing_have_no_cases(monkeypatch: pytest.MonkeyPatch) -> None:
-    missing = PLANNERS["toppra"]._replace(module="no_such_module")
-    monkeypatch.setitem(PLANNERS, "toppra", missing)
-    assert list_methods(NO_DRAG) == {"wholearm, curve"}
-    assert list_methods(LEAST_TIME, part="simulation") == set()
-    assert list_methods(LEAST_TIME, peers=["wholearm, time"]) == {"wholearm, time"}
 
 
 def test_methods_that_nobody_knows_are_named(capsys: pytest.CaptureFixture[str]) -> None:

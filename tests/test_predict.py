@@ -48,11 +48,6 @@ def predicted() -> Prediction:
     return predict(first_phase(), progress=TOLD.append)
 
 
-def test_progress_tells_the_phase() -> None:
-    predicted()
-    assert TOLD == ["predicting phase 1 of 1"]
-
-
 @cache
 def road_of(path: Path, index: int = 0) -> Road:
     problem = problem_of(path)

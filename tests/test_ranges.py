@@ -4,11 +4,9 @@ import copy
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from retelling import Units, in_units
-from wholearm.benchmark.stress.scenes import random_scene
 from wholearm.common.errors import InputError
 from wholearm.geometry.path_guess import load
 from wholearm.problem.read import build_problem
@@ -77,8 +75,3 @@ def test_ranges_follow_the_units(path: Path) -> None:
     problem = load(str(path))
     for units in (Units(1e3, 1e3), Units.of(0.01, 1e-3), Units.of(100.0, 1e4)):
         in_units(units).apply(problem)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_random_scenes_are_in_range(seed: int) -> None:
-    random_scene(np.random.default_rng(seed))

@@ -46,16 +46,6 @@ def test_rays_end_right_before_what_they_gain_touches() -> None:
     assert (measure_gap(scene, rays.gained, place(scene, rays.labels, ends)) < 0).all()
 
 
-def test_each_place_has_the_rays_that_it_has_alone() -> None:
-    own, rays = around_the_start()
-    epsilon = problem_of(SQUARE).epsilon
-    both = shoot([own, own], epsilon)
-    for source in (0, 1):
-        mine = both.pick(both.sources == source)
-        np.testing.assert_array_equal(mine.gained, rays.gained)
-        np.testing.assert_allclose(mine.ends, rays.ends, rtol=1e-12)
-
-
 def test_more_to_press_leaves_fewer_rays() -> None:
     own, rays = around_the_start()
     fewer = shoot([own], 4 * problem_of(SQUARE).epsilon)

@@ -13,7 +13,7 @@ from shipped import HEPTAGON, problem_of
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError, SimulationError
 from wholearm.figures import plots
-from wholearm.results.adopt import narrow, save
+from wholearm.results.adopt import save
 from wholearm.results.torque import TorqueProfile, read_torque_csv
 from wholearm.results.trajectory import Trajectory
 from wholearm.results.trajectory_file import load_trajectory
@@ -107,14 +107,6 @@ def test_a_replay_that_ends_at_once_is_no_trajectory() -> None:
     report = verify(problem_of(HEPTAGON), press(0.3, -0.3))
     with pytest.raises(SimulationError, match="no motion to keep: c_n of v1-palm falls to"):
         plots.force_margins(report)
-
-
-def test_torques_are_taken_of_anything(simulation: Simulation, torque: TorqueProfile) -> None:
-    trajectory = simulation.trajectory
-    assert narrow(torque) == (torque, None)
-    assert narrow(trajectory) == (torque, trajectory)
-    own, moved = narrow(simulation)
-    assert own is torque and moved is not None and moved.duration == trajectory.duration
 
 
 def test_saving_goes_by_the_ending(simulation: Simulation, tmp_path: Path) -> None:

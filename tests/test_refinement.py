@@ -5,14 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from timed import plan_landing, stages_of, tables
+from timed import plan_landing, stages_of
 from wholearm.planning.time_domain.collocation import make_scheme
 from wholearm.planning.time_domain.stage import Stage
 from wholearm.planning.time_domain.time_mesh import (
     AT_ONCE,
     DEAR,
     DEFECT,
-    adopt,
     bisect_intervals,
     cap_halvings,
     count_halvings,
@@ -31,12 +30,6 @@ def make_stages(motions: list[StageMotion]) -> list[Stage]:
 def stages() -> list[Stage]:
     """Those of the landing; every direction of friction is that of the motion."""
     return make_stages(stages_of(plan_landing(time_intervals=6)))
-
-
-def test_a_solution_becomes_the_guess(stages: list[Stage]) -> None:
-    shifted = [stage.guess._replace(duration=2 * stage.guess.duration) for stage in stages]
-    for before, after, guess in zip(stages, adopt(stages, shifted), shifted, strict=True):
-        assert after.guess is guess and after.directions is before.directions
 
 
 def test_only_marked_stages_are_halved(stages: list[Stage]) -> None:
@@ -85,15 +78,6 @@ def test_limits_that_are_broken_are_watched_from_then_on(stages: list[Stage]) ->
     assert [stage.monitored for stage in changed[:-1]] == [
         stage.monitored for stage in monitored[:-1]
     ]
-
-
-def test_halving_by_nothing_keeps_every_table(stages: list[Stage]) -> None:
-    finer = bisect_intervals(
-        stages, SCHEME, [np.zeros(stage.intervals, dtype=int) for stage in stages]
-    )
-    for before, after in zip(stages, finer, strict=True):
-        for one, other in zip(tables(before.guess), tables(after.guess), strict=True):
-            np.testing.assert_array_equal(one, other)
 
 
 def test_intervals_are_quartered_only_where_that_makes_few() -> None:

@@ -12,7 +12,6 @@ import pytest
 from shipped import HEPTAGON, IMPACTS, problem_of
 from wholearm.common.errors import InputError
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.path_domain.path_nlp import build_path_nlp
 from wholearm.planning.plan import solve
 from wholearm.planning.plan_report import describe_plan
 from wholearm.planning.result import Plan, Status
@@ -208,14 +207,6 @@ def test_every_solve_is_counted_once(
     assert json.loads(json.dumps(plan.meta["solves"])) == [
         phase.statistics.solves for phase in plan.phases
     ]
-
-
-def test_an_nlp_at_hand_is_not_built_again() -> None:
-    problem = two_phases()
-    build_path_nlp.cache_clear()
-    first, second = (solve(problem, intervals=45, samples=5, replay=False) for _ in range(2))
-    assert first.timings.build > 0 and second.timings.build == 0
-    assert first.phases[0].statistics.build_time == first.timings.build
 
 
 def test_costs_are_booked_to_the_innermost_phase_and_every_ledger() -> None:

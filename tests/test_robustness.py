@@ -189,11 +189,6 @@ def test_bad_options_are_named(
     assert text in capsys.readouterr().err
 
 
-def test_a_plan_of_other_phases_is_refused(plan: Plan) -> None:
-    with pytest.raises(InputError, match="phases: the plan's contacts are not those"):
-        assess_robustness(wholearm.load(str(PROBLEM)), plan.trajectory, samples=1)
-
-
 def follow(
     stretches: list[tuple[str, float, float]], windows: tuple[TimeWindow, ...]
 ) -> dict[str, Any]:
@@ -251,12 +246,3 @@ def test_contacts_have_to_press_while_their_phase_lasts(
     record = follow(stretches, windows)
     found = (record["lost"], record["phase"], record["time"]) if record["lost"] else None
     assert found == lost and record["kept"] == (lost is None)
-
-
-def test_what_cannot_be_tried_is_refused(problem: Problem, plan: Plan) -> None:
-    with pytest.raises(InputError, match="--phase: 2 given; the plan has phases 1 to 1"):
-        assess_robustness(problem, plan, phase=2)
-    with pytest.raises(InputError, match="samples: 0 given"):
-        assess_robustness(problem, plan, samples=0)
-    with pytest.raises(InputError, match="torques alone"):
-        assess_robustness(problem, plan.trajectory.torque)

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import signal
 import tomllib
 from functools import cache
 from pathlib import Path
@@ -12,11 +11,9 @@ import pytest
 from shipped import HEPTAGON, problem_of
 from wholearm.cli.command import main
 from wholearm.common.errors import InfeasibleError, InputError, SolverError
-from wholearm.common.signals import guard, yielding
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phase
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
-from wholearm.planning.options import PlanOptions
 from wholearm.planning.saved import load_plan
 from wholearm.problem.definition import Phase, Problem
 from wholearm.problem.goal import Goal
@@ -33,7 +30,6 @@ from wholearm.search.find_route import (
 from wholearm.search.places import list_formations_at, make_place
 from wholearm.search.result import describe_block
 from wholearm.search.roadmap import Roadmap, cross, go_to
-from wholearm.search.route_choice import Chooser
 from wholearm.verification.verify import verify
 
 TABLE = {k: v for k, v in tomllib.loads(HEPTAGON.read_text()).items() if k != "phases"}
@@ -169,25 +165,6 @@ def test_a_goal_out_of_the_hand_s_reach_is_refused_without_a_search() -> None:
         find_route(read({"flush": 1, "x": 0.9}))
 
 
-def test_ctrl_c_ends_a_search_that_has_an_answer() -> None:
-    reached = []
-
-    def run() -> int:
-        try:
-            with yielding():
-                signal.raise_signal(signal.SIGINT)
-        except KeyboardInterrupt:
-            reached.append("stopped")
-        with pytest.raises(KeyboardInterrupt), yielding():
-            try:
-                signal.raise_signal(signal.SIGINT)
-            except KeyboardInterrupt:
-                pass  # as a solver would
-        return 0
-
-    assert guard(run) == 0 and reached == ["stopped"]
-
-
 def test_python_and_time_limits_end_a_search(monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
@@ -197,23 +174,6 @@ def test_python_and_time_limits_end_a_search(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr("wholearm.search.route_choice.join_route", interrupt)
     with pytest.raises(KeyboardInterrupt):
         find_route(read({"flush": 6}))
-
-
-def test_a_route_whose_planning_is_interrupted_is_still_there(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    own, route = to_edge_6()
-    chooser = Chooser(problem_of(HEPTAGON), [], own, PlanOptions())
-    chooser.found.append(route)
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr("wholearm.search.route_choice.join_route", interrupt)
-        with pytest.raises(KeyboardInterrupt):
-            chooser.plan(1, print)
-    assert chooser.found == [route] and not chooser.made
 
 
 def fail(*_: object) -> None:

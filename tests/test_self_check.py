@@ -9,14 +9,13 @@ import pytest
 
 from planned import change, plan, plan_landing
 from wholearm.common.arrays import Array
-from wholearm.common.errors import InputError, JammingError, ReplayError, SolverError
+from wholearm.common.errors import JammingError, ReplayError
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning import blocks
 from wholearm.planning import replay_check as self_check
 from wholearm.planning.block_plan import Planning
 from wholearm.planning.blocks import plan_blocks, refine_block
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.plan import solve
 from wholearm.planning.replay_check import (
     RESIDUAL,
     ReplayCheck,
@@ -207,18 +206,6 @@ def test_refining_is_bounded_and_the_error_says_where(
     assert "the intervals: v1-palm jams in phase 2 at t = 0.1 s; " in text and "--no-replay" in text
 
 
-def test_a_finer_plan_that_is_not_found_leaves_the_error(
-    slide: Problem, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: object) -> Planning:
-        raise SolverError("no plan")
-
-    own = Replayed(slide, monkeypatch, 1)
-    monkeypatch.setattr(self_check, "refine_block", fail)
-    with pytest.raises(ReplayError, match="the plan of phase 2 does not hold in its replay: "):
-        own.run()
-
-
 def test_a_plan_that_is_allowed_is_kept_where_finer_ones_are_not(
     slide: Problem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -259,10 +246,3 @@ def test_a_contact_that_is_let_go_counts_until_then() -> None:
     assert margins["v3-finger1"].least > problem.epsilon - Allowance().measure_stray(problem)
     assert find_least_force(phase) == min(phase.contacts, key=lambda margin: margin.least)
     assert find_least_force(phase._replace(contacts=())) is None
-
-
-def test_without_a_replay(slide: Problem) -> None:
-    meta = solve(replace(slide, phases=slide.phases[:1]), intervals=10, replay=False).meta
-    assert meta["replay"] is None
-    with pytest.raises(InputError, match="replay: 'no' given"):
-        PlanOptions(replay="no")  # type: ignore[arg-type]

@@ -18,7 +18,6 @@ from wholearm.planning.plan import solve
 from wholearm.problem.definition import End, Problem
 from wholearm.problem.read import build_problem
 from wholearm.results.trajectory import Samples, Trajectory
-from wholearm.results.trajectory_file import load_trajectory
 from wholearm.verification.verify import verify
 
 OBJECTIVES = ["time", "effort", "margin"]
@@ -129,18 +128,6 @@ def test_what_an_impact_saves_is_what_a_stop_costs(plans: dict[str, Trajectory])
     assert row["saves"] > 0.01
 
 
-def test_an_impact_raises_the_margin(plans: dict[str, Trajectory]) -> None:
-    """Over twice the least time, which stops share in proportion to their own least times."""
-    trajectory = plans["margin"]
-    allowed = 2 * sum(plans["time"].meta["phase_durations"][:3])
-    row = trajectory.meta["transitions"][1]
-    table: dict[str, Any] = copy.deepcopy(dict(edited(row["phase"], 3).table))
-    table["phases"] = table["phases"][:3]
-    stopped = solve(build_problem(table), "margin", duration=allowed, replay=False)
-    gained = min(trajectory.meta["phase_values"][:3]) - stopped.meta["value"]
-    assert row["saves"] == pytest.approx(gained, abs=1e-6) and gained > 0.01
-
-
 def test_no_plan_with_a_stop_leaves_the_saving_open(
     problem: Problem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -169,24 +156,6 @@ def test_without_an_impact_the_plan_is_that_of_stops(heptagon: Problem) -> None:
     ]
     assert plain.transitions == ()
     assert struck.value == pytest.approx(plain.value, rel=1e-6)
-
-
-def test_transitions_survive_their_file(plans: dict[str, Trajectory], tmp_path: Any) -> None:
-    trajectory = plans["time"]
-    trajectory.save(tmp_path / "plan.npz")
-    assert load_trajectory(tmp_path / "plan.npz").meta == trajectory.meta
-
-
-def test_progress_tells_what_is_planned(problem: Problem) -> None:
-    told: list[str] = []
-    solve(problem, "effort", intervals=20, progress=told.append)
-    assert told == [
-        "tracing the phases",
-        "phase 1-2-3-4-5 of 5: effort",
-        "replaying the plan",
-        "phase 1: what its impact saves",
-        "phase 2: what its impact saves",
-    ]
 
 
 def unit(values: Array) -> Array:

@@ -9,7 +9,6 @@ import os
 import pickle
 import subprocess
 import sys
-import weakref
 from collections.abc import Callable
 from dataclasses import replace
 from threading import Thread
@@ -262,12 +261,6 @@ def test_results_copy(planned: tuple[Any, ...], duplicate: Callable[[Any], Any])
     assert wholearm.verify(duplicate(problem), duplicate(trajectory)).ok == report.ok
 
 
-def test_copies_leave_kept_values_behind(tracked: type[Tracked]) -> None:
-    owner = Owner(3)
-    assert owner.value is not copy.copy(owner).value
-    assert copy.deepcopy(owner).number == 3
-
-
 def _plan(problem: wholearm.Problem) -> wholearm.Trajectory:
     return wholearm.solve(problem, intervals=10).trajectory
 
@@ -310,14 +303,6 @@ def test_a_forked_process_can_plan() -> None:
     command = [sys.executable, "-W", "ignore:This process:DeprecationWarning", "-c", code, SQUARE]
     run = subprocess.run(command, capture_output=True, timeout=100)
     assert (run.returncode, run.stderr) == (0, b"")
-
-
-def test_an_owner_that_is_kept_by_nothing_goes(tracked: type[Tracked]) -> None:
-    owner = Owner()
-    assert owner.value is not None
-    reference = weakref.ref(owner)
-    del owner
-    assert reference() is None
 
 
 class Sharer:

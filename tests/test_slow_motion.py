@@ -40,13 +40,6 @@ def test_where_a_plan_exists_a_motion_keeps_the_limits(
     assert 0.0 < slow <= fast + 1e-9
 
 
-def test_without_strength_no_motion_exists(heptagon: Problem, course: tuple[Phase, Course]) -> None:
-    phase, (s, z, z_s) = course
-    scene = _weaker(heptagon.scene, 0.01)
-    assert slow_margin(scene, phase, heptagon.epsilon, z, z_s)[0] < 0.0
-    assert fast_margin(scene, phase, heptagon.epsilon, (s, z, z_s)) < 0.0
-
-
 def test_friction_that_may_be_any_in_its_cone_only_allows_more(
     heptagon: Problem, course: tuple[Phase, Course]
 ) -> None:

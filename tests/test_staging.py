@@ -16,7 +16,6 @@ from wholearm.planning.time_domain.collocation import make_scheme
 from wholearm.planning.time_domain.stage import Stage
 from wholearm.planning.time_domain.stage_modes import LEAST_INTERVALS
 from wholearm.planning.time_domain.stages import guess_stages
-from wholearm.planning.time_domain.units import in_own_units
 from wholearm.problem.definition import End, Until
 
 SCHEME = make_scheme("radau", 3)
@@ -28,20 +27,6 @@ def stages() -> list[Stage]:
     problem = landing()
     start = trace_phases(problem)[-1].end
     return guess_stages(problem, problem.phases[4:], start, SCHEME, 12, 2.0)
-
-
-def test_stages_are_those_of_the_outlines(stages: list[Stage]) -> None:
-    problem = landing()
-    z, phases = trace_phases(problem)[-1].end, []
-    for phase in problem.phases[4:]:
-        for outline in guess_phase(phase, z):
-            phases.append(phase.index)
-            z = outline.z[-1]
-    # What slides the other way after the release has to turn on its way, in one stage more.
-    assert [stage.phase for stage in stages] == [*phases, phases[-1]]
-    own = in_own_units(problem)
-    assert all(stage.formation is own.phases[stage.phase].formation for stage in stages)
-    assert [stage.until is None for stage in stages] == [True, True, True, False]
 
 
 def test_directions_change_where_a_stage_says_that_they_turn(stages: list[Stage]) -> None:

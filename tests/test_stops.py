@@ -58,11 +58,6 @@ def test_parts_start_where_those_before_end() -> None:
     np.testing.assert_allclose([plan.value for plan in plans], LEAST)
 
 
-def test_a_part_of_a_block_is_planned_alone() -> None:
-    (plan,) = plan_stops(plan_part, [1, 2], np.zeros(5), PlanOptions("margin"), 0.2)
-    assert plan.motion.duration == pytest.approx(0.2)
-
-
 def test_a_duration_shorter_than_the_stops_take() -> None:
     with pytest.raises(InfeasibleError, match=r"0\.7 s is not longer .* a stop, 0\.73 s"):
         plan_stops(plan_part, [0, 1, 3], np.zeros(5), PlanOptions("margin"), 0.7)

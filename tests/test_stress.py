@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import tomllib
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,6 @@ import pytest
 from wholearm.benchmark.stress.damage import BASE, change_tree, draw_mutant, look, run_file, to_toml
 from wholearm.benchmark.stress.scenes import draw_case
 from wholearm.benchmark.stress.stress_study import STUDY, compare_values
-from wholearm.cli.command import main
 
 
 def test_a_scene_is_drawn_alike_again_and_is_the_same_as_a_file() -> None:
@@ -83,23 +81,3 @@ def test_the_table_counts_every_finding() -> None:
     assert len(findings) == 2 and findings[0] == "scene 0 4 time: no answer: a | b"
     assert "| no answer | 1 |" in text and "| traceback | 1 |" in text
     assert "| p.toml | time | 1 | 1 | 0.0e+00 |" in text
-
-
-def test_a_study_of_files_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = [
-        "bench",
-        "stress",
-        "--scenes",
-        "0",
-        "--seed",
-        "2",
-        "-o",
-        str(tmp_path),
-        "--jobs",
-        "1",
-    ]
-    assert main([*command, "--files", "3"]) == 0
-    before = (tmp_path / "bench_stress.jsonl").read_text(encoding="utf-8")
-    assert main([*command, "--files", "3"]) == 0
-    assert (tmp_path / "bench_stress.jsonl").read_text(encoding="utf-8") == before
-    assert "Damaged files" in capsys.readouterr().out

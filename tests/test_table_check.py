@@ -7,7 +7,7 @@ import pytest
 
 from planned import change, plan
 from wholearm.common.arrays import Array
-from wholearm.common.errors import InputError, ReplayError
+from wholearm.common.errors import ReplayError
 from wholearm.planning.table_check import make_table, sample_table
 from wholearm.results.torque_table import read_rows
 from wholearm.verification.verify import verify
@@ -67,16 +67,3 @@ def test_samples_at_a_rate_are_reported(interpolation: str) -> None:
     assert find_errors(coarse).sum() > 2 * find_errors(fine).sum()
     unplayed = sample_table(problem, trajectory, 60.0, interpolation, replay=False)
     assert unplayed.figures["replay"] is None
-
-
-def test_a_report_has_every_phase() -> None:
-    problem, trajectory = plan()
-    rows = sample_table(problem, trajectory, 60.0, "hold").figures["replay"]["phases"]
-    assert [row["phase"] for row in rows] == [1, 2, 3, 4, 5]
-    assert rows[-1]["arrival"] is None or rows[-1]["least_c_n"] is not None
-
-
-def test_bad_rates() -> None:
-    problem, trajectory = plan()
-    with pytest.raises(InputError, match="sample_rate"):
-        sample_table(problem, trajectory, 0.0, "linear")

@@ -16,7 +16,6 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.impact import compute_impact
 from wholearm.mechanics.metric import metric_weights
 from wholearm.planning.plan import solve
-from wholearm.planning.plan_report import describe_plan
 from wholearm.planning.result import Plan
 from wholearm.problem.definition import End, Problem
 from wholearm.results.trajectory import Samples, Trajectory
@@ -130,21 +129,6 @@ def test_it_stops_where_no_impact_is_possible() -> None:
     assert row["reason"].startswith("impulse on v") and row["reason"].endswith("per m/s")
     for samples in ends_of(plan, row["phase"] - 1):
         assert np.abs(samples.z_dot).max() < 1e-5
-
-
-def test_impacts_are_listed() -> None:
-    lines = describe_plan(solved("time"), "a.npz").to_text().splitlines()
-    (head,) = (k for k, line in enumerate(lines) if "least impulse [N s per m/s]" in line)
-    for line, row in zip(
-        lines[head + 1 : head + 2], planned("time").meta["transitions"], strict=True
-    ):
-        phase, ratio, impulse, contact, speed, saves = line.split()
-        assert (int(phase), contact) == (row["phase"], row["least_impulse_contact"])
-        figures = (row[key] for key in ("velocity_ratio", "least_impulse", "speed", "saves"))
-        np.testing.assert_allclose(
-            [float(text) for text in (ratio, impulse, speed, saves)], list(figures), atol=5e-7
-        )
-    assert lines[head + 2] == ""
 
 
 def test_least_effort_with_impacts_is_near_that_along_the_curves() -> None:

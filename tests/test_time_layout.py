@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -97,21 +96,6 @@ def test_every_unknown_has_one_place(
     assert layouts[0].nodes.shape == (4, 11 if with_margin else 10)
     assert [len(layout.impulses) for layout in layouts] == [3 if ends_in_impact else 0, 0, 0]
     assert [layout.short.shape[1] for layout in layouts] == ([6, 5, 3] if elastic else [0] * 3)
-
-
-@pytest.mark.parametrize("name, degree", SCHEMES)
-def test_unknowns_are_in_the_order_of_time(name: str, degree: int) -> None:
-    scheme = make_scheme(name, degree)
-    for layout in lay_out(make_stages(name, degree, True), scheme):
-        for k in range(len(layout.tau)):
-            assert layout.nodes[k].max() < layout.h[k] < layout.tau[k].min() < layout.z[k].min()
-            for before, after in pairwise(range(degree)):
-                assert layout.forces[k, before].max() < layout.z[k, after].min()
-            ends = np.concatenate([layout.z[k, -1], layout.v[k, -1]])
-            if scheme.ends:
-                np.testing.assert_array_equal(layout.nodes[k + 1], ends)
-            else:
-                assert layout.forces[k].max() < layout.nodes[k + 1].min()
 
 
 @pytest.mark.parametrize("with_margin", [False, True])

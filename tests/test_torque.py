@@ -34,11 +34,6 @@ def test_linear_rows_with_a_step(tmp_path: Path) -> None:
     assert at(profile, [1.25, 2.0]) == [[2.5, 1.5], [1.0, 3.0]]
 
 
-def test_the_ends_hold_beyond_them() -> None:
-    profile = TorqueProfile.join_rows(np.array([0.0, 1.0]), np.array([[1.0, 2.0], [3.0, 4.0]]))
-    assert at(profile, [-5.0, 9.0]) == [[1.0, 2.0], [3.0, 4.0]]
-
-
 def test_step_at_the_very_start() -> None:
     t, tau = np.array([0.0, 0.0, 1.0]), np.array([[9.0, 9.0], [1.0, 1.0], [2.0, 2.0]])
     assert at(TorqueProfile.join_rows(t, tau), [0.0, 1.0]) == [[1.0, 1.0], [2.0, 2.0]]
@@ -101,12 +96,6 @@ def test_not_text(tmp_path: Path, content: bytes) -> None:
         read_torque_csv(str(path))
 
 
-@pytest.mark.parametrize("name", ["absent.csv", "."])
-def test_unreadable_file(tmp_path: Path, name: str) -> None:
-    with pytest.raises(InputError, match="cannot be read"):
-        read_torque_csv(str(tmp_path / name))
-
-
 @pytest.mark.parametrize("degree", [0, 1, 3, 8])
 def test_fit_is_exact_for_polynomials(degree: int) -> None:
     rng = np.random.default_rng(degree)
@@ -127,16 +116,6 @@ def test_fit_keeps_a_step_at_a_break() -> None:
 
     profile = TorqueProfile.fit(np.array([0.0, 0.3, 1.0]), function, 4)
     np.testing.assert_allclose(profile.at(np.array([0.3 - 1e-9, 0.3])), [[1, 0.3], [5, 0.3]], 1e-8)
-
-
-def test_fit_converges_with_the_degree() -> None:
-    def function(t: Array) -> Array:
-        return np.column_stack([np.exp(t), np.cos(3 * t)])
-
-    t = np.linspace(0, 1, 50)
-    breaks = np.array([0.0, 0.5, 1.0])
-    errors = [abs(TorqueProfile.fit(breaks, function, d).at(t) - function(t)).max() for d in (3, 9)]
-    assert errors[1] < 1e-5 * errors[0]
 
 
 def test_chain_puts_profiles_one_after_the_other() -> None:

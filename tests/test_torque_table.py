@@ -34,13 +34,6 @@ def test_rows_give_the_torques_back(error: float) -> None:
     assert rows[np.flatnonzero(np.diff(rows[:, 0]) == 0), 0].tolist() == [0.4]
 
 
-def test_fewer_errors_take_more_rows() -> None:
-    counts = [len(place_rows(bent(), error)) for error in (1e-3, 1e-5, 1e-7)]
-    # A line misses the square of its length.
-    assert counts[1] / counts[0] == pytest.approx(10, rel=0.3)
-    assert counts[2] / counts[1] == pytest.approx(10, rel=0.1)
-
-
 @pytest.mark.parametrize("error", [1e-3, ERROR])
 def test_rows_are_no_steeper_than_the_torques_may_be(error: float) -> None:
     def ramp(t: Array) -> Array:
@@ -94,11 +87,6 @@ def test_rows_keep_torque_limits() -> None:
     assert np.abs(rows[:, 1:]).max() < 2 * (1 + 1e-12)
 
 
-def test_no_torque_at_all() -> None:
-    rows = place_rows(TorqueProfile(np.array([0.0, 0.2, 0.5]), np.zeros((2, 2, 3))))
-    assert rows.tolist() == [[0, 0, 0], [0.5, 0, 0]]
-
-
 def test_rows_carry_a_motion_as_its_torques_do() -> None:
     problem, trajectory = plan()
     report = verify(problem, read_rows(place_rows(trajectory.torque)))
@@ -121,19 +109,8 @@ def test_samples(rate: float) -> None:
     assert len(hold) == 2 * (count - 1) and hold[-1, 0] == linear[-1, 0]
 
 
-def test_a_sample_at_a_step_is_the_later_one() -> None:
-    rows = sample_rows(bent(), 10.0, "linear")
-    assert rows[4, 0] == pytest.approx(0.4)
-    assert rows[4, 2] == pytest.approx(np.cos(10.0) + 0.7, abs=1e-6)
-
-
 @pytest.mark.parametrize("rate", [0.0, -1.0, math.nan, math.inf, 0.5, 1e8])
 def test_rates_out_of_range(rate: float) -> None:
     with pytest.raises(InputError) as caught:
         sample_rows(bent(), rate, "linear")
     assert caught.value.key == "sample_rate"
-
-
-def test_other_interpolations() -> None:
-    with pytest.raises(InputError, match="'cubic' given; allowed are linear and hold"):
-        sample_rows(bent(), 100.0, "cubic")

@@ -24,12 +24,11 @@ from tipping import roll, tip
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.contacts.closing import close_finger, place_flush
-from wholearm.contacts.elemental import Contact
 from wholearm.contacts.formation import Formation, find_touching
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_curve, trace_phases
 from wholearm.mechanics.metric import metric_weights
-from wholearm.problem.definition import Phase, Problem, Until
+from wholearm.problem.definition import Problem, Until
 from wholearm.problem.read import build_problem
 from wholearm.scene.model import Scene
 
@@ -202,22 +201,6 @@ def test_segments_split_exactly_where_something_reverses(every_curve: tuple[Curv
     assert reversals >= 4
 
 
-def test_sliding_is_measured_at_the_contacts(curves: tuple[Curve, ...]) -> None:
-    """On the palm: minus the speed of the corner, as t = (n_y, -n_x) = (1, 0)."""
-    for curve in curves:
-        h = 1e-6
-        s = interior(curve, 9)
-        one, two = (curve.evaluate(s + k).z for k in (-h, h))
-        for column, contact in enumerate(curve.formation.contacts):
-            if contact.finger is None:
-                corner = [
-                    [place_corners(curve.formation.scene, z)[contact.index, 0] for z in part]
-                    for part in (one, two)
-                ]
-                speed = (np.array(corner[1]) - corner[0]) / (2 * h)
-                np.testing.assert_allclose(curve.sliding(s)[:, column], speed, atol=1e-8)
-
-
 def test_until_is_reached_exactly(heptagon: Problem, curves: tuple[Curve, ...]) -> None:
     start = heptagon.start
     for phase, curve in zip(heptagon.phases, curves, strict=True):
@@ -315,22 +298,6 @@ def test_a_tip_is_reached_and_gone_round(
     assert set(second.contacts) <= set(find_touching(scene, first.end))
     onward = first.evaluate(np.array([first.length])).z_s[0]
     assert follower in trace_curve(second, first.end, onward, NEVER).ending
-
-
-@pytest.mark.parametrize(
-    "until",
-    [
-        NEVER,
-        Until(coordinate="phi", value=0.0),
-        Until(contact=Contact("v", 3, "palm")),
-        Until(contact=Contact("v", 5, "tip", 0)),
-    ],
-    ids=str,
-)
-def test_until_that_never_holds(heptagon: Problem, until: Until) -> None:
-    again = Phase(0, heptagon.phases[0].formation, until)
-    with pytest.raises(InputError, match=r"phases\[1\]\.until"):
-        trace_phases(replace(heptagon, phases=(again,)))
 
 
 @pytest.mark.parametrize("seed", range(4))

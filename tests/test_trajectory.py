@@ -114,19 +114,6 @@ def test_at_takes_many_times_in_any_order(trajectory: Trajectory) -> None:
         check_samples(trajectory, one, phase, np.array([local]))
 
 
-def test_representations_are_one_line(trajectory: Trajectory) -> None:
-    assert repr(trajectory) == "Trajectory(2 phases, 0.9 s)"
-    assert "\n" not in repr(trajectory.torque)
-
-
-def test_files_have_their_endings(trajectory: Trajectory, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"ending '.mat' given; allowed: .npz"):
-        trajectory.save(tmp_path / "plan.mat")
-    with pytest.raises(InputError, match=r"ending '' given; allowed: .csv"):
-        trajectory.save_torques(tmp_path / "torques")
-    assert not list(tmp_path.iterdir())
-
-
 def test_at_reaches_the_end_and_no_farther(trajectory: Trajectory) -> None:
     end = trajectory.at(trajectory.duration)
     np.testing.assert_allclose(end.z, MOTIONS[1].evaluate(np.array([0.2])).z, atol=1e-14)
@@ -252,14 +239,6 @@ def test_bad_value_is_named(
     assert caught.value.key == ("torque_coefficients" if problem == "pieces" else name)
 
 
-def test_empty_arrays(trajectory: Trajectory, tmp_path: Path) -> None:
-    arrays = read_arrays(trajectory)
-    arrays |= {name: arrays[name][:0] for name in [*ARRAYS, "phase"]}
-    np.savez(tmp_path / "a.npz", **arrays)
-    with pytest.raises(InputError, match="phase"):
-        load_trajectory(tmp_path / "a.npz")
-
-
 @pytest.mark.parametrize("content", [b"", b"not an archive", b"PK\x03\x04 broken", None])
 def test_not_a_trajectory_file(tmp_path: Path, content: bytes | None) -> None:
     path = tmp_path / "a.npz"
@@ -271,20 +250,6 @@ def test_not_a_trajectory_file(tmp_path: Path, content: bytes | None) -> None:
     with pytest.raises(InputError, match="is not a trajectory file") as caught:
         load_trajectory(path)
     assert caught.value.source == str(path)
-
-
-@pytest.mark.parametrize("name", ["absent.npz", "."])
-def test_unreadable_file(tmp_path: Path, name: str) -> None:
-    with pytest.raises(InputError, match="cannot be read"):
-        load_trajectory(tmp_path / name)
-
-
-def test_truncated_file(trajectory: Trajectory, tmp_path: Path) -> None:
-    trajectory.save(tmp_path / "a.npz")
-    content = (tmp_path / "a.npz").read_bytes()
-    (tmp_path / "a.npz").write_bytes(content[: len(content) // 2])
-    with pytest.raises(InputError, match="is not a trajectory file"):
-        load_trajectory(tmp_path / "a.npz")
 
 
 def test_unwritable_place_leaves_nothing(trajectory: Trajectory, tmp_path: Path) -> None:
@@ -327,21 +292,6 @@ def test_bad_contact_modes(trajectory: Trajectory, tmp_path: Path, given: Any) -
     with pytest.raises(InputError, match="not a list of spans") as caught:
         load_trajectory(tmp_path / "plan.npz")
     assert caught.value.key == "meta.modes"
-
-
-def test_nothing_rolls_unless_it_is_said(trajectory: Trajectory) -> None:
-    assert trajectory.rolling.shape == trajectory.c_t.shape and not trajectory.rolling.any()
-
-
-@pytest.mark.parametrize("text", ["[" * 100_000, "9" * 5000, "", "{"])
-def test_meta_that_is_not_json_is_named(tmp_path: Path, trajectory: Trajectory, text: str) -> None:
-    path = tmp_path / "plan.npz"
-    trajectory.save(path)
-    with np.load(path) as data:
-        arrays = {name: data[name] for name in data.files}
-    np.savez(path, **arrays | {"meta": np.array(text)})
-    with pytest.raises(InputError, match=r"plan\.npz: meta: is n"):
-        load_trajectory(path)
 
 
 @pytest.mark.parametrize(

@@ -10,11 +10,10 @@ import pytest
 
 import wholearm
 from shipped import FOLDER, HEPTAGON, HEXAGON, LANDING, problem_of
-from wholearm.cli.command import main
 from wholearm.common.errors import InputError
 from wholearm.results.torque import read_notes
 from wholearm.simulation.events import Event, EventKind
-from wholearm.tuning.trial import Bench, TrialOutcome, TuningStep, make_rows, split_passages
+from wholearm.tuning.trial import Bench, TrialOutcome, TuningStep, split_passages
 from wholearm.tuning.tuner import FACTOR
 
 
@@ -87,17 +86,6 @@ def test_constant_torques_do_not_come_to_rest() -> None:
     assert found.reason.startswith("phase 1: x = -0.01 m is reached at ")
     with pytest.raises(ValueError, match="no torques"):
         found.to_csv()
-
-
-def test_steps_hold_until_the_next() -> None:
-    rows = make_rows([TuningStep(0.0, (1.0, -1.0)), TuningStep(0.5, (2.0, 0.0))], 2.0)
-    assert rows.tolist() == [[0, 1, -1], [0.5, 1, -1], [0.5, 2, 0], [2, 2, 0]]
-
-
-def test_only_csv_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    given = ["tune", "problems/heptagon.toml", "-o", str(tmp_path / "tuned.npz")]
-    assert main(given) == 2
-    assert "tuned.npz" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -44,12 +44,6 @@ def test_samples_have_one_in_every_slice_of_every_range() -> None:
         assert sorted(slices) == list(range(50)), name
 
 
-def test_samples_come_from_the_seed() -> None:
-    own = Uncertainty()
-    assert (own.draw(20, 1) == own.draw(20, 1)).all()
-    assert not (own.draw(20, 1) == own.draw(20, 2)).any()
-
-
 @pytest.mark.parametrize(
     "widths, text",
     [

@@ -144,21 +144,6 @@ def test_ways_bend_to_one_side_and_to_the_other() -> None:
     assert off[0] @ off[1] < 0 and np.linalg.norm(off[0]) > 0.1 * nearest.length
 
 
-def test_a_way_sets_out_as_it_is_told() -> None:
-    problem = tipping()
-    (phase,) = problem.phases
-    start, formation = problem.start, phase.formation
-    (nearest,) = guess_phase(phase, start)
-    goal, metric = nearest.z[-1], np.sqrt(weights(problem.scene))
-    straight = connect(formation, start, goal).z
-    back = straight[0] - straight[1]
-    z = connect(formation, start, goal, heading=back).z
-    assert (z[0] == start).all() and np.abs(z[-1] - goal).max() < 1e-9
-    assert np.abs(formation.evaluate(z, z).C).max() < 1e-9
-    first = (z[1] - z[0]) * metric
-    assert first @ (back * metric) > 0.9 * np.linalg.norm(first) * np.linalg.norm(back * metric)
-
-
 def test_a_way_that_slides_while_it_tips_is_planned() -> None:
     problem = tipping()
     (plan,) = plan_phases(
@@ -168,7 +153,3 @@ def test_a_way_that_slides_while_it_tips_is_planned() -> None:
     samples = motion.evaluate(np.linspace(0.0, motion.duration, 50))
     assert np.degrees(samples.z[-1, 2]) == pytest.approx(9.5, abs=1e-5)
     assert samples.c_n.min() > problem.epsilon - 1e-6
-
-
-def test_a_release_and_one_freedom_have_no_ways(heptagon: Problem) -> None:
-    assert not list_ways(heptagon, heptagon.phases[0], heptagon.start, 3)

@@ -60,21 +60,10 @@ def test_results_are_in_order_and_have_what_is_known() -> None:
     assert share([task(k) for k in range(1, 5)], 2, [known]) == [(k, known) for k in range(1, 5)]
 
 
-def test_one_job_is_this_process() -> None:
-    assert share([os.getpid] * 2, 1) == [PARENT, PARENT]
-    assert share([], 2) == []
-
-
 @needs_fork
 @pytest.mark.parametrize("act", [stop, fail])
 def test_what_a_child_does_not_finish_is_done_here(act: Callable[[], object]) -> None:
     assert share([Meeting(in_child(act))] * 2, 2) == [PARENT, PARENT]
-
-
-@needs_fork
-def test_what_cannot_be_sent_is_done_here() -> None:
-    meet = Meeting()
-    assert len(share([lambda: (meet(), threading.Lock())] * 2, 2)) == 2
 
 
 @needs_fork
