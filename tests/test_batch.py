@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from wholearm.common.batch import FEW, SIZE, SOME, Batch
+from wholearm.planning.columns import Columns
 
 
 def build_function() -> ca.Function:
@@ -44,3 +45,44 @@ def test_strided_arguments() -> None:
     expected = batch(wide[::2, ::2].copy(), wide[::-2, 4:].copy())
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+COLUMNS = Columns(z=5, h=1, tau=4)
+
+
+def test_blocks_follow_one_another() -> None:
+    assert COLUMNS.count == 10
+    assert [COLUMNS[name] for name in ("z", "h", "tau")] == [slice(0, 5), slice(5, 6), slice(6, 10)]
+
+
+def test_blocks_are_joined_by_name_whatever_their_order() -> None:
+    tau, z = np.arange(24.0).reshape(2, 3, 4), np.arange(5.0)
+    joined = COLUMNS.join(tau=tau, z=z, h=np.full((2, 1, 1), 7.0))
+    assert joined.shape == (2, 3, 10)
+    np.testing.assert_array_equal(joined[..., COLUMNS["tau"]], tau)
+    np.testing.assert_array_equal(joined[1, 2, COLUMNS["z"]], z)
+    assert (joined[..., COLUMNS["h"]] == 7.0).all()
+
+
+def test_symbols_stand_where_numbers_do() -> None:
+    x = COLUMNS.make_symbols()
+    function = ca.Function("f", [x.every], [x.tau[1], x.h, x.z])
+    given = COLUMNS.join(z=np.arange(5.0), h=[5.0], tau=6.0 + np.arange(4.0))
+    second, h, z = (float(part[0]) for part in function(given))
+    assert (second, h, z) == (7.0, 5.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    "blocks",
+    [
+        {"z": np.zeros(5), "h": np.zeros(1)},
+        {"z": np.zeros(5), "h": np.zeros(1), "tau": np.zeros(3)},
+        {"z": np.zeros(5), "h": np.zeros(1), "torque": np.zeros(4)},
+    ],
+    ids=["missing", "too short", "another name"],
+)
+def test_what_was_not_declared_is_refused(blocks: dict[str, np.ndarray]) -> None:
+    with pytest.raises(ValueError, match=r"are given where .* are declared"):
+        COLUMNS.join(**blocks)
+    with pytest.raises(ValueError, match=r"are given where .* are declared"):
+        COLUMNS.write(**{name: ca.SX(block) for name, block in blocks.items()})

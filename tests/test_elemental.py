@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 from plane import (
+    SQUARE,
     cross,
     make_formation,
     make_scene,
@@ -16,8 +18,10 @@ from plane import (
     point_to_segment,
     rotate,
 )
+from tipping import roll
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
+from wholearm.contacts.cones import find_weakest, force_limit_rows, slip_margins
 from wholearm.contacts.contact_limits import build_clearance, build_limits
 from wholearm.contacts.elemental import (
     Contact,
@@ -26,7 +30,8 @@ from wholearm.contacts.elemental import (
     candidate_contacts,
     parse_contact,
 )
-from wholearm.scene.model import Scene
+from wholearm.contacts.formation import Formation, build_slip
+from wholearm.scene.model import Friction, Scene
 
 KITE = [[-0.04, -0.03], [0.02, -0.035], [0.045, 0.01], [0.0, 0.05], [-0.045, 0.02]]
 NAMES = ["v3-palm", "v2-finger1", "v4-finger2", "e1-tip1", "e3-tip2", "v2-tip1", "v4-tip2"]
@@ -260,3 +265,55 @@ def test_clearances_grow_in_proportion_to_the_vertices() -> None:
         function = ca.Function("all", [build_features(scene).z], [ca.vertcat(*values)])
         sizes.append(function.n_instructions())
     assert sizes[1] < 2.1 * sizes[0] and sizes[2] < 2.1 * sizes[1]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_slip_coordinate_integrates_the_sliding_velocity(scene: Scene, name: str) -> None:
+    """Where a contact touches, the gradient of its slip is A_t, by derivative and difference."""
+    formation = make_formation(scene, name)
+    slip, z_symbol = build_slip(formation.contacts[0], scene), build_features(scene).z
+    function = ca.Function("slip", [z_symbol], [slip, ca.jacobian(slip, z_symbol)])
+    rng = np.random.default_rng(6)
+    for z in configurations(6, 8):
+        gap, _, normal = measure_gap(scene, formation.contacts[0], z)
+        z[:2] -= gap * normal
+        v = rng.uniform(-1, 1, 5)
+        A_t = formation.evaluate(z[None], v[None]).A_t[0]
+        np.testing.assert_allclose(function(z)[1].full(), A_t, atol=1e-14)
+        rise = float(function(z + STEP * v)[0] - function(z - STEP * v)[0])
+        # On a tip's arc truncation is (STEP / radius)^2.
+        assert rise / (2 * STEP) == pytest.approx(A_t[0] @ v, abs=(STEP / 0.005) ** 2)
+
+
+@pytest.fixture
+def formation() -> Formation:
+    scene = replace(make_scene(SQUARE), friction=Friction(0.5, 0.2, 0.3))
+    return roll(make_formation(scene, "v0-finger2 v1-palm v2-finger1"), "v1-palm", "v2-finger1")
+
+
+def test_rows_are_normal_forces_and_both_sides_of_each_cone(formation: Formation) -> None:
+    c = np.array([1.0, 2.0, 3.0, 0.7, -0.4])
+    expected = [1.0, 2.0, 3.0, 0.5 * 2 - 0.7, 0.2 * 3 + 0.4, 0.5 * 2 + 0.7, 0.2 * 3 - 0.4]
+    np.testing.assert_allclose(force_limit_rows(formation) @ c, expected)
+
+
+def test_without_rolling_contacts_only_normal_forces_count() -> None:
+    formation = make_formation(make_scene(SQUARE), "v0-palm v2-finger1")
+    np.testing.assert_array_equal(force_limit_rows(formation), np.eye(2))
+    assert slip_margins(formation, np.ones((4, 2)), np.ones((4, 2))).shape == (4, 0)
+    assert find_weakest(formation, np.array([0.3, -0.2])) == (1, -0.2, None)
+
+
+def test_margin_to_slipping(formation: Formation) -> None:
+    c_n, c_t = np.array([[1.0, 2.0, 3.0]]), np.array([[9.0, -0.7, 0.8]])
+    np.testing.assert_allclose(slip_margins(formation, c_n, c_t), [[0.3, -0.2]])
+
+
+def test_what_gives_way_first(formation: Formation) -> None:
+    H = force_limit_rows(formation)
+    row, c_n, c_t = find_weakest(formation, H @ [1.0, 2.0, 3.0, 0.7, -0.9])
+    assert (row, c_n) == (2, 3.0) and c_t == pytest.approx(-0.9)
+    row, c_n, c_t = find_weakest(formation, H @ [1.0, 2.0, 3.0, 1.2, 0.1])
+    assert (row, c_n) == (1, 2.0) and c_t == pytest.approx(1.2)
+    # A contact that pulls has no cone to be in.
+    assert find_weakest(formation, H @ [1.0, 2.0, -0.1, 0.0, 0.0]) == (2, -0.1, None)

@@ -10,15 +10,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shipped import HEPTAGON, plan_of, problem_of
+from shipped import HEPTAGON, LANDING, plan_of, problem_of
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
-from wholearm.engines.departure import Departure
+from wholearm.contacts.formation import Formation, find_touching
+from wholearm.engines.departure import Departure, compare, find_pairs
 from wholearm.engines.engine_replay import EngineReport, Level, replay_in, require_engine
 from wholearm.engines.feedback import play_policy
 from wholearm.engines.mjcf import write_mjcf
-from wholearm.engines.pressing import EngineDrive
-from wholearm.engines.stretch import Setting, list_stretches
+from wholearm.engines.pressing import LOOSE, EngineDrive, press_in
+from wholearm.engines.shapes import list_pairs
+from wholearm.engines.stretch import (
+    EngineRun,
+    Setting,
+    apply_friction,
+    find_between,
+    list_steps,
+    list_stretches,
+)
 from wholearm.planning.plan import solve
 from wholearm.planning.result import Plan
 from wholearm.policy.closed_loop import ClosedLoop
@@ -26,6 +35,8 @@ from wholearm.policy.make import make_policy
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem
 from wholearm.results.adopt import require_same_phases
+from wholearm.results.torque import TorqueProfile
+from wholearm.results.trajectory_file import load_trajectory
 from wholearm.search.find_route import find_route
 from wholearm.verification.verify import verify
 
@@ -184,3 +195,144 @@ def test_what_cannot_be_replayed(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert main(command) == 2
     assert "torques alone have no motion" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+ROWS = 201
+PHASE = 1
+
+
+def follow() -> EngineRun:
+    """The second phase as planned, with the planned forces."""
+    problem, plan = problem_of(HEPTAGON), plan_of(HEPTAGON)
+    motion, stretch = plan.motions[PHASE], list_stretches(plan, False)[PHASE]
+    t = np.linspace(0.0, motion.duration, ROWS)
+    planned, names = motion.evaluate(t), tuple(pair.name for pair in list_pairs(problem.scene))
+    press = np.zeros((ROWS - 1, len(names)))
+    for k, name in enumerate(motion.contacts):
+        press[:, names.index(name)] = planned.c_n[1:, k]
+    return EngineRun(stretch.start + t, planned.z, planned.z_dot, names, press)
+
+
+def judge(run: EngineRun) -> Departure:
+    problem, plan = problem_of(HEPTAGON), plan_of(HEPTAGON)
+    return compare(problem, plan, list_stretches(plan, False)[PHASE], run, 1e-3)
+
+
+def test_what_goes_as_planned_does_not_depart() -> None:
+    found = judge(follow())
+    assert (found.time, found.reason) == (None, "")
+    assert found.position.max() < 1e-12 and found.angle.max() < 1e-12
+    assert [force.contact for force in found.forces] == list(plan_of(HEPTAGON).motions[1].contacts)
+    # Forces step within rows.
+    assert max(abs(force.off) for force in found.forces) < 2e-2
+
+
+def test_a_contact_that_opens_is_the_reason() -> None:
+    run = follow()
+    length, late = problem_of(HEPTAGON).scene.scales.length, np.arange(ROWS) > 100
+    run.z[:, 1] += np.where(late, 2e-3 * length, 0.0)
+    found = judge(run)
+    assert found.time == pytest.approx(run.t[101])
+    assert found.reason.startswith("v0-palm opens at t = ")
+
+
+def test_a_contact_that_sticks_is_the_reason() -> None:
+    run = follow()
+    length, late = problem_of(HEPTAGON).scene.scales.length, np.arange(ROWS) > 120
+    run.z_dot[80:] = 0.0
+    run.z[:, 0] += np.where(late, 2e-3 * length, 0.0)
+    found = judge(run)
+    assert found.time == pytest.approx(run.t[121])
+    assert "sticks at t = " in found.reason and f"{run.t[80]:.5g}" in found.reason
+
+
+def test_a_contact_that_is_not_planned_is_the_reason() -> None:
+    run = follow()
+    run.z[121:], run.z_dot[121:] = run.z[118:-3].copy(), run.z_dot[118:-3].copy()
+    assert judge(run).reason == "every contact is as planned"
+    run.press[60, run.pairs.index("v6-finger2")] = 1.0
+    assert judge(run).reason.startswith("v6-finger2 presses, which is not planned, at t = ")
+
+
+def test_a_vertex_on_a_tip_ends_two_edges() -> None:
+    assert find_pairs("v4-tip1", 6) == ("v4-finger1", "e3-tip1", "e4-tip1")
+    assert find_pairs("v0-tip2", 6) == ("v0-finger2", "e5-tip2", "e0-tip2")
+    assert find_pairs("e3-tip1", 6) == ("e3-tip1",)
+
+
+def test_phases_are_stretches_or_the_whole_plan_is() -> None:
+    plan = plan_of(HEPTAGON)
+    (whole,) = list_stretches(plan, True)
+    assert (whole.phases, whole.start, whole.stop) == (tuple(range(5)), 0.0, plan.duration)
+    third = list_stretches(plan, False)[2]
+    assert third.phases == (2,)
+    np.testing.assert_allclose([third.start, third.stop], plan.phase_starts[2:4])
+    assert tuple(third.c_n) == plan.motions[2].contacts
+
+
+def test_steps_of_a_constant_force_are_exact() -> None:
+    # Velocity by the force, then position by the velocity: half a step's start makes it exact.
+    problem, plan = problem_of(HEPTAGON), plan_of(HEPTAGON)
+    stretch = list_stretches(plan, False)[0]._replace(z_dot=np.full(5, 0.3), z_ddot=np.full(5, 2.0))
+    torque = TorqueProfile(np.array([0.0, 1.0]), np.full((1, 2, 1), 0.7))
+    steps = list_steps(problem, stretch, torque, 0.01)
+    assert steps.h <= 0.01 * problem.scene.scales.time and steps.ends[-1] == len(steps.tau)
+    assert steps.h * len(steps.tau) == pytest.approx(stretch.stop - stretch.start)
+    z, v = stretch.z.copy(), steps.v.copy()
+    for _ in range(7):
+        v += steps.h * 2.0
+        z += steps.h * v
+    t = 7 * steps.h
+    np.testing.assert_allclose(z, stretch.z + 0.3 * t + t**2, rtol=1e-13)
+    np.testing.assert_allclose(steps.tau, 0.7)
+
+
+def test_torques_are_averages_around_positions() -> None:
+    problem, plan = problem_of(HEPTAGON), plan_of(HEPTAGON)
+    stretch = list_stretches(plan, False)[0]
+    ramp = TorqueProfile(np.array([0.0, 2.0]), np.array([[[1.0, 1.0], [2.0, 2.0]]]))
+    steps = list_steps(problem, stretch, ramp, 0.01)
+    t = steps.h * np.arange(1, len(steps.tau))
+    np.testing.assert_allclose(steps.tau[1:], np.column_stack([t, 2 * t]), rtol=1e-9)
+
+
+def test_dry_friction_has_the_planned_sign() -> None:
+    plan, scene = plan_of(HEPTAGON), problem_of(HEPTAGON).scene
+    t = np.linspace(1e-4, plan.duration - 1e-4, 997)
+    speeds = plan.at(t).z_dot[:, 3:]
+    taken = plan.torque.at(t) - apply_friction(scene, plan).at(t)
+    clear = np.abs(speeds) > 1e-3 * scene.scales.rate
+    assert clear.mean() > 0.95 and {*np.sign(speeds[clear])} == {-1.0, 1.0}
+    np.testing.assert_allclose(taken[clear], 0.01 * np.sign(speeds[clear]), atol=1e-9)
+
+
+def test_a_plan_is_known_between_the_rows_of_its_file(tmp_path: Path) -> None:
+    plan = plan_of(HEPTAGON)
+    plan.save(tmp_path / "plan.npz")
+    loaded = load_trajectory(tmp_path / "plan.npz")
+    found, t = find_between(loaded), np.linspace(0.0, plan.duration - 1e-9, 2001)
+    off = [np.nanmean(np.abs(own.at(t).c_n - plan.at(t).c_n)) for own in (found, loaded)]
+    assert off[0] < 0.1 * off[1]
+    # What does not replay as planned is taken as it is.
+    weaker = replace(loaded.torque, coefficients=0.9 * loaded.torque.coefficients)
+    wrong = replace(loaded, torque=weaker)
+    assert find_between(wrong) is wrong
+
+
+STIFFNESS = 1e8
+
+
+@pytest.mark.parametrize("phase", [0, 5])
+def test_contacts_press_and_what_was_let_go_is_loose(phase: int) -> None:
+    problem, plan = problem_of(LANDING), plan_of(LANDING)
+    stretch, length = list_stretches(plan, False)[phase], problem.scene.scales.length
+    names = problem.phases[phase].formation.names
+    z = press_in(problem, stretch, dict.fromkeys(names, STIFFNESS))
+    touching = Formation(problem.scene, find_touching(problem.scene, stretch.z))
+    before, after = (touching.evaluate(at[None], np.zeros((1, 5))).C[0] for at in (stretch.z, z))
+    gaps = dict(zip(touching.names, after - before, strict=True))
+    for name in names:
+        assert -gaps.pop(name) == pytest.approx(stretch.c_n[name] / STIFFNESS, rel=1e-4)
+    # The landing begins where the plan lets v3 go from the finger.
+    assert list(gaps) == ([] if phase == 0 else ["v3-finger1"])
+    assert all(gap == pytest.approx(LOOSE * length, rel=1e-4) for gap in gaps.values())

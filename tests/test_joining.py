@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator, Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,13 +18,16 @@ from wholearm.planning.result import Plan
 from wholearm.problem.definition import Until
 from wholearm.problem.goal import Goal
 from wholearm.search import edge_plans as joining
-from wholearm.search.astar import RouteSearch
+from wholearm.search import route_choice as choosing
+from wholearm.search.astar import RoadmapRoute, RouteSearch, SearchRule
 from wholearm.search.candidates import Lost
 from wholearm.search.edge_plans import Aside, Kept, PlannedLink, join_route, key_steps
 from wholearm.search.edges import EdgeStep, Link
 from wholearm.search.feasibility import Measured
 from wholearm.search.places import make_place
+from wholearm.search.refinement import FINEST, STEPS, Found, Leaving, RefinedPath
 from wholearm.search.roadmap import Roadmap
+from wholearm.search.route_choice import Chooser
 
 # Where plans come from does not depend on how accurate they are.
 OPTIONS = PlanOptions(accuracy=0.1, replay=False)
@@ -137,3 +142,102 @@ def test_where_a_plan_never_holds_it_is_landed_with_regard_to_it(
     # The border has no other ways: its plan is first refined, then the landing chosen anew.
     tried = [key for key in plans.asked if key != key_steps(onward.steps)]
     assert tried == [key_steps(ways[0].steps), key_steps(landing.steps)] and finished == [2, 2]
+
+
+def make_link(duration: float) -> Link:
+    steps = (EdgeStep(PLACE.contacts, Until(coordinate="x", value=duration)),)
+    return Link(PLACE, PLACE, steps, duration)
+
+
+class FoundRoutes:
+    """A search that finds some routes, each once, as long as they are within its limit."""
+
+    def __init__(self, routes: Sequence[RoadmapRoute]) -> None:
+        self.chart = SimpleNamespace(measured={}, others={}, joined={}, plans={}, polished=set())
+        self.limit, self.waiting = math.inf, list(routes)
+
+    def run(self, rule: SearchRule) -> Iterator[RoadmapRoute]:
+        for route in list(self.waiting):
+            if route.duration <= self.limit:
+                self.waiting.remove(route)
+                yield route
+
+
+def test_what_has_no_plan_neither_bounds_nor_is_tried_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    one, lost, good = (make_link(duration) for duration in (0.1, 0.2, 0.9))
+    routes = [RoadmapRoute((one, lost)), RoadmapRoute((lost, one, one)), RoadmapRoute((good, one))]
+    planned = list[Any]()
+
+    def join(problem: Any, links: Any, *rest: Any) -> Any:
+        planned.append(tuple(link for link, _ in links))
+        if lost in planned[-1]:
+            return Lost.at((lost,), "no plan")
+        return SimpleNamespace(value=1.0)
+
+    monkeypatch.setattr(choosing, "join_route", join)
+    chooser = Chooser(PROBLEM, [], FoundRoutes(routes), PlanOptions())  # type: ignore[arg-type]
+    chooser.run(1, lambda _: None)
+    # The second route has a link of the first one; the third is far longer than what had no plan.
+    assert planned == [routes[0].links, routes[2].links]
+    assert [route for _, route in chooser.made] == [routes[2]] and len(chooser.failures) == 1
+
+
+def plan_of(duration: float) -> Measured:
+    return Measured(duration, (), [])
+
+
+class Cell:
+    """Ways that take longer away from a best place, and none beyond an end."""
+
+    def __init__(self, best: int, end: int, moving: float | None = None, saved: float = 0) -> None:
+        self.best, self.end, self.moving, self.saved = best, end, moving, saved
+        self.tried: list[RefinedPath] = []
+
+    def __call__(self, way: RefinedPath) -> Found:
+        assert way not in self.tried
+        self.tried.append(way)
+        if way.move is None:
+            return "no guess leads to a plan" if self.moving is None else plan_of(self.moving)
+        if way.move < self.end:
+            return "no guess leads to a plan"
+        saved = 0.0 if way.straight else self.saved
+        return plan_of(1 + FINEST * abs(way.move - self.best) - saved)
+
+    def leave(self) -> list[Measured]:
+        return Leaving(self, plan_of(1 + FINEST * abs(self.best))).run()
+
+
+@pytest.mark.parametrize(("best", "end"), [(0, -1), (-7, -8), (5, -20), (-3, -3)])
+def test_a_border_is_left_where_that_is_best(best: int, end: int) -> None:
+    cell = Cell(best, end)
+    found, *others = cell.leave()
+    assert found.duration == pytest.approx(1, abs=1e-9)
+    assert all(own.duration >= found.duration for own in others)
+    assert RefinedPath(0) not in cell.tried
+
+
+def test_a_border_that_no_other_place_is_better_for_may_be_left_in_motion() -> None:
+    cell = Cell(-1, -20, moving=0.9)
+    found, *others = cell.leave()
+    assert cell.tried == [RefinedPath(-STEPS[0]), RefinedPath(STEPS[0]), RefinedPath(None)]
+    assert found.duration == 0.9 and len(others) == 3
+    # Where another place is better, that is gone on with.
+    other = Cell(-7, -20, moving=0.9)
+    assert other.leave()[0].duration == pytest.approx(1) and RefinedPath(None) not in other.tried
+
+
+def test_another_guess_goes_on_from_the_best_place() -> None:
+    cell = Cell(-4, -20, saved=0.3)
+    assert cell.leave()[0].duration == pytest.approx(0.7)
+    nearest = [way.move for way in cell.tried if not way.straight]
+    assert nearest[0] == -4 and set(nearest[1:]) == {-4 + own for own in (-2, 2, -1, 1)}
+
+
+def test_what_is_looked_at_first_may_be_at_hand() -> None:
+    plain, ahead = Cell(-7, -8), Cell(-7, -8)
+    leaving = Leaving(ahead, plan_of(1 + 7 * FINEST))
+    leaving.look_ahead(lambda tasks: [task() for task in tasks])
+    assert leaving.run()[0] == plain.leave()[0]
+    assert set(plain.tried) <= set(ahead.tried)

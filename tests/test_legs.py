@@ -5,13 +5,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from plane import convex_polygon, make_scene
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.contacts.closing import close_fingers, contact_table
 from wholearm.contacts.formation import Formation
 from wholearm.mapping.borders import NOWHERE, flush_track, label_cells
-from wholearm.mapping.legs import split_leg, tolerance
+from wholearm.mapping.legs import choose_leg, describe_miss, find_miss, split_leg, tolerance
 from wholearm.problem.definition import Problem
+from wholearm.search.roadmap import map_labels
 
 PHI = np.radians(-35.0)
 
@@ -88,3 +90,66 @@ def test_a_crossing_is_named_by_its_contacts(heptagon: Problem) -> None:
     words = r"crossing of borders at x = -63.69 mm.*, of v1-palm, v3-finger1, v0-finger2, v0-palm"
     with pytest.raises(InputError, match=words):
         split_leg(heptagon.scene, np.array([x - 0.01, phi - 0.1]), np.array([x + 0.01, phi + 0.1]))
+
+
+def test_near_miss_names_the_border_and_its_distance(heptagon: Problem) -> None:
+    scene, near = heptagon.scene, tolerance(heptagon.scene)
+    aside = np.array([near[0], 0.0])
+    start, stop = (on_border(heptagon, phi) + 2.0 * aside for phi in (PHI, PHI + 0.2))
+    miss = find_miss(scene, start, stop)
+    assert miss is not None and miss.track.flush == (1, 6)
+    assert 1.0 < miss.off <= 2.0
+    text = describe_miss(scene, miss)
+    assert (
+        "e6 flush on finger 2" in text
+        and " up to -" in text
+        and "mm in x" in text
+        and "0.5 deg" in text
+    )
+    assert find_miss(scene, start + 10 * aside, stop + 10 * aside) is None
+    phi = scene.polygon.flush_angle(0) + 3 * near[1]
+    palm = find_miss(scene, np.array([0.045, phi]), np.array([0.0, phi]))
+    assert palm is not None and "e0 flush on the palm, is up to -1.5 deg" in describe_miss(
+        scene, palm
+    )
+
+
+def test_tolerance_is_relative_to_the_object(heptagon: Problem) -> None:
+    """1.5 % of the radius of gyration, half a millimetre for the heptagon, and half a degree."""
+    near = tolerance(heptagon.scene)
+    assert near[0] == 0.015 * heptagon.scene.scales.length
+    np.testing.assert_allclose(near, [5e-4, np.radians(0.5)], rtol=0.01)
+
+
+def test_leg_with_one_end_off_the_border_is_straight(heptagon: Problem) -> None:
+    scene, near = heptagon.scene, tolerance(heptagon.scene)
+    start, stop = on_border(heptagon, PHI), on_border(heptagon, PHI + 0.2)
+    assert choose_leg(scene, start, stop).track.flush == (1, 6)
+    off = stop + np.array([4 * near[0], 4 * near[1]])
+    assert choose_leg(scene, start, off).track.flush is None
+
+
+def test_places_of_the_grid_have_their_labels_however_often_the_object_has_turned() -> None:
+    rng = np.random.default_rng(1)
+    scene = make_scene(convex_polygon(rng, 5))
+    grid = map_labels(scene)
+    poses = np.column_stack([rng.uniform(-0.3, 0.3, 200), rng.uniform(-9, 9, 200)])
+    count = np.rint((poses - [grid.least, 0.0]) / grid.steps)
+    nearest = [grid.least, 0.0] + count * grid.steps
+    labels = label_cells(scene, *nearest.T)[:, [0, 2, 4]]
+    seen = grid.labels[grid.look_up(poses)]
+    assert (seen == labels).all()
+    assert (labels != NOWHERE).any() and (labels == NOWHERE).any()
+
+
+def test_nothing_touches_beyond_the_reach_of_a_finger() -> None:
+    scene = make_scene()
+    grid = map_labels(scene)
+    for x in (-2.0, 2.0):
+        assert (grid.labels[grid.look_up(np.array([x, 0.3]))] == NOWHERE).all()
+
+
+def test_labels_are_found_in_the_list() -> None:
+    grid = map_labels(make_scene())
+    assert grid.find(grid.labels[[3, 1]]).tolist() == [3, 1]
+    assert grid.find(np.array([[10**6, 0, 0]])).tolist() == [-1]

@@ -1,3 +1,5 @@
+"""Least times of many ways at once, against closed forms."""
+
 from __future__ import annotations
 
 import ast
@@ -27,6 +29,7 @@ from wholearm.planning.path_domain.impact_sequence import make_sequence
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.path_domain.sequence_plan import plan_sequence
 from wholearm.problem.read import build_problem
+from wholearm.search.travel_times import find_durations
 
 EPSILON = 0.05
 
@@ -216,3 +219,39 @@ def test_a_place_that_motions_hardly_pass_is_found_on_any_first_grid(
         least.append(found.value)
     assert least == pytest.approx([least[-1]] * len(least), rel=1e-5)
     assert look_along(curves, epsilon, 1000) == pytest.approx(least[-1], rel=1e-3)
+
+
+LENGTH, COUNT = 2.0, 64
+
+
+def push() -> tuple[PathLimitRows, tuple[np.ndarray, np.ndarray]]:
+    """|s''| <= 1 along a way."""
+    shape = (1, COUNT, 2)
+    a = np.broadcast_to([1.0, -1.0], shape).copy()
+    rows = PathLimitRows(
+        a, np.zeros(shape), np.zeros(shape), np.ones(shape), np.full((1, COUNT), np.inf)
+    )
+    return rows, (np.full(COUNT, LENGTH / COUNT), np.full(COUNT, 0.5))
+
+
+def test_half_the_way_is_for_speeding_up_and_half_for_braking() -> None:
+    rows, grid = push()
+    # With s'' the same in each interval this motion is on the grid, where intervals are even.
+    assert find_durations(rows, *grid)[0] == pytest.approx(2 * np.sqrt(LENGTH), rel=1e-9)
+
+
+def test_where_nothing_limits_the_speed_there_is_still_a_time() -> None:
+    rows, grid = push()
+    rows.a[0, COUNT // 2] = 0.0
+    least = find_durations(rows, *grid)[0]
+    # To and from the middle it speeds up and brakes as before, at most.
+    assert 0.9 * 2 * np.sqrt(LENGTH) < least < 2 * np.sqrt(LENGTH) * (1 + 1e-9)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_closed_place_lets_no_viscous_motion_pass() -> None:
+    rows, grid = push()
+    closed = slice(0, COUNT // 4)
+    rows.a[0, closed], rows.one[0, closed] = 0.0, -1.0
+    rows.v[:] = -0.1
+    assert find_durations(rows, *grid)[0] == np.inf

@@ -11,10 +11,12 @@ import pytest
 
 from shipped import HEPTAGON, problem_of
 from toys import LIMIT, Toy, constant
-from wholearm import InputError, Plan, Problem, simulate, solve, verify
+from wholearm import InputError, Plan, Problem, load_plan, simulate, solve, verify
 from wholearm.planning.table_check import make_table
+from wholearm.problem.read import read_own_problem
 from wholearm.problem.table import describe_scene
 from wholearm.results.torque import TorqueProfile, read_torque_csv
+from wholearm.results.torque_change import change_torques, find_change_times
 from wholearm.simulation.events import EventKind, OutcomeKind
 from wholearm.simulation.sticking import balances
 from wholearm.simulation.tolerances import find_tolerances
@@ -163,3 +165,77 @@ def test_keys_are_checked_and_kept(heptagon: Problem, key: str, value: float) ->
     assert known["fingers.2.torque_rate_limit"] == pytest.approx(30.0)
     assert known["fingers.1.actuator_lag"] == pytest.approx(0.01)
     assert other.with_(torque_rate_limit2=None).scene.fingers[1].torque_rate_limit == np.inf
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_one_motor_is_at_its_rate_or_its_command_throughout(heptagon: Problem, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rates, lags = 10 ** rng.uniform(1, 4, 2), 10 ** rng.uniform(-4, -1, 2) * [seed > 2, seed > 5]
+    scene = heptagon.with_(
+        torque_rate_limit1=rates[0],
+        torque_rate_limit2=rates[1],
+        actuator_lag1=lags[0],
+        actuator_lag2=lags[1],
+    ).scene
+    before, after = rng.uniform(-0.98, 0.98, (2, 2)) * scene.torque_limit
+    change = change_torques(scene, before, after)
+    t = np.linspace(0.0, change.duration, 4001)
+    tau = change.torque.at(t)
+    np.testing.assert_allclose(tau[[0, -1]], [before, after], atol=1e-6)
+    rate = np.gradient(tau, t, axis=0)
+    command = np.abs(tau + lags * rate) / scene.torque_limit * (lags > 0)
+    load = np.maximum(np.abs(rate) / rates, command).max(axis=1)[5:-5]
+    assert load.max() < 1 + 1e-4
+    assert load.min() > 1 - 1e-2
+    assert find_change_times(scene, before, after) == pytest.approx(change.duration, rel=1e-12)
+
+
+def test_a_torque_at_its_limit_is_reached_in_a_finite_time(heptagon: Problem) -> None:
+    scene = heptagon.with_(torque_rate_limit=200.0, actuator_lag=0.002).scene
+    limit = scene.torque_limit
+    times = find_change_times(scene, 0.1 * limit, np.stack([0.1 * limit, 0.9 * limit, limit]))
+    assert times[0] == 0
+    assert times[1] < times[2] < 10 * 0.002 + 2 * limit.max() / 200.0
+
+
+PERIOD = 0.011
+
+
+@pytest.fixture(scope="module")
+def slide() -> Problem:
+    problem = problem_of(HEPTAGON)
+    return replace(problem, phases=problem.phases[:1])
+
+
+@pytest.mark.parametrize("hold", ["constant", "linear"])
+def test_torques_are_held_from_period_to_period(slide: Problem, hold: str, tmp_path: Path) -> None:
+    problem = slide.with_(control_period=PERIOD, control_hold=hold)
+    plan = solve(problem, accuracy=1e-2, mode_search=False, replay=False)
+    assert verify(problem, plan).ok
+    torque, spans = plan.trajectory.torque, np.arange(0.0, plan.duration, PERIOD)
+    inside = np.linspace(0.01, 0.99, 8)
+    for start in spans:
+        span = min(PERIOD, plan.duration - start)
+        tau = torque.at(start + span * inside)
+        order = 2 if hold == "linear" else 1
+        assert np.abs(np.diff(tau, order, axis=0)).max() < 1e-5
+    before, after = torque.at(spans[1:] - 1e-9), torque.at(spans[1:] + 1e-9)
+    steps = np.abs(after - before).max()
+    assert steps < 1e-3 if hold == "linear" else steps > 0.1
+    (free,) = [phase.unheld for phase in plan.phases]
+    assert free is not None and free < plan.value < 1.05 * free
+    path = str(tmp_path / "held.npz")
+    plan.save(path)
+    known = load_plan(path)
+    assert known.phases[0].unheld == free
+    scene = read_own_problem(known.trajectory.meta, path).scene
+    assert scene.control_period == pytest.approx(PERIOD) and scene.control_hold == hold
+
+
+def test_keys_are_checked(slide: Problem) -> None:
+    with pytest.raises(InputError, match="control_period"):
+        slide.with_(control_period=-1.0)
+    with pytest.raises(InputError, match="'constant' and 'linear'"):
+        slide.with_(control_period=PERIOD, control_hold="cubic")
+    with pytest.raises(InputError, match=r"control_period: 0.011 given; .*hold them linear"):
+        solve(slide.with_(control_period=PERIOD, torque_rate_limit=100.0))

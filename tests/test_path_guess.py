@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -7,7 +8,8 @@ import numpy as np
 import pytest
 
 from plane import make_formation, measure_gaps, measure_slip, rotate
-from tipping import roll
+from timed import landing
+from tipping import roll, tilting
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.contacts.elemental import parse_contact
@@ -20,11 +22,15 @@ from wholearm.geometry.path_guess import (
     PathGuess,
     count_freedoms,
     guess_curve,
+    guess_onwards,
     guess_phase,
     load,
 )
-from wholearm.geometry.tracing import trace_phase, until_distance
-from wholearm.problem.definition import Phase, Problem, Until
+from wholearm.geometry.tracing import trace_phase, trace_phases, until_distance
+from wholearm.planning.options import PlanOptions
+from wholearm.planning.path_domain.path_plan import plan_path
+from wholearm.planning.time_domain.time_plan import plan_phases
+from wholearm.problem.definition import End, Phase, Problem, Until
 
 HEPTAGON = Path(__file__).parents[1] / "problems" / "heptagon.toml"
 LANDING = "v1-palm v4-finger1 v6-finger2"
@@ -33,15 +39,15 @@ CLOSED = 1e-9
 
 
 @pytest.fixture(scope="module")
-def landing() -> Problem:
+def flipping() -> Problem:
     return load(str(HEPTAGON))
 
 
 @pytest.fixture(scope="module")
-def outlines(landing: Problem) -> list[list[PathGuess]]:
-    parts, z = [], landing.start
-    for phase in landing.phases:
-        parts.append(guess_phase(phase, z, landing.phases[phase.index + 1 :]))
+def outlines(flipping: Problem) -> list[list[PathGuess]]:
+    parts, z = [], flipping.start
+    for phase in flipping.phases:
+        parts.append(guess_phase(phase, z, flipping.phases[phase.index + 1 :]))
         z = parts[-1][-1].z[-1]
     return parts
 
@@ -53,18 +59,18 @@ def released(outlines: list[list[PathGuess]]) -> Array:
 
 
 def test_every_contact_takes_one_freedom(
-    landing: Problem, curves: tuple[Curve, ...], released: Array
+    flipping: Problem, curves: tuple[Curve, ...], released: Array
 ) -> None:
-    assert count_freedoms(landing.phases[5].formation, released) == 2
-    for phase, curve in zip(landing.phases, curves, strict=False):
+    assert count_freedoms(flipping.phases[5].formation, released) == 2
+    for phase, curve in zip(flipping.phases, curves, strict=False):
         assert count_freedoms(phase.formation, curve.end) == 1
         gained = phase.until.contact
         if gained is not None:
             held = (*phase.formation.contacts, gained)
-            assert count_freedoms(Formation(landing.scene, held), curve.end) == 0
+            assert count_freedoms(Formation(flipping.scene, held), curve.end) == 0
         for k in range(4):
             fewer = phase.formation.contacts[:k] + phase.formation.contacts[k + 1 :]
-            assert count_freedoms(Formation(landing.scene, fewer), curve.end) == 2
+            assert count_freedoms(Formation(flipping.scene, fewer), curve.end) == 2
 
 
 def test_outlines_are_closed_at_every_point(outlines: list[list[PathGuess]]) -> None:
@@ -75,9 +81,9 @@ def test_outlines_are_closed_at_every_point(outlines: list[list[PathGuess]]) -> 
 
 
 def test_outlines_end_where_their_phase_does(
-    landing: Problem, outlines: list[list[PathGuess]]
+    flipping: Problem, outlines: list[list[PathGuess]]
 ) -> None:
-    for phase, parts in zip(landing.phases, outlines, strict=True):
+    for phase, parts in zip(flipping.phases, outlines, strict=True):
         if not phase.until.is_release:
             end = parts[-1].z[-1:]
             assert abs(until_distance(phase.formation, phase.until, end)[0]) < CLOSED
@@ -128,9 +134,9 @@ def test_a_share_of_a_curve_is_outlined(curves: tuple[Curve, ...], share: float)
 
 
 def test_a_release_is_guessed_before_the_curve_ends(
-    landing: Problem, outlines: list[list[PathGuess]]
+    flipping: Problem, outlines: list[list[PathGuess]]
 ) -> None:
-    phase = landing.phases[4]
+    phase = flipping.phases[4]
     whole = trace_phase(phase, outlines[4][0].z[0])
     length = sum(part.length for part in outlines[4])
     assert length == pytest.approx(RELEASE_AT * whole.length, rel=1e-3)
@@ -138,17 +144,17 @@ def test_a_release_is_guessed_before_the_curve_ends(
 
 @pytest.mark.parametrize("row, value", [(0, 0.02), (2, -0.9)])
 def test_a_coordinate_can_be_what_ends_a_phase(
-    landing: Problem, released: Array, row: int, value: float
+    flipping: Problem, released: Array, row: int, value: float
 ) -> None:
     until = Until(None, "x" if row == 0 else "phi", value)
-    phase = Phase(5, landing.phases[5].formation, until)
+    phase = Phase(5, flipping.phases[5].formation, until)
     part = guess_phase(phase, released)[-1]
     assert part.z[-1, row] == pytest.approx(value, abs=1e-12)
     assert max(np.abs(measure_gaps(part.formation, z)).max() for z in part.z) < CLOSED
 
 
-def test_closing_moves_as_little_as_possible(landing: Problem, released: Array) -> None:
-    formation = landing.phases[5].formation
+def test_closing_moves_as_little_as_possible(flipping: Problem, released: Array) -> None:
+    formation = flipping.phases[5].formation
     rng = np.random.default_rng(4)
     for _ in range(5):
         away = released + 1e-4 * rng.normal(size=5)
@@ -162,8 +168,8 @@ def test_closing_moves_as_little_as_possible(landing: Problem, released: Array) 
         assert np.abs(free @ moved).max() < 1e-2 * np.linalg.norm(moved)
 
 
-def test_configurations_are_closed_side_by_side(landing: Problem, released: Array) -> None:
-    formation, phi = landing.phases[5].formation, released[2] - 0.02
+def test_configurations_are_closed_side_by_side(flipping: Problem, released: Array) -> None:
+    formation, phi = flipping.phases[5].formation, released[2] - 0.02
     away = released + np.array([[0.0], [0.1], [1e3]]) * released[0] * np.eye(5)[0]
     for z, start in zip(close_all(formation, away, np.zeros(0), ((2, phi),)), away, strict=True):
         alone = close_contacts(formation, start, np.zeros(0), ((2, phi),))
@@ -172,8 +178,8 @@ def test_configurations_are_closed_side_by_side(landing: Problem, released: Arra
     assert np.isnan(close_all(formation, away, np.zeros(0), ((1, 1.0),))).all()
 
 
-def test_closing_keeps_what_has_rolled_by(landing: Problem, released: Array) -> None:
-    formation = roll(landing.phases[5].formation, "v1-palm")
+def test_closing_keeps_what_has_rolled_by(flipping: Problem, released: Array) -> None:
+    formation = roll(flipping.phases[5].formation, "v1-palm")
     vertex = formation.scene.polygon.vertices[1]
 
     def place(z: Array) -> float:
@@ -186,7 +192,7 @@ def test_closing_keeps_what_has_rolled_by(landing: Problem, released: Array) -> 
     # The vertex on the palm stays where it was, and the object turns about it.
     assert place(z) == pytest.approx(place(released), abs=1e-12)
     assert z[2] < released[2] - 0.01
-    part = guess_phase(Phase(5, formation, landing.phases[5].until), released)[-1]
+    part = guess_phase(Phase(5, formation, flipping.phases[5].until), released)[-1]
     assert max(abs(place(z) - place(released)) for z in part.z) < 1e-12
 
 
@@ -202,11 +208,11 @@ def test_closing_keeps_what_has_rolled_by(landing: Problem, released: Array) -> 
     ],
 )
 def test_phases_that_cannot_be_are_named(
-    landing: Problem, released: Array, names: str, until: Until | str, key: str, reason: str | None
+    flipping: Problem, released: Array, names: str, until: Until | str, key: str, reason: str | None
 ) -> None:
     if isinstance(until, str):
-        until = Until(parse_contact(until, landing.scene))
-    phase = Phase(5, make_formation(landing.scene, names), until)
+        until = Until(parse_contact(until, flipping.scene))
+    phase = Phase(5, make_formation(flipping.scene, names), until)
     if reason is None:
         assert guess_phase(phase, released)
         return
@@ -215,10 +221,140 @@ def test_phases_that_cannot_be_are_named(
     assert caught.value.key == f"phases[6].{key}" and caught.value.exit_status == 2
 
 
-def test_five_contacts_leave_nothing_to_plan(landing: Problem, curves: tuple[Curve, ...]) -> None:
-    first = landing.phases[0]
+def test_five_contacts_leave_nothing_to_plan(flipping: Problem, curves: tuple[Curve, ...]) -> None:
+    first = flipping.phases[0]
     assert first.until.contact is not None
-    held = Formation(landing.scene, (*first.formation.contacts, first.until.contact))
+    held = Formation(flipping.scene, (*first.formation.contacts, first.until.contact))
     with pytest.raises(InputError, match="leave no freedom") as caught:
-        guess_phase(Phase(1, held, landing.phases[1].until), curves[0].end)
+        guess_phase(Phase(1, held, flipping.phases[1].until), curves[0].end)
     assert caught.value.key == "phases[2].contacts"
+
+
+FOLDER = Path(__file__).parents[1] / "problems"
+
+
+@pytest.fixture(scope="module")
+def hexagon() -> Problem:
+    return load(str(FOLDER / "hexagon.toml"))
+
+
+@pytest.fixture(scope="module")
+def square() -> Problem:
+    return load(str(FOLDER / "square.toml"))
+
+
+def test_an_end_is_found_where_the_nearest_one_breaks_a_limit(hexagon: Problem) -> None:
+    """v0 is lifted until edge 0 is flush on finger 2, while v1 stays on the link's side."""
+    start = trace_phases(hexagon)[4].end
+    formation = make_formation(hexagon.scene, "v1-palm v3-finger1 v0-finger2")
+    until = parse_contact("v1-finger2", hexagon.scene)
+    ending = Formation(hexagon.scene, (*formation.contacts, until))
+    nearest = close_contacts(ending, start, np.zeros(0))
+    assert nearest is not None and ending.evaluate_limits(nearest[None]).min() < -CLOSED
+    (part,) = guess_phase(Phase(5, formation, Until(until)), start)
+    assert np.abs(measure_gaps(ending, part.z[-1])).max() < CLOSED
+    assert formation.evaluate_limits(part.z).min() > -CLOSED
+    # Edge 0 leaves the palm by the angle between finger 2 and the left end of the palm.
+    np.testing.assert_allclose(part.z[-1, 2], part.z[-1, 4] - np.pi, atol=1e-9)
+
+
+def test_an_end_that_is_nowhere_is_named(hexagon: Problem) -> None:
+    start = trace_phases(hexagon)[4].end
+    formation = make_formation(hexagon.scene, "v1-palm v3-finger1 v0-finger2")
+    until = Until(parse_contact("v5-finger1", hexagon.scene))
+    with pytest.raises(InputError, match="v5-finger1 cannot be reached") as caught:
+        guess_phase(Phase(5, formation, until), start)
+    assert caught.value.key == "phases[6].until"
+
+
+def test_ends_ahead_lie_where_the_motion_goes(square: Problem) -> None:
+    before = guess_curve(trace_phases(square)[2])[-1]
+    landing, start = square.phases[3], before.z[-1]
+    (nearest,) = guess_phase(landing, start)
+    onwards = guess_onwards(landing, before)
+    assert onwards
+    heading = (start - before.z[-2])[0]
+    for part in onwards:
+        np.testing.assert_array_equal(part.z[0], start)
+        assert max(np.abs(measure_gaps(part.formation, z)).max() for z in part.z) < CLOSED
+        assert part.formation.evaluate_limits(part.z).min() > -CLOSED
+        # Edge 1 is down, farther the way that the object goes.
+        assert part.z[-1, 2] == pytest.approx(-np.pi / 2, abs=CLOSED)
+        assert (part.z[-1, 0] - nearest.z[-1, 0]) * heading > 0
+    assert guess_onwards(square.phases[2], before) == []
+
+
+def test_contacts_of_a_flush_edge_turn_as_one(square: Problem) -> None:
+    formation, rng = square.phases[2].formation, np.random.default_rng(7)
+    assert [formation.turn_with(row) for row in range(6)] == [
+        (0,),
+        (1, 2),
+        (1, 2),
+        (3,),
+        (4,),
+        (5,),
+    ]
+    z = trace_phases(square)[2].end
+    free = np.linalg.svd(formation.evaluate(z[None], np.zeros((1, 5))).P[0])[2][4]
+    slip = measure_slip(formation, z, rng.normal() * free)
+    assert slip[1] == pytest.approx(slip[2], rel=1e-9)
+    assert np.abs(slip[[0, 3]] - slip[1]).min() > 1e-3 * np.abs(slip).max()
+
+
+def test_a_flush_edge_that_turns_is_planned_in_the_time_domain_too(square: Problem) -> None:
+    curves, options = trace_phases(square), PlanOptions(time_intervals=6)
+    curve = curves[2]
+    turning = [part.Xi for part in curve.segments]
+    assert len(turning) == 2 and (turning[0] != turning[1]).tolist() == [False, True, True, False]
+    exact = plan_path(curve, square.epsilon, options, 3, None).motion.duration
+    (plan,) = plan_phases(square, square.phases[2:3], curves[1].end, options)
+    # Torques that are linear in each interval come a little behind the true least time.
+    assert exact * (1 - 1e-4) < plan.motion.duration < 1.02 * exact
+
+
+def test_phases_without_ends_of_their_own_go_towards_the_next_end() -> None:
+    """However many of them there are: each is guessed to go half of the way that is left."""
+    sliding = tilting()
+    (phase,) = sliding.phases
+    rolling = roll(phase.formation, "v1-palm")
+    first, second = (
+        replace(phase, index=k, formation=formation, until=Until(), end=End.SMOOTH)
+        for k, formation in enumerate((phase.formation, rolling))
+    )
+    ways = []
+    for phases in ((first, second), (first,)):
+        problem = replace(sliding, phases=(*phases, replace(phase, index=len(phases))))
+        z = problem.start
+        for own in problem.phases:
+            ways.append(guess_phase(own, z, problem.phases[own.index + 1 :])[-1].z)
+            z = ways[-1][-1]
+    np.testing.assert_allclose(ways[0], ways[3], atol=1e-12)
+    gaps = [evaluate_gap(sliding, way[-1]) for way in ways]
+    start = evaluate_gap(sliding, sliding.start)
+    assert start > gaps[0] > gaps[1] > 0.1 * start
+    np.testing.assert_allclose([gaps[2], gaps[4]], 0.0, atol=1e-9)
+
+
+def test_a_phase_that_rolls_between_others_does_not_go_back() -> None:
+    """Though the way back is longer; only a contact that is let go may take that."""
+    problem = landing()
+    *before, last = problem.phases
+    rolling = roll(last.formation, "v1-palm")
+    opened = [
+        replace(last, index=last.index + k, formation=one, until=Until(), end=End.SMOOTH)
+        for k, one in enumerate((last.formation, rolling))
+    ]
+    parts = replace(problem, phases=(*before, *opened, replace(last, index=last.index + 2)))
+    z = guess_phase(parts.phases[4], trace_phases(parts)[-1].end)[-1].z[-1]
+    gaps = [evaluate_gap(problem, z)]
+    for phase in parts.phases[5:]:
+        z = guess_phase(phase, z, parts.phases[phase.index + 1 :])[-1].z[-1]
+        gaps.append(evaluate_gap(problem, z))
+    assert (np.diff(gaps) < 0).all() and gaps[-1] == pytest.approx(0.0, abs=CLOSED)
+
+
+def evaluate_gap(problem: Problem, z: Array) -> float:
+    """Gap of what ends the last phase of a problem [m]."""
+    contact = problem.phases[-1].until.contact
+    assert contact is not None
+    return float(measure_gaps(make_formation(problem.scene, contact.name), z)[0])

@@ -4,7 +4,11 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from wholearm.common.arrays import Array
+from wholearm.geometry.cost_to_go import CostToGo
 from wholearm.geometry.curve import Curve
+from wholearm.geometry.tracing import trace_phase, trace_phases
+from wholearm.mechanics.metric import metric_weights
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain.first_guess import guess
@@ -16,6 +20,7 @@ from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.path_domain.refine import start_at
 from wholearm.planning.path_domain.speed_profile import Fastest, Narrow, find_fastest
 from wholearm.planning.path_domain.terms import LimitShape
+from wholearm.problem.definition import Problem
 
 EPSILON = 0.05
 ELEMENTS = 10
@@ -120,3 +125,33 @@ def test_phases_that_are_joined_switch_within_each(curves: tuple[Curve, ...]) ->
     for place, _ in found.switches:
         assert np.abs(np.array(ends) - place).min() > 0
     assert sum(jumps for _, jumps in found.switches) >= 1
+
+
+def test_the_gradient_of_a_linear_cost_is_its_part_along_the_curve(heptagon: Problem) -> None:
+    phase = heptagon.phases[1]
+    curve = trace_phases(heptagon)[1]
+    slope = np.random.default_rng(4).normal(size=5)
+    value, gradient = CostToGo(phase, lambda z: float(slope @ z)).expand(curve.start)
+    tangent = curve.evaluate(np.zeros(1)).z_s[0]
+    assert value == pytest.approx(slope @ curve.start)
+    # A quotient of differences over a hundredth of a curve that bends.
+    assert gradient @ tangent == pytest.approx(slope @ tangent, rel=0, abs=0.1)
+    # In the metric of curves it has no part across.
+    across = gradient / metric_weights(heptagon.scene) - (gradient @ tangent) * tangent
+    np.testing.assert_allclose(across, 0.0, atol=1e-12 * np.abs(gradient).max())
+
+
+def test_less_way_costs_less_time(heptagon: Problem) -> None:
+    phase, curve = heptagon.phases[1], trace_phases(heptagon)[1]
+    options = PlanOptions(intervals=40)
+
+    def least_time(z: Array) -> float:
+        return plan_path(trace_phase(phase, z), heptagon.epsilon, options, 1).value
+
+    value, gradient = CostToGo(phase, least_time).expand(curve.start)
+    tangent = curve.evaluate(np.zeros(1)).z_s[0]
+    # Forwards, and with steps of another length: what is left is the bend of the time.
+    ahead = 0.02 * curve.length
+    slope = (least_time(curve.evaluate(np.array([ahead])).z[0]) - value) / ahead
+    assert slope < 0
+    assert gradient @ tangent == pytest.approx(slope, rel=0.05)

@@ -1,8 +1,14 @@
 from __future__ import annotations
 
 import json
+import math
+import os
+import re
+import signal
+import time
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,13 +19,24 @@ import pytest
 
 import wholearm
 from wholearm.cli.command import main
+from wholearm.common.crowd import run_all
 from wholearm.common.errors import InputError
 from wholearm.figures.robustness_figure import draw_robustness
 from wholearm.planning.result import Plan
 from wholearm.problem.definition import Problem
-from wholearm.robustness.error_model import Uncertainty, change_problem
+from wholearm.problem.read import read_problem
+from wholearm.problem.uncertainty import NAMES, PARAMETERS
+from wholearm.results.torque import TorqueProfile
+from wholearm.robustness.cluster import connect
+from wholearm.robustness.error_model import Uncertainty, change_problem, change_torques
 from wholearm.robustness.sample_run import TimeWindow, Trial, make_trial
-from wholearm.robustness.sampling import Robustness, assess_robustness, measure_sensitivities
+from wholearm.robustness.sampling import (
+    Robustness,
+    Z,
+    assess_robustness,
+    count_share,
+    measure_sensitivities,
+)
 from wholearm.simulation.events import EventKind
 
 PROBLEM = Path(__file__).parents[1] / "problems" / "heptagon_four_contacts.toml"
@@ -246,3 +263,158 @@ def test_contacts_have_to_press_while_their_phase_lasts(
     record = follow(stretches, windows)
     found = (record["lost"], record["phase"], record["time"]) if record["lost"] else None
     assert found == lost and record["kept"] == (lost is None)
+
+
+@pytest.mark.parametrize("count, total", [(1, 7), (50, 100), (998, 1000)])
+def test_ends_of_the_interval_are_as_unlikely_as_it_says(count: int, total: int) -> None:
+    """Wilson's definition: the share is Z standard deviations off at both ends."""
+    share = count_share(count, total)
+    for p in (share.low, share.high):
+        assert abs(share.value - p) == pytest.approx(Z * math.sqrt(p * (1 - p) / total), rel=1e-9)
+    assert share.low < share.value < share.high
+
+
+def test_none_and_all_have_one_open_end() -> None:
+    none, every = count_share(0, 20), count_share(20, 20)
+    # (1 - p)^n = ... is replaced by the normal law: p = Z^2 / (n + Z^2).
+    assert (none.low, none.high) == pytest.approx((0.0, Z**2 / (20 + Z**2)), rel=1e-12)
+    assert (every.low, every.high) == pytest.approx((1 - Z**2 / (20 + Z**2), 1.0), rel=1e-12)
+    assert str(every) == "100.0 % (20 of 20, 95 %: 83.9 to 100.0 %)"
+
+
+def test_nothing_says_nothing() -> None:
+    share = count_share(0, 0)
+    assert math.isnan(share.value) and (share.low, share.high) == (0.0, 1.0)
+    assert str(share) == "none"
+
+
+def wait_and_square(number: int) -> tuple[int, int]:
+    time.sleep(0.02)
+    return number**2, os.getpid()
+
+
+def test_a_worker_that_is_killed_loses_and_doubles_no_task() -> None:
+    distributed = pytest.importorskip("distributed", reason="Dask is not installed")
+    with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster:
+        answers = run_all(wait_and_square, range(100), lambda: connect(cluster.scheduler_address))
+        found = [next(answers) for _ in range(10)]
+        os.kill(found[-1][1][1], signal.SIGKILL)
+        found += answers
+    assert sorted(task for task, _ in found) == list(range(100))
+    assert all(answer[0] == task**2 for task, answer in found)
+
+
+def test_no_scheduler_is_bad_input() -> None:
+    pytest.importorskip("distributed", reason="Dask is not installed")
+    with pytest.raises(InputError, match="--scheduler: tcp:"):
+        connect("tcp://127.0.0.1:1", patience=0.5)
+
+
+@pytest.fixture(scope="module")
+def whole() -> Problem:
+    return read_problem(str(PROBLEM))
+
+
+@pytest.fixture
+def torque() -> TorqueProfile:
+    """A line and a parabola, with a step at 0.3 s."""
+    breaks = np.array([0.0, 0.3, 0.5])
+    first = [[1.0, 0.5, 0.0], [0.2, 0.0, 0.0]]
+    return TorqueProfile(breaks, np.array([first, [[2.0, 0.0, -0.3], [0.0, 0.1, 0.2]]]))
+
+
+def test_samples_have_one_in_every_slice_of_every_range() -> None:
+    own = Uncertainty({"mass": 0.2, "geometry": 0.0, "delay": 2e-3})
+    names = [parameter.name for parameter in own.varied]
+    assert not {"length1", "base2_y"} & set(names) and len(names) == len(NAMES) - 6
+    samples = own.draw(50, seed=3)
+    assert samples.shape == (50, len(names) + 1)
+    for name, column in zip([*names, "offset"], samples.T, strict=True):
+        low, high = {"delay": (0.0, 2e-3), "offset": (0.0, 1.0)}.get(
+            name, (-own.widths.get(name, 0.0), own.widths.get(name, 0.0))
+        )
+        slices = np.floor((column - low) / (high - low) * 50).astype(int)
+        assert sorted(slices) == list(range(50)), name
+
+
+@pytest.mark.parametrize(
+    "widths, text",
+    [
+        (
+            {"weight": 0.1},
+            "range of weight: is unknown; allowed are friction, geometry, gain, mass",
+        ),
+        ({"mass": -0.1}, "range of mass: "),
+        ({"friction": 1.0}, "range of friction: 1 given; a relative range is below 1"),
+        ({"delay": float("nan")}, "range of delay: "),
+    ],
+)
+def test_ranges_that_make_no_sense_are_refused(widths: dict[str, float], text: str) -> None:
+    with pytest.raises(InputError, match=re.escape(text)):
+        Uncertainty(widths)
+
+
+@pytest.mark.parametrize("name", [*NAMES[: NAMES.index("start_x")]])
+def test_each_parameter_changes_its_own_number(whole: Problem, name: str) -> None:
+    def list_numbers(own: Problem) -> dict[str, float]:
+        scene = own.scene
+        assert scene.polygon.inertia is not None
+        found = {"mass": scene.polygon.mass, "inertia": scene.polygon.inertia}
+        for key in ("palm", "finger1", "finger2"):
+            found[f"friction_{key}"] = getattr(scene.friction, key)
+        for k, finger in enumerate(scene.fingers, 1):
+            base = np.asarray(finger.base)
+            found |= {f"length{k}": finger.length, f"base{k}_x": base[0], f"base{k}_y": base[1]}
+        return found
+
+    before, after = list_numbers(whole), list_numbers(change_problem(whole, {name: 1e-3}))
+    relative = not next(own.unit for own in PARAMETERS if own.name == name)
+    change = before[name] * 1e-3 if relative else 1e-3
+    assert after.pop(name) == pytest.approx(before.pop(name) + change, rel=1e-14)
+    assert after == pytest.approx(before, rel=1e-14)
+
+
+def test_torques_are_scaled_and_late(torque: TorqueProfile) -> None:
+    late = change_torques(torque, {"gain1": 0.01, "gain2": -0.02, "delay": 0.02})
+    times = np.array([0.01, 0.02, 0.1, 0.31, 0.33, 0.5])
+    expected = torque.at(times - 0.02) * [1.01, 0.98]
+    np.testing.assert_allclose(late.at(times), expected, rtol=1e-12)
+    assert late.duration == pytest.approx(0.52)
+    same = change_torques(torque, {})
+    assert (same.at(times) == torque.at(times)).all() and same.duration == torque.duration
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.25])
+def test_torques_are_sampled_and_held(torque: TorqueProfile, offset: float) -> None:
+    held = change_torques(torque, {}, sample_rate=10.0, offset=offset)
+    ticks = np.clip((np.arange(6) - offset) / 10, 0, None)
+    ticks = np.unique(ticks[ticks < 0.5])
+    for start, stop in zip(ticks, [*ticks[1:], 0.5], strict=True):
+        within = np.linspace(start, stop, 5)[:-1] + 1e-9
+        np.testing.assert_allclose(
+            held.at(within), np.tile(torque.at(ticks[ticks <= start][-1:]), (4, 1)), rtol=1e-12
+        )
+
+
+def test_a_problem_brings_its_own_ranges(whole: Problem) -> None:
+    own = whole.with_(uncertainty={"friction": 0.2, "friction_palm": 0.3, "start_x": 5e-4})
+    assert own.table["uncertainty"] == own.uncertainty
+    widths = Uncertainty(own.uncertainty or {}).widths
+    expected = {"friction_palm": 0.3, "friction_finger2": 0.2, "start_x": 5e-4, "mass": 0.05}
+    assert {key: widths[key] for key in expected} == expected
+    assert replace(own, uncertainty=None).table == whole.table
+    assert replace(whole, uncertainty={"mass": 0.1}).table["uncertainty"] == {"mass": 0.1}
+
+
+@pytest.mark.parametrize(
+    "ranges, text",
+    [
+        ({"mas": 0.1}, "uncertainty.mas: unknown key; did you mean 'mass'? allowed are base1_x"),
+        ({"gain": 1}, "uncertainty.gain: 1 given; a relative range is below 1"),
+        ({"start_x": -1e-3}, "uncertainty.start_x: -0.001 is not a number >= 0"),
+        (0.1, "uncertainty: 0.1 is not a table"),
+    ],
+)
+def test_ranges_of_a_problem_are_checked(whole: Problem, ranges: object, text: str) -> None:
+    with pytest.raises(InputError, match=re.escape(text)):
+        whole.with_(uncertainty=ranges)

@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
+import tomllib
 
 import numpy as np
 import pytest
 
+from crossing import make_way
 from integrated import integrate_phase
 from once import once
-from planned import LandingMotion, change, plan_landing
+from plane import make_formation
+from planned import CosineMotion, LandingMotion, change, choose_squeeze, join, plan_landing
 from pushed import forward
 from shipped import HEXAGON, problem_of
 from stepping import march
 from wholearm.common.arrays import Array
 from wholearm.contacts.formation import Formation
+from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.plan import solve
 from wholearm.problem.definition import End, Phase, Problem, Until
 from wholearm.problem.read import build_problem
 from wholearm.results.torque import TorqueProfile
 from wholearm.simulation.events import EventKind, OutcomeKind
 from wholearm.simulation.simulate import project_velocity, simulate
-from wholearm.simulation.start_modes import StartDeparture
+from wholearm.simulation.start_modes import StartDeparture, Touching
 from wholearm.simulation.sticking import find_rest
 from wholearm.verification.verify import verify
 
@@ -287,3 +291,71 @@ def test_a_slow_motion_passes_long_before_the_torques_step() -> None:
     least = np.nanmin(simulation.c_n[simulation.phase == 1])
     # What a few microseconds change of speed and place changes less of forces than that.
     assert least > 0.99 * problem.epsilon
+
+
+def slide_to_the_tip(until: str) -> Problem:
+    """The hexagon slides until v5 is at the pointed tip of a short finger 2, and back."""
+    table = tomllib.loads(HEXAGON.read_text(encoding="utf-8"))
+    for key, length in ("1", 0.18), ("2", 0.057):
+        table["fingers"][key] |= {"length": length, "radius": 0.0}
+    table["start"]["x"] = -0.03
+    contacts = ["v0-palm", "v1-palm", "v3-finger1", "v5-finger2"]
+    ends: list[object] = [until, {"x": -0.025}]
+    return build_problem(table | {"phases": [{"contacts": contacts, "until": u} for u in ends]})
+
+
+@pytest.mark.parametrize("until", ["e4-tip2", "e5-tip2"])
+def test_a_pointed_tip_gains_either_edge_at_a_vertex(until: str) -> None:
+    """Both edges touch the tip there, and the motion back opens both."""
+    problem = slide_to_the_tip(until)
+    curves = trace_phases(problem)
+    # Finger 2 holds v5 in reach on both sides of the place above its joint.
+    corner = np.array([curves[0].end[0] - 0.05, 0.0433]) - problem.scene.fingers[1].base
+    assert np.hypot(*corner) == pytest.approx(0.057, rel=1e-9)
+    motions = [CosineMotion(c, 0.4, choose_squeeze(c, 0.4, 0.2, 2.0)) for c in curves]
+    simulation = simulate(problem, join([motion.fit(20, 7) for motion in motions]), times=[0.2])
+    assert simulation.outcome.reached
+    halfway = motions[0].evaluate(np.array([0.2])).z[0]
+    np.testing.assert_allclose(simulation.at(0.2)[:5], halfway, atol=1e-9)
+    first = simulation.z[simulation.phase == 0][-1]
+    np.testing.assert_allclose(first, curves[0].end, atol=1e-9)
+    np.testing.assert_allclose(simulation.z[-1], curves[1].end, atol=1e-9)
+
+
+@pytest.mark.parametrize("until", ["e4-tip2", "e5-tip2"])
+def test_two_freedoms_start_from_a_pointed_tip(until: str) -> None:
+    """Finger 2 pushes v5 to the right, off its tip or away from it, while finger 1 swings."""
+    problem = slide_to_the_tip(until)
+    formation = make_formation(problem.scene, "v0-palm v1-palm v5-finger2")
+    curve = trace_phases(problem)[0]
+    z = curve.end - np.array([0.0, 0.0, 0.0, 0.3, 0.0])
+    rest = find_rest(formation, z)
+    assert rest.near.sum() == 2  # the end of the link, and an edge at its tip
+    back, onwards = (sign * (curve.end - curve.start) for sign in (-1e-3, 1e-3))
+    touching = Touching(formation, z, rest.near)
+    (edge,) = touching.kinked
+    assert formation.limits[edge].text.endswith("touches the tip of finger 2")
+    # Along the line of the link the edge parts from the tip both ways.
+    assert touching.opens(back) and touching.opens(onwards)
+    departs = rest.wait(np.array([[-0.05], [-0.2]]), -1.0)
+    right = until == "e5-tip2"
+    assert (isinstance(departs, StartDeparture) and departs.heading[0] > 0) == right
+
+
+def test_a_link_that_is_free_may_graze_what_starts_to_move() -> None:
+    """Links of a plan may close by the little that its nodes do not see, but not press."""
+    problem = make_way(solid=True)
+    rest = find_rest(problem.phases[0].formation, problem.start)
+    assert rest.near.sum() == 1  # v3 on finger 1
+    tau = np.array([-0.287, -0.98])
+    way = next(way for way in rest.ways if way.moves(tau))
+    touch = make_formation(problem.scene, "v3-finger1")
+    A = touch.evaluate(problem.start[None], np.zeros((1, 5))).A[0, 0]
+    lever = A[3] / problem.scene.fingers[0].inertia
+    opens = A @ way.depart(-1.0, tau).heading * way.drive(tau)
+    # The torque of finger 1 with which the gap has no acceleration.
+    even = tau - np.array([opens / lever, 0.0])
+    for closing, starts in (-1e-3, True), (2e-5, True), (1.0, False):
+        load = even - np.array([closing / lever, 0.0])
+        begun = rest.wait(load[:, None], -1.0)
+        assert (isinstance(begun, StartDeparture) and begun.x == -1.0) == starts

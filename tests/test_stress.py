@@ -5,14 +5,35 @@ from __future__ import annotations
 import argparse
 import json
 import tomllib
+from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 
+from shipped import HEPTAGON
+from wholearm.benchmark.stress import cell_curves
+from wholearm.benchmark.stress.cell_curves import best_end, find_best, list_ends
 from wholearm.benchmark.stress.damage import BASE, change_tree, draw_mutant, look, run_file, to_toml
-from wholearm.benchmark.stress.scenes import draw_case
+from wholearm.benchmark.stress.event_tracing import follow, resample, slides
+from wholearm.benchmark.stress.newton import balance, clearances, locate, separate
+from wholearm.benchmark.stress.scenes import draw_case, random_route, random_scene
+from wholearm.benchmark.stress.slow_motion import fast_margin, inertia_ratio, slow_margin
 from wholearm.benchmark.stress.stress_study import STUDY, compare_values
+from wholearm.common.arrays import Array
+from wholearm.contacts.elemental import candidate_contacts
+from wholearm.contacts.formation import Formation, find_touching
+from wholearm.geometry.curve import Curve
+from wholearm.geometry.path_guess import load
+from wholearm.geometry.tracing import trace_phases
+from wholearm.mechanics.dynamics import Directions, reduced_inertia
+from wholearm.planning.options import PlanOptions
+from wholearm.planning.path_domain.path_plan import plan_path
+from wholearm.problem.definition import Phase, Problem
+from wholearm.problem.read import build_problem, read_problem
+from wholearm.results.trajectory import Trajectory
+from wholearm.scene.model import Friction, Scene
 
 
 def test_a_scene_is_drawn_alike_again_and_is_the_same_as_a_file() -> None:
@@ -81,3 +102,271 @@ def test_the_table_counts_every_finding() -> None:
     assert len(findings) == 2 and findings[0] == "scene 0 4 time: no answer: a | b"
     assert "| no answer | 1 |" in text and "| traceback | 1 |" in text
     assert "| p.toml | time | 1 | 1 | 0.0e+00 |" in text
+
+
+@pytest.mark.parametrize("index", [1, 3])
+def test_small_steps_end_where_the_curve_does(
+    heptagon: Problem, curves: tuple[Curve, ...], index: int
+) -> None:
+    phase = heptagon.phases[index]
+    start = curves[index].evaluate(np.zeros(1)).z[0]
+    ways = follow(heptagon.scene, phase, start)
+    (reached,) = (way for way in ways if way.reached)
+    assert np.abs(reached.z[-1] - curves[index].end).max() < 1e-5
+    assert {way.ending for way in ways if not way.reached} <= {
+        "object and palm",
+        "object and finger 1",
+        "object and finger 2",
+    }
+
+
+def test_rolling_keeps_its_place() -> None:
+    problem = load(str(HEPTAGON.with_name("box_rolling.toml")))
+    first, second = trace_phases(problem)[:2]
+    ways = follow(problem.scene, problem.phases[1], first.end)
+    (reached,) = (way for way in ways if way.reached)
+    assert np.abs(reached.z[-1] - second.end).max() < 1e-4
+
+
+def test_places_where_a_contact_turns_are_on_the_grid(
+    heptagon: Problem, curves: tuple[Curve, ...]
+) -> None:
+    phase, curve = heptagon.phases[2], curves[2]
+    start = curve.evaluate(np.zeros(1)).z[0]
+    (reached,) = (way for way in follow(heptagon.scene, phase, start) if way.reached)
+    s, z, z_s = resample(heptagon.scene, phase, reached, 20)
+    turns = [part.start for part in curve.segments[1:]]
+    assert turns, "this phase is here for its reversal"
+    for turn in turns:
+        assert np.abs(s - turn).min() < 1e-3 * curve.length
+    rates = slides(heptagon.scene, phase, z, z_s)
+    assert (np.abs(rates[s == s[np.abs(s - turns[0]).argmin()]]).min()) < 1e-4
+
+
+def test_contacts_are_those_of_the_planner(heptagon: Problem) -> None:
+    """Points and normals of rigid bodies give the Jacobians of the C-functions."""
+    scene, random = heptagon.scene, np.random.default_rng(3)
+    z = heptagon.start + random.normal(0.0, 0.02, (7, 5))
+    contacts = tuple(c for part in (None, 0, 1) for c in candidate_contacts(scene, part))
+    rows = Formation(scene, contacts).evaluate(z, z)
+    for k, contact in enumerate(contacts):
+        touch = locate(scene, contact.name, z)
+        np.testing.assert_allclose(touch.gap, rows.C[:, k], atol=1e-14)
+        np.testing.assert_allclose(touch.normal, rows.A[:, k], atol=1e-14)
+        np.testing.assert_allclose(touch.tangent, rows.A_t[:, k], atol=1e-14)
+
+
+def test_a_gap_changes_by_the_rate_of_separation(heptagon: Problem) -> None:
+    scene, step = heptagon.scene, 1e-6
+    way = np.array([0.3, -0.2, 1.0, 0.7, -0.4])
+    for name in ("v2-palm", "v2-finger1", "v5-finger2", "e3-tip1", "v3-tip2"):
+        z = np.stack([heptagon.start - step * way, heptagon.start + step * way])
+        gaps = locate(scene, name, z).gap
+        rate = locate(scene, name, heptagon.start[None]).normal[0] @ way
+        np.testing.assert_allclose((gaps[1] - gaps[0]) / (2 * step), rate, rtol=1e-6)
+
+
+def test_what_is_left_of_the_equations_is_the_force_that_is_missing(
+    heptagon: Problem, trajectory: Trajectory
+) -> None:
+    scene, motion = heptagon.scene, trajectory.motions[0]
+    rows = motion.evaluate(np.linspace(0.01, 0.05, 5))
+    touches = [locate(scene, name, rows.z) for name in motion.contacts]
+    forces = np.stack([rows.c_n, rows.c_t])
+    rates = (rows.z_dot, rows.z_ddot)
+    assert np.abs(balance(scene, touches, rates, rows.tau, forces)).max() < 1e-9
+    more = rows.tau + np.array([0.0, 0.25])
+    left = balance(scene, touches, rates, more, forces)
+    np.testing.assert_allclose(left[:, 4], -0.25, atol=1e-9)
+    forces[0, :, 0] -= 0.5
+    left = balance(scene, touches, rates, rows.tau, forces)
+    np.testing.assert_allclose(left, 0.5 * touches[0].normal, atol=1e-9)
+
+
+Course = tuple[Array, Array, Array]
+
+
+@pytest.fixture(scope="module")
+def course(heptagon: Problem, curves: tuple[Curve, ...]) -> tuple[Phase, Course]:
+    phase = heptagon.phases[2]
+    start = curves[2].evaluate(np.zeros(1)).z[0]
+    (reached,) = (way for way in follow(heptagon.scene, phase, start) if way.reached)
+    return phase, resample(heptagon.scene, phase, reached, 12)
+
+
+def _weaker(scene: Scene, share: float) -> Scene:
+    fingers = [replace(f, torque_limit=share * f.torque_limit) for f in scene.fingers]
+    return replace(scene, fingers=(fingers[0], fingers[1]))
+
+
+def test_where_a_plan_exists_a_motion_keeps_the_limits(
+    heptagon: Problem, course: tuple[Phase, Course]
+) -> None:
+    phase, (s, z, z_s) = course
+    slow, _ = slow_margin(heptagon.scene, phase, heptagon.epsilon, z, z_s)
+    fast = fast_margin(heptagon.scene, phase, heptagon.epsilon, (s, z, z_s))
+    assert 0.0 < slow <= fast + 1e-9
+
+
+def test_friction_that_may_be_any_in_its_cone_only_allows_more(
+    heptagon: Problem, course: tuple[Phase, Course]
+) -> None:
+    phase, curve = course
+    scene = replace(heptagon.scene, friction=Friction(0.4, 0.4, 0.4))
+    strict = fast_margin(scene, phase, heptagon.epsilon, curve)
+    assert fast_margin(scene, phase, heptagon.epsilon, curve, loose=10.0) > strict + 1e-3
+
+
+def test_a_larger_epsilon_takes_no_more_than_itself_from_the_margin(
+    heptagon: Problem, course: tuple[Phase, Course]
+) -> None:
+    phase, (_, z, z_s) = course
+    margin, _ = slow_margin(heptagon.scene, phase, heptagon.epsilon, z, z_s)
+    more = 0.5 * margin
+    epsilon = heptagon.epsilon + more * heptagon.scene.scales.force
+    less, _ = slow_margin(heptagon.scene, phase, epsilon, z, z_s)
+    assert margin - more - 1e-9 <= less < margin
+
+
+def test_planner_and_linear_programme_agree_on_the_weakest_hand(
+    heptagon: Problem, curves: tuple[Curve, ...], course: tuple[Phase, Course]
+) -> None:
+    """The planner still finds a motion where the programme has room, and the margin says so."""
+    phase, (s, z, z_s) = course
+    plan = plan_path(curves[2], heptagon.epsilon, PlanOptions(intervals=20), phase.number)
+    peak = float(np.abs(plan.motion.evaluate(plan.motion.times).tau).max())
+    scene = _weaker(heptagon.scene, 1.001 * peak / 2.0)
+    assert fast_margin(scene, phase, heptagon.epsilon, (s, z, z_s)) >= -1e-9
+
+
+def test_inertia_is_that_of_the_determinant(
+    heptagon: Problem, course: tuple[Phase, Course], curves: tuple[Curve, ...]
+) -> None:
+    phase, (_, z, z_s) = course
+    rough = replace(heptagon.scene, friction=Friction(0.6, 0.9, 0.9))
+    formation = replace(phase.formation, scene=rough)
+    ratios = inertia_ratio(rough, replace(phase, formation=formation), z, z_s)
+    part = curves[2].segments[0]
+    own = reduced_inertia(
+        formation, formation.evaluate(z[:1], z_s[:1]), Directions(part.Xi, part.sigma)
+    )
+    assert ratios[0] == pytest.approx(own[0], rel=1e-9)
+
+
+@cache
+def tipping() -> Problem:
+    """The heptagon tips over its left vertex; to do so, it has to slide."""
+    table = dict(read_problem(str(HEPTAGON)).table)
+    contacts = ["v0-palm", "v2-finger1", "v5-finger2"]
+    return build_problem({**table, "phases": [{"contacts": contacts, "until": {"phi_deg": 9.5}}]})
+
+
+def _ends() -> Array:
+    problem = tipping()
+    start = problem.start
+    stop = float(start[0]), float(start[2]) + 0.2
+    return list_ends(problem.scene, problem.phases[0], start, stop)
+
+
+def test_ends_are_where_the_phase_ends() -> None:
+    (phase,), ends = tipping().phases, _ends()
+    assert len(ends) > 5 and np.ptp(ends[:, 0]) > 0.01
+    assert np.degrees(ends[:, 2]) == pytest.approx(9.5, abs=1e-6)
+    assert np.abs(phase.formation.evaluate(ends, ends).C).max() < 1e-9
+
+
+def test_ends_are_found_though_a_joint_turns_far_on_the_way() -> None:
+    """Where the vertex in the corner leaves it, the finger turns by 76 degrees."""
+    table = dict(read_problem(str(HEPTAGON.with_name("triangle.toml"))).table)
+    flush, corner = ["v0-palm", "v1-palm"], ["v1-finger1", "v0-finger2"]
+    phases = [
+        {"contacts": [*flush, "v1-finger1", "v2-finger2"], "until": "v0-finger2"},
+        {"contacts": [*flush, *corner], "until": {"x": 0.0373}},
+        {"contacts": ["v1-palm", *corner], "until": "v2-finger1"},
+    ]
+    problem = build_problem({**table, "phases": phases})
+    start, stop = trace_phases(problem)[1].end, (0.02953, -0.22767)
+    ends = list_ends(problem.scene, problem.phases[2], start, stop)
+    assert len(ends) > 5 and np.abs(ends[0, [0, 2]] - stop).max() < 1e-3
+    assert ends[0, 3] - start[3] > 1.3
+
+
+def test_the_best_curve_is_one_that_a_slow_motion_can_take() -> None:
+    problem = tipping()
+    (phase,), scene = problem.phases, problem.scene
+    best = find_best(scene, phase, problem.epsilon, problem.start, _ends())
+    assert best.margin > 1e-3 and best.curves > 0
+    assert np.abs(phase.formation.evaluate(best.z, best.z).C).max() < 1e-9
+    assert np.degrees(best.z[-1, 2]) == pytest.approx(9.5, abs=1e-6)
+    assert slow_margin(scene, phase, problem.epsilon, best.z, np.gradient(best.z, axis=0))[0] > 0
+
+
+def test_no_curve_takes_a_hand_that_is_too_weak(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, few in (("DRAWN", 40), ("TRIED", 5), ("BENT", (2, 3))):
+        monkeypatch.setattr(cell_curves, name, few)
+    weak = tipping().with_({f"fingers.{k}.torque_limit": 0.01 for k in (1, 2)})
+    (phase,), ends = weak.phases, _ends()[:1]
+    best = find_best(weak.scene, phase, weak.epsilon, weak.start, ends)
+    assert max(best.margin, best.loose) < -0.1 and best.curves > 5
+    assert best_end(weak.scene, phase, 20.0, ends) < 0.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_scene_starts_with_closed_fingers(seed: int) -> None:
+    problem = build_problem(random_scene(np.random.default_rng(seed)))
+    assert set(find_touching(problem.scene, problem.start)) == set(problem.contacts)
+    assert 3 <= problem.scene.polygon.n_vertices <= 12
+
+
+def test_the_same_generator_gives_the_same_scene_and_route() -> None:
+    tables, routes = [], []
+    for _ in range(2):
+        rng = np.random.default_rng([7, 3])
+        tables.append(random_scene(rng))
+        routes.append(random_route(rng, build_problem(tables[-1])))
+    assert tables[0] == tables[1] and routes[0] == routes[1]
+    start = build_problem(tables[0]).start
+    assert len(routes[0]) >= 2 and routes[0][0] == (start[0], start[2])
+
+
+def test_scenes_span_sizes_masses_and_kinds_of_fingers() -> None:
+    tables = [random_scene(np.random.default_rng(seed)) for seed in range(16)]
+    thin = [table["fingers"]["1"]["radius"] == 0.0 for table in tables]
+    assert 2 < sum(thin) < 14
+    masses = np.log10([table["object"]["mass"] for table in tables])
+    sizes = np.log10([build_problem(table).scene.scales.length for table in tables])
+    assert np.ptp(masses) > 4 and np.ptp(sizes) > 2
+    counts = {len(table["object"]["vertices"]) for table in tables}
+    assert len(counts) >= 6
+
+
+SQUARE = np.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]])
+
+
+@pytest.mark.parametrize(
+    ("segment", "apart"),
+    [
+        ([[2.0, 0.5], [3.0, 0.5]], 1.0),
+        ([[2.0, 2.0], [3.0, 2.0]], np.sqrt(2.0)),
+        ([[-1.0, 1.2], [2.0, 1.2]], 0.2),
+        ([[-1.0, 0.9], [2.0, 0.9]], -0.1),
+        ([[0.95, 0.5], [3.0, 0.5]], -0.05),
+        ([[0.5, 0.5], [0.5, 5.0]], -0.5),
+    ],
+)
+def test_distance_of_a_segment_and_a_square(segment: list[list[float]], apart: float) -> None:
+    assert separate(SQUARE, np.array([segment]))[0] == pytest.approx(apart)
+    assert separate(np.array([segment]), SQUARE)[0] == pytest.approx(apart)
+
+
+def test_crossing_segments_overlap() -> None:
+    one, other = np.array([[[0.0, 0.0], [2.0, 0.0]]]), np.array([[[1.0, -0.25], [1.0, 3.0]]])
+    assert separate(one, other)[0] == pytest.approx(-0.25)
+
+
+def test_a_plan_touches_and_does_not_overlap(heptagon: Problem, trajectory: Trajectory) -> None:
+    apart = clearances(heptagon.scene, trajectory.z)
+    for pair in ("object and palm", "object and finger 1", "object and finger 2"):
+        assert np.abs(apart[pair]).max() < 1e-12
+    deeper = trajectory.z + np.array([0.0, -0.001, 0.0, 0.0, 0.0])
+    assert clearances(heptagon.scene, deeper)["object and palm"].min() == pytest.approx(-0.001)

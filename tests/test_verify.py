@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import re
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any, cast
 
@@ -11,13 +12,18 @@ import numpy as np
 import pytest
 
 from crossing import measure_fingers, slid
-from planned import change, plan
+from planned import change, plan, plan_landing
+from shipped import BOX, HEPTAGON, plan_of, problem_of
 from tipping import PALM, box, scale, tipped
 from wholearm.common.arrays import Array
-from wholearm.common.errors import InputError
+from wholearm.common.errors import InputError, ReplayError
+from wholearm.planning.table_check import make_table, sample_table
 from wholearm.results.torque import TorqueProfile
+from wholearm.results.torque_table import read_rows
 from wholearm.simulation.simulate import simulate
-from wholearm.verification.verify import verify
+from wholearm.verification.margins import find_lowest, list_normal_forces
+from wholearm.verification.verdict import Allowance
+from wholearm.verification.verify import choose_times, verify
 
 
 def brake_less(starts: Array, c: Array) -> Array:
@@ -272,3 +278,143 @@ def test_the_least_gap_of_the_fingers_is_reported() -> None:
     assert text in report.to_text()
     values = json.loads(json.dumps(report.to_dict()))["finger_gap"]
     assert values == {"least": report.finger_gap.least, "time": report.finger_gap.time}
+
+
+def test_the_scalar_equation_holds_along_a_replay() -> None:
+    problem, plan = problem_of(HEPTAGON), plan_of(HEPTAGON)
+    report = verify(problem, plan, reduced=True)
+    assert {row.phase for row in report.reduced} == {1, 2, 3, 4, 5}
+    for row in report.reduced:
+        # Rounding: accelerations come from matrices of condition 1e4.
+        assert abs(row.residual) < 1e-9 * (abs(row.Phi_1 * row.theta_1_ddot) + abs(row.Phi_3))
+        assert plan.phase_starts[row.phase - 1] <= row.time <= plan.phase_starts[row.phase] + 1e-6
+    text = report.to_text()
+    assert "Phi_1 [kg m^2]" in text and len(report.to_dict()["reduced"]) == len(report.reduced)
+
+
+def test_a_phase_with_a_rolling_contact_may_have_four_constraints() -> None:
+    problem = problem_of(BOX)
+    report = verify(problem, plan_of(BOX), reduced=True)
+    four = {p.number for p in problem.phases if p.formation.n_constraints == 4}
+    assert {row.phase for row in report.reduced} == four
+    for row in report.reduced:
+        assert row.residual == pytest.approx(0.0, abs=1e-9 * abs(row.Phi_3))
+
+
+def test_it_is_left_out_unless_asked_for() -> None:
+    report = verify(problem_of(HEPTAGON), plan_of(HEPTAGON))
+    assert report.reduced == () and "Phi_1" not in report.to_text()
+
+
+def test_least_of_a_parabola_is_exact() -> None:
+    t = np.array([0.0, 0.4, 1.0])
+    least, time = find_lowest(t, (t - 0.55) ** 2 + 0.2, t[[0, -1]])
+    assert least == pytest.approx(0.2, abs=1e-13)
+    assert time == pytest.approx(0.55, abs=1e-13)
+
+
+def test_no_parabola_crosses_a_kink_or_a_jump() -> None:
+    flat_then_steep = np.array([0.05, 0.05, 0.05, 1.0, 2.0])
+    t = np.array([0.0, 0.1, 0.2, 0.3, 0.4])
+    assert find_lowest(t, flat_then_steep, np.array([0.0, 0.2, 0.4]))[0] == 0.05
+    t = np.array([0.0, 0.1, 0.1, 0.2, 0.3])
+    values = np.array([1.0, 1.0, 0.2, 0.3, 0.5])
+    # Inside the second stretch the parabola through its three points has its least at its start.
+    assert find_lowest(t, values, np.array([0.0, 0.3]))[0] == pytest.approx(0.2, abs=0.01)
+    assert all(math.isnan(x) for x in find_lowest(t, np.full(5, np.nan), t))
+
+
+def test_a_contact_let_go_softly_counts_until_it_passes_epsilon() -> None:
+    problem, trajectory = plan_landing()
+    simulation, low = simulate(problem, trajectory), problem.epsilon / 2
+    rows, column = np.flatnonzero(simulation.phase == 0), simulation.contacts.index("v3-finger1")
+    c_n = simulation.c_n.copy()
+    c_n[rows, column] = 2 * problem.epsilon
+    c_n[rows[[3, -2, -1]], column] = low, low, 0.0
+    given = replace(simulation, c_n=c_n)
+    forces = list_normal_forces(problem, given, problem.phases[0], rows)["v3-finger1"]
+    assert np.isnan(forces[-2:]).all() and np.nanmin(forces) == forces[3] == low
+
+
+def test_rows_of_a_plan_and_both_ends_of_phases_are_looked_at() -> None:
+    problem, trajectory = plan()
+    times = choose_times(problem, trajectory.torque, trajectory)
+    assert np.isin(times, trajectory.t).all()
+    assert np.isin(trajectory.phase_starts[:-1], times).all() and trajectory.t[-1] in times
+    even = choose_times(problem, trajectory.torque, None)
+    np.testing.assert_allclose(even[[0, -1]], trajectory.torque.breaks[[0, -1]])
+
+
+def wiggle(torque: TorqueProfile, piece: int, size: float) -> TorqueProfile:
+    """Torques with a wiggle in one piece that vanishes at both of its ends and in its middle."""
+    coefficients = np.pad(torque.coefficients, ((0, 0), (0, 0), (0, 3)))
+    coefficients[piece, 0, [1, 3]] += size * np.array([1.0, -1.0])
+    return replace(torque, coefficients=coefficients)
+
+
+@pytest.mark.parametrize(("piece", "size"), [(11, 0.08), (67, -0.08)])
+def test_a_dip_between_instants_is_found(piece: int, size: float) -> None:
+    """The lowest dip of all, by a thousandth of epsilon lower than allowed, and then higher."""
+    problem, trajectory = plan()
+    torque = wiggle(trajectory.torque, piece, size)
+    start, stop = torque.breaks[piece : piece + 2]
+    fine = simulate(problem, torque, times=np.linspace(start, stop, 400))
+    least = np.nanmin(fine.c_n)
+    lowest = int(np.where(np.isnan(fine.c_n), np.inf, fine.c_n).min(axis=1).argmin())
+    assert least > 0.0 and start < fine.t[lowest] < stop
+    rounding = Allowance().measure_stray(problem) - Allowance().stray * problem.epsilon
+    for more, fails in (1e-3, True), (-1e-3, False):
+        epsilon = (least + rounding) / (1 - Allowance().stray - more)
+        texts = verify(problem.with_(epsilon=epsilon), torque).warnings
+        assert any(" falls to " in text for text in texts) is fails
+
+
+def test_a_table_holds_like_its_plan() -> None:
+    problem, trajectory = plan()
+    table = make_table(problem, trajectory)
+    report = verify(problem, read_rows(table.rows))
+    assert report.ok and report.warnings == ()
+    figures = table.figures
+    assert figures["rows"] == len(table.rows) and figures["replay"]["ok"]
+    for row, phase in zip(figures["replay"]["phases"], report.phases, strict=True):
+        assert row["planned_arrival"] == pytest.approx(0.4 * phase.number)
+        assert row["arrival"] == pytest.approx(row["planned_arrival"], abs=1e-5)
+        least = min(margin.least for margin in phase.contacts)
+        assert row["least_c_n"] == pytest.approx(least, abs=1e-3)
+        assert row["planned_least_c_n"] == pytest.approx(least, abs=1e-3)
+
+
+def test_a_table_that_loses_a_contact_is_an_error() -> None:
+    problem, trajectory = plan()
+    weak = replace(trajectory, torque=change(trajectory.torque, brake_less))
+    with pytest.raises(ReplayError, match=r"do not hold in their replay: c_n of .* phase 2"):
+        make_table(problem, weak)
+    assert make_table(problem, weak, replay=False).figures["replay"] is None
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "hold"])
+def test_samples_at_a_rate_are_reported(interpolation: str) -> None:
+    """The closer the samples, the nearer arrivals and forces are to those of the plan."""
+    problem, trajectory = plan()
+    fine = sample_table(problem, trajectory, 8000.0, interpolation).figures
+    coarse = sample_table(problem, trajectory, 60.0, interpolation).figures
+    assert (fine["sample_rate"], fine["interpolation"]) == (8000.0, interpolation)
+    assert not coarse["replay"]["ok"] and " phase " in coarse["replay"]["reason"]
+
+    def find_errors(figures: dict[str, object]) -> Array:
+        replay = figures["replay"]
+        assert isinstance(replay, dict)
+        first = replay["phases"][0]
+        arrival = np.inf if first["arrival"] is None else first["arrival"]
+        return np.array(
+            [
+                abs(arrival - first["planned_arrival"]),
+                abs(first["least_c_n"] - first["planned_least_c_n"]),
+            ]
+        )
+
+    # What is d off at its end arrives sqrt(2 d / a) early: half a period of delay takes 4 ms.
+    assert (find_errors(fine) < [0.02, 0.02]).all()
+    assert find_errors(coarse).sum() > 2 * find_errors(fine).sum()
+    unplayed = sample_table(problem, trajectory, 60.0, interpolation, replay=False)
+    assert unplayed.figures["replay"] is None

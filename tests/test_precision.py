@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -18,9 +19,17 @@ from wholearm.benchmark.precision.planners import (
     is_installed,
     run_planner,
 )
+from wholearm.benchmark.precision.reference import Course, measure_error
 from wholearm.benchmark.precision.reference_check import check_plan
-from wholearm.benchmark.precision.runs import SOLVED, Median
-from wholearm.benchmark.precision.tables import Medians, draw_medians, format_report
+from wholearm.benchmark.precision.runs import SHIFT, SHORT, SOLVED, Median, find_mean, measure
+from wholearm.benchmark.precision.simulators import FEW, SIMULATORS, make_course
+from wholearm.benchmark.precision.tables import (
+    Medians,
+    PeerComparison,
+    draw_medians,
+    find_times,
+    format_report,
+)
 from wholearm.cli.command import main
 from wholearm.problem.definition import End, Problem
 from wholearm.results.torque import TorqueProfile
@@ -105,3 +114,87 @@ def test_peers_get_the_phases_that_they_know(heptagon: Problem) -> None:
     assert slide is not None and len(slide.phases) == 1
     first = box().phases[1]
     assert keep_curves(replace(box(), phases=(first,))) is None
+
+
+PROBLEMS = Path(__file__).parents[1] / "problems"
+FLIPS = str(PROBLEMS / "heptagon_four_contacts.toml")
+
+
+@lru_cache
+def course() -> Course:
+    """The heptagon's first phase, with a reversal on its way."""
+    (first, *_) = list_instances((FLIPS,))
+    found = make_course(first, FEW)
+    assert found is not None
+    return found
+
+
+def test_files_share_phases() -> None:
+    twice = str(PROBLEMS / "heptagon_twice.toml")
+    names = [instance.name for instance in list_instances((FLIPS, twice))]
+    assert names == [f"heptagon_four_contacts {number}" for number in range(1, 6)]
+
+
+def test_reference_is_exact_and_meets_the_reversal() -> None:
+    assert course().own_error < 1e-13
+    directions = {tuple(np.append(span.Xi, span.sigma)) for span in course().spans}
+    assert len(directions) == 2
+    ends = [span.stop for span in course().spans]
+    assert [span.start for span in course().spans] == [0.0, *ends[:-1]]
+
+
+@pytest.mark.parametrize("method", SIMULATORS)
+def test_every_simulator_converges_to_the_reference(method: str) -> None:
+    errors = [
+        measure_error(
+            course().problem, SIMULATORS[method].build(course(), tolerance)(), course().end
+        )
+        for tolerance in (1e-5, 1e-9)
+    ]
+    assert errors[1] < 2e-7 and errors[1] < max(0.3 * errors[0], 1e-10)
+
+
+def test_phases_that_allow_no_slow_motion_have_no_course() -> None:
+    rough = list_instances((str(PROBLEMS / "heptagon_impact.toml"),))
+    assert [make_course(instance, FEW) is None for instance in rough[3:4]] == [True]
+
+
+def test_a_phase_alone_starts_where_its_curve_does() -> None:
+    for instance in list_instances((FLIPS,)):
+        assert isinstance(instance, Instance)
+        assert np.array_equal(instance.problem.start, instance.curve.start)
+
+
+FINE = Median(0.5, 0.3, (-3e-7,))
+MEDIANS: Medians = {
+    ("study", "phase 1", "a, b", "1e-6"): FINE,
+    ("study", "phase 1", "a, b", "1e-3"): FINE._replace(solve=0.1, errors=(1e-4,)),
+    ("study", "phase 2", "a, b", "1e-6"): Median(0.5, 60.0, (math.nan,), "time limit"),
+}
+
+
+def test_some_errors_count_or_all() -> None:
+    median = Median(0.5, 0.2, (1e-4, 1e-2, 0.0))
+    assert median.reaches(1e-3, 1) and not median.reaches(1e-3) and median.reaches(1e-2)
+    assert FINE.reaches(3e-7) and not FINE.reaches(2e-7)
+    assert not median._replace(outcome="a contact is lost").reaches(1.0)
+
+
+def test_medians_keep_the_worst_error_and_the_first_failure() -> None:
+    errors, outcomes = iter([1e-7, -3e-7, 2e-7]), iter([SOLVED, "lost", "late"])
+    found = measure(lambda: lambda: 7, lambda _: ((next(errors),), next(outcomes)))
+    assert found.errors == (-3e-7,) and found.outcome == "lost"
+    assert 0 <= found.solve < SHORT and 0 <= found.build < SHORT
+
+
+def test_the_soonest_setting_counts_and_failures_never_do() -> None:
+    own = PeerComparison("study", "title", "a, b", (1e-3, 1e-6), False, None)
+    assert find_times(MEDIANS, "a, b", own, 1e-3) == {"phase 1": 0.1, "phase 2": math.inf}
+    assert find_times(MEDIANS, "a, b", own, 1e-6) == {"phase 1": 0.3, "phase 2": math.inf}
+    built = own._replace(building=True)
+    assert find_times(MEDIANS, "a, b", built, 1e-6) == {"phase 1": 0.8, "phase 2": math.inf}
+
+
+def test_means_are_geometric_but_for_their_shift() -> None:
+    assert find_mean([0.0, 3 * SHIFT]) == pytest.approx(SHIFT)
+    assert find_mean([1e6, 1e2]) == pytest.approx(1e4, rel=1e-3)
