@@ -1,4 +1,4 @@
-"""Phases whose ends are given in full: where they end, and what is said of other places."""
+"""Initial guesses of phases, and ends that are given in full."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Borders passed without a stop: what is looked at is what planning them as one finds."""
+"""Borders passed without a stop, and parts of curves that are traced once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Routes put together from their links, and what is tried where a link has no plan."""
+"""Routes that are joined, chosen and refined, and what is tried where an edge has no plan."""
 
 from __future__ import annotations
 

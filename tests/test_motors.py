@@ -1,4 +1,4 @@
-"""Torques that motors can follow: their rates, their lag, and pauses where phases meet."""
+"""Rate limits and lag of motors, held torques, and pauses where phases meet."""
 
 from __future__ import annotations
 

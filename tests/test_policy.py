@@ -1,4 +1,4 @@
-"""Torques as a function of the joints."""
+"""Torques as a function of the joints, and reserves where ranges are known."""
 
 from __future__ import annotations
 

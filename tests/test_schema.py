@@ -1,4 +1,4 @@
-"""The JSON Schema of problem files says what their reader says."""
+"""The JSON Schema of problem files, and changes of their keys."""
 
 from __future__ import annotations
 

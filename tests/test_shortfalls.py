@@ -1,4 +1,4 @@
-"""What an error of an infeasible problem knows beside its text."""
+"""What errors of infeasible problems know beside their text, and early refusals."""
 
 from __future__ import annotations
 

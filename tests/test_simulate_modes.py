@@ -1,4 +1,4 @@
-"""Contact modes of replays: rolling, sticking and sliding, against closed forms and time stepping."""
+"""Contact modes of replays, rolling, sticking and sliding: closed forms and time stepping."""
 
 from __future__ import annotations
 

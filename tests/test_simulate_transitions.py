@@ -1,4 +1,4 @@
-"""The simulation of phases with two freedoms, and of what joins phases without a stop."""
+"""Replays with two freedoms, joins of phases without a stop, and what else touches."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The stress study: what it draws, and what counts as a finding."""
+"""The stress study: scenes, findings, and its own tracing and linear programmes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Problem files to begin with plan as they are."""
+"""Problem files to begin with, and goals."""
 
 from __future__ import annotations
 
