@@ -18,20 +18,17 @@ from wholearm.mechanics.dynamics import Directions
 from wholearm.mechanics.limits import CONE, PRESS, make_limits
 from wholearm.planning.options import CLEARANCE, PlanOptions
 from wholearm.planning.plan import solve
-from wholearm.planning.time_domain import tightening as enforcing
 from wholearm.planning.time_domain.collocation import make_scheme
 from wholearm.planning.time_domain.intersample import (
     GRAZE,
     MISS,
     IntersampleLimits,
-    Raised,
     check_between,
     find_misses,
     monitor_missed,
 )
-from wholearm.planning.time_domain.search import TimeSearch, TimeSolution
+from wholearm.planning.time_domain.search import TimeSolution
 from wholearm.planning.time_domain.stage import Stage
-from wholearm.planning.time_domain.tightening import enforce_between
 from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion, make_motions
 from wholearm.planning.time_domain.time_plan import plan_phases, try_phases
 from wholearm.results.trajectory import Trajectory
@@ -141,67 +138,6 @@ def test_released_contacts_have_to_be_clear_in_the_second_half() -> None:
     end = measure_gaps(gaps, reverse.evaluate(np.array([motion.duration])).z[0])[0]
     assert misses[-1] == pytest.approx(CLEARANCE / 2 - end, abs=1e-7)
     assert misses[0] == 0.0
-
-
-def test_limits_rise_by_more_than_they_are_missed() -> None:
-    motion = heaved()
-    stage = as_stage(motion, monitored=(0, 1))
-    plain = IntersampleLimits.none(stage)
-    assert [table.shape[1] for table in plain] == [8, 2, 4] and plain.worst == 0.0
-    missed = IntersampleLimits(*(table + k * 1e-3 for k, table in enumerate(plain)))
-    once = Raised.none(stage).further(missed)
-    for miss, added in zip(missed, once.limits, strict=True):
-        assert (added >= miss).all() and (added <= 2 * miss).all()
-    # Where a third of what was added has been of use, three times as much is needed; forces have
-    # a price, so that they go on as before.
-    left = IntersampleLimits(
-        *(miss - added / 3 for miss, added in zip(missed, once.added, strict=True))
-    )
-    twice = once.further(left)
-    assert twice.added.held == pytest.approx(1.5 * left.held)
-    assert twice.added.gap == pytest.approx(3 * left.gap)
-    assert twice.added.sense == pytest.approx(3 * left.sense)
-    for first, then, whole in zip(once.limits, twice.added, twice.limits, strict=True):
-        assert whole == pytest.approx(first + then)
-
-
-class Creeping(TimeSearch):
-    """Tightening that makes what the first interval misses a tenth less, however often."""
-
-    rounds = 0
-
-    def run(self, *given: Any) -> TimeSolution:
-        self.rounds += 1
-        return solve_at_points()
-
-    def solve(
-        self, stages: list[Stage], before: TimeSolution | None = None, most: int = 0
-    ) -> TimeSolution:
-        return solve_at_points()._replace(stages=stages)
-
-    def miss(self, _: TimeSearch, solution: TimeSolution, __: object) -> list[IntersampleLimits]:
-        missed = [IntersampleLimits.none(stage) for stage in solution.stages]
-        if solution.stages[0].intervals == solve_at_points().stages[0].intervals:
-            missed[0].held[0, 0] = 100 * MISS * 0.9**self.rounds
-        return missed
-
-
-def test_tightening_that_creeps_gives_way_to_finer_intervals(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Where limits are missed, and nowhere else."""
-    loose = solve_at_points()
-    search = Creeping(**vars(TimeSearch.of(landing(), PlanOptions(time_intervals=6))))
-    monkeypatch.setattr(enforcing, "list_misses", search.miss)
-    for name in ("price_misses", "list_gains"):
-        monkeypatch.setattr(enforcing, name, lambda *_: [np.zeros(1)])
-    monkeypatch.setattr(enforcing, "REFINEMENTS", 0)
-    held = enforce_between(search, loose)
-    assert held.success, held.status
-    first, *others = zip(loose.stages, held.stages, strict=True)
-    assert first[1].intervals == first[0].intervals + 1
-    assert first[1].guess.fractions[:2].sum() == pytest.approx(first[0].guess.fractions[0])
-    assert all(one.intervals == other.intervals for one, other in others)
 
 
 @lru_cache(maxsize=1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
@@ -12,68 +11,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shipped import HEPTAGON, IMPACTS, TWICE, problem_of
+from shipped import HEPTAGON, problem_of
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError, SolverError
 from wholearm.common.shortfalls import LimitPlace, Shortfall
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning import blocks
 from wholearm.planning.block_plan import Planning
-from wholearm.planning.blocks import plan_alone
 from wholearm.planning.options import Objective, PlanOptions
-from wholearm.planning.phase_plan import PhasePlan, add_up, combine
+from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.rate_limits import explain_motors
 from wholearm.planning.stops import Plans, plan_stops
 from wholearm.planning.time_domain import time_impacts as impacts
 from wholearm.problem.definition import Phase, Problem
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Samples
-
-
-def planning_of(problem: Any) -> Planning:
-    none: list[float | None] = [None] * len(problem.phases)
-    return Planning(problem, (), PlanOptions(), (), none, none)
-
-
-def test_blocks_are_planned_alone_only_where_that_is_another_plan(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    given: list[Planning] = []
-
-    def plan_each(planning: Planning, finer: list[int], report: object) -> Planning:
-        given.append(planning)
-        return planning
-
-    monkeypatch.setattr(blocks, "plan_each", plan_each)
-    curves, landing = (planning_of(problem_of(path)) for path in (HEPTAGON, TWICE))
-    assert plan_alone(curves, print) is None
-    assert plan_alone(replace(landing, ahead=False), print) is None
-    assert plan_alone(landing, print) == given[0]
-    assert not given[0].ahead and not given[0].blocks
-
-
-def test_no_phase_has_to_press_much_more_than_those_before_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Plans along curves stand for those over time, which are told what is ample."""
-    whole, given = problem_of(HEPTAGON), list[tuple[float, float]]()
-    problem = replace(whole, phases=whole.phases[:3])
-    curves, options = trace_phases(problem), PlanOptions("margin", intervals=20)
-    known = blocks.plan_blocks(problem, curves, options, lambda _: None).plans
-
-    def plan_with_impacts(*of: Any, **others: Any) -> Any:
-        plan = known[of[1][0].index]
-        if of[3].goal is Objective.MARGIN:
-            given.append((others["ample"], plan.value))
-        return [plan]
-
-    monkeypatch.setattr(impacts, "plan_with_impacts", plan_with_impacts)
-    over_time = replace(options, transcription="time")
-    blocks.plan_blocks(problem, curves, over_time, lambda _: None)
-    assert len(given) == len(problem.phases) and given[0][0] == math.inf
-    for index in range(1, len(given)):
-        before = min(value for _, value in given[:index])
-        assert given[index][0] == pytest.approx(blocks.AMPLE * before)
 
 
 @cache
@@ -153,27 +105,9 @@ def test_parts_share_a_duration_by_their_least_times() -> None:
     np.testing.assert_allclose([plan.value for plan in plans], 1.5 / (0.9 * 0.5 + 0.3))
 
 
-def test_parts_start_where_those_before_end() -> None:
-    plans = plan_stops(plan_part, [0, 1, 2, 3], np.ones(5), PlanOptions())
-    starts = [float(plan.motion.evaluate(np.zeros(1)).z[0, 0]) for plan in plans]
-    np.testing.assert_allclose(starts, [1.0, 1.1, 1.5])
-    np.testing.assert_allclose([plan.value for plan in plans], LEAST)
-
-
 def test_a_duration_shorter_than_the_stops_take() -> None:
     with pytest.raises(InfeasibleError, match=r"0\.7 s is not longer .* a stop, 0\.73 s"):
         plan_stops(plan_part, [0, 1, 3], np.zeros(5), PlanOptions("margin"), 0.7)
-
-
-def test_durations_add_up() -> None:
-    phases = problem_of(IMPACTS).phases[:3]
-    assert add_up(phases, [0.1, 0.2, 0.3, 9.0, 9.0]) == pytest.approx(0.6)
-    assert add_up(phases, [None] * 5) is None
-
-
-def test_the_least_margin_counts_and_the_sum_of_anything_else() -> None:
-    assert combine(Objective.MARGIN, [0.3, 0.1, 0.2]) == 0.1
-    assert combine(Objective.EFFORT, [0.3, 0.1, 0.2]) == pytest.approx(0.6)
 
 
 @pytest.mark.parametrize(

@@ -151,11 +151,3 @@ def test_places_on_a_curve_are_found_and_others_are_not() -> None:
         assert find_on(curve, z + 1e-6 * length * np.array([0, 1, 0, 0, 0])) is None
     beyond = curve.end + 1e-3 * length * curve.evaluate(np.array([curve.length])).z_s[0]
     assert find_on(curve, beyond) is None
-
-
-def test_one_way_alone_is_run_from_its_end() -> None:
-    curve = CURVES[0]
-    alone = join(curve, None)
-    np.testing.assert_allclose(alone.start, curve.end, atol=1e-12)
-    np.testing.assert_allclose(alone.end, curve.start, atol=1e-12)
-    assert join(None, curve) is curve

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import wholearm
-from shipped import BOX, FOLDER, HEPTAGON, IMPACTS, problem_of
+from shipped import BOX, FOLDER, HEPTAGON, problem_of
 from wholearm.common.errors import InputError
 from wholearm.problem.definition import End, Problem, Until
 from wholearm.problem.read import build_problem
@@ -138,12 +138,6 @@ def test_what_only_objects_can_say_wrongly() -> None:
     ):
         with pytest.raises(InputError, match=text):
             rebuild(given, **changes)
-
-
-def test_what_is_known_to_be_right_is_not_checked_again() -> None:
-    """Sweeps of scenes and the planner's own units take no time for it."""
-    given = problem_of(IMPACTS)
-    assert given.checked and replace(given, epsilon=-1.0).epsilon == -1.0
 
 
 def test_a_start_that_no_file_can_say_leaves_the_table_empty() -> None:

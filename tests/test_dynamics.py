@@ -237,14 +237,6 @@ def test_reduced_inertia_has_the_sign_of_the_mass_along_the_motion(
         assert ratio == pytest.approx(expected, rel=1e-9)
 
 
-def test_contacts_that_depend_on_each_other_have_no_reduced_inertia() -> None:
-    formation, z = standing()
-    at, twice = formation.evaluate(z[None], z[None]), [0, 0, 1, 1]
-    at = at._replace(A=at.A[:, twice], A_t=at.A_t[:, twice], P=at.P[:, twice])
-    ratio = reduced_inertia(formation, at, Directions(np.ones(4), np.ones(2)))
-    assert not np.isfinite(ratio).any()
-
-
 def test_forward_takes_any_number_of_contacts(curves: tuple[Curve, ...]) -> None:
     curve = curves[0]
     for count in (1, 2, 3):
@@ -341,19 +333,6 @@ def test_three_routes_agree_where_a_contact_rolls(curves: tuple[Curve, ...]) -> 
             Phi_1, Phi_2, Phi_3 = reduce_to_first_joint(formation, z, v[3], tau, directions)
             theta_1_ddot = -(Phi_2 * v[3] + Phi_3) / Phi_1
             assert theta_1_ddot == pytest.approx(expected[3], abs=1e-7 * size)
-
-
-def test_compiled_forward_returns_the_matrix_that_jams(curves: tuple[Curve, ...]) -> None:
-    curve = curves[4]
-    formation = curve.formation
-    z, z_s = (part[0] for part in curve.evaluate(np.array([0.01]))[:2])
-    Xi, sigma = curve.segments[-1].Xi, curve.segments[-1].sigma
-    K = build_forward(formation)(z, z_s, np.zeros(2), Xi, sigma)[2].full()
-    kinematics = formation.evaluate(z[None], z_s[None])
-    A, A_t = kinematics.A[0], kinematics.A_t[0]
-    G = A - (formation.friction * Xi)[:, None] * A_t
-    expected = A @ np.diag(1 / formation.scene.mass_diagonal) @ G.T
-    np.testing.assert_allclose(K, expected, rtol=1e-12)
 
 
 def test_the_squeeze_keeps_its_sense_along_a_curve() -> None:

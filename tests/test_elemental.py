@@ -23,13 +23,7 @@ from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.contacts.cones import find_weakest, force_limit_rows, slip_margins
 from wholearm.contacts.contact_limits import build_clearance, build_limits
-from wholearm.contacts.elemental import (
-    Contact,
-    build_features,
-    build_geometry,
-    candidate_contacts,
-    parse_contact,
-)
+from wholearm.contacts.elemental import Contact, build_features, candidate_contacts, parse_contact
 from wholearm.contacts.formation import Formation, build_slip
 from wholearm.scene.model import Friction, Scene
 
@@ -127,22 +121,6 @@ def test_velocities_at_the_contact_point(scene: Scene, name: str) -> None:
         tangent = np.array([normal[1], -normal[0]])
         assert kinematics.A[0, 0] @ v == pytest.approx(normal @ velocity, abs=DIFFERENCE)
         assert kinematics.A_t[0, 0] @ v == pytest.approx(tangent @ velocity, abs=DIFFERENCE)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_normal_and_point_are_those_measured(scene: Scene, name: str) -> None:
-    contact = parse_contact(name, scene)
-    geometry = build_geometry(contact, scene)
-    function = ca.Function(
-        "g", [build_features(scene).z], [geometry.point, geometry.normal, geometry.gap]
-    )
-    for z in configurations(4, 8):
-        gap, _, normal = measure_gap(scene, contact, z)
-        z[:2] -= gap * normal
-        _, point, normal = measure_gap(scene, contact, z)
-        found = [part.full()[:, 0] for part in function(z)]
-        np.testing.assert_allclose(found[0], point, atol=1e-13)
-        np.testing.assert_allclose(found[1], normal, atol=1e-13)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -275,14 +275,6 @@ def test_limit_knows_what_is_gained(names: str, text: str, gained: str | None) -
     assert limits[text] == (parse_contact(gained, WIDE) if gained else None)
 
 
-def test_nothing_is_gained_at_the_end_of_a_pointed_link() -> None:
-    pointed = make_scene(SQUARE, radius=0.0)
-    ends = [
-        limit for limit in make_formation(pointed, "e1-tip1").limits if "runs off" in limit.text
-    ]
-    assert [limit.gained for limit in ends] == [None, None]
-
-
 @pytest.mark.parametrize("finger", [0, 1])
 def test_a_limit_breaks_as_soon_as_a_free_link_overlaps(finger: int) -> None:
     """Formations without contacts on a finger: its limits and the measured overlap agree."""

@@ -20,7 +20,7 @@ from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, SimulationError
 from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation
-from wholearm.free_simulation.free_simulate import simulate_free, simulate_phases
+from wholearm.free_simulation.free_simulate import simulate_free
 from wholearm.free_simulation.hand import build_system, measure_gaps
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import read_problem
@@ -243,13 +243,6 @@ def test_an_overlap_at_the_start_is_told() -> None:
     with pytest.raises(SimulationError, match=r"finger 1 and object overlap by 0\.01 m at"):
         simulate_free(problem, torque, start=z + np.array([0.01, 0, 0, 0, 0]))
     assert measure_gaps(problem.scene, z[None])[0, :3] == pytest.approx([0.05, 0, 0], abs=1e-13)
-
-
-def test_phases_that_pass_into_one_another_run_together() -> None:
-    problem, trajectory = begin()
-    runs = simulate_phases(problem, trajectory, tolerance=1e-6)
-    assert [(run.first, run.last) for run in runs] == [(0, 0), (1, 1)]
-    assert [run.simulation.t[0] for run in runs] == pytest.approx([0.0, 0.4])
 
 
 def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

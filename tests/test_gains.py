@@ -9,10 +9,9 @@ from scipy.optimize import linprog, minimize
 
 from timed import landing, plan_landing, total
 from wholearm.common.arrays import Array
-from wholearm.common.errors import InfeasibleError
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.time_domain.attempts import GAIN, choose_end, keep_apart
+from wholearm.planning.time_domain.attempts import GAIN, choose_end
 from wholearm.planning.time_domain.search import TimeSearch, TimeSolution
 from wholearm.planning.time_domain.stages import guess_stages
 from wholearm.planning.time_domain.tightening import find_least
@@ -100,22 +99,3 @@ def test_an_end_is_moved_to_where_what_follows_costs_less() -> None:
             # The stages alone cost least where they ended.
             assert own > alone.cost and moved.end[0] < alone.end[0]
     assert max(gains) > GAIN
-
-
-def test_an_end_from_where_nothing_follows_is_kept() -> None:
-    search, alone = landed()
-
-    def fail(_: Array) -> tuple[float, Array]:
-        raise InfeasibleError("nothing")
-
-    assert choose_end(replace(search, to_go=fail), alone)[1] is alone
-
-
-def test_a_stage_ends_clear_of_what_comes_next() -> None:
-    _, alone = landed()
-    stage = alone.stages[-1]
-    open_limits = [limit for limit in stage.formation.limits if limit.gained is not None]
-    kept = keep_apart(stage, open_limits[0].gained)
-    row = next(k for k, limit in enumerate(stage.formation.limits) if limit is open_limits[0])
-    least = kept.list_clearances(np.array([0.1, 0.9]), after=1 / 3)[:, kept.monitored.index(row)]
-    assert least.tolist() == [0.0, pytest.approx(kept.clearance)]

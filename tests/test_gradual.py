@@ -28,7 +28,6 @@ from wholearm.planning.time_domain.stage import Stage
 from wholearm.planning.time_domain.stage_kernels import goal_kernel
 from wholearm.planning.time_domain.stage_modes import mode_of
 from wholearm.planning.time_domain.time_mesh import bisect_intervals
-from wholearm.planning.time_domain.time_nlp import bound_unknowns
 from wholearm.problem.definition import Phase, Problem
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.verification.verify import verify
@@ -182,31 +181,3 @@ def test_an_end_where_a_contact_changes_its_name_has_a_slope() -> None:
     assert np.abs(kernel.function(x, []).full()).max() < 1e-9 * problem.scene.scales.length
     slope = np.abs(kernel.jacobian(x, []).full()).max()
     assert slope > 0.1 * problem.scene.scales.length
-
-
-def test_where_the_last_stage_stops_may_be_given() -> None:
-    """By as many equations as there are freedoms, on the place where it ends."""
-    search, stage = turned(Polynomial([1.0]))
-    stop = stage.guess.nodes[-1, 0]
-    free, held = (search.build([replace(stage, until=None, stop=at)]) for at in (None, stop))
-    there = tangent_basis(stage.formation, stop).T @ stop
-    for before, after in zip(free.rows.bounds, held.rows.bounds, strict=True):
-        assert len(after) == len(before) + 2
-        assert np.setdiff1d(after, before) == pytest.approx(np.sort(there))
-
-
-def test_what_ends_a_phase_is_not_reached_before() -> None:
-    """A motion that first passes its end would be over there."""
-    problem, phase = with_phase("triangle", "v1-palm v1-finger1 v0-finger2", {"phi_deg": -12.0})
-    search = TimeSearch.of(problem, PlanOptions())
-    (stage,) = Attempts(problem, [phase], corner()[2], search, None, True).first.stages
-    row, value, side = 2, np.radians(-12.0), -1.0
-    assert stage.ahead is not None
-    assert np.array(stage.ahead) == pytest.approx([row, value, side])
-    nlp = search.build([stage])
-    (low, high), layout = bound_unknowns(nlp, [stage], search.scheme), nlp.layouts[0]
-    least = low[layout.z[..., row]].ravel()
-    assert (np.diff(least[:-1]) <= 0).all() and (least[:-1] > value).all()
-    assert np.isinf(least[-1]) and np.isinf(high[layout.z[..., row]]).all()
-    # Other phases end by contacts alone.
-    assert turned(Polynomial([1.0]))[1].ahead is None

@@ -43,15 +43,6 @@ def test_the_table_has_every_measurement_and_exponent() -> None:
     assert text.count("[MB]") == text.count(" 1.00 |") == sum(map(len, WORK.values()))
 
 
-def test_axes_are_logarithmic_with_names_and_units() -> None:
-    figure = STUDY.draw(make_rows())
-    assert len(figure.axes) == 2 * len(SIZES)
-    for axes, grows in zip(figure.axes, [*SIZES, *SIZES], strict=True):
-        assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
-        assert axes.get_xlabel() == f"{grows} [-]" and axes.get_ylabel().endswith(("[s]", "[MB]"))
-        assert len(axes.lines) == len(WORK[grows])
-
-
 def test_work_is_as_large_as_is_asked() -> None:
     table = dict(read_problem(str(HEPTAGON)).table)
     # Five nodes for each element of four intervals, of which there are more than switches.

@@ -30,11 +30,6 @@ def test_unknown_attribute() -> None:
     assert not hasattr(wholearm, "numpy_")
 
 
-def test_names_are_sorted_and_unique() -> None:
-    public = [name for name in wholearm.__all__ if name != "__version__"]
-    assert public == sorted(set(public))
-
-
 def test_a_function_is_not_shadowed_by_its_module() -> None:
     """Importing a submodule must not replace the function of the same name."""
     code = (

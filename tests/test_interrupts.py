@@ -138,15 +138,6 @@ def test_files_appear_together_or_not_at_all(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_an_error_is_no_interrupt() -> None:
-    def fail() -> int:
-        raise OSError("disk")
-
-    with pytest.raises(OSError, match="disk"):
-        guard(fail)
-    check()
-
-
 def test_an_ignored_signal_stays_ignored() -> None:
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:

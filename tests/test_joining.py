@@ -11,13 +11,11 @@ import pytest
 
 from shipped import HEPTAGON, problem_of
 from wholearm.common.arrays import Array
-from wholearm.common.errors import ReplayError
-from wholearm.planning.block_plan import BlockPlan, Planning
+from wholearm.planning.block_plan import BlockPlan
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.result import Plan
 from wholearm.problem.definition import Until
 from wholearm.problem.goal import Goal
-from wholearm.search import edge_plans as joining
 from wholearm.search import route_choice as choosing
 from wholearm.search.astar import RoadmapRoute, RouteSearch, SearchRule
 from wholearm.search.candidates import Lost
@@ -109,41 +107,6 @@ def test_where_nothing_leads_on_another_landing_is_tried() -> None:
     assert tried == [key_steps(own) for own in (*(way.steps for way in ways), landing.steps)]
 
 
-def test_a_link_from_a_crossing_is_alone_to_blame() -> None:
-    first, second = (Link(PLACE, PLACE, make_steps(x), 1.0) for x in (0.01, 0.02))
-    plans = Plans(second.steps)
-    lost = join_route(PROBLEM, [(first, []), (second, [])], PlanOptions(), plans, lambda _: None)
-    assert isinstance(lost, Lost) and lost.links == (second,)
-    assert plans.asked == [key_steps(first.steps), key_steps(second.steps)]
-
-
-def test_where_a_plan_never_holds_it_is_landed_with_regard_to_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    landing = Link(PLACE, PLACE, make_steps(0.02), 1.0, in_cell=True)
-    onward = Link(PLACE, PLACE, make_steps(0.03), 1.0)
-    ways = [Measured(1.0, make_steps(x), []) for x in (0.021, 0.022)]
-    plans, finished = Plans(), list[int]()
-
-    def finish(made: Planning, *rest: object) -> str:
-        finished.append(len(made.problem.phases))
-        if len(finished) == 1:
-            raise ReplayError("does not hold, however fine it is")
-        return "holds"
-
-    monkeypatch.setattr(joining, "finish_plan", finish)
-    monkeypatch.setattr(joining, "assemble_plan", lambda made: None)
-    fails = SimpleNamespace(failure=(2, "a contact is lost"))
-    found = SimpleNamespace(culprit=2, usually=fails)
-    checked = SimpleNamespace(of=lambda *given: found)
-    monkeypatch.setattr(joining, "Checked", checked)
-    links = [(landing, ways), (onward, list[Measured]())]
-    assert join_route(PROBLEM, links, PlanOptions(), plans, lambda _: None) == "holds"
-    # The border has no other ways: its plan is first refined, then the landing chosen anew.
-    tried = [key for key in plans.asked if key != key_steps(onward.steps)]
-    assert tried == [key_steps(ways[0].steps), key_steps(landing.steps)] and finished == [2, 2]
-
-
 def make_link(duration: float) -> Link:
     steps = (EdgeStep(PLACE.contacts, Until(coordinate="x", value=duration)),)
     return Link(PLACE, PLACE, steps, duration)
@@ -226,18 +189,3 @@ def test_a_border_that_no_other_place_is_better_for_may_be_left_in_motion() -> N
     # Where another place is better, that is gone on with.
     other = Cell(-7, -20, moving=0.9)
     assert other.leave()[0].duration == pytest.approx(1) and RefinedPath(None) not in other.tried
-
-
-def test_another_guess_goes_on_from_the_best_place() -> None:
-    cell = Cell(-4, -20, saved=0.3)
-    assert cell.leave()[0].duration == pytest.approx(0.7)
-    nearest = [way.move for way in cell.tried if not way.straight]
-    assert nearest[0] == -4 and set(nearest[1:]) == {-4 + own for own in (-2, 2, -1, 1)}
-
-
-def test_what_is_looked_at_first_may_be_at_hand() -> None:
-    plain, ahead = Cell(-7, -8), Cell(-7, -8)
-    leaving = Leaving(ahead, plan_of(1 + 7 * FINEST))
-    leaving.look_ahead(lambda tasks: [task() for task in tasks])
-    assert leaving.run()[0] == plain.leave()[0]
-    assert set(plain.tried) <= set(ahead.tried)

@@ -114,13 +114,6 @@ def test_near_miss_names_the_border_and_its_distance(heptagon: Problem) -> None:
     )
 
 
-def test_tolerance_is_relative_to_the_object(heptagon: Problem) -> None:
-    """1.5 % of the radius of gyration, half a millimetre for the heptagon, and half a degree."""
-    near = tolerance(heptagon.scene)
-    assert near[0] == 0.015 * heptagon.scene.scales.length
-    np.testing.assert_allclose(near, [5e-4, np.radians(0.5)], rtol=0.01)
-
-
 def test_leg_with_one_end_off_the_border_is_straight(heptagon: Problem) -> None:
     scene, near = heptagon.scene, tolerance(heptagon.scene)
     start, stop = on_border(heptagon, PHI), on_border(heptagon, PHI + 0.2)
@@ -147,9 +140,3 @@ def test_nothing_touches_beyond_the_reach_of_a_finger() -> None:
     grid = map_labels(scene)
     for x in (-2.0, 2.0):
         assert (grid.labels[grid.look_up(np.array([x, 0.3]))] == NOWHERE).all()
-
-
-def test_labels_are_found_in_the_list() -> None:
-    grid = map_labels(make_scene())
-    assert grid.find(grid.labels[[3, 1]]).tolist() == [3, 1]
-    assert grid.find(np.array([[10**6, 0, 0]])).tolist() == [-1]

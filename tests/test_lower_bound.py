@@ -240,14 +240,6 @@ def test_half_the_way_is_for_speeding_up_and_half_for_braking() -> None:
     assert find_durations(rows, *grid)[0] == pytest.approx(2 * np.sqrt(LENGTH), rel=1e-9)
 
 
-def test_where_nothing_limits_the_speed_there_is_still_a_time() -> None:
-    rows, grid = push()
-    rows.a[0, COUNT // 2] = 0.0
-    least = find_durations(rows, *grid)[0]
-    # To and from the middle it speeds up and brakes as before, at most.
-    assert 0.9 * 2 * np.sqrt(LENGTH) < least < 2 * np.sqrt(LENGTH) * (1 + 1e-9)
-
-
 @pytest.mark.filterwarnings("error")
 def test_a_closed_place_lets_no_viscous_motion_pass() -> None:
     rows, grid = push()

@@ -18,13 +18,11 @@ from scipy import ndimage
 
 from crossing import hexagon
 from shipped import HEPTAGON
-from wholearm import plots
 from wholearm.cli.command import main
 from wholearm.figures.map_figure import draw_map
-from wholearm.figures.map_lines import choose_tints, find_room, split
+from wholearm.figures.map_lines import find_room, split
 from wholearm.mapping.borders import Window
 from wholearm.mapping.formation_map import FormationMap, build_map
-from wholearm.problem.definition import Problem
 from wholearm.results.trajectory import Trajectory
 
 
@@ -109,13 +107,6 @@ def test_plan_is_drawn_over_the_map(chart: FormationMap, trajectory: Trajectory)
     assert any(np.allclose(end[-1], stop) for end in ends)
 
 
-def test_equal_maps_give_equal_files(heptagon: Problem, tmp_path: Path) -> None:
-    paths = [tmp_path / "one.svg", tmp_path / "two.svg"]
-    for path in paths:
-        plots.save(draw_map(build_map(heptagon, 20, Window((-0.03, 0.03), (-0.1, 0.0)))), path)
-    assert paths[0].read_bytes() == paths[1].read_bytes()
-
-
 def test_command_writes_the_figure(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -171,10 +162,3 @@ def test_parts_and_their_rooms_are_those_of_scipy(seed: int) -> None:
         room = ndimage.distance_transform_edt(np.pad(other, 1), sampling=step)[1:-1, 1:-1]
         row, column, found = find_room(region, step)
         assert found == pytest.approx(room.max()) == pytest.approx(room[row, column])
-
-
-def test_neighbours_have_tints_of_their_own() -> None:
-    cell = np.array([[0, 0, 1], [2, -1, 1], [2, 3, 3]])
-    tints = choose_tints(cell, 3)
-    assert all(tints[a] != tints[b] for a, b in ((0, 1), (0, 2), (1, 3), (2, 3)))
-    assert set(tints.tolist()) <= {0, 1, 2}

@@ -11,11 +11,8 @@ from wholearm.planning.time_domain.collocation import Scheme, make_scheme
 from wholearm.planning.time_domain.stage import Stage, StagePoints
 from wholearm.planning.time_domain.time_mesh import (
     AT_ONCE,
-    DEAR,
     DEFECT,
     bisect,
-    bisect_intervals,
-    cap_halvings,
     count_halvings,
     monitor_violated,
     resample,
@@ -113,9 +110,6 @@ def test_halved_intervals_hold_the_same_motion(name: str, degree: int) -> None:
         np.testing.assert_allclose(finer.tau[k], ends @ part.tau[parent], atol=1e-12)
 
 
-SCHEME = make_scheme("radau", 3)
-
-
 def make_stages(motions: list[StageMotion]) -> list[Stage]:
     return [Stage(0, motion.formation, motion.directions, motion.points) for motion in motions]
 
@@ -124,14 +118,6 @@ def make_stages(motions: list[StageMotion]) -> list[Stage]:
 def stages() -> list[Stage]:
     """Those of the landing; every direction of friction is that of the motion."""
     return make_stages(stages_of(plan_landing(time_intervals=6)))
-
-
-def test_only_marked_stages_are_halved(stages: list[Stage]) -> None:
-    times = [np.zeros(stage.intervals, dtype=int) for stage in stages]
-    times[1][:2] = 1, 2
-    finer = bisect_intervals(stages, SCHEME, times)
-    assert finer[0] is stages[0] and finer[1].intervals == stages[1].intervals + 4
-    assert finer[1].guess.duration == stages[1].guess.duration
 
 
 @pytest.mark.parametrize("name, degree", [("radau", 2), ("radau", 3), ("legendre", 3)])
@@ -147,13 +133,6 @@ def test_defects_that_shrink_with_the_order_need_one_round(name: str, degree: in
     # Once less would not have done.
     assert (left * 2**scheme.order > DEFECT)[times > 0].all()
     assert set(times[sizes < DEFECT].tolist()) == {0}
-
-
-def test_dearer_misses_are_halved_more_often() -> None:
-    prices = DEAR * np.array([0.0, 0.9, 1.1, 10.0, 100.0, 1e9])
-    times = count_halvings(prices, np.zeros((6, 2, 5)), SCHEME)
-    assert times[:3].tolist() == [0, 0, 1] and times[-1] == AT_ONCE
-    assert (np.diff(times) >= 0).all()
 
 
 def test_limits_that_are_broken_are_watched_from_then_on(stages: list[Stage]) -> None:
@@ -172,11 +151,3 @@ def test_limits_that_are_broken_are_watched_from_then_on(stages: list[Stage]) ->
     assert [stage.monitored for stage in changed[:-1]] == [
         stage.monitored for stage in monitored[:-1]
     ]
-
-
-def test_intervals_are_quartered_only_where_that_makes_few() -> None:
-    times = [np.array([2, 0, 1]), np.array([2, 2])]
-    for wanted, own in zip(times, cap_halvings(times, 15), strict=True):
-        assert (wanted == own).all()
-    first, second = cap_halvings(times, 14)
-    assert first.tolist() == [1, 0, 1] and second.tolist() == [1, 1]

@@ -23,7 +23,6 @@ from wholearm.planning.time_domain.stage_modes import (
     merge,
     mode_of,
     release_earlier,
-    sign_sequence,
     split,
 )
 from wholearm.planning.time_domain.time_mesh import resample
@@ -75,25 +74,6 @@ def test_pieces_of_a_stage_are_linked(begin: int, stop: int) -> None:
         assert (piece.until is until) == (end == 8) and piece.opens == (start == 0)
 
 
-def test_what_rolls_next_comes_to_rest_and_what_slides_on_starts_from_it() -> None:
-    stage = make_stage("v1-palm v4-finger1 v6-finger2")
-    first, middle, last = link(split(stage, SCHEME, 3, 6, mode_of(stage).changed((0,), 0.0)))
-    assert first.gained is middle.formation and first.turns == ()
-    assert middle.gained is None and middle.turns == () and last.gained is None
-
-
-def test_merging_undoes_splitting() -> None:
-    stage = make_stage("v1-palm v4-finger1 v6-finger2", 9)
-    pieces = split(stage, SCHEME, 3, 6, turned(stage, 0))
-    (whole,) = merge([in_mode(piece, mode_of(stage)) for piece in pieces])
-    assert whole.guess.duration == pytest.approx(stage.guess.duration, rel=1e-12)
-    np.testing.assert_allclose(whole.guess.fractions, stage.guess.fractions, rtol=1e-12)
-    assert len(merge(pieces)) == 3
-    # Phases stay apart.
-    assert len(merge([stage, replace(stage, phase=1)])) == 2
-    assert sign_sequence(pieces) != sign_sequence([whole])
-
-
 def test_a_stage_that_is_dropped_leaves_its_duties_to_its_neighbours() -> None:
     stage = make_stage("v1-palm v4-finger1 v6-finger2", opens=True, until=Until(coordinate="x"))
     first, last = split(stage, SCHEME, 0, 4, turned(stage, 0))
@@ -120,13 +100,6 @@ def test_releasing_earlier_hands_a_stage_to_the_next_phase() -> None:
     assert release_earlier([before, holding, free], 0) is None
     assert release_earlier([before, free], 0) is None
     assert release_earlier([before, replace(holding, until=Until()), free], 1) is None
-
-
-def test_formations_in_other_modes_are_of_the_same_scene() -> None:
-    stage = make_stage("v1-palm v4-finger1")
-    rolling = in_mode(stage, StageMode((0.0, 1.0, 1.0, 1.0)))
-    assert isinstance(rolling.formation, Formation)
-    assert rolling.formation.scene is stage.formation.scene
 
 
 THREE = "v1-palm v4-finger1 v6-finger2"
@@ -192,16 +165,6 @@ def test_merging_keeps_the_motion() -> None:
     assert_same_motion([stage], merged)
 
 
-def test_dropping_leaves_the_motion_of_the_others() -> None:
-    stage = cubic_stage()
-    pieces = split(stage, SCHEME, 2, 5, turned(stage, 0))
-    left = drop(pieces, 1)
-    assert left is not None
-    assert [mode_of(piece) for piece in left] == [mode_of(stage)] * 2
-    for kept, own in zip(left, (pieces[0], pieces[2]), strict=True):
-        assert_same_motion([own], [kept])
-
-
 def own_formations(stages: list[Stage]) -> list[Formation]:
     return [make_stage(THREE).formation for _ in stages]
 
@@ -256,11 +219,6 @@ def test_what_is_held_back_on_both_sides_of_a_change_turns_on_both() -> None:
     assert [1.0, -1.0, -1.0, 1.0] not in list_signs([first, replace(last, phase=first.phase + 1)])
 
 
-def test_nothing_is_asked_for_where_nothing_is_held_back() -> None:
-    stage = hold_back(make_stage(THREE), 0, 0, 0)
-    assert not list(list_moves([stage], SCHEME, own_formations([stage]), 0.05))
-
-
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_what_leans_on_its_cone_is_let_slide_that_way(sign: float) -> None:
     sliding = hold_back(make_stage(THREE), 0, 0, 0)
@@ -274,18 +232,6 @@ def test_what_leans_on_its_cone_is_let_slide_that_way(sign: float) -> None:
     assert [mode_of(part).signs[0] for part in found] == [0.0, sign, 0.0]
     # What its phase asks to roll goes on rolling.
     assert not list(list_moves([stage], SCHEME, [stage.formation], 0.05, leaning=True))
-
-
-def test_a_stage_that_has_shrunk_to_nothing_is_dropped_first() -> None:
-    stage = hold_back(make_stage(THREE), 0, 0, 0)
-    first, gone, last = split(stage, SCHEME, 3, 6, turned(stage, 0))
-    gone = replace(gone, guess=gone.guess._replace(duration=1e-5))
-    stages = link([first, gone, last])
-    found = next(list_moves(stages, SCHEME, own_formations(stages), 0.05))
-    # Its neighbours are in one mode, and so one stage.
-    assert [mode_of(part) for part in found] == [mode_of(stage)]
-    total = first.guess.duration + last.guess.duration
-    assert found[0].guess.duration == pytest.approx(total, rel=1e-12)
 
 
 def test_what_the_next_phase_lets_roll_slides_until_then() -> None:

@@ -127,20 +127,6 @@ def test_misses_of_the_margin_and_of_torques(curves: tuple[Curve, ...]) -> None:
     np.testing.assert_allclose(low, worst, rtol=0, atol=1e-3)
 
 
-def test_spread_is_exact_at_nodes_and_between(curves: tuple[Curve, ...]) -> None:
-    data = prepare(curves[0], EPSILON, Mesh().make_grid(curves[0], 8), 1)
-    profile, k, h = random_profile(data, 3), data.nonempty, data.grid.steps[data.nonempty]
-    ends = data.interpolate(profile, np.array([0.0, 1.0]))
-    # b' = 2 a has been integrated with the same rule, but for the rounding of powers of degree 4.
-    for found, exact in zip(ends, profile, strict=True):
-        pairs = np.column_stack([exact[k], exact[k + 1]]).ravel()
-        np.testing.assert_allclose(found, pairs, rtol=0, atol=1e-12 * np.abs(exact).max())
-    part = data.interpolate(profile, np.array([0.4, 0.4 + 1e-4]))
-    slope = np.diff(part.b.reshape(-1, 2))[:, 0] / (1e-4 * h)
-    middle = part.a.reshape(-1, 2).mean(axis=1)
-    np.testing.assert_allclose(slope, 2 * middle, rtol=0, atol=1e-6)
-
-
 def test_speed_limits_bound_b(curves: tuple[Curve, ...]) -> None:
     free = prepare(curves[1], EPSILON, Mesh().make_grid(curves[1], 5), 1)
     assert np.isposinf(free.largest_b(free.nodes)).all()

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from plane import make_formation, measure_gaps, measure_slip, rotate
-from timed import landing
 from tipping import roll, tilting
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
@@ -18,7 +17,6 @@ from wholearm.geometry.curve import Curve
 from wholearm.geometry.explore import close_all, close_contacts
 from wholearm.geometry.path_guess import (
     POINTS,
-    RELEASE_AT,
     PathGuess,
     count_freedoms,
     guess_curve,
@@ -26,7 +24,7 @@ from wholearm.geometry.path_guess import (
     guess_phase,
     load,
 )
-from wholearm.geometry.tracing import trace_phase, trace_phases, until_distance
+from wholearm.geometry.tracing import trace_phases, until_distance
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.time_domain.time_plan import plan_phases
@@ -90,16 +88,6 @@ def test_outlines_end_where_their_phase_does(
 
 
 @pytest.mark.parametrize("phase", range(6))
-def test_points_are_spread_evenly(outlines: list[list[PathGuess]], phase: int) -> None:
-    for part in outlines[phase]:
-        scale = part.formation.scene.polygon.gyration_radius ** np.array([0, 0, 1, 1, 1])
-        steps = np.linalg.norm(np.diff(part.z, axis=0) * scale, axis=1)
-        # Arc length is even on curves; a straight line is pulled onto its contacts afterwards.
-        assert steps.max() < 1.2 * steps.min()
-        assert part.length == pytest.approx(steps.sum(), rel=1e-12)
-
-
-@pytest.mark.parametrize("phase", range(6))
 def test_directions_are_those_of_travel(outlines: list[list[PathGuess]], phase: int) -> None:
     for part in outlines[phase]:
         middle = len(part.z) // 2
@@ -123,23 +111,6 @@ def test_curves_are_split_where_something_turns(curves: tuple[Curve, ...]) -> No
             rates = [*measure_slip(part.formation, part.z[-1], speed), *speed[3:]]
             # Rates per metre are about one; reversals are found to rounding.
             assert np.abs([rates[row] for row in part.turns]).max() < 1e-8
-
-
-@pytest.mark.parametrize("share", [0.02, 0.3, 0.7])
-def test_a_share_of_a_curve_is_outlined(curves: tuple[Curve, ...], share: float) -> None:
-    curve = curves[2]
-    parts = guess_curve(curve, share)
-    assert len(parts) == sum(segment.start < share * curve.length for segment in curve.segments)
-    assert sum(part.length for part in parts) == pytest.approx(share * curve.length, rel=1e-3)
-
-
-def test_a_release_is_guessed_before_the_curve_ends(
-    flipping: Problem, outlines: list[list[PathGuess]]
-) -> None:
-    phase = flipping.phases[4]
-    whole = trace_phase(phase, outlines[4][0].z[0])
-    length = sum(part.length for part in outlines[4])
-    assert length == pytest.approx(RELEASE_AT * whole.length, rel=1e-3)
 
 
 @pytest.mark.parametrize("row, value", [(0, 0.02), (2, -0.9)])
@@ -284,23 +255,6 @@ def test_ends_ahead_lie_where_the_motion_goes(square: Problem) -> None:
     assert guess_onwards(square.phases[2], before) == []
 
 
-def test_contacts_of_a_flush_edge_turn_as_one(square: Problem) -> None:
-    formation, rng = square.phases[2].formation, np.random.default_rng(7)
-    assert [formation.turn_with(row) for row in range(6)] == [
-        (0,),
-        (1, 2),
-        (1, 2),
-        (3,),
-        (4,),
-        (5,),
-    ]
-    z = trace_phases(square)[2].end
-    free = np.linalg.svd(formation.evaluate(z[None], np.zeros((1, 5))).P[0])[2][4]
-    slip = measure_slip(formation, z, rng.normal() * free)
-    assert slip[1] == pytest.approx(slip[2], rel=1e-9)
-    assert np.abs(slip[[0, 3]] - slip[1]).min() > 1e-3 * np.abs(slip).max()
-
-
 def test_a_flush_edge_that_turns_is_planned_in_the_time_domain_too(square: Problem) -> None:
     curves, options = trace_phases(square), PlanOptions(time_intervals=6)
     curve = curves[2]
@@ -333,24 +287,6 @@ def test_phases_without_ends_of_their_own_go_towards_the_next_end() -> None:
     start = evaluate_gap(sliding, sliding.start)
     assert start > gaps[0] > gaps[1] > 0.1 * start
     np.testing.assert_allclose([gaps[2], gaps[4]], 0.0, atol=1e-9)
-
-
-def test_a_phase_that_rolls_between_others_does_not_go_back() -> None:
-    """Though the way back is longer; only a contact that is let go may take that."""
-    problem = landing()
-    *before, last = problem.phases
-    rolling = roll(last.formation, "v1-palm")
-    opened = [
-        replace(last, index=last.index + k, formation=one, until=Until(), end=End.SMOOTH)
-        for k, one in enumerate((last.formation, rolling))
-    ]
-    parts = replace(problem, phases=(*before, *opened, replace(last, index=last.index + 2)))
-    z = guess_phase(parts.phases[4], trace_phases(parts)[-1].end)[-1].z[-1]
-    gaps = [evaluate_gap(problem, z)]
-    for phase in parts.phases[5:]:
-        z = guess_phase(phase, z, parts.phases[phase.index + 1 :])[-1].z[-1]
-        gaps.append(evaluate_gap(problem, z))
-    assert (np.diff(gaps) < 0).all() and gaps[-1] == pytest.approx(0.0, abs=CLOSED)
 
 
 def evaluate_gap(problem: Problem, z: Array) -> float:

@@ -101,28 +101,6 @@ def test_profile_holds_the_derivatives_of_s(seed: int) -> None:
     np.testing.assert_array_equal(segment, motion.grid.segment[k])
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_nodes_are_passed_at_their_times(seed: int) -> None:
-    motion = random_motion(seed)
-    s, segment, here = motion.locate(motion.times[1:-1])
-    # Slow ends: a time known to 1e-16 fixes s to the square root of nothing worse than this.
-    np.testing.assert_allclose(s, motion.grid.s[1:-1], rtol=1e-12)
-    later = np.append(motion.grid.steps[1:] > 0, True)[:-1]
-    np.testing.assert_array_equal(segment[later], motion.grid.segment[1:-1][later])
-    np.testing.assert_allclose(here.b, motion.profile.b[1:-1], rtol=1e-10)
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_rest_at_both_ends_and_beyond(seed: int) -> None:
-    motion = random_motion(seed)
-    s, _, here = motion.locate(np.array([-1.0, 0.0, motion.duration, motion.duration + 1.0]))
-    length = motion.curve.length
-    np.testing.assert_allclose(s, [0, 0, length, length], rtol=0, atol=1e-13 * length)
-    np.testing.assert_allclose(here.b, 0.0, atol=1e-12 * motion.profile.b.max())
-    ends = motion.profile.a[[0, 0, -1, -1]]
-    np.testing.assert_allclose(here.a, ends, rtol=1e-9)
-
-
 def test_interval_of_length_zero_takes_no_time_and_jumps() -> None:
     motion = random_motion(0)
     (gap,) = np.flatnonzero(np.diff(motion.grid.segment))

@@ -33,7 +33,6 @@ from wholearm.planning.path_domain.path_nlp import (
     parameters,
     unpack,
 )
-from wholearm.planning.path_domain.refine import move_multipliers
 from wholearm.planning.path_domain.terms import LimitShape
 
 EPSILON = 0.05
@@ -71,19 +70,6 @@ def evaluate(nlp: PathNLP, data: PhaseData, x: Array, time_weight: float = 1.0) 
     oracle = nlp.solver.function.oracle()
     f, g = oracle(x, parameters(nlp, data, UNITS, time_weight))
     return float(f), g.full()[:, 0]
-
-
-@pytest.mark.parametrize("objective", Objective)
-def test_pack_and_unpack(data: PhaseData, profile: Profile, objective: Objective) -> None:
-    nlp = build_path_nlp(SHAPE, INTERVALS, objective)
-    x = pack(nlp, profile, UNITS, 0.7)
-    assert x.shape == (nlp.solver.function.size1_in("x0"),)
-    found, margin = unpack(nlp, data.grid, x, UNITS)
-    for one, other in zip(found, profile, strict=True):
-        np.testing.assert_allclose(one, other, rtol=0, atol=1e-13 * np.abs(other).max())
-    chained = objective in (Objective.MARGIN, Objective.RELAX)
-    assert margin == pytest.approx(0.7 if chained else 0.0)
-    assert found.b[0] == found.b[-1] == 0.0
 
 
 def test_unpack_restores_the_integral_of_a(data: PhaseData, profile: Profile) -> None:
@@ -185,49 +171,6 @@ def test_objectives_measure_the_motion(data: PhaseData, profile: Profile) -> Non
     nlp = build_path_nlp(SHAPE, INTERVALS, Objective.MARGIN)
     low, high = (evaluate(nlp, data, pack(nlp, profile, UNITS, m))[0] for m in (0.0, 1.4))
     assert low - high == pytest.approx(1.4 / UNITS.force, rel=1e-12)
-
-
-def test_tightening_reaches_what_is_slack(data: PhaseData) -> None:
-    nodes = len(data.grid.s)
-    none = Tightening.none(data, 2.0)
-    assert none.limits.shape == (nodes, 8) and not none.limits.any()
-    reach, limits = np.zeros((nodes, 8)), np.zeros((nodes, 8))
-    reach[3, 2], limits[3, 2], limits[4, 2] = 0.5, 0.1, 0.2
-    slow = np.full((nodes, 2, 2), 0.2)
-    tight = none.by(reach, limits, np.full(nodes, 0.1), 0.01, slow)
-    assert tight.limits[3, 2] == pytest.approx(0.6) and tight.limits[4, 2] == pytest.approx(0.2)
-    assert np.count_nonzero(tight.limits) == 2 and tight.duration == pytest.approx(1.98)
-    np.testing.assert_allclose(tight.speed_share, 0.9)
-    np.testing.assert_allclose(tight.motors, 0.8)
-    again = tight.by(reach, limits, np.zeros(nodes), 0.0, slow)
-    assert again.limits[3, 2] == pytest.approx(0.7) and again.limits[4, 2] == pytest.approx(0.4)
-
-
-@pytest.mark.parametrize("objective", [Objective(choice) for choice in CHOICES])
-def test_multipliers_move_between_grids(data: PhaseData, objective: Objective) -> None:
-    nlp = build_path_nlp(SHAPE, INTERVALS, objective)
-    rng = np.random.default_rng(5)
-    sizes = {
-        "lam_x0": nlp.solver.function.size1_in("x0"),
-        "lam_g0": nlp.solver.function.size1_out("g"),
-    }
-    multipliers = {key: rng.uniform(0.1, 1.0, size) for key, size in sizes.items()}
-    same = move_multipliers(nlp, nlp, multipliers, data.grid, data.grid)
-    for key in sizes:
-        np.testing.assert_allclose(same[key], multipliers[key], atol=1e-6)
-    # On twice the elements each node stands for half the length, so multipliers of limits halve.
-    fine = prepare(data.curve, EPSILON, Mesh().make_grid(data.curve, 2 * ELEMENTS), 1)
-    finer = build_path_nlp(SHAPE, len(fine.grid.steps), objective)
-    even = {key: np.ones(size) for key, size in sizes.items()}
-    rows = nlp.columns.g["limits"]
-    even["lam_g0"][rows] = np.repeat(data.grid.weights, 6)
-    moved = move_multipliers(nlp, finer, even, data.grid, fine.grid)
-    rows = finer.columns.g["limits"]
-    np.testing.assert_allclose(moved["lam_g0"][rows], np.repeat(fine.grid.weights, 6), rtol=1e-9)
-    links = moved["lam_g0"][finer.columns.g["links"]]
-    assert len(links) == 2 * ELEMENTS * (DEGREE + 1) - 1
-    np.testing.assert_allclose(links[: -DEGREE - 1], 1.0, rtol=1e-9)
-    assert moved["lam_x0"].shape == (finer.solver.function.size1_in("x0"),)
 
 
 @pytest.mark.parametrize("objective", Objective)

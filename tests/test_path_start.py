@@ -12,7 +12,7 @@ from wholearm.mechanics.metric import metric_weights
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain.first_guess import guess
-from wholearm.planning.path_domain.path_data import PhaseData, join, prepare
+from wholearm.planning.path_domain.path_data import PhaseData, prepare
 from wholearm.planning.path_domain.path_mesh import Mesh
 from wholearm.planning.path_domain.path_motion import PathMotion
 from wholearm.planning.path_domain.path_nlp import build_path_nlp, pack, parameters
@@ -76,12 +76,6 @@ def test_a_place_that_limits_the_margin_is_named(curves: tuple[Curve, ...]) -> N
     assert at_leisure == pytest.approx(at_once, rel=5e-4)
 
 
-def test_no_motion_is_found_that_is_not_there(curves: tuple[Curve, ...]) -> None:
-    assert find_fastest(prepare_on(curves[0], Mesh())._replace(epsilon=EPSILON), None) is not None
-    hard = prepare(curves[0], 50.0, Mesh().make_grid(curves[0], ELEMENTS), 1)
-    assert find_fastest(hard, None) is None
-
-
 @pytest.mark.parametrize("goal", [Objective.TIME, Objective.MARGIN])
 def test_the_start_is_near_a_solution(curves: tuple[Curve, ...], goal: Objective) -> None:
     """The conditions of optimality of the NLP itself, derived by CasADi, almost hold."""
@@ -110,21 +104,6 @@ def test_the_start_is_near_a_solution(curves: tuple[Curve, ...], goal: Objective
     multipliers = start.multipliers["lam_x0"] + of_g.T @ start.multipliers["lam_g0"]
     left = of_f[:, 0] + multipliers
     assert np.abs(left).max() < 0.03 * np.abs(of_f).max()
-
-
-def test_phases_that_are_joined_switch_within_each(curves: tuple[Curve, ...]) -> None:
-    """A reversal, and where phases meet, are ends of elements anyway."""
-    parts = [
-        prepare(curve, EPSILON, Mesh().make_grid(curve, ELEMENTS, rests), 1)
-        for curve, rests in ((curves[0], (True, False)), (curves[0], (False, True)))
-    ]
-    found = find_fastest(join(parts), None)
-    assert isinstance(found, Fastest)
-    lengths = curves[0].length
-    ends = [lengths, *(k * lengths + part.stop for k in (0, 1) for part in curves[0].segments)]
-    for place, _ in found.switches:
-        assert np.abs(np.array(ends) - place).min() > 0
-    assert sum(jumps for _, jumps in found.switches) >= 1
 
 
 def test_the_gradient_of_a_linear_cost_is_its_part_along_the_curve(heptagon: Problem) -> None:

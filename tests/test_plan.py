@@ -2,8 +2,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from shipped import HEPTAGON, plan_of
 from thrown import shove
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError
-from wholearm.planning.blocks import share_again
 from wholearm.planning.options import Objective
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
@@ -212,17 +210,6 @@ def test_samples_and_progress(heptagon: Problem) -> None:
 def test_unknown_option(heptagon: Problem) -> None:
     with pytest.raises(TypeError, match="colour"):
         solve(heptagon, colour="red")
-
-
-def test_a_block_that_starts_elsewhere_gets_another_share(heptagon: Problem) -> None:
-    """In proportion to its own least time; those after it share what that leaves of the whole."""
-    least, quick = ([SimpleNamespace(motion=SimpleNamespace(duration=t))] for t in (0.1, 0.12))
-    allowed: list[float | None] = [0.3, 0.2, 0.4, 0.1]
-    share_again(allowed, heptagon.phases[1:2], cast(Any, least * 4), cast(Any, quick))
-    assert allowed == pytest.approx([0.3, 0.24, 0.4 * 0.92, 0.1 * 0.92])
-    known = list(allowed)
-    share_again(allowed, heptagon.phases[3:4], cast(Any, least * 4), cast(Any, quick))
-    assert allowed == known
 
 
 def shoved_in() -> list[float]:

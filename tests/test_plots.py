@@ -171,13 +171,6 @@ def test_units_suit_the_size(axes: Axes, size: float, prefix: str) -> None:
     assert max(map(len, labels)) <= 5
 
 
-def test_snapshots_say_when_and_which_phase(figure: Figure, planned: Trajectory) -> None:
-    captions = [axes.texts[-1].get_text() for axes in figure.axes[1:6]]
-    times = [float(caption.split()[0]) for caption in captions]
-    np.testing.assert_allclose(times, planned.phase_starts[1:], atol=5e-4)
-    assert [c.split("\n")[1] for c in captions] == [f"phase {k}" for k in range(2, 6)] + ["end"]
-
-
 def test_margins_are_the_trajectory_with_breaks_at_phases(
     figure: Figure, planned: Trajectory
 ) -> None:
@@ -207,16 +200,6 @@ def test_zero_line_and_limits_are_there(
     for line in torques.lines:
         if line.get_label() == "limits":
             assert line.is_dashed()
-
-
-def test_every_contact_is_named_and_styled_alike(figure: Figure, planned: Trajectory) -> None:
-    margins = figure.axes[-2]
-    legend = margins.get_legend()
-    assert legend is not None
-    assert [text.get_text() for text in legend.get_texts()] == list(planned.contacts)
-    for axes, phase in zip(figure.axes[:6], [0, 1, 2, 3, 4, 4], strict=True):
-        for name in planned.motions[phase].contacts:
-            assert line_of(axes, name).get_markerfacecolor() == line_of(margins, name).get_color()
 
 
 def test_torque_lines_have_both_ends_of_every_step(axes: Axes) -> None:

@@ -121,23 +121,6 @@ def test_the_fastest_motion_between_limits_of_the_acceleration() -> None:
     assert b == pytest.approx(2 * np.minimum(s, 1 - s), abs=1e-9)
 
 
-def test_one_place_gives_up_reserve_that_another_one_needs() -> None:
-    # |s''| <= 2 asked with a reserve of 1; halfway only what is as fast as the plan passes.
-    s = np.linspace(0.0, 1.0, 21)
-    limits = np.array([[2.0, 0, 0, -1.0, 0], [2.0, 0, 0, 1.0, 0], [0.0, 0, 0, 0, 0]])
-    slack = np.tile(limits, (21, 1, 1))
-    cap = 4 * np.minimum(s, 1 - s)
-    slack[10, 2, :2] = -0.6 * cap[10], 1.0
-    reserve = np.tile([1.0, 1.0, 0.0], (21, 1))
-    found = retime(s, slack, reserve, cap)
-    b = found.run(0.0)
-    a = np.diff(b) / (2 * np.diff(s))
-    assert b[10] >= 0.6 * cap[10] - 1e-9
-    # In each half |s''| has to be 1.2: all of the reserve cannot be kept, 0.8 of it could.
-    assert 0.5 <= found.share.min() <= 0.8
-    assert np.abs(a).max() <= 2 - found.share.min() + 1e-9
-
-
 def test_a_curve_without_a_reserve_is_run_more_slowly() -> None:
     whole = problem_of(SQUARE)
     start = trace_phase(whole.phases[0], whole.start, whole.phases[1:]).end

@@ -21,15 +21,9 @@ from wholearm.benchmark.precision.planners import (
 )
 from wholearm.benchmark.precision.reference import Course, measure_error
 from wholearm.benchmark.precision.reference_check import check_plan
-from wholearm.benchmark.precision.runs import SHIFT, SHORT, SOLVED, Median, find_mean, measure
+from wholearm.benchmark.precision.runs import SHORT, SOLVED, Median, measure
 from wholearm.benchmark.precision.simulators import FEW, SIMULATORS, make_course
-from wholearm.benchmark.precision.tables import (
-    Medians,
-    PeerComparison,
-    draw_medians,
-    find_times,
-    format_report,
-)
+from wholearm.benchmark.precision.tables import Medians, PeerComparison, find_times
 from wholearm.cli.command import main
 from wholearm.problem.definition import End, Problem
 from wholearm.results.torque import TorqueProfile
@@ -84,23 +78,6 @@ def test_methods_that_nobody_knows_are_named(capsys: pytest.CaptureFixture[str])
     assert "--peers: 'fastest' given; allowed are wholearm;" in capsys.readouterr().err
 
 
-def test_tables_and_figure_compare_what_there_is() -> None:
-    ours, theirs = Median(0.0, 0.1, (1e-5, 0.0, 0.0)), Median(0.5, 1.5, (-5e-5, 1e-5, 0.0))
-    medians: Medians = {
-        (LEAST_TIME, "a", "wholearm, curve", "20"): ours,
-        (LEAST_TIME, "b", "wholearm, curve", "20"): ours,
-        (LEAST_TIME, "a", "yapss", "20"): theirs,
-        (LEAST_TIME, "b", "yapss", "20"): theirs._replace(outcome="a contact is lost"),
-    }
-    text = format_report(medians, 2.0)
-    assert "| yapss | 2.0000 | 1 of 2 | 20 | 2.0000 | 1 of 2 | 20 | 2.0000 | 1 of 2 | 20 |" in text
-    assert "| yapss | 20 | 1 of 2 | 5.0e-05 |" in text
-    (panel, *_) = draw_medians(medians).axes
-    legend = panel.get_legend()
-    assert legend is not None
-    assert [label.get_text() for label in legend.get_texts()] == ["wholearm, curve", "yapss"]
-
-
 def test_peers_get_the_phases_that_they_know(heptagon: Problem) -> None:
     every = keep_curves(heptagon)
     assert every is not None and len(every.phases) == 5
@@ -129,12 +106,6 @@ def course() -> Course:
     return found
 
 
-def test_files_share_phases() -> None:
-    twice = str(PROBLEMS / "heptagon_twice.toml")
-    names = [instance.name for instance in list_instances((FLIPS, twice))]
-    assert names == [f"heptagon_four_contacts {number}" for number in range(1, 6)]
-
-
 def test_reference_is_exact_and_meets_the_reversal() -> None:
     assert course().own_error < 1e-13
     directions = {tuple(np.append(span.Xi, span.sigma)) for span in course().spans}
@@ -152,17 +123,6 @@ def test_every_simulator_converges_to_the_reference(method: str) -> None:
         for tolerance in (1e-5, 1e-9)
     ]
     assert errors[1] < 2e-7 and errors[1] < max(0.3 * errors[0], 1e-10)
-
-
-def test_phases_that_allow_no_slow_motion_have_no_course() -> None:
-    rough = list_instances((str(PROBLEMS / "heptagon_impact.toml"),))
-    assert [make_course(instance, FEW) is None for instance in rough[3:4]] == [True]
-
-
-def test_a_phase_alone_starts_where_its_curve_does() -> None:
-    for instance in list_instances((FLIPS,)):
-        assert isinstance(instance, Instance)
-        assert np.array_equal(instance.problem.start, instance.curve.start)
 
 
 FINE = Median(0.5, 0.3, (-3e-7,))
@@ -193,8 +153,3 @@ def test_the_soonest_setting_counts_and_failures_never_do() -> None:
     assert find_times(MEDIANS, "a, b", own, 1e-6) == {"phase 1": 0.3, "phase 2": math.inf}
     built = own._replace(building=True)
     assert find_times(MEDIANS, "a, b", built, 1e-6) == {"phase 1": 0.8, "phase 2": math.inf}
-
-
-def test_means_are_geometric_but_for_their_shift() -> None:
-    assert find_mean([0.0, 3 * SHIFT]) == pytest.approx(SHIFT)
-    assert find_mean([1e6, 1e2]) == pytest.approx(1e4, rel=1e-3)

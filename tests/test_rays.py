@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -57,19 +56,6 @@ def test_rays_end_right_before_what_they_gain_touches() -> None:
     lengths = np.linalg.norm(rays.ways / unit_steps(scene), axis=1)[:, None]
     ends = rays.ends + BESIDE * rays.ways / lengths
     assert (measure_gap(scene, rays.gained, place(scene, rays.labels, ends)) < 0).all()
-
-
-def test_more_to_press_leaves_fewer_rays() -> None:
-    own, rays = around_the_start()
-    fewer = shoot([own], 4 * problem_of(SQUARE).epsilon)
-    assert len(fewer.gained) < len(rays.gained)
-
-
-def test_places_without_a_cell_have_no_rays() -> None:
-    own, _ = around_the_start()
-    epsilon = problem_of(SQUARE).epsilon
-    assert not len(shoot([replace(own, contacts=own.contacts[:1])], epsilon).gained)
-    assert not len(shoot([replace(own, contacts=())], epsilon).gained)
 
 
 def test_no_way_is_faster_with_more_to_press() -> None:

@@ -11,7 +11,7 @@ import pytest
 from planned import plan
 from shipped import HEPTAGON, problem_of
 from wholearm.cli.command import main
-from wholearm.common.errors import InputError, SimulationError
+from wholearm.common.errors import InputError
 from wholearm.figures import plots
 from wholearm.results.adopt import save
 from wholearm.results.torque import TorqueProfile, read_torque_csv
@@ -101,12 +101,6 @@ def test_a_replay_that_fails_is_drawn_and_saved(tmp_path: Path) -> None:
         report.trajectory.save(tmp_path / "a.npz")
         figure = plots.force_margins(load_trajectory(tmp_path / "a.npz"))
     plots.save(figure, tmp_path / "a.png")
-
-
-def test_a_replay_that_ends_at_once_is_no_trajectory() -> None:
-    report = verify(problem_of(HEPTAGON), press(0.3, -0.3))
-    with pytest.raises(SimulationError, match="no motion to keep: c_n of v1-palm falls to"):
-        plots.force_margins(report)
 
 
 def test_saving_goes_by_the_ending(simulation: Simulation, tmp_path: Path) -> None:

@@ -37,14 +37,6 @@ def test_every_way_to_set_things_in_motion_is_listed_once(freedoms: int, count: 
         assert (np.sign(rates @ way) == signs).all(axis=1).sum() == 1
 
 
-@pytest.mark.parametrize("phase", range(4))
-def test_what_is_planned_can_begin(phase: int) -> None:
-    problem = landing()
-    start = trace_phases(problem)[phase - 1].end if phase else problem.start
-    own, z = in_own_units(problem), scale_state(start, problem.scene.scales)
-    assert find_block(own.phases[phase].formation, z, own.epsilon) is None
-
-
 def test_what_limits_forbid_at_rest_is_refused_at_once() -> None:
     problem = landing()
     z = scale_state(problem.start, problem.scene.scales)
@@ -74,22 +66,6 @@ def test_motions_head_where_contacts_press() -> None:
     for way in headings:
         assert np.linalg.norm(way) > 1e-3
         assert np.abs(formation.evaluate(z[None], way[None]).A[0] @ way).max() < 1e-9
-
-
-@pytest.mark.parametrize("phase", range(4))
-def test_what_is_planned_can_come_to_rest(phase: int) -> None:
-    problem = landing()
-    own = in_own_units(problem)
-    z = scale_state(trace_phases(problem)[phase].end, problem.scene.scales)
-    assert find_block(own.phases[phase].formation, z, own.epsilon, ends=True) is None
-
-
-def test_an_end_at_which_nothing_comes_to_rest_is_refused() -> None:
-    problem = landing()
-    z = scale_state(trace_phases(problem)[0].end, problem.scene.scales)
-    formation = in_own_units(problem).phases[0].formation
-    blocked = find_block(formation, z, 50.0, ends=True)
-    assert blocked is not None and blocked.contact in formation.names and blocked.short > 1.0
 
 
 def test_one_contact_pushes_one_way_unless_the_centroid_passes_above_it() -> None:

@@ -97,13 +97,6 @@ def test_a_plan_says_what_it_is(made: Plan) -> None:
     assert arrivals == pytest.approx([phase.arrival for phase in report.phases])
 
 
-def test_a_search_for_modes_shows_in_the_status(within: Plan) -> None:
-    tried = [phase.sequences for phase in within.phases]
-    assert within.status is (Status.BEST if max(tried) > 1 else Status.SOLVED)
-    stopped = tuple(phase._replace(complete=False) for phase in within.phases)
-    assert Status.of(stopped) is Status.STOPPED
-
-
 def test_a_file_of_0_1_0_loads(made: Plan, tmp_path: Path) -> None:
     path = change_meta(made, tmp_path / "a.npz", {}, NOT_IN_0_1_0)
     loaded = load_plan(path)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import json
-import math
 import re
 import tomllib
 from collections.abc import Callable
@@ -18,15 +17,12 @@ import pytest
 from shipped import BOX, FOLDER, HEPTAGON
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
-from wholearm.contacts.elemental import build_features
 from wholearm.geometry.path_guess import load
-from wholearm.planning.plan import solve
 from wholearm.problem.definition import End, Problem
 from wholearm.problem.keys import TOP, build_schema, write_page
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.problem.table import describe_scene
 from wholearm.scene.model import Friction
-from wholearm.simulation.simulate import simulate
 
 jsonschema = pytest.importorskip("jsonschema")
 SCHEMA = build_schema()
@@ -153,21 +149,6 @@ def test_another_scene_is_the_scene_of_every_phase(heptagon: Problem) -> None:
     assert heptagon.table["friction"]["palm"] == pytest.approx(0.1)
 
 
-def test_both_ways_to_another_friction_plan_the_same(heptagon: Problem) -> None:
-    first = replace(heptagon, phases=heptagon.phases[:1])
-    rough = replace(first, scene=replace(first.scene, friction=Friction(0.2, 0.2, 0.2)))
-    by_name = first.with_(friction=0.2)
-    durations = [solve(problem).duration for problem in (first, rough, by_name)]
-    assert durations[1] == pytest.approx(durations[2], rel=1e-8)
-    assert durations[1] != pytest.approx(durations[0], rel=1e-3)
-    plan = solve(rough)
-    torque = plan.trajectory.torque
-    assert simulate(by_name, torque).outcome.reached
-    other = simulate(first, torque).t[-1]
-    assert other != pytest.approx(plan.duration, rel=1e-3)
-    assert plan.meta["problem"]["friction"]["palm"] == pytest.approx(0.2)
-
-
 @pytest.mark.parametrize(
     ("changes", "key", "expected"),
     [
@@ -196,17 +177,6 @@ def test_names_change_what_they_say(
     check_scene(other)
     check_table(other)
     assert other.source == heptagon.source
-
-
-def test_several_at_once_and_one_after_the_other(heptagon: Problem) -> None:
-    names = {"torque_limit": 2.5, "dry": 0.02}
-    both = heptagon.with_(names, x=0.044, **{"phases[5].until.phi_deg": -49.0})
-    assert both.scene.torque_limit == pytest.approx([2.5, 2.5])
-    assert both.scene.dry[3:] == pytest.approx([0.02, 0.02])
-    assert both.start[0] == 0.044
-    assert both.phases[4].until.value == pytest.approx(math.radians(-49.0))
-    steps = heptagon.with_(torque_limit=2.5).with_(dry=0.02).with_(x=0.044)
-    assert describe_scene(steps.scene) == describe_scene(both.scene)
 
 
 def test_none_leaves_out_what_is_optional(heptagon: Problem) -> None:
@@ -275,9 +245,3 @@ def test_other_phases_and_another_start_are_in_the_table(heptagon: Problem) -> N
     check_table(replace(heptagon, start=moved.start))
     tilted = heptagon.start + 0.1 * np.eye(5)[2]
     assert replace(heptagon, start=tilted).table == {}
-
-
-def test_scenes_of_one_shape_share_their_features(heptagon: Problem) -> None:
-    features = build_features(heptagon.scene)
-    assert build_features(heptagon.with_(friction=0.2, mass=0.3).scene) is features
-    assert build_features(heptagon.with_(length1=0.19).scene) is not features

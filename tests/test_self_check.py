@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -11,10 +10,9 @@ from planned import change, plan, plan_landing
 from wholearm.common.arrays import Array
 from wholearm.common.errors import JammingError, ReplayError
 from wholearm.geometry.tracing import trace_phases
-from wholearm.planning import blocks
 from wholearm.planning import replay_check as self_check
 from wholearm.planning.block_plan import Planning
-from wholearm.planning.blocks import plan_blocks, refine_block
+from wholearm.planning.blocks import plan_blocks
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.replay_check import (
     RESIDUAL,
@@ -23,12 +21,12 @@ from wholearm.planning.replay_check import (
     find_residual,
     replay_plan,
 )
-from wholearm.problem.definition import Phase, Problem
+from wholearm.problem.definition import Problem
 from wholearm.results.replay_figures import ReplayFigures
 from wholearm.results.report import Report
 from wholearm.results.trajectory import Trajectory
 from wholearm.verification.verdict import Allowance, find_least_force
-from wholearm.verification.verify import Observation, verify
+from wholearm.verification.verify import verify
 
 
 def brake_less(starts: Array, c: Array) -> Array:
@@ -53,22 +51,6 @@ def test_torques_that_do_not_carry_the_motion_are_found() -> None:
     assert check.failure is not None and check.failure == (2, verify(problem, weak).reason)
     # The first phase departs by the braking that it lacks.
     assert check.find_culprit(problem.scene.scales, Allowance(departure=1e-5), np.zeros(1)) == 1
-
-
-def test_a_phase_that_hardly_stops_is_found_by_where_the_next_one_ends() -> None:
-    """What departs is the second phase, by the speed that the first one leaves."""
-    problem, trajectory = plan()
-    (check,) = check_plan(
-        problem, replace(trajectory, torque=change(trajectory.torque, brake_less)), Allowance()
-    )
-    assert isinstance(check.report, Report)
-    first, *others = check.report.phases
-    speed, least = 1e-3, Allowance(departure=1.0, rest_speed=1.0)
-    report = replace(check.report, phases=(first._replace(end_speed=speed), *others))
-    left = check._replace(report=report)
-    duration_row = np.array([1.0, 2.0 * least.departure * problem.scene.scales.length / speed])
-    assert left.find_culprit(problem.scene.scales, least, duration_row) == 1
-    assert left.find_culprit(problem.scene.scales, least, duration_row / 4) == 2
 
 
 def test_friction_the_wrong_way_is_found_by_the_residual() -> None:
@@ -162,39 +144,6 @@ def test_only_what_does_not_hold_is_refined(
     assert all(planning.blocks[k] is own.planning.blocks[k] for k in (0, 2))
 
 
-def test_a_block_is_refined_by_twice_its_intervals(
-    slide: Problem, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    planning, asked = plan_coarsely(slide), list[tuple[int, int | None]]()
-
-    def plan_again(
-        _: Planning,
-        phases: Sequence[Phase],
-        z: Array,
-        options: PlanOptions,
-        *__: object,
-        **___: object,
-    ) -> tuple[object, object]:
-        (k,) = (phase.index for phase in phases)
-        asked.append((k, options.intervals))
-        return planning.blocks[k].plans, planning.blocks[k].chain
-
-    monkeypatch.setattr(blocks, "plan_block", plan_again)
-    once = refine_block(planning, 1, lambda _: None)
-    twice = refine_block(once, 1, lambda _: None)
-    assert [own.finer for own in twice.blocks] == [0, 2, 0] and asked == [(1, 20), (1, 40)]
-
-
-def test_a_replay_that_jams_names_the_phase(monkeypatch: pytest.MonkeyPatch) -> None:
-    def jam(*_: object) -> Observation:
-        error = JammingError("v1-palm jams")
-        error.phase = 2
-        raise error
-
-    monkeypatch.setattr(self_check, "observe", jam)
-    assert [own.failure for own in check_plan(*plan(), Allowance())] == [(2, "v1-palm jams")]
-
-
 def test_refining_is_bounded_and_the_error_says_where(
     slide: Problem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -204,19 +153,6 @@ def test_refining_is_bounded_and_the_error_says_where(
     assert caught.value.exit_status == 1
     assert text.startswith("the plan of phase 2 does not hold in its replay, with 8 times the ")
     assert "the intervals: v1-palm jams in phase 2 at t = 0.1 s; " in text and "--no-replay" in text
-
-
-def test_a_plan_that_is_allowed_is_kept_where_finer_ones_are_not(
-    slide: Problem, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    own = Replayed(slide, monkeypatch, 99)
-    own.usual_before = 1
-    planning, _, figures = own.run()
-    assert planning is own.planning and (figures.simulations or 0) > 1
-    # One that is always allowed, and never strictly, is refined once.
-    own.usual_before = 100
-    planning, _, figures = own.run()
-    assert figures.simulations == 2 and [block.finer for block in planning.blocks] == [0, 1, 0]
 
 
 def test_meta_keeps_the_figures(heptagon: Problem, trajectory: Trajectory) -> None:

@@ -11,7 +11,6 @@ import pytest
 from plane import measure_gaps, measure_slip, unbalance
 from shipped import HEPTAGON, IMPACTS, plan_of, problem_of
 from wholearm.common.arrays import Array
-from wholearm.common.errors import InfeasibleError
 from wholearm.mechanics.impact import compute_impact
 from wholearm.mechanics.metric import metric_weights
 from wholearm.planning.plan import solve
@@ -126,20 +125,6 @@ def test_what_an_impact_saves_is_what_a_stop_costs(plans: dict[str, Trajectory])
     stopped = solve(edited(row["phase"]), objective, replay=False)
     assert row["saves"] == pytest.approx(stopped.meta["value"] - value, abs=1e-9)
     assert row["saves"] > 0.01
-
-
-def test_no_plan_with_a_stop_leaves_the_saving_open(
-    problem: Problem, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What is short at rest need not be at speed."""
-
-    def fail(*_: object) -> None:
-        raise InfeasibleError("nothing holds at rest")
-
-    monkeypatch.setattr("wholearm.planning.path_domain.sequence_plan.plan_sequence", fail)
-    rows = solve(problem, "effort", intervals=20, replay=False).meta["transitions"]
-    assert [row["saves"] for row in rows] == 4 * [None]
-    assert [row["speed"] > 0 for row in rows] == [True, True, False, False]
 
 
 def test_without_an_impact_the_plan_is_that_of_stops(heptagon: Problem) -> None:

@@ -17,7 +17,7 @@ from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.contacts.formation import Formation
 from wholearm.free_simulation.free_simulate import simulate_free
-from wholearm.mechanics.arrival import DRIVE, Standstill, find_hold, maximise_margin
+from wholearm.mechanics.arrival import DRIVE, maximise_margin
 from wholearm.planning import dwell as shares
 from wholearm.planning.dwell import DwellEnd, list_touching, settle_plans
 from wholearm.planning.phase_plan import PhasePlan
@@ -26,7 +26,6 @@ from wholearm.planning.result import Plan
 from wholearm.planning.saved import load_plan, write_meta
 from wholearm.planning.stops import Plans
 from wholearm.problem.definition import Problem
-from wholearm.problem.read import place_start
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import assemble
 from wholearm.simulation.start_modes import RestDirection
@@ -163,14 +162,6 @@ def test_shares_are_those_of_the_way_that_ends_best(monkeypatch: pytest.MonkeyPa
     assert tried[1][0] == 0
 
 
-def test_a_start_is_moved_with_its_fingers_closed() -> None:
-    problem = problem_of(HEPTAGON)
-    moved = shares.move_start(problem, 1e-3)
-    assert shares.move_start(problem, 0.0) is None and moved is not None
-    start = place_start(problem.scene, 0, float(problem.start[0]) + 1e-3)
-    np.testing.assert_allclose(moved, start, rtol=0, atol=1e-12)
-
-
 def test_held_ends_are_written_and_read(tmp_path: Path) -> None:
     plan = settled()
     plan.save(tmp_path / "plan.npz")
@@ -208,13 +199,6 @@ def test_margins_are_those_of_the_linear_programme() -> None:
         if found is not None:
             assert found[1] == pytest.approx(answer.x[2], abs=1e-6)
             assert (rows @ [1.0, *found[0]]).min() == pytest.approx(found[1], abs=1e-6)
-
-
-def test_without_friction_nothing_holds_where_no_contact_stops_the_motion() -> None:
-    problem = problem_of(HEPTAGON).with_(friction=0.0, dry=0.0)
-    formation = problem.phases[0].formation
-    place = Standstill(problem.start, formation, None, formation)
-    assert find_hold(place, problem.epsilon, problem.gap, 0.01) is None
 
 
 def test_keys_are_checked_and_kept() -> None:

@@ -19,7 +19,6 @@ import pytest
 
 import wholearm
 from shipped import FOLDER, LANDING, plan_of, problem_of
-from wholearm.common import sharing
 from wholearm.common.sharing import Keeper, Store, exclusive, kept_property, retire_with
 from wholearm.simulation.simulate import simulate
 
@@ -160,22 +159,6 @@ def test_an_error_takes_no_local_variables_along(tracked: type[Tracked]) -> None
         change()
     assert isinstance(caught.value.__cause__, ValueError)
     assert tracked.alive == 0
-
-
-def test_a_function_in_another_thread_waits(tracked: type[Tracked]) -> None:
-    done: list[int] = []
-
-    def work() -> None:
-        nothing()
-        done.append(1)
-
-    thread = Thread(target=work)
-    with sharing.LOCK:
-        thread.start()
-        thread.join(0.05)
-        assert not done
-    thread.join()
-    assert done
 
 
 @pytest.mark.usefixtures("unadvised")

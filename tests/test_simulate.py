@@ -21,7 +21,6 @@ from wholearm.mechanics.dynamics import Directions
 from wholearm.problem.definition import Phase, Problem, Until
 from wholearm.results.torque import TorqueProfile
 from wholearm.scene.model import Finger, Friction, Scene
-from wholearm.simulation import simulate as within
 from wholearm.simulation.events import EventKind, OutcomeKind
 from wholearm.simulation.simulate import simulate
 from wholearm.simulation.sticking import Collapse, balances, find_rest
@@ -199,19 +198,6 @@ def test_looks_are_as_good_as_steps_and_end_none() -> None:
             for run in (looked, reference)
         )
         assert np.allclose(own, exact, rtol=0, atol=bound * (1 + np.nanmax(np.abs(exact))))
-
-
-def test_what_happens_between_the_ends_of_steps_is_not_missed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Steps end where a look shows something that no step has ended at, and nowhere else."""
-    problem, trajectory = plan()
-    looks, shown = np.linspace(0.05, 1.9, 50), 0.7
-    monkeypatch.setattr(within, "shows", lambda step, *_: step.t < shown < step.t + step.h)
-    at = simulate(problem, trajectory, times=[shown])
-    again = simulate(problem, trajectory, closer=lambda _, __, k: () if k else [*looks, shown])
-    assert again.steps == at.steps
-    np.testing.assert_array_equal(again.at(shown), at.at(shown))
 
 
 def test_energy_is_conserved_without_friction() -> None:

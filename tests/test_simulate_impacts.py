@@ -19,7 +19,7 @@ from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.impact import compute_impact
-from wholearm.problem.definition import End, Phase, Problem
+from wholearm.problem.definition import Phase, Problem
 from wholearm.problem.read import build_problem
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Trajectory
@@ -165,30 +165,6 @@ def test_a_step_of_the_torques_just_before_a_planned_stop_is_not_its_end() -> No
     simulation = simulate(problem, TorqueProfile(torque.breaks, steps))
     arrival = simulation.find(EventKind.ARRIVAL)[0]
     assert arrival.time - before > 0.9 * (0.5 - before)
-
-
-def chords(torque: TorqueProfile, count: int) -> TorqueProfile:
-    """Straight lines between points on the torques, `count` in each piece."""
-    x = np.linspace(-1.0, 1.0, count + 1)
-    powers = x[:, None] ** np.arange(torque.coefficients.shape[2])
-    tau = np.einsum("kjd,nd->knj", torque.coefficients, powers)
-    lines = np.stack([tau[:, 1:] + tau[:, :-1], tau[:, 1:] - tau[:, :-1]], axis=3) / 2
-    start, h = torque.breaks[:-1, None], np.diff(torque.breaks)[:, None]
-    inner = (start + h * (x[:-1] + 1) / 2).ravel()
-    return TorqueProfile(np.append(inner, torque.breaks[-1]), lines.reshape(-1, 2, 2))
-
-
-def test_a_planned_stop_is_that_of_a_phase_that_ends_at_rest(problem: Problem) -> None:
-    """Linear torques between rows bring it there a little early, and not quite at rest."""
-    torque = chords(plan_of(IMPACTS, "margin").torque, 64)
-    problem = dataclasses.replace(problem, phases=problem.phases[:3])
-    first, second, *others = problem.phases
-    stops = [dataclasses.replace(phase, end=End.REST) for phase in others]
-    resting = dataclasses.replace(problem, phases=(first, second, *stops))
-    one, other = (simulate(p, torque) for p in (problem, resting))
-    assert [(e.time, e.text) for e in one.events] == [(e.time, e.text) for e in other.events]
-    stop = next(e for e in one.find(EventKind.ARRIVAL) if e.phase == 2)
-    assert stop.value > 1e-4
 
 
 @pytest.mark.parametrize("scale", [1.002, 1.01])

@@ -470,18 +470,6 @@ def test_phases_end_where_a_vertex_comes_to_rest_and_slips_by_plan(
     assert report.to_dict()["changes"][0]["what"] == "v1-palm"
 
 
-def test_torques_may_end_before_anything_slips_or_comes_to_rest() -> None:
-    problem = falling(0.36, 0.2)
-    rolling = problem.phases[0].formation
-    sliding = dataclasses.replace(rolling, rolling=())
-    time = fall(0.36, 0.2)[0]
-    torque = constant((-0.01, 0.01), 0.9 * time)
-    for order, missing in (([rolling, sliding], "slips"), ([sliding, rolling], "comes to rest")):
-        simulation = simulate(divide(problem, order), torque)
-        assert simulation.outcome.kind is OutcomeKind.GOAL_MISSED
-        assert simulation.outcome.text.endswith(f", phase 1, before v1-palm {missing}")
-
-
 def test_what_sticks_as_it_slips_again_and_rests_ends_one_phase_each() -> None:
     """Between two slips the box sticks; what is stuck from the start has not come to rest."""
     problem = falling(0.36, 0.2)

@@ -168,18 +168,6 @@ def test_a_release_that_never_comes() -> None:
     assert report.phases[0].arrival is None
 
 
-def test_another_contact_lost_is_no_release() -> None:
-    problem, trajectory = plan_landing()
-    first, _ = problem.phases
-    kept = tuple(c for c in first.formation.contacts if c.name != "v4-finger1")
-    last = Phase(1, Formation(problem.scene, kept), Until(coordinate="x", value=1.0))
-    simulation = simulate(replace_phases(problem, first, last), trajectory.torque)
-    assert simulation.outcome.kind is OutcomeKind.CONTACT_LOST
-    lost = simulation.events[-1]
-    assert (lost.contact, lost.time, lost.phase) == ("v3-finger1", RELEASE, 0)
-    assert not simulation.find(EventKind.RELEASE)
-
-
 def test_a_release_as_the_squeeze_fades_and_a_contact_that_sticks() -> None:
     problem, trajectory = plan_landing(squeeze=4.0)
     simulation = simulate(problem, trajectory.torque)
@@ -234,18 +222,6 @@ def test_start_with_two_freedoms() -> None:
         state = np.append(z, np.zeros(5))
         run = integrate_phase(moving, 0, torque, state, directions, (0.0, stop))
         assert np.allclose(simulation.at(stop), run.state, atol=1e-10, rtol=0)
-
-
-def test_rest_with_two_freedoms() -> None:
-    problem, _ = plan_landing()
-    phase = Phase(0, problem.phases[1].formation, problem.phases[1].until)
-    z = landing_of().evaluate(np.array([0.1])).z[0]
-    still = replace_phases(dataclasses.replace(problem, start=z), phase)
-    squeezed = simulate(still, constant(np.array([2.0, -2.8]), 0.01))
-    assert [e.kind for e in squeezed.events] == [EventKind.STICK, EventKind.END]
-    assert not squeezed.z_dot.any() and "short of v2-palm" in squeezed.outcome.text
-    pulled = simulate(still, constant(np.array([-0.3, 0.3]), 0.01))
-    assert pulled.outcome.kind is OutcomeKind.CONTACT_LOST and pulled.events[-1].value < 0
 
 
 def test_start_with_a_contact_that_sticks() -> None:

@@ -65,15 +65,6 @@ def test_a_rolling_contact_has_two_rows_more_than_a_sliding_one_along_a_curve(
     assert_bare(spend(tip), 3, 1)
 
 
-def test_phases_that_stop_are_problems_of_their_own(pairs: dict[str, SkipPair]) -> None:
-    pair = pairs["a transition at speed"]
-    # Both phases, an interval of no length between them, and no more: without the ends of one.
-    stopping, going = (spend(case) for case in (pair.without, pair.having))
-    for cost in (stopping, going):
-        assert_bare(cost, CONTACTS, 0)
-    assert going["unknowns"] > stopping["unknowns"]
-
-
 def test_the_table_has_a_row_for_each_part(pairs: dict[str, SkipPair]) -> None:
     pair = pairs["a figure"]
     rows = [

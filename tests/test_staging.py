@@ -1,22 +1,18 @@
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from plane import measure_gaps
-from thrown import lift
 from timed import landing
-from tipping import roll, tilting
 from wholearm.geometry.path_guess import guess_phase
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.time_domain.collocation import make_scheme
 from wholearm.planning.time_domain.stage import Stage
 from wholearm.planning.time_domain.stage_modes import LEAST_INTERVALS
 from wholearm.planning.time_domain.stages import guess_stages
-from wholearm.problem.definition import End, Until
 
 SCHEME = make_scheme("radau", 3)
 
@@ -90,26 +86,3 @@ def test_releases_open_contacts_in_the_next_phase(stages: list[Stage]) -> None:
     # What ends the landing is watched, so that it is not passed before.
     assert all(names.index("v2-palm") in stage.monitored for stage in stages[2:])
     assert all(stage.gained is None and not stage.ends_in_impact for stage in stages)
-
-
-def test_joints_that_turn_after_a_release_have_stages_of_their_own() -> None:
-    problem, _ = lift()
-    stages = guess_stages(problem, problem.phases, problem.start, SCHEME, 8, 2.0)
-    assert [stage.phase for stage in stages] == [0, 1, 1]
-    # The outline of one contact moves finger 2 on, that before turns it back.
-    assert stages[1].turns == (2,)
-    assert [stage.directions.sigma[1] for stage in stages] == [-1.0, -1.0, 1.0]
-
-
-def test_what_has_rolled_slides_the_way_of_its_own_outline() -> None:
-    sliding = tilting()
-    (phase,) = sliding.phases
-    before = replace(phase, formation=roll(phase.formation, "v1-palm"), until=Until())
-    phases = (replace(before, end=End.SMOOTH), replace(phase, index=1))
-    problem = replace(sliding, phases=phases)
-    stages = guess_stages(problem, phases, problem.start, SCHEME, 6, 2.0)
-    assert [stage.phase for stage in stages] == [0, 1]
-    # A direction of zero would leave it without friction.
-    assert np.abs(stages[1].directions.Xi).min() == 1.0
-    alone = guess_stages(sliding, sliding.phases, sliding.start, SCHEME, 6, 2.0)
-    np.testing.assert_array_equal(stages[1].directions.Xi, alone[0].directions.Xi)

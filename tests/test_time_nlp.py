@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from plane import make_formation, measure_gaps
 from planned import CosineMotion
 from shipped import HEPTAGON
 from timed import drive
@@ -19,7 +18,7 @@ from wholearm.geometry.path_guess import load
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions
 from wholearm.mechanics.metric import metric_weights
-from wholearm.planning.options import CLEARANCE, OPENING, Objective
+from wholearm.planning.options import Objective
 from wholearm.planning.time_domain.collocation import Scheme, make_scheme
 from wholearm.planning.time_domain.intersample import IntersampleLimits, raise_bounds
 from wholearm.planning.time_domain.nlp_layout import MARGIN, V, pack
@@ -272,46 +271,6 @@ def test_derivatives_of_the_whole_are_its_differences() -> None:
     bend = (upper + np.triu(upper, 1).T) @ step
     change = (slope(x + h * step).T @ lam - slope(x - h * step).T @ lam) / (2 * h)
     np.testing.assert_allclose(change, bend, atol=1e-6 * np.abs(bend).max())
-
-
-@pytest.mark.parametrize("contacts", [3, 4])
-def test_where_both_joints_turn_everything_stops_and_that_is_said_once(contacts: int) -> None:
-    scheme = make_scheme("radau", 3)
-    first, second = cut(driven("radau", 3, 8, contacts), 3)
-    stopping = [replace(first, turns=(contacts, contacts + 1)), second]
-    plain, nlp = build([first, second], scheme), build(stopping, scheme)
-    added = len(nlp.rows.bounds[0]) - len(plain.rows.bounds[0])
-    assert added == 5 - contacts
-    # The motion goes on there, as it does at its end: that misses the added equations, and no more.
-    moving, before = (misses(own, packed(own, stopping))[0] for own in (nlp, plain))
-    much = 1e-2 * np.linalg.norm(first.guess.nodes[-1, 1])
-    assert 0 < (moving > much).sum() - (before > much).sum() <= added
-    # Equations keep all rates at zero: an inequality that does too would leave no interior.
-    low, high = bound_unknowns(nlp, stopping, scheme)
-    end = nlp.layouts[0].v[-1, -1, 3:]
-    assert np.isinf(low[end]).all() and np.isinf(high[end]).all()
-    assert np.isinf(nlp.rows.bounds[0][nlp.rows_of[0].senses[-1, -1]]).all()
-
-
-@pytest.mark.parametrize("name", ["radau", "legendre"])
-def test_released_contacts_open_and_stay_clear(name: str) -> None:
-    scheme = make_scheme(name, 3)
-    stage = driven(name, 3, 9, 3)
-    formation = stage.formation
-    gained = [limit.gained.name if limit.gained else "" for limit in formation.limits]
-    released = gained.index("v0-finger2")
-    opens = replace(stage, monitored=(released,), released=(released,), opens=True)
-    nlp = build([opens], scheme)
-    low, _ = nlp.rows.bounds
-    rows = nlp.rows_of[0].monitor_rows
-    later = opens.guess.places(scheme.points) > 1 / 3
-    np.testing.assert_allclose(low[rows[..., 0]], np.where(later, CLEARANCE, 0.0))
-    values = call(nlp, "nlp_g", packed(nlp, [opens]))[rows[..., 0]]
-    gaps = make_formation(formation.scene, "v0-finger2")
-    expected = [measure_gaps(gaps, z)[0] for z in stage.guess.z.reshape(-1, 5)]
-    np.testing.assert_allclose(values.ravel(), expected, atol=1e-14)
-    more = len(low) - len(build([replace(opens, opens=False)], scheme).rows.bounds[0])
-    assert more == scheme.degree and (low == OPENING).sum() == scheme.degree
 
 
 @pytest.mark.parametrize("contacts", [4, 3])

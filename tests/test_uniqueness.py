@@ -14,10 +14,8 @@ from tipping import box, roll, tipped
 from wholearm import InputError, solve, verify
 from wholearm.common.arrays import Array
 from wholearm.common.errors import AmbiguityError
-from wholearm.contacts.closing import contact_table
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phases
-from wholearm.mapping.formation_map import check_border
 from wholearm.mechanics.uniqueness import find_minors
 from wholearm.mechanics.wedging import find_static_torques
 from wholearm.planning.options import PlanOptions
@@ -111,21 +109,6 @@ def test_replays_tell_the_uniqueness_margin_of_each_phase() -> None:
     np.testing.assert_allclose(found, planned, atol=5e-3)
     strict = verify(box(), tipped(), uniqueness_margin=0.9)
     assert not strict.ok and strict.failures[0].startswith("ambiguous: ")
-
-
-def test_maps_know_where_forces_are_not_unique() -> None:
-    for mu, expected in ((0.3, False), (0.5, True)):
-        formation, _, _ = box_at(mu, 0, 0.9)
-        table = contact_table(formation.scene)
-        label = np.array([table.index(contact) for contact in formation.contacts])
-        problem = problem_of(BOX).with_(friction_palm=mu)
-        curve = trace_phases(problem)[0]
-        z = curve.evaluate(np.linspace(0.0, curve.length, 9)).z
-        _, back, ambiguous = check_border(formation.scene, problem.epsilon, label, z, 0)
-        assert ambiguous.any() == expected and (back | ambiguous).all()
-        # What is asked for decides.
-        asked = [check_border(formation.scene, 0.05, label, z, 0, limit)[2] for limit in (-9, 0.99)]
-        assert not asked[0].any() and asked[1].any()
 
 
 @pytest.mark.parametrize("path", [BOX, IMPACTS], ids=lambda path: path.stem)

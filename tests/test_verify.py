@@ -23,7 +23,7 @@ from wholearm.results.torque_table import read_rows
 from wholearm.simulation.simulate import simulate
 from wholearm.verification.margins import find_lowest, list_normal_forces
 from wholearm.verification.verdict import Allowance
-from wholearm.verification.verify import choose_times, verify
+from wholearm.verification.verify import verify
 
 
 def brake_less(starts: Array, c: Array) -> Array:
@@ -334,15 +334,6 @@ def test_a_contact_let_go_softly_counts_until_it_passes_epsilon() -> None:
     given = replace(simulation, c_n=c_n)
     forces = list_normal_forces(problem, given, problem.phases[0], rows)["v3-finger1"]
     assert np.isnan(forces[-2:]).all() and np.nanmin(forces) == forces[3] == low
-
-
-def test_rows_of_a_plan_and_both_ends_of_phases_are_looked_at() -> None:
-    problem, trajectory = plan()
-    times = choose_times(problem, trajectory.torque, trajectory)
-    assert np.isin(times, trajectory.t).all()
-    assert np.isin(trajectory.phase_starts[:-1], times).all() and trajectory.t[-1] in times
-    even = choose_times(problem, trajectory.torque, None)
-    np.testing.assert_allclose(even[[0, -1]], trajectory.torque.breaks[[0, -1]])
 
 
 def wiggle(torque: TorqueProfile, piece: int, size: float) -> TorqueProfile:

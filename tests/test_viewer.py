@@ -122,12 +122,6 @@ def test_a_movie_shows_the_whole_motion(tmp_path: Path) -> None:
         assert (np.abs(np.array(image.convert("RGB")) - first).max(axis=2) > 60).mean() > 0.01
 
 
-@pytest.mark.parametrize("speed", [0.0, -1.0, float("nan"), 1e-6])
-def test_a_movie_has_a_speed_that_can_be_shown(speed: float) -> None:
-    with pytest.raises(InputError, match="--speed"):
-        Movie(problem_of(HEPTAGON), plan_of(HEPTAGON), speed=speed)
-
-
 @pytest.mark.parametrize(
     ("output", "words"), [("plan.avi", "'.avi' given"), ("none/plan.gif", "none")]
 )

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import pickle
 from dataclasses import replace
 from functools import lru_cache
 
@@ -16,7 +15,6 @@ from wholearm.planning.time_domain.search import (
     TimeSearch,
     TimeSolution,
     carry_multipliers,
-    find_costate,
     first_multipliers,
 )
 from wholearm.planning.time_domain.stage import Stage
@@ -46,20 +44,6 @@ def coarse(objective: str) -> TimeSolution:
 def replace_scene(stages: list[Stage], problem: Problem) -> list[Stage]:
     """The same stages on the formations of another scene."""
     return [replace(stage, formation=problem.phases[stage.phase].formation) for stage in stages]
-
-
-def test_a_solution_is_gone_on_with_in_another_process() -> None:
-    solution = coarse("time")
-    known = pickle.loads(pickle.dumps(solution))
-    every = [np.ones(stage.intervals, dtype=int) for stage in solution.stages]
-    finer = bisect_intervals(solution.stages, SCHEME, every)
-    nlp = search_for("time").build(finer)
-    one, other = (
-        carry_multipliers(own.multipliers, own.nlp, nlp, SCHEME, own.stages, finer)
-        for own in (solution, known)
-    )
-    for key, values in one.items():
-        assert np.array_equal(values, other[key]) and values.any()
 
 
 def test_first_multipliers_push_away_from_the_bounds_there_are() -> None:
@@ -93,20 +77,6 @@ def test_multipliers_are_shared_among_the_intervals_that_replace_one() -> None:
             total = np.zeros_like(before)
             np.add.at(total, parent, after)
             np.testing.assert_allclose(total, before, rtol=1e-12)
-
-
-def test_costates_of_the_same_intervals_are_those_before() -> None:
-    # Tangent spaces are those of guesses: from a solution they stay as they are.
-    search, first = search_for("time"), coarse("time")
-    solution = search.solve(first.stages, first)
-    nlp = search.build(solution.stages)
-    both = solution.nlp, nlp, SCHEME, solution.stages, solution.stages
-    before = solution.multipliers["lam_g0"]
-    carried = carry_multipliers(solution.multipliers, *both)["lam_g0"]
-    np.testing.assert_allclose(carried[:10], before[:10], rtol=1e-9)
-    for old, new in zip(solution.nlp.rows_of, nlp.rows_of, strict=True):
-        one, other = find_costate(old, before, SCHEME), find_costate(new, carried, SCHEME)
-        assert np.abs(other - one).max() < 1e-4 * np.abs(one).max()
 
 
 @pytest.mark.parametrize("contact", ["palm", "finger1", "finger2"])

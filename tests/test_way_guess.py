@@ -35,16 +35,6 @@ def tipping() -> Problem:
     return build_problem({**table, "phases": [{"contacts": contacts, "until": {"phi_deg": 9.5}}]})
 
 
-def test_ends_beside_the_nearest_are_ends_too() -> None:
-    problem = tipping()
-    (phase,) = problem.phases
-    (nearest,) = guess_phase(phase, problem.start)
-    goals = np.array(list_goals(phase, problem.start, nearest.z[-1]))
-    assert len(goals) > 5 and np.ptp(goals[:, 0]) > 0.01
-    assert np.abs(np.degrees(goals[:, 2]) - 9.5).max() < 1e-6
-    assert np.abs(phase.formation.evaluate(goals, goals).C).max() < 1e-9
-
-
 def test_stretches_of_a_way_keep_their_senses() -> None:
     problem = tipping()
     (phase,) = problem.phases
@@ -128,20 +118,6 @@ def test_a_brisk_motion_keeps_half_the_margin_and_ends_at_rest() -> None:
     least = problem.epsilon / problem.scene.scales.force
     assert pace.forces[:, : problem.phases[0].formation.n_contacts].min() > least - 1e-9
     assert 0.1 < pace.t[-1] / np.sqrt(length / problem.scene.gravity) < 20.0
-
-
-def test_ways_bend_to_one_side_and_to_the_other() -> None:
-    problem = tipping()
-    (phase,) = problem.phases
-    start, formation = problem.start, phase.formation
-    (nearest,) = guess_phase(phase, start)
-    goal, straight = nearest.z[-1], connect(formation, start, nearest.z[-1]).z
-    sides = [connect(formation, start, goal, (bend, 0.0)).z for bend in (0.3, -0.3)]
-    for z in sides:
-        assert (z[0] == start).all() and np.abs(z[-1] - goal).max() < 1e-9
-        assert np.abs(formation.evaluate(z, z).C).max() < 1e-9
-    off = [(z - straight)[len(z) // 2] * np.sqrt(weights(problem.scene)) for z in sides]
-    assert off[0] @ off[1] < 0 and np.linalg.norm(off[0]) > 0.1 * nearest.length
 
 
 def test_a_way_that_slides_while_it_tips_is_planned() -> None:
