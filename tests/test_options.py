@@ -19,43 +19,20 @@ def test_objectives_are_given_by_name_or_as_members(choice: str) -> None:
     assert choice in CHOICES
 
 
-@pytest.mark.parametrize(
-    "key, given",
-    [
-        ("objective", "speed"),
-        ("objective", "elastic"),
-        ("objective", Objective.ELASTIC),
-        ("objective", None),
-        ("objective", 3),
-        ("intervals", 9),
-        ("intervals", -80),
-        ("intervals", 80.0),
-        ("intervals", True),
-        ("intervals", "80"),
-        ("samples", 1),
-        ("samples", 2.5),
-        ("time_weight", 0.0),
-        ("time_weight", -1.0),
-        ("time_weight", math.nan),
-        ("time_weight", math.inf),
-        ("time_weight", "1"),
-        ("duration", 0.0),
-        ("duration", -0.1),
-        ("duration", math.nan),
-        ("time_intervals", 3),
-        ("time_intervals", 10.0),
-        ("time_intervals", True),
-        ("time_intervals", "10"),
-        ("degree", 1),
-        ("degree", 7),
-        ("degree", 3.0),
-        ("degree", False),
-        ("transcription", "path"),
-        ("transcription", ""),
-        ("transcription", None),
-        ("certify", 1),
-    ],
-)
+BAD: dict[str, list[Any]] = {
+    "objective": ["speed", "elastic", Objective.ELASTIC, None, 3],
+    "intervals": [9, -80, 80.0, True, "80"],
+    "samples": [1, 2.5],
+    "time_weight": [0.0, -1.0, math.nan, math.inf, "1"],
+    "duration": [0.0, -0.1, math.nan],
+    "time_intervals": [3, 10.0, True, "10"],
+    "degree": [1, 7, 3.0, False],
+    "transcription": ["path", "", None],
+    "certify": [1],
+}
+
+
+@pytest.mark.parametrize("key, given", [(key, own) for key, every in BAD.items() for own in every])
 def test_bad_options_are_named(key: str, given: Any) -> None:
     options = {"objective": "margin"} | {key: given}
     with pytest.raises(InputError) as caught:
