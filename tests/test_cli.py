@@ -416,27 +416,6 @@ def test_plot(folder: Path, planned: Path, capsys: pytest.CaptureFixture[str]) -
     assert [path.name for path in folder.iterdir()] == ["a.png"]
 
 
-@pytest.mark.parametrize("output, words", [("a.doc", "doc"), ("absent/a.png", "cannot be written")])
-def test_bad_figures(
-    folder: Path, planned: Path, capsys: pytest.CaptureFixture[str], output: str, words: str
-) -> None:
-    message = fails(capsys, 2, "plot", str(planned / "plan.npz"), "-o", output)
-    assert message.startswith(f"{output}: ") and words in message
-    assert list(folder.iterdir()) == []
-
-
-def test_interrupting_leaves_nothing(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("wholearm.planning.blocks.plan_sequence", interrupt)
-    assert main(["solve", str(HEPTAGON)]) == 130
-    assert capsys.readouterr().err == "wholearm: interrupted\n"
-    assert list(folder.iterdir()) == []
-
-
 def run(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-W", "error", *arguments]
     return subprocess.run(command, capture_output=True, text=True, **options)

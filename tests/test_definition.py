@@ -334,13 +334,6 @@ def test_not_toml(tmp_path: Path, content: bytes) -> None:
         read_problem(str(path))
 
 
-@pytest.mark.parametrize("name", ["absent.toml", "."])
-def test_unreadable_file(tmp_path: Path, name: str) -> None:
-    with pytest.raises(InputError, match="cannot be read") as caught:
-        read_problem(str(tmp_path / name))
-    assert caught.value.source == str(tmp_path / name)
-
-
 def test_a_hand_that_is_crossed_at_the_start_is_refused() -> None:
     """Long links close over an object in the middle, unless they pass each other."""
 

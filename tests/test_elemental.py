@@ -22,7 +22,7 @@ from tipping import roll
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.contacts.cones import find_weakest, force_limit_rows, slip_margins
-from wholearm.contacts.contact_limits import build_clearance, build_limits
+from wholearm.contacts.contact_limits import build_clearance
 from wholearm.contacts.elemental import Contact, build_features, candidate_contacts, parse_contact
 from wholearm.contacts.formation import Formation, build_slip
 from wholearm.scene.model import Friction, Scene
@@ -131,63 +131,6 @@ def test_second_derivative_term(scene: Scene, name: str) -> None:
     rise = formation.evaluate(z + STEP * v, v).A - formation.evaluate(z - STEP * v, v).A
     expected = np.einsum("nij,nj->ni", rise / (2 * STEP), v)
     np.testing.assert_allclose(formation.evaluate(z, v).A_dot_v, expected, atol=DIFFERENCE)
-
-
-def limit_values(scene: Scene, name: str, z: Array) -> dict[str, float]:
-    limits = build_limits(parse_contact(name, scene), scene)
-    function = ca.Function("l", [build_features(scene).z], [ca.vertcat(*(e.value for e in limits))])
-    values = function(z).full()[:, 0]
-    return {limit.text: float(value) for limit, value in zip(limits, values, strict=True)}
-
-
-@pytest.mark.parametrize("finger", [1, 2])
-@pytest.mark.parametrize("run, end", [(0.0, "base"), (0.18, "tip")])
-def test_vertex_at_the_end_of_a_link(scene: Scene, finger: int, run: float, end: str) -> None:
-    angle, side = (1.2, 1) if finger == 1 else (1.9, -1)
-    axis = np.array([np.cos(angle), np.sin(angle)])
-    normal = side * np.array([-axis[1], axis[0]])
-    corner = np.asarray(scene.fingers[finger - 1].base) + run * axis + 0.005 * normal
-    z = np.array([*(corner - rotate(0.4, scene.polygon.vertices[2])), 0.4, angle, angle])
-    values = limit_values(scene, f"v2-finger{finger}", z)
-    assert values.pop(f"v2 runs off finger {finger} at its {end}") == pytest.approx(0, abs=1e-13)
-    assert list(values.values()) == pytest.approx([0.18])
-
-
-@pytest.mark.parametrize("edge, corner", [(1, 1), (1, 2), (4, 4), (4, 0)])
-def test_tip_at_the_end_of_an_edge(scene: Scene, edge: int, corner: int) -> None:
-    tip = place_tips(scene, 1, 1.0)
-    vertices = scene.polygon.vertices
-    run = rotate(0.7, vertices[(edge + 1) % 5] - vertices[edge])
-    outward = np.array([run[1], -run[0]]) / np.hypot(*run)
-    at = tip - 0.005 * outward
-    z = np.array([*(at - rotate(0.7, vertices[corner])), 0.7, 1.0, 1.0])
-    values = limit_values(scene, f"e{edge}-tip2", z)
-    text = f"the tip of finger 2 runs off edge {edge} at v{corner}"
-    assert values.pop(text) == pytest.approx(0, abs=1e-13)
-    assert list(values.values()) == pytest.approx([np.hypot(*run)])
-
-
-@pytest.mark.parametrize(
-    "heading, text",
-    [
-        (np.pi / 2, "v2 leaves the tip of finger 1 for the side of the link"),
-        (None, "edge 1 turns onto the tip of finger 1"),
-        (-1.0, "edge 2 turns onto the tip of finger 1"),
-    ],
-)
-def test_vertex_at_the_ends_of_the_tip_arc(scene: Scene, heading: float | None, text: str) -> None:
-    """Contact at a right angle to the link, or along the normal of an edge beside the vertex."""
-    angle, phi = 1.2, 0.4
-    vertices = scene.polygon.vertices
-    if heading is None or heading < 0:
-        edge = 1 if heading is None else 2
-        run = rotate(phi, vertices[edge + 1] - vertices[edge])
-        away = np.array([-run[1], run[0]]) / np.hypot(*run)
-    else:
-        away = rotate(heading, [np.cos(angle), np.sin(angle)])
-    corner = place_tips(scene, 0, angle) + 0.005 * away
-    z = np.array([*(corner - rotate(phi, vertices[2])), phi, angle, angle])
-    assert limit_values(scene, "v2-tip1", z)[text] == pytest.approx(0, abs=1e-13)
 
 
 def test_names_round_trip(scene: Scene) -> None:

@@ -3,7 +3,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import casadi as ca
 import numpy as np
 import pytest
 from scipy.integrate import trapezoid
@@ -171,20 +170,6 @@ def test_objectives_measure_the_motion(data: PhaseData, profile: Profile) -> Non
     nlp = build_path_nlp(SHAPE, INTERVALS, Objective.MARGIN)
     low, high = (evaluate(nlp, data, pack(nlp, profile, UNITS, m))[0] for m in (0.0, 1.4))
     assert low - high == pytest.approx(1.4 / UNITS.force, rel=1e-12)
-
-
-@pytest.mark.parametrize("objective", Objective)
-def test_building_stays_linear(objective: Objective) -> None:
-    """No unknown in more than a few rows, and no more than one row with many unknowns.
-
-    Otherwise the Jacobian would have to be found one unknown at a time.
-    """
-    x, p = build_path_nlp(SHAPE, INTERVALS, objective).solver.function.oracle().sx_in()
-    _, g = build_path_nlp(SHAPE, INTERVALS, objective).solver.function.oracle()(x, p)
-    pattern = ca.jacobian(g, x).sparsity()
-    rows, columns = (np.array(part) for part in pattern.get_triplet())
-    assert np.bincount(columns).max() <= 14
-    assert (np.bincount(rows) > 8).sum() <= (objective is Objective.MARGIN)
 
 
 # Best motions in closed form: a point driven along a line of 1 m.

@@ -172,12 +172,7 @@ def test_what_is_no_plan_is_an_error(
 
 
 @pytest.mark.parametrize(
-    ("case", "options"),
-    [
-        ("slides", {"objective": "time"}),
-        ("slides", {"objective": "margin"}),
-        ("impacts", {"objective": "time"}),
-    ],
+    ("case", "options"), [("slides", {"objective": "margin"}), ("impacts", {"objective": "time"})]
 )
 def test_every_solve_is_counted_once(
     monkeypatch: pytest.MonkeyPatch, case: str, options: dict[str, Any]

@@ -14,7 +14,7 @@ from plane import convex_polygon, make_formation, make_scene, measure_slip, plac
 from planned import plan_landing
 from pushing import Push, Roll, evaluate, linear, pushed, rocking
 from stepping import march
-from tipping import POINTS, box, constant, falling, ramp, roll, tip, tipped
+from tipping import POINTS, box, constant, falling, ramp, roll, tipped
 from wholearm.common.arrays import Array
 from wholearm.contacts.closing import close_finger, place_flush
 from wholearm.contacts.formation import Formation, find_touching
@@ -22,7 +22,7 @@ from wholearm.problem.definition import End, Phase, Problem, Until
 from wholearm.results.torque import TorqueProfile
 from wholearm.scene.model import Friction, Scene
 from wholearm.simulation.events import EventKind, OutcomeKind, Simulation
-from wholearm.simulation.simulate import project_velocity, simulate
+from wholearm.simulation.simulate import simulate
 from wholearm.simulation.sticking import balances
 from wholearm.verification.verify import verify
 
@@ -152,22 +152,6 @@ def test_a_rising_push_slips_a_box_when_statics_say_so() -> None:
     assert simulation.events[-1].contact == "v0-palm"
     assert simulation.events[-1].time == pytest.approx(push * run / rate, rel=1e-9)
     np.testing.assert_allclose(simulation.z[-1, :4], z[:4], atol=1e-14)
-
-
-def test_entering_a_rolling_formation_at_speed_is_a_plastic_impact() -> None:
-    """The impulse acts along the constraints alone, and the vertex stops."""
-    curve = tip()
-    formation = curve.formation
-    z = curve.evaluate(np.array([0.4 * curve.length])).z[0]
-    v = np.random.default_rng(3).uniform(-1, 1, 5)
-    kept = project_velocity(formation, z, v)
-    assert np.abs(measure_slip(formation, z, kept)[0]) < 1e-14
-    P = formation.evaluate(z[None], v[None]).P[0]
-    mass = formation.scene.mass_diagonal
-    impulse = mass * (kept - v)
-    assert np.linalg.lstsq(P.T, impulse)[1] == pytest.approx(0.0, abs=1e-20)
-    lost = 0.5 * mass @ (v**2 - kept**2)
-    assert lost == pytest.approx(0.5 * mass @ (v - kept) ** 2) and lost > 0
 
 
 def test_a_sliding_vertex_is_stopped_where_the_next_phase_lets_it_roll() -> None:
@@ -378,34 +362,6 @@ def test_a_vertex_sticks_and_slips_in_a_landing_of_the_heptagon() -> None:
         )  # fmt: skip
         errors.append(float(np.abs(z[-1] - end[:5]).max()))
     assert errors[1] < 0.65 * errors[0] < 0.01
-
-
-@pytest.mark.parametrize("share, late", [(0.3, -3e-10), (0.3, 3e-10), (-0.8, 0.0)])
-def test_a_vertex_that_rolls_by_plan_in_a_sliding_phase(share: float, late: float) -> None:
-    """It sticks where it comes to rest and the torques step, and slips where they step again."""
-    problem, trajectory = plan_landing()
-    last = problem.phases[1]
-    start = trajectory.motions[1].evaluate(np.array([0.1])).z[0]
-    roll = Roll(last.formation, start, share)
-    phase = dataclasses.replace(last, index=0)
-    problem = dataclasses.replace(problem, start=start, phases=(phase,))
-    exact = roll.fit()
-    inner = np.where((exact.breaks > 0) & (exact.breaks < 0.15), late, 0.0)
-    torque = TorqueProfile(exact.breaks + inner, exact.coefficients)
-    simulation = simulate(problem, torque, tolerance=1e-11, times=[0.08])
-    palm = [e for e in simulation.events if e.contact == "v1-palm" and e.time < 0.14]
-    for planned, kind in ((0.06, EventKind.STICK), (0.1, EventKind.SLIP)):
-        here = [e.kind for e in palm if abs(e.time - planned) < 1e-6]
-        assert here[-1] is kind
-        palm = palm[len(here) :]
-    assert not palm
-    row = int(np.flatnonzero(simulation.t == 0.08)[0])
-    column = simulation.contacts.index("v1-palm")
-    taken = simulation.c_t[row, column] / simulation.c_n[row, column]
-    assert taken == pytest.approx(-0.1 * share, abs=1e-4)
-    # The object turns much farther than the joints: errors of the torques grow as much.
-    assert np.allclose(simulation.z[-1], roll.move(0.15, 2)[0], atol=1e-5, rtol=0)
-    assert_balanced(simulation)
 
 
 def divide(problem: Problem, formations: Sequence[Formation]) -> Problem:

@@ -13,7 +13,6 @@ from refused import advising, ask_shoved
 from thrown import shove
 from tipping import box
 from wholearm.common.errors import InfeasibleError, SolverError
-from wholearm.common.shortfalls import LimitPlace, Parameter, Shortfall
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.limits import EPSILON
@@ -29,7 +28,6 @@ from wholearm.planning.time_domain.stages import guess_stages
 from wholearm.planning.time_domain.time_explain import (
     change_limit,
     explain,
-    is_met,
     list_shortfalls,
     refuse,
     solve_elastic,
@@ -131,21 +129,6 @@ def test_a_force_that_weight_limits_has_its_closed_form() -> None:
     assert float(found[1]) == pytest.approx(1 - LEAST, rel=1e-3)
     # Advice is meant to be within 2 % of what is needed.
     assert 0.98 * LEAST < float(found[2]) < LEAST
-
-
-def test_only_limits_that_a_motion_meets_hold_it_back() -> None:
-    problem, _ = shove()
-    stage, limit = outline(problem), problem.scene.fingers[0].torque_limit
-    place = LimitPlace(1, 0.0, "there")
-    torque = Parameter("torque limit of finger 1", limit, "N m", 1, TORQUE)
-    epsilon = Parameter("epsilon", problem.epsilon, "N", -1, EPSILON)
-    for share in (0.5, 1.0):
-        motion = [stage.guess._replace(tau=np.full_like(stage.guess.tau, -share * limit))]
-        assert is_met(torque, motion, []) == (share == 1.0)
-    for share in (0.9, 1.1):
-        amount = share * problem.epsilon
-        short = Shortfall("press", "v0-palm", "c_n", amount, "N", place, amount)
-        assert is_met(epsilon, [stage.guess], [short]) == (share < 1.0)
 
 
 def test_there_is_a_plan_with_what_is_advised_and_none_with_less() -> None:

@@ -122,15 +122,6 @@ def test_velocities_jump_by_the_impact_law(objective: str) -> None:
         assert energies[1] < energies[0]
 
 
-def test_it_stops_where_no_impact_is_possible() -> None:
-    plan = planned("effort")
-    struck, row = plan.meta["transitions"]
-    assert struck["possible"] and not row["possible"] and row["speed"] == 0.0
-    assert row["reason"].startswith("impulse on v") and row["reason"].endswith("per m/s")
-    for samples in ends_of(plan, row["phase"] - 1):
-        assert np.abs(samples.z_dot).max() < 1e-5
-
-
 def test_least_effort_with_impacts_is_near_that_along_the_curves() -> None:
     within = planned("effort")
     # Torques that are linear in a sixth of a phase cannot be as gentle.

@@ -145,27 +145,6 @@ def test_friction_the_wrong_way_breaks_a_limit(row: int) -> None:
     assert worst > 0.02
 
 
-@pytest.mark.parametrize("name", ["radau", "legendre"])
-def test_raised_limits_are_missed_by_as_much(name: str) -> None:
-    scheme, stage = make_scheme(name, 3), driven(name, 3, 8)
-    nlp = build([stage], scheme)
-    x = packed(nlp, [stage])
-    low_x, high_x = bound_unknowns(nlp, [stage], scheme)
-    limits = IntersampleLimits.none(stage)
-    least = stage.guess.forces[3, :, 1].min()
-    limits.held[3, 1] = (least + 0.25 - 0.05) / stage.formation.scene.scales.force
-    low, _ = raise_bounds(nlp, [stage], [limits], (low_x, high_x))
-    pressed = nlp.rows_of[0].limits.presses[3, :, 1]
-    values = call(nlp, "nlp_g", x)
-    assert (low_x - x).max() == pytest.approx(0.25, abs=1e-12)
-    # Where torques may step, c_n is that of the polynomial through the points.
-    at = [0.0] if scheme.ends else [0.0, 1.0]
-    between = np.polyval(np.polyfit(scheme.points, stage.guess.forces[3, :, 1], 2), at)
-    np.testing.assert_allclose((low - values)[pressed], least + 0.25 - between, atol=1e-10)
-    others = np.setdiff1d(nlp.rows_of[0].limits.presses, pressed)
-    assert (low - values)[others].max() < 0
-
-
 @pytest.mark.parametrize("objective", [Objective.TIME, Objective.EFFORT, Objective.MARGIN])
 def test_what_is_made_least(objective: Objective) -> None:
     scheme, stage = make_scheme("radau", 3), driven("radau", 3, 8)

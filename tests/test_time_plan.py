@@ -420,16 +420,6 @@ def test_torques_are_polynomials_between_the_nodes(stages: list[StageMotion]) ->
         assert stage.torque.coefficients.shape == (len(part.fractions), 2, 3)
 
 
-def test_motions_pass_through_their_nodes(stages: list[StageMotion]) -> None:
-    for stage in stages:
-        hair = 1e-12 * stage.duration
-        for t in (np.maximum(stage.breaks - hair, 0.0), stage.breaks):
-            samples = stage.evaluate(t)
-            # The solver's own tolerance, which pulling onto the contacts removes.
-            np.testing.assert_allclose(samples.z, stage.points.nodes[:, 0], atol=1e-8)
-            np.testing.assert_allclose(samples.z_dot, stage.points.nodes[:, 1], atol=1e-6)
-
-
 def test_stages_and_phases_pass_into_one_another(motions: list[TimeMotion]) -> None:
     every = [stage for motion in motions for stage in motion.stages]
     state = np.stack([every[0].points.nodes[0, 0], np.zeros(5)])

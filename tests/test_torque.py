@@ -38,11 +38,6 @@ def test_linear_rows_with_a_step(tmp_path: Path) -> None:
     assert at(profile, [1.25, 2.0]) == [[2.5, 1.5], [1.0, 3.0]]
 
 
-def test_step_at_the_very_start() -> None:
-    t, tau = np.array([0.0, 0.0, 1.0]), np.array([[9.0, 9.0], [1.0, 1.0], [2.0, 2.0]])
-    assert at(TorqueProfile.join_rows(t, tau), [0.0, 1.0]) == [[1.0, 1.0], [2.0, 2.0]]
-
-
 @pytest.mark.parametrize(
     "text",
     [
