@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shipped import SQUARE, problem_of
-from wholearm.benchmark.kernels import LARGEST, STUDY, Environment, answer, compare, perturb_scenes
+from shipped import SQUARE, problem_of, solved
+from wholearm.benchmark.kernels import LARGEST, STUDY, Environment, compare, perturb_scenes
 from wholearm.benchmark.pool import CaseAnswer
 from wholearm.benchmark.study import Case
 from wholearm.cli.command import main
@@ -37,7 +37,7 @@ def test_what_differs_is_named(changes: dict[str, Any], text: str | None) -> Non
 def test_answers_come_from_the_environment() -> None:
     found = STUDY.run((*Environment(seed=3), str(SQUARE), "time"))
     assert found["fault"] == ""
-    assert found["value"] == pytest.approx(answer(str(SQUARE), "time")["value"], rel=1e-6)
+    assert found["value"] == pytest.approx(solved(SQUARE).value, rel=1e-6)
     absent = STUDY.run((*Environment(), "absent.toml", "time"))
     assert absent["value"] is None and "absent.toml: cannot be read" in absent["fault"]
 

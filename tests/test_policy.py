@@ -13,7 +13,7 @@ from scipy.linalg import solve_continuous_are
 from scipy.optimize import linprog
 
 import wholearm
-from shipped import HEPTAGON, IMPACTS, LANDING, SQUARE, plan_of, problem_of
+from shipped import HEPTAGON, IMPACTS, LANDING, plan_of, problem_of
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
 from wholearm.free_simulation.free_simulate import simulate_free
@@ -119,20 +119,6 @@ def test_the_fastest_motion_between_limits_of_the_acceleration() -> None:
     # Half of it is kept in reserve.
     b = retime(s, slack, np.ones((21, 2)), b).run(0.0)
     assert b == pytest.approx(2 * np.minimum(s, 1 - s), abs=1e-9)
-
-
-def test_a_curve_without_a_reserve_is_run_more_slowly() -> None:
-    whole = problem_of(SQUARE)
-    start = trace_phase(whole.phases[0], whole.start, whole.phases[1:]).end
-    problem = replace(whole, start=start, phases=(replace(whole.phases[1], index=0),))
-    plan = wholearm.solve(problem, replay=False).trajectory
-    policy = make_policy(problem, plan)
-    (about,) = policy.about["phases"]
-    assert about["share"] >= 0.4 and set(about["reserves"]) == set(plan.contacts)
-    assert plan.duration < about["duration"] < 4 * plan.duration
-    heavier = problem.with_({"mass": 1.01 * whole.scene.polygon.mass})
-    report = verify_policy(heavier, plan, policy, tolerance=1e-6)
-    assert report.ok, report.failures
 
 
 def test_the_joints_show_an_impact() -> None:

@@ -166,7 +166,7 @@ def test_nothing_of_casadi_is_left_to_the_garbage_collector() -> None:
     def run(transcription: str = "auto", **changes: Any) -> None:
         problem = wholearm.load(SQUARE)
         problem = replace(problem, phases=problem.phases[:1], **changes)
-        options: dict[str, Any] = {"transcription": transcription, "replay": False}
+        options: dict[str, Any] = {"transcription": transcription, "replay": False, "accuracy": 0.1}
         try:
             plan = wholearm.solve(problem, intervals=10, time_intervals=4, **options)
             wholearm.verify(problem, plan)

@@ -123,7 +123,11 @@ def test_a_brisk_motion_keeps_half_the_margin_and_ends_at_rest() -> None:
 def test_a_way_that_slides_while_it_tips_is_planned() -> None:
     problem = tipping()
     (plan,) = plan_phases(
-        problem, problem.phases, problem.start, PlanOptions(time_intervals=4), explained=False
+        problem,
+        problem.phases,
+        problem.start,
+        PlanOptions(time_intervals=4, accuracy=1e-2),
+        explained=False,
     )
     motion = plan.motion
     samples = motion.evaluate(np.linspace(0.0, motion.duration, 50))
