@@ -94,15 +94,6 @@ def test_values_and_derivatives_are_those_of_the_same_nlp_in_one_piece(seed: int
     assert np.abs(expected).max() > 0.1
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_derivatives_have_no_entry_that_is_always_zero(seed: int) -> None:
-    built, x, _, g = make_nlp(seed)
-    _, jacobian = built.derivatives["jac_g"].mx_out()
-    assert jacobian.sparsity().nnz() == ca.jacobian(g, x).sparsity().nnz()
-    hessian = built.derivatives["hess_lag"].sparsity_out(0)
-    assert hessian.is_triu() and hessian.nnz() < SIZE * (SIZE + 1) / 2
-
-
 def test_the_solver_takes_the_derivatives_that_it_is_given() -> None:
     x = ca.SX.sym("x", 2)
     # Rosenbrock's valley, one share of the cost, on a circle.

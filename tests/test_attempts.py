@@ -36,11 +36,6 @@ PACE = "{}, {} times as long as a fall over that height"
 AHEAD = [PACE.format("one to an end of the phases further on", falls) for falls in (2, 4, 1) * 2]
 
 
-def list_attempts(problem: Problem, count: int, patient: bool = True) -> Attempts:
-    search = TimeSearch.of(problem, OPTIONS)
-    return Attempts(problem, problem.phases[:count], problem.start, search, None, patient)
-
-
 def test_an_end_that_is_known_is_first_looked_for_straight() -> None:
     """As on a route, which is given it: pinned in a file the first guess is the same."""
     problem = landing()
@@ -61,11 +56,6 @@ def test_an_end_that_is_known_is_first_looked_for_straight() -> None:
     # Without one there is nothing to go straight to, nor are there straight ways of two phases.
     free = Attempts(problem, [phase], start, search, None, True)
     assert [attempt.name for attempt in free.begin()] == [nearest]
-
-
-def test_where_patience_is_not_asked_for_there_is_one_attempt() -> None:
-    attempts = list_attempts(problem_of(HEPTAGON), 1, patient=False)
-    assert list(attempts) == [attempts.first]
 
 
 @pytest.fixture

@@ -50,11 +50,6 @@ def test_strided_arguments() -> None:
 COLUMNS = Columns(z=5, h=1, tau=4)
 
 
-def test_blocks_follow_one_another() -> None:
-    assert COLUMNS.count == 10
-    assert [COLUMNS[name] for name in ("z", "h", "tau")] == [slice(0, 5), slice(5, 6), slice(6, 10)]
-
-
 def test_blocks_are_joined_by_name_whatever_their_order() -> None:
     tau, z = np.arange(24.0).reshape(2, 3, 4), np.arange(5.0)
     joined = COLUMNS.join(tau=tau, z=z, h=np.full((2, 1, 1), 7.0))

@@ -8,33 +8,25 @@ import numpy as np
 import pytest
 
 from crossing import make_way, measure_fingers
-from plane import finger_gap, make_formation, measure_gaps
+from plane import finger_gap
 from thrown import heave
-from timed import instants, landing, plan_landing, stages_of
+from timed import instants, plan_landing, stages_of
 from wholearm.common.arrays import Array
-from wholearm.contacts.links import FINGERS_TOUCH
-from wholearm.geometry.tracing import trace_phases
-from wholearm.mechanics.dynamics import Directions
 from wholearm.mechanics.limits import CONE, PRESS, make_limits
-from wholearm.planning.options import CLEARANCE, PlanOptions
+from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
-from wholearm.planning.time_domain.collocation import make_scheme
 from wholearm.planning.time_domain.intersample import (
-    GRAZE,
     MISS,
     IntersampleLimits,
     check_between,
     find_misses,
-    monitor_missed,
 )
-from wholearm.planning.time_domain.search import TimeSolution
 from wholearm.planning.time_domain.stage import Stage
-from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion, make_motions
-from wholearm.planning.time_domain.time_plan import plan_phases, try_phases
+from wholearm.planning.time_domain.time_motion import StageMotion
+from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.results.trajectory import Trajectory
 
 EPSILON = 0.05
-SCHEME = make_scheme("radau", 3, 3)
 
 
 def as_stage(motion: StageMotion, **fields: object) -> Stage:
@@ -113,60 +105,6 @@ def test_cones_are_missed_by_what_epsilon_takes_from_them_but_the_margin_does_no
     assert not in_newtons(stage, check(stage, motion, EPSILON, large), CONE).any()
 
 
-def test_released_contacts_have_to_be_clear_in_the_second_half() -> None:
-    # The first stage without the contact that is let go.
-    motion = next(motion for motion in landed() if motion.formation.n_contacts == 3)
-    formation = motion.formation
-    names = [limit.gained.name if limit.gained else "" for limit in formation.limits]
-    k = names.index("v3-finger1")
-    gaps = make_formation(formation.scene, "v3-finger1")
-    fields = {"monitored": (k,), "released": (k,), "opens": True}
-    stage = as_stage(motion, **fields)
-    assert check(stage, motion, EPSILON).gap.max() <= GRAZE
-    # Played backwards it is clear at first, and touches at the end.
-    part = motion.points
-    back = part._replace(
-        fractions=part.fractions[::-1],
-        nodes=part.nodes[::-1] * np.array([[1.0], [-1.0]]),
-        z=part.z[::-1],
-        v=-part.v[::-1],
-        a=part.a[::-1],
-        tau=part.tau[::-1, ::-1],
-    )
-    reverse = replace(motion, points=back)
-    misses = check(as_stage(reverse, **fields), reverse, EPSILON).gap[:, 0]
-    end = measure_gaps(gaps, reverse.evaluate(np.array([motion.duration])).z[0])[0]
-    assert misses[-1] == pytest.approx(CLEARANCE / 2 - end, abs=1e-7)
-    assert misses[0] == 0.0
-
-
-@lru_cache(maxsize=1)
-def solve_at_points() -> TimeSolution:
-    """The heptagon's landing on few intervals, with limits at the points alone."""
-    problem = landing()
-    start = trace_phases(problem)[-1].end
-    options = PlanOptions(time_intervals=6)
-    begun = try_phases(problem, problem.phases[4:], start, options, further=9)
-    assert begun is not None and isinstance(begun[0].solution, TimeSolution)
-    return begun[0].solution
-
-
-def test_rates_against_the_directions_of_a_stage_are_missed() -> None:
-    solution = solve_at_points()
-    motions = make_motions(solution.stages, SCHEME)
-    for stage, motion in zip(solution.stages, motions, strict=True):
-        seen, formation = check_between(stage, motion), stage.formation
-        z, v = seen.samples.z, seen.samples.z_dot
-        slip = np.einsum("nij,nj->ni", formation.evaluate(z, v).A_t, v)
-        rates = np.hstack([slip / formation.scene.scales.length, v[:, 3:]])
-        senses = rates * np.concatenate(stage.directions)
-        # With every direction turned round, each rate is missed by what it is.
-        turned = Directions(-stage.directions.Xi, -stage.directions.sigma)
-        missed = find_misses(replace(stage, directions=turned), seen, EPSILON).sense
-        largest = senses.reshape(stage.intervals, -1, senses.shape[1]).max(axis=1)
-        np.testing.assert_allclose(missed, largest.clip(0.0), atol=2e-3 * senses.max())
-
-
 @lru_cache(maxsize=1)
 def make_way_twice() -> tuple[Trajectory, Trajectory]:
     """Plans of least effort with fingers that pass each other, and with solid ones."""
@@ -191,18 +129,3 @@ def test_the_links_are_kept_apart_between_points_too() -> None:
     assert least[0] < -5e-3 and least[1] > -2e-8
     # With less that is allowed effort is larger, to the accuracy of plans.
     assert solid.meta["value"] > (1 - 1e-4) * passing.meta["value"]
-
-
-def test_what_is_broken_between_points_is_watched() -> None:
-    """In the plan of fingers that pass each other the gap is, in the other nothing."""
-    formation = make_way(solid=True).phases[0].formation
-    (gap,) = [k for k, limit in enumerate(formation.limits) if limit.text == FINGERS_TOUCH]
-    for plan, monitored in zip(make_way_twice(), ((gap,), ()), strict=True):
-        (whole,) = plan.motions
-        assert isinstance(whole, TimeMotion)
-        motions = [replace(part, formation=formation) for part in whole.stages]
-        stages = [as_stage(part) for part in motions]
-        checks = [check_between(*pair) for pair in zip(stages, motions, strict=True)]
-        found = monitor_missed(stages, checks)
-        assert {k for stage in found or stages for k in stage.monitored} == set(monitored)
-        assert (found is None) == (monitored == ())

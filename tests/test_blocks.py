@@ -4,66 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from shipped import HEPTAGON, problem_of
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError, SolverError
-from wholearm.common.shortfalls import LimitPlace, Shortfall
-from wholearm.geometry.tracing import trace_phases
-from wholearm.planning import blocks
 from wholearm.planning.block_plan import Planning
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.rate_limits import explain_motors
 from wholearm.planning.stops import Plans, plan_stops
-from wholearm.planning.time_domain import time_impacts as impacts
 from wholearm.problem.definition import Phase, Problem
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Samples
-
-
-@cache
-def plan_along() -> Plans:
-    problem = problem_of(HEPTAGON)
-    given = problem, trace_phases(problem), PlanOptions(intervals=20)
-    return blocks.plan_blocks(*given, lambda _: None).plans
-
-
-@pytest.mark.parametrize("share", [2.0, 0.1])
-def test_what_is_far_from_possible_later_stops_planning_before(
-    monkeypatch: pytest.MonkeyPatch, share: float
-) -> None:
-    """What is near to being possible may be so from where a better plan ends."""
-    problem, begun = problem_of(HEPTAGON), list[tuple[int, bool, bool]]()
-    curves, options = trace_phases(problem), PlanOptions(intervals=20)
-    known = plan_along()
-    place = LimitPlace(3, 0.0, "there")
-    short = Shortfall("press", "v1-palm", "c_n", 1.0, "N", place, share * blocks.CLEAR)
-
-    def plan_with_impacts(*of: Any, **others: Any) -> Any:
-        number = of[1][0].number
-        begun.append((number, others["only_begin"], bool(others["begun"])))
-        if number == 3 and others["only_begin"]:
-            raise InfeasibleError("phase 3 is infeasible", [short])
-        return [known[number - 1]]
-
-    monkeypatch.setattr(impacts, "plan_with_impacts", plan_with_impacts)
-    over_time = replace(options, transcription="time")
-    if share > 1:
-        with pytest.raises(InfeasibleError, match="phase 3"):
-            blocks.plan_blocks(problem, curves, over_time, lambda _: None)
-    else:
-        blocks.plan_blocks(problem, curves, over_time, lambda _: None)
-    whole = [(number, False, number < 3) for number in range(1, len(known) + 1)]
-    first = [(number, True, False) for number in (1, 2, 3)]
-    assert begun == (first if share > 1 else [*first, *whole])
-
 
 LEAST = (0.1, 0.4, 0.3)
 """Least times of phases; those that are passed in motion take a tenth less."""

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 import wholearm
-from plane import finger_gap, place_corners
 from shipped import HEPTAGON, problem_of
 from wholearm.common.errors import InputError
 from wholearm.geometry.path_guess import load
@@ -73,18 +72,6 @@ def test_heptagon_is_read() -> None:
     assert " ".join(contact.name for contact in problem.contacts) == names
 
 
-def test_start_is_closed_and_flush() -> None:
-    problem = read_problem(str(HEPTAGON))
-    z = problem.start
-    heights = place_corners(problem.scene, z)[:, 1]
-    np.testing.assert_allclose(heights[:2], 0.0, atol=1e-13)
-    assert z[0] == pytest.approx(0.045) and (heights[2:] > 0.01).all()
-    for finger in (0, 1):
-        assert finger_gap(problem.scene, z[:3], finger, z[3 + finger])[0] == pytest.approx(
-            0.0, abs=1e-13
-        )
-
-
 def test_defaults() -> None:
     def edit(table: dict[str, Any]) -> None:
         del table["name"], table["gravity"]
@@ -96,18 +83,6 @@ def test_defaults() -> None:
     assert problem.name == "unnamed" and problem.scene.gravity == pytest.approx(9.81)
     assert (finger.viscous, finger.dry, finger.speed_limit) == (0.0, 0.0, math.inf)
     assert problem.scene.speed_limit.tolist() == [math.inf, math.inf]
-
-
-def test_optional_keys() -> None:
-    def edit(table: dict[str, Any]) -> None:
-        table["object"]["inertia"] = 1e-3
-        table["fingers"]["2"]["speed_limit"] = 3
-        table["phases"][0]["until"] = {"x": 0.02}
-
-    problem = read_edited(edit)
-    assert problem.scene.polygon.inertia == pytest.approx(1e-3)
-    assert problem.scene.fingers[1].speed_limit == pytest.approx(3.0)
-    assert str(problem.phases[0].until) == "x = 0.02 m"
 
 
 @pytest.mark.parametrize(

@@ -15,14 +15,7 @@ from wholearm.contacts.elemental import build_features, build_geometry
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
-from wholearm.mechanics.dynamics import (
-    Directions,
-    build_forward,
-    energy,
-    inverse,
-    reduced_inertia,
-    split_forces,
-)
+from wholearm.mechanics.dynamics import Directions, build_forward, energy, inverse, reduced_inertia
 from wholearm.problem.read import build_problem
 from wholearm.scene.model import Friction, Scene
 from wholearm.verification.minimal_coordinates import reduce_to_first_joint
@@ -284,31 +277,6 @@ def test_rolling_contacts_obey_newton_and_euler(curves: tuple[Curve, ...]) -> No
         held = np.hstack([formation.evaluate(path, path).C, formation.evaluate_slip(path)])
         size = 1 + np.abs(z_ddot).max()
         np.testing.assert_allclose((held[0] - 2 * held[1] + held[2]) / h**2, 0, atol=1e-6 * size)
-
-
-def test_rolling_friction_does_no_work(curves: tuple[Curve, ...]) -> None:
-    """d/dt energy = power of the torques - friction at joints and at the contacts that slide."""
-    rng = np.random.default_rng(17)
-    for formation, z, v, directions in rolling_states(curves):
-        scene, tau = formation.scene, rng.uniform(-1, 1, 2)
-        kinematics = formation.evaluate(z[None], v[None])
-        if reduced_inertia(formation, kinematics, directions)[0] <= 0.05:
-            continue
-        z_ddot, c = forward(formation, z, v, tau, directions)
-        c_n, c_t = split_forces(formation, c, directions.Xi)
-        h = 1e-5
-        before, after = (
-            energy(formation, (z + k * v + k**2 / 2 * z_ddot)[None], (v + k * z_ddot)[None])[0]
-            for k in (-h, h)
-        )
-        slip = kinematics.A_t[0] @ v
-        slides = [contact not in formation.rolling for contact in formation.contacts]
-        lost = (np.abs(slip) * formation.friction * c_n)[slides].sum()
-        assert -slip @ c_t == pytest.approx(lost, abs=1e-12 * (1 + abs(lost)))
-        lost += scene.viscous @ v**2 + scene.dry @ np.abs(v)
-        power = tau @ v[3:] - lost
-        size = 1 + abs(power) + np.abs(z_ddot).max()
-        assert (after - before) / (2 * h) == pytest.approx(power, abs=1e-8 * size)
 
 
 def test_three_routes_agree_where_a_contact_rolls(curves: tuple[Curve, ...]) -> None:

@@ -22,7 +22,6 @@ from tipping import roll
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.contacts.cones import find_weakest, force_limit_rows, slip_margins
-from wholearm.contacts.contact_limits import build_clearance
 from wholearm.contacts.elemental import Contact, build_features, candidate_contacts, parse_contact
 from wholearm.contacts.formation import Formation, build_slip
 from wholearm.scene.model import Friction, Scene
@@ -159,33 +158,6 @@ def test_pointed_tip_has_no_arc() -> None:
     assert len(candidate_contacts(pointed, 0)) == 10
     with pytest.raises(InputError, match=r"fingers\.1\.radius is 0"):
         parse_contact("v1-tip1", pointed)
-
-
-@pytest.mark.parametrize("count", [3, 4, 9])
-def test_a_tip_farther_outside_another_edge_cannot_touch_this_one(count: int) -> None:
-    """The largest gap of all other edges, against plain maxima at random places."""
-    rng = np.random.default_rng(count)
-    angles = 2 * np.pi * np.arange(count) / count
-    scene = make_scene(0.05 * np.column_stack([np.cos(angles), np.sin(angles)]))
-    features = build_features(scene)
-    for link in features.links:
-        function = ca.Function("gaps", [features.z], [link.edge_gap, ca.horzcat(*link.other_gap)])
-        for _ in range(20):
-            own, others = (part.full()[0] for part in function(rng.uniform(-0.3, 0.3, 5)))
-            np.testing.assert_array_equal(others, [np.delete(own, k).max() for k in range(count)])
-
-
-def test_clearances_grow_in_proportion_to_the_vertices() -> None:
-    """Operations in the clearances of all contacts that an object can have."""
-    sizes = []
-    for count in (12, 24, 48):
-        angles = 2 * np.pi * np.arange(count) / count
-        scene = make_scene(0.05 * np.column_stack([np.cos(angles), np.sin(angles)]))
-        every = [contact for part in (None, 0, 1) for contact in candidate_contacts(scene, part)]
-        values = [build_clearance(contact, scene, touching=False).value for contact in every]
-        function = ca.Function("all", [build_features(scene).z], [ca.vertcat(*values)])
-        sizes.append(function.n_instructions())
-    assert sizes[1] < 2.1 * sizes[0] and sizes[2] < 2.1 * sizes[1]
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -14,8 +13,8 @@ from shipped import HEPTAGON, LANDING, plan_of, problem_of
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
 from wholearm.contacts.formation import Formation, find_touching
-from wholearm.engines.departure import Departure, compare, find_pairs
-from wholearm.engines.engine_replay import EngineReport, Level, replay_in, require_engine
+from wholearm.engines.departure import Departure, compare
+from wholearm.engines.engine_replay import EngineReport, Level, replay_in
 from wholearm.engines.feedback import play_policy
 from wholearm.engines.mjcf import write_mjcf
 from wholearm.engines.pressing import LOOSE, EngineDrive, press_in
@@ -163,16 +162,6 @@ def test_what_departs_with_some_settings_only_has_not_converged() -> None:
         assert report.exit_status == 1 and f": {verdict}: " in report.to_text().splitlines()[0]
 
 
-def test_an_engine_that_is_installed_in_part_is_said_to_be(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "mujoco.py").write_text("raise ImportError('core bindings are\\nmissing')")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "mujoco", raising=False)
-    with pytest.raises(InputError, match="--engine: mujoco: core bindings are missing"):
-        require_engine("mujoco")
-
-
 def test_an_engine_that_is_missing_or_unknown(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -252,12 +241,6 @@ def test_a_contact_that_is_not_planned_is_the_reason() -> None:
     assert judge(run).reason == "every contact is as planned"
     run.press[60, run.pairs.index("v6-finger2")] = 1.0
     assert judge(run).reason.startswith("v6-finger2 presses, which is not planned, at t = ")
-
-
-def test_a_vertex_on_a_tip_ends_two_edges() -> None:
-    assert find_pairs("v4-tip1", 6) == ("v4-finger1", "e3-tip1", "e4-tip1")
-    assert find_pairs("v0-tip2", 6) == ("v0-finger2", "e5-tip2", "e0-tip2")
-    assert find_pairs("e3-tip1", 6) == ("e3-tip1",)
 
 
 def test_phases_are_stretches_or_the_whole_plan_is() -> None:

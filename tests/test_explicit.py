@@ -13,7 +13,6 @@ from wholearm.contacts.closing import (
     evaluate_contacts,
     evaluate_each,
     first_contact,
-    group_alike,
 )
 from wholearm.contacts.explicit import measure_gap, move, place
 from wholearm.contacts.formation import Formation
@@ -113,21 +112,3 @@ def test_rows_are_those_of_each_formation() -> None:
         for one, other in zip(found, expected, strict=True):
             # Formations' own expressions share parts, which costs the last bits.
             np.testing.assert_allclose(one[k], other[0], rtol=1e-12, atol=1e-12)
-
-
-def test_groups_have_the_friction_of_all_their_formations() -> None:
-    scene = problem_of(HEPTAGON).with_(friction_palm=0.1, friction_finger1=0.2).scene
-    table = contact_table(scene)
-    names = ("v0-palm", "v1-palm", "v2-finger1", "v5-finger2")
-    others = ("v1-palm", "v1-finger1", "v2-finger1", "v5-finger2")
-    by_name = {contact.name: k for k, contact in enumerate(table)}
-    labels = np.array([[by_name[name] for name in own] for own in (names, others, names)])
-    groups = list(group_alike(scene, labels))
-    assert sorted(rows.tolist() for _, rows in groups) == [
-        [False, True, False],
-        [True, False, True],
-    ]
-    for formation, rows in groups:
-        for label in labels[rows]:
-            own = Formation(scene, tuple(table[k] for k in label.tolist()))
-            np.testing.assert_array_equal(formation.friction, own.friction)

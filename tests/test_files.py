@@ -12,7 +12,7 @@ import pytest
 
 from wholearm.common import files as archive
 from wholearm.common.errors import InputError
-from wholearm.common.files import read_arrays, require_writable, write_whole
+from wholearm.common.files import read_arrays, write_whole
 
 
 def fail_halfway(stream: BinaryIO) -> None:
@@ -82,14 +82,6 @@ def test_a_pipe_is_written_to_and_not_replaced(tmp_path: Path) -> None:
     finally:
         os.close(reader)
     assert stat.S_ISFIFO(pipe.stat().st_mode) and list(tmp_path.iterdir()) == [pipe]
-
-
-@pytest.mark.parametrize("name", ["absent/out.txt", "", "file.txt/out.txt"])
-def test_checked_before_the_work(tmp_path: Path, name: str) -> None:
-    (tmp_path / "file.txt").write_bytes(b"")
-    with pytest.raises(InputError, match="cannot be written") as caught:
-        require_writable(tmp_path / name)
-    assert caught.value.source == str(tmp_path / name)
 
 
 def _write(path: Path, members: dict[str, bytes]) -> str:

@@ -22,7 +22,6 @@ from wholearm.common.errors import InputError
 from wholearm.contacts.closing import close_finger, place_flush
 from wholearm.contacts.elemental import build_features, parse_contact
 from wholearm.contacts.formation import Formation, find_touching
-from wholearm.problem.definition import Problem
 from wholearm.scene.model import Scene
 
 # Distances of metres-sized coordinates in double precision.
@@ -147,21 +146,6 @@ def test_mirrored_scene_closes_mirrored(seed: int) -> None:
         assert np.sin(angle) == pytest.approx(np.sin(other), abs=ROUNDING)
 
 
-@pytest.mark.parametrize("count", [1, 2, 5])
-def test_many_configurations_are_evaluated_one_by_one(heptagon: Problem, count: int) -> None:
-    formation = heptagon.phases[0].formation
-    rng = np.random.default_rng(count)
-    z, v = heptagon.start + rng.uniform(-0.1, 0.1, (2, count, 5))
-    together = formation.evaluate(z, v)
-    for i in range(count):
-        alone = formation.evaluate(z[i : i + 1], v[i : i + 1])
-        for many, one in zip(together, alone, strict=True):
-            assert (many[i] == one[0]).all()
-    assert formation.evaluate_limits(z).shape == (count, len(formation.limits))
-    gap = formation.evaluate_gap(formation.contacts[2], z)
-    np.testing.assert_array_equal(gap, together.C[:, 2])
-
-
 ROLLING = ["v0-palm", "v2-finger1", "v3-finger2", "e1-tip1", "v2-tip1"]
 
 
@@ -181,16 +165,6 @@ def test_a_rolling_contact_adds_its_tangential_row(name: str) -> None:
     ahead, behind = (formation.evaluate(z + step * speed, speed).P for step in (v, -v))
     expected = np.einsum("nij,nj->ni", (ahead - behind) / (2 * v), speed)
     np.testing.assert_allclose(here.P_dot_v, expected, atol=1e-8)
-
-
-def test_slip_coordinates_are_in_the_order_of_the_contacts() -> None:
-    """Whatever the order in which the rolling ones are given; x of a vertex on the palm."""
-    scene = make_scene(SQUARE)
-    contacts = make_formation(scene, "v0-palm v1-palm").contacts
-    formation = Formation(scene, contacts, contacts[::-1])
-    assert formation.rolling_rows == (0, 1)
-    z = np.array([[0.01, 0.03, 0.0, 1.0, 2.0]])
-    np.testing.assert_allclose(formation.evaluate_slip(z), [[-0.02, 0.04]], atol=ROUNDING)
 
 
 def test_only_contacts_roll() -> None:

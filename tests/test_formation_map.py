@@ -249,21 +249,6 @@ def test_plan_runs_along_borders(chart: FormationMap, curves: tuple[Curve, ...])
         assert distance_to(own, points).max() < 2e-5
 
 
-def test_plan_is_possible_quasistatically_the_way_it_goes(
-    chart: FormationMap, curves: tuple[Curve, ...]
-) -> None:
-    for curve in curves:
-        names = set(curve.formation.names)
-        (border,) = [b for b in chart.borders if set(b.names) == names]
-        index = 0 if border.along == "x" else 1
-        ends = sorted([curve.start[2 * index], curve.end[2 * index]])
-        value = border.points[:, index]
-        used = (value > ends[0]) & (value < ends[1])
-        # Every phase goes left, or turns clockwise.
-        assert curve.end[2 * index] < curve.start[2 * index]
-        assert border.back[used].all()
-
-
 def most_slack(problem: Problem, border: Border, k: int, way: float) -> float | None:
     """How far all limits can be kept at a border's point, by a linear programme; None: unclear."""
     scene = problem.scene

@@ -6,17 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from retelling import (
-    RETELLINGS,
-    Answer,
-    Retelling,
-    Units,
-    answer,
-    compare,
-    in_units,
-    mirrored,
-    renumbered,
-)
+from retelling import RETELLINGS, Answer, Retelling, answer, compare
 from wholearm.geometry.path_guess import load
 from wholearm.geometry.tracing import trace_phases
 from wholearm.problem.definition import Problem
@@ -76,20 +66,3 @@ def test_a_retelling_changes_what_it_says(problem: Problem, telling: Retelling) 
         turns = (same.end - z) / (2 * np.pi) * [0, 0, 0, 1, 1]
         np.testing.assert_allclose(same.end - 2 * np.pi * np.round(turns), z, atol=1e-11 * scale[0])
         assert same.length == pytest.approx(telling.units.length * one.length, rel=1e-11)
-
-
-def test_retellings_turn_back(problem: Problem) -> None:
-    units = Units(7.0, 3.0, 2.0)
-    there, back = in_units(units), in_units(Units(*(1 / unit for unit in units)))
-    count = problem.scene.polygon.n_vertices
-    for one, other in [(there, back), (mirrored(), mirrored()), (renumbered(2), renumbered(-2))]:
-        table = other.table(one.table(problem.table))
-        assert table["phases"] == problem.table["phases"]
-        assert table["start"] == pytest.approx(problem.table["start"])
-        found, wanted = (np.array(own["object"]["vertices"]) for own in (table, problem.table))
-        assert found.shape == (count, 2)
-        np.testing.assert_allclose(found, wanted, rtol=1e-14)
-        for key in ("1", "2"):
-            finger, given = table["fingers"][key], problem.table["fingers"][key]
-            assert finger.pop("base") == pytest.approx(given["base"])
-            assert finger == pytest.approx({k: v for k, v in given.items() if k != "base"})

@@ -11,7 +11,7 @@ from wholearm.common.errors import InputError
 from wholearm.contacts.closing import close_fingers, contact_table
 from wholearm.contacts.formation import Formation
 from wholearm.mapping.borders import NOWHERE, flush_track, label_cells
-from wholearm.mapping.legs import choose_leg, describe_miss, find_miss, split_leg, tolerance
+from wholearm.mapping.legs import describe_miss, find_miss, split_leg, tolerance
 from wholearm.problem.definition import Problem
 from wholearm.search.roadmap import map_labels
 
@@ -112,14 +112,6 @@ def test_near_miss_names_the_border_and_its_distance(heptagon: Problem) -> None:
     assert palm is not None and "e0 flush on the palm, is up to -1.5 deg" in describe_miss(
         scene, palm
     )
-
-
-def test_leg_with_one_end_off_the_border_is_straight(heptagon: Problem) -> None:
-    scene, near = heptagon.scene, tolerance(heptagon.scene)
-    start, stop = on_border(heptagon, PHI), on_border(heptagon, PHI + 0.2)
-    assert choose_leg(scene, start, stop).track.flush == (1, 6)
-    off = stop + np.array([4 * near[0], 4 * near[1]])
-    assert choose_leg(scene, start, off).track.flush is None
 
 
 def test_places_of_the_grid_have_their_labels_however_often_the_object_has_turned() -> None:

@@ -17,7 +17,6 @@ from wholearm.planning.time_domain.stage import Stage, StagePoints
 from wholearm.planning.time_domain.stage_modes import (
     LEAST_INTERVALS,
     StageMode,
-    drop,
     in_mode,
     link,
     merge,
@@ -72,17 +71,6 @@ def test_pieces_of_a_stage_are_linked(begin: int, stop: int) -> None:
         # Between two pieces the contact comes to rest; the last one ends as the whole did.
         assert piece.turns == (() if end == 8 else (0,))
         assert (piece.until is until) == (end == 8) and piece.opens == (start == 0)
-
-
-def test_a_stage_that_is_dropped_leaves_its_duties_to_its_neighbours() -> None:
-    stage = make_stage("v1-palm v4-finger1 v6-finger2", opens=True, until=Until(coordinate="x"))
-    first, last = split(stage, SCHEME, 0, 4, turned(stage, 0))
-    assert first.opens and first.until is None and last.until is not None
-    (left,) = drop([first, last], 0) or [first]
-    assert left.opens and left.until is last.until
-    (left,) = drop([first, last], 1) or [first]
-    assert left.opens and left.until is last.until and left.directions is first.directions
-    assert drop([first, replace(last, phase=1)], 0) is None
 
 
 def test_releasing_earlier_hands_a_stage_to_the_next_phase() -> None:

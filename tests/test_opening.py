@@ -18,7 +18,7 @@ from wholearm.problem.read import build_problem
 from wholearm.search.astar import RouteSearch
 from wholearm.search.cuts import Opening, list_cut, list_gates, list_openings, look_through
 from wholearm.search.edges import Link
-from wholearm.search.find_route import choose_opening, explain, find_hand, find_opening, list_hands
+from wholearm.search.find_route import choose_opening, explain, find_hand, find_opening
 from wholearm.search.places import make_place
 from wholearm.search.result import describe_block
 from wholearm.search.roadmap import Roadmap
@@ -81,23 +81,6 @@ def test_what_is_advised_opens_the_way() -> None:
     ).duration == pytest.approx(float(text.split()[-2]), rel=0.05)
     said = describe_block(own, [], text, lambda blocked: explain(rough, PlanOptions(), blocked))
     assert "blocked; v0-palm" in said and said.endswith(text) and " N short; " in said
-
-
-def test_hands_are_changed_alike_where_they_are_alike() -> None:
-    """And each change is one that a problem takes, by its data."""
-    alike = problem_of(HEPTAGON)
-    changes = list_hands(alike.scene)
-    assert {own.parameter.key for own in changes} == {"length", "fingers.1.base[1]"}
-    sizes = [abs(own.value / own.parameter.value - 1) for own in changes]
-    assert sizes == pytest.approx(sorted(sizes), abs=5e-3) and max(sizes) < 0.21
-    for own in changes:
-        right, left = alike.with_(own.values, phases=[]).scene.fingers
-        bases = np.array([right.base, left.base])
-        assert right.length == left.length
-        assert bases[0].tolist() == [-bases[1, 0], bases[1, 1]]
-    uneven = alike.with_(length1=0.9 * alike.scene.fingers[0].length, base2=[-0.085, -0.01])
-    keys = [f"fingers.{k}.{what}" for what in ("base[1]", "length") for k in (1, 2)]
-    assert [own.parameter.key for own in list_hands(uneven.scene)[:4]] == keys
 
 
 def test_fingers_that_cross_on_the_way_are_mounted_elsewhere(

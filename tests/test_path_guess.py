@@ -18,7 +18,6 @@ from wholearm.geometry.explore import close_all, close_contacts
 from wholearm.geometry.path_guess import (
     POINTS,
     PathGuess,
-    count_freedoms,
     guess_curve,
     guess_onwards,
     guess_phase,
@@ -54,21 +53,6 @@ def outlines(flipping: Problem) -> list[list[PathGuess]]:
 def released(outlines: list[list[PathGuess]]) -> Array:
     """Where the landing is guessed to start."""
     return np.asarray(outlines[-1][0].z[0])
-
-
-def test_every_contact_takes_one_freedom(
-    flipping: Problem, curves: tuple[Curve, ...], released: Array
-) -> None:
-    assert count_freedoms(flipping.phases[5].formation, released) == 2
-    for phase, curve in zip(flipping.phases, curves, strict=False):
-        assert count_freedoms(phase.formation, curve.end) == 1
-        gained = phase.until.contact
-        if gained is not None:
-            held = (*phase.formation.contacts, gained)
-            assert count_freedoms(Formation(flipping.scene, held), curve.end) == 0
-        for k in range(4):
-            fewer = phase.formation.contacts[:k] + phase.formation.contacts[k + 1 :]
-            assert count_freedoms(Formation(flipping.scene, fewer), curve.end) == 2
 
 
 def test_outlines_are_closed_at_every_point(outlines: list[list[PathGuess]]) -> None:

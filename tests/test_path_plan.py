@@ -202,19 +202,6 @@ def test_torques_do_not_jitter(phase: int, objective: str) -> None:
         assert count_swings(squeeze, 0.01 * np.ptp(squeeze) + 0.05) <= 6
 
 
-def test_planning_twice_gives_the_same_plan(curves: tuple[Curve, ...]) -> None:
-    objective = "margin"
-    first = plan(curves[2], objective)
-    # Another phase in between must leave no trace.
-    options = PlanOptions(objective=objective, intervals=COARSE)
-    plan_path(curves[0], EPSILON, options, 1, ALLOWED)
-    again = plan_path(curves[2], EPSILON, options, 1, ALLOWED)
-    # The solver's own tolerance is 1e-8; a plan that started from another one would differ more.
-    for one, other in zip(first.motion.profile, again.motion.profile, strict=True):
-        np.testing.assert_allclose(one, other, rtol=0, atol=1e-7 * np.abs(one).max())
-    assert again.value == pytest.approx(first.value, rel=1e-9)
-
-
 def test_one_build_serves_all_phases(curves: tuple[Curve, ...]) -> None:
     before = build_path_nlp.cache_info().misses
     options = PlanOptions(intervals=47)

@@ -159,14 +159,6 @@ def test_more_time_never_lowers_the_margin(heptagon: Problem) -> None:
     assert values[0] >= heptagon.epsilon and values[-1] > values[0] + 0.1
 
 
-def test_default_margin_takes_twice_the_least_time(heptagon: Problem) -> None:
-    problem = replace(heptagon, phases=heptagon.phases[:1])
-    default = solve(problem, "margin", intervals=20, replay=False)
-    least = solve(problem, intervals=20, replay=False).duration
-    given = solve(problem, "margin", intervals=20, replay=False, duration=2 * least)
-    assert default.meta["value"] == pytest.approx(given.meta["value"], rel=1e-9)
-
-
 @pytest.mark.parametrize("objective", OBJECTIVES)
 def test_meta_says_how_it_was_made(
     heptagon: Problem, plans: dict[str, Trajectory], objective: str

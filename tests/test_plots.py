@@ -260,10 +260,6 @@ def test_snapshots_are_at_least_six_and_one_of_every_phase(planned: Trajectory) 
         assert set(boundaries) <= set(rows)
 
 
-def test_text_is_inside_and_apart(figure: Figure) -> None:
-    check_layout(figure)
-
-
 @pytest.mark.parametrize("width", [3.5, 7.0])
 def test_text_is_inside_and_apart_in_other_widths(width: float, planned: Trajectory) -> None:
     figure = plots.force_margins(planned, width=width, motion=True)

@@ -1,16 +1,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from timed import landing
-from tipping import box
-from wholearm.benchmark.precision.phases import Instance, keep_curves, list_instances
+from wholearm.benchmark.precision.phases import Instance, list_instances
 from wholearm.benchmark.precision.planners import (
     LEAST_TIME,
     NO_DRAG,
@@ -25,7 +22,6 @@ from wholearm.benchmark.precision.runs import SHORT, SOLVED, Median, measure
 from wholearm.benchmark.precision.simulators import FEW, SIMULATORS, make_course
 from wholearm.benchmark.precision.tables import Medians, PeerComparison, find_times
 from wholearm.cli.command import main
-from wholearm.problem.definition import End, Problem
 from wholearm.results.torque import TorqueProfile
 
 FILES = (str(Path(__file__).parents[1] / "problems" / "heptagon_four_contacts.toml"),)
@@ -52,13 +48,6 @@ def test_every_planner_comes_near_the_least_time(method: str) -> None:
     assert least == pytest.approx(LEAST[study], rel=1e-5)
 
 
-def test_reversals_of_our_plan_are_those_of_its_torques() -> None:
-    plan = PLANNERS["wholearm, curve"].build(phase(3), "1e-3")()
-    assert len(plan.marks) == 1 and plan.marks[0] in plan.torque.breaks
-    # Where torques and directions step together nothing is lost in the replay.
-    assert check_plan(phase(3), plan).violation < 1e-5
-
-
 def test_what_a_replay_does_not_keep_is_no_solution() -> None:
     plan = PLANNERS["wholearm, curve"].build(phase(4), "1e-3")()
     good = check_plan(phase(4), plan)
@@ -76,21 +65,6 @@ def test_methods_that_nobody_knows_are_named(capsys: pytest.CaptureFixture[str])
     command = ["bench", "precision", "--problems", str(Path(FILES[0]).parent), "-o", "out"]
     assert main([*command, "--peers", "fastest"]) == 2
     assert "--peers: 'fastest' given; allowed are wholearm;" in capsys.readouterr().err
-
-
-def test_peers_get_the_phases_that_they_know(heptagon: Problem) -> None:
-    every = keep_curves(heptagon)
-    assert every is not None and len(every.phases) == 5
-    # The landing joins its last curve smoothly, and a phase without an end is no curve.
-    kept = keep_curves(landing())
-    assert kept is not None
-    for got, own in zip(kept.phases, landing().phases[:4], strict=True):
-        assert got.formation is own.formation
-    assert {own.end for own in kept.phases} == {End.REST}
-    slide = keep_curves(box())
-    assert slide is not None and len(slide.phases) == 1
-    first = box().phases[1]
-    assert keep_curves(replace(box(), phases=(first,))) is None
 
 
 PROBLEMS = Path(__file__).parents[1] / "problems"

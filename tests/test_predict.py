@@ -183,19 +183,6 @@ def test_breaks_are_found_and_so_is_what_only_speed_keeps() -> None:
     assert rising.speed == 0.0 and rising.again == pytest.approx(0.3, rel=1e-6)
 
 
-def test_paces_are_motions() -> None:
-    road = road_of(HEPTAGON)
-    for rests in ((True, True), (True, False), (False, True), (False, False)):
-        pace = Pace.between(road, rests)
-        assert pace.b.max() == pytest.approx(1.0, abs=1e-4)
-        assert (pace.b[0] == 0, pace.b[-1] < 1e-12) == rests
-        rise = np.diff(pace.b) - (pace.a[1:] + pace.a[:-1]) * np.diff(road.s)
-        assert np.abs(rise).max() < 1e-12
-        inner = slice(40, -40)
-        part = np.interp(np.linspace(road.s[40], road.s[-41], 4001), road.s, pace.b) ** -0.5
-        assert part.mean() * np.ptp(road.s[inner]) < pace.way
-
-
 def test_what_is_left_out_is_named() -> None:
     table = {"contacts": ["v1-palm", "v2-finger1"], "until": {"x": 0.04}}
     problem = problem_of(HEPTAGON).with_({"phases": [table]})

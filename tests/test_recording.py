@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -31,18 +30,6 @@ def torque() -> TorqueProfile:
 @pytest.fixture(scope="module")
 def simulation(torque: TorqueProfile) -> Simulation:
     return simulate(problem_of(HEPTAGON), torque, times=np.linspace(0, 2, 301))
-
-
-@pytest.fixture(scope="module")
-def stepping() -> Simulation:
-    """The first phase, whose torques step at a third of it from a little too much to the plan's."""
-    problem, trajectory = plan()
-    first = replace(problem, phases=problem.phases[:1])
-
-    profile = trajectory.torque
-    coefficients = profile.coefficients.copy()
-    coefficients[profile.breaks[:-1] < 0.13] *= 1.0001
-    return simulate(first, TorqueProfile(profile.breaks, coefficients))
 
 
 def press(tau_1: float, tau_2: float) -> TorqueProfile:
@@ -77,16 +64,6 @@ def test_a_replay_survives_its_file(simulation: Simulation, tmp_path: Path) -> N
     report = verify(simulation.problem, loaded)
     assert report.ok and report.phases[-1].deviation is not None
     assert report.phases[-1].deviation.position < 1e-8
-
-
-def test_steps_of_the_torques_are_kept(stepping: Simulation, tmp_path: Path) -> None:
-    found = stepping.trajectory
-    twice = np.flatnonzero((np.diff(found.t) == 0) & (np.diff(found.phase) == 0))
-    assert len(twice) >= 1
-    jumps = np.abs(found.tau[twice + 1] - found.tau[twice]).max(axis=1)
-    assert jumps.max() > 1e-6
-    save(stepping, tmp_path / "a.npz")
-    assert len(load_trajectory(tmp_path / "a.npz").t) == len(found.t)
 
 
 def test_a_replay_that_fails_is_drawn_and_saved(tmp_path: Path) -> None:

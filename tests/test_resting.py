@@ -12,12 +12,7 @@ from wholearm.common.errors import InfeasibleError
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.time_domain.resting import (
-    find_block,
-    list_headings,
-    list_ways,
-    pushes_one_way,
-)
+from wholearm.planning.time_domain.resting import find_block, list_ways, pushes_one_way
 from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.planning.time_domain.units import in_own_units, scale_state
 from wholearm.problem.read import build_problem, read_problem
@@ -54,18 +49,6 @@ def test_a_finger_that_would_have_to_pull_is_named() -> None:
     with pytest.raises(InfeasibleError, match="no motion begins in any contact mode: c_n of v"):
         plan_phases(feeble, feeble.phases[4:], start, COARSE, explained=False)
     assert plan_landing(time_intervals=6)
-
-
-def test_motions_head_where_contacts_press() -> None:
-    problem = landing()
-    z = scale_state(problem.start, problem.scene.scales)
-    own = in_own_units(problem)
-    formation = own.phases[0].formation
-    headings = list_headings(formation, z, own.epsilon)
-    assert headings and list_headings(formation, z, 50.0) == []
-    for way in headings:
-        assert np.linalg.norm(way) > 1e-3
-        assert np.abs(formation.evaluate(z[None], way[None]).A[0] @ way).max() < 1e-9
 
 
 def test_one_contact_pushes_one_way_unless_the_centroid_passes_above_it() -> None:

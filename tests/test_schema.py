@@ -179,14 +179,6 @@ def test_names_change_what_they_say(
     assert other.source == heptagon.source
 
 
-def test_none_leaves_out_what_is_optional(heptagon: Problem) -> None:
-    uniform = heptagon.with_(inertia=None).scene.polygon.inertia
-    doubled = heptagon.with_(inertia=None, mass=0.4).scene.polygon.inertia
-    assert uniform is not None
-    assert doubled == pytest.approx(2 * uniform)
-    assert heptagon.with_(speed_limit=None).scene.speed_limit.tolist() == [np.inf, np.inf]
-
-
 def test_another_shape_closes_the_fingers_anew(heptagon: Problem) -> None:
     small = 0.99 * np.asarray(heptagon.scene.polygon.vertices)
     other = heptagon.with_(vertices=small)

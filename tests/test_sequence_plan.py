@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import copy
 import tomllib
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,11 +9,10 @@ import pytest
 
 from plane import measure_gaps, measure_slip, unbalance
 from shipped import HEPTAGON, IMPACTS, plan_of, problem_of
-from wholearm.common.arrays import Array
 from wholearm.mechanics.impact import compute_impact
 from wholearm.mechanics.metric import metric_weights
 from wholearm.planning.plan import solve
-from wholearm.problem.definition import End, Problem
+from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem
 from wholearm.results.trajectory import Samples, Trajectory
 from wholearm.verification.verify import verify
@@ -125,36 +123,6 @@ def test_what_an_impact_saves_is_what_a_stop_costs(plans: dict[str, Trajectory])
     stopped = solve(edited(row["phase"]), objective, replay=False)
     assert row["saves"] == pytest.approx(stopped.meta["value"] - value, abs=1e-9)
     assert row["saves"] > 0.01
-
-
-def test_without_an_impact_the_plan_is_that_of_stops(heptagon: Problem) -> None:
-    """Where friction is low, none is possible."""
-    stops = replace(heptagon, phases=heptagon.phases[:3])
-    impacts = [replace(phase, end=End.IMPACT) for phase in stops.phases[:-1]]
-    struck, plain = (
-        solve(problem, "effort", intervals=20, replay=False)
-        for problem in (replace(stops, phases=(*impacts, stops.phases[-1])), stops)
-    )
-    assert not any(row.possible for row in struck.transitions)
-    assert [p.duration for p in struck.phases] == [
-        pytest.approx(p.duration, rel=1e-5) for p in plain.phases
-    ]
-    assert plain.transitions == ()
-    assert struck.value == pytest.approx(plain.value, rel=1e-6)
-
-
-def unit(values: Array) -> Array:
-    return np.asarray(values / np.linalg.norm(values))
-
-
-def test_the_torque_steps_at_an_impact(plans: dict[str, Trajectory]) -> None:
-    trajectory, hair = plans["time"], 1e-9
-    for k, start in enumerate(trajectory.phase_starts[1:3]):
-        around = trajectory.torque.at(np.array([start - hair, start + hair]))
-        end, begin = ends_of(trajectory, k)
-        np.testing.assert_allclose(around, [end.tau[0], begin.tau[0]], rtol=0, atol=1e-4)
-        assert start in trajectory.torque.breaks
-        assert not np.allclose(unit(end.z_dot[0]), unit(begin.z_dot[0]), atol=1e-2)
 
 
 def slide(*ends: float) -> Problem:

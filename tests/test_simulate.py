@@ -90,18 +90,6 @@ def test_follows_the_plan() -> None:
     assert np.allclose([event.time for event in arrivals], boundaries, atol=1e-5, rtol=0)
 
 
-def test_contacts_stay_closed() -> None:
-    problem, trajectory = plan()
-    simulation = simulate(problem, trajectory.torque)
-    for index, phase in enumerate(problem.phases):
-        rows = simulation.phase == index
-        kinematics = phase.formation.evaluate(simulation.z[rows], simulation.z_dot[rows])
-        rates = np.einsum("nij,nj->ni", kinematics.A, simulation.z_dot[rows])
-        # Each step is projected, which leaves rounding.
-        assert np.abs(kinematics.C).max() < 1e-15
-        assert np.abs(rates).max() < 1e-13
-
-
 @pytest.mark.parametrize("index", [0, 2, 4])
 def test_finds_the_reversals_of_the_curve(index: int) -> None:
     problem, motion = pick(index)

@@ -168,31 +168,6 @@ def test_a_release_that_never_comes() -> None:
     assert report.phases[0].arrival is None
 
 
-def test_a_release_as_the_squeeze_fades_and_a_contact_that_sticks() -> None:
-    problem, trajectory = plan_landing(squeeze=4.0)
-    simulation = simulate(problem, trajectory.torque)
-    (release,) = simulation.find(EventKind.RELEASE)
-    assert release.time < RELEASE
-    # The torques do not jump, so the force is zero there.
-    assert abs(release.value) < 1e-9
-    departing = trajectory.motions[0].evaluate(np.array([release.time])).c_n[0]
-    assert abs(departing[1]) < 1e-8 and np.delete(departing, 1).min() > 1.0
-    # Palm friction then stops the vertex, which the phase plans as sliding, while the object turns.
-    stuck = next(e for e in simulation.events if e.contact == "v1-palm")
-    assert stuck.kind is EventKind.STICK and stuck.phase == 1
-    assert stuck.text == f"v1-palm sticks at t = {stuck.time:.5g} s, phase 2"
-    row = int(np.flatnonzero(simulation.t == stuck.time)[-1])
-    formation = problem.phases[1].formation
-    v_t = formation.evaluate(simulation.z[row:], simulation.z_dot[row:]).A_t[:, 0]
-    slipping = [e.time for e in simulation.find(EventKind.SLIP)]
-    until = min(slipping, default=np.inf)
-    held = simulation.t[row:] < until
-    assert held.sum() > 2
-    assert np.abs(np.einsum("nj,nj->n", v_t, simulation.z_dot[row:])[held]).max() < 1e-12
-    assert np.abs(simulation.z_dot[row:, 2][held]).min() > 0.01
-    assert np.abs(simulation.energies.residual).max() < 1e-9 * simulation.energies.work.max()
-
-
 def test_start_with_two_freedoms() -> None:
     problem, _ = plan_landing()
     phase = Phase(0, problem.phases[1].formation, problem.phases[1].until)
@@ -255,18 +230,6 @@ def test_a_vertex_goes_on_from_link_to_tip_at_speed(early: float) -> None:
     assert simulation.outcome.reached
     # Torques that are off for so short a time have turned nothing by more than that at 10 rad/s.
     assert np.allclose(simulation.z[-1], simulate(problem, torque).z[-1], atol=1e-6, rtol=0)
-
-
-def test_a_slow_motion_passes_long_before_the_torques_step() -> None:
-    """At 0.03 m/s an error of 0.1 um comes to 4 us, for which the contact before goes on."""
-    problem, torque, passed = plan_passing(0.0726)
-    breaks = torque.breaks.copy()
-    breaks[np.abs(breaks - passed).argmin()] += 4e-6
-    simulation = simulate(problem, TorqueProfile(breaks, torque.coefficients))
-    assert simulation.outcome.reached
-    least = np.nanmin(simulation.c_n[simulation.phase == 1])
-    # What a few microseconds change of speed and place changes less of forces than that.
-    assert least > 0.99 * problem.epsilon
 
 
 def slide_to_the_tip(until: str) -> Problem:

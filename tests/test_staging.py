@@ -73,16 +73,3 @@ def test_the_duration_is_that_of_a_fall_times_the_pace(pace: float) -> None:
     whole = sum(stage.guess.duration for stage in stages) * problem.scene.scales.time
     # The outline that is split leaves out nothing but the rounding of its length.
     assert whole == pytest.approx(pace * np.sqrt(length / 9.81), rel=1e-3)
-
-
-def test_releases_open_contacts_in_the_next_phase(stages: list[Stage]) -> None:
-    limits = stages[-1].formation.limits
-    names = [limit.gained.name if limit.gained else "" for limit in limits]
-    released = names.index("v3-finger1")
-    for stage in stages[2:]:
-        assert stage.released == (released,) and released in stage.monitored
-    assert [stage.opens for stage in stages] == [False, False, True, False]
-    assert all(not stage.released for stage in stages[:2])
-    # What ends the landing is watched, so that it is not passed before.
-    assert all(names.index("v2-palm") in stage.monitored for stage in stages[2:])
-    assert all(stage.gained is None and not stage.ends_in_impact for stage in stages)

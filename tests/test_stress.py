@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import tomllib
 from dataclasses import replace
 from functools import cache
@@ -14,7 +13,7 @@ import pytest
 
 from shipped import HEPTAGON
 from wholearm.benchmark.stress.cell_curves import find_best, list_ends
-from wholearm.benchmark.stress.damage import BASE, change_tree, draw_mutant, look, run_file, to_toml
+from wholearm.benchmark.stress.damage import look, run_file, to_toml
 from wholearm.benchmark.stress.event_tracing import follow, resample, slides
 from wholearm.benchmark.stress.newton import balance, clearances, locate, separate
 from wholearm.benchmark.stress.scenes import draw_case, random_scene
@@ -40,16 +39,6 @@ def test_a_scene_is_drawn_alike_again_and_is_the_same_as_a_file() -> None:
     assert case == again
     assert case.table["phases"]
     assert tomllib.loads(to_toml(case.table)) == case.table
-
-
-def test_mutants_are_reproducible_and_differ_from_what_they_come_from() -> None:
-    for number in range(40):
-        mutant = draw_mutant(1, number)
-        assert mutant == draw_mutant(1, number)
-        assert mutant.what
-    table = json.loads(json.dumps(BASE))
-    change_tree(np.random.default_rng(0), table)
-    assert table != BASE
 
 
 @pytest.mark.parametrize("number", range(12))

@@ -15,7 +15,6 @@ from wholearm.cli.command import main
 from wholearm.common.errors import InputError
 from wholearm.comparison.metrics import compare
 from wholearm.geometry.path_guess import load
-from wholearm.mapping.formation_map import choose_window
 from wholearm.mapping.template import write_template
 from wholearm.planning.plan import solve
 from wholearm.problem.definition import Problem
@@ -110,12 +109,6 @@ def test_phases_and_goals_exclude_each_other() -> None:
     table = tomllib.loads(HEPTAGON.read_text())
     with pytest.raises(InputError, match=r"goal: given with \[\[phases\]\]"):
         build_problem({**table, "goal": {"flush": 6}})
-
-
-def test_the_map_covers_goals() -> None:
-    scene = problem_of(HEPTAGON).scene
-    low, high = choose_window(read({"flush": 6})).phi
-    assert low < scene.polygon.flush_angle(0) < scene.polygon.flush_angle(6) < high
 
 
 def test_a_plan_brings_the_phases_that_lead_to_its_goal(tmp_path: Path) -> None:

@@ -221,17 +221,6 @@ def test_failures_that_no_limit_explains_are_the_solvers() -> None:
     assert "leave out --transcription time" in str(failed)
 
 
-def test_the_motion_that_is_short_of_least_is_described() -> None:
-    problem = change_limit(shove()[0], EPSILON, 1.2)
-    near, far = outline(problem), outline(problem)
-    far = replace(far, guess=far.guess._replace(forces=0.5 * far.guess.forces))
-    for short in ([far], [near]), ([near], [far]):
-        error = explain(search(problem), problem, problem.phases[:1], short, "", None)
-        assert isinstance(error, InfeasibleError) and error.exit_status == 1
-        assert str(error).startswith("phase 1 is infeasible: c_n of ")
-        assert str(error).count(" is 0.2 N short at t = ") == 3 == str(error).count(" short ")
-
-
 def test_easing_leaves_what_is_feasible_as_it_is() -> None:
     problem, _ = shove()
     stages = guess_stages(problem, problem.phases, problem.start, SCHEME, 4, 2.0)

@@ -25,7 +25,6 @@ from wholearm.planning.time_domain.stage_kernels import (
     find_leaving,
     goal_kernel,
     impact_kernel,
-    monitor_kernel,
     new_rows,
     opening_kernel,
     point_kernel,
@@ -183,17 +182,6 @@ def test_gaps_open_with_their_second_derivative() -> None:
         one = Formation(formation.scene, (contact,))
         second = constraints(one, z, w, u)[1][0]
         np.testing.assert_allclose(call(kernel, [z, w, u]), second, atol=1e-5)
-
-
-def test_limits_are_watched() -> None:
-    rng = np.random.default_rng(6)
-    formation = make_formation(landing().scene, "v1-palm v4-finger1 v6-finger2")
-    texts = [limit.gained.name if limit.gained else "" for limit in formation.limits]
-    monitored = tuple(texts.index(name) for name in ("v2-palm", "v0-palm", "v3-finger1"))
-    gaps = make_formation(formation.scene, "v2-palm v0-palm v3-finger1")
-    z, _, _ = draw(rng)
-    got = call(monitor_kernel(formation, monitored), [z])
-    np.testing.assert_allclose(got, measure_gaps(gaps, z), atol=1e-13)
 
 
 @pytest.mark.parametrize("name, degree", [("radau", 3), ("legendre", 2)])

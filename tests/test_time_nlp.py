@@ -21,7 +21,7 @@ from wholearm.mechanics.metric import metric_weights
 from wholearm.planning.options import Objective
 from wholearm.planning.time_domain.collocation import Scheme, make_scheme
 from wholearm.planning.time_domain.intersample import IntersampleLimits, raise_bounds
-from wholearm.planning.time_domain.nlp_layout import MARGIN, V, pack
+from wholearm.planning.time_domain.nlp_layout import pack
 from wholearm.planning.time_domain.stage import Stage, StagePoints
 from wholearm.planning.time_domain.time_limits import Target
 from wholearm.planning.time_domain.time_nlp import TimeNLP, bound_unknowns, build_time_nlp
@@ -194,34 +194,6 @@ def cut(stage: Stage, count: int) -> list[Stage]:
         halves.append(replace(stage, guess=guess))
     assert sum(half.intervals for half in halves) == K
     return halves
-
-
-@pytest.mark.parametrize("ends_in_impact", [False, True])
-@pytest.mark.parametrize("objective", [Objective.TIME, Objective.MARGIN])
-def test_stages_that_follow_share_their_state(objective: Objective, ends_in_impact: bool) -> None:
-    scheme = make_scheme("radau", 3)
-    first, second = cut(driven("radau", 3, 8), 3)
-    if ends_in_impact:
-        # An impact without impulses changes nothing.
-        still = np.zeros(first.formation.n_constraints)
-        first = replace(first, ends_in_impact=True, guess=first.guess._replace(impulses=still))
-    stages = [first, second]
-    nlp = build(stages, scheme, objective)
-    assert first.guess.duration != pytest.approx(second.guess.duration)
-    x = packed(nlp, stages, 0.3)
-    plain, _ = misses(nlp, x)
-    # All but the end at rest and collocation holds.
-    assert np.delete(plain, [*range(len(plain) - 1, len(plain))]).max() < 1e-3
-    node = nlp.layouts[1].nodes[0]
-    for change, least in ((node[0], 1e-3), (node[V][2], 1e-3), (nlp.layouts[1].h[0], 1e-3)):
-        moved = x.copy()
-        moved[change] += 1e-3
-        assert (misses(nlp, moved)[0] - plain).max() > 0.3 * least
-    if objective is Objective.MARGIN:
-        moved = x.copy()
-        moved[node[MARGIN]] += 1e-3
-        assert (misses(nlp, moved)[0] - plain).max() > 0.9e-3
-        assert call(nlp, "nlp_g", x)[nlp.duration_row] == pytest.approx(DURATION, rel=1e-12)
 
 
 def test_derivatives_of_the_whole_are_its_differences() -> None:

@@ -412,19 +412,6 @@ def test_velocities_are_derivatives(stages: list[StageMotion]) -> None:
         assert np.abs(z_ddot - samples.z_ddot).max() < 1e-3 * np.abs(samples.z_ddot).max()
 
 
-def test_torques_are_polynomials_between_the_nodes(stages: list[StageMotion]) -> None:
-    for stage in stages:
-        part = stage.points
-        x = np.array([0.1, 0.5, 0.9])
-        t = (stage.duration * part.places(x)).ravel()
-        shares = np.stack([(1 - x) ** 2, 2 * x * (1 - x), x**2], axis=1)
-        expected = shares @ part.tau
-        np.testing.assert_allclose(stage.torque.at(t), expected.reshape(-1, 2), atol=1e-11)
-        np.testing.assert_array_equal(stage.evaluate(t).tau, stage.torque.at(t))
-        assert stage.torque.duration == pytest.approx(stage.duration, rel=1e-14)
-        assert stage.torque.coefficients.shape == (len(part.fractions), 2, 3)
-
-
 def test_stages_and_phases_pass_into_one_another(motions: list[TimeMotion]) -> None:
     every = [stage for motion in motions for stage in motion.stages]
     state = np.stack([every[0].points.nodes[0, 0], np.zeros(5)])
@@ -434,26 +421,6 @@ def test_stages_and_phases_pass_into_one_another(motions: list[TimeMotion]) -> N
         np.testing.assert_allclose(stage.points.nodes[0], state, atol=1e-6)
         state = stage.points.nodes[-1]
     np.testing.assert_allclose(state[1], 0.0, atol=1e-6)
-
-
-def test_a_phase_is_its_stages_one_after_the_other(motions: list[TimeMotion]) -> None:
-    for motion in motions:
-        durations = [stage.duration for stage in motion.stages]
-        assert motion.duration == pytest.approx(sum(durations), rel=1e-14)
-        assert motion.contacts == motion.stages[0].formation.names
-        rng = np.random.default_rng(10)
-        for start, stage in zip(motion.starts, motion.stages, strict=False):
-            t = rng.uniform(0.01, 0.99, 7) * stage.duration
-            whole, own = motion.evaluate(start + t), stage.evaluate(t)
-            for given, got in zip(own, whole, strict=True):
-                # The clock of the phase rounds differently from that of the stage.
-                np.testing.assert_allclose(got, given, rtol=1e-8, atol=1e-8)
-            np.testing.assert_allclose(motion.torque.at(start + t), own.tau, atol=1e-9)
-        shuffled = rng.permutation(np.linspace(0.0, motion.duration, 30))
-        for given, got in zip(
-            motion.evaluate(np.sort(shuffled)), motion.evaluate(shuffled), strict=True
-        ):
-            np.testing.assert_array_equal(got, given[np.argsort(np.argsort(shuffled))])
 
 
 @lru_cache(maxsize=16)

@@ -12,7 +12,6 @@ import pytest
 from tipping import tipped
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
-from wholearm.results.sampled import SampledMotion
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Samples, Trajectory, assemble
 from wholearm.results.trajectory_file import load_trajectory
@@ -106,14 +105,6 @@ def check_samples(trajectory: Trajectory, found: Samples, phase: int, local: Arr
         assert np.isnan(np.delete(whole, columns, axis=1)).all()
 
 
-def test_at_takes_many_times_in_any_order(trajectory: Trajectory) -> None:
-    times = np.array([0.8, 0.1, 0.7, 0.3])
-    many = trajectory.at(times)
-    for row, (phase, local) in enumerate([(1, 0.1), (0, 0.1), (1, 0.0), (0, 0.3)]):
-        one = Samples(*(table[row : row + 1] for table in many))
-        check_samples(trajectory, one, phase, np.array([local]))
-
-
 def test_at_reaches_the_end_and_no_farther(trajectory: Trajectory) -> None:
     end = trajectory.at(trajectory.duration)
     np.testing.assert_allclose(end.z, MOTIONS[1].evaluate(np.array([0.2])).z, atol=1e-14)
@@ -154,15 +145,6 @@ def test_loaded_motions_reproduce_quintics(trajectory: Trajectory, tmp_path: Pat
         order = [known.contacts.index(name) for name in motion.contacts]
         np.testing.assert_allclose(found.c_n, wanted.c_n[:, order], atol=1e-13)
         np.testing.assert_allclose(found.c_t, wanted.c_t[:, order], atol=1e-13)
-
-
-def test_sampled_motion_goes_through_its_samples() -> None:
-    rng = np.random.default_rng(4)
-    t = np.cumsum(rng.uniform(0.1, 0.3, 6))
-    known = Samples(*(rng.uniform(-1, 1, (6, width)) for width in (5, 5, 5, 2, 4, 4)))
-    motion = SampledMotion(t, ("a", "b", "c", "d"), known)
-    for found, wanted in zip(motion.evaluate(t - t[0]), known, strict=True):
-        np.testing.assert_allclose(found, wanted, atol=1e-11)
 
 
 def changed(arrays: dict[str, Any], name: str, change: str) -> Any:

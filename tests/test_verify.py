@@ -301,11 +301,6 @@ def test_a_phase_with_a_rolling_contact_may_have_four_constraints() -> None:
         assert row.residual == pytest.approx(0.0, abs=1e-9 * abs(row.Phi_3))
 
 
-def test_it_is_left_out_unless_asked_for() -> None:
-    report = verify(problem_of(HEPTAGON), plan_of(HEPTAGON))
-    assert report.reduced == () and "Phi_1" not in report.to_text()
-
-
 def test_least_of_a_parabola_is_exact() -> None:
     t = np.array([0.0, 0.4, 1.0])
     least, time = find_lowest(t, (t - 0.55) ** 2 + 0.2, t[[0, -1]])

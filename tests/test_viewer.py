@@ -63,24 +63,6 @@ def test_a_motion_survives_its_page() -> None:
         np.testing.assert_allclose(c[:, 1], plan.c_t[:, index], rtol=1e-5, atol=1e-12)
 
 
-def test_of_a_long_motion_fewer_samples_are_taken() -> None:
-    plan, most = plan_of(HEPTAGON), 100
-    whole, few = (describe_motion(plan, problem_of(HEPTAGON), plan, k) for k in (10**6, most))
-    assert len(few["t"]) == len(few["z"]) == len(few["phase"]) < 2 * most < len(whole["t"])
-    assert len(few["ghost"]["t"]) < 2 * most
-    # Both sides of steps stay, and ends of phases.
-    for after in (0, -1):
-        times = [[own["t"][k + after] for k in own["steps"]] for own in (whole, few)]
-        assert times[0] == times[1]
-    assert set(plan.phase_starts.round(6)) <= set(np.round(few["t"], 6))
-    for own, other in zip(whole["contacts"], few["contacts"], strict=True):
-        rows, taken = (
-            {(of["t"][s["first"] + k], *c) for s in one["spans"] for k, c in enumerate(s["c"])}
-            for of, one in ((whole, own), (few, other))
-        )
-        assert taken and taken <= rows
-
-
 def test_names_cannot_end_a_script() -> None:
     name = "</script><script>alert(1)"
     motion = describe_motion(plan_of(HEPTAGON), problem_of(HEPTAGON)) | {"name": name}

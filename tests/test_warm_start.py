@@ -11,12 +11,7 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.time_domain.collocation import make_scheme
 from wholearm.planning.time_domain.nlp_layout import pack
-from wholearm.planning.time_domain.search import (
-    TimeSearch,
-    TimeSolution,
-    carry_multipliers,
-    first_multipliers,
-)
+from wholearm.planning.time_domain.search import TimeSearch, TimeSolution, carry_multipliers
 from wholearm.planning.time_domain.stage import Stage
 from wholearm.planning.time_domain.time_mesh import bisect_intervals
 from wholearm.planning.time_domain.time_plan import try_phases
@@ -44,15 +39,6 @@ def coarse(objective: str) -> TimeSolution:
 def replace_scene(stages: list[Stage], problem: Problem) -> list[Stage]:
     """The same stages on the formations of another scene."""
     return [replace(stage, formation=problem.phases[stage.phase].formation) for stage in stages]
-
-
-def test_first_multipliers_push_away_from_the_bounds_there_are() -> None:
-    low, high = np.array([-np.inf, 0.0, -np.inf, -1.0]), np.array([np.inf, np.inf, 2.0, 1.0])
-    low_g, high_g = np.array([0.0, 0.0]), np.array([0.0, np.inf])
-    start = first_multipliers((low, high), (low_g, high_g))
-    # Of a lower bound negative, of an upper one positive, and of both none.
-    assert np.sign(start["lam_x0"]).tolist() == [0, -1, 1, 0]
-    assert np.sign(start["lam_g0"]).tolist() == [0, -1]
 
 
 def test_multipliers_are_shared_among_the_intervals_that_replace_one() -> None:

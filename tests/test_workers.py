@@ -89,13 +89,6 @@ def test_the_first_error_is_raised_whoever_meets_it() -> None:
 
 
 @needs_fork
-def test_tasks_inside_tasks_are_not_shared() -> None:
-    meet = Meeting()
-    for own, *inner in share([lambda: (meet(), *share([os.getpid] * 2, 2))] * 2, 2):
-        assert inner == [own, own]
-
-
-@needs_fork
 def test_an_interrupt_ends_children() -> None:
     def interrupt() -> None:
         if os.getpid() == PARENT:
