@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from wholearm.common.arrays import Array, Expression
+from wholearm.common.batch import FEW, SIZE, SOME, Batch
+from wholearm.planning.columns import Columns
 from wholearm.planning.time_domain.assembly import (
     Block,
     Kernel,
@@ -14,8 +16,9 @@ from wholearm.planning.time_domain.assembly import (
     assemble_nlp,
     build_kernel,
 )
+from wholearm.solvers.ipopt import build_solver, record_runs
 
-SIZE = 11
+UNKNOWNS = 11
 CLOSE = 1e-12
 """What rounding leaves of sums of terms that are about one."""
 
@@ -43,7 +46,7 @@ def make_nlp(seed: int) -> tuple[Any, Expression, Expression, Expression]:
 
     def choose(count: int, width: int) -> Any:
         # Copies share unknowns, but none has one twice.
-        return np.array([rng.choice(SIZE, width, replace=False) for _ in range(count)])
+        return np.array([rng.choice(UNKNOWNS, width, replace=False) for _ in range(count)])
 
     blocks = [
         Block(pair, choose(4, 3), rows[0], rng.normal(size=(4, 1))),
@@ -51,11 +54,11 @@ def make_nlp(seed: int) -> tuple[Any, Expression, Expression, Expression]:
         Block(line, choose(3, 2), rows[1], rng.normal(size=(3, 1))),
     ]
     # The last linear row has no entries.
-    columns = np.concatenate([rng.choice(SIZE, 3, replace=False) for _ in range(3)])
+    columns = np.concatenate([rng.choice(UNKNOWNS, 3, replace=False) for _ in range(3)])
     entries = Triplets(np.repeat(linear[:3], 3), columns, rng.normal(size=9))
-    cost = rng.normal(size=SIZE)
-    built = assemble_nlp(SIZE, entries, linear, blocks, cost)
-    x = ca.MX.sym("x", SIZE)
+    cost = rng.normal(size=UNKNOWNS)
+    built = assemble_nlp(UNKNOWNS, entries, linear, blocks, cost)
+    x = ca.MX.sym("x", UNKNOWNS)
     f, g = ca.dot(ca.DM(cost), x), [ca.MX(0.0)] * 15
     for row, column, value in zip(*entries, strict=True):
         g[row] = g[row] + value * x[int(column)]
@@ -78,7 +81,7 @@ def test_values_and_derivatives_are_those_of_the_same_nlp_in_one_piece(seed: int
     built, x, f, g = make_nlp(seed)
     rng = np.random.default_rng(100 + seed)
     lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", g.numel())
-    at, on_f, on_g = rng.normal(size=SIZE), rng.normal(size=1), rng.normal(size=g.numel())
+    at, on_f, on_g = rng.normal(size=UNKNOWNS), rng.normal(size=1), rng.normal(size=g.numel())
     nlp = built.nlp
     for own, expected in ((nlp["f"], f), (nlp["g"], g)):
         got = evaluate([nlp["x"]], own, at)
@@ -139,3 +142,134 @@ def test_kernels_have_the_derivatives_of_their_expression(which: int) -> None:
     H[tuple(kernel.hessian_at)] = kernel.hessian(x, p, lam).full()[:, 0]
     bend = np.array([lam @ (dense(x + h) - dense(x - h)) / 2e-5 for h in steps])
     np.testing.assert_allclose(H, np.triu(bend), atol=1e-8)
+
+
+def build(max_iter: int) -> Expression:
+    """Least x^2 + y^2 with x + y >= 1 and x >= 0.8."""
+    x = ca.SX.sym("x", 2)
+    nlp = {"x": x, "f": ca.dot(x, x), "g": x[0] + x[1]}
+    return build_solver("toy", nlp, 1e-9, max_iter=max_iter)
+
+
+@pytest.fixture(scope="module")
+def solver() -> Expression:
+    return build(50)
+
+
+def solve(solver: Expression, **start: Expression) -> dict[str, Expression]:
+    answer: dict[str, Expression] = solver(lbx=[0.8, -ca.inf], lbg=1.0, ubg=ca.inf, **start)
+    assert solver.stats()["success"]
+    return answer
+
+
+def test_bounds_are_kept_exactly(solver: Expression) -> None:
+    answer = solve(solver, x0=[3.0, 3.0])
+    # The barrier keeps inequalities strictly; relaxed bounds would be missed by 1e-8.
+    assert float(answer["x"][0]) >= 0.8
+    assert float(answer["g"]) >= 1.0
+    assert float(answer["x"][0]) == pytest.approx(0.8, abs=1e-7)
+    assert float(answer["x"][1]) == pytest.approx(0.2, abs=1e-7)
+
+
+def test_a_solution_is_kept_as_a_start(solver: Expression) -> None:
+    """It is pushed from its bounds by as little as was asked for, and not by Ipopt's 1 %."""
+    answer = solve(solver, x0=[3.0, 3.0])
+    start = {"x0": answer["x"], "lam_x0": answer["lam_x"], "lam_g0": answer["lam_g"]}
+    kept = build(0)(lbx=[0.8, -ca.inf], lbg=1.0, ubg=ca.inf, **start)
+    assert float(ca.norm_inf(kept["x"] - answer["x"])) < 1e-8
+    again = solve(solver, **start)
+    assert float(again["f"]) == pytest.approx(0.8**2 + 0.2**2, abs=1e-7)
+
+
+def test_failure_is_a_status_and_no_exception(solver: Expression) -> None:
+    solver(x0=[3.0, 3.0], lbx=[0.8, 0.8], ubx=[0.9, 0.9], lbg=5.0, ubg=ca.inf)
+    assert not solver.stats()["success"]
+
+
+def test_runs_are_recorded_with_their_sizes(solver: Expression) -> None:
+    with record_runs() as runs:
+        solve(solver, x0=[3.0, 3.0])
+        with record_runs() as inner:
+            solve(solver, x0=[0.9, 0.9])
+    solve(solver, x0=[3.0, 3.0])
+    assert len(runs) == 2 and inner == runs[1:]
+    for run in runs:
+        assert (run.unknowns, run.rows) == (2, 1)
+        # The row has both unknowns; the Hessian is diagonal.
+        assert (run.jacobian_nonzeros, run.hessian_nonzeros) == (2, 2)
+        assert run.iterations > 0 and run.seconds >= 0.0
+
+
+def build_function() -> ca.Function:
+    """(x, y) -> (outer product with a structural shape of its own, a sum)."""
+    x, y = ca.SX.sym("x", 3), ca.SX.sym("y", 2)
+    return ca.Function("f", [x, y], [ca.mtimes(x, y.T) + 1, ca.sin(ca.sum1(x)) * y[0]])
+
+
+@pytest.mark.parametrize(
+    "count", [0, 1, FEW, FEW + 1, SOME, SOME + 1, SIZE - 1, SIZE, SIZE + 1, 3 * SIZE + 5]
+)
+def test_batches_agree_with_single_calls(count: int) -> None:
+    rng = np.random.default_rng(count)
+    function = build_function()
+    x, y = rng.uniform(-1, 1, (count, 3)), rng.uniform(-1, 1, (count, 2))
+    outer, total = Batch(function)(x, y)
+    assert outer.shape == (count, 3, 2) and total.shape == (count, 1, 1)
+    for k in range(count):
+        one, other = function(x[k], y[k])
+        np.testing.assert_array_equal(outer[k], one.full())
+        np.testing.assert_array_equal(total[k], other.full())
+
+
+def test_results_survive_the_next_call() -> None:
+    batch = Batch(build_function())
+    first = batch(np.ones((2, 3)), np.ones((2, 2)))[0]
+    kept = first.copy()
+    batch(np.zeros((2, 3)), np.zeros((2, 2)))
+    np.testing.assert_array_equal(first, kept)
+
+
+def test_strided_arguments() -> None:
+    rng = np.random.default_rng(3)
+    wide = rng.uniform(-1, 1, (10, 6))
+    batch = Batch(build_function())
+    found = batch(wide[::2, ::2], wide[::-2, 4:])
+    expected = batch(wide[::2, ::2].copy(), wide[::-2, 4:].copy())
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+COLUMNS = Columns(z=5, h=1, tau=4)
+
+
+def test_blocks_are_joined_by_name_whatever_their_order() -> None:
+    tau, z = np.arange(24.0).reshape(2, 3, 4), np.arange(5.0)
+    joined = COLUMNS.join(tau=tau, z=z, h=np.full((2, 1, 1), 7.0))
+    assert joined.shape == (2, 3, 10)
+    np.testing.assert_array_equal(joined[..., COLUMNS["tau"]], tau)
+    np.testing.assert_array_equal(joined[1, 2, COLUMNS["z"]], z)
+    assert (joined[..., COLUMNS["h"]] == 7.0).all()
+
+
+def test_symbols_stand_where_numbers_do() -> None:
+    x = COLUMNS.make_symbols()
+    function = ca.Function("f", [x.every], [x.tau[1], x.h, x.z])
+    given = COLUMNS.join(z=np.arange(5.0), h=[5.0], tau=6.0 + np.arange(4.0))
+    second, h, z = (float(part[0]) for part in function(given))
+    assert (second, h, z) == (7.0, 5.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    "blocks",
+    [
+        {"z": np.zeros(5), "h": np.zeros(1)},
+        {"z": np.zeros(5), "h": np.zeros(1), "tau": np.zeros(3)},
+        {"z": np.zeros(5), "h": np.zeros(1), "torque": np.zeros(4)},
+    ],
+    ids=["missing", "too short", "another name"],
+)
+def test_what_was_not_declared_is_refused(blocks: dict[str, np.ndarray]) -> None:
+    with pytest.raises(ValueError, match=r"are given where .* are declared"):
+        COLUMNS.join(**blocks)
+    with pytest.raises(ValueError, match=r"are given where .* are declared"):
+        COLUMNS.write(**{name: ca.SX(block) for name, block in blocks.items()})

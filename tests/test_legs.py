@@ -1,18 +1,29 @@
 from __future__ import annotations
 
+import copy
+import json
+import tomllib
 from itertools import pairwise
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+import wholearm
 from plane import convex_polygon, make_scene
+from shipped import FOLDER, HEPTAGON, problem_of
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.contacts.closing import close_fingers, contact_table
 from wholearm.contacts.formation import Formation
+from wholearm.geometry.curve import Curve
+from wholearm.geometry.path_guess import guess_phase
 from wholearm.mapping.borders import NOWHERE, flush_track, label_cells
+from wholearm.mapping.formation_list import Route, format_route, list_formations
 from wholearm.mapping.legs import describe_miss, find_miss, split_leg, tolerance
 from wholearm.problem.definition import Problem
+from wholearm.problem.read import build_problem
 from wholearm.search.roadmap import map_labels
 
 PHI = np.radians(-35.0)
@@ -132,3 +143,214 @@ def test_nothing_touches_beyond_the_reach_of_a_finger() -> None:
     grid = map_labels(scene)
     for x in (-2.0, 2.0):
         assert (grid.labels[grid.look_up(np.array([x, 0.3]))] == NOWHERE).all()
+
+
+TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
+FLAT = -1.984
+
+
+def write_table(table: dict[str, Any], path: str = "") -> str:
+    """A problem file's tables as TOML, without its phases."""
+    plain = {k: v for k, v in table.items() if not isinstance(v, dict) and k != "phases"}
+    lines = [f"{key} = {json.dumps(value)}" for key, value in plain.items()]
+    for key, value in table.items():
+        if isinstance(value, dict):
+            lines += [f"[{path}{key}]", write_table(value, f"{path}{key}.")]
+    return "\n".join(lines) + "\n"
+
+
+def load_pasted(table: dict[str, Any], route: Route, folder: Path) -> Problem:
+    """What loading gives when the list replaces what it names in a problem file."""
+    text = format_route(route)
+    kept = {key: value for key, value in table.items() if key not in tomllib.loads(text)}
+    path = folder / "pasted.toml"
+    path.write_text(write_table(kept) + text, encoding="utf-8")
+    return wholearm.load(str(path))
+
+
+def list_degrees(problem: Problem, *poses: tuple[float, float]) -> Route:
+    return list_formations(problem, *((x, np.radians(phi)) for x, phi in poses))
+
+
+def test_slide_is_listed_as_in_the_problem_file(heptagon: Problem) -> None:
+    text = format_route(list_degrees(heptagon, (0.045, FLAT), (-0.0637, FLAT)))
+    assert tomllib.loads(text)["phases"] == TABLE["phases"][:3]
+    assert "[start]" not in text
+    assert [line.split("#")[1][:5] for line in text.splitlines() if "[[" in line] == [
+        " 1: t",
+        " 2: t",
+        " 3: t",
+    ]
+
+
+def test_route_along_curved_borders_is_the_whole_plan(
+    heptagon: Problem, curves: tuple[Curve, ...], tmp_path: Path
+) -> None:
+    # Poses as read off the map: to a tenth of a millimetre and of a degree.
+    poses = [(0.045, -2.0), (-0.0637, -2.0), (-0.0505, -23.4), (0.0078, -50.0)]
+    route = list_degrees(heptagon, *poses)
+    assert tomllib.loads(format_route(route))["phases"] == TABLE["phases"]
+    for stretch, curve in zip(route, curves, strict=True):
+        # Ends are those of the traced curves, but for the last, which the user gives.
+        np.testing.assert_allclose(stretch.start, curve.start[[0, 2]], atol=1e-9)
+    assert len(load_pasted(TABLE, route, tmp_path).phases) == 5
+
+
+def test_turn_back_on_a_border_is_a_phase(heptagon: Problem, tmp_path: Path) -> None:
+    route = list_degrees(heptagon, (0.045, FLAT), (0.03, FLAT), (0.04, FLAT))
+    assert [str(stretch.until) for stretch in route] == ["x = 0.03 m", "x = 0.04 m"]
+    assert set(route[0].contacts) == set(route[1].contacts)
+    assert len(load_pasted(TABLE, route, tmp_path).phases) == 2
+    onwards = list_degrees(heptagon, (0.045, FLAT), (0.04, FLAT), (0.03, FLAT))
+    assert [str(stretch.until) for stretch in onwards] == ["x = 0.03 m"]
+
+
+def test_route_that_starts_elsewhere_brings_its_start(heptagon: Problem, tmp_path: Path) -> None:
+    route = list_degrees(heptagon, (-0.05, FLAT + 0.2), (0.03, FLAT))
+    assert [str(stretch.until) for stretch in route] == ["v5-finger2", "v2-finger1", "x = 0.03 m"]
+    text = format_route(route)
+    assert tomllib.loads(text)["start"] == {"flush": 0, "x": -0.05}
+    assert "takes the place of the problem's own" in text
+    assert load_pasted(TABLE, route, tmp_path).start[0] == -0.05
+
+
+def test_route_that_starts_in_a_cell_is_led_there(heptagon: Problem, tmp_path: Path) -> None:
+    route = list_degrees(heptagon, (0.03, -8.0), (0.01, -12.0))
+    assert route.start is None and "from the problem's start" in format_route(route)
+    np.testing.assert_allclose(route[0].start, heptagon.start[[0, 2]], rtol=1e-12)
+    assert len(load_pasted(TABLE, route, tmp_path).phases) == len(route)
+
+
+def test_routes_that_cannot_be_followed_are_named(heptagon: Problem) -> None:
+    start = (float(heptagon.start[0]), float(heptagon.start[2]))
+    with pytest.raises(InputError, match=r"leg 1 cannot be followed .* finger 2 is too short"):
+        list_formations(heptagon, start, (0.2, 0.2))
+    with pytest.raises(InputError, match="two or more"):
+        list_formations(heptagon, start)
+    with pytest.raises(InputError, match="same place"):
+        list_formations(heptagon, start, start)
+    with pytest.raises(InputError, match=r"cannot start at .*: finger 1 is too short"):
+        list_formations(heptagon, (0.4, start[1]), start)
+    with pytest.raises(InputError, match=r"route: -63\.7 given; allowed are .* m "):
+        list_formations(heptagon, start, (-63.7, start[1]))
+
+
+def test_lists_do_not_depend_on_units(heptagon: Problem) -> None:
+    size = 700.0
+    table = copy.deepcopy(TABLE)
+    table["object"]["vertices"] = (size * np.array(table["object"]["vertices"])).tolist()
+    for finger in table["fingers"].values():
+        finger |= {key: size * finger[key] for key in ("length", "radius")}
+        finger["base"] = [size * value for value in finger["base"]]
+    table["start"]["x"] *= size
+    table["phases"][-1]["until"] = {"x": 0.0}
+    large = build_problem(table)
+    poses = [(0.045, -2.0), (-0.0637, -2.0), (-0.0505, -23.4), (0.03, 3.0)]
+    one = list_degrees(heptagon, *poses)
+    two = list_degrees(large, *((size * x, phi) for x, phi in poses))
+    assert [s.contacts for s in one] == [s.contacts for s in two]
+    for a, b in zip(one, two, strict=True):
+        np.testing.assert_allclose(a.stop * [size, 1.0], b.stop, rtol=1e-4, atol=1e-4)
+
+
+HARD = {
+    "a pointed tip runs off an edge that lies flush": (
+        "-0.0861 -0.0032; -0.0337 -0.0679; 0.0661 -0.0493; 0.0721 0.0395; -0.0278 0.0712",
+        [([0.0687, 0.0075], 0.2347, 0.0), ([-0.195, 0.0028], 0.2047, 0.0)],
+        (0, -0.0009),
+        [(-0.0009, 51.034), (0.0133, 51.034), (-0.109, 91.915)],
+        "v3-finger2",
+    ),
+    "a pointed tip passes from edge to edge": (
+        "0.0666 0.0695; 0.0511 0.0713; -0.0296 0.0332; -0.0733 -0.0178; -0.0678 -0.0691; "
+        "-0.0189 -0.0631; 0.0071 -0.0494; 0.0694 0.011",
+        [([0.2446, -0.0229], 0.3186, 0.0), ([-0.2226, 0.026], 0.2919, 0.0)],
+        (6, 0.0873),
+        [(0.0873, -44.138), (0.1379, -28.38), (0.1384, -27.663), (0.0715, -27.663)],
+        "v2-finger2",
+    ),
+    "a vertex passes from the side of a link to its rounded tip": (
+        "-0.0492 -0.092; -0.0364 -0.0739; 0.0087 0.0079; 0.0328 0.055; 0.0492 0.0923; "
+        "0.0333 0.0687; -0.001 0.0068; -0.0404 -0.0706",
+        [([0.1886, -0.0131], 0.1886, 0.0012), ([-0.1469, -0.0287], 0.1492, 0.0053)],
+        (1, -0.0139),
+        [(-0.0139, -61.107), (0.0364, -62.899), (-0.1043, -62.936)],
+        "v5-tip1",
+    ),
+    "the end of a cell is far away": (
+        "0.0771 0.0821; 0.0302 0.0392; -0.0333 -0.0287; -0.0767 -0.0826; -0.0332 -0.0422; "
+        "0.0334 0.0288",
+        [([0.117, -0.0326], 0.3934, 0.0128), ([-0.0972, -0.0252], 0.3999, 0.0093)],
+        (4, -0.1417),
+        [(-0.1417, -46.856), (-0.1387, -47.581), (0.3798, -42.853)],
+        "v5-finger1",
+    ),
+    "a contact may be gained both ways along a border": (
+        "0.1283 0.0553; -0.0557 0.0251; -0.0548 -0.0629",
+        [([0.1915, -0.0479], 0.1946, 0.0), ([-0.1548, -0.0395], 0.1405, 0.0)],
+        (2, 0.0151),
+        [(0.0151, -32.848), (-0.1111, -32.848), (0.0093, -32.848)],
+        "v0-finger1",
+    ),
+    "a vertex at a pointed tip is nearer than the edge that lies flush": (
+        "-0.0647 -0.0725; -0.0373 -0.0694; -0.0031 -0.0481; 0.0298 -0.017; 0.0471 0.0042; "
+        "0.0707 0.0505; 0.0622 0.0735; 0.0525 0.0739; 0.0158 0.0574; -0.0296 0.0173; "
+        "-0.0521 -0.0113; -0.0708 -0.0508",
+        [([0.2366, -0.0346], 0.2665, 0.0), ([-0.0996, -0.008], 0.3867, 0.0)],
+        (11, 0.0098),
+        [(0.0098, 74.176), (0.0183, 129.255)],
+        "v9-palm",
+    ),
+}
+"""Vertices [m], fingers (base, length, radius) [m], start (edge, x), poses [m, deg], an end."""
+
+
+def build_table(
+    vertices: str, hands: list[tuple[list[float], float, float]], start: tuple[int, float]
+) -> dict[str, Any]:
+    """A problem file's tables whose phase names what touches at the start."""
+    table = copy.deepcopy(TABLE) | {"start": {"flush": start[0], "x": start[1]}}
+    corners = [[float(x) for x in corner.split()] for corner in vertices.split(";")]
+    table["object"]["vertices"] = corners
+    for finger, (base, length, radius) in zip(table["fingers"].values(), hands, strict=True):
+        finger |= {"base": base, "length": length, "radius": radius}
+    lowest = [f"v{start[0]}-palm", f"v{(start[0] + 1) % len(corners)}-palm"]
+    table["phases"] = [{"contacts": lowest, "until": {"x": start[1]}}]
+    return table
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_hard_lists_load(name: str, tmp_path: Path) -> None:
+    vertices, hands, start, poses, end = HARD[name]
+    table = build_table(vertices, hands, start)
+    route = list_degrees(build_problem(table), *poses)
+    assert end in [str(stretch.until) for stretch in route]
+    problem = load_pasted(table, route, tmp_path)
+    assert len(problem.phases) == len(route)
+
+
+def test_list_goes_on_where_loading_ends_a_phase(heptagon: Problem, tmp_path: Path) -> None:
+    """Each phase of a list, loaded, ends where the next one's contacts touch."""
+    route = list_degrees(heptagon, (0.045, FLAT), (0.03, -20.0), (-0.02, -30.0), (-0.0505, -23.4))
+    problem = load_pasted(TABLE, route, tmp_path)
+    z = problem.start
+    for phase in problem.phases:
+        gaps = phase.formation.evaluate(z[None], z[None]).C[0]
+        assert np.abs(gaps).max() < 1e-9
+        assert phase.formation.evaluate_limits(z[None]).min() > -1e-9
+        z = guess_phase(phase, z)[-1].z[-1]
+
+
+def test_a_contact_that_a_leg_begins_with_has_been_gained(tmp_path: Path) -> None:
+    """Also after a leg that ends in a cell, next to where another contact is gained."""
+    square = problem_of(FOLDER / "square.toml")
+    turns = [(0.0352104, -0.1879037), (0.0561329, -0.4940113), (0.0813296, -0.6529818)]
+    route = list_formations(square, (0.06, 0.0), (0.007424, 0.0), *turns)
+    for before, after in pairwise(route):
+        assert {*after.contacts} <= {*before.contacts, before.until.contact}
+    # Legs that end in a cell do so where they are said to, to what is printed.
+    unit = (square.scene.scales.length, 1.0)
+    for turn in turns:
+        assert min(np.abs((own.stop - turn) / unit).max() for own in route) < 1e-5
+    assert sum(len(own.until.poses) == 2 for own in route) == len(turns)
+    load_pasted(dict(square.table), route, tmp_path)

@@ -1,23 +1,41 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.optimize import linprog, minimize
 
-from timed import plan_landing, stages_of, tables
+from plane import measure_gaps
+from timed import landing, plan_landing, stages_of, tables, total
 from wholearm.common.arrays import Array
+from wholearm.geometry.path_guess import guess_phase
+from wholearm.geometry.tracing import trace_phases
+from wholearm.planning.options import PlanOptions
+from wholearm.planning.time_domain.attempts import GAIN, choose_end
 from wholearm.planning.time_domain.collocation import Scheme, make_scheme
+from wholearm.planning.time_domain.nlp_layout import pack
+from wholearm.planning.time_domain.search import TimeSearch, TimeSolution, carry_multipliers
 from wholearm.planning.time_domain.stage import Stage, StagePoints
+from wholearm.planning.time_domain.stage_modes import LEAST_INTERVALS
+from wholearm.planning.time_domain.stages import guess_stages
+from wholearm.planning.time_domain.tightening import find_least
 from wholearm.planning.time_domain.time_mesh import (
     AT_ONCE,
     DEFECT,
     bisect,
+    bisect_intervals,
     count_halvings,
     monitor_violated,
     resample,
+    spread_halvings,
 )
 from wholearm.planning.time_domain.time_motion import StageMotion
+from wholearm.planning.time_domain.time_plan import try_phases
+from wholearm.planning.time_domain.units import in_own_units
+from wholearm.problem.definition import Problem
 
 SCHEMES = [("radau", 2), ("radau", 4), ("legendre", 3)]
 
@@ -151,3 +169,225 @@ def test_limits_that_are_broken_are_watched_from_then_on(stages: list[Stage]) ->
     assert [stage.monitored for stage in changed[:-1]] == [
         stage.monitored for stage in monitored[:-1]
     ]
+
+
+SCHEME = make_scheme("radau", 3)
+
+
+@pytest.fixture(scope="module")
+def outlined() -> list[Stage]:
+    """Of the flip's last formation and the landing."""
+    problem = landing()
+    start = trace_phases(problem)[-1].end
+    return guess_stages(problem, problem.phases[4:], start, SCHEME, 12, 2.0)
+
+
+def test_directions_change_where_a_stage_says_that_they_turn(outlined: list[Stage]) -> None:
+    for before, after in pairwise(outlined):
+        signs = np.concatenate(before.directions)
+        names = [*before.formation.names, "joint 1", "joint 2"]
+        turned = {names[row] for row in before.turns}
+        known = dict(zip(names, signs, strict=True))
+        names = [*after.formation.names, "joint 1", "joint 2"]
+        for name, sign in zip(names, np.concatenate(after.directions), strict=True):
+            assert (sign != known.get(name, sign)) == (name in turned)
+    assert outlined[-1].turns == ()
+
+
+def test_guesses_follow_the_outlines_in_one_sweep(outlined: list[Stage]) -> None:
+    parts = [stage.guess for stage in outlined]
+    for stage, part in zip(outlined, parts, strict=True):
+        assert stage.intervals >= LEAST_INTERVALS
+        np.testing.assert_allclose(part.fractions, 1 / stage.intervals)
+        # Points on straight lines between 25 closed configurations, in radii of gyration.
+        gaps = [measure_gaps(stage.formation, z) for z in part.z.reshape(-1, 5)]
+        assert np.abs(gaps).max() < 3e-3
+        np.testing.assert_allclose(part.nodes[1:, 0], part.z[:, -1], atol=1e-12)
+        assert part.forces[..., : stage.formation.n_contacts].min() > 0
+        limits = stage.formation.scene.torque_limit
+        assert (np.abs(part.tau) < limits).all()
+        # Velocities are the slope of what is guessed.
+        t = part.duration * part.places(SCHEME.points)
+        step = np.diff(part.z[:, :2], axis=1)[:, 0] / np.diff(t[:, :2], axis=1)
+        middle = (part.v[:, 0] + part.v[:, 1]) / 2
+        assert np.abs(step - middle).max() < 0.15 * np.abs(part.v).max()
+    for before, after in pairwise(parts):
+        np.testing.assert_allclose(before.nodes[-1, 0], after.nodes[0, 0], atol=1e-12)
+    for node in (parts[0].nodes[0, 1], parts[-1].nodes[-1, 1]):
+        np.testing.assert_allclose(node, 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("pace", [1.0, 4.0])
+def test_the_duration_is_that_of_a_fall_times_the_pace(pace: float) -> None:
+    problem = landing()
+    start, phases = trace_phases(problem)[-1].end, problem.phases[4:]
+    outlined = guess_stages(problem, phases, start, SCHEME, 12, pace)
+    z, length = start, 0.0
+    for phase in phases:
+        for outline in guess_phase(phase, z):
+            length += outline.length
+            z = outline.z[-1]
+    whole = sum(stage.guess.duration for stage in outlined) * problem.scene.scales.time
+    # The outline that is split leaves out nothing but the rounding of its length.
+    assert whole == pytest.approx(pace * np.sqrt(length / 9.81), rel=1e-3)
+
+
+def search_for(objective: str) -> TimeSearch:
+    return TimeSearch.of(landing(), PlanOptions(objective=objective))
+
+
+@lru_cache(maxsize=2)
+def coarse(objective: str) -> TimeSolution:
+    """The heptagon's landing on few intervals, with limits at the points alone."""
+    problem = landing()
+    start = trace_phases(problem)[-1].end
+    options = PlanOptions(objective=objective, time_intervals=8)
+    begun = try_phases(problem, problem.phases[4:], start, options, further=9)
+    assert begun is not None and isinstance(begun[0].solution, TimeSolution)
+    return begun[0].solution
+
+
+def replace_scene(stages: list[Stage], problem: Problem) -> list[Stage]:
+    """The same stages on the formations of another scene."""
+    return [replace(stage, formation=problem.phases[stage.phase].formation) for stage in stages]
+
+
+def test_multipliers_are_shared_among_the_intervals_that_replace_one() -> None:
+    solution = coarse("time")
+    marked = [(np.arange(stage.intervals) + 1) % 2 for stage in solution.stages]
+    stages = bisect_intervals(solution.stages, SCHEME, marked)
+    search = search_for("time")
+    nlp = search.build(stages)
+    rng = np.random.default_rng(2)
+    given = {key: rng.normal(size=len(table)) for key, table in solution.multipliers.items()}
+    carried = carry_multipliers(given, solution.nlp, nlp, SCHEME, solution.stages, stages)
+    assert len(carried["lam_g0"]) == len(nlp.rows.bounds[0])
+    for k, own in enumerate(marked):
+        parent = np.repeat(np.arange(len(own)), 1 + own)
+        for layouts, key, name in (
+            ((solution.nlp.layouts, nlp.layouts), "lam_x0", "forces"),
+            ((solution.nlp.layouts, nlp.layouts), "lam_x0", "tau"),
+            ((solution.nlp.rows_of, nlp.rows_of), "lam_g0", "points"),
+        ):
+            old, new = (getattr(part[k], name) for part in layouts)
+            before, after = given[key][old], carried[key][new]
+            total = np.zeros_like(before)
+            np.add.at(total, parent, after)
+            np.testing.assert_allclose(total, before, rtol=1e-12)
+
+
+@pytest.mark.parametrize("contact", ["palm", "finger1", "finger2"])
+def test_friction_is_worth_what_a_little_less_of_it_saves(contact: str) -> None:
+    """By the envelope theorem: as much as the Lagrangian falls, all else as it is."""
+    solution, share = coarse("effort"), 1e-3
+    mu = getattr(landing().scene.friction, contact)
+    other = landing().with_({f"friction_{contact}": (1 - share) * mu})
+    least = PlanOptions(objective="effort")
+    values = list[float]()
+    for problem in (landing(), other):
+        stages = replace_scene(solution.stages, in_own_units(problem))
+        nlp = TimeSearch.of(problem, least).build(stages)
+        x = pack([stage.guess for stage in stages], nlp.layouts, 0.0)
+        g = nlp.solver.function.get_function("nlp_g")(x, [])
+        values.append(float(solution.multipliers["lam_g0"] @ g.full()[:, 0]))
+    own = [
+        solution.price_friction(k)[..., [n.endswith(contact) for n in stage.formation.names]].sum()
+        for k, stage in enumerate(solution.stages)
+    ]
+    # The other way is less by twice of all there is.
+    assert values[0] - values[1] == pytest.approx(share / 2 * sum(own), rel=1e-6, abs=1e-12)
+
+
+def test_multipliers_of_a_solution_are_those_of_its_limits() -> None:
+    solution = coarse("time")
+    pressing = 0
+    for stage, layout in zip(solution.stages, solution.nlp.layouts, strict=True):
+        lam, c_n = solution.multipliers["lam_x0"][layout.forces], stage.guess.forces
+        # A bound pushes only where it is reached, to the tolerance of the solver.
+        least = in_own_units(landing()).epsilon
+        assert (np.abs(lam * (c_n - least)) < 1e-6).all() and lam.max() < 1e-7
+        pressing += int((lam < -1e-6).sum())
+    assert pressing > 10
+
+
+def draw(rng: np.random.Generator, count: int) -> tuple[Array, Array, Array]:
+    """Slopes, and rows of a polygon about zero with their slack, some of them touching it."""
+    box = np.tile(np.concatenate([np.eye(2), -np.eye(2)]), (count, 1, 1))
+    rows = np.concatenate([rng.normal(size=(count, 3, 2)), box], axis=1)
+    slack = rng.uniform(0.0, 2.0, rows.shape[:2]) * (rng.uniform(size=rows.shape[:2]) > 0.2)
+    return rng.normal(size=(count, 2)), rows, slack
+
+
+def test_the_least_over_a_polygon_is_that_of_a_linear_programme() -> None:
+    slopes, rows, slack = draw(np.random.default_rng(0), 30)
+    least = find_least(slopes, 0.0, rows, slack)
+    for k, slope in enumerate(slopes):
+        answer = linprog(slope, -rows[k], slack[k], bounds=(None, None))
+        assert least[k] == pytest.approx(answer.fun, abs=1e-9)
+    assert (least < -0.1).sum() > 10
+
+
+def test_the_least_square_over_a_polygon_is_that_of_a_solver() -> None:
+    slopes, rows, slack = draw(np.random.default_rng(1), 30)
+    least = find_least(slopes, 0.4, rows, slack)
+    for k, slope in enumerate(slopes):
+        limits = {"type": "ineq", "fun": lambda u, k=k: rows[k] @ u + slack[k]}
+        answer = minimize(lambda u, g=slope: g @ u + 0.4 * u @ u, np.zeros(2), constraints=limits)
+        assert least[k] == pytest.approx(answer.fun, abs=1e-6)
+    assert len(set(np.round(least, 6))) > 10
+
+
+def test_what_is_held_moves_along_its_limit_alone() -> None:
+    slopes, rows, slack = draw(np.random.default_rng(2), 5)
+    held = np.array([0.6, 0.8])
+    both = np.concatenate([rows, np.tile([held, -held], (5, 1, 1))], axis=1)
+    least = find_least(slopes, 0.0, both, np.hstack([slack, np.zeros((5, 2))]))
+    way = np.array([-0.8, 0.6])
+    for k, slope in enumerate(slopes):
+        along = rows[k] @ way
+        with np.errstate(divide="ignore"):
+            ends = -slack[k] / along
+        farthest = ends[along < 0].min(), ends[along > 0].max()
+        assert least[k] == pytest.approx(min(slope @ way * end for end in farthest), abs=1e-9)
+
+
+def test_the_estimated_error_is_about_that_of_a_finer_plan() -> None:
+    coarse, fine = plan_landing(time_intervals=6), plan_landing()
+    lost = total(coarse) / total(fine) - 1
+    assert fine[0].error < PlanOptions().accuracy < coarse[0].error == coarse[1].error
+    assert lost == pytest.approx(coarse[0].error - fine[0].error, rel=0.6)
+
+
+def test_largest_shares_of_an_error_are_halved_first() -> None:
+    shares = [np.array([1e-3, 1e-6, 4e-5]), np.array([3e-4, 0.0])]
+    times = spread_halvings(shares, 1e-4)
+    left = [share / 4.0**own for share, own in zip(shares, times, strict=True)]
+    assert [own.tolist() for own in times] == [[2, 0, 1], [2, 0]]
+    assert sum(own.sum() for own in left) < 2e-4
+    assert not any(own.any() for own in spread_halvings(shares, 1e-2))
+
+
+@lru_cache(maxsize=2)
+def landed(intervals: int = 8) -> tuple[TimeSearch, TimeSolution]:
+    """The landing alone: where along the palm it ends is left open."""
+    problem = landing()
+    search = TimeSearch.of(problem, PlanOptions())
+    start = trace_phases(problem)[-1].end
+    stages = guess_stages(problem, problem.phases[4:], start, search.scheme, intervals, 2.0)
+    return search, search.solve(stages)
+
+
+def test_an_end_is_moved_to_where_what_follows_costs_less() -> None:
+    """Or kept, where the solver finds nothing better; it does on one of two grids at least."""
+    price, gains = 0.5 * np.eye(5)[0], []
+    for intervals in (4, 8):
+        search, alone = landed(intervals)
+        whole = replace(search, to_go=lambda z: (float(price @ z), price))
+        priced, moved = choose_end(whole, alone)
+        own = moved.cost - priced.charge(moved.end)
+        gains.append(alone.cost + price @ alone.end - own - price @ moved.end)
+        assert moved is alone or gains[-1] > GAIN * alone.cost
+        if moved is not alone:
+            # The stages alone cost least where they ended.
+            assert own > alone.cost and moved.end[0] < alone.end[0]
+    assert max(gains) > GAIN

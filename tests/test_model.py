@@ -2,12 +2,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import fields, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
 
-from plane import SQUARE, make_finger, make_scene
+from plane import SQUARE, convex_polygon, cross, make_finger, make_scene, rotate
+from wholearm.common.arrays import Array
 from wholearm.common.errors import LONGEST, InputError, name_source, require_number, require_vector
 from wholearm.common.fields import keys_of
 from wholearm.scene.model import Finger, Friction, Scene
@@ -133,3 +135,157 @@ def test_a_source_is_given_to_errors_without_one() -> None:
         raise InputError("", "key", "problem")
     with pytest.raises(InputError, match="a: key: problem"), name_source("b"):
         raise InputError("a", "key", "problem")
+
+
+PENTAGRAM = [[math.cos(a), math.sin(a)] for a in 2 * np.pi * np.arange(5) * 2 / 5]
+
+
+def regular(count: int, radius: float) -> Array:
+    angles = 2 * np.pi * np.arange(count) / count
+    return radius * np.column_stack([np.cos(angles), np.sin(angles)])
+
+
+def triangulate(corners: Array) -> tuple[float, Array, float]:
+    """Area, centroid and polar second moment about it, by midside quadrature on triangles.
+
+    The rule is exact for quadratics, and the second moment is one.
+    """
+    area, first, points, weights = 0.0, np.zeros(2), [], []
+    for one, two in pairwise(corners[1:]):
+        triangle = np.array([corners[0], one, two])
+        size = float(cross(one - corners[0], two - corners[0])) / 2
+        area += size
+        first += size * triangle.mean(axis=0)
+        points.append((triangle + np.roll(triangle, -1, axis=0)) / 2)
+        weights.append(np.full(3, size / 3))
+    centroid = first / area
+    arms = np.concatenate(points) - centroid
+    return area, centroid, float(np.concatenate(weights) @ (arms**2).sum(axis=1))
+
+
+@pytest.mark.parametrize("angle, offset", [(0.0, (0.0, 0.0)), (1.1, (0.3, -0.2))])
+def test_rectangle_has_textbook_inertia(angle: float, offset: tuple[float, float]) -> None:
+    width, height, mass = 0.08, 0.03, 0.4
+    corners = rotate(angle, np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * [width, height]) + offset
+    polygon = Polygon(corners, mass)
+    assert polygon.inertia == pytest.approx(mass * (width**2 + height**2) / 12, rel=1e-12)
+    middle = rotate(angle, [width / 2, height / 2]) + offset
+    np.testing.assert_allclose(polygon.centroid, middle, atol=1e-13)
+    np.testing.assert_allclose(polygon.vertices, corners - middle, atol=1e-13)
+
+
+@pytest.mark.parametrize("count", [3, 5, 8])
+def test_regular_polygon_has_textbook_inertia(count: int) -> None:
+    radius, mass = 0.06, 0.3
+    polygon = Polygon(regular(count, radius) + np.array([0.5, -0.7]), mass)
+    closed = mass * radius**2 / 2 * (1 - 2 / 3 * math.sin(math.pi / count) ** 2)
+    # The offset costs two digits of the corners' differences.
+    assert polygon.inertia == pytest.approx(closed, rel=1e-10)
+    assert polygon.gyration_radius == pytest.approx(math.sqrt(closed / mass), rel=1e-10)
+    np.testing.assert_allclose(polygon.centroid, [0.5, -0.7], rtol=1e-13)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_centroid_and_inertia_equal_quadrature(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    corners = convex_polygon(rng, 3 + seed)
+    area, centroid, second = triangulate(corners)
+    polygon = Polygon(corners, 0.7)
+    np.testing.assert_allclose(polygon.centroid, centroid, atol=1e-13)
+    assert polygon.inertia == pytest.approx(0.7 * second / area, rel=1e-11)
+
+
+def test_given_inertia_is_kept_and_points_may_be_lists() -> None:
+    polygon = Polygon(SQUARE, 1, 0.25)
+    assert (polygon.mass, polygon.inertia, polygon.n_vertices) == pytest.approx((1.0, 0.25, 4))
+
+
+@pytest.mark.parametrize("edge", range(5))
+def test_flush_edge_lies_below_the_object(edge: int) -> None:
+    polygon = Polygon(convex_polygon(np.random.default_rng(edge), 5), 1.0)
+    heights = rotate(polygon.flush_angle(edge), polygon.vertices)[:, 1]
+    lowest = heights.min()
+    flush = [edge, (edge + 1) % 5]
+    np.testing.assert_allclose(heights[flush], lowest, atol=1e-13)
+    assert (np.delete(heights, flush) > lowest + 1e-3).all()
+
+
+def test_arrays_are_read_only_copies() -> None:
+    corners = np.array(SQUARE)
+    polygon = Polygon(corners, 1.0)
+    corners[0] = 9.0
+    assert np.asarray(polygon.points)[0, 0] == pytest.approx(SQUARE[0][0])
+    with pytest.raises(ValueError, match="read-only"):
+        polygon.vertices[0, 0] = 0.0
+
+
+@pytest.mark.parametrize(
+    "points, key, text",
+    [
+        (SQUARE[::-1], "object.vertices", "clockwise"),
+        ([[0, 0], [1, 0], [2, 0]], "object.vertices", "flat"),
+        ([[0, 0], [2, 0], [2, 2], [1, 0.5], [0, 2]], "object.vertices[3]", "convex"),
+        ([[0, 0], [1, 0], [2, 0], [2, 2], [0, 2]], "object.vertices[1]", "convex"),
+        ([[0, 0], [1, 0], [1, 0], [1, 1]], "object.vertices[1]", "convex"),
+        ([[0, 0], [0, 0], [1, 0], [1, 1]], "object.vertices[0]", "convex"),
+        (PENTAGRAM, "object.vertices", "crosses itself"),
+        ([[0, 0], [1, 0]], "object.vertices", "3 or more"),
+        ([], "object.vertices", "3 or more"),
+        ("square", "object.vertices", "3 or more"),
+        (None, "object.vertices", "3 or more"),
+        ([[0, 0], [1, 0], [1, math.nan]], "object.vertices[2]", "finite"),
+        ([[0, 0], [1, 0], [1, math.inf]], "object.vertices[2]", "finite"),
+        ([[0, 0], [1, 0], [1, True]], "object.vertices[2]", "finite"),
+        ([[0, 0], [1, 0], [1, "1"]], "object.vertices[2]", "'1'"),
+        ([[0, 0], [1, 0], [1, 1, 1]], "object.vertices[2]", "2 numbers"),
+        ([[0, 0], 7, [1, 1]], "object.vertices[1]", "2 numbers"),
+    ],
+)
+def test_bad_polygon_names_the_corner(points: Any, key: str, text: str) -> None:
+    with pytest.raises(InputError, match=text) as caught:
+        Polygon(points, 1.0)
+    assert caught.value.key == key
+
+
+@pytest.mark.parametrize("value", [-1.0, 0.0, math.nan, math.inf, True, "1", [1.0], 10**400, 1j])
+@pytest.mark.parametrize("key", ["mass", "inertia"])
+def test_bad_mass_and_inertia(key: str, value: Any) -> None:
+    with pytest.raises(InputError, match="positive") as caught:
+        Polygon(SQUARE, **({"mass": 1.0} | {key: value}))
+    assert caught.value.key == f"object.{key}"
+
+
+def test_size_and_uniform_inertia() -> None:
+    polygon = Polygon(np.array([[0, 0], [3, 0], [3, 4], [0, 4]]), 2.0, 1.0)
+    assert polygon.size == pytest.approx(5.0, rel=1e-13)
+    assert polygon.uniform_inertia == pytest.approx(2.0 * 25 / 12, rel=1e-14)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_far_from_the_origin_only_the_corners_lose_digits(seed: int) -> None:
+    corners = convex_polygon(np.random.default_rng(seed), 7)
+    size = Polygon(corners, 1.0).size
+    away = Polygon(corners + np.array([700.0, -300.0]) * size, 1.0)
+    here = Polygon(away.points - np.asarray(away.points)[0], 1.0)
+    np.testing.assert_allclose(away.vertices, here.vertices, rtol=0, atol=1e-12 * size)
+
+
+@pytest.mark.parametrize(
+    "points, text",
+    [
+        (1e-5 * np.array(SQUARE) / np.abs(SQUARE).max(), "allowed are 0.0001 to 1000 m"),
+        (2e3 * np.array(SQUARE) / np.abs(SQUARE).max(), "allowed are 0.0001 to 1000 m"),
+        ([[1e300, 0], [0, 1e300], [-1e300, 0]], "allowed are coordinates up to 1e"),
+        ([[1000, 0], [1000.1, 0], [1000, 0.1]], "m from the origin; allowed are 141 m"),
+        ([[0, 0], [1, 0], [0.5, 9e-4]], "is 0.0009 m wide; allowed are 0.001 m and more"),
+        (
+            [[0, 0], [1, 0], [1, 1], [9e-5, 1], [0, 1 - 5e-5]],
+            "has 0.000103 m; allowed are 0.000141 m",
+        ),
+        (regular(501, 1.0), "501 corners given; allowed are 3 to 500"),
+    ],
+)
+def test_polygons_beyond_all_reason(points: Any, text: str) -> None:
+    with pytest.raises(InputError, match=text) as caught:
+        Polygon(points, 1.0)
+    assert caught.value.key.startswith("object.vertices")

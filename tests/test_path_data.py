@@ -1,20 +1,44 @@
 from __future__ import annotations
 
+import math
+from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any
+
+import casadi as ca
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from wholearm.common.arrays import Array
 from wholearm.common.quadrature import find_minima
-from wholearm.geometry.curve import Curve
+from wholearm.geometry.cost_to_go import CostToGo
+from wholearm.geometry.curve import Curve, Segment
+from wholearm.geometry.tracing import trace_phase, trace_phases
 from wholearm.mechanics.dynamics import PathForces, inverse
-from wholearm.planning.options import PlanOptions
-from wholearm.planning.path_domain.elements import Profile
+from wholearm.mechanics.metric import metric_weights
+from wholearm.planning.lower_bound.lower_bound import bound_least_time
+from wholearm.planning.options import Objective, PlanOptions
+from wholearm.planning.path_domain.elements import (
+    DEGREE,
+    FROM_REST,
+    INSIDE,
+    TO_REST,
+    Profile,
+    find_basis,
+    lay_out,
+)
+from wholearm.planning.path_domain.first_guess import guess
 from wholearm.planning.path_domain.interpolation import fit_torque
 from wholearm.planning.path_domain.path_data import PhaseData, choose_sampling, prepare
 from wholearm.planning.path_domain.path_mesh import Mesh
-from wholearm.planning.path_domain.path_motion import directions_of
+from wholearm.planning.path_domain.path_motion import PathMotion, directions_of
+from wholearm.planning.path_domain.path_nlp import build_path_nlp, pack, parameters
 from wholearm.planning.path_domain.path_plan import plan_path
+from wholearm.planning.path_domain.refine import start_at
+from wholearm.planning.path_domain.speed_profile import Fastest, Narrow, find_fastest
+from wholearm.planning.path_domain.terms import LimitShape
+from wholearm.problem.definition import Problem
 
 PHASES = range(5)
 EPSILON = 0.05
@@ -164,3 +188,251 @@ def test_dips_next_to_rest_are_found(nodes: int, deepest: float) -> None:
         least = find_minima(sampled[None, :, None])[0, 0]
         # A look next to the dip, and the parabola through it, miss little of it.
         assert least == pytest.approx(-deepest, rel=0.1)
+
+
+SEEDS = range(4)
+
+
+def stub_curve(length: float, breaks: list[float]) -> Curve:
+    ends = [0.0, *breaks, length]
+    stub: Any = SimpleNamespace(
+        length=length,
+        segments=tuple(Segment(a, b, np.ones(4), np.ones(2)) for a, b in pairwise(ends)),
+        formation=SimpleNamespace(names=("v0-palm",)),
+    )
+    curve: Curve = stub
+    return curve
+
+
+def random_motion(seed: int) -> PathMotion:
+    """From rest to rest over a random grid, with a jump of a where two segments meet."""
+    rng = np.random.default_rng(seed)
+    length, break_at = rng.uniform(0.02, 0.5), rng.uniform(0.2, 0.8)
+    curve = stub_curve(length, [break_at * length])
+    grid = Mesh().make_grid(curve, 6)
+    x = grid.s / length
+    waves = rng.uniform(-0.4, 0.4, 2)
+    a = (1 - 2 * x) * (1 + waves[0] * np.sin(5 * x)) + 0.3 * waves[1] * grid.segment
+    a = rng.uniform(0.5, 20.0) * (a - grid.integrate(a)[-1] / (2 * length))
+    b = grid.integrate(a)
+    b[-1] = 0.0
+    assert (b[1:-1] > 0).all()
+    return PathMotion(curve, grid, Profile(a, b, rng.uniform(0, 1, len(a))))
+
+
+def acceleration(motion: PathMotion, element: int, s: Array) -> Array:
+    """S'' at places of an element, by an interpolation of its own."""
+    grid = motion.grid
+    start, stop = grid.edges[element]
+    share = np.clip((s - start) / (stop - start), 0.0, 1.0)
+    kind = int(grid.kinds[element])
+    y = {INSIDE: share, FROM_REST: np.sqrt(share), TO_REST: np.sqrt(1 - share)}[kind]
+    nodes = find_basis().y[kind]
+    own = motion.profile.a[element * (DEGREE + 1) : (element + 1) * (DEGREE + 1)]
+    return np.polyval(np.polyfit(nodes, own, DEGREE), y)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_motion_integrates_its_acceleration(seed: int) -> None:
+    """S'' is that of the elements, s' its integral over time, and s that of s'."""
+    motion = random_motion(seed)
+    length, nodes, weights = motion.curve.length, *np.polynomial.legendre.leggauss(20)
+    speed, place = 0.0, 0.0
+    for k in motion.grid.nonempty.tolist():
+        start, stop = motion.times[k], motion.times[k + 1]
+        t = start + (1 + nodes) / 2 * (stop - start)
+        s, _, here = motion.locate(t)
+        expected = acceleration(motion, k // (DEGREE + 1), s)
+        scale = np.abs(motion.profile.a).max()
+        np.testing.assert_allclose(here.a, expected, rtol=0, atol=1e-9 * scale)
+        place += (stop - start) / 2 * float(weights @ np.sqrt(here.b))
+        speed += (stop - start) / 2 * float(weights @ here.a)
+        assert place == pytest.approx(motion.grid.s[k + 1], abs=1e-10 * length)
+        top = math.sqrt(motion.profile.b.max())
+        assert speed == pytest.approx(math.sqrt(motion.profile.b[k + 1]), abs=1e-9 * top)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_profile_holds_the_derivatives_of_s(seed: int) -> None:
+    motion = random_motion(seed)
+    rng = np.random.default_rng(100 + seed)
+    k = rng.choice(motion.grid.nonempty, 40)
+    start, stop = motion.times[k], motion.times[k + 1]
+    t = start + rng.uniform(0.2, 0.8, 40) * (stop - start)
+    # Inside an interval s is smooth; the step trades 1e-16 / h^2 against h^2.
+    h = 0.02 * (stop - start)
+    before, (s, segment, here), after = (motion.locate(t + d) for d in (-h, 0 * h, h))
+    speed, fastest = (after[0] - before[0]) / (2 * h), np.sqrt(motion.profile.b.max())
+    np.testing.assert_allclose(np.sqrt(here.b), speed, rtol=0, atol=2e-4 * fastest)
+    bend = (after[0] - 2 * s + before[0]) / h**2
+    np.testing.assert_allclose(here.a, bend, rtol=0, atol=2e-4 * np.abs(motion.profile.a).max())
+    np.testing.assert_array_equal(segment, motion.grid.segment[k])
+
+
+def test_interval_of_length_zero_takes_no_time_and_jumps() -> None:
+    motion = random_motion(0)
+    (gap,) = np.flatnonzero(np.diff(motion.grid.segment))
+    assert motion.grid.steps[gap] == 0.0 and motion.times[gap] == motion.times[gap + 1]
+    instant = 1e-9 * motion.duration
+    _, segment, here = motion.locate(motion.times[gap] + np.array([-instant, instant]))
+    assert segment.tolist() == [0, 1]
+    np.testing.assert_allclose(here.a, motion.profile.a[[gap, gap + 1]], rtol=1e-6)
+    assert abs(here.a[1] - here.a[0]) > 1e-3 * abs(here.a[0])
+    np.testing.assert_allclose(here.squeeze, motion.profile.squeeze[[gap, gap + 1]], rtol=1e-5)
+
+
+def test_a_stall_is_seen() -> None:
+    """The speed all but vanishes in the middle of an element, though not at its nodes."""
+    edges = np.array([[0.0, 0.4], [0.4, 0.6], [0.6, 1.0]])
+    grid = lay_out(edges, np.zeros(3, dtype=np.int64), (True, True))
+    dip = np.where((grid.s >= 0.4) & (grid.s <= 0.6), 0.9, 0.0)
+    y = np.clip((grid.s - 0.4) / 0.2, 0.0, 1.0)
+    b = np.where(dip > 0, (y - 0.3) ** 2 + 1e-12, grid.s * (1 - grid.s))
+    a = np.where(dip > 0, (y - 0.3) / 0.2, 0.5 - grid.s)
+    smooth = np.where(dip > 0, 0.24, b)
+    stalled, moving = (
+        PathMotion(stub_curve(1.0, []), grid, Profile(own_a, own_b, own_a))
+        for own_a, own_b in ((a, b), (np.where(dip > 0, 0.0, a), smooth))
+    )
+    assert stalled.stalls and not moving.stalls
+
+
+@pytest.mark.parametrize("elements", [6, 7, 37])
+@pytest.mark.parametrize("breaks", [[], [0.4], [0.01, 0.02], [0.3, 0.300001, 0.9], [1 - 1e-6]])
+def test_grid_has_its_elements_and_breaks(elements: int, breaks: list[float]) -> None:
+    length = 0.037
+    curve = stub_curve(length, [length * part for part in breaks])
+    switches = length * np.array([0.123, 0.777])
+    grid = Mesh(switches).make_grid(curve, elements)
+    assert len(grid.s) == len(grid.segment) == elements * (DEGREE + 1)
+    assert grid.s[0] == 0.0 and grid.s[-1] == length
+    assert (np.diff(grid.s) >= 0).all() and (np.diff(grid.segment) >= 0).all()
+    # Of length zero are exactly the intervals between elements.
+    gaps = np.flatnonzero(np.diff(grid.s) == 0)
+    np.testing.assert_array_equal(gaps, DEGREE + (DEGREE + 1) * np.arange(elements - 1))
+    assert set(switches) <= set(grid.edges[:, 0])
+    for index, segment in enumerate(curve.segments):
+        mine = grid.s[grid.segment == index]
+        assert len(mine) >= 2 and mine[0] == segment.start and mine[-1] == segment.stop
+    assert grid.kinds.tolist() == [FROM_REST, *[INSIDE] * (elements - 2), TO_REST]
+
+
+def test_grid_is_fine_towards_the_ends_or_where_it_is_asked_to_be() -> None:
+    grid = Mesh().make_grid(stub_curve(1.0, []), 20)
+    # Even in the angle of s = (1 - cos) / 2.
+    np.testing.assert_allclose(grid.edges[:, 0], (1 - np.cos(np.pi * np.arange(20) / 20)) / 2)
+    weighted = Mesh(np.array([0.5]), np.array([1.0, 3.0])).make_grid(stub_curve(1.0, []), 20)
+    assert (weighted.edges[:, 1] <= 0.5).sum() == 5
+
+
+ELEMENTS = 10
+
+
+def prepare_on(curve: Curve, mesh: Mesh, phase: int = 1) -> PhaseData:
+    return prepare(curve, EPSILON, mesh.make_grid(curve, ELEMENTS), phase)
+
+
+def find(curve: Curve, duration: float | None = None) -> Fastest:
+    found = find_fastest(prepare_on(curve, Mesh()), duration)
+    assert isinstance(found, Fastest)
+    return found
+
+
+def measure(found: Fastest) -> float:
+    """Duration of a motion with a constant s'' in each interval [s]."""
+    speed = np.sqrt(found.b)
+    return float((2 * np.diff(found.s) / (speed[1:] + speed[:-1])).sum())
+
+
+@pytest.mark.parametrize("phase", range(2))
+def test_a_sweep_takes_about_the_least_time(curves: tuple[Curve, ...], phase: int) -> None:
+    bound = bound_least_time([curves[phase]], EPSILON)
+    assert bound is not None
+    assert measure(find(curves[phase])) == pytest.approx(bound.value, rel=2e-4)
+
+
+def test_a_margin_takes_the_duration_that_is_allowed(curves: tuple[Curve, ...]) -> None:
+    fastest = find(curves[0])
+    allowed = 1.5 * measure(fastest)
+    slower = find(curves[0], allowed)
+    assert measure(slower) == pytest.approx(allowed, rel=1e-3)
+    assert slower.margin > 0
+    # With that margin no motion is faster.
+    bound = bound_least_time([curves[0]], EPSILON + slower.margin)
+    assert bound is not None
+    assert bound.value == pytest.approx(allowed, rel=1e-3)
+    assert find_fastest(prepare_on(curves[0], Mesh()), 0.9 * measure(fastest)) is None
+
+
+def test_a_place_that_limits_the_margin_is_named(curves: tuple[Curve, ...]) -> None:
+    """At the start of this phase no contact can press harder, however long a motion takes."""
+    curve = curves[2]
+    data, least = prepare_on(curve, Mesh()), measure(find(curve))
+    found = find_fastest(data, 2 * least)
+    assert isinstance(found, Narrow)
+    assert 0 < max(place for place, _ in found.switches) < 0.02 * curve.length
+    at_once, at_leisure = (
+        plan_path(curve, EPSILON, PlanOptions(objective=Objective.MARGIN), 3, ratio * least).value
+        for ratio in (2.0, 3.0)
+    )
+    assert at_leisure == pytest.approx(at_once, rel=5e-4)
+
+
+@pytest.mark.parametrize("goal", [Objective.TIME, Objective.MARGIN])
+def test_the_start_is_near_a_solution(curves: tuple[Curve, ...], goal: Objective) -> None:
+    """The conditions of optimality of the NLP itself, derived by CasADi, almost hold."""
+    curve = curves[0]
+    coarse = prepare_on(curve, Mesh())
+    least = measure(find(curve))
+    duration = 1.5 * least if goal is Objective.MARGIN else None
+    found = find_fastest(coarse, duration)
+    assert isinstance(found, Fastest)
+    data = prepare_on(curve, Mesh.of(curve, found.switches))
+    nlp = build_path_nlp(LimitShape.of(data.limits), len(data.grid.steps), goal)
+    units = guess(coarse)[1]
+    start = start_at(nlp, data, units, found)[0]
+    assert start.margin == found.margin
+    # Limits are kept at the nodes, and so is the duration.
+    slack = data.slack(data.nodes, start.profile, start.margin) / data.spans
+    assert slack.min() > -1e-6
+    motion = PathMotion(curve, data.grid, start.profile)
+    assert motion.duration == pytest.approx(duration or least, rel=1e-3)
+    oracle = nlp.solver.function.oracle()
+    x, p = oracle.mx_in(0), oracle.mx_in(1)
+    f, g = oracle(x, p)
+    gradient = ca.Function("gradient", [x, p], [ca.gradient(f, x), ca.jacobian(g, x)])
+    here = pack(nlp, start.profile, units, start.margin)
+    of_f, of_g = (part.full() for part in gradient(here, parameters(nlp, data, units, 0.0)))
+    multipliers = start.multipliers["lam_x0"] + of_g.T @ start.multipliers["lam_g0"]
+    left = of_f[:, 0] + multipliers
+    assert np.abs(left).max() < 0.03 * np.abs(of_f).max()
+
+
+def test_the_gradient_of_a_linear_cost_is_its_part_along_the_curve(heptagon: Problem) -> None:
+    phase = heptagon.phases[1]
+    curve = trace_phases(heptagon)[1]
+    slope = np.random.default_rng(4).normal(size=5)
+    value, gradient = CostToGo(phase, lambda z: float(slope @ z)).expand(curve.start)
+    tangent = curve.evaluate(np.zeros(1)).z_s[0]
+    assert value == pytest.approx(slope @ curve.start)
+    # A quotient of differences over a hundredth of a curve that bends.
+    assert gradient @ tangent == pytest.approx(slope @ tangent, rel=0, abs=0.1)
+    # In the metric of curves it has no part across.
+    across = gradient / metric_weights(heptagon.scene) - (gradient @ tangent) * tangent
+    np.testing.assert_allclose(across, 0.0, atol=1e-12 * np.abs(gradient).max())
+
+
+def test_less_way_costs_less_time(heptagon: Problem) -> None:
+    phase, curve = heptagon.phases[1], trace_phases(heptagon)[1]
+    options = PlanOptions(intervals=40)
+
+    def least_time(z: Array) -> float:
+        return plan_path(trace_phase(phase, z), heptagon.epsilon, options, 1).value
+
+    value, gradient = CostToGo(phase, least_time).expand(curve.start)
+    tangent = curve.evaluate(np.zeros(1)).z_s[0]
+    # Forwards, and with steps of another length: what is left is the bend of the time.
+    ahead = 0.02 * curve.length
+    slope = (least_time(curve.evaluate(np.array([ahead])).z[0]) - value) / ahead
+    assert slope < 0
+    assert gradient @ tangent == pytest.approx(slope, rel=0.05)

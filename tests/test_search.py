@@ -1,6 +1,10 @@
+"""Searches of routes, and changes of one number that open a way that is blocked."""
+
 from __future__ import annotations
 
+import math
 import tomllib
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -8,19 +12,29 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shipped import HEPTAGON, problem_of
+from shipped import HEPTAGON, HEXAGON, problem_of
 from wholearm.cli.command import main
 from wholearm.common.errors import InfeasibleError, InputError, SolverError
+from wholearm.common.shortfalls import Change, Parameter
+from wholearm.common.signals import OutOfTime
+from wholearm.contacts.closing import close_fingers
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phase
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
+from wholearm.planning.options import PlanOptions
 from wholearm.planning.saved import load_plan
 from wholearm.problem.definition import Phase, Problem
 from wholearm.problem.goal import Goal
 from wholearm.problem.read import build_problem
 from wholearm.search.astar import RoadmapRoute, RouteSearch
 from wholearm.search.bounds import bound_borders
+from wholearm.search.cuts import Opening, list_cut, list_gates, list_openings, look_through
+from wholearm.search.edges import Link
 from wholearm.search.find_route import (
+    choose_opening,
+    explain,
+    find_hand,
+    find_opening,
     find_route,
     load_chart,
     require_folder,
@@ -205,3 +219,86 @@ def test_route_prints_phases_that_load(tmp_path: Path, capsys: pytest.CaptureFix
     # What needs phases says where they come from.
     assert main(["predict", str(path)]) == 2
     assert "`wholearm route FILE` finds" in capsys.readouterr().err
+
+
+TORQUE = Parameter("torque limit of finger 1", 2.0, "N m", 1, "fingers.1.torque_limit")
+EPSILON = Parameter("epsilon", 0.05, "N", -1, "epsilon")
+NEVER = math.nan
+
+
+@pytest.mark.parametrize("needed, least", [(2.5, 2.5), (2.9, 3.0), (9.0, None)])
+def test_a_number_is_changed_no_further_than_its_way_needs(
+    needed: float, least: float | None
+) -> None:
+    """All that a number opens is looked through first, then the way that was found, alone."""
+    openings = [Opening(EPSILON, (0.04, NEVER, 0.03)), Opening(TORQUE, (NEVER, 2.5, 3.0))]
+    tried = list[tuple[Change, list[int], bool]]()
+
+    def find(change: Change, beyond: Sequence[int], plan: bool) -> tuple[float, list[int]] | None:
+        tried.append((change, list(beyond), plan))
+        seen = change.parameter is TORQUE and (not plan or change.value >= needed)
+        return (0.5, [1]) if seen else None
+
+    text, changes = choose_opening(openings, find)
+    assert tried[:3] == [
+        (Change(EPSILON, 0.03), [0, 2], False),
+        (Change(TORQUE, 3.0), [1, 2], False),
+        (Change(TORQUE, 2.5), [1], True),
+    ]
+    assert tried[3:] == ([] if needed <= 2.5 else [(Change(TORQUE, 3.0), [1, 2], True)])
+    if least is None:
+        assert changes == () and text == (
+            "the goal is not reached with epsilon = 0.03 N instead of 0.05, "
+            "nor with torque limit of finger 1 = 3 N m instead of 2"
+        )
+        return
+    assert changes == (Change(TORQUE, least),)
+    assert text == f"with {changes[0]} the goal is reached, in about 0.5 s"
+
+
+def test_what_is_advised_opens_the_way() -> None:
+    """On a rough palm the slide cannot begin; with the friction that is named it can."""
+    goal, rough = Goal(flush=0, x=0.03), problem_of(HEPTAGON).with_(friction_palm=1.5)
+    own = RouteSearch(Roadmap(rough, 0.1), make_place(rough.scene, rough.start), goal)
+    assert not list(own.run())
+    # All that leads on from what is reached is in the cut, and nothing that ends where it was.
+    assert all(blocked.stop.key not in own.reached for blocked in list_cut(own))
+    gates = list_gates(own)
+    assert [gate.blocked for gate in gates] == list_cut(own)
+    for opening in list_openings(gates):
+        for gate, value in zip(gates, opening.values, strict=True):
+            if not math.isnan(value):
+                change = Change(opening.parameter, value)
+                assert isinstance(look_through(gate, change), Link)
+    text, (change,) = find_opening(own, rough, PlanOptions(), 0.0, lambda _: None)
+    assert change.parameter.key == "friction.palm" and change.value < 1.5
+    assert text.startswith(f"with {change} the goal is reached, in about ")
+    eased = rough.with_({"friction.palm": change.value})
+    assert next(
+        RouteSearch(Roadmap(eased, 0.1), make_place(eased.scene, eased.start), goal).run()
+    ).duration == pytest.approx(float(text.split()[-2]), rel=0.05)
+    said = describe_block(own, [], text, lambda blocked: explain(rough, PlanOptions(), blocked))
+    assert "blocked; v0-palm" in said and said.endswith(text) and " N short; " in said
+
+
+def test_fingers_that_cross_on_the_way_are_mounted_elsewhere(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With links of 0.18 m the fingers touch halfway through the slide; none closes at x = 0."""
+    table = {key: own for key, own in problem_of(HEXAGON).table.items() if key != "phases"}
+    crossing = build_problem({**table, "goal": {"flush": 0, "x": -0.01}}).with_(length=0.18)
+    (goal,), place = crossing.goals, make_place(crossing.scene, crossing.start)
+    own, told = RouteSearch(Roadmap(crossing, 0.1), place, goal), list[str]()
+    monkeypatch.setattr("wholearm.search.find_route.HANDS", (0.95,))
+    text, (change,) = find_hand(own, crossing, PlanOptions(), 0.0, told.append)
+    assert text.startswith(f"with {change} the goal is reached") and f"{change}" in told[0]
+    assert change.values == {"fingers.1.base[1]": 0.076, "fingers.2.base[1]": -0.076}
+    changed = crossing.with_(change.values)
+    closed = [close_fingers(p.scene, np.zeros(1), p.start[2:3]) for p in (crossing, changed)]
+    assert [bool(c.obstacle.any()) for c in closed] == [True, False]
+
+    def end(_: str) -> None:
+        raise OutOfTime
+
+    text, changes = find_hand(own, crossing, PlanOptions(), 0.0, end)
+    assert changes == () and "not reached with 0 other" in text
