@@ -416,36 +416,6 @@ def test_a_problem_of_objects_has_the_table_of_its_file(path: Any) -> None:
         assert (str(one.until), one.end) == (str(other.until), other.end)
 
 
-def test_a_problem_is_built_from_nothing() -> None:
-    """The README's example."""
-    link: dict[str, Any] = {
-        "length": 0.11,
-        "radius": 0.0,
-        "inertia": 1e-4,
-        "viscous": 0.0,
-        "dry": 0.0,
-    }
-    scene = wholearm.Scene(
-        wholearm.Polygon([[-0.03, 0.0], [0.03, 0.0], [0.03, 0.06], [-0.03, 0.06]], mass=0.2),
-        (
-            wholearm.Finger(base=(0.1, -0.01), torque_limit=2.0, **link),
-            wholearm.Finger(base=(-0.1, -0.01), torque_limit=2.0, **link),
-        ),
-        wholearm.Friction(0.1, 0.1, 0.1),
-    )
-    start = wholearm.place_start(scene, flush=0, x=0.0)
-    slide = wholearm.Phase(
-        0,
-        wholearm.read_formation(scene, ["v0-palm", "v1-palm", "v2-finger1", "v3-finger2"]),
-        wholearm.read_until(scene, {"x": -0.01}),
-    )
-    problem = wholearm.Problem("box", scene, 0.05, start, (slide,))
-    assert [finger.name for finger in problem.scene.fingers] == ["fingers.1", "fingers.2"]
-    plan = wholearm.solve(problem, intervals=10)
-    assert wholearm.verify(problem, plan).ok
-    assert plan.meta["problem"]["start"] == {"flush": 0, "x": 0.0}
-
-
 @pytest.mark.parametrize(
     ("objects", "file"),
     [

@@ -50,15 +50,6 @@ def test_known_contacts_are_where_closing_fingers_come_to_touch(
     np.testing.assert_allclose(place(scene, labels, poses), z, atol=1e-10)
 
 
-def test_a_tip_that_is_too_far_away_has_no_angle() -> None:
-    scene, labels, poses, _ = close(0.01)
-    on_tip = labels[:, 1:] >= first_contact(scene, 0) + 4
-    on_tip[:, 1] = labels[:, 2] >= first_contact(scene, 1) + 4
-    z = place(scene, labels, poses + np.array([0.5, 0.0]))
-    assert np.isfinite(z[:, :3]).all() and on_tip.any()
-    np.testing.assert_array_equal(np.isnan(z[:, 3:]), on_tip)
-
-
 def test_rates_are_those_of_contacts_that_stay_closed() -> None:
     scene, labels, poses, _ = close(0.01)
     ways = np.random.default_rng(4).normal(size=poses.shape) * [0.03, 1.0]

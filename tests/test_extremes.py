@@ -49,12 +49,6 @@ def test_extreme_scenes_are_planned(joints: dict[str, Any]) -> None:
     assert report.ok, report.failures
 
 
-def test_a_motion_that_all_but_stops_is_planned_on_a_finer_grid() -> None:
-    """Ten intervals leave one between whose nodes the motion has no time."""
-    coarse, fine = (solve(edited(viscous=16.0), intervals=k, replay=False) for k in (10, 40))
-    assert coarse.value == pytest.approx(fine.value, rel=2e-2)
-
-
 def test_strong_drag_bounds_the_speed() -> None:
     """Ten times the drag takes ten times as long: inertia does not matter any more."""
     slow, slower = (solve(edited(viscous=drag), replay=False).value for drag in (2.3, 23.0))

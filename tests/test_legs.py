@@ -138,13 +138,6 @@ def test_places_of_the_grid_have_their_labels_however_often_the_object_has_turne
     assert (labels != NOWHERE).any() and (labels == NOWHERE).any()
 
 
-def test_nothing_touches_beyond_the_reach_of_a_finger() -> None:
-    scene = make_scene()
-    grid = map_labels(scene)
-    for x in (-2.0, 2.0):
-        assert (grid.labels[grid.look_up(np.array([x, 0.3]))] == NOWHERE).all()
-
-
 TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
 FLAT = -1.984
 

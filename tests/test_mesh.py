@@ -28,9 +28,7 @@ from wholearm.planning.time_domain.time_mesh import (
     bisect,
     bisect_intervals,
     count_halvings,
-    monitor_violated,
     resample,
-    spread_halvings,
 )
 from wholearm.planning.time_domain.time_motion import StageMotion
 from wholearm.planning.time_domain.time_plan import try_phases
@@ -153,24 +151,6 @@ def test_defects_that_shrink_with_the_order_need_one_round(name: str, degree: in
     assert set(times[sizes < DEFECT].tolist()) == {0}
 
 
-def test_limits_that_are_broken_are_watched_from_then_on(stages: list[Stage]) -> None:
-    monitored = monitor_violated(stages) or stages
-    # What is broken already, by less than counts, changes nothing the second time.
-    assert monitor_violated(monitored) is None
-    low = monitored[-1]
-    sunk = low.guess.z.copy()
-    sunk[2, 1, 1] -= 0.001
-    guess = low.guess._replace(z=sunk)
-    changed = monitor_violated([*monitored[:-1], replace(low, guess=guess)])
-    assert changed is not None
-    more = set(changed[-1].monitored) - set(low.monitored)
-    values = low.formation.evaluate_limits(sunk[2, 1][None])[0]
-    assert more and all(values[k] < -1e-9 for k in more)
-    assert [stage.monitored for stage in changed[:-1]] == [
-        stage.monitored for stage in monitored[:-1]
-    ]
-
-
 SCHEME = make_scheme("radau", 3)
 
 
@@ -180,18 +160,6 @@ def outlined() -> list[Stage]:
     problem = landing()
     start = trace_phases(problem)[-1].end
     return guess_stages(problem, problem.phases[4:], start, SCHEME, 12, 2.0)
-
-
-def test_directions_change_where_a_stage_says_that_they_turn(outlined: list[Stage]) -> None:
-    for before, after in pairwise(outlined):
-        signs = np.concatenate(before.directions)
-        names = [*before.formation.names, "joint 1", "joint 2"]
-        turned = {names[row] for row in before.turns}
-        known = dict(zip(names, signs, strict=True))
-        names = [*after.formation.names, "joint 1", "joint 2"]
-        for name, sign in zip(names, np.concatenate(after.directions), strict=True):
-            assert (sign != known.get(name, sign)) == (name in turned)
-    assert outlined[-1].turns == ()
 
 
 def test_guesses_follow_the_outlines_in_one_sweep(outlined: list[Stage]) -> None:
@@ -356,15 +324,6 @@ def test_the_estimated_error_is_about_that_of_a_finer_plan() -> None:
     lost = total(coarse) / total(fine) - 1
     assert fine[0].error < PlanOptions().accuracy < coarse[0].error == coarse[1].error
     assert lost == pytest.approx(coarse[0].error - fine[0].error, rel=0.6)
-
-
-def test_largest_shares_of_an_error_are_halved_first() -> None:
-    shares = [np.array([1e-3, 1e-6, 4e-5]), np.array([3e-4, 0.0])]
-    times = spread_halvings(shares, 1e-4)
-    left = [share / 4.0**own for share, own in zip(shares, times, strict=True)]
-    assert [own.tolist() for own in times] == [[2, 0, 1], [2, 0]]
-    assert sum(own.sum() for own in left) < 2e-4
-    assert not any(own.any() for own in spread_halvings(shares, 1e-2))
 
 
 @lru_cache(maxsize=2)

@@ -26,17 +26,14 @@ from wholearm.planning.time_domain.nlp_layout import (
 )
 from wholearm.planning.time_domain.stage import Stage, StagePoints
 from wholearm.planning.time_domain.stage_modes import (
-    LEAST_INTERVALS,
     StageMode,
     in_mode,
     link,
     merge,
     mode_of,
-    release_earlier,
     split,
 )
 from wholearm.planning.time_domain.time_mesh import resample
-from wholearm.problem.definition import Until
 
 SCHEMES = [("radau", 2), ("radau", 3), ("legendre", 2), ("legendre", 4)]
 
@@ -164,40 +161,6 @@ def test_what_rolls_keeps_the_friction_that_it_has() -> None:
     again = in_mode(rolling, mode_of(stage))
     np.testing.assert_array_equal(again.guess.forces, stage.guess.forces)
     assert in_mode(again, mode_of(rolling)).formation is rolling.formation
-
-
-@pytest.mark.parametrize("begin, stop", [(0, 2), (2, 4), (5, 8), (0, 8)])
-def test_pieces_of_a_stage_are_linked(begin: int, stop: int) -> None:
-    until = Until(coordinate="x", value=0.1)
-    stage = make_stage("v1-palm v4-finger1 v6-finger2", until=until, opens=True)
-    pieces = link(split(stage, SCHEME, begin, stop, turned(stage, 0)))
-    ends = sorted({0, begin, stop, 8})
-    assert len(pieces) == len(ends) - 1
-    for piece, start, end in zip(pieces, ends[:-1], ends[1:], strict=True):
-        assert piece.directions.Xi[0] == (-1.0 if start == begin else 1.0)
-        share = stage.guess.fractions[start:end].sum()
-        assert piece.guess.duration == pytest.approx(share * stage.guess.duration, rel=1e-12)
-        assert piece.intervals >= LEAST_INTERVALS
-        # Between two pieces the contact comes to rest; the last one ends as the whole did.
-        assert piece.turns == (() if end == 8 else (0,))
-        assert (piece.until is until) == (end == 8) and piece.opens == (start == 0)
-
-
-def test_releasing_earlier_hands_a_stage_to_the_next_phase() -> None:
-    names = "v1-palm v3-finger1 v4-finger1 v6-finger2"
-    before, holding = make_stage(names), make_stage(names, 5)
-    free = make_stage("v1-palm v4-finger1 v6-finger2", 6, phase=1, opens=True)
-    stages = release_earlier([before, holding, free], 1)
-    assert stages is not None
-    assert [stage.phase for stage in stages] == [0, 1, 1]
-    assert [stage.opens for stage in stages] == [False, True, False]
-    moved = stages[1]
-    assert moved.formation is free.formation
-    np.testing.assert_array_equal(moved.guess.forces, holding.guess.forces[..., [0, 2, 3]])
-    # A phase keeps one stage at least, and what is gained cannot be held before.
-    assert release_earlier([before, holding, free], 0) is None
-    assert release_earlier([before, free], 0) is None
-    assert release_earlier([before, replace(holding, until=Until()), free], 1) is None
 
 
 THREE = "v1-palm v4-finger1 v6-finger2"

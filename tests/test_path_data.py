@@ -136,34 +136,6 @@ def test_a_planted_miss_is_found(
     assert short.max() <= 5e-7
 
 
-def test_misses_of_the_margin_and_of_torques(curves: tuple[Curve, ...]) -> None:
-    data = prepare(curves[2], EPSILON, Mesh().make_grid(curves[2], 20), 1)
-    profile = random_profile(data, 2)
-    low, high = data.misses(profile, 0.0)[0], data.misses(profile, 10.0)[0]
-    both = (low[:, :4] > 0) & (high[:, :4] > 0)
-    assert both.any()
-    np.testing.assert_allclose((high - low)[:, :4][both], 10.0, rtol=1e-12)
-    np.testing.assert_array_equal(low[:, 4:], high[:, 4:])
-    checks = data.slack(data.checks, data.interpolate(profile, data.sampling.checks))
-    worst = np.maximum(-checks, 0).reshape(len(data.nonempty), -1, 8).max(axis=1)
-    assert (low >= worst).all()
-    np.testing.assert_allclose(low, worst, rtol=0, atol=1e-3)
-
-
-@pytest.mark.parametrize("phase", [0, 3])
-def test_torque_polynomials_follow_inverse_dynamics(curves: tuple[Curve, ...], phase: int) -> None:
-    curve, rng = curves[phase], np.random.default_rng(phase)
-    plan = plan_path(curve, EPSILON, PlanOptions(), 1)
-    t = np.sort(rng.uniform(0.0, plan.motion.duration, 400))
-    exact = plan.motion.evaluate(t).tau
-    found = plan.torque.at(t)
-    # Quartic interpolation of torques up to 2 N m over intervals of 1/80: (1/80)^5 is 3e-10, times
-    # the derivatives that the slow ends bring.
-    np.testing.assert_allclose(found, exact, rtol=0, atol=1e-6)
-    assert plan.torque.breaks[0] == 0.0
-    assert plan.torque.breaks[-1] == plan.motion.duration
-
-
 @pytest.mark.parametrize("phase", [1, 4])
 def test_effort_is_the_integral_of_squared_torque(curves: tuple[Curve, ...], phase: int) -> None:
     curve = curves[phase]
@@ -252,23 +224,6 @@ def test_motion_integrates_its_acceleration(seed: int) -> None:
         assert speed == pytest.approx(math.sqrt(motion.profile.b[k + 1]), abs=1e-9 * top)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_profile_holds_the_derivatives_of_s(seed: int) -> None:
-    motion = random_motion(seed)
-    rng = np.random.default_rng(100 + seed)
-    k = rng.choice(motion.grid.nonempty, 40)
-    start, stop = motion.times[k], motion.times[k + 1]
-    t = start + rng.uniform(0.2, 0.8, 40) * (stop - start)
-    # Inside an interval s is smooth; the step trades 1e-16 / h^2 against h^2.
-    h = 0.02 * (stop - start)
-    before, (s, segment, here), after = (motion.locate(t + d) for d in (-h, 0 * h, h))
-    speed, fastest = (after[0] - before[0]) / (2 * h), np.sqrt(motion.profile.b.max())
-    np.testing.assert_allclose(np.sqrt(here.b), speed, rtol=0, atol=2e-4 * fastest)
-    bend = (after[0] - 2 * s + before[0]) / h**2
-    np.testing.assert_allclose(here.a, bend, rtol=0, atol=2e-4 * np.abs(motion.profile.a).max())
-    np.testing.assert_array_equal(segment, motion.grid.segment[k])
-
-
 def test_interval_of_length_zero_takes_no_time_and_jumps() -> None:
     motion = random_motion(0)
     (gap,) = np.flatnonzero(np.diff(motion.grid.segment))
@@ -315,14 +270,6 @@ def test_grid_has_its_elements_and_breaks(elements: int, breaks: list[float]) ->
         mine = grid.s[grid.segment == index]
         assert len(mine) >= 2 and mine[0] == segment.start and mine[-1] == segment.stop
     assert grid.kinds.tolist() == [FROM_REST, *[INSIDE] * (elements - 2), TO_REST]
-
-
-def test_grid_is_fine_towards_the_ends_or_where_it_is_asked_to_be() -> None:
-    grid = Mesh().make_grid(stub_curve(1.0, []), 20)
-    # Even in the angle of s = (1 - cos) / 2.
-    np.testing.assert_allclose(grid.edges[:, 0], (1 - np.cos(np.pi * np.arange(20) / 20)) / 2)
-    weighted = Mesh(np.array([0.5]), np.array([1.0, 3.0])).make_grid(stub_curve(1.0, []), 20)
-    assert (weighted.edges[:, 1] <= 0.5).sum() == 5
 
 
 ELEMENTS = 10

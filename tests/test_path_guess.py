@@ -213,15 +213,6 @@ def test_an_end_is_found_where_the_nearest_one_breaks_a_limit(hexagon: Problem) 
     np.testing.assert_allclose(part.z[-1, 2], part.z[-1, 4] - np.pi, atol=1e-9)
 
 
-def test_an_end_that_is_nowhere_is_named(hexagon: Problem) -> None:
-    start = trace_phases(hexagon)[4].end
-    formation = make_formation(hexagon.scene, "v1-palm v3-finger1 v0-finger2")
-    until = Until(parse_contact("v5-finger1", hexagon.scene))
-    with pytest.raises(InputError, match="v5-finger1 cannot be reached") as caught:
-        guess_phase(Phase(5, formation, until), start)
-    assert caught.value.key == "phases[6].until"
-
-
 def test_ends_ahead_lie_where_the_motion_goes(square: Problem) -> None:
     before = guess_curve(trace_phases(square)[2])[-1]
     landing, start = square.phases[3], before.z[-1]

@@ -215,35 +215,6 @@ def test_one_build_serves_all_phases(curves: tuple[Curve, ...]) -> None:
     assert all(cost.solves >= 1 and cost.iterations >= 1 for cost in costs)
 
 
-@pytest.mark.parametrize("limits", [(1.0, np.inf), (2.0, 2.0)])
-def test_joint_speed_limits_are_kept(
-    curves: tuple[Curve, ...], limits: tuple[float, float]
-) -> None:
-    for curve in (curves[0], curves[4]):
-        slow = plan_path(with_speed_limit(curve, limits), EPSILON, PlanOptions(intervals=COARSE), 1)
-        samples = slow.motion.evaluate(inner_times(slow, np.linspace(0, 1, 21)))
-        speeds = np.abs(samples.z_dot[:, 3:]).max(axis=0)
-        # b is kept to 5e-7 relative.
-        assert (speeds <= np.array(limits) * (1 + 1e-6)).all()
-        assert (speeds / limits).max() == pytest.approx(1.0, rel=1e-3)
-        assert slow.value > plan(curve).value
-        assert samples.c_n.min() >= EPSILON - 1e-6
-
-
-@pytest.mark.parametrize("phase, objective, intervals", [(1, "time", 160)])
-def test_small_dips_between_slack_nodes_are_lifted(
-    curves: tuple[Curve, ...], phase: int, objective: str, intervals: int
-) -> None:
-    """A force that dips below its limit between nodes at which it is above."""
-    chosen = plan(curves[phase], objective, intervals)
-    c_n = chosen.motion.evaluate(inner_times(chosen, np.linspace(0, 1, 41))).c_n
-    least = chosen.value if objective == "margin" else EPSILON
-    assert c_n.min() >= least - 1e-6
-    # The lift itself costs next to nothing, as a few nodes need it.
-    coarse = plan(curves[phase], objective, 80).value
-    assert chosen.value == pytest.approx(coarse, rel=2e-3)
-
-
 # No plan: why, where and by how much.
 
 

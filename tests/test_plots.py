@@ -17,7 +17,6 @@ from matplotlib.patches import Polygon
 from matplotlib.text import Text
 
 import tipping
-import wholearm
 from wholearm import plots
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
@@ -277,16 +276,6 @@ def test_text_is_inside_and_apart_in_other_widths(width: float, planned: Traject
 def test_widths_that_are_no_paper_are_refused(width: float, planned: Trajectory) -> None:
     with pytest.raises(InputError, match="width"):
         plots.force_margins(planned, width=width)
-
-
-def test_loaded_trajectory_gives_the_same_figure(
-    planned: Trajectory, figure: Figure, tmp_path: Path
-) -> None:
-    planned.save(tmp_path / "plan.npz")
-    loaded = plots.force_margins(wholearm.load_trajectory(tmp_path / "plan.npz"))
-    plots.save(figure, tmp_path / "planned.svg")
-    plots.save(loaded, tmp_path / "loaded.svg")
-    assert (tmp_path / "planned.svg").read_bytes() == (tmp_path / "loaded.svg").read_bytes()
 
 
 def test_simulation_is_drawn_over_the_plan(planned: Trajectory) -> None:

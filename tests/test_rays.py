@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-import warnings
 from functools import cache
 
 import numpy as np
 import pytest
 
 from shipped import HEPTAGON, IMPACTS, LANDING, SQUARE, problem_of, solved
-from wholearm.contacts.closing import contact_table, first_contact
+from wholearm.contacts.closing import contact_table
 from wholearm.contacts.explicit import measure_gap, place
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.arcs import find_on, join, take
@@ -22,7 +21,6 @@ from wholearm.planning.lower_bound.lower_bound import look_along
 from wholearm.planning.lower_bound.speed_sweep import NoMotionError
 from wholearm.problem.definition import End, Until
 from wholearm.problem.goal import Goal
-from wholearm.search import times
 from wholearm.search.border_limits import sketch, survey
 from wholearm.search.cell_paths import can_set_out, time_ways
 from wholearm.search.edges import Link, cut_curve, time_parts
@@ -87,15 +85,6 @@ def test_only_ways_that_can_be_set_out_on_have_times() -> None:
     assert np.isinf(time_ways(own.scene, 1e3, rays.labels, rays.starts, rays.ends)).all()
 
 
-def test_ways_beyond_the_reach_of_a_tip_have_no_time() -> None:
-    own, rays = around_the_start()
-    labels, epsilon = rays.labels.copy(), problem_of(SQUARE).epsilon
-    labels[:, 1] = first_contact(own.scene, 0) + own.scene.polygon.n_vertices
-    far = rays.starts + np.array([1.0, 0.0])
-    assert np.isinf(time_ways(own.scene, epsilon, labels, rays.starts, far)).all()
-    assert not can_set_out(own.scene, epsilon, labels, far, rays.ways).any()
-
-
 def look(curve: Curve, epsilon: float) -> float:
     try:
         return look_along((curve,), epsilon, 100)
@@ -121,17 +110,6 @@ def test_times_of_borders_are_those_of_sweeps_along_traced_curves() -> None:
     # Twelve points and twenty-four intervals leave an error of a few in a hundred.
     assert found == pytest.approx(np.array(expected), rel=0.04)
     assert np.isfinite(found[:, 0]).all()
-
-
-def test_borders_with_ambiguous_forces_are_not_passed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With or without viscous friction, and without a warning."""
-    problem = problem_of(HEPTAGON)
-    (curve,) = trace_phases(problem)[:1]
-    monkeypatch.setattr(times, "UNIQUENESS_MARGIN", 1.1)
-    for own in (problem, problem.with_(viscous=0.0)):
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            assert np.isinf(time_borders(own, [make_border(curve)])).all()
 
 
 def test_a_chain_of_impacts_is_bounded_as_its_plan_takes() -> None:

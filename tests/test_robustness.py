@@ -264,12 +264,6 @@ def test_none_and_all_have_one_open_end() -> None:
     assert str(every) == "100.0 % (20 of 20, 95 %: 83.9 to 100.0 %)"
 
 
-def test_nothing_says_nothing() -> None:
-    share = count_share(0, 0)
-    assert math.isnan(share.value) and (share.low, share.high) == (0.0, 1.0)
-    assert str(share) == "none"
-
-
 def wait_and_square(number: int) -> tuple[int, int]:
     time.sleep(0.02)
     return number**2, os.getpid()
