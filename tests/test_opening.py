@@ -93,8 +93,8 @@ def test_hands_are_changed_alike_where_they_are_alike() -> None:
     for own in changes:
         right, left = alike.with_(own.values, phases=[]).scene.fingers
         bases = np.array([right.base, left.base])
-        assert right.length == left.length
-        assert bases[0].tolist() == [-bases[1, 0], bases[1, 1]]
+        assert right.length == pytest.approx(left.length, rel=1e-12)
+        assert bases[0] == pytest.approx([-bases[1, 0], bases[1, 1]], rel=1e-12)
     uneven = alike.with_(length1=0.9 * alike.scene.fingers[0].length, base2=[-0.085, -0.01])
     keys = [f"fingers.{k}.{what}" for what in ("base[1]", "length") for k in (1, 2)]
     assert [own.parameter.key for own in list_hands(uneven.scene)[:4]] == keys
