@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import pickle
 import sys
 import time
@@ -54,6 +55,8 @@ NEAR = 1e-4
 """How far beside a goal the hand may close instead, in radii of gyration."""
 TRIED = 3
 """Most numbers with which the goal is looked for."""
+SYMMETRIC = 1e-9
+"""Relative difference of lengths and bases up to which the hand is symmetric."""
 HANDS = (1.05, 0.95, 1.1, 0.9, 1.2, 0.8)
 """Lengths of fingers and distances of their bases that are tried, over those given."""
 TIMES, AT_LEAST = 4.0, 20.0
@@ -442,7 +445,7 @@ def list_hands(scene: Scene) -> list[Change]:
     half, base = (first - second) / 2, "fingers.{}.base[1]"
     given: list[tuple[str, float, float, tuple[str, ...]]]
     # Where fingers stand has decided more often than how long they are.
-    if first == -second:
+    if math.isclose(first, -second, rel_tol=SYMMETRIC):
         keys = base.format(1), base.format(2)
         given = [("x of base 1, mirrored for base 2,", first, half, keys)]
     else:
@@ -450,7 +453,7 @@ def list_hands(scene: Scene) -> list[Change]:
             ("x of base 1", first, half, (base.format(1),)),
             ("x of base 2", second, -half, (base.format(2),)),
         ]
-    if right.length == left.length:
+    if math.isclose(right.length, left.length, rel_tol=SYMMETRIC):
         given.append(("length of both fingers", right.length, right.length, ("length",)))
     else:
         given.append(("length of finger 1", right.length, right.length, ("fingers.1.length",)))
