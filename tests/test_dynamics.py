@@ -3,20 +3,19 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 import pytest
 
-from plane import SQUARE, cross, make_formation, make_scene
+from plane import SQUARE, make_formation, make_scene, measure_slip, unbalance
 from pushed import forward
 from wholearm.common.arrays import Array
 from wholearm.contacts.closing import close_finger
-from wholearm.contacts.elemental import build_features, build_geometry
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions, build_forward, energy, inverse, reduced_inertia
 from wholearm.problem.read import build_problem
+from wholearm.results.trajectory import Samples
 from wholearm.scene.model import Friction, Scene
 from wholearm.verification.minimal_coordinates import reduce_to_first_joint
 
@@ -57,48 +56,17 @@ def test_three_routes_agree(curves: tuple[Curve, ...]) -> None:
         assert -(Phi_2 * v[3] + Phi_3) / Phi_1 == pytest.approx(z_ddot[3], abs=1e-10 * size)
 
 
-def contact_frames(formation: Formation, z: Array) -> tuple[Array, Array]:
-    """Contact points and normals, (n_c, 2) each; their own tests measure them."""
-    scene = formation.scene
-    parts = [build_geometry(contact, scene) for contact in formation.contacts]
-    columns = [ca.horzcat(*(getattr(p, name) for p in parts)) for name in ("point", "normal")]
-    points, normals = ca.Function("frames", [build_features(scene).z], columns)(z)
-    return points.full().T, normals.full().T
-
-
 def newton_euler_residual(
     formation: Formation, z: Array, v: Array, z_ddot: Array, tau: Array, c: Array
 ) -> Array:
     """What is missing in each body's balance: 2 forces and 1 moment, and 2 joint moments."""
-    scene = formation.scene
-    points, normals = contact_frames(formation, z)
-    force = np.zeros_like(points)
-    for k, contact in enumerate(formation.contacts):
-        at, n = points[k], normals[k]
-        t = np.array([n[1], -n[0]])
-        object_speed = v[:2] + v[2] * np.array([-(at - z[:2])[1], (at - z[:2])[0]])
-        finger_speed = np.zeros(2)
-        if contact.finger is not None:
-            arm = at - np.asarray(scene.fingers[contact.finger].base)
-            finger_speed = v[3 + contact.finger] * np.array([-arm[1], arm[0]])
-        slip = (object_speed - finger_speed) @ t
-        c_t = -scene.friction.of(contact.finger) * np.sign(slip) * c[k]
-        if contact in formation.rolling:
-            assert abs(slip) < 1e-14
-            c_t = c[formation.n_contacts + formation.rolling_rows.index(k)]
-        force[k] = c[k] * n + c_t * t
-    body = scene.polygon
-    assert body.inertia is not None
-    weight = np.array([0.0, -body.mass * scene.gravity])
-    linear = force.sum(axis=0) + weight - body.mass * z_ddot[:2]
-    angular = cross(points - z[:2], force).sum() - body.inertia * z_ddot[2]
-    joints = []
-    for finger, link in enumerate(scene.fingers):
-        mine = [c.finger == finger for c in formation.contacts]
-        moment = cross(points[mine] - np.asarray(link.base), -force[mine]).sum()
-        drag = link.viscous * v[3 + finger] + link.dry * np.sign(v[3 + finger])
-        joints.append(tau[finger] + moment - drag - link.inertia * z_ddot[3 + finger])
-    return np.array([*linear, angular, *joints])
+    n_c, rows = formation.n_contacts, list(formation.rolling_rows)
+    slip = measure_slip(formation, z, v)
+    assert (np.abs(slip[rows]) < 1e-14).all()
+    c_t = -formation.friction * np.sign(slip) * c[:n_c]
+    c_t[rows] = c[n_c:]
+    samples = Samples(z, v, z_ddot, tau, c[:n_c], c_t)
+    return np.asarray(unbalance(formation, samples, np.sign(v[3:]))[0])
 
 
 def test_every_body_obeys_newton_and_euler(curves: tuple[Curve, ...]) -> None:
