@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from plane import measure_slip, place_corners, unbalance, with_speed_limit
-from shipped import HEPTAGON, IMPACTS, plan_of, problem_of
+from shipped import HEPTAGON, plan_of, problem_of
 from tipping import box, tip
 from toys import Toy, constant
 from wholearm.common.arrays import Array
@@ -24,11 +24,9 @@ from wholearm.mechanics.dynamics import inverse
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain import path_plan, task
-from wholearm.planning.path_domain.impact_sequence import ImpactSequence, make_sequence
 from wholearm.planning.path_domain.path_motion import PathMotion, directions_of
 from wholearm.planning.path_domain.path_nlp import PathNLP, build_path_nlp
 from wholearm.planning.path_domain.path_plan import plan_curves, plan_path
-from wholearm.planning.path_domain.sequence_plan import plan_sequence
 from wholearm.planning.path_domain.terms import LimitShape
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
@@ -53,31 +51,6 @@ def plan(curve: Curve, objective: str = "time", intervals: int = COARSE) -> Phas
     return plan_path(curve, EPSILON, options, 1, ALLOWED if objective == "margin" else None)
 
 
-def inner_times(chosen: PhasePlan[PathMotion], fractions: Array) -> Array:
-    """Times at `fractions` of every interval that has a length."""
-    times = chosen.motion.times
-    spans = np.diff(times)
-    k = np.flatnonzero(spans > 0)
-    return np.asarray((times[k, None] + fractions * spans[k, None]).ravel())
-
-
-@pytest.mark.parametrize("objective", OBJECTIVES)
-@pytest.mark.parametrize("phase", [4])
-def test_limits_hold_at_random_instants(
-    curves: tuple[Curve, ...], phase: int, objective: str
-) -> None:
-    chosen = plan(curves[phase], objective, 10)
-    fractions = np.random.default_rng(phase).uniform(0, 1, 50)
-    samples = chosen.motion.evaluate(inner_times(chosen, fractions))
-    # What is asked of a plan.
-    assert samples.c_n.min() >= EPSILON - 1e-6
-    assert np.abs(samples.tau).max() <= LIMIT + 1e-6
-    if objective == "margin":
-        assert samples.c_n.min() >= chosen.value - 1e-6
-        assert samples.c_n.min() == pytest.approx(chosen.value, abs=1e-2)
-        assert chosen.motion.duration <= ALLOWED * (1 + 1e-6)
-
-
 def test_a_phase_that_only_a_quick_motion_carries(curves: tuple[Curve, ...]) -> None:
     """Slow motions cannot press v1 on the palm so hard in phase 3."""
     epsilon = 0.8
@@ -90,46 +63,6 @@ def test_a_phase_that_only_a_quick_motion_carries(curves: tuple[Curve, ...]) -> 
 
 
 # Phases that are run through one after the other.
-
-
-@pytest.fixture(scope="module")
-def chain() -> ImpactSequence:
-    """Three phases that impacts join."""
-    problem = problem_of(IMPACTS)
-    return make_sequence(problem.phases, trace_phases(problem)).split()[0]
-
-
-@cache
-def plan_joined(chain: ImpactSequence, objective: str) -> list[PhasePlan[PathMotion]]:
-    options = PlanOptions(objective=objective, intervals=12)
-    return plan_sequence(chain, EPSILON, options, 0.5 if objective == "margin" else None)
-
-
-@pytest.mark.parametrize("objective", OBJECTIVES)
-def test_limits_hold_along_a_chain(chain: ImpactSequence, objective: str) -> None:
-    plans = plan_joined(chain, objective)
-    fractions = np.random.default_rng(6).uniform(0, 1, 50)
-    for chosen in plans:
-        samples = chosen.motion.evaluate(inner_times(chosen, fractions))
-        assert samples.c_n.min() >= EPSILON - 1e-6
-        assert np.abs(samples.tau).max() <= LIMIT + 1e-6
-        if objective == "margin":
-            assert samples.c_n.min() >= chosen.value - 1e-6
-    if objective == "margin":
-        assert sum(chosen.motion.duration for chosen in plans) <= 0.5 * (1 + 1e-6)
-
-
-def test_a_chain_is_one_problem(chain: ImpactSequence) -> None:
-    plans = plan_joined(chain, "time")
-    assert all(plan.value == plan.motion.duration for plan in plans)
-    motions = [plan.motion for plan in plans]
-    speeds = [np.sqrt(motion.profile.b[[0, -1]]) for motion in motions]
-    assert speeds[0][0] == speeds[2][1] == 0.0
-    for before, after in pairwise(speeds):
-        assert before[1] == after[0] > 0.1
-    for one, other in pairwise(motions):
-        end, start = one.evaluate(np.array([one.duration])), other.evaluate(np.zeros(1))
-        np.testing.assert_allclose(start.z, end.z, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("objective", OBJECTIVES)

@@ -15,7 +15,6 @@ from wholearm.planning.plan import solve
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem
 from wholearm.results.trajectory import Samples, Trajectory
-from wholearm.verification.verify import verify
 
 OBJECTIVES = ["time", "effort", "margin"]
 LIMIT = 2.0
@@ -104,17 +103,6 @@ def test_every_sample_obeys_newton_and_euler(
         np.testing.assert_allclose(row.c_t[moving], law[moving], rtol=1e-12)
         assert row.c_n.min() >= problem.epsilon - 1e-6
         assert np.abs(row.tau).max() <= LIMIT + 1e-6
-
-
-def test_the_simulator_follows(problem: Problem, plans: dict[str, Trajectory]) -> None:
-    report = verify(problem, plans["margin"])
-    assert report.ok and abs(report.missed_by) < 1e-5
-    for phase in report.phases:
-        assert phase.end_deviation is not None
-        # What is asked of a phase: 1e-5.
-        assert max(phase.end_deviation.position, phase.end_deviation.angle) < 1e-5
-    impulses = [phase.impact.impulse for phase in report.phases if phase.impact is not None]
-    assert len(impulses) == 2 and min(impulses) > 0
 
 
 def test_what_an_impact_saves_is_what_a_stop_costs(plans: dict[str, Trajectory]) -> None:

@@ -25,7 +25,6 @@ from timed import (
     total,
 )
 from tipping import PALM, box, tip, tipped
-from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
@@ -278,19 +277,6 @@ def test_the_released_contact_opens(motions: list[TimeMotion]) -> None:
     assert (opening[100:] > 1e-5).all() and (opening[20:] > 1e-7).all()
     held = measure_gaps(gaps, before.evaluate(np.linspace(0, before.duration, 9)).z)
     assert np.abs(held).max() < 1e-9
-
-
-def test_the_object_lands_at_rest_on_its_next_edge(motions: list[TimeMotion]) -> None:
-    problem, (z, v) = landing(), motions[-1].stages[-1].points.nodes[-1]
-    scene = problem.scene
-    edge = Formation(scene, tuple(parse_contact(f"v{k}-palm", scene) for k in (1, 2)))
-    assert np.abs(measure_gaps(edge, z)).max() < 1e-9
-    assert z[2] == pytest.approx(scene.polygon.flush_angle(1), abs=1e-8)
-    # The solver's tolerance of 1e-8, of speeds of up to 20 rad/s.
-    np.testing.assert_allclose(v, 0.0, atol=1e-6)
-    last = motions[-1].evaluate(motions[-1].duration - np.array([2e-3, 1e-3, 0.0]))
-    heights = measure_gaps(edge, last.z)[:, 1]
-    assert heights[0] > heights[1] > 0
 
 
 def test_the_torques_alone_carry_the_object_to_its_goal(stages: list[StageMotion]) -> None:

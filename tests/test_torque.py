@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from planned import plan
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.results.torque import TorqueProfile, read_torque_csv
 from wholearm.results.torque_table import ERROR, place_rows, read_rows, sample_rows
-from wholearm.verification.verify import verify
 
 GOOD = "t,tau1,tau2\n0,1,-1\n0.5,2,-2\n0.5,4,0\n2,1,3\n"
 
@@ -220,14 +218,6 @@ def test_rows_keep_torque_limits() -> None:
 
     rows = place_rows(TorqueProfile.fit(t, torque, 4), 1e-3)
     assert np.abs(rows[:, 1:]).max() < 2 * (1 + 1e-12)
-
-
-def test_rows_carry_a_motion_as_its_torques_do() -> None:
-    problem, trajectory = plan()
-    report = verify(problem, read_rows(place_rows(trajectory.torque)))
-    assert report.ok, report.to_text()
-    for phase, arrival in zip(report.phases, trajectory.phase_starts[1:], strict=True):
-        assert phase.arrival == pytest.approx(arrival, abs=1e-5)
 
 
 @pytest.mark.parametrize("rate", [10.0, 1000.0, 31.7])

@@ -6,11 +6,9 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
-from multiprocessing import get_context
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -119,18 +117,6 @@ def square(number: int) -> int:
     return number**2
 
 
-def die_of(task: tuple[str, int]) -> int:
-    """Ends its process: of -1 always, of multiples of 40 the first time."""
-    folder, number = task
-    if number == -1:
-        os._exit(3)
-    marker = Path(folder) / str(number)
-    if number % 40 == 0 and not marker.exists():
-        marker.touch()
-        os._exit(3)
-    return number**2
-
-
 def test_every_task_is_answered_once() -> None:
     answers = list(run_all(square, range(200), partial(ThreadPoolExecutor, 3)))
     assert sorted(task for task, _ in answers) == list(range(200))
@@ -187,12 +173,3 @@ def test_what_workers_die_of_is_found(ahead: int) -> None:
     assert sorted(task for task, _ in answers) == list(range(30))
     died = [task for task, answer in answers if isinstance(answer, DiedError)]
     assert died == [20]
-
-
-def test_processes_that_die_are_replaced(tmp_path: Path) -> None:
-    numbers = [*range(1, 60), -1]
-    pool = partial(ProcessPoolExecutor, 2, get_context("forkserver"))
-    answers = dict(run_all(die_of, [(str(tmp_path), number) for number in numbers], pool))
-    died = [number for (_, number), answer in answers.items() if isinstance(answer, DiedError)]
-    assert died == [-1] and len(answers) == 60
-    assert all(answers[str(tmp_path), number] == number**2 for number in range(1, 60))
