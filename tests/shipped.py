@@ -44,3 +44,11 @@ def chart() -> FormationMap:
 
 def plan_of(path: Path, objective: str = "time") -> Trajectory:
     return solved(path, objective).trajectory
+
+
+@cache
+def tipping(degrees: float = 9.5) -> Problem:
+    """The heptagon tips over its left vertex; to do so, it has to slide."""
+    contacts = ["v0-palm", "v2-finger1", "v5-finger2"]
+    phase = {"contacts": contacts, "until": {"phi_deg": degrees}}
+    return problem_of(HEPTAGON).with_({"phases": [phase]})

@@ -6,8 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from planned import change, plan, plan_landing
-from wholearm.common.arrays import Array
+from planned import brake_less, change, plan, plan_landing
 from wholearm.common.errors import JammingError, ReplayError
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning import replay_check as self_check
@@ -27,11 +26,6 @@ from wholearm.results.report import Report
 from wholearm.results.trajectory import Trajectory
 from wholearm.verification.verdict import Allowance, find_least_force
 from wholearm.verification.verify import verify
-
-
-def brake_less(starts: Array, c: Array) -> Array:
-    c[(starts > 0.3) & (starts < 0.4 - 1e-9)] *= 0.97
-    return c
 
 
 def test_a_plan_that_holds() -> None:

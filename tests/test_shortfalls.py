@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from refused import ask_shoved
-from shipped import HEPTAGON, problem_of
+from shipped import HEPTAGON, problem_of, tipping
 from wholearm.benchmark.stress import refusals
 from wholearm.benchmark.stress.refusals import judge
 from wholearm.common.errors import InfeasibleError, InputError, JammingError
@@ -156,22 +156,14 @@ def test_the_event_that_ends_a_curve(until: str, kind: str) -> None:
 )
 def test_a_leg_through_a_cell(x: float, changes: dict[str, float], kind: str) -> None:
     """The object tips over its left vertex while it slides by `x`."""
-    table = dict(read_problem(str(HEPTAGON)).table)
-    contacts = ["v0-palm", "v2-finger1", "v5-finger2"]
-    problem = build_problem(
-        {**table, "phases": [{"contacts": contacts, "until": {"phi_deg": 9.5}}]}
-    ).with_(changes)
+    problem = tipping().with_(changes)
     stop = (float(problem.start[0]) + x, float(problem.start[2]) + 0.2)
     verdict = judge(problem, InfeasibleError("phase 1 is infeasible"), [stop])
     assert verdict.kind == kind
 
 
-def test_a_leg_into_the_palm_has_no_end(heptagon: Problem) -> None:
-    table = dict(read_problem(str(HEPTAGON)).table)
-    contacts = ["v0-palm", "v2-finger1", "v5-finger2"]
-    problem = build_problem(
-        {**table, "phases": [{"contacts": contacts, "until": {"phi_deg": -13.0}}]}
-    )
+def test_a_leg_into_the_palm_has_no_end() -> None:
+    problem = tipping(-13.0)
     stop = (float(problem.start[0]) + 0.01, float(problem.start[2]) - 0.2)
     verdict = judge(problem, InfeasibleError("phase 1 is infeasible"), [stop])
     assert verdict.kind == "open" and "no place of its end" in verdict.reason

@@ -14,7 +14,7 @@ import pytest
 import wholearm
 from crossing import hexagon, measure_fingers, shorten, slid
 from integrated import integrate_phase
-from planned import CosineMotion, change, plan
+from planned import CosineMotion, brake_less, change, plan
 from pushed import forward
 from wholearm.benchmark.precision.reference import solve_motion
 from wholearm.common.arrays import Array
@@ -300,10 +300,6 @@ def test_contact_is_lost_when_the_squeeze_fades() -> None:
 
 def test_overshoot_arrives_at_a_speed() -> None:
     problem, trajectory = plan()
-
-    def brake_less(starts: Array, c: Array) -> Array:
-        c[(starts > 0.3) & (starts < 0.4 - 1e-9)] *= 0.97
-        return c
 
     simulation = simulate(problem, change(trajectory.torque, brake_less))
     event = simulation.find(EventKind.ARRIVAL)[0]

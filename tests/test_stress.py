@@ -5,13 +5,12 @@ from __future__ import annotations
 import argparse
 import tomllib
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 
-from shipped import HEPTAGON
+from shipped import HEPTAGON, tipping
 from wholearm.benchmark.stress.cell_curves import find_best, list_ends
 from wholearm.benchmark.stress.damage import look, run_file, to_toml
 from wholearm.benchmark.stress.event_tracing import follow, resample, slides
@@ -219,14 +218,6 @@ def test_inertia_is_that_of_the_determinant(
         formation, formation.evaluate(z[:1], z_s[:1]), Directions(part.Xi, part.sigma)
     )
     assert ratios[0] == pytest.approx(own[0], rel=1e-9)
-
-
-@cache
-def tipping() -> Problem:
-    """The heptagon tips over its left vertex; to do so, it has to slide."""
-    table = dict(read_problem(str(HEPTAGON)).table)
-    contacts = ["v0-palm", "v2-finger1", "v5-finger2"]
-    return build_problem({**table, "phases": [{"contacts": contacts, "until": {"phi_deg": 9.5}}]})
 
 
 def _ends() -> Array:

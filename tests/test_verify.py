@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from crossing import measure_fingers, slid
-from planned import change, plan, plan_landing
+from planned import brake_less, change, plan, plan_landing
 from shipped import BOX, HEPTAGON, plan_of, problem_of
 from tipping import PALM, box, scale, tipped
 from wholearm.common.arrays import Array
@@ -24,11 +24,6 @@ from wholearm.simulation.simulate import simulate
 from wholearm.verification.margins import find_lowest, list_normal_forces
 from wholearm.verification.verdict import Allowance
 from wholearm.verification.verify import verify
-
-
-def brake_less(starts: Array, c: Array) -> Array:
-    c[(starts > 0.3) & (starts < 0.4 - 1e-9)] *= 0.97
-    return c
 
 
 def test_a_good_plan_passes() -> None:

@@ -1,13 +1,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from shipped import HEPTAGON
+from shipped import tipping
 from wholearm.benchmark.stress.event_tracing import weights
 from wholearm.benchmark.stress.slow_motion import fast_margin
 from wholearm.common.errors import InfeasibleError
@@ -23,16 +22,6 @@ from wholearm.planning.time_domain.initial_path import (
 )
 from wholearm.planning.time_domain.time_explain import refuse_ways
 from wholearm.planning.time_domain.time_plan import plan_phases
-from wholearm.problem.definition import Problem
-from wholearm.problem.read import build_problem, read_problem
-
-
-@cache
-def tipping() -> Problem:
-    """The heptagon tips over its left vertex; to do so, it has to slide."""
-    table = dict(read_problem(str(HEPTAGON)).table)
-    contacts = ["v0-palm", "v2-finger1", "v5-finger2"]
-    return build_problem({**table, "phases": [{"contacts": contacts, "until": {"phi_deg": 9.5}}]})
 
 
 def test_stretches_of_a_way_keep_their_senses() -> None:
