@@ -36,20 +36,16 @@ from ..scene.model import Scene
 
 PARTS, DIVISIONS = 16, 13
 """An interval in which the label changes is cut into so many parts, so often: to rounding."""
-CROWDED = 8
-"""Most changes that are told apart between two neighbouring places."""
+CROWDED = 8  # Most changes that are told apart between two neighbouring places
 SAME_ANGLE, ROUNDING = 1e-7, 1e-11
 """Differences [rad] below which a closed finger that touches one of a border's contacts, and one
 that touches anything, is where the border has it: at the ends of a link angles lose digits."""
 ASIDE = 3e-8
 """Distance beside a pointed tip at a vertex at which the two contacts that meet there are looked
 up, in radii of gyration."""
-LEVEL = 3e-11
-"""Height within which vertices lie on the line of a link, in radii of gyration."""
-LONGEST = 0.06
-"""Longest step in x between neighbouring points of a border, in radii of gyration."""
-NOWHERE = -1
-"""Fills the labels of places that are no border."""
+LEVEL = 3e-11  # Height within which vertices lie on the line of a link, in radii of gyration
+LONGEST = 0.06  # Longest step in x between neighbouring points of a border, in radii of gyration
+NOWHERE = -1  # Fills the labels of places that are no border
 
 
 @dataclass(frozen=True, eq=False)

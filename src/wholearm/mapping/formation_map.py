@@ -46,24 +46,18 @@ from .borders import (
 )
 from .formation_list import Stretch, list_formations, trace_problem
 
-BEYOND = np.radians(6.0)
-"""Reach of the window beyond the flush angles next to the plan [rad]."""
-BESIDE = 0.25
-"""The same over half the distance of these angles, at most."""
-WAYS = ("+x", "-x", "+phi", "-phi")
-"""Directions of travel inside a cell."""
+BEYOND = np.radians(6.0)  # Reach of the window beyond the flush angles next to the plan [rad]
+BESIDE = 0.25  # The same over half the distance of these angles, at most
+WAYS = ("+x", "-x", "+phi", "-phi")  # Directions of travel inside a cell
 REGULAR = 1e-9
 """Least ratio of singular values of A at which contacts count as independent; least determinant of
 their wrenches, in radii of gyration, likewise."""
 _WAYS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-Flush = tuple[int | None, int]
-"""A finger (None for the palm) and an edge that lies flush on it."""
+Flush = tuple[int | None, int]  # A finger (None for the palm) and an edge that lies flush on it
 SAMPLES = 100
 """Places per radian of the window, and least across it, at which borders are looked for."""
-ARROWS = 24
-"""Places across the map at which directions inside cells are checked."""
-CROSSED = -5
-"""Cell of the places where the closed fingers would overlap."""
+ARROWS = 24  # Places across the map at which directions inside cells are checked
+CROSSED = -5  # Cell of the places where the closed fingers would overlap
 SAME_PLACE = 3e-5
 """Distance, in radii of gyration and radians, below which ends of borders are one crossing."""
 

@@ -45,32 +45,20 @@ NEAR = (0.015, float(np.radians(0.5)))
 """Distances within which poses are on a border or crossing: x in radii of gyration, phi in rad."""
 MISSED = 4.0
 """Distance from a border, over `NEAR`, within which a leg beside it is said to be a near miss."""
-PLACES = 401
-"""Places along a leg at which contacts are looked up."""
+PLACES = 401  # Places along a leg at which contacts are looked up
 SAME_PLACE = 1e-3
 """Length of a part over `NEAR` below which it is left out: its ends are one crossing."""
-BESIDE = 1e-6
-"""Gap between parts, over `NEAR`, above which what lies between cannot be reached."""
-SHORTEST = 0.3
-"""Share of a short leg that stands for `NEAR` along it."""
-AT_START = 1e-4
-"""Length over `NEAR` below which the first part of a leg counts as rounding."""
-INSIDE = 0.2
-"""Distance of the end of a leg from the end of what can be reached, over `NEAR`."""
-PROBES = 9
-"""Places of an excursion into a neighbouring cell at which its depth is measured."""
-Span = tuple[Numbers, float, float]
-"""A label and the parameters between which a leg has it."""
-DIGITS = 1e-5
-"""Coordinates that end a phase are rounded to this, in radii of gyration and radians."""
-SAME = 9
-"""Decimals of an angle in degrees beyond which there is rounding only."""
-REPLANS = 12
-"""Most times that the rest of a leg is looked at anew from where its phases so far end."""
-BEFORE = 0.98
-"""Share of a part at which phases that guide it end: short of the change of contacts."""
-Step = tuple[tuple[Contact, ...], Until]
-"""One phase: its contacts and what ends it."""
+BESIDE = 1e-6  # Gap between parts, over `NEAR`, above which what lies between cannot be reached
+SHORTEST = 0.3  # Share of a short leg that stands for `NEAR` along it
+AT_START = 1e-4  # Length over `NEAR` below which the first part of a leg counts as rounding
+INSIDE = 0.2  # Distance of the end of a leg from the end of what can be reached, over `NEAR`
+PROBES = 9  # Places of an excursion into a neighbouring cell at which its depth is measured
+Span = tuple[Numbers, float, float]  # A label and the parameters between which a leg has it
+DIGITS = 1e-5  # Coordinates that end a phase are rounded to this, in radii of gyration and radians
+SAME = 9  # Decimals of an angle in degrees beyond which there is rounding only
+REPLANS = 12  # Most times that the rest of a leg is looked at anew from where its phases so far end
+BEFORE = 0.98  # Share of a part at which phases that guide it end: short of the change of contacts
+Step = tuple[tuple[Contact, ...], Until]  # One phase: its contacts and what ends it
 
 
 class Part(NamedTuple):

@@ -13,8 +13,7 @@ from ..problem.read import build_problem
 from ..scene.polygon import Polygon
 from .formation_list import format_route, list_formations
 
-_MOST = 50
-"""Corners of a polygon that a file still shows well."""
+_MOST = 50  # Corners of a polygon that a file still shows well
 _SIZE, _MASS = 0.05, 0.2
 """Radius [m] and mass [kg] of the object whose hand is scaled to others of the same density."""
 _LEFT, _START, _SLIDE = (-1.6, -0.2), (0.3, 1.2), 0.4
@@ -22,8 +21,7 @@ _LEFT, _START, _SLIDE = (-1.6, -0.2), (0.3, 1.2), 0.4
 fingers would meet above them; and how far they slide. The right joint is at 1.6."""
 _OTHERS = tuple((wide, start) for wide in (True, False) for start in (1.2, 0.8, 0.3, 0.0))
 """Other hands and starts, where the corners are given and the first does not close on them."""
-_COMMENTS = 31
-"""Column of the comments."""
+_COMMENTS = 31  # Column of the comments
 
 
 def write_template(

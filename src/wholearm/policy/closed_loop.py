@@ -7,10 +7,8 @@ from collections.abc import Mapping
 from ..common.arrays import Array
 from .playback import Policy
 
-ROOM = 1.0
-"""Time that a simulation goes on after the policy's own, over that."""
-EXTRA = 0.05
-"""Time in which the contact of the first phase may close, in addition [s]."""
+ROOM = 1.0  # Time that a simulation goes on after the policy's own, over that
+EXTRA = 0.05  # Time in which the contact of the first phase may close, in addition [s]
 
 
 class ClosedLoop:

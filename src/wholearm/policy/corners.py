@@ -37,8 +37,7 @@ OTHERS = (*GROUPS["geometry"], *GROUPS["gain"])
 _ORDER = [0, 2, 4, 1, 3]
 """Columns of derivatives, of 1, a, b, squeeze and s', in the order used here."""
 
-Motion = tuple[Array, Array, Array]
-"""a, b and squeeze at n places."""
+Motion = tuple[Array, Array, Array]  # a, b and squeeze at n places
 
 
 class Corners(NamedTuple):

@@ -24,57 +24,40 @@ from collections.abc import Mapping, Sequence
 from math import ceil, isfinite, sqrt
 from typing import Any, NamedTuple
 
-SAME = 1e-12
-"""Difference of levels that is none."""
-SMOOTH = 0.3
-"""Part of a bias that the last sample makes up."""
-FELT = 0.1
-"""Force with which a contact presses, over the mean of all."""
-FEW = 0.2
-"""Least force that is aimed at, over the mean of all: a part of less is no measure."""
-SHARE = 0.3
-"""Part of the torque limits that feedback adds at most."""
+SAME = 1e-12  # Difference of levels that is none
+SMOOTH = 0.3  # Part of a bias that the last sample makes up
+FELT = 0.1  # Force with which a contact presses, over the mean of all
+FEW = 0.2  # Least force that is aimed at, over the mean of all: a part of less is no measure
+SHARE = 0.3  # Part of the torque limits that feedback adds at most
 END_INTEGRAL = 30.0
 """Gain on the integral of what the angles are off at the end, over that on the angles [1/s]."""
 LEVEL, PART = 1.0, 0.5
 """Level of limits below which feedback gives way, in reserves: at most the first, and at most the
 second times that of the reference, which may have less."""
-LEAST = 0.3
-"""Level of limits at an arrival, of all contacts, that is worth another squeeze."""
-IGNORED = 1e6
-"""Level from which on a limit is none."""
-CORRECTION = 0.25
-"""Gain on the speed, times the period and the delay."""
-MEMORY = 0.2
-"""Gain on the integral of the speed, over the square of that on the speed."""
+LEAST = 0.3  # Level of limits at an arrival, of all contacts, that is worth another squeeze
+IGNORED = 1e6  # Level from which on a limit is none
+CORRECTION = 0.25  # Gain on the speed, times the period and the delay
+MEMORY = 0.2  # Gain on the integral of the speed, over the square of that on the speed
 LEAST_SPEED = 0.4
 """Part of the touching speed below which braking never aims: friction turns round with motion."""
-SLOW = 0.5
-"""Part of the reference's speed below which the motion does not brake with it."""
-LAST = 0.02
-"""Part of the curve, at its end, on which standing still counts as having arrived."""
-STARTING = 10
-"""Periods in which the motion may start before standing still counts."""
-THERE = 1e-3
-"""How much before its end the curve counts as run through, over its length."""
+SLOW = 0.5  # Part of the reference's speed below which the motion does not brake with it
+LAST = 0.02  # Part of the curve, at its end, on which standing still counts as having arrived
+STARTING = 10  # Periods in which the motion may start before standing still counts
+THERE = 1e-3  # How much before its end the curve counts as run through, over its length
 NEAR = 0.1
 """Part of the curve, at its end, in which an impact may be, where the end is passed at speed."""
-LATE = 5.0
-"""Periods after which it counts as over, where the joints do not show it."""
-SHORT = 4.0
-"""How many times as long the joints have to stand still short of that."""
+LATE = 5.0  # Periods after which it counts as over, where the joints do not show it
+SHORT = 4.0  # How many times as long the joints have to stand still short of that
 CATCH = 10.0
 """Way in which the reference's place becomes the motion's, over how far off the start is."""
 GROWTH, FASTEST = 0.01, 4.0
 """Time over which the wanted speed grows with the way beyond the end [s], up to so many times the
 touching speed."""
-STOPPED = 0.3
-"""Part of the touching speed below which the joints have been stopped."""
+STOPPED = 0.3  # Part of the touching speed below which the joints have been stopped
 DRIVE, RISE = 0.3, 2
 """Drive that joints withstand where a contact is made, over the largest a of the integral, and the
 periods in which it rises to that."""
-LONGEST = 3.0
-"""Times the least time of standing still after which joints are let creep."""
+LONGEST = 3.0  # Times the least time of standing still after which joints are let creep
 BARRED = 0.1
 """Deceleration along the next curve, likewise, from which on a contact stops the joints."""
 SOON, AHEAD, FAR = 0.02, 0.05, 0.3
@@ -503,10 +486,7 @@ class Sensing:
                 self.bias[k] += SMOOTH * (force - known - self.bias[k])
 
     def shift(
-        self,
-        place: tuple[int, float, float, float, float],
-        low: float,
-        high: float,
+        self, place: tuple[int, float, float, float, float], low: float, high: float
     ) -> float:
         """Change of the squeeze, from `low` to `high`.
 

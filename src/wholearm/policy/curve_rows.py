@@ -26,18 +26,12 @@ DOUBTS = {"mass": 0.05, "inertia": 0.05} | {
     f"friction_{part}": 0.1 for part in ("palm", "finger1", "finger2")
 }
 """By how much numbers of a scene may be off, relative: what a reserve of normal force is for."""
-GAIN = 0.01
-"""By how much each torque may be off, relative."""
-LATE = 5e-4
-"""By how much torques may be early or late [s]."""
-LEAST = 0.02
-"""Least reserve of a normal force, over the scene's unit of force."""
-SPARE = 0.05
-"""Reserve of a torque, over its limit: what feedback may add."""
-NEAR = 1e-3
-"""Time before and after a reversal in which friction may have either direction [s]."""
-NEVER = 1e9
-"""Level of a limit that does not count."""
+GAIN = 0.01  # By how much each torque may be off, relative
+LATE = 5e-4  # By how much torques may be early or late [s]
+LEAST = 0.02  # Least reserve of a normal force, over the scene's unit of force
+SPARE = 0.05  # Reserve of a torque, over its limit: what feedback may add
+NEAR = 1e-3  # Time before and after a reversal in which friction may have either direction [s]
+NEVER = 1e9  # Level of a limit that does not count
 
 
 class CurveLimitRows(NamedTuple):

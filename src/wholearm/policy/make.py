@@ -30,43 +30,28 @@ from .range_margins import WIDEST
 from .reference_motion import TOUCH, ReferencePiece, Reserve, trace_pieces
 from .regulator import RATE, ROOM, end_within, follow
 
-WIDEST_FACTOR = 64.0
-"""Largest factor that is tried."""
-SHARES = (1.0, 0.5, 0.25)
-"""Parts of the reserve that are tried, the largest first."""
-SLOWER = 1.5
-"""Duration over the plan's from which on a motion costs more than its reserve is worth."""
+WIDEST_FACTOR = 64.0  # Largest factor that is tried
+SHARES = (1.0, 0.5, 0.25)  # Parts of the reserve that are tried, the largest first
+SLOWER = 1.5  # Duration over the plan's from which on a motion costs more than its reserve is worth
 SAME = 1e-5
 """How far ends may be from the plan's to count as the same, over the scene's length and in rad."""
-Planner = Callable[[Problem], Trajectory]
-"""Makes a plan of a problem."""
-ENOUGH = 5.0
-"""Reserves beyond which more normal force is not asked for."""
-LEAST = 0.3
-"""Fewest reserves with which a contact counts as pressed."""
+Planner = Callable[[Problem], Trajectory]  # Makes a plan of a problem
+ENOUGH = 5.0  # Reserves beyond which more normal force is not asked for
+LEAST = 0.3  # Fewest reserves with which a contact counts as pressed
 DRIVE = 0.15
 """Least acceleration with which a contact that is still open is closed, over the scene's unit."""
 BRAKE = 0.3
 """Deceleration along the next curve for each reserve, over the scene's unit: the contact that is
 gained need not be in the way of the motion."""
-FRICTION = (0.7, 1.0, 1.2)
-"""Parts of all friction with which the torques have to balance."""
-FULL = 0.98
-"""Part of the torque limits that is used."""
-STILL = 1e-3
-"""Speed along curves that counts as none, over the scene's."""
-USUAL = 2.5
-"""Reserve of normal forces where no ranges are known, in those of `curve_rows`."""
-DWELL = 3e-3
-"""How long joints stand still before the next phase begins [s]."""
-CLOSING = 0.02
-"""Time in which held torques are to close a contact [s]."""
-SHOWN = 1e-3
-"""Part of a displacement that joints have to show, over what they show at most."""
-WEAK = 10.0
-"""Torques over the dry friction of the joints, below which it decides what is at rest."""
-MOST = 0.5
-"""Largest acceleration of the integral, over the scene's."""
+FRICTION = (0.7, 1.0, 1.2)  # Parts of all friction with which the torques have to balance
+FULL = 0.98  # Part of the torque limits that is used
+STILL = 1e-3  # Speed along curves that counts as none, over the scene's
+USUAL = 2.5  # Reserve of normal forces where no ranges are known, in those of `curve_rows`
+DWELL = 3e-3  # How long joints stand still before the next phase begins [s]
+CLOSING = 0.02  # Time in which held torques are to close a contact [s]
+SHOWN = 1e-3  # Part of a displacement that joints have to show, over what they show at most
+WEAK = 10.0  # Torques over the dry friction of the joints, below which it decides what is at rest
+MOST = 0.5  # Largest acceleration of the integral, over the scene's
 
 
 def make_policy(

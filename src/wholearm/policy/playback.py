@@ -15,8 +15,7 @@ from ..common.errors import InputError, require_number
 from ..common.files import read_arrays, require_ending, write_whole
 from .curve_law import CurveLaw, LoopSettings, MotionLaw, Sensing
 
-FORMAT = 1
-"""Version of the files."""
+FORMAT = 1  # Version of the files
 CURVE = {
     "s": (-1,), "theta": (-1, 2), "b": (-1,), "levels": (-1, 2, -1, 5), "torque": (-1, 2, 2, 5),
     "push": (2,), "passes": (1,), "arrival": (-1, 5), "forces": (-1, 2, -1, 5),

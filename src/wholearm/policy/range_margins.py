@@ -21,23 +21,16 @@ from .corners import Corners, Motion, find_corners, list_scenes
 from .curve_rows import LATE, LEAST, NEAR, NEVER, SPARE, CurveLimitRows, find_squeeze, turn
 from .retiming import Reach, retime
 
-ROUNDS = 3
-"""How many times worst corners and motion are found from one another."""
-KEPT = 1.3
-"""Reserve of forces of the reference, in units: feedback may use what is above one."""
-ENOUGH = 0.5
-"""Part of these reserves without which ranges are too wide."""
+ROUNDS = 3  # How many times worst corners and motion are found from one another
+KEPT = 1.3  # Reserve of forces of the reference, in units: feedback may use what is above one
+ENOUGH = 0.5  # Part of these reserves without which ranges are too wide
 LESS, CLOSE, NONE = 0.8, 0.03, 0.02
 """Factor by which ranges shrink where they are too wide, the error of how wide they may be, and a
 part of them that is as good as none."""
-WIDEST = 0.9
-"""Largest relative range."""
-WIDER = 1.01
-"""Least width of a reversal, over the distance to the next node."""
-STEP = 1e-4
-"""Step of differences along a curve, over its length."""
-AUTHORITY = 2.0
-"""Reserve of torques, in those of `curve_rows`: feedback adds to the motion."""
+WIDEST = 0.9  # Largest relative range
+WIDER = 1.01  # Least width of a reversal, over the distance to the next node
+STEP = 1e-4  # Step of differences along a curve, over its length
+AUTHORITY = 2.0  # Reserve of torques, in those of `curve_rows`: feedback adds to the motion
 
 
 class Within(NamedTuple):

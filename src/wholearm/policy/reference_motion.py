@@ -20,15 +20,12 @@ from .curve_rows import CurveLimitRows, find_directions, find_squeeze, make_rows
 from .range_margins import retime_within
 from .retiming import ENOUGH, Reach, retime
 
-INTERVALS = 120
-"""Intervals of a curve's table, dense at its ends."""
-PLACES = 400
-"""Places of a curve at which a plan's place is looked for first."""
+INTERVALS = 120  # Intervals of a curve's table, dense at its ends
+PLACES = 400  # Places of a curve at which a plan's place is looked for first
 NEWTON = 4
 AUTHORITY = 2.0
 """Reserve of torques along the way, in those of `curve_rows`: feedback adds to the motion."""
-TOUCH = 3e-3
-"""Speed along curves at which contacts are made, over the scene's."""
+TOUCH = 3e-3  # Speed along curves at which contacts are made, over the scene's
 ARRIVAL = 3e-3
 """Time in which the rest of the way is run through at the end, a motion that fades away [s]."""
 SLOWER = (1.0, 0.5, 0.25, 0.12, 0.06)

@@ -23,16 +23,11 @@ from ..mechanics.metric import metric_weights
 from ..problem.definition import Phase, Problem
 from ..results.trajectory import Trajectory
 
-RATE = 100.0
-"""Rate at which errors fade where torques change no contact force [1/s]."""
-PRESSED = 0.1
-"""Acceleration, over the scene's unit, that costs as much as doubling a contact force."""
-LEAST = 0.05
-"""Least contact force in that, over the scene's unit of force."""
-STEP = 1e-6
-"""Step of differences, in rad and over the scene's unit of time."""
-STANDS = 1e-6
-"""Joint speed that counts as none, over the scene's."""
+RATE = 100.0  # Rate at which errors fade where torques change no contact force [1/s]
+PRESSED = 0.1  # Acceleration, over the scene's unit, that costs as much as doubling a contact force
+LEAST = 0.05  # Least contact force in that, over the scene's unit of force
+STEP = 1e-6  # Step of differences, in rad and over the scene's unit of time
+STANDS = 1e-6  # Joint speed that counts as none, over the scene's
 SOFT = 0.02
 """Error of the angles for which a whole torque limit is worth it [rad]; it bounds gains where the
 joints hardly show, or torques hardly change, how the object moves."""

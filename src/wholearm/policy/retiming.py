@@ -19,19 +19,15 @@ from .curve_rows import NEVER
 SHARES = (*(0.8**k for k in range(12)), 0.04, 0.0, -0.1, -0.2, -0.4, -0.8)
 """Parts of the reserve that are tried, the largest first. A plan's limits hold between its own
 nodes, so that at others a little may lack."""
-SLOWEST = 0.1
-"""Least part of the plan's b of a motion with a reserve: what crawls can stick."""
+SLOWEST = 0.1  # Least part of the plan's b of a motion with a reserve: what crawls can stick
 PARTS = (0.5, 0.2, 0.0)
 """Parts of the reserve that all places are limited to, where some place has less."""
 NEAR, ENOUGH = 0.8, 0.4
 """Part of such a limit, and of the reserve, from which on the place with least is near enough."""
-SPACE = 1e-9
-"""Part of the plan's b by which limits of b may cross, from rounding."""
+SPACE = 1e-9  # Part of the plan's b by which limits of b may cross, from rounding
 
-ROUNDING = 1e-12
-"""Part of its terms that is nothing in a difference."""
-HUGE = 1e12
-"""Larger than any b."""
+ROUNDING = 1e-12  # Part of its terms that is nothing in a difference
+HUGE = 1e12  # Larger than any b
 
 
 class Reach(NamedTuple):

@@ -26,10 +26,8 @@ from .roadmap import Ahead, Roadmap
 
 CROSSING = 1.0
 """Least time of a motion through a cell from a place, by a rule of thumb, in the scene's time."""
-OFTEN = 2
-"""How often a place is settled, on different ways."""
-MOST = 4000
-"""Most entries of the queue that are looked at."""
+OFTEN = 2  # How often a place is settled, on different ways
+MOST = 4000  # Most entries of the queue that are looked at
 
 
 class SearchRule(NamedTuple):

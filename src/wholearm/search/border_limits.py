@@ -22,12 +22,10 @@ from ..planning.lower_bound.path_terms import PathTerms
 from ..planning.lower_bound.rows import PathLimitRows, limit_along
 from ..planning.lower_bound.speed_sweep import NoMotionError, add_up, find_steady
 
-INTERVALS = 24
-"""Intervals of the grid on which the fastest motion along a border is looked for."""
+INTERVALS = 24  # Intervals of the grid on which the fastest motion along a border is looked for
 CHECKED = 12
 """Places of a segment at which jamming and ambiguous forces are looked for, besides those."""
-INDEPENDENT = 1e-12
-"""Least Gram determinant of the rows of contacts, each of length one."""
+INDEPENDENT = 1e-12  # Least Gram determinant of the rows of contacts, each of length one
 DEPENDENT = "its contacts depend on each other"
 
 

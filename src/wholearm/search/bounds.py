@@ -13,8 +13,7 @@ from .edges import ROUGHLY, Link
 from .goals import is_at
 from .places import Key, RoadmapPlace
 
-MOST = 240
-"""Most places that are settled to bound routes from below."""
+MOST = 240  # Most places that are settled to bound routes from below
 
 
 class BorderBound(NamedTuple):

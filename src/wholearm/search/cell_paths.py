@@ -21,8 +21,7 @@ from ..planning.lower_bound.rows import PathLimitRows, limit
 from ..scene.model import Scene
 from .travel_times import find_durations
 
-NODES = 12
-"""Intervals of a way."""
+NODES = 12  # Intervals of a way
 
 _ENDS = (1 - np.cos(np.linspace(0, np.pi, NODES + 1))) / 2
 MIDDLES = (_ENDS[1:] + _ENDS[:-1]) / 2

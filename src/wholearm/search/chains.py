@@ -17,8 +17,7 @@ from ..planning.path_domain.impact_sequence import BEND, compute_curve_impact
 from ..problem.definition import End, Phase, Until
 from .edges import Blocked, BorderEdge, EdgeStep, Link, link_along
 
-LONGEST = 6
-"""Most borders that are passed in one go."""
+LONGEST = 6  # Most borders that are passed in one go
 
 
 @dataclass(frozen=True, eq=False)

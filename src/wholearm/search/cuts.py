@@ -19,12 +19,9 @@ from .astar import RoadmapRoute, RouteSearch
 from .edges import Blocked, BorderEdge, Link, cut_curve, link_along
 from .goals import measure_along
 
-CUT = 16
-"""Most borders that are looked at with other numbers, those nearest to the goal."""
-FARTHEST = 10.0
-"""Most times that a number is made larger or smaller; friction may go to zero."""
-HALVINGS = 6
-"""How often what is between such a number and the given one is halved."""
+CUT = 16  # Most borders that are looked at with other numbers, those nearest to the goal
+FARTHEST = 10.0  # Most times that a number is made larger or smaller; friction may go to zero
+HALVINGS = 6  # How often what is between such a number and the given one is halved
 
 
 class Gate(NamedTuple):

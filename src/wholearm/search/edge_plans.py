@@ -42,10 +42,8 @@ from .places import measure_apart
 OFF = 1e-4
 """Distance from the end of a border's link from which on it is another end, in radii of gyration or
 radians."""
-PINNED = 1e-9
-"""Coordinates at which landings are pinned are rounded to this, in the same unit."""
-SAME = 9
-"""Decimals of configurations that are one, in the same unit."""
+PINNED = 1e-9  # Coordinates at which landings are pinned are rounded to this, in the same unit
+SAME = 9  # Decimals of configurations that are one, in the same unit
 Key = tuple[object, ...]
 MET = 1e-8
 """Largest distance of a border's end as planned from the same end as found, in radii of gyration or
@@ -53,8 +51,7 @@ radians."""
 T = TypeVar("T")
 Links = Sequence[tuple[Link, Sequence[Measured]]]
 """Links of a route, with the ways in which those through cells can be gone."""
-Chosen = tuple[Link, Measured | None]
-"""A link, and what is begun of it."""
+Chosen = tuple[Link, Measured | None]  # A link, and what is begun of it
 
 
 @dataclass
@@ -189,11 +186,7 @@ def _plan_ahead(
 
 
 def _plan_part(
-    problem: Problem,
-    links: Sequence[Chosen],
-    part: Sequence[int],
-    options: PlanOptions,
-    kept: Kept,
+    problem: Problem, links: Sequence[Chosen], part: Sequence[int], options: PlanOptions, kept: Kept
 ) -> dict[Key, PlannedLink | str]:
     """What there is to keep of links, by their numbers, planned one after the other."""
     # What is planned here is kept at once: an interrupt loses none of it.
@@ -277,8 +270,7 @@ class PlannedLink:
         return sum(plan.motion.duration for own in self.blocks for plan in own.plans)
 
 
-Kept = MutableMapping[Key, PlannedLink | str]
-"""Plans of links, or why there are none."""
+Kept = MutableMapping[Key, PlannedLink | str]  # Plans of links, or why there are none
 
 
 def key_configuration(scene: Scene, z: Array) -> tuple[float, ...]:

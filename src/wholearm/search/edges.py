@@ -28,8 +28,7 @@ BARRED = 0.01
 ROUGHLY = 0.999
 """Share of a bound on a coarse grid that is one: its quadrature errs by 2e-5 at most, measured over
 the borders of seven scenes."""
-PARTED = 16
-"""Intervals on which the fastest motion along a part of a border is looked for."""
+PARTED = 16  # Intervals on which the fastest motion along a part of a border is looked for
 
 
 class Terms(NamedTuple):

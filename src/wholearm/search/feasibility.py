@@ -24,8 +24,7 @@ from .border_limits import INTERVALS
 from .edges import EdgeStep, Link
 from .places import settle
 
-ROUGH = 1e-2
-"""Accuracy of plans of which only matters about how long they take."""
+ROUGH = 1e-2  # Accuracy of plans of which only matters about how long they take
 SINGULAR = "its contacts depend on each other"
 """Why there is no plan where the equations of motion have no single solution."""
 

@@ -46,14 +46,10 @@ from .result import Alternative, Answer, describe_block
 from .roadmap import Roadmap
 from .route_choice import NEARBY, Chooser
 
-LARGEST = 200_000_000
-"""Most bytes that a chart is written with."""
-_RECURSION = 20_000
-"""Depth of recursion that pickling a chart may take."""
-NEAR = 1e-4
-"""How far beside a goal the hand may close instead, in radii of gyration."""
-TRIED = 3
-"""Most numbers with which the goal is looked for."""
+LARGEST = 200_000_000  # Most bytes that a chart is written with
+_RECURSION = 20_000  # Depth of recursion that pickling a chart may take
+NEAR = 1e-4  # How far beside a goal the hand may close instead, in radii of gyration
+TRIED = 3  # Most numbers with which the goal is looked for
 HANDS = (1.05, 0.95, 1.1, 0.9, 1.2, 0.8)
 """Lengths of fingers and distances of their bases that are tried, over those given."""
 TIMES, AT_LEAST = 4.0, 20.0
@@ -61,8 +57,7 @@ TIMES, AT_LEAST = 4.0, 20.0
 Try = Callable[[Change, Sequence[int], bool], tuple[float, Sequence[int]] | None]
 """Looks for the goal with a change, beyond some borders: about how long the route takes [s], which
 is planned if that is asked for, and over which of the borders it leads."""
-CHARTS = 4
-"""Scenes whose charts are kept."""
+CHARTS = 4  # Scenes whose charts are kept
 _charts: OrderedDict[object, Roadmap] = OrderedDict()
 
 

@@ -15,8 +15,7 @@ from ..geometry.curve import describe_pose
 from ..geometry.explore import close_contacts
 from ..scene.model import Scene
 
-FINE = 1e-4
-"""Grid on which places with the same contacts are one, in radii of gyration and radians."""
+FINE = 1e-4  # Grid on which places with the same contacts are one, in radii of gyration and radians
 COARSE = 0.25
 """The same of places where a motion through a cell lands, which the planner chooses anew."""
 

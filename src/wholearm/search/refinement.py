@@ -20,16 +20,11 @@ from .roadmap import Roadmap
 
 FURTHER = 2
 """Guesses of a way through a cell, beyond the first ones, that are looked at for any plan."""
-FINEST = 0.03
-"""Share of a border by which the place where it is left is moved in the end."""
-STEPS = (4, 2, 1)
-"""How often that, one after the other."""
-ELSEWHERE = (0.15, -0.15)
-"""The same where a way from the first place has no plan."""
-GAIN = 0.998
-"""Largest share of a link's time that is worth another plan."""
-INSIDE = 0.02
-"""Least share of a border before and after the place where it is left."""
+FINEST = 0.03  # Share of a border by which the place where it is left is moved in the end
+STEPS = (4, 2, 1)  # How often that, one after the other
+ELSEWHERE = (0.15, -0.15)  # The same where a way from the first place has no plan
+GAIN = 0.998  # Largest share of a link's time that is worth another plan
+INSIDE = 0.02  # Least share of a border before and after the place where it is left
 
 Found = Measured | str
 T = TypeVar("T")

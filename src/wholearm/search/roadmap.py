@@ -51,28 +51,19 @@ if TYPE_CHECKING:
 
 AROUND = 64
 """Places of the grid around a turn; as far apart in x, in radii of gyration, as they are in phi."""
-HEADINGS = 36
-"""Ways in which motions may set out from a place."""
+HEADINGS = 36  # Ways in which motions may set out from a place
 SPACING, REACH = 2 * np.pi / AROUND, 3.0
 """Distance of places looked at along a ray, and its length, in radii of gyration and radians."""
-FIRST = 0.02
-"""Where a ray has to be inside a cell, in the same unit; no way is shorter."""
-OUTSIDE = 4
-"""At how many places of a ray outside of its cell contacts that come into view count."""
-CLOSER = 0.05
-"""Distance of places at which a gap is evaluated, around where a contact is gained."""
-AROUND_END = 6
-"""How many of these there are before and after."""
-BESIDE = 4e-4
-"""How far before and after a border what touches is looked up."""
-NEAREST = 0.02
-"""Length of the shortest way to a pose, in radii of gyration or radians."""
+FIRST = 0.02  # Where a ray has to be inside a cell, in the same unit; no way is shorter
+OUTSIDE = 4  # At how many places of a ray outside of its cell contacts that come into view count
+CLOSER = 0.05  # Distance of places at which a gap is evaluated, around where a contact is gained
+AROUND_END = 6  # How many of these there are before and after
+BESIDE = 4e-4  # How far before and after a border what touches is looked up
+NEAREST = 0.02  # Length of the shortest way to a pose, in radii of gyration or radians
 TIED = 1 - 1e-9
 """Part of another time below which a time is less: of mirrored ways the first is the fastest."""
-RELEASES = (0.15, 0.4, 0.6, 0.75, 0.88)
-"""Shares of a border at which contacts may be let go."""
-NEAR = 1.0
-"""How far landings are moved to where a goal is, at most, in radii of gyration."""
+RELEASES = (0.15, 0.4, 0.6, 0.75, 0.88)  # Shares of a border at which contacts may be let go
+NEAR = 1.0  # How far landings are moved to where a goal is, at most, in radii of gyration
 Found = list[Link | Blocked]
 
 

@@ -21,14 +21,12 @@ from .refinement import Polisher
 
 FASTER = 0.7
 """Share of the time of straight ways through cells that plans take at least, by experience."""
-TRIED = 6
-"""Most routes that are looked at, or planned in vain, beyond those that are asked for."""
+TRIED = 6  # Most routes that are looked at, or planned in vain, beyond those that are asked for
 OTHERS = 2
 """Most slower ways through a cell that are tried where the plan of the fastest does not hold."""
 BEYOND = 1.1
 """Times of routes, by the search, over that of the best one, from which on they are left out."""
-NEARBY = 30
-"""Most places that are looked at in a glance."""
+NEARBY = 30  # Most places that are looked at in a glance
 MEASURED, MORE = 24, 8
 """Most links through cells that are planned for themselves, until there is a route and after it."""
 

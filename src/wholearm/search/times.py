@@ -19,8 +19,7 @@ from ..planning.lower_bound.rows import PathLimitRows, limit
 from ..problem.definition import Problem
 from .travel_times import find_durations
 
-NODES = 24
-"""Intervals of a border."""
+NODES = 24  # Intervals of a border
 
 
 def time_borders(problem: Problem, borders: Sequence[Border]) -> Array:

@@ -12,8 +12,7 @@ from ..common.arrays import Array
 from ..contacts.closing import Flags
 from ..planning.lower_bound.rows import PathLimitRows
 
-PAIRS = 200_000
-"""Pairs of rows that are looked at together."""
+PAIRS = 200_000  # Pairs of rows that are looked at together
 
 
 def find_durations(rows: PathLimitRows, steps: Array, part: Array) -> Array:
