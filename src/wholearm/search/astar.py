@@ -80,7 +80,7 @@ class RoadmapRoute:
 class RouteSearch:
     """Routes from a start to a goal."""
 
-    chart: Roadmap
+    roadmap: Roadmap
     start: RoadmapPlace
     goal: Goal
     # links that no motion can take, as they are met
@@ -98,11 +98,11 @@ class RouteSearch:
 
     def measure(self, place: RoadmapPlace, turning: float = 1.0) -> float:
         """About the time from a place to the goal, where turning by a radian takes that [s]."""
-        return turning * self.chart.scene.scales.time * measure_turn(place, self.goal)
+        return turning * self.roadmap.scene.scales.time * measure_turn(place, self.goal)
 
     def run(self, rule: SearchRule = EAGER) -> Iterator[RoadmapRoute]:
         """Find routes that have not been found before, about in the order of their durations."""
-        time = self.chart.scene.scales.time
+        time = self.roadmap.scene.scales.time
         number, queue = (
             count(),
             list[tuple[float, int, float, RoadmapRoute, RoadmapPlace, object]](),
@@ -134,7 +134,7 @@ class RouteSearch:
                         yield route
                     continue
                 if work is not None:
-                    for own in self.chart.go_on(work, self.goal):
+                    for own in self.roadmap.go_on(work, self.goal):
                         put_along(route.links[:-1], own)
                 key = place.key
                 if times[key] >= (1 if place.landed else OFTEN):
@@ -147,18 +147,21 @@ class RouteSearch:
                     elif times[key] == 1 and own.link not in self.blocked:
                         self.blocked.append(own.link)
                 if not place.landed:
-                    for index, (border, _) in enumerate(self.chart.follow(place)):
+                    for index, (border, _) in enumerate(self.roadmap.follow(place)):
                         if not self._is_back(route, border):
                             put(route, place, (border, index), rule.leaving * time)
                     put(route, place, "cells", CROSSING * time)
                 continue
             if isinstance(work, tuple):
                 border, index = work
-                links = self.chart.release(border, index)
-                links = [*links, *self.chart.land_at(links, self.goal)]
+                links = self.roadmap.release(border, index)
+                links = [*links, *self.roadmap.land_at(links, self.goal)]
             else:
-                links = [*self.chart.cross_cells(place), *self.chart.end_in_cell(place, self.goal)]
-                links += self.chart.land_at(links, self.goal)
+                links = [
+                    *self.roadmap.cross_cells(place),
+                    *self.roadmap.end_in_cell(place, self.goal),
+                ]
+                links += self.roadmap.land_at(links, self.goal)
             for link in links:
                 if isinstance(link, Link):
                     put(RoadmapRoute((*route.links, link)), link.stop, None)
@@ -169,7 +172,7 @@ class RouteSearch:
         """Links along borders from the end of a route, but not back."""
         return [
             own
-            for own in self.chart.set_out(place, self.goal)
+            for own in self.roadmap.set_out(place, self.goal)
             if not self._is_back(route, own.chain.borders[0])
         ]
 

@@ -88,14 +88,14 @@ class Roadmap:
     plans     plans of routes through it, or why there are none; see `candidates`
     others    slower plans of these
     joined    plans of links from rest to rest; see `linking`
-    polished  those that were planned with borders left in motion, too
+    refined   links whose place on the border has been optimized
     measured  links through cells that were planned for themselves, or why they have no plan
     """
 
     def __init__(self, problem: Problem, uniqueness_margin: float) -> None:
         self.scene, self.epsilon = problem.scene, problem.epsilon
         self.terms = Terms(problem.epsilon, uniqueness_margin)
-        self.polished: set[Link] = set()
+        self.refined: set[Link] = set()
         self._borders: dict[tuple[Key, tuple[Contact, ...]], list[BorderEdge]] = {}
         self._curves: dict[frozenset[Contact], list[Curve]] = {}
         self._links: dict[Key, list[tuple[BorderEdge, Link | Blocked | None]]] = {}
