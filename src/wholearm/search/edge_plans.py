@@ -61,7 +61,7 @@ class BackgroundTask(Generic[T]):
 
 
 def can_join(problem: Problem, options: PlanOptions) -> bool:
-    """Whether joined plans from rest to rest are of the objective: time, with torques free to jump."""
+    """Whether plans from rest to rest can be joined: for least time with torques free to jump."""
     scene = problem.scene
     return options.goal.value == "time" and not (scene.has_slow_motors or scene.control_period)
 

@@ -22,7 +22,7 @@ from ..planning.time_domain.time_motion import TimeMotion
 from ..problem.definition import End, Phase, Problem, Until
 from .border_limits import INTERVALS
 from .edges import EdgeStep, Link
-from .places import settle
+from .places import close_place
 
 ROUGH = 1e-2  # accuracy of plans that only estimate durations
 SINGULAR = "its contacts depend on each other"
@@ -74,7 +74,7 @@ def measure_link(
             curve = trace_phase(phases[0], z)
             spent = look_along((curve,), problem.epsilon, INTERVALS)
             z, phases = curve.end, phases[1:]
-        goal = settle(link.stop) if len(phases) == 1 else None
+        goal = close_place(link.stop) if len(phases) == 1 else None
         if goal is None:
             goal = replace(link.stop, z=find_end(phases[0], z, phases[1:]))
         moved = metric_weights(problem.scene) @ (goal.z - z) ** 2
