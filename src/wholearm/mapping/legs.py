@@ -1,4 +1,4 @@
-"""Phases along one straight leg of a route in (x, phi), each carried out from where the last ends."""
+"""Phases along one straight leg of a route in (x, phi), each from where the one before ends."""
 
 from __future__ import annotations
 
@@ -91,15 +91,16 @@ def walk_leg(problem: Problem, index: int, z: Array, start: Array, stop: Array) 
     walked: list[Walked] = []
     parts, replans = split_leg(problem.scene, start, stop), 0
     while parts:
-        while len(parts) > 1 and _can_start(problem.scene, z, parts[1].contacts):
-            # A first part within `NEAR` is left out.
-            if not (np.abs(parts[0].stop - parts[0].start) < tolerance(problem.scene)).all():
+        near = tolerance(problem.scene)
+        while len(parts) > 1 and (np.abs(parts[0].stop - parts[0].start) < near).all():
+            # A first part within `NEAR` is left out if the next one can start here.
+            if not _can_start(problem.scene, z, parts[1].contacts):
                 break
             parts = parts[1:]
         try:
             walked += _walk_part(problem, index + len(walked), z, parts[:2])
         except InputError as error:
-            moved = (np.abs(z[[0, 2]] - parts[0].start) > 1e-3 * tolerance(problem.scene)).any()
+            moved = (np.abs(z[[0, 2]] - parts[0].start) > 1e-3 * near).any()
             if not moved or replans == REPLANS:
                 raise InputError("", "route", error.problem) from None
             parts, replans = split_leg(problem.scene, z[[0, 2]], stop), replans + 1

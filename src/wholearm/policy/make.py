@@ -23,7 +23,7 @@ from ..problem.uncertainty import PARAMETERS
 from ..results.adopt import Moved, adopt_motion
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion, Trajectory, assemble
-from .curve_law import LoopSettings, choose_squeeze
+from .curve_law import LoopSettings, choose_internal_force
 from .curve_rows import CurveLimitRows, find_forces, leave_one
 from .playback import Policy
 from .range_margins import WIDEST
@@ -368,7 +368,7 @@ def find_still(curve: Curve) -> Array:
     limits = make_limits(formation, 0.0).only(PRESS, TORQUE)
     sides = SideTerms.of(limits, forces, point.z_s[:, 3:])
     base, press = sides.rest[0].tolist(), sides.press[0].tolist()
-    _, squeeze = choose_squeeze(base, [0.0] * len(base), press, 0.0)
+    _, squeeze = choose_internal_force(base, [0.0] * len(base), press, 0.0)
     return np.asarray((forces.T0 + squeeze * forces.Tl)[0])
 
 

@@ -16,7 +16,13 @@ from ..mechanics.limits import CONE, PRESS, make_limits
 from ..mechanics.metric import metric_weights
 from ..problem.definition import End, Phase, Problem
 from ..results.trajectory import Trajectory
-from .curve_rows import CurveLimitRows, find_directions, find_squeeze, make_rows, measure_levels
+from .curve_rows import (
+    CurveLimitRows,
+    find_directions,
+    find_internal_force,
+    make_rows,
+    measure_levels,
+)
 from .range_margins import retime_within
 from .retiming import ENOUGH, Reach, retime
 
@@ -124,7 +130,7 @@ def _trace(
         motion = part * a, part * b
         rows = make_rows(curve, s, (*motion, squeeze))
         for _ in range(REFINE if part < 1.0 else 0):
-            rows = make_rows(curve, s, (*motion, find_squeeze(rows, *motion)))
+            rows = make_rows(curve, s, (*motion, find_internal_force(rows, *motion)))
         wanted = reserve.size * rows.unit
         wanted[:, rows.presses :] = AUTHORITY * rows.unit[:, rows.presses :]
         found = retime(s, rows.slack, wanted, motion[1], end)
