@@ -150,7 +150,7 @@ def _estimate_errors(
     tau: Array,
     delayed: Array,
 ) -> Array:
-    """Errors of forces from uncertain numbers, torques and delays, root of summed squares (n, m)."""
+    """Errors of forces from uncertain numbers, torques and delays, root sum square, (n, m)."""
     values = np.column_stack([np.ones(len(speed)), speed**2, speed])
 
     def find(scene: Scene) -> PathForces:

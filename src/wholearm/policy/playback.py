@@ -178,9 +178,9 @@ class Policy(Result):
         Parameters
         ----------
         theta, theta_dot : [rad, rad/s]  of finger 1, the right one, and finger 2
-        forces  measured normal forces [N] by names of contacts (`v3-finger1`): 0 of open ones, missing
-                or NaN without a sensor. They correct internal forces along curves and show gained
-                contacts.
+        forces  measured normal forces [N] by names of contacts (`v3-finger1`): 0 of open ones,
+                missing or NaN without a sensor. They correct internal forces along curves and show
+                gained contacts.
         """
         law = self.laws[self.index]
         tau = law.step(theta, theta_dot, forces)

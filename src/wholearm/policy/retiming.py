@@ -15,8 +15,8 @@ import numpy as np
 from ..common.arrays import Array
 from .curve_rows import NEVER
 
-# Shares of the margin that are tried, the largest first. Negative: limits of a plan hold between its
-# own nodes, so that at others they may be violated a little.
+# Shares of the margin that are tried, the largest first. Negative ones: limits of a plan hold
+# between its own nodes, so that at others they may be violated a little.
 SHARES = (*(0.8**k for k in range(12)), 0.04, 0.0, -0.1, -0.2, -0.4, -0.8)
 SLOWEST = 0.1  # least b over the plan's of a motion with a margin: slow motions can stick
 PARTS = (0.5, 0.2, 0.0)  # upper limits of the share of all intervals, if some interval has less
