@@ -12,7 +12,7 @@ from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phases
 from wholearm.problem.definition import End
 from wholearm.problem.goal import Goal
-from wholearm.search.border_limits import sketch, survey
+from wholearm.search.border_limits import estimate_duration, find_border_limits
 from wholearm.search.edges import Link, cut_curve, time_parts
 from wholearm.search.goals import is_at
 from wholearm.search.places import make_place
@@ -77,8 +77,8 @@ def test_parts_of_a_border_take_as_long_together_as_one_by_one() -> None:
         times = time_parts(border, shares)
         for share, took in zip(shares, times, strict=True):
             part = cut_curve(border.curve, share * border.curve.length)
-            ground = survey(part, *chart.terms)
-            alone = ground.closed or ground.begins or ground.ends or sketch([ground])
+            limits = find_border_limits(part, *chart.terms)
+            alone = limits.closed or limits.begins or limits.ends or estimate_duration([limits])
             assert np.isfinite(took) == (not isinstance(alone, str))
             assert isinstance(alone, str) or took == pytest.approx(alone, rel=0.02)
 
@@ -86,10 +86,10 @@ def test_parts_of_a_border_take_as_long_together_as_one_by_one() -> None:
 def test_a_border_is_kept_without_what_is_seen_of_it() -> None:
     problem = problem_of(IMPACTS)
     border = Roadmap(problem, 0.1).trace(make_place(problem.scene, problem.start))[0]
-    seen = border.ground
+    seen = border.limits
     kept = pickle.loads(pickle.dumps(border))
-    assert "ground" not in kept.__dict__
-    np.testing.assert_allclose(kept.ground.rows.one, seen.rows.one, rtol=1e-9, atol=1e-12)
+    assert "limits" not in kept.__dict__
+    np.testing.assert_allclose(kept.limits.rows.one, seen.rows.one, rtol=1e-9, atol=1e-12)
 
 
 def test_a_landing_is_led_to_where_the_goal_is() -> None:

@@ -32,7 +32,7 @@ class Found:
     """A search that finds some routes, each once, as long as they are within its limit."""
 
     def __init__(self, routes: Sequence[RoadmapRoute]) -> None:
-        self.chart = SimpleNamespace(measured={}, others={}, joined={}, plans={}, polished=set())
+        self.roadmap = SimpleNamespace(measured={}, others={}, joined={}, plans={}, refined=set())
         self.limit, self.waiting = math.inf, list(routes)
 
     def run(self, rule: SearchRule) -> Iterator[RoadmapRoute]:

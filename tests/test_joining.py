@@ -18,7 +18,7 @@ from wholearm.problem.goal import Goal
 from wholearm.search import edge_plans as joining
 from wholearm.search.astar import RouteSearch
 from wholearm.search.candidates import Lost
-from wholearm.search.edge_plans import Aside, Kept, PlannedLink, join_route, key_steps
+from wholearm.search.edge_plans import BackgroundTask, Cache, PlannedLink, join_route, key_steps
 from wholearm.search.edges import EdgeStep, Link
 from wholearm.search.feasibility import Measured
 from wholearm.search.places import make_place
@@ -28,7 +28,9 @@ from wholearm.search.roadmap import Roadmap
 OPTIONS = PlanOptions(accuracy=0.1, replay=False)
 
 
-def join(links: tuple[Link, ...], kept: Kept, jobs: int, aside: Aside[int] | None = None) -> Plan:
+def join(
+    links: tuple[Link, ...], kept: Cache, jobs: int, aside: BackgroundTask[int] | None = None
+) -> Plan:
     own = [(link, list[Measured]()) for link in links]
     plan = join_route(problem_of(HEPTAGON), own, OPTIONS, kept, lambda _: None, jobs, aside)
     assert isinstance(plan, Plan), plan
@@ -42,8 +44,8 @@ def test_links_planned_at_the_same_time_make_the_same_plan() -> None:
     )
     route = next(search.run())
     assert len(route.links) > 1
-    kept: Kept = {}
-    asides = [Aside(lambda: 7) for _ in range(2)]
+    kept: Cache = {}
+    asides = [BackgroundTask(lambda: 7) for _ in range(2)]
     one, other = join(route.links, {}, 1, asides[0]), join(route.links, kept, 2, asides[1])
     assert [own.result for own in asides] == [None, 7]
     # Solves in another process may differ in the last bits, and by the solver's tolerance then.

@@ -16,7 +16,7 @@ from wholearm.planning.options import PlanOptions
 from wholearm.problem.goal import Goal
 from wholearm.problem.read import build_problem
 from wholearm.search.astar import RouteSearch
-from wholearm.search.cuts import Opening, list_cut, list_gates, list_openings, look_through
+from wholearm.search.cuts import Opening, link_changed, list_cut, list_cut_borders, list_openings
 from wholearm.search.edges import Link
 from wholearm.search.find_route import choose_opening, explain, find_hand, find_opening, list_hands
 from wholearm.search.places import make_place
@@ -65,13 +65,13 @@ def test_what_is_advised_opens_the_way() -> None:
     assert not list(own.run())
     # All that leads on from what is reached is in the cut, and nothing that ends where it was.
     assert all(blocked.stop.key not in own.reached for blocked in list_cut(own))
-    gates = list_gates(own)
-    assert [gate.blocked for gate in gates] == list_cut(own)
-    for opening in list_openings(gates):
-        for gate, value in zip(gates, opening.values, strict=True):
+    cuts = list_cut_borders(own)
+    assert [cut.blocked for cut in cuts] == list_cut(own)
+    for opening in list_openings(cuts):
+        for cut, value in zip(cuts, opening.values, strict=True):
             if not math.isnan(value):
                 change = Change(opening.parameter, value)
-                assert isinstance(look_through(gate, change), Link)
+                assert isinstance(link_changed(cut, change), Link)
     text, (change,) = find_opening(own, rough, PlanOptions(), 0.0, lambda _: None)
     assert change.parameter.key == "friction.palm" and change.value < 1.5
     assert text.startswith(f"with {change} the goal is reached, in about ")

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from wholearm.search.feasibility import Measured
-from wholearm.search.refinement import FINEST, STEPS, Found, Leaving, RefinedPath
+from wholearm.search.refinement import FINEST, STEPS, Found, RefinedPath, ReleaseSearch
 
 
 def plan_of(duration: float) -> Measured:
@@ -28,7 +28,7 @@ class Cell:
         return plan_of(1 + FINEST * abs(way.move - self.best) - saved)
 
     def leave(self) -> list[Measured]:
-        return Leaving(self, plan_of(1 + FINEST * abs(self.best))).run()
+        return ReleaseSearch(self, plan_of(1 + FINEST * abs(self.best))).run()
 
 
 @pytest.mark.parametrize(("best", "end"), [(0, -1), (-7, -8), (5, -20), (-3, -3)])
@@ -59,7 +59,7 @@ def test_another_guess_goes_on_from_the_best_place() -> None:
 
 def test_what_is_looked_at_first_may_be_at_hand() -> None:
     plain, ahead = Cell(-7, -8), Cell(-7, -8)
-    leaving = Leaving(ahead, plan_of(1 + 7 * FINEST))
-    leaving.look_ahead(lambda tasks: [task() for task in tasks])
+    leaving = ReleaseSearch(ahead, plan_of(1 + 7 * FINEST))
+    leaving.prefetch(lambda tasks: [task() for task in tasks])
     assert leaving.run()[0] == plain.leave()[0]
     assert set(plain.tried) <= set(ahead.tried)

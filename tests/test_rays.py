@@ -31,7 +31,7 @@ def test_rays_stay_in_a_cell_of_the_place_until_a_contact_is_gained() -> None:
         assert tuple(table[k] for k in label) in cells
         assert table[gained] not in own.contacts
     parts = np.arange(1, PARTS + 1) / PARTS
-    poses = rays.starts[:, None] + parts[:, None] * rays.ways[:, None]
+    poses = rays.starts[:, None] + parts[:, None] * rays.runs[:, None]
     labels = label_cells(scene, *poses.reshape(-1, 2).T)[:, [0, 2, 4]]
     assert (labels.reshape(len(poses), -1, 3) == rays.labels[:, None]).all()
 
@@ -41,8 +41,8 @@ def test_rays_end_right_before_what_they_gain_touches() -> None:
     scene = own.scene
     before = measure_gap(scene, rays.gained, place(scene, rays.labels, rays.ends))
     assert (before > 0).all()
-    lengths = np.linalg.norm(rays.ways / unit_steps(scene), axis=1)[:, None]
-    ends = rays.ends + BESIDE * rays.ways / lengths
+    lengths = np.linalg.norm(rays.runs / unit_steps(scene), axis=1)[:, None]
+    ends = rays.ends + BESIDE * rays.runs / lengths
     assert (measure_gap(scene, rays.gained, place(scene, rays.labels, ends)) < 0).all()
 
 

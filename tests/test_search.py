@@ -25,10 +25,10 @@ from wholearm.search.astar import RoadmapRoute, RouteSearch
 from wholearm.search.bounds import bound_borders
 from wholearm.search.find_route import (
     find_route,
-    load_chart,
+    load_roadmap,
     require_folder,
     require_reach,
-    store_chart,
+    store_roadmap,
 )
 from wholearm.search.places import list_formations_at, make_place
 from wholearm.search.result import describe_block
@@ -129,9 +129,9 @@ def test_charts_are_kept_in_files(tmp_path: Path) -> None:
     _, route = to_edge_6()
     folder = tmp_path / "new"
     require_folder(folder)
-    store_chart(folder, "one", chart())
-    known = load_chart(folder, "one")
-    assert known is not None and load_chart(folder, "other") is None
+    store_roadmap(folder, "one", chart())
+    known = load_roadmap(folder, "one")
+    assert known is not None and load_roadmap(folder, "other") is None
     problem = problem_of(HEPTAGON)
     own = RouteSearch(known, make_place(problem.scene, problem.start), Goal(flush=6))
     again = next(own.run())
@@ -140,7 +140,7 @@ def test_charts_are_kept_in_files(tmp_path: Path) -> None:
     written = file.read_bytes()
     for damaged in (b"", written[:-1], written[:40] + b"x" + written[41:]):
         file.write_bytes(damaged)
-        assert load_chart(folder, "one") is None
+        assert load_roadmap(folder, "one") is None
     with pytest.raises(InputError, match="--cache"):
         require_folder(file)
 
@@ -233,7 +233,7 @@ def test_route_prints_phases_that_load(tmp_path: Path, capsys: pytest.CaptureFix
     assert phase["until"] == load_plan(plan).problem.table["phases"][0]["until"]
     assert f"wrote {plan}" in capsys.readouterr().out
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("wholearm.search.find_route.store_chart", fail)
+        patch.setattr("wholearm.search.find_route.store_roadmap", fail)
         assert main(["route", str(path), "--cache", str(found)]) == 0
     said = capsys.readouterr()
     assert tomllib.loads(said.out)["phases"] == [phase]

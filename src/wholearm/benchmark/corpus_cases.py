@@ -23,7 +23,7 @@ import numpy as np
 import wholearm
 from wholearm import Plan, Problem
 
-from ..search.find_route import forget_charts
+from ..search.find_route import forget_roadmaps
 from .kernels import list_modes
 from .queries import draw_leg, draw_query
 from .stress.damage import BASE, to_toml
@@ -224,7 +224,7 @@ def _reach(folder: Path, number: int) -> Row:
         free = {"flush": flush} if number % 4 else {"phi_deg": np.degrees(edge) + 10.0}
         problem = problem.with_({"goal": free})
     # What is known of a scene from other goals may lead to another route.
-    forget_charts()
+    forget_roadmaps()
     try:
         found = wholearm.find_route(problem)
     except wholearm.WholearmError as error:

@@ -25,7 +25,7 @@ from ..mapping.formation_list import format_route, list_formations
 from ..problem.definition import Problem
 from ..problem.goal import Goal
 from ..problem.read import build_problem, place_start, read_problem
-from ..search.find_route import find_route, forget_charts
+from ..search.find_route import find_route, forget_roadmaps
 from ..verification.verify import verify
 from .stress.scenes import Table
 from .study import Case, Row, Study
@@ -71,7 +71,7 @@ class Queries(Study):
     def run(self, case: Case) -> Row:
         """Ask a query, and a second one."""
         problem = draw_query(case[0], case[1], Path(case[2]))
-        forget_charts()
+        forget_roadmaps()
         row: Row = {"text": f"{problem.name}: {problem.table['start']} to {problem.goals[0]}"}
         started = time.process_time()
         try:

@@ -18,17 +18,13 @@ from ..problem.definition import Phase, Problem
 from ..results.trajectory import Samples, Trajectory
 from .stretch import EngineRun, EngineStretch
 
-OPEN = 0.1
-"""Gap at which a contact is open, over the departure that is allowed."""
-SLOW = 0.1
-"""Share of the planned sliding speed below which a contact sticks."""
-MOVES = 2e-3
-"""Sliding speed from which on a contact is known to slide, over the scene's speed."""
+OPEN = 0.1  # Gap at which a contact is open, over the departure that is allowed
+SLOW = 0.1  # Share of the planned sliding speed below which a contact sticks
+MOVES = 2e-3  # Sliding speed from which on a contact is known to slide, over the scene's speed
 PRESS = 0.25
 """Normal force above which a contact that is not planned presses, and from which on forces are
 compared, over the scene's force: 0.5 N in the scenes of `problems/`."""
-_INSTANTS = 2000
-"""Instants of a phase over which planned forces are averaged."""
+_INSTANTS = 2000  # Instants of a phase over which planned forces are averaged
 
 
 class Force(NamedTuple):
@@ -76,11 +72,7 @@ class _Part(NamedTuple):
 
 
 def compare(
-    problem: Problem,
-    plan: Trajectory,
-    stretch: EngineStretch,
-    run: EngineRun,
-    allowed: float,
+    problem: Problem, plan: Trajectory, stretch: EngineStretch, run: EngineRun, allowed: float
 ) -> Departure:
     """Compare a replay with the plan.
 

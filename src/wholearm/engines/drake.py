@@ -21,14 +21,10 @@ from .stretch import EngineRun, EngineStretch, Setting, Steps, list_steps
 
 SINKING = 6e-3
 """How far the scene's force presses a contact in, over the scene's length and the step."""
-STICTION = 1e-5
-"""Sliding speed up to which friction grows, over the scene's speed."""
-DISSIPATION = 1000.0
-"""Damping of contacts by Hunt and Crossley, times the scene's speed."""
-_EVERY = 4
-"""Steps from one look at the forces to the next: contacts swing ten times as slowly."""
-_ROUGH = 1e12
-"""Friction of vertices and edges, which makes that of a pair twice the other shape's."""
+STICTION = 1e-5  # Sliding speed up to which friction grows, over the scene's speed
+DISSIPATION = 1000.0  # Damping of contacts by Hunt and Crossley, times the scene's speed
+_EVERY = 4  # Steps from one look at the forces to the next: contacts swing ten times as slowly
+_ROUGH = 1e12  # Friction of vertices and edges, which makes that of a pair twice the other shape's
 
 
 def play(

@@ -20,8 +20,7 @@ from ..results.trajectory import Trajectory
 from .departure import PRESS, Departure, compare
 from .stretch import Engine, EngineStretch, Setting, apply_friction, find_between, list_stretches
 
-PARTS = 5
-"""Equal parts of a stretch at whose ends the error is listed."""
+PARTS = 5  # Equal parts of a stretch at whose ends the error is listed
 
 
 class Known(NamedTuple):

@@ -23,17 +23,13 @@ from .stretch import apply_friction
 
 SHARE = 1e-6
 """Weight of a joint's angle in its tendon, over the scene's time; that of the clock is 1."""
-DRIVE = 1e9
-"""Force that drives the clock, over what all springs may exert."""
-BEND = 1e-3
-"""Largest error of the ramps, relative to the largest torque."""
-RISE = 1e-6
-"""Least time from row to row, over the time step."""
+DRIVE = 1e9  # Force that drives the clock, over what all springs may exert
+BEND = 1e-3  # Largest error of the ramps, relative to the largest torque
+RISE = 1e-6  # Least time from row to row, over the time step
 CLOCK = "clock"
 HIDDEN = {"group": 3}
 """Group of joints and actuators for which MuJoCo's viewer has no sliders, unless asked for."""
-STEP = 1.6e-4
-"""Time step, over the scene's time: 1e-5 s in the scenes of `problems/`."""
+STEP = 1.6e-4  # Time step, over the scene's time: 1e-5 s in the scenes of `problems/`
 
 
 class Softness(NamedTuple):

@@ -17,8 +17,7 @@ from .pressing import EngineDrive, press_in
 from .shapes import list_pairs
 from .stretch import EngineRun, EngineStretch, Setting, list_steps
 
-_LITTLE = 1e-6
-"""Depth at which contacts are looked at, over the scene's length."""
+_LITTLE = 1e-6  # Depth at which contacts are looked at, over the scene's length
 
 
 def play(

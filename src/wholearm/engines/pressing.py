@@ -16,8 +16,7 @@ from .stretch import EngineStretch
 
 CREEP = 10.0
 """Speed from which on dry friction is all there, over that which it takes away in a step."""
-LOOSE = 3e-7
-"""Gap of what touches without a force, over the scene's length."""
+LOOSE = 3e-7  # Gap of what touches without a force, over the scene's length
 _APART = 0.1
 """Share of a contact's row that no other contact has, from which on it is another place."""
 

@@ -28,11 +28,9 @@ from ..common.arrays import Array
 from ..common.errors import InputError
 from ..scene.model import Scene
 
-ROUNDING = 1e-7
-"""Radius of vertices and edges, over the object's radius of gyration."""
+ROUNDING = 1e-7  # Radius of vertices and edges, over the object's radius of gyration
 OBJECT = "object"
-LINKS = ("link1", "link2")
-"""Bodies that move."""
+LINKS = ("link1", "link2")  # Bodies that move
 PALM = "palm"
 
 

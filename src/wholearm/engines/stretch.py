@@ -17,23 +17,16 @@ from ..results.trajectory import Trajectory
 from ..scene.model import Scene
 from ..simulation.simulate import simulate
 
-SAME = 1e-4
-"""Largest difference between plan and replay, over the scene's length and in rad."""
+SAME = 1e-4  # Largest difference between plan and replay, over the scene's length and in rad
 LATE = 1e-3
 """Largest difference of the times at which phases end, over the scene's time: an end at rest is
 reached so slowly that little in place is much in time."""
-_ROWS = 400
-"""Instants of each phase at which the replay is known, besides its steps."""
-_INSTANTS = 2000
-"""Instants of each phase at which the sign of a joint's speed is looked at."""
-ROWS = 200
-"""About how many times a phase is looked at."""
-FEWEST = 5000
-"""Fewest steps of a stretch: after a step of torques contacts swing for tens of steps."""
-_LOOKS = 8
-"""Instants of each step over which torques are averaged."""
-_LEAST = 1e-3
-"""First of these instants after the start, in steps."""
+_ROWS = 400  # Instants of each phase at which the replay is known, besides its steps
+_INSTANTS = 2000  # Instants of each phase at which the sign of a joint's speed is looked at
+ROWS = 200  # About how many times a phase is looked at
+FEWEST = 5000  # Fewest steps of a stretch: after a step of torques contacts swing for tens of steps
+_LOOKS = 8  # Instants of each step over which torques are averaged
+_LEAST = 1e-3  # First of these instants after the start, in steps
 
 
 class EngineStretch(NamedTuple):

@@ -82,7 +82,7 @@ class Trial:
             what = change_torques(self.torque, changes, rate, offset)
         else:
             gains = (1 + changes.get("gain1", 0.0), 1 + changes.get("gain2", 0.0))
-            delay = changes.get("delay", self.policy.pace.delay)
+            delay = changes.get("delay", self.policy.settings.delay)
             what = ClosedLoop(self.policy, self.windows[0].phase, delay, gains)
         try:
             simulation = self.simulate(changes, what, self.uncertainty.tolerance)

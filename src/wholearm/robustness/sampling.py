@@ -295,7 +295,7 @@ def _stamp(trial: Trial, seed: int) -> dict[str, Any]:
         "problem": trial.problem.table,
         "plan": _digest([trial.torque.breaks, trial.torque.coefficients, trial.state]),
         "policy": None if policy is None else _digest(known),
-        "pace": None if policy is None else policy.pace._asdict(),
+        "pace": None if policy is None else policy.settings._asdict(),
         "sensor": policy is not None and policy.sensor,
         "phases": [own.phase for own in trial.windows],
         "widths": trial.uncertainty.widths,
