@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..simulation.events import EventKind
+from ..simulation.tolerances import STANDING, STILL
 from .contact_problem import (
     APART,
     BACK,
@@ -29,7 +30,7 @@ from .contact_problem import (
     try_modes,
 )
 from .free_stepper import Modes
-from .state import AHEAD, CLOSED, STANDING, STILL, SUNK, FreeRun
+from .state import AHEAD, CLOSED, SUNK, FreeRun
 from .system import ContactRows, System
 
 CLEAR = 1e-3

@@ -17,6 +17,7 @@ from ..results.sampled import interpolate_quintic
 from ..simulation.events import EventKind
 from ..simulation.root_finding import find_crossing, find_root
 from ..simulation.runge_kutta import ORDER
+from ..simulation.tolerances import ROUNDING_FORCE, SHORTEST_STEP, STANDING, STILL
 from .contact_modes import ClosedContacts, Pattern, decide, find_closed, stands
 from .contact_problem import (
     APART,
@@ -30,19 +31,15 @@ from .contact_problem import (
     try_modes,
 )
 from .free_stepper import FreeOutputs, Modes
-from .state import AHEAD, ARMED, CLOSED, NO_PROGRESS, STANDING, STILL, SUNK, FreeRun
+from .state import AHEAD, ARMED, CLOSED, NO_PROGRESS, SUNK, FreeRun
 from .system import System
 
-ROUNDING = 1e-9
-"""Shortfall of a force that counts as rounding, in the scene's unit."""
 SPEED_ROUNDING = 1e-12
 """Likewise of a sliding or turning speed."""
 TURNING = 1e-4
 """Speed, relative to the scene's, below which sliding or turning may be about to reverse."""
 GROWTH = 10.0
 """Largest growth of a step."""
-SHORTEST = 1e-13
-"""Step below which the integration gives up, relative to the scene's time and the time gone by."""
 LOOKS = 8
 """Instants of the longest step at which gaps are looked at, its end among them."""
 REACH = 0.3
@@ -163,7 +160,7 @@ def _list_margins(run: FreeRun) -> Array:
     unit[k + len(stuck) :] = system.friction_units[list(modes.held)]
     margins = np.vstack([c[:k], bound - c[k:], bound + c[k:]])
     margins /= np.concatenate([unit, unit[k:]])[:, None]
-    margins[:, 0] += ROUNDING
+    margins[:, 0] += ROUNDING_FORCE
     rates = acceleration / (system.units[n:] / scales.time)[:, None]
     creeps = np.vstack([-rates, rates])
     creeps[:, 0] += 10 * STILL
@@ -362,7 +359,7 @@ class _Motion:
         self.watch = run.watches[run.modes]
         self.slack, self.watched = self.watch.slack, self.watch.pairs
         self.time = system.scales.time
-        self.near = 1e-3 * SHORTEST * max(self.time, abs(run.t))
+        self.near = 1e-3 * SHORTEST_STEP * max(self.time, abs(run.t))
 
     def move(self) -> None:
         """Integrate until something happens or the torques step or end."""
@@ -423,7 +420,7 @@ class _Motion:
         speed = self._find_most(start.out[n : 2 * n])
         push = self._find_most(start.out[to.acceleration])
         reach = 2 * REACH / (speed + math.sqrt(speed**2 + 2 * push * REACH) + 1e-300)
-        least = SHORTEST * max(self.time, abs(run.t))
+        least = SHORTEST_STEP * max(self.time, abs(run.t))
         while True:
             h = min(run.h, reach)
             whole = h >= 0.999 * remaining
@@ -670,8 +667,8 @@ def build_watch(system: System, modes: Modes, to: FreeOutputs) -> Watch:
         columns,
         np.ascontiguousarray(rows[:, columns]),
         constant,
-        np.repeat([ROUNDING, SPEED_ROUNDING, CLOSED], counts),
-        np.repeat([10 * ROUNDING, TURNING, 10 * CLOSED], counts),
+        np.repeat([ROUNDING_FORCE, SPEED_ROUNDING, CLOSED], counts),
+        np.repeat([10 * ROUNDING_FORCE, TURNING, 10 * CLOSED], counts),
         pairs,
         not holds,
     )

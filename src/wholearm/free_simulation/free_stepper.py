@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
-from ..simulation.layout import lay_out
+from ..simulation.layout import bind, build_torque, lay_out
 from ..simulation.runge_kutta import GLIMPSES, build_error, build_step
 from .system import Structure
 
@@ -118,7 +118,6 @@ class _FreeEquations:
         self.at = FreeInputs(*lay_out(size, None, None, None, k, n, s, 2, 2 * degree + 2, *numbers))
         pairs = len(structure.pairs)
         self.to = FreeOutputs(*lay_out(size, self.n, k, s, k, 2, None, None, pairs, pairs))
-        self.degree = degree
         self.dips: list[Expression] = []
         self._move = self._build_move()
         self._correct = self._build_correction()
@@ -145,13 +144,8 @@ class _FreeEquations:
             gaps = self.structure.gap_function(state[:n], packed[at.geometry])
             outputs = ca.vertcat(state, rates[n : 2 * n], *parts, *extra, ca.vec(gaps))
             functions.append(ca.Function("step", [packed], [ca.densify(outputs)]))
-        inputs, results = np.zeros(at.size), np.zeros(self.to.size)
-        buffers = [function.buffer() for function in functions]
-        for buffer, _ in buffers:
-            buffer.set_arg(0, inputs.data)
-            buffer.set_res(0, results.data)
-        step, look = (call for _, call in buffers)
-        return FreeStepper(inputs, results, at, self.to, step, look, buffers)
+        inputs, outputs, *calls = bind(at.size, self.to.size, functions)
+        return FreeStepper(inputs, outputs, at, self.to, *calls)
 
     def _build_move(self) -> Expression:
         """CasADi function (state, time, packed, geometry) -> rates, c_n, f, v_t, tau, spare.
@@ -169,7 +163,7 @@ class _FreeEquations:
         P = ca.vertcat(A, *(A_t[row, :] for row in stick), hold)
         G = ca.vertcat(G, *(A_t[row, :] for row in stick), hold)
         curve = ca.vertcat(bend, *(bend_t[row] for row in stick), ca.DM(len(self.held), 1))
-        tau = self._torque(time, packed)
+        tau = build_torque(time, packed[at.piece], packed[at.torque])
         viscous, dry = packed[at.viscous] * v, packed[at.dry] * sigma
         drive = ca.SX(n, 1)
         for row, coordinate in enumerate(structure.driven):
@@ -194,15 +188,6 @@ class _FreeEquations:
         outputs = [ca.vertcat(v, lift * force, *losses), c_n, f, v_t, tau, least]
         inputs = [ca.vertcat(z, v), time, packed, structure.geometry]
         return ca.Function("move", inputs, [ca.densify(part) for part in outputs])
-
-    def _torque(self, time: Expression, packed: Expression) -> Expression:
-        start, stop = packed[self.at.piece][0], packed[self.at.piece][1]
-        x = (2 * time - start - stop) / (stop - start)
-        coefficients = ca.reshape(packed[self.at.torque], self.degree + 1, 2)
-        value = coefficients[-1, :]
-        for power in range(self.degree - 1, -1, -1):
-            value = value * x + coefficients[power, :]
-        return value.T
 
     def _build_correction(self) -> Expression:
         """CasADi function (state, packed) -> state on the contacts, the shortest way in M.

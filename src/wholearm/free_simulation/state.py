@@ -13,6 +13,8 @@ from ..common.arrays import Array
 from ..common.errors import SimulationError, require_number
 from ..results.torque import TorqueProfile
 from ..simulation.events import Event, EventKind
+from ..simulation.layout import find_torque_steps
+from ..simulation.tolerances import STEP_OF_TORQUE
 from .free_stepper import LOSSES, FreeStepper, Modes, build_stepper
 from .system import System
 
@@ -25,8 +27,6 @@ SUNK = 1e-6
 another."""
 ARMED = 1e-13
 """Gap from which on a pair has been apart, relative to the scene's length."""
-STANDING = 1e-9
-"""Speed that counts as none, relative to the scene's."""
 CHATTER = 1e-6
 """Speed of impacts below which they count as the last one, relative to the scene's: what is closed
 and parts more slowly is pressed together again before it is apart by more than rounding."""
@@ -36,13 +36,9 @@ BURST = 3e-4
 """Time, relative to the scene's, in which `MANY` impacts raise `CHATTER` tenfold, and twice as many
 a hundredfold: fingers may knock an object to and fro for ever."""
 MANY = 20
-STILL = 1e-10
-"""Acceleration that counts as none, relative to the scene's."""
 AHEAD = 2e-5
 """How much later contact modes are judged, relative to the scene's time: forces that leave their
 range are told from those that come back into it."""
-TORQUE_STEP = 2e-8
-"""Jump of the torques that counts as one, relative to the scene's torque."""
 NO_PROGRESS = 60
 """Most decisions in a row without any time passing."""
 
@@ -61,12 +57,6 @@ class Record(NamedTuple):
     c_n: Array
     c_t: Array
     impact: float
-
-
-def _find_steps(before: Array, after: Array, unit: float) -> NDArray[np.bool_]:
-    """Whether torques step between two pieces, for n pairs of pieces, shape (n, 2, d + 1) each."""
-    jumps = after @ (-1.0) ** np.arange(after.shape[2]) - before.sum(axis=2)
-    return np.asarray(np.abs(jumps).max(axis=1) > TORQUE_STEP * unit)
 
 
 class FreeRun:
@@ -112,8 +102,8 @@ class FreeRun:
         self.events: list[Event] = []
         self.watches: dict[Modes, Any] = {}
         self.rub = np.zeros(0)
-        known = self.torque.coefficients
-        self._steps = _find_steps(known[:-1], known[1:], system.scales.torque).tolist()
+        parts, self.torque_step = self.torque.coefficients, STEP_OF_TORQUE * system.scales.torque
+        self._steps = find_torque_steps(parts[:-1], parts[1:], self.torque_step).tolist()
         self._begin_piece()
 
     @property
@@ -178,7 +168,7 @@ class FreeRun:
         """Whether the torques step at the start of the present piece."""
         if self.feedback is not None:
             before, after = self.torque.coefficients[self.piece - 1 : self.piece + 1]
-            return bool(_find_steps(before[None], after[None], self.system.scales.torque)[0])
+            return bool(find_torque_steps(before[None], after[None], self.torque_step)[0])
         return bool(self._steps[self.piece - 1])
 
     def face(self, z: Array, v: Array) -> tuple[Array, NDArray[np.bool_]]:

@@ -13,7 +13,7 @@ from ..contacts.formation import Formation
 from ..problem.definition import Phase, Problem
 from ..results.torque import TorqueProfile
 from .events import Event, EventKind, Outcome, OutcomeKind, Section
-from .layout import STATE
+from .layout import STATE, find_torque_steps
 from .modes import FREE, Grips
 from .stepper import ModeStepper, build_stepper
 from .tolerances import find_tolerances
@@ -29,7 +29,7 @@ class Replay:
     h : [s]                  the step to try next
     piece                    piece of the torques
     has_slid                 whether those that come to rest have slid in the phase
-    ways                     directions in which contacts, by name, have just begun to slip
+    slip_signs               directions in which contacts, by name, have just begun to slip
     side                     sign of (coordinate - value) before the end of the phase, if that is a
                              coordinate's value
     tolerances               those of the scene
@@ -37,7 +37,7 @@ class Replay:
     passes                   whether a motion may pass the end of the phase at any speed, without an
                              impact
     moving                   whether the motion goes on into the phase that is entered
-    left                     that of the last phase which has ended at rest
+    previous                 formation of the last phase that has ended at rest
     wanted                   instants at which steps have to end; infinity is last
     stuck                    contacts, then joints, of the phase's formation that stay while the
                              rest moves
@@ -64,7 +64,8 @@ class Replay:
         self.until_unit = 1.0
         self.breaks = [float(b) for b in torque.breaks]
         self.coefficients = torque.coefficients
-        self.steps_at = _find_steps(torque, self.tolerances.torque_step)
+        parts, least = torque.coefficients, self.tolerances.torque_step
+        self.steps_at = [True, *find_torque_steps(parts[:-1], parts[1:], least).tolist()]
         ends = torque.breaks[:-1], torque.breaks[1:]
         flat = self.coefficients.reshape(len(self.coefficients), -1)
         self.pieces = np.column_stack([*ends, flat])
@@ -79,11 +80,11 @@ class Replay:
         self.held_until = self.settled_by = -math.inf
         self.impact = 0.0
         self.passes = self.moving = False
-        self.left: Formation | None = None
+        self.previous: Formation | None = None
         self.side = 1.0
         self.stuck: set[int] = set()
         self.has_slid = False
-        self.ways: dict[str, float] = {}
+        self.slip_signs: dict[str, float] = {}
         self.decided = (-math.inf, 0)
         self.sections: list[Section] = []
         self.steppers: list[ModeStepper] = []
@@ -276,10 +277,3 @@ class Replay:
         scene, v = self.problem.scene, self.y[5:10]
         height = scene.polygon.mass * scene.gravity * self.y[1]
         return float(0.5 * v**2 @ scene.mass_diagonal + height)
-
-
-def _find_steps(torque: TorqueProfile, least: float) -> list[bool]:
-    """Whether the torques step by more than `least` at the start of each of k pieces."""
-    alternate = (-1.0) ** np.arange(torque.coefficients.shape[2])
-    jump = (torque.coefficients[1:] @ alternate) - torque.coefficients[:-1].sum(axis=2)
-    return [True, *(np.abs(jump).max(axis=1) > least).tolist()]
