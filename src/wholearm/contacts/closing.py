@@ -23,20 +23,16 @@ from .elemental import Contact, candidate_contacts
 from .formation import Formation, Kinematics
 from .links import FINGERS_TOUCH, evaluate_finger_gap
 
-_PLACES = 1000
-"""Places along x that are tried."""
+_PLACES = 1000  # places along x that are tried
 Numbers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 TOO_SHORT, JOINT_COVERED, FINGERS_CROSS = 1, 2, 3
 """Reasons why a finger cannot close: it reaches no part of the object; its joint is in the object
 or right above it, so that the link overlaps the object before it closes; the other finger is closed
 in its way."""
-AROUND = 3
-"""Neighbouring vertices that are looked at where a finger closes."""
-LEVEL = 1e-12
-"""How far below a joint the object is still level with it, over the link's length."""
-CHUNK = 4096
-"""Poses that are closed at a time, so that they stay in the cache."""
+AROUND = 3  # neighbouring vertices that are looked at where a finger closes
+LEVEL = 1e-12  # how far below a joint the object is still level with it, over the link's length
+CHUNK = 4096  # poses that are closed at a time, so that they stay in the cache
 
 
 class ClosedFinger(NamedTuple):

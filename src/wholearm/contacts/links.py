@@ -23,8 +23,7 @@ from ..common.sharing import Store, exclusive
 from ..scene.model import Scene
 from .elemental import GapLimit, build_features, rotate_quarter
 
-FINGERS_TOUCH = "finger 1 touches finger 2"
-"""Sentence for where the gap of the fingers is zero."""
+FINGERS_TOUCH = "finger 1 touches finger 2"  # sentence for where the gap of the fingers is zero
 _ROUNDING = 1e-30
 """Added to squared distances over squared lengths, so that ends that coincide have a direction."""
 

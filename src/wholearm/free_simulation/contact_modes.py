@@ -35,10 +35,8 @@ from .system import ContactRows, System
 
 CLEAR = 1e-3
 """Forces and rates, relative to the largest, that a moment does not make zero: it is `AHEAD`."""
-DEPENDENT = 1e-7
-"""Share of a row that others leave, below which it is no constraint of its own."""
-ROUNDED = 1e-15
-"""Speed that rounding leaves, relative to the largest one."""
+DEPENDENT = 1e-7  # share of a row that others leave, below which it is no constraint of its own
+ROUNDED = 1e-15  # speed that rounding leaves, relative to the largest one
 _NONE = np.zeros(0)
 _NOTHING = (_NONE, np.zeros(0, dtype=np.int64), _NONE, _NONE)
 

@@ -34,14 +34,11 @@ from .free_stepper import FreeOutputs, Modes
 from .state import AHEAD, ARMED, CLOSED, NO_PROGRESS, SUNK, FreeRun
 from .system import System
 
-SPEED_ROUNDING = 1e-12
-"""Likewise of a sliding or turning speed."""
+SPEED_ROUNDING = 1e-12  # likewise of a sliding or turning speed
 TURNING = 1e-4
 """Speed, relative to the scene's, below which sliding or turning may be about to reverse."""
-GROWTH = 10.0
-"""Largest growth of a step."""
-LOOKS = 8
-"""Instants of the longest step at which gaps are looked at, its end among them."""
+GROWTH = 10.0  # largest growth of a step
+LOOKS = 8  # instants of the longest step at which gaps are looked at, its end among them
 REACH = 0.3
 """Farthest that a step may go, in units of the scene: gaps are seen every `REACH` / `LOOKS`."""
 EXACT = 1e-14
@@ -50,8 +47,7 @@ CHATTER_PAUSE = 1e-3
 """Time in which the end of the impacts of a pair is told once, relative to the scene's time."""
 SLIDES = 1e-3
 """Least sliding of what slides on, relative to that before and to the speed of the impact."""
-ROUNDS = 30
-"""Most impacts at one instant; what is left after them is plastic."""
+ROUNDS = 30  # most impacts at one instant; what is left after them is plastic
 
 
 def play(run: FreeRun, touching: float, halt: Callable[[FreeRun], bool] | None = None) -> None:

@@ -13,25 +13,21 @@ from ..common.arrays import Array
 from ..common.errors import SimulationError, require_number
 from ..results.torque import TorqueProfile
 from ..simulation.events import Event, EventKind
-from ..simulation.layout import find_torque_steps
+from ..simulation.layout import evaluate_piece, find_torque_steps
 from ..simulation.tolerances import STEP_OF_TORQUE
 from .free_stepper import LOSSES, FreeStepper, Modes, build_stepper
 from .system import System
 
-SAME = 1e-9
-"""Distance of two instants that counts as none, relative to the period."""
-CLOSED = 1e-10
-"""Gap that counts as closed at an event, relative to the scene's length."""
+SAME = 1e-9  # distance of two instants that counts as none, relative to the period
+CLOSED = 1e-10  # gap that counts as closed at an event, relative to the scene's length
 SUNK = 1e-6
 """Overlap up to which features touch, relative to the scene's length; beyond it they are behind one
 another."""
-ARMED = 1e-13
-"""Gap from which on a pair has been apart, relative to the scene's length."""
+ARMED = 1e-13  # gap from which on a pair has been apart, relative to the scene's length
 CHATTER = 1e-6
 """Speed of impacts below which they count as the last one, relative to the scene's: what is closed
 and parts more slowly is pressed together again before it is apart by more than rounding."""
-COARSE = 1e3
-"""The same over the tolerance, where that is coarser than impacts need."""
+COARSE = 1e3  # the same over the tolerance, where that is coarser than impacts need
 BURST = 3e-4
 """Time, relative to the scene's, in which `MANY` impacts raise `CHATTER` tenfold, and twice as many
 a hundredfold: fingers may knock an object to and fro for ever."""
@@ -39,8 +35,7 @@ MANY = 20
 AHEAD = 2e-5
 """How much later contact modes are judged, relative to the scene's time: forces that leave their
 range are told from those that come back into it."""
-NO_PROGRESS = 60
-"""Most decisions in a row without any time passing."""
+NO_PROGRESS = 60  # most decisions in a row without any time passing
 
 
 class Record(NamedTuple):
@@ -159,10 +154,7 @@ class FreeRun:
 
     def tau(self, t: float) -> Array:
         """Torques of the present piece at `t`, also beyond its end, shape (2,) [N m]."""
-        start, stop = self.torque.breaks[self.piece : self.piece + 2]
-        coefficients = self.torque.coefficients[self.piece]
-        x = (2 * t - start - stop) / (stop - start)
-        return np.asarray(coefficients @ x ** np.arange(coefficients.shape[1]))
+        return evaluate_piece(self.torque, self.piece, t)
 
     def torque_steps(self) -> bool:
         """Whether the torques step at the start of the present piece."""

@@ -22,8 +22,7 @@ from ..common.batch import Batch
 from ..common.sharing import Keeper, kept_property
 from ..scene.model import Scales
 
-_ANYWHERE = 1e9
-"""Range of features that face each other wherever they are [m]."""
+_ANYWHERE = 1e9  # range of features that face each other wherever they are [m]
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,14 +12,10 @@ from .curve import Curve, Panel, Segment
 
 NEAR = 0.2
 """Distance from the nodes of a curve, in radii of gyration, from which on a place is not on it."""
-ON = 1e-9
-"""Distance from a curve, in radii of gyration, up to which a place is on it."""
-ROUNDS = 8
-"""Most steps of Newton's method to the nearest place of a curve."""
-SHORTEST = 1e-7
-"""Shortest segment, over the length of its curve."""
-LEAST = 1e-9
-"""The same of panels; what is missing at an end is extrapolated."""
+ON = 1e-9  # distance from a curve, in radii of gyration, up to which a place is on it
+ROUNDS = 8  # most steps of Newton's method to the nearest place of a curve
+SHORTEST = 1e-7  # shortest segment, over the length of its curve
+LEAST = 1e-9  # the same of panels; what is missing at an end is extrapolated
 
 
 def find_on(curve: Curve, z: Array) -> float | None:

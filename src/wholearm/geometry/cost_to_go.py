@@ -16,8 +16,7 @@ from ..mechanics.metric import metric_weights
 from ..problem.definition import Phase
 from .tracing import trace_phase
 
-_STEP = 1e-2
-"""Step of the difference quotient, over the length of the curve that follows."""
+_STEP = 1e-2  # step of the difference quotient, over the length of the curve that follows
 
 
 @dataclass(frozen=True, eq=False)

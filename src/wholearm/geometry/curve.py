@@ -20,8 +20,7 @@ from ..common.arrays import Array
 from ..contacts.formation import Formation, Kinematics
 from ..mechanics.metric import metric_weights
 
-REFINE = 3
-"""Places per node of a panel at which limits and reversals are looked for."""
+REFINE = 3  # places per node of a panel at which limits and reversals are looked for
 _TIED = 1e-6
 """Part of two rates, over both, below which they are proportional, and below which one is none."""
 

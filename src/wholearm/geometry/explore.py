@@ -11,10 +11,8 @@ from ..contacts.closing import close_fingers, lower
 from ..contacts.formation import Formation
 from ..mechanics.metric import metric_weights
 
-GRID = (120, 60)
-"""Places across x and phi at which a formation is looked at."""
-SEEDS = 24
-"""Most places from which an end is looked for: those that are nearest to it."""
+GRID = (120, 60)  # places across x and phi at which a formation is looked at
+SEEDS = 24  # most places from which an end is looked for: those that are nearest to it
 STILL = 1e-4
 """Distance from the start, in radii of gyration, below which a phase would have nothing to do."""
 CLOSED = 3e-11

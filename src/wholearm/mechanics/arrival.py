@@ -31,12 +31,10 @@ from .dynamics import Directions, force_rows
 from .impact import ViolationKind, compute_impact
 from .wedging import SURE, find_static_torques
 
-LEAST = 1e-2
-"""Margin over what is ample below which torques do not hold, or close, for sure."""
+LEAST = 1e-2  # margin over what is ample below which torques do not hold, or close, for sure
 AMPLE = 0.1
 """Margin that is ample: of a normal force, a torque or an acceleration, over the scene's."""
-DRIVE = 0.02
-"""Least acceleration towards a contact that is still open, over the scene's."""
+DRIVE = 0.02  # least acceleration towards a contact that is still open, over the scene's
 SLOW = 0.2
 """Least margin of torques that close a contact more slowly, over that of torques that only hold."""
 _CREEP = 0.02
@@ -45,14 +43,11 @@ scene's."""
 _STILL = 1e-9
 """Rate of sliding or turning that counts as none, over how fast anything moves; change of a gap
 that counts as none, over how far everything moves."""
-_JAMS = 1e-6
-"""Determinant of K over that without friction, at which and below a way jams."""
+_JAMS = 1e-6  # determinant of K over that without friction, at which and below a way jams
 _INDEPENDENT = 1e-12
 """Least Gram determinant of the rows of constraints, each of length one, that are independent."""
-_SMALL = 1e-9
-"""What counts as zero in the linear programme."""
-_FAR = 1e3
-"""Largest margin that is looked for, over what is ample."""
+_SMALL = 1e-9  # what counts as zero in the linear programme
+_FAR = 1e3  # largest margin that is looked for, over what is ample
 
 
 class ArrivalPath(NamedTuple):

@@ -29,8 +29,7 @@ from .dynamics import PathForces
 
 PRESS, CONE, TORQUE, SPEED = "press", "cone", "torque", "speed"
 """Kinds of limits: least normal forces, friction cones, torques and speeds of the joints."""
-EPSILON = "epsilon"
-"""Key of the least normal force."""
+EPSILON = "epsilon"  # key of the least normal force
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,8 +29,7 @@ from ..scene.model import Scene
 SURE = 1e-3
 """Distance from torques that friction can hold, beyond which a motion begins for sure, relative to
 the scene's torque."""
-_TINY = 1e-9
-"""What counts as zero of numbers of the order of one."""
+_TINY = 1e-9  # what counts as zero of numbers of the order of one
 
 
 class StaticTorques(NamedTuple):

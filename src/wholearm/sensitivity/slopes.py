@@ -33,12 +33,9 @@ from ..mechanics.dynamics import Directions, PathForces, force_rows
 from ..mechanics.metric import metric_weights
 from ..results.trajectory import Samples
 
-COUNT = 5
-"""Number of coefficients: of 1, a, b, the squeeze and s'."""
-_STEP = 1e-5
-"""Step of the differences of kinematics, over the scene's length."""
-_LOOSE = 1e-6
-"""Weight of the fingers' angles where they follow the object."""
+COUNT = 5  # number of coefficients: of 1, a, b, the squeeze and s'
+_STEP = 1e-5  # step of the differences of kinematics, over the scene's length
+_LOOSE = 1e-6  # weight of the fingers' angles where they follow the object
 
 
 class _Change(NamedTuple):

@@ -21,50 +21,37 @@ from ..results.trajectory import Trajectory
 from .layout import Outputs
 from .runge_kutta import GLIMPSES, NODES
 
-REPLAYED = "replayed"
-"""Status in the `meta` of such a trajectory."""
+REPLAYED = "replayed"  # status in the `meta` of such a trajectory
 
 
 class EventKind(Enum):
     """What happens at an instant of a simulation."""
 
-    START = "start"
-    """The object starts to move from rest."""
-    REST = "rest"
-    """The object comes to rest short of the end of the phase."""
+    START = "start"  # the object starts to move from rest
+    REST = "rest"  # the object comes to rest short of the end of the phase
     STICK = "stick"
     """Friction holds a contact or a joint while the rest moves, or the object stays at rest."""
-    REVERSAL = "reversal"
-    """A contact's sliding or a joint changes direction."""
-    TORQUE_STEP = "torque step"
-    """The torques jump."""
-    ARRIVAL = "arrival"
-    """The end of the phase is reached, and the next formation taken."""
+    REVERSAL = "reversal"  # a contact's sliding or a joint changes direction
+    TORQUE_STEP = "torque step"  # the torques jump
+    ARRIVAL = "arrival"  # the end of the phase is reached, and the next formation taken
     IMPACT = "impact"
     """The velocity jumps onto the next formation, which is taken if every contact presses."""
     RELEASE = "release"
     """The contacts that the next phase does not have are let go, and its formation is taken."""
-    CONTACT_LOST = "contact lost"
-    """A normal force falls to zero."""
+    CONTACT_LOST = "contact lost"  # a normal force falls to zero
     SLIP = "slip"
     """Friction no longer holds a contact or a joint; if the phase lets that contact roll the motion
     ends."""
-    LIMIT = "limit"
-    """The formation stops being valid in another way."""
-    END = "end"
-    """The torques end before the goal."""
-    GAINED = "contact gained"
-    """A contact that nothing was said about presses from here on."""
-    PASS = "pass"
-    """A contact goes on as one of a neighbouring feature."""
-    CHATTER = "chatter"
-    """Impacts that come ever faster are over: the contact stays closed."""
+    LIMIT = "limit"  # the formation stops being valid in another way
+    END = "end"  # the torques end before the goal
+    GAINED = "contact gained"  # a contact that nothing was said about presses from here on
+    PASS = "pass"  # a contact goes on as one of a neighbouring feature
+    CHATTER = "chatter"  # impacts that come ever faster are over: the contact stays closed
     AMBIGUOUS = "ambiguous"
     """The laws of contact allow several motions; the one nearest to the last is taken."""
     INCONSISTENT = "inconsistent"
     """They allow none with finite forces: an impact without a collision."""
-    GIVEN_UP = "given up"
-    """Events come without time passing, or steps do not get anywhere."""
+    GIVEN_UP = "given up"  # events come without time passing, or steps do not get anywhere
 
 
 class Event(NamedTuple):
@@ -92,8 +79,7 @@ class OutcomeKind(Enum):
     HELD = "held"
     LIMIT_REACHED = "limit reached"
     GOAL_MISSED = "goal missed"
-    ENDED = "ended"
-    """A simulation that is told no contacts came to its end."""
+    ENDED = "ended"  # a simulation that is told no contacts came to its end
     GIVEN_UP = "given up"
 
 

@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array, Expression
+from ..results.torque import TorqueProfile
 
-STATE = 14
-"""Length of the integrated vector: z, z', then work, viscous, dry and contact losses."""
-MOVING = 10
-"""Length of what the motion depends on: z, z'."""
+STATE = 14  # length of the integrated vector: z, z', then work, viscous, dry and contact losses
+MOVING = 10  # length of what the motion depends on: z, z'
 
 
 class Inputs(NamedTuple):
@@ -111,3 +110,10 @@ def find_torque_steps(before: Array, after: Array, least: float) -> NDArray[np.b
     """Whether torques step by more than `least` from pieces to pieces, (n, 2, d + 1) each, (n,)."""
     jump = after @ (-1.0) ** np.arange(after.shape[2]) - before.sum(axis=2)
     return np.asarray(np.abs(jump).max(axis=1) > least)
+
+
+def evaluate_piece(torque: TorqueProfile, piece: int, t: float) -> Array:
+    """Torques of a piece at time `t`, also beyond its ends, shape (2,) [N m]."""
+    start, stop = torque.breaks[piece : piece + 2].tolist()
+    x = (2 * t - start - stop) / (stop - start)
+    return np.asarray(torque.coefficients[piece] @ x ** np.arange(torque.coefficients.shape[2]))

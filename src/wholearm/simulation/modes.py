@@ -46,8 +46,7 @@ class Grips:
         return len(self.contacts) + len(self.joints)
 
 
-FREE = Grips()
-"""Nothing is held."""
+FREE = Grips()  # nothing is held
 
 
 class Unit(NamedTuple):

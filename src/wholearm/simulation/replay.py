@@ -20,13 +20,12 @@ from .tolerances import find_tolerances
 
 
 class Replay:
-    """A simulation under way: the state, where it is in the torques, and what is recorded.
+    """State, piece of the torques and records of a running simulation.
 
     Attributes
     ----------
-    t : [s]
+    t, h : [s]               present time, and the step to try next
     y : (STATE,)             z, z', then work, viscous, dry and contact losses
-    h : [s]                  the step to try next
     piece                    piece of the torques
     has_slid                 whether those that come to rest have slid in the phase
     slip_signs               directions in which contacts, by name, have just begun to slip
@@ -70,8 +69,8 @@ class Replay:
         flat = self.coefficients.reshape(len(self.coefficients), -1)
         self.pieces = np.column_stack([*ends, flat])
         self.step_times = [b for b, s in zip(self.breaks, self.steps_at, strict=False) if s]
-        known = wanted[(wanted >= self.breaks[0]) & (wanted <= self.breaks[-1])]
-        self.wanted = [*known.tolist(), math.inf]
+        within = wanted[(wanted >= self.breaks[0]) & (wanted <= self.breaks[-1])]
+        self.wanted = [*within.tolist(), math.inf]
         self.next_wanted = 0
         self.t, self.piece = self.breaks[0], 0
         self.y = np.zeros(STATE)
@@ -101,14 +100,6 @@ class Replay:
         s.inputs[s.at.tolerance] = self.tolerance
         s.inputs[s.at.kept] = s.mode.read_kept(self.y[:5])
         self.load_piece()
-
-    def count_decision(self, most: int) -> None:
-        """Count one decision of friction; raise an error if there are `most` at one instant."""
-        count = self.decided[1] + 1 if self.t <= self.decided[0] else 1
-        self.decided = (self.t, count)
-        if count > most:
-            names = " ".join(self.phase.formation.names)
-            raise SimulationError(f"sticking and slipping of {names} do not end {self.where()}")
 
     def accept(self, t: float) -> Array:
         """Take the step just made, to time `t`, and record its end."""
@@ -164,8 +155,8 @@ class Replay:
 
     def repeats(self) -> bool:
         """Whether the last two records are of the same instant of one phase, but for rounding."""
-        own = [section for section in self.sections if section.phase is self.phase]
-        times = [time for section in own[-2:] for time in section.times[-2:]]
+        sections = [section for section in self.sections if section.phase is self.phase]
+        times = [time for section in sections[-2:] for time in section.times[-2:]]
         return len(times) > 1 and self.t - times[-2] <= self.tolerances.settling
 
     def note(
@@ -198,32 +189,27 @@ class Replay:
 
     def run_out(self) -> Outcome:
         """End because the torques end."""
-        if self.phase.until.is_release:
-            text = f"the torques end {self.when()}, before {self.describe_end()}"
-            self.note(EventKind.END, text)
-            return Outcome(OutcomeKind.GOAL_MISSED, text)
-        distance = self.value(self.stepper.rows.until)
-        unit = "rad" if self.phase.until.coordinate == "phi" else "m"
-        text = f"the torques end {self.when()}, {distance:.3g} {unit} short of {self.phase.until}"
+        until, distance = self.phase.until, math.nan
+        if until.is_release:
+            names = self.phase.formation.names
+            ends = [(self.resting, "comes to rest"), (self.slipping, "slips")]
+            texts = [f"{', '.join(names[k] for k in sorted(rows))} {t}" for rows, t in ends if rows]
+            if self.releasable:
+                texts = [f"{', '.join(self.releasable)} is released"]
+            text = f"the torques end {self.when()}, before {' or '.join(texts)}"
+        else:
+            distance = self.value(self.stepper.rows.until)
+            unit = "rad" if until.coordinate == "phi" else "m"
+            text = f"the torques end {self.when()}, {distance:.3g} {unit} short of {until}"
         self.note(EventKind.END, text, "", distance)
         return Outcome(OutcomeKind.GOAL_MISSED, text)
-
-    def describe_end(self) -> str:
-        """What ends a phase without an `until`, to follow "before"."""
-        names = self.phase.formation.names
-        rest, slip = (
-            ", ".join(names[k] for k in sorted(rows)) for rows in (self.resting, self.slipping)
-        )
-        if self.releasable:
-            return f"{', '.join(self.releasable)} is released"
-        return " or ".join([f"{rest} comes to rest"] * bool(rest) + [f"{slip} slips"] * bool(slip))
 
     def value(self, row: int) -> float:
         """One of the event values at the present state."""
         return float(self.stepper.outputs[self.stepper.to.events.start + row])
 
     def load_piece(self) -> None:
-        """Hand the present piece of the torques to the stepper."""
+        """Set the stepper's inputs for the present piece of the torques."""
         s = self.stepper
         s.inputs[s.at.piece.start : s.at.torque.stop] = self.pieces[self.piece]
 
@@ -246,15 +232,8 @@ class Replay:
         """When the torques last stepped, at their start or later [s]."""
         return self.step_times[bisect_left(self.step_times, self.breaks[self.piece + 1]) - 1]
 
-    def torque(self, t: float) -> Array:
-        """Torques of the present piece at time `t`, also beyond its end, shape (2,) [N m]."""
-        start, stop = self.breaks[self.piece], self.breaks[self.piece + 1]
-        coefficients = self.coefficients[self.piece]
-        x = (2 * t - start - stop) / (stop - start)
-        return np.asarray(coefficients @ x ** np.arange(coefficients.shape[1]))
-
     def fraction(self, t: float) -> float:
-        """Where time `t` is on the present piece, from -1 to 1."""
+        """Coordinate of time `t` on the present piece, from -1 to 1."""
         start, stop = self.breaks[self.piece], self.breaks[self.piece + 1]
         return min(1.0, max(-1.0, (2 * t - start - stop) / (stop - start)))
 

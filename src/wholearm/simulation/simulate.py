@@ -84,10 +84,8 @@ _OUTCOMES = {
     ViolationKind.CLOSING: OutcomeKind.LIMIT_REACHED,
     ViolationKind.HELD: OutcomeKind.HELD,
 }
-_GROWTH = 40.0
-"""Largest growth of a step: at order 8 an error of 1e-13 of the tolerance allows it."""
-_HELD_AT = 5
-"""Places of a piece of the torques at which they have to hold the object."""
+_GROWTH = 40.0  # largest growth of a step: at order 8 an error of 1e-13 of the tolerance allows it
+_HELD_AT = 5  # places of a piece of the torques at which they have to hold the object
 ROUNDS = 8
 """Most simulations, each with more steps that end where something showed within those before."""
 Closer = Callable[[Simulation, Glimpses, int], ArrayLike]

@@ -17,20 +17,17 @@ from ..scene.model import Scene
 
 ROUNDING_FORCE = 1e-9
 """Largest shortfall of a force, a torque or what friction has left that counts as rounding."""
-ROUNDING_SPEED = 2e-13
-"""Largest negative speed that counts as rounding."""
+ROUNDING_SPEED = 2e-13  # largest negative speed that counts as rounding
 ROUNDING_LIMIT = 3e-8
 """Largest overlap that counts as rounding: the contact just given up starts at zero."""
 SHORT = 3e-5
 """Largest overlap at the start of a phase: one may end at rest this much short of the place where
 the next one's formation begins."""
-REACHED = 3e-5
-"""Distance to the end of a phase that counts as there, when at rest."""
+REACHED = 3e-5  # distance to the end of a phase that counts as there, when at rest
 PASSED = 1e-5
 """Distance beyond the end of a phase that is passed at speed, for which a formation may still be
 taken for the one before, until the torques step: an error of a long motion before it."""
-SLOW = 2e-4
-"""Speed that counts as rest at the end of a phase."""
+SLOW = 2e-4  # speed that counts as rest at the end of a phase
 CREEPING = 1e-7
 """Speed of a motion that fades at the end of its phase, from which on it is not yet there: more
 than what the integration and a table of torques leave there."""
@@ -45,14 +42,11 @@ REST_WINDOW = 2e-3
 for its contacts to part by more than what counts as touching."""
 LONGEST_WINDOW = 2e-2
 """Longest time before a torque break at which an arrival at a speed still belongs to it."""
-FIRST_STEP = 2e-2
-"""Length of the first step tried from rest."""
+FIRST_STEP = 2e-2  # length of the first step tried from rest
 SHORTEST_STEP = 1e-13
 """Step below which the integration gives up, relative to the scene's time and the time gone by."""
-STEP_OF_TORQUE = 2e-8
-"""Jump of the torques at a break that counts as one."""
-STILL = 1e-10
-"""Acceleration that counts as rounding."""
+STEP_OF_TORQUE = 2e-8  # jump of the torques at a break that counts as one
+STILL = 1e-10  # acceleration that counts as rounding
 CLOSING = 1e-7
 """Acceleration of a gap that counts as rounding: its gradient is a difference quotient."""
 
