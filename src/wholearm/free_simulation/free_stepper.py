@@ -1,4 +1,4 @@
-"""Steps of a motion with given modes of contact, compiled when they are first used."""
+"""Compiled Runge-Kutta steps of a motion with given contact modes."""
 
 from __future__ import annotations
 
@@ -57,11 +57,7 @@ class FreeInputs(NamedTuple):
 
 
 class FreeOutputs(NamedTuple):
-    """Where each output is.
-
-    State, z'', c_n, friction that holds, v_t, tau, error, least within; gaps and ranges of all
-    pairs.
-    """
+    """Where each output is: state, z'', forces, v_t, tau, error, least margin, gaps, ranges."""
 
     y: slice
     acceleration: slice
@@ -89,29 +85,18 @@ class FreeStepper(NamedTuple):
 
 
 @lru_cache(maxsize=256)
-def build_stepper(
-    structure: Structure,
-    kept: tuple[int, ...],
-    stuck: tuple[int, ...],
-    held: tuple[int, ...],
-    degree: int,
-) -> FreeStepper:
-    """Return the steps of a set of modes, for torques of a polynomial degree."""
-    return _FreeEquations(structure, kept, stuck, held, degree).compile()
+def build_stepper(structure: Structure, modes: Modes, degree: int) -> FreeStepper:
+    """Steps of a set of modes without its signs, for torques of a polynomial degree."""
+    return _FreeEquations(structure, modes, degree).compile()
 
 
 class _FreeEquations:
-    """The equations of motion, as expressions of one packed vector."""
+    """Equations of motion, as expressions of one packed vector."""
 
-    def __init__(
-        self,
-        structure: Structure,
-        kept: tuple[int, ...],
-        stuck: tuple[int, ...],
-        held: tuple[int, ...],
-        degree: int,
-    ) -> None:
-        self.structure, self.kept, self.stuck, self.held = structure, kept, stuck, held
+    def __init__(self, structure: Structure, modes: Modes, degree: int) -> None:
+        self.structure, (kept, stuck, held, _, _) = structure, modes
+        self.kept, self.held = kept, held
+        self.stick = [kept.index(pair) for pair in stuck]
         self.n, k, s = structure.n, len(kept), len(stuck) + len(held)
         n, size, g = structure.n, 2 * structure.n + LOSSES, structure.geometry.shape[0]
         numbers = (g, n, n, n, n, k, 2 * n, None, n)
@@ -147,21 +132,20 @@ class _FreeEquations:
         inputs, outputs, *calls = bind(at.size, self.to.size, functions)
         return FreeStepper(inputs, outputs, at, self.to, *calls)
 
-    def _build_move(self) -> Expression:
-        """CasADi function (state, time, packed, geometry) -> rates, c_n, f, v_t, tau, spare.
+    def _stack(self, normal: Expression, tangential: Expression) -> Expression:
+        """Constraint rows: normal ones, tangential ones that stick, held coordinates."""
+        hold = ca.DM(np.eye(self.n)[list(self.held)].reshape(len(self.held), self.n))
+        return ca.vertcat(normal, *(tangential[row, :] for row in self.stick), hold)
 
-        The last is what friction and contacts have left, in units of the scene.
-        """
+    def _build_move(self) -> Expression:
+        """CasADi function (state, time, packed, geometry) -> rates, c_n, f, v_t, tau, margin."""
         structure, n, at = self.structure, self.n, self.at
-        k, stick = len(self.kept), [self.kept.index(pair) for pair in self.stuck]
+        k, stick = len(self.kept), self.stick
         z, v, time = structure.z, ca.SX.sym("v", n), ca.SX.sym("time")
         packed = ca.SX.sym("packed", at.size)
         Xi, sigma, mu = packed[at.Xi], packed[at.sigma], packed[at.mu]
         _, _, A, A_t, bend, bend_t = structure.build_rows(self.kept, v)
-        G = A - ca.repmat(mu * Xi, 1, n) * A_t
-        hold = ca.DM(np.eye(n)[list(self.held)].reshape(len(self.held), n))
-        P = ca.vertcat(A, *(A_t[row, :] for row in stick), hold)
-        G = ca.vertcat(G, *(A_t[row, :] for row in stick), hold)
+        P, G = (self._stack(part, A_t) for part in (A, A - ca.repmat(mu * Xi, 1, n) * A_t))
         curve = ca.vertcat(bend, *(bend_t[row] for row in stick), ca.DM(len(self.held), 1))
         tau = build_torque(time, packed[at.piece], packed[at.torque])
         viscous, dry = packed[at.viscous] * v, packed[at.dry] * sigma
@@ -190,7 +174,7 @@ class _FreeEquations:
         return ca.Function("move", inputs, [ca.densify(part) for part in outputs])
 
     def _build_correction(self) -> Expression:
-        """CasADi function (state, packed) -> state on the contacts, the shortest way in M.
+        """CasADi function (state, packed) -> its projection on the constraints in the metric M.
 
         A step leaves gaps of the size of its error, so one Newton iteration closes them.
         """
@@ -198,19 +182,18 @@ class _FreeEquations:
         z, v = structure.z, ca.SX.sym("v", n)
         packed = ca.SX.sym("packed", self.at.size)
         gap, slip, A, A_t, _, _ = structure.build_rows(self.kept, v)
-        stick = [self.kept.index(pair) for pair in self.stuck]
-        hold = ca.DM(np.eye(n)[list(self.held)].reshape(len(self.held), n))
-        P = ca.vertcat(A, *(A_t[row, :] for row in stick), hold)
-        state = ca.vertcat(z, v)
+        P, state = self._stack(A, A_t), ca.vertcat(z, v)
         if not P.shape[0]:
             return ca.Function("correct", [state, packed], [state])
         wanted = ca.vertcat(ca.DM(len(self.kept), 1), packed[self.at.stay])
         lift = ca.repmat(packed[self.at.lift], 1, P.shape[0]) * P.T
-        off = ca.vertcat(gap, *(slip[row] for row in stick), *(z[i] for i in self.held)) - wanted
-        y, given = ca.MX.sym("y", 2 * n), ca.MX.sym("packed", self.at.size)
+        off = (
+            ca.vertcat(gap, *(slip[row] for row in self.stick), *(z[i] for i in self.held)) - wanted
+        )
+        y, inputs = ca.MX.sym("y", 2 * n), ca.MX.sym("packed", self.at.size)
         off_function = ca.Function("off", [z, packed, structure.geometry], [P, lift, off])
-        P, lift, off = off_function(y[:n], given, given[self.at.geometry])
+        P, lift, off = off_function(y[:n], inputs, inputs[self.at.geometry])
         place = y[:n] - lift @ ca.solve(P @ lift, off)
-        P, lift, _ = off_function(place, given, given[self.at.geometry])
+        P, lift, _ = off_function(place, inputs, inputs[self.at.geometry])
         speed = y[n:] - lift @ ca.solve(P @ lift, P @ y[n:])
-        return ca.Function("correct", [y, given], [ca.vertcat(place, speed)])
+        return ca.Function("correct", [y, inputs], [ca.vertcat(place, speed)])

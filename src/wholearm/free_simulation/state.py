@@ -1,4 +1,4 @@
-"""A free simulation under way: the state, the torques, and what is recorded."""
+"""State, torques and records of a running free simulation; torques of a feedback law."""
 
 from __future__ import annotations
 
@@ -39,10 +39,7 @@ NO_PROGRESS = 60  # most decisions in a row without any time passing
 
 
 class Record(NamedTuple):
-    """One instant: time, state with losses, z'', tau, pairs that press, their c_n and c_t, impacts.
-
-    The last one is the energy lost to impacts so far [J].
-    """
+    """One instant; `impact` is the energy lost to impacts so far [J], `kept` the closed pairs."""
 
     t: float
     y: Array
@@ -55,7 +52,7 @@ class Record(NamedTuple):
 
 
 class FreeRun:
-    """A free simulation under way.
+    """A running free simulation.
 
     Attributes
     ----------
@@ -63,10 +60,9 @@ class FreeRun:
     y : (2 n + LOSSES,)
     modes                what keeps which contacts at present
     armed : (N,)         pairs that have been apart, so that their closing is an event
-    unique               whether the present modes were the only answer for sure when they were
-                         chosen
+    unique               whether the present modes were certainly the only solution
     impact : [J]         energy lost to impacts so far
-    watches              what is looked at with each of the modes so far
+    watches              event values of each of the modes so far
     rub : (k,)           c_t over c_n of the present kept pairs, zero where they stick
     """
 
@@ -141,7 +137,7 @@ class FreeRun:
         return True
 
     def _begin_piece(self) -> None:
-        """Have a law of torques asked, if there is one."""
+        """Sample the feedback law, if there is one."""
         if self.feedback is None:
             return
         theta, theta_dot = (part[list(self.system.driven)] for part in (self.z, self.v))
@@ -175,7 +171,7 @@ class FreeRun:
         return gaps, faces
 
     def take_impulse(self, v: Array) -> None:
-        """Change the velocity; what energy that costs is lost to impacts."""
+        """Change the velocity; its kinetic energy is lost to impacts."""
         before = self.system.stored(self.z, self.v)
         self.y[self.system.n : 2 * self.system.n] = v
         self.impact += float(before - self.system.stored(self.z, self.v))
@@ -184,13 +180,10 @@ class FreeRun:
         """The steps of the present modes, with their inputs set to the present state."""
         system, modes = self.system, self.modes
         degree = self.torque.coefficients.shape[2] - 1
-        s = build_stepper(system.structure, modes.kept, modes.stuck, modes.held, degree)
+        s = build_stepper(system.structure, modes._replace(Xi=(), sigma=()), degree)
         inputs, at = s.inputs, s.at
-        inputs[at.tolerance], inputs[at.Xi], inputs[at.sigma] = (
-            self.tolerance,
-            modes.Xi,
-            modes.sigma,
-        )
+        inputs[at.tolerance] = self.tolerance
+        inputs[at.Xi], inputs[at.sigma] = modes.Xi, modes.sigma
         inputs[at.geometry], inputs[at.lift] = system.geometry, 1 / system.mass
         inputs[at.applied], inputs[at.viscous] = system.applied, system.viscous
         inputs[at.dry], inputs[at.mu] = system.dry, system.friction[list(modes.kept)]
@@ -219,20 +212,19 @@ class FreeRun:
         self.events.append(Event(self.t, 0, kind, text, contact, value))
 
     def record(self, s: FreeStepper | None, out: Array | None = None) -> None:
-        """Record the present instant, with a stepper's outputs, which are kept; without at rest."""
-        n = self.system.n
+        """Record the present instant from a stepper's outputs, or at rest."""
+        kept, y, acceleration = self.modes.kept, self.y.copy(), np.zeros(self.system.n)
         if s is None or out is None:
-            none = np.full(len(self.modes.kept), np.nan)
-            row = (np.zeros(n), self.tau(self.t), self.modes.kept, none, none)
-            self.records.append(Record(self.t, self.y.copy(), *row, self.impact))
-            return
-        to, kept = s.to, self.modes.kept
-        c_n = out[to.c_n]
-        c_t = c_n * self.rub
-        for place, pair in enumerate(self.modes.stuck):
-            c_t[kept.index(pair)] = out[to.f.start + place]
-        row = (out[to.acceleration], out[to.tau], kept, c_n, c_t)
-        self.records.append(Record(self.t, out[to.y], *row, self.impact))
+            c_n = c_t = np.full(len(kept), np.nan)
+            tau = self.tau(self.t)
+        else:
+            y, acceleration, tau, c_n = (
+                out[k] for k in (s.to.y, s.to.acceleration, s.to.tau, s.to.c_n)
+            )
+            c_t = c_n * self.rub
+            for place, pair in enumerate(self.modes.stuck):
+                c_t[kept.index(pair)] = out[s.to.f.start + place]
+        self.records.append(Record(self.t, y, acceleration, tau, kept, c_n, c_t, self.impact))
 
 
 @runtime_checkable
@@ -250,33 +242,18 @@ class Law(Protocol):
     def held(
         self, t: float, theta: Array, theta_dot: Array, forces: Mapping[str, float]
     ) -> ArrayLike:
-        """The torques that follow from a state.
+        """Torques, shape (2,) [N m], held from time `t` [s] on.
 
         Parameters
         ----------
-        t : [s]
         theta, theta_dot : (2,) [rad, rad/s]
-        forces   c_n of the contacts that press, by name, just before `t`; NaN at rest. Empty at the
-                 start [N].
-
-        Returns
-        -------
-        array_like, shape (2,)
-            [N m]
+        forces : [N]  c_n of the contacts that press, by name, just before `t`; NaN at rest, empty
+                      at the start
         """
 
 
 class Feedback:
-    """The torques of a law, known up to the present.
-
-    Parameters
-    ----------
-    until : [s]
-
-    Attributes
-    ----------
-    torque  a constant for each piece; those that have not begun are zero
-    """
+    """Sampled torques of a law up to time `until` [s]: `torque` is zero from the present on."""
 
     def __init__(self, law: Law, until: float) -> None:
         self.law = law

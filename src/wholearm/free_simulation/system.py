@@ -1,4 +1,4 @@
-"""Rigid bodies with pairs of features that may touch, as expressions of their coordinates.
+"""Rigid bodies with pairs of features that may touch: gaps, sliding and their Jacobians.
 
 The motion is M z'' = f + S tau - B z' - friction + A^T c_n + A_t^T c_t with a constant diagonal M.
 A pair of features has a gap C(z), whose gradient is its row of A, and a slip coordinate s(z), whose
