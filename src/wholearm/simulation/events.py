@@ -1,4 +1,4 @@
-"""What a simulation returns: states, forces, energies, events and how it ended."""
+"""Results of a simulation: states, forces, energies, events and outcome."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ class Energies(NamedTuple):
 
 
 class Glimpses(NamedTuple):
-    """Normal forces within steps, as good as the stages of Runge-Kutta steps know the state."""
+    """Normal forces within steps, to the accuracy of Runge-Kutta stages."""
 
     t: Array  # (k,) [s]
     phase: NDArray[np.int64]  # (k,)
@@ -157,7 +157,7 @@ class Simulation(Drawn):
 
     @property
     def trajectory(self) -> Trajectory:
-        """The simulated motion as a trajectory, to be saved and drawn like a plan."""
+        """The simulated motion as a trajectory, as of a plan."""
         return make_trajectory(self)
 
     def find(self, kind: EventKind) -> tuple[Event, ...]:
@@ -250,7 +250,7 @@ def collect(
 
 
 def list_glimpses(problem: Problem, sections: Sequence[Section]) -> Glimpses:
-    """What the stages of all steps have seen."""
+    """Normal forces at the stages of all steps."""
     contacts = problem.contacts
     nodes = np.array(NODES)[list(GLIMPSES)]
     columns = [(np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros((0, len(contacts))))]
@@ -269,9 +269,7 @@ def list_glimpses(problem: Problem, sections: Sequence[Section]) -> Glimpses:
 
 
 def make_trajectory(simulation: Simulation) -> Trajectory:
-    """The motion of a simulation with every recorded instant, for files and figures.
-
-    A phase that is entered in its last instant only is left out.
+    """Trajectory of a simulation at every recorded instant, without phases of one instant.
 
     Raises
     ------
@@ -280,12 +278,11 @@ def make_trajectory(simulation: Simulation) -> Trajectory:
     rows, problem = _choose_rows(simulation), simulation.problem
     if not len(rows):
         raise SimulationError(f"there is no motion to keep: {simulation.outcome.text}")
-    z, z_dot, z_ddot = (getattr(simulation, name)[rows] for name in ("z", "z_dot", "z_ddot"))
-    arrays: dict[str, Any] = {
-        name: getattr(simulation, name)[rows] for name in ("t", "tau", "c_n", "c_t", "phase")
-    }
-    arrays |= {"q": z[:, :3], "q_dot": z_dot[:, :3], "q_ddot": z_ddot[:, :3]}
-    arrays |= {"theta": z[:, 3:], "theta_dot": z_dot[:, 3:], "theta_ddot": z_ddot[:, 3:]}
+    names = ("t", "tau", "c_n", "c_t", "phase")
+    arrays: dict[str, Any] = {name: getattr(simulation, name)[rows] for name in names}
+    for suffix in ("", "_dot", "_ddot"):
+        z = getattr(simulation, f"z{suffix}")[rows]
+        arrays |= {f"q{suffix}": z[:, :3], f"theta{suffix}": z[:, 3:]}
     motions = sample_phases(arrays, simulation.contacts)
     rolling = [phase.formation.rolling for phase in problem.phases[: len(motions)]]
     meta = {
@@ -304,14 +301,14 @@ def make_trajectory(simulation: Simulation) -> Trajectory:
 
 def _choose_rows(simulation: Simulation) -> NDArray[np.int64]:
     """Rows whose times increase in each phase, but for one repetition where forces step."""
-    chosen: list[int] = []
+    chosen = [np.zeros(0, dtype=np.int64)]
     for index in range(int(simulation.phase[-1]) + 1):
-        own = np.flatnonzero(simulation.phase == index)
-        t = simulation.t[own]
+        rows = np.flatnonzero(simulation.phase == index)
+        t = simulation.t[rows]
         before, after = np.append(True, np.diff(t) > 0), np.append(np.diff(t) > 0, True)
         # At the end of a phase what comes before the last step stands for its last instant.
-        kept = own[before | (after & (t < t[-1]))]
+        kept = rows[before | (after & (t < t[-1]))]
         if len(kept) < 2:
             break
-        chosen += kept.tolist()
-    return np.array(chosen, dtype=np.int64)
+        chosen.append(kept)
+    return np.concatenate(chosen)
