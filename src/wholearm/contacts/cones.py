@@ -1,4 +1,4 @@
-"""Friction cones: what contact forces have to exceed for a formation to hold, and by how much."""
+"""Force limits of a formation: normal forces and friction cones, as rows and margins."""
 
 from __future__ import annotations
 

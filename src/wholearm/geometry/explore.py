@@ -1,4 +1,4 @@
-"""Closing contacts from nearby, and looking for the end of a phase all over a formation."""
+"""Projection onto closed contacts (Gauss-Newton), and global search for the end of a phase."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.arrays import Array
-from ..contacts.closing import close_fingers, lower
+from ..contacts.closing import close_fingers, find_reach, lower
 from ..contacts.formation import Formation
 from ..mechanics.metric import metric_weights
 
@@ -46,9 +46,9 @@ class Ending:
 
 
 def explore(formation: Formation, z: Array, slip: Array, ends: list[Ending]) -> Array | None:
-    """An end of a phase, found from places all over the formation; None if none is found.
+    """Nearest end of a phase by a multistart over the formation; None if none is found.
 
-    Only with palm and both fingers touching, where (x, phi) says the whole configuration.
+    Only with palm and both fingers touching, where (x, phi) determines the configuration.
 
     Parameters
     ----------
@@ -87,10 +87,7 @@ def _list_places(formation: Formation, z: Array) -> Array:
     turned = z[2] + np.linspace(-np.pi, np.pi, 721)
     (lowest,) = (c.index for c in formation.contacts if c.finger is None)
     turned = turned[lower(scene, turned)[1] == lowest]
-    size = float(np.hypot(*scene.polygon.vertices.T).max())
-    bases = np.array([np.asarray(finger.base)[0] for finger in scene.fingers])
-    reach = np.array([size + finger.length + finger.radius for finger in scene.fingers])
-    across = np.linspace((bases - reach).max(), (bases + reach).min(), GRID[0])
+    across = np.linspace(*find_reach(scene), GRID[0])
     x, phi = np.meshgrid(across, np.linspace(turned.min(), turned.max(), GRID[1]))
     closed = close_fingers(scene, x.ravel(), phi.ravel()).z
     closed = np.vstack([z, closed[np.isfinite(closed).all(axis=1)]])
