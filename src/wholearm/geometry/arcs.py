@@ -1,4 +1,4 @@
-"""Curves that are traced once: run from anywhere on them, either way."""
+"""Parts of traced curves: location of a configuration, cutting, reversing and joining."""
 
 from __future__ import annotations
 
@@ -48,11 +48,8 @@ def take(curve: Curve, start: float, stop: float) -> Curve:
         if last - first < LEAST * length:
             continue
         own = panel if (first, last) == (panel.s[0], panel.s[-1]) else _cut(panel, first, last)
-        panels.append(
-            Panel((high - own.s)[::-1], own.z[::-1], -own.z_s[::-1])
-            if back
-            else Panel(own.s - low, own.z, own.z_s)
-        )
+        columns = (high - own.s)[::-1], own.z[::-1], -own.z_s[::-1]
+        panels.append(Panel(*columns) if back else Panel(own.s - low, own.z, own.z_s))
     sign = -1.0 if back else 1.0
     segments = []
     for part in curve.segments:
@@ -73,10 +70,8 @@ def join(back: Curve | None, forth: Curve | None) -> Curve:
     if back is None:
         return forth
     first, offset = take(back, back.length, 0.0), back.length
-    panels = [
-        *first.panels,
-        *(Panel(offset + panel.s, panel.z, panel.z_s) for panel in forth.panels),
-    ]
+    moved_panels = (Panel(offset + panel.s, panel.z, panel.z_s) for panel in forth.panels)
+    panels = [*first.panels, *moved_panels]
     segments = list(first.segments)
     for part in forth.segments:
         moved = replace(part, start=offset + part.start, stop=offset + part.stop)
@@ -99,7 +94,7 @@ def _cut(panel: Panel, first: float, last: float) -> Panel:
 def _make(curve: Curve, panels: list[Panel], segments: list[Segment], length: float) -> Curve:
     segments[0] = replace(segments[0], start=0.0)
     segments[-1] = replace(segments[-1], stop=length)
-    found = Curve(curve.formation, tuple(panels), length, "", False, curve.speed_ratio)
+    part = Curve(curve.formation, tuple(panels), length, "", False, curve.speed_ratio)
     # Reversals are where they were.
-    found.__dict__["segments"] = tuple(segments)
-    return found
+    part.__dict__["segments"] = tuple(segments)
+    return part

@@ -1,4 +1,4 @@
-"""The curve z(s) that one freedom leaves, with its tangent, curvature and reversals.
+"""Curve z(s) of a one-freedom formation: panels, tangent, curvature and reversals.
 
 The parameter is the arc length s in metres, in the metric
 
@@ -114,14 +114,12 @@ class Curve:
             return self
         share = self.speed_ratio / ratio
         panels = tuple(Panel(share * panel.s, panel.z, panel.z_s) for panel in self.panels)
-        found = replace(self, panels=panels, length=share * self.length, speed_ratio=ratio)
+        curve = replace(self, panels=panels, length=share * self.length, speed_ratio=ratio)
         if "segments" in self.__dict__:
             # Reversals are where they were.
-            found.__dict__["segments"] = tuple(
-                replace(part, start=share * part.start, stop=share * part.stop)
-                for part in self.segments
-            )
-        return found
+            ends = ((part, share * part.start, share * part.stop) for part in self.segments)
+            curve.__dict__["segments"] = tuple(replace(p, start=a, stop=b) for p, a, b in ends)
+        return curve
 
     @property
     def start(self) -> Array:

@@ -97,11 +97,7 @@ def _list_places(formation: Formation, z: Array) -> Array:
 
 
 def close_contacts(
-    formation: Formation,
-    z: Array,
-    slip: Array,
-    fixed: Fixed = (),
-    active: tuple[int, ...] = (),
+    formation: Formation, z: Array, slip: Array, fixed: Fixed = (), active: tuple[int, ...] = ()
 ) -> Array | None:
     """Nearest configuration with all contacts closed, shape (5,); None if there is none.
 
@@ -112,11 +108,7 @@ def close_contacts(
 
 
 def close_all(
-    formation: Formation,
-    z: Array,
-    slip: Array,
-    fixed: Fixed = (),
-    active: tuple[int, ...] = (),
+    formation: Formation, z: Array, slip: Array, fixed: Fixed = (), active: tuple[int, ...] = ()
 ) -> Array:
     """Nearest configurations with all contacts closed, by Gauss-Newton, shape (n, 5).
 

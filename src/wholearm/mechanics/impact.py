@@ -1,4 +1,4 @@
-"""Plastic impacts: a contact gained at speed throws the velocity onto the next formation.
+"""Plastic impacts: projection of the velocity onto the next formation, by impulses with friction.
 
 In no time at all, only impulses act: those of the contacts of the new formation, with friction by
 the sliding law. With v- and v+ the velocities z' before and after,
@@ -93,7 +93,7 @@ class Impact:
 
 
 def compute_impact(before: Formation, after: Formation, z: Array, v: Array) -> Impact:
-    """Throw a velocity onto a formation.
+    """Plastic impact of a velocity onto a formation.
 
     Parameters
     ----------
@@ -116,14 +116,14 @@ def compute_impact(before: Formation, after: Formation, z: Array, v: Array) -> I
         Xi = choice
         while Xi not in tried:
             tried[Xi] = impact = _compute_impact(before, after, z, v, np.array(Xi))
-            if _is_sound(impact):
+            if not {h.kind for h in impact.violations} & {ViolationKind.JAM, ViolationKind.HELD}:
                 return impact
             Xi = directions(impact.v)
     return tried[likely]
 
 
 def _compute_impact(before: Formation, after: Formation, z: Array, v: Array, Xi: Array) -> Impact:
-    """Throw a velocity onto a formation with given sliding directions."""
+    """Plastic impact of a velocity onto a formation with given sliding directions."""
     kinematics = after.evaluate(z[None], v[None])
     P, mass = kinematics.P[0], after.scene.mass_diagonal
     directions = Directions(Xi, np.ones(2))
@@ -136,10 +136,9 @@ def _compute_impact(before: Formation, after: Formation, z: Array, v: Array, Xi:
     momentum = float(np.abs(mass * v / np.sqrt(metric_weights(after.scene))).max())
     rolls = [after.names[row] for row in after.rolling_rows]
     normal, cones = np.split(force_limit_rows(after) @ p, [after.n_contacts])
+    along = Xi * (kinematics.A_t[0] @ v_after)
     found = [
-        *_list(
-            ViolationKind.HELD, after.names, Xi * (kinematics.A_t[0] @ v_after), ROUNDING * speed
-        ),
+        *_list(ViolationKind.HELD, after.names, along, ROUNDING * speed),
         *_list(ViolationKind.PULL, after.names, normal, ROUNDING * momentum),
         *_list(ViolationKind.SLIP, [*rolls, *rolls], cones, ROUNDING * momentum),
         *_list(ViolationKind.CLOSING, *_rates(before, after, z, v_after), ROUNDING * speed),
@@ -161,11 +160,6 @@ def solve_impulses(mass: Array, rows: Array, force_rows: Array, v: Array) -> tup
     lift = force_rows.T / mass[:, None]
     p = -np.linalg.solve(rows @ lift, rows @ v)
     return np.asarray(v + lift @ p), np.asarray(p)
-
-
-def _is_sound(impact: Impact) -> bool:
-    """Whether the sliding directions are those of the velocity they give."""
-    return all(h.kind not in (ViolationKind.JAM, ViolationKind.HELD) for h in impact.violations)
 
 
 def _list(

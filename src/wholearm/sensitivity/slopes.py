@@ -1,4 +1,4 @@
-"""How contact forces change with numbers that are off, at one state and torques.
+"""Parametric sensitivity of contact forces, by differentiating the equations of motion.
 
 With z, z' and tau given, the equations of motion (`mechanics.dynamics`)
 
@@ -9,8 +9,8 @@ same matrices:
 
     M5 dz'' - G^T dc = dg + S dtau - db - dM5 z'' + dG^T c,    P dz'' = -dP z'' - d(P' z').
 
-Along a curve z'' = z_s a + z_ss b, and c and tau are affine in a = s'', b = s'^2, the squeeze and
-s'. So dc/dp is affine in them too.
+Along a curve z'' = z_s a + z_ss b, and c, tau and dc/dp are affine in a = s'', b = s'^2, the
+internal force lambda and s'.
 
 Where geometry is off other places are possible. The nearest one counts as the same, and so does
 the nearest velocity: along a curve these have the same s and s'. Contacts of a finger depend on
@@ -33,7 +33,7 @@ from ..mechanics.dynamics import Directions, PathForces, force_rows
 from ..mechanics.metric import metric_weights
 from ..results.trajectory import Samples
 
-COUNT = 5  # number of coefficients: of 1, a, b, the squeeze and s'
+COUNT = 5  # number of coefficients: of 1, a, b, the internal force and s'
 _STEP = 1e-5  # step of the differences of kinematics, over the scene's length
 _LOOSE = 1e-6  # weight of the fingers' angles where they follow the object
 
@@ -67,7 +67,7 @@ def find_force_slopes(
     Returns
     -------
     ndarray, shape (n, n_c + R, len(names), COUNT)
-        dc/dp = sum of coefficients times (1, a, b, squeeze, s') [N per unit of p].
+        dc/dp = sum of coefficients times (1, a, b, lambda, s') [N per unit of p].
     """
     return _along(formation, point, directions, forces).find_slopes(names)
 

@@ -52,11 +52,7 @@ class Replay:
     slipping: frozenset[int]
 
     def __init__(
-        self,
-        problem: Problem,
-        torque: TorqueProfile,
-        tolerance: float,
-        wanted: Array,
+        self, problem: Problem, torque: TorqueProfile, tolerance: float, wanted: Array
     ) -> None:
         self.problem, self.torques, self.tolerance = problem, torque, tolerance
         self.tolerances = find_tolerances(problem.scene)

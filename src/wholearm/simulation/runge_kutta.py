@@ -117,11 +117,7 @@ def _build_combinations(n: int, moving: int) -> tuple[list[Expression], Expressi
 
 
 def build_error(
-    fifth: Expression,
-    third: Expression,
-    y: Expression,
-    units: Expression,
-    tolerance: Expression,
+    fifth: Expression, third: Expression, y: Expression, units: Expression, tolerance: Expression
 ) -> Expression:
     """Size of a step's error over the tolerance, which counts in `units`, or in y above them.
 
