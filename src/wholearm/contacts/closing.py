@@ -137,8 +137,7 @@ def close_finger(scene: Scene, q: Array, finger: int) -> float:
 
     Raises
     ------
-    InputError  if the finger reaches no part of the object, or its joint is in the object or too
-                near
+    InputError  if the finger does not reach the object, or its joint is in the object or near it
     """
     link = scene.fingers[finger]
     angle, _, (obstacle,) = _close_finger(scene, finger, *np.asarray(q)[:3, None])
@@ -155,10 +154,7 @@ def close_finger(scene: Scene, q: Array, finger: int) -> float:
 def _close_finger(
     scene: Scene, finger: int, x: Array, y: Array, phi: Array
 ) -> tuple[Array, Numbers, Numbers]:
-    """Angle and first feature (side, edge, arc in the order of candidates) of a closing finger.
-
-    And 0, or why it cannot close, for n poses of the object.
-    """
+    """Angle, first feature (sides, edges, arcs as in the candidates) and obstacle, at n poses."""
     link, count = scene.fingers[finger], scene.polygon.n_vertices
     angle, feature = np.empty(len(x)), np.empty(len(x), dtype=np.int64)
     obstacle = np.zeros(len(x), dtype=np.int64)
@@ -313,12 +309,9 @@ def _distance(corners: Array) -> Array:
 
 
 def evaluate_each(scene: Scene, labels: Numbers, z: Array, v: Array | None = None) -> Kinematics:
-    """Rows of n formations of contacts that slide, each at a configuration of its own.
+    """Rows of n formations of sliding contacts, each at a configuration of its own.
 
-    Parameters
-    ----------
-    labels : (n, n_c)  contacts, as indices into `closing.contact_table`
-    z, v : (n, 5)      configurations, and the velocities for A' v, `z` if left out
+    `labels` (n, n_c) are indices into `contact_table`; z, v (n, 5), v is `z` if left out.
     """
     v = z if v is None else v
     C, A_dot_v = np.empty((2, *labels.shape))

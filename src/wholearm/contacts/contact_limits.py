@@ -124,10 +124,8 @@ def takes_over(contact: Contact, scene: Scene, held: Sequence[Contact]) -> bool:
 def build_clearance(contact: Contact, scene: Scene, touching: bool) -> GapLimit:
     """Return the limit at which `contact`, not in the formation, is gained.
 
-    A feature beyond the ends of its partner cannot touch it, so its gap does not count there, and
-    a tip that is farther outside another edge cannot touch this one. The exception is a link that
-    already touches a vertex with its side (`touching`): by convexity the whole object then stays
-    on that side of the link's line.
+    Gaps beyond the ends of a feature do not count, nor of a tip with an edge if another is farther.
+    With a link that touches a vertex with its side (`touching`) they do, by convexity.
     """
     gap = own = build_gap(contact, scene)
     text = f"{contact.corner} touches {contact.part}"

@@ -47,13 +47,7 @@ class _Touch(NamedTuple):
 
 
 def place(scene: Scene, labels: Numbers, poses: Array) -> Array:
-    """Configurations at n poses (x, phi), shape (n, 5); NaN angles where a tip reaches nothing.
-
-    Parameters
-    ----------
-    labels : (n, 3)
-    poses : (n, 2) [m, rad]
-    """
+    """Configurations (n, 5) at poses (x, phi), labels (n, 3); NaN where a tip cannot reach."""
     z = np.full((len(poses), 5), np.nan)
     z[:, [0, 2]] = poses
     z[:, 1] = -_turn(scene.polygon.vertices[labels[:, 0]], poses[:, 1])[:, 1]
@@ -77,13 +71,7 @@ def place(scene: Scene, labels: Numbers, poses: Array) -> Array:
 
 
 def move(scene: Scene, labels: Numbers, poses: Array, rates: Array) -> ExplicitMotion:
-    """Rates along straight paths at n poses.
-
-    Parameters
-    ----------
-    labels : (n, 3)
-    poses, rates : (n, 2)  (x, phi) and (x', phi')
-    """
+    """Rates along straight paths at poses (x, phi), rates (x', phi'), (n, 2), and labels (n, 3)."""
     z = place(scene, labels, poses)
     z_u, z_uu = np.zeros_like(z), np.zeros_like(z)
     A, A_t, bend = np.zeros((len(z), 3, 5)), np.zeros((len(z), 3, 5)), np.zeros((len(z), 3))

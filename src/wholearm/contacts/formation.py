@@ -133,11 +133,7 @@ class Formation(Keeper):
         return _ROLL_FUNCTIONS(self)
 
     def build_constraints(self, z: Expression, v: Expression) -> tuple[Expression, ...]:
-        """Expressions of z and v: the gaps and slip coordinates [m], P, P' v and A_t.
-
-        Gaps and slip coordinates are one column of n_c + R rows. The contacts hold where the gaps
-        are zero and the slip coordinates what they were when the rolling began.
-        """
+        """Expressions of z and v: gaps and slip coordinates [m] in one column, P, P' v and A_t."""
         C, A, A_t, A_dot_v = self.function(z, v)
         if not self.rolling:
             return C, A, A_dot_v, A_t
@@ -163,12 +159,7 @@ class Formation(Keeper):
         return Batch(_LIMIT_FUNCTIONS(self))
 
     def evaluate(self, z: Array, v: Array) -> Kinematics:
-        """Evaluate the formation at n configurations.
-
-        Parameters
-        ----------
-        z, v : (n, 5)  configurations, and the velocities for A' v
-        """
+        """Evaluate the formation at n configurations z and velocities v, shape (n, 5) each."""
         C, A, A_t, A_dot_v = self._batch(z, v)
         P, P_dot_v = A, A_dot_v
         if self.rolling:

@@ -92,12 +92,7 @@ _GAPS = Store(_build_gap, lambda scene: scene.shape)
 
 @exclusive
 def evaluate_finger_gap(scene: Scene, z: Array) -> Array:
-    """Gap between the two links at n configurations, shape (n,) [m], negative where they overlap.
-
-    Parameters
-    ----------
-    z : (n, 5)  naN where a joint angle is unknown, which makes the gap NaN
-    """
+    """Signed distance of the links at configurations z (n, 5), (n,) [m]; NaN where theta is."""
     numbers = np.concatenate([[*np.asarray(link.base), link.length] for link in scene.fingers])
     numbers = np.broadcast_to(numbers, (len(z), 6))
     gaps = _build_gap_function()(z[:, 3:], numbers)[0][:, 0, 0]

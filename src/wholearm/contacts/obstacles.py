@@ -32,10 +32,7 @@ def build_far_side(scene: Scene, finger: int, vertex: int, apart: Expression | N
 
 
 def build_joint_edge(scene: Scene, finger: int, edge: int, held: bool) -> GapLimit:
-    """Return the limit at which an edge touches the circle about a joint.
-
-    `held` says that the tip touches the same edge, so that no other edge is nearer.
-    """
+    """Limit at which an edge touches a joint's circle; `held`: the tip touches that edge."""
     features = build_features(scene)
     gaps, runs = _place_joint(scene, finger)
     gap = confine(gaps[edge], runs[edge], float(features.edge_lengths[edge]))
@@ -95,18 +92,16 @@ def confine(
 ) -> Expression:
     """Return a gap that counts only where 0 <= run <= length.
 
-    With `apart`, the gap of the whole bodies, it counts only where they overlap nowhere else: the
-    gap to one side of a link is negative on all of the other side.
+    With `apart`, the gap of the whole bodies, it counts only where they overlap nowhere else.
     """
     value = ca.fmax(gap, ca.fmax(-run, run - length))
     return value if apart is None else ca.fmax(value, apart - gap / 2)
 
 
 def build_apart(scene: Scene, finger: int) -> Expression:
-    """Return the gap between a link and the object [m]: the largest separation of any direction.
+    """Return the signed distance between a link and the object [m], by separating axes.
 
-    The candidates are the normals of the link and of every edge, and the lines from either end of
-    the link to every vertex. Where the two overlap it is minus the least push that parts them.
+    Candidates are the normals of link and edges, and the lines from ends of the link to vertices.
     """
     features = build_features(scene)
     link, part = features.links[finger], scene.fingers[finger]

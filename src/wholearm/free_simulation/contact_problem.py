@@ -264,10 +264,10 @@ def _try(p: ContactProblem, combinations: _Combinations) -> list[ContactAnswer]:
     both = np.abs(forces[:, :k] * rates[:, :k]).max(axis=1, initial=0.0)
     distinct: list[Array] = []
     answers = []
-    for row in np.flatnonzero((worst >= -slack) & (both <= slack * size)):
-        if all(np.abs(rates[row] - other).max() > SAME * size for other in distinct):
-            distinct.append(rates[row])
-            answers.append(read(p, np.maximum(c_n[row], 0.0), f[row]))
+    for k in np.flatnonzero((worst >= -slack) & (both <= slack * size)).tolist():
+        if all(np.abs(rates[k] - other).max() > SAME * size for other in distinct):
+            distinct.append(rates[k])
+            answers.append(read(p, np.maximum(c_n[k], 0.0), f[k]))
     return answers
 
 

@@ -50,13 +50,7 @@ ROUNDS = 30  # most impacts at one instant; what is left after them is plastic
 
 
 def play(run: FreeRun, touching: float, halt: Callable[[FreeRun], bool] | None = None) -> None:
-    """Simulate until the torques end.
-
-    Parameters
-    ----------
-    touching : [m]  gap that counts as closed at the start
-    halt            asked at every event whether that is enough
-    """
+    """Simulate until the torques end or `halt`, called at events; `touching` [m]: gaps to close."""
     _close(run, touching)
     while run.t < run.end and not (halt is not None and halt(run)):
         if run.t >= run.stop:
@@ -262,10 +256,7 @@ def _expand(
 
 
 def jolt(run: FreeRun) -> bool:
-    """Impact without collision (Painleve) where no finite forces keep contacts closed; whether so.
-
-    It is the limit of time stepping: the impulses of a short time that do not vanish with it.
-    """
+    """Impact without collision (Painleve), the limit of time stepping; whether there is one."""
     system, scales = run.system, run.system.scales
     closed = find_closed(run)
     pattern = Pattern(run, closed)
@@ -577,10 +568,9 @@ class _Motion:
 
 
 class Watch(NamedTuple):
-    """Values that are positive until something happens, in units of the scene.
+    """Event values, positive until an event, in units of the scene.
 
-    In this order: c_n; reserves of friction that holds, either way; speeds of what slides and
-    turns; ranges of the kept pairs.
+    In this order: c_n; friction margins of both signs; sliding and turning speeds; ranges.
     """
 
     columns: NDArray[np.int64]  # (c,): outputs of a step that they depend on

@@ -159,12 +159,7 @@ class System:
         return gaps, ranges
 
     def measure(self, z: Array) -> tuple[Array, Array]:
-        """Gaps of all pairs and how far inside their ranges they are, shape (m, N) each [m].
-
-        Parameters
-        ----------
-        z : (m, n)
-        """
+        """Gaps of all pairs and distances inside their ranges, (m, N) each [m], at z (m, n)."""
         geometry = np.broadcast_to(self.geometry, (len(z), len(self.geometry)))
         both = self.structure.gaps(z, geometry)[0]
         return both[:, :, 0], both[:, :, 1]

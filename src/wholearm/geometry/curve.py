@@ -201,11 +201,7 @@ def border(P: Array, last: Array) -> Array:
 
 
 def tangent_basis(formation: Formation, z: Array) -> Array:
-    """Covectors N of the null space of P at `z`, shape (5, f), in radii of gyration.
-
-    N^T dz are the coordinates of a displacement in an orthonormal basis of that space; N over the
-    metric spans it.
-    """
+    """Orthonormal covectors N of the null space of P at `z`, shape (5, f), in radii of gyration."""
     metric = metric_weights(formation.scene)
     P = formation.evaluate(z[None], np.zeros((1, 5))).P[0]
     _, values, right = np.linalg.svd(P / np.sqrt(metric))
@@ -214,11 +210,9 @@ def tangent_basis(formation: Formation, z: Array) -> Array:
 
 
 def find_tied(formation: Formation, z: Array, row: int) -> tuple[int, ...]:
-    """Rows of (contacts, joints) that turn as one with a row at `z`: that row, then the others.
+    """Rows of (contacts, joints) that reverse as one with a row at `z`: that row, then the others.
 
-    With two freedoms those are all whose rates are proportional to its own: of a flush edge, and of
-    a vertex in the corner of palm and link, which stands still with the link. With one freedom all
-    rates are; of these only a flush edge's change their sense together.
+    With two freedoms those are all with proportional rates, with one freedom those of a flush edge.
     """
     flush, N = formation.turn_with(row), tangent_basis(formation, z)
     if N.shape[1] != 2:

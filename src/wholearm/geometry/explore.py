@@ -46,15 +46,9 @@ class Ending:
 
 
 def explore(formation: Formation, z: Array, slip: Array, ends: list[Ending]) -> Array | None:
-    """Nearest end of a phase by a multistart over the formation; None if none is found.
+    """Nearest of several ends of a phase from z, (5,), by a multistart over the formation, or None.
 
     Only with palm and both fingers touching, where (x, phi) determines the configuration.
-
-    Parameters
-    ----------
-    z : (5,)         where the phase starts
-    slip : (R,) [m]  slip coordinates that rolling contacts keep
-    ends             any of these will do
     """
     parts = [contact.finger for contact in formation.contacts]
     if len(parts) != 3 or set(parts) != {None, 0, 1} or formation.rolling:
@@ -99,10 +93,7 @@ def _list_places(formation: Formation, z: Array) -> Array:
 def close_contacts(
     formation: Formation, z: Array, slip: Array, fixed: Fixed = (), active: tuple[int, ...] = ()
 ) -> Array | None:
-    """Nearest configuration with all contacts closed, shape (5,); None if there is none.
-
-    Parameters are those of `close_all`, but for `z`, shape (5,).
-    """
+    """As `close_all` for one configuration, shape (5,); None if there is none."""
     closed = close_all(formation, z[None], slip, fixed, active)[0]
     return closed if np.isfinite(closed).all() else None
 
@@ -110,16 +101,14 @@ def close_contacts(
 def close_all(
     formation: Formation, z: Array, slip: Array, fixed: Fixed = (), active: tuple[int, ...] = ()
 ) -> Array:
-    """Nearest configurations with all contacts closed, by Gauss-Newton, shape (n, 5).
-
-    Those are NaN to which there is none.
+    """Nearest configurations with all contacts closed, by Gauss-Newton, shape (n, 5), or NaN.
 
     Parameters
     ----------
-    z : (n, 5)       where to start
-    slip : (R,) [m]  slip coordinates that rolling contacts keep
-    fixed            rows of z and the values that they have to take
-    active           limits of the formation that are met exactly
+    z : (n, 5)       initial values
+    slip : (R,) [m]  slip coordinates of rolling contacts
+    fixed            rows of z and their values
+    active           limits of the formation that are zero
     """
     metric, rho = metric_weights(formation.scene), formation.scene.scales.length
     sizes = np.full(formation.n_constraints, rho)

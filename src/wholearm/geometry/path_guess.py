@@ -198,11 +198,7 @@ def _project(end: Ending, z: Array, slip: Array) -> tuple[Array | None, str]:
 
 
 def guess_onwards(phase: Phase, before: PathGuess) -> list[PathGuess]:
-    """Path guesses that continue another one, to the ends nearest to places ahead of it.
-
-    Where a contact may be gained in many places, the nearest is often beside the motion so far.
-    There are none for a phase with one freedom.
-    """
+    """Path guesses that continue another one, to ends nearest to places ahead; two freedoms."""
     formation, z = phase.formation, before.z[-1]
     if phase.until.contact is None or phase.until.pins or count_freedoms(formation, z) < 2:
         return []

@@ -93,12 +93,7 @@ def trace_phase(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> Curve:
 
 
 def require_touching(phase: Phase, z: Array) -> None:
-    """Check that a phase's contacts touch at `z`, shape (5,), and that nothing is overlapped.
-
-    Raises
-    ------
-    InputError  if not; lists what touches
-    """
+    """Raise an `InputError` unless a phase's contacts touch at `z`, (5,), and nothing overlaps."""
     key = f"phases[{phase.number}].contacts"
     formation = phase.formation
     gaps = formation.evaluate(z[None], np.zeros((1, 5))).C[0]
@@ -154,15 +149,7 @@ def _headings(formation: Formation, z: Array, until: Until) -> list[Array]:
 
 
 def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) -> Curve:
-    """Trace a formation's curve from `z` along `heading` to `until` or to where it ends early.
-
-    Parameters
-    ----------
-    formation       with four constraints
-    z : (5,)        start, with all contacts closed; rolling ones roll from there
-    heading : (5,)  which way to go
-    until           what to trace for
-    """
+    """Trace a curve with four constraints from `z` along `heading`, (5,), to `until` or its end."""
     rho = formation.scene.polygon.gyration_radius
     names = [limit.text for limit in formation.limits] + [str(until)]
     wanted = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]

@@ -237,12 +237,9 @@ def _list_signs(
 def maximise_margin(
     scene: Scene, rows: Array, bounds: Array | None = None
 ) -> tuple[Array, float] | None:
-    """Torques within their limits with the largest least margin, and that margin; None if none.
+    """Torques within their limits that maximise the least of rows @ (1, tau), (k, 3), and that.
 
-    Parameters
-    ----------
-    rows : (k, 3)    margins are rows @ (1, tau_1, tau_2)
-    bounds : (l, 3)  what has to be positive, too, without a margin
+    Values of `bounds`, (l, 3), only have to be positive. None if there are no such torques.
     """
     limits, unit = scene.torque_limit, scene.scales.torque
     box = [[limit, *(-side * axis)] for limit, axis in zip(limits, np.eye(2), strict=True)

@@ -108,13 +108,7 @@ def build_force_rows(
 
 
 def split_forces(formation: Formation, c: Array, Xi: Array) -> tuple[Array, Array]:
-    """Normal and tangential forces of every contact, shape (..., n_c) each, from c [N].
-
-    Parameters
-    ----------
-    c : (..., n_c + R) [N]  contact forces [c_n; c_t(rolling)]
-    Xi : (..., n_c)         sliding directions
-    """
+    """Normal and tangential forces of every contact, (..., n_c) each, from c (..., n_c + R) [N]."""
     n_c = formation.n_contacts
     c_n = c[..., :n_c]
     c_t = np.asarray(-formation.sliding_friction * Xi * c_n)

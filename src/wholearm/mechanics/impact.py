@@ -93,13 +93,7 @@ class Impact:
 
 
 def compute_impact(before: Formation, after: Formation, z: Array, v: Array) -> Impact:
-    """Plastic impact of a velocity onto a formation.
-
-    Parameters
-    ----------
-    before, after  what the motion comes from and what it goes on with, all contacts closed
-    z, v : (5,)    configuration, and velocity z' just before
-    """
+    """Plastic impact of a velocity `v` at `z`, (5,) each, between closed formations."""
     kinematics = after.evaluate(z[None], v[None])
     P, A_t = kinematics.P[0], kinematics.A_t[0]
     slides = np.ones(after.n_contacts)
@@ -149,13 +143,7 @@ def _compute_impact(before: Formation, after: Formation, z: Array, v: Array, Xi:
 def solve_impulses(mass: Array, rows: Array, force_rows: Array, v: Array) -> tuple[Array, Array]:
     """Velocity and impulses p of the jump M5 (v+ - v) = force_rows^T p with rows v+ = 0.
 
-    Parameters
-    ----------
-    mass : (5,)                diagonal of M5
-    rows, force_rows : (r, 5)  constraints on the velocity after, and where the impulse of each
-                               acts: G = A without friction, and then v+ is the nearest velocity in
-                               the metric M5
-    v : (5,)
+    Without friction both (r, 5) are equal: v+ is nearest to v in the metric M5, `mass` (5,).
     """
     lift = force_rows.T / mass[:, None]
     p = -np.linalg.solve(rows @ lift, rows @ v)

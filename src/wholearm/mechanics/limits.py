@@ -82,10 +82,7 @@ class LimitSet:
 
     @cached_property
     def sides(self) -> tuple[NDArray[np.int64], Array, Array]:
-        """Rows, signs and bounds of one-sided limits, sign (row y - bound) >= 0, shape (n,) each.
-
-        First those of all lower bounds, then those of all upper ones.
-        """
+        """Rows, signs, bounds (n,) of one-sided limits, sign (row y - bound) >= 0; lower first."""
         lows, highs = (np.flatnonzero(np.isfinite(bound)) for bound in (self.low, self.high))
         signs = np.repeat([1.0, -1.0], [len(lows), len(highs)])
         bounds = np.concatenate([self.low[lows], self.high[highs]])
@@ -207,13 +204,7 @@ class SideTerms(NamedTuple):
 
     @staticmethod
     def of(limits: LimitSet, forces: PathForces, rates: Array) -> SideTerms:
-        """The sides of some limits.
-
-        Parameters
-        ----------
-        forces          at n places
-        rates : (n, 2)  d theta / ds there
-        """
+        """The sides of some limits, from forces at n places and d theta / ds there, (n, 2)."""
         of_c, of_tau, of_rates = (part.T for part in limits.columns)
         rows, signs, bounds = limits.sides
         scale = signs / limits.scales[rows]

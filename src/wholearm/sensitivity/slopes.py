@@ -39,10 +39,7 @@ _LOOSE = 1e-6  # weight of the fingers' angles where they follow the object
 
 
 class _Change(NamedTuple):
-    """The right sides of the derivative: of Newton's and Euler's laws, and of the constraints.
-
-    Shapes (n, 5, COUNT) and (n, n_c + R, COUNT).
-    """
+    """Right sides of the derivative: of Newton's and Euler's laws, and of the constraints."""
 
     load: Array
     bend: Array
@@ -55,19 +52,18 @@ def find_force_slopes(
     forces: PathForces,
     names: Sequence[str],
 ) -> Array:
-    """Derivatives of the contact forces by some numbers, at n places of a curve.
+    """Derivatives of contact forces by uncertain numbers, at n places of a curve.
 
     Parameters
     ----------
-    directions  one row for each place
-    forces      of the formation there
-    names       of the numbers, as in `problem.uncertainty`: relative ones, or lengths in m.
-                `start_x` is how far the object is along the curve. `delay` has no derivative.
+    directions, forces  one row for each place
+    names               as in `problem.uncertainty`: relative numbers, or lengths in m. `start_x` is
+                        the place along the curve; `delay` has no derivative.
 
     Returns
     -------
     ndarray, shape (n, n_c + R, len(names), COUNT)
-        dc/dp = sum of coefficients times (1, a, b, lambda, s') [N per unit of p].
+        coefficients of dc/dp for (1, a, b, lambda, s') [N per unit of p]
     """
     return _along(formation, point, directions, forces).find_slopes(names)
 
@@ -75,11 +71,7 @@ def find_force_slopes(
 def find_shifts(
     formation: Formation, point: CurvePoint, directions: Directions, forces: PathForces, name: str
 ) -> Array:
-    """By how much joints seem to be further along a curve than they are, where geometry is off.
-
-    Joint angles of the nearest place are others than on the curve; what is along it is taken for
-    progress. Per unit of the number of a name, shape (n,); as `find_force_slopes` otherwise.
-    """
+    """Apparent progress along a curve by joint angles, per unit of a length error, (n,)."""
     dz, rates = _along(formation, point, directions, forces).displace(name), point.z_s[:, 3:]
     square = np.maximum((rates**2).sum(axis=1), 1e-30)
     return np.asarray((dz[:, 3:] * rates).sum(axis=1) / square)

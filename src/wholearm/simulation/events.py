@@ -123,10 +123,7 @@ class Glimpses(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Simulation(Drawn):
-    """A simulated motion, at every accepted step and every instant asked for.
-
-    A phase boundary and a step of the torques are there twice, since forces jump.
-    """
+    """A simulated motion at every accepted step and requested instant, twice where forces jump."""
 
     t: Array  # (n,) [s]
     z: Array  # z, z_dot, z_ddot (n, 5):

@@ -118,10 +118,7 @@ def _hold(run: Replay) -> Switched:
 
 
 def let_go(run: Replay, contacts: Sequence[int]) -> Released | Outcome:
-    """End because contacts would have to pull: a release if that is planned of one of them.
-
-    The next formation then decides whether the others press, and whether the released ones part.
-    """
+    """End as contacts would have to pull: a release if that is planned of one of them."""
     s = run.stepper
     forces = dict(zip(s.formation.names, s.outputs[s.to.c_n].tolist(), strict=True))
     pulling = [s.formation.names[k] for k in contacts]
@@ -154,10 +151,7 @@ def slip(run: Replay) -> Released | Switched | Outcome:
 
 
 def let_slip(run: Replay, events: Sequence[int]) -> Ending | None:
-    """Go on after friction has reached its bound for some of what it holds.
-
-    A contact that the phase lets roll must not slip.
-    """
+    """Go on after friction has reached its bound; a prescribed rolling contact must not slip."""
     s = run.stepper
     count = len(s.mode.holders)
     cone = range(s.rows.cone.start, s.rows.cone.stop)
@@ -180,11 +174,7 @@ def find_slipping(s: ModeStepper) -> list[int]:
 
 
 def turn(run: Replay, events: Sequence[int]) -> Ending | None:
-    """Go on where contacts or joints have come to rest; None if the motion goes on.
-
-    Planned torques step where friction does. If the step comes a little later, by rounding, the old
-    friction signs act until then.
-    """
+    """Go on where contacts or joints have come to rest; None if the motion goes on."""
     s, window = run.stepper, run.tolerances.rest_window
     s.inputs[s.at.t] = now = run.t
     rows = [k - s.rows.slide.start for k in events if k in _turning(s)]
@@ -245,11 +235,7 @@ def is_there(run: Replay) -> bool:
 
 
 def _bridge(run: Replay) -> bool:
-    """Integrate from a reversal to the torque step that goes with it; whether all motion has ended.
-
-    By rounding the two come one after the other. In between the forces are those of neither and are
-    not recorded.
-    """
+    """Integrate from a reversal to its torque step, unrecorded; whether all motion has ended."""
     s = run.stepper
     if steps_within(run, run.tolerances.settling):
         run.drop()

@@ -60,7 +60,10 @@ class Replay:
         self.breaks = [float(b) for b in torque.breaks]
         self.coefficients = torque.coefficients
         parts, least = torque.coefficients, self.tolerances.torque_step
-        self.steps_at = [True, *find_torque_steps(parts[:-1], parts[1:], least).tolist()]
+        self.steps_at: list[bool] = [
+            True,
+            *find_torque_steps(parts[:-1], parts[1:], least).tolist(),
+        ]
         ends = torque.breaks[:-1], torque.breaks[1:]
         flat = self.coefficients.reshape(len(self.coefficients), -1)
         self.pieces = np.column_stack([*ends, flat])

@@ -95,11 +95,9 @@ def build_step(
 
 @lru_cache(maxsize=8)
 def _build_combinations(n: int, moving: int) -> tuple[list[Expression], Expression]:
-    """CasADi functions of y, t, h and rates of stages, for states of length n.
+    """CasADi functions of y, t, h and rates of stages, for any right-hand side of length n.
 
-    Those of the stages return where and when each one's rate is taken, from the rates that it
-    takes in; the last one, from all rates, the end and both errors. They are the same for every
-    right-hand side, and each step calls them.
+    Those of the stages return state and time of each stage, the last one the end and both errors.
     """
     y, t, h = ca.SX.sym("y", n), ca.SX.sym("t"), ca.SX.sym("h")
     rates = [ca.SX.sym(f"rate_{j}", n) for j in range(len(ROWS))]

@@ -377,9 +377,8 @@ def _try_step(run: Replay, target: float) -> tuple[float, bool]:
 
 
 def _is_at_end(run: Replay, t: float) -> bool:
-    """Whether the step just tried ends at the end of the phase, and at a torque break.
+    """Whether the step just tried ends the phase, at a torque break and but for rounding.
 
-    By rounding a planned motion ends a little beyond the end of its phase, or has just turned back.
     It has to be at rest there or to reach a contact softly. A coordinate, or the end of a contact's
     range, is passed at any speed; an impact comes at any, with its torque step or at their end.
     """
@@ -401,11 +400,7 @@ def _is_at_end(run: Replay, t: float) -> bool:
 
 
 def _comes_later(run: Replay) -> bool:
-    """Whether a motion whose deceleration fades still approaches, at a break that is not its end.
-
-    It is slow, and near the end of its phase, long before it is there. Rate-limited torques may
-    have breaks anywhere, as tables of torques do.
-    """
+    """Whether a motion with fading deceleration still approaches, at a break before its end."""
     coming = run.piece + 1
     if not run.problem.scene.has_slow_motors or run.phase.end is not End.REST:
         return False
@@ -606,11 +601,7 @@ def set_off(run: Replay, departure: StartDeparture) -> None:
 
 
 def go_on(run: Replay) -> Ending | None:
-    """Set the friction signs of the present velocity; what ends the motion at once, if anything.
-
-    Contacts and joints at rest are decided by Coulomb's law; with one freedom they have the first
-    direction that does not jam.
-    """
+    """Set the friction signs of the present velocity; what ends the motion at once, if anything."""
     s = run.stepper
     y, formation = run.y, run.phase.formation
     s.inputs[s.at.y], s.inputs[s.at.t] = y, run.t

@@ -56,11 +56,7 @@ def choose_mode(
 ) -> bool:
     """Choose the friction signs of all that stands still; whether the motion has ended.
 
-    Parameters
-    ----------
-    turned      contacts, then joints, whose speed has just come to zero
-    time : [s]  when that was, if not at present
-    enters      whether the directions so far are a guess, as a formation is entered
+    Parameters as of `jumps.restart`.
     """
     s = run.stepper
     formation, scene = run.phase.formation, run.problem.scene
@@ -140,12 +136,7 @@ def _list_options(
 def _choose(
     run: Replay, signs: Array, still: Sequence[Unit], orders: Sequence[tuple[float, ...]]
 ) -> Choice:
-    """The directions of the first clear combination, or of the best.
-
-    Raises
-    ------
-    JammingError  if no combination is consistent, and it is not that a contact would have to pull
-    """
+    """Signs of the first clear combination or of the best; `JammingError` if none is consistent."""
     evaluation = _Evaluation(run, still)
     choices: list[Choice] = []
     for options in product(*orders):

@@ -85,12 +85,9 @@ class Slack(NamedTuple):
 
 
 class Touching:
-    """What touches at a configuration `z` but is not in the formation: the limits `near` zero.
+    """Limits `near` zero at `z` of what touches outside the formation, with gradient (k, 5).
 
-    Attributes
-    ----------
-    gradient : (k, 5)  of those that have one. Where a pointed tip is at a vertex the gap of an edge
-                       has none.
+    A pointed tip at a vertex has a kink instead.
     """
 
     def __init__(self, formation: Formation, z: Array, near: NDArray[np.bool_]) -> None:

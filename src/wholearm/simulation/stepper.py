@@ -1,8 +1,4 @@
-"""Steps of the simulation, compiled for one contact formation and what friction holds in it.
-
-A whole Runge-Kutta step, with the projection on the contacts and everything that events are found
-from, is one CasADi function of one packed vector, so that a step costs one call.
-"""
+"""Compiled steps of a contact mode: Runge-Kutta, projection and events in one CasADi function."""
 
 from __future__ import annotations
 
@@ -55,14 +51,9 @@ class ModeStepper(NamedTuple):
 def build_stepper(
     formation: Formation, until: Until, side: float, degree: int, grips: Grips = FREE
 ) -> ModeStepper:
-    """Return the steps of a formation for torques of a polynomial degree, compiled when first used.
+    """Steps of a formation for torques of a polynomial degree, compiled when first used.
 
-    Parameters
-    ----------
-    until   what ends the phase
-    side    +1 or -1: the sign of (coordinate - value) before the end, when `until` is a coordinate
-    degree  of the torque's polynomials
-    grips   what friction holds meanwhile
+    `side` is the sign of (coordinate - value) before the end of the phase, `until`.
     """
     mode, at, to, rows, slack, functions = _compile(formation, until, side, degree, grips)
     inputs, outputs, *calls = bind(at.size, to.size, functions)

@@ -1,8 +1,4 @@
-"""The simulator's tolerances, each relative to a scale of the scene (`Scene.scales`).
-
-Lengths are counted in the scene's length, angles in rad, forces and torques in its force and
-torque, and so on: the same motion told in other units is simulated with the same tolerances.
-"""
+"""Tolerances of the simulator, each relative to a scale of the scene (`Scene.scales`)."""
 
 from __future__ import annotations
 
