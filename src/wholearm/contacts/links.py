@@ -24,8 +24,7 @@ from ..scene.model import Scene
 from .elemental import GapLimit, build_features, rotate_quarter
 
 FINGERS_TOUCH = "finger 1 touches finger 2"  # sentence for where the gap of the fingers is zero
-ROUNDING = 1e-30
-"""Added to squared distances over squared lengths, so that ends that coincide have a direction."""
+ROUNDING = 1e-30  # added to squared distances over squared lengths: normals at coincident points
 
 
 class _Segment(NamedTuple):

@@ -32,8 +32,7 @@ from .free_stepper import Modes
 from .state import AHEAD, CLOSED, SUNK, FreeRun
 from .system import ContactRows, System
 
-CLEAR = 1e-3
-"""Forces and rates, relative to the largest, that a moment does not make zero: it is `AHEAD`."""
+CLEAR = 1e-3  # forces and rates, over the largest, that do not vanish within `AHEAD`
 DEPENDENT = 1e-7  # share of a row that others leave, below which it is no constraint of its own
 ROUNDED = 1e-15  # speed that rounding leaves, relative to the largest one
 _NONE = np.zeros(0)

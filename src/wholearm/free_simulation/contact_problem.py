@@ -27,17 +27,14 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array
 
-PIVOTS = (1e-8, 1e-11)
-"""Least pivot, for rows of M of the size of one: rounding of redundant rows is below the first, and
-what is not solved with it is tried with the other."""
+PIVOTS = (1e-8, 1e-11)  # least pivots to try, above and below the rounding of redundant rows
 GOOD = 1e-10  # residual with which an attempt is the last one, relative to the largest entry of q
 TIE = 1e-12  # difference of ratios that counts as none, relative to the largest entry of q
 TURNS = 60  # most pivots for each unknown
 RESIDUAL = 1e-8  # largest residual of a solution, relative to the largest rate without contacts
 EDGE = 1e-9  # reserve of friction that counts as none, relative to its bound or the largest force
 MOST = 4000  # most combinations of modes that are looked through for other answers
-SAME = 1e-6
-"""Difference of rates that counts as none, relative to the largest rate without contacts."""
+SAME = 1e-6  # difference of rates that is none, over the largest rate without contacts
 SINGULAR = 1e-9  # determinant of a scaled system that counts as zero
 APART, STICKS, FORTH, BACK = range(4)
 """Modes of a contact; of a joint all but the first. One without friction that presses sticks."""

@@ -34,18 +34,13 @@ from .state import AHEAD, ARMED, CLOSED, NO_PROGRESS, SUNK, FreeRun
 from .system import System
 
 SPEED_ROUNDING = 1e-12  # sliding or turning speed that counts as rounding, over the scene's
-TURNING = 1e-4
-"""Speed, relative to the scene's, below which sliding or turning may be about to reverse."""
+TURNING = 1e-4  # speed, over the scene's, below which a reversal may be near
 GROWTH = 10.0  # largest growth of a step
 LOOKS = 8  # instants of the longest step at which gaps are looked at, its end among them
-REACH = 0.3
-"""Farthest that a step may go, in units of the scene: gaps are seen every `REACH` / `LOOKS`."""
-EXACT = 1e-14
-"""Gap at which a contact is found closed, relative to the scene's length: some ten roundings."""
-CHATTER_PAUSE = 1e-3
-"""Time in which the end of the impacts of a pair is told once, relative to the scene's time."""
-SLIDES = 1e-3
-"""Least sliding of what slides on, relative to that before and to the speed of the impact."""
+REACH = 0.3  # longest step, in units of the scene: gaps are sampled every `REACH` / `LOOKS`
+EXACT = 1e-14  # gap of a closed contact, over the scene's length: some ten roundings
+CHATTER_PAUSE = 1e-3  # time between two notes of chatter of a pair, over the scene's
+SLIDES = 1e-3  # least sliding after an impact, over that before and the impact speed
 ROUNDS = 30  # most impacts at one instant; what is left after them is plastic
 
 

@@ -13,8 +13,7 @@ from ..simulation.layout import bind, build_torque, lay_out
 from ..simulation.runge_kutta import GLIMPSES, build_error, build_step
 from .system import Structure
 
-LOSSES = 4
-"""Integrals along the motion: work of the torques, losses to viscous, dry and sliding friction."""
+LOSSES = 4  # integrals: work, losses to viscous, dry and sliding friction
 
 
 class Modes(NamedTuple):

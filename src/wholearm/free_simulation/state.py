@@ -20,21 +20,15 @@ from .system import System
 
 SAME = 1e-9  # distance of two instants that counts as none, relative to the period
 CLOSED = 1e-10  # gap that counts as closed at an event, relative to the scene's length
-SUNK = 1e-6
-"""Overlap up to which features touch, relative to the scene's length; beyond it they are behind one
-another."""
+SUNK = 1e-6  # overlap up to which features touch, over the scene's length; else they are behind
 ARMED = 1e-13  # gap from which on a pair has been apart, relative to the scene's length
-CHATTER = 1e-6
-"""Speed of impacts below which they count as the last one, relative to the scene's: what is closed
-and parts more slowly is pressed together again before it is apart by more than rounding."""
+CHATTER = 1e-6  # speed of the last impact, over the scene's: separation stays below rounding
 COARSE = 1e3  # the same over the tolerance, where that is coarser than impacts need
 BURST = 3e-4
 """Time, relative to the scene's, in which `MANY` impacts raise `CHATTER` tenfold, and twice as many
 a hundredfold: fingers may knock an object to and fro for ever."""
 MANY = 20
-AHEAD = 2e-5
-"""How much later contact modes are judged, relative to the scene's time: forces that leave their
-range are told from those that come back into it."""
+AHEAD = 2e-5  # delay at which modes are evaluated, over the scene's time: a force's trend counts
 NO_PROGRESS = 60  # most decisions in a row without any time passing
 
 

@@ -10,8 +10,7 @@ from ..common.arrays import Array
 from ..mechanics.metric import metric_weights
 from .curve import Curve, Panel, Segment
 
-NEAR = 0.2
-"""Distance from the nodes of a curve, in radii of gyration, from which on a place is not on it."""
+NEAR = 0.2  # distance from nodes, in radii of gyration, beyond which a place is off a curve
 ON = 1e-9  # distance from a curve, in radii of gyration, up to which a place is on it
 ROUNDS = 8  # most steps of Newton's method to the nearest place of a curve
 SHORTEST = 1e-7  # shortest segment, over the length of its curve

@@ -21,8 +21,7 @@ from ..contacts.formation import Formation, Kinematics
 from ..mechanics.metric import metric_weights
 
 REFINE = 3  # places per node of a panel at which limits and reversals are looked for
-_TIED = 1e-6
-"""Part of two rates, over both, below which they are proportional, and below which one is none."""
+_TIED = 1e-6  # relative error of two rates that are proportional, and relative rate of none
 
 
 class CurvePoint(NamedTuple):

@@ -13,12 +13,9 @@ from ..mechanics.metric import metric_weights
 
 GRID = (120, 60)  # places across x and phi at which a formation is looked at
 SEEDS = 24  # most places from which an end is looked for: those that are nearest to it
-STILL = 1e-4
-"""Distance from the start, in radii of gyration, below which a phase would have nothing to do."""
-CLOSED = 3e-11
-"""Largest gap of closed contacts, in radii of gyration, and error of a coordinate likewise."""
-_STEP = 1e-5
-"""Step of the differences that give the gradients of limits, in radii of gyration or radians."""
+STILL = 1e-4  # distance from the start, in radii of gyration, that counts as none
+CLOSED = 3e-11  # largest gap of closed contacts, and coordinate error, in radii of gyration
+_STEP = 1e-5  # step of difference quotients of limits, in radii of gyration or rad
 
 
 Fixed = tuple[tuple[int, float], ...]

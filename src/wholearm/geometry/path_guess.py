@@ -23,10 +23,8 @@ from .tracing import require_touching, runs_on_curve, trace_phase, trace_phases
 POINTS = 25  # configurations along an outline
 RELEASE_AT = 0.8  # share of a curve without an end of its own at which a release is guessed
 _MOST_ACTIVE = 2  # most limits that a phase's end may be right on
-_AHEAD = (0.25, 0.5, 1.0, 2.0)
-"""Distances ahead at which ends are looked for, over that to the nearest."""
-_TURNS = np.linspace(-1.0, 1.0, 21)
-"""Turns of the object from which an end that is not the nearest is looked for [rad]."""
+_AHEAD = (0.25, 0.5, 1.0, 2.0)  # distances at which ends are searched for, over that to the nearest
+_TURNS = np.linspace(-1.0, 1.0, 21)  # rotations from which another end is searched for [rad]
 
 
 @exclusive

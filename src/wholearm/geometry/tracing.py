@@ -23,14 +23,11 @@ from ..scene.model import TOUCHING
 from .curve import Curve, Panel, border, describe_pose, find_root, refine
 
 NODES = 17  # nodes of a panel
-RESOLVED = 1e-13
-"""Largest trailing Chebyshev coefficient of a resolved panel, relative to the object's size."""
-NEWTON = 3e-8
-"""Last change of Newton's method, in radii of gyration: the next one would be about its square."""
+RESOLVED = 1e-13  # largest trailing Chebyshev coefficient of a panel, over the object's size
+NEWTON = 3e-8  # last Newton change, in radii of gyration: the next is about its square
 SHORTER = 0.5  # factor on the length of a panel whose points are not found
 AIM = 0.3  # trailing coefficient that the length of a panel is chosen for, over the largest one
-HELD = 3e-5
-"""Distance to `until`, in radii of gyration or radians, below which there is nothing to do."""
+HELD = 3e-5  # distance to `until`, in radii of gyration or rad, that counts as none
 FIRST = 0.5  # length of the first panel that is tried, in radii of gyration
 ROUNDING = 3e-10  # below zero by no more than this, in radii of gyration, a limit counts as kept
 CLOSER = 4  # times that dips of a limit between two places are looked at more closely

@@ -31,20 +31,13 @@ from .impact import ViolationKind, compute_impact
 from .wedging import SURE, find_static_torques
 
 LEAST = 1e-2  # margin over what is ample below which torques do not hold, or close, for sure
-AMPLE = 0.1
-"""Margin that is ample: of a normal force, a torque or an acceleration, over the scene's."""
+AMPLE = 0.1  # saturation of margins of forces, torques, accelerations, over the scene's
 DRIVE = 0.02  # least acceleration towards a contact that is still open, over the scene's
-SLOW = 0.2
-"""Least margin of torques that close a contact more slowly, over that of torques that only hold."""
-_CREEP = 0.02
-"""Ample acceleration of what slides and turns where the directions of sliding are assumed, over the
-scene's."""
-_STILL = 1e-9
-"""Rate of sliding or turning that counts as none, over how fast anything moves; change of a gap
-that counts as none, over how far everything moves."""
+SLOW = 0.2  # least margin of slowly closing torques, over that of torques that only hold
+_CREEP = 0.02  # saturation of sliding and turning with assumed signs, over the scene's
+_STILL = 1e-9  # relative rate of sliding, turning or opening that counts as none
 _JAMS = 1e-6  # determinant of K over that without friction, at which and below a way jams
-_INDEPENDENT = 1e-12
-"""Least Gram determinant of the rows of constraints, each of length one, that are independent."""
+_INDEPENDENT = 1e-12  # least Gram determinant of independent normalized constraints
 _SMALL = 1e-9  # what counts as zero in the linear programme
 _FAR = 1e3  # largest margin that is looked for, over what is ample
 

@@ -29,8 +29,7 @@ from ..contacts.formation import Formation
 from .dynamics import Directions, force_rows, reduced_inertia
 from .metric import measure_speed, metric_weights
 
-ROUNDING = 1e-6
-"""Share of the momentum or of the speed, in the metric of curves, that counts as rounding."""
+ROUNDING = 1e-6  # momentum or speed, in the metric of curves, that counts as rounding
 _STEP = 1e-5  # step of the difference quotient of limits, in radii of gyration or radians
 
 
@@ -38,8 +37,7 @@ class ViolationKind(Enum):
     """What keeps an impact from throwing the velocity onto a formation."""
 
     JAM = "jam"  # friction makes the reduced inertia vanish or turn negative
-    HELD = "held"
-    """Friction holds a contact: no sliding directions are those of the velocity that they give."""
+    HELD = "held"  # no sliding directions are those of the velocity that they give
     PULL = "pull"  # a contact would have to pull
     SLIP = "slip"  # a rolling contact would leave its friction cone
     CLOSING = "closing"  # something that touches, but is not in the formation, would be driven into

@@ -32,9 +32,7 @@ from ..contacts.formation import Formation, Kinematics
 from .margin_key import UNIQUENESS
 
 UNIQUENESS_MARGIN: float = UNIQUENESS.default
-_INDEPENDENT = 1e-12
-"""Least Gram determinant of the rows of contacts, each of length one, at which they are
-independent."""
+_INDEPENDENT = 1e-12  # least Gram determinant of independent normalized contact rows
 _SLIDES, _STICKS, _SLIPS = " ", " sticking", (" slipping +", " slipping -")
 
 

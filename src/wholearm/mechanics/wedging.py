@@ -26,9 +26,7 @@ from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..scene.model import Scene
 
-SURE = 1e-3
-"""Distance from torques that friction can hold, beyond which a motion begins for sure, relative to
-the scene's torque."""
+SURE = 1e-3  # distance from torques that friction can hold, over the scene's, at which it moves
 _TINY = 1e-9  # what counts as zero of numbers of the order of one
 
 

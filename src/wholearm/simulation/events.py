@@ -29,28 +29,21 @@ class EventKind(Enum):
 
     START = "start"  # the object starts to move from rest
     REST = "rest"  # the object comes to rest short of the end of the phase
-    STICK = "stick"
-    """Friction holds a contact or a joint while the rest moves, or the object stays at rest."""
+    STICK = "stick"  # friction holds a contact or joint, or the object stays at rest
     REVERSAL = "reversal"  # a contact's sliding or a joint changes direction
     TORQUE_STEP = "torque step"  # the torques jump
     ARRIVAL = "arrival"  # the end of the phase is reached, and the next formation taken
-    IMPACT = "impact"
-    """The velocity jumps onto the next formation, which is taken if every contact presses."""
-    RELEASE = "release"
-    """The contacts that the next phase does not have are let go, and its formation is taken."""
+    IMPACT = "impact"  # the velocity jumps onto the next formation
+    RELEASE = "release"  # contacts that the next phase does not have are let go
     CONTACT_LOST = "contact lost"  # a normal force falls to zero
-    SLIP = "slip"
-    """Friction no longer holds a contact or a joint; if the phase lets that contact roll the motion
-    ends."""
+    SLIP = "slip"  # friction no longer holds a contact or joint; a rolling one ends the motion
     LIMIT = "limit"  # the formation stops being valid in another way
     END = "end"  # the torques end before the goal
     GAINED = "contact gained"  # a contact that nothing was said about presses from here on
     PASS = "pass"  # a contact goes on as one of a neighbouring feature
     CHATTER = "chatter"  # impacts that come ever faster are over: the contact stays closed
-    AMBIGUOUS = "ambiguous"
-    """The laws of contact allow several motions; the one nearest to the last is taken."""
-    INCONSISTENT = "inconsistent"
-    """They allow none with finite forces: an impact without a collision."""
+    AMBIGUOUS = "ambiguous"  # several motions are possible; the one nearest to the last is taken
+    INCONSISTENT = "inconsistent"  # no motion has finite forces: an impact without a collision
     GIVEN_UP = "given up"  # events come without time passing, or steps do not get anywhere
 
 

@@ -16,9 +16,7 @@ from .sliding_signs import choose_mode, note_change
 from .stepper import ModeStepper
 from .tolerances import REACHED, SETTLING, SLOW, is_slower, measure_units
 
-_FAR = 100.0
-"""Ratio of speed and its change, in the scene's units, from which on nothing can turn: slopes and
-lever arms make the change of a contact's sliding a few times that of the velocities."""
+_FAR = 100.0  # speed over its change at which nothing reverses: lever arms are below that
 
 
 class Arrival(NamedTuple):

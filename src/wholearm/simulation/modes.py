@@ -25,12 +25,10 @@ from ..common.arrays import Array, Expression
 from ..contacts.formation import Formation
 from ..mechanics.dynamics import build_force_rows
 
-INDEPENDENT = 1e-9
-"""Least singular value of constraints, each of length one, for forces to be determined."""
+INDEPENDENT = 1e-9  # least singular value of normalized constraints that are independent
 
 
-FIXED = 1e-7
-"""Share of a contact's or joint's freedom that constraints leave, below which they leave none."""
+FIXED = 1e-7  # share of a freedom below which constraints leave none
 
 
 @dataclass(frozen=True)

@@ -86,8 +86,7 @@ _OUTCOMES = {
 }
 _GROWTH = 40.0  # largest growth of a step: at order 8 an error of 1e-13 of the tolerance allows it
 _HELD_AT = 5  # places of a piece of the torques at which they have to hold the object
-ROUNDS = 8
-"""Most simulations, each with more steps that end where something showed within those before."""
+ROUNDS = 8  # most simulations, each with steps that end at events missed before
 Closer = Callable[[Simulation, Glimpses, int], ArrayLike]
 """Simulation, forces within its steps and number of calls so far -> further instants to check."""
 

@@ -37,8 +37,7 @@ from .modes import Mode, ModeRows, Response, Unit, find_fixed, find_grips, list_
 from .replay import Replay
 from .tolerances import STANDING, is_slower
 
-CLEAR = 1e-8
-"""Least margin of a clear decision, relative to the scene's forces, torques or accelerations."""
+CLEAR = 1e-8  # least margin of a clear decision, over the scene's units
 TRIES = 50  # most decisions in a row without any time passing
 
 

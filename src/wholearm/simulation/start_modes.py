@@ -23,9 +23,7 @@ from .tolerances import ROUNDING_FORCE, Tolerances, find_tolerances, measure_uni
 
 _STEP = 3e-5  # step of the difference quotient, in units of the scene
 _KINK = 1e-2  # rise of a limit both ways, over the step, from which it has a kink and no gradient
-_GRAZE = 1e-3
-"""Acceleration at which a gap may close, over those of sliding and turning in all: planned motions
-that graze a link between their nodes do."""
+_GRAZE = 1e-3  # largest closing acceleration of a gap that grazes, over sliding and turning
 
 
 class StartDeparture(NamedTuple):

@@ -29,14 +29,12 @@ from .root_finding import find_root
 from .start_modes import RestDirection, StartDeparture, StartMode, find_patterns, respond_at_rest
 from .tolerances import find_tolerances, measure_units
 
-BALANCED = 1e-6
-"""Pull that counts as none, relative to the scene's force: the accuracy of the linear programme."""
+BALANCED = 1e-6  # pull that counts as none, over the scene's force: accuracy of the LP
 _CLOSED = 3e-15  # gap that counts as rounding, relative to the scene's length
 _AHEAD = 1e-5  # step along the free direction for signs and gaps, in units of the scene
 _NARROW = 1e-10  # width of the bracket of a loss of balance, over half a piece of the torques
 _CHECKS = 9  # samples of a nonlinear piece at which balance is checked
-_CLEAR = 1e3
-"""Least acceleration halfway to the next change with which a motion starts, over rounding."""
+_CLEAR = 1e3  # least starting acceleration halfway to the next change, over rounding
 
 
 class Collapse(NamedTuple):
