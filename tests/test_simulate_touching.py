@@ -74,7 +74,7 @@ def test_a_link_that_is_free_may_graze_what_starts_to_move() -> None:
     rest = find_rest(problem.phases[0].formation, problem.start)
     assert rest.near.sum() == 1  # v3 on finger 1
     tau = np.array([-0.287, -0.98])
-    way = next(way for way in rest.ways if way.moves(tau))
+    way = next(way for way in rest.sliding if way.moves(tau))
     touch = make_formation(problem.scene, "v3-finger1")
     A = touch.evaluate(problem.start[None], np.zeros((1, 5))).A[0, 0]
     lever = A[3] / problem.scene.fingers[0].inertia

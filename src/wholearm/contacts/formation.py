@@ -1,4 +1,4 @@
-"""Contact formations: contacts as constraints P z' = 0, and where they stop being valid.
+"""Contact formations: constraints P z' = 0 with their derivatives, and gap limits.
 
 With the rows of each contact stacked, Eq. (4) reads A z' = 0 with A = [W_n^T, -J_n], the sliding
 velocities are v_t = A_t z' with A_t = [W_t^T, -J_t], and differentiating once more gives
@@ -133,11 +133,7 @@ class Formation(Keeper):
         return _ROLL_FUNCTIONS(self)
 
     def build_constraints(self, z: Expression, v: Expression) -> tuple[Expression, ...]:
-        """Expressions of z and v: the gaps and slip coordinates [m], P, P' v and A_t.
-
-        Gaps and slip coordinates are one column of n_c + R rows. The contacts hold where the gaps
-        are zero and the slip coordinates what they were when the rolling began.
-        """
+        """Expressions of z and v: gaps and slip coordinates [m] in one column, P, P' v and A_t."""
         C, A, A_t, A_dot_v = self.function(z, v)
         if not self.rolling:
             return C, A, A_dot_v, A_t
@@ -158,22 +154,12 @@ class Formation(Keeper):
         """Where this formation stops being valid, as expressions of its own scene's z."""
         return tuple(list_limits(self.scene, self.contacts))
 
-    @property
-    def limit_function(self) -> Expression:
-        """CasADi function z -> values of `limits`, shape (n_limits,) [m]."""
-        return _LIMIT_FUNCTIONS(self)
-
     @kept_property
     def _limit_batch(self) -> Batch:
-        return Batch(self.limit_function)
+        return Batch(_LIMIT_FUNCTIONS(self))
 
     def evaluate(self, z: Array, v: Array) -> Kinematics:
-        """Evaluate the formation at n configurations.
-
-        Parameters
-        ----------
-        z, v : (n, 5)  configurations, and the velocities for A' v
-        """
+        """Evaluate the formation at n configurations z and velocities v, shape (n, 5) each."""
         C, A, A_t, A_dot_v = self._batch(z, v)
         P, P_dot_v = A, A_dot_v
         if self.rolling:
@@ -226,21 +212,18 @@ def describe(contacts: Sequence[Contact]) -> str:
 
 
 class _Parts:
-    """Expressions of single contacts, which formations of scenes of one shape are put together of.
-
-    Making them takes most of the time that it takes to make a function of a formation.
-    """
+    """Expressions of single contacts, shared by the formations of scenes of one shape."""
 
     def __init__(self, scene: Scene) -> None:
         self.z, self.v = build_features(scene).z, ca.SX.sym("v", 5)
-        self._known: dict[Contact, tuple[Expression, ...]] = {}
+        self._parts: dict[Contact, tuple[Expression, ...]] = {}
 
     def find(self, contact: Contact, scene: Scene) -> tuple[Expression, ...]:
         """Gap, rows A and A_t, and A' v of a contact."""
-        if contact not in self._known:
+        if contact not in self._parts:
             gap, A, A_t = build_rows((contact,), scene)
-            self._known[contact] = gap, A, A_t, ca.jtimes(A @ self.v, self.z, self.v)
-        return self._known[contact]
+            self._parts[contact] = gap, A, A_t, ca.jtimes(A @ self.v, self.z, self.v)
+        return self._parts[contact]
 
 
 _PARTS = Store(_Parts, lambda scene: scene.shape)
@@ -271,17 +254,10 @@ def _build_limit_function(formation: Formation) -> Expression:
     return ca.Function("limits", [build_features(formation.scene).z], [values])
 
 
-_FUNCTIONS = Store(_build_function, lambda own: (own.scene.shape, own.contacts))
-
-
-_ROLL_FUNCTIONS = Store(
-    _build_roll_function, lambda own: (own.scene.shape, own.contacts, own.rolling)
-)
-
-
+_FUNCTIONS = Store(_build_function, lambda f: (f.scene.shape, f.contacts))
+_ROLL_FUNCTIONS = Store(_build_roll_function, lambda f: (f.scene.shape, f.contacts, f.rolling))
 _LIMIT_FUNCTIONS = Store(
-    _build_limit_function,
-    lambda own: (own.scene.shape, own.scene.fingers_collide, own.contacts),
+    _build_limit_function, lambda f: (f.scene.shape, f.scene.fingers_collide, f.contacts)
 )
 
 

@@ -1,4 +1,4 @@
-"""Uniqueness margin of contact forces: least principal minor of K over that without friction.
+"""Uniqueness margin of contact forces (P-matrix): least principal minor of K over the frictionless.
 
 Contacts only press, c_n >= 0, and only those that press keep their gaps closed. Which of them do is
 a complementarity problem with the matrix K = A M5^-1 (A - U Xi A_t)^T. It has exactly one solution,
@@ -32,9 +32,7 @@ from ..contacts.formation import Formation, Kinematics
 from .margin_key import UNIQUENESS
 
 UNIQUENESS_MARGIN: float = UNIQUENESS.default
-_INDEPENDENT = 1e-12
-"""Least Gram determinant of the rows of contacts, each of length one, at which they are
-independent."""
+_INDEPENDENT = 1e-12  # least Gram determinant of independent normalized contact rows
 _SLIDES, _STICKS, _SLIPS = " ", " sticking", (" slipping +", " slipping -")
 
 

@@ -1,4 +1,4 @@
-"""How contact forces change with numbers that are off, at one state and torques.
+"""Parametric sensitivity of contact forces, by differentiating the equations of motion.
 
 With z, z' and tau given, the equations of motion (`mechanics.dynamics`)
 
@@ -9,8 +9,8 @@ same matrices:
 
     M5 dz'' - G^T dc = dg + S dtau - db - dM5 z'' + dG^T c,    P dz'' = -dP z'' - d(P' z').
 
-Along a curve z'' = z_s a + z_ss b, and c and tau are affine in a = s'', b = s'^2, the squeeze and
-s'. So dc/dp is affine in them too.
+Along a curve z'' = z_s a + z_ss b, and c, tau and dc/dp are affine in a = s'', b = s'^2, the
+internal force lambda and s'.
 
 Where geometry is off other places are possible. The nearest one counts as the same, and so does
 the nearest velocity: along a curve these have the same s and s'. Contacts of a finger depend on
@@ -33,19 +33,13 @@ from ..mechanics.dynamics import Directions, PathForces, force_rows
 from ..mechanics.metric import metric_weights
 from ..results.trajectory import Samples
 
-COUNT = 5
-"""Number of coefficients: of 1, a, b, the squeeze and s'."""
-_STEP = 1e-5
-"""Step of the differences of kinematics, over the scene's length."""
-_LOOSE = 1e-6
-"""Weight of the fingers' angles where they follow the object."""
+COUNT = 5  # number of coefficients: of 1, a, b, the internal force and s'
+_STEP = 1e-5  # step of the differences of kinematics, over the scene's length
+_LOOSE = 1e-6  # weight of the fingers' angles where they follow the object
 
 
 class _Change(NamedTuple):
-    """The right sides of the derivative: of Newton's and Euler's laws, and of the constraints.
-
-    Shapes (n, 5, COUNT) and (n, n_c + R, COUNT).
-    """
+    """Right sides of the derivative: of Newton's and Euler's laws, and of the constraints."""
 
     load: Array
     bend: Array
@@ -58,19 +52,18 @@ def find_force_slopes(
     forces: PathForces,
     names: Sequence[str],
 ) -> Array:
-    """Derivatives of the contact forces by some numbers, at n places of a curve.
+    """Derivatives of contact forces by uncertain numbers, at n places of a curve.
 
     Parameters
     ----------
-    directions  one row for each place
-    forces      of the formation there
-    names       of the numbers, as in `problem.uncertainty`: relative ones, or lengths in m.
-                `start_x` is how far the object is along the curve. `delay` has no derivative.
+    directions, forces  one row for each place
+    names               as in `problem.uncertainty`: relative numbers, or lengths in m. `start_x` is
+                        the place along the curve; `delay` has no derivative.
 
     Returns
     -------
     ndarray, shape (n, n_c + R, len(names), COUNT)
-        dc/dp = sum of coefficients times (1, a, b, squeeze, s') [N per unit of p].
+        coefficients of dc/dp for (1, a, b, lambda, s') [N per unit of p]
     """
     return _along(formation, point, directions, forces).find_slopes(names)
 
@@ -78,11 +71,7 @@ def find_force_slopes(
 def find_shifts(
     formation: Formation, point: CurvePoint, directions: Directions, forces: PathForces, name: str
 ) -> Array:
-    """By how much joints seem to be further along a curve than they are, where geometry is off.
-
-    Joint angles of the nearest place are others than on the curve; what is along it is taken for
-    progress. Per unit of the number of a name, shape (n,); as `find_force_slopes` otherwise.
-    """
+    """Apparent progress along a curve by joint angles, per unit of a length error, (n,)."""
     dz, rates = _along(formation, point, directions, forces).displace(name), point.z_s[:, 3:]
     square = np.maximum((rates**2).sum(axis=1), 1e-30)
     return np.asarray((dz[:, 3:] * rates).sum(axis=1) / square)

@@ -1,4 +1,4 @@
-"""The first event within a step, found by repeating the step with other lengths."""
+"""Event location within a step: root finding on steps of other lengths."""
 
 from __future__ import annotations
 

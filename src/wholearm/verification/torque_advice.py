@@ -24,7 +24,7 @@ from ..results.tuning_advice import Approach, ForceAt, Loss, TorqueAdvice, Tunin
 from ..simulation.events import EventKind, Simulation
 from ..simulation.modes import find_grips, list_units, respond, share_mode
 from ..simulation.sliding_signs import evaluate_rows, measure_rates
-from ..simulation.start_modes import StartPath
+from ..simulation.start_modes import StartMode
 from ..simulation.sticking import find_rest
 from .margins import find_lowest
 from .verdict import Allowance
@@ -178,13 +178,13 @@ def _measure_way(phase: Phase, z: Array, v: Array) -> tuple[Array, Array, Array]
     return side * offset, gradient, np.zeros(len(z))
 
 
-def list_ways(formation: Formation, z: Array) -> Sequence[StartPath]:
+def list_ways(formation: Formation, z: Array) -> Sequence[StartMode]:
     """The ways in which a formation at rest at `z` could begin to move."""
-    return find_rest(formation, z).all_ways
+    return find_rest(formation, z).modes
 
 
 def find_worst(
-    formation: Formation, ways: Sequence[StartPath], z: Array, tau: Array
+    formation: Formation, ways: Sequence[StartMode], z: Array, tau: Array
 ) -> Instant | None:
     """Forces as torques begin a motion in the way that holds worst; None if they begin none."""
     load = np.array([1.0, *tau])
@@ -196,7 +196,7 @@ def find_worst(
 
 def find_resting_changes(
     formation: Formation,
-    ways: Sequence[StartPath],
+    ways: Sequence[StartMode],
     epsilon: float,
     z: Array,
     tau: Array,
@@ -228,13 +228,13 @@ def find_resting_changes(
     return tuple(sorted(found, key=lambda change: (change.holds, np.hypot(*change.change))))
 
 
-def _answer(formation: Formation, z: Array, way: StartPath) -> Instant | None:
+def _answer(formation: Formation, z: Array, way: StartMode) -> Instant | None:
     return answer(formation, z, np.zeros(5), np.concatenate(way.directions))
 
 
 def _move(
     formation: Formation,
-    way: StartPath,
+    way: StartMode,
     epsilon: float,
     z: Array,
     tau: Array,
