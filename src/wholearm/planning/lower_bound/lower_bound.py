@@ -19,21 +19,16 @@ from .path_terms import PathGrid, PathTerms
 from .rows import Extreme, PathLimitRows
 from .speed_sweep import NoMotionError, Sweep, SweepMode, add_up, find_fastest, find_steady
 
-_NEAR = 6
-"""Intervals from a switch within which a row that it turns about is looked for."""
+_NEAR = 6  # intervals from a switch within which a row that it turns about is looked for
 _STIFF = 4.0
 """Growth in an interval from which on the trapezoidal rule is left for the exponential one."""
-_TOLERANCE = 3e-8
-"""What the bound may lose, and its error, relative to the time."""
-GRID_INTERVALS = 100
-"""Of the first grid."""
-_ROUNDS = 16
-"""Most grids: where motions hardly pass a place losses fall by 64 from one to the next."""
+_TOLERANCE = 3e-8  # what the bound may lose, and its error, relative to the time
+GRID_INTERVALS = 100  # of the first grid
+_ROUNDS = 16  # most grids: where motions hardly pass a place losses fall by 64 from one to the next
 _NARROW, _PARTS, _TRIES = 2, 4, 4
 """Intervals on each side of the one that no motion passes which are split, into how many, and how
 often: the border of an octagon's flip is passed at a tenth of the speed beside it."""
-_MOST = 1500
-"""Most intervals."""
+_MOST = 1500  # most intervals
 _SAFETY = 2.0
 """Factor on the difference of two rules of quadrature; where limits take turns both err alike."""
 _RULES = tuple(np.polynomial.legendre.leggauss(count) for count in (2, 3))

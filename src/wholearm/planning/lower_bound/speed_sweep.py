@@ -40,12 +40,10 @@ class Sweep(NamedTuple):
     modes: NDArray[np.int64]
 
 
-_ROUNDING = 1e-12
-"""Largest b below zero at the end that is rounding, over the largest b."""
+_ROUNDING = 1e-12  # largest b below zero at the end that is rounding, over the largest b
 
 
-_SPEEDS = 4
-"""Most sweeps until viscous friction is linearised about the right speed."""
+_SPEEDS = 4  # most sweeps until viscous friction is linearised about the right speed
 _SETTLED = 2e-3
 """Change of b, over the largest, from which on it is: the next one would be about its square."""
 

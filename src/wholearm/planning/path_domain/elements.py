@@ -22,14 +22,11 @@ from numpy.typing import NDArray
 from ...common.arrays import Array
 from ...common.quadrature import jacobi_nodes
 
-DEGREE = 4
-"""Degree of the polynomials."""
+DEGREE = 4  # degree of the polynomials
 INSIDE, FROM_REST, TO_REST, FROM_HOLD, TO_HOLD = 0, 1, 2, 3, 4
 """Kinds of elements: amid a motion, at its start and at its end, and there without acceleration."""
-POWERS = np.array([1, 2, 2, 3, 3])
-"""Power of y that s goes with in each kind."""
-SIGNS = np.array([1.0, 1.0, -1.0, 1.0, -1.0])
-"""Whether y grows or falls with time in each kind."""
+POWERS = np.array([1, 2, 2, 3, 3])  # power of y that s goes with in each kind
+SIGNS = np.array([1.0, 1.0, -1.0, 1.0, -1.0])  # whether y grows or falls with time in each kind
 
 
 class Basis(NamedTuple):

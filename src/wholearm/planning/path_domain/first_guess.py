@@ -10,8 +10,7 @@ from .path_data import PhaseData
 from .path_nlp import Units
 from .rate_terms import exceeds_rates
 
-_SLOW = -12
-"""Height of the slowest guess, as a power of two times that of a fall."""
+_SLOW = -12  # height of the slowest guess, as a power of two times that of a fall
 _QUICK = 30.0
 """Largest square of the speed of a guess, over that which the torque limits alone allow."""
 _FIRM = 40.0

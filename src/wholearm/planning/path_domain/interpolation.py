@@ -12,8 +12,7 @@ from .path_motion import PathMotion
 
 TORQUE_ERROR = 5e-7
 """Largest error of the torque's polynomials between the knots, over the torque limit."""
-PLACES = 13
-"""Places that they go through where that is exceeded."""
+PLACES = 13  # places that they go through where that is exceeded
 
 
 class StalledError(SolverError):

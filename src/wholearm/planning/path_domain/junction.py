@@ -30,14 +30,10 @@ from .first_guess import find_squeeze_range
 from .path_data import PhaseData, prepare
 from .path_mesh import Mesh
 
-_PLACES = 129
-"""Squeezes that are looked at on each side of a joint."""
-_WIDEST = 40.0
-"""Largest range of them, over the scene's force."""
-_INSIDE = 0.01
-"""Part of the range at both of its ends that is left out."""
-_ELEMENTS = 3
-"""Elements of a grid of which only the ends count."""
+_PLACES = 129  # squeezes that are looked at on each side of a joint
+_WIDEST = 40.0  # largest range of them, over the scene's force
+_INSIDE = 0.01  # part of the range at both of its ends that is left out
+_ELEMENTS = 3  # elements of a grid of which only the ends count
 _VERGE = 1e-6
 """Distance over the scene's torque beyond those that friction can hold, that is rounding."""
 

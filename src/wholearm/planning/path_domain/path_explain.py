@@ -51,16 +51,12 @@ from .speed_profile import is_hopeless
 from .task import Task
 from .terms import LimitShape
 
-_TRIED = (2.0, 10.0, 100.0)
-"""Factors on the rates of motors with which a plan is looked for."""
-_ROUGH = 4.0
-"""Largest factor on the friction of a rolling contact."""
+_TRIED = (2.0, 10.0, 100.0)  # factors on the rates of motors with which a plan is looked for
+_ROUGH = 4.0  # largest factor on the friction of a rolling contact
 _TORQUE = 15.0
 """Unit of the torques' shortfalls, over the scene's torque: as bad as one of its force."""
-_FORCE = 5.0
-"""Largest unit of force when a limit is relaxed, over the scene's."""
-FRICTION = "friction"
-"""Beginning of the keys of frictions."""
+_FORCE = 5.0  # largest unit of force when a limit is relaxed, over the scene's
+FRICTION = "friction"  # beginning of the keys of frictions
 Replan = Callable[[Sequence[Curve], float], object]
 """Plans the phases along curves with a least normal force [N]; raises if there is no plan."""
 
@@ -249,7 +245,7 @@ def _list_shortfalls(
     return list_shortfalls(data.limits, data.evaluate(data.nodes, profile), locate)
 
 
-def explain_motors(
+def explain_rate_limits(
     task: Task, parts: Sequence[PhaseData], reason: str, plan: Callable[..., Any]
 ) -> WholearmError:
     """The error for phases that `plan`, which is `plan_curves`, has found no plan for.

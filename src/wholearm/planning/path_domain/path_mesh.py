@@ -22,24 +22,18 @@ from .switches import Switch, find_switches
 
 START, SOFT = 10, 20
 """Elements of a phase to begin with, and where plans switch more softly, for least effort."""
-MOST = 80
-"""Elements of a phase from which on they are not doubled."""
-SLOW_MOST = 40
-"""The same for slow motors, unless a high accuracy is asked for."""
+MOST = 80  # elements of a phase from which on they are not doubled
+SLOW_MOST = 40  # the same for slow motors, unless a high accuracy is asked for
 SHIFTED = 0.02
 """Relative loss of an end of an element that is so far from a switch, over the curve's length."""
-_ORDER = 6
-"""Power of an element's length that its price falls with."""
-_APART = 1e-5
-"""Least length of an element that switches lead to, over the curve's."""
+_ORDER = 6  # power of an element's length that its price falls with
+_APART = 1e-5  # least length of an element that switches lead to, over the curve's
 _CLOSE = 1e-10
 """The same for slow motors: next to rest little of the way is passed while a torque changes."""
-_NEAR = 0.02
-"""Distance at which a switch is the one that a break was for, over the curve's length."""
+_NEAR = 0.02  # distance at which a switch is the one that a break was for, over the curve's length
 _ENDS = 0.1
 """Share of elements of the first and the last stretch where s is cubic in the first and last."""
-_CHEAP = 1e-3
-"""Least price of a stretch that counts, over that of all."""
+_CHEAP = 1e-3  # least price of a stretch that counts, over that of all
 
 
 class Mesh(NamedTuple):

@@ -20,12 +20,10 @@ from ...mechanics.dynamics import Directions, inverse, split_forces
 from ...results.trajectory import Samples
 from .elements import DEGREE, Elements, Grid, Profile
 
-_POINTS = 12
-"""Gauss points for the time in an interval between nodes."""
+_POINTS = 12  # Gauss points for the time in an interval between nodes
 _STALLED = 100.0
 """Speed that the ends of an interval suggest over the one inside at which a motion stalls."""
-_TINY = 1e-100
-"""Least speed [m/s] that is divided by."""
+_TINY = 1e-100  # least speed [m/s] that is divided by
 _NEWTON = 5
 """Steps of Newton's method from a time to a place: rates of time differ little in an interval."""
 

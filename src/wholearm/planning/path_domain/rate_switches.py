@@ -19,33 +19,22 @@ from .path_motion import PathMotion
 from .rate_terms import find_torques
 from .switches import Switch
 
-_LONGER = 1.05
-"""Factor on the least time of ramps, so that they are inside the limits."""
-_STEP = 1e-2
-"""Least step of a torque that gets a ramp, over its limit."""
-_LAGS = 3.0
-"""Time that a lag takes for a step of the size of the torque limit, over the lag."""
-_BRIEF = 0.3
-"""Largest part of the motion's time that all ramps may take together."""
-_RAMP_REACH = 0.3
-"""Least way between a ramp and another end of an element, over that of the ramp."""
-_HALF = 0.5
-"""Rate, over the largest one, from which on a torque is on its way to change at that."""
-_SLOW = 0.1
-"""Rate, over the largest one, up to which it is not."""
-_KINK = 2.0
-"""Least step of a rate that no motor limits, over the torque limit in the motion's time."""
-_NEAR = 0.06
-"""Least time between two switches, over that in which a torque changes by its limit."""
-_APART = 4e-3
-"""The same, over the duration, where that is less."""
+_LONGER = 1.05  # factor on the least time of ramps, so that they are inside the limits
+_STEP = 1e-2  # least step of a torque that gets a ramp, over its limit
+_LAGS = 3.0  # time that a lag takes for a step of the size of the torque limit, over the lag
+_BRIEF = 0.3  # largest part of the motion's time that all ramps may take together
+_RAMP_REACH = 0.3  # least way between a ramp and another end of an element, over that of the ramp
+_HALF = 0.5  # rate, over the largest one, from which on a torque is on its way to change at that
+_SLOW = 0.1  # rate, over the largest one, up to which it is not
+_KINK = 2.0  # least step of a rate that no motor limits, over the torque limit in the motion's time
+_NEAR = 0.06  # least time between two switches, over that in which a torque changes by its limit
+_APART = 4e-3  # the same, over the duration, where that is less
 _LATE = 0.4
 """Least part of the ramp at an end that an element takes: a short one there hides what it holds."""
-_MOST = 24
-"""Most switches of a phase: those beyond flicker."""
+_MOST = 24  # most switches of a phase: those beyond flicker
 
 
-def find_motor_switches(part: PhaseData, profile: Profile) -> list[Switch]:
+def find_rate_switches(part: PhaseData, profile: Profile) -> list[Switch]:
     """Where torques of a phase begin to change at other rates, as places along its curve."""
     motion = PathMotion(part.curve, part.grid, profile)
     if motion.stalls:

@@ -37,8 +37,7 @@ if TYPE_CHECKING:
     from ..columns import Symbols
 
 
-_LOOKS = 21
-"""Instants of each interval at which rates are looked at."""
+_LOOKS = 21  # instants of each interval at which rates are looked at
 _NODES = DEGREE + 1
 
 
@@ -52,7 +51,7 @@ class MotorShape(NamedTuple):
     def of(scene: Scene) -> MotorShape:
         """The shape of a scene's motors."""
         if not scene.has_slow_motors:
-            return QUICK
+            return UNLIMITED
         limited, lags = np.isfinite(scene.torque_rate_limit), scene.actuator_lag > 0
         return MotorShape(*(tuple(np.flatnonzero(own).tolist()) for own in (limited, lags)))
 
@@ -72,8 +71,7 @@ class MotorShape(NamedTuple):
         }
 
 
-QUICK = MotorShape()
-"""Motors whose torques may step."""
+UNLIMITED = MotorShape()  # motors whose torques may step
 
 
 def list_kinds(count: int, held: bool) -> list[int]:

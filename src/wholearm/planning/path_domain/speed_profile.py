@@ -21,18 +21,15 @@ from .switches import Sights, Switch
 
 _SHARES = {SweepMode.PUSH: 0.0, SweepMode.SWITCH: 0.0, SweepMode.BRAKE: 1.0, SweepMode.HELD: 0.5}
 """How far s'' is from its largest, over the range that limits allow."""
-_CLOSE = 1e-4
-"""Error of the duration that is good enough for a margin, relatively."""
-_TRIES = 40
-"""Most margins that are tried."""
+_CLOSE = 1e-4  # error of the duration that is good enough for a margin, relatively
+_TRIES = 40  # most margins that are tried
 _SAME = 1e-4
 """Difference of margins, relatively, with one of which there is a motion and with one none."""
 
 
 _WIDER = 5e-3
 """By how much limits are wider, over what is much for each, where it is sure that they are."""
-_FREE = 1e6
-"""The same for limits that do not count."""
+_FREE = 1e6  # the same for limits that do not count
 _GRADES = (1e-4, 1e-3, 1e-2)
 """Ends of elements next to an end that limits the margin, over the length of the curve."""
 

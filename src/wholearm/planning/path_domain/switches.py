@@ -19,20 +19,13 @@ from ..lower_bound.rows import PathLimitRows, eliminate
 from .elements import DEGREE, Elements, Profile
 from .path_data import PhaseData, Places
 
-_PICARD = 4
-"""Rounds in which speeds and extremes of s'' are made to agree."""
-_LOOKS = 320
-"""Places at which corners are looked for, at least two in an interval between nodes."""
-_CAPPED = np.iinfo(np.int64).max
-"""Label of places where a speed limit decides."""
-_AT_CAP = 1e-3
-"""Share of the largest square of the speed within which it does."""
-_SURE = 0.03
-"""Share of the range of s'' within which it counts as the largest or the least."""
-_FLICKER = 4e-3
-"""Length over which changes of corners count as one, over that of the curve."""
-_THIN = 1e-3
-"""Range of s'', over its largest, below which limits leave no choice."""
+_PICARD = 4  # rounds in which speeds and extremes of s'' are made to agree
+_LOOKS = 320  # places at which corners are looked for, at least two in an interval between nodes
+_CAPPED = np.iinfo(np.int64).max  # label of places where a speed limit decides
+_AT_CAP = 1e-3  # share of the largest square of the speed within which it does
+_SURE = 0.03  # share of the range of s'' within which it counts as the largest or the least
+_FLICKER = 4e-3  # length over which changes of corners count as one, over that of the curve
+_THIN = 1e-3  # range of s'', over its largest, below which limits leave no choice
 
 
 class Switch(NamedTuple):

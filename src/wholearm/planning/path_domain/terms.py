@@ -27,7 +27,7 @@ from ...mechanics.limits import PRESS, TORQUE, LimitSet
 from ..columns import Columns, Symbols
 from ..options import Objective
 from .elements import DEGREE, FROM_REST, INSIDE, POWERS, SIGNS, find_basis
-from .rate_terms import QUICK, MotorShape, find_first_slopes, list_kinds, write_motor_rows
+from .rate_terms import UNLIMITED, MotorShape, find_first_slopes, list_kinds, write_motor_rows
 
 CHAINED = (Objective.MARGIN, Objective.RELAX)
 """Objectives with one more unknown, which every node has a copy of."""
@@ -36,13 +36,11 @@ SOFT = (Objective.ELASTIC, Objective.RELAX)
 LEAST_B = 1e-8
 """Least s'' at rest, in units of the typical one, and least b far away from it; next to rest b goes
 with the way. Keeps the square root differentiable."""
-_CALM = 1e-6
-"""Weight of the squeeze against the objective: picks one among equally good ones."""
+_CALM = 1e-6  # weight of the squeeze against the objective: picks one among equally good ones
 _ROUGH = 0.1
 """Weight of the highest polynomial of a and lambda in each element: rules out that they bend at a
 single node towards other limits than around it. It falls fast where the plan is smooth."""
-_EVEN = 1e-4
-"""Weight of changes of a from node to node where limits give way."""
+_EVEN = 1e-4  # weight of changes of a from node to node where limits give way
 _STIFF = 1e3
 """The same, over that, where limits give way, for s'' that is not linear in an element, or next to
 rest not constant."""
@@ -59,10 +57,10 @@ class LimitShape(NamedTuple):
     presses: tuple[int, ...]
     torques: tuple[int, ...]
     fast: tuple[int, ...]
-    motors: MotorShape = QUICK
+    motors: MotorShape = UNLIMITED
 
     @staticmethod
-    def of(limits: LimitSet, motors: MotorShape = QUICK) -> LimitShape:
+    def of(limits: LimitSet, motors: MotorShape = UNLIMITED) -> LimitShape:
         """The shape of a set of limits."""
         rows, signs, _ = limits.sides
         known = [part.any(axis=1) for part in limits.columns[1:]]

@@ -20,14 +20,11 @@ from ..robust.robust_rows import RobustHold, list_holds, measure_holds
 from .elements import Profile
 from .path_data import PhaseData
 
-BEYOND = 10.0
-"""How far beyond, over what is enough, the first node is placed."""
-WORTH = 0.02
-"""Share of the objective of its phases that a sure start may cost."""
+BEYOND = 10.0  # how far beyond, over what is enough, the first node is placed
+WORTH = 0.02  # share of the objective of its phases that a sure start may cost
 _SHARES = (0.0, 0.002, 0.005, 0.01, WORTH)
 """Shares of a margin that are given up for it, as little as will do."""
-_KEPT = 1e-9
-"""What passes for keeping a limit, over what is much for it."""
+_KEPT = 1e-9  # what passes for keeping a limit, over what is much for it
 
 
 class SureStart(NamedTuple):

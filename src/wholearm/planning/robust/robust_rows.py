@@ -35,16 +35,11 @@ from ...scene.model import Friction, Scene
 from ...sensitivity.slopes import COUNT, find_force_slopes
 from ..lower_bound.rows import PathLimitRows, eliminate
 
-COPIES = 5
-"""Rows for each force limit: two for each corner, and one for the motion that is known."""
-_LOOKS = 97
-"""Places of a stretch without reversals at which signs are found."""
-_ROUNDS = 8
-"""Rounds in which corners and rows are made to agree."""
-_LOWER = 0.5
-"""Factor on b where limits leave no corners."""
-_SAME = 1e-9
-"""Miss of a row that is none, over what is much for it."""
+COPIES = 5  # rows for each force limit: two for each corner, and one for the motion that is known
+_LOOKS = 97  # places of a stretch without reversals at which signs are found
+_ROUNDS = 8  # rounds in which corners and rows are made to agree
+_LOWER = 0.5  # factor on b where limits leave no corners
+_SAME = 1e-9  # miss of a row that is none, over what is much for it
 
 
 class Guide(NamedTuple):
@@ -168,7 +163,7 @@ def spread_limits(limits: LimitSet) -> LimitSet:
     return LimitSet(tuple(found))
 
 
-def spread(curve: Curve, epsilon: float, widths: Mapping[str, float], guide: Guide) -> Spread:
+def spread(curve: Curve, guide: Guide, epsilon: float, widths: Mapping[str, float]) -> Spread:
     """What ranges make of the force limits of a curve, for motions near one that is known.
 
     Parameters
