@@ -18,10 +18,10 @@ from ...common.quadrature import find_minima
 from ...common.shortfalls import Parameter
 from ...geometry.curve import Curve, describe_pose
 from ...mechanics.dynamics import PathForces, inverse, reduced_inertia
-from ...mechanics.limits import CONE, PRESS, SPEED, TORQUE, LimitSet, make_limits
+from ...mechanics.limits import CONE, PRESS, SPEED, TORQUE, LimitSet, SideTerms, make_limits
+from ..lower_bound.rows import LimitSides, directions_of
 from ..robust.robust_rows import Spread, spread_limits
 from .elements import Elements, Grid, Profile
-from .path_motion import directions_of
 
 
 class Sampling(NamedTuple):
@@ -125,6 +125,13 @@ class PhaseData(NamedTuple):
         values = self.evaluate(places, profile)
         values[:, self.limits.of(PRESS)] -= margin
         return self.limits.find_slack(values)
+
+    def list_sides(self, places: Places, margin: float) -> LimitSides:
+        """The sides of the limits for a margin of normal forces over epsilon [N]."""
+        terms = SideTerms.of(self.limits, places.forces, places.rates)
+        normal = np.isin(self.limits.sides[0], self.limits.of(PRESS))
+        rest = terms.rest - margin * normal / self.spans
+        return LimitSides(rest, *terms[1:], self.largest_b(places))
 
     def largest_b(self, places: Places, spared: Parameter | None = None) -> Array:
         """Largest b that the joints' speed limits allow, shape (n,) [m^2/s^2].

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from ...common.arrays import Array
 from ...geometry.curve import Curve
-from ...mechanics.dynamics import Directions, inverse, split_forces
+from ...mechanics.dynamics import inverse, split_forces
 from ...results.trajectory import Samples
+from ..lower_bound.rows import directions_of
 from .elements import DEGREE, Elements, Grid, Profile
 
 _POINTS = 12  # Gauss points for the time in an interval between nodes
@@ -184,10 +185,3 @@ def _share(v0: Array, v1: Array, w: Array) -> tuple[Array, Array]:
     total = np.maximum(v0 + v1, _TINY)
     done = w * (v0 * (2 - w) + v1 * w) / total
     return done, (1 - w) * (v1 * (1 + w) + v0 * (1 - w)) / total
-
-
-def directions_of(curve: Curve, segment: NDArray[np.int64]) -> Directions:
-    """Directions at n places, given the segment that each belongs to."""
-    Xi = np.array([part.Xi for part in curve.segments])
-    sigma = np.array([part.sigma for part in curve.segments])
-    return Directions(Xi[segment], sigma[segment])

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
-from ..lower_bound.rows import PathLimitRows
+from ..lower_bound.rows import LimitSides, PathLimitRows
 from ..lower_bound.speed_sweep import SweepMode
 from ..options import Objective
 from ..phase_plan import PhasePlan
@@ -37,7 +37,6 @@ from .path_motion import PathMotion
 from .path_nlp import PathNLP, Tightening, Units, make_bounds, pack, parameters, unpack
 from .rate_switches import find_rate_switches, ramp_up
 from .speed_profile import Fastest, find_fastest
-from .switches import LimitSides
 from .task import EARLY, Task
 from .terms import LEAST_B
 from .violations import Misses, PathSolution, anticipate, price
@@ -406,7 +405,7 @@ def start_at(
 
     The profile is at vertices of the polygon of s'' and internal force that limits allow.
     """
-    sides = LimitSides.of(data, data.nodes, found.margin)
+    sides = data.list_sides(data.nodes, found.margin)
     vertices = _Vertices.at(data.grid, sides, found)
     rows = data.limits.sides[0]
     scale = data.spans / units.of(data.limits)[rows]
@@ -418,7 +417,7 @@ def start_at(
         rate = 1 / max(float((kept * presses).sum()), _COLD_MU)
     on_links, kept = rate * on_links, np.maximum(rate * kept, _COLD_MU / _COLD_INSIDE)
     moved = vertices.move_inside(sides, _COLD_MU / kept / scale[vertices.sides])
-    on_sides = _COLD_MU / np.maximum(sides.find_slack(moved) * scale, _COLD_INSIDE)
+    on_sides = _COLD_MU / np.maximum(sides.find_slack(*moved) * scale, _COLD_INSIDE)
     free = np.flatnonzero(~vertices.held)
     on_sides[free[:, None], vertices.sides[free]] = kept[free]
     on_b = -_COLD_MU / np.maximum(moved.b / units.profile[0], _COLD_INSIDE)

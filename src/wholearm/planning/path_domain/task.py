@@ -13,12 +13,12 @@ from ...geometry.curve import Curve, describe_pose
 from ...mechanics.dynamics import reduced_inertia
 from ...mechanics.uniqueness import describe_uniqueness, find_minors
 from ..advice import name_phases
+from ..lower_bound.rows import directions_of
 from ..options import Objective, PlanOptions
 from ..robust.robust_rows import Guide, Spread, spread
 from .elements import DEGREE
 from .path_data import PhaseData, join, prepare
 from .path_mesh import SOFT, START, Mesh, find_ends
-from .path_motion import directions_of
 from .path_nlp import PathNLP, build_path_nlp
 from .rate_terms import UNLIMITED, MotorShape
 from .switches import Switch
