@@ -95,18 +95,10 @@ def find_fastest(
     if b[-1] < -_ROUNDING * max(b):
         raise NoMotionError(count - 1)
     b[-1] = max(b[-1], 0.0)
-    mode = SweepMode
-    modes = [
-        mode.PUSH
-        if not after
-        else mode.SWITCH
-        if not before
-        else mode.BRAKE
-        if brake
-        else mode.HELD
-        for before, after, brake in zip(reaches[:-1], reaches[1:], braked, strict=True)
-    ]
-    return Sweep(np.array(b), np.array(modes, dtype=np.int64))
+    slower = ~np.array(reaches)
+    modes = np.where(braked, SweepMode.BRAKE, SweepMode.HELD)
+    modes = np.where(slower[:-1], SweepMode.SWITCH, modes)
+    return Sweep(np.array(b), np.where(slower[1:], SweepMode.PUSH, modes))
 
 
 def find_steady(rows: PathLimitRows, steps: Array, part: Array, cap: Array) -> Sweep:
