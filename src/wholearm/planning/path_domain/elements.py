@@ -83,11 +83,9 @@ class Grid(NamedTuple):
     def kinds(self) -> NDArray[np.int64]:
         """Kind of each element, shape (E,)."""
         kinds = np.full(len(self.s) // (DEGREE + 1), INSIDE)
-        for at, kind in (
-            (0, FROM_HOLD if self.held else FROM_REST),
-            (-1, TO_HOLD if self.held else TO_REST),
-        ):
-            kinds[at] = kind if self.rests[at] else kinds[at]
+        ends = (FROM_HOLD, TO_HOLD) if self.held else (FROM_REST, TO_REST)
+        for at in (0, -1):
+            kinds[at] = ends[at] if self.rests[at] else kinds[at]
         return kinds
 
     @property

@@ -43,7 +43,7 @@ class Mesh(NamedTuple):
     def of(curve: Curve, switches: Sequence[Switch], held: bool = False) -> Mesh:
         """The mesh for a motion that switches at some places."""
         if held:
-            return Mesh(_space(switches, curve))
+            return Mesh(_keep_apart([place for place, _ in switches], curve, _CLOSE))
         return Mesh(_match(np.zeros(0), switches, curve)[0])
 
     def make_grid(
@@ -122,7 +122,7 @@ def adapt(
     return Better(Mesh(breaks, weights), shift, float((price * finer**_ORDER).sum()))
 
 
-def _match(known: Array, switches: Sequence[Switch], curve: Curve) -> tuple[Array, float]:
+def _match(breaks: Array, switches: Sequence[Switch], curve: Curve) -> tuple[Array, float]:
     """Breaks moved to switches near them, with new ones, and their shift.
 
     None is given up: a switch at an element's end may not show.
@@ -130,25 +130,22 @@ def _match(known: Array, switches: Sequence[Switch], curve: Curve) -> tuple[Arra
     fixed, least = find_ends(curve, np.zeros(0)), _APART * curve.length
     moved, fresh, shift = dict[int, float](), list[float](), 0.0
     for place, jumps in switches:
-        far = np.abs(known - place)
+        far = np.abs(breaks - place)
         far[list(moved)] = np.inf
         if far.min(initial=np.inf) < _NEAR * curve.length:
             moved[int(far.argmin())] = place
             shift = max(shift, float(far.min()) / curve.length)
-        elif np.abs(np.concatenate([fixed, known, fresh]) - place).min() > least:
+        elif np.abs(np.concatenate([fixed, breaks, fresh]) - place).min() > least:
             fresh.append(place)
-            shift = np.inf if jumps or not len(known) else shift
-    kept = list[float]()
-    for place in sorted([*(moved.get(k, place) for k, place in enumerate(known)), *fresh]):
-        if np.abs(np.append(fixed, kept) - place).min() > least:
-            kept.append(place)
-    return np.array(kept), shift
+            shift = np.inf if jumps or not len(breaks) else shift
+    every = sorted([*(moved.get(k, place) for k, place in enumerate(breaks)), *fresh])
+    return _keep_apart(every, curve, _APART), shift
 
 
-def _space(switches: Sequence[Switch], curve: Curve) -> Array:
-    """Breaks at switches, but where there is an end close to it."""
+def _keep_apart(places: Sequence[float], curve: Curve, least: float) -> Array:
+    """Places with a least distance, over the curve's length, to reversals and to each other [m]."""
     fixed, kept = find_ends(curve, np.zeros(0)), list[float]()
-    for place, _ in switches:
-        if np.abs(np.append(fixed, kept) - place).min() > _CLOSE * curve.length:
+    for place in places:
+        if np.abs(np.append(fixed, kept) - place).min() > least * curve.length:
             kept.append(place)
     return np.array(sorted(kept))
