@@ -13,12 +13,12 @@ from wholearm.common.quadrature import find_minima
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.mechanics.dynamics import PathForces, inverse
+from wholearm.planning.lower_bound.rows import directions_of
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.elements import Profile
 from wholearm.planning.path_domain.interpolation import fit_torque
 from wholearm.planning.path_domain.path_data import PhaseData, choose_sampling, prepare
 from wholearm.planning.path_domain.path_mesh import Mesh
-from wholearm.planning.path_domain.path_motion import directions_of
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.scene.model import Friction, Scene
 

@@ -20,10 +20,11 @@ from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import inverse
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
+from wholearm.planning.lower_bound.rows import directions_of
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain import path_plan, task
 from wholearm.planning.path_domain.impact_sequence import ImpactSequence, make_sequence
-from wholearm.planning.path_domain.path_motion import PathMotion, directions_of
+from wholearm.planning.path_domain.path_motion import PathMotion
 from wholearm.planning.path_domain.path_nlp import PathNLP, build_path_nlp
 from wholearm.planning.path_domain.path_plan import plan_curves, plan_path
 from wholearm.planning.path_domain.sequence_plan import plan_sequence

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ...common.arrays import Array
 from ...mechanics.dynamics import PathForces, inverse
 from ...mechanics.limits import make_limits
-from ...planning.path_domain.path_motion import directions_of
+from ...planning.lower_bound.rows import directions_of
 from ...results.torque import TorqueProfile
 from .phases import (
     NO_PLAN,

@@ -1,8 +1,7 @@
-"""The planning NLP of one-freedom phases in the path domain: building, bounds, packing.
+"""The planning NLP in the path domain: building, parameters, bounds, packing.
 
-`terms` has its expressions. Built once for some contacts, intervals and an objective,
-it serves every phase: grid, coefficients and limits are its parameters and bounds. Phases that
-impacts join have an interval of length zero between them (`chain`).
+`terms` has its expressions. Built once for some contacts, intervals and an objective, it serves
+every phase: grid, coefficients and limits are its parameters and bounds.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ class Units(NamedTuple):
     force: float  # [N]
     torque: Array  # (2,) [N m]: of each joint
     power: float  # [(N m)^2]: of the effort's integrand
-    press: float  # [N]: what the hand can press with: a squeeze so large is nothing to be avoided
+    press: float  # [N]: typical internal force, in the regularization
 
     @property
     def profile(self) -> Array:
@@ -50,7 +49,7 @@ class Units(NamedTuple):
 
 
 class Relaxation(NamedTuple):
-    """Which number gives way, and by how much when the relaxation of the NLP grows by 1."""
+    """The relaxed parameter, and its change per unit relaxation of the NLP."""
 
     parameter: Parameter
     step: float  # in its unit; that of a speed is of its square, relatively
@@ -64,14 +63,13 @@ class Relaxation(NamedTuple):
 
 
 class Tightening(NamedTuple):
-    """By how much limits at the nodes are tightened so that they hold between nodes too."""
+    """Tightening of limits at the nodes so that they hold between nodes too."""
 
     limits: Array  # (N + 1, n_sides) [N, N m]: of each side of the limits
     speed_share: Array  # (N + 1,): factor on the largest b
     duration: float | None  # [s]: longest duration, if there is one
-    missed: Array  # (N + 1, n_sides) [N, N m]: the part of `limits` beyond what was slack anyway
-    # (N + 1, 2, 2): factors on the largest rates of torques, and on the largest commands
-    motors: Array
+    missed: Array  # (N + 1, n_sides) [N, N m]: the part of `limits` beyond the slack at nodes
+    motors: Array  # (N + 1, 2, 2): factors on torque rate limits and on the largest commands
 
     @staticmethod
     def none(data: PhaseData, duration: float | None) -> Tightening:
@@ -81,22 +79,24 @@ class Tightening(NamedTuple):
         return Tightening(limits, np.ones(count), duration, limits, np.ones((count, 2, 2)))
 
     def ease(self, spare: Array) -> Tightening:
-        """Tighten less, by what limits are from being missed about each node."""
+        """Tighten less, by the `spare` slack about each node."""
         eased = np.minimum(self.missed, spare)
         return self._replace(limits=self.limits - eased, missed=self.missed - eased)
 
     def by(
         self, reach: Array, limits: Array, speed_share: Array, late: float, motors: Array
     ) -> Tightening:
-        """Tighten further: limits by so much, b, duration and motors by a relative amount.
+        """Tighten further: limits absolutely, b, duration and torque rates relatively.
 
-        Limits are first raised to `reach`, as what is slack already would not feel the rest.
+        Limits are first raised to `reach`, the slack at nodes, which would absorb the rest.
         """
-        duration = None if self.duration is None else self.duration * (1 - late)
-        raised = np.maximum(self.limits, reach) + limits
-        share = self.speed_share * (1 - speed_share)
-        missed, quick = self.missed + limits, self.motors * (1 - motors)
-        return Tightening(raised, share, duration, missed, quick)
+        return Tightening(
+            np.maximum(self.limits, reach) + limits,
+            self.speed_share * (1 - speed_share),
+            None if self.duration is None else self.duration * (1 - late),
+            self.missed + limits,
+            self.motors * (1 - motors),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,11 +123,11 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     started = time.perf_counter()
     nlp = write_terms(shape, intervals, objective)
     book(SolverStatistics(build_time=time.perf_counter() - started))
-    # Started from nowhere near their optimum, these need the more robust strategy.
+    # Soft NLPs start far from their optimum, and need the more robust strategy.
     strategy: dict[str, Any]
     strategy = {"mu_strategy": "monotone"} if objective in SOFT else {"mu_oracle": "probing"}
     if shape.motors.slow:
-        # Next to rest slopes of the time are large, by which it would count for little.
+        # Large gradients of the time next to rest would scale the objective down.
         strategy |= {"nlp_scaling_method": "none"}
     solver = build_solver("path_nlp", nlp, 1e-9, max_iter=300, **strategy)
     columns = list_columns(shape, intervals, objective)
@@ -189,13 +189,13 @@ def make_bounds(
     n, node = len(data.grid.s), nlp.columns.node
     low, high = np.full((n, node.count), -np.inf), np.full((n, node.count), np.inf)
     b_max = data.largest_b(data.nodes, relaxation.parameter if relaxation else None)
-    # Next to rest b goes with the way: of the least s'' it is twice as much.
+    # Next to rest b is 2 s times the least s''.
     s, length = data.grid.s, data.grid.s[-1]
     low[:, 0] = LEAST_B * np.minimum(s, length - s) / length
     high[:, 0] = np.maximum(b_max * speed_share / units.profile[0], 2 * LEAST_B)
     if data.grid.held:
         low[:, 0], high[:, 0] = LEAST_B, high[:, 0] / data.grid.sizes
-    # From rest and to rest, with no way back.
+    # From rest to rest, without reversal.
     if nlp.shape.motors.slow:
         low[[0, -1], node["a"]] = high[[0, -1], node["a"]] = 0.0
     else:
@@ -209,10 +209,8 @@ def make_bounds(
             low[place, node["squeeze"]] = high[place, node["squeeze"]] = pin / units.profile[2]
     low[:, node["extra"]] = -np.inf if nlp.objective is Objective.MARGIN else 0.0
     rows, signs, bounds = data.limits.sides
-    # The constant part of what limits are of is on this side.
-    sides = (bounds + signs * tight - data.find_terms().constant[:, rows]) / units.of(data.limits)[
-        rows
-    ]
+    sides = bounds + signs * tight - data.find_terms().constant[:, rows]
+    sides /= units.of(data.limits)[rows]
     side = np.arange(len(rows)) if nlp.objective in SOFT else rows
     width = nlp.columns.g.sizes["limits"] // n
     rows_low, rows_high = np.full((n, width), -np.inf), np.full((n, width), np.inf)
@@ -252,10 +250,9 @@ def pack(
     extra: float | Array,
     sizes: Array | float = 1.0,
 ) -> Array:
-    """Unknowns of the NLP, in its units, from a profile and what its objective adds.
+    """Unknowns of the NLP, in its units, from a profile, with the `sizes` of b on its grid.
 
-    That is the least margin [N], the relaxation, or shortfalls in the units of the limits. With
-    the `sizes` of b on its grid.
+    `extra` is the least margin [N], the relaxation, or shortfalls in the units of the limits.
     """
     table = np.empty(nlp.free.shape)
     table[:, nlp.columns.node["extra"]] = extra / _margin_unit(nlp, units)
@@ -269,9 +266,9 @@ def _margin_unit(nlp: PathNLP, units: Units) -> float:
 
 
 def unpack(nlp: PathNLP, grid: Grid, x: Array, units: Units) -> tuple[Profile, float]:
-    """Profile of a solution, and the least margin [N] or the relaxation if that is an unknown.
+    """Profile of a solution, and the least margin [N] or the relaxation, if any.
 
-    b is integrated again from a, so that b' = 2 a holds to rounding and not to Ipopt's tolerance.
+    b is integrated again from a: b' = 2 a to rounding, not to Ipopt's tolerance.
     """
     table = np.zeros(nlp.free.shape)
     table[nlp.free] = x
