@@ -25,18 +25,13 @@ from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion, Trajectory, assemble
 from ..scene.model import Scene
 
-SHORT = 1e-4
-"""Least shortfall that counts, over what is much for a limit."""
-SHORT_OF = "misses limits least"
-"""Status in the `meta` of such a motion."""
-ROWS = 201
-"""Rows of each of its phases."""
-DIGITS = 3
-"""Significant digits of what is advised."""
+SHORT = 1e-4  # least shortfall that counts, over what is much for a limit
+SHORT_OF = "misses limits least"  # status in the `meta` of such a motion
+ROWS = 201  # rows of each of its phases
+DIGITS = 3  # significant digits of what is advised
 _BEYOND = (0.0, 0.005, 0.015, 0.05, 0.15, 0.5)
 """Relative distances beyond the least change to try: plans keep limits between nodes too."""
-_CLOSE = 0.02
-"""Relative excess over the least change that is good enough."""
+_CLOSE = 0.02  # relative excess over the least change that is good enough
 
 
 _unadvised: ContextVar[bool] = ContextVar("_unadvised", default=False)

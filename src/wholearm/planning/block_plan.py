@@ -16,10 +16,8 @@ from .stops import Plans, end_of
 
 PLAIN = -1
 """Number of doublings that stands for as many intervals as at first, and no search for modes."""
-BEGUN = -2
-"""The same for plans that are only begun: they may miss limits between points."""
-FINEST = 64
-"""Most intervals of a phase in the time domain that refining asks for."""
+BEGUN = -2  # the same for plans that are only begun: they may miss limits between points
+FINEST = 64  # most intervals of a phase in the time domain that refining asks for
 
 
 @dataclass(frozen=True, eq=False)

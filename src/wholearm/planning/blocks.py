@@ -34,27 +34,19 @@ from .phase_plan import PhasePlan, add_up
 from .rate_limits import explain_motors, free_torques, require_steps
 from .stops import Plans, leads_on, runs_along_curves, split_blocks
 
-SKETCH = 24
-"""Intervals on which what follows a block is looked at where it is only sketched."""
+SKETCH = 24  # intervals on which what follows a block is looked at where it is only sketched
 CLEAR = 0.05
 """Least shortfall, over what is much for a limit, that no better plan of phases before mends."""
-COARSE = 80
-"""Intervals along a curve that refining doubles where none are asked for."""
-AMPLE = 1.1
-"""Ratio to the least normal force of other phases from which on more decides nothing."""
+COARSE = 80  # intervals along a curve that refining doubles where none are asked for
+AMPLE = 1.1  # ratio to the least normal force of other phases from which on more decides nothing
 MOVED = 1e-9
 """Distance from which on a block starts somewhere else, in radii of gyration or radians."""
-APART = 1e-6
-"""The same, from which on its plans of least duration are others."""
-SHORT = 5e-7
-"""Largest shortfall of a margin below epsilon by rounding, over the scene's force."""
+APART = 1e-6  # the same, from which on its plans of least duration are others
+SHORT = 5e-7  # largest shortfall of a margin below epsilon by rounding, over the scene's force
 
 
 def plan_blocks(
-    problem: Problem,
-    curves: tuple[Curve, ...],
-    options: PlanOptions,
-    report: Callable[[str], None],
+    problem: Problem, curves: tuple[Curve, ...], options: PlanOptions, report: Callable[[str], None]
 ) -> Planning:
     """Plan every block of a problem, each from where the one before ends.
 

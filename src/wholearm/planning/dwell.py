@@ -33,8 +33,7 @@ from .path_domain.junction import begin_from
 from .phase_plan import PhasePlan, Settled
 from .stops import Plans, end_of
 
-CLOSED = 0.01
-"""What is left of a gap that counts as closed, over the gap."""
+CLOSED = 0.01  # what is left of a gap that counts as closed, over the gap
 
 
 class DwellEnd(NamedTuple):
@@ -191,12 +190,10 @@ WAYS = (
 """Ways to share that are tried, in this order, until a plan ends no farther off than its start."""
 
 
-STOP = 0.06
-"""Time for an end where nothing has to close, over that for a contact."""
+STOP = 0.06  # time for an end where nothing has to close, over that for a contact
 
 
-BETTER = 0.8
-"""How far off another way's end may be to be better, over that of the best one before."""
+BETTER = 0.8  # how far off another way's end may be to be better, over that of the best one before
 
 
 def share_time(problem: Problem, plans: Plans) -> list[DwellEnd | None]:

@@ -41,8 +41,7 @@ if TYPE_CHECKING:
     from .replay_check import Checked
 
 
-_STILL = 1e-9
-"""Speed of a plan that is rest but for rounding, relative to the scene's."""
+_STILL = 1e-9  # speed of a plan that is rest but for rounding, relative to the scene's
 
 
 def solve(
@@ -193,10 +192,7 @@ def finish_plan(
 
 
 def _plan(
-    problem: Problem,
-    curves: tuple[Curve, ...],
-    options: PlanOptions,
-    report: Callable[[str], None],
+    problem: Problem, curves: tuple[Curve, ...], options: PlanOptions, report: Callable[[str], None]
 ) -> Planning:
     """Plan every block, and let an error's motion carry the problem along like a plan's."""
     try:

@@ -20,12 +20,9 @@ from .path_domain.range_factor import find_widest
 from .phase_plan import combine
 from .robust.robust_rows import Guide, list_holds, measure_holds
 
-WIDEST = 0.95
-"""Largest relative range that is tried."""
-_STILL = 1e-9
-"""Speed of a plan that is rest but for rounding, relative to the scene's."""
-_MOST = 1e3
-"""Largest factor that is tried."""
+WIDEST = 0.95  # largest relative range that is tried
+_STILL = 1e-9  # speed of a plan that is rest but for rounding, relative to the scene's
+_MOST = 1e3  # largest factor that is tried
 
 
 def assess_ranges(planning: Planning, report: Callable[[str], None]) -> RangeFigures:

@@ -16,8 +16,7 @@ from .stops import Plans, runs_along_curves, split_blocks
 
 FREE = {"torque_rate_limit": None, "actuator_lag": None, "control_period": None}
 """Changes of a problem after which motors are quick, and torques are not held."""
-_ROUGH = 1e-2
-"""Least accuracy of plans of which only matters that there are any."""
+_ROUGH = 1e-2  # least accuracy of plans of which only matters that there are any
 
 
 def require_steps(problem: Problem, options: PlanOptions) -> None:

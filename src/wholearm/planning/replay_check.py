@@ -12,13 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import (
-    InfeasibleError,
-    JammingError,
-    ReplayError,
-    SimulationError,
-    SolverError,
-)
+from ..common.errors import InfeasibleError, JammingError, ReplayError, SimulationError, SolverError
 from ..problem.definition import Problem
 from ..results.replay_figures import LeastForce, ReplayedPhase, ReplayFigures
 from ..results.report import Report
@@ -30,22 +24,18 @@ from ..verification.verify import judge, observe
 from .block_plan import PLAIN, BlockPlan, Planning
 from .blocks import plan_alone, press_more, refine_block
 
-REFINEMENTS = 3
-"""Most doublings of the intervals of a block."""
+REFINEMENTS = 3  # most doublings of the intervals of a block
 ROUGH = 2
 """Most doublings in the time domain, before contact modes are left as they come: a plan that hangs
 on a contact that comes to rest need not hold, however fine it is."""
-STRICT = 0.5
-"""Share of what `verify` allows that a plan may use, if another plan is to be had."""
+STRICT = 0.5  # share of what `verify` allows that a plan may use, if another plan is to be had
 DIP = 2e-3
 """Largest shortfall of a normal force, over the scene's force, that pressing more is to mend."""
-SPARE = 2.0
-"""How much more a plan is then to press, over that shortfall."""
+SPARE = 2.0  # how much more a plan is then to press, over that shortfall
 RESIDUAL = 1e-8
 """Largest residual of the equations of motion, relative to the scene's force or torque, length or
 speed: rounding leaves 1e-13."""
-DENSE = 201
-"""Rows per phase for the equations of motion, if the trajectory has not half as many."""
+DENSE = 201  # rows per phase for the equations of motion, if the trajectory has not half as many
 
 
 class Residual(NamedTuple):

@@ -41,8 +41,7 @@ _STATISTICS = {
     "solve_times": "solve_time",
 }  # fmt: skip
 """Likewise of solving; missing ones are zero."""
-_UNITS = ("m", "rad", "s")
-"""What files call the fields of deviations."""
+_UNITS = ("m", "rad", "s")  # what files call the fields of deviations
 
 
 def write_meta(plan: Plan) -> dict[str, Any]:

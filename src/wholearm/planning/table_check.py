@@ -18,10 +18,8 @@ from ..verification.margins import describe_motors, find_commands
 from ..verification.verdict import Allowance, find_least_force
 from ..verification.verify import judge, observe
 
-FINER = 8.0
-"""Divisor of the error of the rows of a table when its replay does not hold."""
-ATTEMPTS = 3
-"""Most tables that are tried."""
+FINER = 8.0  # divisor of the error of the rows of a table when its replay does not hold
+ATTEMPTS = 3  # most tables that are tried
 
 
 class TorqueTable(NamedTuple):
@@ -89,11 +87,7 @@ def make_table(problem: Problem, trajectory: Trajectory, replay: bool = True) ->
 
 
 def sample_table(
-    problem: Problem,
-    trajectory: Trajectory,
-    rate: float,
-    interpolation: str,
-    replay: bool = True,
+    problem: Problem, trajectory: Trajectory, rate: float, interpolation: str, replay: bool = True
 ) -> TorqueTable:
     """Samples of a plan's torques at a rate [Hz], and what becomes of the motion with them.
 

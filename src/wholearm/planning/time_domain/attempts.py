@@ -30,45 +30,28 @@ from .time_mesh import halve, resample, with_controls
 
 _TRIES = ((1.01, 2), (1.03, 2), (1.07, 3), (1.15, 4), (1.3, 6), (1.6, 8))
 """Durations of phases with held torques to try, over those with free ones, and least periods."""
-_PATIENCE = 80
-"""Most iterations of one solve."""
-_SLIVER = 0.5
-"""Duration of a stage, over a period, below which it is first left out."""
-_BRIEF = 1e-3
-"""Share of a period below which it counts as nothing."""
-_SHORTER = 4
-"""Most times that a period is left out."""
-ONSETS = (0.1, 0.03)
-"""Rates at which friction sets in, one after the other, in the scene's unit."""
-HOMOTOPY_ITERATIONS = 50
-"""Most iterations of the solver for each of them."""
-MOST = 9
-"""Turns beyond which modes are those of a motion that trembles."""
-SLOW = 1e-5
-"""Rate over the largest one at the same instant below which its sign says nothing."""
-STILL = 1e-4
-"""Largest rate at an instant, over that of all, below which none of them says anything."""
-BRIEF = 0.02
-"""Least share of its stage's duration that a piece of it has."""
-ROUNDS = 4
-"""Most times that the cost-to-go is expanded."""
-GAIN = 1e-4
-"""Least gain of moving the end, over the cost of the stages."""
-FIRST = 10
-"""Most intervals of a phase to start with."""
-NEAREST = "a motion to the nearest end of the phase"
-"""Name of the first guess."""
+_PATIENCE = 80  # most iterations of one solve
+_SLIVER = 0.5  # duration of a stage, over a period, below which it is first left out
+_BRIEF = 1e-3  # share of a period below which it counts as nothing
+_SHORTER = 4  # most times that a period is left out
+ONSETS = (0.1, 0.03)  # rates at which friction sets in, one after the other, in the scene's unit
+HOMOTOPY_ITERATIONS = 50  # most iterations of the solver for each of them
+MOST = 9  # turns beyond which modes are those of a motion that trembles
+SLOW = 1e-5  # rate over the largest one at the same instant below which its sign says nothing
+STILL = 1e-4  # largest rate at an instant, over that of all, below which none of them says anything
+BRIEF = 0.02  # least share of its stage's duration that a piece of it has
+ROUNDS = 4  # most times that the cost-to-go is expanded
+GAIN = 1e-4  # least gain of moving the end, over the cost of the stages
+FIRST = 10  # most intervals of a phase to start with
+NEAREST = "a motion to the nearest end of the phase"  # name of the first guess
 GRADUAL = " with friction that sets in gradually"
 """What is added to the name of a guess whose modes are found that way."""
-NEAR = -0.3
-"""Margin of a way from which on a motion beside it may keep its limits."""
-WAYS = 3
-"""Most ways along which a motion is guessed."""
+NEAR = -0.3  # margin of a way from which on a motion beside it may keep its limits
+WAYS = 3  # most ways along which a motion is guessed
 ATTEMPT = 50
 """Most iterations of the first run of the solver from a guess: where it leads to a plan it takes 25
 or less in one phase."""
-FEW = 35
-"""The same where a plan is known, and others may be better: of up to two phases."""
+FEW = 35  # the same where a plan is known, and others may be better: of up to two phases
 SPLIT = 80
 """The same in modes that friction has shown which sets in gradually, with many stages, and straight
 to a place: phase 4 of query 3 (`benchmark.queries`) takes 65."""
@@ -428,10 +411,7 @@ def _drop_last(stage: Stage) -> Stage:
     left = 1 - part.fractions[-1]
     tables = {name: getattr(part, name)[:-1] for name in ("z", "v", "a", "forces", "tau")}
     guess = part._replace(
-        duration=part.duration * left,
-        fractions=part.fractions[:-1] / left,
-        nodes=nodes,
-        **tables,
+        duration=part.duration * left, fractions=part.fractions[:-1] / left, nodes=nodes, **tables
     )
     return replace(stage, guess=guess, periods=stage.periods[:-1])
 

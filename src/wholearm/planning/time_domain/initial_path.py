@@ -26,36 +26,23 @@ from ...problem.definition import Phase, Problem
 from .resting import list_headings
 from .units import in_own_units, scale_state
 
-FASTEST = 9.0
-"""Largest square of the speed, over gravity times the radius of gyration."""
-BRISK = 0.5
-"""Share of a positive margin that a brisk motion keeps."""
-GIVES = 0.02
-"""What a brisk motion may lose of a negative margin."""
-LEAST = 1e-4
-"""Least square of the speed, in the same unit, that a duration is taken from."""
-STEP = 0.15
-"""How far apart ends are looked at, over the length of the way to the nearest end."""
-GROWTH = 1.2
-"""By how much more each of these is apart from the one before."""
-STEPS = 12
-"""Most ends on either side of the nearest one."""
-HEADINGS = 1
-"""In how many other ways motions are looked at that set out."""
-BENT = 4
-"""How many of the best ways are bent, twice; the best one alone after that."""
-SCALES = (1.0, 0.4, 0.3, 0.2, 0.1)
-"""How far ways are bent in each round, over `BENDS`."""
-CLOSE = -0.2
-"""Margin from which on it is worth to go on."""
+FASTEST = 9.0  # largest square of the speed, over gravity times the radius of gyration
+BRISK = 0.5  # share of a positive margin that a brisk motion keeps
+GIVES = 0.02  # what a brisk motion may lose of a negative margin
+LEAST = 1e-4  # least square of the speed, in the same unit, that a duration is taken from
+STEP = 0.15  # how far apart ends are looked at, over the length of the way to the nearest end
+GROWTH = 1.2  # by how much more each of these is apart from the one before
+STEPS = 12  # most ends on either side of the nearest one
+HEADINGS = 1  # in how many other ways motions are looked at that set out
+BENT = 4  # how many of the best ways are bent, twice; the best one alone after that
+SCALES = (1.0, 0.4, 0.3, 0.2, 0.1)  # how far ways are bent in each round, over `BENDS`
+CLOSE = -0.2  # margin from which on it is worth to go on
 BENDS = ((0.4, 0.0), (-0.4, 0.0), (0.8, 0.0), (-0.8, 0.0), (0.0, 0.3), (0.0, -0.3))
 """How ways are bent: parts of one arc and of two, over their length."""
-_STRETCHES = 6
-"""Most stretches of a way, between which something turns."""
+_STRETCHES = 6  # most stretches of a way, between which something turns
 _SHORTEST = 2
 """Fewest configurations, after its first, of a stretch that is not merged into another."""
-SURE = 1e-3
-"""Margin from which a motion surely keeps its limits."""
+SURE = 1e-3  # margin from which a motion surely keeps its limits
 Way = list[PathGuess]
 
 

@@ -21,19 +21,14 @@ from .time_motion import StageMotion
 from .time_nlp import TimeNLP
 from .time_rate_limits import find_relieved
 
-MISS = 2.5e-7
-"""Largest miss of a force limit between points, over the weight of the object."""
-GRAZE = 3e-7
-"""Deepest overlap between points, over the radius of gyration."""
+MISS = 2.5e-7  # largest miss of a force limit between points, over the weight of the object
+GRAZE = 3e-7  # deepest overlap between points, over the radius of gyration
 FALTER = 0.1
 """Deepest fall of a rate below half of the least one between points, over the least one: friction
 might hold in a replay what turns there for an instant."""
-CHECKS = 25
-"""Places per interval at which limits are checked."""
-_OVER = 1.5
-"""Factor on the miss by which a limit is tightened at first."""
-_AMPLE = 1e3
-"""Slack, over what is much for a limit, of what does not count."""
+CHECKS = 25  # places per interval at which limits are checked
+_OVER = 1.5  # factor on the miss by which a limit is tightened at first
+_AMPLE = 1e3  # slack, over what is much for a limit, of what does not count
 _MOST = (_OVER, 4.0, 4.0)
 """The same at most, of forces, gaps and senses, where tightening has made the miss little less:
 forces have a price."""

@@ -17,10 +17,8 @@ from .search import TimeSearch, TimeSolution
 from .stage import Stage
 from .stage_modes import drop, link, merge, mode_of, release_earlier, sign_sequence, split
 
-_STALLED = 1e-6
-"""Rate over the largest one at which a direction of friction counts as held back."""
-_SLOW = 1e-2
-"""Rate over the largest one below which what is held back stays in all of an interval."""
+_STALLED = 1e-6  # rate over the largest one at which a direction of friction counts as held back
+_SLOW = 1e-2  # rate over the largest one below which what is held back stays in all of an interval
 _LEANS = 1e-4
 """Margin to the friction cone over mu c_n at which a rolling contact counts as leaning on it."""
 WORTH = 1e-4
@@ -28,12 +26,9 @@ WORTH = 1e-4
 _GONE = 2e-4
 """Mean duration of an interval, in the scene's unit of time, below which its stage counts as shrunk
 to nothing."""
-MOST = 12
-"""Most sequences of modes to try from one start."""
-LOST = 3
-"""Sequences that led to nothing since the last gain after which no more are tried."""
-PATIENCE = 50
-"""Most iterations of one of them."""
+MOST = 12  # most sequences of modes to try from one start
+LOST = 3  # sequences that led to nothing since the last gain after which no more are tried
+PATIENCE = 50  # most iterations of one of them
 
 
 def improve(search: TimeSearch, solution: TimeSolution) -> TimeSolution:

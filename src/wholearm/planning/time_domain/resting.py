@@ -22,20 +22,15 @@ from ...common.arrays import Array
 from ...contacts.formation import Formation
 from ...geometry.curve import tangent_basis
 
-MOVES = 1e-5
-"""Least sum of accelerations, over the scene's own, that counts as a motion."""
-BEGINS = 0.3
-"""Sum of accelerations with which a motion sets out, over the scene's own."""
+MOVES = 1e-5  # least sum of accelerations, over the scene's own, that counts as a motion
+BEGINS = 0.3  # sum of accelerations with which a motion sets out, over the scene's own
 PUSHES = 1e-3
 """Part of contact forces along one direction, of all, that surely sets the object in motion."""
 _SAME = 1e-9
 """Difference of two forces, over the scene's own, below which they are those of one motion."""
-_STILL = 1e-9
-"""Rate over the largest one below which something does not move."""
-_PROBE = 1e-6
-"""Steps that slopes of limits are taken over, in radii of gyration and rad."""
-_LEVEL = 1e-6
-"""Slope of a limit, in radii of gyration, below which no motion changes it."""
+_STILL = 1e-9  # rate over the largest one below which something does not move
+_PROBE = 1e-6  # steps that slopes of limits are taken over, in radii of gyration and rad
+_LEVEL = 1e-6  # slope of a limit, in radii of gyration, below which no motion changes it
 
 
 class BlockedStart(NamedTuple):

@@ -27,16 +27,12 @@ from .time_nlp import TimeNLP, bound_unknowns, build_time_nlp
 from .time_rate_limits import MotorRows
 from .units import in_own_units, scale_options, unit_lengths, unit_of
 
-FIRST_SIZE = 1e-2
-"""Multipliers of a first guess."""
-Multipliers = dict[str, Array]
-"""Of the unknowns' bounds, `lam_x0`, and of the rows, `lam_g0`."""
+FIRST_SIZE = 1e-2  # multipliers of a first guess
+Multipliers = dict[str, Array]  # of the unknowns' bounds, `lam_x0`, and of the rows, `lam_g0`
 _ITERATIONS = {Objective.ELASTIC: 90, Objective.RELAX: 50}
 """Most iterations of one solve, if not 150."""
-_SLOWER = 2
-"""Factor on the most iterations of one solve, where rates of torques are limited."""
-_CAP = 1.1
-"""Largest margin that is looked for, over the one from which on more decides nothing."""
+_SLOWER = 2  # factor on the most iterations of one solve, where rates of torques are limited
+_CAP = 1.1  # largest margin that is looked for, over the one from which on more decides nothing
 
 
 class Price(NamedTuple):
@@ -170,10 +166,7 @@ class TimeSearch:
         return self.ample - self.problem.epsilon
 
     def solve(
-        self,
-        stages: list[Stage],
-        before: TimeSolution | None = None,
-        most: int = 150,
+        self, stages: list[Stage], before: TimeSolution | None = None, most: int = 150
     ) -> TimeSolution:
         """Solve from the stages' guesses, until no limit is broken at the points.
 

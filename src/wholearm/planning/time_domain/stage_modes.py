@@ -23,8 +23,7 @@ from .stage import Stage, StagePoints
 from .stage_kernels import new_rows
 from .time_mesh import resample
 
-LEAST_INTERVALS = 3
-"""Fewest intervals of a stage."""
+LEAST_INTERVALS = 3  # fewest intervals of a stage
 
 
 class StageMode(NamedTuple):

@@ -18,10 +18,8 @@ from .stage import Stage, StagePoints
 from .stage_modes import LEAST_INTERVALS, link
 from .units import in_own_units, scale_state
 
-PRESS = 0.5
-"""Normal forces that a first guess is near, over the weight of the object."""
-_NEAR = 0.02
-"""Distance over the radius of gyration at which a limit is monitored from the start."""
+PRESS = 0.5  # normal forces that a first guess is near, over the weight of the object
+_NEAR = 0.02  # distance over the radius of gyration at which a limit is monitored from the start
 _TOUCHES = 1e-5
 """Gap over the radius of gyration below which a contact touches that a phase lets go."""
 

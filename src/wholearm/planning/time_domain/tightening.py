@@ -32,50 +32,35 @@ from .time_limits import price_sides
 from .time_mesh import bisect_intervals, cap_halvings, count_halvings, spread_halvings
 from .time_motion import MotionResponse, StageMotion, make_motions
 
-_PLACES = 7
-"""Gauss points of an interval at which torques are compared."""
-_HELD = 3.0
-"""Rate over the least one below which that holds it."""
-_CLOSE = 1e-6
-"""Gap over the radius of gyration below which it is held open."""
-_STEP = 1e-6
-"""Step of z by which slopes of gaps are found, over accelerations of a torque of 1."""
-_ROUNDING = 1e-9
-"""Largest miss of a limit that counts as none, over what is much for it."""
-ROUNDS = 24
-"""Most times that limits are tightened."""
-STALLED = 5
-"""Times of tightening in which it has to lead somewhere."""
+_PLACES = 7  # gauss points of an interval at which torques are compared
+_HELD = 3.0  # rate over the least one below which that holds it
+_CLOSE = 1e-6  # gap over the radius of gyration below which it is held open
+_STEP = 1e-6  # step of z by which slopes of gaps are found, over accelerations of a torque of 1
+_ROUNDING = 1e-9  # largest miss of a limit that counts as none, over what is much for it
+ROUNDS = 24  # most times that limits are tightened
+STALLED = 5  # times of tightening in which it has to lead somewhere
 _CREEPS = 0.3
 """Share of the miss that is left then if it does; otherwise finer intervals are tried instead."""
-REFINEMENTS = 8
-"""Most times that intervals are halved because of misses."""
+REFINEMENTS = 8  # most times that intervals are halved because of misses
 MOST = 64
 """Intervals of each phase from which on none is halved, with the accuracy of the default; they go
 with the root of its inverse."""
 _BEYOND = 2
 """Largest number of intervals with which limits are looked for that are missed, over that."""
-_USUAL = 1e-4
-"""The accuracy of the default."""
-_SPARE = 0.5
-"""Share of the accuracy that halving intervals is to leave."""
-PATIENCE = 80
-"""Most iterations of one solve on finer intervals, that starts from a solution."""
+_USUAL = 1e-4  # the accuracy of the default
+_SPARE = 0.5  # share of the accuracy that halving intervals is to leave
+PATIENCE = 80  # most iterations of one solve on finer intervals, that starts from a solution
 _VAGUE = 20.0
 """Error of a plan from which finer intervals lead nowhere, over the accuracy, from which on it is
 no plan: that something moves the wrong way for an instant only finer intervals show."""
-_DEARER = 0.2
-"""Largest relative cost increase accepted from tightening."""
+_DEARER = 0.2  # largest relative cost increase accepted from tightening
 DEARER = "a plan that keeps limits between points is much dearer"
 """Status of solutions whose limits between points cannot be kept by tightening them."""
-_UNKNOWN = 0.01
-"""Error with limited rates where none is known."""
-_SLOWLY = 0.5
-"""Share of the error that intervals halved at once are to leave, with limited rates."""
+_UNKNOWN = 0.01  # error with limited rates where none is known
+_SLOWLY = 0.5  # share of the error that intervals halved at once are to leave, with limited rates
 _HOPELESS = 1.0
 """Price of all that limits miss, over the cost, from which on no finer intervals are tried."""
-_COARSE = 0.1
-"""Largest relative cost increase accepted from finer intervals."""
+_COARSE = 0.1  # largest relative cost increase accepted from finer intervals
 
 
 def enforce_between(search: TimeSearch, solution: TimeSolution) -> TimeSolution:

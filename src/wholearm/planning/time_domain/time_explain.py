@@ -35,12 +35,9 @@ from .stage import Stage, StagePoints
 from .time_motion import TimeMotion, make_motions
 from .units import to_si
 
-MISSED = 0.02
-"""Least share by which limits are missed along a way that is no way."""
-MET = 0.98
-"""Share of a limit from which on a motion meets it."""
-ADVICE = 0.6
-"""Processor time [s] after which no further change of a limit is tried."""
+MISSED = 0.02  # least share by which limits are missed along a way that is no way
+MET = 0.98  # share of a limit from which on a motion meets it
+ADVICE = 0.6  # processor time [s] after which no further change of a limit is tried
 Replan = Callable[[Problem], object]
 """Plans the same phases of another problem; raises if there is no plan."""
 

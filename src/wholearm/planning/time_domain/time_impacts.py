@@ -26,8 +26,7 @@ from ..phase_plan import PhasePlan
 from ..stops import PlanPart, Plans, end_of, plan_stops
 from .time_plan import plan_phases
 
-AT_REST = 1e-4
-"""Speed below which an impact counts as a stop, in the scene's own units."""
+AT_REST = 1e-4  # speed below which an impact counts as a stop, in the scene's own units
 
 
 def plan_with_impacts(

@@ -22,10 +22,8 @@ from ...results.trajectory import Samples
 from .collocation import Scheme, blend
 from .stage import Stage, StagePoints
 
-_NODES = 8
-"""Places per interval at which the equations of motion are solved."""
-_SWEEPS = 6
-"""Times that accelerations are improved. Each gains one to two digits."""
+_NODES = 8  # places per interval at which the equations of motion are solved
+_SWEEPS = 6  # times that accelerations are improved. Each gains one to two digits.
 _FORWARDS = Store(
     lambda formation: Batch(build_forward(formation)), lambda formation: formation.equations
 )

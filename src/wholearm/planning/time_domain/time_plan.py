@@ -48,28 +48,19 @@ if TYPE_CHECKING:
     from .time_explain import Replan
 
 
-_ROUNDS = 20
-"""Most solves."""
-_SWINGS = 5
-"""The first of them, in which limits are raised by what ranges change, and not by more."""
-_OVER = 1.2
-"""Factor on what is missed after that."""
-MOVED = "a plan that chooses where it ends"
-"""Name of the guess."""
-FURTHER = 4
-"""Guesses, beyond the first one, from which such a plan is looked for."""
-PATIENCE = 50
-"""Most iterations of the solver for one step."""
-SHORTEST = 1 / 16
-"""Shortest step of the end, over its whole way."""
+_ROUNDS = 20  # most solves
+_SWINGS = 5  # the first of them, in which limits are raised by what ranges change, and not by more
+_OVER = 1.2  # factor on what is missed after that
+MOVED = "a plan that chooses where it ends"  # name of the guess
+FURTHER = 4  # guesses, beyond the first one, from which such a plan is looked for
+PATIENCE = 50  # most iterations of the solver for one step
+SHORTEST = 1 / 16  # shortest step of the end, over its whole way
 NEARER = (0.3, 0.1)
 """Shares of the way that is left, after which it is asked what motions are short of."""
 CONVINCING = 2
 """Motions that miss limits least, from different guesses, after which there seems to be no plan."""
-BUDGET = 400
-"""Iterations of the solver after which no further guess is begun: of one block."""
-ROUGH = 1e-2
-"""Least accuracy of plans of which only matters that there are any."""
+BUDGET = 400  # iterations of the solver after which no further guess is begun: of one block
+ROUGH = 1e-2  # least accuracy of plans of which only matters that there are any
 
 
 def plan_phases(
