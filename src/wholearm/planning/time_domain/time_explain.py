@@ -14,7 +14,6 @@ from ...geometry.curve import describe_pose
 from ...geometry.path_guess import count_freedoms
 from ...mechanics.limits import EPSILON, PRESS, make_limits
 from ...problem.definition import Phase, Problem
-from ...results.trajectory import Trajectory
 from ...scene.model import Scales
 from .. import advice
 from ..advice import (
@@ -32,7 +31,7 @@ from .collocation import Scheme, blend
 from .initial_path import PacedWay
 from .search import TimeSearch
 from .stage import Stage, StagePoints
-from .time_motion import TimeMotion, make_motions
+from .time_motion import make_phase_motions
 from .units import to_si
 
 MISSED = 0.02  # least share by which limits are missed along a way that is no way
@@ -174,10 +173,10 @@ def explain(
     elastic = min(short, key=sum_up)
 
     ranked = rank_shortfalls(list_shortfalls(problem, elastic, search.scheme))
-    solved = [to_si(stage, problem).guess for stage in elastic]
+    stages = [to_si(stage, problem) for stage in elastic]
 
     def find_value(parameter: Parameter) -> float | None:
-        if not is_met(parameter, solved, ranked):
+        if not is_met(parameter, [stage.guess for stage in stages], ranked):
             return np.nan
         aim = search.aiming(Objective.RELAX, parameter)
         solution = aim.solve(elastic)
@@ -189,7 +188,9 @@ def explain(
 
     text = f"{name_phases(numbers, 'infeasible')}: {describe_shortfalls(ranked)}"
     error = _advise(problem, phases[0], text, find_value, replan, ranked)
-    error.motion = _make_trajectory(problem, phases, search, elastic)
+    motions = make_phase_motions(stages, search.scheme, phases)
+    torques = [motion.torque for motion in motions]
+    error.motion = assemble_least(motions, torques, [phase.formation for phase in phases])
     return error
 
 
@@ -230,19 +231,6 @@ def refuse_ways(problem: Problem, phase: Phase, ways: Sequence[PacedWay]) -> Non
         f"straight ones and bent ones, at any speed: {shortfall}",
         [shortfall],
     )
-
-
-def _make_trajectory(
-    problem: Problem, phases: Sequence[Phase], search: TimeSearch, stages: Sequence[Stage]
-) -> Trajectory:
-    """The motion of stages."""
-    solved = [to_si(stage, problem) for stage in stages]
-    pieces = make_motions(solved, search.scheme)
-    motions = [
-        TimeMotion([p for p, own in zip(pieces, solved, strict=True) if own.phase == phase.index])
-        for phase in phases
-    ]
-    return assemble_least(motions, [own.torque for own in motions], [p.formation for p in phases])
 
 
 def _unit_of(parameter: Parameter, scales: Scales) -> float:

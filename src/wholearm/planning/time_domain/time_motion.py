@@ -16,6 +16,7 @@ from ...contacts.elemental import Contact
 from ...contacts.formation import Formation
 from ...mechanics.dynamics import Directions, build_forward, split_forces
 from ...mechanics.metric import metric_weights
+from ...problem.definition import Phase
 from ...results.mode_names import ROLLS, ModeSpan
 from ...results.torque import TorqueProfile
 from ...results.trajectory import Samples
@@ -249,6 +250,16 @@ class TimeMotion:
             for table, values in zip(tables, part, strict=True):
                 table[mine] = values
         return Samples(*tables)
+
+
+def make_phase_motions(
+    stages: Sequence[Stage], scheme: Scheme, phases: Sequence[Phase]
+) -> list[TimeMotion]:
+    """The motion of each phase from the stages' guesses."""
+    pairs = list(zip(make_motions(stages, scheme), stages, strict=True))
+    return [
+        TimeMotion([own for own, stage in pairs if stage.phase == phase.index]) for phase in phases
+    ]
 
 
 def make_motions(stages: Sequence[Stage], scheme: Scheme) -> list[StageMotion]:
