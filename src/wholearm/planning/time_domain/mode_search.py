@@ -200,8 +200,8 @@ def _turn(
 
 def _pays(run: ModeRun, stage: Stage, savings: Array) -> bool:
     """Whether rolling over a run might gain, if the contact can roll."""
-    saving = savings[run.begin : run.stop, :, run.row].clip(min=0.0).sum()
-    return not _can_roll(stage, run) or float(saving) > WORTH
+    own = (slice(run.begin, run.stop), slice(None), run.row)
+    return not _can_roll(stage, run) or float(savings[own].clip(min=0.0).sum()) > WORTH
 
 
 def _can_roll(stage: Stage, run: ModeRun) -> bool:
