@@ -1,4 +1,4 @@
-"""What to plan for, and how finely."""
+"""Options of the planner: objective, discretization, verification."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..mechanics.margin_key import UNIQUENESS
 
 
 class Objective(Enum):
-    """What a plan makes best."""
+    """Objective of a plan."""
 
     TIME = "time"  # least duration
     EFFORT = "effort"  # least integral of tau^T tau, plus a weight on time

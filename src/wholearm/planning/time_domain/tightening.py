@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,7 +125,7 @@ def _check(
     return motions, [check_between(*pair) for pair in zip(solution.stages, motions, strict=True)]
 
 
-def _sum(tables: Iterable[Array]) -> float:
+def _sum(tables: Iterable[NDArray[Any]]) -> float:
     return float(sum(table.sum() for table in tables))
 
 

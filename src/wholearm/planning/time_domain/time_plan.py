@@ -107,9 +107,8 @@ def plan_phases(
     # Straight to a pinned end modes may be found that are not the best: phase 3 of query 33.
     enough = first.success and (len(guesses) == 1 or bool(fastest))
     moved = ContinuedEnd() if enough else approach(search, problem, phases, z)
-    plans = [
-        pair for pair in ((first, name), (moved.solution, MOVED)) if pair[0] and pair[0].success
-    ]
+    plans = [(first, name)] if first.success else []
+    plans += [(moved.solution, MOVED)] if moved.solution else []
     if plans:
         solution, name = min(plans, key=lambda pair: pair[0].cost)
         return list_plans(problem, search, phases, solution, name)
