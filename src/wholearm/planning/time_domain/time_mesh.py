@@ -16,16 +16,11 @@ DEFECT = 2e-8
 """Largest error of z and z' by collocation at the end of an interval, in the scene's own units."""
 DEAR = 1e-5
 """Largest price of limits that are raised in an interval, over the cost, without halving it."""
-AT_ONCE = 2
-"""Most times that an interval is halved at once."""
-_LESS = 4.0
-"""Factor by which a halving makes what better torques would gain less."""
-_CHEAPER = 3
-"""Power of two by which a halving makes misses of limits cheaper."""
-_BROKEN = 1e-6
-"""Distance below zero from which on a limit is broken, over the radius of gyration."""
-_HAIR = 1e-12
-"""Share of a duration that rounding may move a place by."""
+AT_ONCE = 2  # most times that an interval is halved at once
+_LESS = 4.0  # factor by which a halving makes what better torques would gain less
+_CHEAPER = 3  # power of two by which a halving makes misses of limits cheaper
+_BROKEN = 1e-6  # distance below zero from which on a limit is broken, over the radius of gyration
+_HAIR = 1e-12  # share of a duration that rounding may move a place by
 
 
 def resample(

@@ -16,16 +16,15 @@ from ...contacts.elemental import Contact
 from ...contacts.formation import Formation
 from ...mechanics.dynamics import Directions, build_forward, split_forces
 from ...mechanics.metric import metric_weights
+from ...problem.definition import Phase
 from ...results.mode_names import ROLLS, ModeSpan
 from ...results.torque import TorqueProfile
 from ...results.trajectory import Samples
 from .collocation import Scheme, blend
 from .stage import Stage, StagePoints
 
-_NODES = 8
-"""Places per interval at which the equations of motion are solved."""
-_SWEEPS = 6
-"""Times that accelerations are improved. Each gains one to two digits."""
+_NODES = 8  # places per interval at which the equations of motion are solved
+_SWEEPS = 6  # times that accelerations are improved. Each gains one to two digits.
 _FORWARDS = Store(
     lambda formation: Batch(build_forward(formation)), lambda formation: formation.equations
 )
@@ -251,6 +250,16 @@ class TimeMotion:
             for table, values in zip(tables, part, strict=True):
                 table[mine] = values
         return Samples(*tables)
+
+
+def make_phase_motions(
+    stages: Sequence[Stage], scheme: Scheme, phases: Sequence[Phase]
+) -> list[TimeMotion]:
+    """The motion of each phase from the stages' guesses."""
+    pairs = list(zip(make_motions(stages, scheme), stages, strict=True))
+    return [
+        TimeMotion([own for own, stage in pairs if stage.phase == phase.index]) for phase in phases
+    ]
 
 
 def make_motions(stages: Sequence[Stage], scheme: Scheme) -> list[StageMotion]:

@@ -53,15 +53,13 @@ SHORTEST = 1e-6
 _BEND = 1e-2
 """Weight of the bends of torques within intervals, over their limits, against time or the margin:
 where those leave torques open for a while, they would ring between the points."""
-_HURRY = 3e-4
-"""Weight of time against shortfalls: keeps a motion that is short of something brisk."""
+_HURRY = 3e-4  # weight of time against shortfalls: keeps a motion that is short of something brisk
 CLEAR = 1e-3
 """Distance that a coordinate keeps in the scene's unit from the value that ends a phase; towards
 the end it is less, as where things come to rest."""
 LONGEST = 120.0
 """Most processor time of one run of the solver [s]: iterations need not end by themselves."""
-NEAR, FAR = 1e-6, 1e-2
-"""Distance that a start keeps from its bounds: a solution, and a first guess."""
+NEAR, FAR = 1e-6, 1e-2  # distance that a start keeps from its bounds: a solution, and a first guess
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,10 +103,7 @@ class TimeNLP:
 
 
 def build_time_nlp(
-    stages: Sequence[Stage],
-    scheme: Scheme,
-    target: Target,
-    max_iter: int,
+    stages: Sequence[Stage], scheme: Scheme, target: Target, max_iter: int
 ) -> TimeNLP:
     """Build the NLP of stages that follow one another and end at rest.
 
@@ -162,11 +157,7 @@ def _add_costs(
         kernel, weight = bend_kernel(scheme.controls), stage.formation.scene.torque_limit**-2.0
         given = np.tile(_BEND * weight, (stage.intervals, 1))
         rows.add_cost(kernel, kernel.x.join(tau=layout.tau, h=layout.h[:, None]), given)
-    of_time = {
-        Objective.TIME: 1.0,
-        Objective.EFFORT: target.time_weight,
-        Objective.ELASTIC: _HURRY,
-    }
+    of_time = {Objective.TIME: 1.0, Objective.EFFORT: target.time_weight, Objective.ELASTIC: _HURRY}
     cost[layout.h] = of_time.get(target.objective, 0.0)
     cost[layout.short] = 1 / stage.intervals
 
