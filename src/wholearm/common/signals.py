@@ -39,9 +39,7 @@ _cleanups: list[Callable[[], object]] = []
 
 
 def guard(
-    run: Callable[[], int],
-    tidy: Callable[[], object] = int,
-    leave: Callable[[int], object] = int,
+    run: Callable[[], int], tidy: Callable[[], object] = int, leave: Callable[[int], object] = int
 ) -> int:
     """Run a command with signals that end it, and return its exit status: 128 + the signal's.
 

@@ -66,10 +66,7 @@ _ROWS = 8
 
 @exclusive
 def predict(
-    problem: Problem,
-    *,
-    squeeze: float = SQUEEZE,
-    progress: Callable[[str], None] | None = None,
+    problem: Problem, *, squeeze: float = SQUEEZE, progress: Callable[[str], None] | None = None
 ) -> Prediction:
     """Predict quasistatic motions along the phases of a problem, and at which speed they break.
 

@@ -140,10 +140,7 @@ class Bench:
         """Simulate torques until the end of the passage, or what keeps it from coming."""
         end = steps[-1].time + LASTS * self.problem.scene.scales.time
         found = simulate_free(
-            self.problem,
-            read_rows(make_rows(steps, end)),
-            start=self.z,
-            halt=self._is_over,
+            self.problem, read_rows(make_rows(steps, end)), start=self.z, halt=self._is_over
         )
         self.simulations += 1
         self.trials.append(self._judge(tuple(steps), found))
@@ -270,11 +267,7 @@ class Bench:
             return -self.sign * float(v), self.sign * float(a), row.z[0]
         z, v, a = found.z[at], found.z_dot[at], found.z_ddot[at]
         if self.pair is None:
-            return (
-                -self.sign * float(v[self.column]),
-                self.sign * float(a[self.column]),
-                z,
-            )
+            return (-self.sign * float(v[self.column]), self.sign * float(a[self.column]), z)
         if self.passage.passed:
             step = _NUDGE * self.problem.scene.scales.time
             back, _, on = (float(x) for x in self.measure(z + np.outer([-step, 0, step], v)))

@@ -200,11 +200,7 @@ class _Setting(NamedTuple):
         phases = self.passage.phases
         own = PhaseTuning(phases[0].number, phases[-1].number, str(self.passage.until))
         if any(phase.until.value is not None for phase in phases[:-1]):
-            return (
-                own,
-                None,
-                "a coordinate is passed in motion; the rule tunes phases to rest",
-            )
+            return (own, None, "a coordinate is passed in motion; the rule tunes phases to rest")
         found = self._balance(phases, z)
         if found is None:
             return (
@@ -226,11 +222,7 @@ class _Setting(NamedTuple):
         best: _Attempt | None = None
         for tau in list_starts(balance.tau, acting):
             rule = TuningRule(
-                bench,
-                tau,
-                balance.tau[-1],
-                acting,
-                lambda text: self.tell(f"{title}: {text}"),
+                bench, tau, balance.tau[-1], acting, lambda text: self.tell(f"{title}: {text}")
             )
             found = self._tune_from(rule, replace(own, acting=acting + 1))
             if found[1] is not None:
@@ -384,12 +376,7 @@ class TuningRule:
     """
 
     def __init__(
-        self,
-        bench: Bench,
-        tau: Array,
-        last: Array,
-        acting: int,
-        tell: Callable[[str], None],
+        self, bench: Bench, tau: Array, last: Array, acting: int, tell: Callable[[str], None]
     ) -> None:
         self.bench, self.acting, self.tell = bench, acting, tell
         self.tau, self.last = tau, last

@@ -112,11 +112,7 @@ def warn(title: str, simulation: FreeSimulation) -> list[str]:
 
 
 def _compare(
-    problem: Problem,
-    plan: Trajectory,
-    simulation: FreeSimulation,
-    indices: range,
-    allowed: float,
+    problem: Problem, plan: Trajectory, simulation: FreeSimulation, indices: range, allowed: float
 ) -> list[FreePhase]:
     """Phases by the clock: where each ends, and which of its contacts are lost meanwhile."""
     found, starts = [], plan.phase_starts

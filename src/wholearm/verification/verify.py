@@ -259,12 +259,7 @@ def _report_phase(
 
 
 def _compare(
-    simulation: Simulation,
-    plan: Trajectory,
-    index: int,
-    arrived: bool,
-    passes: bool,
-    length: float,
+    simulation: Simulation, plan: Trajectory, index: int, arrived: bool, passes: bool, length: float
 ) -> tuple[Deviation | None, Deviation | None]:
     """Difference from the plan at the end of a phase and at worst."""
     planned = np.flatnonzero(plan.phase == index)

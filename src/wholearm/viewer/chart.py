@@ -317,10 +317,7 @@ def _number_paths(paper: Paper, paths: Sequence[Array]) -> Iterable[str]:
 
 
 def _write_labels(
-    chart: FormationMap,
-    paper: Paper,
-    paths: Sequence[Array],
-    parts: Sequence[tuple[int, Flags]],
+    chart: FormationMap, paper: Paper, paths: Sequence[Array], parts: Sequence[tuple[int, Flags]]
 ) -> Iterable[str]:
     x, y = _grid(chart, paper)
     clear = np.ones(chart.cell.shape, dtype=bool)

@@ -50,10 +50,7 @@ def place_pushes(scene: Scene, trajectory: Trajectory) -> Pushes:
 
 
 def describe_motion(
-    trajectory: Trajectory,
-    problem: Problem,
-    ghost: Trajectory | None = None,
-    most: int = MOST,
+    trajectory: Trajectory, problem: Problem, ghost: Trajectory | None = None, most: int = MOST
 ) -> dict[str, Any]:
     """Everything that a page needs to play a motion, as plain values.
 
