@@ -86,8 +86,7 @@ PINNED = 40
 SEED = 0
 ROUTE = ((0.045, -2.0), (-0.0637, -2.0), (-0.0505, -23.4), (0.0078, -50.0))
 """Of `list_formations`: x [m] and phi [degrees]."""
-MOMENT = 1e-3
-"""Time before the end of a phase in which contacts may bounce [s]."""
+MOMENT = 1e-3  # time before the end of a phase in which contacts may bounce [s]
 NUMBER = re.compile(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
 
 

@@ -35,8 +35,7 @@ from ..scene.model import Finger, Friction, Scene
 from ..scene.polygon import Polygon
 from .study import Case, Row, Study
 
-LARGEST = 4
-"""Largest change of a number, in units of 2^-52 of it."""
+LARGEST = 4  # largest change of a number, in units of 2^-52 of it
 
 
 def perturb_scenes(seed: int) -> None:

@@ -31,18 +31,12 @@ from .stress.scenes import Table
 from .study import Case, Row, Study
 
 SHIPPED = ("heptagon", "hexagon", "square", "triangle")
-POLYGONS = 5
-"""Random polygons, in the hexagon's hand."""
-RADIUS = 0.05
-"""Of the circle that their vertices are near [m]."""
-ACROSS = 3.0
-"""Largest x of a start or a goal, over the radius of gyration."""
-SECOND = 0.1
-"""How far the second query starts from the first one, over the radius of gyration."""
-TRIES = 200
-"""Most routes that are drawn for one leg."""
-SLIDE = (0.1, 2.5)
-"""Least and longest slide of a leg, over the radius of gyration."""
+POLYGONS = 5  # random polygons, in the hexagon's hand
+RADIUS = 0.05  # of the circle that their vertices are near [m]
+ACROSS = 3.0  # largest x of a start or a goal, over the radius of gyration
+SECOND = 0.1  # how far the second query starts from the first one, over the radius of gyration
+TRIES = 200  # most routes that are drawn for one leg
+SLIDE = (0.1, 2.5)  # least and longest slide of a leg, over the radius of gyration
 CELL = ((-0.6, 1.0), (0.05, 0.5))
 """What one cell adds to x, over the radius of gyration, and takes from phi [rad]."""
 

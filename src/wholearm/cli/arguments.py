@@ -16,8 +16,7 @@ from ..mechanics.margin_key import MARGIN
 from ..planning.options import PLANNER
 from .help import TOPICS
 
-SIMULATORS = ("told", "free")
-"""What `plot --simulate` takes; the first one if it is left out."""
+SIMULATORS = ("told", "free")  # what `plot --simulate` takes; the first one if it is left out
 
 
 class Parser(argparse.ArgumentParser):
@@ -34,8 +33,7 @@ def number(low: float, high: float) -> Callable[[str], float]:
     return Range(low, high).parse
 
 
-JOBS = number(1, 256)
-"""Processes."""
+JOBS = number(1, 256)  # processes
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,7 @@ from ..common.errors import InputError
 from .output import name_files, print_result
 from .progress import show_progress
 
-_SPEED = 0.05
-"""Mean speed along the phases of the torques that are written [m/s]."""
+_SPEED = 0.05  # mean speed along the phases of the torques that are written [m/s]
 
 
 def predict(options: argparse.Namespace) -> int:

@@ -13,8 +13,7 @@ from typing import Any, BinaryIO, NamedTuple
 from .errors import InputError
 from .signals import held
 
-_SHOWN = 3
-"""Differences that are written out; the others are counted."""
+_SHOWN = 3  # differences that are written out; the others are counted
 try:
     import fcntl
 except ImportError:  # not on Windows

@@ -51,14 +51,10 @@ from .style import STYLE
 
 SIZE = (11.0, 7.9)  # in
 _BOX = (0.75, 1.0, 9.4, 6.2)  # axes: left, bottom, width, height [in]
-_ASIDE = 2.6
-"""Offset of directed lines from the border [points]."""
-_ARROW = 8.0
-"""Length of the arrows inside cells [points]."""
-_DISC = 16.0
-"""Room for the number of a phase [points]."""
-_LETTER, _HEIGHT = 4.4, 9.0
-"""Size of a letter of a label [points]."""
+_ASIDE = 2.6  # offset of directed lines from the border [points]
+_ARROW = 8.0  # length of the arrows inside cells [points]
+_DISC = 16.0  # room for the number of a phase [points]
+_LETTER, _HEIGHT = 4.4, 9.0  # size of a letter of a label [points]
 
 
 @exclusive

@@ -26,8 +26,7 @@ UNREACHED = {
 """What is written where nothing can be reached, and its code in `FormationMap.cell`."""
 FORTH, BACK, FREE = "#0072B2", "#D55E00", "#7a838f"
 TINTS = ("#f3f6fb", "#fbf6ea", "#eef7f0", "#f9eff4", "#f4f1fb", "#eef6f8", "#f7f7ee")
-SPACING = 42.0
-"""Distance between arrow heads on a directed line [points]."""
+SPACING = 42.0  # distance between arrow heads on a directed line [points]
 
 
 def shorten(contact: Contact) -> str:

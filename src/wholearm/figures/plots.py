@@ -51,12 +51,9 @@ _FORMATS: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 _LEFT, _RIGHT, _BOTTOM, _TOP, _GAP = 0.80, 1.30, 0.55, 0.40, 0.22  # margins [in]
 _MARGINS, _TORQUES, _CONES, _MOTION = 3.6, 1.75, 0.85, 1.2  # heights of panels [in]
-_SHORT = 0.65
-"""Heights of panels of a slim figure, over those of a wide one."""
-_SLIM = 7.0
-"""Width below which legends stand at the foot, as in a column of a paper [in]."""
-_LINE = 0.17
-"""Height of a line of text [in]."""
+_SHORT = 0.65  # heights of panels of a slim figure, over those of a wide one
+_SLIM = 7.0  # width below which legends stand at the foot, as in a column of a paper [in]
+_LINE = 0.17  # height of a line of text [in]
 
 
 @exclusive

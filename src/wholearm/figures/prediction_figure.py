@@ -16,19 +16,13 @@ from ..common.sharing import exclusive
 from ..quasistatic.prediction import PhasePrediction, Prediction, Survival
 from .style import GRID, INK, LOST, LOW, PALETTE, STYLE
 
-_COLUMNS = 3
-"""Most panels side by side."""
-_WIDTH, _HEIGHT = 3.7, 2.85
-"""Of a panel with what is written about it [in]."""
-_ROOM = (0.62, 0.15, 0.50, 0.80)
-"""Room at the left, right, bottom and top of a panel [in]."""
-_TOP = 0.45
-"""Room above all panels [in]."""
+_COLUMNS = 3  # most panels side by side
+_WIDTH, _HEIGHT = 3.7, 2.85  # of a panel with what is written about it [in]
+_ROOM = (0.62, 0.15, 0.50, 0.80)  # room at the left, right, bottom and top of a panel [in]
+_TOP = 0.45  # room above all panels [in]
 _LOOKS: Any = ({"linestyle": "-"}, {"linestyle": (0, (5, 1.5))}, {"linestyle": (0, (1.5, 1))})
-_WIDE = 20.0
-"""Largest speed over the least from which on fewer speeds have labels."""
-_REACH = 2.2
-"""Largest force shown, over that near rest."""
+_WIDE = 20.0  # largest speed over the least from which on fewer speeds have labels
+_REACH = 2.2  # largest force shown, over that near rest
 
 
 @exclusive

@@ -25,18 +25,13 @@ from ..scene.model import Finger, Scene
 from .plot_data import choose_snapshots
 from .style import FINGERS, INK, PALM, STRIP, Sheet, Styles, count_decimals, write
 
-NUMBER = 8.0
-"""Size of the numbers at vertices [points]."""
-_FEW = 5
-"""Most vertices of an object whose numbers may stand outside; case: a ruler, 120 x 15 mm."""
-_CAPTION = 0.42
-"""Height of the caption of a snapshot [in]."""
+NUMBER = 8.0  # size of the numbers at vertices [points]
+_FEW = 5  # most vertices of an object whose numbers may stand outside; case: a ruler, 120 x 15 mm
+_CAPTION = 0.42  # height of the caption of a snapshot [in]
 _ROOM = (1.38, 0.78)
 """Width that a snapshot needs for its caption, on average, in wide and in slim figures [in]."""
-_ROWS = 3
-"""Most rows of a strip; of more snapshots some are left out, evenly."""
-_BAR = 0.2
-"""Height of the bar that gives the scale, above a strip [in]."""
+_ROWS = 3  # most rows of a strip; of more snapshots some are left out, evenly
+_BAR = 0.2  # height of the bar that gives the scale, above a strip [in]
 
 
 def draw_snapshot(

@@ -15,10 +15,8 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
-WIDTH = 10.0
-"""Width of a figure, unless another one is asked for [in]."""
-WIDTHS = Range(3.0, 40.0)
-"""Least and largest width [in]."""
+WIDTH = 10.0  # width of a figure, unless another one is asked for [in]
+WIDTHS = Range(3.0, 40.0)  # least and largest width [in]
 # Okabe and Ito's colours without yellow and black, which here are Tol's wine and a grey.
 PALETTE = (
     "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#882255", "#56B4E9", "#D55E00", "#777777",
@@ -37,8 +35,7 @@ STYLE: Any = {
 SIMULATED: Any = {"color": "black", "linestyle": (0, (1, 2)), "linewidth": 1.0, "zorder": 5}
 SIMULATED_2: Any = SIMULATED | {"linestyle": (0, (3, 5)), "linewidth": 0.9}
 """What is simulated; the torque of finger 2, to be told from that of finger 1."""
-PALM = 0.12
-"""Thickness of the palm, over the object's radius of gyration."""
+PALM = 0.12  # thickness of the palm, over the object's radius of gyration
 _PREFIXES = ((3e4, "k", 1e-3), (0.3, "", 1.0), (3e-4, "m", 1e3), (0.0, "\u00b5", 1e6))
 """Least size of a quantity, its prefix, and the factor that goes with it."""
 
@@ -52,8 +49,7 @@ class ContactStyle(NamedTuple):
 
 
 Styles = Mapping[str, ContactStyle]
-STRIP = 1.75
-"""Greatest height of a row of snapshots [in]."""
+STRIP = 1.75  # greatest height of a row of snapshots [in]
 
 
 class Sheet(NamedTuple):

@@ -12,8 +12,7 @@ from ..common.fields import NUMBER, declare, key, leave
 from ..scene.model import Scene
 from ..scene.ranges import PLACE, TURN, check_place
 
-INDEX = leave({"type": "integer", "minimum": 0})
-"""Number of an edge."""
+INDEX = leave({"type": "integer", "minimum": 0})  # number of an edge
 _ALLOWED = "allowed is a table with flush or phi_deg, and x"
 
 

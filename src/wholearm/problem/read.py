@@ -29,11 +29,9 @@ from .goal import read_goals
 
 _T = TypeVar("_T")
 
-_THERE = 1e-3
-"""How far from a goal a plan may end, in radii of gyration and in rad."""
+_THERE = 1e-3  # how far from a goal a plan may end, in radii of gyration and in rad
 
-ROLLING = " rolling"
-"""Follows the name of a contact that rolls in a phase's `contacts`."""
+ROLLING = " rolling"  # follows the name of a contact that rolls in a phase's `contacts`
 
 
 def read_problem(path: str) -> Problem:

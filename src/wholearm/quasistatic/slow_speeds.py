@@ -42,26 +42,19 @@ from .prediction import (
 )
 from .squeeze import Squeezing
 
-PLACES = 241
-"""About how many places of a phase are looked at."""
-_NEWTON = 20
-"""Most steps that close contacts."""
-_CLOSED = 1e-11
-"""Step that counts as none, in radii of gyration or radians."""
+PLACES = 241  # about how many places of a phase are looked at
+_NEWTON = 20  # most steps that close contacts
+_CLOSED = 1e-11  # step that counts as none, in radii of gyration or radians
 _SCALED_SPEEDS = np.geomspace(1e-2, 1e2, 49)
 """Speeds at which a break is looked for, over the scene's speed."""
-_HALVINGS = 24
-"""Steps of bisection."""
+_HALVINGS = 24  # steps of bisection
 SQUEEZE = 0.5
 """How hard quasistatic torques squeeze: as hard as needs be at 0, as contacts press most at 1."""
-OWN = "own torques"
-"""Name of the motion under the torques of the quasistatic one."""
-_SPEEDS = 61
-"""Speeds of a curve."""
+OWN = "own torques"  # name of the motion under the torques of the quasistatic one
+_SPEEDS = 61  # speeds of a curve
 _SHOWN = 1.4
 """Largest speed of curves over the largest at which something breaks; its cube for the least."""
-_ROWS = 8
-"""Every so many places of a phase quasistatic torques are kept."""
+_ROWS = 8  # every so many places of a phase quasistatic torques are kept
 
 
 @exclusive

@@ -17,12 +17,10 @@ from ..contacts.formation import Formation
 from ..mechanics.dynamics import PathForces
 from ..mechanics.limits import CONE, PRESS, LimitSet, SideTerms, make_limits
 
-_FAR = 1e6
-"""Squeeze that stands for an infinite one, over the scene's force."""
+_FAR = 1e6  # squeeze that stands for an infinite one, over the scene's force
 _LEVEL = 1e-12
 """Slope over the squeeze below which a limit does not depend on it, over what is much for it."""
-_TIED = 1e-9
-"""Slack of a limit that counts as none, over what is much for it."""
+_TIED = 1e-9  # slack of a limit that counts as none, over what is much for it
 
 
 class Grasp(NamedTuple):

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-ROLLS = "rolls"
-"""Mode of a contact that rolls; one that slides has the sign of its direction."""
+ROLLS = "rolls"  # mode of a contact that rolls; one that slides has the sign of its direction
 
 
 class ModeSpan(NamedTuple):

@@ -15,13 +15,11 @@ from ..common.arrays import Array
 from ..common.errors import InputError, require_number
 from .torque import COLUMNS, TorqueProfile
 
-ERROR = 1e-5
-"""Largest error of the straight lines between rows, relative to the largest torque."""
+ERROR = 1e-5  # largest error of the straight lines between rows, relative to the largest torque
 STEP = 1e-6
 """Jump at a break from which on the rows keep it as a step, relative to the largest torque."""
 INTERPOLATIONS = ("linear", "hold")
-_PLACES = np.linspace(-1.0, 1.0, 17)
-"""Places in each piece of torques at which it is looked at."""
+_PLACES = np.linspace(-1.0, 1.0, 17)  # places in each piece of torques at which it is looked at
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(6)
 
 

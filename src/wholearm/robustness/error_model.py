@@ -18,8 +18,7 @@ from ..scene.model import Scene
 
 REACHED = 0.03
 """How far from the planned place a goal counts as reached, over the scene's length: 1 mm of 33."""
-TOLERANCE = 1e-6
-"""Of the simulations of samples, if no other is given, relative to the scene."""
+TOLERANCE = 1e-6  # of the simulations of samples, if no other is given, relative to the scene
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,7 @@ PAUSE = 1e-3
 """Time for which a planned contact may be open, in the scene's unit of time, and still be kept."""
 CLOSING = 0.1
 """Time, likewise, in which a contact that is open when its phase begins has to close for good."""
-SNAPSHOTS = 24
-"""Poses of a motion that are kept for figures."""
+SNAPSHOTS = 24  # poses of a motion that are kept for figures
 
 
 class TimeWindow(NamedTuple):

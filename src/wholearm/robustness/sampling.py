@@ -33,21 +33,16 @@ from ..results.adopt import Torques, adopt_motion, require_same_phases
 from .error_model import Uncertainty, change_torques
 from .sample_run import TimeWindow, Trial, make_trial
 
-Z = 1.959963984540054
-"""Standard normal quantile of 0.975."""
-STEP = 1e-3
-"""Step of the differences, over the half width of a range."""
+Z = 1.959963984540054  # standard normal quantile of 0.975
+STEP = 1e-3  # step of the differences, over the half width of a range
 APART = 0.01
 """How far from events the instant is at which a force is looked at, over the duration: where a
 contact slides the other way forces step, at another time when numbers are off."""
 Task = tuple[int, tuple[float, ...]]
 """Number and values of a sample."""
-SAMPLES = Range(1, 10**6)
-"""Samples of a study."""
-DRAWN = 200
-"""Samples whose paths are kept, for figures."""
-_ROWS = 8
-"""Contacts lost first that the text lists; the others are counted."""
+SAMPLES = Range(1, 10**6)  # samples of a study
+DRAWN = 200  # samples whose paths are kept, for figures
+_ROWS = 8  # contacts lost first that the text lists; the others are counted
 
 
 @dataclass(frozen=True, eq=False, repr=False)

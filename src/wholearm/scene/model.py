@@ -70,12 +70,9 @@ from .ranges import (
     VISCOUS,
 )
 
-LIGHT = 1e-4
-"""Weight, over what the weaker finger can press with, that is next to nothing."""
-HOLDS = ("constant", "linear")
-"""How torques may be held over control periods."""
-TOUCHING = 3e-6
-"""Gap below which features count as touching, in radii of gyration of the object."""
+LIGHT = 1e-4  # weight, over what the weaker finger can press with, that is next to nothing
+HOLDS = ("constant", "linear")  # how torques may be held over control periods
+TOUCHING = 3e-6  # gap below which features count as touching, in radii of gyration of the object
 
 
 @declare(

@@ -15,14 +15,10 @@ from .ranges import INERTIA, MASS
 
 SIZES = (1e-4, 1e3)
 """Least and largest distance between the two corners of a polygon that are farthest apart [m]."""
-FAR = 1e3
-"""Largest distance of given corners from the origin, over that distance."""
-SLENDER = 1e-3
-"""Least width of a polygon, over that distance."""
-SHORTEST_EDGE = 1e-4
-"""Least length of an edge, over that distance."""
-MOST_VERTICES = 500
-"""Most corners of a polygon."""
+FAR = 1e3  # largest distance of given corners from the origin, over that distance
+SLENDER = 1e-3  # least width of a polygon, over that distance
+SHORTEST_EDGE = 1e-4  # least length of an edge, over that distance
+MOST_VERTICES = 500  # most corners of a polygon
 
 
 def _read_corners(given: object, key: str) -> Array:

@@ -27,8 +27,7 @@ LASTS = 40.0
 """How long a trial goes on after its last step of the torques, relative to the scene's time."""
 _BACK = 1e-6
 """Share of the way by which the end is farther away than before once the motion has turned back."""
-_NUDGE = 1e-6
-"""Time over which a rate is a difference, relative to the scene's."""
+_NUDGE = 1e-6  # time over which a rate is a difference, relative to the scene's
 
 
 class TrialOutcome(Enum):

@@ -27,44 +27,28 @@ FACTOR = 1.1
 SLOW = 3e-5
 """Speed at which the end of a phase may be reached by a brake, relative to the scene's: contacts
 part for less than a moment then."""
-_ROUGH = 50.0
-"""How much faster than that an end is reached while brakes are compared."""
-_RAISED = 60
-"""Most times a torque is raised or lowered: a factor of 300."""
+_ROUGH = 50.0  # how much faster than that an end is reached while brakes are compared
+_RAISED = 60  # most times a torque is raised or lowered: a factor of 300
 _SUPPORT = 3
 """So many times the supporting torque is raised at once, by a third, as each needs searches."""
-ENOUGH = 600
-"""Simulations from one start after which no further drive, brake or support is tried."""
-_SUPPORTED = 13
-"""It is raised fewer times than this."""
-_SOONER = 0.02
-"""Share of the time by which another 10 % has to bring the end sooner."""
-_COARSE = 2
-"""So many times the acting torque is lowered at once while it brakes too little."""
-_PLACES = 16
-"""Instants to brake at that are looked at, where each of them lets the object arrive."""
-_CLOSER = 45
-"""Most steps to the one at which it arrives most slowly, by golden sections."""
+ENOUGH = 600  # simulations from one start after which no further drive, brake or support is tried
+_SUPPORTED = 13  # it is raised fewer times than this
+_SOONER = 0.02  # share of the time by which another 10 % has to bring the end sooner
+_COARSE = 2  # so many times the acting torque is lowered at once while it brakes too little
+_PLACES = 16  # instants to brake at that are looked at, where each of them lets the object arrive
+_CLOSER = 45  # most steps to the one at which it arrives most slowly, by golden sections
 _GOLDEN = (3 - math.sqrt(5)) / 2
-_MISSES = 2
-"""So many torques that stop nothing end that, once one has."""
-_SEARCH = 24
-"""Most trials that look for the instant to brake."""
+_MISSES = 2  # so many torques that stop nothing end that, once one has
+_SEARCH = 24  # most trials that look for the instant to brake
 _NARROW = 1e-3
 """Share of the time in which the end is either reached at speed or not at all: what starts the
 motion again, or lets it turn back, is not a matter of when to brake."""
-_FAR, _FAST = 0.02, 0.1
-"""Shares of the way and of the drive's speed that are much for that."""
-_SOON = 1e-3
-"""Share of a drive's time: where the end is reached with a brake that early it is none."""
-_LOSSES = 4
-"""Most of them that may lose a contact."""
-PAUSE = 0.2
-"""How long the object is held at the end of each phase, relative to the scene's time."""
-MOST_STOPS = 7
-"""Stops of a phase that may be allowed at most: halves of halves of halves."""
-_LOWERED = 6
-"""How many times the acting torque is lowered for that, less one."""
+_FAR, _FAST = 0.02, 0.1  # shares of the way and of the drive's speed that are much for that
+_SOON = 1e-3  # share of a drive's time: where the end is reached with a brake that early it is none
+_LOSSES = 4  # most of them that may lose a contact
+PAUSE = 0.2  # how long the object is held at the end of each phase, relative to the scene's time
+MOST_STOPS = 7  # stops of a phase that may be allowed at most: halves of halves of halves
+_LOWERED = 6  # how many times the acting torque is lowered for that, less one
 
 
 @exclusive

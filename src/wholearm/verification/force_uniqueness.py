@@ -19,8 +19,7 @@ from .verdict import measure_speed
 
 PLACES = 33
 """Instants of a phase at which uniqueness margins are looked at, and at which torques are."""
-_LEANS = 1 - 1e-6
-"""Share of U c_n from which on a tangential force is that of sliding."""
+_LEANS = 1 - 1e-6  # share of U c_n from which on a tangential force is that of sliding
 
 
 def find_uniqueness_margin(

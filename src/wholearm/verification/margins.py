@@ -19,17 +19,13 @@ from ..scene.model import Scene
 from ..simulation.events import EventKind, Simulation
 from ..simulation.tolerances import SETTLING
 
-HURRIED = 1e-3
-"""Largest relative miss of a torque's rate, or of a command, that is not reported."""
-STEPPED = 1e-5
-"""Largest step of a torque that is none, over its limit."""
-_LOOKS = 33
-"""Instants of each piece of the torques that are looked at."""
+HURRIED = 1e-3  # largest relative miss of a torque's rate, or of a command, that is not reported
+STEPPED = 1e-5  # largest step of a torque that is none, over its limit
+_LOOKS = 33  # instants of each piece of the torques that are looked at
 SHORTEST = 2 * SETTLING
 """Interval below which forces may jump, and rounding spoils a parabola, relative to the scene's
 time."""
-MISSED = 1e-6
-"""Miss of a limit, over what is much for it, from which on it is reported."""
+MISSED = 1e-6  # miss of a limit, over what is much for it, from which on it is reported
 
 
 class Parabolas(NamedTuple):

@@ -16,12 +16,9 @@ from ..problem.definition import Problem
 from ..results.report import ReducedState
 from ..simulation.events import Simulation
 
-ROWS = 5
-"""Instants of every phase at which the equation is set up."""
-MOVING = 1e-4
-"""Least speed of everything that slides or turns there, over the scene's."""
-_OTHERS = [0, 1, 2, 4]
-"""Degrees of freedom that are eliminated: q and theta_2."""
+ROWS = 5  # instants of every phase at which the equation is set up
+MOVING = 1e-4  # least speed of everything that slides or turns there, over the scene's
+_OTHERS = [0, 1, 2, 4]  # degrees of freedom that are eliminated: q and theta_2
 
 
 def list_reduced_states(problem: Problem, simulation: Simulation) -> tuple[ReducedState, ...]:

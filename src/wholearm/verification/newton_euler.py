@@ -28,8 +28,7 @@ if TYPE_CHECKING:
     from ..contacts.elemental import Contact
     from ..results.trajectory import Samples
 
-STILL = 1e-4
-"""Speed that counts as none, relative to the scene's speed."""
+STILL = 1e-4  # speed that counts as none, relative to the scene's speed
 BODIES = (
     "the object along x",
     "the object along y",

@@ -29,20 +29,16 @@ from ..simulation.sticking import find_rest
 from .margins import find_lowest
 from .verdict import Allowance
 
-KEPT = 1e-9
-"""Shortfall of a limit that counts as none, over what is much for it."""
+KEPT = 1e-9  # shortfall of a limit that counts as none, over what is much for it
 FLAT = 1e-9
 """What a limit's slack changes with a torque below which it does not depend on it, in what is much
 for each."""
 SLOW = 1e-6
 """Speed below which the direction of friction is looked for, relative to the scene's speed."""
-_TORQUES = ((0,), (1,), (0, 1))
-"""Which torques change: one alone, or both."""
+_TORQUES = ((0,), (1,), (0, 1))  # which torques change: one alone, or both
 _KINDS = {EventKind.CONTACT_LOST: "lost", EventKind.SLIP: "slips"}
-LEAST = 1e-3
-"""Least normal force to aim at, over the scene's force, where epsilon is less."""
-TURNED = 1e-6
-"""Speed from which on a motion counts as going one way, relative to the scene's speed."""
+LEAST = 1e-3  # least normal force to aim at, over the scene's force, where epsilon is less
+TURNED = 1e-6  # speed from which on a motion counts as going one way, relative to the scene's speed
 
 
 def find_help(

@@ -61,10 +61,8 @@ from .verdict import (
 ROWS = 20
 """About how many rows of each phase of a trajectory its replay is compared with; without one, about
 how many even parts of each phase are looked at."""
-POINTS = 8
-"""Instants around what seems to be a dip."""
-LOOKS = 3
-"""How often what the looks before leave open is looked at closer."""
+POINTS = 8  # instants around what seems to be a dip
+LOOKS = 3  # how often what the looks before leave open is looked at closer
 WORTH = 1e-7
 """How far below all that is known a dip has to seem, relative to the scene's force or length."""
 Dips = list[tuple[float, float]]

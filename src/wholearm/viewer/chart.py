@@ -44,20 +44,13 @@ from .motion_data import count_places, describe_hand
 
 SHEET = (1000.0, 620.0)
 """Width and height of the drawing, in its own units; texts are 11 of these high."""
-BOX = (58.0, 44.0, 868.0, 566.0)
-"""The axes: left, bottom, width, height."""
-_ASIDE = 3.0
-"""Offset of directed lines from the border."""
-_ARROW = 8.0
-"""Length of the arrows inside cells."""
-_LETTER, _HEIGHT = 6.2, 13.0
-"""Size of a letter of a label."""
-_DISC = 18.0
-"""Room for the number of a phase."""
-_CLEAR = 9.0
-"""Distance of labels from the plan."""
-_MOST = 40
-"""Points of a line that is clicked; more cannot be told apart."""
+BOX = (58.0, 44.0, 868.0, 566.0)  # the axes: left, bottom, width, height
+_ASIDE = 3.0  # offset of directed lines from the border
+_ARROW = 8.0  # length of the arrows inside cells
+_LETTER, _HEIGHT = 6.2, 13.0  # size of a letter of a label
+_DISC = 18.0  # room for the number of a phase
+_CLEAR = 9.0  # distance of labels from the plan
+_MOST = 40  # points of a line that is clicked; more cannot be told apart
 
 
 class MapChart(NamedTuple):

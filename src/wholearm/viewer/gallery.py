@@ -15,10 +15,8 @@ from ..search.solve import solve
 from ..verification.verify import verify
 from .movie import Movie, write_movie
 
-_WIDTH, _DOTS = 8.0, 110
-"""Of figures [in] and [dots per inch]."""
-_LASTS, _RESOLUTION = 2.0, 50
-"""Of movies [s] and [dots per inch]."""
+_WIDTH, _DOTS = 8.0, 110  # of figures [in] and [dots per inch]
+_LASTS, _RESOLUTION = 2.0, 50  # of movies [s] and [dots per inch]
 _HEADS = ["problem", "phases:d", "least time [s]:.6f", "least c_n [N]:.4f", "finger gap [mm]:.1f"]
 
 

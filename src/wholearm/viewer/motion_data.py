@@ -20,10 +20,8 @@ from ..problem.definition import Problem
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
 
-_DIGITS = 6
-"""Significant digits of numbers in a page: more than a screen shows."""
-MOST = 4000
-"""Samples of a motion in a page."""
+_DIGITS = 6  # significant digits of numbers in a page: more than a screen shows
+MOST = 4000  # samples of a motion in a page
 
 
 class Pushes(NamedTuple):

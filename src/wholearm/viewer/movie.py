@@ -45,21 +45,15 @@ from ..problem.definition import Problem
 from ..results.trajectory import Trajectory
 from .motion_data import place_pushes
 
-FRAMES = 25
-"""Frames in a second of the movie."""
-_MOST = 3000
-"""Frames of a movie: two minutes."""
+FRAMES = 25  # frames in a second of the movie
+_MOST = 3000  # frames of a movie: two minutes
 _SIZE = (8.0, 7.4)
-RESOLUTION = 90
-"""Dots per inch of a movie that is 8 inches wide."""
-_REACH = 0.3
-"""Length of the largest force's arrow, over the picture's."""
-_BEYOND = 1.15
-"""Length of friction cones over that of the arrows in them."""
+RESOLUTION = 90  # dots per inch of a movie that is 8 inches wide
+_REACH = 0.3  # length of the largest force's arrow, over the picture's
+_BEYOND = 1.15  # length of friction cones over that of the arrows in them
 BODY, TURNS, GHOST = "#fbf3df", "#D55E00", "#bbbbbb"
 """Colours of the object, of torques and the cursor, and of what is drawn behind."""
-_TURN = 1.5 * math.pi
-"""Angle of the arc of a torque at its limit."""
+_TURN = 1.5 * math.pi  # angle of the arc of a torque at its limit
 
 
 class _Scene:

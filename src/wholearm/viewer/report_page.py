@@ -18,10 +18,8 @@ from . import page
 from .chart import describe_map
 from .motion_data import describe_motion
 
-_SAMPLES = 8000
-"""Of all motions in a page, which they leave at some 3 MB."""
-_RESOLUTION = 90
-"""Grid of the map: its borders are exact, only cells are drawn by it."""
+_SAMPLES = 8000  # of all motions in a page, which they leave at some 3 MB
+_RESOLUTION = 90  # grid of the map: its borders are exact, only cells are drawn by it
 
 
 def build_report(

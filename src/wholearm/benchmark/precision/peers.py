@@ -25,10 +25,8 @@ from .phases import (
     sample_slow_motion,
 )
 
-APART = 1e-7
-"""Distance of grid points from a reversal between them, over the curve's length."""
-TORQUE_NODES = 5
-"""Instants in an interval that its torque's polynomial goes through."""
+APART = 1e-7  # distance of grid points from a reversal between them, over the curve's length
+TORQUE_NODES = 5  # instants in an interval that its torque's polynomial goes through
 
 
 class _PeerRows:
@@ -165,8 +163,7 @@ IPOPT = {
     "max_iter": 1000,
     "mu_strategy": "adaptive",
 }
-POINTS = 2
-"""Collocation points of a segment."""
+POINTS = 2  # collocation points of a segment
 
 
 def build_yapss(instance: Instance, setting: str) -> Callable[[], PeerPlan]:

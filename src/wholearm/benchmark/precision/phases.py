@@ -93,8 +93,7 @@ def pick(instances: Sequence[Instance], name: str) -> Instance:
     return next(instance for instance in instances if instance.name == name)
 
 
-OPTIMUM = "Solve_Succeeded"
-"""Ipopt's status of a solution."""
+OPTIMUM = "Solve_Succeeded"  # Ipopt's status of a solution
 
 
 class PeerPlan(NamedTuple):

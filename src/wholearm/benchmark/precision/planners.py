@@ -28,8 +28,7 @@ LEAST_TIME, NO_DRAG = "least time", "least time without viscous friction"
 """Studies: all phases, and the same without viscous friction."""
 FINE = 1e-7
 """Accuracy of a plan along a curve whose duration is the reference where there is no bound."""
-NEAR = 1e-7
-"""Distance over the duration in which a step of the torques is that of a reversal."""
+NEAR = 1e-7  # distance over the duration in which a step of the torques is that of a reversal
 
 
 class Planner(NamedTuple):

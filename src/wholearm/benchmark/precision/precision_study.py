@@ -16,10 +16,8 @@ from .planners import LEAST_TIME, NO_DRAG, PLANNERS, is_installed, run_planner
 from .simulators import FEW, MANY, SIMULATORS, TOLERANCES, run_simulator
 from .tables import draw_medians, format_report, read_medians
 
-METHODS = [*SIMULATORS, *PLANNERS]
-"""Names of all methods, in the order of the tables."""
-REFERENCE = 120.0
-"""Processor time that the reference of a phase may take on top [s]."""
+METHODS = [*SIMULATORS, *PLANNERS]  # names of all methods, in the order of the tables
+REFERENCE = 120.0  # processor time that the reference of a phase may take on top [s]
 
 
 class Precision(Study):

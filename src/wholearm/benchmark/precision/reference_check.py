@@ -18,12 +18,10 @@ from .reference import Course, Span, measure_error
 from .runs import SOLVED
 from .simulators import pack_span, write_rates
 
-STEPS = 1000
-"""Least number of steps of a replay."""
+STEPS = 1000  # least number of steps of a replay
 CLOSE = 1e-2
 """Error of the end state, and of torques over their limits, up to which a plan counts as one."""
-LOOKS = 9
-"""Instants of every piece of the torques at which their limits are looked at."""
+LOOKS = 9  # instants of every piece of the torques at which their limits are looked at
 
 
 class ReferenceCheck(NamedTuple):

@@ -9,16 +9,11 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
 
-REPEATS = 3
-"""Largest number of runs that a median is of."""
-BUDGET = 0.3
-"""Time after which a run is not repeated any more [s]."""
-SHIFT = 0.01
-"""Shift of the geometric means [s]."""
-SHORT = 0.05
-"""Time up to which something is done several times over, in about this time [s]."""
-MOST = 200
-"""Largest number of times."""
+REPEATS = 3  # largest number of runs that a median is of
+BUDGET = 0.3  # time after which a run is not repeated any more [s]
+SHIFT = 0.01  # shift of the geometric means [s]
+SHORT = 0.05  # time up to which something is done several times over, in about this time [s]
+MOST = 200  # largest number of times
 SOLVED = "solved"
 
 _Answer = TypeVar("_Answer")

@@ -32,12 +32,10 @@ FEW, MANY = "simulation, few pieces", "simulation, many pieces"
 """Studies: torques in a few long pieces, and planned torques in eighty."""
 TOLERANCES = {FEW: tuple(10.0**-k for k in (4, *range(6, 14))), MANY: (1e-6, 1e-9, 1e-12)}
 """Tolerances of each study."""
-DEGREES = {FEW: 14, MANY: 6}
-"""Degrees of the torques' polynomials."""
+DEGREES = {FEW: 14, MANY: 6}  # degrees of the torques' polynomials
 SLOW = 0.3
 """Square of the speed of the motion with few pieces, over that of a first guess of a plan."""
-LOOKS = 201
-"""Instants at which contact forces of a motion are looked at."""
+LOOKS = 201  # instants at which contact forces of a motion are looked at
 STOP = 0.95
 """Share of the last stretch between reversals that is run: just before a stop all is ill-posed."""
 

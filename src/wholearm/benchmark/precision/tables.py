@@ -20,10 +20,8 @@ from .simulators import FEW, MANY, SIMULATORS
 Key = tuple[str, str, str, str]
 """Study, instance, method and setting: what one median is of."""
 Medians = dict[Key, Median]
-MARKERS = "osD^vP*Xdh<>"
-"""Markers of the methods of a panel."""
-SMALLEST = 1e-16
-"""Error that is drawn for none at all."""
+MARKERS = "osD^vP*Xdh<>"  # markers of the methods of a panel
+SMALLEST = 1e-16  # error that is drawn for none at all
 
 
 class PeerComparison(NamedTuple):

@@ -21,28 +21,18 @@ from .event_tracing import weights
 from .newton import clearances, locate
 from .slow_motion import fast_margin, rest_margin
 
-PLACES = 40
-"""Configurations along a curve."""
-INSIDE = 1e-4
-"""Overlap, and distance beyond a feature, that passes, over the radius of gyration."""
-DRAWN = 400
-"""Curves that are drawn at first; most leave the cell."""
-TRIED = 40
-"""Curves of these that are looked at."""
-BENT = (6, 10)
-"""Rounds in which the best curves are bent, and curves in each."""
-BEST = 3
-"""Curves that are bent further in each round."""
+PLACES = 40  # configurations along a curve
+INSIDE = 1e-4  # overlap, and distance beyond a feature, that passes, over the radius of gyration
+DRAWN = 400  # curves that are drawn at first; most leave the cell
+TRIED = 40  # curves of these that are looked at
+BENT = (6, 10)  # rounds in which the best curves are bent, and curves in each
+BEST = 3  # curves that are bent further in each round
 LOOSE = 0.01
 """Rate of sliding over that of the whole below which a contact may stick: nearby curves roll."""
-ENDS = 16
-"""Most places of the end on either side of the nearest one."""
-STEP = 0.08
-"""Distance of the nearest of these, over the radius of gyration."""
-GROWTH = 1.12
-"""Ratio of each distance to the one before."""
-ENOUGH = 1e-3
-"""Margin with which a curve is as good as wanted."""
+ENDS = 16  # most places of the end on either side of the nearest one
+STEP = 0.08  # distance of the nearest of these, over the radius of gyration
+GROWTH = 1.12  # ratio of each distance to the one before
+ENOUGH = 1e-3  # margin with which a curve is as good as wanted
 
 Flags = NDArray[np.bool_]
 

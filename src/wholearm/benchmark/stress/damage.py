@@ -335,10 +335,8 @@ def _value(value: Any) -> str:
 
 
 STATUSES = (0, 1, 2)
-LONGEST = 2000
-"""Longest line on stderr that still counts as clear."""
-PROGRESS = re.compile(r"wholearm: \d+ s: ")
-"""Lines that tell how long work goes on already."""
+LONGEST = 2000  # longest line on stderr that still counts as clear
+PROGRESS = re.compile(r"wholearm: \d+ s: ")  # lines that tell how long work goes on already
 
 
 def run_file(seed: int, number: int) -> dict[str, Any]:

@@ -16,14 +16,11 @@ from ...problem.definition import Phase, Until
 from ...scene.model import Scene
 from .newton import clearances, locate
 
-STEP = 0.02
-"""Length of a step over the radius of gyration."""
-LONGEST = 60.0
-"""Longest curve, over the radius of gyration: several turns of the object."""
+STEP = 0.02  # length of a step over the radius of gyration
+LONGEST = 60.0  # longest curve, over the radius of gyration: several turns of the object
 OVERLAP = 1e-6
 """Overlap over the radius of gyration from which on two bodies count as running into each other."""
-MET = 1e-5
-"""Distance over the radius of gyration (or angle) that counts as having reached `until`."""
+MET = 1e-5  # distance over the radius of gyration (or angle) that counts as having reached `until`
 
 
 class Trace(NamedTuple):

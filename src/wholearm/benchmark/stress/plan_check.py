@@ -12,14 +12,10 @@ from .newton import Touch, balance, clearances, locate
 
 INSTANTS = 401
 """Instants of a phase that are looked at, besides some in short pieces of its torques."""
-BRIEF = 1e-6
-"""Share of a phase below which a piece of its torques has no length."""
-ROUNDING = 1e-6
-"""What may be left of an equation, over the largest of its terms."""
-OVERLAP = 1e-6
-"""Overlap and open gaps that pass for rounding, over the radius of gyration."""
-STILL = 1e-5
-"""Speed over the scene's own below which friction may point either way."""
+BRIEF = 1e-6  # share of a phase below which a piece of its torques has no length
+ROUNDING = 1e-6  # what may be left of an equation, over the largest of its terms
+OVERLAP = 1e-6  # overlap and open gaps that pass for rounding, over the radius of gyration
+STILL = 1e-5  # speed over the scene's own below which friction may point either way
 THIN = 2e-3
 """What a normal force may lack of epsilon, over epsilon: what `verification.verify` allows."""
 

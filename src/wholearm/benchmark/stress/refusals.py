@@ -17,14 +17,10 @@ from .cell_curves import best_end, find_best, list_ends
 from .event_tracing import Trace, follow, resample, weights
 from .slow_motion import fast_margin, inertia_ratio, rest_margin, slow_margin
 
-PLACES = 60
-"""Places along a curve at which limits are looked at."""
-CLEAR = 1e-3
-"""Margin over the scene's weight, or a torque limit, from which a motion surely exists."""
-UNABLE = -1e-7
-"""Margin below which none exists."""
-FREE = 0.02
-"""Reduced inertia over that without friction above which nothing jams."""
+PLACES = 60  # places along a curve at which limits are looked at
+CLEAR = 1e-3  # margin over the scene's weight, or a torque limit, from which a motion surely exists
+UNABLE = -1e-7  # margin below which none exists
+FREE = 0.02  # reduced inertia over that without friction above which nothing jams
 
 SURE = 0.02
 """What the best of many curves misses limits by, as a margin, where surely none keeps them."""

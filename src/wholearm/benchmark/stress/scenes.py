@@ -37,12 +37,9 @@ SIZES, MASSES = (-3.0, 1.0), (-4.0, 3.0)
 """Powers of ten: radius of the object [m], and its mass [kg]."""
 DECADES = (-6.0, 0.0)
 """Powers of ten: joint inertia, viscous and dry friction, over what the object has of them."""
-POINTED = 0.5
-"""Share of the scenes whose fingers have no thickness."""
-TRIES = 200
-"""Hands that are drawn for one object before another object is."""
-PLACES = 60
-"""Places along a border at which a route looks for its ends."""
+POINTED = 0.5  # share of the scenes whose fingers have no thickness
+TRIES = 200  # hands that are drawn for one object before another object is
+PLACES = 60  # places along a border at which a route looks for its ends
 
 
 def random_scene(rng: np.random.Generator) -> Table:
@@ -210,14 +207,10 @@ def _distance(piece: Piece, here: Array, size: Array) -> float:
     return float(np.hypot(*((points - here) / size).T).min())
 
 
-LISTS = 4
-"""Routes that are drawn for one scene before another scene is."""
-LOOKS = 4
-"""Places of a stretch at which it is looked whether a slow motion is possible."""
-WILLING = 0.7
-"""Share of the cases whose route a slow motion can probably follow."""
-SCENES = 6
-"""Scenes that are drawn for one case before its last list is taken as it is."""
+LISTS = 4  # routes that are drawn for one scene before another scene is
+LOOKS = 4  # places of a stretch at which it is looked whether a slow motion is possible
+WILLING = 0.7  # share of the cases whose route a slow motion can probably follow
+SCENES = 6  # scenes that are drawn for one case before its last list is taken as it is
 
 
 @dataclass(frozen=True)

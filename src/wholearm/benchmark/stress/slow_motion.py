@@ -39,8 +39,7 @@ from .newton import Touch, locate
 
 Bounds = list[tuple[float | None, float | None]]
 
-FASTEST = 1e3
-"""Largest speed that is considered, over the scene's own."""
+FASTEST = 1e3  # largest speed that is considered, over the scene's own
 TANGENTS = np.geomspace(1e-6, 1.0, 13)
 """Places of the tangents that bound sqrt(b), over the largest b."""
 
@@ -327,8 +326,7 @@ __all__ = ["fast_margin", "inertia_ratio", "slow_margin"]
 
 TOUCHES = 1e-6
 """Gap over the radius of gyration below which a contact touches that the phase does without."""
-STILL = 1e-9
-"""Rate over the largest one below which something stands still."""
+STILL = 1e-9  # rate over the largest one below which something stands still
 
 
 def rest_margin(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: bool = False) -> float:

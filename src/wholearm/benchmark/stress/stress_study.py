@@ -36,14 +36,11 @@ from .scenes import draw_case
 OBJECTIVES = ("time", "effort", "margin")
 LIMITS = {"scene": 30.0, "file": 20.0, "problem": 60.0}
 """Processor time that a scene and an objective (two plans), a file and a problem may take [s]."""
-NOISE = 1e-10
-"""Relative change of the masses that must not change an answer."""
-SAME = 1e-6
-"""Relative difference of two values that rounding may make."""
+NOISE = 1e-10  # relative change of the masses that must not change an answer
+SAME = 1e-6  # relative difference of two values that rounding may make
 TRIALS = {"noise": 8, "change": 20}
 """Times that noise is added to the masses, and that masses, friction, drag and limits change."""
-SPREAD = 0.1
-"""Largest relative change."""
+SPREAD = 0.1  # largest relative change
 _FINGER = ("inertia", "viscous", "dry", "torque_limit")
 
 Finding = tuple[str, str]
