@@ -20,7 +20,7 @@ from ..common.errors import (
     SolverError,
 )
 from ..problem.definition import Problem
-from ..results.replay_figures import LeastForce, ReplayedPhase, ReplayFigures
+from ..results.plan_record import LeastForce, ReplayedPhase, ReplayFigures
 from ..results.report import Report
 from ..results.trajectory import Samples, Trajectory, assemble
 from ..scene.model import Scales
