@@ -1,4 +1,4 @@
-"""The command ``wholearm robustness``: how much error a plan bears."""
+"""Commands that analyse: ``predict``, ``tune``, ``compare`` and ``robustness``."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from ..common.errors import InputError
-from .origin import tell_origin
-from .output import name_files, print_result
+from .output import name_files, print_result, require_output, tell_origin
 from .progress import show_progress
 
 if TYPE_CHECKING:
@@ -20,33 +19,86 @@ if TYPE_CHECKING:
     from ..problem.definition import Problem
     from ..robustness.error_model import Uncertainty
 
+_SPEED = 0.05  # mean speed along the phases of quasistatic torques that are written [m/s]
+
+
+def predict(options: argparse.Namespace) -> int:
+    """Predict up to which speed quasistatic motions keep contacts, and write what is asked for."""
+    from ..problem.read import read_problem
+    from ..quasistatic.slow_speeds import make_torques
+    from ..quasistatic.slow_speeds import predict as run
+
+    require_output(options.output)
+    require_output(options.torques, ".csv")
+    if options.torques is None and options.speed is not None:
+        raise InputError("", "--speed", "is for --torques FILE, the torques to write")
+    problem = read_problem(options.problem)
+    prediction = run(problem, squeeze=options.squeeze, progress=show_progress())
+    if options.output is not None:
+        from ..figures import plots
+        from ..figures.prediction_figure import draw_prediction
+
+        plots.save(draw_prediction(prediction), options.output)
+    status = print_result(options, prediction)
+    if options.torques is not None:
+        from ..results.adopt import save
+
+        save(make_torques(prediction, options.speed or _SPEED), options.torques)
+    name_files(options, options.output, options.torques)
+    return status
+
+
+def tune(options: argparse.Namespace) -> int:
+    """Tune torques in steps of 10 %, print what became of each phase, write them if they hold."""
+    from ..common.files import write_text
+    from ..geometry.path_guess import load
+    from ..tuning.tuner import tune as run
+
+    require_output(options.output, ".csv")
+    given = {key: getattr(options, key) for key in ("brake", "stops", "squeeze", "share")}
+    tuning = run(load(options.problem), **given, progress=show_progress())
+    status = print_result(options, tuning)
+    if options.output is not None and tuning.ok:
+        write_text(options.output, tuning.to_csv())
+        name_files(options, options.output)
+    return status
+
+
+def compare(options: argparse.Namespace) -> int:
+    """Replay plans and torques for one problem, print the tables, and draw the margins."""
+    from ..comparison.metrics import compare as run
+    from ..geometry.path_guess import load
+
+    require_output(options.output)
+    comparison = run(load(options.problem), options.files, show_progress())
+    if options.output is not None:
+        from ..figures import plots
+        from ..figures.comparison import draw_comparison
+
+        plots.save(draw_comparison(comparison), options.output)
+    status = print_result(options, comparison)
+    name_files(options, options.output)
+    return status
+
 
 def robustness(options: argparse.Namespace) -> int:
     """Replay samples, and print what becomes of them."""
-    from ..common.files import require_ending, require_writable
     from ..policy.playback import Policy
     from ..problem.read import adopt_phases, read_problem
     from ..results.trajectory_file import load_trajectory
     from ..robustness.sampling import assess_robustness
 
     output = options.output or _name_output(options)
-    require_writable(output)
-    require_ending(output, ".jsonl")
-    if options.figure is not None:
-        from ..figures import plots
-
-        require_writable(options.figure)
-        plots.require_format(options.figure)
+    require_output(output, ".jsonl")
+    require_output(options.figure)
     if options.sensor and options.policy is None:
         raise InputError("", "--sensor", "needs --policy")
-    policy = None if options.policy is None else Policy.load(options.policy)
+    policy = options.policy and Policy.load(options.policy).with_sensor(options.sensor)
     plan = load_trajectory(options.plan)
     problem = read_problem(options.problem)
     problem = adopt_phases(problem, plan.meta, plan.q[-1], options.plan)
-    if policy is not None:
-        policy = policy.with_sensor(options.sensor)
-    given = None if policy is None else (options.policy, policy)
-    notes = tell_origin(problem, (options.plan, plan), given, options.json)
+    own = policy and (options.policy, policy)
+    notes = tell_origin(problem, (options.plan, plan), own, options.json)
     study = assess_robustness(
         problem,
         plan,
@@ -61,6 +113,7 @@ def robustness(options: argparse.Namespace) -> int:
         progress=show_progress(),
     )
     if options.figure is not None:
+        from ..figures import plots
         from ..figures.robustness_figure import draw_robustness
 
         plots.save(draw_robustness(study), options.figure)
