@@ -1,7 +1,4 @@
-"""Whether a replay holds, and the reasons why not, in words.
-
-Nothing is decided by a sign: each limit has a tolerance, relative to the scene's scales.
-"""
+"""Verdict on a replay: limits with tolerances relative to the scene, and their messages."""
 
 from __future__ import annotations
 
