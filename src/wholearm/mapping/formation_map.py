@@ -32,7 +32,7 @@ from ..mechanics.margin_key import UNIQUENESS
 from ..mechanics.metric import metric_weights
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN, find_minors
 from ..problem.definition import Problem
-from ..quasistatic.squeeze import Squeezing
+from ..quasistatic.squeeze import InternalForceLimits
 from ..scene.model import Scene
 from .borders import (
     NOWHERE,
@@ -373,8 +373,8 @@ def _check_path(
 ) -> Flags:
     directions = Directions.of(kinematics, z_s)
     forces = inverse(formation, z, z_s, np.zeros_like(z_s), directions, kinematics)
-    squeezing, still = Squeezing.of(formation, forces, z_s[:, 3:]), np.zeros(len(z))
-    low, high = squeezing.find_span(still, still, epsilon)
+    limits, still = InternalForceLimits.of(formation, forces, z_s[:, 3:]), np.zeros(len(z))
+    low, high = limits.find_span(still, still, epsilon)
     return np.asarray(low <= high)
 
 
