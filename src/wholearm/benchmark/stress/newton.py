@@ -77,15 +77,9 @@ def locate(scene: Scene, name: str, z: Array) -> Touch:
 
 
 def _touch(
-    scene: Scene,
-    z: Array,
-    finger: int | None,
-    point: Array,
-    normal: Array,
-    gap: Array,
-    low: Array,
-    high: Array,
+    scene: Scene, z: Array, finger: int | None, point: Array, normal: Array, *sides: Array
 ) -> Touch:
+    """A contact with its `sides`: gap, low and high."""
     tangent = np.stack([normal[:, 1], -normal[:, 0]], axis=1)
     rows = []
     for direction in (normal, tangent):
@@ -97,7 +91,7 @@ def _touch(
                 point - np.asarray(scene.fingers[finger].base), direction
             )
         rows.append(row)
-    return Touch(gap, low, high, rows[0], rows[1], scene.friction.of(finger))
+    return Touch(*sides, rows[0], rows[1], scene.friction.of(finger))
 
 
 def balance(

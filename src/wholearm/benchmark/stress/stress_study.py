@@ -102,10 +102,9 @@ class Stress(Study):
 
     def run(self, case: Case) -> Row:
         """Run one case."""
-        kind, *given = case
-        if kind == "scene":
-            return run_scene(*given)
-        return run_file(*given) if kind == "file" else run_trial(*given)
+        kind, *arguments = case
+        run = {"scene": run_scene, "file": run_file, "problem": run_trial}[kind]
+        return run(*arguments)
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
         """Tables of each part, and every finding."""
