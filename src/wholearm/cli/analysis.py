@@ -93,12 +93,14 @@ def robustness(options: argparse.Namespace) -> int:
     require_output(options.figure)
     if options.sensor and options.policy is None:
         raise InputError("", "--sensor", "needs --policy")
-    policy = options.policy and Policy.load(options.policy).with_sensor(options.sensor)
+    policy = None
+    if options.policy is not None:
+        policy = Policy.load(options.policy).with_sensor(options.sensor)
     plan = load_trajectory(options.plan)
     problem = read_problem(options.problem)
     problem = adopt_phases(problem, plan.meta, plan.q[-1], options.plan)
-    own = policy and (options.policy, policy)
-    notes = tell_origin(problem, (options.plan, plan), own, options.json)
+    named = None if policy is None else (options.policy, policy)
+    notes = tell_origin(problem, (options.plan, plan), named, options.json)
     study = assess_robustness(
         problem,
         plan,
@@ -150,10 +152,8 @@ def _read_ranges(options: argparse.Namespace, problem: Problem) -> Uncertainty:
 
 
 def _choose_executor(options: argparse.Namespace) -> Callable[[], Executor] | None:
+    from ..robustness.sampling import connect, use_processes
+
     if options.scheduler is not None:
-        from ..robustness.cluster import connect
-
         return partial(connect, options.scheduler)
-    from ..robustness.sampling import use_processes
-
     return partial(use_processes, options.jobs)

@@ -156,7 +156,7 @@ class Drawn(Brief):
     def _repr_html_(self) -> str:
         name, function = "plots", "force_margins"
         if hasattr(self, "crossings"):
-            name, function = "formation_map", "draw_map"
+            name, function = "map_figure", "draw_map"
         # Figures stand on everything else, so that nothing loads them before it is drawn.
         figure = getattr(import_module(f"wholearm.figures.{name}"), function)(self)
         stream = io.StringIO()

@@ -14,6 +14,7 @@ from ..common.fields import Range
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 WIDTH = 10.0  # width of a figure, unless another one is asked for [in]
 WIDTHS = Range(3.0, 40.0)  # least and largest width [in]
@@ -85,6 +86,13 @@ def list_contacts(axes: Axes, room: float, largest: float = 9.0) -> None:
     size = min(largest, room / (1.1 * max(count, 1)))
     look: Any = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.02), "fontsize": size}
     axes.legend(**look, labelspacing=min(0.5, max(room / (size * max(count, 1)) - 1.0, 0.05)))
+
+
+def write_title(figure: Figure, text: str, size: float = 10.5, left: float = 0.2) -> None:
+    """Write the title of a figure at its upper left corner, `left` inches from the edge."""
+    width, height = figure.get_size_inches()
+    look: Any = {"fontsize": size, "fontweight": "bold", "parse_math": False}
+    figure.text(left / width, 1 - 0.12 / height, text, va="top", **look)
 
 
 def choose_styles(contacts: Sequence[str]) -> dict[str, ContactStyle]:

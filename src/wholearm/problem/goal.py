@@ -1,4 +1,4 @@
-"""Where an object shall come to lie, in place of the phases that lead there."""
+"""Goals of a problem: poses at rest that the object is to reach, in place of phases."""
 
 from __future__ import annotations
 
@@ -94,11 +94,8 @@ def read_goals(table: Mapping[str, Any]) -> tuple[Goal, ...]:
 
 def name_goal(goals: tuple[Goal, ...], index: int, table: Mapping[str, Any]) -> str:
     """The key of a goal, by its index from 0, as its file has it."""
-    return (
-        "goal"
-        if len(goals) == 1 and not isinstance(table.get("goal"), list)
-        else (f"goal[{index + 1}]")
-    )
+    alone = len(goals) == 1 and not isinstance(table.get("goal"), list)
+    return "goal" if alone else f"goal[{index + 1}]"
 
 
 def match_goals(goals: tuple[Goal, ...], table: Mapping[str, Any]) -> Any:

@@ -1,4 +1,4 @@
-"""What is not known exactly of a scene and of what carries torques out, and by how much."""
+"""Error model of a scene and its actuators: parametric ranges, sample-and-hold, gains, delay."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A study of samples: run, kept as they come, and counted."""
+"""Robustness by Latin-hypercube sampling: runs, shares with Wilson intervals, sensitivities."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _ROWS = 8  # contacts lost first that the text lists; the others are counted
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Robustness(Result):
-    """What a plan bears."""
+    """Shares of samples that reach the goal, and sensitivities of the least normal force."""
 
     trial: Trial
     samples: Array  # (n, len(varied) + 1): as `Uncertainty.draw` gives them
@@ -266,6 +266,31 @@ def _run(trial: Runs, task: Task) -> dict[str, Any]:
 def use_processes(jobs: int | None = None) -> Executor:
     """Processes of one thread each, on all cores or as many as `jobs` says."""
     return ProcessPoolExecutor(jobs or os.cpu_count(), Spawning(), _end_with_parent)
+
+
+def connect(address: str, patience: float = 10.0) -> Executor:
+    """An executor on the workers of a Dask scheduler.
+
+    Parameters
+    ----------
+    address         such as ``tcp://10.0.0.1:8786``
+    patience : [s]  how long to wait for an answer
+
+    Raises
+    ------
+    InputError  if Dask is not installed, or no scheduler answers there
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        text = "Dask is not installed; pip install 'wholearm[cluster]' brings it"
+        raise InputError("", "--scheduler", text) from None
+    try:
+        client = Client(address, timeout=patience, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise InputError("", "--scheduler", f"{address}: {error}") from None
+    executor: Executor = client.get_executor(pure=False)
+    return executor
 
 
 def _end_with_parent() -> None:

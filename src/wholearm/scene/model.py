@@ -83,9 +83,7 @@ TOUCHING = 3e-6  # gap below which features count as touching, in radii of gyrat
     key(
         "viscous",
         "Viscous friction of the joint [N m s].",
-        NONNEGATIVE,
-        "drag",
-        VISCOUS,
+        *(NONNEGATIVE, "drag", VISCOUS),
         default=0.0,
     ),
     key("dry", "Dry friction of the joint [N m].", NONNEGATIVE, "torque", DRY, default=0.0),
@@ -235,11 +233,8 @@ class Scene:
         object.__setattr__(self, "fingers", fingers)
         right, left = (np.asarray(finger.base) for finger in self.fingers)
         if right[0] <= left[0]:
-            raise InputError(
-                "",
-                "fingers.1.base",
-                f"{right.tolist()} is not to the right of fingers.2.base {left.tolist()}",
-            )
+            text = f"{right.tolist()} is not to the right of fingers.2.base {left.tolist()}"
+            raise InputError("", "fingers.1.base", text)
 
     @cached_property
     def scales(self) -> Scales:

@@ -291,7 +291,9 @@ class _Setting(NamedTuple):
         work: list[Array] = []
         for phase in phases:
             path = sample_path(phase, z, self.problem.phases[phase.index + 1 :])
-            torques = path and find_torques(path, self.problem.epsilon, self.squeeze)
+            torques = None
+            if path is not None:
+                torques = find_torques(path, self.problem.epsilon, self.squeeze)
             if path is None or torques is None:
                 break
             tau.append(torques.tau)

@@ -1,4 +1,4 @@
-"""The map of contact formations in a page, and what can be clicked on it."""
+"""The map of contact formations as SVG, with the cells, borders and crossings to click."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from ..figures.map_lines import (
     trace_plan,
 )
 from ..mapping.formation_list import trace_problem
-from ..mapping.formation_map import CROSSED, Border, Crossing, FormationMap
+from ..mapping.formation_map import CROSSED, Border, FormationMap
 from ..results.trajectory import Trajectory
 from ..search.times import time_borders
 from .motion_data import count_places, describe_hand
@@ -75,20 +75,24 @@ def describe_map(chart: FormationMap, plan: Trajectory | None = None) -> MapChar
     middles = np.array([[chart.x[column], chart.phi[row]] for row, column, _ in rooms])
     poses = close_fingers(scene, *middles.T).z
     cells = [
-        _describe(chart.formations[index], _describe_cell(point), z[None])
+        _describe(
+            chart.formations[index],
+            f"a cell, two freedoms; its middle is at {_name_place(point)}",
+            z[None],
+        )
         for (index, _), point, z in zip(parts, middles, poses, strict=True)
     ]
     held = [border for border in chart.borders if border.flush is not None]
-    few = [
-        np.unique(np.linspace(0, len(own.points) - 1, _MOST).round().astype(int)) for own in held
-    ]
+    counts = [len(border.points) for border in held]
+    few = [np.unique(np.linspace(0, n - 1, _MOST).round().astype(int)) for n in counts]
     times = time_borders(chart.problem, held)
     borders = [
         _describe(border.contacts, _describe_border(border, own), border.z[rows])
         for border, own, rows in zip(held, times, few, strict=True)
     ]
     crossings = [
-        _describe(own.contacts, _describe_crossing(own), own.z[None]) for own in chart.crossings
+        _describe(own.contacts, f"a crossing at {_name_place(own.point)}", own.z[None])
+        for own in chart.crossings
     ]
     drawing = draw_map(
         chart,
@@ -118,17 +122,13 @@ def _name_place(point: Array) -> str:
     return f"x = {1e3 * x:.2f} mm, phi = {math.degrees(phi):.2f} deg"
 
 
-def _describe_cell(point: Array) -> str:
-    return f"a cell, two freedoms; its middle is at {_name_place(point)}"
-
-
 def _describe_border(border: Border, times: Array) -> str:
     """Where a border runs, and what motions along it are possible each way."""
     ways = zip(("increasing", "decreasing"), (border.forth, border.back), times, strict=True)
-    possible = [
-        f"{border.along} {way}: {_name_time(time)}, slow motions {_name_share(share.mean())}"
-        for way, share, time in ways
-    ]
+    possible = []
+    for way, flags, time in ways:
+        where = "all along" if flags.all() else "on parts" if flags.any() else "nowhere"
+        possible.append(f"{border.along} {way}: {_name_time(time)}, slow motions {where}")
     (x, phi), (x_end, phi_end) = border.points[0], border.points[-1]
     return (
         f"a border, one freedom, x {1e3 * x:.1f} to {1e3 * x_end:.1f} mm, phi "
@@ -136,18 +136,9 @@ def _describe_border(border: Border, times: Array) -> str:
     )
 
 
-def _name_share(share: float) -> str:
-    """Where along a border slow motions are possible."""
-    return "all along" if share == 1 else "on parts" if share > 0 else "nowhere"
-
-
 def _name_time(time: float) -> str:
     """How long the fastest motion from one end to the other takes."""
     return f"least time about {time:.3f} s" if math.isfinite(time) else "no motion from end to end"
-
-
-def _describe_crossing(crossing: Crossing) -> str:
-    return f"a crossing at {_name_place(crossing.point)}"
 
 
 def draw_map(
@@ -182,8 +173,11 @@ def draw_map(
             *_draw_borders(chart, paper),
             *_draw_paths(paper, paths),
             *_write_labels(chart, paper, paths, parts),
-            *(f'<polyline class="hit" points="{write_line(paper.place(own))}"/>' for own in lines),
-            *_draw_crossings(paper, points),
+            *(f'<polyline class="hit" points="{_join(paper.place(own))}"/>' for own in lines),
+            *(
+                f'<circle class="hit" cx="{x:.1f}" cy="{SHEET[1] - y:.1f}" r="3.4" fill="{INK}"/>'
+                for x, y in paper.place(points)
+            ),
             *_number_paths(paper, paths),
             f'</g>{clip} fill="none" stroke="{INK}" stroke-width="0.8"/>',
             *_draw_axes(chart, paper),
@@ -330,11 +324,6 @@ def _write_labels(
             yield write_text(text, (x[column], y[row] - 4.0), f' class="name{look}"')
 
 
-def _draw_crossings(paper: Paper, points: Array) -> Iterable[str]:
-    for x, y in paper.place(points):
-        yield f'<circle class="hit" cx="{x:.1f}" cy="{SHEET[1] - y:.1f}" r="3.4" fill="{INK}"/>'
-
-
 def _draw_axes(chart: FormationMap, paper: Paper) -> Iterable[str]:
     left, bottom, width, height = BOX
     ticks = []
@@ -384,11 +373,6 @@ def turn(points: Array) -> Array:
 def write_path(lines: Iterable[Array], closed: bool = False) -> str:
     """What a path of polylines, each of shape (n, 2), draws."""
     return "".join(f"M{_join(line)}{'z' if closed else ''}" for line in lines)
-
-
-def write_line(line: Array) -> str:
-    """A polyline's points."""
-    return _join(line)
 
 
 def write_text(text: str, place: Iterable[float], look: str = "") -> str:

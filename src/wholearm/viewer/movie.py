@@ -242,9 +242,8 @@ class Movie:
         frames = math.ceil(trajectory.duration / speed * FRAMES) + 1
         if frames > _MOST:
             least = trajectory.duration * FRAMES / _MOST
-            raise InputError(
-                "", "--speed", f"{speed:g} given; from {least:.2g} on, movies are short enough"
-            )
+            text = f"{speed:g} given; from {least:.2g} on, movies are short enough"
+            raise InputError("", "--speed", text)
         self.times = np.linspace(0.0, trajectory.duration, max(2, frames))
         self._problem, self._trajectory, self._ghost = problem, trajectory, ghost
         self._resolution = resolution
@@ -266,11 +265,8 @@ class Movie:
                 list_contacts(axes, 72 * _SIZE[1] * room, 8.0)
             margins.set_ylabel(f"margin {unit_of(margins)}")
             margins.tick_params(labelbottom=False)
-            torques.set(
-                xlabel="time $t$ [s]",
-                ylabel=rf"$\tau$ {unit_of(torques)}",
-                xlim=(0.0, own.duration),
-            )
+            label = rf"$\tau$ {unit_of(torques)}"
+            torques.set(xlabel="time $t$ [s]", ylabel=label, xlim=(0.0, own.duration))
             figure.align_ylabels([margins, torques])
             cursors = [axes.axvline(0.0, color=TURNS, lw=1.3) for axes in (margins, torques)]
             clock = figure.text(0.02, 0.975, "", va="top", fontsize=10.5, fontweight="bold")
@@ -342,9 +338,8 @@ def _encode(pictures: Iterator[Array], path: str | os.PathLike[str]) -> bytes:
     """An MP4 of pictures."""
     program = shutil.which("ffmpeg")
     if program is None:
-        raise InputError(
-            str(path), "", "MP4 needs ffmpeg, which is not there; .gif and .html do not"
-        )
+        text = "MP4 needs ffmpeg, which is not there; .gif and .html do not"
+        raise InputError(str(path), "", text)
     first = next(pictures)
     height, width = first.shape[:2]
     raw = ["-f", "rawvideo", "-pix_fmt", "rgba", "-s", f"{width}x{height}", "-r", str(FRAMES)]

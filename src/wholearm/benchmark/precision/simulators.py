@@ -170,7 +170,7 @@ def build_cvodes(course: Course, tolerance: float) -> Runner:
     ends, x = ca.SX.sym("ends", 2), ca.SX.sym("x")
     half, now = (ends[1] - ends[0]) / 2, (ends[0] + ends[1] + x * (ends[1] - ends[0])) / 2
     system = {"x": y, "t": x, "p": ca.vertcat(p, ends), "ode": half * ca.substitute(ode, t, now)}
-    options = {"abstol": tolerance, "reltol": tolerance, "max_num_steps": 100000}
+    options: dict[str, Any] = {"abstol": tolerance, "reltol": tolerance, "max_num_steps": 100000}
     options |= {"linear_multistep_method": "adams", "nonlinear_solver_iteration": "functional"}
     step = ca.integrator("step", "cvodes", system, -1.0, 1.0, options)
     chain = step.mapaccum(len(course.spans))

@@ -80,6 +80,7 @@ def _touch(
     scene: Scene, z: Array, finger: int | None, point: Array, normal: Array, *sides: Array
 ) -> Touch:
     """A contact with its `sides`: gap, low and high."""
+    gap, low, high = sides
     tangent = np.stack([normal[:, 1], -normal[:, 0]], axis=1)
     rows = []
     for direction in (normal, tangent):
@@ -91,7 +92,7 @@ def _touch(
                 point - np.asarray(scene.fingers[finger].base), direction
             )
         rows.append(row)
-    return Touch(*sides, rows[0], rows[1], scene.friction.of(finger))
+    return Touch(gap, low, high, rows[0], rows[1], scene.friction.of(finger))
 
 
 def balance(

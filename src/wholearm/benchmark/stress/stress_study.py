@@ -11,7 +11,7 @@ import copy
 import os
 import traceback
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -103,8 +103,8 @@ class Stress(Study):
     def run(self, case: Case) -> Row:
         """Run one case."""
         kind, *arguments = case
-        run = {"scene": run_scene, "file": run_file, "problem": run_trial}[kind]
-        return run(*arguments)
+        runs: dict[str, Callable[..., Row]] = {"scene": run_scene, "file": run_file}
+        return runs.get(kind, run_trial)(*arguments)
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
         """Tables of each part, and every finding."""
