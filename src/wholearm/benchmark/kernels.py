@@ -163,12 +163,12 @@ def answer(path: str, objective: str) -> dict[str, Any]:
 
 def list_modes(plan: Plan) -> list[list[str]]:
     """Contact modes and directions of the joints that follow each other in every phase."""
-    found = []
+    modes = []
     for phase in plan.phases:
         spans = [s for s in phase.modes if s.stop - s.start > BRIEF * phase.duration]
         texts = (f"{' '.join(s.contacts.values())} {' '.join(s.joints)}" for s in spans)
-        found.append([text for text, _ in groupby(texts)])
-    return found
+        modes.append([text for text, _ in groupby(texts)])
+    return modes
 
 
 class Kernels(Study):

@@ -69,12 +69,12 @@ class Queries(Study):
         row: Row = {"text": f"{problem.name}: {problem.table['start']} to {problem.goals[0]}"}
         started = time.process_time()
         try:
-            found = find_route(problem)
+            answer = find_route(problem)
         except WholearmError as error:
             kind = "blocked" if isinstance(error, InfeasibleError) else "no answer"
             return row | {"kind": kind, "first": time.process_time() - started, "why": str(error)}
         row["first"] = time.process_time() - started
-        failures = verify(found.problem, found.plan).failures
+        failures = verify(answer.problem, answer.plan).failures
         if failures:
             return row | {"kind": "plan that fails", "findings": list(failures[:1])}
         started = time.process_time()
@@ -83,8 +83,8 @@ class Queries(Study):
             row["second"] = time.process_time() - started
         except WholearmError:
             pass
-        phases, duration = len(found.problem.phases), found.plan.duration
-        return row | {"kind": "solved", "gap": found.gap, "duration": duration, "phases": phases}
+        phases, duration = len(answer.problem.phases), answer.plan.duration
+        return row | {"kind": "solved", "gap": answer.gap, "duration": duration, "phases": phases}
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
         """What came of them, and the times."""
@@ -94,7 +94,7 @@ class Queries(Study):
         lines += ["| processor time | median [s] | 95 % [s] | most [s] |", "|---|---|---|---|"]
         for name, times in (
             ("all", [row["first"] for row in rows]),
-            *((own, [row["first"] for row in rows if row["kind"] == own]) for own in kinds),
+            *((kind, [row["first"] for row in rows if row["kind"] == kind]) for kind in kinds),
             ("second query", [row["second"] for row in rows if "second" in row]),
         ):
             if times:
@@ -203,5 +203,5 @@ def draw_leg(seed: int, number: int, folder: Path) -> QueryLeg | None:
 
 def _leave_open(problem: Problem) -> Problem:
     """The problem with ends that the planner chooses: what a refusal says holds for all places."""
-    phases = (replace(own, until=replace(own.until, pins=())) for own in problem.phases)
+    phases = (replace(phase, until=replace(phase.until, pins=())) for phase in problem.phases)
     return replace(problem, phases=tuple(phases))

@@ -67,7 +67,7 @@ def policy(options: argparse.Namespace) -> int:
         text = f"{output}: written although in the free simulation, {failures}"
         print(f"wholearm: warning: {text}", file=sys.stderr)
     elif not report.ok:
-        opened = [loss.gap for own in report.phases for loss in own.losses]
+        opened = [loss.gap for phase in report.phases for loss in phase.losses]
         enough = ""
         if len(opened) == len(report.failures):
             # Nothing but openings: rounded up to two digits.

@@ -115,8 +115,8 @@ class Journal:
         if other is None or other.get("study") != kind:
             text = f"holds no {kind} study; --fresh begins anew, or choose another with -o"
             raise InputError(self.path, "", text)
-        found = find_differences(other, own)
-        text = describe_differences(found, "in the file", "now")
+        differences = find_differences(other, own)
+        text = describe_differences(differences, "in the file", "now")
         if text:
             what = f"holds another study: {text}; --fresh begins anew, or choose another with -o"
             raise InputError(self.path, "", what)

@@ -28,7 +28,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
 
     Replays are drawn; where nothing has moved a panel says so.
     """
-    shown = [(own, _find_motion(own)) for own in comparison.contenders]
+    shown = [(contender, _find_motion(contender)) for contender in comparison.contenders]
     motions = [motion for _, motion in shown if motion is not None]
     styles = choose_styles(tuple(dict.fromkeys(name for own in motions for name in own.contacts)))
     longest = max((motion.duration for motion in motions), default=1.0)

@@ -89,7 +89,7 @@ def draw_map(chart: FormationMap, plan: Trajectory | Moved | None = None) -> Fig
         points = _to_axes(np.array([c.point for c in flush]).reshape(-1, 2))
         axes.plot(*points.T, "o", ms=3.6, mfc=INK, mec="white", mew=0.5, zorder=6, ls="none")
         _draw_paths(axes, paths)
-        ambiguous = chart.ambiguous.any() or any(own.ambiguous.any() for own in chart.borders)
+        ambiguous = chart.ambiguous.any() or any(border.ambiguous.any() for border in chart.borders)
         _draw_legend(figure, bool(paths), bool((chart.cell == CROSSED).any()), bool(ambiguous))
         _name_palm_lines(axes, chart)
         problem = chart.problem

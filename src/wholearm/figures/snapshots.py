@@ -74,7 +74,7 @@ def draw_snapshot(
     ends = axes.transData.transform([[0.0, 0.0], [1.0, 0.0]])
     scale = 72 / axes.figure.dpi * float(np.ptp(ends[:, 0]))
     corners = [parse_contact(name, scene) for name in contacts]
-    first = [own.index for own in corners if own.feature == "v"]
+    first = [corner.index for corner in corners if corner.feature == "v"]
     style: Any = {"va": "center", "fontsize": NUMBER, "color": "#555555", "zorder": 5.5}
     style["path_effects"] = [withStroke(linewidth=1.5, foreground="white", alpha=0.7)]
     for index, shift in choose_numbers(scale * vertices, first, 0.0).items():
@@ -110,19 +110,19 @@ def choose_numbers(
 
     def put(chosen: Iterable[int]) -> dict[int, Array]:
         """Those of the chosen that stand clear of the ones before."""
-        found: dict[int, Array] = {}
+        numbers: dict[int, Array] = {}
         for index in chosen:
             for shift in (shifts[index], -shifts[index])[: 1 + (count <= _FEW)]:
                 place = vertices[index] + shift
                 far = [
                     np.abs(vertices[k] + own - place)
                     > NUMBER * np.array([0.34 * (len(str(index)) + len(str(k))), 1.2])
-                    for k, own in found.items()
+                    for k, own in numbers.items()
                 ]
                 if all(apart.any() for apart in far) and place[1] > lowest:
-                    found[index] = shift
+                    numbers[index] = shift
                     break
-        return found
+        return numbers
 
     steps = (k * 10**n for n in range(4) for k in (1, 2, 5))
     # None of them where even the first number would stand too low.

@@ -80,7 +80,7 @@ def predict(
     """
     require_phases(problem)
     share = SHARE.read(squeeze, "squeeze")
-    found: list[PhasePrediction] = []
+    predictions: list[PhasePrediction] = []
     z, moving = problem.start, False
     with name_source(problem.source):
         for phase in problem.phases:
@@ -89,10 +89,10 @@ def predict(
             later = problem.phases[phase.index + 1 :]
             path = sample_path(phase, z, later)
             rests = not moving, phase.end is End.REST
-            found.append(_predict_phase(problem, phase, path, rests, share))
+            predictions.append(_predict_phase(problem, phase, path, rests, share))
             z = find_end(phase, z, later) if path is None else path.z[-1]
             moving = phase.end is not End.REST
-    return Prediction(problem.name, problem.epsilon, tuple(found))
+    return Prediction(problem.name, problem.epsilon, tuple(predictions))
 
 
 def make_torques(prediction: Prediction, speed: float) -> TorqueProfile:
@@ -237,7 +237,12 @@ def _draw(
     survivals: tuple[Survival, ...], motions: dict[str, tuple[Evaluate, float]], unit: float
 ) -> Curves:
     """Least forces over speed, about those at which something breaks."""
-    every = [speed for own in survivals for speed in (own.speed, own.lost, own.again) if speed]
+    every = [
+        speed
+        for survival in survivals
+        for speed in (survival.speed, survival.lost, survival.again)
+        if speed
+    ]
     ends = (min(every) / _SHOWN**3, _SHOWN * max(every)) if every else (0.1 * unit, 10 * unit)
     speeds = np.geomspace(*ends, _SPEEDS)
     forces = {

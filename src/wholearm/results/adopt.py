@@ -60,7 +60,11 @@ def adopt_torques(
 
 def require_same_contacts(problem: Problem, plan: Trajectory | None) -> None:
     """Check that a plan, if there is one, has the contacts of a problem."""
-    odd = set() if plan is None else set(plan.contacts) ^ {own.name for own in problem.contacts}
+    odd = (
+        set()
+        if plan is None
+        else set(plan.contacts) ^ {contact.name for contact in problem.contacts}
+    )
     if odd:
         text = f"trajectory and problem differ in {', '.join(sorted(odd))}"
         raise InputError("", "contacts", text)

@@ -52,7 +52,9 @@ def place_rows(
     ends = np.concatenate([breaks[:1], steps, breaks[-1:]])
     at = np.searchsorted(knots, ends)
     stretches = [knots[i : j + 1] for i, j in pairwise(at)]
-    rows = np.concatenate([np.column_stack([own, _fit_lines(torque, own)]) for own in stretches])
+    rows = np.concatenate(
+        [np.column_stack([stretch, _fit_lines(torque, stretch)]) for stretch in stretches]
+    )
     # Lines through a bend miss it on both sides; no limit is to be missed for that.
     peak = np.maximum(peak, np.abs(torque.at(knots)).max(axis=0))
     rows[:, 1:] = np.clip(rows[:, 1:], -peak, peak)

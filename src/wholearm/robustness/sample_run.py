@@ -151,13 +151,17 @@ class Trial:
         unit = self.problem.scene.scales.time
         began, losses, least = self.windows[0].start, list[tuple[float, int, str]](), math.inf
         for window in self.windows:
-            gains = [own.start for own in simulation.stretches if own.contact == window.gained]
+            gains = [
+                stretch.start
+                for stretch in simulation.stretches
+                if stretch.contact == window.gained
+            ]
             gain = min((time for time in gains if time > began), default=math.inf)
             # A phase ends when its contact is made, even if it bounces then.
             makes = [
-                own.time
-                for own in simulation.events
-                if own.contact == window.gained and own.kind is EventKind.GAINED
+                event.time
+                for event in simulation.events
+                if event.contact == window.gained and event.kind is EventKind.GAINED
             ]
             made = min((time for time in makes if time > began), default=gain)
             planned = window.stop + delay
@@ -189,7 +193,7 @@ def _find_loss(
     least = float(known.min()) if len(known) else math.inf
     pauses = list_pauses(simulation.stretches, name, start, stop)
     if pauses and pauses[0][0] <= start:
-        pauses = [own for own in pauses if own[1] > start + CLOSING * unit]
+        pauses = [pause for pause in pauses if pause[1] > start + CLOSING * unit]
     return next((first for first, after in pauses if after - first > PAUSE * unit), None), least
 
 

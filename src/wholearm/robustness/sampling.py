@@ -76,18 +76,18 @@ class Robustness(Result):
     @property
     def reached(self) -> Share:
         """How many reach the goal, as near as the uncertainty says."""
-        return count_share(sum(own["reached"] for own in self.records), len(self.records))
+        return count_share(sum(record["reached"] for record in self.records), len(self.records))
 
     @property
     def kept(self) -> Share:
         """How many reach it and keep all planned contacts."""
-        good = sum(own["reached"] and own["kept"] for own in self.records)
+        good = sum(record["reached"] and record["kept"] for record in self.records)
         return count_share(good, len(self.records))
 
     @property
     def first_lost(self) -> dict[str, Share]:
         """Which contact goes first, by number of the phase and name, the most frequent first."""
-        names = Counter(_name_loss(own) for own in self.records if own["lost"])
+        names = Counter(_name_loss(record) for record in self.records if record["lost"])
         return {name: count_share(n, len(self.records)) for name, n in names.most_common()}
 
     @property
@@ -317,7 +317,7 @@ def _stamp(trial: Trial, seed: int) -> dict[str, Any]:
         "policy": None if policy is None else _digest(known),
         "pace": None if policy is None else policy.pace._asdict(),
         "sensor": policy is not None and policy.sensor,
-        "phases": [own.phase for own in trial.windows],
+        "phases": [window.phase for window in trial.windows],
         "widths": trial.uncertainty.widths,
         "sample_rate": trial.uncertainty.sample_rate,
         "tolerance": trial.uncertainty.tolerance,
@@ -380,19 +380,19 @@ def find_least(
 ) -> tuple[str, float, float]:
     """The planned contact that presses least, when, and its c_n; none has no name."""
     t = simulation.t
-    events = np.array([0.0, t[-1], *(own.time for own in simulation.events)])
+    events = np.array([0.0, t[-1], *(event.time for event in simulation.events)])
     apart = np.abs(t[:, None] - events).min(axis=1) > APART * t[-1]
-    found, start = ("", math.nan, math.nan), 0.0
+    least, start = ("", math.nan, math.nan), 0.0
     for window in windows:
         for name in window.contacts:
             c_n = simulation.c_n[:, simulation.contacts.index(name)]
             here = np.flatnonzero(apart & (t > start) & (t < window.stop) & (c_n == c_n))
             if len(here):
                 row = here[c_n[here].argmin()]
-                if not c_n[row] >= found[2]:
-                    found = (name, float(t[row]), float(c_n[row]))
+                if not c_n[row] >= least[2]:
+                    least = (name, float(t[row]), float(c_n[row]))
         start = window.stop
-    return found
+    return least
 
 
 def _find_force(trial: Trial, name: str, change: float, contact: str, time: float) -> float:

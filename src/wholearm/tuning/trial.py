@@ -159,8 +159,10 @@ class Bench:
         if passage.passed:
             # Whichever of the two presses where they meet.
             stretches = tuple(
-                own._replace(contact=passage.passed) if own.contact == self.until else own
-                for own in stretches
+                stretch._replace(contact=passage.passed)
+                if stretch.contact == self.until
+                else stretch
+                for stretch in stretches
             )
         later = passage.after or passage.phases[-1]
         names = later.formation.names

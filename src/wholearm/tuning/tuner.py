@@ -92,25 +92,25 @@ def tune(
     if stops and not brake:
         raise InputError("", "stops", f"{stops} given without a brake; allowed then is 0")
     tell = progress or (lambda text: None)
-    found: list[PhaseTuning] = []
+    tuned: list[PhaseTuning] = []
     steps: list[TuningStep] = []
     z, clock = problem.start, 0.0
     with name_source(problem.source):
         for passage in split_passages(problem):
             setting = _Setting(problem, passage, brake, squeeze, share, tell)
             parts, end, reason = _carry(setting, z, stops)
-            found += parts
+            tuned += parts
             if end is None:
                 title = parts[-1].title
                 reason = f"phase{'s' if '-' in title else ''} {title}: {reason}"
-                return Tuning(problem.name, tuple(found), None, None, reason)
+                return Tuning(problem.name, tuple(tuned), None, None, reason)
             for own in parts:
                 steps += [step._replace(time=clock + step.time) for step in own.steps]
                 clock += own.duration + setting.pause
             z = end
     rows = make_rows(steps, clock)
     report = verify_free(problem, read_rows(rows))
-    return Tuning(problem.name, tuple(found), rows, report, report.reason)
+    return Tuning(problem.name, tuple(tuned), rows, report, report.reason)
 
 
 def _carry(setting: _Setting, z: Array, stops: int) -> tuple[list[PhaseTuning], Array | None, str]:

@@ -158,12 +158,12 @@ def find_lowest(
         return math.nan, math.nan
     first = int(np.nanargmin(values))
     least, time = float(values[first]), float(t[first])
-    found = fit_parabolas(t, values, breaks, shortest)
+    parabolas = fit_parabolas(t, values, breaks, shortest)
     # Where the middle is not the least of three, a curve that flattens out would seem to dip.
-    lowest = np.where(found.dips, found.lowest, math.inf)
+    lowest = np.where(parabolas.dips, parabolas.lowest, math.inf)
     if len(lowest) and lowest.min() < least:
         k = int(lowest.argmin())
-        least, time = float(lowest[k]), float(found.time[k])
+        least, time = float(lowest[k]), float(parabolas.time[k])
     return least, time
 
 
@@ -204,7 +204,7 @@ def find_commands(torque: TorqueProfile, lag: Array) -> TorqueProfile:
 
 
 def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float, str]]:
-    """What motors cannot follow, with the time of the worst place of each kind [s]."""
+    """What misses cannot follow, with the time of the worst place of each kind [s]."""
     scene = problem.scene
     if not scene.has_slow_motors:
         return []
@@ -212,7 +212,7 @@ def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float
     values, ones = torque.at_places(x), find_commands(torque, np.ones(2)).at_places(x)
     rates, commands = ones - values, values + scene.actuator_lag[:, None] * (ones - values)
     steps = np.abs(values[1:, :, 0] - values[:-1, :, -1])
-    found = list[tuple[float, str]]()
+    misses = list[tuple[float, str]]()
     limits = zip(scene.torque_limit, scene.torque_rate_limit, scene.actuator_lag, strict=True)
     for joint, (limit, fastest, lag) in enumerate(limits):
         name = f"tau_{joint + 1}"
@@ -225,7 +225,7 @@ def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float
             why = (
                 f"its rate limit is {fastest:g} N m/s" if np.isfinite(fastest) else "its motor lags"
             )
-            found.append((t, f"{text}, where {why}"))
+            misses.append((t, f"{text}, where {why}"))
         kinds = (
             (rates[:, joint], fastest, "changes at {:.4g} N m/s, above its rate limit {:g} N m/s"),
             (commands[:, joint], limit, "takes a command of {:.4g} N m, above its limit {:g} N m"),
@@ -237,5 +237,5 @@ def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float
                 start, stop = torque.breaks[[piece, piece + 1]]
                 t = float(start + (stop - start) * look / (_LOOKS - 1))
                 said = text.format(size[piece, look], most)
-                found.append((t, f"{name} {said}, at t = {t:.5g} s"))
-    return found
+                misses.append((t, f"{name} {said}, at t = {t:.5g} s"))
+    return misses

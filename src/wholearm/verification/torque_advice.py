@@ -204,17 +204,19 @@ def find_resting_changes(
     gradient : (5,)   of the distance to the end of the phase, if that is known
     """
     moved = [_move(formation, path, epsilon, z, tau, gradient) for path in paths]
-    found: list[TorqueAdvice] = []
+    resting_changes: list[TorqueAdvice] = []
     for k, free in enumerate(_TORQUES):
         known = [change for own in moved if (change := own[k]) is not None]
-        if len(free) == 2 and found:
+        if len(free) == 2 and resting_changes:
             break
         held = None if known else _hold(formation, epsilon, z, tau, free)
         if known:
-            found.append(make_advice(min(known, key=np.linalg.norm), tau))
+            resting_changes.append(make_advice(min(known, key=np.linalg.norm), tau))
         elif held is not None:
-            found.append(make_advice(held, tau, holds=True))
-    return tuple(sorted(found, key=lambda change: (change.holds, np.hypot(*change.change))))
+            resting_changes.append(make_advice(held, tau, holds=True))
+    return tuple(
+        sorted(resting_changes, key=lambda change: (change.holds, np.hypot(*change.change)))
+    )
 
 
 def _answer(formation: Formation, z: Array, path: StartPath) -> Instant | None:
@@ -332,15 +334,15 @@ def find_moving(
     still = [unit for unit in list_units(formation) if slow[list(unit.rows)].all()]
     holds = formation.n_constraints < 4
     options = [(1.0, -1.0, 0.0) if holds and unit.grips else (1.0, -1.0) for unit in still]
-    found: list[tuple[float, Instant]] = []
+    candidates: list[tuple[float, Instant]] = []
     for choice in product(*options):
         for unit, sign in zip(still, choice, strict=True):
             signs[list(unit.rows)] = sign
         instant = answer(formation, z, v, signs)
         if instant is not None:
             misfit = instant.acceleration @ [1.0, *tau] - acceleration
-            found.append((float(scene.mass_diagonal @ misfit**2), instant))
-    return min(found, key=lambda pair: pair[0])[1] if found else None
+            candidates.append((float(scene.mass_diagonal @ misfit**2), instant))
+    return min(candidates, key=lambda pair: pair[0])[1] if candidates else None
 
 
 def answer(formation: Formation, z: Array, v: Array, signs: Array) -> Instant | None:
@@ -390,10 +392,10 @@ def find_changes(
         return make_advice(unit * change, tau, but)
 
     singles = [change_one(slack, slope, joint) for joint in range(2)]
-    found = [describe(one) for one in singles if one is not None]
-    both = change_both(slack, slope) if all(change.but for change in found) else None
-    found += [] if both is None else [describe(both)]
-    return tuple(sorted(found, key=lambda change: (bool(change.but), np.hypot(*change.change))))
+    changes = [describe(one) for one in singles if one is not None]
+    both = change_both(slack, slope) if all(change.but for change in changes) else None
+    changes += [] if both is None else [describe(both)]
+    return tuple(sorted(changes, key=lambda change: (bool(change.but), np.hypot(*change.change))))
 
 
 def normalise(sides: Array, scale: Array, tau: Array, unit: float) -> tuple[Array, Array]:

@@ -349,10 +349,10 @@ class Series(NamedTuple):
         return self._fit(self.t[within], self.values[within])
 
     def _fit(self, t: Array, values: Array) -> Dips:
-        found = fit_parabolas(t, values, self.breaks, self.shortest)
+        parabolas = fit_parabolas(t, values, self.breaks, self.shortest)
         least = np.nanmin(self.values, initial=np.inf) - self.depth
-        low = np.flatnonzero(found.lowest < least).tolist()
-        return [(float(found.start[k]), float(found.stop[k])) for k in low]
+        low = np.flatnonzero(parabolas.lowest < least).tolist()
+        return [(float(parabolas.start[k]), float(parabolas.stop[k])) for k in low]
 
 
 def make_closer(problem: Problem, breaks: Array) -> Closer:

@@ -91,8 +91,10 @@ def describe_map(chart: FormationMap, plan: Trajectory | None = None) -> MapChar
         for border, own, rows in zip(held, times, few, strict=True)
     ]
     crossings = [
-        _describe(own.contacts, f"a crossing at {_name_place(own.point)}", own.z[None])
-        for own in chart.crossings
+        _describe(
+            crossing.contacts, f"a crossing at {_name_place(crossing.point)}", crossing.z[None]
+        )
+        for crossing in chart.crossings
     ]
     drawing = draw_map(
         chart,
@@ -173,7 +175,7 @@ def draw_map(
             *_draw_borders(chart, paper),
             *_draw_paths(paper, paths),
             *_write_labels(chart, paper, paths, parts),
-            *(f'<polyline class="hit" points="{_join(paper.place(own))}"/>' for own in lines),
+            *(f'<polyline class="hit" points="{_join(paper.place(line))}"/>' for line in lines),
             *(
                 f'<circle class="hit" cx="{x:.1f}" cy="{SHEET[1] - y:.1f}" r="3.4" fill="{INK}"/>'
                 for x, y in paper.place(points)
@@ -200,7 +202,7 @@ def draw_legend(chart: FormationMap, with_path: bool) -> str:
     ]
     if (chart.cell == CROSSED).any():
         entries.append(('<rect width="26" height="10" fill="url(#crossed)"/>', "fingers overlap"))
-    if chart.ambiguous.any() or any(own.ambiguous.any() for own in chart.borders):
+    if chart.ambiguous.any() or any(border.ambiguous.any() for border in chart.borders):
         text = "contact forces would not be unique"
         entries.append((_swatch(AMBIGUOUS, dashes="3 3"), text))
     if with_path:
@@ -293,7 +295,7 @@ def _draw_paths(paper: Paper, paths: Sequence[Array]) -> Iterable[str]:
 
 
 def _number_paths(paper: Paper, paths: Sequence[Array]) -> Iterable[str]:
-    lines = [paper.place(own) for own in paths]
+    lines = [paper.place(path) for path in paths]
     corners = np.array([BOX[:2], np.add(BOX[:2], BOX[2:])])
     places = place_discs(lines, _DISC, *corners)
     for number, (own, (x, y)) in enumerate(zip(lines, places, strict=True), start=1):

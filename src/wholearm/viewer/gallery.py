@@ -69,7 +69,10 @@ def _list_figures(name: str, plan: Plan) -> tuple[object, ...]:
     report = verify(plan.problem, plan)
     gap = "" if report.finger_gap is None else report.finger_gap.least
     least = min(
-        own.least for phase in report.phases for own in phase.contacts if own.least == own.least
+        contact.least
+        for phase in report.phases
+        for contact in phase.contacts
+        if contact.least == contact.least
     )
     verdict = "ok" if report.ok else "FAILED"
     return name, len(plan.phases), plan.value, least, gap, verdict

@@ -38,7 +38,7 @@ class Pushes(NamedTuple):
 def place_pushes(scene: Scene, trajectory: Trajectory) -> Pushes:
     """Contacts and their forces at the samples of a trajectory."""
     places = [build_geometry(parse_contact(name, scene), scene) for name in trajectory.contacts]
-    rows = [ca.vertcat(own.point, own.normal) for own in places]
+    rows = [ca.vertcat(place.point, place.normal) for place in places]
     evaluate = ca.Function("places", [build_features(scene).z], [ca.vertcat(*rows)])
     values = evaluate(trajectory.z.T).full().T.reshape(len(trajectory.t), -1, 4)
     points, normals = values[..., :2], values[..., 2:]
@@ -103,12 +103,12 @@ def _list_spans(
     c = np.column_stack([trajectory.c_n[rows, index], trajectory.c_t[rows, index]])
     return [
         {
-            "first": own.start,
-            "point": _fix(pushes.points[rows[own], index], scene),
-            "normal": _fix(pushes.normals[rows[own], index], scene),
-            "c": _round(c[own]),
+            "first": run.start,
+            "point": _fix(pushes.points[rows[run], index], scene),
+            "normal": _fix(pushes.normals[rows[run], index], scene),
+            "c": _round(c[run]),
         }
-        for own in find_runs(np.isfinite(c).all(axis=1))
+        for run in find_runs(np.isfinite(c).all(axis=1))
     ]
 
 

@@ -100,13 +100,13 @@ def find_times(
 
     Infinite where it does not.
     """
-    found: dict[str, float] = {}
+    times: dict[str, float] = {}
     for (study, name, which, _), median in medians.items():
         if (study, which) == (own.study, method):
             took = median.solve + own.building * median.build
             reached = took if median.reaches(target, own.errors) else math.inf
-            found[name] = min(found.get(name, math.inf), reached)
-    return found
+            times[name] = min(times.get(name, math.inf), reached)
+    return times
 
 
 def list_methods(medians: Medians, study: str) -> list[str]:
@@ -249,7 +249,10 @@ class Precision(Study):
             if method not in METHODS:
                 text = f"{method!r} given; allowed are {'; '.join(METHODS)}"
                 raise InputError("", "--peers", text)
-        every = {drag: [own.name for own in list_instances(files, drag)] for drag in (True, False)}
+        every = {
+            drag: [instance.name for instance in list_instances(files, drag)]
+            for drag in (True, False)
+        }
         if options.part != "planning":
             for study, phase, method in product((FEW, MANY), every[True], SIMULATORS):
                 if method in options.peers:

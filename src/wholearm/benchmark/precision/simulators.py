@@ -61,8 +61,8 @@ def build_own(course: Course, tolerance: float) -> Runner:
     """Our simulator; what it keeps of a formation is built by a first run."""
 
     def run() -> Array:
-        found = simulate(course.problem, course.torque, tolerance=tolerance)
-        return np.append(found.z[-1], found.z_dot[-1])
+        simulation = simulate(course.problem, course.torque, tolerance=tolerance)
+        return np.append(simulation.z[-1], simulation.z_dot[-1])
 
     run()
     return run

@@ -344,13 +344,13 @@ def rest_margin(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: bool
 def list_others(scene: Scene, phase: Phase, z: Array) -> list[Touch]:
     """Contacts that touch at `z` but are none of the phase's: they may only open."""
     names = set(phase.formation.names)
-    found = []
+    others = []
     for name in sorted(_every_name(scene) - names):
         touch = locate(scene, name, z[None])
         near = TOUCHES * scene.scales.length
         if abs(touch.gap[0]) < near and min(touch.low[0], touch.high[0]) > near:
-            found.append(touch)
-    return found
+            others.append(touch)
+    return others
 
 
 def _every_name(scene: Scene) -> set[str]:
