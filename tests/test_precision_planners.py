@@ -10,7 +10,13 @@ import pytest
 
 from timed import landing
 from tipping import box
-from wholearm.benchmark.precision.phases import Instance, keep_curves, list_instances
+from wholearm.benchmark.precision.phases import (
+    SOLVED,
+    Instance,
+    Median,
+    keep_curves,
+    list_instances,
+)
 from wholearm.benchmark.precision.planners import (
     LEAST_TIME,
     NO_DRAG,
@@ -19,10 +25,14 @@ from wholearm.benchmark.precision.planners import (
     is_installed,
     run_planner,
 )
-from wholearm.benchmark.precision.precision_study import METHODS, STUDY
-from wholearm.benchmark.precision.reference_check import check_plan
-from wholearm.benchmark.precision.runs import SOLVED, Median
-from wholearm.benchmark.precision.tables import Medians, draw_medians, format_report
+from wholearm.benchmark.precision.precision_study import (
+    METHODS,
+    STUDY,
+    Medians,
+    draw_medians,
+    format_report,
+)
+from wholearm.benchmark.precision.simulators import check_plan
 from wholearm.cli.command import main
 from wholearm.problem.definition import End, Problem
 from wholearm.results.torque import TorqueProfile

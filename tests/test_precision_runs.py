@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from wholearm.benchmark.precision.runs import SHIFT, SHORT, SOLVED, Median, find_mean, measure
-from wholearm.benchmark.precision.tables import Medians, PeerComparison, find_times
+from wholearm.benchmark.precision.phases import SHIFT, SHORT, SOLVED, Median, find_mean, measure
+from wholearm.benchmark.precision.precision_study import Medians, PeerComparison, find_times
 
 FINE = Median(0.5, 0.3, (-3e-7,))
 MEDIANS: Medians = {

@@ -8,7 +8,7 @@ import pytest
 
 from wholearm.common.crowd import run_all
 from wholearm.common.errors import InputError
-from wholearm.robustness.cluster import connect
+from wholearm.robustness.sampling import connect
 
 
 def wait_and_square(number: int) -> tuple[int, int]:

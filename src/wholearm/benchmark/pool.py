@@ -22,8 +22,7 @@ MEMORY = 6 * 2**30
 
 PATIENCE = 20.0
 """Wall-clock time that a task may take over its bound of processor time: others may run too."""
-_CPU = getattr(signal, "SIGPROF", 27)
-"""Signal that ends a process whose processor time is used up."""
+_CPU = getattr(signal, "SIGPROF", 27)  # signal that ends a process whose processor time is used up
 
 Limit = Callable[[Any], float]
 """Processor time that a task may take [s]."""

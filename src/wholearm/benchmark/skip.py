@@ -24,10 +24,8 @@ from ..problem.read import build_problem
 from ..solvers.ipopt import record_runs
 from .study import Case, Row, Study
 
-REPEATS = 3
-"""Runs of which the medians are taken."""
-PUSHED = 0.03
-"""Place that the object is pushed to by one finger or by both [m]."""
+REPEATS = 3  # runs of which the medians are taken
+PUSHED = 0.03  # place that the object is pushed to by one finger or by both [m]
 AWAY = np.array([0.0, 0.0, 0.0, 0.0, 0.6])
 """Change of the start that turns an idle finger away [m, rad]."""
 COLUMNS = ("unknowns", "rows", "building", "solving")

@@ -19,8 +19,7 @@ from typing import Any, TypeVar
 from .errors import InputError, require_number, require_vector
 
 T = TypeVar("T")
-REQUIRED: Any = object()
-"""Default of what has to be given."""
+REQUIRED: Any = object()  # default of what has to be given
 Schema = Mapping[str, Any]
 """JSON Schema of a value."""
 

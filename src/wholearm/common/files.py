@@ -18,8 +18,7 @@ import numpy as np
 from .errors import InputError
 from .signals import held, on_end
 
-LARGEST = 2**28
-"""Largest array that is read [byte]: a million rows of everything take less."""
+LARGEST = 2**28  # largest array that is read [byte]: a million rows of everything take less
 
 
 def require_writable(path: str | os.PathLike[str]) -> None:

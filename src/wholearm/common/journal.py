@@ -13,8 +13,7 @@ from typing import Any, BinaryIO, NamedTuple
 from .errors import InputError
 from .signals import held
 
-_SHOWN = 3
-"""Differences that are written out; the others are counted."""
+_SHOWN = 3  # differences that are written out; the others are counted
 try:
     import fcntl
 except ImportError:  # not on Windows
@@ -116,8 +115,8 @@ class Journal:
         if other is None or other.get("study") != kind:
             text = f"holds no {kind} study; --fresh begins anew, or choose another with -o"
             raise InputError(self.path, "", text)
-        found = find_differences(other, own)
-        text = describe_differences(found, "in the file", "now")
+        differences = find_differences(other, own)
+        text = describe_differences(differences, "in the file", "now")
         if text:
             what = f"holds another study: {text}; --fresh begins anew, or choose another with -o"
             raise InputError(self.path, "", what)

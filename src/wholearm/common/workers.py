@@ -29,10 +29,8 @@ from .signals import WATCHER
 _T = TypeVar("_T")
 Task = Callable[[], _T]
 
-DEEP = 20_000
-"""Depth of recursion that pickling may take."""
-_NUMBER = 2
-"""Bytes of a task's number."""
+DEEP = 20_000  # depth of recursion that pickling may take
+_NUMBER = 2  # bytes of a task's number
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _sharing = False
 

@@ -32,7 +32,6 @@ from ..mechanics.margin_key import UNIQUENESS
 from ..mechanics.metric import metric_weights
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN, find_minors
 from ..problem.definition import Problem
-from ..quasistatic.squeeze import Squeezing
 from ..scene.model import Scene
 from .borders import (
     NOWHERE,

@@ -14,8 +14,8 @@ import numpy as np
 from ..common.errors import InfeasibleError, SolverError
 from ..mechanics.impact import Impact
 from ..problem.definition import Phase
+from ..results.plan_record import Transition
 from ..results.trajectory import Motion
-from ..results.transition import Transition
 from ..solvers.statistics import charge
 from .options import Objective, PlanOptions
 from .phase_plan import PhasePlan, add_up, combine

@@ -22,10 +22,10 @@ from ..geometry.tracing import trace_phases
 from ..mechanics.uniqueness import describe_uniqueness
 from ..problem.check import require_phases
 from ..problem.definition import Problem
+from ..results.plan_record import Transition
 from ..results.report import UniquenessMargin
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory, assemble
-from ..results.transition import Transition
 from ..solvers.statistics import Ledger, open_ledger
 from ..verification.force_uniqueness import find_uniqueness_margin, find_wedged
 from .block_plan import Planning

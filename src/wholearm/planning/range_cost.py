@@ -10,7 +10,7 @@ import numpy as np
 from ..mechanics.metric import measure_speed
 from ..mechanics.wedging import SURE
 from ..problem.uncertainty import PARAMETERS
-from ..results.range_figures import RangeFigures
+from ..results.plan_record import RangeFigures
 from .block_plan import Planning
 from .blocks import plan_blocks
 from .options import Objective, PlanOptions

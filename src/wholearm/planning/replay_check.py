@@ -13,7 +13,7 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.errors import InfeasibleError, JammingError, ReplayError, SimulationError, SolverError
 from ..problem.definition import Problem
-from ..results.replay_figures import LeastForce, ReplayedPhase, ReplayFigures
+from ..results.plan_record import LeastForce, ReplayedPhase, ReplayFigures
 from ..results.report import Report
 from ..results.trajectory import Samples, Trajectory, assemble
 from ..scene.model import Scales

@@ -14,14 +14,10 @@ from numpy.typing import ArrayLike
 
 from ..common.document import Document, Drawn, Result
 from ..problem.definition import Problem
-from ..results.certificate import Certificate
 from ..results.dwell_record import Settling
-from ..results.mode_names import ModeSpan
-from ..results.range_figures import RangeFigures
-from ..results.replay_figures import ReplayFigures
+from ..results.plan_record import Certificate, ModeSpan, RangeFigures, ReplayFigures, Transition
 from ..results.report import UniquenessMargin
 from ..results.trajectory import Samples, Trajectory
-from ..results.transition import Transition
 from ..solvers.statistics import SolverStatistics
 from .options import Objective, PlanOptions
 

@@ -11,12 +11,9 @@ from ..common.errors import InputError
 from ..common.plain import plain, restore
 from ..problem.definition import Problem
 from ..problem.read import read_own_problem
-from ..results.certificate import Certificate
-from ..results.range_figures import RangeFigures
-from ..results.replay_figures import ReplayFigures
+from ..results.plan_record import Certificate, RangeFigures, ReplayFigures, Transition
 from ..results.trajectory import Trajectory
 from ..results.trajectory_file import load_trajectory
-from ..results.transition import Transition
 from ..solvers.statistics import SolverStatistics
 from .options import PlanOptions
 from .result import Plan, PlannedPhase, Status, Timings

@@ -58,6 +58,18 @@ def adopt_torques(
     return problem, torque, trajectory
 
 
+def require_same_contacts(problem: Problem, plan: Trajectory | None) -> None:
+    """Check that a plan, if there is one, has the contacts of a problem."""
+    odd = (
+        set()
+        if plan is None
+        else set(plan.contacts) ^ {contact.name for contact in problem.contacts}
+    )
+    if odd:
+        text = f"trajectory and problem differ in {', '.join(sorted(odd))}"
+        raise InputError("", "contacts", text)
+
+
 def require_same_phases(problem: Problem, plan: Trajectory) -> None:
     """Check that a plan has the phases of a problem."""
     require_phases(problem)

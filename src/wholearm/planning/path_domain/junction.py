@@ -19,7 +19,7 @@ from ...common.errors import InfeasibleError
 from ...contacts.formation import Formation
 from ...geometry.curve import Curve
 from ...mechanics.wedging import find_static_torques
-from ...results.mode_names import ModeSpan
+from ...results.plan_record import ModeSpan
 from ...results.torque import TorqueProfile
 from ...results.torque_change import TorqueChange, change_torques, find_change_times
 from ...results.trajectory import Motion, Samples

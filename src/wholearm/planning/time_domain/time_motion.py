@@ -17,7 +17,7 @@ from ...contacts.formation import Formation
 from ...mechanics.dynamics import Directions, build_forward, split_forces
 from ...mechanics.metric import metric_weights
 from ...problem.definition import Phase
-from ...results.mode_names import ROLLS, ModeSpan
+from ...results.plan_record import ROLLS, ModeSpan
 from ...results.torque import TorqueProfile
 from ...results.trajectory import Samples
 from .collocation import Scheme, blend
