@@ -76,14 +76,14 @@ def find_fastest(
     largest, braked = [0.0] * (count + 1), [False] * count
     following = 0.0
     for k in range(count - 1, -1, -1):
-        found = float(least(brake_slopes[k] * following + brake_values[k]))
-        pushed = float(least(push_slopes[k] * found + push_values[k])) if found < caps[k] else 0.0
-        braked[k] = found < caps[k] and pushed >= following
+        b_k = float(least(brake_slopes[k] * following + brake_values[k]))
+        pushed = float(least(push_slopes[k] * b_k + push_values[k])) if b_k < caps[k] else 0.0
+        braked[k] = b_k < caps[k] and pushed >= following
         if not braked[k]:
-            found = min(_find_corner(before[k], after[k], one[k], following), caps[k])
-        if not found > 0 and (k or found < 0):
+            b_k = min(_find_corner(before[k], after[k], one[k], following), caps[k])
+        if not b_k > 0 and (k or b_k < 0):
             raise NoMotionError(k)
-        largest[k] = following = found
+        largest[k] = following = b_k
     b, reaches = [0.0] * (count + 1), [False] * (count + 1)
     reached = 0.0
     for k in range(count):

@@ -49,12 +49,12 @@ class Places(NamedTuple):
 
 
 class LimitTerms(NamedTuple):
-    """Limited values, constant + a s'' + b s'^2 + squeeze lambda + speed s', (n, m) each."""
+    """Limited values, constant + a s'' + b s'^2 + lam lambda + speed s', (n, m) each."""
 
     constant: Array
     a: Array
     b: Array
-    squeeze: Array
+    lam: Array
     speed: Array
 
 

@@ -151,17 +151,17 @@ class PathMotion:
 
     def evaluate(self, t: Array) -> Samples:
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""
-        s, segment, (a, b, squeeze) = self.locate(np.asarray(t, dtype=float))
+        s, segment, (a, b, lam) = self.locate(np.asarray(t, dtype=float))
         point = self.curve.evaluate(s)
         directions = directions_of(self.curve, segment)
         formation = self.curve.formation
         forces = inverse(formation, *point[:3], directions, point.kinematics)
-        c_n, c_t = split_forces(formation, forces.c(a, b, squeeze), directions.Xi)
+        c_n, c_t = split_forces(formation, forces.c(a, b, lam), directions.Xi)
         return Samples(
             point.z,
             point.z_s * np.sqrt(b)[:, None],
             point.z_s * a[:, None] + point.z_ss * b[:, None],
-            forces.tau(a, b, squeeze),
+            forces.tau(a, b, lam),
             c_n,
             c_t,
         )

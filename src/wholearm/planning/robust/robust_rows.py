@@ -48,12 +48,12 @@ class Guide(NamedTuple):
     s: Array
     a: Array
     b: Array
-    squeeze: Array
+    lam: Array
 
     def at(self, s: Array) -> tuple[Array, Array, Array]:
         """The motion at some places."""
-        a, b, squeeze = (np.interp(s, self.s, column) for column in self[1:])
-        return a, b, squeeze
+        a, b, lam = (np.interp(s, self.s, column) for column in self[1:])
+        return a, b, lam
 
 
 class Spread(NamedTuple):
@@ -130,8 +130,8 @@ def find_edges(formation: Formation, rows: Array, name: str) -> Array | None:
 
 def measure(swings: Array, motion: tuple[Array, Array, Array]) -> Array:
     """Parametric bounds of a motion, shape (n, m, p) [N]."""
-    a, b, squeeze = motion
-    columns = np.stack([np.ones_like(a), a, b, squeeze, np.sqrt(np.maximum(b, 0.0))], axis=-1)
+    a, b, lam = motion
+    columns = np.stack([np.ones_like(a), a, b, lam, np.sqrt(np.maximum(b, 0.0))], axis=-1)
     return np.asarray(np.einsum("nmpq,nq->nmp", swings, columns))
 
 
@@ -196,8 +196,8 @@ def _find_signs(
         ends = [sides.meet(b, sides.pair(row)) for row in extremes]
         with np.errstate(invalid="ignore"):
             b = np.where(ends[0][0] < ends[1][0], _LOWER * b, b)
-        for end, (a, squeeze) in enumerate(ends):
-            here = np.nan_to_num(a), b, np.nan_to_num(squeeze)
+        for end, (a, lam) in enumerate(ends):
+            here = np.nan_to_num(a), b, np.nan_to_num(lam)
             slack = bare.evaluate(forces, swings, here) - forced.low
             rowed = extended.c(*here)[:, bare.rows.shape[1] :].reshape(*slack.shape, -1)
             missed = slack < rowed.min(axis=2) - forced.low - _SAME * forced.scales
