@@ -378,13 +378,7 @@ def _minimise(c: Array, g: Array, cap: Array) -> Array:
             root = np.where(g == 0, root, x)
         v = np.sqrt(cap)
         inner = np.where(root > 0, np.minimum(1 / root, v), v)
-        values = [
-            np.where(np.isfinite(x), 1 / x + g * x + c * x**2, _far(c, g)) for x in (inner, v)
-        ]
+        first = np.where(c == 0, g, c)
+        limit = np.where(first == 0, 0.0, np.copysign(np.inf, first))
+        values = [np.where(np.isfinite(x), 1 / x + g * x + c * x**2, limit) for x in (inner, v)]
         return np.where(c > 0, values[0], np.minimum(*values))
-
-
-def _far(c: Array, g: Array) -> Array:
-    """Limit of 1/v + g v + c v^2 for a large v."""
-    first = np.where(c == 0, g, c)
-    return np.where(first == 0, 0.0, np.copysign(np.inf, first))

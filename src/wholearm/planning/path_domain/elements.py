@@ -44,13 +44,14 @@ def find_basis(degree: int = DEGREE) -> Basis:
     x = (np.concatenate([[-1.0], jacobi_nodes(degree - 1, 1, 1), [1.0]]) + 1) / 2
     y = np.stack([x, x, 1 - x, x, 1 - x])
     powers = np.arange(degree + 1)
-    to_powers: Array = np.linalg.inv(y[..., None] ** powers)
+    to_powers = np.asarray(np.linalg.inv(y[..., None] ** powers), dtype=float)
     plain = 2 * np.diff(y[0][:, None] ** (powers + 1), axis=0) / (powers + 1)
     rooted = 4 * np.diff(y[1:3, :, None] ** (powers + 2), axis=1) / (powers + 2)
     cubic = 6 * np.diff(y[3:, :, None] ** (powers + 3), axis=1) / (powers + 3)
     rises = np.stack([plain, rooted[0], -rooted[1], cubic[0], -cubic[1]])
     weights = (1 / (powers + 1)) @ to_powers[0]
-    modes: Array = np.linalg.inv(legendre.legvander(2 * x - 1, degree))
+    vandermonde = legendre.legvander(2 * x - 1, degree)
+    modes = np.asarray(np.linalg.inv(vandermonde), dtype=float)
     return Basis(y, to_powers, rises @ to_powers, weights, modes)
 
 

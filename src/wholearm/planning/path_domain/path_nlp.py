@@ -221,26 +221,19 @@ def make_bounds(
     late = nlp.columns.g.sizes["duration"]
     equal = np.zeros(nlp.columns.g["limits"].start)
     longest = np.full(late, (duration or np.inf) / units.time)
-    quick_low, quick_high = _bound_motors(nlp, data, units, tightening.motors)
+    rates, commands = map(list, nlp.shape.motors)
+    torque, sizes = units.of(data.limits)[list(nlp.shape.torques)], nlp.columns.g.sizes
+    quickest, most = tightening.motors[:, 0], tightening.motors[:, 1] * data.torque_limit / torque
+    joins, begins = np.zeros(sizes["joins"]), np.full(sizes["begins"] // 2, LEAST_B)
+    within = np.concatenate([quickest[:, rates].ravel("F"), most[:, commands].ravel("F")])
+    motors_low = -within, joins, begins, -np.inf * begins
+    motors_high = within, joins, np.inf * begins, -begins
     return {
         "lbx": low[nlp.free],
         "ubx": high[nlp.free],
-        "lbg": np.concatenate([equal, rows_low.ravel(), np.full(late, -np.inf), quick_low]),
-        "ubg": np.concatenate([equal, rows_high.ravel(), longest, quick_high]),
+        "lbg": np.concatenate([equal, rows_low.ravel(), np.full(late, -np.inf), *motors_low]),
+        "ubg": np.concatenate([equal, rows_high.ravel(), longest, *motors_high]),
     }
-
-
-def _bound_motors(
-    nlp: PathNLP, data: PhaseData, units: Units, shares: Array
-) -> tuple[Array, Array]:
-    """Bounds of the rows of `motor_terms`."""
-    rates, commands = map(list, nlp.shape.motors)
-    sizes, torque = nlp.columns.g.sizes, units.of(data.limits)[list(nlp.shape.torques)]
-    most = shares[:, 1] * data.torque_limit / torque
-    within = np.concatenate([shares[:, 0, rates].ravel("F"), most[:, commands].ravel("F")])
-    joins, begins = np.zeros(sizes["joins"]), np.full(sizes["begins"] // 2, LEAST_B)
-    low = np.concatenate([-within, joins, begins, -np.inf * begins])
-    return low, np.concatenate([within, joins, np.inf * begins, -begins])
 
 
 def pack(

@@ -416,7 +416,10 @@ def start_at(
         # Slope of the margin over the duration.
         rate = 1 / max(float((kept * presses).sum()), _COLD_MU)
     on_links, kept = rate * on_links, np.maximum(rate * kept, _COLD_MU / _COLD_INSIDE)
-    moved = vertices.move_inside(sides, _COLD_MU / kept / scale[vertices.sides])
+    (a, b, lam), slack = vertices.profile, _COLD_MU / kept / scale[vertices.sides]
+    inner_a, inner_lam = sides.meet(b, vertices.sides, slack)
+    stay = vertices.held | ~(np.isfinite(inner_a) & np.isfinite(inner_lam))
+    moved = Profile(np.where(stay, a, inner_a), b, np.where(stay, lam, inner_lam))
     on_sides = _COLD_MU / np.maximum(sides.find_slack(*moved) * scale, _COLD_INSIDE)
     free = np.flatnonzero(~vertices.held)
     on_sides[free[:, None], vertices.sides[free]] = kept[free]
@@ -494,13 +497,6 @@ class _Vertices(NamedTuple):
         jumps = np.flatnonzero((modes[:-1] == SweepMode.PUSH) & (modes[1:] == SweepMode.BRAKE))
         pair = np.where(pushed[:, None], most, least)
         return _Vertices(Profile(a, b, lam), pair, held, jumps)
-
-    def move_inside(self, sides: LimitSides, slack: Array) -> Profile:
-        """The motion with some slack (n, 2) of the sides that meet."""
-        a, b, lam = self.profile
-        inner_a, inner_lam = sides.meet(b, self.sides, slack)
-        stay = self.held | ~(np.isfinite(inner_a) & np.isfinite(inner_lam))
-        return Profile(np.where(stay, a, inner_a), b, np.where(stay, lam, inner_lam))
 
 
 def _find_pairs(

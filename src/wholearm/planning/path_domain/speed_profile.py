@@ -54,19 +54,9 @@ class Fastest(NamedTuple):
 
 
 class Narrow(NamedTuple):
-    """Breaks about a place that limits the margin, whatever the duration."""
+    """Breaks about a place that limits the margin, whatever the duration; graded at an end."""
 
     switches: list[Switch]
-
-    @staticmethod
-    def about(places: Array, length: float) -> Narrow:
-        """Breaks about an interval, (2,), of a curve with a length [m]; graded at its ends."""
-        near = length * np.array(_GRADES)
-        if places[0] < near[-1]:
-            places = near
-        elif places[1] > length - near[-1]:
-            places = length - near
-        return Narrow([Switch(float(place), False) for place in np.sort(places)])
 
 
 def find_fastest(data: PhaseData, duration: float | None) -> Fastest | Narrow | None:
@@ -180,7 +170,13 @@ def _find_margin(data: PhaseData, samples: Samples, duration: float) -> float | 
             high, at_high, stuck = guess, value, blocked
         if stuck is not None and high - low < _SAME * high:
             ends = 2 * stride * np.arange(stuck, stuck + 2)
-            return Narrow.about(np.append(samples.s, samples.length)[ends], samples.length)
+            places = np.append(samples.s, samples.length)[ends]
+            graded = samples.length * np.array(_GRADES)
+            if places[0] < graded[-1]:
+                places = graded
+            elif places[1] > samples.length - graded[-1]:
+                places = samples.length - graded
+            return Narrow([Switch(float(place), False) for place in np.sort(places)])
         guess = low + at_low / (at_low - at_high) * (high - low) if np.isfinite(high) else 2 * low
     else:
         return None

@@ -30,7 +30,7 @@ from ...mechanics.dynamics import Directions, PathForces, inverse
 from ...mechanics.limits import CONE, PRESS, SPEED, LimitSet, SideTerms, make_limits
 from ...mechanics.wedging import StaticTorques, find_static_torques
 from ...problem.uncertainty import PARAMETERS
-from ...scene.model import Friction, Scene
+from ...scene.model import Friction
 from ...sensitivity.slopes import find_force_slopes
 from ..lower_bound.rows import LimitSides, directions_of
 
@@ -228,9 +228,12 @@ def list_holds(formation: Formation, z: Array, ranges: Mapping[str, float]) -> l
     """
     fingers = (ranges.get("gain1", 0.0), ranges.get("gain2", 0.0))
     gains = list(product(*(_spread(width) for width in fingers)))
-    holds = []
+    scene, parts, holds = formation.scene, ("palm", "finger1", "finger2"), []
+    largest = {part: 1 + ranges.get(f"friction_{part}", 0.0) for part in parts}
+    friction = Friction(**{part: getattr(scene.friction, part) * largest[part] for part in parts})
     for mass in _spread(ranges.get("mass", 0.0)):
-        corner = replace(formation, scene=_change(formation.scene, ranges, mass))
+        polygon = replace(scene.polygon, mass=scene.polygon.mass * mass)
+        corner = replace(formation, scene=replace(scene, polygon=polygon, friction=friction))
         static = find_static_torques([corner], z)
         holds += [RobustHold(static, np.array(gain)) for gain in gains]
     return holds
@@ -243,11 +246,3 @@ def measure_holds(holds: Sequence[RobustHold], tau: Array) -> float:
 
 def _spread(width: float) -> tuple[float, ...]:
     return (1 - width, 1 + width) if width else (1.0,)
-
-
-def _change(scene: Scene, ranges: Mapping[str, float], mass: float) -> Scene:
-    parts = ("palm", "finger1", "finger2")
-    more = {part: 1 + ranges.get(f"friction_{part}", 0.0) for part in parts}
-    friction = Friction(**{part: getattr(scene.friction, part) * more[part] for part in parts})
-    polygon = replace(scene.polygon, mass=scene.polygon.mass * mass)
-    return replace(scene, polygon=polygon, friction=friction)
