@@ -46,7 +46,7 @@ class NoMotionError(ValueError):
 
 
 def find_fastest(
-    rows: PathLimitRows, steps: Array, part: Array, cap: Array, near: Array | None
+    rows: PathLimitRows, steps: Array, part: Array, cap: Array, b_guess: Array | None
 ) -> Sweep:
     """Minimum-time speed profile on a grid, from rest to rest.
 
@@ -55,11 +55,11 @@ def find_fastest(
     rows                at a place of each interval
     steps, part : (N,)  lengths of the intervals, and which part of each is before its place
     cap : (N + 1,)      largest b at the nodes
-    near : (N,)         b about which the speed is linearised; without it, or at rest, neglected
+    b_guess : (N,)      b about which the speed is linearised; without it, or at rest, neglected
     """
     of_b, one = rows.b, rows.one
-    if near is not None:
-        speed = np.sqrt(np.maximum(near, 0.0))[:, None]
+    if b_guess is not None:
+        speed = np.sqrt(np.maximum(b_guess, 0.0))[:, None]
         drag = np.divide(rows.v, 2 * speed, out=np.zeros_like(rows.v), where=speed > 0)
         of_b, one = of_b + drag, one + rows.v * speed / 2
     of_a = rows.a / (2 * steps)[:, None]
