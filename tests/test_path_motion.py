@@ -152,7 +152,7 @@ def test_interval_of_length_zero_takes_no_time_and_jumps() -> None:
     assert segment.tolist() == [0, 1]
     np.testing.assert_allclose(here.a, motion.profile.a[[gap, gap + 1]], rtol=1e-6)
     assert abs(here.a[1] - here.a[0]) > 1e-3 * abs(here.a[0])
-    np.testing.assert_allclose(here.squeeze, motion.profile.squeeze[[gap, gap + 1]], rtol=1e-5)
+    np.testing.assert_allclose(here.lam, motion.profile.lam[[gap, gap + 1]], rtol=1e-5)
 
 
 def test_a_stall_is_seen() -> None:

@@ -106,8 +106,8 @@ class Solver:
         """
         beat()
         # CasADi takes lists in three times as fast as arrays.
-        given = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in arguments.items()}
-        result: dict[str, Expression] = self.function(**given)
+        lists = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in arguments.items()}
+        result: dict[str, Expression] = self.function(**lists)
         stats = self.function.stats()
         # A solver that was stopped does not always say what it has done.
         cost = stats.get("iter_count", 0), stats.get("t_wall_total", 0.0)

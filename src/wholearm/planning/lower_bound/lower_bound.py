@@ -59,17 +59,17 @@ def bound_least_time(curves: Sequence[Curve], epsilon: float) -> LowerBound | No
     epsilon : [N]  least normal force
     """
     path = PathTerms(curves, epsilon)
-    grid, near, result, tries = path.make_grid(GRID_INTERVALS), None, None, 0
+    grid, b_guess, result, tries = path.make_grid(GRID_INTERVALS), None, None, 0
     for _ in range(_ROUNDS):
         try:
-            result = _bound(path, grid, near)
+            result = _bound(path, grid, b_guess)
         except NoMotionError as error:
             tries += 1
             if tries > _TRIES:
                 break
             parts = np.ones(len(grid.owners), dtype=np.int64)
             parts[max(error.interval - _NARROW, 0) : error.interval + _NARROW + 1] = _PARTS
-            grid, near = grid.split(parts), None
+            grid, b_guess = grid.split(parts), None
             continue
         share = result.losses / (_TOLERANCE * result.time)
         # Losses at switches and kinks fall with the square or the third power of the interval.
@@ -81,7 +81,7 @@ def bound_least_time(curves: Sequence[Curve], epsilon: float) -> LowerBound | No
             break
         finer = grid.split(parts)
         middles = (finer.angles[1:] + finer.angles[:-1]) / 2
-        near = np.interp(path.place(middles), path.place(grid.angles), result.motion.b)
+        b_guess = np.interp(path.place(middles), path.place(grid.angles), result.motion.b)
         grid = finer
     return result and result.bound
 
@@ -122,8 +122,8 @@ def _join_caps(left: Array, right: Array) -> Array:
     return np.asarray(np.minimum(np.append(left, np.inf), np.append(np.inf, right)))
 
 
-def _bound(path: PathTerms, grid: PathGrid, near: Array | None) -> _Round:
-    """The bound on a grid; viscous friction is linearised about b = `near` in its intervals."""
+def _bound(path: PathTerms, grid: PathGrid, b_guess: Array | None) -> _Round:
+    """The bound on a grid; viscous friction is linearised about b = `b_guess` in its intervals."""
     h = np.diff(grid.angles)[:, None]
     angles = grid.angles[:-1, None] + _PLACES * h
     rows = path.evaluate(angles, grid.owners)
@@ -131,10 +131,10 @@ def _bound(path: PathTerms, grid: PathGrid, near: Array | None) -> _Round:
     s = path.place(grid.angles)
     part = (path.place(angles) - s[:-1, None]) / np.diff(s)[:, None]
     cap, places = _join_caps(left.cap, right.cap), part[:, 1]
-    if near is None:
+    if b_guess is None:
         motion = find_steady(middle, np.diff(s), places, cap)
     else:
-        motion = find_fastest(middle, np.diff(s), places, cap, near)
+        motion = find_fastest(middle, np.diff(s), places, cap, b_guess)
     b = motion.b[:-1, None] + part * np.diff(motion.b)[:, None]
     costate = find_costate(path, grid, left, right, motion)
     shape = len(h), len(_PLACES) - 3
@@ -309,9 +309,9 @@ def _integrate(
         for k in order:
             if modes[k] != mode:
                 continue
-            beside = k - step
-            goes_on = 0 <= beside <= last and modes[beside] in (mode, SweepMode.SWITCH)
-            y[k, near] = y[beside, far] if goes_on else 0.0
+            previous = k - step
+            goes_on = 0 <= previous <= last and modes[previous] in (mode, SweepMode.SWITCH)
+            y[k, near] = y[previous, far] if goes_on else 0.0
             if k == (last if far else 0):
                 y[k, far] = at_rest[far]
             else:
@@ -378,13 +378,7 @@ def _minimise(c: Array, g: Array, cap: Array) -> Array:
             root = np.where(g == 0, root, x)
         v = np.sqrt(cap)
         inner = np.where(root > 0, np.minimum(1 / root, v), v)
-        values = [
-            np.where(np.isfinite(x), 1 / x + g * x + c * x**2, _far(c, g)) for x in (inner, v)
-        ]
+        first = np.where(c == 0, g, c)
+        limit = np.where(first == 0, 0.0, np.copysign(np.inf, first))
+        values = [np.where(np.isfinite(x), 1 / x + g * x + c * x**2, limit) for x in (inner, v)]
         return np.where(c > 0, values[0], np.minimum(*values))
-
-
-def _far(c: Array, g: Array) -> Array:
-    """Limit of 1/v + g v + c v^2 for a large v."""
-    first = np.where(c == 0, g, c)
-    return np.where(first == 0, 0.0, np.copysign(np.inf, first))

@@ -46,7 +46,7 @@ class NoMotionError(ValueError):
 
 
 def find_fastest(
-    rows: PathLimitRows, steps: Array, part: Array, cap: Array, near: Array | None
+    rows: PathLimitRows, steps: Array, part: Array, cap: Array, b_guess: Array | None
 ) -> Sweep:
     """Minimum-time speed profile on a grid, from rest to rest.
 
@@ -55,11 +55,11 @@ def find_fastest(
     rows                at a place of each interval
     steps, part : (N,)  lengths of the intervals, and which part of each is before its place
     cap : (N + 1,)      largest b at the nodes
-    near : (N,)         b about which the speed is linearised; without it, or at rest, neglected
+    b_guess : (N,)      b about which the speed is linearised; without it, or at rest, neglected
     """
     of_b, one = rows.b, rows.one
-    if near is not None:
-        speed = np.sqrt(np.maximum(near, 0.0))[:, None]
+    if b_guess is not None:
+        speed = np.sqrt(np.maximum(b_guess, 0.0))[:, None]
         drag = np.divide(rows.v, 2 * speed, out=np.zeros_like(rows.v), where=speed > 0)
         of_b, one = of_b + drag, one + rows.v * speed / 2
     of_a = rows.a / (2 * steps)[:, None]
@@ -76,14 +76,14 @@ def find_fastest(
     largest, braked = [0.0] * (count + 1), [False] * count
     following = 0.0
     for k in range(count - 1, -1, -1):
-        found = float(least(brake_slopes[k] * following + brake_values[k]))
-        pushed = float(least(push_slopes[k] * found + push_values[k])) if found < caps[k] else 0.0
-        braked[k] = found < caps[k] and pushed >= following
+        b_k = float(least(brake_slopes[k] * following + brake_values[k]))
+        pushed = float(least(push_slopes[k] * b_k + push_values[k])) if b_k < caps[k] else 0.0
+        braked[k] = b_k < caps[k] and pushed >= following
         if not braked[k]:
-            found = min(_find_corner(before[k], after[k], one[k], following), caps[k])
-        if not found > 0 and (k or found < 0):
+            b_k = min(_find_corner(before[k], after[k], one[k], following), caps[k])
+        if not b_k > 0 and (k or b_k < 0):
             raise NoMotionError(k)
-        largest[k] = following = found
+        largest[k] = following = b_k
     b, reaches = [0.0] * (count + 1), [False] * (count + 1)
     reached = 0.0
     for k in range(count):

@@ -44,13 +44,14 @@ def find_basis(degree: int = DEGREE) -> Basis:
     x = (np.concatenate([[-1.0], jacobi_nodes(degree - 1, 1, 1), [1.0]]) + 1) / 2
     y = np.stack([x, x, 1 - x, x, 1 - x])
     powers = np.arange(degree + 1)
-    to_powers = np.linalg.inv(y[..., None] ** powers)
+    to_powers = np.asarray(np.linalg.inv(y[..., None] ** powers), dtype=float)
     plain = 2 * np.diff(y[0][:, None] ** (powers + 1), axis=0) / (powers + 1)
     rooted = 4 * np.diff(y[1:3, :, None] ** (powers + 2), axis=1) / (powers + 2)
     cubic = 6 * np.diff(y[3:, :, None] ** (powers + 3), axis=1) / (powers + 3)
     rises = np.stack([plain, rooted[0], -rooted[1], cubic[0], -cubic[1]])
     weights = (1 / (powers + 1)) @ to_powers[0]
-    modes = np.linalg.inv(legendre.legvander(2 * x - 1, degree))
+    vandermonde = legendre.legvander(2 * x - 1, degree)
+    modes = np.asarray(np.linalg.inv(vandermonde), dtype=float)
     return Basis(y, to_powers, rises @ to_powers, weights, modes)
 
 
@@ -176,10 +177,10 @@ class Profile(NamedTuple):
 
     a: Array
     b: Array
-    squeeze: Array
+    lam: Array
 
 
-def follow(grid: Grid, a: Array, squeeze: Array) -> Profile:
+def follow(grid: Grid, a: Array, lam: Array) -> Profile:
     """The motion with these s'' and internal forces, s'' corrected so that it ends at rest."""
     spread = np.ones_like(a)
     if grid.held:
@@ -188,7 +189,7 @@ def follow(grid: Grid, a: Array, squeeze: Array) -> Profile:
     # At junctions with nearly no speed b may round to less than zero.
     b = np.maximum(grid.integrate(a), 0.0)
     b[-1] = 0.0
-    return Profile(a, b, squeeze)
+    return Profile(a, b, lam)
 
 
 class Elements:
@@ -204,7 +205,7 @@ class Elements:
         basis, kinds = find_basis(), grid.kinds
         self._y = basis.y[kinds].ravel()
         self._rooted, self._power = kinds > 0, POWERS[kinds]
-        table = np.stack([profile.a, profile.squeeze], axis=-1)
+        table = np.stack([profile.a, profile.lam], axis=-1)
         table = table.reshape(len(kinds), DEGREE + 1, 2)
         self._motion = basis.to_powers[kinds] @ table
         powers = np.arange(DEGREE + 1)[:, None]

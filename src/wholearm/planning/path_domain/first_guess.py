@@ -12,7 +12,7 @@ from .rate_terms import exceeds_rates
 
 _SLOW = -12  # height of the slowest guess over that of a fall, as a power of two
 _QUICK = 30.0  # largest b of a guess, over that which the torque limits alone allow
-_FIRM = 40.0  # largest range of the squeeze of a guess, over the scene's force or its least value
+_FIRM = 40.0  # largest range of lambda in a guess, over the scene's force or its least value
 _LIGHT = 0.5  # least unit of force, over the scene's
 
 
@@ -26,7 +26,7 @@ def guess(data: PhaseData, time_weight: float = 0.0) -> tuple[Profile, Units]:
     fall = _fall(data)
 
     def possible(height: float) -> bool:
-        low, high = find_squeeze_range(data, height)
+        low, high = find_internal_force_range(data, height)
         a, b = _parabola(data, height)
         kept = bool(((low <= high) & (low < np.inf)).all() and (b <= b_max).all())
         return kept and not exceeds_rates(data, Profile(a, b, _find_middle(data, low, high)))
@@ -57,15 +57,11 @@ def _fall(data: PhaseData) -> float:
         """Value at which this coefficient alone takes a joint to its torque limit."""
         return 1 / max(float((np.abs(coefficients) / data.torque_limit).max(axis=1).mean()), 1e-100)
 
-    b_max = data.largest_b(data.nodes)
+    # The upper median; NumPy's takes 10 ms to import what it needs.
+    b_max, middle = data.largest_b(data.nodes), len(data.grid.s) // 2
+    median = float(np.partition(b_max, middle)[middle])
     inertia, drag = 2 * length * usual(forces.Ta), usual(forces.Tv) ** 2
-    return min(fall, _QUICK * min(inertia, drag, _find_median(b_max)))
-
-
-def _find_median(values: Array) -> float:
-    """Median, the upper one of two; that of numpy takes 10 ms to import what it needs."""
-    middle = values.size // 2
-    return float(np.partition(values.ravel(), middle)[middle])
+    return min(fall, _QUICK * min(inertia, drag, median))
 
 
 def _parabola(data: PhaseData, height: float) -> tuple[Array, Array]:
@@ -79,12 +75,12 @@ def _parabola(data: PhaseData, height: float) -> tuple[Array, Array]:
     return height * 2 * (1 - 2 * x) / length, height * 4 * x * (1 - x)
 
 
-def find_squeeze_range(data: PhaseData, height: float) -> tuple[Array, Array]:
-    """Least and largest squeeze that limits allow at each node."""
+def find_internal_force_range(data: PhaseData, height: float) -> tuple[Array, Array]:
+    """Least and largest internal force that limits allow at each node."""
     a, b = _parabola(data, height)
     slack = data.slack(data.nodes, Profile(a, b, np.zeros_like(a)))
     rows, signs, _ = data.limits.sides
-    rate = signs * data.find_terms().squeeze[:, rows]
+    rate = signs * data.find_terms().lam[:, rows]
     with np.errstate(divide="ignore", invalid="ignore"):
         bound = -slack / rate
     never = np.where((rate == 0) & (slack < 0), np.inf, -np.inf)
@@ -94,7 +90,7 @@ def find_squeeze_range(data: PhaseData, height: float) -> tuple[Array, Array]:
 
 
 def _find_middle(data: PhaseData, low: Array, high: Array) -> Array:
-    """The squeeze amid its range, limited by `_FIRM`; zero where that is empty or infinite."""
+    """The internal force amid its range, at most `_FIRM`; zero where that is empty or infinite."""
     weight = data.curve.formation.scene.scales.force
     finite = np.isfinite(low + high) & (low <= high)
     high = np.minimum(high, low + _FIRM * np.maximum(weight, np.abs(low)))
@@ -102,7 +98,7 @@ def _find_middle(data: PhaseData, low: Array, high: Array) -> Array:
 
 
 def _guess_at(data: PhaseData, height: float, time_weight: float = 0.0) -> tuple[Profile, Units]:
-    low, high = find_squeeze_range(data, height)
+    low, high = find_internal_force_range(data, height)
     weight = data.curve.formation.scene.scales.force
     finite = np.isfinite(low + high) & (low <= high)
     press = float(np.abs(np.where(finite, (low + high) / 2, 0.0)).mean())

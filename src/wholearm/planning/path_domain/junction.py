@@ -25,7 +25,7 @@ from ...results.torque_change import TorqueChange, change_torques, find_change_t
 from ...results.trajectory import Motion, Samples
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
-from .first_guess import find_squeeze_range
+from .first_guess import find_internal_force_range
 from .path_data import PhaseData, prepare
 from .path_mesh import Mesh
 
@@ -96,9 +96,9 @@ def _list_torques(curve: Curve, epsilon: float, phase: int, place: int) -> tuple
     low, high = require_hold(data, phase, place)
     high = min(high, low + _WIDEST * curve.formation.scene.scales.force)
     share = np.linspace(_INSIDE, 1 - _INSIDE, _PLACES)
-    squeezes = low + share * (high - low)
+    lams = low + share * (high - low)
     forces = data.nodes.forces
-    return forces.T0[place] + np.outer(squeezes, forces.Tl[place]), squeezes
+    return forces.T0[place] + np.outer(lams, forces.Tl[place]), lams
 
 
 def require_hold(data: PhaseData, phase: int, place: int) -> tuple[float, float]:
@@ -108,7 +108,7 @@ def require_hold(data: PhaseData, phase: int, place: int) -> tuple[float, float]
     ------
     InfeasibleError  if there is none
     """
-    low, high = (float(bound[place]) for bound in find_squeeze_range(data, 0.0))
+    low, high = (float(bound[place]) for bound in find_internal_force_range(data, 0.0))
     if low <= high:
         return low, high
     where = "end" if place else "start"

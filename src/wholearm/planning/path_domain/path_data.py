@@ -20,7 +20,7 @@ from ...geometry.curve import Curve, describe_pose
 from ...mechanics.dynamics import PathForces, inverse, reduced_inertia
 from ...mechanics.limits import CONE, PRESS, SPEED, TORQUE, LimitSet, SideTerms, make_limits
 from ..lower_bound.rows import LimitSides, directions_of
-from ..robust.robust_rows import Spread, spread_limits
+from ..robust.robust_rows import RobustLimits, spread_limits
 from .elements import Elements, Grid, Profile
 
 
@@ -36,7 +36,7 @@ class Places(NamedTuple):
 
     forces: PathForces
     rates: Array  # (n, 2): d theta / ds
-    swings: Array  # (n, m, p, 5): parametric bounds (`robust_rows`), or none of shape (n, 0)
+    variations: Array  # (n, m, p, 5): parametric bounds (`robust_rows`), or none of shape (n, 0)
 
     def pick(self, rows: Any) -> Places:
         """Return the places that `rows` indexes."""
@@ -45,16 +45,16 @@ class Places(NamedTuple):
     def map(self, change: Callable[[Array], Array]) -> Places:
         """The same with every table changed."""
         forces = PathForces(*map(change, self.forces))
-        return Places(forces, change(self.rates), change(self.swings))
+        return Places(forces, change(self.rates), change(self.variations))
 
 
 class LimitTerms(NamedTuple):
-    """Limited values, constant + a s'' + b s'^2 + squeeze lambda + speed s', (n, m) each."""
+    """Limited values, constant + a s'' + b s'^2 + lam lambda + speed s', (n, m) each."""
 
     constant: Array
     a: Array
     b: Array
-    squeeze: Array
+    lam: Array
     speed: Array
 
 
@@ -71,7 +71,7 @@ class PhaseData(NamedTuple):
     knots: Places  # at the knots of every solid interval, interval by interval
     checks: Places  # at the checks of every solid interval, interval by interval
     rate_limit: Array  # (2,) [N m/s]: of torques, infinite where they may step
-    spread: Spread | None = None  # robust force limits, if there are ranges
+    spread: RobustLimits | None = None  # robust force limits, if there are ranges
 
     @property
     def nonempty(self) -> NDArray[np.int64]:
@@ -107,7 +107,7 @@ class PhaseData(NamedTuple):
         if of_rates.any():
             values += places.rates * np.sqrt(profile.b)[:, None] @ of_rates
         if self.spread is not None:
-            least = self.spread.evaluate(places.forces, places.swings, profile)
+            least = self.spread.evaluate(places.forces, places.variations, profile)
             rows = self.limits.of(PRESS, CONE)
             values[:, rows] = np.repeat(least, len(rows) // least.shape[1], axis=1)
         return np.asarray(values)
@@ -182,7 +182,7 @@ def prepare(
     epsilon: float,
     grid: Grid,
     phase: int,
-    spread: Spread | None = None,
+    spread: RobustLimits | None = None,
 ) -> PhaseData:
     """Evaluate inverse dynamics and limits, with a `spread` robust ones, along a curve.
 
@@ -211,10 +211,10 @@ def prepare(
             f"friction makes the reduced inertia {inertia[worst]:.3g} of its frictionless value"
         )
     forces = inverse(formation, *point[:3], directions, point.kinematics)
-    swings = np.zeros((len(s), 0))
+    variations = np.zeros((len(s), 0))
     if spread is not None:
-        swings = spread.find_swings(formation, point, directions, forces, epsilon)
-    every = Places(forces, point.z_s[:, 3:], swings)
+        variations = spread.find_variations(formation, point, directions, forces, epsilon)
+    every = Places(forces, point.z_s[:, 3:], variations)
     added = len(grid.s) + np.arange(len(between)).reshape(len(nonempty), -1)
     order = np.hstack([nonempty[:, None], added, nonempty[:, None] + 1])
     knots = every.pick(order.ravel())
@@ -239,7 +239,9 @@ def prepare(
         inside = (grid.s[nonempty, None] + steps).ravel()
         owners = np.repeat(grid.segment[nonempty], len(sampling.checks))
         nodes, checks = (
-            each._replace(forces=spread.extend(each.forces, each.swings, spread.pick_signs(*at)))
+            each._replace(
+                forces=spread.extend(each.forces, each.variations, spread.pick_signs(*at))
+            )
             for each, at in ((nodes, (grid.s, grid.segment)), (checks, (inside, owners)))
         )
     kept = limits.without(SPEED), limits.only(SPEED)

@@ -178,7 +178,8 @@ def _search_friction(parameter: Parameter, plan: Callable[[float], object]) -> f
 
 def _solve_elastic(data: PhaseData, profile: Profile, units: Units) -> Profile | None:
     """The motion with the least shortfalls when every limit is soft."""
-    short = np.maximum(_find_shortfalls(data, profile), 0.0) + 0.05 * data.limits.scales
+    short = data.limits.fold(-data.slack(data.nodes, profile))
+    short = np.maximum(short, 0.0) + 0.05 * data.limits.scales
     solution = _solve_soft(data, profile, units, short / units.of(data.limits), None)
     return solution[0] if solution else None
 
@@ -188,7 +189,7 @@ def _relax(data: PhaseData, profile: Profile, units: Units, parameter: Parameter
     if is_hopeless(data, parameter):
         return None
     step = units.force if parameter.unit == "N" else parameter.value
-    short = _find_shortfalls(data, profile).max(axis=0)
+    short = data.limits.fold(-data.slack(data.nodes, profile)).max(axis=0)
     weights = step * data.limits.weigh(parameter)
     needed = np.divide(short, weights, out=np.zeros_like(short), where=weights > 0)
     relaxation = Relaxation(parameter, step)
@@ -215,11 +216,6 @@ def _solve_soft(
     if not nlp.solver.stats()["success"]:
         return None
     return unpack(nlp, data.grid, result["x"].full()[:, 0], units)
-
-
-def _find_shortfalls(data: PhaseData, profile: Profile) -> Array:
-    """Shortfalls of limits at the nodes, shape (n, m) [N, N m]."""
-    return data.limits.fold(-data.slack(data.nodes, profile))
 
 
 def _list_shortfalls(

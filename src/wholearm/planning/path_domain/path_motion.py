@@ -27,15 +27,10 @@ _TINY = 1e-100  # least speed [m/s] that is divided by
 _NEWTON = 5  # iterations from a time to a place
 
 
-def _integrals() -> tuple[Array, Array]:
-    """Gauss points, and the matrix from values there to Legendre coefficients of the integral."""
-    x, weights = legendre.leggauss(_POINTS)
-    to_modes = legendre.legvander(x, _POINTS - 1) * weights[:, None]
-    to_modes *= (2 * np.arange(_POINTS) + 1) / 2
-    return x, np.asarray(legendre.legint(to_modes, lbnd=-1, axis=1), dtype=float)
-
-
-_GAUSS = _integrals()
+# Gauss points, and the matrix from values there to Legendre coefficients of the integral.
+_GAUSS, _WEIGHTS = legendre.leggauss(_POINTS)
+_MODES = legendre.legvander(_GAUSS, _POINTS - 1) * _WEIGHTS[:, None]
+_INTEGRAL = legendre.legint(_MODES * ((2 * np.arange(_POINTS) + 1) / 2), lbnd=-1, axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +66,7 @@ class PathMotion:
         Of the variable w from 0 to 1 in which the speed at constant s'' is linear.
         """
         k, (v0, v1) = self.grid.nonempty, (speed[:, None] for speed in self._ends)
-        w = (1 + _GAUSS[0]) / 2
+        w = (1 + _GAUSS) / 2
         done, left = _share(v0, v1, w)
         every = np.repeat(k, len(w))
         y = self.elements.find_y(every, done.ravel(), left.ravel())
@@ -97,7 +92,7 @@ class PathMotion:
         """Legendre coefficients in 2 w - 1 of the time since each interval's start, (n, m + 1)."""
         v0, v1 = self._ends
         mean = self.grid.steps[self.grid.nonempty] / np.maximum(v0 + v1, _TINY)
-        return np.asarray(mean[:, None] * (self._slowness @ _GAUSS[1]))
+        return np.asarray(mean[:, None] * (self._slowness @ _INTEGRAL))
 
     def durations(self, fractions: Array) -> Array:
         """Time from the start of each interval inside elements to a fraction of it, (n, m) [s]."""
@@ -151,17 +146,17 @@ class PathMotion:
 
     def evaluate(self, t: Array) -> Samples:
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""
-        s, segment, (a, b, squeeze) = self.locate(np.asarray(t, dtype=float))
+        s, segment, (a, b, lam) = self.locate(np.asarray(t, dtype=float))
         point = self.curve.evaluate(s)
         directions = directions_of(self.curve, segment)
         formation = self.curve.formation
         forces = inverse(formation, *point[:3], directions, point.kinematics)
-        c_n, c_t = split_forces(formation, forces.c(a, b, squeeze), directions.Xi)
+        c_n, c_t = split_forces(formation, forces.c(a, b, lam), directions.Xi)
         return Samples(
             point.z,
             point.z_s * np.sqrt(b)[:, None],
             point.z_s * a[:, None] + point.z_ss * b[:, None],
-            forces.tau(a, b, squeeze),
+            forces.tau(a, b, lam),
             c_n,
             c_t,
         )

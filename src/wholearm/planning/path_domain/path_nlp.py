@@ -38,7 +38,7 @@ class Units(NamedTuple):
 
     @property
     def profile(self) -> Array:
-        """Units of (b, a, squeeze), shape (3,)."""
+        """Units of (b, a, internal force), shape (3,)."""
         speed = self.length / self.time
         return np.array([speed**2, speed / self.time, self.force])
 
@@ -146,7 +146,7 @@ def parameters(
     blocks = {
         "a": terms.a * a_unit / unit,
         "b": terms.b * b_unit / unit,
-        "squeeze": terms.squeeze * force / unit,
+        "lam": terms.lam * force / unit,
         "speed": (terms.speed * np.sqrt(b_unit) / unit)[:, nlp.shape.fast],
     }
     torque, motors = unit[list(nlp.shape.torques)], nlp.shape.motors
@@ -203,10 +203,10 @@ def make_bounds(
     if start is not None:
         _, a_unit, force = units.profile
         low[0, node["a"]] = max(start.least_a / a_unit, LEAST_B)
-        low[0, node["squeeze"]], high[0, node["squeeze"]] = start.low / force, start.high / force
+        low[0, node["lam"]], high[0, node["lam"]] = start.low / force, start.high / force
     for place, pin in zip((0, -1), pins, strict=True):
         if pin is not None:
-            low[place, node["squeeze"]] = high[place, node["squeeze"]] = pin / units.profile[2]
+            low[place, node["lam"]] = high[place, node["lam"]] = pin / units.profile[2]
     low[:, node["extra"]] = -np.inf if nlp.objective is Objective.MARGIN else 0.0
     rows, signs, bounds = data.limits.sides
     sides = bounds + signs * tight - data.find_terms().constant[:, rows]
@@ -221,26 +221,19 @@ def make_bounds(
     late = nlp.columns.g.sizes["duration"]
     equal = np.zeros(nlp.columns.g["limits"].start)
     longest = np.full(late, (duration or np.inf) / units.time)
-    quick_low, quick_high = _bound_motors(nlp, data, units, tightening.motors)
+    rates, commands = map(list, nlp.shape.motors)
+    torque, sizes = units.of(data.limits)[list(nlp.shape.torques)], nlp.columns.g.sizes
+    quickest, most = tightening.motors[:, 0], tightening.motors[:, 1] * data.torque_limit / torque
+    joins, begins = np.zeros(sizes["joins"]), np.full(sizes["begins"] // 2, LEAST_B)
+    within = np.concatenate([quickest[:, rates].ravel("F"), most[:, commands].ravel("F")])
+    motors_low = -within, joins, begins, -np.inf * begins
+    motors_high = within, joins, np.inf * begins, -begins
     return {
         "lbx": low[nlp.free],
         "ubx": high[nlp.free],
-        "lbg": np.concatenate([equal, rows_low.ravel(), np.full(late, -np.inf), quick_low]),
-        "ubg": np.concatenate([equal, rows_high.ravel(), longest, quick_high]),
+        "lbg": np.concatenate([equal, rows_low.ravel(), np.full(late, -np.inf), *motors_low]),
+        "ubg": np.concatenate([equal, rows_high.ravel(), longest, *motors_high]),
     }
-
-
-def _bound_motors(
-    nlp: PathNLP, data: PhaseData, units: Units, shares: Array
-) -> tuple[Array, Array]:
-    """Bounds of the rows of `motor_terms`."""
-    rates, commands = map(list, nlp.shape.motors)
-    sizes, torque = nlp.columns.g.sizes, units.of(data.limits)[list(nlp.shape.torques)]
-    most = shares[:, 1] * data.torque_limit / torque
-    within = np.concatenate([shares[:, 0, rates].ravel("F"), most[:, commands].ravel("F")])
-    joins, begins = np.zeros(sizes["joins"]), np.full(sizes["begins"] // 2, LEAST_B)
-    low = np.concatenate([-within, joins, begins, -np.inf * begins])
-    return low, np.concatenate([within, joins, np.inf * begins, -begins])
 
 
 def pack(
@@ -256,7 +249,7 @@ def pack(
     """
     table = np.empty(nlp.free.shape)
     table[:, nlp.columns.node["extra"]] = extra / _margin_unit(nlp, units)
-    table[:, :3] = np.column_stack([profile.b, profile.a, profile.squeeze]) / units.profile
+    table[:, :3] = np.column_stack([profile.b, profile.a, profile.lam]) / units.profile
     table[:, 0] /= sizes
     return np.asarray(table[nlp.free])
 
@@ -272,6 +265,6 @@ def unpack(nlp: PathNLP, grid: Grid, x: Array, units: Units) -> tuple[Profile, f
     """
     table = np.zeros(nlp.free.shape)
     table[nlp.free] = x
-    a, squeeze = table[:, 1] * units.profile[1], table[:, 2] * units.profile[2]
+    a, lam = table[:, 1] * units.profile[1], table[:, 2] * units.profile[2]
     margin = x[-1] * _margin_unit(nlp, units) if nlp.objective in CHAINED else 0.0
-    return follow(grid, a, squeeze), float(margin)
+    return follow(grid, a, lam), float(margin)

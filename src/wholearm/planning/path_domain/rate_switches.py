@@ -87,11 +87,11 @@ def _find_ramps(
             flat = rate < _FLAT
             steady = flat & ~np.isin(owner[looks], owner[looks][~flat])
             flat = steady if steady.any() else flat
-            beside = looks[int(np.argmax(flat) if flat.any() else rate.argmin())]
-            rise = tau[beside] - level - slope * largest * (t[beside] - middle)
-            change = (slope - shares[beside]) * largest
+            neighbour = looks[int(np.argmax(flat) if flat.any() else rate.argmin())]
+            rise = tau[neighbour] - level - slope * largest * (t[neighbour] - middle)
+            change = (slope - shares[neighbour]) * largest
             if change:
-                switches.append(float(t[beside] + rise / change))
+                switches.append(float(t[neighbour] + rise / change))
     return np.array(switches)
 
 
@@ -136,23 +136,23 @@ class Ramped(NamedTuple):
 
     def guess(self, old: Grid, profile: Profile, new: Grid) -> Profile:
         """A `profile` on a grid, with ramps, on another grid."""
-        a, _, squeeze = Elements(old, profile).move(new)
-        ramped, holds = (a.copy(), squeeze.copy()), ((0.0, 0.0), self.holds.tolist())
+        a, _, lam = Elements(old, profile).move(new)
+        ramped, holds = (a.copy(), lam.copy()), ((0.0, 0.0), self.holds.tolist())
         middles = np.repeat(new.edges.mean(axis=1), DEGREE + 1)
         for k, (start, stop) in enumerate(self.spans.tolist()):
-            own = np.flatnonzero((middles > start) & (middles < stop))
-            if not len(own):
+            inside = np.flatnonzero((middles > start) & (middles < stop))
+            if not len(inside):
                 continue
-            beside = np.clip([own[0] - 1, own[-1] + 1], 0, len(a) - 1)
-            share = (new.s[own] - start) / (stop - start)
+            neighbour = np.clip([inside[0] - 1, inside[-1] + 1], 0, len(a) - 1)
+            share = (new.s[inside] - start) / (stop - start)
             end = 0 if k == 0 else 1 if k == len(self.spans) - 1 else None
             if end is not None:
                 share = 1 - np.cbrt(1 - share) if end else np.cbrt(share)
             for column, hold in zip(ramped, holds, strict=True):
-                values = column[beside]
+                values = column[neighbour]
                 if end is not None:
                     values[end] = hold[end]
-                column[own] = values[0] + share * (values[1] - values[0])
+                column[inside] = values[0] + share * (values[1] - values[0])
         return follow(new, *ramped)
 
 

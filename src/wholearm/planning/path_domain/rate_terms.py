@@ -88,7 +88,7 @@ def find_first_slopes(a: Expression) -> tuple[Expression, Expression]:
 
 def write_motor_rows(
     shape: MotorShape,
-    given: Symbols,
+    symbols: Symbols,
     torques: Expression,
     a: Expression,
     paces: Expression,
@@ -98,16 +98,16 @@ def write_motor_rows(
 
     Parameters
     ----------
-    given                                parameters `quick`, 1 / rate limit, and `lags`
+    symbols                              parameters `quick`, 1 / rate limit, and `lags`
     torques, a : (n, 2), (n,)
     paces, lengths : (p + 1, E), (1, E)  dy/dt times the element's length, and that
     """
     if not shape.slow:
         return dict.fromkeys(shape.list_sizes(0), ca.SX(0, 1))
     rates = {joint: _differentiate(torques[:, joint], paces, lengths) for joint in shape.slow}
-    rows = [given.quick[k] * rates[joint] for k, joint in enumerate(shape.rates)]
+    rows = [symbols.quick[k] * rates[joint] for k, joint in enumerate(shape.rates)]
     lagged = [
-        torques[:, joint] + given.lags[k] * rates[joint] for k, joint in enumerate(shape.commands)
+        torques[:, joint] + symbols.lags[k] * rates[joint] for k, joint in enumerate(shape.commands)
     ]
     joins = [torques[_NODES::_NODES, j] - torques[DEGREE:-1:_NODES, j] for j in shape.slow]
     return {

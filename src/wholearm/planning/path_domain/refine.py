@@ -44,7 +44,7 @@ from .violations import Misses, PathSolution, anticipate, price
 _COLD_MU = 1e-7  # initial barrier parameter: complementarity of the multipliers
 _COLD_INSIDE = 1e-2  # larger slacks count as this one [units of the NLP]
 _FAR_MU, _FAR_INSIDE = 1e-2, 1e-3  # the same two without a speed profile
-_REGULARIZATION = 1e-10  # of normal equations with dependent rows, over their mean diagonal
+_DAMPING = 1e-10  # of normal equations with dependent rows, over their mean diagonal
 _PICARD = 2  # Picard iterations between speeds and vertices
 _WILD = 10.0  # s'' over its median above which a vertex is of nearly parallel limits
 _NODES = DEGREE + 1
@@ -147,15 +147,15 @@ class Iterate:
             profile = Elements(source.data.grid, source.solution.profile).move(data.grid)
             multipliers = source.move_multipliers(nlp, data)
             if data.grid.held:
-                profile = follow(data.grid, profile.a, profile.squeeze)
+                profile = follow(data.grid, profile.a, profile.lam)
                 multipliers = center(nlp, data, self.units, profile, multipliers, task)
             start = source.solution._replace(profile=profile, multipliers=multipliers)
         else:
             start, vertices = start_at(nlp, data, self.units, self.fastest)
             if task.options.accuracy >= EARLY:
                 tightening = anticipate(data, start._replace(profile=vertices), tightening)
-        rest = self.units, start, tightening, self.fastest, allowed, shift, self.interior
-        return Iterate(task, *layout, *rest)
+        first = Iterate(task, *layout, self.units, start, tightening, self.fastest, allowed)
+        return replace(first, shift=shift, interior=self.interior)
 
     def move_multipliers(self, nlp: PathNLP, data: PhaseData) -> dict[str, Array]:
         """Multipliers of the solution on another grid of the same curves."""
@@ -399,14 +399,14 @@ def balance(nlp: PathNLP, data: PhaseData, units: Units, profile: Profile) -> di
 
 
 def start_at(
-    nlp: PathNLP, data: PhaseData, units: Units, found: Fastest
+    nlp: PathNLP, data: PhaseData, units: Units, fastest: Fastest
 ) -> tuple[PathSolution, Profile]:
     """Start near the minimum-time profile with estimated multipliers, and that profile itself.
 
     The profile is at vertices of the polygon of s'' and internal force that limits allow.
     """
-    sides = data.list_sides(data.nodes, found.margin)
-    vertices = _Vertices.at(data.grid, sides, found)
+    sides = data.list_sides(data.nodes, fastest.margin)
+    vertices = _Vertices.at(data.grid, sides, fastest)
     rows = data.limits.sides[0]
     scale = data.spans / units.of(data.limits)[rows]
     on_links, kept = _find_multipliers(data.grid, sides, vertices, scale, units)
@@ -416,14 +416,17 @@ def start_at(
         # Slope of the margin over the duration.
         rate = 1 / max(float((kept * presses).sum()), _COLD_MU)
     on_links, kept = rate * on_links, np.maximum(rate * kept, _COLD_MU / _COLD_INSIDE)
-    moved = vertices.move_inside(sides, _COLD_MU / kept / scale[vertices.sides])
+    (a, b, lam), slack = vertices.profile, _COLD_MU / kept / scale[vertices.sides]
+    inner_a, inner_lam = sides.meet(b, vertices.sides, slack)
+    stay = vertices.held | ~(np.isfinite(inner_a) & np.isfinite(inner_lam))
+    moved = Profile(np.where(stay, a, inner_a), b, np.where(stay, lam, inner_lam))
     on_sides = _COLD_MU / np.maximum(sides.find_slack(*moved) * scale, _COLD_INSIDE)
     free = np.flatnonzero(~vertices.held)
     on_sides[free[:, None], vertices.sides[free]] = kept[free]
     on_b = -_COLD_MU / np.maximum(moved.b / units.profile[0], _COLD_INSIDE)
     on_b[vertices.held] += kept[vertices.held, 0]
     multipliers = _join(nlp, data, on_sides, on_b, on_links, rate)
-    return PathSolution(moved, found.margin, multipliers), vertices.profile
+    return PathSolution(moved, fastest.margin, multipliers), vertices.profile
 
 
 def _join(
@@ -462,17 +465,17 @@ class _Vertices(NamedTuple):
     jumps: NDArray[np.int64]  # elements after which s'' jumps from its largest to its least
 
     @staticmethod
-    def at(grid: Grid, sides: LimitSides, found: Fastest) -> _Vertices:
+    def at(grid: Grid, sides: LimitSides, fastest: Fastest) -> _Vertices:
         """The vertices of a minimum-time profile.
 
         Speeds are integrated forwards where s'' is the largest, and backwards where the least.
         """
-        modes = found.find_modes(grid.edges.mean(axis=1))
+        modes = fastest.find_modes(grid.edges.mean(axis=1))
         of_nodes = np.repeat(modes, _NODES)
         runs = np.split(np.arange(len(of_nodes)), np.flatnonzero(np.diff(of_nodes)) + 1)
         held, pushed = of_nodes == SweepMode.HELD, of_nodes == SweepMode.PUSH
-        wanted = np.interp(grid.s, (found.s[1:] + found.s[:-1]) / 2, found.slopes)
-        b, rows = np.interp(grid.s, found.s, found.b), sides.eliminate()
+        wanted = np.interp(grid.s, (fastest.s[1:] + fastest.s[:-1]) / 2, fastest.slopes)
+        b, rows = np.interp(grid.s, fastest.s, fastest.b), sides.eliminate()
         for _ in range(_PICARD):
             most, least = (_find_pairs(sides, rows, b, largest) for largest in (True, False))
             (high, press), (low, other) = (sides.meet(b, pair) for pair in (most, least))
@@ -480,12 +483,12 @@ class _Vertices(NamedTuple):
                 share = np.nan_to_num(np.clip((wanted - low) / (high - low), 0.0, 1.0))
             a = np.where(held, wanted, np.where(pushed, high, low))
             between = share * press + (1 - share) * other
-            squeeze = np.where(held, between, np.where(pushed, press, other))
+            lam = np.where(held, between, np.where(pushed, press, other))
             # Rows within ranges may coincide, and then meet nowhere: no vertex either.
-            wild = ~(np.abs(a) <= _WILD * np.median(np.abs(found.slopes))) | ~np.isfinite(squeeze)
+            wild = ~(np.abs(a) <= _WILD * np.median(np.abs(fastest.slopes))) | ~np.isfinite(lam)
             if wild.any() and not wild.all():
                 a = np.where(wild, wanted, a)
-                squeeze[wild] = np.interp(grid.s[wild], grid.s[~wild], squeeze[~wild])
+                lam[wild] = np.interp(grid.s[wild], grid.s[~wild], lam[~wild])
             rise = grid.integrate(a)
             for run in runs:
                 end = run[0] if pushed[run[0]] else run[-1]
@@ -493,14 +496,7 @@ class _Vertices(NamedTuple):
                     b[run] = np.maximum(b[end] + rise[run] - rise[end], 0.0)
         jumps = np.flatnonzero((modes[:-1] == SweepMode.PUSH) & (modes[1:] == SweepMode.BRAKE))
         pair = np.where(pushed[:, None], most, least)
-        return _Vertices(Profile(a, b, squeeze), pair, held, jumps)
-
-    def move_inside(self, sides: LimitSides, slack: Array) -> Profile:
-        """The motion with some slack (n, 2) of the sides that meet."""
-        a, b, squeeze = self.profile
-        inner_a, inner_squeeze = sides.meet(b, self.sides, slack)
-        stay = self.held | ~(np.isfinite(inner_a) & np.isfinite(inner_squeeze))
-        return Profile(np.where(stay, a, inner_a), b, np.where(stay, squeeze, inner_squeeze))
+        return _Vertices(Profile(a, b, lam), pair, held, jumps)
 
 
 def _find_pairs(
@@ -523,25 +519,25 @@ def _find_multipliers(
     Where a speed limit is active, its multiplier is in the first column. The normal equations of
     stationarity of the duration are block tridiagonal in elements: block Gaussian elimination.
     """
-    own, across = _list_rows(grid, sides, vertices, scale, units)
+    local, across = _list_rows(grid, sides, vertices, scale, units)
     slope = _find_slopes(grid, vertices.profile, units)
-    ahead = np.concatenate([own[1:], np.zeros_like(own[:1])])
-    squares = own @ own.transpose(0, 2, 1) + across @ across.transpose(0, 2, 1)
-    squares += _REGULARIZATION * np.trace(squares, axis1=1, axis2=2).mean() * np.eye(own.shape[1])
-    beside = across @ ahead.transpose(0, 2, 1)
-    pull = -(own @ slope[..., None])
+    following = np.concatenate([local[1:], np.zeros_like(local[:1])])
+    squares = local @ local.transpose(0, 2, 1) + across @ across.transpose(0, 2, 1)
+    squares += _DAMPING * np.trace(squares, axis1=1, axis2=2).mean() * np.eye(local.shape[1])
+    coupling = across @ following.transpose(0, 2, 1)
+    pull = -(local @ slope[..., None])
     pull[:-1] -= across[:-1] @ slope[1:, :, None]
-    for e in range(len(own) - 1):
-        solved = np.linalg.solve(squares[e], np.hstack([beside[e], pull[e]]))
-        squares[e + 1] -= beside[e].T @ solved[:, :-1]
-        pull[e + 1] -= beside[e].T @ solved[:, -1:]
-        beside[e], pull[e] = solved[:, :-1], solved[:, -1:]
+    for e in range(len(local) - 1):
+        solved = np.linalg.solve(squares[e], np.hstack([coupling[e], pull[e]]))
+        squares[e + 1] -= coupling[e].T @ solved[:, :-1]
+        pull[e + 1] -= coupling[e].T @ solved[:, -1:]
+        coupling[e], pull[e] = solved[:, :-1], solved[:, -1:]
     pull[-1] = np.linalg.solve(squares[-1], pull[-1])
-    for e in reversed(range(len(own) - 1)):
-        pull[e] -= beside[e] @ pull[e + 1]
-    found = pull[..., 0]
-    on_sides = -found[:, _NODES:].reshape(-1, 2, _NODES).transpose(0, 2, 1)
-    return found[:, :_NODES].ravel()[:-1], on_sides.reshape(-1, 2)
+    for e in reversed(range(len(local) - 1)):
+        pull[e] -= coupling[e] @ pull[e + 1]
+    values = pull[..., 0]
+    on_sides = -values[:, _NODES:].reshape(-1, 2, _NODES).transpose(0, 2, 1)
+    return values[:, :_NODES].ravel()[:-1], on_sides.reshape(-1, 2)
 
 
 def _list_rows(
@@ -554,13 +550,13 @@ def _list_rows(
     """
     count, inner = len(grid.kinds), np.arange(DEGREE)
     lengths = np.diff(grid.edges) / units.length
-    own = np.zeros((count, 3 * _NODES, 3 * _NODES))
-    across = np.zeros_like(own)
-    own[:, inner, inner], own[:, inner, inner + 1] = -1.0, 1.0
-    own[:, :DEGREE, _NODES : 2 * _NODES] = -lengths[..., None] * find_basis().links[grid.kinds]
-    own[:-1, DEGREE, DEGREE], across[:-1, DEGREE, 0] = -1.0, 1.0
+    local = np.zeros((count, 3 * _NODES, 3 * _NODES))
+    across = np.zeros_like(local)
+    local[:, inner, inner], local[:, inner, inner + 1] = -1.0, 1.0
+    local[:, :DEGREE, _NODES : 2 * _NODES] = -lengths[..., None] * find_basis().links[grid.kinds]
+    local[:-1, DEGREE, DEGREE], across[:-1, DEGREE, 0] = -1.0, 1.0
     # Where s'' jumps the duration does not depend on the speed.
-    own[vertices.jumps, DEGREE], across[vertices.jumps, DEGREE] = 0.0, 0.0
+    local[vertices.jumps, DEGREE], across[vertices.jumps, DEGREE] = 0.0, 0.0
     k = np.arange(len(grid.s))[:, None]
     speed = np.sqrt(np.maximum(vertices.profile.b, LEAST_B * units.profile[0]))[:, None]
     of_b = (sides.bend + sides.drag / (2 * speed))[k, vertices.sides]
@@ -573,9 +569,9 @@ def _list_rows(
     for side in range(2):
         for unknown in range(3):
             rows, columns = node + (1 + side) * _NODES, node + unknown * _NODES
-            own[:, rows, columns] = parts[:, :, side, unknown]
-    own[0, :, 0] = own[-1, :, DEGREE] = 0.0
-    return own, across
+            local[:, rows, columns] = parts[:, :, side, unknown]
+    local[0, :, 0] = local[-1, :, DEGREE] = 0.0
+    return local, across
 
 
 def _find_slopes(grid: Grid, profile: Profile, units: Units) -> Array:

@@ -43,7 +43,7 @@ def plan_sequence(
 
 def plan_slowly(
     parts: Sequence[ImpactSequence],
-    beside: tuple[Curve | Array | None, Curve | Formation | None],
+    neighbours: tuple[Curve | Array | None, Curve | Formation | None],
     epsilon: float,
     options: PlanOptions,
     durations: Sequence[float | None],
@@ -52,14 +52,17 @@ def plan_slowly(
 
     Parameters
     ----------
-    beside           the curves before and after all of them, if any; in the time domain the final
+    neighbours       the curves before and after all of them, if any; in the time domain the final
                      torques of the former, and the formation of the latter
     durations : [s]  the longest duration of each, for the objective `margin`
     """
     plans: Plans = []
-    firsts: list[Curve | Formation | None] = [*(part.curves[0] for part in parts[1:]), beside[1]]
+    firsts: list[Curve | Formation | None] = [
+        *(part.curves[0] for part in parts[1:]),
+        neighbours[1],
+    ]
     joint: Joint | None = None
-    before: Curve | Array | None = beside[0]
+    before: Curve | Array | None = neighbours[0]
     for part, after, duration in zip(parts, firsts, durations, strict=True):
         number, first, last = part.phases[0].number, part.curves[0], part.curves[-1]
         if before is not None and joint is None:

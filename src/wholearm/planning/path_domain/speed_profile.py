@@ -48,25 +48,15 @@ class Fastest(NamedTuple):
         modes = self.modes[np.clip(np.searchsorted(self.s, places) - 1, 0, len(self.modes) - 1)]
         jumps = np.array([place for place, jumps in self.switches if jumps])
         for k in np.flatnonzero(modes == SweepMode.SWITCH).tolist():
-            near = jumps[np.abs(jumps - places[k]).argmin()] if len(jumps) else places[k]
-            modes[k] = SweepMode.PUSH if places[k] < near else SweepMode.BRAKE
+            jump = jumps[np.abs(jumps - places[k]).argmin()] if len(jumps) else places[k]
+            modes[k] = SweepMode.PUSH if places[k] < jump else SweepMode.BRAKE
         return modes
 
 
 class Narrow(NamedTuple):
-    """Breaks about a place that limits the margin, whatever the duration."""
+    """Breaks about a place that limits the margin, whatever the duration; graded at an end."""
 
     switches: list[Switch]
-
-    @staticmethod
-    def about(places: Array, length: float) -> Narrow:
-        """Breaks about an interval, (2,), of a curve with a length [m]; graded at its ends."""
-        near = length * np.array(_GRADES)
-        if places[0] < near[-1]:
-            places = near
-        elif places[1] > length - near[-1]:
-            places = length - near
-        return Narrow([Switch(float(place), False) for place in np.sort(places)])
 
 
 def find_fastest(data: PhaseData, duration: float | None) -> Fastest | Narrow | None:
@@ -107,9 +97,9 @@ def is_hopeless(data: PhaseData, spared: Parameter | None = None) -> bool:
 
 
 def _find_at(samples: Samples, margin: float) -> Fastest:
-    s, b, modes, near = _sweep(samples, samples.rows, 1, None)
+    s, b, modes, b_middle = _sweep(samples, samples.rows, 1, None)
     steps, middle = np.diff(s), samples.rows.pick(slice(1, None, 2))
-    pushed, braked = (middle.extreme(near, largest).a for largest in (True, False))
+    pushed, braked = (middle.extreme(b_middle, largest).a for largest in (True, False))
     # In an interval with a switch s'' is first the largest, then the least.
     with np.errstate(divide="ignore", invalid="ignore"):
         first = (np.diff(b) / 2 - braked * steps) / (pushed - braked)
@@ -125,23 +115,23 @@ def _find_at(samples: Samples, margin: float) -> Fastest:
 
 
 def _sweep(
-    samples: Samples, rows: PathLimitRows, stride: int, near: Array | None
+    samples: Samples, rows: PathLimitRows, stride: int, b_guess: Array | None
 ) -> tuple[Array, Array, NDArray[np.int64], Array]:
     """Sweep with the middle of an interval every `2 stride` places, for limits `rows` there.
 
-    Nodes s, b, modes, and b at the middles. Viscous friction is linearised about b = `near` there,
-    by default that of a coarse sweep without it.
+    Nodes s, b, modes, and b at the middles. Viscous friction is linearised about `b_guess` there,
+    by default b of a coarse sweep without it.
     """
     places = np.append(samples.s, samples.length)
     s, middle = places[:: 2 * stride], slice(stride, len(samples.s), 2 * stride)
     inner, steps = rows.pick(middle), np.diff(s)
     part = (samples.s[middle] - s[:-1]) / steps
     cap = np.append(rows.cap[:: 2 * stride], np.inf)
-    if near is None and inner.v.any():
+    if b_guess is None and inner.v.any():
         wide = max(len(samples.fractions) // 2, stride)
         ends, b, *_ = _sweep(samples, rows._replace(v=np.zeros_like(rows.v)), wide, None)
-        near = np.interp(samples.s[middle], ends, b)
-    motion = sweep(inner, steps, part, cap, near)
+        b_guess = np.interp(samples.s[middle], ends, b)
+    motion = sweep(inner, steps, part, cap, b_guess)
     return s, motion.b, motion.modes, (1 - part) * motion.b[:-1] + part * motion.b[1:]
 
 
@@ -150,14 +140,14 @@ def _find_margin(data: PhaseData, samples: Samples, duration: float) -> float | 
     force, rows = data.curve.formation.scene.scales.force, samples.rows
     rate = (Samples.of(data, force).rows.one - rows.one) / force
 
-    def evaluate(margin: float, stride: int, near: Array | None) -> tuple[float, Array]:
+    def evaluate(margin: float, stride: int, b_guess: Array | None) -> tuple[float, Array]:
         """Relative excess of the squared mean speed, nearly linear in the margin, and b."""
         tight = rows._replace(one=rows.one + margin * rate)
-        s, b, _, near = _sweep(samples, tight, stride, near)
-        return (duration / add_up(b, np.diff(s))) ** 2 - 1, near
+        s, b, _, b_guess = _sweep(samples, tight, stride, b_guess)
+        return (duration / add_up(b, np.diff(s))) ** 2 - 1, b_guess
 
     stride = max(len(samples.fractions) // 4, 1)
-    at_low, near = evaluate(0.0, stride, None)
+    at_low, b_guess = evaluate(0.0, stride, None)
     if at_low < 0:
         return None
     low, high, at_high, guess, side = 0.0, np.inf, -1.0, force, 0
@@ -166,7 +156,7 @@ def _find_margin(data: PhaseData, samples: Samples, duration: float) -> float | 
     for _ in range(_TRIES):
         blocked = None
         try:
-            value, near = evaluate(guess, stride, near)
+            value, b_guess = evaluate(guess, stride, b_guess)
             slope, margin, last = (value - last) / (guess - margin), guess, value
         except NoMotionError as error:
             value, blocked = -1.0, error.interval
@@ -180,7 +170,13 @@ def _find_margin(data: PhaseData, samples: Samples, duration: float) -> float | 
             high, at_high, stuck = guess, value, blocked
         if stuck is not None and high - low < _SAME * high:
             ends = 2 * stride * np.arange(stuck, stuck + 2)
-            return Narrow.about(np.append(samples.s, samples.length)[ends], samples.length)
+            places = np.append(samples.s, samples.length)[ends]
+            graded = samples.length * np.array(_GRADES)
+            if places[0] < graded[-1]:
+                places = graded
+            elif places[1] > samples.length - graded[-1]:
+                places = samples.length - graded
+            return Narrow([Switch(float(place), False) for place in np.sort(places)])
         guess = low + at_low / (at_low - at_high) * (high - low) if np.isfinite(high) else 2 * low
     else:
         return None

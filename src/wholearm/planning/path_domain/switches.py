@@ -170,5 +170,5 @@ class _Looks(NamedTuple):
         crossed = np.flatnonzero((gap[1:] <= 0) & (gap[:-1] > 0))
         if not len(crossed):
             return None
-        k = int(crossed[0])
-        return float(s[k] + steps[k] * gap[k] / (gap[k] - gap[k + 1]))
+        i = int(crossed[0])
+        return float(s[i] + steps[i] * gap[i] / (gap[i] - gap[i + 1]))

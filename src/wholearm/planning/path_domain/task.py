@@ -15,7 +15,7 @@ from ...mechanics.uniqueness import describe_uniqueness, find_minors
 from ..advice import name_phases
 from ..lower_bound.rows import directions_of
 from ..options import Objective, PlanOptions
-from ..robust.robust_rows import Guide, Spread, spread
+from ..robust.robust_rows import Guide, RobustLimits, spread
 from .elements import DEGREE
 from .path_data import PhaseData, join, prepare
 from .path_mesh import SOFT, START, Mesh, find_ends
@@ -48,7 +48,7 @@ class Task:
     pins: Pins = (None, None)
 
     @cached_property
-    def spreads(self) -> list[Spread | None]:
+    def spreads(self) -> list[RobustLimits | None]:
         """Robust force limits of each curve, None without ranges."""
         if not self.guides:
             return [None] * len(self.curves)

@@ -65,10 +65,10 @@ class LimitShape(NamedTuple):
 class NLPColumns(NamedTuple):
     """Blocks of the vectors of an NLP."""
 
-    # unknowns of each node: b over its size (none at the two ends), a, squeeze, and `extra`:
+    # unknowns of each node: b over its size (none at the two ends), a, internal force, and `extra`:
     # shortfalls for `elastic`, the least margin, or the relaxation for `relax`
     node: Columns
-    # speeds at the `ends`, `steps`, `weight` of time, unit of squeeze in the regularization;
+    # speeds at the `ends`, `steps`, `weight` of time, unit of internal force in the regularization;
     # coefficients of the limits at the nodes, column by column (the constant ones are part of the
     # bounds); constant torques and weights of joints for `effort`; how limits and b's one give way
     # for `relax`; 1 / rate limits, lags, bends of elements and `sizes` of b for rate limits
@@ -84,7 +84,7 @@ def list_columns(shape: LimitShape, intervals: int, objective: Objective) -> NLP
     chained = objective in CHAINED
     extra = m if objective is Objective.ELASTIC else int(chained)
     p = {"ends": 2, "steps": intervals, "weight": 1, "calm": 1, "a": n * m, "b": n * m}
-    p |= {"squeeze": n * m, "speed": n * len(shape.fast)}
+    p |= {"lam": n * m, "speed": n * len(shape.fast)}
     if objective is Objective.EFFORT or shape.motors.slow:
         p |= {"torque": n * 2}
     if objective is Objective.EFFORT:
@@ -97,7 +97,7 @@ def list_columns(shape: LimitShape, intervals: int, objective: Objective) -> NLP
     rows = (len(shape.sides) if objective in SOFT else m) + relax
     g = {"links": intervals, "chain": intervals * chained, "limits": n * rows}
     g |= {"duration": int(objective is Objective.MARGIN)} | shape.motors.list_sizes(intervals)
-    return NLPColumns(Columns(b=1, a=1, squeeze=1, extra=extra), Columns(**p), Columns(**g))
+    return NLPColumns(Columns(b=1, a=1, lam=1, extra=extra), Columns(**p), Columns(**g))
 
 
 def write_terms(shape: LimitShape, intervals: int, objective: Objective) -> dict[str, Expression]:
@@ -108,12 +108,12 @@ def write_terms(shape: LimitShape, intervals: int, objective: Objective) -> dict
     dict  expressions of x, p, f and g
     """
     n, columns = intervals + 1, list_columns(shape, intervals, objective)
-    given = columns.p.make_symbols()
-    b_inner, a, squeeze = ca.SX.sym("b", n - 2), ca.SX.sym("a", n), ca.SX.sym("squeeze", n)
+    symbols = columns.p.make_symbols()
+    b_inner, a, lam = ca.SX.sym("b", n - 2), ca.SX.sym("a", n), ca.SX.sym("lam", n)
     extra = ca.SX.sym("extra", n, columns.node.sizes["extra"])
-    h, ends, fast = given.steps, given.ends, list(shape.fast)
+    h, ends, fast = symbols.steps, symbols.ends, list(shape.fast)
     # Under rate limits b is scaled: next to rest it is many orders of magnitude smaller.
-    bends, sizes = (given.bends.T, given.sizes) if shape.motors.slow else (None, ca.DM.ones(n))
+    bends, sizes = (symbols.bends.T, symbols.sizes) if shape.motors.slow else (None, ca.DM.ones(n))
     b = ca.vertcat(ends[0] ** 2, b_inner * sizes[1:-1], ends[1] ** 2)
     speed = ca.vertcat(ends[0], ca.sqrt(b[1:-1]), ends[1])
     largest = ca.fmax(sizes[1:], sizes[:-1])
@@ -121,20 +121,20 @@ def write_terms(shape: LimitShape, intervals: int, objective: Objective) -> dict
     times = ca.vec(ca.DM(find_basis().weights) @ lengths / paces)
 
     def scale(name: str, column: Expression) -> Expression:
-        table = ca.reshape(getattr(given, name), n, -1)
+        table = ca.reshape(getattr(symbols, name), n, -1)
         return table * ca.repmat(column, 1, table.shape[1])
 
     # Limits but for their constant part, which is in the bounds.
-    values = scale("a", a) + scale("b", b) + scale("squeeze", squeeze)
+    values = scale("a", a) + scale("b", b) + scale("lam", lam)
     values[:, fast] += scale("speed", speed)
     torques = values[:, list(shape.torques)]
     if objective is Objective.EFFORT or shape.motors.slow:
-        torques += ca.reshape(given.torque, n, 2)
+        torques += ca.reshape(symbols.torque, n, 2)
     # The relaxation has to outweigh the regularization.
     share = 1e-3 if objective is Objective.RELAX else 1.0
-    squeezed, node_weights = given.calm * squeeze, ca.vertcat(0, h) + ca.vertcat(h, 0)
-    node_costs = share * _CALM * node_weights * squeezed**2
-    rough = _find_bends(a, DEGREE) + _find_bends(squeezed, DEGREE)
+    scaled_lam, node_weights = symbols.calm * lam, ca.vertcat(0, h) + ca.vertcat(h, 0)
+    node_costs = share * _CALM * node_weights * scaled_lam**2
+    rough = _find_bends(a, DEGREE) + _find_bends(scaled_lam, DEGREE)
     if objective is Objective.ELASTIC:
         # Soft limits would otherwise be avoided by motions that reverse between nodes.
         slopes, bends = _find_bends(a, 1), _find_bends(a, 2)
@@ -144,7 +144,7 @@ def write_terms(shape: LimitShape, intervals: int, objective: Objective) -> dict
     if objective is Objective.TIME:
         node_costs += times
     elif objective is Objective.EFFORT:
-        node_costs += times * (torques**2 @ given.joints + given.weight)
+        node_costs += times * (torques**2 @ symbols.joints + symbols.weight)
     elif objective is Objective.MARGIN:
         node_costs[0] -= extra[0]
     elif objective is Objective.ELASTIC:
@@ -153,19 +153,19 @@ def write_terms(shape: LimitShape, intervals: int, objective: Objective) -> dict
     else:
         node_costs[0] += extra[0]
         node_costs += 1e-5 * times
-    nodes = ca.horzcat(ca.vertcat(0, b_inner, 0), a, squeeze, extra).T
+    nodes = ca.horzcat(ca.vertcat(0, b_inner, 0), a, lam, extra).T
     chained, late = objective in CHAINED, objective is Objective.MARGIN
-    rows = _write_limits(shape, objective, given, values, extra, b)
+    rows = _write_limits(shape, objective, symbols, values, extra, b)
     return {
         "x": ca.vertcat(nodes[1:, 0], ca.vec(nodes[:, 1:-1]), nodes[1:, -1]),
-        "p": given.every,
+        "p": symbols.every,
         "f": ca.sum1(node_costs),
         "g": columns.g.write(
             links=(b[1:] - b[:-1] - _write_rises(a, h, bends)) / largest,
             chain=extra[1:] - extra[:-1] if chained else ca.SX(0, 1),
             limits=rows.T,
             duration=ca.sum1(times) if late else ca.SX(0, 1),
-            **write_motor_rows(shape.motors, given, torques, a, paces, lengths),
+            **write_motor_rows(shape.motors, symbols, torques, a, paces, lengths),
         ),
     }
 
@@ -219,7 +219,7 @@ def _find_bends(values: Expression, degree: int) -> Expression:
 def _write_limits(
     shape: LimitShape,
     objective: Objective,
-    given: Symbols,
+    symbols: Symbols,
     values: Expression,
     extra: Expression,
     b: Expression,
@@ -231,8 +231,8 @@ def _write_limits(
     if objective not in SOFT:
         return values
     relax = objective is Objective.RELAX
-    short = extra @ given.gives.T if relax else extra
+    short = extra @ symbols.gives.T if relax else extra
     rows = [values[:, row] + sign * short[:, row] for row, sign in shape.sides]
     if relax:
-        rows.append(given.rates * b - short[:, shape.rows])
+        rows.append(symbols.rates * b - short[:, shape.rows])
     return ca.horzcat(*rows)

@@ -26,7 +26,7 @@ _KEPT = 1e-9  # violation of a limit that is rounding, over its scale
 
 
 class SureStart(NamedTuple):
-    """Bounds of the first node: s'' from `least_a` up, squeeze from `low` to `high`."""
+    """Bounds of the first node: s'' from `least_a` up, internal force from `low` to `high`."""
 
     least_a: float
     low: float
@@ -45,7 +45,7 @@ def find_sure_start(
     """
     formation, forces = data.curve.formation, data.nodes.forces
     holds = list_holds(formation, data.curve.start, ranges)
-    here = np.array([profile.a[0], profile.squeeze[0]])
+    here = np.array([profile.a[0], profile.lam[0]])
     T0, T = forces.T0[0], np.column_stack([forces.Ta[0], forces.Tl[0]])
     unit = formation.scene.scales.torque
     if measure_holds(holds, T0 + T @ here) > SURE * unit:
@@ -53,7 +53,7 @@ def find_sure_start(
     rows, signs, bounds = data.limits.sides
     presses = np.isin(rows, data.limits.of(PRESS)) & (signs > 0)
     terms = data.find_terms()
-    slopes = signs[:, None] * np.column_stack([terms.a[0], terms.squeeze[0]])[rows]
+    slopes = signs[:, None] * np.column_stack([terms.a[0], terms.lam[0]])[rows]
     scales = formation.scene.scales
     units = np.array([scales.acceleration, scales.force])
     for share in _SHARES if margin > 0 else _SHARES[:1]:

@@ -30,7 +30,7 @@ from ...mechanics.dynamics import Directions, PathForces, inverse
 from ...mechanics.limits import CONE, PRESS, SPEED, LimitSet, SideTerms, make_limits
 from ...mechanics.wedging import StaticTorques, find_static_torques
 from ...problem.uncertainty import PARAMETERS
-from ...scene.model import Friction, Scene
+from ...scene.model import Friction
 from ...sensitivity.slopes import find_force_slopes
 from ..lower_bound.rows import LimitSides, directions_of
 
@@ -48,15 +48,15 @@ class Guide(NamedTuple):
     s: Array
     a: Array
     b: Array
-    squeeze: Array
+    lam: Array
 
     def at(self, s: Array) -> tuple[Array, Array, Array]:
         """The motion at some places."""
-        a, b, squeeze = (np.interp(s, self.s, column) for column in self[1:])
-        return a, b, squeeze
+        a, b, lam = (np.interp(s, self.s, column) for column in self[1:])
+        return a, b, lam
 
 
-class Spread(NamedTuple):
+class RobustLimits(NamedTuple):
     """Robust force limits of a curve."""
 
     names: tuple[str, ...]  # parameters with a range that counts
@@ -66,7 +66,7 @@ class Spread(NamedTuple):
     segment: NDArray[np.int64]  # (n,)
     signs: NDArray[np.int8]  # (n, m, COPIES, p)
 
-    def find_swings(
+    def find_variations(
         self,
         formation: Formation,
         point: CurvePoint,
@@ -76,14 +76,14 @@ class Spread(NamedTuple):
     ) -> Array:
         """Parametric bounds of each force limit, shape (n, m, p, COUNT)."""
         slopes = find_force_slopes(formation, point, directions, forces, self.names)
-        swings = np.einsum("mi,nipq->nmpq", self.rows, slopes)
+        variations = np.einsum("mi,nipq->nmpq", self.rows, slopes)
         c = _stack(forces)
         for k, name in enumerate(self.names):
             edges = find_edges(formation, self.rows, name)
             if edges is not None:
-                swings[:, :, k] += np.einsum("mi,niq->nmq", edges, c)
-                swings[:, :, k, 0] -= epsilon * edges.sum(axis=1)
-        return np.asarray(swings * self.radii[:, None])
+                variations[:, :, k] += np.einsum("mi,niq->nmq", edges, c)
+                variations[:, :, k, 0] -= epsilon * edges.sum(axis=1)
+        return np.asarray(variations * self.radii[:, None])
 
     def pick_signs(self, s: Array, segment: NDArray[np.int64]) -> NDArray[np.int8]:
         """Signs at some places, each of a segment, shape (n, m, COPIES, p)."""
@@ -94,9 +94,9 @@ class Spread(NamedTuple):
             rows[here] = table[np.searchsorted((places[1:] + places[:-1]) / 2, s[here])]
         return self.signs[rows]
 
-    def extend(self, forces: PathForces, swings: Array, signs: NDArray[np.int8]) -> PathForces:
+    def extend(self, forces: PathForces, variations: Array, signs: NDArray[np.int8]) -> PathForces:
         """Forces with the robust value of each copy of each limit as further columns."""
-        spread = np.einsum("nmkp,nmpq->nmkq", signs, swings)
+        spread = np.einsum("nmkp,nmpq->nmkq", signs, variations)
         nominal = np.einsum("mi,niq->nmq", self.rows, _stack(forces))
         nominal = np.repeat(nominal, spread.shape[2], axis=1)
         added = np.moveaxis(nominal - spread.reshape(nominal.shape), -1, 0)
@@ -105,11 +105,11 @@ class Spread(NamedTuple):
         return forces._replace(**wider)
 
     def evaluate(
-        self, forces: PathForces, swings: Array, motion: tuple[Array, Array, Array]
+        self, forces: PathForces, variations: Array, motion: tuple[Array, Array, Array]
     ) -> Array:
         """The left sides of the robust limits, shape (n, m) [N]."""
         nominal = forces.c(*motion)[:, : self.rows.shape[1]] @ self.rows.T
-        return np.asarray(nominal - np.abs(measure(swings, motion)).sum(axis=2))
+        return np.asarray(nominal - np.abs(measure(variations, motion)).sum(axis=2))
 
 
 def find_edges(formation: Formation, rows: Array, name: str) -> Array | None:
@@ -128,11 +128,11 @@ def find_edges(formation: Formation, rows: Array, name: str) -> Array | None:
     return edges
 
 
-def measure(swings: Array, motion: tuple[Array, Array, Array]) -> Array:
+def measure(variations: Array, motion: tuple[Array, Array, Array]) -> Array:
     """Parametric bounds of a motion, shape (n, m, p) [N]."""
-    a, b, squeeze = motion
-    columns = np.stack([np.ones_like(a), a, b, squeeze, np.sqrt(np.maximum(b, 0.0))], axis=-1)
-    return np.asarray(np.einsum("nmpq,nq->nmp", swings, columns))
+    a, b, lam = motion
+    columns = np.stack([np.ones_like(a), a, b, lam, np.sqrt(np.maximum(b, 0.0))], axis=-1)
+    return np.asarray(np.einsum("nmpq,nq->nmp", variations, columns))
 
 
 def spread_limits(limits: LimitSet) -> LimitSet:
@@ -154,7 +154,7 @@ def spread_limits(limits: LimitSet) -> LimitSet:
     return LimitSet(tuple(wider))
 
 
-def spread(curve: Curve, guide: Guide, epsilon: float, widths: Mapping[str, float]) -> Spread:
+def spread(curve: Curve, guide: Guide, epsilon: float, widths: Mapping[str, float]) -> RobustLimits:
     """Robust force limits of a curve near a reference, for ranges of some radii but the delay."""
     names = [each.name for each in PARAMETERS if widths.get(each.name, 0.0) > 0]
     names = [name for name in names if name != "delay"]
@@ -170,38 +170,38 @@ def spread(curve: Curve, guide: Guide, epsilon: float, widths: Mapping[str, floa
     rows = limits.only(PRESS, CONE).rows[:, :-4]
     none = np.zeros((len(s), len(rows), COPIES, len(names)), dtype=np.int8)
     radii = np.array([widths[name] for name in names])
-    bare = Spread(tuple(names), radii, rows, s, segment, none)
-    swings = bare.find_swings(formation, point, directions, forces, epsilon)
-    signs = _find_signs(bare, limits, forces, swings, point.z_s[:, 3:], guide.at(s))
+    bare = RobustLimits(tuple(names), radii, rows, s, segment, none)
+    variations = bare.find_variations(formation, point, directions, forces, epsilon)
+    signs = _find_signs(bare, limits, forces, variations, point.z_s[:, 3:], guide.at(s))
     return bare._replace(signs=signs)
 
 
 def _find_signs(
-    bare: Spread,
+    bare: RobustLimits,
     limits: LimitSet,
     forces: PathForces,
-    swings: Array,
+    variations: Array,
     rates: Array,
     motion: tuple[Array, Array, Array],
 ) -> NDArray[np.int8]:
     """Signs of the rows that meet at the vertices of largest and least a."""
     wider, signs, b = spread_limits(limits), bare.signs.copy(), motion[1].copy()
-    signs[:, :, 4] = np.sign(measure(swings, motion))
+    signs[:, :, 4] = np.sign(measure(variations, motion))
     forced = limits.only(PRESS, CONE)
     for turn in range(_ROUNDS):
-        extended = bare.extend(forces, swings, signs)
+        extended = bare.extend(forces, variations, signs)
         sides = LimitSides(*SideTerms.of(wider, extended, rates), np.full(len(b), np.inf))
         rows = sides.eliminate()
         extremes = (rows.extreme(b, largest).row for largest in (True, False))
         ends = [sides.meet(b, sides.pair(row)) for row in extremes]
         with np.errstate(invalid="ignore"):
             b = np.where(ends[0][0] < ends[1][0], _LOWER * b, b)
-        for end, (a, squeeze) in enumerate(ends):
-            here = np.nan_to_num(a), b, np.nan_to_num(squeeze)
-            slack = bare.evaluate(forces, swings, here) - forced.low
+        for end, (a, lam) in enumerate(ends):
+            here = np.nan_to_num(a), b, np.nan_to_num(lam)
+            slack = bare.evaluate(forces, variations, here) - forced.low
             rowed = extended.c(*here)[:, bare.rows.shape[1] :].reshape(*slack.shape, -1)
             missed = slack < rowed.min(axis=2) - forced.low - _SAME * forced.scales
-            better = np.sign(measure(swings, here)).astype(np.int8)
+            better = np.sign(measure(variations, here)).astype(np.int8)
             slots = (2 * end, 2 * end + 1) if turn == 0 else (2 * end + turn % 2,)
             for slot in slots:
                 signs[:, :, slot] = np.where(missed[..., None], better, signs[:, :, slot])
@@ -228,9 +228,12 @@ def list_holds(formation: Formation, z: Array, ranges: Mapping[str, float]) -> l
     """
     fingers = (ranges.get("gain1", 0.0), ranges.get("gain2", 0.0))
     gains = list(product(*(_spread(width) for width in fingers)))
-    holds = []
+    scene, parts, holds = formation.scene, ("palm", "finger1", "finger2"), []
+    largest = {part: 1 + ranges.get(f"friction_{part}", 0.0) for part in parts}
+    friction = Friction(**{part: getattr(scene.friction, part) * largest[part] for part in parts})
     for mass in _spread(ranges.get("mass", 0.0)):
-        corner = replace(formation, scene=_change(formation.scene, ranges, mass))
+        polygon = replace(scene.polygon, mass=scene.polygon.mass * mass)
+        corner = replace(formation, scene=replace(scene, polygon=polygon, friction=friction))
         static = find_static_torques([corner], z)
         holds += [RobustHold(static, np.array(gain)) for gain in gains]
     return holds
@@ -243,11 +246,3 @@ def measure_holds(holds: Sequence[RobustHold], tau: Array) -> float:
 
 def _spread(width: float) -> tuple[float, ...]:
     return (1 - width, 1 + width) if width else (1.0,)
-
-
-def _change(scene: Scene, ranges: Mapping[str, float], mass: float) -> Scene:
-    parts = ("palm", "finger1", "finger2")
-    more = {part: 1 + ranges.get(f"friction_{part}", 0.0) for part in parts}
-    friction = Friction(**{part: getattr(scene.friction, part) * more[part] for part in parts})
-    polygon = replace(scene.polygon, mass=scene.polygon.mass * mass)
-    return replace(scene, polygon=polygon, friction=friction)
