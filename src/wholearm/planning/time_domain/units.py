@@ -1,8 +1,7 @@
-"""The scene's own units, in which phases are planned: whatever a problem is written in, the same.
+"""Scaling of problems, options and stages to the scene's own units, and back.
 
-The unit of length is the object's radius of gyration, that of force its weight, that of mass its
-mass; the unit of time follows (`scene.model.Scales`). Everything that is tolerated, guessed or
-weighed in the time domain counts in these.
+Length is the object's radius of gyration, force its weight, mass its mass; time follows
+(`scene.model.Scales`). Tolerances and guesses of the time domain are in these.
 """
 
 from __future__ import annotations
@@ -84,13 +83,13 @@ def scale_options(options: PlanOptions, scales: Scales) -> PlanOptions:
 
 
 def unit_of(goal: Objective, scales: Scales) -> float:
-    """What one unit of an objective is in SI units."""
+    """Unit of an objective in SI units."""
     efforts = scales.torque**2 * scales.time
     return {Objective.TIME: scales.time, Objective.EFFORT: efforts}.get(goal, scales.force)
 
 
 def unit_lengths(scales: Scales) -> Array:
-    """What one unit of each coordinate of z is in SI units, shape (5,)."""
+    """Units of the coordinates of z in SI units, shape (5,)."""
     return np.array([scales.length, scales.length, 1.0, 1.0, 1.0])
 
 
