@@ -130,10 +130,7 @@ def _guess(
 ) -> StagePoints:
     """Motion along an initial path, with equal normal forces where it has no speed profile.
 
-    Parameters
-    ----------
-    clock, ends : (2,)  shares of all stages' time and length at the start and the end
-    total : [s]         duration of all stages
+    `clock` and `ends` are shares of the time `total` [s] and length of all stages at both ends.
     """
     knots = np.linspace(0.0, 1.0, len(outline.z))
     slopes = np.gradient(outline.z, knots, axis=0)

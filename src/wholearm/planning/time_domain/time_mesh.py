@@ -31,10 +31,10 @@ def resample(
     shape = (len(fractions), scheme.degree, -1)
     points = _interpolate(part, scheme, (begin + span * inner).ravel())
     nodes = np.stack(_interpolate(part, scheme, begin + span * breaks)[:2], axis=1)
-    tables = (table.reshape(shape) for table in points)
+    z, v, a, forces = (table.reshape(shape) for table in points)
     tau = _torques(part, begin + span * breaks)
     impulses = part.impulses if stop == 1.0 else part.impulses[:0]
-    return StagePoints(part.duration * span, fractions, nodes, *tables, tau, impulses)
+    return StagePoints(part.duration * span, fractions, nodes, z, v, a, forces, tau, impulses)
 
 
 def bisect(part: StagePoints, scheme: Scheme, times: NDArray[np.int64]) -> StagePoints:

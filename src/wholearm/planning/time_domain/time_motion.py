@@ -232,17 +232,12 @@ class TimeMotion:
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""
         t = np.asarray(t, dtype=float)
         owner = np.clip(np.searchsorted(self.starts, t, side="right") - 1, 0, len(self.stages) - 1)
-        tables: list[Array] = []
+        order, parts = np.argsort(owner, kind="stable"), list[Samples]()
         for index, stage in enumerate(self.stages):
-            mine = owner == index
-            if not mine.any():
-                continue
-            part = stage.evaluate(t[mine] - self.starts[index])
-            if not tables:
-                tables = [np.empty((len(t), table.shape[1])) for table in part]
-            for table, values in zip(tables, part, strict=True):
-                table[mine] = values
-        return Samples(*tables)
+            if (owner == index).any():
+                parts.append(stage.evaluate(t[owner == index] - self.starts[index]))
+        inverse = np.argsort(order)
+        return Samples(*(np.concatenate(tables)[inverse] for tables in zip(*parts, strict=True)))
 
 
 def make_phase_motions(

@@ -113,12 +113,12 @@ def hold_ends(
         formation = stage.formation
         if not k and stage.phase:
             # A command approaches a torque limit only asymptotically in the pause before.
-            scene, tau = formation.scene, layout.tau[0, :2]
+            scene, first = formation.scene, layout.tau[0, :2]
             for joint in np.flatnonzero(scene.actuator_lag):
                 limit = scene.torque_limit[joint]
                 fastest = scene.torque_rate_limit[joint] * scene.actuator_lag[joint] / limit
                 most = 1 - min(_ROOM, float(fastest))
-                rows.add_entries(rows.linear(1, low=-most, high=most), tau[joint], 1 / limit)
+                rows.add_entries(rows.linear(1, low=-most, high=most), first[joint], 1 / limit)
         for r, row in enumerate(formation.rolling_rows):
             mu = float(formation.friction[row])
             own = rows.linear(2, low=mu * epsilon, high=np.inf)

@@ -20,7 +20,7 @@ from ...problem.uncertainty import PARAMETERS
 from ...scene.model import Scales, Scene
 from ...scene.polygon import Polygon
 from ..options import Objective, PlanOptions
-from .stage import Stage, StagePoints
+from .stage import Stage
 
 
 @lru_cache(maxsize=16)
@@ -97,16 +97,15 @@ def to_si(stage: Stage, problem: Problem) -> Stage:
     """A stage in SI units, of the same problem in SI units."""
     scales, part = problem.scene.scales, stage.guess
     lengths, unit = unit_lengths(scales), scales.time
-    points = StagePoints(
-        part.duration * unit,
-        part.fractions,
-        part.nodes * lengths / np.array([[1.0], [unit]]),
-        part.z * lengths,
-        part.v * lengths / unit,
-        part.a * lengths / unit**2,
-        part.forces * scales.force,
-        part.tau * scales.torque,
-        part.impulses * scales.force * unit,
+    points = part._replace(
+        duration=part.duration * unit,
+        nodes=part.nodes * lengths / np.array([[1.0], [unit]]),
+        z=part.z * lengths,
+        v=part.v * lengths / unit,
+        a=part.a * lengths / unit**2,
+        forces=part.forces * scales.force,
+        tau=part.tau * scales.torque,
+        impulses=part.impulses * scales.force * unit,
     )
     formation = problem.phases[stage.phase].formation
     rolling = stage.formation.rolling
