@@ -154,11 +154,8 @@ def _balance(
     Also those of the equations of motion and of the sliding directions alone.
     """
     formation, shape = stage.formation, layout.z.shape[:2]
-    gradual = stage.onset > 0
-    kernel, node = (
-        kernels.point_kernel(formation, scheme.controls, gradual),
-        layout.nodes[:-1, None],
-    )
+    homotopy, node = stage.onset > 0, layout.nodes[:-1, None]
+    kernel = kernels.point_kernel(formation, scheme.controls, homotopy)
     first = node[..., Z] if formation.rolling else node[..., :0]
     state = {"z": layout.z, "v": layout.v, "a": layout.a}
     columns = kernel.x.join(**state, forces=layout.forces, tau=layout.tau[:, None], first=first)
@@ -168,12 +165,12 @@ def _balance(
         sigma=stage.directions.sigma,
         shares=blend(scheme.points, scheme.controls),
         least=np.maximum(least, 0.0),
-        onset=np.full(1 * gradual, stage.onset),
+        onset=np.full(1 * homotopy, stage.onset),
     )
     still, senses = find_still(stage, last) if scheme.ends else set(), kernel.y["senses"]
     low, high = np.zeros((*shape, kernel.outputs)), np.zeros(kernel.outputs)
     high[senses] = np.inf
-    low[..., senses] = -np.inf if gradual else 0.0
+    low[..., senses] = -np.inf if homotopy else 0.0
     low[-1, -1, senses][[k in still for k in formation.rubbing_rows]] = -np.inf
     own = rows.nonlinear(*shape, kernel.outputs, low=low, high=high)
     rows.add_copies(kernel, columns, own, parameters)

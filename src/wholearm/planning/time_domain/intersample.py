@@ -105,12 +105,12 @@ def find_misses(
     check: CheckPlaces,
     epsilon: float,
     margin: float = 0.0,
-    swings: Array | float = 0.0,
+    deviations: Array | float = 0.0,
 ) -> IntersampleLimits:
     """Largest misses of limits in each interval.
 
     c_n, but not friction cones, have to exceed epsilon by `margin`, and each side its bound by
-    `swings` times its scale, shape (K CHECKS, n_sides).
+    `deviations` times its scale, shape (K CHECKS, n_sides).
     """
     samples, limits = check.samples, make_limits(stage.formation, epsilon)
     clear = stage.list_clearances(check.places, after=1 / 2) / 2
@@ -122,7 +122,7 @@ def find_misses(
     senses[:, np.delete(np.arange(formation.n_contacts), formation.rubbing_rows)] = 1.0
     relieved = np.repeat(np.where(find_relieved(stage, limits), _AMPLE, 0.0), CHECKS, axis=0)
     tables = (
-        _find_slack(stage, limits, samples, margin) - swings + relieved,
+        _find_slack(stage, limits, samples, margin) - deviations + relieved,
         values - clear,
         senses - 0.5 * least_senses(stage, check.places),
     )
