@@ -33,8 +33,8 @@ def list_attempts(problem: Problem, count: int, patient: bool = True) -> Attempt
     return Attempts(problem, problem.phases[:count], problem.start, search, None, patient)
 
 
-def along(margin: float, gradual: bool = False) -> str:
-    return f"a straight path that keeps limits with {margin:g} to spare{GRADUAL * gradual}"
+def along(margin: float, homotopy: bool = False) -> str:
+    return f"a straight path that keeps limits with {margin:g} to spare{GRADUAL * homotopy}"
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,7 @@ def test_a_single_phase_is_tried_along_paths_and_at_several_paces(
     found = list(attempts)
     paces = [PACE.format(NEAREST, falls) for falls in (4, 1, 2, 4, 1)]
     assert [own.name for own in found] == [NEAREST + GRADUAL, *ways, NEAREST, *paces]
-    assert [own.gradual for own in found] == [own.name.endswith(GRADUAL) for own in found]
+    assert [own.homotopy for own in found] == [own.name.endswith(GRADUAL) for own in found]
     # The first one is guessed once: its modes are found before they are given.
     assert found[0].stages is attempts.first.stages
     # Half the intervals, as 12 are more than a phase starts with; then the same on all of them.

@@ -17,7 +17,7 @@ from ..common.errors import AmbiguityError, InfeasibleError, SolverError
 from ..common.plain import plain
 from ..common.sharing import exclusive
 from ..common.signals import OutOfTime, Reporter, limited
-from ..geometry.curve import Curve, describe_pose
+from ..geometry.curve import describe_pose
 from ..geometry.tracing import trace_phases
 from ..mechanics.uniqueness import describe_uniqueness
 from ..problem.check import require_phases
@@ -112,7 +112,14 @@ def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]
         report("tracing the phases")
         curves = trace_phases(problem)
         traced = time.perf_counter()
-        planning = _plan(problem, curves, options, report)
+        try:
+            planning = plan_blocks(problem, curves, options, report)
+        except InfeasibleError as error:
+            # The motion of an error carries its problem, like that of a plan.
+            if error.motion is not None:
+                about = {"name": problem.name, "epsilon": problem.epsilon, "problem": problem.table}
+                error.motion = replace(error.motion, meta=error.motion.meta | about)
+            raise
         return finish_plan(planning, report, ledger, (started, traced))
 
 
@@ -189,19 +196,6 @@ def finish_plan(
         ranges,
     )
     return replace(plan, trajectory=replace(trajectory, meta=write_meta(plan)))
-
-
-def _plan(
-    problem: Problem, curves: tuple[Curve, ...], options: PlanOptions, report: Callable[[str], None]
-) -> Planning:
-    """Plan every block; the motion of an error gets the problem in its `meta`, like a plan."""
-    try:
-        return plan_blocks(problem, curves, options, report)
-    except InfeasibleError as error:
-        if error.motion is not None:
-            known = {"name": problem.name, "epsilon": problem.epsilon, "problem": problem.table}
-            error.motion = replace(error.motion, meta=error.motion.meta | known)
-        raise
 
 
 def assemble_plan(planning: Planning) -> Trajectory:

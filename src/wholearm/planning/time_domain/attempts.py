@@ -1,6 +1,6 @@
 """Initial guesses of phases in the time domain, their order, and the solution from each.
 
-Contact modes come from the guess or from a homotopy in the friction, regularised by tanh(rate /
+Contact modes come from the guess or from a homotopy in the friction, regularized by tanh(rate /
 onset). Torques held over control periods are a second NLP, from the plan with free torques.
 """
 
@@ -51,20 +51,12 @@ NEAREST = "a motion to the nearest end of the phase"  # name of the first guess
 GRADUAL = " with friction that sets in gradually"  # suffix of names where modes are found so
 NEAR = -0.3  # margin of a path above which a motion near it may keep its limits
 WAYS = 3  # most paths along which a motion is guessed
-ATTEMPT = (
-    50  # most iterations of the first solve from a guess: successes take 25 or less in one phase
-)
+ATTEMPT = 50  # most iterations of the first solve from a guess; successes take up to 25
 FEW = 35  # the same where a plan is known, of up to two phases
-SPLIT = (
-    80  # the same in modes of the friction homotopy and straight to a place; query 3, phase 4: 65
-)
+SPLIT = 80  # the same in modes of the homotopy and straight to a place; query 3, phase 4: 65
 MUCH_DEARER = 3.0  # cost of a plan, over that of the friction homotopy, above which it is rejected
 ROUNDING = 5e-7  # largest shortfall of a margin below epsilon by rounding, over the object's weight
-FALLS = (
-    2.0,
-    4.0,
-    1.0,
-)  # guessed durations, over that of a fall over the length of the initial path
+FALLS = (2.0, 4.0, 1.0)  # guessed durations, over that of a fall over the path's length
 
 
 class Attempt(NamedTuple):
@@ -73,7 +65,7 @@ class Attempt(NamedTuple):
     name: str
     halvings: int  # of its intervals, after the first solve
     stages: list[Stage]
-    gradual: bool = False  # whether its modes come from the friction homotopy
+    homotopy: bool = False  # whether its modes come from the friction homotopy
     before: TimeSolution | None = None  # solution that the stages are from
     most: int = ATTEMPT  # most solver iterations of the first solve
 
@@ -137,13 +129,13 @@ class Attempts:
         there or further ahead with other durations.
         """
         if self.patient:
-            yield self.first._replace(name=f"{self.first.name}{GRADUAL}", gradual=True)
+            yield self.first._replace(name=f"{self.first.name}{GRADUAL}", homotopy=True)
         near = [way for way in self.ways if way.margin > NEAR] or self.ways[:1]
         guesses = [self._follow(way) for way in near]
         sure = sum(way.margin > 0 for way in near)
         yield from guesses[:sure]
         for guess in [] if self.are_far else guesses:
-            yield guess._replace(name=f"{guess.name}{GRADUAL}", gradual=True)
+            yield guess._replace(name=f"{guess.name}{GRADUAL}", homotopy=True)
         yield from guesses[sure:]
         yield self.first
         onwards = len(self.phases) > 1
@@ -189,7 +181,7 @@ class Attempts:
 def solve_attempt(search: TimeSearch, attempt: Attempt) -> TimeSolution:
     """Solve, search modes, choose a free end, refine intervals, and enforce limits in between."""
     stages, least, patience = attempt.stages, math.nan, attempt.most
-    if attempt.gradual:
+    if attempt.homotopy:
         solution = find_modes(search, stages)
         if not solution.success:
             return solution

@@ -8,19 +8,11 @@ import numpy as np
 
 from ...common.arrays import Array
 from ...geometry.curve import find_tied, tangent_basis
+from . import stage_kernels as kernels
 from .assembly import Indices
 from .collocation import Scheme, blend
 from .nlp_layout import MARGIN, NlpRows, StageLayout, V, Z
 from .stage import Stage
-from .stage_kernels import (
-    collocation_kernel,
-    end_kernel,
-    goal_kernel,
-    impact_kernel,
-    monitor_kernel,
-    opening_kernel,
-    point_kernel,
-)
 from .time_limits import LimitRows, Target, add_limits
 from .time_rate_limits import MotorRows, add_motors, join_motors
 
@@ -64,7 +56,7 @@ def add_stage(
     points, balance, senses = _balance(rows, stage, layout, scheme, last)
     first = node[:, Z] if formation.rolling else node[:, :0]
     if not scheme.ends:
-        kernel = end_kernel(formation)
+        kernel = kernels.end_kernel(formation)
         own = rows.nonlinear(stage.intervals, kernel.outputs)
         rows.add_copies(kernel, kernel.x.join(z=ends[:, Z], v=ends[:, V], first=first), own)
         chain = np.hstack([chain, own])
@@ -74,7 +66,7 @@ def add_stage(
     # With continuous torques a released contact has no acceleration at first.
     opening = stage.opening * (scheme.points[:, None] if slow else 1.0)
     for contact in [c for c in gained if c is not None and stage.opens]:
-        kernel = opening_kernel(formation, contact)
+        kernel = kernels.opening_kernel(formation, contact)
         columns = kernel.x.join(z=layout.z[0], v=layout.v[0], a=layout.a[0])
         own = rows.nonlinear(scheme.degree, kernel.outputs, low=opening, high=np.inf)
         rows.add_copies(kernel, columns, own)
@@ -88,7 +80,7 @@ def add_stage(
         turns, gained_softly = (), None
         N = tangent_basis(formation, stage.guess.nodes[-1, 0])
         rows.add_entries(rows.linear(N.shape[1])[:, None], layout.nodes[-1, V], N.T)
-    goal = goal_kernel(formation, until, turns, gained_softly)
+    goal = kernels.goal_kernel(formation, until, turns, gained_softly)
     if goal is not None:
         end = layout.nodes[-1]
         rows.add_copies(goal, goal.x.join(z=end[Z], v=end[V]), rows.nonlinear(goal.outputs))
@@ -124,7 +116,7 @@ def _collocate(
     middles = stage.guess.z[:, scheme.degree // 2]
     bases = np.array([tangent_basis(stage.formation, z) for z in middles])
     K, _, f = bases.shape
-    kernel = collocation_kernel(scheme.name, scheme.degree, f)
+    kernel = kernels.collocation_kernel(scheme.name, scheme.degree, f)
     parameters, collected = bases.transpose(0, 2, 1).reshape(K, -1), []
     if not f:
         return np.zeros((K, 2, len(scheme.rungs), 0), dtype=np.int64), bases
@@ -162,8 +154,8 @@ def _balance(
     Also those of the equations of motion and of the sliding directions alone.
     """
     formation, shape = stage.formation, layout.z.shape[:2]
-    gradual = stage.onset > 0
-    kernel, node = point_kernel(formation, scheme.controls, gradual), layout.nodes[:-1, None]
+    homotopy, node = stage.onset > 0, layout.nodes[:-1, None]
+    kernel = kernels.point_kernel(formation, scheme.controls, homotopy)
     first = node[..., Z] if formation.rolling else node[..., :0]
     state = {"z": layout.z, "v": layout.v, "a": layout.a}
     columns = kernel.x.join(**state, forces=layout.forces, tau=layout.tau[:, None], first=first)
@@ -173,12 +165,12 @@ def _balance(
         sigma=stage.directions.sigma,
         shares=blend(scheme.points, scheme.controls),
         least=np.maximum(least, 0.0),
-        onset=np.full(1 * gradual, stage.onset),
+        onset=np.full(1 * homotopy, stage.onset),
     )
     still, senses = find_still(stage, last) if scheme.ends else set(), kernel.y["senses"]
     low, high = np.zeros((*shape, kernel.outputs)), np.zeros(kernel.outputs)
     high[senses] = np.inf
-    low[..., senses] = -np.inf if gradual else 0.0
+    low[..., senses] = -np.inf if homotopy else 0.0
     low[-1, -1, senses][[k in still for k in formation.rubbing_rows]] = -np.inf
     own = rows.nonlinear(*shape, kernel.outputs, low=low, high=high)
     rows.add_copies(kernel, columns, own, parameters)
@@ -229,7 +221,7 @@ def _add_monitor_rows(rows: NlpRows, stage: Stage, layout: StageLayout, scheme: 
     if scheme.ends:
         low[-1, -1, reached] = -np.inf
     own = rows.nonlinear(K, d, len(stage.monitored), low=low, high=np.inf)
-    kernel = monitor_kernel(formation, stage.monitored)
+    kernel = kernels.monitor_kernel(formation, stage.monitored)
     rows.add_copies(kernel, kernel.x.join(z=layout.z), own)
     return own
 
@@ -250,7 +242,7 @@ def join_stages(
     rows.add_entries(own, first[same], 1.0)
     rows.add_entries(own, last[same], -1.0)
     if stage.ends_in_impact:
-        kernel = impact_kernel(stage.formation, coming.formation)
+        kernel = kernels.impact_kernel(stage.formation, coming.formation)
         high = np.zeros(kernel.outputs)
         high[kernel.y["leaving"]] = high[kernel.y["cones"]] = np.inf
         columns = kernel.x.join(after=first[V], before=last[V], z=last[Z], impulses=layout.impulses)

@@ -49,13 +49,13 @@ class PacedWay(NamedTuple):
 
     stretches: Way
     margin: float
-    pace: PathSpeed | None
+    profile: PathSpeed | None
     forces: WayForces  # the linear programme
 
     @staticmethod
     def of(way: Way, forces: WayForces, margin: float) -> PacedWay:
         """The path with its speed profile."""
-        return PacedWay(way, margin, forces.find_pace(margin), forces)
+        return PacedWay(way, margin, forces.find_profile(margin), forces)
 
 
 class _Bent(NamedTuple):
@@ -314,7 +314,7 @@ class WayForces:
             shares[kind] += float(share)
         return max(shares, key=lambda kind: shares[kind])
 
-    def find_pace(self, margin: float) -> PathSpeed | None:
+    def find_profile(self, margin: float) -> PathSpeed | None:
         """A fast speed profile whose margin is not much less than the largest, `margin`."""
         speed = np.zeros(self.size)
         speed[: len(self.top)] = 1.0

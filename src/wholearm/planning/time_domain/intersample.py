@@ -47,16 +47,16 @@ class IntersampleLimits(NamedTuple):
 
     @property
     def worst(self) -> float:
-        """The largest, over what is allowed."""
+        """The largest, over its tolerance."""
         return float(self._over.max(initial=0.0))
 
     def list_missed(self) -> NDArray[np.bool_]:
-        """Which intervals miss more than is allowed, shape (K,)."""
+        """Which intervals miss more than the tolerance, shape (K,)."""
         return np.asarray(self._over > 1.0)
 
     @property
     def _over(self) -> Array:
-        """The largest of each interval, over what is allowed, shape (K,)."""
+        """The largest of each interval, over its tolerance, shape (K,)."""
         allowed = (MISS, GRAZE, FALTER * SLIDING)
         parts = (t.max(axis=1, initial=0.0) / a for t, a in zip(self, allowed, strict=True))
         return np.asarray(np.max(list(parts), axis=0))
@@ -105,23 +105,26 @@ def find_misses(
     check: CheckPlaces,
     epsilon: float,
     margin: float = 0.0,
-    swings: Array | float = 0.0,
+    deviations: Array | float = 0.0,
 ) -> IntersampleLimits:
     """Largest misses of limits in each interval.
 
     c_n, but not friction cones, have to exceed epsilon by `margin`, and each side its bound by
-    `swings` times its scale, shape (K CHECKS, n_sides).
+    `deviations` times its scale, shape (K CHECKS, n_sides).
     """
     samples, limits = check.samples, make_limits(stage.formation, epsilon)
     clear = stage.list_clearances(check.places, after=1 / 2) / 2
     # Misses at the start of a stage do not depend on it.
     values = check.limits[:, list(stage.monitored)]
     values = values - np.minimum(values[:1], 0.0)
+    senses, formation = stage.measure_senses(samples.z, samples.z_dot), stage.formation
+    # Only contacts with friction have a sliding direction.
+    senses[:, np.delete(np.arange(formation.n_contacts), formation.rubbing_rows)] = 1.0
     relieved = np.repeat(np.where(find_relieved(stage, limits), _AMPLE, 0.0), CHECKS, axis=0)
     tables = (
-        _find_slack(stage, limits, samples, margin) - swings + relieved,
+        _find_slack(stage, limits, samples, margin) - deviations + relieved,
         values - clear,
-        _measure_senses(stage, samples) - 0.5 * least_senses(stage, check.places),
+        senses - 0.5 * least_senses(stage, check.places),
     )
     shape = (stage.intervals, CHECKS)
     slack = (find_minima(table.reshape(*shape, table.shape[1])) for table in tables)
@@ -138,13 +141,6 @@ def _find_slack(stage: Stage, limits: LimitSet, samples: Samples, margin: float)
     bent = np.flatnonzero(of_c.any(axis=1) | of_rates.any(axis=1))
     slack[:, ~np.isin(limits.sides[0], bent)] = 0.0
     return slack
-
-
-def _measure_senses(stage: Stage, samples: Samples) -> Array:
-    """Rates in a stage's directions, shape (n, n_c + 2); 1 for contacts that do not rub."""
-    senses, formation = stage.measure_senses(samples.z, samples.z_dot), stage.formation
-    senses[:, np.delete(np.arange(formation.n_contacts), formation.rubbing_rows)] = 1.0
-    return senses
 
 
 def monitor_missed(stages: Sequence[Stage], checks: Sequence[CheckPlaces]) -> list[Stage] | None:

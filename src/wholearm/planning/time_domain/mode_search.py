@@ -99,14 +99,10 @@ def list_moves(
     leaning: bool = False,
     savings: Sequence[Array] = (),
 ) -> Iterator[list[Stage]]:
-    """Mode sequences that a solution suggests, the most promising ones first.
+    """Mode sequences suggested by a solution, the guesses of stages; the most promising first.
 
-    Parameters
-    ----------
-    stages                 with the solution as guesses
-    own                    formation of each stage's phase, whose rolling contacts have to roll
-    leaning                whether only contacts at their cones count
-    savings : (K, d, n_c)  relative saving by friction the other way in each stage, if known
+    `own` are the formations of the stages' phases, whose rolling contacts have to roll; `leaning`:
+    only contacts at their cones count; `savings` are those of `TimeSolution.price_friction`.
     """
     slides = [_find_leaning(stage, scheme, own[k], epsilon) for k, stage in enumerate(stages)]
     if leaning:

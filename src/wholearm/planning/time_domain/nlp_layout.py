@@ -112,10 +112,10 @@ def unpack(x: Array, layouts: Sequence[StageLayout]) -> list[StagePoints]:
     for own in layouts:
         duration = float(x[own.h].sum())
         nodes = x[own.nodes[:, :STATE]].reshape(-1, 2, 5)
-        tables = (x[part] for part in (own.z, own.v, own.a, own.forces))
+        z, v, a, forces = (x[part] for part in (own.z, own.v, own.a, own.forces))
         tau = x[own.tau].reshape(len(own.tau), -1, 2)
-        fractions = x[own.h] / duration
-        parts.append(StagePoints(duration, fractions, nodes, *tables, tau, x[own.impulses]))
+        fractions, impulses = x[own.h] / duration, x[own.impulses]
+        parts.append(StagePoints(duration, fractions, nodes, z, v, a, forces, tau, impulses))
     return parts
 
 

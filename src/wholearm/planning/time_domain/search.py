@@ -28,8 +28,7 @@ from .units import in_own_units, scale_options, unit_lengths, unit_of
 
 FIRST_SIZE = 1e-2  # multipliers of a first guess
 Multipliers = dict[str, Array]  # of the unknowns' bounds, `lam_x0`, and of the rows, `lam_g0`
-_ITERATIONS = {Objective.ELASTIC: 90, Objective.RELAX: 50}
-"""Most iterations of one solve, if not 150."""
+_ITERATIONS = {Objective.ELASTIC: 90, Objective.RELAX: 50}  # most of one solve, else 150
 _SLOWER = 2  # factor on the most iterations of one solve with rate-limited torques
 _CAP = 1.1  # upper bound of the margin, over the one at which it saturates
 

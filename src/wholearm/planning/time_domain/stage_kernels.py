@@ -74,20 +74,20 @@ def name_kernel(x: Symbols, p: Symbols, **y: Expression) -> NamedKernel:
 
 
 @share(32)
-def point_kernel(formation: Formation, controls: int, gradual: bool = False) -> NamedKernel:
+def point_kernel(formation: Formation, controls: int, homotopy: bool = False) -> NamedKernel:
     """Contact constraints, equations of motion, and rates of sliding contacts at a point.
 
     `tau` are the control points of the torques, `shares` their Bernstein polynomials, `first` is z
-    at the start of the interval if a contact rolls, `least` are the least rates. `gradual` friction
-    is regularized by tanh(rate / onset).
+    at the start of the interval if a contact rolls, `least` are the least rates. In the `homotopy`
+    friction is regularized by tanh(rate / onset).
     """
     scene, n_c, rolls = formation.scene, formation.n_contacts, bool(formation.rolling)
     x = Columns(z=5, v=5, a=5, forces=formation.n_constraints, tau=2 * controls, first=5 * rolls)
     s = x.make_symbols()
-    p = Columns(Xi=n_c, sigma=2, shares=controls, least=n_c, onset=1 * gradual).make_symbols()
+    p = Columns(Xi=n_c, sigma=2, shares=controls, least=n_c, onset=1 * homotopy).make_symbols()
     gaps, P, P_dot_v, A_t = formation.build_constraints(s.z, s.v)
     Xi, sigma = p.Xi, p.sigma
-    if gradual:
+    if homotopy:
         Xi, sigma = ca.tanh(A_t @ s.v / p.onset), ca.tanh(s.v[3:] / p.onset)
     if rolls:
         gaps[n_c:] -= formation.roll_function(s.first, s.v)[0]

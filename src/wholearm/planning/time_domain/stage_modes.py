@@ -189,8 +189,10 @@ def _join(first: StagePoints, second: StagePoints) -> StagePoints:
     total = first.duration + second.duration
     fractions = [part.fractions * (part.duration / total) for part in (first, second)]
     nodes = np.concatenate([first.nodes[:-1], second.nodes])
-    tables = (np.concatenate(pair) for pair in zip(first[3:8], second[3:8], strict=True))
-    return StagePoints(total, np.concatenate(fractions), nodes, *tables, second.impulses)
+    pairs = zip(first[3:8], second[3:8], strict=True)
+    z, v, a, forces, tau = (np.concatenate(pair) for pair in pairs)
+    shares = np.concatenate(fractions)
+    return StagePoints(total, shares, nodes, z, v, a, forces, tau, second.impulses)
 
 
 def _cut(part: StagePoints, scheme: Scheme, begin: int, stop: int) -> StagePoints:

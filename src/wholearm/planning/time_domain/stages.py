@@ -45,17 +45,17 @@ def guess_stages(
     lengths = np.array([outline.length for _, outline, _ in parts])
     ends = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()
     # The path parameter of the guess is (1 - cos) / 2 over all stages.
-    total, pace = falls * float(np.sqrt(lengths.sum())), None if way is None else way.pace
+    total, profile = falls * float(np.sqrt(lengths.sum())), None if way is None else way.profile
     clock = np.arccos(1 - 2 * np.clip(ends, 0.0, 1.0)) / np.pi
-    if pace is not None:
-        total = float(pace.t[-1]) / problem.scene.scales.time
-        clock = np.interp(ends, pace.s, pace.t / pace.t[-1])
+    if profile is not None:
+        total = float(profile.t[-1]) / problem.scene.scales.time
+        clock = np.interp(ends, profile.s, profile.t / profile.t[-1])
     stages: list[Stage] = []
     released: tuple[int, ...] = ()
     for k, (phase, outline, last) in enumerate(parts):
         whole = lengths[[own is phase for own, _, _ in parts]].sum()
         count = max(LEAST_INTERVALS, round(lengths[k] / whole * intervals))
-        guess = _guess(outline, scheme, count, clock[k : k + 2], ends[k : k + 2], total, pace)
+        guess = _guess(outline, scheme, count, clock[k : k + 2], ends[k : k + 2], total, profile)
         ends_in_impact = last and phase.end is End.IMPACT and k + 1 < len(parts)
         if ends_in_impact:
             guess = guess._replace(impulses=np.zeros(parts[k + 1][0].formation.n_constraints))
@@ -126,14 +126,11 @@ def _guess(
     clock: Array,
     ends: Array,
     total: float,
-    pace: PathSpeed | None,
+    profile: PathSpeed | None,
 ) -> StagePoints:
     """Motion along an initial path, with equal normal forces where it has no speed profile.
 
-    Parameters
-    ----------
-    clock, ends : (2,)  shares of all stages' time and length at the start and the end
-    total : [s]         duration of all stages
+    `clock` and `ends` are shares of the time `total` [s] and length of all stages at both ends.
     """
     knots = np.linspace(0.0, 1.0, len(outline.z))
     slopes = np.gradient(outline.z, knots, axis=0)
@@ -143,7 +140,7 @@ def _guess(
     def follow(share: Array) -> tuple[Array, Array, Array]:
         passed = clock[0] + share * (clock[1] - clock[0])
         span = max(ends[1] - ends[0], 1e-12)
-        place, rate, gain = _evaluate_pace(pace, passed)
+        place, rate, gain = _evaluate_profile(profile, passed)
         place = (place - ends[0]) / span
         rate, gain = rate[..., None] / (span * total), gain[..., None] / (span * total**2)
         z, slope, bend = (
@@ -154,12 +151,12 @@ def _guess(
 
     at = breaks[:-1, None] + scheme.points / count
     z, v, a = follow(at)
-    if pace is None:
+    if profile is None:
         forces = _press(outline, z, v, a)
     else:
         passed = clock[0] + at * (clock[1] - clock[0])
-        own = np.searchsorted(pace.t / pace.t[-1], passed) - 1
-        forces = pace.forces[np.clip(own, 0, len(pace.forces) - 1)]
+        own = np.searchsorted(profile.t / profile.t[-1], passed) - 1
+        forces = profile.forces[np.clip(own, 0, len(profile.forces) - 1)]
     tau = _balance(outline, scheme, z, v, a, forces)
     return StagePoints(
         total * (clock[1] - clock[0]),
@@ -174,16 +171,16 @@ def _guess(
     )
 
 
-def _evaluate_pace(pace: PathSpeed | None, passed: Array) -> tuple[Array, Array, Array]:
+def _evaluate_profile(profile: PathSpeed | None, passed: Array) -> tuple[Array, Array, Array]:
     """Share of the length at shares of the time, and its derivatives, without a profile by cos."""
-    if pace is None:
+    if profile is None:
         angle = np.pi * passed
         return (1 - np.cos(angle)) / 2, np.pi / 2 * np.sin(angle), np.pi**2 / 2 * np.cos(angle)
-    total = pace.t[-1]
-    k = np.clip(np.searchsorted(pace.t, passed * total) - 1, 0, len(pace.forces) - 1)
-    begin, since = pace.v[k], passed * total - pace.t[k]
-    gain = (np.diff(pace.v) / np.diff(pace.t))[k]
-    place = pace.s[k] + since * (begin + gain * since / 2)
+    total = profile.t[-1]
+    k = np.clip(np.searchsorted(profile.t, passed * total) - 1, 0, len(profile.forces) - 1)
+    begin, since = profile.v[k], passed * total - profile.t[k]
+    gain = (np.diff(profile.v) / np.diff(profile.t))[k]
+    place = profile.s[k] + since * (begin + gain * since / 2)
     return place, total * (begin + gain * since), total**2 * gain
 
 

@@ -16,15 +16,6 @@ from ...mechanics.limits import EPSILON, PRESS, make_limits
 from ...problem.definition import Phase, Problem
 from ...scene.model import Scales
 from .. import advice
-from ..advice import (
-    advise,
-    assemble_least,
-    change_scene,
-    describe_shortfalls,
-    keep_worst,
-    name_phases,
-    rank_shortfalls,
-)
 from ..options import Objective, PlanOptions
 from ..stops import runs_along_curves
 from .collocation import Scheme, blend
@@ -155,7 +146,8 @@ def explain(
     numbers = [phase.number for phase in phases]
     if not short:
         names = " and ".join(" ".join(phase.formation.names) for phase in phases)
-        text = f"no plan for {name_phases(numbers)} ({names}, until {phases[-1].until}): {status}"
+        where = advice.name_phases(numbers)
+        text = f"no plan for {where} ({names}, until {phases[-1].until}): {status}"
         usual = search.options.transcription == "time" and not problem.scene.control_period
         if usual and runs_along_curves(phases, PlanOptions()):
             return SolverError(f"{text}; leave out --transcription time, which plans along curves")
@@ -164,7 +156,7 @@ def explain(
     lists = [list_shortfalls(problem, stages, search.scheme) for stages in short]
     sums = [sum(shortfall.amount for shortfall in shortfalls) for shortfalls in lists]
     best = sums.index(min(sums))
-    elastic, ranked = short[best], rank_shortfalls(lists[best])
+    elastic, ranked = short[best], advice.rank_shortfalls(lists[best])
     stages = [to_si(stage, problem) for stage in elastic]
 
     def find_value(parameter: Parameter) -> float | None:
@@ -177,11 +169,11 @@ def explain(
         unit = _unit_of(parameter, problem.scene.scales)
         return parameter.value + parameter.sign * unit * solution.cost
 
-    text = f"{name_phases(numbers, 'infeasible')}: {describe_shortfalls(ranked)}"
+    text = f"{advice.name_phases(numbers, 'infeasible')}: {advice.describe_shortfalls(ranked)}"
     error = _advise(problem, phases[0], text, find_value, replan, ranked)
     motions = make_phase_motions(stages, search.scheme, phases)
     torques = [motion.torque for motion in motions]
-    error.motion = assemble_least(motions, torques, [phase.formation for phase in phases])
+    error.motion = advice.assemble_least(motions, torques, [phase.formation for phase in phases])
     return error
 
 
@@ -239,7 +231,7 @@ def _advise(
         return replan(change_limit(problem, parameter.key, value))
 
     parameters = make_limits(phase.formation, problem.epsilon).parameters
-    found = advise(text, parameters, find_value, change if replan else None, ADVICE)
+    found = advice.advise(text, parameters, find_value, change if replan else None, ADVICE)
     return InfeasibleError(found.text, shortfalls, found.changes)
 
 
@@ -263,11 +255,11 @@ def list_shortfalls(problem: Problem, stages: Sequence[Stage], scheme: Scheme) -
         values = (y @ limits.rows.T).reshape(-1, len(limits.low))
         shortfalls += advice.list_shortfalls(limits, values, places.__getitem__)
         passed += part.duration
-    return keep_worst(shortfalls)
+    return advice.keep_worst(shortfalls)
 
 
 def change_limit(problem: Problem, key: str, value: float) -> Problem:
     """The problem with another value of a parameter of its limits."""
     if key == EPSILON:
         return replace(problem, epsilon=value)
-    return replace(problem, scene=change_scene(problem.scene, key, value))
+    return replace(problem, scene=advice.change_scene(problem.scene, key, value))

@@ -48,8 +48,8 @@ def plan_with_impacts(
     ends = _find_impacts(block)
     if not ends:
         plan = partial(plan_phases, to_go=to_go, ample=ample, pinned=pinned, only_begin=only_begin)
-        guesses = {"fastest": fastest or (), "begun": begun or ()}
-        return [*plan(problem, block, z, options, duration, **guesses)]
+        plan = partial(plan, fastest=fastest or (), begun=begun or ())
+        return [*plan(problem, block, z, options, duration)]
     explained = plan_parts_of(problem, block, ample, explained=True)
     if duration is not None and fastest and all(_is_stop(problem, fastest[k - 1]) for k in ends):
         # Without an impact in least time there is none in a longer duration.

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from .time_explain import Replan
 
 _ROUNDS = 20  # most solves for ranges
-_SWINGS = 5  # the first of them, in which limits are raised by what ranges change alone
+_PARAMETRIC = 5  # the first of them, in which limits are raised by what ranges change alone
 _OVER = 1.2  # factor on the misses by which limits are raised after that
 MOVED = "a plan that chooses where it ends"  # name of the guess
 FURTHER = 4  # guesses, beyond the first one, for a plan with free end
@@ -134,7 +134,7 @@ def try_phases(
     options: PlanOptions,
     goal: Array | None = None,
     further: int = 0,
-    hurried: bool = False,
+    single_guess: bool = False,
 ) -> list[PhasePlan[TimeMotion]] | None:
     """Coarse plans of phases (`only_begin` of `plan_phases`), without a mode search or reasons.
 
@@ -142,19 +142,19 @@ def try_phases(
     ----------
     goal : (5,)  end of the first, straight guess of a single phase; otherwise its nearest end
     further      number of further guesses
-    hurried      whether to solve from one guess alone, for few iterations
+    single_guess      whether to solve from one guess alone, for few iterations
     """
     search = TimeSearch.of(problem, replace(options, mode_search=False), only_begins=True)
     attempts = Attempts(problem, phases, z, search, None, further > 0)
     guesses = attempts.begin(goal)[: None if further else 1]
-    if hurried:
+    if single_guess:
         guesses = [attempt._replace(most=FEW) for attempt in guesses]
     for attempt in chain(guesses, attempts.list_further(further)):
         solution, name = solve_attempt(search, attempt), attempt.name
         if solution.success:
             break
     else:
-        moved = None if hurried else approach(search, problem, phases, z).solution
+        moved = None if single_guess else approach(search, problem, phases, z).solution
         if moved is None:
             return None
         solution, name = moved, MOVED
@@ -212,10 +212,10 @@ def _try_all(
     stop = search.tried.iterations + BUDGET
     far, count, outcomes = False, 0, list[_Outcome]()
     for attempt in attempts:
-        far = far or (not attempt.gradual and attempts.are_far)
+        far = far or (not attempt.homotopy and attempts.are_far)
         # Far from any plan, or after a violation, the elastic problem is solved at once.
         elastic = far or count or attempt is attempts.first
-        solved = first if elastic and not attempt.gradual else None
+        solved = first if elastic and not attempt.homotopy else None
         outcomes.append(_try(search, problem, attempt, solved))
         count += bool(outcomes[-1].short)
         late = search.tried.iterations > stop
@@ -233,7 +233,7 @@ def _try(
 ) -> _Outcome:
     """Solve, unless `solved`; without success solve the elastic problem, and again from there."""
     solution = solve_attempt(search, attempt) if solved is None else solved
-    if solution.success or attempt.gradual:
+    if solution.success or attempt.homotopy:
         return _Outcome(attempt.name, solution, [])
     # Finer intervals may show violations that coarse ones do not.
     lost = solution.is_lost
@@ -299,9 +299,9 @@ def _slow_down(
         coarse.append(replace(stage, guess=resample(stage.guess, search.scheme, breaks)))
     end = coarse[-1].guess.nodes[-1, 0] if pinned else None
     tries = ((first, False), (coarse, False)) if usual else ((coarse, False), (first, True))
-    for stages, gradual in tries:
+    for stages, homotopy in tries:
         stages = [*stages[:-1], replace(stages[-1], stop=end)]
-        solution = solve_attempt(search, attempt._replace(stages=stages, gradual=gradual))
+        solution = solve_attempt(search, attempt._replace(stages=stages, homotopy=homotopy))
         if solution.success:
             return solution
     search.tried.complete = False
@@ -460,20 +460,20 @@ def keep_within(
     error, epsilon, ranges = solution.error, search.problem.epsilon, search.options.ranges
     where = name_phases([phase.number for phase in phases])
     for iterate in range(_ROUNDS):
-        swings, misses = list[Array](), list[IntersampleLimits]()
+        deviations, misses = list[Array](), list[IntersampleLimits]()
         motions = make_motions(solution.stages, search.scheme)
         for stage, motion in zip(solution.stages, motions, strict=True):
             check = check_between(stage, motion)
-            swing = find_swings_at(stage, check, epsilon, ranges)
-            misses.append(find_misses(stage, check, epsilon, solution.margin, swing))
-            table = swing.reshape(stage.intervals, CHECKS, -1).max(axis=1)
-            swings.append(np.where(table > MISS, table, 0.0))
+            deviation = find_deviations(stage, check, epsilon, ranges)
+            misses.append(find_misses(stage, check, epsilon, solution.margin, deviation))
+            table = deviation.reshape(stage.intervals, CHECKS, -1).max(axis=1)
+            deviations.append(np.where(table > MISS, table, 0.0))
         if iterate and max(miss.worst for miss in misses) <= 1:
             return solution._replace(error=error)
-        if iterate < _SWINGS:
+        if iterate < _PARAMETRIC:
             raised = [
-                old._replace(held=swing, gap=old.gap + miss.gap)
-                for old, swing, miss in zip(raised, swings, misses, strict=True)
+                old._replace(held=deviation, gap=old.gap + miss.gap)
+                for old, deviation, miss in zip(raised, deviations, misses, strict=True)
             ]
         else:
             raised = [
@@ -489,7 +489,7 @@ def keep_within(
     raise SolverError(f"{where}: limits are still missed within the ranges after {_ROUNDS} solves")
 
 
-def find_swings_at(
+def find_deviations(
     stage: Stage, check: CheckPlaces, epsilon: float, ranges: Mapping[str, float]
 ) -> Array:
     """Change of each side of the limits by all ranges, relative to its scale, (n, n_sides)."""
