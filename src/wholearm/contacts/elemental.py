@@ -132,12 +132,7 @@ class GapLimit(NamedTuple):
 
 
 def parse_contact(name: object, scene: Scene) -> Contact:
-    """Return the contact called `name`.
-
-    Raises
-    ------
-    InputError  if there is no such contact on this object and hand; lists what is allowed
-    """
+    """Return the contact called `name`; an `InputError` lists what is allowed."""
     count = scene.polygon.n_vertices
     match = _PATTERN.fullmatch(name) if isinstance(name, str) else None
     allowed = (

@@ -262,16 +262,12 @@ _LIMIT_FUNCTIONS = Store(
 
 
 def build_slip(contact: Contact, scene: Scene) -> Expression:
-    """Return the slip coordinate of `contact` [m], an expression of the features' symbol z.
-
-    Its time derivative is v_t for as long as the contact touches: how far the object has slid along
-    t on the palm or the link. What a contact has to keep when it rolls is a constant, therefore:
+    """Slip coordinate of `contact` [m], whose rate is v_t, an expression of the features' z.
 
     * vertex on the palm: x of the vertex;
-    * vertex on the side of a link: how far along the link it is, positive towards the tip for
-      finger 1, whose tangent is the link's axis, and towards the joint for finger 2;
-    * tip on an edge: less how far along the edge the tip is, less the arc on which it has rolled;
-    * vertex on the arc of a tip: less the arc from the link's axis to the vertex.
+    * vertex on a link: place along it, towards the tip for finger 1, the joint for finger 2;
+    * tip on an edge: minus the place along the edge and the arc rolled;
+    * vertex on a tip: minus the arc from the link's axis.
     """
     features = build_features(scene)
     if contact.finger is None:

@@ -30,8 +30,7 @@ class Modes(NamedTuple):
 class FreeInputs(NamedTuple):
     """Where each input of a step is in its packed vector; compare `simulation.layout.Inputs`.
 
-    Those from `geometry` on are numbers of the system: M^-1, gravity, friction of coordinates and
-    of the kept pairs, units of z and z', of forces and of the friction of coordinates.
+    Those from `geometry` on are numbers of the system and its units.
     """
 
     y: slice

@@ -236,13 +236,9 @@ class Law(Protocol):
     def held(
         self, t: float, theta: Array, theta_dot: Array, forces: Mapping[str, float]
     ) -> ArrayLike:
-        """Torques, shape (2,) [N m], held from time `t` [s] on.
+        """Torques, shape (2,) [N m], held from time `t` [s] on, from angles and rates, (2,) each.
 
-        Parameters
-        ----------
-        theta, theta_dot : (2,) [rad, rad/s]
-        forces : [N]  c_n of the contacts that press, by name, just before `t`; NaN at rest, empty
-                      at the start
+        `forces` [N] are the c_n of contacts that press, by name; NaN at rest, empty at the start.
         """
 
 
@@ -266,12 +262,7 @@ class Feedback:
     def begin(
         self, piece: int, theta: Array, theta_dot: Array, forces: Mapping[str, float]
     ) -> None:
-        """Take a sample where one is due at the start of a piece, and set the piece's torques.
-
-        Raises
-        ------
-        SimulationError  if the law gives no two numbers
-        """
+        """Sample where one is due at the start of a piece, and set the torques of the piece."""
         latest = self._latest[piece]
         if piece == 0 or latest > self._latest[piece - 1]:
             t = float(self.torque.breaks[piece])

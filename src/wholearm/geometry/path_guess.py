@@ -29,24 +29,14 @@ _TURNS = np.linspace(-1.0, 1.0, 21)  # rotations from which another end is searc
 
 @exclusive
 def load(path: str) -> Problem:
-    """Read a problem file and check that every phase can be carried out geometrically.
-
-    Raises
-    ------
-    InputError  if the file is malformed, a formation does not touch, or an `until` is never reached
-    """
+    """Read a problem file and check its phases geometrically, or raise an `InputError`."""
     problem = read_problem(path)
     check_phases(problem)
     return problem
 
 
 def check_phases(problem: Problem) -> None:
-    """Check that every phase of a problem can be carried out geometrically.
-
-    Raises
-    ------
-    InputError  if a formation does not touch, or an `until` is never reached
-    """
+    """Raise an `InputError` if a formation does not touch, or an `until` is never reached."""
     curves = trace_phases(problem)
     z = curves[-1].end if curves else problem.start
     with name_source(problem.source):
@@ -94,16 +84,9 @@ def guess_curve(curve: Curve, share: float = 1.0) -> list[PathGuess]:
 def guess_phase(
     phase: Phase, z: Array, later: Sequence[Phase] = (), release_at: float = RELEASE_AT
 ) -> list[PathGuess]:
-    """Path guesses of a phase from `z`, shape (5,), to its end.
+    """Path guesses of a phase from `z`, (5,), to its end; an `InputError` if there is none.
 
-    Parameters
-    ----------
-    later       following phases: a phase that ends by a release heads for their end
-    release_at  share of the curve at which it is released
-
-    Raises
-    ------
-    InputError  if the contacts do not touch at `z`, leave no freedom, or the end cannot be reached
+    A phase that ends by a release heads for the end of `later` ones, at the share `release_at`.
     """
     formation = phase.formation
     require_touching(phase, z)

@@ -75,16 +75,10 @@ class Hold(NamedTuple):
 
 
 def find_hold(place: Standstill, epsilon: float, gap: float, time: float) -> Hold | None:
-    """Torques with the largest margin for a standstill; None if none hold.
+    """Torques with the largest margin for a standstill; None if none hold c_n >= `epsilon` [N].
 
-    Where a contact is gained, they also close it from `gap` before it, if any do: with the least
-    acceleration `DRIVE`, or else with that which closes it in `time`, or less.
-
-    Parameters
-    ----------
-    epsilon : [N]  least normal force
-    gap : [m]      largest opening of the contact
-    time : [s]     duration of the hold
+    A gained contact, open by up to `gap` [m], is closed with the least acceleration `DRIVE` if any
+    torques do, or else with that which closes it in `time` [s].
     """
     rest = _list_holding(place, epsilon)
     best = maximise_margin(place.formation.scene, rest)

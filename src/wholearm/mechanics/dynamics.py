@@ -140,16 +140,11 @@ def inverse(
     directions: Directions,
     kinematics: Kinematics | None = None,
 ) -> PathForces:
-    """Forces that carry a formation along a curve, at n places.
+    """Forces that carry a formation along a curve, z' = z_s s', z'' = z_s s'' + z_ss s'^2.
 
     The object's rows M q'' = g + [W_n - W_t U Xi, W_t(rolling)] c leave four forces c one free
-    number: the internal force lambda, their component along a unit null vector. Three leave none.
-
-    Parameters
-    ----------
-    z, z_s, z_ss : (n, 5)  the curve: z' = z_s s' and z'' = z_s s'' + z_ss s'^2
-    directions             signs for motion along +s, one for all places or one row for each
-    kinematics             of the formation at `z`
+    number: the internal force lambda along a unit null vector; three leave none. `directions` are
+    signs for motion along +s, in one row or n.
     """
     scene = formation.scene
     kinematics = kinematics or formation.evaluate(z, z_s)
@@ -185,11 +180,7 @@ def energy(formation: Formation, z: Array, v: Array) -> Array:
 
 
 def _null_vector(wrench: Array) -> Array:
-    """Unit null vector of each (3, 4) matrix, by its minors; NaN where its rank is below three.
-
-    Minors change continuously along a curve. A sign chosen place by place would not: where it
-    changes, an internal force interpolated between two places would step.
-    """
+    """Unit null vector of each (3, 4) matrix, by its minors (continuous); NaN if not unique."""
     minors = [np.linalg.det(np.delete(wrench, k, axis=2)) for k in range(4)]
     null = np.stack([minors[0], -minors[1], minors[2], -minors[3]], axis=1)
     size = np.linalg.norm(null, axis=1)[:, None]

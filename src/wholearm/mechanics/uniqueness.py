@@ -74,13 +74,9 @@ class _Choices(NamedTuple):
 def find_minors(
     formation: Formation, kinematics: Kinematics, Xi: Array, sticking: tuple[int, ...] = ()
 ) -> Minors:
-    """Find the least ratio of a principal minor to that without friction, at n configurations.
+    """Least ratio of a principal minor to that without friction, at n configurations.
 
-    Parameters
-    ----------
-    Xi : (n_c,) or (n, n_c)  sliding directions
-    sticking                 contacts that do not slide there, besides those that the formation lets
-                             roll
+    Signs Xi are (n_c,) or (n, n_c); `sticking` contacts do not slide, besides rolling ones.
     """
     held, friction = {*formation.rolling_rows, *sticking}, formation.friction
     kinds = tuple((k in held, own > 0) for k, own in enumerate(friction.tolist()))

@@ -55,12 +55,10 @@ class StaticTorques(NamedTuple):
 def find_static_torques(
     touching: Sequence[Formation], z: Array, least: float = 0.0
 ) -> StaticTorques:
-    """Torques with which contact forces and joint friction can balance gravity at `z`, shape (5,).
+    """Torque polygon in which contact forces and joint friction can balance gravity at `z`, (5,).
 
-    Parameters
-    ----------
-    touching     formations with all contacts that touch, some perhaps in more than one
-    least : [N]  apex of every cone: c_n >= least and |c_t| <= mu (c_n - least)
+    `touching` are formations with all contacts that touch; `least` [N] is the apex of every cone,
+    c_n >= least and |c_t| <= mu (c_n - least).
     """
     scene = touching[0].scene
     edges, normals = _list_edges(touching, z)

@@ -52,18 +52,10 @@ def find_force_slopes(
     forces: PathForces,
     names: Sequence[str],
 ) -> Array:
-    """Derivatives of contact forces by uncertain numbers, at n places of a curve.
+    """Derivatives of contact forces by uncertain numbers, (n, n_c + R, len(names), COUNT).
 
-    Parameters
-    ----------
-    directions, forces  one row for each place
-    names               as in `problem.uncertainty`: relative numbers, or lengths in m. `start_x` is
-                        the place along the curve; `delay` has no derivative.
-
-    Returns
-    -------
-    ndarray, shape (n, n_c + R, len(names), COUNT)
-        coefficients of dc/dp for (1, a, b, lambda, s') [N per unit of p]
+    They are coefficients of (1, a, b, lambda, s') [N per unit]. Names are of `problem.uncertainty`:
+    relative numbers, or lengths in m; `start_x` is the place along the curve.
     """
     return _along(formation, point, directions, forces).find_slopes(names)
 

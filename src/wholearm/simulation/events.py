@@ -259,12 +259,7 @@ def list_glimpses(problem: Problem, sections: Sequence[Section]) -> Glimpses:
 
 
 def make_trajectory(simulation: Simulation) -> Trajectory:
-    """Trajectory of a simulation at every recorded instant, without phases of one instant.
-
-    Raises
-    ------
-    SimulationError  if the simulation ended where it started, so that there is no motion
-    """
+    """Trajectory without phases of one instant; `SimulationError` if there is no motion."""
     rows, problem = _choose_rows(simulation), simulation.problem
     if not len(rows):
         raise SimulationError(f"there is no motion to keep: {simulation.outcome.text}")

@@ -196,13 +196,9 @@ class Response(NamedTuple):
 
 
 def respond(mode: Mode, signs: Array, rows: ModeRows, v: Array) -> Response | None:
-    """Solve the equations of motion; None if the constraints are not independent.
+    """Solve the equations of motion at velocity v, (5,); None for dependent constraints.
 
-    Parameters
-    ----------
-    signs : (n_c + 2,)  directions of contacts and joints, zero for what is held or rolls
-    rows                at the state
-    v : (5,)            its velocity
+    `signs`, (n_c + 2,), are those of contacts and joints, zero for what is held or rolls.
     """
     formation, scene = mode.formation, mode.formation.scene
     count, rolling = formation.n_contacts, list(mode.rolled.rolling_rows)
