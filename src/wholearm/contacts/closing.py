@@ -314,10 +314,7 @@ def evaluate_each(scene: Scene, labels: Numbers, z: Array, v: Array | None = Non
 
 
 def group_alike(scene: Scene, labels: Numbers) -> Iterator[tuple[Formation, Flags]]:
-    """Groups of formations with the same friction at each contact, one of which stands for all.
-
-    All else that the mechanics takes of a formation is in its rows.
-    """
+    """Groups of formations with the same friction at each contact, with one that stands for all."""
     table = contact_table(scene)
     fingers = np.array([-1 if own.finger is None else own.finger for own in table])[labels]
     for kind in np.unique(fingers, axis=0):

@@ -50,9 +50,7 @@ class FreeRun:
 
     Attributes
     ----------
-    t : [s]
-    y : (2 n + LOSSES,)
-    modes                what keeps which contacts at present
+    y : (2 n + LOSSES,)  state and energies at time t [s]
     armed : (N,)         pairs that have been apart, so that their closing is an event
     unique               whether the present modes were certainly the only solution
     impact : [J]         energy lost to impacts so far
@@ -268,7 +266,7 @@ class Feedback:
             t = float(self.torque.breaks[piece])
             tau = np.asarray(self.law.held(t, theta, theta_dot, forces), dtype=float)
             if tau.shape != (2,) or not np.isfinite(tau).all():
-                given = f"{tau.tolist()} at t = {t:.6g} s; two finite numbers are needed"
-                raise SimulationError(f"the law of the torques gives {given}")
+                text = f"{tau.tolist()} at t = {t:.6g} s; two finite numbers are needed"
+                raise SimulationError(f"the law of the torques gives {text}")
             self._samples[latest] = tau
         self.torque.coefficients[piece, :, 0] = self._samples[self._source[piece]]

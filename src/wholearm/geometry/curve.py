@@ -203,10 +203,7 @@ def tangent_basis(formation: Formation, z: Array) -> Array:
 
 
 def find_tied(formation: Formation, z: Array, row: int) -> tuple[int, ...]:
-    """Rows of (contacts, joints) that reverse as one with a row at `z`: that row, then the others.
-
-    With two freedoms those are all with proportional rates, with one freedom those of a flush edge.
-    """
+    """Rows of (contacts, joints) that reverse with a row: proportional, or of a flush edge."""
     flush, N = formation.turn_with(row), tangent_basis(formation, z)
     if N.shape[1] != 2:
         return flush

@@ -228,11 +228,7 @@ def _first_crossing(
 
 
 def _refine_dips(grid: Array, values: Array) -> Array:
-    """Samples around minima that may fall below zero between two places, shape (n,).
-
-    The gap of the fingers is piecewise linear where a tip passes the other link, so a minimum is no
-    deeper than half the second difference.
-    """
+    """Samples around minima that may fall below zero: no deeper than half the second difference."""
     before, here, after = values[:-2], values[1:-1], values[2:]
     dips = (here <= before) & (here <= after) & (here > ROUNDING)
     rows = np.flatnonzero((dips & (here < before - 2 * here + after)).any(axis=1))

@@ -118,10 +118,7 @@ def split_forces(formation: Formation, c: Array, Xi: Array) -> tuple[Array, Arra
 
 
 def reduced_inertia(formation: Formation, kinematics: Kinematics, directions: Directions) -> Array:
-    """Reduced inertia over that without friction, shape (n,): jamming at zero and below.
-
-    Infinite or NaN where the contacts depend on each other.
-    """
+    """Reduced inertia over the frictionless, (n,): jamming at zero and below, or not finite."""
     inverse_mass = 1 / formation.scene.mass_diagonal
     P = kinematics.P
     G = force_rows(formation, kinematics, directions)

@@ -1,14 +1,11 @@
 """Static torque polygon: torques under which friction can hold a formation at rest.
 
-At rest every contact force within its cone and every joint friction within [-D, D] is possible.
-With the edges of the cones as columns E and their amounts e >= 0, balance is
+With the edges of the friction cones as columns E, amounts e >= 0 and joint friction d, balance is
 
     g + S (tau - d) + E e = 0,   e >= 0,   |d| <= D.
 
-Projected onto the torques, what this linear programme allows is a convex polygon, perhaps without
-bounds. Its corners are basic solutions of the object's three rows, with three edges each, its rays
-internal forces, combinations of edges in balance. Beyond the polygon, by its distance from tau, a
-motion begins, whatever the forces are.
+Its projection onto the torques is a convex polygon, perhaps unbounded. Corners are basic solutions
+of the object's three rows, rays are internal forces. Beyond it a motion begins in any case.
 """
 
 from __future__ import annotations

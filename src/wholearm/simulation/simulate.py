@@ -484,11 +484,7 @@ def _strikes(run: Replay) -> bool:
 
 
 def _pass_on(run: Replay) -> Arrival:
-    """The end of a phase is reached that the motion passes.
-
-    A planned motion that comes early by its error keeps its formation until the torques step; the
-    gap dips below zero by that error.
-    """
+    """The end of a phase is passed; the torques of the next one may still have to come."""
     s = run.stepper
     s.inputs[s.at.t] = run.t
     window = settling = run.tolerances.settling

@@ -70,7 +70,11 @@ class _Equations:
         self.mechanics = share_mechanics(mode, degree)
         self.short = find_tolerances(formation.scene).short
         self._measure = _build_measure(formation, until, side, self.short)
-        self._stage = _build_stage(mode, self.mechanics)
+        inputs = [
+            ca.SX.sym(n, k) for n, k in (("y", MOVING), ("t", 1), ("p", self.mechanics.at.size))
+        ]
+        _, *rows = mode.build_constraints(inputs[0][:5], inputs[0][5:10])
+        self._stage = ca.Function("stage", inputs, self.mechanics.stage(*inputs, *rows))
         self.packed = ca.MX.sym("packed", self.mechanics.at.size)
         self.least: list[Expression] = []
         self.c_n: list[Expression] = []
@@ -131,14 +135,6 @@ def _compile(
     step = ca.Function("step", [packed], [outputs])
     look = ca.Function("look", [packed], [equations.report(y, t, 0, 0, ca.DM.zeros(brief))])
     return mode, at, to, rows, slack, (step, look)
-
-
-def _build_stage(mode: Mode, mechanics: Mechanics) -> Expression:
-    """CasADi function (state, time, packed) -> (its rates, the least that holds it, c_n)."""
-    state, time = ca.SX.sym("state", MOVING), ca.SX.sym("time")
-    packed = ca.SX.sym("packed", mechanics.at.size)
-    _, *rows = mode.build_constraints(state[:5], state[5:10])
-    return ca.Function("stage", [state, time, packed], mechanics.stage(state, time, packed, *rows))
 
 
 def _build_measure(formation: Formation, until: Until, side: float, short: float) -> Expression:
