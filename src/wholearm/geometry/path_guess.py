@@ -219,7 +219,7 @@ def connect(
     heading : (5,)  initial direction, if not straight to the goal
     """
     slip = formation.evaluate_slip(start[None])[0]
-    aside = _find_side(formation, start, goal) if any(bends) else np.zeros(5)
+    aside = _find_normal(formation, start, goal) if any(bends) else np.zeros(5)
     x = np.linspace(0.0, 1.0, POINTS)[1:, None]
     off = bends[0] * np.sin(np.pi * x) + bends[1] * np.sin(2 * np.pi * x)
     line = goal - start
@@ -239,7 +239,7 @@ def connect(
     return PathGuess(formation, z, Directions(signs[:-2], signs[-2:]))
 
 
-def _find_side(formation: Formation, start: Array, goal: Array) -> Array:
+def _find_normal(formation: Formation, start: Array, goal: Array) -> Array:
     """Normal of a line in the tangent plane at its start, as long as the line."""
     metric = np.sqrt(metric_weights(formation.scene))
     line = (goal - start) * metric

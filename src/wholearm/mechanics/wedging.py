@@ -58,20 +58,16 @@ def find_static_torques(
     c_n >= least and |c_t| <= mu (c_n - least).
     """
     scene = touching[0].scene
-    edges, normals = _list_edges(touching, z)
-    static = _project(scene, edges, scene.applied_force + least * normals.sum(axis=0))
-    return static._replace(bounds=static.bounds + np.abs(static.normals) @ scene.dry[3:])
-
-
-def _list_edges(touching: Sequence[Formation], z: Array) -> tuple[Array, Array]:
-    """Edges of all cones as forces on (q, theta), shape (2 n_c, 5), and the normals, (n_c, 5)."""
     rows: dict[Contact, tuple[Array, Array]] = {}
     for formation in touching:
         kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
         slip = formation.friction[:, None] * kinematics.A_t[0]
         rows |= dict(zip(formation.contacts, zip(kinematics.A[0], slip, strict=True), strict=True))
-    edges = np.array([normal + way * slip for normal, slip in rows.values() for way in (-1, 1)])
-    return edges, np.array([normal for normal, _ in rows.values()])
+    # Edges of all cones, (2 n_c, 5), and normals, (n_c, 5), as forces on (q, theta).
+    edges = np.array([normal + sign * slip for normal, slip in rows.values() for sign in (-1, 1)])
+    normals = np.array([normal for normal, _ in rows.values()])
+    static = _project(scene, edges, scene.applied_force + least * normals.sum(axis=0))
+    return static._replace(bounds=static.bounds + np.abs(static.normals) @ scene.dry[3:])
 
 
 def _project(scene: Scene, edges: Array, applied: Array) -> StaticTorques:
