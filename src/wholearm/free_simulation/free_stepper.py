@@ -10,7 +10,7 @@ import numpy as np
 
 from ..common.arrays import Array, Expression
 from ..simulation.layout import bind, build_torque, lay_out
-from ..simulation.runge_kutta import GLIMPSES, build_error, build_step
+from ..simulation.runge_kutta import INNER_STAGES, build_error, build_step
 from .system import Structure
 
 LOSSES = 4  # integrals: work, losses to viscous, dry and sliding friction
@@ -118,7 +118,7 @@ class _FreeEquations:
 
         end, fifth, third = build_step(rate, y, t, h, 2 * n)
         error = build_error(fifth, third, y[: 2 * n], packed[at.units], packed[at.tolerance])
-        dip = ca.mmin(ca.vertcat(*(self.dips[stage] for stage in GLIMPSES)))
+        dip = ca.mmin(ca.vertcat(*(self.dips[stage] for stage in INNER_STAGES)))
         moved = self._correct(end[: 2 * n], packed)
         end = ca.vertcat(moved, end[2 * n :])
         functions = []

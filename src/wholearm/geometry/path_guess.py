@@ -20,9 +20,9 @@ from .curve import Curve, tangent_basis
 from .explore import Ending, close_all, close_contacts, explore, is_inside
 from .tracing import require_touching, runs_on_curve, trace_phase, trace_phases
 
-POINTS = 25  # configurations along an outline
-RELEASE_AT = 0.8  # share of a curve without an end of its own at which a release is guessed
-_MOST_ACTIVE = 2  # most limits that a phase's end may be right on
+POINTS = 25  # configurations along a guess
+RELEASE_AT = 0.8  # share of a curve at which a release is guessed
+_MOST_ACTIVE = 2  # most active limits at the end of a phase
 _AHEAD = (0.25, 0.5, 1.0, 2.0)  # distances at which ends are searched for, over that to the nearest
 _TURNS = np.linspace(-1.0, 1.0, 21)  # rotations from which another end is searched for [rad]
 

@@ -30,16 +30,16 @@ from .dynamics import Directions, force_rows
 from .impact import ViolationKind, compute_impact
 from .wedging import SURE, find_static_torques
 
-LEAST = 1e-2  # margin over what is ample below which torques do not hold, or close, for sure
+LEAST = 1e-2  # least margin over saturation of torques that hold or close
 AMPLE = 0.1  # saturation of margins of forces, torques, accelerations, over the scene's
 DRIVE = 0.02  # least acceleration towards a contact that is still open, over the scene's
 SLOW = 0.2  # least margin of slowly closing torques, over that of torques that only hold
 _CREEP = 0.02  # saturation of sliding and turning with assumed signs, over the scene's
 _STILL = 1e-9  # relative rate of sliding, turning or opening that counts as none
-_JAMS = 1e-6  # determinant of K over that without friction, at which and below a way jams
+_JAMS = 1e-6  # determinant of K over the frictionless one, at and below which a mode jams
 _INDEPENDENT = 1e-12  # least Gram determinant of independent normalized constraints
 _SMALL = 1e-9  # what counts as zero in the linear programme
-_FAR = 1e3  # largest margin that is looked for, over what is ample
+_FAR = 1e3  # largest margin, over saturation
 
 
 class ArrivalPath(NamedTuple):

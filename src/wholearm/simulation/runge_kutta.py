@@ -44,7 +44,7 @@ NODES = (
     0.3333333333333333, 0.25, 0.3076923076923077, 0.6512820512820513, 0.6, 0.8571428571428571, 1.0,
 )
 """Times of the stages, as shares of a step."""
-GLIMPSES = (3, 5, 9, 10)  # stages spread over the step that approximate the state well
+INNER_STAGES = (3, 5, 9, 10)  # stages spread over the step that approximate the state well
 WEIGHTS = {
     0: 0.054293734116568765, 5: 4.450312892752409, 6: 1.8915178993145003, 7: -5.801203960010585,
     8: 0.3111643669578199, 9: -0.1521609496625161, 10: 0.20136540080403034, 11: 0.04471061572777259,
