@@ -181,14 +181,10 @@ def _close_finger(
 def find_nearby(scene: Scene, finger: int, x: Array, y: Array, phi: Array) -> tuple[Numbers, Flags]:
     """Vertices that a closing finger may touch first, for n poses.
 
-    The edges whose outer side faces the joint are a chain. A link that is long enough touches the
-    vertex at the end of the chain that it comes to first. A shorter one touches with its tip, where
-    distances from the joint first fall to its length: along the chain they fall, then rise.
-
-    Returns
-    -------
-    first : (n,)  first of `AROUND` neighbouring vertices, one of which it is or is next to
-    clear : (n,)  whether this holds: the joint is outside of the object and not above any of it
+    The edges whose outer side faces the joint are a chain. A long link touches the vertex at its
+    end; a short one touches with its tip, where distances from the joint first fall to its length.
+    Returns the first of `AROUND` neighbouring vertices, (n,), and whether this holds, (n,): the
+    joint is outside of the object and not above any of it.
     """
     link, body = scene.fingers[finger], scene.polygon.vertices
     count, radius = len(body), link.radius
@@ -236,16 +232,9 @@ def _list_edges(scene: Scene) -> tuple[Array, Array, Array, Array, Array]:
 
 
 def _touch(link: Finger, finger: int, corners: Array) -> tuple[Array, Numbers]:
-    """Angle at which a closing finger first touches a chain of corners, and with which feature.
+    """Angle of first contact of a closing finger, (n,), and feature of m sides, edges, arcs, or -1.
 
-    Parameters
-    ----------
-    corners : (n, m + 1, 2)  from the joint; the last one is the end of the last edge only
-
-    Returns
-    -------
-    angle : (n,)
-    feature : (n,)  of m sides, m edges and m arcs; -1 where it reaches none
+    `corners`, (n, m + 1, 2), are relative to the joint; the last one is only the end of an edge.
     """
     following, corners = corners[:, 1:], corners[:, :-1]
     sign = 1.0 if finger == 0 else -1.0
@@ -325,10 +314,7 @@ def evaluate_each(scene: Scene, labels: Numbers, z: Array, v: Array | None = Non
 
 
 def group_alike(scene: Scene, labels: Numbers) -> Iterator[tuple[Formation, Flags]]:
-    """Groups of formations with the same friction at each contact, one of which stands for all.
-
-    All else that the mechanics takes of a formation is in its rows.
-    """
+    """Groups of formations with the same friction at each contact, with one that stands for all."""
     table = contact_table(scene)
     fingers = np.array([-1 if own.finger is None else own.finger for own in table])[labels]
     for kind in np.unique(fingers, axis=0):

@@ -122,9 +122,8 @@ def takes_over(contact: Contact, scene: Scene, held: Sequence[Contact]) -> bool:
 
 
 def build_clearance(contact: Contact, scene: Scene, touching: bool) -> GapLimit:
-    """Return the limit at which `contact`, not in the formation, is gained.
+    """Limit at which `contact`, not in the formation, is gained; gaps beyond ends do not count.
 
-    Gaps beyond the ends of a feature do not count, nor of a tip with an edge if another is farther.
     With a link that touches a vertex with its side (`touching`) they do, by convexity.
     """
     gap = own = build_gap(contact, scene)

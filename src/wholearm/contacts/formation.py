@@ -1,18 +1,12 @@
 """Contact formations: constraints P z' = 0 with their derivatives, and gap limits.
 
-With the rows of each contact stacked, Eq. (4) reads A z' = 0 with A = [W_n^T, -J_n], the sliding
-velocities are v_t = A_t z' with A_t = [W_t^T, -J_t], and differentiating once more gives
-A z'' + A' z' = 0. A contact that rolls has v_t = 0 as well, so with R of them the constraints are
+With the rows of all contacts, Eq. (4) reads A z' = 0 with A = [W_n^T, -J_n]; sliding velocities are
+v_t = A_t z' with A_t = [W_t^T, -J_t]. Rolling contacts have v_t = 0 as well:
 
     P z' = 0,  P z'' + P' z' = 0,  P = [A; A_t(rolling)],
 
-n_c + R = 2R + S rows for S sliding contacts. Rolling is holonomic here: v_t is the rate of a slip
-coordinate (`contacts.slip`), which keeps its value from where the rolling begins.
-
-For four sliding contacts, Eqs. (6)-(9) split A by the columns of (q, theta_2) and
-theta_1,
-
-    P_AI (q', theta_2') + P_AII theta_1' = 0,  P_AI = [W_n^T, -j_2n],  P_AII = -j_1n.
+n_c + R rows. Rolling is holonomic here: v_t is the rate of a slip coordinate (`build_slip`), which
+keeps its value from where the rolling begins.
 """
 
 from __future__ import annotations
@@ -262,16 +256,12 @@ _LIMIT_FUNCTIONS = Store(
 
 
 def build_slip(contact: Contact, scene: Scene) -> Expression:
-    """Return the slip coordinate of `contact` [m], an expression of the features' symbol z.
-
-    Its time derivative is v_t for as long as the contact touches: how far the object has slid along
-    t on the palm or the link. What a contact has to keep when it rolls is a constant, therefore:
+    """Slip coordinate of `contact` [m], whose rate is v_t, an expression of the features' z.
 
     * vertex on the palm: x of the vertex;
-    * vertex on the side of a link: how far along the link it is, positive towards the tip for
-      finger 1, whose tangent is the link's axis, and towards the joint for finger 2;
-    * tip on an edge: less how far along the edge the tip is, less the arc on which it has rolled;
-    * vertex on the arc of a tip: less the arc from the link's axis to the vertex.
+    * vertex on a link: place along it, towards the tip for finger 1, the joint for finger 2;
+    * tip on an edge: minus the place along the edge and the arc rolled;
+    * vertex on a tip: minus the arc from the link's axis.
     """
     features = build_features(scene)
     if contact.finger is None:

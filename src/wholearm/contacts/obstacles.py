@@ -1,13 +1,5 @@
 """Gap limits between the object and the far side of a link or the circle about its joint.
 
-====================  ===========================================  ========================
-object                link                                         C-function
-====================  ===========================================  ========================
-vertex 3              far side                                     -n . (p - base) - radius
-vertex 3              circle about the joint                       abs(p - base) - radius
-edge 2                circle about the joint                       m . (base - p_2) - radius
-====================  ===========================================  ========================
-
 A link that touches a vertex, with side or tip, needs none of these: by convexity its line or the
 tangent to the tip separates it from the object. One whose tip touches an edge can only turn onto
 the edge's line, with either side.

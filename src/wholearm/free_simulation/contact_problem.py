@@ -69,10 +69,7 @@ class ContactProblem:
 
     @cached_property
     def is_unique(self) -> bool:
-        """Whether there is one solution for sure, as nothing might stick and K is positive.
-
-        A matrix whose symmetric part is positive definite has positive principal minors only.
-        """
+        """Whether there is surely one solution: nothing may stick, K + K^T is positive definite."""
         if len(self.b_t):
             return False
         K = self.scaled[2]
@@ -103,8 +100,7 @@ def solve(problem: ContactProblem, presses: Sequence[bool] = ()) -> ContactAnswe
 def _exchange(p: ContactProblem, presses: Sequence[bool]) -> ContactAnswer | None:
     """Bard-type principal pivoting: blocks of contacts first, then the first infeasible one.
 
-    The latter ends for every P-matrix (K. G. Murty, "Note on a Bard-type scheme for solving the
-    complementarity problem", 1974).
+    The latter ends for every P-matrix (Murty, "Note on a Bard-type scheme ...", 1974).
     """
     s_n, _, K, q = p.scaled
     k = len(q)
@@ -278,13 +274,7 @@ class ContactSolution(NamedTuple):
 
 
 def solve_lcp(M: Array, q: Array) -> ContactSolution:
-    """Solve w = M z + q, z >= 0, w >= 0, z w = 0 by Lemke's method.
-
-    Parameters
-    ----------
-    M : (n, n)  scaled so that its entries are of the size of one
-    q : (n,)
-    """
+    """Solve w = M z + q, z >= 0, w >= 0, z w = 0 by Lemke's method; M (n, n) is near one."""
     n = len(q)
     size = float(np.abs(q).max(initial=0.0))
     if n == 0 or (q >= 0).all():
@@ -329,10 +319,7 @@ def _pivot(M: Array, q: Array, size: float, least: float) -> ContactSolution:
 
 
 def _choose(table: Array, rows: NDArray[np.int64], pivots: Array) -> int:
-    """The row with the lexicographically least ratio to its pivot.
-
-    For the first pivot the column is negative, so that the ratios are those of what falls most.
-    """
+    """Row of the lexicographically least ratio to its pivot; first, of what falls most."""
     sizes = np.abs(pivots)
     ratios = table[rows, 0] / sizes
     least = (ratios == ratios.min()).nonzero()[0]

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..common.arrays import Array, Expression
 from ..simulation.layout import bind, build_torque, lay_out
-from ..simulation.runge_kutta import GLIMPSES, build_error, build_step
+from ..simulation.runge_kutta import INNER_STAGES, build_error, build_step
 from .system import Structure
 
 LOSSES = 4  # integrals: work, losses to viscous, dry and sliding friction
@@ -30,8 +30,7 @@ class Modes(NamedTuple):
 class FreeInputs(NamedTuple):
     """Where each input of a step is in its packed vector; compare `simulation.layout.Inputs`.
 
-    Those from `geometry` on are numbers of the system: M^-1, gravity, friction of coordinates and
-    of the kept pairs, units of z and z', of forces and of the friction of coordinates.
+    Those from `geometry` on are numbers of the system and its units.
     """
 
     y: slice
@@ -119,7 +118,7 @@ class _FreeEquations:
 
         end, fifth, third = build_step(rate, y, t, h, 2 * n)
         error = build_error(fifth, third, y[: 2 * n], packed[at.units], packed[at.tolerance])
-        dip = ca.mmin(ca.vertcat(*(self.dips[stage] for stage in GLIMPSES)))
+        dip = ca.mmin(ca.vertcat(*(self.dips[stage] for stage in INNER_STAGES)))
         moved = self._correct(end[: 2 * n], packed)
         end = ca.vertcat(moved, end[2 * n :])
         functions = []

@@ -46,9 +46,8 @@ def list_pauses(
 class FreeSimulation(Simulation):
     """A simulated motion without prescribed contacts, at every step.
 
-    As of `Simulation`, but phases are those of the clock of a plan, or one; `contacts` has others
-    that pressed besides the problem's; forces are NaN where a contact does not press, and at rest;
-    instants of events are there twice, as forces may step; `missed_by` is NaN.
+    As of `Simulation`, but phases are those of a plan's clock, `contacts` has others that pressed,
+    forces are NaN where a contact does not press, events are there twice, and `missed_by` is NaN.
     """
 
     # when each pair of features pressed, by the order of their start

@@ -50,9 +50,7 @@ class FreeRun:
 
     Attributes
     ----------
-    t : [s]
-    y : (2 n + LOSSES,)
-    modes                what keeps which contacts at present
+    y : (2 n + LOSSES,)  state and energies at time t [s]
     armed : (N,)         pairs that have been apart, so that their closing is an event
     unique               whether the present modes were certainly the only solution
     impact : [J]         energy lost to impacts so far
@@ -236,13 +234,9 @@ class Law(Protocol):
     def held(
         self, t: float, theta: Array, theta_dot: Array, forces: Mapping[str, float]
     ) -> ArrayLike:
-        """Torques, shape (2,) [N m], held from time `t` [s] on.
+        """Torques, shape (2,) [N m], held from time `t` [s] on, from angles and rates, (2,) each.
 
-        Parameters
-        ----------
-        theta, theta_dot : (2,) [rad, rad/s]
-        forces : [N]  c_n of the contacts that press, by name, just before `t`; NaN at rest, empty
-                      at the start
+        `forces` [N] are the c_n of contacts that press, by name; NaN at rest, empty at the start.
         """
 
 
@@ -266,18 +260,13 @@ class Feedback:
     def begin(
         self, piece: int, theta: Array, theta_dot: Array, forces: Mapping[str, float]
     ) -> None:
-        """Take a sample where one is due at the start of a piece, and set the piece's torques.
-
-        Raises
-        ------
-        SimulationError  if the law gives no two numbers
-        """
+        """Sample where one is due at the start of a piece, and set the torques of the piece."""
         latest = self._latest[piece]
         if piece == 0 or latest > self._latest[piece - 1]:
             t = float(self.torque.breaks[piece])
             tau = np.asarray(self.law.held(t, theta, theta_dot, forces), dtype=float)
             if tau.shape != (2,) or not np.isfinite(tau).all():
-                given = f"{tau.tolist()} at t = {t:.6g} s; two finite numbers are needed"
-                raise SimulationError(f"the law of the torques gives {given}")
+                text = f"{tau.tolist()} at t = {t:.6g} s; two finite numbers are needed"
+                raise SimulationError(f"the law of the torques gives {text}")
             self._samples[latest] = tau
         self.torque.coefficients[piece, :, 0] = self._samples[self._source[piece]]

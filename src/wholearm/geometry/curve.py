@@ -25,10 +25,7 @@ _TIED = 1e-6  # relative error of two rates that are proportional, and relative 
 
 
 class CurvePoint(NamedTuple):
-    """A curve at n places: z, its tangent z_s and its curvature z_ss, each (n, 5).
-
-    `kinematics` is the formation there.
-    """
+    """Curve at n places: z, tangent z_s and curvature z_ss, (n, 5) each, and kinematics there."""
 
     z: Array
     z_s: Array
@@ -143,10 +140,7 @@ class Curve:
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
-        """The curve split wherever a contact's sliding or a joint reverses.
-
-        Raises `LinAlgError` where the contacts depend on each other.
-        """
+        """The curve split at its reversals; `LinAlgError` where contacts are dependent."""
         grids = [refine(panel.s, self.length) for panel in self.panels]
         grid = np.concatenate([grid[index > 0 :] for index, grid in enumerate(grids)])
         z, tangent = self.interpolate(grid)
@@ -209,10 +203,7 @@ def tangent_basis(formation: Formation, z: Array) -> Array:
 
 
 def find_tied(formation: Formation, z: Array, row: int) -> tuple[int, ...]:
-    """Rows of (contacts, joints) that reverse as one with a row at `z`: that row, then the others.
-
-    With two freedoms those are all with proportional rates, with one freedom those of a flush edge.
-    """
+    """Rows of (contacts, joints) that reverse with a row: proportional, or of a flush edge."""
     flush, N = formation.turn_with(row), tangent_basis(formation, z)
     if N.shape[1] != 2:
         return flush

@@ -20,33 +20,23 @@ from .curve import Curve, tangent_basis
 from .explore import Ending, close_all, close_contacts, explore, is_inside
 from .tracing import require_touching, runs_on_curve, trace_phase, trace_phases
 
-POINTS = 25  # configurations along an outline
-RELEASE_AT = 0.8  # share of a curve without an end of its own at which a release is guessed
-_MOST_ACTIVE = 2  # most limits that a phase's end may be right on
+POINTS = 25  # configurations along a guess
+RELEASE_AT = 0.8  # share of a curve at which a release is guessed
+_MOST_ACTIVE = 2  # most active limits at the end of a phase
 _AHEAD = (0.25, 0.5, 1.0, 2.0)  # distances at which ends are searched for, over that to the nearest
 _TURNS = np.linspace(-1.0, 1.0, 21)  # rotations from which another end is searched for [rad]
 
 
 @exclusive
 def load(path: str) -> Problem:
-    """Read a problem file and check that every phase can be carried out geometrically.
-
-    Raises
-    ------
-    InputError  if the file is malformed, a formation does not touch, or an `until` is never reached
-    """
+    """Read a problem file and check its phases geometrically, or raise an `InputError`."""
     problem = read_problem(path)
     check_phases(problem)
     return problem
 
 
 def check_phases(problem: Problem) -> None:
-    """Check that every phase of a problem can be carried out geometrically.
-
-    Raises
-    ------
-    InputError  if a formation does not touch, or an `until` is never reached
-    """
+    """Raise an `InputError` if a formation does not touch, or an `until` is never reached."""
     curves = trace_phases(problem)
     z = curves[-1].end if curves else problem.start
     with name_source(problem.source):
@@ -94,16 +84,9 @@ def guess_curve(curve: Curve, share: float = 1.0) -> list[PathGuess]:
 def guess_phase(
     phase: Phase, z: Array, later: Sequence[Phase] = (), release_at: float = RELEASE_AT
 ) -> list[PathGuess]:
-    """Path guesses of a phase from `z`, shape (5,), to its end.
+    """Path guesses of a phase from `z`, (5,), to its end; an `InputError` if there is none.
 
-    Parameters
-    ----------
-    later       following phases: a phase that ends by a release heads for their end
-    release_at  share of the curve at which it is released
-
-    Raises
-    ------
-    InputError  if the contacts do not touch at `z`, leave no freedom, or the end cannot be reached
+    A phase that ends by a release heads for the end of `later` ones, at the share `release_at`.
     """
     formation = phase.formation
     require_touching(phase, z)
@@ -236,7 +219,7 @@ def connect(
     heading : (5,)  initial direction, if not straight to the goal
     """
     slip = formation.evaluate_slip(start[None])[0]
-    aside = _find_side(formation, start, goal) if any(bends) else np.zeros(5)
+    aside = _find_normal(formation, start, goal) if any(bends) else np.zeros(5)
     x = np.linspace(0.0, 1.0, POINTS)[1:, None]
     off = bends[0] * np.sin(np.pi * x) + bends[1] * np.sin(2 * np.pi * x)
     line = goal - start
@@ -256,7 +239,7 @@ def connect(
     return PathGuess(formation, z, Directions(signs[:-2], signs[-2:]))
 
 
-def _find_side(formation: Formation, start: Array, goal: Array) -> Array:
+def _find_normal(formation: Formation, start: Array, goal: Array) -> Array:
     """Normal of a line in the tangent plane at its start, as long as the line."""
     metric = np.sqrt(metric_weights(formation.scene))
     line = (goal - start) * metric

@@ -36,13 +36,9 @@ LONGEST = 60.0  # longest curve that is traced, in radii of gyration: several tu
 
 @lru_cache(maxsize=8)
 def trace_phases(problem: Problem) -> tuple[Curve, ...]:
-    """Trace the curve of every phase from the end of the one before.
+    """Trace the curves of all phases up to the first with more freedoms or a smooth end.
 
-    Up to the first phase with more freedoms or a smooth end: geometry does not say where these end.
-
-    Raises
-    ------
-    InputError  if a phase's contacts do not touch at its start, or its `until` is never reached
+    Raises an `InputError` as `trace_phase`.
     """
     curves: list[Curve] = []
     z = problem.start
@@ -61,16 +57,10 @@ def runs_on_curve(phase: Phase) -> bool:
 
 
 def trace_phase(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> Curve:
-    """Trace a one-freedom phase from `z` to its `until`, or as far as it goes before a release.
+    """Trace a one-freedom phase from `z`, (5,), to its `until`, or to its limits before a release.
 
-    Parameters
-    ----------
-    z : (5,)
-    later     what follows, which says where a phase that ends by a release is heading
-
-    Raises
-    ------
-    InputError  if the contacts do not touch at `z`, or the `until` is never reached
+    Such a phase heads for the end of `later` ones. Raises an `InputError` if the contacts do not
+    touch or the `until` is never reached.
     """
     require_touching(phase, z)
     if not phase.until.is_release:
@@ -238,11 +228,7 @@ def _first_crossing(
 
 
 def _refine_dips(grid: Array, values: Array) -> Array:
-    """Samples around minima that may fall below zero between two places, shape (n,).
-
-    The gap of the fingers is piecewise linear where a tip passes the other link, so a minimum is no
-    deeper than half the second difference.
-    """
+    """Samples around minima that may fall below zero: no deeper than half the second difference."""
     before, here, after = values[:-2], values[1:-1], values[2:]
     dips = (here <= before) & (here <= after) & (here > ROUNDING)
     rows = np.flatnonzero((dips & (here < before - 2 * here + after)).any(axis=1))

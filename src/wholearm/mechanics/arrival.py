@@ -30,16 +30,16 @@ from .dynamics import Directions, force_rows
 from .impact import ViolationKind, compute_impact
 from .wedging import SURE, find_static_torques
 
-LEAST = 1e-2  # margin over what is ample below which torques do not hold, or close, for sure
+LEAST = 1e-2  # least margin over saturation of torques that hold or close
 AMPLE = 0.1  # saturation of margins of forces, torques, accelerations, over the scene's
 DRIVE = 0.02  # least acceleration towards a contact that is still open, over the scene's
 SLOW = 0.2  # least margin of slowly closing torques, over that of torques that only hold
 _CREEP = 0.02  # saturation of sliding and turning with assumed signs, over the scene's
 _STILL = 1e-9  # relative rate of sliding, turning or opening that counts as none
-_JAMS = 1e-6  # determinant of K over that without friction, at which and below a way jams
+_JAMS = 1e-6  # determinant of K over the frictionless one, at and below which a mode jams
 _INDEPENDENT = 1e-12  # least Gram determinant of independent normalized constraints
 _SMALL = 1e-9  # what counts as zero in the linear programme
-_FAR = 1e3  # largest margin that is looked for, over what is ample
+_FAR = 1e3  # largest margin, over saturation
 
 
 class ArrivalPath(NamedTuple):
@@ -75,16 +75,10 @@ class Hold(NamedTuple):
 
 
 def find_hold(place: Standstill, epsilon: float, gap: float, time: float) -> Hold | None:
-    """Torques with the largest margin for a standstill; None if none hold.
+    """Torques with the largest margin for a standstill; None if none hold c_n >= `epsilon` [N].
 
-    Where a contact is gained, they also close it from `gap` before it, if any do: with the least
-    acceleration `DRIVE`, or else with that which closes it in `time`, or less.
-
-    Parameters
-    ----------
-    epsilon : [N]  least normal force
-    gap : [m]      largest opening of the contact
-    time : [s]     duration of the hold
+    A gained contact, open by up to `gap` [m], is closed with the least acceleration `DRIVE` if any
+    torques do, or else with that which closes it in `time` [s].
     """
     rest = _list_holding(place, epsilon)
     best = maximise_margin(place.formation.scene, rest)

@@ -118,10 +118,7 @@ def split_forces(formation: Formation, c: Array, Xi: Array) -> tuple[Array, Arra
 
 
 def reduced_inertia(formation: Formation, kinematics: Kinematics, directions: Directions) -> Array:
-    """Reduced inertia over that without friction, shape (n,): jamming at zero and below.
-
-    Infinite or NaN where the contacts depend on each other.
-    """
+    """Reduced inertia over the frictionless, (n,): jamming at zero and below, or not finite."""
     inverse_mass = 1 / formation.scene.mass_diagonal
     P = kinematics.P
     G = force_rows(formation, kinematics, directions)
@@ -140,16 +137,11 @@ def inverse(
     directions: Directions,
     kinematics: Kinematics | None = None,
 ) -> PathForces:
-    """Forces that carry a formation along a curve, at n places.
+    """Forces that carry a formation along a curve, z' = z_s s', z'' = z_s s'' + z_ss s'^2.
 
     The object's rows M q'' = g + [W_n - W_t U Xi, W_t(rolling)] c leave four forces c one free
-    number: the internal force lambda, their component along a unit null vector. Three leave none.
-
-    Parameters
-    ----------
-    z, z_s, z_ss : (n, 5)  the curve: z' = z_s s' and z'' = z_s s'' + z_ss s'^2
-    directions             signs for motion along +s, one for all places or one row for each
-    kinematics             of the formation at `z`
+    number: the internal force lambda along a unit null vector; three leave none. `directions` are
+    signs for motion along +s, in one row or n.
     """
     scene = formation.scene
     kinematics = kinematics or formation.evaluate(z, z_s)
@@ -185,11 +177,7 @@ def energy(formation: Formation, z: Array, v: Array) -> Array:
 
 
 def _null_vector(wrench: Array) -> Array:
-    """Unit null vector of each (3, 4) matrix, by its minors; NaN where its rank is below three.
-
-    Minors change continuously along a curve. A sign chosen place by place would not: where it
-    changes, an internal force interpolated between two places would step.
-    """
+    """Unit null vector of each (3, 4) matrix, by its minors (continuous); NaN if not unique."""
     minors = [np.linalg.det(np.delete(wrench, k, axis=2)) for k in range(4)]
     null = np.stack([minors[0], -minors[1], minors[2], -minors[3]], axis=1)
     size = np.linalg.norm(null, axis=1)[:, None]

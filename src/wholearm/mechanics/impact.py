@@ -1,16 +1,12 @@
 """Plastic impacts: projection of the velocity onto the next formation, by impulses with friction.
 
-In no time at all, only impulses act: those of the contacts of the new formation, with friction by
-the sliding law. With v- and v+ the velocities z' before and after,
+With v- and v+ the velocities z' before and after and the rows P and G of the new formation
+(`mechanics.dynamics`), G with the sliding signs Xi of v+,
 
-    M5 (v+ - v-) = G^T p,   P v+ = 0,
+    M5 (v+ - v-) = G^T p,   P v+ = 0.
 
-where P and G are the constraint and force rows of the new formation (`mechanics.dynamics`): where
-nothing rolls P = A and G = A - U Xi A_t with the sliding directions Xi of v+. The impulses p are
-those of c, and have to obey the same inequalities: every contact presses, and those that roll stay
-in their friction cones. Joint torques, gravity and joint friction are finite and give no impulse.
-The energy lost is half (v+ - v-)^T M5 (v+ - v-) plus the work |v_t|^T U p against sliding friction,
-so it is never gained.
+The impulses p obey the inequalities of c: every contact presses, rolling ones stay in their cones.
+The energy lost is half (v+ - v-)^T M5 (v+ - v-) plus the work |v_t|^T U p against sliding friction.
 """
 
 from __future__ import annotations

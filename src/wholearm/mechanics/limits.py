@@ -1,9 +1,6 @@
-"""Limits of a motion: what contact forces, torques and joint speeds must keep at every instant.
+"""Motion limits, low <= rows (c, tau, theta') <= high: contact forces, torques and joint speeds.
 
-With y = (c, tau, theta'), every limit has the form low <= rows y <= high. A sliding contact has to
-press with c_n >= epsilon. A rolling one must not slip either, |c_t| <= mu c_n, which is kept as if
-the contact pressed with epsilon less: what c_n may lose before the contact is lost it may lose
-before the contact slips.
+A rolling contact does not slip, with the same reserve epsilon as a sliding one has to press with:
 
     c_n >= epsilon,    mu c_n - c_t >= mu epsilon,    mu c_n + c_t >= mu epsilon.
 

@@ -1,14 +1,11 @@
 """Static torque polygon: torques under which friction can hold a formation at rest.
 
-At rest every contact force within its cone and every joint friction within [-D, D] is possible.
-With the edges of the cones as columns E and their amounts e >= 0, balance is
+With the edges of the friction cones as columns E, amounts e >= 0 and joint friction d, balance is
 
     g + S (tau - d) + E e = 0,   e >= 0,   |d| <= D.
 
-Projected onto the torques, what this linear programme allows is a convex polygon, perhaps without
-bounds. Its corners are basic solutions of the object's three rows, with three edges each, its rays
-internal forces, combinations of edges in balance. Beyond the polygon, by its distance from tau, a
-motion begins, whatever the forces are.
+Its projection onto the torques is a convex polygon, perhaps unbounded. Corners are basic solutions
+of the object's three rows, rays are internal forces. Beyond it a motion begins in any case.
 """
 
 from __future__ import annotations
@@ -55,28 +52,22 @@ class StaticTorques(NamedTuple):
 def find_static_torques(
     touching: Sequence[Formation], z: Array, least: float = 0.0
 ) -> StaticTorques:
-    """Torques with which contact forces and joint friction can balance gravity at `z`, shape (5,).
+    """Torque polygon in which contact forces and joint friction can balance gravity at `z`, (5,).
 
-    Parameters
-    ----------
-    touching     formations with all contacts that touch, some perhaps in more than one
-    least : [N]  apex of every cone: c_n >= least and |c_t| <= mu (c_n - least)
+    `touching` are formations with all contacts that touch; `least` [N] is the apex of every cone,
+    c_n >= least and |c_t| <= mu (c_n - least).
     """
     scene = touching[0].scene
-    edges, normals = _list_edges(touching, z)
-    static = _project(scene, edges, scene.applied_force + least * normals.sum(axis=0))
-    return static._replace(bounds=static.bounds + np.abs(static.normals) @ scene.dry[3:])
-
-
-def _list_edges(touching: Sequence[Formation], z: Array) -> tuple[Array, Array]:
-    """Edges of all cones as forces on (q, theta), shape (2 n_c, 5), and the normals, (n_c, 5)."""
     rows: dict[Contact, tuple[Array, Array]] = {}
     for formation in touching:
         kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
         slip = formation.friction[:, None] * kinematics.A_t[0]
         rows |= dict(zip(formation.contacts, zip(kinematics.A[0], slip, strict=True), strict=True))
-    edges = np.array([normal + way * slip for normal, slip in rows.values() for way in (-1, 1)])
-    return edges, np.array([normal for normal, _ in rows.values()])
+    # Edges of all cones, (2 n_c, 5), and normals, (n_c, 5), as forces on (q, theta).
+    edges = np.array([normal + sign * slip for normal, slip in rows.values() for sign in (-1, 1)])
+    normals = np.array([normal for normal, _ in rows.values()])
+    static = _project(scene, edges, scene.applied_force + least * normals.sum(axis=0))
+    return static._replace(bounds=static.bounds + np.abs(static.normals) @ scene.dry[3:])
 
 
 def _project(scene: Scene, edges: Array, applied: Array) -> StaticTorques:

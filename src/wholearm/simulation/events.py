@@ -19,7 +19,7 @@ from ..results.sampled import sample_phases
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from .layout import Outputs
-from .runge_kutta import GLIMPSES, NODES
+from .runge_kutta import INNER_STAGES, NODES
 
 REPLAYED = "replayed"  # status in the `meta` of such a trajectory
 
@@ -242,7 +242,7 @@ def collect(
 def list_glimpses(problem: Problem, sections: Sequence[Section]) -> Glimpses:
     """Normal forces at the stages of all steps."""
     contacts = problem.contacts
-    nodes = np.array(NODES)[list(GLIMPSES)]
+    nodes = np.array(NODES)[list(INNER_STAGES)]
     columns = [(np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros((0, len(contacts))))]
     for section in sections:
         if not section.steps:
@@ -251,7 +251,7 @@ def list_glimpses(problem: Problem, sections: Sequence[Section]) -> Glimpses:
         places = np.array([(step.t, step.h) for step in section.steps])
         t = (places[:, :1] + nodes * places[:, 1:]).ravel()
         c_n = np.full((len(t), len(contacts)), np.nan)
-        seen = np.array([step.row[section.to.glimpses] for step in section.steps])
+        seen = np.array([step.row[section.to.stage_forces] for step in section.steps])
         where = [contacts.index(contact) for contact in own]
         c_n[:, where] = seen.reshape(len(t), len(own))
         columns.append((t, np.full(len(t), section.phase.index), c_n))
@@ -259,12 +259,7 @@ def list_glimpses(problem: Problem, sections: Sequence[Section]) -> Glimpses:
 
 
 def make_trajectory(simulation: Simulation) -> Trajectory:
-    """Trajectory of a simulation at every recorded instant, without phases of one instant.
-
-    Raises
-    ------
-    SimulationError  if the simulation ended where it started, so that there is no motion
-    """
+    """Trajectory without phases of one instant; `SimulationError` if there is no motion."""
     rows, problem = _choose_rows(simulation), simulation.problem
     if not len(rows):
         raise SimulationError(f"there is no motion to keep: {simulation.outcome.text}")

@@ -55,11 +55,7 @@ def restart(
 ) -> Ending | None:
     """Choose contact modes after forces jump and record them; what ends the motion, if that does.
 
-    Parameters
-    ----------
-    turned      contacts and then joints that have just come to rest
-    time : [s]  when that was, if not at present
-    enters      whether a formation has just been entered
+    `turned`: contacts, then joints, that came to rest at `time` [s]; `enters`: a new formation.
     """
     stuck = run.stuck
     if _decide(run, turned, time=time, enters=enters):

@@ -50,7 +50,9 @@ class Outputs(NamedTuple):
     worst: int  # least of the event values plus their slacks: below zero something has happened
     # least c_n and reserve of friction at the stages within the step, in units of the scene
     dip: int
-    glimpses: slice  # c_n at the stages of `GLIMPSES`, one after the other [N]; zero without a step
+    stage_forces: (
+        slice  # c_n at the stages of `INNER_STAGES`, one after the other [N]; zero without a step
+    )
     until_rate: int  # time derivative of the distance to the phase's end
     events: slice  # values that are positive until something happens; see `EventRows`
     size: int

@@ -1,7 +1,6 @@
 """Contact modes of a moving formation: what slides, what sticks, and the equations of motion.
 
-With two or more freedoms friction may hold some sliding contacts, or joints with dry friction. A
-stuck contact is integrated like a rolling one, v_t = 0 with c_t free, and a held joint with
+A stuck contact is integrated like a rolling one, v_t = 0 with c_t free, and a held joint with
 theta_i' = 0 and a free friction torque f:
 
     P = [A; A_t(rolling); A_t(stuck); e(held)],    |c_t| <= mu c_n,    |f| <= D.
@@ -165,7 +164,7 @@ class Mode:
         return c_t
 
     def read_kept(self, z: Array) -> Array:
-        """What rolling and stuck contacts and held joints keep from `z`, shape (K,) [m, rad]."""
+        """Slip coordinates and angles that rolling, stuck and held ones keep, (K,) [m, rad]."""
         slip = self.rolled.evaluate_slip(z[None])[0]
         return np.concatenate([slip, z[[3 + joint for joint in self.grips.joints]]])
 
@@ -196,13 +195,9 @@ class Response(NamedTuple):
 
 
 def respond(mode: Mode, signs: Array, rows: ModeRows, v: Array) -> Response | None:
-    """Solve the equations of motion; None if the constraints are not independent.
+    """Solve the equations of motion at velocity v, (5,); None for dependent constraints.
 
-    Parameters
-    ----------
-    signs : (n_c + 2,)  directions of contacts and joints, zero for what is held or rolls
-    rows                at the state
-    v : (5,)            its velocity
+    `signs`, (n_c + 2,), are those of contacts and joints, zero for what is held or rolls.
     """
     formation, scene = mode.formation, mode.formation.scene
     count, rolling = formation.n_contacts, list(mode.rolled.rolling_rows)
@@ -216,8 +211,11 @@ def respond(mode: Mode, signs: Array, rows: ModeRows, v: Array) -> Response | No
         held = np.vstack([rows.A_t[rolling], np.eye(5)[joints]])
         P, G = np.vstack([P, held]), np.vstack([G, held])
         bend = np.concatenate([bend, rows.A_t_dot_v[rolling], np.zeros(len(joints))])
-    if mode.grips and not _are_independent(P * np.sqrt(inverse_mass)):
-        return None
+    if mode.grips:
+        lines = P * np.sqrt(inverse_mass)
+        lines /= np.linalg.norm(lines, axis=1)[:, None]
+        if len(P) > 5 or np.linalg.svd(lines, compute_uv=False)[-1] <= INDEPENDENT:
+            return None
     applied = np.zeros((5, 3))
     applied[:, 0] = scene.applied_force - scene.viscous * v
     applied[3:, 0] -= scene.dry[3:] * signs[count:]
@@ -250,11 +248,3 @@ def find_fixed(mode: Mode, A: Array, A_t: Array) -> NDArray[np.bool_]:
     basis = np.linalg.svd(P / np.linalg.norm(P, axis=1)[:, None], full_matrices=False)[2]
     rest = free - (free @ basis.T) @ basis
     return np.asarray(np.linalg.norm(rest, axis=1) < FIXED * length)
-
-
-def _are_independent(rows: Array) -> bool:
-    """Whether rows, in the metric of masses, leave forces that are determined."""
-    if len(rows) > 5:
-        return False
-    unit = rows / np.linalg.norm(rows, axis=1)[:, None]
-    return bool(np.linalg.svd(unit, compute_uv=False)[-1] > INDEPENDENT)

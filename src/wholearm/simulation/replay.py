@@ -26,20 +26,15 @@ class Replay:
     ----------
     t, h : [s]               present time, and the step to try next
     y : (STATE,)             z, z', then work, viscous, dry and contact losses
-    piece                    piece of the torques
-    has_slid                 whether those that come to rest have slid in the phase
-    slip_signs               directions in which contacts, by name, have just begun to slip
-    side                     sign of (coordinate - value) before the end of the phase, if that is a
-                             coordinate's value
-    tolerances               those of the scene
+    has_slid                 whether contacts that come to rest have slid in the phase
+    slip_signs               signs of contacts, by name, that have just begun to slip
+    side                     sign of (coordinate - value) before the end of the phase
     until_unit : [m or rad]  unit of the distance to the end of the phase
-    passes                   whether a motion may pass the end of the phase at any speed, without an
-                             impact
-    moving                   whether the motion goes on into the phase that is entered
+    passes                   whether the end may be passed at any speed, without an impact
+    moving                   whether the motion goes on into the next phase
     previous                 formation of the last phase that has ended at rest
     wanted                   instants at which steps have to end; infinity is last
-    stuck                    contacts, then joints, of the phase's formation that stay while the
-                             rest moves
+    stuck                    contacts, then joints, that stick while the rest moves
     """
 
     stepper: ModeStepper  # of the phase's formation

@@ -44,7 +44,7 @@ NODES = (
     0.3333333333333333, 0.25, 0.3076923076923077, 0.6512820512820513, 0.6, 0.8571428571428571, 1.0,
 )
 """Times of the stages, as shares of a step."""
-GLIMPSES = (3, 5, 9, 10)  # stages spread over the step that approximate the state well
+INNER_STAGES = (3, 5, 9, 10)  # stages spread over the step that approximate the state well
 WEIGHTS = {
     0: 0.054293734116568765, 5: 4.450312892752409, 6: 1.8915178993145003, 7: -5.801203960010585,
     8: 0.3111643669578199, 9: -0.1521609496625161, 10: 0.20136540080403034, 11: 0.04471061572777259,
@@ -69,19 +69,9 @@ def build_step(
     h: Expression,
     moving: int,
 ) -> tuple[Expression, Expression, Expression]:
-    """One step of y' = rate(y[:moving], t), with its two error estimates.
+    """Step of y' = rate(y[:moving], t) of length h: the end, and errors of order 5 and 3.
 
-    Parameters
-    ----------
-    rate        right-hand side on expressions, shape (n,)
-    y : (n,)
-    t, h : [s]  start and length of the step
-    moving      the others are integrals along the motion of so many, which stages need not have
-
-    Returns
-    -------
-    end, fifth, third : (n,), (moving,) and (moving,)  the state at t + h, and the errors of the
-        embedded formulas of order 5 and 3
+    Components of y (n,) from `moving` on are integrals along the motion; errors do not cover them.
     """
     stages, last = _build_combinations(y.shape[0], moving)
     rates: list[Expression] = []
@@ -116,10 +106,7 @@ def _build_combinations(n: int, moving: int) -> tuple[list[Expression], Expressi
 def build_error(
     fifth: Expression, third: Expression, y: Expression, units: Expression, tolerance: Expression
 ) -> Expression:
-    """Size of a step's error over the tolerance, which counts in `units`, or in y above them.
-
-    The combination of the two estimates is that of DOP853 and behaves like h^8.
-    """
+    """Error over the tolerance in `units` or y, if larger, combined as in DOP853 (like h^8)."""
     scale = tolerance * (units + ca.fabs(y))
     high, low = ca.sumsqr(fifth / scale), ca.sumsqr(third / scale)
     return high / ca.sqrt(y.shape[0] * ca.fmax(high + 0.01 * low, 1e-300))

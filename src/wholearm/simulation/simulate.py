@@ -484,11 +484,7 @@ def _strikes(run: Replay) -> bool:
 
 
 def _pass_on(run: Replay) -> Arrival:
-    """The end of a phase is reached that the motion passes.
-
-    A planned motion that comes early by its error keeps its formation until the torques step; the
-    gap dips below zero by that error.
-    """
+    """The end of a phase is passed; the torques of the next one may still have to come."""
     s = run.stepper
     s.inputs[s.at.t] = run.t
     window = settling = run.tolerances.settling
@@ -638,12 +634,7 @@ def _set_signs(run: Replay, signs: Array) -> None:
 
 
 def look_within(run: Replay, times: Array) -> list[float]:
-    """Record the states at increasing instants, shape (n,) [s], within steps; others are ignored.
-
-    Returns
-    -------
-    list of float, [s]  instants of events that the steps missed
-    """
+    """Record states at increasing instants, (n,) [s], within steps; those of missed events."""
     missed: list[float] = []
     scene, scales = run.problem.scene, run.problem.scene.scales
     for section, stepper in zip(run.sections, run.steppers, strict=True):
@@ -674,10 +665,7 @@ def look_within(run: Replay, times: Array) -> list[float]:
 
 
 def shows(step: Step, stepper: ModeStepper, slack: Array) -> bool:
-    """Whether an event lies in a step before the instant just evaluated.
-
-    A step that ends with the phase may have passed its end, and turned back.
-    """
+    """Whether an event lies in a step before the instant just evaluated; its end may be passed."""
     short = stepper.outputs[stepper.to.events] + slack < 0
     if step.arrives:
         rows = stepper.rows

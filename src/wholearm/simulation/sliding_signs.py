@@ -1,19 +1,15 @@
 """Contact mode after a sliding or joint velocity reaches zero: stick, reverse or continue.
 
-Coulomb's law at rest, as a complementarity problem with few unknowns, solved by enumeration.
-
 A contact at rest may slide with a sign if it then accelerates with it, or stick if its c_t stays in
 the cone; a joint likewise. Each combination is one linear system, and every contact has to press.
 Forces are evaluated a short time later, which tells one that leaves its cone from one that returns.
+The first combination that is consistent by more than rounding is taken, or else the one with the
+largest margin. What has just come to rest tries to reverse, then to stick, then to continue; all
+else tries its present mode, or to slip if its cone is just reached.
 
-With moderate friction exactly one combination is consistent. The first that is so by more than
-rounding is taken: what has just come to rest tries to reverse, then to stick, then to continue; all
-else tries its present mode, or to slip if its cone is just reached. If none is clear, the one with
-the largest margin is taken.
-
-What cannot move because something else sticks, as a finger that leans on a stuck object, has no
-independent constraint. Its friction is indeterminate and has either sign: margins elsewhere are
-monotonic in it, so some sign is consistent for as long as any friction is. It counts as stuck.
+What cannot move because something else sticks has no independent constraint. Its friction is
+indeterminate and has either sign: margins elsewhere are monotonic in it, so some sign is consistent
+for as long as any friction is. It counts as stuck.
 """
 
 from __future__ import annotations

@@ -173,12 +173,9 @@ StartMode = RestDirection | ModeChoice
 def find_patterns(
     formation: Formation, z: Array, near: NDArray[np.bool_], held: bool
 ) -> Iterator[ModeChoice]:
-    """Yield every start mode at a configuration z, shape (5,).
+    """Yield every start mode at `z`, (5,), where limits `near`, (n_limits,), are zero.
 
-    Parameters
-    ----------
-    near : (n_limits,)  which limits of the formation are zero at `z`
-    held                whether to yield those with sticking, the least first, or the others
+    `held`: only those with sticking, the least first, or else the others.
     """
     kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
     touching = Touching(formation, z, near)

@@ -16,7 +16,7 @@ from ..problem.definition import Until
 from ..scene.model import Scene
 from .layout import MOVING, STATE, EventRows, Inputs, Outputs, bind, build_torque, lay_out
 from .modes import FREE, Grips, Mode
-from .runge_kutta import GLIMPSES, build_error, build_step
+from .runge_kutta import INNER_STAGES, build_error, build_step
 from .tolerances import ROUNDING_FORCE, find_tolerances, measure_units
 
 
@@ -70,7 +70,11 @@ class _Equations:
         self.mechanics = share_mechanics(mode, degree)
         self.short = find_tolerances(formation.scene).short
         self._measure = _build_measure(formation, until, side, self.short)
-        self._stage = _build_stage(mode, self.mechanics)
+        inputs = [
+            ca.SX.sym(n, k) for n, k in (("y", MOVING), ("t", 1), ("p", self.mechanics.at.size))
+        ]
+        _, *rows = mode.build_constraints(inputs[0][:5], inputs[0][5:10])
+        self._stage = ca.Function("stage", inputs, self.mechanics.stage(*inputs, *rows))
         self.packed = ca.MX.sym("packed", self.mechanics.at.size)
         self.least: list[Expression] = []
         self.c_n: list[Expression] = []
@@ -83,15 +87,15 @@ class _Equations:
         return rates
 
     def report(self, state: Expression, time: Expression, *errors: Expression) -> Expression:
-        """Outputs at a state, with error, dip and glimpses of the step that led there."""
+        """Outputs at a state, with error, dip and stage forces of the step that led there."""
         mechanics, packed = self.mechanics, self.packed
         _, *constraints = self.mode.build_constraints(state[:5], state[5:10])
         outputs, events, speed, least = mechanics.report(state, time, packed, *constraints)
         values, distance, approach, closest = self._measure(state[:5], state[5:10])
-        error, dip, glimpses = errors
+        error, dip, stage_forces = errors
         worst = ca.fmin(least, closest)
         return ca.vertcat(
-            outputs, error, worst, dip, glimpses, approach, events, values, distance, speed
+            outputs, error, worst, dip, stage_forces, approach, events, values, distance, speed
         )
 
     def project(self, y: Expression) -> Expression:
@@ -118,27 +122,19 @@ def _compile(
     at, n_c, held = mechanics.at, formation.n_contacts, len(mode.holders)
     limits = len(open_limits(formation, until))
     rows = EventRows(*lay_out(n_c, 2 * held, n_c, 2, limits, None, None))
-    brief = len(GLIMPSES) * n_c
+    brief = len(INNER_STAGES) * n_c
     to = Outputs(*lay_out(STATE, 5, n_c, n_c, 2, 5, None, None, None, None, brief, None, rows.size))
     short = np.full(limits, equations.short)
     slack = np.concatenate([mechanics.slack, short, [0.0, mechanics.stall]])
     y, t, h = packed[at.y], packed[at.t], packed[at.h]
     end, fifth, third = build_step(equations.rate, y, t, h, MOVING)
     error = mechanics.error(fifth, third, packed)
-    glimpses = ca.vertcat(*(equations.c_n[stage] for stage in GLIMPSES))
+    stage_forces = ca.vertcat(*(equations.c_n[stage] for stage in INNER_STAGES))
     dip = ca.mmin(ca.vertcat(*equations.least))
-    outputs = equations.report(equations.project(end), t + h, error, dip, glimpses)
+    outputs = equations.report(equations.project(end), t + h, error, dip, stage_forces)
     step = ca.Function("step", [packed], [outputs])
     look = ca.Function("look", [packed], [equations.report(y, t, 0, 0, ca.DM.zeros(brief))])
     return mode, at, to, rows, slack, (step, look)
-
-
-def _build_stage(mode: Mode, mechanics: Mechanics) -> Expression:
-    """CasADi function (state, time, packed) -> (its rates, the least that holds it, c_n)."""
-    state, time = ca.SX.sym("state", MOVING), ca.SX.sym("time")
-    packed = ca.SX.sym("packed", mechanics.at.size)
-    _, *rows = mode.build_constraints(state[:5], state[5:10])
-    return ca.Function("stage", [state, time, packed], mechanics.stage(state, time, packed, *rows))
 
 
 def _build_measure(formation: Formation, until: Until, side: float, short: float) -> Expression:

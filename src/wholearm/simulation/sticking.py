@@ -80,12 +80,7 @@ class Rest:
             yield mode
 
     def wait(self, coefficients: Array, x: float) -> StartDeparture | Collapse | None:
-        """Find what ends the rest on one piece of the torques, from `x` on; None if nothing does.
-
-        Parameters
-        ----------
-        coefficients : (2, d + 1) [N m]  torques in ascending powers of x in [-1, 1]
-        """
+        """End of the rest on a piece of torques, (2, d + 1) [N m] in powers of x, or None."""
         tau = _evaluate(coefficients, x)
         for mode in self._list_modes():
             if mode.moves(tau):
@@ -143,11 +138,7 @@ class Rest:
         return None
 
     def _narrow(self, coefficients: Array, low: float, high: float) -> tuple[float, float]:
-        """Bracket of a loss of balance, narrowed to `_NARROW`.
-
-        The pull that is needed is convex in the torques: Newton's method on its supporting line
-        comes from above.
-        """
+        """Bracket of a loss of balance, narrowed by Newton's method: the pull is convex in tau."""
         scene = self.formation.scene
         while high - low > _NARROW:
             tau = _evaluate(coefficients, high)
@@ -188,12 +179,7 @@ class Rest:
 
 
 def find_rest(formation: Formation, z: Array) -> Rest:
-    """Return a formation at rest at `z`, shape (5,).
-
-    Raises
-    ------
-    SimulationError  if the contacts depend on one another, or leave no freedom
-    """
+    """Formation at rest at `z`, (5,); `SimulationError` for dependent contacts or no freedom."""
     root = np.sqrt(formation.scene.mass_diagonal)
     kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
     P = kinematics.P[0]
@@ -275,16 +261,8 @@ def close_contacts(
 ) -> Array:
     """Nearest configuration, in the metric M5, with every contact of the formation closed.
 
-    Parameters
-    ----------
-    z : (5,)
-    within : [m]     largest gap to close
-    slip : (R,) [m]  slip coordinates to give to rolling contacts; without them these start to roll
-                     where they are
-
-    Raises
-    ------
-    SimulationError  if a gap is larger, or the contacts cannot be closed from `z`
+    Gaps up to `within` [m] are closed; rolling contacts take coordinates `slip`, (R,) [m], if any.
+    A `SimulationError` says which contact cannot be closed.
     """
     inverse_mass = 1 / formation.scene.mass_diagonal
     closed = _CLOSED * formation.scene.scales.length
@@ -332,21 +310,10 @@ def measure_lack(
 
 
 def find_pulls(scene: Scene, contacts: tuple[Contact, ...], z: Array, tau: Array) -> Array:
-    """Least pulls with which contact forces balance gravity and torques at rest.
+    """Least pulls p with which contact forces balance gravity, (n_c,) [N], infinite if none do.
 
-    A linear programme in c_n >= 0, c_t within U c_n, dry joint friction within D and a pull p >= 0
-    of each contact: least sum of p with g + S (tau - friction) + A^T (c_n - p) + A_t^T c_t = 0.
-
-    Parameters
-    ----------
-    contacts          all that touch
-    z : (5,)
-    tau : (2,) [N m]
-
-    Returns
-    -------
-    ndarray, shape (n,), [N]
-        Pull of each contact, infinite if none balance; all zero if no contact has to pull.
+    A linear programme in c_n >= 0, c_t within U c_n, dry joint friction within D and p >= 0: least
+    sum of p with g + S (tau - friction) + A^T (c_n - p) + A_t^T c_t = 0.
     """
     answer, n_c = _solve(scene, contacts, z, tau), len(contacts)
     return scene.scales.force * answer.x[-n_c:] if answer.status == 0 else np.full(n_c, np.inf)
