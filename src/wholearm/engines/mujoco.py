@@ -17,7 +17,7 @@ from .pressing import EngineDrive, press_in
 from .shapes import list_pairs
 from .stretch import EngineRun, EngineStretch, Setting, list_steps
 
-_LITTLE = 1e-6  # Depth at which contacts are looked at, over the scene's length
+_LITTLE = 1e-6  # depth at which stiffnesses are read, over the scene's length
 
 
 def play(
@@ -40,7 +40,8 @@ def play(
     numbers = _number_pairs(model, problem)
     data.qpos[:], data.qvel[:] = _press(problem, stretch, model, data, numbers), steps.v
     states, press, start = [(stretch.z, stretch.z_dot)], [], 0
-    mujoco.set_mju_user_warning(_ignore)
+    # Warnings of states that are not finite would go to stderr and to a file; the deviation shows.
+    mujoco.set_mju_user_warning(lambda _: None)
     for end in steps.ends:
         total = np.zeros(len(names))
         for step in range(start, end):
@@ -66,13 +67,6 @@ def play(
     return EngineRun(t, z, z_dot, names, np.array(press))
 
 
-def _ignore(_: str) -> None:
-    """Take a warning of MuJoCo, which else goes to stderr and to a file in the current folder.
-
-    What it warns of, states that are not finite, shows as a departure.
-    """
-
-
 def _number_pairs(model: Any, problem: Problem) -> NDArray[np.int64]:
     """Numbers of the pairs by the numbers of their shapes, in either order."""
     table = np.full((model.ngeom, model.ngeom), -1)
@@ -85,10 +79,9 @@ def _number_pairs(model: Any, problem: Problem) -> NDArray[np.int64]:
 def _press(
     problem: Problem, stretch: EngineStretch, model: Any, data: Any, numbers: NDArray[np.int64]
 ) -> Array:
-    """The planned start, with contacts pressed in.
+    """The planned start with penetrations that give the planned forces.
 
-    The stiffness of a contact, which MuJoCo makes of its time constant and of the inertias that
-    meet there, is read where all are pressed in a little.
+    MuJoCo computes stiffnesses from time constants and inertias; they are read at a small depth.
     """
     import mujoco
 
@@ -103,9 +96,7 @@ def _press(
     own = data.efc_KBIP[rows, 0] * data.efc_KBIP[rows, 2] / data.efc_R[rows]
     np.add.at(found, numbers[contact.geom1[held], contact.geom2[held]], own)
     names, corners = [pair.name for pair in list_pairs(problem.scene)], problem.scene.polygon
-    stiffness = {
-        name: sum(found[names.index(pair)] for pair in find_pairs(name, corners.n_vertices))
-        for name in stretch.c_n
-    }
+    pairs = {name: find_pairs(name, corners.n_vertices) for name in stretch.c_n}
+    stiffness = {k: sum(found[names.index(p)] for p in own) for k, own in pairs.items()}
     mujoco.mj_resetData(model, data)
     return press_in(problem, stretch, {k: v if v > 0 else np.inf for k, v in stiffness.items()})

@@ -129,7 +129,7 @@ def find_directions(curve: Curve, s: Array) -> Directions:
 
 
 def blend_directions(curve: Curve, s: Array, width: Array) -> list[Directions]:
-    """Sliding directions, blended and as before and after each reversal, within a width (n,) [m]."""
+    """Sliding directions blended over reversals of a width (n,) [m], and as before and after."""
     first = curve.segments[0]
     found = [[np.tile(part, (len(s), 1)) for part in (first.Xi, first.sigma)] for _ in range(3)]
     for before, after in pairwise(curve.segments):
