@@ -31,9 +31,7 @@ def play(
 ) -> EngineRun:
     """Replay a stretch in Drake; an `Engine`.
 
-    Raises
-    ------
-    ImportError  if Drake is not installed
+    ImportError if Drake is not installed.
     """
     from pydrake.systems.analysis import Simulator
 

@@ -152,9 +152,7 @@ def _describe(stretch: EngineStretch, found: Departure) -> dict[str, Any]:
 def require_engine(name: str) -> Engine:
     """The function that replays in an engine.
 
-    Raises
-    ------
-    InputError  if there is no such engine, or it is not installed
+    InputError if there is no such engine, or it is not installed.
     """
     if name not in ENGINES:
         raise InputError("", "--engine", f"{name!r} given; allowed are {', '.join(ENGINES)}")

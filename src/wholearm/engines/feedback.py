@@ -133,8 +133,9 @@ def _join(parts: list[EngineStretch], policy: Policy, whole: bool) -> list[Engin
     begins = [1] if whole else policy.resting
     found = []
     for first, after in zip(begins, [*begins[1:], len(parts) + 1], strict=True):
-        rest = {"z_dot": np.zeros(5), "z_ddot": np.zeros(5), "stop": parts[after - 2].stop}
-        found.append(parts[first - 1]._replace(phases=tuple(range(first - 1, after - 1)), **rest))
+        phases, stop, rest = tuple(range(first - 1, after - 1)), parts[after - 2].stop, np.zeros(5)
+        start = parts[first - 1]
+        found.append(start._replace(phases=phases, stop=stop, z_dot=rest, z_ddot=rest))
     return found
 
 

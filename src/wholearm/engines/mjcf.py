@@ -209,11 +209,11 @@ def add_clock(root: Element, scene: Scene, plan: Trajectory, step: float) -> Non
             add(springs, "general", name=f"{name}-{row}", tendon=name, **ramp, **spring)
     # Keyframes with positions, velocities and the clock.
     starts, keys = plan.phase_starts[:-1], _find(root, "keyframe")
-    rows = [int(np.flatnonzero(plan.phase == index)[0]) for index in range(len(starts))]
+    firsts = [int(np.flatnonzero(plan.phase == index)[0]) for index in range(len(starts))]
     names = ["home", *(f"phase{number}" for number in range(1, len(starts) + 1))]
-    for name, row in zip(names, [0, *rows], strict=True):
-        at = plan.t[row]
-        add(keys, "key", name=name, time=at, qpos=[*plan.z[row], at], qvel=[*plan.z_dot[row], 1.0])
+    for name, k in zip(names, [0, *firsts], strict=True):
+        at = plan.t[k]
+        add(keys, "key", name=name, time=at, qpos=[*plan.z[k], at], qvel=[*plan.z_dot[k], 1.0])
 
 
 def _find(root: Element, tag: str) -> Element:

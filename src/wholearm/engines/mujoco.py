@@ -25,9 +25,7 @@ def play(
 ) -> EngineRun:
     """Replay a stretch in MuJoCo; an `Engine`.
 
-    Raises
-    ------
-    ImportError  if MuJoCo is not installed
+    ImportError if MuJoCo is not installed.
     """
     import mujoco
 

@@ -22,9 +22,7 @@ LATE = 1e-3  # difference of phase ends, over the scene's time: rest is approach
 _ROWS = 400  # samples of each phase of the reference replay, besides its steps
 _INSTANTS = 2000  # samples of each phase for reversals of joints
 ROWS = 200  # approximate rows of a result per phase
-FEWEST = (
-    5000  # least steps of a stretch: contacts oscillate for tens of steps after a jump of torques
-)
+FEWEST = 5000  # least steps of a stretch: contacts oscillate after a jump of torques
 _LOOKS = 8  # samples of each step over which torques are averaged
 _LEAST = 1e-3  # first of these samples after the start, in steps
 

@@ -329,7 +329,7 @@ def _find_changes(
 ) -> dict[int, list[tuple[float, float, Numbers]]]:
     """Changes of labels by track: last place with the old one, first with the new, and the new."""
     within = owners[1:] == owners[:-1]
-    changed = np.flatnonzero(_differ(labels[1:], labels[:-1]) & within)
+    changed = np.flatnonzero((labels[1:] != labels[:-1]).any(axis=1) & within)
     low, high, owner = places[changed], places[changed + 1], owners[changed]
     old, last = labels[changed], labels[changed + 1]
     found: dict[int, list[tuple[float, float, Numbers]]] = {}
@@ -351,14 +351,10 @@ def _find_changes(
         ):
             found.setdefault(k, []).append((before, after, label))
         # A second change may hide behind the first.
-        more = _differ(new, last) & (high < stop)
+        more = (new != last).any(axis=1) & (high < stop)
         low, high, old, last = high[more], stop[more], new[more], last[more]
         owner = owner[more]
     return {index: sorted(own, key=lambda change: change[0]) for index, own in found.items()}
-
-
-def _differ(labels: Numbers, others: Numbers) -> Flags:
-    return np.asarray((labels != others).any(axis=1))
 
 
 def _fill(track: Track, low: float, high: float) -> Array:

@@ -159,15 +159,16 @@ def _can_start(scene: Scene, z: Array, contacts: tuple[Contact, ...]) -> bool:
 
 def _list_steps(scene: Scene, z: Array, part: Part, last: bool) -> Iterator[list[Step]]:
     """Candidate phases for a part from `z`, the simplest first."""
-    simple: list[list[Step]] = [[(part.contacts, Until(contact=own))] for own in part.gained]
+    simple: list[list[Step]] = [[(part.contacts, Until(contact=c))] for c in part.gained]
+    ends: list[list[Step]] = list(simple) or [[]]
     if not part.gained or (part.inside != part.stop).any():
         simple.append([(part.contacts, end_at(scene, part.coordinate, part.inside))])
     if last and len(part.contacts) == 3:
         # One phase with terminal constraints on the pose.
         pose = [end_at(scene, row, part.stop) for row in (0, 1)]
-        pins = [((own.coordinate, own.value or 0.0),) for own in pose]
-        for contact in part.gained:
-            yield from ([(part.contacts, Until(contact=contact, pins=pin))] for pin in pins)
+        pins = [((end.coordinate, end.value or 0.0),) for end in pose]
+        for contact, pin in product(part.gained, pins):
+            yield [(part.contacts, Until(contact=contact, pins=pin))]
         if not part.gained:
             row = part.coordinate
             yield [(part.contacts, replace(pose[row], pins=pins[1 - row]))]
@@ -182,7 +183,6 @@ def _list_steps(scene: Scene, z: Array, part: Part, last: bool) -> Iterator[list
     rows = (part.coordinate,) if len(part.contacts) == 4 else (0, 1)
     aim = part.start + (BEFORE if part.gained else 1.0) * (part.stop - part.start)
     between = [(part.contacts, end_at(scene, row, aim)) for row in rows]
-    ends: list[list[Step]] = [[(part.contacts, Until(contact=own))] for own in part.gained] or [[]]
     for count in range(1, len(rows) + 1):
         for chosen in permutations(between, count):
             yield from ([*chosen, *end] for end in ends)

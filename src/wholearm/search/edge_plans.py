@@ -39,9 +39,8 @@ from .edges import EdgeStep, Link, describe_steps, find_headings, point_out
 from .feasibility import SINGULAR, Measured, make_phases
 from .places import measure_apart
 
-OFF = (
-    1e-4  # distance of a traced end from a border's end that makes it another one [r. of gyr., rad]
-)
+# Distances are in radii of gyration and radians.
+OFF = 1e-4  # distance of a traced end from a border's end that makes it another one
 PINNED = 1e-9  # pinned coordinates of landings are rounded to this, in the same unit
 SAME = 9  # decimals of configurations that count as equal, in the same unit
 MET = 1e-8  # distance of planned from traced ends of borders that count as equal, in the same unit

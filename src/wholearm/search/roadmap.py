@@ -337,7 +337,8 @@ class Rays(NamedTuple):
 
     def pick(self, kept: Flags | Numbers) -> Rays:
         """Some of the rays."""
-        return Rays(*(array[kept] for array in self))
+        numbers = self.sources[kept], self.labels[kept], self.gained[kept]
+        return Rays(*numbers, self.starts[kept], self.ends[kept])
 
     @property
     def runs(self) -> Array:
