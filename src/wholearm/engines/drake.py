@@ -145,10 +145,10 @@ def _add_bodies(plant: Any, scene: Scene) -> None:
     body = add(OBJECT, polygon.mass, polygon.inertia)
     plant.AddJoint(PlanarJoint(OBJECT, plant.world_frame(), body.body_frame()))
     for name, link in zip(LINKS, scene.fingers, strict=True):
-        own = add(name, link.inertia / link.length**2, link.inertia)
+        link_body = add(name, link.inertia / link.length**2, link.inertia)
         place = RigidTransform([*np.asarray(link.base), 0.0])
         base = plant.AddFrame(FixedOffsetFrame(f"{name} base", plant.world_frame(), place))
-        turn = RevoluteJoint(name, base, own.body_frame(), [0.0, 0.0, 1.0], link.viscous)
+        turn = RevoluteJoint(name, base, link_body.body_frame(), [0.0, 0.0, 1.0], link.viscous)
         plant.AddJointActuator(name, plant.AddJoint(turn))
     plant.mutable_gravity_field().set_gravity_vector([0.0, -scene.gravity, 0.0])
 

@@ -66,7 +66,8 @@ class EngineReport(Result):
         """Whether every stretch that departs also does with finer settings."""
         rows = zip(*(level.departures for level in self.levels), strict=True)
         return all(
-            own.time is None or all(each.time is not None for each in finer) for own, *finer in rows
+            first.time is None or all(each.time is not None for each in finer)
+            for first, *finer in rows
         )
 
     @property
@@ -219,5 +220,5 @@ def list_settings(setting: Setting, halvings: int) -> list[Setting]:
     """A setting, finer ones, and finer steps alone, with contacts as they are at first."""
     finer = [setting._replace(step=setting.step / 2**k) for k in range(halvings + 1)]
     return finer + [
-        own._replace(softness=setting.softness * 2**k) for k, own in enumerate(finer[1:], 1)
+        level._replace(softness=setting.softness * 2**k) for k, level in enumerate(finer[1:], 1)
     ]

@@ -49,16 +49,16 @@ class PolicyReport(Result):
     @property
     def ok(self) -> bool:
         """Whether every stretch ends, at the planned pose."""
-        return all(self.find_failure(own) is None for own in self.arrivals)
+        return all(self.find_failure(end) is None for end in self.arrivals)
 
-    def find_failure(self, own: StretchEnd) -> str | None:
+    def find_failure(self, end: StretchEnd) -> str | None:
         """Description of a failure, if there is one."""
-        far = max(own.position / self.problem.scene.scales.length, own.angle)
+        far = max(end.position / self.problem.scene.scales.length, end.angle)
         if not far <= self.allowed:
-            text = f"{own.position * 1e3:.3g} mm and {math.degrees(own.angle):.3g} degrees"
-            return f"phase {own.stretch.name} ends {text} away from the plan"
-        if not own.over:
-            return f"phase {own.stretch.name} does not end within {own.duration:.4g} s"
+            text = f"{end.position * 1e3:.3g} mm and {math.degrees(end.angle):.3g} degrees"
+            return f"phase {end.stretch.name} ends {text} away from the plan"
+        if not end.over:
+            return f"phase {end.stretch.name} does not end within {end.duration:.4g} s"
         return None
 
     @property
@@ -69,7 +69,7 @@ class PolicyReport(Result):
             "duration": "policy [s]:.6f", "position": "end off [mm]:.4f", "angle": "[deg]:.4f",
             "gap": "largest gap [mm]:.4f", "contact": "",
         }  # fmt: skip
-        failures = [self.find_failure(own) or "" for own in self.arrivals]
+        failures = [self.find_failure(end) or "" for end in self.arrivals]
         title = f"{self.problem.name} in {self.title}, by the policy"
         verdict, table = "ok" if self.ok else "FAILS", Table.of(self.arrivals, columns)
         return Document(title, verdict, parts=[*failures, table])
@@ -77,9 +77,9 @@ class PolicyReport(Result):
     @property
     def values(self) -> dict[str, Any]:
         """The report for machines, in m, rad and s."""
-        stretches = [{"phases": own.stretch.numbers, **own._asdict()} for own in self.arrivals]
-        for own in stretches:
-            del own["stretch"]
+        stretches = [{"phases": end.stretch.numbers, **end._asdict()} for end in self.arrivals]
+        for stretch in stretches:
+            del stretch["stretch"]
         values = {"problem": self.problem.name, "engine": self.title, "ok": self.ok}
         return {**values, "allowed": self.allowed, "stretches": stretches}
 

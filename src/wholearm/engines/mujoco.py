@@ -50,10 +50,10 @@ def play(
             mujoco.mj_step(model, data)
             if data.ncon:
                 contact = data.contact
-                own = contact.efc_address
-                held = own >= 0
+                address = contact.efc_address
+                held = address >= 0
                 pair = numbers[contact.geom1[held], contact.geom2[held]]
-                np.add.at(total, pair, data.efc_force[own[held]])
+                np.add.at(total, pair, data.efc_force[address[held]])
         press.append(total / (end - start))
         states.append((data.qpos.copy(), data.qvel.copy()))
         start = end
@@ -91,10 +91,10 @@ def _press(
     contact, found = data.contact, np.zeros(len(list_pairs(problem.scene)))
     held = contact.efc_address >= 0
     rows = contact.efc_address[held]
-    own = data.efc_KBIP[rows, 0] * data.efc_KBIP[rows, 2] / data.efc_R[rows]
-    np.add.at(found, numbers[contact.geom1[held], contact.geom2[held]], own)
+    stiffness_row = data.efc_KBIP[rows, 0] * data.efc_KBIP[rows, 2] / data.efc_R[rows]
+    np.add.at(found, numbers[contact.geom1[held], contact.geom2[held]], stiffness_row)
     names, corners = [pair.name for pair in list_pairs(problem.scene)], problem.scene.polygon
     pairs = {name: find_pairs(name, corners.n_vertices) for name in stretch.c_n}
-    stiffness = {k: sum(found[names.index(p)] for p in own) for k, own in pairs.items()}
+    stiffness = {k: sum(found[names.index(p)] for p in v) for k, v in pairs.items()}
     mujoco.mj_resetData(model, data)
     return press_in(problem, stretch, {k: v if v > 0 else np.inf for k, v in stiffness.items()})

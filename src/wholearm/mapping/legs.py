@@ -294,9 +294,9 @@ def _drop_excursions(scene: Scene, leg: Leg, spans: list[Span]) -> list[Span]:
     labels = np.array([label for label, _, _ in spans])
     box = np.array(list(product((-1, 0, 1), repeat=2))) * tolerance(scene)
     for column in (0, 2, 4):
-        own = labels[:, column]
+        contacts = labels[:, column]
         for k in range(1, len(spans)):
-            again = np.flatnonzero(own[k:] == own[k - 1])
+            again = np.flatnonzero(contacts[k:] == contacts[k - 1])
             if not len(again) or again[0] == 0:
                 continue
             first, last = spans[k][1], spans[k + int(again[0]) - 1][2]
@@ -304,8 +304,8 @@ def _drop_excursions(scene: Scene, leg: Leg, spans: list[Span]) -> list[Span]:
             x, phi = leg.track.pose(np.linspace(first, last, PROBES))
             poses = (np.column_stack([x, phi])[:, None] + box).reshape(-1, 2)
             near = label_cells(scene, *poses.T).reshape(PROBES, len(box), -1)[..., column]
-            if (near == own[k - 1]).any(axis=1).all():
-                own[k : k + int(again[0])] = own[k - 1]
+            if (near == contacts[k - 1]).any(axis=1).all():
+                contacts[k : k + int(again[0])] = contacts[k - 1]
     kept: list[Span] = []
     for label, (_, first, last) in zip(labels, spans, strict=True):
         if kept and (kept[-1][0] == label).all():
@@ -425,10 +425,10 @@ def _locate(track: Track, pose: Array, near: Array) -> tuple[float, float]:
         return np.asarray(np.nan_to_num((np.abs(points - pose) / near).max(axis=1), nan=np.inf))
 
     low, high = float(track.places[0]), float(track.places[-1])
-    own = float(np.clip(pose[1], low, high))
-    straight = float(off(np.array([own]))[0])
+    phi = float(np.clip(pose[1], low, high))
+    straight = float(off(np.array([phi]))[0])
     if straight < 1:
-        return own, straight
+        return phi, straight
     for count in (101, 41, 41):
         places = np.linspace(low, high, count)
         away = off(places)
