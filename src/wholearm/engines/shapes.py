@@ -68,9 +68,7 @@ def find_rounding(scene: Scene) -> float:
 def list_shapes(scene: Scene) -> list[Shape]:
     """Every shape of object and links.
 
-    Raises
-    ------
-    InputError  if a link has no thickness: what sinks into it would come out on the other side
+    InputError if a link has no thickness: what sinks into it would come out on the other side.
     """
     r, corners = find_rounding(scene), scene.polygon.vertices
     after = np.roll(corners, -1, axis=0)

@@ -259,8 +259,8 @@ def _is_closed(closed: ClosedFinger, finger: int, angle: Array, pair: Numbers) -
     """Whether a closed finger is at `angle`, where it would touch a pair of contacts."""
     with np.errstate(invalid="ignore"):
         off = np.abs(np.mod(closed.z[:, 3 + finger] - angle + np.pi, 2 * np.pi) - np.pi)
-        own = (closed.touched[:, [finger]] == pair).any(axis=1)
-        return np.asarray((off < ROUNDING) | (own & (off < SAME_ANGLE)))
+        touches = (closed.touched[:, [finger]] == pair).any(axis=1)
+        return np.asarray((off < ROUNDING) | (touches & (off < SAME_ANGLE)))
 
 
 def name_contacts(table: tuple[Contact, ...], label: Numbers) -> tuple[Contact, ...]:
@@ -280,20 +280,20 @@ class _Tracks(NamedTuple):
         x, phi = np.empty((2, len(places)))
         starts = np.flatnonzero(np.diff(owners, prepend=-1)).tolist()
         groups = [slice(a, b) for a, b in pairwise([*starts, len(owners)])]
-        for own in groups:
-            x[own], phi[own] = self.tracks[owners[own.start]].pose(places[own])
+        for group in groups:
+            x[group], phi[group] = self.tracks[owners[group.start]].pose(places[group])
         inside = np.isfinite(x)
         if self.window is not None:
             inside &= (x >= self.window.x[0]) & (x <= self.window.x[1])
         labels = np.full((len(places), 6), NOWHERE)
         closed = close_fingers(self.scene, x[inside], phi[inside])
         rows = np.cumsum(inside) - 1
-        for own in groups:
-            (within,) = np.nonzero(inside[own])
+        for group in groups:
+            (within,) = np.nonzero(inside[group])
             if len(within):
-                at = own.start + within
+                at = group.start + within
                 part = ClosedFinger(*(values[rows[at]] for values in closed))
-                labels[at] = self.tracks[owners[own.start]].label(x[at], phi[at], part)
+                labels[at] = self.tracks[owners[group.start]].label(x[at], phi[at], part)
         return labels
 
 
@@ -307,15 +307,15 @@ def cut(scene: Scene, tracks: Sequence[Track], window: Window | None = None) -> 
     changes = _find_changes(every, owners, places, labels)
     pieces, first = [], 0
     for index, (track, size) in enumerate(zip(tracks, sizes, strict=True)):
-        own, first = slice(first, first + size), first + size
-        if (labels[own] == NOWHERE).all():
+        rows, first = slice(first, first + size), first + size
+        if (labels[rows] == NOWHERE).all():
             continue
-        start, held = float(places[own][0]), labels[own][0]
+        start, held = float(places[rows][0]), labels[rows][0]
         parts = []
         for before, after, following in changes.get(index, ()):
             parts.append((start, before, held))
             start, held = after, following
-        parts.append((start, float(places[own][-1]), held))
+        parts.append((start, float(places[rows][-1]), held))
         pieces += [
             Piece(track, _fill(track, low, high), label)
             for low, high, label in parts
@@ -329,7 +329,7 @@ def _find_changes(
 ) -> dict[int, list[tuple[float, float, Numbers]]]:
     """Changes of labels by track: last place with the old one, first with the new, and the new."""
     within = owners[1:] == owners[:-1]
-    changed = np.flatnonzero(_differ(labels[1:], labels[:-1]) & within)
+    changed = np.flatnonzero((labels[1:] != labels[:-1]).any(axis=1) & within)
     low, high, owner = places[changed], places[changed + 1], owners[changed]
     old, last = labels[changed], labels[changed + 1]
     found: dict[int, list[tuple[float, float, Numbers]]] = {}
@@ -351,14 +351,10 @@ def _find_changes(
         ):
             found.setdefault(k, []).append((before, after, label))
         # A second change may hide behind the first.
-        more = _differ(new, last) & (high < stop)
+        more = (new != last).any(axis=1) & (high < stop)
         low, high, old, last = high[more], stop[more], new[more], last[more]
         owner = owner[more]
-    return {index: sorted(own, key=lambda change: change[0]) for index, own in found.items()}
-
-
-def _differ(labels: Numbers, others: Numbers) -> Flags:
-    return np.asarray((labels != others).any(axis=1))
+    return {k: sorted(changes, key=lambda change: change[0]) for k, changes in found.items()}
 
 
 def _fill(track: Track, low: float, high: float) -> Array:

@@ -43,7 +43,7 @@ from .borders import (
     list_tracks,
     name_contacts,
 )
-from .formation_list import Stretch, list_formations, trace_problem
+from .formation_list import trace_problem
 
 BEYOND = np.radians(6.0)  # reach of the window beyond the flush angles next to the plan [rad]
 BESIDE = 0.25  # largest reach over half the distance of these angles
@@ -246,18 +246,6 @@ def _check_cells(problem: Problem, window: Window, limit: float) -> tuple[Array,
     return places, *check_cell(scene, problem.epsilon, triples, z, limit)
 
 
-__all__ = [
-    "Border",
-    "Crossing",
-    "FormationMap",
-    "Stretch",
-    "Window",
-    "build_map",
-    "choose_window",
-    "list_formations",
-]
-
-
 def check_border(
     scene: Scene,
     epsilon: float,
@@ -338,26 +326,20 @@ def check_cell(
             right = np.zeros((regular.sum(), 5, 1))
             right[:, 3:, 0] = direction
             z_s = np.linalg.solve(matrix[regular], right)[..., 0]
-            held[regular, k] = _check_balance(formation, part, epsilon, z_s)
-            feasible = held[regular, k]
+            # Contact forces and torques at rest, with friction that opposes z_s.
+            directions = Directions.of(part, z_s)
+            G = force_rows(formation, part, directions)
+            wrench = G[:, :, :3].transpose(0, 2, 1)
+            solvable = np.abs(np.linalg.det(wrench)) > REGULAR * scene.scales.length
+            wrench[~solvable] = np.eye(3)
+            right = np.broadcast_to(-scene.applied_force[:3, None], (len(G), 3, 1))
+            c_n = np.linalg.solve(wrench, right)[..., 0]
+            tau = scene.dry[3:] * directions.sigma - np.einsum("nij,ni->nj", G[:, :, 3:], c_n)
+            within = (c_n >= epsilon).all(axis=1) & (np.abs(tau) <= scene.torque_limit).all(axis=1)
+            held[regular, k] = feasible = within & solvable
             sole = _are_unique(formation, part, z_s, feasible, uniqueness_margin)
             unique[held[:, k], k] = sole
     return held & unique, np.any(held & ~unique, axis=1)
-
-
-def _check_balance(
-    formation: Formation, kinematics: Kinematics, epsilon: float, z_s: Array
-) -> Flags:
-    scene, directions = formation.scene, Directions.of(kinematics, z_s)
-    G = force_rows(formation, kinematics, directions)
-    wrench = G[:, :, :3].transpose(0, 2, 1)
-    regular = np.abs(np.linalg.det(wrench)) > REGULAR * scene.scales.length
-    wrench[~regular] = np.eye(3)
-    right = np.broadcast_to(-scene.applied_force[:3, None], (len(G), 3, 1))
-    c_n = np.linalg.solve(wrench, right)[..., 0]
-    tau = scene.dry[3:] * directions.sigma - np.einsum("nij,ni->nj", G[:, :, 3:], c_n)
-    held = (c_n >= epsilon).all(axis=1) & (np.abs(tau) <= scene.torque_limit).all(axis=1)
-    return np.asarray(held & regular)
 
 
 def _are_unique(

@@ -159,15 +159,16 @@ def _can_start(scene: Scene, z: Array, contacts: tuple[Contact, ...]) -> bool:
 
 def _list_steps(scene: Scene, z: Array, part: Part, last: bool) -> Iterator[list[Step]]:
     """Candidate phases for a part from `z`, the simplest first."""
-    simple: list[list[Step]] = [[(part.contacts, Until(contact=own))] for own in part.gained]
+    simple: list[list[Step]] = [[(part.contacts, Until(contact=c))] for c in part.gained]
+    ends: list[list[Step]] = list(simple) or [[]]
     if not part.gained or (part.inside != part.stop).any():
         simple.append([(part.contacts, end_at(scene, part.coordinate, part.inside))])
     if last and len(part.contacts) == 3:
         # One phase with terminal constraints on the pose.
         pose = [end_at(scene, row, part.stop) for row in (0, 1)]
-        pins = [((own.coordinate, own.value or 0.0),) for own in pose]
-        for contact in part.gained:
-            yield from ([(part.contacts, Until(contact=contact, pins=pin))] for pin in pins)
+        pins = [((end.coordinate, end.value or 0.0),) for end in pose]
+        for contact, pin in product(part.gained, pins):
+            yield [(part.contacts, Until(contact=contact, pins=pin))]
         if not part.gained:
             row = part.coordinate
             yield [(part.contacts, replace(pose[row], pins=pins[1 - row]))]
@@ -182,7 +183,6 @@ def _list_steps(scene: Scene, z: Array, part: Part, last: bool) -> Iterator[list
     rows = (part.coordinate,) if len(part.contacts) == 4 else (0, 1)
     aim = part.start + (BEFORE if part.gained else 1.0) * (part.stop - part.start)
     between = [(part.contacts, end_at(scene, row, aim)) for row in rows]
-    ends: list[list[Step]] = [[(part.contacts, Until(contact=own))] for own in part.gained] or [[]]
     for count in range(1, len(rows) + 1):
         for chosen in permutations(between, count):
             yield from ([*chosen, *end] for end in ends)
@@ -294,9 +294,9 @@ def _drop_excursions(scene: Scene, leg: Leg, spans: list[Span]) -> list[Span]:
     labels = np.array([label for label, _, _ in spans])
     box = np.array(list(product((-1, 0, 1), repeat=2))) * tolerance(scene)
     for column in (0, 2, 4):
-        own = labels[:, column]
+        contacts = labels[:, column]
         for k in range(1, len(spans)):
-            again = np.flatnonzero(own[k:] == own[k - 1])
+            again = np.flatnonzero(contacts[k:] == contacts[k - 1])
             if not len(again) or again[0] == 0:
                 continue
             first, last = spans[k][1], spans[k + int(again[0]) - 1][2]
@@ -304,8 +304,8 @@ def _drop_excursions(scene: Scene, leg: Leg, spans: list[Span]) -> list[Span]:
             x, phi = leg.track.pose(np.linspace(first, last, PROBES))
             poses = (np.column_stack([x, phi])[:, None] + box).reshape(-1, 2)
             near = label_cells(scene, *poses.T).reshape(PROBES, len(box), -1)[..., column]
-            if (near == own[k - 1]).any(axis=1).all():
-                own[k : k + int(again[0])] = own[k - 1]
+            if (near == contacts[k - 1]).any(axis=1).all():
+                contacts[k : k + int(again[0])] = contacts[k - 1]
     kept: list[Span] = []
     for label, (_, first, last) in zip(labels, spans, strict=True):
         if kept and (kept[-1][0] == label).all():
@@ -425,10 +425,10 @@ def _locate(track: Track, pose: Array, near: Array) -> tuple[float, float]:
         return np.asarray(np.nan_to_num((np.abs(points - pose) / near).max(axis=1), nan=np.inf))
 
     low, high = float(track.places[0]), float(track.places[-1])
-    own = float(np.clip(pose[1], low, high))
-    straight = float(off(np.array([own]))[0])
+    phi = float(np.clip(pose[1], low, high))
+    straight = float(off(np.array([phi]))[0])
     if straight < 1:
-        return own, straight
+        return phi, straight
     for count in (101, 41, 41):
         places = np.linspace(low, high, count)
         away = off(places)

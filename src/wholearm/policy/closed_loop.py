@@ -48,7 +48,7 @@ class ClosedLoop:
     def find_duration(self, last: int) -> float:
         """Nominal duration of the phases up to the `last` [s]."""
         phases = self.policy.about["phases"][self.first - 1 : last]
-        return EXTRA + sum(float(own["duration"]) for own in phases)
+        return EXTRA + sum(float(phase["duration"]) for phase in phases)
 
     def held(
         self, t: float, theta: Array, theta_dot: Array, forces: Mapping[str, float]

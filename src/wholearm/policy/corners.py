@@ -1,8 +1,8 @@
 """Limits of contact forces in the corners of parameter ranges, as a policy keeps them.
 
 At given s, s' and torques, forces and s'' of a perturbed scene are affine in 1, b = s'^2, s',
-a = s'' and the internal force: in each corner of the ranges of mass, inertia and friction a limit is
-a row of five coefficients. Geometry, gains and delays are added to first order, in absolute sum.
+a = s'' and the internal force: in each corner of the ranges of mass, inertia and friction a limit
+is a row of five coefficients. Geometry, gains and delays are added to first order, in absolute sum.
 
 The worst corner depends on the motion: `Corners.pick` takes that of one motion.
 """

@@ -159,8 +159,8 @@ class CurveLaw:
         if self.after is not None:
             wanted += min(max(s - self.length, 0.0) / GROWTH, FASTEST * settings.touch)
         error = wanted - v
-        way = half * max(v, settings.touch)
-        planned = (self._look(j, place + way) - self._look(j, place - way)) / (4.0 * way)
+        reach = half * max(v, settings.touch)
+        planned = (self._look(j, place + reach) - self._look(j, place - reach)) / (4.0 * reach)
         j, share = self._locate(j, s)
         if planned < 0.0 and v < SLOW * wanted:
             planned = 0.0
@@ -195,15 +195,15 @@ class CurveLaw:
 
     def _measure(self, one: float, two: float, rate_one: float, rate_two: float) -> None:
         """Place and speed: the joints' projection on the chords next to the last one."""
-        j, last, way = self.j, len(self.chords) - 1, 0
+        j, last, sign = self.j, len(self.chords) - 1, 0
         while True:
             node, (e, f), square = self.theta[j], self.chords[j], self.squares[j]
             share = ((one - node[0]) * e + (two - node[1]) * f) / square
             # At a bend two chords may point at one another: the search keeps its direction.
-            if share > 1.0 and j < last and way >= 0:
-                j, way = j + 1, 1
-            elif share < 0.0 and j > 0 and way <= 0:
-                j, way = j - 1, -1
+            if share > 1.0 and j < last and sign >= 0:
+                j, sign = j + 1, 1
+            elif share < 0.0 and j > 0 and sign <= 0:
+                j, sign = j - 1, -1
             else:
                 break
         h = self.steps[j]
@@ -494,12 +494,12 @@ class Sensing:
             force = c + share * d + (cb + share * db) * v * v + (ca + share * da) * a
             plain.append(force + by * internal)
             press.append(by)
-        least = FEW * sum(abs(own) for own in plain) / len(plain)
-        sizes = [max(own, least) or 1.0 for own in plain]
-        parts = [(own + off) / size for own, off, size in zip(plain, self.bias, sizes, strict=True)]
-        rates = [own / size for own, size in zip(press, sizes, strict=True)]
+        least = FEW * sum(abs(f) for f in plain) / len(plain)
+        sizes = [max(f, least) or 1.0 for f in plain]
+        parts = [(f + off) / size for f, off, size in zip(plain, self.bias, sizes, strict=True)]
+        rates = [f / size for f, size in zip(press, sizes, strict=True)]
         change = min(max(self._choose(parts, rates), low), high)
-        self.expected.append([own + by * change for own, by in zip(plain, press, strict=True)])
+        self.expected.append([f + by * change for f, by in zip(plain, press, strict=True)])
         return change
 
     def _choose(self, parts: list[float], rates: list[float]) -> float:
@@ -524,7 +524,8 @@ def choose_internal_force(
     replaces one of them until none is less.
     """
     lines = [(p + rate * a, q) for p, rate, q in zip(base, rates, press, strict=True)]
-    ups, downs = [own for own in lines if own[1] > 0.0], [own for own in lines if own[1] < 0.0]
+    ups = [line for line in lines if line[1] > 0.0]
+    downs = [line for line in lines if line[1] < 0.0]
     flat = min([p for p, q in lines if q == 0.0], default=1e30)
     if not ups or not downs:
         return flat, 0.0

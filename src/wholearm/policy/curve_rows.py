@@ -113,10 +113,10 @@ def _measure_base(rows: CurveLimitRows, a: Array, b: Array) -> Array:
 def find_forces(curve: Curve, s: Array, speed: Array) -> Array:
     """Normal forces at both ends of the intervals between places, (n - 1, 2, n_c, 5) [N]."""
     formation, point = curve.formation, curve.evaluate(s)
-    own = inverse(
+    forces = inverse(
         formation, *point[:3], blend_directions(curve, s, speed * NEAR)[0], point.kinematics
     )
-    of = np.stack([own.C0, own.Cb, np.zeros_like(own.C0), own.Ca, own.Cl], axis=2)
+    of = np.stack([forces.C0, forces.Cb, np.zeros_like(forces.C0), forces.Ca, forces.Cl], axis=2)
     of = of[:, : formation.n_contacts]
     return np.stack([of[:-1], of[1:]], axis=1)
 
@@ -124,21 +124,23 @@ def find_forces(curve: Curve, s: Array, speed: Array) -> Array:
 def find_directions(curve: Curve, s: Array) -> Directions:
     """Directions at n places."""
     ends = [part.stop for part in curve.segments[:-1]]
-    own = [curve.segments[k] for k in np.searchsorted(ends, s)]
-    return Directions(np.array([part.Xi for part in own]), np.array([part.sigma for part in own]))
+    segments = [curve.segments[k] for k in np.searchsorted(ends, s)]
+    return Directions(
+        np.array([part.Xi for part in segments]), np.array([part.sigma for part in segments])
+    )
 
 
 def blend_directions(curve: Curve, s: Array, width: Array) -> list[Directions]:
-    """Sliding directions, blended and as before and after each reversal, within a width (n,) [m]."""
+    """Sliding directions blended over reversals of a width (n,) [m], and as before and after."""
     first = curve.segments[0]
     found = [[np.tile(part, (len(s), 1)) for part in (first.Xi, first.sigma)] for _ in range(3)]
     for before, after in pairwise(curve.segments):
         near = max(float(np.interp(before.stop, s, width)), 1e-3 * curve.length)
         share = np.clip(0.5 + (s - before.stop) / (2 * near), 0.0, 1.0)[:, None]
-        for own, part in zip(found, (share, np.floor(share), np.ceil(share)), strict=True):
-            own[0] += part * (after.Xi - before.Xi)
-            own[1] += part * (after.sigma - before.sigma)
-    return [Directions(*own) for own in found]
+        for directions, part in zip(found, (share, np.floor(share), np.ceil(share)), strict=True):
+            directions[0] += part * (after.Xi - before.Xi)
+            directions[1] += part * (after.sigma - before.sigma)
+    return [Directions(*directions) for directions in found]
 
 
 def _estimate_errors(

@@ -203,9 +203,9 @@ def _tabulate_motion(
 
 def _list_free_joints(problem: Problem, phase: Phase, z: Array) -> Array:
     """Orthonormal basis of joint displacements that the contacts at the end leave free, (f, 2)."""
-    own, contact = phase.formation, phase.until.contact
-    contacts = own.contacts if contact is None else (*own.contacts, contact)
-    both = Formation(problem.scene, contacts, own.rolling)
+    formation, contact = phase.formation, phase.until.contact
+    contacts = formation.contacts if contact is None else (*formation.contacts, contact)
+    both = Formation(problem.scene, contacts, formation.rolling)
     units = np.sqrt(metric_weights(problem.scene))
     P = both.evaluate(z, np.zeros_like(z)).P[0] / units
     left = np.linalg.svd(P)[2][len(P) :] / units

@@ -155,9 +155,7 @@ class Policy(Result):
         Unless an impact leads into it, a later phase starts with the end of the one before, at
         which the contact is closed.
 
-        Raises
-        ------
-        InputError  if there is no such phase, or the one before passes into it in motion
+        InputError if there is no such phase, or the one before passes into it in motion.
         """
         if phase not in self.firsts:
             allowed = f"allowed are {', '.join(map(str, self.firsts))}"
@@ -208,9 +206,7 @@ class Policy(Result):
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the policy to a ``.npz`` file.
 
-        Raises
-        ------
-        InputError  if the file has another ending or cannot be written
+        InputError if the file has another ending or cannot be written.
         """
         require_ending(path, ".npz")
         kinds = ["curve" if "s" in arrays else "motion" for arrays in self.tables]
@@ -227,9 +223,7 @@ class Policy(Result):
     def load(path: str | os.PathLike[str]) -> Policy:
         """Read a policy.
 
-        Raises
-        ------
-        InputError  if the file cannot be read or is no policy
+        InputError if the file cannot be read or is no policy.
         """
         source = str(path)
         meta = _read_meta(source, read_arrays(path, ["meta"]))

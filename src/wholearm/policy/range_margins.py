@@ -117,8 +117,8 @@ def find_within(
 def _find_torques(curve: Curve, s: Array, directions: Directions) -> Array:
     """Torques at n places, shape (n, 2, 5)."""
     point = curve.evaluate(np.clip(s, 0.0, curve.length))
-    own = inverse(curve.formation, *point[:3], directions, point.kinematics)
-    return np.stack([own.T0, own.Tb, own.Tv, own.Ta, own.Tl], axis=2)
+    forces = inverse(curve.formation, *point[:3], directions, point.kinematics)
+    return np.stack([forces.T0, forces.Tb, forces.Tv, forces.Ta, forces.Tl], axis=2)
 
 
 def retime_within(

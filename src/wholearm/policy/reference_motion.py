@@ -105,9 +105,9 @@ def _trace(
     problem: Problem, phase: Phase, plan: Trajectory, reserve: Reserve, after: ReferencePiece | None
 ) -> ReferencePiece:
     """A phase's curve, and the controllable motions along it that keep margins."""
-    own = np.flatnonzero((plan.phase == phase.index) & ~plan.held)
-    curve = trace_phase(phase, plan.z[own[0]], problem.phases[phase.index + 1 :])
-    places, *values = _follow(curve, plan, own)
+    rows_of_phase = np.flatnonzero((plan.phase == phase.index) & ~plan.held)
+    curve = trace_phase(phase, plan.z[rows_of_phase[0]], problem.phases[phase.index + 1 :])
+    places, *values = _follow(curve, plan, rows_of_phase)
     s = _place_nodes(curve)
     a, b, internal = (np.interp(s, places, value) for value in values)
     touch, begins, passes, end = TOUCH * problem.scene.scales.speed, float(b[0]), 0.0, None
@@ -144,23 +144,23 @@ def _trace(
 
 
 def _follow(
-    curve: Curve, plan: Trajectory, own: NDArray[np.int64]
+    curve: Curve, plan: Trajectory, rows: NDArray[np.int64]
 ) -> tuple[Array, Array, Array, Array]:
     """Places s, a, b and internal force of a plan's rows along a curve."""
     formation, metric = curve.formation, metric_weights(curve.formation.scene)
-    z, grid = plan.z[own], np.linspace(0.0, curve.length, PLACES)
+    z, grid = plan.z[rows], np.linspace(0.0, curve.length, PLACES)
     away = (z[:, None] - curve.evaluate(grid).z[None]) ** 2 @ metric
     s = grid[away.argmin(axis=1)]
     for _ in range(NEWTON):
         point = curve.evaluate(s)
         s = np.clip(s + ((z - point.z) * point.z_s) @ metric, 0.0, curve.length)
     point = curve.evaluate(s)
-    v = (point.z_s * plan.z_dot[own]) @ metric
-    a = (point.z_s * plan.z_ddot[own]) @ metric
+    v = (point.z_s * plan.z_dot[rows]) @ metric
+    a = (point.z_s * plan.z_ddot[rows]) @ metric
     forces = inverse(formation, *point[:3], find_directions(curve, s), point.kinematics)
     columns = [plan.contacts.index(name) for name in formation.names]
     rolls = [columns[row] for row in formation.rolling_rows]
-    c = np.hstack([plan.c_n[own][:, columns], plan.c_t[own][:, rolls]])
+    c = np.hstack([plan.c_n[rows][:, columns], plan.c_t[rows][:, rolls]])
     # The other parts of the forces are orthogonal to that of the internal force.
     return s, a, v**2, np.asarray(np.einsum("ni,ni->n", c, forces.Cl))
 

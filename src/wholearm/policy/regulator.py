@@ -1,9 +1,9 @@
 """Time-varying linear-quadratic regulator along phases with several degrees of freedom.
 
 Displacements N xi that the contacts leave free are seen by the joints as theta = Theta xi; N is
-scaled so that xi are the joint angles (two degrees of freedom), or their arc length (one). About the
-plan xi'' = A1 xi + A2 xi' + B tau. Torques are weighted by the accelerations and the relative contact
-forces that they cause; the Riccati equation is integrated backwards.
+scaled so that xi are the joint angles (two degrees of freedom), or their arc length (one). About
+the plan xi'' = A1 xi + A2 xi' + B tau. Torques are weighted by the accelerations and the relative
+contact forces that they cause; the Riccati equation is integrated backwards.
 """
 
 from __future__ import annotations

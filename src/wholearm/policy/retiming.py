@@ -84,7 +84,7 @@ def _pass(
     steps, count = np.diff(s), len(s)
     least, most = SLOWEST * cap, cap.copy()
     least[-1], most[-1] = end
-    shares = [part, *(own for own in SHARES if own < part)]
+    shares = [part, *(smaller for smaller in SHARES if smaller < part)]
     share = np.empty(count - 1)
     bounds: list[Array] = []
     for k in range(count - 2, -1, -1):
@@ -147,7 +147,7 @@ def find_range(rows: Array) -> tuple[float, float]:
     high = float((-fixed[falls] / slope[falls]).min(initial=np.inf))
     if not up.any() or not down.any() or low > high:
         return low, high
-    floors, roofs = (np.column_stack([fixed, slope])[own] / -rate[own, None] for own in (up, down))
+    floors, roofs = (np.column_stack([fixed, slope])[k] / -rate[k, None] for k in (up, down))
 
     def close(b: float, sign: float) -> float | None:
         for _ in range(len(rows)):

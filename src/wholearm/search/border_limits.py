@@ -64,9 +64,8 @@ def find_border_limits(curve: Curve, epsilon: float, uniqueness_margin: float) -
         at = curve.evaluate(s)
         closed, clear = _find_ambiguity(curve, s, at, owners, uniqueness_margin)
         first = Kinematics(*(array[:count] for array in at.kinematics))
-        rows = limit_along(
-            curve, epsilon, CurvePoint(*(v[:count] for v in at[:3]), first), owners[:count]
-        )
+        nodes_at = CurvePoint(at.z[:count], at.z_s[:count], at.z_ss[:count], first)
+        rows = limit_along(curve, epsilon, nodes_at, owners[:count])
     except np.linalg.LinAlgError:
         none = np.zeros((len(steps), 1))
         rows = PathLimitRows(none, none, none, none - 1, none[:, 0])

@@ -39,9 +39,8 @@ from .edges import EdgeStep, Link, describe_steps, find_headings, point_out
 from .feasibility import SINGULAR, Measured, make_phases
 from .places import measure_apart
 
-OFF = (
-    1e-4  # distance of a traced end from a border's end that makes it another one [r. of gyr., rad]
-)
+# Distances are in radii of gyration and radians.
+OFF = 1e-4  # distance of a traced end from a border's end that makes it another one
 PINNED = 1e-9  # pinned coordinates of landings are rounded to this, in the same unit
 SAME = 9  # decimals of configurations that count as equal, in the same unit
 MET = 1e-8  # distance of planned from traced ends of borders that count as equal, in the same unit
@@ -49,7 +48,7 @@ Key = tuple[object, ...]
 T = TypeVar("T")
 Links = Sequence[tuple[Link, Sequence[Measured]]]
 """Links of a route, each with the plans of it that are known, the fastest first."""
-Chosen = tuple[Link, Measured | None]  # A link, and what is begun of it
+Chosen = tuple[Link, Measured | None]  # a link, and a plan of it as initial guess
 
 
 @dataclass
@@ -92,11 +91,11 @@ def join_route(
     guesses, culprit = [[*measured, None] for _, measured in links], None
     try:
         with unadvised():
-            first = [(link, own[0]) for (link, _), own in zip(links, guesses, strict=True)]
+            first = [(link, plans[0]) for (link, _), plans in zip(links, guesses, strict=True)]
             if jobs > 1:
                 _plan_parallel(problem, first, options, cache, report, jobs, background)
             while True:
-                chosen = [(link, own[0]) for (link, _), own in zip(links, guesses, strict=True)]
+                chosen = [(link, plans[0]) for (link, _), plans in zip(links, guesses, strict=True)]
                 planned, reason = _plan_links(problem, chosen, options, cache, report)
                 if reason:
                     culprit = len(planned)
@@ -279,7 +278,7 @@ def key_configuration(scene: Scene, z: Array) -> tuple[float, ...]:
 
 def key_steps(steps: Sequence[EdgeStep]) -> Key:
     """Contacts and ends of phases."""
-    return tuple((tuple(c.name for c in own.contacts), own.until, own.end.value) for own in steps)
+    return tuple((tuple(c.name for c in s.contacts), s.until, s.end.value) for s in steps)
 
 
 def _plan_link(

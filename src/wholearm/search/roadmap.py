@@ -307,17 +307,17 @@ def go_to(
 ) -> CellCrossing | None:
     """The fastest straight path from a place to one of some poses (x, phi) inside a cell."""
     scene = start.scene
-    own = np.array([contact_table(scene).index(contact) for contact in formation.contacts])
+    label = np.array([contact_table(scene).index(contact) for contact in formation.contacts])
     begin = np.broadcast_to(start.z[[0, 2]], poses.shape)
     middles = list_middles(begin, poses)
     places = np.concatenate([middles, poses[:, None]], axis=1)
     labels = label_cells(scene, *places.reshape(-1, 2).T)[:, [0, 2, 4]]
-    inside = (labels == own).all(axis=1).reshape(places.shape[:2]).all(axis=1)
+    inside = (labels == label).all(axis=1).reshape(places.shape[:2]).all(axis=1)
     inside &= np.abs((poses - begin) / unit_steps(scene)).max(axis=1) > NEAREST
     if not inside.any():
         return None
     ends = poses[inside]
-    labels = np.broadcast_to(own, (len(ends), 3))
+    labels = np.broadcast_to(label, (len(ends), 3))
     times = time_paths(scene, epsilon, labels, begin[inside], ends)
     k = int(times.argmin())
     if not np.isfinite(times[k]):
@@ -337,7 +337,8 @@ class Rays(NamedTuple):
 
     def pick(self, kept: Flags | Numbers) -> Rays:
         """Some of the rays."""
-        return Rays(*(array[kept] for array in self))
+        numbers = self.sources[kept], self.labels[kept], self.gained[kept]
+        return Rays(*numbers, self.starts[kept], self.ends[kept])
 
     @property
     def runs(self) -> Array:
@@ -391,9 +392,9 @@ def _look_ahead(scene: Scene, rays: Rays, held: Numbers) -> tuple[Numbers, Numbe
     # All rays from one place into one cell share this.
     cell = np.column_stack([rays.sources, rays.labels])
     cell, group = np.unique(cell, axis=0, return_inverse=True)
-    own, beside = cell[:, None, 1:], held[cell[:, 0], None, None]
-    other = (grid.labels != own) & ~(grid.labels[:, :, None] == beside).any(axis=3)
-    new = other & ~_list_renamed(scene)[grid.labels, own] & (grid.labels != NOWHERE)
+    cell_label, touching = cell[:, None, 1:], held[cell[:, 0], None, None]
+    other = (grid.labels != cell_label) & ~(grid.labels[:, :, None] == touching).any(axis=3)
+    new = other & ~_list_renamed(scene)[grid.labels, cell_label] & (grid.labels != NOWHERE)
     outside = other.any(axis=2)[group[:, None], seen]
     outside &= outside.cumsum(axis=1) <= OUTSIDE
     ray, step = np.nonzero(outside)
@@ -424,13 +425,13 @@ def _find_root(scene: Scene, rays: Rays, places: Array) -> Array:
     near = np.clip(first - 1, 0, places.shape[1] - 4)[:, None] + np.arange(4)
     around = first[:, None] + np.arange(2)
     left, right = np.take_along_axis(places, around, 1).T
-    own, values = (np.take_along_axis(part, near, 1) for part in (places, gaps))
-    inner = _interpolate(own, values, left, right)
+    s, values = (np.take_along_axis(part, near, 1) for part in (places, gaps))
+    inner = _interpolate(s, values, left, right)
     inner_gap = _measure_gaps(scene, rays, inner[:, None])[:, 0]
-    own = np.column_stack([left, inner, right])
+    s = np.column_stack([left, inner, right])
     values = np.insert(np.take_along_axis(gaps, around, 1), 1, inner_gap, axis=1)
     left, right = np.where(inner_gap > 0, (inner, right), (left, inner))
-    root = _interpolate(own, values, left, right)
+    root = _interpolate(s, values, left, right)
     return np.where(falls[rows, first], root, np.nan)
 
 

@@ -67,10 +67,10 @@ def _sweep(rows: PathLimitRows, steps: Array, part: Array, near: Array | None) -
     return b.T
 
 
-def _solve(own: Array, other: Array, one: Array, used: Flags) -> tuple[Array, Array]:
+def _solve(p: Array, q: Array, one: Array, used: Flags) -> tuple[Array, Array]:
     """Used rows own p + other q + one >= 0 as p <= start + slope q, shape (n, w, m)."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        starts, slopes = np.where(used, one / -own, np.inf), np.where(used, other / -own, 0.0)
+        starts, slopes = np.where(used, one / -p, np.inf), np.where(used, q / -p, 0.0)
     return np.ascontiguousarray(starts.swapaxes(0, 1)), np.ascontiguousarray(slopes.swapaxes(0, 1))
 
 
@@ -84,12 +84,12 @@ def _bound(starts: Array, slopes: Array, other: Array) -> Array:
 def _find_corners(before: Array, after: Array, one: Array) -> Array:
     """Largest b for which some next b >= 0 keeps the rows, shape (w, n)."""
     none = np.zeros((*one.shape[:-1], 1))
-    rise, own, rest = (
+    rise, fixed, rest = (
         np.concatenate([part, none + more], axis=-1)[..., :, None]
         for part, more in ((after, 1), (before, 0), (one, 0))
     )
     rise, fall = np.maximum(rise, 0), np.maximum(-after, 0)[..., None, :]
-    slope = fall * own + rise * before[..., None, :]
+    slope = fall * fixed + rise * before[..., None, :]
     value = fall * rest + rise * one[..., None, :]
     bounded = (rise > 0) & (fall > 0) & (slope < 0)
     with np.errstate(divide="ignore", invalid="ignore"):
