@@ -8,6 +8,7 @@ import os
 import threading
 import zipfile
 import zlib
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -168,7 +169,7 @@ _staged: ContextVar[list[tuple[str, str]] | None] = ContextVar("staged", default
 """Temporary files and where they are to appear, inside `together`."""
 
 
-on_end(lambda: [_remove(part) for part in tuple(_parts)])
+on_end(lambda: deque(map(_remove, tuple(_parts)), maxlen=0))
 
 
 def read_arrays(path: str | os.PathLike[str], names: Iterable[str]) -> dict[str, Any]:
