@@ -7,9 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from plane import with_speed_limit
-from wholearm.common.arrays import Array
+from wholearm.common.arrays import Array, find_minima
 from wholearm.common.errors import JammingError
-from wholearm.common.quadrature import find_minima
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.mechanics.dynamics import PathForces, inverse

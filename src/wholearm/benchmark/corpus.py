@@ -1,4 +1,4 @@
-"""Everything that the package answers, against answers that are stored.
+"""Regression corpus: answers of the package compared with stored ones.
 
 Two answers agree if kinds, verdicts and contact modes are the same and numbers are within
 `TOLERANCES`. A better value of the objective is no difference, whatever else it changes.

@@ -1,4 +1,4 @@
-"""What the corpus asks of the package, and the answers as plain values.
+"""Cases of the corpus, and their answers as plain values.
 
 A case names a family and what that is asked with. Families call the public functions alone.
 """

@@ -165,7 +165,9 @@ def _serve(pipe: Connection, run: Callable[[Any], Any], limit: Limit, strict: bo
                 task = pipe.recv()
             except (EOFError, OSError):
                 return
-            _limit_time(limit(task))
+            if hasattr(signal, "setitimer"):
+                # A limit of the whole process would drift; this one idles between tasks.
+                signal.setitimer(signal.ITIMER_PROF, limit(task))
             before, begun = find_peak(), time.process_time()
             try:
                 outcome = "done", run(task)
@@ -196,15 +198,6 @@ def find_peak() -> float:
     # Where there is `/proc`, the other figure starts from that of the parent.
     (peak,) = (line.split()[1] for line in lines if line.startswith("VmHWM:"))
     return int(peak) * 1024 / 1e6
-
-
-def _limit_time(bound: float) -> None:
-    """Let the process end when it has used up its time from now on; between tasks it idles.
-
-    A limit of the whole process would drift: it is counted in other ticks than can be read.
-    """
-    if hasattr(signal, "setitimer"):
-        signal.setitimer(signal.ITIMER_PROF, bound)
 
 
 def _limit_memory() -> None:

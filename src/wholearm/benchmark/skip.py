@@ -1,4 +1,4 @@
-"""What each part of the model costs: the same phases with it and without it.
+"""Cost of each part of the model: the same phases with it and without it.
 
 A part that a scene does not have adds no unknowns and no rows, and its code is not run.
 """

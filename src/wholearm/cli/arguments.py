@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from typing import NoReturn
 
 from ..common.command_options import read_options
 from ..common.errors import InputError
-from ..common.fields import Range
 from ..mechanics.margin_key import MARGIN
 from ..planning.options import PLANNER
 from .help import TOPICS
@@ -26,14 +25,6 @@ class Parser(argparse.ArgumentParser):
         """Refuse the command line."""
         text = message.removeprefix("argument ")
         raise InputError("", "", f"{text}; see {self.prog} --help")
-
-
-def number(low: float, high: float) -> Callable[[str], float]:
-    """What reads an option that is a number from `low` to `high`, a whole one if `low` is."""
-    return Range(low, high).parse
-
-
-JOBS = number(1, 256)  # processes
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Many tasks through any executor, each answered once, whatever becomes of its workers."""
+"""Tasks through any executor, each answered once, with retries where workers die."""
 
 from __future__ import annotations
 

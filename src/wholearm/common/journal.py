@@ -1,4 +1,4 @@
-"""Records of a study that are kept as they come, so that it can go on where it was stopped."""
+"""Journal of a study: one JSON record per line, kept as they come, to resume from."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import json
 import os
 import stat
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from itertools import islice
 from typing import Any, BinaryIO, NamedTuple
 
@@ -128,22 +127,6 @@ class Journal:
 
     def _fail(self, error: OSError) -> InputError:
         return InputError(self.path, "", f"cannot be written: {error.strerror}")
-
-
-@contextmanager
-def locked(folder: str) -> Iterator[None]:
-    """Keep other runs, that ask for it too, from a folder.
-
-    Raises
-    ------
-    InputError  if another run has it
-    """
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        _lock(descriptor, folder)
-        yield
-    finally:
-        os.close(descriptor)
 
 
 def _lock(descriptor: int, path: str) -> None:

@@ -1,4 +1,4 @@
-"""Tasks that do not depend on each other, done at the same time by forked processes.
+"""Independent tasks in parallel, by forked processes.
 
 Children are forked where tasks are shared out, so that they have all that is known by then. Each
 process takes the next task for as long as there is one, and children send what has come of theirs.

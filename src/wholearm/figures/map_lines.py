@@ -1,4 +1,4 @@
-"""What is drawn of a map's borders and paths, on any paper: runs, lines aside, arrow heads."""
+"""Geometry of map drawings: offset lines, arrow heads, labels, tints; in points of the paper."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What plans, replays, trajectories and torques have in common."""
+"""Torques and motions of plans, replays and trajectories, checked against a problem; saving."""
 
 from __future__ import annotations
 

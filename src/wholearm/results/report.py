@@ -1,4 +1,4 @@
-"""What a replay of torques showed, phase by phase, as numbers and as tables."""
+"""Report of a replay: margins, ends, deviations and energies by phase, as tables."""
 
 from __future__ import annotations
 

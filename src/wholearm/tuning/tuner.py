@@ -31,28 +31,28 @@ FACTOR = 1.1
 SLOW = 3e-5
 """Speed at which the end of a phase may be reached by a brake, relative to the scene's: contacts
 part for less than a moment then."""
-_ROUGH = 50.0  # how much faster than that an end is reached while brakes are compared
-_RAISED = 60  # most times a torque is raised or lowered: a factor of 300
-_SUPPORT = 3
+_COARSE_SPEED = 50.0  # how much faster than that an end is reached while brakes are compared
+_MAX_RAISES = 60  # most times a torque is raised or lowered: a factor of 300
+_SUPPORT_STEP = 3
 """So many times the supporting torque is raised at once, by a third, as each needs searches."""
-ENOUGH = 600  # simulations from one start after which no further drive, brake or support is tried
-_SUPPORTED = 13  # it is raised fewer times than this
-_SOONER = 0.02  # share of the time by which another 10 % has to bring the end sooner
-_COARSE = 2  # so many times the acting torque is lowered at once while it brakes too little
-_PLACES = 16  # instants to brake at that are looked at, where each of them lets the object arrive
-_CLOSER = 45  # most steps to the one at which it arrives most slowly, by golden sections
+MAX_SIMULATIONS = 600  # simulations from one start, after which nothing further is tried
+_MAX_SUPPORT = 13  # it is raised fewer times than this
+_MIN_GAIN = 0.02  # share of the time by which another 10 % has to bring the end sooner
+_COARSE_STEP = 2  # so many times the acting torque is lowered at once while it brakes too little
+_GRID = 16  # instants to brake at that are looked at, where each of them lets the object arrive
+_MAX_SECTIONS = 45  # most steps to the one at which it arrives most slowly, by golden sections
 _GOLDEN = (3 - math.sqrt(5)) / 2
-_MISSES = 2  # so many torques that stop nothing end that, once one has
-_SEARCH = 24  # most trials that look for the instant to brake
-_NARROW = 1e-3
+_MAX_FAILURES = 2  # so many torques that stop nothing end that, once one has
+_MAX_TRIALS = 24  # most trials that look for the instant to brake
+_MIN_BRACKET = 1e-3
 """Share of the time in which the end is either reached at speed or not at all: what starts the
 motion again, or lets it turn back, is not a matter of when to brake."""
 _FAR, _FAST = 0.02, 0.1  # shares of the way and of the drive's speed that are much for that
-_SOON = 1e-3  # share of a drive's time: where the end is reached with a brake that early it is none
-_LOSSES = 4  # most of them that may lose a contact
+_EARLIEST = 1e-3  # share of a drive's time, before which a brake is none
+_MAX_LOSSES = 4  # most of them that may lose a contact
 PAUSE = 0.2  # how long the object is held at the end of each phase, relative to the scene's time
 MOST_STOPS = 7  # stops of a phase that may be allowed at most: halves of halves of halves
-_LOWERED = 6  # how many times the acting torque is lowered for that, less one
+_HOLD_STEPS = 6  # how many times the acting torque is lowered for that, less one
 
 
 @exclusive
@@ -209,7 +209,7 @@ class _Setting(NamedTuple):
                 return attempt
             if best is None or best[0].raised is None:
                 best = attempt
-            if rule.is_enough:
+            if rule.is_exhausted:
                 break
         assert best is not None
         return best
@@ -276,12 +276,12 @@ class _Setting(NamedTuple):
             acting, (first, second) = balance.acting, (float(tau) for tau in balance.tau[0])
         lowered = [
             (first / FACTOR**n, second) if acting == 0 else (first, second / FACTOR**n)
-            for n in range(1, _LOWERED)
+            for n in range(1, _HOLD_STEPS)
         ]
         if after is None:
             arrived = np.array(trial.steps[-1].tau)
-            arrived[1 - acting] /= FACTOR**_LOWERED
-            held = [tuple((arrived / FACTOR ** (_LOWERED * n)).tolist()) for n in range(3)]
+            arrived[1 - acting] /= FACTOR**_HOLD_STEPS
+            held = [tuple((arrived / FACTOR ** (_HOLD_STEPS * n)).tolist()) for n in range(3)]
             return [None, *lowered, *held]
         return [None, *lowered]
 
@@ -356,9 +356,9 @@ class TuningRule:
         self.time = scales.time
 
     @property
-    def is_enough(self) -> bool:
+    def is_exhausted(self) -> bool:
         """Whether there have been so many simulations that no other torques are tried."""
-        return self.bench.simulations > ENOUGH
+        return self.bench.simulations > MAX_SIMULATIONS
 
     @property
     def is_free(self) -> bool:
@@ -378,9 +378,9 @@ class TuningRule:
         The last trial says what was lost, or that the object did not slide.
         """
         found = []
-        for raised in range(_RAISED):
+        for raised in range(_MAX_RAISES):
             tau = self.scale(raised)
-            if self.is_enough or abs(tau[self.acting]) > self.limit[self.acting]:
+            if self.is_exhausted or abs(tau[self.acting]) > self.limit[self.acting]:
                 break
             trial = self._run([TuningStep(0.0, tau)], f"raised {raised} times")
             if trial.outcome is TrialOutcome.ARRIVES:
@@ -402,11 +402,13 @@ class TuningRule:
         last = self._count_steps(1 - self.acting)
         # With two freedoms either torque sets the object in motion again, if it is too much there.
         likely = [last, 0] if self.is_free else [0, last]
-        for supported in dict.fromkeys([*likely, *range(_SUPPORT, _SUPPORTED, _SUPPORT)]):
+        for supported in dict.fromkeys(
+            [*likely, *range(_SUPPORT_STEP, _MAX_SUPPORT, _SUPPORT_STEP)]
+        ):
             if abs(self.scale(0, supported)[1 - self.acting]) > self.limit[1 - self.acting]:
                 continue
             for drive in chosen:
-                if self.is_enough:
+                if self.is_exhausted:
                     return None
                 found = self._lower(drive.trial, first, supported)
                 if found is not None:
@@ -416,22 +418,22 @@ class TuningRule:
     def _count_steps(self, finger: int) -> int:
         """How many times a torque is raised, lowered if negative, until it is that of the end."""
         share = float(self.last[finger] / self.tau[finger]) if self.tau[finger] else 1.0
-        return math.floor(math.log(max(share, FACTOR**-_RAISED)) / math.log(FACTOR))
+        return math.floor(math.log(max(share, FACTOR**-_MAX_RAISES)) / math.log(FACTOR))
 
     def _lower(self, drive: TuningTrial, first: int, supported: int) -> TuningDrive | None:
         """Lower the acting torque while that brings the end sooner; None if nothing stops there."""
         best: TuningDrive | None = None
         raised, missed = first, 0
-        while raised > -_RAISED and missed < _MISSES and not self.is_enough:
+        while raised > -_MAX_RAISES and missed < _MAX_FAILURES and not self.is_exhausted:
             steps = [*drive.steps, TuningStep(0.0, self.scale(raised, supported))]
-            trial = self._place(steps, drive, best and best.trial, _ROUGH * self.slow)
+            trial = self._place(steps, drive, best and best.trial, _COARSE_SPEED * self.slow)
             if trial is None:
                 if best is None and self.bench.trials[-1].outcome is TrialOutcome.LOSES:
                     break
                 missed += best is not None
-                raised -= _COARSE
+                raised -= _COARSE_STEP
                 continue
-            if best and trial.time > (1 - _SOONER) * best.trial.time:
+            if best and trial.time > (1 - _MIN_GAIN) * best.trial.time:
                 break
             best = TuningDrive(raised, trial, supported)
             if trial.rate < self.slow:
@@ -458,20 +460,20 @@ class TuningRule:
             at = high * (1 - 1e-4)
         elif near is not None:
             at = min(1.02 * near.steps[-1].time, 0.5 * (near.steps[-1].time + high))
-        for count in range(_SEARCH):
+        for count in range(_MAX_TRIALS):
             steps = [*steps[:-1], steps[-1]._replace(time=at)]
             trial = self._run(steps, f"brake at {at:.5g} s")
             if trial.outcome is TrialOutcome.ARRIVES:
                 if trial.rate < slow:
                     return trial
-                if at < _SOON * drive.time:
+                if at < _EARLIEST * drive.time:
                     return self._graze(steps, drive) if self.is_free else None
                 high, above, rate = at, self._overshoot(trial, slow), trial.rate
                 below /= 2 if side < 0 else 1
                 side = -1
             else:
                 losses += trial.outcome is TrialOutcome.LOSES
-                if losses > _LOSSES:
+                if losses > _MAX_LOSSES:
                     return None
                 low, short = at, trial.short
                 # How far it is through several phases is not known.
@@ -479,7 +481,7 @@ class TuningRule:
                 above /= 2 if side > 0 else 1
                 side = 1
             jumps = short > _FAR * self.bench.way and rate > _FAST * drive.rate
-            if jumps and high - low < _NARROW * high:
+            if jumps and high - low < _MIN_BRACKET * high:
                 return None
             share = below / (below + above) if count % 4 != 3 else 0.5
             at = low + (high - low) * min(max(share, 0.02), 0.98)
@@ -499,17 +501,17 @@ class TuningRule:
             trial = self._run(again, f"brake at {at:.5g} s")
             return trial.rate if trial.outcome is TrialOutcome.ARRIVES else math.inf, trial
 
-        grid = [drive.time * (k + 1) / (_PLACES + 1) for k in range(_PLACES)]
+        grid = [drive.time * (k + 1) / (_GRID + 1) for k in range(_GRID)]
         found = [run(at) for at in grid]
-        k = min(range(1, _PLACES - 1), key=lambda k: found[k][0])
+        k = min(range(1, _GRID - 1), key=lambda k: found[k][0])
         low, at, high = grid[k - 1 : k + 2]
         rate, best = found[k]
         if rate > min(found[k - 1][0], found[k + 1][0]):
             return None
-        for count in range(_CLOSER):
+        for count in range(_MAX_SECTIONS):
             if rate < self.slow:
                 return best
-            if count == _PLACES and rate > 2 * _ROUGH * self.slow:
+            if count == _GRID and rate > 2 * _COARSE_SPEED * self.slow:
                 return None
             left = at - low > high - at
             other = at - _GOLDEN * (at - low) if left else at + _GOLDEN * (high - at)
@@ -542,8 +544,8 @@ def list_starts(tau: Array, acting: int) -> list[Array]:
     hard = float(tau[:, 0].max() if acting else tau[:, 1].min())
     values = list(dict.fromkeys([start, hard]))
     if start and hard / start > 1:
-        count = math.ceil(math.log(hard / start) / math.log(FACTOR) / _SUPPORT)
-        values += [start * FACTOR ** (_SUPPORT * n) for n in range(1, count)]
+        count = math.ceil(math.log(hard / start) / math.log(FACTOR) / _SUPPORT_STEP)
+        values += [start * FACTOR ** (_SUPPORT_STEP * n) for n in range(1, count)]
     found = np.tile(tau[0], (len(values), 1))
     found[:, other] = values
     return list(found)

@@ -37,7 +37,7 @@ SLOW = 1e-6
 _TORQUES = ((0,), (1,), (0, 1))  # which torques change: one alone, or both
 _KINDS = {EventKind.CONTACT_LOST: "lost", EventKind.SLIP: "slips"}
 LEAST = 1e-3  # least normal force to aim at, over the scene's force, where epsilon is less
-TURNED = 1e-6  # speed from which on a motion counts as going one way, relative to the scene's speed
+MIN_SPEED = 1e-6  # speed above which a direction of motion counts, over the scene's speed
 
 
 def find_help(
@@ -137,7 +137,9 @@ def find_approach(problem: Problem, simulation: Simulation) -> Approach | None:
     gaps, gradient, _ = distance
     rates = -np.einsum("ni,ni->n", gradient, v)
     least, time = find_lowest(t, gaps, simulation.torque.breaks)
-    going = np.flatnonzero(np.abs(rates) > TURNED * (1 / scales.time if is_angle else scales.speed))
+    going = np.flatnonzero(
+        np.abs(rates) > MIN_SPEED * (1 / scales.time if is_angle else scales.speed)
+    )
     turns = going[np.flatnonzero(np.diff(np.sign(rates[going])))]
     return Approach(
         phase=phase.number,

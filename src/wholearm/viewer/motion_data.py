@@ -1,4 +1,4 @@
-"""A motion as what is drawn of it: outlines, and where contacts are and push at each instant."""
+"""Data of a motion for players: outlines, contact points and forces by sample."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ LOOSE = 0.01
 ENDS = 16  # most places of the end on either side of the nearest one
 STEP = 0.08  # distance of the nearest of these, over the radius of gyration
 GROWTH = 1.12  # ratio of each distance to the one before
-ENOUGH = 1e-3  # margin with which a curve is as good as wanted
+SUFFICIENT = 1e-3  # margin with which a curve is as good as wanted
 
 Flags = NDArray[np.bool_]
 
@@ -78,7 +78,7 @@ def list_ends(scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]) -
 def find_best(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: Array) -> Best:
     """Look for the curve from `z` to one of `ends` along which a motion keeps limits best.
 
-    The search stops at a curve with the margin `ENOUGH`.
+    The search stops at a curve with the margin `SUFFICIENT`.
     """
     rng = np.random.default_rng(0)
     start, size = z[[0, 2]], np.array([scene.scales.length, 1.0])
@@ -104,7 +104,7 @@ def find_best(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: Array)
             best.append((*margins, controls[k], curves[k]))
         count += len(kept)
         best = sorted(best, key=lambda one: -max(one[0], one[1]))[:BEST]
-        return any(one[0] > ENOUGH for one in best)
+        return any(one[0] > SUFFICIENT for one in best)
 
     straight = np.linspace(0, 1, 4)[:, None] * (goals - start)[:, None] + start
     if not look(straight, len(straight)) and not look(draw(DRAWN, 0.5), TRIED):

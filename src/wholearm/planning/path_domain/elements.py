@@ -18,8 +18,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
-from ...common.arrays import Array
-from ...common.quadrature import jacobi_nodes
+from ...common.arrays import Array, jacobi_nodes
 
 DEGREE = 4  # degree of the polynomials
 # Kinds of elements: amid a motion, at its start and end, and there without acceleration.

@@ -12,9 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...common.arrays import Array
+from ...common.arrays import Array, find_minima
 from ...common.errors import InputError, JammingError
-from ...common.quadrature import find_minima
 from ...common.shortfalls import Parameter
 from ...geometry.curve import Curve, describe_pose
 from ...mechanics.dynamics import PathForces, inverse, reduced_inertia

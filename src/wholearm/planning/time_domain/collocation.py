@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...common.arrays import Array
-from ...common.quadrature import jacobi_nodes
+from ...common.arrays import Array, jacobi_nodes
 
 
 class Scheme(NamedTuple):

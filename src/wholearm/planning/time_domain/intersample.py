@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...common.arrays import Array
-from ...common.quadrature import find_minima
+from ...common.arrays import Array, find_minima
 from ...mechanics.limits import PRESS, LimitSet, make_limits
 from ...results.trajectory import Samples
 from .equations import SLIDING, least_senses
