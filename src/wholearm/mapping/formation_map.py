@@ -32,6 +32,7 @@ from ..mechanics.margin_key import UNIQUENESS
 from ..mechanics.metric import metric_weights
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN, find_minors
 from ..problem.definition import Problem
+from ..quasistatic.squeeze import InternalForceLimits
 from ..scene.model import Scene
 from .borders import (
     NOWHERE,
@@ -284,7 +285,7 @@ def check_border(
         for k, tangent in enumerate((z_s[rows], -z_s[rows])):
             directions = Directions.of(part, tangent)
             forces = inverse(formation, z[rows], tangent, np.zeros_like(tangent), directions, part)
-            squeezing = Squeezing.of(formation, forces, tangent[:, 3:])
+            squeezing = InternalForceLimits.of(formation, forces, tangent[:, 3:])
             low, high = squeezing.find_span(still, still, epsilon)
             held[k, rows] = feasible = low <= high
             sole = _are_unique(formation, part, tangent, feasible, uniqueness_margin)

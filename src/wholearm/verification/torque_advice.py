@@ -79,7 +79,7 @@ def _examine_loss(
     columns = [simulation.contacts.index(name) for name in formation.names]
     rests = bool(np.isnan(simulation.c_n[row, columns]).all())
     if rests:
-        paths = find_rest(formation, z).all_ways
+        paths = find_rest(formation, z).modes
         instant = find_worst(formation, paths, z, tau)
         gradient = None if distance is None else distance[1][0]
         changes = find_resting_changes(formation, paths, epsilon, z, tau, gradient)

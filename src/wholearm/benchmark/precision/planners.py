@@ -20,10 +20,10 @@ from ...common.arrays import Array
 from ...mechanics.dynamics import PathForces, inverse
 from ...mechanics.limits import make_limits
 from ...planning.lower_bound.lower_bound import bound_least_time
+from ...planning.lower_bound.rows import directions_of
 from ...planning.options import Objective, PlanOptions
 from ...planning.path_domain.path_data import prepare
 from ...planning.path_domain.path_mesh import Mesh
-from ...planning.path_domain.path_motion import directions_of
 from ...planning.path_domain.path_nlp import build_path_nlp
 from ...planning.path_domain.path_plan import plan_path
 from ...planning.path_domain.terms import LimitShape
