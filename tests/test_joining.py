@@ -19,11 +19,11 @@ from wholearm.problem.goal import Goal
 from wholearm.search import route_choice as choosing
 from wholearm.search.astar import RoadmapRoute, RouteSearch, SearchRule
 from wholearm.search.candidates import Lost
-from wholearm.search.edge_plans import Aside, Kept, PlannedLink, join_route, key_steps
+from wholearm.search.edge_plans import BackgroundTask, Cache, PlannedLink, join_route, key_steps
 from wholearm.search.edges import EdgeStep, Link
 from wholearm.search.feasibility import Measured
 from wholearm.search.places import make_place
-from wholearm.search.refinement import FINEST, STEPS, Found, Leaving, RefinedPath
+from wholearm.search.refinement import FINEST, STEPS, Found, RefinedPath, ReleaseSearch
 from wholearm.search.roadmap import Roadmap
 from wholearm.search.route_choice import Chooser
 
@@ -31,7 +31,9 @@ from wholearm.search.route_choice import Chooser
 OPTIONS = PlanOptions(accuracy=0.1, replay=False)
 
 
-def join(links: tuple[Link, ...], kept: Kept, jobs: int, aside: Aside[int] | None = None) -> Plan:
+def join(
+    links: tuple[Link, ...], kept: Cache, jobs: int, aside: BackgroundTask[int] | None = None
+) -> Plan:
     own = [(link, list[Measured]()) for link in links]
     plan = join_route(problem_of(HEPTAGON), own, OPTIONS, kept, lambda _: None, jobs, aside)
     assert isinstance(plan, Plan), plan
@@ -45,8 +47,8 @@ def test_links_planned_at_the_same_time_make_the_same_plan() -> None:
     )
     route = next(search.run())
     assert len(route.links) > 1
-    kept: Kept = {}
-    asides = [Aside(lambda: 7) for _ in range(2)]
+    kept: Cache = {}
+    asides = [BackgroundTask(lambda: 7) for _ in range(2)]
     one, other = join(route.links, {}, 1, asides[0]), join(route.links, kept, 2, asides[1])
     assert [own.result for own in asides] == [None, 7]
     # Solves in another process may differ in the last bits, and by the solver's tolerance then.
@@ -116,7 +118,7 @@ class FoundRoutes:
     """A search that finds some routes, each once, as long as they are within its limit."""
 
     def __init__(self, routes: Sequence[RoadmapRoute]) -> None:
-        self.chart = SimpleNamespace(measured={}, others={}, joined={}, plans={}, polished=set())
+        self.roadmap = SimpleNamespace(measured={}, others={}, joined={}, plans={}, refined=set())
         self.limit, self.waiting = math.inf, list(routes)
 
     def run(self, rule: SearchRule) -> Iterator[RoadmapRoute]:
@@ -169,7 +171,7 @@ class Cell:
         return plan_of(1 + FINEST * abs(way.move - self.best) - saved)
 
     def leave(self) -> list[Measured]:
-        return Leaving(self, plan_of(1 + FINEST * abs(self.best))).run()
+        return ReleaseSearch(self, plan_of(1 + FINEST * abs(self.best))).run()
 
 
 @pytest.mark.parametrize(("best", "end"), [(0, -1), (-7, -8), (5, -20), (-3, -3)])

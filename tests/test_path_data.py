@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from wholearm.common.arrays import Array
-from wholearm.common.quadrature import find_minima
+from wholearm.common.arrays import Array, find_minima
 from wholearm.geometry.cost_to_go import CostToGo
 from wholearm.geometry.curve import Curve, Segment
 from wholearm.geometry.tracing import trace_phase, trace_phases
 from wholearm.mechanics.dynamics import PathForces, inverse
 from wholearm.mechanics.metric import metric_weights
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
+from wholearm.planning.lower_bound.rows import directions_of
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain.elements import (
     DEGREE,
@@ -32,7 +32,7 @@ from wholearm.planning.path_domain.first_guess import guess
 from wholearm.planning.path_domain.interpolation import fit_torque
 from wholearm.planning.path_domain.path_data import PhaseData, choose_sampling, prepare
 from wholearm.planning.path_domain.path_mesh import Mesh
-from wholearm.planning.path_domain.path_motion import PathMotion, directions_of
+from wholearm.planning.path_domain.path_motion import PathMotion
 from wholearm.planning.path_domain.path_nlp import build_path_nlp, pack, parameters
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.path_domain.refine import start_at
@@ -233,7 +233,7 @@ def test_interval_of_length_zero_takes_no_time_and_jumps() -> None:
     assert segment.tolist() == [0, 1]
     np.testing.assert_allclose(here.a, motion.profile.a[[gap, gap + 1]], rtol=1e-6)
     assert abs(here.a[1] - here.a[0]) > 1e-3 * abs(here.a[0])
-    np.testing.assert_allclose(here.squeeze, motion.profile.squeeze[[gap, gap + 1]], rtol=1e-5)
+    np.testing.assert_allclose(here.lam, motion.profile.lam[[gap, gap + 1]], rtol=1e-5)
 
 
 def test_a_stall_is_seen() -> None:

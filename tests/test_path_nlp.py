@@ -53,7 +53,7 @@ def data(curves: tuple[Curve, ...]) -> PhaseData:
 
 @pytest.fixture(scope="module")
 def profile(data: PhaseData) -> Profile:
-    """From rest to rest, with jumps of a and squeeze at the reversal."""
+    """From rest to rest, with jumps of a and lambda at the reversal."""
     rng = np.random.default_rng(1)
     x = data.grid.s / data.curve.length
     a = 3 * (1 - 2 * x) + 0.2 * rng.uniform(-1, 1, len(x))
@@ -237,7 +237,7 @@ def test_largest_margin_within_a_duration(duration: float) -> None:
     plan = toy.plan(objective="margin", duration=duration)
     assert plan.motion.duration <= duration * (1 + 5e-7)
     t = np.linspace(0, plan.motion.duration, 1001)
-    assert plan.motion.locate(t)[2].squeeze.min() == pytest.approx(plan.value, abs=1e-6)
+    assert plan.motion.locate(t)[2].lam.min() == pytest.approx(plan.value, abs=1e-6)
 
 
 def test_inertia_that_steps_at_a_reversal() -> None:

@@ -22,9 +22,10 @@ from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import inverse
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
+from wholearm.planning.lower_bound.rows import directions_of
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain import path_plan, task
-from wholearm.planning.path_domain.path_motion import PathMotion, directions_of
+from wholearm.planning.path_domain.path_motion import PathMotion
 from wholearm.planning.path_domain.path_nlp import PathNLP, build_path_nlp
 from wholearm.planning.path_domain.path_plan import plan_curves, plan_path
 from wholearm.planning.path_domain.terms import LimitShape
@@ -86,7 +87,7 @@ def test_fastest_motion_is_at_a_limit(curves: tuple[Curve, ...], phase: int) -> 
     samples = motion.evaluate(np.linspace(0, motion.duration, 4001))
     near = np.hstack([samples.c_n - EPSILON, LIMIT - np.abs(samples.tau)]) < 1e-3
     # All but the intervals in which it goes over from one limit to another; mostly two limits, of
-    # which one fixes the squeeze.
+    # which one fixes the internal force.
     assert (near.sum(axis=1) >= 1).mean() > 0.95
     assert (near.sum(axis=1) >= 2).mean() > 0.75
 
@@ -131,8 +132,8 @@ def test_torques_do_not_jitter(phase: int, objective: str) -> None:
             # A swing is one of 1 % of the limit. A plan has a few switches, not dozens.
             assert count_swings(tau, 0.01 * LIMIT) <= 5
             assert np.abs(np.diff(tau)).sum() <= 3.2 * np.ptp(tau) + 0.1
-        squeeze = motion.locate(t)[2].squeeze
-        assert count_swings(squeeze, 0.01 * np.ptp(squeeze) + 0.05) <= 6
+        lam = motion.locate(t)[2].lam
+        assert count_swings(lam, 0.01 * np.ptp(lam) + 0.05) <= 6
 
 
 def test_one_build_serves_all_phases(curves: tuple[Curve, ...]) -> None:

@@ -21,7 +21,13 @@ from wholearm.geometry.tracing import trace_phase
 from wholearm.mechanics.dynamics import build_forward
 from wholearm.planning.result import Plan
 from wholearm.policy.corners import list_scenes
-from wholearm.policy.curve_law import CurveLaw, LoopSettings, MotionLaw, Sensing, choose_squeeze
+from wholearm.policy.curve_law import (
+    CurveLaw,
+    LoopSettings,
+    MotionLaw,
+    Sensing,
+    choose_internal_force,
+)
 from wholearm.policy.make import SAME, find_widest, hold_end, make_policy
 from wholearm.policy.playback import Policy
 from wholearm.policy.range_margins import find_within, retime_within
@@ -56,7 +62,7 @@ def test_the_squeeze_has_the_largest_least_level() -> None:
     rng = np.random.default_rng(3)
     for _ in range(20):
         base, rates, press = rng.normal(size=(3, 8))
-        level, squeeze = choose_squeeze(base.tolist(), rates.tolist(), press.tolist(), 0.3)
+        level, squeeze = choose_internal_force(base.tolist(), rates.tolist(), press.tolist(), 0.3)
         values = base + 0.3 * rates
         assert level == pytest.approx((values + press * squeeze).min(), abs=1e-12)
         rows = np.column_stack([np.ones(8), -press])
@@ -142,7 +148,7 @@ def test_the_joints_show_an_impact() -> None:
     report = verify_policy(problem, plan, policy)
     assert report.ok, report.failures
     made = min(own.start for own in report.whole.stretches if own.contact == "v3-finger1")
-    assert made <= report.phases[1].start <= made + 1.01 * policy.pace.period
+    assert made <= report.phases[1].start <= made + 1.01 * policy.settings.period
 
 
 def test_without_a_reserve_it_is_as_fast_as_the_plan(
@@ -273,7 +279,7 @@ def test_no_policy_is_written_that_does_not_carry_out_its_plan(
     plan.save(tmp_path / "plan.npz")
     # Torques that let go where the second phase begins.
     first, last = policy.tables
-    weak = Policy([first, {**last, "torque": 0.2 * last["torque"]}], policy.pace)
+    weak = Policy([first, {**last, "torque": 0.2 * last["torque"]}], policy.settings)
     weak.about = policy.about
     monkeypatch.setattr("wholearm.policy.make.make_policy", lambda *_, **__: weak)
     output = tmp_path / "policy.npz"

@@ -7,7 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from wholearm.benchmark.precision.phases import Instance, list_instances
+from wholearm.benchmark.precision.phases import (
+    SHORT,
+    SOLVED,
+    Instance,
+    Median,
+    list_instances,
+    measure,
+)
 from wholearm.benchmark.precision.planners import (
     LEAST_TIME,
     NO_DRAG,
@@ -16,11 +23,9 @@ from wholearm.benchmark.precision.planners import (
     is_installed,
     run_planner,
 )
+from wholearm.benchmark.precision.precision_study import Medians, PeerComparison, find_times
 from wholearm.benchmark.precision.reference import Course, measure_error
-from wholearm.benchmark.precision.reference_check import check_plan
-from wholearm.benchmark.precision.runs import SHORT, SOLVED, Median, measure
-from wholearm.benchmark.precision.simulators import FEW, SIMULATORS, make_course
-from wholearm.benchmark.precision.tables import Medians, PeerComparison, find_times
+from wholearm.benchmark.precision.simulators import FEW, SIMULATORS, check_plan, make_course
 from wholearm.cli.command import main
 from wholearm.results.torque import TorqueProfile
 

@@ -21,13 +21,13 @@ from wholearm.quasistatic.prediction import Prediction, Survival
 from wholearm.quasistatic.slow_speeds import (
     OWN,
     Least,
-    Pace,
-    Road,
+    PathSamples,
+    UnitProfile,
     find_break,
     find_torques,
-    make_road,
     make_torques,
     predict,
+    sample_path,
 )
 from wholearm.results.torque import TorqueProfile
 from wholearm.simulation.events import EventKind, Simulation
@@ -49,18 +49,18 @@ def predicted() -> Prediction:
 
 
 @cache
-def road_of(path: Path, index: int = 0) -> Road:
+def road_of(path: Path, index: int = 0) -> PathSamples:
     problem = problem_of(path)
-    z, roads = problem.start, list[Road]()
+    z, roads = problem.start, list[PathSamples]()
     for phase in problem.phases[: index + 1]:
-        road = make_road(phase, z, problem.phases[phase.index + 1 :])
+        road = sample_path(phase, z, problem.phases[phase.index + 1 :])
         assert road is not None
         roads.append(road)
         z = road.z[-1]
     return roads[-1]
 
 
-def find_least_by_lp(road: Road, row: int, a: float, b: float) -> float:
+def find_least_by_lp(road: PathSamples, row: int, a: float, b: float) -> float:
     """The largest epsilon at one place, by a linear programme in forces and torques."""
     formation, scene = road.phase.formation, road.phase.formation.scene
     G = force_rows(formation, road.kinematics, road.directions)[row]
@@ -86,14 +86,16 @@ def test_the_best_squeeze_is_that_of_a_linear_programme(path: Path, index: int) 
     road, random = road_of(path, index), np.random.default_rng(7)
     a, b = random.normal(0.0, 3.0, len(road.s)), random.uniform(0.0, 0.3, len(road.s))
     a[::3] = b[::3] = 0.0
-    grasp = road.squeezing.find_best(a, b)
+    grasp = road.force_limits.find_best(a, b)
     rows = np.linspace(1, len(road.s) - 2, 12).astype(int)
     expected = [find_least_by_lp(road, k, a[k], b[k]) for k in rows.tolist()]
     assert grasp.least[rows] == pytest.approx(expected, rel=1e-6, abs=1e-7)
     known = np.isfinite(grasp.least)
-    low, high = road.squeezing.find_span(a, b, grasp.least - 1e-3)
-    assert (low[known] <= grasp.squeeze[known]).all() and (grasp.squeeze <= high)[known].all()
-    low, high = road.squeezing.find_span(a, b, grasp.least + 1e-3)
+    low, high = road.force_limits.find_span(a, b, grasp.least - 1e-3)
+    assert (low[known] <= grasp.internal_force[known]).all() and (grasp.internal_force <= high)[
+        known
+    ].all()
+    low, high = road.force_limits.find_span(a, b, grasp.least + 1e-3)
     assert (low > high)[known].all()
 
 
@@ -107,14 +109,14 @@ def test_forces_under_torques_are_those_of_inverse_dynamics() -> None:
 
 def test_quasistatic_torques_balance_and_are_the_least() -> None:
     road, still = road_of(HEPTAGON), np.zeros(len(road_of(HEPTAGON).s))
-    most = road.squeezing.find_best(still, still).least.min()
+    most = road.force_limits.find_best(still, still).least.min()
     for share in (0.0, 0.5, 1.0):
         torques = find_torques(road, 0.05, share)
         assert torques is not None
         wanted = 0.05 + share * (most - 0.05)
         assert (torques.c_n.min(axis=1) >= wanted - 1e-9).all()
         assert torques.c_n == pytest.approx(road.press_under(torques.tau, 0.0), abs=1e-9)
-        low, high = road.squeezing.find_span(still, still, wanted)
+        low, high = road.force_limits.find_span(still, still, wanted)
         for part in (0.1, 0.9):
             other = road.forces.tau(still, still, low + part * (high - low))
             assert ((other**2).sum(axis=1) >= (torques.tau**2).sum(axis=1) - 1e-9).all()
@@ -123,9 +125,9 @@ def test_quasistatic_torques_balance_and_are_the_least() -> None:
 def replay(speed: float) -> Simulation:
     """The first phase from rest to rest with the best squeeze."""
     road = road_of(HEPTAGON)
-    pace = Pace.between(road, (True, True))
+    pace = UnitProfile.between(road, (True, True))
     a, b = speed**2 * pace.a, speed**2 * pace.b
-    tau = road.forces.tau(a, b, road.squeezing.find_best(a, b).squeeze)
+    tau = road.forces.tau(a, b, road.force_limits.find_best(a, b).internal_force)
     t = pace.way / speed * np.arccos(1 - 2 * road.s / road.length) / np.pi
     return simulate(first_phase(), TorqueProfile.join_rows(t, tau))
 
@@ -153,7 +155,7 @@ def test_the_replay_holds_below_the_predicted_speed_and_not_above() -> None:
 def test_the_straight_line_keeps_its_contacts_and_newtons_laws() -> None:
     table = {"contacts": ["v1-palm", "v2-finger1", "v5-finger2"], "until": {"phi_deg": -5.0}}
     problem = problem_of(HEPTAGON).with_({"phases": [table]})
-    road = make_road(problem.phases[0], problem.start, ())
+    road = sample_path(problem.phases[0], problem.start, ())
     assert road is not None and road.curve is None
     formation, scene = road.phase.formation, problem.scene
     assert np.abs(road.kinematics.C).max() < 1e-12

@@ -21,8 +21,8 @@ from wholearm.planning.lower_bound.lower_bound import look_along
 from wholearm.planning.lower_bound.speed_sweep import NoMotionError
 from wholearm.problem.definition import End, Until
 from wholearm.problem.goal import Goal
-from wholearm.search.border_limits import sketch, survey
-from wholearm.search.cell_paths import can_set_out, time_ways
+from wholearm.search.border_limits import estimate_duration, find_border_limits
+from wholearm.search.cell_paths import can_start, time_paths
 from wholearm.search.edges import Link, cut_curve, time_parts
 from wholearm.search.goals import is_at
 from wholearm.search.places import RoadmapPlace, list_formations_at, make_place, unit_steps
@@ -48,7 +48,7 @@ def test_rays_stay_in_a_cell_of_the_place_until_a_contact_is_gained() -> None:
         assert tuple(table[k] for k in label) in cells
         assert table[gained] not in own.contacts
     parts = np.arange(1, PARTS + 1) / PARTS
-    poses = rays.starts[:, None] + parts[:, None] * rays.ways[:, None]
+    poses = rays.starts[:, None] + parts[:, None] * rays.runs[:, None]
     labels = label_cells(scene, *poses.reshape(-1, 2).T)[:, [0, 2, 4]]
     assert (labels.reshape(len(poses), -1, 3) == rays.labels[:, None]).all()
 
@@ -58,8 +58,8 @@ def test_rays_end_right_before_what_they_gain_touches() -> None:
     scene = own.scene
     before = measure_gap(scene, rays.gained, place(scene, rays.labels, rays.ends))
     assert (before > 0).all()
-    lengths = np.linalg.norm(rays.ways / unit_steps(scene), axis=1)[:, None]
-    ends = rays.ends + BESIDE * rays.ways / lengths
+    lengths = np.linalg.norm(rays.runs / unit_steps(scene), axis=1)[:, None]
+    ends = rays.ends + BESIDE * rays.runs / lengths
     assert (measure_gap(scene, rays.gained, place(scene, rays.labels, ends)) < 0).all()
 
 
@@ -67,22 +67,22 @@ def test_no_way_is_faster_with_more_to_press() -> None:
     own, rays = around_the_start()
     epsilon = problem_of(SQUARE).epsilon
     times, harder = (
-        time_ways(own.scene, least, rays.labels, rays.starts, rays.ends)
+        time_paths(own.scene, least, rays.labels, rays.starts, rays.ends)
         for least in (epsilon, 4 * epsilon)
     )
     assert np.isfinite(times).any() and (harder >= times * (1 - 1e-12)).all()
-    one = time_ways(own.scene, epsilon, rays.labels[:1], rays.starts[:1], rays.ends[:1])
+    one = time_paths(own.scene, epsilon, rays.labels[:1], rays.starts[:1], rays.ends[:1])
     assert one[0] == pytest.approx(times[0], rel=1e-9)
 
 
 def test_only_ways_that_can_be_set_out_on_have_times() -> None:
     own, rays = around_the_start()
     epsilon = problem_of(SQUARE).epsilon
-    times = time_ways(own.scene, epsilon, rays.labels, rays.starts, rays.ends)
-    assert can_set_out(own.scene, epsilon, rays.labels, rays.starts, rays.ways).all()
+    times = time_paths(own.scene, epsilon, rays.labels, rays.starts, rays.ends)
+    assert can_start(own.scene, epsilon, rays.labels, rays.starts, rays.runs).all()
     assert np.isfinite(times).any()
-    assert not can_set_out(own.scene, 1e3, rays.labels, rays.starts, rays.ways).any()
-    assert np.isinf(time_ways(own.scene, 1e3, rays.labels, rays.starts, rays.ends)).all()
+    assert not can_start(own.scene, 1e3, rays.labels, rays.starts, rays.runs).any()
+    assert np.isinf(time_paths(own.scene, 1e3, rays.labels, rays.starts, rays.ends)).all()
 
 
 def look(curve: Curve, epsilon: float) -> float:
@@ -170,8 +170,8 @@ def test_parts_of_a_border_take_as_long_together_as_one_by_one() -> None:
         times = time_parts(border, shares)
         for share, took in zip(shares, times, strict=True):
             part = cut_curve(border.curve, share * border.curve.length)
-            ground = survey(part, *chart.terms)
-            alone = ground.closed or ground.begins or ground.ends or sketch([ground])
+            limits = find_border_limits(part, *chart.terms)
+            alone = limits.closed or limits.begins or limits.ends or estimate_duration([limits])
             assert np.isfinite(took) == (not isinstance(alone, str))
             assert isinstance(alone, str) or took == pytest.approx(alone, rel=0.02)
 

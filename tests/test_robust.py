@@ -17,8 +17,8 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions, build_forward, inverse
 from wholearm.mechanics.metric import metric_weights
 from wholearm.mechanics.wedging import find_static_torques
+from wholearm.planning.lower_bound.rows import directions_of
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.path_domain.path_motion import directions_of
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.path_domain.range_factor import find_widest
 from wholearm.planning.phase_plan import PhasePlan

@@ -26,13 +26,13 @@ from wholearm.problem.definition import Problem
 from wholearm.problem.read import read_problem
 from wholearm.problem.uncertainty import NAMES, PARAMETERS
 from wholearm.results.torque import TorqueProfile
-from wholearm.robustness.cluster import connect
 from wholearm.robustness.error_model import Uncertainty, change_problem, change_torques
 from wholearm.robustness.sample_run import TimeWindow, Trial, make_trial
 from wholearm.robustness.sampling import (
     Robustness,
     Z,
     assess_robustness,
+    connect,
     count_share,
     measure_sensitivities,
 )

@@ -28,7 +28,7 @@ from wholearm.problem.goal import Goal
 from wholearm.problem.read import build_problem
 from wholearm.search.astar import RoadmapRoute, RouteSearch
 from wholearm.search.bounds import bound_borders
-from wholearm.search.cuts import Opening, list_cut, list_gates, list_openings, look_through
+from wholearm.search.cuts import Opening, link_changed, list_cut, list_cut_borders, list_openings
 from wholearm.search.edges import Link
 from wholearm.search.find_route import (
     choose_opening,
@@ -36,10 +36,10 @@ from wholearm.search.find_route import (
     find_hand,
     find_opening,
     find_route,
-    load_chart,
+    load_roadmap,
     require_folder,
     require_reach,
-    store_chart,
+    store_roadmap,
 )
 from wholearm.search.places import list_formations_at, make_place
 from wholearm.search.result import describe_block
@@ -139,9 +139,9 @@ def test_charts_are_kept_in_files(tmp_path: Path) -> None:
     _, route = to_edge_6()
     folder = tmp_path / "new"
     require_folder(folder)
-    store_chart(folder, "one", chart())
-    known = load_chart(folder, "one")
-    assert known is not None and load_chart(folder, "other") is None
+    store_roadmap(folder, "one", chart())
+    known = load_roadmap(folder, "one")
+    assert known is not None and load_roadmap(folder, "other") is None
     problem = problem_of(HEPTAGON)
     own = RouteSearch(known, make_place(problem.scene, problem.start), Goal(flush=6))
     again = next(own.run())
@@ -150,7 +150,7 @@ def test_charts_are_kept_in_files(tmp_path: Path) -> None:
     written = file.read_bytes()
     for damaged in (b"", written[:-1], written[:40] + b"x" + written[41:]):
         file.write_bytes(damaged)
-        assert load_chart(folder, "one") is None
+        assert load_roadmap(folder, "one") is None
     with pytest.raises(InputError, match="--cache"):
         require_folder(file)
 
@@ -207,7 +207,7 @@ def test_route_prints_phases_that_load(tmp_path: Path, capsys: pytest.CaptureFix
     assert phase["until"] == load_plan(plan).problem.table["phases"][0]["until"]
     assert f"wrote {plan}" in capsys.readouterr().out
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("wholearm.search.find_route.store_chart", fail)
+        patch.setattr("wholearm.search.find_route.store_roadmap", fail)
         assert main(["route", str(path), "--cache", str(found)]) == 0
     said = capsys.readouterr()
     assert tomllib.loads(said.out)["phases"] == [phase]
@@ -263,13 +263,13 @@ def test_what_is_advised_opens_the_way() -> None:
     assert not list(own.run())
     # All that leads on from what is reached is in the cut, and nothing that ends where it was.
     assert all(blocked.stop.key not in own.reached for blocked in list_cut(own))
-    gates = list_gates(own)
-    assert [gate.blocked for gate in gates] == list_cut(own)
-    for opening in list_openings(gates):
-        for gate, value in zip(gates, opening.values, strict=True):
+    cuts = list_cut_borders(own)
+    assert [cut.blocked for cut in cuts] == list_cut(own)
+    for opening in list_openings(cuts):
+        for cut, value in zip(cuts, opening.values, strict=True):
             if not math.isnan(value):
                 change = Change(opening.parameter, value)
-                assert isinstance(look_through(gate, change), Link)
+                assert isinstance(link_changed(cut, change), Link)
     text, (change,) = find_opening(own, rough, PlanOptions(), 0.0, lambda _: None)
     assert change.parameter.key == "friction.palm" and change.value < 1.5
     assert text.startswith(f"with {change} the goal is reached, in about ")

@@ -21,7 +21,7 @@ from wholearm.planning.replay_check import (
     replay_plan,
 )
 from wholearm.problem.definition import Problem
-from wholearm.results.replay_figures import ReplayFigures
+from wholearm.results.plan_record import ReplayFigures
 from wholearm.results.report import Report
 from wholearm.results.trajectory import Trajectory
 from wholearm.verification.verdict import Allowance, find_least_force

@@ -97,13 +97,13 @@ def test_they_drive_on_towards_what_is_still_open() -> None:
         z = motion.z[np.flatnonzero(motion.phase == phase.index)[-1]]
         gained = Formation(problem.scene, (phase.until.contact,))
         normal = gained.evaluate(z[None], np.zeros((1, 5))).A[0][0]
-        first = find_rest(phase.formation, z).ways[0]
+        first = find_rest(phase.formation, z).sliding[0]
         assert isinstance(first, RestDirection)
         back = settling.gap / (normal @ first.heading) * first.heading
         z = close_contacts(phase.formation, z + back)
         gap = float(gained.evaluate(z[None], np.zeros((1, 5))).C[0, 0])
         assert gap == pytest.approx(settling.gap, rel=0.02)
-        tau, (one, two) = np.array(settling.tau), find_rest(phase.formation, z).ways
+        tau, (one, two) = np.array(settling.tau), find_rest(phase.formation, z).sliding
         assert isinstance(one, RestDirection) and isinstance(two, RestDirection)
         way = one if normal @ one.heading < 0 else two
         closing = -float(normal @ way.heading) * way.drive(tau)

@@ -175,9 +175,9 @@ def test_start_with_two_freedoms() -> None:
     rng = np.random.default_rng(3)
     moving = replace_phases(dataclasses.replace(problem, start=z), phase)
     rest, seen = find_rest(phase.formation, z), 0
-    assert len(rest.ways) == 2**5
+    assert len(rest.sliding) == 2**5
     # One more constraint at most leaves a freedom to move in.
-    assert len(rest.all_ways) == 2**5 + 5 * 2**4
+    assert len(rest.modes) == 2**5 + 5 * 2**4
     while seen < 3:
         tau = np.array([1.0, -1.0]) * rng.uniform(0.0, 2.0, size=2)
         change_of_state = rest.wait(tau[:, None], -1.0)
@@ -287,7 +287,7 @@ def test_a_link_that_is_free_may_graze_what_starts_to_move() -> None:
     rest = find_rest(problem.phases[0].formation, problem.start)
     assert rest.near.sum() == 1  # v3 on finger 1
     tau = np.array([-0.287, -0.98])
-    way = next(way for way in rest.ways if way.moves(tau))
+    way = next(way for way in rest.sliding if way.moves(tau))
     touch = make_formation(problem.scene, "v3-finger1")
     A = touch.evaluate(problem.start[None], np.zeros((1, 5))).A[0, 0]
     lever = A[3] / problem.scene.fingers[0].inertia

@@ -96,17 +96,17 @@ def test_ways_that_miss_a_limit_are_refused_with_it(key: str) -> None:
 def test_a_brisk_motion_keeps_half_the_margin_and_ends_at_rest() -> None:
     problem = tipping()
     best, *_ = list_ways(problem, problem.phases[0], problem.start, 1)
-    pace = best.pace
-    assert pace is not None and pace.t[0] == 0.0 and pace.s[-1] == pytest.approx(1.0)
-    assert (np.diff(pace.t) > 0).all() and (np.diff(pace.s) > 0).all()
-    speeds = np.diff(pace.s) / np.diff(pace.t)
+    profile = best.profile
+    assert profile is not None and profile.t[0] == 0.0 and profile.s[-1] == pytest.approx(1.0)
+    assert (np.diff(profile.t) > 0).all() and (np.diff(profile.s) > 0).all()
+    speeds = np.diff(profile.s) / np.diff(profile.t)
     assert speeds[[0, -1]].max() < speeds.max()
     # No faster than gravity and the torques allow; no slower than a few falls over its length.
     length = sum(part.length for part in best.stretches)
-    assert pace.forces.shape == (len(pace.t) - 1, problem.phases[0].formation.n_constraints)
+    assert profile.forces.shape == (len(profile.t) - 1, problem.phases[0].formation.n_constraints)
     least = problem.epsilon / problem.scene.scales.force
-    assert pace.forces[:, : problem.phases[0].formation.n_contacts].min() > least - 1e-9
-    assert 0.1 < pace.t[-1] / np.sqrt(length / problem.scene.gravity) < 20.0
+    assert profile.forces[:, : problem.phases[0].formation.n_contacts].min() > least - 1e-9
+    assert 0.1 < profile.t[-1] / np.sqrt(length / problem.scene.gravity) < 20.0
 
 
 def test_a_way_that_slides_while_it_tips_is_planned() -> None:

@@ -1,4 +1,4 @@
-"""Everything that the package answers, against answers that are stored.
+"""Regression corpus: answers of the package compared with stored ones.
 
 Two answers agree if kinds, verdicts and contact modes are the same and numbers are within
 `TOLERANCES`. A better value of the objective is no difference, whatever else it changes.
@@ -24,16 +24,13 @@ TOLERANCES = {"value": 1e-6, "amount": 1e-2, "advice": 5e-2, "numbers": 1e-3, "l
 An amount is the shortfall of a motion that solves another problem, advice a bisection. Numbers of a
 report have four digits, and a least force is one at an instant.
 """
-USUAL = 1e-4
-"""For all others: the accuracy that plans are made with."""
+USUAL = 1e-4  # for all others: the accuracy that plans are made with
 LOCAL = ("plan over time", "goal", "scene", "leg")
 """Families whose optimum need not be the only one: values agree within `USUAL`."""
-SAMPLES = 1
-"""How many samples may end otherwise, of those at the edge of what a plan bears."""
+SAMPLES = 1  # how many samples may end otherwise, of those at the edge of what a plan bears
 WORDS = ("words", "text", "advice", "help", "reason")
 """Entries that do not count as an answer: words, and advice, which ends by processor time."""
-COUNTED = ("goals", "kept")
-"""Entries that count samples."""
+COUNTED = ("goals", "kept")  # entries that count samples
 
 
 class Corpus(Study):

@@ -1,4 +1,4 @@
-"""What the corpus asks of the package, and the answers as plain values.
+"""Cases of the corpus, and their answers as plain values.
 
 A case names a family and what that is asked with. Families call the public functions alone.
 """
@@ -23,7 +23,8 @@ import numpy as np
 import wholearm
 from wholearm import Plan, Problem
 
-from ..search.find_route import forget_charts
+from ..search.find_route import forget_roadmaps
+from ..verification.verdict import find_least_force
 from .kernels import list_modes
 from .queries import draw_leg, draw_query
 from .stress.damage import BASE, to_toml
@@ -86,8 +87,7 @@ PINNED = 40
 SEED = 0
 ROUTE = ((0.045, -2.0), (-0.0637, -2.0), (-0.0505, -23.4), (0.0078, -50.0))
 """Of `list_formations`: x [m] and phi [degrees]."""
-MOMENT = 1e-3
-"""Time before the end of a phase in which contacts may bounce [s]."""
+MOMENT = 1e-3  # time before the end of a phase in which contacts may bounce [s]
 NUMBER = re.compile(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
 
 
@@ -148,7 +148,7 @@ def _refuse(error: Exception) -> Row:
         row["short"] = [own.part for own in short[:1]] + [short[0].kind, short[0].place.phase]
         row["amount"] = short[0].amount
     changes = getattr(error, "changes", ())
-    row["advice"] = {own.parameter.key: own.value for own in changes}
+    row["advice"] = {change.parameter.key: change.value for change in changes}
     return row
 
 
@@ -157,7 +157,7 @@ def _describe_plan(plan: Plan) -> Row:
         "status": plan.status.value,
         "objective": plan.options.goal.value,
         "value": plan.value,
-        "durations": [own.duration for own in plan.phases],
+        "durations": [phase.duration for phase in plan.phases],
         "modes": list_modes(plan),
         "impacts": len(plan.transitions),
     }
@@ -174,11 +174,7 @@ def _describe_plan(plan: Plan) -> Row:
 def _verify(problem: Problem, what: Any) -> Row:
     """The verdict about a plan or torques, and what the replay shows."""
     report = wholearm.verify(problem, what)
-    known = [
-        min((own for own in phase.contacts if own.least == own.least), key=lambda own: own.least)
-        for phase in report.phases
-        if any(own.least == own.least for own in phase.contacts)
-    ]
+    known = filter(None, map(find_least_force, report.phases))
     energy = report.energy
     return {
         "ok": report.ok,
@@ -187,7 +183,7 @@ def _verify(problem: Problem, what: Any) -> Row:
         "failures": [mask(text) for text in report.failures],
         "arrivals": [own.arrival for own in report.phases],
         "least": [own.least for own in known],
-        "events": [own.time for own in report.changes],
+        "events": [change.time for change in report.changes],
         "kinds": [f"{own.phase} {own.what} {own.kind}" for own in report.changes],
         "energy": [energy.work, energy.kinetic, energy.potential, energy.dry, energy.contact],
         "help": mask(json.dumps(report.to_dict().get("help"))) if not report.ok else "",
@@ -224,7 +220,7 @@ def _reach(folder: Path, number: int) -> Row:
         free = {"flush": flush} if number % 4 else {"phi_deg": np.degrees(edge) + 10.0}
         problem = problem.with_({"goal": free})
     # What is known of a scene from other goals may lead to another route.
-    forget_charts()
+    forget_roadmaps()
     try:
         found = wholearm.find_route(problem)
     except wholearm.WholearmError as error:
@@ -291,10 +287,10 @@ def _follow(folder: Path, name: str, share: float) -> Row:
         path.write_text(rows[0] + text, encoding="utf-8")
         torque = wholearm.read_torque_csv(str(path))
     report = wholearm.verify_free(problem, torque)
-    lost = [(own.number, loss) for own in report.phases for loss in own.losses]
+    lost = [(phase.number, loss) for phase in report.phases for loss in phase.losses]
     # Once contacts bounce, and beyond the first loss, what rounding does grows from event to event.
     end = min([report.phases[0].stop, *(loss.time for _, loss in lost)]) - MOMENT
-    events = [own for own in report.whole.events if own.time < end]
+    events = [event for event in report.whole.events if event.time < end]
     free = {
         "ok": report.ok,
         "lost": [f"{number} {loss.contact}" for number, loss in lost[:1]],
@@ -311,32 +307,29 @@ def _follow(folder: Path, name: str, share: float) -> Row:
 
 
 def _tune(folder: Path, name: str) -> Row:
-    found = wholearm.tune(_load(folder, name), brake=True, stops=TUNED[name][1])
+    tuning = wholearm.tune(_load(folder, name), brake=True, stops=TUNED[name][1])
     return {
-        "ok": found.ok,
-        "reason": mask(found.reason),
-        "raised": [[own.raised, own.braked, own.supported] for own in found.phases],
-        "acting": [own.acting for own in found.phases],
-        "durations": [own.duration for own in found.phases],
-        "least": [own.least for own in found.phases],
-        "simulations": found.simulations,
+        "ok": tuning.ok,
+        "reason": mask(tuning.reason),
+        "raised": [[phase.raised, phase.braked, phase.supported] for phase in tuning.phases],
+        "simulations": tuning.simulations,
+        **_collect(tuning.phases, acting="acting", durations="duration", least="least"),
     }
 
 
 def _predict(folder: Path, name: str) -> Row:
-    phases = []
-    for own in wholearm.predict(_load(folder, name)).phases:
-        phases.append(
-            {
-                "path": own.path,
-                "length": own.length,
-                "kept": own.is_kept,
-                "first": "" if own.slow is None else own.slow.name,
-                "least": None if own.slow is None else own.slow.force,
-                "speeds": [one.speed for one in own.survivals],
-                "breaks": [f"{one.motion}: {one.first.name}" for one in own.survivals],
-            }
-        )
+    phases = [
+        {
+            "path": own.path,
+            "length": own.length,
+            "kept": own.is_kept,
+            "first": "" if own.slow is None else own.slow.name,
+            "least": None if own.slow is None else own.slow.force,
+            "speeds": [one.speed for one in own.survivals],
+            "breaks": [f"{one.motion}: {one.first.name}" for one in own.survivals],
+        }
+        for own in wholearm.predict(_load(folder, name)).phases
+    ]
     return {"phases": phases}
 
 
@@ -354,7 +347,7 @@ def _control(folder: Path, name: str) -> Row:
         "durations": [own["duration"] for own in policy.about["phases"]],
         "shares": [own["share"] for own in policy.about["phases"]],
         "ok": report.ok,
-        "reached": [own.number for own in report.phases if own.reached],
+        "reached": [phase.number for phase in report.phases if phase.reached],
         "stops": [own.stop for own in report.phases],
         "lost": [f"{own.number} {loss.contact}" for own in report.phases for loss in own.losses],
     }
@@ -378,18 +371,25 @@ def _compare(folder: Path, name: str) -> Row:
     with tempfile.TemporaryDirectory() as place:
         path = str(Path(place, "plan.npz"))
         wholearm.solve(problem).save(path)
-        found = wholearm.compare(problem, [path, str(folder / "torques" / TUNED[name][0])])
-    own = found.contenders
-    return {
-        "ok": [one.ok for one in own],
-        "contacts": [f"{one.contact} in phase {one.phase}" for one in own],
-        "durations": [one.duration for one in own],
-        "efforts": [one.effort for one in own],
-        "margins": [one.margin for one in own],
-        "losses": [one.lost for one in own],
-        "peaks": [list(one.peaks) for one in own],
-        "simulations": [one.simulations for one in own],
-    }
+        comparison = wholearm.compare(problem, [path, str(folder / "torques" / TUNED[name][0])])
+    numbers = _collect(
+        comparison.contenders,
+        ok="ok",
+        durations="duration",
+        efforts="effort",
+        margins="margin",
+        losses="lost",
+        peaks="peaks",
+        simulations="simulations",
+    )
+    contacts = [f"{own.contact} in phase {own.phase}" for own in comparison.contenders]
+    return numbers | {"contacts": contacts}
+
+
+def _collect(items: Iterable[Any], **names: str) -> Row:
+    """Lists of attributes of the items, by key."""
+    items = list(items)
+    return {key: [getattr(item, name) for item in items] for key, name in names.items()}
 
 
 def _report(folder: Path, name: str) -> Row:
@@ -410,10 +410,10 @@ def _report(folder: Path, name: str) -> Row:
 
 def _draw_map(folder: Path, name: str) -> Row:
     chart = wholearm.build_map(_load(folder, name))
-    points = np.array([own.point for own in chart.crossings])
+    points = np.array([crossing.point for crossing in chart.crossings])
     return {
         "formations": _count(chart.formations),
-        "borders": _count(own.contacts for own in chart.borders),
+        "borders": _count(border.contacts for border in chart.borders),
         "crossings": _count(own.contacts for own in chart.crossings),
         "x": np.sort(points[:, 0]).tolist(),
         "phi": np.sort(points[:, 1]).tolist(),
@@ -425,7 +425,7 @@ def _draw_map(folder: Path, name: str) -> Row:
 
 def _count(formations: Iterable[Iterable[object]]) -> list[Any]:
     """How many formations there are, and a digest of their names."""
-    names = sorted(" ".join(map(str, own)) for own in formations)
+    names = sorted(" ".join(map(str, formation)) for formation in formations)
     return [len(names), f"{crc32(' '.join(names).encode()):08x}"]
 
 
@@ -444,7 +444,7 @@ def _list(folder: Path, number: int) -> Row:
         return {"refused": "no route"}
     return {
         "route": [" ".join(own["contacts"]) for own in _phases(leg.problem)],
-        "places": [list(own) for own in leg.stops],
+        "places": [list(stop) for stop in leg.stops],
     }
 
 

@@ -35,10 +35,8 @@ WORK = {
     "vertices": ("reading", "map"),
 }
 """Kinds of work that are measured for each."""
-RADIUS = 0.05
-"""Radius of the regular polygons [m]."""
-TURNS = (0.04, 0.045)
-"""Places between which the phases go back and forth [m]."""
+RADIUS = 0.05  # radius of the regular polygons [m]
+TURNS = (0.04, 0.045)  # places between which the phases go back and forth [m]
 FIELDS = {"seconds": "processor time [s]", "memory": "rise of memory [MB]"}
 """Quantities that are drawn, and their labels."""
 _LOOKS = {

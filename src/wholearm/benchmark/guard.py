@@ -1,4 +1,4 @@
-"""Guarding against growth: counts of each problem's plan that no clock has a part in.
+"""Regression of costs: sizes, iterations and evaluations of each plan against stored counts.
 
 Sizes of the first NLP of every block of phases are the same on every machine. Iterations of the
 solver, evaluations in the replay and panels of the traced curves depend on rounding: they may grow

@@ -35,8 +35,7 @@ from ..scene.model import Finger, Friction, Scene
 from ..scene.polygon import Polygon
 from .study import Case, Row, Study
 
-LARGEST = 4
-"""Largest change of a number, in units of 2^-52 of it."""
+LARGEST = 4  # largest change of a number, in units of 2^-52 of it
 
 
 def perturb_scenes(seed: int) -> None:
@@ -164,12 +163,12 @@ def answer(path: str, objective: str) -> dict[str, Any]:
 
 def list_modes(plan: Plan) -> list[list[str]]:
     """Contact modes and directions of the joints that follow each other in every phase."""
-    found = []
+    modes = []
     for phase in plan.phases:
         spans = [s for s in phase.modes if s.stop - s.start > BRIEF * phase.duration]
         texts = (f"{' '.join(s.contacts.values())} {' '.join(s.joints)}" for s in spans)
-        found.append([text for text, _ in groupby(texts)])
-    return found
+        modes.append([text for text, _ in groupby(texts)])
+    return modes
 
 
 class Kernels(Study):

@@ -22,8 +22,7 @@ MEMORY = 6 * 2**30
 
 PATIENCE = 20.0
 """Wall-clock time that a task may take over its bound of processor time: others may run too."""
-_CPU = getattr(signal, "SIGPROF", 27)
-"""Signal that ends a process whose processor time is used up."""
+_CPU = getattr(signal, "SIGPROF", 27)  # signal that ends a process whose processor time is used up
 
 Limit = Callable[[Any], float]
 """Processor time that a task may take [s]."""
@@ -166,7 +165,9 @@ def _serve(pipe: Connection, run: Callable[[Any], Any], limit: Limit, strict: bo
                 task = pipe.recv()
             except (EOFError, OSError):
                 return
-            _limit_time(limit(task))
+            if hasattr(signal, "setitimer"):
+                # A limit of the whole process would drift; this one idles between tasks.
+                signal.setitimer(signal.ITIMER_PROF, limit(task))
             before, begun = find_peak(), time.process_time()
             try:
                 outcome = "done", run(task)
@@ -197,15 +198,6 @@ def find_peak() -> float:
     # Where there is `/proc`, the other figure starts from that of the parent.
     (peak,) = (line.split()[1] for line in lines if line.startswith("VmHWM:"))
     return int(peak) * 1024 / 1e6
-
-
-def _limit_time(bound: float) -> None:
-    """Let the process end when it has used up its time from now on; between tasks it idles.
-
-    A limit of the whole process would drift: it is counted in other ticks than can be read.
-    """
-    if hasattr(signal, "setitimer"):
-        signal.setitimer(signal.ITIMER_PROF, bound)
 
 
 def _limit_memory() -> None:

@@ -25,24 +25,18 @@ from ..mapping.formation_list import format_route, list_formations
 from ..problem.definition import Problem
 from ..problem.goal import Goal
 from ..problem.read import build_problem, place_start, read_problem
-from ..search.find_route import find_route, forget_charts
+from ..search.find_route import find_route, forget_roadmaps
 from ..verification.verify import verify
 from .stress.scenes import Table
 from .study import Case, Row, Study
 
 SHIPPED = ("heptagon", "hexagon", "square", "triangle")
-POLYGONS = 5
-"""Random polygons, in the hexagon's hand."""
-RADIUS = 0.05
-"""Of the circle that their vertices are near [m]."""
-ACROSS = 3.0
-"""Largest x of a start or a goal, over the radius of gyration."""
-SECOND = 0.1
-"""How far the second query starts from the first one, over the radius of gyration."""
-TRIES = 200
-"""Most routes that are drawn for one leg."""
-SLIDE = (0.1, 2.5)
-"""Least and longest slide of a leg, over the radius of gyration."""
+POLYGONS = 5  # random polygons, in the hexagon's hand
+RADIUS = 0.05  # of the circle that their vertices are near [m]
+ACROSS = 3.0  # largest x of a start or a goal, over the radius of gyration
+SECOND = 0.1  # how far the second query starts from the first one, over the radius of gyration
+TRIES = 200  # most routes that are drawn for one leg
+SLIDE = (0.1, 2.5)  # least and longest slide of a leg, over the radius of gyration
 CELL = ((-0.6, 1.0), (0.05, 0.5))
 """What one cell adds to x, over the radius of gyration, and takes from phi [rad]."""
 
@@ -71,16 +65,16 @@ class Queries(Study):
     def run(self, case: Case) -> Row:
         """Ask a query, and a second one."""
         problem = draw_query(case[0], case[1], Path(case[2]))
-        forget_charts()
+        forget_roadmaps()
         row: Row = {"text": f"{problem.name}: {problem.table['start']} to {problem.goals[0]}"}
         started = time.process_time()
         try:
-            found = find_route(problem)
+            answer = find_route(problem)
         except WholearmError as error:
             kind = "blocked" if isinstance(error, InfeasibleError) else "no answer"
             return row | {"kind": kind, "first": time.process_time() - started, "why": str(error)}
         row["first"] = time.process_time() - started
-        failures = verify(found.problem, found.plan).failures
+        failures = verify(answer.problem, answer.plan).failures
         if failures:
             return row | {"kind": "plan that fails", "findings": list(failures[:1])}
         started = time.process_time()
@@ -89,8 +83,8 @@ class Queries(Study):
             row["second"] = time.process_time() - started
         except WholearmError:
             pass
-        phases, duration = len(found.problem.phases), found.plan.duration
-        return row | {"kind": "solved", "gap": found.gap, "duration": duration, "phases": phases}
+        phases, duration = len(answer.problem.phases), answer.plan.duration
+        return row | {"kind": "solved", "gap": answer.gap, "duration": duration, "phases": phases}
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
         """What came of them, and the times."""
@@ -100,7 +94,7 @@ class Queries(Study):
         lines += ["| processor time | median [s] | 95 % [s] | most [s] |", "|---|---|---|---|"]
         for name, times in (
             ("all", [row["first"] for row in rows]),
-            *((own, [row["first"] for row in rows if row["kind"] == own]) for own in kinds),
+            *((kind, [row["first"] for row in rows if row["kind"] == kind]) for kind in kinds),
             ("second query", [row["second"] for row in rows if "second" in row]),
         ):
             if times:
@@ -209,5 +203,5 @@ def draw_leg(seed: int, number: int, folder: Path) -> QueryLeg | None:
 
 def _leave_open(problem: Problem) -> Problem:
     """The problem with ends that the planner chooses: what a refusal says holds for all places."""
-    phases = (replace(own, until=replace(own.until, pins=())) for own in problem.phases)
+    phases = (replace(phase, until=replace(phase.until, pins=())) for phase in problem.phases)
     return replace(problem, phases=tuple(phases))

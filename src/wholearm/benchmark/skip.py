@@ -1,4 +1,4 @@
-"""What each part of the model costs: the same phases with it and without it.
+"""Cost of each part of the model: the same phases with it and without it.
 
 A part that a scene does not have adds no unknowns and no rows, and its code is not run.
 """
@@ -24,10 +24,8 @@ from ..problem.read import build_problem
 from ..solvers.ipopt import record_runs
 from .study import Case, Row, Study
 
-REPEATS = 3
-"""Runs of which the medians are taken."""
-PUSHED = 0.03
-"""Place that the object is pushed to by one finger or by both [m]."""
+REPEATS = 3  # runs of which the medians are taken
+PUSHED = 0.03  # place that the object is pushed to by one finger or by both [m]
 AWAY = np.array([0.0, 0.0, 0.0, 0.0, 0.6])
 """Change of the start that turns an idle finger away [m, rad]."""
 COLUMNS = ("unknowns", "rows", "building", "solving")

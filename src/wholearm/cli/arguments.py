@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from typing import NoReturn
 
 from ..common.command_options import read_options
 from ..common.errors import InputError
-from ..common.fields import Range
 from ..mechanics.margin_key import MARGIN
 from ..planning.options import PLANNER
 from .help import TOPICS
 
-SIMULATORS = ("told", "free")
-"""What `plot --simulate` takes; the first one if it is left out."""
+SIMULATORS = ("told", "free")  # what `plot --simulate` takes; the first one if it is left out
 
 
 class Parser(argparse.ArgumentParser):
@@ -27,15 +25,6 @@ class Parser(argparse.ArgumentParser):
         """Refuse the command line."""
         text = message.removeprefix("argument ")
         raise InputError("", "", f"{text}; see {self.prog} --help")
-
-
-def number(low: float, high: float) -> Callable[[str], float]:
-    """What reads an option that is a number from `low` to `high`, a whole one if `low` is."""
-    return Range(low, high).parse
-
-
-JOBS = number(1, 256)
-"""Processes."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +112,7 @@ trajectory         trajectory file (.npz), or torques to replay (.csv)
     among told|free
 --width            of the figure [in], 3 to 40 (10) in 3.0..40
 --motion           also draw the object's pose, and the joints' angles and speeds
-[[predict]]  predict:predict  see up to which speed slow motions keep every contact
+[[predict]]  analysis:predict  see up to which speed slow motions keep every contact
 {PROBLEM}\
 -o --output FILE  figure to write (.png, .pdf, .svg) of the least normal force over speed
 {SQUEEZE}\
@@ -131,7 +120,7 @@ trajectory         trajectory file (.npz), or torques to replay (.csv)
 --speed V         mean speed along the phases for these [m/s], over which they are spread in time
     (0.05) in 1e-9..1e6
 {JSON}\
-[[tune]]  tune:tune  tune torques from quasistatic ones by steps of 10 percent
+[[tune]]  analysis:tune  tune torques from quasistatic ones by steps of 10 percent
 {PROBLEM}\
 -o --output FILE  torques to write (.csv)
 --brake           let each phase have one more step of its torques, which stops it at its end
@@ -141,7 +130,7 @@ trajectory         trajectory file (.npz), or torques to replay (.csv)
 --share           raises beyond the first that reaches the end: 0 none, 1 all that keep contacts
     = 1 in 0.0..1.0
 {JSON}\
-[[compare]]  compare:compare  put plans and torques for a problem side by side
+[[compare]]  analysis:compare  put plans and torques for a problem side by side
 {PROBLEM}\
 files FILE ...    trajectory files (.npz) or torques (.csv) for that problem
 -o --output FILE  figure to write (.png, .pdf, .svg) of the force margins of all
@@ -191,7 +180,7 @@ problem           problem file (TOML) with [goal] in place of [[phases]]
     (1e-3) in 1e-9..1e3
 --write-anyway    write the policy although its simulation does not hold, marked so in its file
 {JSON}\
-[[robustness]]  robustness:robustness  see how much error a plan bears
+[[robustness]]  analysis:robustness  see how much error a plan bears
 {PROBLEM}{PLAN}\
 --samples             samples to replay, a Latin hypercube of all ranges = 1000 in 1..1000000
 --seed                of the samples = 0 in 0..9223372036854775808

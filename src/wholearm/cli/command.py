@@ -19,11 +19,10 @@ from ..common.signals import guard
 from .arguments import COMMANDS, Parser, name_simulator
 from .bench import add_bench
 from .map import protect
-from .origin import tell_origin
-from .output import name_files, print_result
-from .overlay import overlay
+from .output import name_files, print_result, require_output, tell_origin
 from .progress import announce, clear_progress, progress_log, show_progress
 from .route import find
+from .viewer import overlay
 
 if TYPE_CHECKING:
     from ..planning.result import Plan
@@ -106,36 +105,33 @@ class _Version(argparse.Action):
 def solve(options: argparse.Namespace) -> int:
     """Plan, and write the plan."""
     from ..common.fields import keys_of
-    from ..common.files import require_ending, require_writable, together
+    from ..common.files import together
     from ..geometry.path_guess import load
     from ..planning.options import PlanOptions
     from ..planning.plan import solve_with
     from ..planning.plan_report import describe_plan
     from ..scene.ranges import find_unit_hint
 
-    output = options.output or _stem(options.problem) + ".npz"
+    output = options.output or f"{os.path.splitext(os.path.basename(options.problem))[0]}.npz"
     given = {key: getattr(options, key) for key in keys_of(PlanOptions)}
     plan_options = PlanOptions(**{key: own for key, own in given.items() if own is not None})
-    for path, ending in ((output, ".npz"), (options.torques, ".csv")):
-        if path is not None:
-            require_writable(path)
-            require_ending(path, ending)
+    require_output(output, ".npz")
+    require_output(options.torques, ".csv")
     _check_sampling(options)
     problem = load(options.problem)
     if hint := find_unit_hint(problem.scene):
         _complain(f"{options.problem}: {hint}")
-    if options.cache is not None and not problem.goals:
-        raise InputError("", "--cache", "is for problems with [goal]")
-    if options.jobs is not None and not problem.goals:
-        raise InputError("", "--jobs", "is for problems with [goal]")
-    own = problem, plan_options, show_progress(), options.time_limit
+    for key in ("cache", "jobs"):
+        if getattr(options, key) is not None and not problem.goals:
+            raise InputError("", f"--{key}", "is for problems with [goal]")
     try:
         if problem.goals:
             asked = {key: getattr(options, key) for key in ("cache", "jobs", "time_limit")}
             answer = find(problem, plan_options, **asked)
             plan, found = answer.plan, answer.to_text()
         else:
-            plan, found = solve_with(*own), ""
+            plan = solve_with(problem, plan_options, show_progress(), options.time_limit)
+            found = ""
         table = None if options.torques is None else _make_table(options, plan)
     except WholearmError as error:
         clear_progress()
@@ -183,28 +179,16 @@ def _make_table(options: argparse.Namespace, plan: Plan) -> TorqueTable:
     )
 
 
-def _stem(path: str) -> str:
-    return os.path.splitext(os.path.basename(path))[0]
-
-
 def verify(options: argparse.Namespace) -> int:
     """Replay torques, and print the verdict."""
-    from ..common.files import require_ending, require_writable
     from ..problem.read import adopt_phases, read_problem
     from ..results.trajectory import Trajectory
     from ..verification.verify import verify as run
 
-    if options.output is not None:
-        require_writable(options.output)
-        require_ending(options.output, ".npz")
-    given = {
-        key: getattr(options, key)
-        for key in ("tolerance", "departure", "rest_speed")
-        if getattr(options, key) is not None
-    }
+    require_output(options.output, ".npz")
+    keys = ("tolerance", "departure", "rest_speed", "uniqueness_margin")
+    given = {key: own for key in keys if (own := getattr(options, key)) is not None}
     _check_free(options)
-    if options.uniqueness_margin is not None:
-        given["uniqueness_margin"] = options.uniqueness_margin
     problem = read_problem(options.problem)
     torques = _read_torques(options.torques)
     policy, notes = _read_policy(options, torques), {}
@@ -218,8 +202,7 @@ def verify(options: argparse.Namespace) -> int:
 
         check_phases(problem)
     if options.free:
-        rate = {} if options.restitution is None else {"restitution": options.restitution}
-        given = {**given, **rate}
+        given |= {} if options.restitution is None else {"restitution": options.restitution}
         report: Report | FreeReport = _simulate_free(problem, torques, policy, given)
     else:
         announce(f"replaying {len(problem.phases)} phases")
@@ -285,12 +268,10 @@ def _read_torques(path: str) -> Trajectory | TorqueProfile:
 
 def plot(options: argparse.Namespace) -> int:
     """Draw a plan, or the replay of torques."""
-    from ..common.files import require_writable
     from ..figures import plots
     from ..results.trajectory import Trajectory
 
-    plots.require_format(options.output)
-    require_writable(options.output)
+    require_output(options.output)
     trajectory = _read_torques(options.trajectory)
     if not isinstance(trajectory, Trajectory):
         trajectory = _replay(options, trajectory)

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 from ..common.errors import InputError, name_source
 from ..common.fields import Range
-from .origin import tell_origin
-from .output import name_files, print_result
+from .output import name_files, print_result, require_output, tell_origin
 from .progress import show_progress
 
 if TYPE_CHECKING:
@@ -22,12 +21,11 @@ STEPS = Range(1e-6, 1e-1, lambda scene, _: scene.scales.time, "times the scene's
 
 def export(options: argparse.Namespace) -> int:
     """Write the scene, with a plan if one is given."""
-    from ..common.files import require_ending, require_writable, write_text
+    from ..common.files import write_text
     from ..engines.mjcf import write_mjcf
     from ..problem.read import read_problem
 
-    require_writable(options.mjcf)
-    require_ending(options.mjcf, ".xml")
+    require_output(options.mjcf, ".xml")
     problem = read_problem(options.problem)
     if options.step is not None:
         STEPS.check("--step", options.step, "s", problem.scene)
@@ -56,7 +54,7 @@ def replay(options: argparse.Namespace) -> int:
     if options.softness is not None:
         setting = setting._replace(softness=options.softness)
     if options.policy is not None:
-        return _play_policy(options, problem, plan, setting, options.departure)
+        return _play_policy(options, problem, plan, setting)
     notes = tell_origin(problem, (options.plan, plan), silent=options.json)
     with name_source(options.problem):
         report = replay_in(
@@ -73,11 +71,7 @@ def replay(options: argparse.Namespace) -> int:
 
 
 def _play_policy(
-    options: argparse.Namespace,
-    problem: Problem,
-    plan: Trajectory,
-    setting: Setting,
-    departure: float | None,
+    options: argparse.Namespace, problem: Problem, plan: Trajectory, setting: Setting
 ) -> int:
     from ..engines.feedback import ALLOWED, play_policy
     from ..policy.playback import Policy
@@ -85,8 +79,7 @@ def _play_policy(
     if options.refine:
         raise InputError("", "--refine", "is for plans by the clock, not with --policy")
     policy = Policy.load(options.policy)
-    named = options.policy, policy
-    notes = tell_origin(problem, (options.plan, plan), named, options.json)
+    notes = tell_origin(problem, (options.plan, plan), (options.policy, policy), options.json)
     with name_source(options.policy):
         report = play_policy(
             options.engine,
@@ -95,7 +88,7 @@ def _play_policy(
             policy,
             whole=options.whole,
             setting=setting,
-            allowed=ALLOWED if departure is None else departure,
+            allowed=ALLOWED if options.departure is None else options.departure,
             progress=show_progress(),
         )
     return print_result(options, report, notes)

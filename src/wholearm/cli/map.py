@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 
 from ..common.errors import InputError
-from .origin import tell_origin
+from .output import require_output, tell_origin
 from .progress import clear_progress, show_progress
 
 
@@ -33,7 +33,6 @@ def draw(options: argparse.Namespace) -> int:
 
 
 def _draw_map(options: argparse.Namespace, phi: tuple[float, float] | None) -> int:
-    from ..common.files import require_writable
     from ..figures import plots
     from ..figures.map_figure import draw_map
     from ..mapping.formation_map import build_map, choose_window
@@ -41,18 +40,14 @@ def _draw_map(options: argparse.Namespace, phi: tuple[float, float] | None) -> i
     from ..results.trajectory_file import load_trajectory
 
     output = options.output or f"map_{os.path.splitext(os.path.basename(options.problem))[0]}.png"
-    plots.require_format(output)
-    require_writable(output)
+    require_output(output)
     problem = read_problem(options.problem)
     plan = None if options.plan is None else load_trajectory(options.plan)
     if plan is not None:
         tell_origin(problem, (options.plan, plan), silent=bool(options.list))
     window = choose_window(problem, phi)
-    limit = (
-        {}
-        if options.uniqueness_margin is None
-        else {"uniqueness_margin": options.uniqueness_margin}
-    )
+    margin = options.uniqueness_margin
+    limit = {} if margin is None else {"uniqueness_margin": margin}
     known = build_map(problem, window=window, progress=show_progress(), **limit)
     plots.save(draw_map(known, plan), output)
     clear_progress()

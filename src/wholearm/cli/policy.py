@@ -8,7 +8,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from ..common.errors import name_source
-from .output import print_result
+from .output import print_result, require_output
 from .progress import clear_progress, show_progress
 
 _QUICK = 2e-4
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 def policy(options: argparse.Namespace) -> int:
     """Make a policy, simulate it, and write it if it holds."""
     from ..common.errors import ReplayError
-    from ..common.files import require_ending, require_writable
     from ..planning.plan import solve
     from ..policy.make import find_widest, make_policy
     from ..problem.read import read_own_problem
@@ -31,8 +30,7 @@ def policy(options: argparse.Namespace) -> int:
 
     stem = os.path.splitext(os.path.basename(options.plan))[0]
     output = options.output or f"{stem}_policy.npz"
-    require_writable(output)
-    require_ending(output, ".npz")
+    require_output(output, ".npz")
     plan = load_trajectory(options.plan)
     problem = read_own_problem(plan.meta, options.plan)
     given = {key: getattr(options, key) for key in ("reserve", "period", "delay", "torque_limit")}
@@ -69,7 +67,7 @@ def policy(options: argparse.Namespace) -> int:
         text = f"{output}: written although in the free simulation, {failures}"
         print(f"wholearm: warning: {text}", file=sys.stderr)
     elif not report.ok:
-        opened = [loss.gap for own in report.phases for loss in own.losses]
+        opened = [loss.gap for phase in report.phases for loss in phase.losses]
         enough = ""
         if len(opened) == len(report.failures):
             # Nothing but openings: rounded up to two digits.

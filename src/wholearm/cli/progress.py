@@ -10,8 +10,7 @@ from contextlib import contextmanager
 
 from ..common.signals import listen
 
-EVERY = 10.0
-"""Time between lines where stderr is no terminal [s]."""
+EVERY = 10.0  # time between lines where stderr is no terminal [s]
 
 
 class _Lines:
@@ -43,8 +42,7 @@ class _Lines:
             pass  # nobody reads it
 
 
-_LINES = _Lines()
-"""Those of the command, which may show progress of several things."""
+_LINES = _Lines()  # those of the command, which may show progress of several things
 
 
 @contextmanager

@@ -9,6 +9,7 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .output import require_output
 from .progress import clear_progress, show_progress
 
 if TYPE_CHECKING:
@@ -22,15 +23,10 @@ MOST_JOBS = 2
 
 def route(options: argparse.Namespace) -> int:
     """Find a route, print its phases, and draw it if that is asked for."""
-    from ..common.files import require_writable
     from ..planning.options import PlanOptions
     from ..problem.read import read_problem
 
-    if options.output is not None:
-        from ..figures import plots
-
-        plots.require_format(options.output)
-        require_writable(options.output)
+    require_output(options.output)
     problem = read_problem(options.problem)
     own = PlanOptions(objective=options.objective)
     answer = find(
@@ -62,11 +58,19 @@ def find(
     count = min(MOST_JOBS, count_cores()) if jobs is None else jobs
     try:
         folder = None if cache is None else Path(cache)
-        given = options, alternatives, show_progress(), folder, count
         with warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)
             warnings.showwarning = _warn
-            return find_route_with(problem, *given, time_limit=time_limit, hurry=hasten)
+            return find_route_with(
+                problem,
+                options,
+                alternatives,
+                show_progress(),
+                folder,
+                count,
+                time_limit=time_limit,
+                hurry=hasten,
+            )
     except WholearmError:
         clear_progress()
         raise

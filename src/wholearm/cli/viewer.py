@@ -1,22 +1,40 @@
-"""The commands ``wholearm animate`` and ``wholearm report``: motions to look at."""
+"""The commands ``gallery``, ``animate`` and ``report``: movies and pages of motions."""
 
 from __future__ import annotations
 
 import argparse
 import os
+from typing import TYPE_CHECKING
 
-from .output import name_files
-from .overlay import overlay
+from .output import name_files, require_output
 from .progress import show_progress
+
+if TYPE_CHECKING:
+    from ..results.trajectory import Trajectory
+    from ..simulation.events import Simulation
+
+
+def overlay(simulator: str, trajectory: Trajectory) -> Simulation:
+    """Simulate the torques of a trajectory; `simulator` is told or free."""
+    from ..problem.read import read_own_problem
+
+    problem, say = read_own_problem(trajectory.meta), show_progress()
+    if simulator == "free":
+        from ..free_simulation.free_simulate import simulate_free
+
+        if say is not None:
+            say("simulating the whole")
+        return simulate_free(problem, trajectory).show(trajectory.contacts)
+    from ..simulation.simulate import simulate
+
+    return simulate(problem, trajectory.torque, progress=say)
 
 
 def gallery(options: argparse.Namespace) -> int:
     """Plan problems, and write their page."""
-    from ..common.files import require_ending, require_writable
     from ..viewer.gallery import write_gallery
 
-    require_ending(options.output, ".md")
-    require_writable(options.output)
+    require_output(options.output, ".md")
     write_gallery(options.files, options.output, show_progress())
     name_files(options, options.output)
     return 0
@@ -25,17 +43,16 @@ def gallery(options: argparse.Namespace) -> int:
 def animate(options: argparse.Namespace) -> int:
     """Write a movie, or a page."""
     from ..common.errors import name_source
-    from ..common.files import require_ending, require_writable, write_text
+    from ..common.files import write_text
     from ..problem.read import read_own_problem
     from ..results.trajectory_file import load_trajectory
 
-    ending = require_ending(options.output, ".gif", ".mp4", ".html")
-    require_writable(options.output)
+    require_output(options.output, ".gif", ".mp4", ".html")
     trajectory = load_trajectory(options.trajectory)
     with name_source(options.trajectory):
         problem = read_own_problem(trajectory.meta)
         ghost = overlay(options.simulate, trajectory).trajectory if options.simulate else None
-        if ending == ".html":
+        if options.output.lower().endswith(".html"):
             from ..viewer import page
             from ..viewer.motion_data import describe_motion
 
@@ -56,14 +73,13 @@ def report(options: argparse.Namespace) -> int:
     import tempfile
     from pathlib import Path
 
-    from ..common.files import require_ending, require_writable, write_text
+    from ..common.files import write_text
     from ..problem.read import read_problem
     from ..viewer.report_page import build_report
 
     stem = os.path.splitext(os.path.basename(options.problem))[0]
     output = options.output or f"{stem}.html"
-    require_ending(output, ".html")
-    require_writable(output)
+    require_output(output, ".html")
     problem, say = read_problem(options.problem), show_progress()
     with tempfile.TemporaryDirectory() as folder:
         paths = options.files

@@ -1,4 +1,4 @@
-"""Types of arrays and of expressions, and what NumPy takes long for."""
+"""Types of arrays and expressions; quadrature nodes, and minima of sampled functions."""
 
 from __future__ import annotations
 
@@ -20,3 +20,33 @@ def sort_unique(values: Array) -> Array:
     """
     ordered = np.sort(values, axis=None)
     return ordered[np.diff(ordered, prepend=-np.inf) > 0]
+
+
+def jacobi_nodes(count: int, alpha: int = 0, beta: int = 0) -> Array:
+    """Zeros of the Jacobi polynomial P_n^(alpha, beta), increasing, shape (n,), in (-1, 1).
+
+    Eigenvalues of the symmetric tridiagonal matrix of the three-term recurrence (Golub and Welsch
+    1969), which are real in any arithmetic. Gauss-Legendre nodes are those of (0, 0); with the ends
+    added, Radau nodes with 1 are those of (1, 0), Lobatto nodes those of (1, 1).
+
+    Parameters
+    ----------
+    count        degree n of the polynomial; zero gives no nodes
+    alpha, beta  exponents of the weight (1 - x)^alpha (1 + x)^beta, not negative
+    """
+    k, total = np.arange(count), alpha + beta
+    diagonal = (beta**2 - alpha**2) / np.maximum((2 * k + total) * (2 * k + total + 2), 1)
+    diagonal[:1] = (beta - alpha) / (total + 2)
+    k = k[1:]
+    squares = 4 * k * (k + alpha) * (k + beta) * (k + total)
+    squares = squares / ((2 * k + total) ** 2 * (2 * k + total + 1) * (2 * k + total - 1))
+    return np.linalg.eigvalsh(np.diag(diagonal) + np.diag(np.sqrt(squares), -1))
+
+
+def find_minima(values: Array) -> Array:
+    """Least value along the middle axis of evenly spaced values, also between them (parabolas)."""
+    before, here, after = values[:, :-2], values[:, 1:-1], values[:, 2:]
+    bend = before - 2 * here + after
+    inside = (here <= before) & (here <= after) & (bend > 0)
+    dip = np.divide((after - before) ** 2, 8 * bend, out=np.zeros_like(here), where=inside)
+    return np.asarray(np.minimum((here - dip).min(axis=1), values[:, [0, -1]].min(axis=1)))

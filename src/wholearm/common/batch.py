@@ -7,10 +7,8 @@ import numpy as np
 from .arrays import Array, Expression
 from .sharing import exclusive
 
-SIZE = 64
-"""Most points per call. More need more memory at no gain; fewer, more calls."""
-SOME = 20
-"""Points of a smaller call."""
+SIZE = 64  # most points per call. More need more memory at no gain; fewer, more calls.
+SOME = 20  # points of a smaller call
 FEW = 5
 """Points up to which each is a call of its own: one for `SOME` costs as much as half a dozen."""
 

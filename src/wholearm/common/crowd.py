@@ -1,4 +1,4 @@
-"""Many tasks through any executor, each answered once, whatever becomes of its workers."""
+"""Tasks through any executor, each answered once, with retries where workers die."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future
 from itertools import islice
 from typing import Any
 
-AHEAD = 64
-"""Tasks that are given to the executor before the first is answered."""
+AHEAD = 64  # tasks that are given to the executor before the first is answered
 CHANCES = 3
 """Times that a task may be under way when workers die, before it is taken for the reason."""
 

@@ -13,8 +13,7 @@ import numpy as np
 
 from .plain import plain
 
-LONGEST = 100
-"""Characters of a `repr`."""
+LONGEST = 100  # characters of a `repr`
 SCALES = {"mm": 1e3, "mm/s": 1e3, "ms": 1e3, "deg": 180 / math.pi, "%": 1e2}
 """What numbers in SI units are multiplied by in a column of that unit."""
 

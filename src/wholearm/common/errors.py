@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from .arrays import Array
 
 
-LONGEST = 1000
-"""Characters of a message beyond which its middle is left out."""
+LONGEST = 1000  # characters of a message beyond which its middle is left out
 
 
 class WholearmError(Exception):

@@ -19,8 +19,7 @@ from typing import Any, TypeVar
 from .errors import InputError, require_number, require_vector
 
 T = TypeVar("T")
-REQUIRED: Any = object()
-"""Default of what has to be given."""
+REQUIRED: Any = object()  # default of what has to be given
 Schema = Mapping[str, Any]
 """JSON Schema of a value."""
 
@@ -122,16 +121,15 @@ def choice(*words: str) -> FieldKind:
     return FieldKind(read, {"enum": list(words)})
 
 
-def _read_boolean(given: Any, key: str) -> bool:
-    if not isinstance(given, bool):
-        raise InputError("", key, f"{given!r} given; allowed are true and false")
-    return given
+def _read_type(kind: type, text: str) -> Callable[[Any, str], Any]:
+    """Reader of values of one type; `text` follows a value that is of another one."""
 
+    def read(given: Any, key: str) -> Any:
+        if not isinstance(given, kind):
+            raise InputError("", key, f"{given!r} {text}")
+        return given
 
-def _read_text(given: Any, key: str) -> str:
-    if not isinstance(given, str):
-        raise InputError("", key, f"{given!r} is not a string")
-    return given
+    return read
 
 
 def refer(name: str) -> Schema:
@@ -152,8 +150,8 @@ POSITIVE = FieldKind(
 NONNEGATIVE = FieldKind(partial(require_number, nonnegative=True), {"type": "number", "minimum": 0})
 COEFFICIENT = FieldKind(NONNEGATIVE.read, refer("coefficient"))
 POINT = FieldKind(partial(require_vector, size=2), refer("point"))
-BOOLEAN = FieldKind(_read_boolean, {"type": "boolean"})
-TEXT = FieldKind(_read_text, {"type": "string"})
+BOOLEAN = FieldKind(_read_type(bool, "given; allowed are true and false"), {"type": "boolean"})
+TEXT = FieldKind(_read_type(str, "is not a string"), {"type": "string"})
 
 
 @dataclass(frozen=True)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import threading
 import zipfile
 import zlib
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -18,8 +20,7 @@ import numpy as np
 from .errors import InputError
 from .signals import held, on_end
 
-LARGEST = 2**28
-"""Largest array that is read [byte]: a million rows of everything take less."""
+LARGEST = 2**28  # largest array that is read [byte]: a million rows of everything take less
 
 
 def require_writable(path: str | os.PathLike[str]) -> None:
@@ -160,11 +161,6 @@ def _remove(part: str) -> None:
     _parts.discard(part)
 
 
-def _remove_all() -> None:
-    for part in tuple(_parts):
-        _remove(part)
-
-
 _parts: set[str] = set()
 """Temporary files that exist now."""
 
@@ -173,7 +169,7 @@ _staged: ContextVar[list[tuple[str, str]] | None] = ContextVar("staged", default
 """Temporary files and where they are to appear, inside `together`."""
 
 
-on_end(_remove_all)
+on_end(lambda: deque(map(_remove, tuple(_parts)), maxlen=0))
 
 
 def read_arrays(path: str | os.PathLike[str], names: Iterable[str]) -> dict[str, Any]:
@@ -194,15 +190,11 @@ def read_arrays(path: str | os.PathLike[str], names: Iterable[str]) -> dict[str,
             return _read_archive(source, stream, names)
     except OSError as error:
         raise InputError(source, "", f"cannot be read: {error.strerror or error}") from None
-    except (
-        ValueError,
-        EOFError,
-        MemoryError,
-        RuntimeError,
-        zipfile.BadZipFile,
-        zlib.error,
-    ) as error:
+    except _BROKEN as error:
         raise InputError(source, "", f"is not a trajectory file: {error}") from None
+
+
+_BROKEN = (ValueError, EOFError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error)
 
 
 def _read_archive(source: str, stream: BinaryIO, names: Iterable[str]) -> dict[str, Any]:
@@ -227,23 +219,15 @@ def _read_array(source: str, name: str, content: bytes) -> Any:
     import io
 
     stream = io.BytesIO(content)
-    shape, _, kind = _read_header(stream)
+    version = np.lib.format.read_magic(stream)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"version {version} of the array format is unknown")
+    read = np.lib.format.read_array_header_1_0
+    shape, _, kind = (read if version == (1, 0) else np.lib.format.read_array_header_2_0)(stream)
     if kind.hasobject:
         raise InputError(source, name, "holds Python objects; numbers or text are needed")
-    count = 1
-    for size in shape:
-        count *= size
-    claimed, given = count * kind.itemsize, len(content) - stream.tell()
+    claimed, given = math.prod(shape) * kind.itemsize, len(content) - stream.tell()
     if min(shape, default=0) < 0 or claimed != given:
         raise InputError(source, name, f"claims {claimed} bytes of {shape} and holds {given}")
     stream.seek(0)
     return np.lib.format.read_array(stream, allow_pickle=False)
-
-
-def _read_header(stream: BinaryIO) -> tuple[tuple[int, ...], bool, Any]:
-    version = np.lib.format.read_magic(stream)
-    if version == (1, 0):
-        return np.lib.format.read_array_header_1_0(stream)
-    if version == (2, 0):
-        return np.lib.format.read_array_header_2_0(stream)
-    raise ValueError(f"version {version} of the array format is unknown")

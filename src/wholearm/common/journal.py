@@ -1,4 +1,4 @@
-"""Records of a study that are kept as they come, so that it can go on where it was stopped."""
+"""Journal of a study: one JSON record per line, kept as they come, to resume from."""
 
 from __future__ import annotations
 
@@ -6,15 +6,13 @@ import json
 import os
 import stat
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from itertools import islice
 from typing import Any, BinaryIO, NamedTuple
 
 from .errors import InputError
 from .signals import held
 
-_SHOWN = 3
-"""Differences that are written out; the others are counted."""
+_SHOWN = 3  # differences that are written out; the others are counted
 try:
     import fcntl
 except ImportError:  # not on Windows
@@ -116,8 +114,8 @@ class Journal:
         if other is None or other.get("study") != kind:
             text = f"holds no {kind} study; --fresh begins anew, or choose another with -o"
             raise InputError(self.path, "", text)
-        found = find_differences(other, own)
-        text = describe_differences(found, "in the file", "now")
+        differences = find_differences(other, own)
+        text = describe_differences(differences, "in the file", "now")
         if text:
             what = f"holds another study: {text}; --fresh begins anew, or choose another with -o"
             raise InputError(self.path, "", what)
@@ -129,22 +127,6 @@ class Journal:
 
     def _fail(self, error: OSError) -> InputError:
         return InputError(self.path, "", f"cannot be written: {error.strerror}")
-
-
-@contextmanager
-def locked(folder: str) -> Iterator[None]:
-    """Keep other runs, that ask for it too, from a folder.
-
-    Raises
-    ------
-    InputError  if another run has it
-    """
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        _lock(descriptor, folder)
-        yield
-    finally:
-        os.close(descriptor)
 
 
 def _lock(descriptor: int, path: str) -> None:

@@ -19,8 +19,7 @@ from weakref import WeakKeyDictionary, WeakValueDictionary, finalize
 _T = TypeVar("_T")
 _P = ParamSpec("_P")
 
-LOCK = RLock()
-"""Held by whoever uses CasADi."""
+LOCK = RLock()  # held by whoever uses CasADi
 _retired: deque[object] = deque()
 """Values whose owners are gone, to be deleted by the next holder of the lock."""
 

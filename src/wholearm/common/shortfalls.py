@@ -1,4 +1,4 @@
-"""What a motion is short of where there is no plan, and what would make one possible, as data."""
+"""Limits that an infeasible motion misses, and changes of parameters that make one feasible."""
 
 from __future__ import annotations
 

@@ -22,13 +22,10 @@ from typing import TextIO
 
 _listeners: list[Callable[[], object]] = []
 _deadline: float | None = None
-PATIENCE = 0.45
-"""Longest time that a command may take to clean up [s]."""
-WATCHER = "wholearm signals"
-"""Name of that thread."""
+PATIENCE = 0.45  # longest time that a command may take to clean up [s]
+WATCHER = "wholearm signals"  # name of that thread
 _WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
-ENDED = tuple(128 + number for number in _WORDS)
-"""Exit statuses of commands that a signal ended."""
+ENDED = tuple(128 + number for number in _WORDS)  # exit statuses of commands that a signal ended
 _guarded = False
 _received: int | None = None
 _holding = _said = False
@@ -39,9 +36,7 @@ _cleanups: list[Callable[[], object]] = []
 
 
 def guard(
-    run: Callable[[], int],
-    tidy: Callable[[], object] = int,
-    leave: Callable[[int], object] = int,
+    run: Callable[[], int], tidy: Callable[[], object] = int, leave: Callable[[int], object] = int
 ) -> int:
     """Run a command with signals that end it, and return its exit status: 128 + the signal's.
 

@@ -1,4 +1,4 @@
-"""Tasks that do not depend on each other, done at the same time by forked processes.
+"""Independent tasks in parallel, by forked processes.
 
 Children are forked where tasks are shared out, so that they have all that is known by then. Each
 process takes the next task for as long as there is one, and children send what has come of theirs.
@@ -29,10 +29,8 @@ from .signals import WATCHER
 _T = TypeVar("_T")
 Task = Callable[[], _T]
 
-DEEP = 20_000
-"""Depth of recursion that pickling may take."""
-_NUMBER = 2
-"""Bytes of a task's number."""
+DEEP = 20_000  # depth of recursion that pickling may take
+_NUMBER = 2  # bytes of a task's number
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _sharing = False
 

@@ -1,4 +1,4 @@
-"""Replay plans and torques for one problem, and put side by side what they do."""
+"""Comparison of plans and torques for one problem by their replays: margins, effort, losses."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..common.arrays import Array
 from ..common.errors import InputError, JammingError, SimulationError, name_source
 from ..common.files import require_ending
 from ..problem.check import require_phases
@@ -57,7 +56,7 @@ def compare(
 def _read(problem: Problem, path: str) -> tuple[Problem, Trajectory | TorqueProfile, int | None]:
     """Torques or a trajectory that fits the problem, and how many simulations it took.
 
-    Goals of the problem give way to the phases that a trajectory has found.
+    Goals of the problem give way to the phases that a trajectory has forces.
     """
     if require_ending(path, ".npz", ".csv") == ".csv":
         noted = read_notes(path).get(SIMULATIONS)
@@ -77,9 +76,9 @@ def _read(problem: Problem, path: str) -> tuple[Problem, Trajectory | TorqueProf
 def _judge(
     name: str, problem: Problem, what: Trajectory | TorqueProfile, simulations: int | None
 ) -> Contender:
-    """What one of them does."""
+    """The replay of one of them, in numbers."""
     torque = what if isinstance(what, TorqueProfile) else what.torque
-    limits = np.abs(_find_peaks(torque))
+    limits = np.abs(torque.at_places(np.linspace(-1, 1, 17))).max(axis=(0, 2))
     peaks = (float(limits[0]), float(limits[1]))
     effort = torque.integrate_squares()
     try:
@@ -97,8 +96,8 @@ def _collect(
     peaks: tuple[float, float],
     simulations: int | None,
 ) -> Contender:
-    found = [(find_least_force(phase), phase) for phase in report.phases]
-    known = [(least, phase.number) for least, phase in found if least is not None]
+    forces = [(find_least_force(phase), phase) for phase in report.phases]
+    known = [(least, phase.number) for least, phase in forces if least is not None]
     least = min(known, key=lambda pair: pair[0].least, default=None)
     energy = report.energy
     lasts = [
@@ -119,12 +118,6 @@ def _collect(
         0 if least is None else least[1],
         energy.viscous + energy.dry + energy.contact + energy.impact,
         tuple(lasts),
-        tuple(math.nan if own is None else own.margin for own, _ in found),
+        tuple(math.nan if least_force is None else least_force.margin for least_force, _ in forces),
         report,
     )
-
-
-def _find_peaks(torque: TorqueProfile) -> Array:
-    """Largest torque of each joint, shape (2,) [N m]."""
-    powers = np.linspace(-1, 1, 17)[:, None] ** np.arange(torque.coefficients.shape[2])
-    return np.asarray(np.abs(torque.coefficients @ powers.T).max(axis=(0, 2)))

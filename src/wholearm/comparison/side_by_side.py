@@ -59,12 +59,12 @@ class Comparison(Result):
     @property
     def headline(self) -> str:
         """Verdicts, in a line."""
-        return "; ".join(f"{own.name}: {own.verdict}" for own in self.contenders)
+        return "; ".join(f"{contender.name}: {contender.verdict}" for contender in self.contenders)
 
     @property
     def ok(self) -> bool:
         """Whether all of them hold."""
-        return all(own.ok for own in self.contenders)
+        return all(contender.ok for contender in self.contenders)
 
     @property
     def summary(self) -> Table:
@@ -80,7 +80,11 @@ class Comparison(Result):
     @property
     def document(self) -> Document:
         """A table of all, one of their phases, and the reasons of those that fail."""
-        failed = [f"{own.name}: {own.reason}" for own in self.contenders if not own.ok]
+        failed = [
+            f"{contender.name}: {contender.reason}"
+            for contender in self.contenders
+            if not contender.ok
+        ]
         names = [own.name for own in self.contenders]
         heads = [f"{name}:{form}" for form in (".5f", "+z.4f") for name in names]
         lasts = zip_longest(*(own.lasts for own in self.contenders))

@@ -1,7 +1,4 @@
-"""Closing palm and fingers on the object at many poses (x, phi) at once.
-
-With the object lowered until it touches the palm and each finger closed until it touches the
-object, a configuration is a function of (x, phi) alone.
+"""Closed configurations at many poses (x, phi) at once: object on the palm, fingers on the object.
 
 Contacts are counted as in `contact_table`: those with the palm, with finger 1 and with finger 2.
 """
@@ -23,20 +20,16 @@ from .elemental import Contact, candidate_contacts
 from .formation import Formation, Kinematics
 from .links import FINGERS_TOUCH, evaluate_finger_gap
 
-_PLACES = 1000
-"""Places along x that are tried."""
+_PLACES = 1000  # places along x that are tried
 Numbers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 TOO_SHORT, JOINT_COVERED, FINGERS_CROSS = 1, 2, 3
 """Reasons why a finger cannot close: it reaches no part of the object; its joint is in the object
 or right above it, so that the link overlaps the object before it closes; the other finger is closed
 in its way."""
-AROUND = 3
-"""Neighbouring vertices that are looked at where a finger closes."""
-LEVEL = 1e-12
-"""How far below a joint the object is still level with it, over the link's length."""
-CHUNK = 4096
-"""Poses that are closed at a time, so that they stay in the cache."""
+AROUND = 3  # neighbouring vertices that are looked at where a finger closes
+LEVEL = 1e-12  # how far below a joint the object is still level with it, over the link's length
+CHUNK = 4096  # poses that are closed at a time, so that they stay in the cache
 
 
 class ClosedFinger(NamedTuple):
@@ -58,10 +51,9 @@ def contact_table(scene: Scene) -> tuple[Contact, ...]:
     return tuple(c for finger in (None, 0, 1) for c in candidate_contacts(scene, finger))
 
 
-@lru_cache(maxsize=8)
-def _single_contacts(scene: Scene) -> dict[int, Formation]:
-    """Formations of one contact each, as they are made, by their index into `contact_table`."""
-    return {}
+@lru_cache(maxsize=1024)
+def _make_single(scene: Scene, index: int) -> Formation:
+    return Formation(scene, (contact_table(scene)[index],))
 
 
 def evaluate_contacts(
@@ -71,12 +63,7 @@ def evaluate_contacts(
 
     Many formations have few contacts in common, but each contact is in many of them.
     """
-    v = z if v is None else v
-    single, parts = _single_contacts(scene), []
-    for index in label:
-        if index not in single:
-            single[index] = Formation(scene, (contact_table(scene)[index],))
-        parts.append(single[index].evaluate(z, v))
+    parts = [_make_single(scene, index).evaluate(z, z if v is None else v) for index in label]
     return Kinematics(*(np.concatenate(part, axis=1) for part in zip(*parts, strict=True)))
 
 
@@ -130,15 +117,13 @@ def _close_fingers(scene: Scene, x: Array, phi: Array) -> ClosedFinger:
 
 def describe_obstacle(closed: ClosedFinger) -> str:
     """Why the first of some poses cannot be closed, in words; empty where it can."""
-    text = ""
-    for number, obstacle in enumerate(closed.obstacle[0].tolist(), start=1):
-        if obstacle:
-            text = {
-                TOO_SHORT: f"finger {number} is too short",
-                JOINT_COVERED: f"the joint of finger {number} is in the object or above it",
-                FINGERS_CROSS: FINGERS_TOUCH,
-            }[obstacle]
-    return text
+    texts = {
+        TOO_SHORT: "finger {} is too short",
+        JOINT_COVERED: "the joint of finger {} is in the object or above it",
+        FINGERS_CROSS: FINGERS_TOUCH,
+    }
+    pairs = enumerate(closed.obstacle[0].tolist(), start=1)
+    return ([texts[obstacle].format(number) for number, obstacle in pairs if obstacle] or [""])[-1]
 
 
 def place_flush(scene: Scene, edge: int, x: float) -> Array:
@@ -152,8 +137,7 @@ def close_finger(scene: Scene, q: Array, finger: int) -> float:
 
     Raises
     ------
-    InputError  if the finger reaches no part of the object, or its joint is in the object or too
-                near
+    InputError  if the finger does not reach the object, or its joint is in the object or near it
     """
     link = scene.fingers[finger]
     angle, _, (obstacle,) = _close_finger(scene, finger, *np.asarray(q)[:3, None])
@@ -170,10 +154,7 @@ def close_finger(scene: Scene, q: Array, finger: int) -> float:
 def _close_finger(
     scene: Scene, finger: int, x: Array, y: Array, phi: Array
 ) -> tuple[Array, Numbers, Numbers]:
-    """Angle and first feature (side, edge, arc in the order of candidates) of a closing finger.
-
-    And 0, or why it cannot close, for n poses of the object.
-    """
+    """Angle, first feature (sides, edges, arcs as in the candidates) and obstacle, at n poses."""
     link, count = scene.fingers[finger], scene.polygon.n_vertices
     angle, feature = np.empty(len(x)), np.empty(len(x), dtype=np.int64)
     obstacle = np.zeros(len(x), dtype=np.int64)
@@ -198,17 +179,12 @@ def _close_finger(
 
 
 def find_nearby(scene: Scene, finger: int, x: Array, y: Array, phi: Array) -> tuple[Numbers, Flags]:
-    """Where on the object a closing finger may touch it first, for n poses.
+    """Vertices that a closing finger may touch first, for n poses.
 
-    The edges on whose outer side the joint is are a chain. A link that is long enough touches the
-    vertex at the end of the chain that it comes to first. A shorter one touches with its tip:
-    distances from the joint fall along the chain up to the nearest place and rise from there, so
-    it is where they first fall to its length.
-
-    Returns
-    -------
-    first : (n,)  first of `AROUND` neighbouring vertices, one of which it is or is next to
-    clear : (n,)  whether this holds: the joint is outside of the object and not above any of it
+    The edges whose outer side faces the joint are a chain. A long link touches the vertex at its
+    end; a short one touches with its tip, where distances from the joint first fall to its length.
+    Returns the first of `AROUND` neighbouring vertices, (n,), and whether this holds, (n,): the
+    joint is outside of the object and not above any of it.
     """
     link, body = scene.fingers[finger], scene.polygon.vertices
     count, radius = len(body), link.radius
@@ -256,16 +232,9 @@ def _list_edges(scene: Scene) -> tuple[Array, Array, Array, Array, Array]:
 
 
 def _touch(link: Finger, finger: int, corners: Array) -> tuple[Array, Numbers]:
-    """Angle at which a closing finger first touches a chain of corners, and with which feature.
+    """Angle of first contact of a closing finger, (n,), and feature of m sides, edges, arcs, or -1.
 
-    Parameters
-    ----------
-    corners : (n, m + 1, 2)  from the joint; the last one is the end of the last edge only
-
-    Returns
-    -------
-    angle : (n,)
-    feature : (n,)  of m sides, m edges and m arcs; -1 where it reaches none
+    `corners`, (n, m + 1, 2), are relative to the joint; the last one is only the end of an edge.
     """
     following, corners = corners[:, 1:], corners[:, :-1]
     sign = 1.0 if finger == 0 else -1.0
@@ -329,12 +298,9 @@ def _distance(corners: Array) -> Array:
 
 
 def evaluate_each(scene: Scene, labels: Numbers, z: Array, v: Array | None = None) -> Kinematics:
-    """Rows of n formations of contacts that slide, each at a configuration of its own.
+    """Rows of n formations of sliding contacts, each at a configuration of its own.
 
-    Parameters
-    ----------
-    labels : (n, n_c)  contacts, as indices into `closing.contact_table`
-    z, v : (n, 5)      configurations, and the velocities for A' v, `z` if left out
+    `labels` (n, n_c) are indices into `contact_table`; z, v (n, 5), v is `z` if left out.
     """
     v = z if v is None else v
     C, A_dot_v = np.empty((2, *labels.shape))
@@ -348,10 +314,7 @@ def evaluate_each(scene: Scene, labels: Numbers, z: Array, v: Array | None = Non
 
 
 def group_alike(scene: Scene, labels: Numbers) -> Iterator[tuple[Formation, Flags]]:
-    """Groups of formations with the same friction at each contact, one of which stands for all.
-
-    All else that the mechanics takes of a formation is in its rows.
-    """
+    """Groups of formations with the same friction at each contact, with one that stands for all."""
     table = contact_table(scene)
     fingers = np.array([-1 if own.finger is None else own.finger for own in table])[labels]
     for kind in np.unique(fingers, axis=0):
@@ -360,13 +323,17 @@ def group_alike(scene: Scene, labels: Numbers) -> Iterator[tuple[Formation, Flag
         yield Formation(scene, contacts), rows
 
 
+def find_reach(scene: Scene) -> tuple[float, float]:
+    """Bounds of x [m] within which both fingers may reach the object."""
+    size = float(np.hypot(*scene.polygon.vertices.T).max())
+    reach = np.array([size + finger.length + finger.radius for finger in scene.fingers])
+    bases = np.array([np.asarray(finger.base)[0] for finger in scene.fingers])
+    return float((bases - reach).max()), float((bases + reach).min())
+
+
 def name_reach(scene: Scene, phi: float) -> str:
     """For which x [m] both fingers close, and not into each other, as part of a message."""
-    size = float(np.hypot(*scene.polygon.vertices.T).max())
-    reach = [size + finger.length + finger.radius for finger in scene.fingers]
-    bases = [float(np.asarray(finger.base)[0]) for finger in scene.fingers]
-    low = max(base - own for base, own in zip(bases, reach, strict=True))
-    high = min(base + own for base, own in zip(bases, reach, strict=True))
+    low, high = find_reach(scene)
     x = np.linspace(low, max(low, high), _PLACES)
     closes = (close_fingers(scene, x, np.full(len(x), phi)).obstacle == 0).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], closes.astype(int), [0]])))
@@ -385,6 +352,5 @@ def _round(low: float, high: float) -> tuple[float, float]:
     """Ends of a span in few digits, inside of it."""
     digits = 2 - math.floor(math.log10(high - low))
     step = 10.0**-digits
-    return round(math.ceil(low / step) * step, digits), round(
-        math.floor(high / step) * step, digits
-    )
+    inner = math.ceil(low / step) * step, math.floor(high / step) * step
+    return round(inner[0], digits), round(inner[1], digits)

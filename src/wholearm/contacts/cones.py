@@ -1,4 +1,4 @@
-"""Friction cones: what contact forces have to exceed for a formation to hold, and by how much."""
+"""Force limits of a formation: normal forces and friction cones, as rows and margins."""
 
 from __future__ import annotations
 
@@ -18,18 +18,7 @@ def force_limit_rows(formation: Formation) -> Array:
 
 
 def find_weakest(formation: Formation, held: Array) -> tuple[int, float, float | None]:
-    """The contact that gives way first, by pulling or else by slipping.
-
-    Parameters
-    ----------
-    held : (n_c + 2 R,) [N]  h c
-
-    Returns
-    -------
-    row        the contact
-    c_n : [N]
-    c_t : [N]  if it slips
-    """
+    """Row, c_n and c_t (if it slips) of the contact that gives way first; H c (n_c + 2 R,) [N]."""
     count, rolls = formation.n_contacts, formation.n_rolling
     row = int(held[:count].argmin())
     if held[row] < 0 or not rolls:
@@ -40,11 +29,6 @@ def find_weakest(formation: Formation, held: Array) -> tuple[int, float, float |
 
 
 def slip_margins(formation: Formation, c_n: Array, c_t: Array) -> Array:
-    """Margin of each rolling contact to slipping, mu c_n - |c_t|, shape (..., R) [N].
-
-    Parameters
-    ----------
-    c_n, c_t : (..., n_c) [N]  of every contact
-    """
+    """Slip margins mu c_n - |c_t| of rolling contacts, (..., R) [N], from c_n, c_t (..., n_c)."""
     rolling = list(formation.rolling_rows)
     return np.asarray(formation.friction[rolling] * c_n[..., rolling] - np.abs(c_t[..., rolling]))

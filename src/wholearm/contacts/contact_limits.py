@@ -1,12 +1,9 @@
-"""Where a contact formation stops being valid.
-
-It does where a contact leaves its own range, where another feature of object and hand is touched,
-and where the links touch each other.
-"""
+"""Gap limits of a contact formation: ranges of its contacts, other features, link against link."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import casadi as ca
 
@@ -19,8 +16,7 @@ from .obstacles import build_obstacles, face
 
 def list_limits(scene: Scene, contacts: Sequence[Contact]) -> list[GapLimit]:
     """Return every limit of a formation: of its contacts, of other features, and of the links."""
-    known = _KNOWN(scene)
-    limits = [limit for contact in contacts for limit in known.find_limits(contact, scene)]
+    limits = [limit for c in contacts for limit in _build_once(build_limits, c, scene)]
     for finger in (None, 0, 1):
         held = [contact for contact in contacts if contact.finger == finger]
         clearances = _list_clearances(scene, finger, held)
@@ -50,32 +46,19 @@ def _list_clearances(scene: Scene, finger: int | None, held: Sequence[Contact]) 
             continue
         if tips and not on_side and (on_tip or contact.index not in behind):
             continue
-        limits.append(_KNOWN(scene).find_clearance(contact, scene, bool(on_side)))
+        limits.append(_build_once(build_clearance, contact, scene, bool(on_side)))
     return limits
 
 
-class _Known:
-    """Limits of single contacts, which formations of scenes of one shape have in common."""
-
-    def __init__(self, _: Scene) -> None:
-        self._limits: dict[Contact, list[GapLimit]] = {}
-        self._clearances: dict[tuple[Contact, bool], GapLimit] = {}
-
-    def find_limits(self, contact: Contact, scene: Scene) -> list[GapLimit]:
-        """See `build_limits`."""
-        if contact not in self._limits:
-            self._limits[contact] = build_limits(contact, scene)
-        return self._limits[contact]
-
-    def find_clearance(self, contact: Contact, scene: Scene, touching: bool) -> GapLimit:
-        """See `build_clearance`."""
-        key = contact, touching
-        if key not in self._clearances:
-            self._clearances[key] = build_clearance(contact, scene, touching)
-        return self._clearances[key]
+_LIMITS: Store[dict[Any, Any]] = Store(lambda scene: {}, lambda scene: scene.shape)
+"""Limits of single contacts, which formations of scenes of one shape have in common."""
 
 
-_KNOWN = Store(_Known, lambda scene: scene.shape)
+def _build_once(build: Callable[..., Any], contact: Contact, scene: Scene, *options: bool) -> Any:
+    key, limits = (build, contact, *options), _LIMITS(scene)
+    if key not in limits:
+        limits[key] = build(contact, scene, *options)
+    return limits[key]
 
 
 def build_limits(contact: Contact, scene: Scene) -> list[GapLimit]:
@@ -134,21 +117,14 @@ def build_limits(contact: Contact, scene: Scene) -> list[GapLimit]:
 
 
 def takes_over(contact: Contact, scene: Scene, held: Sequence[Contact]) -> bool:
-    """Whether a contact goes on for one of those `held`, which leaves its range there.
-
-    The object then rolls or slides on from one feature to the next, at any speed, while a gap can
-    only be closed softly.
-    """
+    """Whether `contact` is the neighbour of one of `held` at the end of its range."""
     return any(limit.gained == contact for own in held for limit in build_limits(own, scene))
 
 
 def build_clearance(contact: Contact, scene: Scene, touching: bool) -> GapLimit:
-    """Return the limit at which `contact`, not in the formation, is gained.
+    """Limit at which `contact`, not in the formation, is gained; gaps beyond ends do not count.
 
-    A feature beyond the ends of its partner cannot touch it, so its gap does not count there, and
-    a tip that is farther outside another edge cannot touch this one. The exception is a link that
-    already touches a vertex with its side (`touching`): by convexity the whole object then stays
-    on that side of the link's line.
+    With a link that touches a vertex with its side (`touching`) they do, by convexity.
     """
     gap = own = build_gap(contact, scene)
     text = f"{contact.corner} touches {contact.part}"

@@ -10,14 +10,12 @@ name            touching                        C-function
 ==============  ==============================  =======================================
 
 p is a vertex in the world, n the normal of the contact (into the object), m = -n the outward normal
-of an edge; edge j runs from vertex j to vertex j + 1. The right finger touches with its left side,
-the left finger with its right one.
+of an edge; edge j runs from vertex j to vertex j + 1. Finger 1 touches with its left side, finger 2
+with its right one. With the contact point p_c the rows of Eq. (4) are
 
-From the contact point p_c and the normal n follow the rows of Eq. (4),
+    W_n^T = [n, (p_c - c) x n] = dC/dq,  J_n = n . d p_finger / d theta = -dC/dtheta,
 
-    W_n^T = [n, (p_c - c) x n],  J_n = n . d p_finger / d theta,
-
-and the same with t = (n_y, -n_x) for W_t and J_t. W_n^T = dC/dq and J_n = -dC/dtheta hold exactly.
+and the same with t = (n_y, -n_x) for W_t and J_t.
 """
 
 from __future__ import annotations
@@ -132,12 +130,7 @@ class GapLimit(NamedTuple):
 
 
 def parse_contact(name: object, scene: Scene) -> Contact:
-    """Return the contact called `name`.
-
-    Raises
-    ------
-    InputError  if there is no such contact on this object and hand; lists what is allowed
-    """
+    """Return the contact called `name`; an `InputError` lists what is allowed."""
     count = scene.polygon.n_vertices
     match = _PATTERN.fullmatch(name) if isinstance(name, str) else None
     allowed = (

@@ -1,9 +1,8 @@
-"""Configurations with one known contact each with palm and fingers, as functions of (x, phi).
+"""Closed-form configurations with one contact each of palm and fingers, as functions of (x, phi).
 
-With the vertex on the palm known, y is a function of phi; with what a finger touches known, its
-joint angle is an arcus function of where the object is. So are the rates along a straight way
-(x', phi'), with u for the way's parameter and x'' = phi'' = 0. Relations are explicit, so that
-poses with different contacts are evaluated together.
+The height follows from the vertex on the palm, each joint angle from what the finger touches; so do
+their rates along a straight path (x', phi') with parameter u and x'' = phi'' = 0. Poses with
+different contacts are evaluated together.
 
 A label is three indices into `closing.contact_table`: with the palm, with finger 1 and finger 2.
 """
@@ -26,9 +25,9 @@ SIDE, EDGE, ARC = 0, 1, 2
 
 
 class ExplicitMotion(NamedTuple):
-    """Straight ways at n places."""
+    """Straight paths at n places."""
 
-    # z, z_u, z_uu (n, 5): configurations, and their first and second derivatives along the ways
+    # z, z_u, z_uu (n, 5): configurations, and their first and second derivatives along the paths
     z: Array
     z_u: Array
     z_uu: Array
@@ -48,13 +47,7 @@ class _Touch(NamedTuple):
 
 
 def place(scene: Scene, labels: Numbers, poses: Array) -> Array:
-    """Configurations at n poses (x, phi), shape (n, 5); NaN angles where a tip reaches nothing.
-
-    Parameters
-    ----------
-    labels : (n, 3)
-    poses : (n, 2) [m, rad]
-    """
+    """Configurations (n, 5) at poses (x, phi), labels (n, 3); NaN where a tip cannot reach."""
     z = np.full((len(poses), 5), np.nan)
     z[:, [0, 2]] = poses
     z[:, 1] = -_turn(scene.polygon.vertices[labels[:, 0]], poses[:, 1])[:, 1]
@@ -77,22 +70,16 @@ def place(scene: Scene, labels: Numbers, poses: Array) -> Array:
     return z
 
 
-def move(scene: Scene, labels: Numbers, poses: Array, ways: Array) -> ExplicitMotion:
-    """Rates along straight ways at n poses.
-
-    Parameters
-    ----------
-    labels : (n, 3)
-    poses, ways : (n, 2)  (x, phi) and (x', phi')
-    """
+def move(scene: Scene, labels: Numbers, poses: Array, rates: Array) -> ExplicitMotion:
+    """Rates along straight paths at poses (x, phi), rates (x', phi'), (n, 2), and labels (n, 3)."""
     z = place(scene, labels, poses)
     z_u, z_uu = np.zeros_like(z), np.zeros_like(z)
     A, A_t, bend = np.zeros((len(z), 3, 5)), np.zeros((len(z), 3, 5)), np.zeros((len(z), 3))
-    arm, turn = _turn(scene.polygon.vertices[labels[:, 0]], z[:, 2]), ways[:, 1]
+    arm, turn = _turn(scene.polygon.vertices[labels[:, 0]], z[:, 2]), rates[:, 1]
     A[:, 0, 1], A[:, 0, 2] = 1.0, arm[:, 0]
     A_t[:, 0, 0], A_t[:, 0, 2] = 1.0, -arm[:, 1]
     bend[:, 0] = -(turn**2) * arm[:, 1]
-    z_u[:, [0, 2]] = ways
+    z_u[:, [0, 2]] = rates
     z_u[:, 1], z_uu[:, 1] = -arm[:, 0] * turn, -bend[:, 0]
     for finger, link in enumerate(scene.fingers):
         sign, joint = (1.0 if finger == 0 else -1.0), 3 + finger

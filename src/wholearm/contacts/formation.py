@@ -1,18 +1,12 @@
-"""Contact formations: contacts as constraints P z' = 0, and where they stop being valid.
+"""Contact formations: constraints P z' = 0 with their derivatives, and gap limits.
 
-With the rows of each contact stacked, Eq. (4) reads A z' = 0 with A = [W_n^T, -J_n], the sliding
-velocities are v_t = A_t z' with A_t = [W_t^T, -J_t], and differentiating once more gives
-A z'' + A' z' = 0. A contact that rolls has v_t = 0 as well, so with R of them the constraints are
+With the rows of all contacts, Eq. (4) reads A z' = 0 with A = [W_n^T, -J_n]; sliding velocities are
+v_t = A_t z' with A_t = [W_t^T, -J_t]. Rolling contacts have v_t = 0 as well:
 
     P z' = 0,  P z'' + P' z' = 0,  P = [A; A_t(rolling)],
 
-n_c + R = 2R + S rows for S sliding contacts. Rolling is holonomic here: v_t is the rate of a slip
-coordinate (`contacts.slip`), which keeps its value from where the rolling begins.
-
-For four sliding contacts, Eqs. (6)-(9) split A by the columns of (q, theta_2) and
-theta_1,
-
-    P_AI (q', theta_2') + P_AII theta_1' = 0,  P_AI = [W_n^T, -j_2n],  P_AII = -j_1n.
+n_c + R rows. Rolling is holonomic here: v_t is the rate of a slip coordinate (`build_slip`), which
+keeps its value from where the rolling begins.
 """
 
 from __future__ import annotations
@@ -133,11 +127,7 @@ class Formation(Keeper):
         return _ROLL_FUNCTIONS(self)
 
     def build_constraints(self, z: Expression, v: Expression) -> tuple[Expression, ...]:
-        """Expressions of z and v: the gaps and slip coordinates [m], P, P' v and A_t.
-
-        Gaps and slip coordinates are one column of n_c + R rows. The contacts hold where the gaps
-        are zero and the slip coordinates what they were when the rolling began.
-        """
+        """Expressions of z and v: gaps and slip coordinates [m] in one column, P, P' v and A_t."""
         C, A, A_t, A_dot_v = self.function(z, v)
         if not self.rolling:
             return C, A, A_dot_v, A_t
@@ -158,22 +148,12 @@ class Formation(Keeper):
         """Where this formation stops being valid, as expressions of its own scene's z."""
         return tuple(list_limits(self.scene, self.contacts))
 
-    @property
-    def limit_function(self) -> Expression:
-        """CasADi function z -> values of `limits`, shape (n_limits,) [m]."""
-        return _LIMIT_FUNCTIONS(self)
-
     @kept_property
     def _limit_batch(self) -> Batch:
-        return Batch(self.limit_function)
+        return Batch(_LIMIT_FUNCTIONS(self))
 
     def evaluate(self, z: Array, v: Array) -> Kinematics:
-        """Evaluate the formation at n configurations.
-
-        Parameters
-        ----------
-        z, v : (n, 5)  configurations, and the velocities for A' v
-        """
+        """Evaluate the formation at n configurations z and velocities v, shape (n, 5) each."""
         C, A, A_t, A_dot_v = self._batch(z, v)
         P, P_dot_v = A, A_dot_v
         if self.rolling:
@@ -226,21 +206,18 @@ def describe(contacts: Sequence[Contact]) -> str:
 
 
 class _Parts:
-    """Expressions of single contacts, which formations of scenes of one shape are put together of.
-
-    Making them takes most of the time that it takes to make a function of a formation.
-    """
+    """Expressions of single contacts, shared by the formations of scenes of one shape."""
 
     def __init__(self, scene: Scene) -> None:
         self.z, self.v = build_features(scene).z, ca.SX.sym("v", 5)
-        self._known: dict[Contact, tuple[Expression, ...]] = {}
+        self._parts: dict[Contact, tuple[Expression, ...]] = {}
 
     def find(self, contact: Contact, scene: Scene) -> tuple[Expression, ...]:
         """Gap, rows A and A_t, and A' v of a contact."""
-        if contact not in self._known:
+        if contact not in self._parts:
             gap, A, A_t = build_rows((contact,), scene)
-            self._known[contact] = gap, A, A_t, ca.jtimes(A @ self.v, self.z, self.v)
-        return self._known[contact]
+            self._parts[contact] = gap, A, A_t, ca.jtimes(A @ self.v, self.z, self.v)
+        return self._parts[contact]
 
 
 _PARTS = Store(_Parts, lambda scene: scene.shape)
@@ -271,31 +248,20 @@ def _build_limit_function(formation: Formation) -> Expression:
     return ca.Function("limits", [build_features(formation.scene).z], [values])
 
 
-_FUNCTIONS = Store(_build_function, lambda own: (own.scene.shape, own.contacts))
-
-
-_ROLL_FUNCTIONS = Store(
-    _build_roll_function, lambda own: (own.scene.shape, own.contacts, own.rolling)
-)
-
-
+_FUNCTIONS = Store(_build_function, lambda f: (f.scene.shape, f.contacts))
+_ROLL_FUNCTIONS = Store(_build_roll_function, lambda f: (f.scene.shape, f.contacts, f.rolling))
 _LIMIT_FUNCTIONS = Store(
-    _build_limit_function,
-    lambda own: (own.scene.shape, own.scene.fingers_collide, own.contacts),
+    _build_limit_function, lambda f: (f.scene.shape, f.scene.fingers_collide, f.contacts)
 )
 
 
 def build_slip(contact: Contact, scene: Scene) -> Expression:
-    """Return the slip coordinate of `contact` [m], an expression of the features' symbol z.
-
-    Its time derivative is v_t for as long as the contact touches: how far the object has slid along
-    t on the palm or the link. What a contact has to keep when it rolls is a constant, therefore:
+    """Slip coordinate of `contact` [m], whose rate is v_t, an expression of the features' z.
 
     * vertex on the palm: x of the vertex;
-    * vertex on the side of a link: how far along the link it is, positive towards the tip for
-      finger 1, whose tangent is the link's axis, and towards the joint for finger 2;
-    * tip on an edge: less how far along the edge the tip is, less the arc on which it has rolled;
-    * vertex on the arc of a tip: less the arc from the link's axis to the vertex.
+    * vertex on a link: place along it, towards the tip for finger 1, the joint for finger 2;
+    * tip on an edge: minus the place along the edge and the arc rolled;
+    * vertex on a tip: minus the arc from the link's axis.
     """
     features = build_features(scene)
     if contact.finger is None:

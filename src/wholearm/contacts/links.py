@@ -1,8 +1,8 @@
-"""The gap between the two links, which are solid to each other.
+"""Signed distance of the two links, by separating axes.
 
-Two convex bodies are apart by the largest separation over all directions d, that of the projections
-on d; where they overlap it is minus the least push that parts them. For two segments the candidates
-are both sides of each link and the lines from an end of one to an end of the other, so that
+The distance of two convex bodies is the largest separation of their projections over all directions
+d, or minus the penetration depth. For two segments the candidates are both sides of each link and
+the lines from an end of one to an end of the other, so that
 
     gap = max_d (min_(q on link 2) d . q - max_(p on link 1) d . p) - radius_1 - radius_2
 
@@ -23,10 +23,8 @@ from ..common.sharing import Store, exclusive
 from ..scene.model import Scene
 from .elemental import GapLimit, build_features, rotate_quarter
 
-FINGERS_TOUCH = "finger 1 touches finger 2"
-"""Sentence for where the gap of the fingers is zero."""
-_ROUNDING = 1e-30
-"""Added to squared distances over squared lengths, so that ends that coincide have a direction."""
+FINGERS_TOUCH = "finger 1 touches finger 2"  # sentence for where the gap of the fingers is zero
+ROUNDING = 1e-30  # added to squared distances over squared lengths: normals at coincident points
 
 
 class _Segment(NamedTuple):
@@ -64,7 +62,7 @@ def _separate(one: _Segment, two: _Segment) -> Expression:
     first = ca.horzcat(one.base, one.base, one.tip, one.tip)
     second = ca.horzcat(two.base, two.tip, two.base, two.tip)
     run = second - first
-    distance = ca.sqrt(ca.sum1(run**2) + _ROUNDING * sum(lengths) ** 2)
+    distance = ca.sqrt(ca.sum1(run**2) + ROUNDING * sum(lengths) ** 2)
     onwards = axes[0].T @ run * ca.DM([[1.0, 1.0, -1.0, -1.0]]) * lengths[0]
     backwards = axes[1].T @ run * ca.DM([[-1.0, 1.0, -1.0, 1.0]]) * lengths[1]
     parts.append((distance - (ca.fmax(onwards, 0) + ca.fmax(backwards, 0)) / distance).T)
@@ -93,12 +91,7 @@ _GAPS = Store(_build_gap, lambda scene: scene.shape)
 
 @exclusive
 def evaluate_finger_gap(scene: Scene, z: Array) -> Array:
-    """Gap between the two links at n configurations, shape (n,) [m], negative where they overlap.
-
-    Parameters
-    ----------
-    z : (n, 5)  naN where a joint angle is unknown, which makes the gap NaN
-    """
+    """Signed distance of the links at configurations z (n, 5), (n,) [m]; NaN where theta is."""
     numbers = np.concatenate([[*np.asarray(link.base), link.length] for link in scene.fingers])
     numbers = np.broadcast_to(numbers, (len(z), 6))
     gaps = _build_gap_function()(z[:, 3:], numbers)[0][:, 0, 0]

@@ -1,20 +1,8 @@
-"""Where the object runs into a part of a link that makes no contact with a name.
+"""Gap limits between the object and the far side of a link or the circle about its joint.
 
-Contacts are made with the touching side of a link and with its tip. The far side and the circle
-about the joint, of the link's radius, are solid as well:
-
-====================  ===========================================  ========================
-object                link                                         C-function
-====================  ===========================================  ========================
-vertex 3              far side                                     -n . (p - base) - radius
-vertex 3              circle about the joint                       abs(p - base) - radius
-edge 2                circle about the joint                       m . (base - p_2) - radius
-====================  ===========================================  ========================
-
-A link that touches a vertex with its side needs none of these: by convexity the whole object is on
-that side of the link's line. Nor does one that touches a vertex with its tip: the tangent to the
-tip there has the link on one side and the object on the other. One whose tip touches an edge can
-only turn onto the edge's line, with either side.
+A link that touches a vertex, with side or tip, needs none of these: by convexity its line or the
+tangent to the tip separates it from the object. One whose tip touches an edge can only turn onto
+the edge's line, with either side.
 """
 
 from __future__ import annotations
@@ -24,19 +12,11 @@ import casadi as ca
 from ..common.arrays import Expression
 from ..scene.model import Scene
 from .elemental import Contact, GapLimit, build_features
-
-_ROUNDING = 1e-30
-"""Added to squared distances over squared lengths: points that coincide have a direction."""
+from .links import ROUNDING
 
 
 def build_far_side(scene: Scene, finger: int, vertex: int, apart: Expression | None) -> GapLimit:
-    """Return the limit at which a vertex touches the far side of a link.
-
-    Parameters
-    ----------
-    apart : [m]  gap between the whole link and the object, where nothing else says on which side of
-                 the link the object is
-    """
+    """Return the limit at which a vertex touches a link's far side; `apart` as of `confine`."""
     link, part = build_features(scene).links[finger], scene.fingers[finger]
     gap = -link.vertex_gap[vertex] - 2 * part.radius
     text = f"v{vertex} touches the far side of finger {finger + 1}"
@@ -44,10 +24,7 @@ def build_far_side(scene: Scene, finger: int, vertex: int, apart: Expression | N
 
 
 def build_joint_edge(scene: Scene, finger: int, edge: int, held: bool) -> GapLimit:
-    """Return the limit at which an edge touches the circle about a joint.
-
-    `held` says that the tip touches the same edge, so that no other edge is nearer.
-    """
+    """Limit at which an edge touches a joint's circle; `held`: the tip touches that edge."""
     features = build_features(scene)
     gaps, runs = _place_joint(scene, finger)
     gap = confine(gaps[edge], runs[edge], float(features.edge_lengths[edge]))
@@ -63,14 +40,15 @@ def build_joint_vertex(scene: Scene, finger: int, vertex: int) -> GapLimit:
     link, lengths = features.links[finger], features.edge_lengths
     _, runs = _place_joint(scene, finger)
     before = (vertex - 1) % len(lengths)
-    gap = _distance(features.vertices[:, vertex] - link.base) - scene.fingers[finger].radius
+    away = features.vertices[:, vertex] - link.base
+    gap = ca.sqrt(ca.sum1(away**2)) - scene.fingers[finger].radius
     beyond = ca.fmax(runs[vertex], float(lengths[before]) - runs[before])
     gap = ca.fmax(gap, ca.fmax(link.vertex_run[vertex], beyond))
     return GapLimit(gap, f"v{vertex} touches the joint of finger {finger + 1}")
 
 
 def build_obstacles(scene: Scene, finger: int, held: list[Contact]) -> list[GapLimit]:
-    """Return the limits of a link's far side and joint, given its contacts of a formation."""
+    """Return the limits of a link's far side and joint, with its contacts `held`."""
     vertices = range(scene.polygon.n_vertices)
     if not held:
         apart = build_apart(scene, finger)
@@ -106,18 +84,16 @@ def confine(
 ) -> Expression:
     """Return a gap that counts only where 0 <= run <= length.
 
-    With `apart`, the gap of the whole bodies, it counts only where they overlap nowhere else: the
-    gap to one side of a link is negative on all of the other side.
+    With `apart`, the gap of the whole bodies, it counts only where they overlap nowhere else.
     """
     value = ca.fmax(gap, ca.fmax(-run, run - length))
     return value if apart is None else ca.fmax(value, apart - gap / 2)
 
 
 def build_apart(scene: Scene, finger: int) -> Expression:
-    """Return the gap between a link and the object [m]: the largest separation of any direction.
+    """Return the signed distance between a link and the object [m], by separating axes.
 
-    The candidates are the normals of the link and of every edge, and the lines from either end of
-    the link to every vertex. Where the two overlap it is minus the least push that parts them.
+    Candidates are the normals of link and edges, and the lines from ends of the link to vertices.
     """
     features = build_features(scene)
     link, part = features.links[finger], scene.fingers[finger]
@@ -129,7 +105,7 @@ def build_apart(scene: Scene, finger: int) -> Expression:
     ]
     for own, other in ((link.base, link.tip), (link.tip, link.base)):
         rays = features.vertices - ca.repmat(own, 1, features.vertices.shape[1])
-        distance = ca.sqrt(ca.sum1(rays**2) + _ROUNDING * part.length**2)
+        distance = ca.sqrt(ca.sum1(rays**2) + ROUNDING * part.length**2)
         table = rays.T @ ca.horzcat(rays, other - own) / ca.repmat(distance.T, 1, rays.shape[1] + 1)
         nearest = table[:, 0]
         for column in range(1, rays.shape[1]):
@@ -146,7 +122,3 @@ def _place_joint(scene: Scene, finger: int) -> tuple[Expression, Expression]:
     normals = features.edge_normals
     along = ca.vertcat(normals[1, :], -normals[0, :])
     return -ca.sum1(normals * to_joint) - scene.fingers[finger].radius, ca.sum1(along * to_joint)
-
-
-def _distance(vector: Expression) -> Expression:
-    return ca.sqrt(ca.sum1(vector**2))

@@ -1,8 +1,7 @@
-"""How far a replay is from the plan, and where and why it departs.
+"""Deviation of a replay from the plan, and its cause.
 
-What makes a replay depart is looked for in its contacts, up to the row at which it is beyond what
-is allowed: one that opens, one that sticks where it should slide or slides where it should roll,
-or one that presses and is not planned. The reason is the first of those that last until then.
+The cause is the first deviation in contacts that lasts until the error of the pose exceeds its
+limit: a contact opens, sticks, slips, or one that is not planned has force.
 """
 
 from __future__ import annotations
@@ -18,17 +17,11 @@ from ..problem.definition import Phase, Problem
 from ..results.trajectory import Samples, Trajectory
 from .stretch import EngineRun, EngineStretch
 
-OPEN = 0.1
-"""Gap at which a contact is open, over the departure that is allowed."""
-SLOW = 0.1
-"""Share of the planned sliding speed below which a contact sticks."""
-MOVES = 2e-3
-"""Sliding speed from which on a contact is known to slide, over the scene's speed."""
-PRESS = 0.25
-"""Normal force above which a contact that is not planned presses, and from which on forces are
-compared, over the scene's force: 0.5 N in the scenes of `problems/`."""
-_INSTANTS = 2000
-"""Instants of a phase over which planned forces are averaged."""
+OPEN = 0.1  # gap of an open contact, over the allowed error
+SLOW = 0.1  # share of the planned sliding speed below which a contact sticks
+MOVES = 2e-3  # sliding speed of a contact that slides, over the scene's speed
+PRESS = 0.25  # least normal force that counts, over the scene's force: 0.5 N in `problems/`
+_INSTANTS = 2000  # samples of a phase over which planned forces are averaged
 
 
 class Force(NamedTuple):
@@ -41,25 +34,23 @@ class Force(NamedTuple):
 
     @property
     def off(self) -> float:
-        """How far it is off, over the planned one."""
+        """Error relative to the planned one."""
         return (self.found - self.planned) / self.planned
 
 
 class Departure(NamedTuple):
     """A stretch, compared with the plan."""
 
-    # t, position, angle (n,) [s], [m] and [rad]: error of the object's pose over time, from the
-    # start of the plan
-    t: Array
-    position: Array
-    angle: Array
+    t: Array  # (n,) [s]: from the start of the plan
+    position: Array  # (n,) [m]: error of the object's position
+    angle: Array  # (n,) [rad]: error of its angle
     forces: tuple[Force, ...]
-    time: float | None  # [s]: when it is beyond what is allowed
-    reason: str  # what made it depart; empty where it does not
+    time: float | None  # [s]: when the error exceeds its limit
+    reason: str  # the cause; empty without one
 
 
-class _PressChange(NamedTuple):
-    """A contact that is not as planned, from when until when [s]."""
+class _Change(NamedTuple):
+    """A deviation of a contact and its interval [s]."""
 
     start: float
     stop: float
@@ -67,7 +58,7 @@ class _PressChange(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """A phase of a stretch: which rows of the run are its own, and the plan there."""
+    """A phase of a stretch: its rows of the run, and the plan there."""
 
     phase: Phase
     contacts: tuple[str, ...]
@@ -76,11 +67,7 @@ class _Part(NamedTuple):
 
 
 def compare(
-    problem: Problem,
-    plan: Trajectory,
-    stretch: EngineStretch,
-    run: EngineRun,
-    allowed: float,
+    problem: Problem, plan: Trajectory, stretch: EngineStretch, run: EngineRun, allowed: float
 ) -> Departure:
     """Compare a replay with the plan.
 
@@ -97,26 +84,21 @@ def compare(
     if not len(beyond):
         return Departure(run.t, position, angle, forces, None, "")
     time = float(run.t[beyond[0]])
-    changes = [
-        each for part in parts for each in _list_changes(problem, part, run, allowed * length)
-    ]
-    return Departure(run.t, position, angle, forces, time, _choose_reason(changes, time))
-
-
-def _choose_reason(changes: list[_PressChange], time: float) -> str:
-    """The first change that lasts until the replay departs, or else the last one before."""
-    before = [each for each in changes if each.start <= time]
-    lasting = [each for each in before if each.stop >= time]
-    if not before:
-        return "every contact is as planned"
-    reason = min(lasting) if lasting else max(before, key=lambda each: each.stop)
-    return f"{reason.what} at t = {reason.start:.5g} s"
+    changes = [c for part in parts for c in _list_changes(problem, part, run, allowed * length)]
+    before = [change for change in changes if change.start <= time]
+    # The first one that lasts until then, or else the last one before.
+    lasting = [change for change in before if change.stop >= time]
+    reason = "every contact is as planned"
+    if before:
+        cause = min(lasting) if lasting else max(before, key=lambda change: change.stop)
+        reason = f"{cause.what} at t = {cause.start:.5g} s"
+    return Departure(run.t, position, angle, forces, time, reason)
 
 
 def _divide(
     problem: Problem, plan: Trajectory, stretch: EngineStretch, run: EngineRun
 ) -> list[_Part]:
-    """The phases of a stretch; the row at which one ends is its own."""
+    """The phases of a stretch; each includes the row at its end."""
     starts, parts = plan.phase_starts, []
     owner = np.searchsorted(starts[1:-1], run.t, side="left")
     owner = np.clip(owner, stretch.phases[0], stretch.phases[-1])
@@ -129,7 +111,7 @@ def _divide(
 
 
 def find_pairs(contact: str, corners: int) -> tuple[str, ...]:
-    """Pairs of shapes that make up a contact: a vertex on a tip's arc also ends two edges."""
+    """Pairs of shapes of a contact; of a vertex on a tip's arc also both edges."""
     corner, part = contact.split("-")
     if corner[0] == "e" or not part.startswith("tip"):
         return (contact,)
@@ -144,13 +126,12 @@ def _find_columns(contact: str, part: _Part, run: EngineRun) -> list[int]:
 
 
 def _average(plan: Trajectory, part: _Part, run: EngineRun) -> list[Force]:
-    """Planned and found normal forces of a phase, averaged over its time.
+    """Planned and found normal forces of a phase, averaged until the gained contact closes.
 
-    That is until the contact that ends the phase presses: its gap closes at a speed that vanishes,
-    so that it is closed early by what is little in the pose.
+    Its gap closes at a vanishing speed: a small error of the pose closes it early.
     """
     motion, until = plan.motions[part.phase.index], part.phase.until.contact
-    # What presses before a row is in the row before it.
+    # Forces before a row are stored in the row before it.
     ends = part.rows[part.rows > 0]
     if until is not None:
         gained = run.press[ends - 1][:, _find_columns(until.name, part, run)].any(axis=1)
@@ -165,19 +146,17 @@ def _average(plan: Trajectory, part: _Part, run: EngineRun) -> list[Force]:
     return [Force(part.phase.number, *row) for row in rows]
 
 
-def _list_changes(
-    problem: Problem, part: _Part, run: EngineRun, reach: float
-) -> Iterator[_PressChange]:
-    """When the contacts of a phase are not as planned, and how."""
+def _list_changes(problem: Problem, part: _Part, run: EngineRun, reach: float) -> Iterator[_Change]:
+    """Deviations of contacts from the plan in a phase."""
     scales, formation, rows = problem.scene.scales, part.phase.formation, part.rows
-    own = formation.evaluate(run.z[rows], run.z_dot[rows])
+    actual = formation.evaluate(run.z[rows], run.z_dot[rows])
     planned = formation.evaluate(part.want.z, part.want.z_dot)
-    slides = np.einsum("nij,nj->ni", own.A_t, run.z_dot[rows])
+    slides = np.einsum("nij,nj->ni", actual.A_t, run.z_dot[rows])
     meant = np.einsum("nij,nj->ni", planned.A_t, part.want.z_dot)
     pressing = run.press[rows[rows > 0] - 1].copy()
     for k, name in enumerate(formation.names):
         pressing[:, _find_columns(name, part, run)] = 0.0
-        yield from _find_runs(run.t[rows], own.C[:, k] > OPEN * reach, f"{name} opens")
+        yield from _find_runs(run.t[rows], actual.C[:, k] > OPEN * reach, f"{name} opens")
         moves = MOVES * scales.speed
         if k in formation.rolling_rows:
             yield from _find_runs(run.t[rows], np.abs(slides[:, k]) > moves, f"{name} slips")
@@ -190,8 +169,8 @@ def _list_changes(
         yield from _find_runs(times, hits, f"{run.pairs[column]} presses, which is not planned,")
 
 
-def _find_runs(t: Array, happens: NDArray[np.bool_], what: str) -> Iterator[_PressChange]:
-    """Times from when until when something happens."""
+def _find_runs(t: Array, happens: NDArray[np.bool_], what: str) -> Iterator[_Change]:
+    """Intervals in which a flag is set."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], happens, [False]]).astype(int)))
     for first, last in zip(edges[::2], edges[1::2] - 1, strict=True):
-        yield _PressChange(float(t[first]), float(t[last]), what)
+        yield _Change(float(t[first]), float(t[last]), what)

@@ -1,4 +1,4 @@
-"""Replays in Drake."""
+"""Replays in Drake, with its point contact model and the TAMSI solver."""
 
 from __future__ import annotations
 
@@ -9,26 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from ..common.arrays import Array
 from ..policy.closed_loop import ClosedLoop
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from ..scene.model import Scene
 from .departure import find_pairs
 from .pressing import EngineDrive, press_in
-from .shapes import LINKS, OBJECT, PALM, Pair, Shape, find_rounding, list_pairs, list_shapes
+from .shapes import LINKS, OBJECT, PALM, Shape, find_rounding, list_pairs, list_shapes
 from .stretch import EngineRun, EngineStretch, Setting, Steps, list_steps
 
 SINKING = 6e-3
-"""How far the scene's force presses a contact in, over the scene's length and the step."""
-STICTION = 1e-5
-"""Sliding speed up to which friction grows, over the scene's speed."""
-DISSIPATION = 1000.0
-"""Damping of contacts by Hunt and Crossley, times the scene's speed."""
-_EVERY = 4
-"""Steps from one look at the forces to the next: contacts swing ten times as slowly."""
-_ROUGH = 1e12
-"""Friction of vertices and edges, which makes that of a pair twice the other shape's."""
+"""penetration by the scene's force, over the scene's length and the relative step."""
+STICTION = 1e-5  # stiction tolerance, over the scene's speed
+DISSIPATION = 1000.0  # Hunt-Crossley damping of contacts, times the scene's speed
+_EVERY = 4  # Steps from one look at the forces to the next: contacts swing ten times as slowly
+_ROUGH = 1e12  # Friction of vertices and edges, which makes that of a pair twice the other shape's
 
 
 def play(
@@ -36,9 +31,7 @@ def play(
 ) -> EngineRun:
     """Replay a stretch in Drake; an `Engine`.
 
-    Raises
-    ------
-    ImportError  if Drake is not installed
+    ImportError if Drake is not installed.
     """
     from pydrake.systems.analysis import Simulator
 
@@ -50,7 +43,9 @@ def play(
         diagram, plant, pairs = _build(problem.scene, steps, setting, drive is None)
         simulator = Simulator(diagram)
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    plant.SetPositions(context, _press(problem, stretch, setting))
+    corners, stiffness = problem.scene.polygon.n_vertices, _find_stiffness(problem.scene, setting)
+    shares = {name: len(find_pairs(name, corners)) * stiffness for name in stretch.c_n}
+    plant.SetPositions(context, press_in(problem, stretch, shares))
     plant.SetVelocities(context, steps.v)
     simulator.Initialize()
     results = plant.get_contact_results_output_port()
@@ -150,10 +145,10 @@ def _add_bodies(plant: Any, scene: Scene) -> None:
     body = add(OBJECT, polygon.mass, polygon.inertia)
     plant.AddJoint(PlanarJoint(OBJECT, plant.world_frame(), body.body_frame()))
     for name, link in zip(LINKS, scene.fingers, strict=True):
-        own = add(name, link.inertia / link.length**2, link.inertia)
+        link_body = add(name, link.inertia / link.length**2, link.inertia)
         place = RigidTransform([*np.asarray(link.base), 0.0])
         base = plant.AddFrame(FixedOffsetFrame(f"{name} base", plant.world_frame(), place))
-        turn = RevoluteJoint(name, base, own.body_frame(), [0.0, 0.0, 1.0], link.viscous)
+        turn = RevoluteJoint(name, base, link_body.body_frame(), [0.0, 0.0, 1.0], link.viscous)
         plant.AddJointActuator(name, plant.AddJoint(turn))
     plant.mutable_gravity_field().set_gravity_vector([0.0, -scene.gravity, 0.0])
 
@@ -185,7 +180,9 @@ def _add_shapes(plant: Any, graph: Any, scene: Scene, setting: Setting) -> dict[
 
     numbers = {}
     for number, pair in enumerate(list_pairs(scene)):
-        ids = [register(name, friction) for name, friction in _share_friction(pair)]
+        # Drake combines two frictions as 2 a b / (a + b).
+        one, two = (_ROUGH, pair.friction / 2) if pair.friction else (0.0, 0.0)
+        ids = [register(pair.first, one), register(pair.second, two)]
         numbers[frozenset(ids)] = number
     manager = graph.collision_filter_manager()
     manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(list(known.values()))))
@@ -194,20 +191,6 @@ def _add_shapes(plant: Any, graph: Any, scene: Scene, setting: Setting) -> dict[
         allowed.AllowBetween(GeometrySet(first), GeometrySet(second))
     manager.Apply(allowed)
     return numbers
-
-
-def _share_friction(pair: Pair) -> tuple[tuple[str, float], tuple[str, float]]:
-    """Both shapes of a pair with frictions that Drake makes that of the pair of."""
-    if pair.friction == 0.0:
-        return (pair.first, 0.0), (pair.second, 0.0)
-    return (pair.first, _ROUGH), (pair.second, pair.friction / 2)
-
-
-def _press(problem: Problem, stretch: EngineStretch, setting: Setting) -> Array:
-    """The planned start, with contacts pressed in."""
-    corners, stiffness = problem.scene.polygon.n_vertices, _find_stiffness(problem.scene, setting)
-    shares = {name: len(find_pairs(name, corners)) for name in stretch.c_n}
-    return press_in(problem, stretch, {name: n * stiffness for name, n in shares.items()})
 
 
 def _find_stiffness(scene: Scene, setting: Setting) -> float:

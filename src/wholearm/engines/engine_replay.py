@@ -1,4 +1,4 @@
-"""Replays of plans in physics engines, and what they show."""
+"""Verification of plans by open-loop replay in physics engines."""
 
 from __future__ import annotations
 
@@ -20,22 +20,21 @@ from ..results.trajectory import Trajectory
 from .departure import PRESS, Departure, compare
 from .stretch import Engine, EngineStretch, Setting, apply_friction, find_between, list_stretches
 
-PARTS = 5
-"""Equal parts of a stretch at whose ends the error is listed."""
+PARTS = 5  # equal parts of a stretch at whose ends the error is listed
 
 
-class Known(NamedTuple):
-    """An engine that plans can be replayed in."""
+class EngineInfo(NamedTuple):
+    """A physics engine."""
 
-    title: str  # title, package: what it is called, and the package that it is imported from
-    package: str
-    allowed: float  # error of the pose that is allowed, over the scene's length and in rad
+    title: str
+    package: str  # that it is imported from
+    allowed: float  # error of the pose, over the scene's length and in rad
     setting: Setting
 
 
 ENGINES = {
-    "mujoco": Known("MuJoCo", "mujoco", 3e-3, Setting(1.6e-4)),
-    "drake": Known("Drake", "pydrake", 1.5e-3, Setting(1.6e-4)),
+    "mujoco": EngineInfo("MuJoCo", "mujoco", 3e-3, Setting(1.6e-4)),
+    "drake": EngineInfo("Drake", "pydrake", 1.5e-3, Setting(1.6e-4)),
 }
 """In the scenes of `problems/` 3e-3 are 0.1 mm and 0.17 degrees, and steps take 1e-5 s."""
 
@@ -49,30 +48,31 @@ class Level(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class EngineReport(Result):
-    """What replays in an engine have shown."""
+    """Errors and forces of replays in an engine."""
 
     problem: Problem
     title: str  # the engine and its version
     allowed: float
     stretches: tuple[EngineStretch, ...]
-    levels: tuple[Level, ...]  # the first with the setting that was asked for, then finer ones
+    levels: tuple[Level, ...]  # the chosen setting, then finer ones
 
     @property
     def ok(self) -> bool:
-        """Whether no stretch departs by more than is allowed."""
+        """Whether no stretch exceeds the allowed error."""
         return all(each.time is None for each in self.levels[0].departures)
 
     @property
     def converged(self) -> bool:
-        """Whether every stretch that departs does so with the finer settings, too."""
+        """Whether every stretch that departs also does with finer settings."""
         rows = zip(*(level.departures for level in self.levels), strict=True)
         return all(
-            own.time is None or all(each.time is not None for each in finer) for own, *finer in rows
+            first.time is None or all(each.time is not None for each in finer)
+            for first, *finer in rows
         )
 
     @property
     def document(self) -> Document:
-        """How far replays are from the plan, and the forces that they find."""
+        """Errors and forces of each stretch."""
         scales, departures = self.problem.scene.scales, self.levels[0].departures
         setting = self.levels[0].setting
         millimetres, degrees = self.allowed * scales.length * 1e3, math.degrees(self.allowed)
@@ -83,9 +83,9 @@ class EngineReport(Result):
         errors, forces, levels = list[list[Any]](), list[tuple[Any, ...]](), list[list[Any]]()
         for stretch, found in pairs:
             at = np.linspace(stretch.start, stretch.stop, PARTS + 1)[1:]
+            sampled = np.interp(at, found.t, found.position)
             largest = np.max(found.position), np.max(found.angle)
-            over = np.interp(at, found.t, found.position)
-            errors.append([stretch.name, stretch.duration, *largest, *over])
+            errors.append([stretch.name, stretch.duration, *largest, *sampled])
             for force in found.forces:
                 off = force.off if force.planned > PRESS * scales.force else None
                 forces.append((force.phase, force.contact, force.planned, force.found, off))
@@ -153,9 +153,7 @@ def _describe(stretch: EngineStretch, found: Departure) -> dict[str, Any]:
 def require_engine(name: str) -> Engine:
     """The function that replays in an engine.
 
-    Raises
-    ------
-    InputError  if there is no such engine, or it is not installed
+    InputError if there is no such engine, or it is not installed.
     """
     if name not in ENGINES:
         raise InputError("", "--engine", f"{name!r} given; allowed are {', '.join(ENGINES)}")
@@ -182,43 +180,39 @@ def replay_in(
     halvings: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> EngineReport:
-    """Replay a plan open loop in an engine that is not told which contacts hold.
+    """Replay a plan open loop in an engine that does not know the contact sequence.
 
     Parameters
     ----------
     engine : {"mujoco", "drake"}
-    whole                         from the start to the end; otherwise phase by phase, each from its
-                                  planned start
-    setting                       time step and softness of contacts; those of `ENGINES` when left
-                                  out
-    allowed                       error of the pose that is allowed, over the scene's length and in
-                                  rad
-    halvings                      how often the step is halved, with harder contacts and with the
-                                  same
+    whole      from start to end; otherwise phase by phase, each from its planned start
+    setting    time step and softness of contacts; by default those of `ENGINES`
+    allowed    error of the pose, over the scene's length and in rad; by default that of `ENGINES`
+    halvings   number of halvings of the step, with harder contacts and with the same
 
     Raises
     ------
     InputError  if the engine is unknown or not installed, the plan is of other phases, or a link
                 has no thickness
     """
-    known, play = ENGINES.get(engine), require_engine(engine)
-    assert known is not None
+    play = require_engine(engine)
+    info = ENGINES[engine]
     problem, plan = adopt_motion(problem, plan)
     require_same_phases(problem, plan)
-    setting = known.setting if setting is None else setting
-    allowed = known.allowed if allowed is None else allowed
+    setting = info.setting if setting is None else setting
+    allowed = info.allowed if allowed is None else allowed
     plan = find_between(plan)
     torque, stretches = apply_friction(problem.scene, plan), list_stretches(plan, whole)
     levels = []
-    for own in list_settings(setting, halvings):
+    for level in list_settings(setting, halvings):
         found = []
         for stretch in stretches:
             if progress is not None:
-                progress(f"phase {stretch.name} in {known.title}, step {own.step:.3g}")
-            run = play(problem, stretch, torque, own)
+                progress(f"phase {stretch.name} in {info.title}, step {level.step:.3g}")
+            run = play(problem, stretch, torque, level)
             found.append(compare(problem, plan, stretch, run, allowed))
-        levels.append(Level(own, tuple(found)))
-    title = f"{known.title} {version(engine)}"
+        levels.append(Level(level, tuple(found)))
+    title = f"{info.title} {version(engine)}"
     return EngineReport(problem, title, allowed, tuple(stretches), tuple(levels))
 
 
@@ -226,5 +220,5 @@ def list_settings(setting: Setting, halvings: int) -> list[Setting]:
     """A setting, finer ones, and finer steps alone, with contacts as they are at first."""
     finer = [setting._replace(step=setting.step / 2**k) for k in range(halvings + 1)]
     return finer + [
-        own._replace(softness=setting.softness * 2**k) for k, own in enumerate(finer[1:], 1)
+        level._replace(softness=setting.softness * 2**k) for k, level in enumerate(finer[1:], 1)
     ]

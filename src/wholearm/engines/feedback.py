@@ -1,4 +1,4 @@
-"""Policies in physics engines: torques by feedback, and where the motion ends."""
+"""Simulation of policies in physics engines."""
 
 from __future__ import annotations
 
@@ -21,27 +21,25 @@ from .departure import find_pairs
 from .engine_replay import ENGINES, require_engine
 from .stretch import EngineRun, EngineStretch, Setting, find_between, list_stretches
 
+# Allowed error of the final pose, over the scene's length and in rad; soft contacts cause 2e-3.
 ALLOWED = 1e-2
-"""How far from the plan's a motion may end, over the scene's length and in rad: in soft contacts
-the shipped plans end at most 2e-3 away."""
 
 
 class StretchEnd(NamedTuple):
     """A stretch that a policy carries out in an engine."""
 
     stretch: EngineStretch
-    duration: float  # [s]: until the joints stand still at the end
-    over: bool  # whether they do
-    position: float  # position, angle [m] and [rad]: how far from the plan's the pose ends
-    angle: float
-    # the planned contact that opens most, from when its phase begins until the next contact
-    contact: str
-    gap: float  # [m]: by how much
+    duration: float  # [s]: until the joints are at rest at the end
+    over: bool  # whether they are
+    position: float  # [m]: final error of the object's position
+    angle: float  # [rad]: of its angle
+    contact: str  # the planned contact that opens most during its phase
+    gap: float  # [m]: its gap
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PolicyReport(Result):
-    """What a policy does in an engine; `allowed` is over the scene's length and in rad."""
+    """Final errors of a policy in an engine; `allowed` is over the scene's length and in rad."""
 
     problem: Problem
     title: str
@@ -50,28 +48,28 @@ class PolicyReport(Result):
 
     @property
     def ok(self) -> bool:
-        """Whether every stretch ends, and where it is to end."""
-        return all(self.find_failure(own) is None for own in self.arrivals)
+        """Whether every stretch ends, at the planned pose."""
+        return all(self.find_failure(end) is None for end in self.arrivals)
 
-    def find_failure(self, own: StretchEnd) -> str | None:
-        """What is wrong with a stretch."""
-        far = max(own.position / self.problem.scene.scales.length, own.angle)
+    def find_failure(self, end: StretchEnd) -> str | None:
+        """Description of a failure, if there is one."""
+        far = max(end.position / self.problem.scene.scales.length, end.angle)
         if not far <= self.allowed:
-            text = f"{own.position * 1e3:.3g} mm and {math.degrees(own.angle):.3g} degrees"
-            return f"phase {own.stretch.name} ends {text} away from the plan"
-        if not own.over:
-            return f"phase {own.stretch.name} does not end within {own.duration:.4g} s"
+            text = f"{end.position * 1e3:.3g} mm and {math.degrees(end.angle):.3g} degrees"
+            return f"phase {end.stretch.name} ends {text} away from the plan"
+        if not end.over:
+            return f"phase {end.stretch.name} does not end within {end.duration:.4g} s"
         return None
 
     @property
     def document(self) -> Document:
-        """Durations beside those of the plan, and where stretches end."""
+        """Durations and final errors."""
         columns = {
             "stretch.name": "phase:d", "stretch.duration": "plan [s]:.6f",
             "duration": "policy [s]:.6f", "position": "end off [mm]:.4f", "angle": "[deg]:.4f",
             "gap": "largest gap [mm]:.4f", "contact": "",
         }  # fmt: skip
-        failures = [self.find_failure(own) or "" for own in self.arrivals]
+        failures = [self.find_failure(end) or "" for end in self.arrivals]
         title = f"{self.problem.name} in {self.title}, by the policy"
         verdict, table = "ok" if self.ok else "FAILS", Table.of(self.arrivals, columns)
         return Document(title, verdict, parts=[*failures, table])
@@ -79,9 +77,9 @@ class PolicyReport(Result):
     @property
     def values(self) -> dict[str, Any]:
         """The report for machines, in m, rad and s."""
-        stretches = [{"phases": own.stretch.numbers, **own._asdict()} for own in self.arrivals]
-        for own in stretches:
-            del own["stretch"]
+        stretches = [{"phases": end.stretch.numbers, **end._asdict()} for end in self.arrivals]
+        for stretch in stretches:
+            del stretch["stretch"]
         values = {"problem": self.problem.name, "engine": self.title, "ok": self.ok}
         return {**values, "allowed": self.allowed, "stretches": stretches}
 
@@ -97,16 +95,14 @@ def play_policy(
     allowed: float = ALLOWED,
     progress: Callable[[str], None] | None = None,
 ) -> PolicyReport:
-    """Let a policy move the hand in an engine that is not told which contacts hold.
+    """Simulate a policy in an engine that does not know the contact sequence.
 
     Parameters
     ----------
     engine : {"mujoco", "drake"}
-    plan                          where phases start and end
-    whole                         from the start to the end; otherwise phase by phase, from rest
-                                  where each is planned to start, but for those that impacts or
-                                  their own motion lead into
-    setting, allowed, progress    as of `replay_in`
+    plan                        start and end of each phase
+    whole                       from start to end; otherwise from each phase that begins at rest
+    setting, allowed, progress  as of `replay_in`
 
     Raises
     ------
@@ -117,36 +113,36 @@ def play_policy(
     if policy.count != len(problem.phases):
         given = f"{policy.count} given; the problem has {len(problem.phases)}"
         raise InputError("", "phases of the policy", given)
-    known = ENGINES[engine]
-    setting = known.setting if setting is None else setting
+    info = ENGINES[engine]
+    setting = info.setting if setting is None else setting
     arrivals = []
     for stretch in _join(list_stretches(find_between(plan), False), policy, whole):
         if progress is not None:
-            progress(f"phase {stretch.name} in {known.title}")
+            progress(f"phase {stretch.name} in {info.title}")
         last = stretch.phases[-1] + 1
         loop = ClosedLoop(policy.cut(last), stretch.phases[0] + 1)
         until = stretch.start + (1 + ROOM) * loop.find_duration(last)
         run = play(problem, stretch._replace(stop=until), loop, setting)
         arrivals.append(_judge(problem, plan, stretch, loop, run))
-    title = f"{known.title} {version(engine)}"
+    title = f"{info.title} {version(engine)}"
     return PolicyReport(problem, title, allowed, tuple(arrivals))
 
 
 def _join(parts: list[EngineStretch], policy: Policy, whole: bool) -> list[EngineStretch]:
-    """Stretches at rest in the beginning, one after another; or all as one."""
+    """Stretches that begin at rest, or one of all phases."""
     begins = [1] if whole else policy.resting
     found = []
     for first, after in zip(begins, [*begins[1:], len(parts) + 1], strict=True):
-        own, still = parts[first - 1], np.zeros(5)
-        phases, stop = tuple(range(first - 1, after - 1)), parts[after - 2].stop
-        found.append(own._replace(phases=phases, stop=stop, z_dot=still, z_ddot=still))
+        phases, stop, rest = tuple(range(first - 1, after - 1)), parts[after - 2].stop, np.zeros(5)
+        start = parts[first - 1]
+        found.append(start._replace(phases=phases, stop=stop, z_dot=rest, z_ddot=rest))
     return found
 
 
 def _judge(
     problem: Problem, plan: Trajectory, stretch: EngineStretch, loop: ClosedLoop, run: EngineRun
 ) -> StretchEnd:
-    """Where a run ends, and which planned contact opens most on the way."""
+    """Final error of a run, and the planned contact that opens most."""
     goal = plan.z[np.flatnonzero(plan.phase == stretch.phases[-1])[-1]]
     away, t = np.abs(run.z[-1] - goal), run.t - stretch.start
     position, angle = float(np.hypot(*away[:2])), float(away[2])

@@ -23,30 +23,24 @@ from .stretch import apply_friction
 
 SHARE = 1e-6
 """Weight of a joint's angle in its tendon, over the scene's time; that of the clock is 1."""
-DRIVE = 1e9
-"""Force that drives the clock, over what all springs may exert."""
-BEND = 1e-3
-"""Largest error of the ramps, relative to the largest torque."""
-RISE = 1e-6
-"""Least time from row to row, over the time step."""
+DRIVE = 1e9  # Force that drives the clock, over what all springs may exert
+BEND = 1e-3  # Largest error of the ramps, relative to the largest torque
+RISE = 1e-6  # Least time from row to row, over the time step
 CLOCK = "clock"
 HIDDEN = {"group": 3}
 """Group of joints and actuators for which MuJoCo's viewer has no sliders, unless asked for."""
-STEP = 1.6e-4
-"""Time step, over the scene's time: 1e-5 s in the scenes of `problems/`."""
+STEP = 1.6e-4  # Time step, over the scene's time: 1e-5 s in the scenes of `problems/`
 
 
 class Softness(NamedTuple):
-    """How soft contacts are.
+    """Softness of contacts.
 
-    Sliding in a convex model of contact parts the surfaces at a rate that falls with the time
-    constant of friction and with the impedance; where they part for long, forces come too late.
+    In a convex contact model sliding separates the surfaces at a rate that falls with the time
+    constant of friction and with the impedance.
     """
 
-    # press, rub: time constants of gap and sliding speed, as of critically damped springs, in time
-    # steps
-    press: float = 7.5
-    rub: float = 300.0
+    press: float = 7.5  # time constant of the gap (critically damped), in time steps
+    rub: float = 300.0  # time constant of the sliding speed, in time steps
     impedance: float = 0.01  # share of the unconstrained motion that a contact takes away
     ratio: float = 100.0  # impedance of friction over that of the gap
 
@@ -83,10 +77,26 @@ def write_mjcf(
     softness = Softness() if softness is None else softness
     _add_options(root, scene, step, softness)
     world = add(root, "worldbody")
-    _add_palm(world, scene)
+    reach = 10 * max(scene.polygon.size, *(link.length for link in scene.fingers))
+    place, size = [0.0, -find_rounding(scene), 0.0], [reach, reach, reach / 100]
+    _add_geom(world, PALM, "plane", pos=place, zaxis=[0, 1, 0], size=size, rgba=".6 .6 .6 .3")
     _add_object(world, scene, home[:3])
     _add_links(world, scene, home[3:])
-    _add_pairs(add(root, "contact"), scene, step, softness)
+    contact, impedance = add(root, "contact"), softness.impedance
+    for pair in list_pairs(scene):
+        rough = pair.friction > 0
+        add(
+            contact,
+            "pair",
+            name=pair.name,
+            geom1=pair.first,
+            geom2=pair.second,
+            condim="3" if rough else "1",
+            friction=[pair.friction, pair.friction, 0, 0, 0] if rough else [1, 1, 0, 0, 0],
+            solref=[softness.press * step, 1.0],
+            solreffriction=[softness.rub * step, 1.0],
+            solimp=[impedance, impedance, 1.0],
+        )
     motors = add(root, "actuator")
     for number, link in enumerate(scene.fingers, 1):
         # Controls contain the dry friction of the joint.
@@ -124,13 +134,6 @@ def _add_geom(body: Element, name: str, kind: str, **attributes: object) -> None
     add(body, "geom", name=name, type=kind, contype="0", conaffinity="0", **attributes)
 
 
-def _add_palm(world: Element, scene: Scene) -> None:
-    reach = 10 * max(scene.polygon.size, *(link.length for link in scene.fingers))
-    place = [0.0, -find_rounding(scene), 0.0]
-    size = [reach, reach, reach / 100]
-    _add_geom(world, PALM, "plane", pos=place, zaxis=[0, 1, 0], size=size, rgba=".6 .6 .6 .3")
-
-
 def _add_object(world: Element, scene: Scene, q: Array) -> None:
     polygon = scene.polygon
     body = add(world, "body", name=OBJECT, pos=[*q[:2], 0.0])
@@ -165,23 +168,6 @@ def _add_shapes(body: Element, scene: Scene, angle: float) -> None:
             ends = np.pad(shape.points @ np.array([[c, s], [-s, c]]), ((0, 0), (0, 1)))
             kind, key = ("sphere", "pos") if len(ends) == 1 else ("capsule", "fromto")
             _add_geom(body, shape.name, kind, size=shape.radius, **{key: ends})
-
-
-def _add_pairs(contact: Element, scene: Scene, step: float, softness: Softness) -> None:
-    for pair in list_pairs(scene):
-        rough = pair.friction > 0
-        add(
-            contact,
-            "pair",
-            name=pair.name,
-            geom1=pair.first,
-            geom2=pair.second,
-            condim="3" if rough else "1",
-            friction=[pair.friction, pair.friction, 0, 0, 0] if rough else [1, 1, 0, 0, 0],
-            solref=[softness.press * step, 1.0],
-            solreffriction=[softness.rub * step, 1.0],
-            solimp=[softness.impedance, softness.impedance, 1.0],
-        )
 
 
 def list_ramps(scene: Scene, plan: Trajectory, step: float) -> tuple[Array, Array]:
@@ -221,17 +207,13 @@ def add_clock(root: Element, scene: Scene, plan: Trajectory, step: float) -> Non
             rise, slope = rises[row, k], rises[row, k] / (t[row + 1] - t[row])
             ramp = {"biasprm": [-slope * t[row], slope, 0], "forcerange": sorted((0.0, rise))}
             add(springs, "general", name=f"{name}-{row}", tendon=name, **ramp, **spring)
-    _add_keys(_find(root, "keyframe"), plan)
-
-
-def _add_keys(keys: Element, plan: Trajectory) -> None:
-    """Keyframes with positions, velocities and the clock."""
-    starts = plan.phase_starts[:-1]
-    rows = [int(np.flatnonzero(plan.phase == index)[0]) for index in range(len(starts))]
+    # Keyframes with positions, velocities and the clock.
+    starts, keys = plan.phase_starts[:-1], _find(root, "keyframe")
+    firsts = [int(np.flatnonzero(plan.phase == index)[0]) for index in range(len(starts))]
     names = ["home", *(f"phase{number}" for number in range(1, len(starts) + 1))]
-    for name, row in zip(names, [0, *rows], strict=True):
-        t = plan.t[row]
-        add(keys, "key", name=name, time=t, qpos=[*plan.z[row], t], qvel=[*plan.z_dot[row], 1.0])
+    for name, k in zip(names, [0, *firsts], strict=True):
+        at = plan.t[k]
+        add(keys, "key", name=name, time=at, qpos=[*plan.z[k], at], qvel=[*plan.z_dot[k], 1.0])
 
 
 def _find(root: Element, tag: str) -> Element:

@@ -17,8 +17,7 @@ from .pressing import EngineDrive, press_in
 from .shapes import list_pairs
 from .stretch import EngineRun, EngineStretch, Setting, list_steps
 
-_LITTLE = 1e-6
-"""Depth at which contacts are looked at, over the scene's length."""
+_LITTLE = 1e-6  # depth at which stiffnesses are read, over the scene's length
 
 
 def play(
@@ -26,9 +25,7 @@ def play(
 ) -> EngineRun:
     """Replay a stretch in MuJoCo; an `Engine`.
 
-    Raises
-    ------
-    ImportError  if MuJoCo is not installed
+    ImportError if MuJoCo is not installed.
     """
     import mujoco
 
@@ -41,7 +38,8 @@ def play(
     numbers = _number_pairs(model, problem)
     data.qpos[:], data.qvel[:] = _press(problem, stretch, model, data, numbers), steps.v
     states, press, start = [(stretch.z, stretch.z_dot)], [], 0
-    mujoco.set_mju_user_warning(_ignore)
+    # Warnings of states that are not finite would go to stderr and to a file; the deviation shows.
+    mujoco.set_mju_user_warning(lambda _: None)
     for end in steps.ends:
         total = np.zeros(len(names))
         for step in range(start, end):
@@ -52,10 +50,10 @@ def play(
             mujoco.mj_step(model, data)
             if data.ncon:
                 contact = data.contact
-                own = contact.efc_address
-                held = own >= 0
+                address = contact.efc_address
+                held = address >= 0
                 pair = numbers[contact.geom1[held], contact.geom2[held]]
-                np.add.at(total, pair, data.efc_force[own[held]])
+                np.add.at(total, pair, data.efc_force[address[held]])
         press.append(total / (end - start))
         states.append((data.qpos.copy(), data.qvel.copy()))
         start = end
@@ -65,13 +63,6 @@ def play(
     z, z_dot = (np.array(part) for part in zip(*states, strict=True))
     t = stretch.start + steps.h * np.array([0, *steps.ends[: len(press)]])
     return EngineRun(t, z, z_dot, names, np.array(press))
-
-
-def _ignore(_: str) -> None:
-    """Take a warning of MuJoCo, which else goes to stderr and to a file in the current folder.
-
-    What it warns of, states that are not finite, shows as a departure.
-    """
 
 
 def _number_pairs(model: Any, problem: Problem) -> NDArray[np.int64]:
@@ -86,10 +77,9 @@ def _number_pairs(model: Any, problem: Problem) -> NDArray[np.int64]:
 def _press(
     problem: Problem, stretch: EngineStretch, model: Any, data: Any, numbers: NDArray[np.int64]
 ) -> Array:
-    """The planned start, with contacts pressed in.
+    """The planned start with penetrations that give the planned forces.
 
-    The stiffness of a contact, which MuJoCo makes of its time constant and of the inertias that
-    meet there, is read where all are pressed in a little.
+    MuJoCo computes stiffnesses from time constants and inertias; they are read at a small depth.
     """
     import mujoco
 
@@ -101,12 +91,10 @@ def _press(
     contact, found = data.contact, np.zeros(len(list_pairs(problem.scene)))
     held = contact.efc_address >= 0
     rows = contact.efc_address[held]
-    own = data.efc_KBIP[rows, 0] * data.efc_KBIP[rows, 2] / data.efc_R[rows]
-    np.add.at(found, numbers[contact.geom1[held], contact.geom2[held]], own)
+    stiffness_row = data.efc_KBIP[rows, 0] * data.efc_KBIP[rows, 2] / data.efc_R[rows]
+    np.add.at(found, numbers[contact.geom1[held], contact.geom2[held]], stiffness_row)
     names, corners = [pair.name for pair in list_pairs(problem.scene)], problem.scene.polygon
-    stiffness = {
-        name: sum(found[names.index(pair)] for pair in find_pairs(name, corners.n_vertices))
-        for name in stretch.c_n
-    }
+    pairs = {name: find_pairs(name, corners.n_vertices) for name in stretch.c_n}
+    stiffness = {k: sum(found[names.index(p)] for p in v) for k, v in pairs.items()}
     mujoco.mj_resetData(model, data)
     return press_in(problem, stretch, {k: v if v > 0 else np.inf for k, v in stiffness.items()})

@@ -1,4 +1,4 @@
-"""Starts of replays at which contacts, which give way in engines, press as the plan says."""
+"""Starts of replays with penetrations that give the planned forces; torques of policies."""
 
 from __future__ import annotations
 
@@ -15,53 +15,43 @@ from ..scene.model import Scene
 from .stretch import EngineStretch
 
 CREEP = 10.0
-"""Speed from which on dry friction is all there, over that which it takes away in a step."""
-LOOSE = 3e-7
-"""Gap of what touches without a force, over the scene's length."""
+"""regularization speed of dry friction, over its change of speed in a step."""
+LOOSE = 3e-7  # gap of contacts without a force, over the scene's length
 _APART = 0.1
 """Share of a contact's row that no other contact has, from which on it is another place."""
 
 
 def press_in(problem: Problem, stretch: EngineStretch, stiffness: Mapping[str, float]) -> Array:
-    """The planned start, with contacts pressed in as far as the planned forces press them.
+    """The planned start with penetrations of planned force over stiffness [N/m], shape (5,).
 
-    What touches elsewhere without a force, as a contact that has just been let go, is loose: it
-    would be hit by what swings at the start.
-
-    Parameters
-    ----------
-    stiffness  that of each contact [N/m]
-
-    Returns
-    -------
-    ndarray, shape (5,)
-        The nearest such configuration, by the kinetic energy of getting there.
+    It is the nearest such configuration in the metric of the kinetic energy. Contacts without a
+    force, such as released ones, get a small gap: oscillations at the start would hit them.
     """
     scene, formation = problem.scene, problem.phases[stretch.phases[0]].formation
     touching = find_touching(scene, stretch.z)
     contacts = formation.contacts + tuple(c for c in touching if c not in formation.contacts)
     A = Formation(scene, contacts).evaluate(stretch.z[None], stretch.z_dot[None]).A[0]
     weight = 1 / np.sqrt(scene.mass_diagonal)
-    rows = _drop_repeated(A * weight, formation.n_contacts)
+    rows = _list_independent(A * weight, formation.n_contacts)
     depth = np.full(len(contacts), -LOOSE * scene.scales.length)
     for k, name in enumerate(formation.names):
         depth[k] = stretch.c_n[name] / stiffness[name]
     return np.asarray(stretch.z - weight * (np.linalg.pinv((A * weight)[rows]) @ depth[rows]))
 
 
-def _drop_repeated(rows: Array, kept: int) -> list[int]:
-    """The first rows, and of the others those that are not at the place of one before."""
+def _list_independent(rows: Array, kept: int) -> list[int]:
+    """The first `kept` rows, and those of the others that are independent of the rows before."""
     unit, chosen = rows / np.linalg.norm(rows, axis=1)[:, None], list(range(kept))
     for row in range(kept, len(rows)):
-        known = unit[chosen]
-        rest = unit[row] - np.linalg.pinv(known) @ (known @ unit[row])
+        basis = unit[chosen]
+        rest = unit[row] - np.linalg.pinv(basis) @ (basis @ unit[row])
         if np.linalg.norm(rest) > _APART:
             chosen.append(row)
     return chosen
 
 
 class EngineDrive:
-    """The torques that a policy applies in an engine.
+    """Torques of a policy in an engine, sampled, delayed, and less regularized dry friction.
 
     Parameters
     ----------
@@ -69,7 +59,7 @@ class EngineDrive:
 
     Attributes
     ----------
-    over  whether the motion is
+    over  whether the motion is over
     """
 
     def __init__(self, scene: Scene, loop: ClosedLoop, h: float) -> None:

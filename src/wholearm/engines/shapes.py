@@ -28,11 +28,9 @@ from ..common.arrays import Array
 from ..common.errors import InputError
 from ..scene.model import Scene
 
-ROUNDING = 1e-7
-"""Radius of vertices and edges, over the object's radius of gyration."""
+ROUNDING = 1e-7  # Radius of vertices and edges, over the object's radius of gyration
 OBJECT = "object"
-LINKS = ("link1", "link2")
-"""Bodies that move."""
+LINKS = ("link1", "link2")  # Bodies that move
 PALM = "palm"
 
 
@@ -70,9 +68,7 @@ def find_rounding(scene: Scene) -> float:
 def list_shapes(scene: Scene) -> list[Shape]:
     """Every shape of object and links.
 
-    Raises
-    ------
-    InputError  if a link has no thickness: what sinks into it would come out on the other side
+    InputError if a link has no thickness: what sinks into it would come out on the other side.
     """
     r, corners = find_rounding(scene), scene.polygon.vertices
     after = np.roll(corners, -1, axis=0)

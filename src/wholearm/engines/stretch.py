@@ -1,4 +1,4 @@
-"""What an engine is asked, and what it answers."""
+"""Interface of physics engines: parts of a plan, settings, time steps and results."""
 
 from __future__ import annotations
 
@@ -17,30 +17,21 @@ from ..results.trajectory import Trajectory
 from ..scene.model import Scene
 from ..simulation.simulate import simulate
 
-SAME = 1e-4
-"""Largest difference between plan and replay, over the scene's length and in rad."""
-LATE = 1e-3
-"""Largest difference of the times at which phases end, over the scene's time: an end at rest is
-reached so slowly that little in place is much in time."""
-_ROWS = 400
-"""Instants of each phase at which the replay is known, besides its steps."""
-_INSTANTS = 2000
-"""Instants of each phase at which the sign of a joint's speed is looked at."""
-ROWS = 200
-"""About how many times a phase is looked at."""
-FEWEST = 5000
-"""Fewest steps of a stretch: after a step of torques contacts swing for tens of steps."""
-_LOOKS = 8
-"""Instants of each step over which torques are averaged."""
-_LEAST = 1e-3
-"""First of these instants after the start, in steps."""
+SAME = 1e-4  # difference of replay and plan that counts as none, over the scene's length and in rad
+LATE = 1e-3  # difference of phase ends, over the scene's time: rest is approached slowly
+_ROWS = 400  # samples of each phase of the reference replay, besides its steps
+_INSTANTS = 2000  # samples of each phase for reversals of joints
+ROWS = 200  # approximate rows of a result per phase
+FEWEST = 5000  # least steps of a stretch: contacts oscillate after a jump of torques
+_LOOKS = 8  # samples of each step over which torques are averaged
+_LEAST = 1e-3  # first of these samples after the start, in steps
 
 
 class EngineStretch(NamedTuple):
-    """A part of a plan that is replayed on its own: one phase, or all."""
+    """A part of a plan that is replayed alone: one phase, or all."""
 
     phases: tuple[int, ...]  # indices of its phases, from 0
-    start: float  # start, stop [s]:
+    start: float  # start, stop [s]
     stop: float
     z: Array  # z, z_dot, z_ddot (5,): the planned motion at its start
     z_dot: Array
@@ -59,40 +50,35 @@ class EngineStretch(NamedTuple):
 
     @property
     def duration(self) -> float:
-        """How long it is planned to last [s]."""
+        """Planned duration [s]."""
         return self.stop - self.start
 
 
 class Setting(NamedTuple):
-    """How finely an engine computes."""
+    """Discretization of an engine."""
 
     step: float  # time step, over the scene's time
-    # softness of contacts, over the engine's default, which is in proportion to the step
-    softness: float = 1.0
+    softness: float = 1.0  # of contacts, over the engine's default, which is in proportion to step
 
 
 class Steps(NamedTuple):
-    """The time steps of a stretch, and those after which the state is recorded.
+    """Time steps of a stretch.
 
-    Engines change the velocity by the forces at a position, and then the position by the new
-    velocity. That is of second order in h where velocities are taken for those of half a step
-    before: at the start, and for the torques.
+    Engines use the semi-implicit Euler method, which is of second order in h if velocities are read
+    as those of half a step before: at the start, and for the torques.
     """
 
     h: float  # [s]
     v: Array  # (5,): velocity half a step before the start
-    # (n, 2) [N m]: applied torques, averaged from half a step before to half a step after each
-    # position
-    tau: Array
-    # (rows,): numbers of steps after which there is a row, increasing; the last is n
-    ends: list[int]
+    tau: Array  # (n, 2) [N m]: torques, averaged over half a step before and after each position
+    ends: list[int]  # numbers of the steps after which the state is recorded; the last is n
 
 
 class EngineRun(NamedTuple):
     """A stretch in an engine."""
 
     t: Array  # (rows + 1,) [s]: from the start of the plan
-    z: Array  # z, z_dot (rows + 1, 5):
+    z: Array  # z, z_dot (rows + 1, 5)
     z_dot: Array
     pairs: tuple[str, ...]  # pairs of shapes, see `shapes.list_pairs`
     press: Array  # (rows, n_pairs) [N]: normal forces, averaged between rows
@@ -106,14 +92,14 @@ def list_stretches(plan: Trajectory, whole: bool) -> list[EngineStretch]:
     """The whole plan, or its phases, each from its planned start."""
     starts, count = plan.phase_starts, len(plan.motions)
     found = []
-    for own in [tuple(range(count))] if whole else [(index,) for index in range(count)]:
-        motion, start, stop = plan.motions[own[0]], starts[own[0]], starts[own[-1] + 1]
+    for phases in [tuple(range(count))] if whole else [(index,) for index in range(count)]:
+        motion, start, stop = plan.motions[phases[0]], starts[phases[0]], starts[phases[-1] + 1]
         at = motion.evaluate(np.linspace(0.0, motion.duration, ROWS))
-        # Forces are not known of a replay that waits at rest.
-        known = at.c_n[int(np.argmax(np.isfinite(at.c_n).all(axis=1)))]
-        forces = dict(zip(motion.contacts, np.nan_to_num(known).tolist(), strict=True))
+        # Forces of a replay that waits at rest are NaN.
+        c_n = np.nan_to_num(at.c_n[int(np.argmax(np.isfinite(at.c_n).all(axis=1)))])
+        forces = dict(zip(motion.contacts, c_n.tolist(), strict=True))
         state = at.z[0], at.z_dot[0], at.z_ddot[0]
-        found.append(EngineStretch(own, float(start), float(stop), *state, forces))
+        found.append(EngineStretch(phases, float(start), float(stop), *state, forces))
     return found
 
 
@@ -129,24 +115,25 @@ def list_steps(
     h = duration / count
     tau = np.zeros((count, 2))
     if isinstance(torque, TorqueProfile):
-        tau = _average(torque, stretch.start, h, count)
+        t = (np.arange(count * _LOOKS) + 0.5) * (h / _LOOKS) - h / 2
+        samples = torque.at(stretch.start + np.maximum(t, _LEAST * h))
+        tau = np.asarray(samples.reshape(count, _LOOKS, 2).mean(axis=1))
     v = stretch.z_dot - h / 2 * stretch.z_ddot
     rows = min(count, ROWS * len(stretch.phases))
     ends = np.linspace(0, count, rows + 1)[1:].astype(int).tolist()
     return Steps(h, v, tau, ends)
 
 
-def _average(torque: TorqueProfile, start: float, h: float, count: int) -> Array:
-    """Torques of steps."""
-    places = (np.arange(count * _LOOKS) + 0.5) * (h / _LOOKS) - h / 2
-    places = start + np.maximum(places, _LEAST * h)
-    return np.asarray(torque.at(places).reshape(count, _LOOKS, 2).mean(axis=1))
-
-
 def apply_friction(scene: Scene, plan: Trajectory) -> TorqueProfile:
     """The torques of a plan less D sgn(theta') of its own joint velocities, with its steps."""
-    torque = plan.torque
-    cuts = sort_unique(np.concatenate([torque.breaks, *_find_reversals(plan)]))
+    torque, reversals = plan.torque, list[Array]()
+    for start, motion in zip(plan.phase_starts[:-1], plan.motions, strict=True):
+        t = np.linspace(0.0, motion.duration, _INSTANTS)
+        for speed in motion.evaluate(t).z_dot[:, 3:].T:
+            back = np.flatnonzero(speed[1:-2] * speed[2:-1] < 0) + 1
+            share = speed[back] / (speed[back] - speed[back + 1])
+            reversals.append(start + t[back] + share * (t[back + 1] - t[back]))
+    cuts = sort_unique(np.concatenate([torque.breaks, *reversals]))
     cuts = cuts[np.append(True, np.diff(cuts) > 1e-12 * torque.duration)]
     cuts[-1] = torque.breaks[-1]
     turns = np.sign(plan.at((cuts[1:] + cuts[:-1]) / 2).z_dot[:, 3:]) * scene.dry[3:]
@@ -156,18 +143,6 @@ def apply_friction(scene: Scene, plan: Trajectory) -> TorqueProfile:
         return np.asarray(torque.at(t) - turns[piece])
 
     return TorqueProfile.fit(cuts, evaluate, torque.coefficients.shape[2] - 1)
-
-
-def _find_reversals(plan: Trajectory) -> list[Array]:
-    """Instants at which a joint turns back within a phase, for each phase and joint [s]."""
-    found = []
-    for start, motion in zip(plan.phase_starts[:-1], plan.motions, strict=True):
-        t = np.linspace(0.0, motion.duration, _INSTANTS)
-        for speed in motion.evaluate(t).z_dot[:, 3:].T:
-            back = np.flatnonzero(speed[1:-2] * speed[2:-1] < 0) + 1
-            share = speed[back] / (speed[back] - speed[back + 1])
-            found.append(start + t[back] + share * (t[back + 1] - t[back]))
-    return found
 
 
 def find_between(plan: Trajectory) -> Trajectory:

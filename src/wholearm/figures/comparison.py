@@ -14,7 +14,7 @@ from ..common.sharing import exclusive
 from ..comparison.side_by_side import Comparison, Contender
 from ..results.trajectory import Trajectory
 from .curves import draw_margins, draw_phases
-from .style import INK, STYLE, choose_styles, list_contacts, unit_of
+from .style import INK, STYLE, choose_styles, list_contacts, unit_of, write_title
 
 _WIDTH, _HEIGHT = 10.0, 2.7
 """Width of the figure, and height of a panel with what is written above it [in]."""
@@ -28,7 +28,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
 
     Replays are drawn; where nothing has moved a panel says so.
     """
-    shown = [(own, _find_motion(own)) for own in comparison.contenders]
+    shown = [(contender, _find_motion(contender)) for contender in comparison.contenders]
     motions = [motion for _, motion in shown if motion is not None]
     styles = choose_styles(tuple(dict.fromkeys(name for own in motions for name in own.contacts)))
     longest = max((motion.duration for motion in motions), default=1.0)
@@ -57,11 +57,8 @@ def draw_comparison(comparison: Comparison) -> Figure:
             axes.set_ylabel(f"$c_n - \\varepsilon$ {unit_of(axes)}")
             axes.set_xlabel("time $t$ [s]" if motion is motions[-1] else "")
             high -= _BOTTOM
-        title = (
-            f"{comparison.name}  \u00b7  force margins  \u00b7  \u03b5 = {comparison.epsilon:g} N"
-        )
-        bold: Any = {"fontsize": 10.5, "fontweight": "bold", "parse_math": False}
-        figure.text(0.2 / _WIDTH, 1 - 0.12 / height, title, va="top", **bold)
+        title = f"{comparison.name}  \u00b7  force margins  \u00b7  \u03b5 = "
+        write_title(figure, f"{title}{comparison.epsilon:g} N")
     return figure
 
 

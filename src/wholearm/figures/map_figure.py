@@ -47,18 +47,14 @@ from .map_lines import (
     split,
     trace_plan,
 )
-from .style import STYLE
+from .style import STYLE, write_title
 
 SIZE = (11.0, 7.9)  # in
 _BOX = (0.75, 1.0, 9.4, 6.2)  # axes: left, bottom, width, height [in]
-_ASIDE = 2.6
-"""Offset of directed lines from the border [points]."""
-_ARROW = 8.0
-"""Length of the arrows inside cells [points]."""
-_DISC = 16.0
-"""Room for the number of a phase [points]."""
-_LETTER, _HEIGHT = 4.4, 9.0
-"""Size of a letter of a label [points]."""
+_ASIDE = 2.6  # offset of directed lines from the border [points]
+_ARROW = 8.0  # length of the arrows inside cells [points]
+_DISC = 16.0  # room for the number of a phase [points]
+_LETTER, _HEIGHT = 4.4, 9.0  # size of a letter of a label [points]
 
 
 @exclusive
@@ -84,11 +80,8 @@ def draw_map(chart: FormationMap, plan: Trajectory | Moved | None = None) -> Fig
         axes.set(xlim=(x[0], x[-1]), ylim=(phi[0], phi[-1]))
         axes.set(xlabel="$x$ of the centroid [mm]", ylabel=r"orientation $\phi$ [deg]")
         _draw_cells(axes, chart, x, phi)
-        paths = (
-            trace_problem(chart.problem)
-            if plan is None
-            else trace_plan(adopt_motion(chart.problem, plan)[1])
-        )
+        path = None if plan is None else adopt_motion(chart.problem, plan)[1]
+        paths = trace_problem(chart.problem) if path is None else trace_plan(path)
         boxes = _draw_labels(axes, chart, x, phi, paths)
         _draw_directions(axes, chart, boxes)
         _draw_borders(axes, chart.borders)
@@ -96,14 +89,14 @@ def draw_map(chart: FormationMap, plan: Trajectory | Moved | None = None) -> Fig
         points = _to_axes(np.array([c.point for c in flush]).reshape(-1, 2))
         axes.plot(*points.T, "o", ms=3.6, mfc=INK, mec="white", mew=0.5, zorder=6, ls="none")
         _draw_paths(axes, paths)
-        _draw_legend(figure, bool(paths), bool((chart.cell == CROSSED).any()), _is_ambiguous(chart))
+        ambiguous = chart.ambiguous.any() or any(border.ambiguous.any() for border in chart.borders)
+        _draw_legend(figure, bool(paths), bool((chart.cell == CROSSED).any()), bool(ambiguous))
         _name_palm_lines(axes, chart)
         problem = chart.problem
         limits = " and ".join(dict.fromkeys(f"{v:g}" for v in problem.scene.torque_limit))
         title = f"{problem.name}  \u00b7  contact formations with palm and both fingers touching"
         text = f"{title}  \u00b7  \u03b5 = {problem.epsilon:g} N, |\u03c4| \u2264 {limits} N m"
-        look: Any = {"fontsize": 10.5, "fontweight": "bold", "parse_math": False}
-        figure.text(0.2 / SIZE[0], 1 - 0.12 / SIZE[1], text, va="top", **look)
+        write_title(figure, text)
     return figure
 
 
@@ -261,11 +254,6 @@ def _name_palm_lines(axes: Axes, chart: FormationMap) -> None:
 def _patch(look: tuple[str, str, str], label: str) -> Patch:
     face, edge, hatch = look
     return Patch(fc=face, ec=edge, hatch=hatch, lw=0, label=label)
-
-
-def _is_ambiguous(chart: FormationMap) -> bool:
-    """Whether friction lets other contact forces be possible somewhere."""
-    return bool(chart.ambiguous.any() or any(own.ambiguous.any() for own in chart.borders))
 
 
 def _draw_legend(figure: Figure, with_path: bool, crossed: bool, ambiguous: bool) -> None:

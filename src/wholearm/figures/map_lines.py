@@ -1,4 +1,4 @@
-"""What is drawn of a map's borders and paths, on any paper: runs, lines aside, arrow heads."""
+"""Geometry of map drawings: offset lines, arrow heads, labels, tints; in points of the paper."""
 
 from __future__ import annotations
 
@@ -26,8 +26,7 @@ UNREACHED = {
 """What is written where nothing can be reached, and its code in `FormationMap.cell`."""
 FORTH, BACK, FREE = "#0072B2", "#D55E00", "#7a838f"
 TINTS = ("#f3f6fb", "#fbf6ea", "#eef7f0", "#f9eff4", "#f4f1fb", "#eef6f8", "#f7f7ee")
-SPACING = 42.0
-"""Distance between arrow heads on a directed line [points]."""
+SPACING = 42.0  # distance between arrow heads on a directed line [points]
 
 
 def shorten(contact: Contact) -> str:
@@ -88,16 +87,16 @@ def place_discs(paths: Sequence[Array], size: float, low: Array, high: Array) ->
     angles = np.pi / 8 * (np.arange(16) + 4)
     ring = np.column_stack([np.cos(angles), np.sin(angles)])
     aside = np.concatenate([radius * size * ring for radius in (1.0, 1.6, 2.3, 3.2, 4.2)])
-    found = np.empty((0, 2))
+    discs = np.empty((0, 2))
     for path in paths:
         middle = find_middle(path)
         shares = np.array([0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8])
         every = np.concatenate([[find_middle(path, share) for share in shares], middle + aside])
-        clear = np.hypot(*(every[:, None] - found[None]).transpose(2, 0, 1)) >= size
+        clear = np.hypot(*(every[:, None] - discs[None]).transpose(2, 0, 1)) >= size
         inside = ((every >= low + size / 2) & (every <= high - size / 2)).all(axis=1)
         free = clear.all(axis=1) & inside
-        found = np.vstack([found, every[free.argmax() if free.any() else 0]])
-    return found
+        discs = np.vstack([discs, every[free.argmax() if free.any() else 0]])
+    return discs
 
 
 def find_middle(points: Array, share: float = 0.5) -> Array:

@@ -1,4 +1,4 @@
-"""What figures draw of a plan: its snapshots, where forces step, and torques between samples."""
+"""Samples of a plan for figures: snapshots, steps of forces, torques, friction-cone shares."""
 
 from __future__ import annotations
 

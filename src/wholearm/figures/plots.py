@@ -41,7 +41,7 @@ from .snapshots import (
     place_vertices,
     trace_link,
 )
-from .style import STYLE, WIDTH, WIDTHS, Sheet, choose_styles, list_contacts, unit_of
+from .style import STYLE, WIDTH, WIDTHS, Sheet, choose_styles, list_contacts, unit_of, write_title
 
 if TYPE_CHECKING:
     from ..simulation.events import Simulation
@@ -51,12 +51,9 @@ _FORMATS: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 _LEFT, _RIGHT, _BOTTOM, _TOP, _GAP = 0.80, 1.30, 0.55, 0.40, 0.22  # margins [in]
 _MARGINS, _TORQUES, _CONES, _MOTION = 3.6, 1.75, 0.85, 1.2  # heights of panels [in]
-_SHORT = 0.65
-"""Heights of panels of a slim figure, over those of a wide one."""
-_SLIM = 7.0
-"""Width below which legends stand at the foot, as in a column of a paper [in]."""
-_LINE = 0.17
-"""Height of a line of text [in]."""
+_SHORT = 0.65  # heights of panels of a slim figure, over those of a wide one
+_SLIM = 7.0  # width below which legends stand at the foot, as in a column of a paper [in]
+_LINE = 0.17  # height of a line of text [in]
 
 
 @exclusive
@@ -117,10 +114,10 @@ def _draw(
     share = _SHORT if slim else 1.0
     sizes = [_MOTION * share] * 3 * motion + [_TORQUES * share] + [_CONES] * rolls
     sizes.append(_MARGINS * share)
-    bold: Any = {"fontsize": 8.5 if slim else 10.5, "fontweight": "bold", "parse_math": False}
+    size_of_title = 8.5 if slim else 10.5
     between = " \u00b7 " if slim else "  \u00b7  "
     whole = _title(trajectory, scene, epsilon, between)
-    title = textwrap.wrap(whole, max(24, int(11.5 * width * 10.5 / bold["fontsize"])))
+    title = textwrap.wrap(whole, max(24, int(11.5 * width * 10.5 / size_of_title)))
     above = _TOP + _LINE * (len(title) - 1)
     panels_high = sum(sizes) + _GAP * (len(sizes) - 1) + 0.3
     sheet = Sheet(width, foot + panels_high + strip.height + above)
@@ -151,8 +148,7 @@ def _draw(
             axes.set_ylabel(f"{name} {unit_of(axes)}")
         _draw_legend(figure, [margins, torques], columns)
     _label(figure, panels, panels[-1] if motion else torques, trajectory, slim)
-    top = 1 - 0.12 / sheet.height
-    figure.text(0.2 / width, top, "\n".join(title), va="top", **bold)
+    write_title(figure, "\n".join(title), size_of_title)
     return figure
 
 

@@ -14,21 +14,15 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 
 from ..common.sharing import exclusive
 from ..quasistatic.prediction import PhasePrediction, Prediction, Survival
-from .style import GRID, INK, LOST, LOW, PALETTE, STYLE
+from .style import GRID, INK, LOST, LOW, PALETTE, STYLE, write_title
 
-_COLUMNS = 3
-"""Most panels side by side."""
-_WIDTH, _HEIGHT = 3.7, 2.85
-"""Of a panel with what is written about it [in]."""
-_ROOM = (0.62, 0.15, 0.50, 0.80)
-"""Room at the left, right, bottom and top of a panel [in]."""
-_TOP = 0.45
-"""Room above all panels [in]."""
+_COLUMNS = 3  # most panels side by side
+_WIDTH, _HEIGHT = 3.7, 2.85  # of a panel with what is written about it [in]
+_ROOM = (0.62, 0.15, 0.50, 0.80)  # room at the left, right, bottom and top of a panel [in]
+_TOP = 0.45  # room above all panels [in]
 _LOOKS: Any = ({"linestyle": "-"}, {"linestyle": (0, (5, 1.5))}, {"linestyle": (0, (1.5, 1))})
-_WIDE = 20.0
-"""Largest speed over the least from which on fewer speeds have labels."""
-_REACH = 2.2
-"""Largest force shown, over that near rest."""
+_WIDE = 20.0  # largest speed over the least from which on fewer speeds have labels
+_REACH = 2.2  # largest force shown, over that near rest
 
 
 @exclusive
@@ -53,8 +47,7 @@ def draw_prediction(prediction: Prediction) -> Figure:
             axes.set_xlabel("speed along the phase [m/s]" if k >= len(phases) - columns else "")
         name = f"{prediction.name}  \u00b7  quasistatic motions at speed"
         title = f"{name}  \u00b7  \u03b5 = {prediction.epsilon:g} N"
-        look: Any = {"fontsize": 10.5, "fontweight": "bold", "parse_math": False}
-        figure.text(0.15 / width, 1 - 0.12 / height, title, va="top", **look)
+        write_title(figure, title, left=0.15)
     return figure
 
 

@@ -23,8 +23,7 @@ _KINDS = (
     ("goal missed", PALETTE[6], "x"),
 )
 """What becomes of a sample, its colour and its mark."""
-_LEAST = 1e-4
-"""What lesser distances [mm] and angles [deg] are drawn as."""
+_LEAST = 1e-4  # what lesser distances [mm] and angles [deg] are drawn as
 
 
 def draw_robustness(study: Robustness) -> Figure:

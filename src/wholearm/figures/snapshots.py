@@ -25,18 +25,13 @@ from ..scene.model import Finger, Scene
 from .plot_data import choose_snapshots
 from .style import FINGERS, INK, PALM, STRIP, Sheet, Styles, count_decimals, write
 
-NUMBER = 8.0
-"""Size of the numbers at vertices [points]."""
-_FEW = 5
-"""Most vertices of an object whose numbers may stand outside; case: a ruler, 120 x 15 mm."""
-_CAPTION = 0.42
-"""Height of the caption of a snapshot [in]."""
+NUMBER = 8.0  # size of the numbers at vertices [points]
+_FEW = 5  # most vertices of an object whose numbers may stand outside; case: a ruler, 120 x 15 mm
+_CAPTION = 0.42  # height of the caption of a snapshot [in]
 _ROOM = (1.38, 0.78)
 """Width that a snapshot needs for its caption, on average, in wide and in slim figures [in]."""
-_ROWS = 3
-"""Most rows of a strip; of more snapshots some are left out, evenly."""
-_BAR = 0.2
-"""Height of the bar that gives the scale, above a strip [in]."""
+_ROWS = 3  # most rows of a strip; of more snapshots some are left out, evenly
+_BAR = 0.2  # height of the bar that gives the scale, above a strip [in]
 
 
 def draw_snapshot(
@@ -79,7 +74,7 @@ def draw_snapshot(
     ends = axes.transData.transform([[0.0, 0.0], [1.0, 0.0]])
     scale = 72 / axes.figure.dpi * float(np.ptp(ends[:, 0]))
     corners = [parse_contact(name, scene) for name in contacts]
-    first = [own.index for own in corners if own.feature == "v"]
+    first = [corner.index for corner in corners if corner.feature == "v"]
     style: Any = {"va": "center", "fontsize": NUMBER, "color": "#555555", "zorder": 5.5}
     style["path_effects"] = [withStroke(linewidth=1.5, foreground="white", alpha=0.7)]
     for index, shift in choose_numbers(scale * vertices, first, 0.0).items():
@@ -115,19 +110,19 @@ def choose_numbers(
 
     def put(chosen: Iterable[int]) -> dict[int, Array]:
         """Those of the chosen that stand clear of the ones before."""
-        found: dict[int, Array] = {}
+        numbers: dict[int, Array] = {}
         for index in chosen:
             for shift in (shifts[index], -shifts[index])[: 1 + (count <= _FEW)]:
                 place = vertices[index] + shift
                 far = [
                     np.abs(vertices[k] + own - place)
                     > NUMBER * np.array([0.34 * (len(str(index)) + len(str(k))), 1.2])
-                    for k, own in found.items()
+                    for k, own in numbers.items()
                 ]
                 if all(apart.any() for apart in far) and place[1] > lowest:
-                    found[index] = shift
+                    numbers[index] = shift
                     break
-        return found
+        return numbers
 
     steps = (k * 10**n for n in range(4) for k in (1, 2, 5))
     # None of them where even the first number would stand too low.

@@ -14,11 +14,10 @@ from ..common.fields import Range
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
-WIDTH = 10.0
-"""Width of a figure, unless another one is asked for [in]."""
-WIDTHS = Range(3.0, 40.0)
-"""Least and largest width [in]."""
+WIDTH = 10.0  # width of a figure, unless another one is asked for [in]
+WIDTHS = Range(3.0, 40.0)  # least and largest width [in]
 # Okabe and Ito's colours without yellow and black, which here are Tol's wine and a grey.
 PALETTE = (
     "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#882255", "#56B4E9", "#D55E00", "#777777",
@@ -37,8 +36,7 @@ STYLE: Any = {
 SIMULATED: Any = {"color": "black", "linestyle": (0, (1, 2)), "linewidth": 1.0, "zorder": 5}
 SIMULATED_2: Any = SIMULATED | {"linestyle": (0, (3, 5)), "linewidth": 0.9}
 """What is simulated; the torque of finger 2, to be told from that of finger 1."""
-PALM = 0.12
-"""Thickness of the palm, over the object's radius of gyration."""
+PALM = 0.12  # thickness of the palm, over the object's radius of gyration
 _PREFIXES = ((3e4, "k", 1e-3), (0.3, "", 1.0), (3e-4, "m", 1e3), (0.0, "\u00b5", 1e6))
 """Least size of a quantity, its prefix, and the factor that goes with it."""
 
@@ -52,8 +50,7 @@ class ContactStyle(NamedTuple):
 
 
 Styles = Mapping[str, ContactStyle]
-STRIP = 1.75
-"""Greatest height of a row of snapshots [in]."""
+STRIP = 1.75  # greatest height of a row of snapshots [in]
 
 
 class Sheet(NamedTuple):
@@ -89,6 +86,13 @@ def list_contacts(axes: Axes, room: float, largest: float = 9.0) -> None:
     size = min(largest, room / (1.1 * max(count, 1)))
     look: Any = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.02), "fontsize": size}
     axes.legend(**look, labelspacing=min(0.5, max(room / (size * max(count, 1)) - 1.0, 0.05)))
+
+
+def write_title(figure: Figure, text: str, size: float = 10.5, left: float = 0.2) -> None:
+    """Write the title of a figure at its upper left corner, `left` inches from the edge."""
+    width, height = figure.get_size_inches()
+    look: Any = {"fontsize": size, "fontweight": "bold", "parse_math": False}
+    figure.text(left / width, 1 - 0.12 / height, text, va="top", **look)
 
 
 def choose_styles(contacts: Sequence[str]) -> dict[str, ContactStyle]:

@@ -1,24 +1,24 @@
-"""Which contacts press, slide and stick from now on.
+"""Choice of contact modes: the solution of the contact problem that changes the fewest modes.
 
-Contact modes are judged a moment later, by what accelerations now lead to until then. The last
-answer is tried first; where it no longer holds Lemke's method finds another, and where there are
-several the one that changes the fewest modes is taken.
+Modes are evaluated a short time later, at the state that present accelerations lead to. The last
+modes are tried first, then Lemke's method.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..simulation.events import EventKind
+from ..simulation.tolerances import STANDING, STILL
 from .contact_problem import (
     APART,
     BACK,
     FORTH,
+    MODES,
     SAME,
     STICKS,
     ContactAnswer,
@@ -29,15 +29,12 @@ from .contact_problem import (
     try_modes,
 )
 from .free_stepper import Modes
-from .state import AHEAD, CLOSED, STANDING, STILL, SUNK, FreeRun
+from .state import AHEAD, CLOSED, SUNK, FreeRun
 from .system import ContactRows, System
 
-CLEAR = 1e-3
-"""Forces and rates, relative to the largest, that a moment does not make zero: it is `AHEAD`."""
-DEPENDENT = 1e-7
-"""Share of a row that others leave, below which it is no constraint of its own."""
-ROUNDED = 1e-15
-"""Speed that rounding leaves, relative to the largest one."""
+CLEAR = 1e-3  # forces and rates, over the largest, that do not vanish within `AHEAD`
+DEPENDENT = 1e-7  # share of a row that others leave, below which it is no constraint of its own
+ROUNDED = 1e-15  # speed that rounding leaves, relative to the largest one
 _NONE = np.zeros(0)
 _NOTHING = (_NONE, np.zeros(0, dtype=np.int64), _NONE, _NONE)
 
@@ -76,7 +73,7 @@ def find_closed(run: FreeRun) -> ClosedContacts:
 
 
 class Pattern:
-    """What of closed pairs and coordinates stands still, and which way the rest slides."""
+    """Closed pairs and coordinates at rest, and sliding signs of the others."""
 
     def __init__(self, run: FreeRun, found: ClosedContacts) -> None:
         system = run.system
@@ -93,10 +90,7 @@ class Pattern:
         self.joints = ((system.dry > 0) & slow).nonzero()[0]
 
     def pose(self, free: Array, rows: ContactRows) -> ContactProblem:
-        """The contact problem of accelerations at a state, of rows there.
-
-        `free` has the accelerations without contacts, shape (n,).
-        """
+        """Contact problem of rows, from accelerations without contacts, `free` (n,)."""
         system, lift = self.system, 1 / self.system.mass
         G, b_n = rows.A - self.rub * rows.A_t, rows.A @ free + rows.bend
         if not len(self.standing) and not len(self.joints):
@@ -131,29 +125,26 @@ class Pattern:
 
     def describe(self, answer: ContactAnswer) -> list[int]:
         """Modes of an answer as `try_modes` has them."""
-        ways = {0.0: STICKS, 1.0: FORTH, -1.0: BACK}
         choice = [STICKS if c > 0 else APART for c in answer.c_n]
-        count = len(self.standing)
-        for k, way in zip(self.standing, answer.way, strict=False):
+        signs = [MODES[sign] for sign in answer.sign.tolist()]
+        for k, mode in zip(self.standing, signs, strict=False):
             if choice[k] != APART:
-                choice[k] = ways[float(way)]
-        return choice + [ways[float(way)] for way in answer.way[count:]]
+                choice[k] = mode
+        return choice + signs[len(self.standing) :]
 
 
-def decide(run: FreeRun, found: ClosedContacts | None = None) -> bool | None:
-    """Take the modes that the laws of contact ask for.
-
-    Parameters
-    ----------
-    found  what is closed, where that is known
-
-    Returns
-    -------
-    bool or None
-        Whether everything rests; None where no modes obey them.
-    """
+def decide(run: FreeRun, closed: ClosedContacts | None = None) -> bool | None:
+    """Set the contact modes; whether everything rests, None where no modes are consistent."""
     system, lift = run.system, 1 / run.system.mass
-    pattern = Pattern(run, _end_chatter(run, found or find_closed(run)))
+    closed = closed or find_closed(run)
+    if (np.abs(closed.rows.A @ run.v) > STANDING * system.scales.speed).any():
+        # What is closed and parts more slowly than chatter is closed at rest, all at once.
+        pairs, rows = closed
+        sticks = np.abs(rows.A_t @ run.v) < run.chatter
+        sticks &= system.friction[list(pairs)] > 0
+        _project_velocity(run, np.vstack([rows.A, rows.A_t[sticks]]))
+        closed = ClosedContacts(pairs, system.evaluate(run.z, run.v, pairs))
+    pattern = Pattern(run, closed)
     later = AHEAD * system.scales.time
     coming = free = lift * system.push(run.v, run.tau(run.t), pattern.sigma)
     problem, rows = pattern.pose(free, pattern.rows), pattern.rows
@@ -173,9 +164,13 @@ def decide(run: FreeRun, found: ClosedContacts | None = None) -> bool | None:
     still = run.resting or _is_still(run, acceleration)
     rests = stands(run) and still and _is_still(run, coming + answer.change)
     modes = _make_modes(run, pattern, answer, rows)
-    tell_changes(run, pattern.closed, modes, rests)
+    _note_changes(run, pattern.closed, modes, rests)
     run.modes = modes
-    _snap(run, pattern)
+    # Rounding of speeds that are zero.
+    kept = [k for k, pair in enumerate(pattern.closed) if pair in modes.kept]
+    joints = np.eye(system.n)[pattern.joints]
+    at_rest = [pattern.rows.A[kept], pattern.rows.A_t[pattern.standing], joints]
+    _project_velocity(run, np.vstack(at_rest))
     return rests
 
 
@@ -204,20 +199,20 @@ def _answer(run: FreeRun, problem: ContactProblem, last: Sequence[int]) -> Conta
 def _choose(
     run: FreeRun, pattern: Pattern, problem: ContactProblem, free: Array
 ) -> ContactAnswer | None:
-    """The answer that is nearest to the last one: what rests goes on resting if it may.
+    """The answer nearest to the last one; what rests stays at rest if possible.
 
     `free` has the accelerations without contacts, shape (n,).
     """
     last = pattern.recall(run.modes)
     run.unique = problem.is_unique
-    found = [] if run.unique else list_answers(problem) or []
-    if len(found) > 1:
-        modes = [pattern.describe(answer) for answer in found]
+    answers = [] if run.unique else list_answers(problem) or []
+    if len(answers) > 1:
+        modes = [pattern.describe(answer) for answer in answers]
         if run.modes.kept or len(problem.b_n):
-            tell_ambiguity(run, pattern, modes)
-        starts = [run.resting and not _is_still(run, free + a.change) for a in found]
-        away = [sum(a != b for a, b in zip(own, last, strict=True)) for own in modes]
-        return found[min(range(len(found)), key=lambda k: (starts[k], away[k]))]
+            _note_ambiguity(run, pattern, modes)
+        starts = [run.resting and not _is_still(run, free + a.change) for a in answers]
+        away = [sum(a != b for a, b in zip(one, last, strict=True)) for one in modes]
+        return answers[min(range(len(answers)), key=lambda k: (starts[k], away[k]))]
     return _answer(run, problem, last)
 
 
@@ -253,17 +248,17 @@ def _make_modes(run: FreeRun, pattern: Pattern, answer: ContactAnswer, rows: Con
     count = len(pattern.standing)
     stuck, Xi = [], pattern.Xi.copy()
     held, sigma = [], pattern.sigma.copy()
-    sigma[pattern.joints] = answer.way[count:]
+    sigma[pattern.joints] = answer.sign[count:]
     # Of what sticks as one, as the contacts of a flush edge do, what has to hold comes first.
     for j in np.argsort(-answer.shares, kind="stable").tolist():
-        way = answer.way[j]
+        sign = answer.sign[j]
         if j >= count:
             joint = int(pattern.joints[j - count])
-            if way == 0 and adds(np.eye(system.n)[joint]):
+            if sign == 0 and adds(np.eye(system.n)[joint]):
                 held.append(joint)
         elif (k := int(pattern.standing[j])) in kept:
-            Xi[k] = way
-            if way == 0 and adds(rows.A_t[k]):
+            Xi[k] = sign
+            if sign == 0 and adds(rows.A_t[k]):
                 stuck.append(k)
     # What touches without a force stays, for as long as it needs none.
     kept |= {k for k in order if not presses[k] and answer.r_n[k] <= still and adds(rows.A[k])}
@@ -277,29 +272,8 @@ def _make_modes(run: FreeRun, pattern: Pattern, answer: ContactAnswer, rows: Con
     )
 
 
-def _snap(run: FreeRun, pattern: Pattern) -> None:
-    """Take away what rounding leaves of speeds that are zero."""
-    kept = [k for k, pair in enumerate(pattern.closed) if pair in run.modes.kept]
-    rows = pattern.rows.A[kept]
-    if len(pattern.standing) or len(pattern.joints):
-        joints = np.eye(run.system.n)[pattern.joints]
-        rows = np.vstack([rows, pattern.rows.A_t[pattern.standing], joints])
-    _settle(run, rows)
-
-
-def _end_chatter(run: FreeRun, found: ClosedContacts) -> ClosedContacts:
-    """Close at rest, and all at once, what is closed and parts more slowly than chatter."""
-    system, rows = run.system, found.rows
-    if not (np.abs(rows.A @ run.v) > STANDING * system.scales.speed).any():
-        return found
-    rubs = system.friction[list(found.pairs)] > 0
-    sticks = (np.abs(rows.A_t @ run.v) < run.chatter) & rubs
-    _settle(run, np.vstack([rows.A, rows.A_t[sticks]]))
-    return ClosedContacts(found.pairs, system.evaluate(run.z, run.v, found.pairs))
-
-
-def _settle(run: FreeRun, rows: Array) -> None:
-    """Take away the speeds along some rows, the shortest way in the metric of masses."""
+def _project_velocity(run: FreeRun, rows: Array) -> None:
+    """Project the velocity onto rows v = 0, in the metric of masses."""
     root = np.sqrt(run.system.mass)
     scaled = rows / root
     scaled /= np.sqrt((scaled**2).sum(axis=1))[:, None]
@@ -311,20 +285,12 @@ def _settle(run: FreeRun, rows: Array) -> None:
     run.take_impulse(run.v - change / root)
 
 
-class Standing(Protocol):
-    """Closed pairs, and which of them and of the joints stand still."""
-
-    closed: tuple[int, ...]
-    standing: NDArray[np.int64]
-    joints: NDArray[np.int64]
-
-
 def _name(system: System, joint: int) -> str:
     known = joint in system.driven
     return f"joint {system.driven.index(joint) + 1}" if known else f"coordinate {joint + 1}"
 
 
-def tell_changes(run: FreeRun, closed: Sequence[int], modes: Modes, rests: bool) -> None:
+def _note_changes(run: FreeRun, closed: Sequence[int], modes: Modes, rests: bool) -> None:
     """Record what changes."""
     if rests and run.resting:
         # Other forces that hold the same rest are no event.
@@ -351,17 +317,17 @@ def tell_changes(run: FreeRun, closed: Sequence[int], modes: Modes, rests: bool)
             continue
         old = before.Xi[before.kept.index(pair)]
         now = modes.Xi[modes.kept.index(pair)]
-        _tell_change(run, names[pair], old, now, "slides", system.friction[pair] > 0)
+        _note_change(run, names[pair], old, now, "slides", system.friction[pair] > 0)
     for joint in np.flatnonzero(system.dry > 0) if run.records else ():
         old, now = before.sigma[joint], modes.sigma[joint]
-        _tell_change(run, _name(system, int(joint)), old, now, "turns", True)
+        _note_change(run, _name(system, int(joint)), old, now, "turns", True)
     if rests:
         run.note(EventKind.REST, "everything rests")
     elif run.resting:
         run.note(EventKind.START, "the motion begins")
 
 
-def _tell_change(run: FreeRun, name: str, old: float, now: float, verb: str, rubs: bool) -> None:
+def _note_change(run: FreeRun, name: str, old: float, now: float, verb: str, rubs: bool) -> None:
     if old == now or not rubs:
         return
     contact = verb == "slides"
@@ -375,7 +341,7 @@ def _tell_change(run: FreeRun, name: str, old: float, now: float, verb: str, rub
         run.note(EventKind.REVERSAL, f"{name} {verb} the other way", name)
 
 
-def tell_ambiguity(run: FreeRun, pattern: Standing, answers: Sequence[Sequence[int]]) -> None:
+def _note_ambiguity(run: FreeRun, pattern: Pattern, answers: Sequence[Sequence[int]]) -> None:
     """Record that there are several answers, once for each set of contacts."""
     names = [run.system.names[pair] for pair in pattern.closed]
     words = {APART: "parts", STICKS: "presses", FORTH: "slides +", BACK: "slides -"}

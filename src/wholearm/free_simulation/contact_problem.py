@@ -1,4 +1,4 @@
-"""Which contacts press, stick and slide: no pulling and Coulomb's law as a complementarity problem.
+"""Contact modes from a linear complementarity problem (Stewart and Trinkle), exact in the plane.
 
 With the forces c_n >= 0 of contacts and f of everything that stands still and may stick (contacts
 and joints), rates r = (r_n, r_t) follow linearly,
@@ -8,13 +8,9 @@ and joints), rates r = (r_n, r_t) follow linearly,
 and have to keep r_n >= 0 and c_n r_n = 0, abs(f) <= bound, and f opposite to r_t and at its bound
 wherever r_t is not zero. The bound is mu c_n of a contact and D of a joint. Rates are accelerations
 while forces act, and velocities in an impact. A contact that slides already has its friction in
-G = A - mu Xi A_t. Splitting f into its parts of either sign gives the linear problem of Stewart and
-Trinkle, which is exact in the plane.
-
-References
-----------
-D. E. Stewart, J. C. Trinkle, "An implicit time-stepping scheme for rigid body dynamics with
-inelastic collisions and Coulomb friction", 1996.
+G = A - mu Xi A_t. Splitting f into its parts of either sign makes the problem linear (Stewart and
+Trinkle, "An implicit time-stepping scheme for rigid body dynamics with inelastic collisions and
+Coulomb friction", 1996).
 """
 
 from __future__ import annotations
@@ -31,27 +27,18 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array
 
-PIVOTS = (1e-8, 1e-11)
-"""Least pivot, for rows of M of the size of one: rounding of redundant rows is below the first, and
-what is not solved with it is tried with the other."""
-GOOD = 1e-10
-"""Residual with which an attempt is the last one, relative to the largest entry of q."""
-TIE = 1e-12
-"""Difference of ratios that counts as none, relative to the largest entry of q."""
-TURNS = 60
-"""Most pivots for each unknown."""
-RESIDUAL = 1e-8
-"""Largest residual of a solution, relative to the largest rate without contacts."""
-EDGE = 1e-9
-"""Reserve of friction that counts as none, relative to its bound or the largest force."""
-MOST = 4000
-"""Most combinations of modes that are looked through for other answers."""
-SAME = 1e-6
-"""Difference of rates that counts as none, relative to the largest rate without contacts."""
-SINGULAR = 1e-9
-"""Determinant of a scaled system that counts as zero."""
+PIVOTS = (1e-8, 1e-11)  # least pivots to try, above and below the rounding of redundant rows
+GOOD = 1e-10  # residual with which an attempt is the last one, relative to the largest entry of q
+TIE = 1e-12  # difference of ratios that counts as none, relative to the largest entry of q
+TURNS = 60  # most pivots for each unknown
+RESIDUAL = 1e-8  # largest residual of a solution, relative to the largest rate without contacts
+EDGE = 1e-9  # reserve of friction that counts as none, relative to its bound or the largest force
+MOST = 4000  # most combinations of modes that are looked through for other answers
+SAME = 1e-6  # difference of rates that is none, over the largest rate without contacts
+SINGULAR = 1e-9  # determinant of a scaled system that counts as zero
 APART, STICKS, FORTH, BACK = range(4)
 """Modes of a contact; of a joint all but the first. One without friction that presses sticks."""
+MODES = {0.0: STICKS, 1.0: FORTH, -1.0: BACK}  # by sliding sign
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +69,7 @@ class ContactProblem:
 
     @cached_property
     def is_unique(self) -> bool:
-        """Whether there is one solution for sure, as nothing might stick and K is positive.
-
-        A matrix whose symmetric part is positive definite has positive principal minors only.
-        """
+        """Whether there is surely one solution: nothing may stick, K + K^T is positive definite."""
         if len(self.b_t):
             return False
         K = self.scaled[2]
@@ -102,34 +86,21 @@ class ContactAnswer(NamedTuple):
     r_n: Array  # r_n, r_t (k,) and (s,):
     r_t: Array
     shares: Array  # (s,): friction over the most that it may be
-    # (s,): +1 or -1 where friction is at its bound and gives way in that direction, 0 where it
-    # holds
-    way: Array
+    sign: Array  # (s,): sliding sign where friction is at its bound, 0 where it holds
     change: Array  # (n,): M^-1 (G^T c_n + T^T f)
     residual: float  # relative; see `RESIDUAL`
 
 
 def solve(problem: ContactProblem, presses: Sequence[bool] = ()) -> ContactAnswer | None:
-    """Solve by exchanges of contacts where that ends for sure, or by Lemke's method.
-
-    Parameters
-    ----------
-    presses  contacts to begin with
-
-    Returns
-    -------
-    Answer or None
-        None where nothing is found.
-    """
-    found = _exchange(problem, presses) if problem.is_unique else None
-    return found or _solve_by_lemke(problem)
+    """Solve by principal pivoting from the contacts that press, or by Lemke's method, or fail."""
+    answer = _exchange(problem, presses) if problem.is_unique else None
+    return answer or _solve_by_lemke(problem)
 
 
 def _exchange(p: ContactProblem, presses: Sequence[bool]) -> ContactAnswer | None:
-    """Let go what pulls and take what closes: all at once, and one by one where that circles.
+    """Bard-type principal pivoting: blocks of contacts first, then the first infeasible one.
 
-    Exchanging the first one that is wrong ends for every P-matrix; see K. G. Murty, "Note on a
-    Bard-type scheme for solving the complementarity problem", 1974.
+    The latter ends for every P-matrix (Murty, "Note on a Bard-type scheme ...", 1974).
     """
     s_n, _, K, q = p.scaled
     k = len(q)
@@ -173,19 +144,20 @@ def _solve_by_lemke(p: ContactProblem) -> ContactAnswer | None:
 
 
 def read(problem: ContactProblem, c_n: Array, f: Array, residual: float = 0.0) -> ContactAnswer:
-    """What given forces do."""
+    """Rates, signs and friction shares that forces give."""
     p = problem
     if not len(f):
         change = p.lift * (c_n @ p.G)
         return ContactAnswer(c_n, f, p.b_n + p.A @ change, f, f, f, change, residual)
     change = p.lift * (c_n @ p.G + f @ p.T)
-    most = _bound(p, c_n)
-    # Friction whose bound is zero by c_n has nothing to give, whichever way.
+    contacts, most = p.owner >= 0, p.bound.copy()
+    most[contacts] += p.mu[contacts] * c_n[p.owner[contacts]]
+    # Friction whose bound is zero by c_n has no margin in either direction.
     edge = most - np.abs(f) <= EDGE * np.maximum(most, 1e-3 * np.abs(f).max(initial=0.0))
     r_t = p.b_t + p.T @ change
-    way = np.where(edge, np.where(f != 0, -np.sign(f), np.sign(r_t)), 0.0)
+    sign = np.where(edge, np.where(f != 0, -np.sign(f), np.sign(r_t)), 0.0)
     shares = np.abs(f) / np.maximum(most, np.finfo(float).tiny)
-    return ContactAnswer(c_n, f, p.b_n + p.A @ change, r_t, shares, way, change, residual)
+    return ContactAnswer(c_n, f, p.b_n + p.A @ change, r_t, shares, sign, change, residual)
 
 
 def is_clear(problem: ContactProblem, answer: ContactAnswer, least: float) -> bool:
@@ -196,20 +168,17 @@ def is_clear(problem: ContactProblem, answer: ContactAnswer, least: float) -> bo
 
 
 def list_answers(problem: ContactProblem) -> list[ContactAnswer] | None:
-    """Every solution with other rates than the others; None where that is too much to look through.
-
-    Each contact is apart, or presses and sticks or slides either way; each joint is held or turns.
-    """
+    """All solutions with distinct rates, by enumeration of modes; None if these are too many."""
     combinations = _combine(len(problem.b_n), len(problem.lift), tuple(problem.owner.tolist()))
     return None if combinations is None else _try(problem, combinations)
 
 
 def try_modes(problem: ContactProblem, choice: Sequence[int]) -> ContactAnswer | None:
-    """The solution with given modes of contacts, then joints, if they are consistent."""
+    """Solution with the modes `choice` of contacts, then joints, if they are consistent."""
     sizes = len(problem.b_n), len(problem.lift), tuple(problem.owner.tolist())
     combinations = _combine(*sizes, tuple(choice))
-    found = [] if combinations is None else _try(problem, combinations)
-    return found[0] if found else None
+    answers = [] if combinations is None else _try(problem, combinations)
+    return answers[0] if answers else None
 
 
 class _Combinations(NamedTuple):
@@ -224,10 +193,7 @@ class _Combinations(NamedTuple):
 def _combine(
     k: int, n: int, owner: tuple[int, ...], choice: tuple[int, ...] | None = None
 ) -> _Combinations | None:
-    """Modes of k contacts and n coordinates: one choice, or all of them if they are not too many.
-
-    More conditions than coordinates are no conditions of their own.
-    """
+    """One choice of modes of k contacts and n coordinates, or all, with up to n conditions."""
     own = np.array(owner, dtype=int)
     options: list[tuple[int, ...]]
     options = [(APART, STICKS, FORTH, BACK) if i in owner else (APART, STICKS) for i in range(k)]
@@ -252,7 +218,7 @@ def _combine(
 
 
 def _try(p: ContactProblem, combinations: _Combinations) -> list[ContactAnswer]:
-    """Solve with each of some modes, and return what is consistent, each motion once."""
+    """Solve for each combination of modes; the consistent solutions with distinct rates."""
     s_n, s_t, K, q = p.scaled
     ways, groups = combinations
     k, held = len(s_n), (p.owner >= 0).nonzero()[0]
@@ -272,49 +238,34 @@ def _try(p: ContactProblem, combinations: _Combinations) -> list[ContactAnswer]:
             own, row, at = own[fine], row[fine], at[fine]
         forces[row, at] = np.linalg.solve(own, right[row, at][:, :, None])[:, :, 0]
     size = float(np.abs(q).max(initial=0.0)) or 1.0
-    # What pulls is none, whatever else it does.
-    sound &= (forces[:, :k] >= -EDGE * size).all(axis=1)
+    slack = EDGE * size
+    sound &= (forces[:, :k] >= -slack).all(axis=1)
+    if not sound.any():
+        return []
     forces, ways = forces[sound], ways[sound]
     forces[:, k:] -= ways * bound
     forces[:, k + held] -= ways[:, held] * share * forces[:, owner]
-    return _pick(p, forces, p.scaled, size) if len(forces) else []
-
-
-def _pick(
-    p: ContactProblem, forces: Array, scaled: tuple[Array, Array, Array, Array], size: float
-) -> list[ContactAnswer]:
-    """Those of the forces that solve the problem, each motion once."""
-    s_n, s_t, K, q = scaled
-    k = len(s_n)
     rates = q + forces @ K.T
     c_n, f = forces[:, :k] * s_n, forces[:, k:] * s_t
     own = np.where(p.owner >= 0, c_n[:, np.maximum(p.owner, 0)] if k else 0.0, 0.0)
     spare = (p.mu * own + p.bound - np.abs(f)) / s_t
-    slack = EDGE * size
     turning = np.where(spare <= slack, -np.sign(f) * rates[:, k:], -np.abs(rates[:, k:]))
     turning[np.abs(rates[:, k:]) <= slack] = 0.0
     # What slides without a force has nothing that could be wrong.
     turning[(np.abs(f / s_t) <= slack) & (spare <= slack)] = 0.0
     worst = np.hstack([forces[:, :k], rates[:, :k], spare, turning]).min(axis=1, initial=0.0)
     both = np.abs(forces[:, :k] * rates[:, :k]).max(axis=1, initial=0.0)
-    found: list[Array] = []
+    distinct: list[Array] = []
     answers = []
-    for row in np.flatnonzero((worst >= -slack) & (both <= slack * size)):
-        if all(np.abs(rates[row] - other).max() > SAME * size for other in found):
-            found.append(rates[row])
-            answers.append(read(p, np.maximum(c_n[row], 0.0), f[row]))
+    for k in np.flatnonzero((worst >= -slack) & (both <= slack * size)).tolist():
+        if all(np.abs(rates[k] - other).max() > SAME * size for other in distinct):
+            distinct.append(rates[k])
+            answers.append(read(p, np.maximum(c_n[k], 0.0), f[k]))
     return answers
 
 
-def _bound(p: ContactProblem, c_n: Array) -> Array:
-    own = p.owner >= 0
-    most = p.bound.copy()
-    most[own] += p.mu[own] * c_n[p.owner[own]]
-    return most
-
-
 class ContactSolution(NamedTuple):
-    """What the method found."""
+    """Solution of a linear complementarity problem."""
 
     z: Array  # z, w (n,):
     w: Array
@@ -323,27 +274,21 @@ class ContactSolution(NamedTuple):
 
 
 def solve_lcp(M: Array, q: Array) -> ContactSolution:
-    """Solve one problem.
-
-    Parameters
-    ----------
-    M : (n, n)  scaled so that its entries are of the size of one
-    q : (n,)
-    """
+    """Solve w = M z + q, z >= 0, w >= 0, z w = 0 by Lemke's method; M (n, n) is near one."""
     n = len(q)
     size = float(np.abs(q).max(initial=0.0))
     if n == 0 or (q >= 0).all():
         return ContactSolution(np.zeros(n), q.copy(), 0.0)
-    found = []
+    solutions = []
     for least in PIVOTS:
-        found.append(_pivot(M, q, size, least))
-        if found[-1].residual <= GOOD * size:
+        solutions.append(_pivot(M, q, size, least))
+        if solutions[-1].residual <= GOOD * size:
             break
-    return min(found, key=lambda one: one.residual)
+    return min(solutions, key=lambda solution: solution.residual)
 
 
 def _pivot(M: Array, q: Array, size: float, least: float) -> ContactSolution:
-    """Go from basis to basis until the artificial unknown is out."""
+    """Complementary pivoting until the artificial unknown leaves the basis."""
     n = len(q)
     # Columns: the right-hand side, w, z and the artificial z_0.
     table = np.empty((n, 2 * n + 2))
@@ -374,10 +319,7 @@ def _pivot(M: Array, q: Array, size: float, least: float) -> ContactSolution:
 
 
 def _choose(table: Array, rows: NDArray[np.int64], pivots: Array) -> int:
-    """The row with the lexicographically least ratio to its pivot.
-
-    For the first pivot the column is negative, so that the ratios are those of what falls most.
-    """
+    """Row of the lexicographically least ratio to its pivot; first, of what falls most."""
     sizes = np.abs(pivots)
     ratios = table[rows, 0] / sizes
     least = (ratios == ratios.min()).nonzero()[0]
@@ -389,7 +331,7 @@ def _choose(table: Array, rows: NDArray[np.int64], pivots: Array) -> int:
 
 
 def _read(M: Array, q: Array, basis: NDArray[np.int64]) -> ContactSolution:
-    """The solution of a complementary basis, solved anew from the problem itself."""
+    """Solution of a complementary basis, from the original matrix."""
     n = len(q)
     chosen = basis[basis > n] - n - 1
     z = np.zeros(n)

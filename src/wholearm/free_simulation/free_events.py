@@ -1,4 +1,4 @@
-"""A free simulation from its start to its end, event by event."""
+"""Event-driven integration with contact modes from complementarity problems, impacts included."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from ..results.sampled import interpolate_quintic
 from ..simulation.events import EventKind
 from ..simulation.root_finding import find_crossing, find_root
 from ..simulation.runge_kutta import ORDER
+from ..simulation.tolerances import ROUNDING_FORCE, SHORTEST_STEP, STANDING, STILL
 from .contact_modes import ClosedContacts, Pattern, decide, find_closed, stands
 from .contact_problem import (
     APART,
-    BACK,
-    FORTH,
+    MODES,
     STICKS,
     ContactAnswer,
     ContactProblem,
@@ -30,41 +30,22 @@ from .contact_problem import (
     try_modes,
 )
 from .free_stepper import FreeOutputs, Modes
-from .state import AHEAD, ARMED, CLOSED, NO_PROGRESS, STANDING, STILL, SUNK, FreeRun
+from .state import AHEAD, ARMED, CLOSED, NO_PROGRESS, SUNK, FreeRun
 from .system import System
 
-ROUNDING = 1e-9
-"""Shortfall of a force that counts as rounding, in the scene's unit."""
-SPEED_ROUNDING = 1e-12
-"""Likewise of a sliding or turning speed."""
-TURNING = 1e-4
-"""Speed, relative to the scene's, below which sliding or turning may be about to reverse."""
-GROWTH = 10.0
-"""Largest growth of a step."""
-SHORTEST = 1e-13
-"""Step below which the integration gives up, relative to the scene's time and the time gone by."""
-LOOKS = 8
-"""Instants of the longest step at which gaps are looked at, its end among them."""
-REACH = 0.3
-"""Farthest that a step may go, in units of the scene: gaps are seen every `REACH` / `LOOKS`."""
-EXACT = 1e-14
-"""Gap at which a contact is found closed, relative to the scene's length: some ten roundings."""
-CHATTER_PAUSE = 1e-3
-"""Time in which the end of the impacts of a pair is told once, relative to the scene's time."""
-SLIDES = 1e-3
-"""Least sliding of what slides on, relative to that before and to the speed of the impact."""
-ROUNDS = 30
-"""Most impacts at one instant; what is left after them is plastic."""
+SPEED_ROUNDING = 1e-12  # sliding or turning speed that counts as rounding, over the scene's
+TURNING = 1e-4  # speed, over the scene's, below which a reversal may be near
+GROWTH = 10.0  # largest growth of a step
+LOOKS = 8  # instants of the longest step at which gaps are looked at, its end among them
+REACH = 0.3  # longest step, in units of the scene: gaps are sampled every `REACH` / `LOOKS`
+EXACT = 1e-14  # gap of a closed contact, over the scene's length: some ten roundings
+CHATTER_PAUSE = 1e-3  # time between two notes of chatter of a pair, over the scene's
+SLIDES = 1e-3  # least sliding after an impact, over that before and the impact speed
+ROUNDS = 30  # most impacts at one instant; what is left after them is plastic
 
 
 def play(run: FreeRun, touching: float, halt: Callable[[FreeRun], bool] | None = None) -> None:
-    """Simulate until the torques end.
-
-    Parameters
-    ----------
-    touching : [m]  gap that counts as closed at the start
-    halt            asked at every event whether that is enough
-    """
+    """Simulate until the torques end or `halt`, called at events; `touching` [m]: gaps to close."""
     _close(run, touching)
     while run.t < run.end and not (halt is not None and halt(run)):
         if run.t >= run.stop:
@@ -74,7 +55,10 @@ def play(run: FreeRun, touching: float, halt: Callable[[FreeRun], bool] | None =
         rests = decide(run, found)
         if moved and stands(run):
             rests = decide(run)
-        if not _advances(run):
+        run.decisions = run.decisions + 1 if run.t == run.decided_at else 0
+        run.decided_at = run.t
+        if run.decisions > NO_PROGRESS:
+            run.note(EventKind.GIVEN_UP, "decisions do not end")
             return
         if rests is None:
             if not jolt(run):
@@ -89,7 +73,7 @@ def play(run: FreeRun, touching: float, halt: Callable[[FreeRun], bool] | None =
             hold(run)
             continue
         try:
-            move(run)
+            _Motion(run).move()
         except StuckError:
             # Forces grow without bound where the motion jams.
             if not jolt(run):
@@ -97,18 +81,8 @@ def play(run: FreeRun, touching: float, halt: Callable[[FreeRun], bool] | None =
                 return
 
 
-def _advances(run: FreeRun) -> bool:
-    """Count decisions without time passing; whether it goes on."""
-    run.decisions = run.decisions + 1 if run.t == run.decided_at else 0
-    run.decided_at = run.t
-    if run.decisions > NO_PROGRESS:
-        run.note(EventKind.GIVEN_UP, "decisions do not end")
-        return False
-    return True
-
-
 def _close(run: FreeRun, touching: float) -> None:
-    """Move onto what touches at the start, the shortest way in the metric of masses."""
+    """Project the start onto what touches, in the metric of masses."""
     system = run.system
     root = np.sqrt(system.mass)
     for _ in range(5):
@@ -137,10 +111,7 @@ def hold(run: FreeRun) -> None:
 
 
 def _list_margins(run: FreeRun) -> Array:
-    """What has to be positive at rest, as polynomials on the present piece, shape (m, d + 1).
-
-    Ascending powers of x in [-1, 1]; forces and accelerations in units of the scene.
-    """
+    """Margins at rest, polynomials of x in [-1, 1] on the present piece, (m, d + 1), scaled."""
     system, modes = run.system, run.modes
     scales, n = system.scales, system.n
     rows = system.evaluate(run.z, run.v, modes.kept)
@@ -163,7 +134,7 @@ def _list_margins(run: FreeRun) -> Array:
     unit[k + len(stuck) :] = system.friction_units[list(modes.held)]
     margins = np.vstack([c[:k], bound - c[k:], bound + c[k:]])
     margins /= np.concatenate([unit, unit[k:]])[:, None]
-    margins[:, 0] += ROUNDING
+    margins[:, 0] += ROUNDING_FORCE
     rates = acceleration / (system.units[n:] / scales.time)[:, None]
     creeps = np.vstack([-rates, rates])
     creeps[:, 0] += 10 * STILL
@@ -171,7 +142,7 @@ def _list_margins(run: FreeRun) -> Array:
 
 
 def _find_breach(margins: Array, x: float) -> float:
-    """Where from `x` on the first polynomial turns negative; at least 1 if none does before."""
+    """First `x` at which a polynomial turns negative; at least 1 if none does before."""
     if margins.shape[1] == 1:
         return x if (margins < 0).any() else 2.0
     first = 2.0
@@ -192,72 +163,64 @@ def _find_breach(margins: Array, x: float) -> float:
 
 
 def collide(run: FreeRun) -> ClosedContacts:
-    """Change the velocity where closed gaps still close; what is closed after that."""
+    """Resolve impacts until no closed gap closes further; what is closed then."""
     limit = STANDING * run.system.scales.speed
-    for turn in range(ROUNDS + 1):
-        found = find_closed(run)
-        rates = found.rows.A @ run.v
+    for count in range(ROUNDS + 1):
+        closed = find_closed(run)
+        rates = closed.rows.A @ run.v
         if not (rates < -limit).any():
-            return found
-        bouncing = -rates.min() > run.chatter and turn < ROUNDS
-        _collide(run, found, rates, run.restitution if bouncing else 0.0, bouncing)
+            return closed
+        _collide(run, closed, rates, -rates.min() > run.chatter and count < ROUNDS)
     return find_closed(run)
 
 
-def _collide(
-    run: FreeRun, found: ClosedContacts, rates: Array, restitution: float, bouncing: bool
-) -> None:
-    problem = _pose(run, found, run.v)
+def _collide(run: FreeRun, closed: ClosedContacts, rates: Array, bouncing: bool) -> None:
+    problem = _pose(run, closed, run.v)
     answer = _slide_on(problem) or solve(problem)
     if answer is None:
         raise ArithmeticError("the plastic impact has no solution")
     run.residual = max(run.residual, answer.residual)
     v = run.v + answer.change
-    if restitution:
-        v = _expand(run, found, answer, v, restitution)
-    for k, pair in enumerate(found.pairs):
+    if bouncing and run.restitution:
+        v = _expand(run, closed, answer, v, run.restitution)
+    pause = CHATTER_PAUSE * run.system.scales.time
+    for k, pair in enumerate(closed.pairs):
         if rates[k] >= -STANDING * run.system.scales.speed or answer.c_n[k] <= 0:
             continue
         name, text = run.system.names[pair], run.system.structure.pairs[pair].text
+        noted = [e.time for e in run.events if (e.kind, e.contact) == (EventKind.CHATTER, name)]
         if bouncing:
             note = f"{text or name} at {-rates[k]:.4g} m/s"
             run.note(EventKind.IMPACT, note, name, float(-rates[k]))
-        elif not _is_told(run, name):
+        elif not noted or run.t - noted[-1] >= pause:
             note = f"the impacts of {name} come ever closer and are over"
             run.note(EventKind.CHATTER, note, name, float(-rates[k]))
     run.take_impulse(v)
 
 
 def _slide_on(p: ContactProblem) -> ContactAnswer | None:
-    """The impact after which everything slides on as before, if there is one.
+    """Impact after which every sliding sign is that before, if there is one.
 
-    Of several it is the nearest to what was; and without what may stick the problem is small.
+    Of several solutions it is the nearest, and without sticking the problem is small.
     """
     k, none = len(p.b_n), np.zeros(0)
-    ways, pushes = np.sign(p.b_t), p.A.copy()
-    pushes[p.owner] -= (p.mu * ways)[:, None] * p.T
+    signs, pushes = np.sign(p.b_t), p.A.copy()
+    pushes[p.owner] -= (p.mu * signs)[:, None] * p.T
     slides = ContactProblem(p.lift, p.A, pushes, p.b_n, p.T[:0], none, p.owner[:0], none, none)
-    answer = solve(slides) if k and slides.is_unique and ways.all() else None
+    answer = solve(slides) if k and slides.is_unique and signs.all() else None
     if answer is None:
         return None
     rates = p.b_t + p.T @ answer.change
     least = SLIDES * np.maximum(np.abs(p.b_t), np.abs(p.b_n).max())
-    if ((rates * ways <= least) & (answer.c_n[p.owner] > 0)).any():
+    if ((rates * signs <= least) & (answer.c_n[p.owner] > 0)).any():
         return None
-    return read(p, answer.c_n, -p.mu * ways * answer.c_n[p.owner], answer.residual)
+    return read(p, answer.c_n, -p.mu * signs * answer.c_n[p.owner], answer.residual)
 
 
-def _is_told(run: FreeRun, name: str) -> bool:
-    """Whether it has just been said that the impacts of a pair are over."""
-    brief = CHATTER_PAUSE * run.system.scales.time
-    own = [e for e in run.events if (e.kind, e.contact) == (EventKind.CHATTER, name)]
-    return bool(own) and run.t - own[-1].time < brief
-
-
-def _pose(run: FreeRun, found: ClosedContacts, v: Array) -> ContactProblem:
-    """The contact problem of velocities: whatever has friction may stick."""
-    system, rows = run.system, found.rows
-    mu = system.friction[list(found.pairs)]
+def _pose(run: FreeRun, closed: ClosedContacts, v: Array) -> ContactProblem:
+    """Contact problem of velocities: whatever has friction may stick."""
+    system, rows = run.system, closed.rows
+    mu = system.friction[list(closed.pairs)]
     rubs = np.flatnonzero(mu > 0)
     T = rows.A_t[rubs]
     none = np.zeros(len(rubs))
@@ -267,17 +230,17 @@ def _pose(run: FreeRun, found: ClosedContacts, v: Array) -> ContactProblem:
 
 
 def _expand(
-    run: FreeRun, found: ClosedContacts, plastic: ContactAnswer, v: Array, restitution: float
+    run: FreeRun, closed: ClosedContacts, plastic: ContactAnswer, v: Array, restitution: float
 ) -> Array:
-    """The velocity after the impulses of compression have come back."""
+    """Velocity after expansion with Poisson's restitution, which may not gain energy."""
     system = run.system
     before = float(run.v**2 @ system.mass)
     while restitution > 1e-3:
-        given = restitution * plastic.c_n
-        problem = _pose(run, found, v)
-        pushed = v + problem.lift * (problem.A.T @ given)
-        bound = problem.mu * given[problem.owner]
-        problem = replace(_pose(run, found, pushed), bound=bound)
+        impulse = restitution * plastic.c_n
+        problem = _pose(run, closed, v)
+        pushed = v + problem.lift * (problem.A.T @ impulse)
+        bound = problem.mu * impulse[problem.owner]
+        problem = replace(_pose(run, closed, pushed), bound=bound)
         answer = solve(problem)
         if answer is not None:
             after = pushed + answer.change
@@ -288,24 +251,20 @@ def _expand(
 
 
 def jolt(run: FreeRun) -> bool:
-    """An impact without a collision, where no finite forces keep contacts closed; whether it was.
-
-    It is the limit of time stepping: the impulses of a short time that do not vanish with it.
-    """
+    """Impact without collision (Painleve), the limit of time stepping; whether there is one."""
     system, scales = run.system, run.system.scales
-    found = find_closed(run)
-    pattern = Pattern(run, found)
+    closed = find_closed(run)
+    pattern = Pattern(run, closed)
     later = AHEAD * scales.time
     free = system.push(run.v, run.tau(run.t), pattern.sigma) / system.mass
-    answer = solve(_pose(run, found, run.v + later * free))
+    answer = solve(_pose(run, closed, run.v + later * free))
     if answer is None:
         return False
     # With the modes that it ends in, the impact at the instant itself is linear.
-    problem = _pose(run, found, run.v)
-    ways = {0.0: STICKS, 1.0: FORTH, -1.0: BACK}
+    problem = _pose(run, closed, run.v)
     choice = [STICKS if c > 0 else APART for c in answer.c_n]
-    for own, way in zip(problem.owner, answer.way, strict=True):
-        choice[own] = ways[float(way)] if choice[own] != APART else APART
+    for contact, sign in zip(problem.owner, answer.sign, strict=True):
+        choice[contact] = MODES[float(sign)] if choice[contact] != APART else APART
     exact = try_modes(problem, choice)
     units = system.units[system.n :]
     if exact is None or (np.abs(exact.change) < STANDING * units).all():
@@ -325,12 +284,10 @@ class StuckError(ArithmeticError):
 
 
 class View(NamedTuple):
-    """What is looked at of a step."""
+    """Event values of a step."""
 
     out: Array  # outputs at its end
-    # forces, reserves of friction, speeds and ranges at its end, each positive until something
-    # happens, in units of the scene
-    values: Array
+    values: Array  # values of `Watch` there
     times: Array  # (m,) [s]: instants since its start
     gaps: Array  # gaps, ranges (m, N) [m]: of all pairs then
     ranges: Array
@@ -345,13 +302,8 @@ class Closing(NamedTuple):
     right: float
 
 
-def move(run: FreeRun) -> None:
-    """Integrate until something happens or the torques step or end."""
-    _Motion(run).move()
-
-
 class _Motion:
-    """A motion with given contact modes."""
+    """Integration with given contact modes."""
 
     def __init__(self, run: FreeRun) -> None:
         self.run, self.s = run, run.load()
@@ -362,10 +314,10 @@ class _Motion:
         self.watch = run.watches[run.modes]
         self.slack, self.watched = self.watch.slack, self.watch.pairs
         self.time = system.scales.time
-        self.near = 1e-3 * SHORTEST * max(self.time, abs(run.t))
+        self.near = 1e-3 * SHORTEST_STEP * max(self.time, abs(run.t))
 
     def move(self) -> None:
-        """Integrate until something happens or the torques step or end."""
+        """Integrate until an event or until the torques step or end."""
         run, s = self.run, self.s
         run.stay(s)
         s.look()
@@ -404,10 +356,7 @@ class _Motion:
             start = end
 
     def _holds(self, end: View) -> bool:
-        """Whether the modes are the only answer after a step of the torques, by more than rounding.
-
-        Everything that touches has to press and slide, as it did before.
-        """
+        """Whether the modes are the only solution after a torque step, by more than rounding."""
         clear = np.count_nonzero(end.values > self.watch.clear) == len(end.values)
         if not (self.run.unique and self.watch.plain and clear):
             return False
@@ -423,7 +372,7 @@ class _Motion:
         speed = self._find_most(start.out[n : 2 * n])
         push = self._find_most(start.out[to.acceleration])
         reach = 2 * REACH / (speed + math.sqrt(speed**2 + 2 * push * REACH) + 1e-300)
-        least = SHORTEST * max(self.time, abs(run.t))
+        least = SHORTEST_STEP * max(self.time, abs(run.t))
         while True:
             h = min(run.h, reach)
             whole = h >= 0.999 * remaining
@@ -492,22 +441,18 @@ class _Motion:
                 h, found = (h, found) if root is None else (root, True)
             else:
                 row = int(low[np.argmin(shares)])
-                h = self._find_value(
-                    row, float(floor[row]), float(first[row]), float(values[row]), h
-                )
+                least = float(floor[row])
+
+                def value(step: float, row: int = row, least: float = least) -> float:
+                    self._step_to(step)
+                    return float(self.watch.measure(self.s.outputs)[row]) + least
+
+                ends = float(first[row]), float(values[row])
+                h = find_root(value, h, *ends, self.near, 1e-3 * least)
                 floor = np.where(np.arange(len(floor)) == row, np.inf, floor)
                 found = True
             self._step_to(h)
             end = self.view(start.out, h)
-
-    def _find_value(self, row: int, floor: float, first: float, last: float, h: float) -> float:
-        """When one of the values falls below its floor."""
-
-        def value(step: float) -> float:
-            self._step_to(step)
-            return float(self.watch.measure(self.s.outputs)[row]) + floor
-
-        return find_root(value, h, first, last, self.near, 1e-3 * floor)
 
     def _find_contact(self, start: View, h: float, closing: Closing) -> float | None:
         """When a pair closes within a step; None if it does not, or where the two do not face."""
@@ -533,9 +478,8 @@ class _Motion:
 
     def _approach(self, out: Array, pair: int) -> float:
         """Rate of a pair's gap at a state [m/s]."""
-        n = self.run.system.n
-        v = out[n : 2 * n]
-        return float(self.run.system.evaluate(out[:n], v, (pair,)).A[0] @ v)
+        z, v, _ = np.split(out, [self.run.system.n, 2 * self.run.system.n])
+        return float(self.run.system.evaluate(z, v, (pair,)).A[0] @ v)
 
     def _find_closing(self, start: View, end: View, passed: set[int]) -> Closing | None:
         """The first pair that closes within the step, and a bracket of when."""
@@ -565,9 +509,9 @@ class _Motion:
         return Closing(pair, float(level[row, pair]), left, float(end.times[row]))
 
     def _find_entering(self, start: View, end: View, passed: set[int]) -> Closing | None:
-        """The first pair that comes into range as it touches or is apart, and overlaps after that.
+        """The first pair that comes into range apart or touching, and overlaps after that.
 
-        A gap means nothing out of range, so that it may be negative at every look.
+        Out of range a gap has no meaning and may be negative throughout.
         """
         earlier = start.ranges[-1:]
         if len(end.times) > 1:
@@ -619,10 +563,9 @@ class _Motion:
 
 
 class Watch(NamedTuple):
-    """Values that are positive until something happens, in units of the scene.
+    """Event values, positive until an event, in units of the scene.
 
-    In this order: c_n; reserves of friction that holds, either way; speeds of what slides and
-    turns; ranges of the kept pairs.
+    In this order: c_n; friction margins of both signs; sliding and turning speeds; ranges.
     """
 
     columns: NDArray[np.int64]  # (c,): outputs of a step that they depend on
@@ -670,8 +613,8 @@ def build_watch(system: System, modes: Modes, to: FreeOutputs) -> Watch:
         columns,
         np.ascontiguousarray(rows[:, columns]),
         constant,
-        np.repeat([ROUNDING, SPEED_ROUNDING, CLOSED], counts),
-        np.repeat([10 * ROUNDING, TURNING, 10 * CLOSED], counts),
+        np.repeat([ROUNDING_FORCE, SPEED_ROUNDING, CLOSED], counts),
+        np.repeat([10 * ROUNDING_FORCE, TURNING, 10 * CLOSED], counts),
         pairs,
         not holds,
     )

@@ -1,4 +1,4 @@
-"""Free simulation of a hand: joint torques in, motion, contacts and events out."""
+"""Free simulation of a hand: from joint torques to motion, contacts and events."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def simulate_free(
     tolerance: float = 1e-9,
     halt: Callable[[FreeRun], bool] | None = None,
 ) -> FreeSimulation:
-    """Simulate torques without being told which contacts hold, also after one is lost.
+    """Simulate torques without prescribed contacts, also after one is lost.
 
     Parameters
     ----------
@@ -130,14 +130,23 @@ def _simulate(
     z, v = np.split(state, 2)
     system = build_system(problem.scene)
     if not is_apart(system, z, problem.scene.touching):
-        _require_apart(problem, z)
+        depths = -measure_gaps(problem.scene, z[None])[0]
+        worst = int(depths.argmax())
+        if depths[worst] > 10 * problem.scene.touching:
+            pairs = (
+                "palm and object",
+                "finger 1 and object",
+                "finger 2 and object",
+                "both fingers",
+            )
+            raise SimulationError(f"{pairs[worst]} overlap by {depths[worst]:.3g} m at the start")
     run = FreeRun(system, profile, z, v, restitution, tolerance, hint)
     play(run, problem.scene.touching, halt)
     return collect(run, problem, starts)
 
 
 def _recall(problem: Problem, plan: Trajectory, row: int) -> Modes:
-    """Contact modes with which a plan begins: the last answer, where there are several."""
+    """Contact modes with which a plan begins, for the choice among several solutions."""
     system = build_system(problem.scene)
     names = [name for name, c in zip(plan.contacts, plan.c_n[row], strict=True) if c == c]
     kept = sorted(system.names.index(name) for name in names)
@@ -165,15 +174,3 @@ def _require_start(problem: Problem, start: ArrayLike | None) -> Array:
             "", "start", f"shape {state.shape} given; 5 or 10 finite numbers are needed"
         )
     return np.concatenate([state, np.zeros(10 - len(state))])
-
-
-def _require_apart(problem: Problem, z: Array) -> None:
-    """Check that nothing overlaps at the start by more than what counts as touching."""
-    depths = -measure_gaps(problem.scene, z[None])[0]
-    which = int(depths.argmax())
-    if depths[which] > 10 * problem.scene.touching:
-        pair = ("palm and object", "finger 1 and object", "finger 2 and object", "both fingers")
-        raise SimulationError(f"{pair[which]} overlap by {depths[which]:.3g} m at the start")
-
-
-__all__ = ["PhaseRun", "SimulationError", "simulate_free", "simulate_phases"]

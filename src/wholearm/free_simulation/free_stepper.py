@@ -1,4 +1,4 @@
-"""Steps of a motion with given modes of contact, compiled when they are first used."""
+"""Compiled Runge-Kutta steps of a motion with given contact modes."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
-from ..simulation.layout import lay_out
-from ..simulation.runge_kutta import GLIMPSES, build_error, build_step
+from ..simulation.layout import bind, build_torque, lay_out
+from ..simulation.runge_kutta import INNER_STAGES, build_error, build_step
 from .system import Structure
 
-LOSSES = 4
-"""Integrals along the motion: work of the torques, losses to viscous, dry and sliding friction."""
+LOSSES = 4  # integrals: work, losses to viscous, dry and sliding friction
 
 
 class Modes(NamedTuple):
@@ -31,8 +30,7 @@ class Modes(NamedTuple):
 class FreeInputs(NamedTuple):
     """Where each input of a step is in its packed vector; compare `simulation.layout.Inputs`.
 
-    Those from `geometry` on are numbers of the system: M^-1, gravity, friction of coordinates and
-    of the kept pairs, units of z and z', of forces and of the friction of coordinates.
+    Those from `geometry` on are numbers of the system and its units.
     """
 
     y: slice
@@ -57,11 +55,7 @@ class FreeInputs(NamedTuple):
 
 
 class FreeOutputs(NamedTuple):
-    """Where each output is.
-
-    State, z'', c_n, friction that holds, v_t, tau, error, least within; gaps and ranges of all
-    pairs.
-    """
+    """Where each output is: state, z'', forces, v_t, tau, error, least margin, gaps, ranges."""
 
     y: slice
     acceleration: slice
@@ -89,36 +83,24 @@ class FreeStepper(NamedTuple):
 
 
 @lru_cache(maxsize=256)
-def build_stepper(
-    structure: Structure,
-    kept: tuple[int, ...],
-    stuck: tuple[int, ...],
-    held: tuple[int, ...],
-    degree: int,
-) -> FreeStepper:
-    """Return the steps of a set of modes, for torques of a polynomial degree."""
-    return _FreeEquations(structure, kept, stuck, held, degree).compile()
+def build_stepper(structure: Structure, modes: Modes, degree: int) -> FreeStepper:
+    """Steps of a set of modes without its signs, for torques of a polynomial degree."""
+    return _FreeEquations(structure, modes, degree).compile()
 
 
 class _FreeEquations:
-    """The equations of motion, as expressions of one packed vector."""
+    """Equations of motion, as expressions of one packed vector."""
 
-    def __init__(
-        self,
-        structure: Structure,
-        kept: tuple[int, ...],
-        stuck: tuple[int, ...],
-        held: tuple[int, ...],
-        degree: int,
-    ) -> None:
-        self.structure, self.kept, self.stuck, self.held = structure, kept, stuck, held
+    def __init__(self, structure: Structure, modes: Modes, degree: int) -> None:
+        self.structure, (kept, stuck, held, _, _) = structure, modes
+        self.kept, self.held = kept, held
+        self.stick = [kept.index(pair) for pair in stuck]
         self.n, k, s = structure.n, len(kept), len(stuck) + len(held)
         n, size, g = structure.n, 2 * structure.n + LOSSES, structure.geometry.shape[0]
         numbers = (g, n, n, n, n, k, 2 * n, None, n)
         self.at = FreeInputs(*lay_out(size, None, None, None, k, n, s, 2, 2 * degree + 2, *numbers))
         pairs = len(structure.pairs)
         self.to = FreeOutputs(*lay_out(size, self.n, k, s, k, 2, None, None, pairs, pairs))
-        self.degree = degree
         self.dips: list[Expression] = []
         self._move = self._build_move()
         self._correct = self._build_correction()
@@ -136,7 +118,7 @@ class _FreeEquations:
 
         end, fifth, third = build_step(rate, y, t, h, 2 * n)
         error = build_error(fifth, third, y[: 2 * n], packed[at.units], packed[at.tolerance])
-        dip = ca.mmin(ca.vertcat(*(self.dips[stage] for stage in GLIMPSES)))
+        dip = ca.mmin(ca.vertcat(*(self.dips[stage] for stage in INNER_STAGES)))
         moved = self._correct(end[: 2 * n], packed)
         end = ca.vertcat(moved, end[2 * n :])
         functions = []
@@ -145,31 +127,25 @@ class _FreeEquations:
             gaps = self.structure.gap_function(state[:n], packed[at.geometry])
             outputs = ca.vertcat(state, rates[n : 2 * n], *parts, *extra, ca.vec(gaps))
             functions.append(ca.Function("step", [packed], [ca.densify(outputs)]))
-        inputs, results = np.zeros(at.size), np.zeros(self.to.size)
-        buffers = [function.buffer() for function in functions]
-        for buffer, _ in buffers:
-            buffer.set_arg(0, inputs.data)
-            buffer.set_res(0, results.data)
-        step, look = (call for _, call in buffers)
-        return FreeStepper(inputs, results, at, self.to, step, look, buffers)
+        inputs, outputs, *calls = bind(at.size, self.to.size, functions)
+        return FreeStepper(inputs, outputs, at, self.to, *calls)
+
+    def _stack(self, normal: Expression, tangential: Expression) -> Expression:
+        """Constraint rows: normal ones, tangential ones that stick, held coordinates."""
+        hold = ca.DM(np.eye(self.n)[list(self.held)].reshape(len(self.held), self.n))
+        return ca.vertcat(normal, *(tangential[row, :] for row in self.stick), hold)
 
     def _build_move(self) -> Expression:
-        """CasADi function (state, time, packed, geometry) -> rates, c_n, f, v_t, tau, spare.
-
-        The last is what friction and contacts have left, in units of the scene.
-        """
+        """CasADi function (state, time, packed, geometry) -> rates, c_n, f, v_t, tau, margin."""
         structure, n, at = self.structure, self.n, self.at
-        k, stick = len(self.kept), [self.kept.index(pair) for pair in self.stuck]
+        k, stick = len(self.kept), self.stick
         z, v, time = structure.z, ca.SX.sym("v", n), ca.SX.sym("time")
         packed = ca.SX.sym("packed", at.size)
         Xi, sigma, mu = packed[at.Xi], packed[at.sigma], packed[at.mu]
         _, _, A, A_t, bend, bend_t = structure.build_rows(self.kept, v)
-        G = A - ca.repmat(mu * Xi, 1, n) * A_t
-        hold = ca.DM(np.eye(n)[list(self.held)].reshape(len(self.held), n))
-        P = ca.vertcat(A, *(A_t[row, :] for row in stick), hold)
-        G = ca.vertcat(G, *(A_t[row, :] for row in stick), hold)
+        P, G = (self._stack(part, A_t) for part in (A, A - ca.repmat(mu * Xi, 1, n) * A_t))
         curve = ca.vertcat(bend, *(bend_t[row] for row in stick), ca.DM(len(self.held), 1))
-        tau = self._torque(time, packed)
+        tau = build_torque(time, packed[at.piece], packed[at.torque])
         viscous, dry = packed[at.viscous] * v, packed[at.dry] * sigma
         drive = ca.SX(n, 1)
         for row, coordinate in enumerate(structure.driven):
@@ -195,17 +171,8 @@ class _FreeEquations:
         inputs = [ca.vertcat(z, v), time, packed, structure.geometry]
         return ca.Function("move", inputs, [ca.densify(part) for part in outputs])
 
-    def _torque(self, time: Expression, packed: Expression) -> Expression:
-        start, stop = packed[self.at.piece][0], packed[self.at.piece][1]
-        x = (2 * time - start - stop) / (stop - start)
-        coefficients = ca.reshape(packed[self.at.torque], self.degree + 1, 2)
-        value = coefficients[-1, :]
-        for power in range(self.degree - 1, -1, -1):
-            value = value * x + coefficients[power, :]
-        return value.T
-
     def _build_correction(self) -> Expression:
-        """CasADi function (state, packed) -> state on the contacts, the shortest way in M.
+        """CasADi function (state, packed) -> its projection on the constraints in the metric M.
 
         A step leaves gaps of the size of its error, so one Newton iteration closes them.
         """
@@ -213,19 +180,18 @@ class _FreeEquations:
         z, v = structure.z, ca.SX.sym("v", n)
         packed = ca.SX.sym("packed", self.at.size)
         gap, slip, A, A_t, _, _ = structure.build_rows(self.kept, v)
-        stick = [self.kept.index(pair) for pair in self.stuck]
-        hold = ca.DM(np.eye(n)[list(self.held)].reshape(len(self.held), n))
-        P = ca.vertcat(A, *(A_t[row, :] for row in stick), hold)
-        state = ca.vertcat(z, v)
+        P, state = self._stack(A, A_t), ca.vertcat(z, v)
         if not P.shape[0]:
             return ca.Function("correct", [state, packed], [state])
         wanted = ca.vertcat(ca.DM(len(self.kept), 1), packed[self.at.stay])
         lift = ca.repmat(packed[self.at.lift], 1, P.shape[0]) * P.T
-        off = ca.vertcat(gap, *(slip[row] for row in stick), *(z[i] for i in self.held)) - wanted
-        y, given = ca.MX.sym("y", 2 * n), ca.MX.sym("packed", self.at.size)
+        off = (
+            ca.vertcat(gap, *(slip[row] for row in self.stick), *(z[i] for i in self.held)) - wanted
+        )
+        y, inputs = ca.MX.sym("y", 2 * n), ca.MX.sym("packed", self.at.size)
         off_function = ca.Function("off", [z, packed, structure.geometry], [P, lift, off])
-        P, lift, off = off_function(y[:n], given, given[self.at.geometry])
+        P, lift, off = off_function(y[:n], inputs, inputs[self.at.geometry])
         place = y[:n] - lift @ ca.solve(P @ lift, off)
-        P, lift, _ = off_function(place, given, given[self.at.geometry])
+        P, lift, _ = off_function(place, inputs, inputs[self.at.geometry])
         speed = y[n:] - lift @ ca.solve(P @ lift, P @ y[n:])
-        return ca.Function("correct", [y, given], [ca.vertcat(place, speed)])
+        return ca.Function("correct", [y, inputs], [ca.vertcat(place, speed)])

@@ -1,4 +1,4 @@
-"""A scene as a system: every feature of object, palm and links that may touch another.
+"""Gaps, slip coordinates and ranges of all pairs of features of object, palm and links.
 
 ==============  ====================================================  ========================
 name            touching                                              gap
@@ -28,14 +28,14 @@ import numpy as np
 from ..common.arrays import Array, Expression
 from ..common.sharing import exclusive
 from ..contacts.elemental import build_features, rotate_quarter
-from ..contacts.links import build_finger_gap
+from ..contacts.links import FINGERS_TOUCH, build_finger_gap
 from ..contacts.obstacles import build_apart
 from ..scene.model import Scene
 from .system import ContactPair, Structure, System
 
 
 class _Link(NamedTuple):
-    """A link as expressions: its joint, tip, axis, normal of the touching side, size and angle."""
+    """A link as expressions; `normal` is that of its touching side."""
 
     base: Expression
     tip: Expression
@@ -47,15 +47,11 @@ class _Link(NamedTuple):
 
 
 class _Bodies(NamedTuple):
-    """The object and both links as expressions of z and of the numbers of a scene.
-
-    Vertices and directions of the edges, which run from each vertex to the next, have the shape
-    (2, n_v).
-    """
+    """The object and both links as expressions of z and of the numbers of a scene."""
 
     z: Expression
     geometry: Expression
-    vertices: Expression
+    vertices: Expression  # vertices, along (2, n_v): along are directions of the edges
     along: Expression
     lengths: Expression
     links: tuple[_Link, _Link]
@@ -67,11 +63,7 @@ def build_system(scene: Scene) -> System:
     structure = _build(scene.polygon.n_vertices, rounded, scene.fingers_collide)
     links = [[*np.asarray(f.base), f.length, f.radius] for f in scene.fingers]
     parts = {"m": scene.friction.palm, "1": scene.friction.finger1, "2": scene.friction.finger2}
-    slides = [name[0] in "tj" for name in structure.names]
-    friction = [
-        0.0 if slide else parts[name[-1]]
-        for name, slide in zip(structure.names, slides, strict=True)
-    ]
+    friction = [0.0 if name[0] in "tj" else parts[name[-1]] for name in structure.names]
     return System(
         structure,
         np.concatenate([scene.polygon.vertices.ravel(), *links]),
@@ -85,12 +77,7 @@ def build_system(scene: Scene) -> System:
 
 
 def is_apart(system: System, z: Array, touching: float) -> bool:
-    """Whether lines along palm, links and edges show that nothing overlaps; False says nothing.
-
-    Parameters
-    ----------
-    touching : [m]  overlap that counts as none
-    """
+    """Whether some separating line shows each pair apart by -`touching` [m]; sufficient only."""
     gaps = dict(zip(system.names, system.measure(z[None])[0][0] >= -touching, strict=True))
 
     def hold(*names: str) -> bool:
@@ -110,14 +97,10 @@ def is_apart(system: System, z: Array, touching: float) -> bool:
 
 @exclusive
 def measure_gaps(scene: Scene, z: Array) -> Array:
-    """Least gaps of the bodies at n configurations, shape (n, 4) [m], negative where they overlap.
+    """Gaps of the bodies at n configurations, shape (n, 4) [m], negative where they overlap.
 
-    Object and palm, object and links 1 and 2, link and link (infinite where they pass each other).
-    They come by another way than those of the pairs: the largest separation in any direction.
-
-    Parameters
-    ----------
-    z : (n, 5)
+    Object and palm, object and links 1 and 2, link and link (infinite where they pass each other):
+    the largest separation in any direction, independent of the pairs.
     """
     features = build_features(scene)
     gaps = [ca.mmin(features.vertices[1, :]), *(build_apart(scene, k) for k in range(2))]
@@ -130,7 +113,11 @@ def measure_gaps(scene: Scene, z: Array) -> Array:
 def _build(count: int, rounded: tuple[bool, ...], collide: bool) -> Structure:
     """The structure of all scenes with as many vertices, and links with or without a radius."""
     bodies = _place(count, rounded)
-    pairs = _list_palm(bodies)
+    height, run = bodies.vertices[1, :], bodies.vertices[0, :]
+    pairs = [
+        ContactPair(f"v{i}-palm", height[i], run[i], text=f"v{i} touches the palm")
+        for i in range(count)
+    ]
     for finger in range(2):
         pairs += _list_sides(bodies, finger) + _list_ends(bodies, finger, rounded[finger])
     if collide:
@@ -159,18 +146,10 @@ def _place(count: int, rounded: tuple[bool, ...]) -> _Bodies:
     return _Bodies(z, geometry, vertices, along, lengths, (links[0], links[1]))
 
 
-def _list_palm(bodies: _Bodies) -> list[ContactPair]:
-    p = bodies.vertices
-    return [
-        ContactPair(f"v{i}-palm", p[1, i], p[0, i], text=f"v{i} touches the palm")
-        for i in range(p.shape[1])
-    ]
-
-
 def _list_sides(bodies: _Bodies, finger: int) -> list[ContactPair]:
     """Vertices against both sides of a link."""
     link, k, side = bodies.links[finger], finger + 1, 1.0 if finger == 0 else -1.0
-    # What touches a side between its ends has the whole object on that side, by convexity.
+    # By convexity the whole object is on the side that it touches between its ends.
     middle = link.normal.T @ (bodies.z[:2] - link.base)
     pairs = []
     for i in range(bodies.vertices.shape[1]):
@@ -211,7 +190,7 @@ def _list_ends(bodies: _Bodies, finger: int, rounded: bool) -> list[ContactPair]
 
 def _list_link_pairs(bodies: _Bodies, rounded: bool) -> list[ContactPair]:
     """Tips and joints of either link against the other link."""
-    links, pairs = bodies.links, []
+    links, pairs, none = bodies.links, list[ContactPair](), ca.SX(0)
     thick = links[0].radius + links[1].radius
     for own, other in ((0, 1), (1, 0)):
         mine, theirs = links[own], links[other]
@@ -222,7 +201,7 @@ def _list_link_pairs(bodies: _Bodies, rounded: bool) -> list[ContactPair]:
             for side, way in (("finger", 1.0), ("back", -1.0)):
                 title = f"{name}{own + 1}-{side}{other + 1}"
                 ranges = (run, theirs.length - run, way * behind)
-                pairs.append(_slide(title, way * level - thick, ranges))
+                pairs.append(ContactPair(title, way * level - thick, none, ranges, FINGERS_TOUCH))
     if not rounded:
         return pairs
     ends = [("tip", link.tip, link.axis) for link in links]
@@ -231,9 +210,6 @@ def _list_link_pairs(bodies: _Bodies, rounded: bool) -> list[ContactPair]:
         run = second[1] - first[1]
         gap = ca.sqrt(ca.sumsqr(run)) - thick
         beyond = (first[2].T @ run, -(second[2].T @ run))
-        pairs.append(_slide(f"{first[0]}1-{second[0]}2", gap, beyond))
+        name = f"{first[0]}1-{second[0]}2"
+        pairs.append(ContactPair(name, gap, none, beyond, FINGERS_TOUCH))
     return pairs
-
-
-def _slide(name: str, gap: Expression, ranges: tuple[Expression, ...]) -> ContactPair:
-    return ContactPair(name, gap, ca.SX(0), ranges, "finger 1 touches finger 2")

@@ -1,4 +1,4 @@
-"""What a free simulation returns."""
+"""Results of a free simulation: states, forces and periods in which pairs press."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..common.arrays import Array
 from ..common.errors import InputError
 from ..contacts.elemental import parse_contact
 from ..problem.definition import Problem
@@ -46,12 +44,10 @@ def list_pauses(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FreeSimulation(Simulation):
-    """A simulated motion for which no contact was assumed, at every step.
+    """A simulated motion without prescribed contacts, at every step.
 
-    As of `Simulation`, with these differences. Phases are those that the clock of a plan is in; for
-    torques without one there is one phase. Beside the problem's, `contacts` has others that
-    pressed; forces are NaN where a contact does not press, and at rest. An event is there twice,
-    as forces may step. `missed_by` is NaN.
+    As of `Simulation`, but phases are those of a plan's clock, `contacts` has others that pressed,
+    forces are NaN where a contact does not press, events are there twice, and `missed_by` is NaN.
     """
 
     # when each pair of features pressed, by the order of their start
@@ -69,17 +65,13 @@ class FreeSimulation(Simulation):
 
 
 def collect(run: FreeRun, problem: Problem, starts: Sequence[float]) -> FreeSimulation:
-    """Put together what a run has recorded; `starts` says when phases begin by the clock [s]."""
+    """The result of a run; `starts` are the starts of the phases by the clock [s]."""
     rows, n, names = run.records, run.system.n, run.system.names
     y, t = np.array([row.y for row in rows]), np.array([row.t for row in rows])
     planned = [contact.name for contact in problem.contacts]
-    used = dict.fromkeys(
-        names[pair] for kept in dict.fromkeys(row.kept for row in rows) for pair in kept
-    )
-    contacts = (
-        *planned,
-        *(name for name in used if name not in planned and _is_named(name, problem)),
-    )
+    used = dict.fromkeys(pair for kept in dict.fromkeys(row.kept for row in rows) for pair in kept)
+    others = [names[pair] for pair in used if names[pair] not in planned]
+    contacts = (*planned, *(name for name in others if _is_named(name, problem)))
     columns = {name: column for column, name in enumerate(contacts)}
     forces = np.full((2, len(rows), len(contacts)), np.nan)
     groups = [list(group) for _, group in groupby(rows, lambda row: row.kept)]
@@ -96,6 +88,9 @@ def collect(run: FreeRun, problem: Problem, starts: Sequence[float]) -> FreeSimu
         outcome = Outcome(OutcomeKind.GIVEN_UP, given_up.text)
     clock = np.asarray(starts)
     owners = np.searchsorted(clock, [event.time for event in run.events], side="right") - 1
+    # Of two rows at a boundary the first one ends the phase before.
+    twice = np.append(np.diff(t) == 0, False) & np.isin(t, clock[1:])
+    phases = np.maximum(np.searchsorted(clock, t, side="right") - 1 - twice, 0)
     stored = run.system.stored(y[:, :n], y[:, n : 2 * n])
     impact = np.array([row.impact for row in rows])
     return FreeSimulation(
@@ -104,7 +99,7 @@ def collect(run: FreeRun, problem: Problem, starts: Sequence[float]) -> FreeSimu
         z_dot=y[:, n : 2 * n],
         z_ddot=np.array([row.acceleration for row in rows]),
         tau=np.array([row.tau for row in rows]),
-        phase=_find_phases(t, clock),
+        phase=phases,
         contacts=contacts,
         c_n=forces[0],
         c_t=forces[1],
@@ -122,13 +117,6 @@ def collect(run: FreeRun, problem: Problem, starts: Sequence[float]) -> FreeSimu
         steps=run.steps,
         rejected=run.rejected,
     )
-
-
-def _find_phases(t: Array, starts: Array) -> NDArray[np.int64]:
-    """Phases by the clock; of two rows at a boundary the first one ends the phase before."""
-    found = np.searchsorted(starts, t, side="right") - 1
-    twice = np.append(np.diff(t) == 0, False) & np.isin(t, starts[1:])
-    return np.asarray(np.maximum(found - twice, 0))
 
 
 def _is_named(name: str, problem: Problem) -> bool:

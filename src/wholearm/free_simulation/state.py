@@ -1,4 +1,4 @@
-"""A free simulation under way: the state, the torques, and what is recorded."""
+"""State, torques and records of a running free simulation; torques of a feedback law."""
 
 from __future__ import annotations
 
@@ -13,45 +13,27 @@ from ..common.arrays import Array
 from ..common.errors import SimulationError, require_number
 from ..results.torque import TorqueProfile
 from ..simulation.events import Event, EventKind
+from ..simulation.layout import evaluate_piece, find_torque_steps
+from ..simulation.tolerances import STEP_OF_TORQUE
 from .free_stepper import LOSSES, FreeStepper, Modes, build_stepper
 from .system import System
 
-SAME = 1e-9
-"""Distance of two instants that counts as none, relative to the period."""
-CLOSED = 1e-10
-"""Gap that counts as closed at an event, relative to the scene's length."""
-SUNK = 1e-6
-"""Overlap up to which features touch, relative to the scene's length; beyond it they are behind one
-another."""
-ARMED = 1e-13
-"""Gap from which on a pair has been apart, relative to the scene's length."""
-STANDING = 1e-9
-"""Speed that counts as none, relative to the scene's."""
-CHATTER = 1e-6
-"""Speed of impacts below which they count as the last one, relative to the scene's: what is closed
-and parts more slowly is pressed together again before it is apart by more than rounding."""
-COARSE = 1e3
-"""The same over the tolerance, where that is coarser than impacts need."""
+SAME = 1e-9  # distance of two instants that counts as none, relative to the period
+CLOSED = 1e-10  # gap that counts as closed at an event, relative to the scene's length
+SUNK = 1e-6  # overlap up to which features touch, over the scene's length; else they are behind
+ARMED = 1e-13  # gap from which on a pair has been apart, relative to the scene's length
+CHATTER = 1e-6  # speed of the last impact, over the scene's: separation stays below rounding
+COARSE = 1e3  # the same over the tolerance, where that is coarser than impacts need
 BURST = 3e-4
 """Time, relative to the scene's, in which `MANY` impacts raise `CHATTER` tenfold, and twice as many
 a hundredfold: fingers may knock an object to and fro for ever."""
 MANY = 20
-STILL = 1e-10
-"""Acceleration that counts as none, relative to the scene's."""
-AHEAD = 2e-5
-"""How much later contact modes are judged, relative to the scene's time: forces that leave their
-range are told from those that come back into it."""
-TORQUE_STEP = 2e-8
-"""Jump of the torques that counts as one, relative to the scene's torque."""
-NO_PROGRESS = 60
-"""Most decisions in a row without any time passing."""
+AHEAD = 2e-5  # delay at which modes are evaluated, over the scene's time: a force's trend counts
+NO_PROGRESS = 60  # most decisions in a row without any time passing
 
 
 class Record(NamedTuple):
-    """One instant: time, state with losses, z'', tau, pairs that press, their c_n and c_t, impacts.
-
-    The last one is the energy lost to impacts so far [J].
-    """
+    """One instant; `impact` is the energy lost to impacts so far [J], `kept` the closed pairs."""
 
     t: float
     y: Array
@@ -63,25 +45,16 @@ class Record(NamedTuple):
     impact: float
 
 
-def _find_steps(before: Array, after: Array, unit: float) -> NDArray[np.bool_]:
-    """Whether torques step between two pieces, for n pairs of pieces, shape (n, 2, d + 1) each."""
-    jumps = after @ (-1.0) ** np.arange(after.shape[2]) - before.sum(axis=2)
-    return np.asarray(np.abs(jumps).max(axis=1) > TORQUE_STEP * unit)
-
-
 class FreeRun:
-    """A free simulation under way.
+    """A running free simulation.
 
     Attributes
     ----------
-    t : [s]
-    y : (2 n + LOSSES,)
-    modes                what keeps which contacts at present
+    y : (2 n + LOSSES,)  state and energies at time t [s]
     armed : (N,)         pairs that have been apart, so that their closing is an event
-    unique               whether the present modes were the only answer for sure when they were
-                         chosen
+    unique               whether the present modes were certainly the only solution
     impact : [J]         energy lost to impacts so far
-    watches              what is looked at with each of the modes so far
+    watches              event values of each of the modes so far
     rub : (k,)           c_t over c_n of the present kept pairs, zero where they stick
     """
 
@@ -112,8 +85,8 @@ class FreeRun:
         self.events: list[Event] = []
         self.watches: dict[Modes, Any] = {}
         self.rub = np.zeros(0)
-        known = self.torque.coefficients
-        self._steps = _find_steps(known[:-1], known[1:], system.scales.torque).tolist()
+        parts, self.torque_step = self.torque.coefficients, STEP_OF_TORQUE * system.scales.torque
+        self._steps = find_torque_steps(parts[:-1], parts[1:], self.torque_step).tolist()
         self._begin_piece()
 
     @property
@@ -156,7 +129,7 @@ class FreeRun:
         return True
 
     def _begin_piece(self) -> None:
-        """Have a law of torques asked, if there is one."""
+        """Sample the feedback law, if there is one."""
         if self.feedback is None:
             return
         theta, theta_dot = (part[list(self.system.driven)] for part in (self.z, self.v))
@@ -169,16 +142,13 @@ class FreeRun:
 
     def tau(self, t: float) -> Array:
         """Torques of the present piece at `t`, also beyond its end, shape (2,) [N m]."""
-        start, stop = self.torque.breaks[self.piece : self.piece + 2]
-        coefficients = self.torque.coefficients[self.piece]
-        x = (2 * t - start - stop) / (stop - start)
-        return np.asarray(coefficients @ x ** np.arange(coefficients.shape[1]))
+        return evaluate_piece(self.torque, self.piece, t)
 
     def torque_steps(self) -> bool:
         """Whether the torques step at the start of the present piece."""
         if self.feedback is not None:
             before, after = self.torque.coefficients[self.piece - 1 : self.piece + 1]
-            return bool(_find_steps(before[None], after[None], self.system.scales.torque)[0])
+            return bool(find_torque_steps(before[None], after[None], self.torque_step)[0])
         return bool(self._steps[self.piece - 1])
 
     def face(self, z: Array, v: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -193,7 +163,7 @@ class FreeRun:
         return gaps, faces
 
     def take_impulse(self, v: Array) -> None:
-        """Change the velocity; what energy that costs is lost to impacts."""
+        """Change the velocity; its kinetic energy is lost to impacts."""
         before = self.system.stored(self.z, self.v)
         self.y[self.system.n : 2 * self.system.n] = v
         self.impact += float(before - self.system.stored(self.z, self.v))
@@ -202,13 +172,10 @@ class FreeRun:
         """The steps of the present modes, with their inputs set to the present state."""
         system, modes = self.system, self.modes
         degree = self.torque.coefficients.shape[2] - 1
-        s = build_stepper(system.structure, modes.kept, modes.stuck, modes.held, degree)
+        s = build_stepper(system.structure, modes._replace(Xi=(), sigma=()), degree)
         inputs, at = s.inputs, s.at
-        inputs[at.tolerance], inputs[at.Xi], inputs[at.sigma] = (
-            self.tolerance,
-            modes.Xi,
-            modes.sigma,
-        )
+        inputs[at.tolerance] = self.tolerance
+        inputs[at.Xi], inputs[at.sigma] = modes.Xi, modes.sigma
         inputs[at.geometry], inputs[at.lift] = system.geometry, 1 / system.mass
         inputs[at.applied], inputs[at.viscous] = system.applied, system.viscous
         inputs[at.dry], inputs[at.mu] = system.dry, system.friction[list(modes.kept)]
@@ -237,20 +204,19 @@ class FreeRun:
         self.events.append(Event(self.t, 0, kind, text, contact, value))
 
     def record(self, s: FreeStepper | None, out: Array | None = None) -> None:
-        """Record the present instant, with a stepper's outputs, which are kept; without at rest."""
-        n = self.system.n
+        """Record the present instant from a stepper's outputs, or at rest."""
+        kept, y, acceleration = self.modes.kept, self.y.copy(), np.zeros(self.system.n)
         if s is None or out is None:
-            none = np.full(len(self.modes.kept), np.nan)
-            row = (np.zeros(n), self.tau(self.t), self.modes.kept, none, none)
-            self.records.append(Record(self.t, self.y.copy(), *row, self.impact))
-            return
-        to, kept = s.to, self.modes.kept
-        c_n = out[to.c_n]
-        c_t = c_n * self.rub
-        for place, pair in enumerate(self.modes.stuck):
-            c_t[kept.index(pair)] = out[to.f.start + place]
-        row = (out[to.acceleration], out[to.tau], kept, c_n, c_t)
-        self.records.append(Record(self.t, out[to.y], *row, self.impact))
+            c_n = c_t = np.full(len(kept), np.nan)
+            tau = self.tau(self.t)
+        else:
+            y, acceleration, tau, c_n = (
+                out[k] for k in (s.to.y, s.to.acceleration, s.to.tau, s.to.c_n)
+            )
+            c_t = c_n * self.rub
+            for place, pair in enumerate(self.modes.stuck):
+                c_t[kept.index(pair)] = out[s.to.f.start + place]
+        self.records.append(Record(self.t, y, acceleration, tau, kept, c_n, c_t, self.impact))
 
 
 @runtime_checkable
@@ -268,33 +234,14 @@ class Law(Protocol):
     def held(
         self, t: float, theta: Array, theta_dot: Array, forces: Mapping[str, float]
     ) -> ArrayLike:
-        """The torques that follow from a state.
+        """Torques, shape (2,) [N m], held from time `t` [s] on, from angles and rates, (2,) each.
 
-        Parameters
-        ----------
-        t : [s]
-        theta, theta_dot : (2,) [rad, rad/s]
-        forces   c_n of the contacts that press, by name, just before `t`; NaN at rest. Empty at the
-                 start [N].
-
-        Returns
-        -------
-        array_like, shape (2,)
-            [N m]
+        `forces` [N] are the c_n of contacts that press, by name; NaN at rest, empty at the start.
         """
 
 
 class Feedback:
-    """The torques of a law, known up to the present.
-
-    Parameters
-    ----------
-    until : [s]
-
-    Attributes
-    ----------
-    torque  a constant for each piece; those that have not begun are zero
-    """
+    """Sampled torques of a law up to time `until` [s]: `torque` is zero from the present on."""
 
     def __init__(self, law: Law, until: float) -> None:
         self.law = law
@@ -313,18 +260,13 @@ class Feedback:
     def begin(
         self, piece: int, theta: Array, theta_dot: Array, forces: Mapping[str, float]
     ) -> None:
-        """Take a sample where one is due at the start of a piece, and set the piece's torques.
-
-        Raises
-        ------
-        SimulationError  if the law gives no two numbers
-        """
+        """Sample where one is due at the start of a piece, and set the torques of the piece."""
         latest = self._latest[piece]
         if piece == 0 or latest > self._latest[piece - 1]:
             t = float(self.torque.breaks[piece])
             tau = np.asarray(self.law.held(t, theta, theta_dot, forces), dtype=float)
             if tau.shape != (2,) or not np.isfinite(tau).all():
-                given = f"{tau.tolist()} at t = {t:.6g} s; two finite numbers are needed"
-                raise SimulationError(f"the law of the torques gives {given}")
+                text = f"{tau.tolist()} at t = {t:.6g} s; two finite numbers are needed"
+                raise SimulationError(f"the law of the torques gives {text}")
             self._samples[latest] = tau
         self.torque.coefficients[piece, :, 0] = self._samples[self._source[piece]]

@@ -1,4 +1,4 @@
-"""Rigid bodies with pairs of features that may touch, as expressions of their coordinates.
+"""Rigid bodies with pairs of features that may touch: gaps, sliding and their Jacobians.
 
 The motion is M z'' = f + S tau - B z' - friction + A^T c_n + A_t^T c_t with a constant diagonal M.
 A pair of features has a gap C(z), whose gradient is its row of A, and a slip coordinate s(z), whose
@@ -22,8 +22,7 @@ from ..common.batch import Batch
 from ..common.sharing import Keeper, kept_property
 from ..scene.model import Scales
 
-_ANYWHERE = 1e9
-"""Range of features that face each other wherever they are [m]."""
+_ANYWHERE = 1e9  # range of features that face each other wherever they are [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,12 +159,7 @@ class System:
         return gaps, ranges
 
     def measure(self, z: Array) -> tuple[Array, Array]:
-        """Gaps of all pairs and how far inside their ranges they are, shape (m, N) each [m].
-
-        Parameters
-        ----------
-        z : (m, n)
-        """
+        """Gaps of all pairs and distances inside their ranges, (m, N) each [m], at z (m, n)."""
         geometry = np.broadcast_to(self.geometry, (len(z), len(self.geometry)))
         both = self.structure.gaps(z, geometry)[0]
         return both[:, :, 0], both[:, :, 1]

@@ -1,4 +1,4 @@
-"""Curves that are traced once: run from anywhere on them, either way."""
+"""Parts of traced curves: location of a configuration, cutting, reversing and joining."""
 
 from __future__ import annotations
 
@@ -10,16 +10,11 @@ from ..common.arrays import Array
 from ..mechanics.metric import metric_weights
 from .curve import Curve, Panel, Segment
 
-NEAR = 0.2
-"""Distance from the nodes of a curve, in radii of gyration, from which on a place is not on it."""
-ON = 1e-9
-"""Distance from a curve, in radii of gyration, up to which a place is on it."""
-ROUNDS = 8
-"""Most steps of Newton's method to the nearest place of a curve."""
-SHORTEST = 1e-7
-"""Shortest segment, over the length of its curve."""
-LEAST = 1e-9
-"""The same of panels; what is missing at an end is extrapolated."""
+NEAR = 0.2  # distance from nodes, in radii of gyration, beyond which a place is off a curve
+ON = 1e-9  # distance from a curve, in radii of gyration, up to which a place is on it
+ROUNDS = 8  # most steps of Newton's method to the nearest place of a curve
+SHORTEST = 1e-7  # shortest segment, over the length of its curve
+LEAST = 1e-9  # the same of panels; what is missing at an end is extrapolated
 
 
 def find_on(curve: Curve, z: Array) -> float | None:
@@ -52,11 +47,8 @@ def take(curve: Curve, start: float, stop: float) -> Curve:
         if last - first < LEAST * length:
             continue
         own = panel if (first, last) == (panel.s[0], panel.s[-1]) else _cut(panel, first, last)
-        panels.append(
-            Panel((high - own.s)[::-1], own.z[::-1], -own.z_s[::-1])
-            if back
-            else Panel(own.s - low, own.z, own.z_s)
-        )
+        columns = (high - own.s)[::-1], own.z[::-1], -own.z_s[::-1]
+        panels.append(Panel(*columns) if back else Panel(own.s - low, own.z, own.z_s))
     sign = -1.0 if back else 1.0
     segments = []
     for part in curve.segments:
@@ -77,10 +69,8 @@ def join(back: Curve | None, forth: Curve | None) -> Curve:
     if back is None:
         return forth
     first, offset = take(back, back.length, 0.0), back.length
-    panels = [
-        *first.panels,
-        *(Panel(offset + panel.s, panel.z, panel.z_s) for panel in forth.panels),
-    ]
+    moved_panels = (Panel(offset + panel.s, panel.z, panel.z_s) for panel in forth.panels)
+    panels = [*first.panels, *moved_panels]
     segments = list(first.segments)
     for part in forth.segments:
         moved = replace(part, start=offset + part.start, stop=offset + part.stop)
@@ -103,7 +93,7 @@ def _cut(panel: Panel, first: float, last: float) -> Panel:
 def _make(curve: Curve, panels: list[Panel], segments: list[Segment], length: float) -> Curve:
     segments[0] = replace(segments[0], start=0.0)
     segments[-1] = replace(segments[-1], stop=length)
-    found = Curve(curve.formation, tuple(panels), length, "", False, curve.speed_ratio)
+    part = Curve(curve.formation, tuple(panels), length, "", False, curve.speed_ratio)
     # Reversals are where they were.
-    found.__dict__["segments"] = tuple(segments)
-    return found
+    part.__dict__["segments"] = tuple(segments)
+    return part

@@ -1,8 +1,4 @@
-"""What is still to come costs, as a function of where a motion ends.
-
-A block of phases may leave open where it ends; planned alone it ends where it costs least itself,
-however long the way is that it leaves to the phases after it.
-"""
+"""Cost-to-go of the phases after a block, as a function of where the block ends."""
 
 from __future__ import annotations
 
@@ -16,8 +12,7 @@ from ..mechanics.metric import metric_weights
 from ..problem.definition import Phase
 from .tracing import trace_phase
 
-_STEP = 1e-2
-"""Step of the difference quotient, over the length of the curve that follows."""
+_STEP = 1e-2  # step of the difference quotient, over the length of the curve that follows
 
 
 @dataclass(frozen=True, eq=False)

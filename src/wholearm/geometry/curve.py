@@ -1,4 +1,4 @@
-"""The curve z(s) that one freedom leaves, with its tangent, curvature and reversals.
+"""Curve z(s) of a one-freedom formation: panels, tangent, curvature and reversals.
 
 The parameter is the arc length s in metres, in the metric
 
@@ -20,17 +20,12 @@ from ..common.arrays import Array
 from ..contacts.formation import Formation, Kinematics
 from ..mechanics.metric import metric_weights
 
-REFINE = 3
-"""Places per node of a panel at which limits and reversals are looked for."""
-_TIED = 1e-6
-"""Part of two rates, over both, below which they are proportional, and below which one is none."""
+REFINE = 3  # places per node of a panel at which limits and reversals are looked for
+_TIED = 1e-6  # relative error of two rates that are proportional, and relative rate of none
 
 
 class CurvePoint(NamedTuple):
-    """A curve at n places: z, its tangent z_s and its curvature z_ss, each (n, 5).
-
-    `kinematics` is the formation there.
-    """
+    """Curve at n places: z, tangent z_s and curvature z_ss, (n, 5) each, and kinematics there."""
 
     z: Array
     z_s: Array
@@ -115,14 +110,12 @@ class Curve:
             return self
         share = self.speed_ratio / ratio
         panels = tuple(Panel(share * panel.s, panel.z, panel.z_s) for panel in self.panels)
-        found = replace(self, panels=panels, length=share * self.length, speed_ratio=ratio)
+        curve = replace(self, panels=panels, length=share * self.length, speed_ratio=ratio)
         if "segments" in self.__dict__:
             # Reversals are where they were.
-            found.__dict__["segments"] = tuple(
-                replace(part, start=share * part.start, stop=share * part.stop)
-                for part in self.segments
-            )
-        return found
+            ends = ((part, share * part.start, share * part.stop) for part in self.segments)
+            curve.__dict__["segments"] = tuple(replace(p, start=a, stop=b) for p, a, b in ends)
+        return curve
 
     @property
     def start(self) -> Array:
@@ -147,10 +140,7 @@ class Curve:
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
-        """The curve split wherever a contact's sliding or a joint reverses.
-
-        Raises `LinAlgError` where the contacts depend on each other.
-        """
+        """The curve split at its reversals; `LinAlgError` where contacts are dependent."""
         grids = [refine(panel.s, self.length) for panel in self.panels]
         grid = np.concatenate([grid[index > 0 :] for index, grid in enumerate(grids)])
         z, tangent = self.interpolate(grid)
@@ -204,11 +194,7 @@ def border(P: Array, last: Array) -> Array:
 
 
 def tangent_basis(formation: Formation, z: Array) -> Array:
-    """Covectors N of the null space of P at `z`, shape (5, f), in radii of gyration.
-
-    N^T dz are the coordinates of a displacement in an orthonormal basis of that space; N over the
-    metric spans it.
-    """
+    """Orthonormal covectors N of the null space of P at `z`, shape (5, f), in radii of gyration."""
     metric = metric_weights(formation.scene)
     P = formation.evaluate(z[None], np.zeros((1, 5))).P[0]
     _, values, right = np.linalg.svd(P / np.sqrt(metric))
@@ -217,12 +203,7 @@ def tangent_basis(formation: Formation, z: Array) -> Array:
 
 
 def find_tied(formation: Formation, z: Array, row: int) -> tuple[int, ...]:
-    """Rows of (contacts, joints) that turn as one with a row at `z`: that row, then the others.
-
-    With two freedoms those are all whose rates are proportional to its own: of a flush edge, and of
-    a vertex in the corner of palm and link, which stands still with the link. With one freedom all
-    rates are; of these only a flush edge's change their sense together.
-    """
+    """Rows of (contacts, joints) that reverse with a row: proportional, or of a flush edge."""
     flush, N = formation.turn_with(row), tangent_basis(formation, z)
     if N.shape[1] != 2:
         return flush

@@ -1,4 +1,4 @@
-"""Closing contacts from nearby, and looking for the end of a phase all over a formation."""
+"""Projection onto closed contacts (Gauss-Newton), and global search for the end of a phase."""
 
 from __future__ import annotations
 
@@ -7,20 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.arrays import Array
-from ..contacts.closing import close_fingers, lower
+from ..contacts.closing import close_fingers, find_reach, lower
 from ..contacts.formation import Formation
 from ..mechanics.metric import metric_weights
 
-GRID = (120, 60)
-"""Places across x and phi at which a formation is looked at."""
-SEEDS = 24
-"""Most places from which an end is looked for: those that are nearest to it."""
-STILL = 1e-4
-"""Distance from the start, in radii of gyration, below which a phase would have nothing to do."""
-CLOSED = 3e-11
-"""Largest gap of closed contacts, in radii of gyration, and error of a coordinate likewise."""
-_STEP = 1e-5
-"""Step of the differences that give the gradients of limits, in radii of gyration or radians."""
+GRID = (120, 60)  # places across x and phi at which a formation is looked at
+SEEDS = 24  # most places from which an end is looked for: those that are nearest to it
+STILL = 1e-4  # distance from the start, in radii of gyration, that counts as none
+CLOSED = 3e-11  # largest gap of closed contacts, and coordinate error, in radii of gyration
+_STEP = 1e-5  # step of difference quotients of limits, in radii of gyration or rad
 
 
 Fixed = tuple[tuple[int, float], ...]
@@ -48,15 +43,9 @@ class Ending:
 
 
 def explore(formation: Formation, z: Array, slip: Array, ends: list[Ending]) -> Array | None:
-    """An end of a phase, found from places all over the formation; None if none is found.
+    """Nearest of several ends of a phase from z, (5,), by a multistart over the formation, or None.
 
-    Only with palm and both fingers touching, where (x, phi) says the whole configuration.
-
-    Parameters
-    ----------
-    z : (5,)         where the phase starts
-    slip : (R,) [m]  slip coordinates that rolling contacts keep
-    ends             any of these will do
+    Only with palm and both fingers touching, where (x, phi) determines the configuration.
     """
     parts = [contact.finger for contact in formation.contacts]
     if len(parts) != 3 or set(parts) != {None, 0, 1} or formation.rolling:
@@ -89,10 +78,7 @@ def _list_places(formation: Formation, z: Array) -> Array:
     turned = z[2] + np.linspace(-np.pi, np.pi, 721)
     (lowest,) = (c.index for c in formation.contacts if c.finger is None)
     turned = turned[lower(scene, turned)[1] == lowest]
-    size = float(np.hypot(*scene.polygon.vertices.T).max())
-    bases = np.array([np.asarray(finger.base)[0] for finger in scene.fingers])
-    reach = np.array([size + finger.length + finger.radius for finger in scene.fingers])
-    across = np.linspace((bases - reach).max(), (bases + reach).min(), GRID[0])
+    across = np.linspace(*find_reach(scene), GRID[0])
     x, phi = np.meshgrid(across, np.linspace(turned.min(), turned.max(), GRID[1]))
     closed = close_fingers(scene, x.ravel(), phi.ravel()).z
     closed = np.vstack([z, closed[np.isfinite(closed).all(axis=1)]])
@@ -102,37 +88,24 @@ def _list_places(formation: Formation, z: Array) -> Array:
 
 
 def close_contacts(
-    formation: Formation,
-    z: Array,
-    slip: Array,
-    fixed: Fixed = (),
-    active: tuple[int, ...] = (),
+    formation: Formation, z: Array, slip: Array, fixed: Fixed = (), active: tuple[int, ...] = ()
 ) -> Array | None:
-    """Nearest configuration with all contacts closed, shape (5,); None if there is none.
-
-    Parameters are those of `close_all`, but for `z`, shape (5,).
-    """
+    """As `close_all` for one configuration, shape (5,); None if there is none."""
     closed = close_all(formation, z[None], slip, fixed, active)[0]
     return closed if np.isfinite(closed).all() else None
 
 
 def close_all(
-    formation: Formation,
-    z: Array,
-    slip: Array,
-    fixed: Fixed = (),
-    active: tuple[int, ...] = (),
+    formation: Formation, z: Array, slip: Array, fixed: Fixed = (), active: tuple[int, ...] = ()
 ) -> Array:
-    """Nearest configurations with all contacts closed, by Gauss-Newton, shape (n, 5).
-
-    Those are NaN to which there is none.
+    """Nearest configurations with all contacts closed, by Gauss-Newton, shape (n, 5), or NaN.
 
     Parameters
     ----------
-    z : (n, 5)       where to start
-    slip : (R,) [m]  slip coordinates that rolling contacts keep
-    fixed            rows of z and the values that they have to take
-    active           limits of the formation that are met exactly
+    z : (n, 5)       initial values
+    slip : (R,) [m]  slip coordinates of rolling contacts
+    fixed            rows of z and their values
+    active           limits of the formation that are zero
     """
     metric, rho = metric_weights(formation.scene), formation.scene.scales.length
     sizes = np.full(formation.n_constraints, rho)

@@ -1,4 +1,4 @@
-"""A first idea of a motion, from geometry alone: what the time-domain planner starts from."""
+"""Initial guess of a path from geometry alone, for the time-domain planner."""
 
 from __future__ import annotations
 
@@ -20,38 +20,23 @@ from .curve import Curve, tangent_basis
 from .explore import Ending, close_all, close_contacts, explore, is_inside
 from .tracing import require_touching, runs_on_curve, trace_phase, trace_phases
 
-POINTS = 25
-"""Configurations along an outline."""
-RELEASE_AT = 0.8
-"""Share of a curve without an end of its own at which a release is guessed."""
-_MOST_ACTIVE = 2
-"""Most limits that a phase's end may be right on."""
-_AHEAD = (0.25, 0.5, 1.0, 2.0)
-"""Distances ahead at which ends are looked for, over that to the nearest."""
-_TURNS = np.linspace(-1.0, 1.0, 21)
-"""Turns of the object from which an end that is not the nearest is looked for [rad]."""
+POINTS = 25  # configurations along a guess
+RELEASE_AT = 0.8  # share of a curve at which a release is guessed
+_MOST_ACTIVE = 2  # most active limits at the end of a phase
+_AHEAD = (0.25, 0.5, 1.0, 2.0)  # distances at which ends are searched for, over that to the nearest
+_TURNS = np.linspace(-1.0, 1.0, 21)  # rotations from which another end is searched for [rad]
 
 
 @exclusive
 def load(path: str) -> Problem:
-    """Read a problem file and check that every phase can be carried out geometrically.
-
-    Raises
-    ------
-    InputError  if the file is malformed, a formation does not touch, or an `until` is never reached
-    """
+    """Read a problem file and check its phases geometrically, or raise an `InputError`."""
     problem = read_problem(path)
     check_phases(problem)
     return problem
 
 
 def check_phases(problem: Problem) -> None:
-    """Check that every phase of a problem can be carried out geometrically.
-
-    Raises
-    ------
-    InputError  if a formation does not touch, or an `until` is never reached
-    """
+    """Raise an `InputError` if a formation does not touch, or an `until` is never reached."""
     curves = trace_phases(problem)
     z = curves[-1].end if curves else problem.start
     with name_source(problem.source):
@@ -68,7 +53,7 @@ def find_end(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class PathGuess:
-    """A stretch of a phase without a reversal, as configurations along it."""
+    """Configurations along a part of a phase without reversal."""
 
     formation: Formation
     z: Array  # (n, 5): with all contacts closed, evenly spread
@@ -84,36 +69,24 @@ class PathGuess:
 
 
 def guess_curve(curve: Curve, share: float = 1.0) -> list[PathGuess]:
-    """Outline a curve, or the first `share` of it, split at its reversals."""
+    """Path guesses along a curve, or the first `share` of it, split at its reversals."""
     stop = share * curve.length
     parts = [part for part in curve.segments if part.start < stop]
-    outlines = []
-    for part, following in zip(parts, [*parts[1:], None], strict=True):
+    guesses = []
+    signs = [np.concatenate([part.Xi, part.sigma]) for part in parts]
+    for part, here, there in zip(parts, signs, [*signs[1:], signs[-1]], strict=True):
         s = np.linspace(part.start, min(part.stop, stop), POINTS)
-        signs = np.concatenate([part.Xi, part.sigma])
-        turns: tuple[int, ...] = ()
-        if following is not None:
-            flips = signs != np.concatenate([following.Xi, following.sigma])
-            turns = tuple(np.flatnonzero(flips).tolist())
-        directions = Directions(part.Xi, part.sigma)
-        outlines.append(PathGuess(curve.formation, curve.evaluate(s).z, directions, turns))
-    return outlines
+        turns, directions = np.flatnonzero(here != there).tolist(), Directions(part.Xi, part.sigma)
+        guesses.append(PathGuess(curve.formation, curve.evaluate(s).z, directions, tuple(turns)))
+    return guesses
 
 
 def guess_phase(
     phase: Phase, z: Array, later: Sequence[Phase] = (), release_at: float = RELEASE_AT
 ) -> list[PathGuess]:
-    """Outline a phase from `z`, shape (5,), to its end.
+    """Path guesses of a phase from `z`, (5,), to its end; an `InputError` if there is none.
 
-    Parameters
-    ----------
-    z : (5,)
-    later       what follows, which says where a phase that ends by a release is heading
-    release_at  the share of the curve at which a release is
-
-    Raises
-    ------
-    InputError  if the contacts do not touch at `z`, leave no freedom, or the end cannot be reached
+    A phase that ends by a release heads for the end of `later` ones, at the share `release_at`.
     """
     formation = phase.formation
     require_touching(phase, z)
@@ -148,18 +121,28 @@ def _find_goal(phase: Phase, z: Array, later: Sequence[Phase]) -> Array:
     slip, reasons, goals = phase.formation.evaluate_slip(z[None])[0], [], []
     endings = list_ends(phase)
     for end in endings:
-        goal, reason = _settle(end, z, slip)
+        goal, reason = _project(end, z, slip)
         reasons.append(reason)
         goals += [goal] if goal is not None else []
+    metric = metric_weights(phase.formation.scene)
+
+    def distance(goal: Array) -> float:
+        return float(metric @ (goal - z) ** 2)
+
     if not goals and phase.until.contact is not None:
-        found = _look_around(phase.formation, _close_end(phase), z, slip)
-        goals = [found] if found is not None else []
+        end = _close_end(phase)
+        for turn in _TURNS:
+            turned = close_contacts(phase.formation, z, slip, ((2, z[2] + turn),))
+            goal = (
+                turned if turned is None else close_contacts(end.formation, turned, slip, end.fixed)
+            )
+            if goal is not None and is_inside(end.formation, goal):
+                goals.append(goal)
     if not goals:
-        found = explore(phase.formation, z, slip, endings)
-        goals = [found] if found is not None else []
+        goal = explore(phase.formation, z, slip, endings)
+        goals = [goal] if goal is not None else []
     if goals:
-        metric = metric_weights(phase.formation.scene)
-        return min(goals, key=lambda goal: float(metric @ (goal - z) ** 2))
+        return min(goals, key=distance)
     text = f"{phase.until} cannot be reached with these contacts{reasons[0]}"
     raise InputError("", key, text)
 
@@ -178,8 +161,8 @@ def list_ends(phase: Phase) -> list[Ending]:
     return ends
 
 
-def _settle(end: Ending, z: Array, slip: Array) -> tuple[Array | None, str]:
-    """The end nearest to `z`, up to `_MOST_ACTIVE` limits met exactly, or what is in the way."""
+def _project(end: Ending, z: Array, slip: Array) -> tuple[Array | None, str]:
+    """Nearest end by an active-set method with up to `_MOST_ACTIVE` limits, or what blocks it."""
     formation, active, reason = end.formation, end.active, ""
     goal = close_contacts(formation, z, slip, end.fixed, active)
     while goal is not None:
@@ -196,17 +179,13 @@ def _settle(end: Ending, z: Array, slip: Array) -> tuple[Array | None, str]:
 
 
 def guess_onwards(phase: Phase, before: PathGuess) -> list[PathGuess]:
-    """Outline a phase that goes on from another outline, to ends that lie ahead of it.
-
-    Where a contact may be gained in many places, the nearest is often beside the motion so far:
-    these are nearest to places ahead. There are none for a phase with one freedom.
-    """
+    """Path guesses that continue another one, to ends nearest to places ahead; two freedoms."""
     formation, z = phase.formation, before.z[-1]
     if phase.until.contact is None or phase.until.pins or count_freedoms(formation, z) < 2:
         return []
     ending, slip = _close_end(phase).formation, formation.evaluate_slip(z[None])[0]
     step = z - before.z[-2]
-    metric, outlines = metric_weights(formation.scene), []
+    metric, guesses = metric_weights(formation.scene), []
     nearest = close_contacts(ending, z, slip)
     if nearest is None:
         return []
@@ -214,8 +193,8 @@ def guess_onwards(phase: Phase, before: PathGuess) -> list[PathGuess]:
     for share in _AHEAD:
         goal = close_contacts(ending, z + share * far * step, slip)
         if goal is not None and is_inside(ending, goal):
-            outlines.append(connect(formation, z, goal))
-    return outlines
+            guesses.append(connect(formation, z, goal))
+    return guesses
 
 
 def _close_end(phase: Phase) -> Ending:
@@ -225,20 +204,6 @@ def _close_end(phase: Phase) -> Ending:
     return Ending(Formation(formation.scene, closed, formation.rolling), phase.until.poses)
 
 
-def _look_around(formation: Formation, end: Ending, z: Array, slip: Array) -> Array | None:
-    """Nearest end inside all limits that is found from `z` turned by some angle, if any."""
-    metric, best, least = metric_weights(formation.scene), None, np.inf
-    for turn in _TURNS:
-        turned = close_contacts(formation, z, slip, ((2, z[2] + turn),))
-        goal = None if turned is None else close_contacts(end.formation, turned, slip, end.fixed)
-        if goal is None or not is_inside(end.formation, goal):
-            continue
-        distance = float(metric @ (goal - z) ** 2)
-        if distance < least:
-            best, least = goal, distance
-    return best
-
-
 def connect(
     formation: Formation,
     start: Array,
@@ -246,17 +211,15 @@ def connect(
     bends: tuple[float, float] = (0.0, 0.0),
     heading: Array | None = None,
 ) -> PathGuess:
-    """A straight line, pulled onto the contacts, with the directions of its middle.
+    """Straight line projected onto the contacts, with the signs of its mean rates.
 
     Parameters
     ----------
-    start, goal : (5,)
-    bends               how far it bends to one side in one arc and in two, over its length; with
-                        two freedoms
-    heading : (5,)      which way it sets out, if not straight to the goal
+    bends           sideways amplitudes of one arc and of two, over the length; with two freedoms
+    heading : (5,)  initial direction, if not straight to the goal
     """
     slip = formation.evaluate_slip(start[None])[0]
-    aside = _find_side(formation, start, goal) if any(bends) else np.zeros(5)
+    aside = _find_normal(formation, start, goal) if any(bends) else np.zeros(5)
     x = np.linspace(0.0, 1.0, POINTS)[1:, None]
     off = bends[0] * np.sin(np.pi * x) + bends[1] * np.sin(2 * np.pi * x)
     line = goal - start
@@ -266,7 +229,7 @@ def connect(
         length = np.linalg.norm(line * metric) / np.linalg.norm(heading * metric)
         places += x * (1 - x) ** 2 * (length * heading - line)
     z = np.vstack([start, close_all(formation, places, slip)])
-    # Where contacts do not close, the way waits.
+    # Where contacts do not close, the path waits.
     last = np.maximum.accumulate(np.where(np.isfinite(z).all(axis=1), np.arange(len(z)), 0))
     z = z[last]
     speed = np.gradient(z, axis=0)
@@ -276,8 +239,8 @@ def connect(
     return PathGuess(formation, z, Directions(signs[:-2], signs[-2:]))
 
 
-def _find_side(formation: Formation, start: Array, goal: Array) -> Array:
-    """The way aside of a line in the tangent plane at its start, as long as the line."""
+def _find_normal(formation: Formation, start: Array, goal: Array) -> Array:
+    """Normal of a line in the tangent plane at its start, as long as the line."""
     metric = np.sqrt(metric_weights(formation.scene))
     line = (goal - start) * metric
     plane = np.linalg.qr(tangent_basis(formation, start) / metric[:, None])[0]

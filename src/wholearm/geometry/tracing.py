@@ -1,15 +1,14 @@
-"""One-freedom phases: tracing the curve z(s) that the contacts leave free, from phase to phase.
+"""Solution curve z(s) of four constraints, by Chebyshev collocation and Newton, phase by phase.
 
-Four constraints P(z) z' = 0, of four sliding contacts or of two sliding and one rolling, leave
-one direction, so the motion runs along a curve. It is traced panel by panel: on each, the points
-whose projection on the panel's first tangent is a Chebyshev-Lobatto node are solved for by Newton,
-all at once, and the arc length is integrated spectrally. No coordinate is singled out, so places
-where theta_1 (or any other) is stationary are nothing special.
+Four constraints P(z) z' = 0 leave one direction. On each panel the points whose projections on its
+first tangent are Chebyshev-Lobatto nodes are solved for all at once, and the arc length is
+integrated spectrally. No coordinate is singled out: none has to be monotonic.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -23,38 +22,23 @@ from ..problem.definition import End, Phase, Problem, Until
 from ..scene.model import TOUCHING
 from .curve import Curve, Panel, border, describe_pose, find_root, refine
 
-NODES = 17
-"""Nodes of a panel."""
-RESOLVED = 1e-13
-"""Largest trailing Chebyshev coefficient of a resolved panel, relative to the object's size."""
-NEWTON = 3e-8
-"""Last change of Newton's method, in radii of gyration: the next one would be about its square."""
-SHORTER = 0.5
-"""Factor on the length of a panel whose points are not found."""
-AIM = 0.3
-"""Trailing coefficient that the length of a panel is chosen for, over the largest one."""
-HELD = 3e-5
-"""Distance to `until`, in radii of gyration or radians, below which there is nothing to do."""
-FIRST = 0.5
-"""Length of the first panel that is tried, in radii of gyration."""
-ROUNDING = 3e-10
-"""Below zero by no more than this, in radii of gyration, a limit counts as kept."""
-CLOSER = 4
-"""Times that dips of a limit between two places are looked at more closely."""
-LONGEST = 60.0
-"""Longest curve that is traced, in radii of gyration: several turns of the object."""
+NODES = 17  # nodes of a panel
+RESOLVED = 1e-13  # largest trailing Chebyshev coefficient of a panel, over the object's size
+NEWTON = 3e-8  # last Newton change, in radii of gyration: the next is about its square
+SHORTER = 0.5  # factor on the length of a panel whose points are not found
+AIM = 0.3  # trailing coefficient that the length of a panel is chosen for, over the largest one
+HELD = 3e-5  # distance to `until`, in radii of gyration or rad, that counts as none
+FIRST = 0.5  # length of the first panel that is tried, in radii of gyration
+ROUNDING = 3e-10  # below zero by no more than this, in radii of gyration, a limit counts as kept
+CLOSER = 4  # times that dips of a limit between two places are looked at more closely
+LONGEST = 60.0  # longest curve that is traced, in radii of gyration: several turns of the object
 
 
 @lru_cache(maxsize=8)
 def trace_phases(problem: Problem) -> tuple[Curve, ...]:
-    """Trace the curve of every phase, each from the end of the one before.
+    """Trace the curves of all phases up to the first with more freedoms or a smooth end.
 
-    Only as far as geometry alone says where a phase ends: up to the first that has more than one
-    freedom or passes smoothly into the next.
-
-    Raises
-    ------
-    InputError  if a phase's contacts do not touch at its start, or its `until` is never reached
+    Raises an `InputError` as `trace_phase`.
     """
     curves: list[Curve] = []
     z = problem.start
@@ -73,28 +57,22 @@ def runs_on_curve(phase: Phase) -> bool:
 
 
 def trace_phase(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> Curve:
-    """Trace a one-freedom phase from `z` to its `until`, or as far as it goes before a release.
+    """Trace a one-freedom phase from `z`, (5,), to its `until`, or to its limits before a release.
 
-    Parameters
-    ----------
-    z : (5,)
-    later     what follows, which says where a phase that ends by a release is heading
-
-    Raises
-    ------
-    InputError  if the contacts do not touch at `z`, or the `until` is never reached
+    Such a phase heads for the end of `later` ones. Raises an `InputError` if the contacts do not
+    touch or the `until` is never reached.
     """
     require_touching(phase, z)
     if not phase.until.is_release:
         return _trace_phase(phase, z)
     formation, until = phase.formation, phase.until
     ends = [*(p.until for p in later if not p.until.is_release), until]
-    ways = [trace_curve(formation, z, way, until) for way in _headings(formation, z, ends[0])]
-    curve, least = max(ways, key=lambda curve: curve.length), HELD * formation.scene.scales.length
+    curves = [trace_curve(formation, z, v, until) for v in _headings(formation, z, ends[0])]
+    curve, least = max(curves, key=lambda curve: curve.length), HELD * formation.scene.scales.length
     same = later and set(later[0].formation.contacts) == set(formation.contacts)
-    if same and ways[0].length >= least:
-        # Only modes change, which can be anywhere on the way to where a phase ends next.
-        curve = ways[0]
+    if same and curves[0].length >= least:
+        # Only modes change, anywhere on the path to the next end of a phase.
+        curve = curves[0]
     if curve.length < least:
         key = f"phases[{phase.number}].contacts"
         raise InputError("", key, f"cannot move: {curve.ending}")
@@ -102,24 +80,16 @@ def trace_phase(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> Curve:
 
 
 def require_touching(phase: Phase, z: Array) -> None:
-    """Check that a phase's contacts touch at `z`, shape (5,), and that nothing is overlapped.
-
-    Raises
-    ------
-    InputError  if not; lists what touches
-    """
+    """Raise an `InputError` unless a phase's contacts touch at `z`, (5,), and nothing overlaps."""
     key = f"phases[{phase.number}].contacts"
     formation = phase.formation
     gaps = formation.evaluate(z[None], np.zeros((1, 5))).C[0]
     touching = formation.scene.touching
     if np.abs(gaps).max() > touching:
-        missing = [
-            c.name for c, gap in zip(formation.contacts, gaps, strict=True) if abs(gap) > touching
-        ]
+        missing = ", ".join(np.array(formation.names)[np.abs(gaps) > touching])
         when = f"at the end of phase {phase.index}" if phase.index else "at the start"
-        found = describe(find_touching(formation.scene, z))
-        text = f"{', '.join(missing)} does not touch {when}; touching are {found}"
-        raise InputError("", key, text)
+        others = describe(find_touching(formation.scene, z))
+        raise InputError("", key, f"{missing} does not touch {when}; touching are {others}")
     limits = formation.evaluate_limits(z[None])[0]
     if limits.min() < -touching:
         text = formation.limits[int(limits.argmin())].text
@@ -134,8 +104,11 @@ def _trace_phase(phase: Phase, z: Array) -> Curve:
     reason = []
     for heading in _headings(formation, z, until):
         curve = trace_curve(formation, z, heading, until)
-        if curve.reached and until.measure_pins(curve.end, rho) < 3 * HELD and _is_regular(curve):
-            return curve
+        if curve.reached and until.measure_pins(curve.end, rho) < 3 * HELD:
+            # Segments need contacts that stay independent all along the curve.
+            with suppress(np.linalg.LinAlgError):
+                if curve.segments:
+                    return curve
         reason.append(curve.ending)
     text = f"going one way {reason[0]}, going the other way {reason[1]}"
     text += "; one freedom leaves no choice" if until.pins else ""
@@ -143,24 +116,12 @@ def _trace_phase(phase: Phase, z: Array) -> Curve:
 
 
 def _holds(formation: Formation, until: Until, z: Array) -> bool:
-    """Whether `until` holds at `z`.
-
-    Of a contact counts where it can be gained: what is on a line only because an edge lies flush
-    there, beyond the end of the edge or of the link, does not touch.
-    """
+    """Whether `until` holds at `z`; a contact counts within the ends of its edge and link only."""
     if until.contact is None:
         return bool(abs(until_distance(formation, until, z[None])[0]) < HELD)
     gaining = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]
     gaps = formation.evaluate_limits(z[None])[0, gaining] / formation.scene.scales.length
     return bool(len(gaps) and (np.abs(gaps) < HELD).all())
-
-
-def _is_regular(curve: Curve) -> bool:
-    """Whether the contacts stay independent all along the curve, which its segments need."""
-    try:
-        return bool(curve.segments)
-    except np.linalg.LinAlgError:
-        return False
 
 
 def _headings(formation: Formation, z: Array, until: Until) -> list[Array]:
@@ -175,20 +136,12 @@ def _headings(formation: Formation, z: Array, until: Until) -> list[Array]:
 
 
 def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) -> Curve:
-    """Trace a formation's curve from `z` along `heading` to `until` or to where it ends early.
-
-    Parameters
-    ----------
-    formation       with four constraints
-    z : (5,)        start, with all contacts closed; rolling ones roll from there
-    heading : (5,)  which way to go
-    until           what to trace for
-    """
+    """Trace a curve with four constraints from `z` along `heading`, (5,), to `until` or its end."""
     rho = formation.scene.polygon.gyration_radius
     names = [limit.text for limit in formation.limits] + [str(until)]
     wanted = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]
     # What is closed from the start, such as the end of a flush edge that the link does not reach
-    # yet, is not what is waited for.
+    # yet, does not end the phase.
     closed = np.abs(formation.evaluate_limits(z[None])[0]) / rho < HELD
     wanted = [k for k in wanted if not closed[k]] or wanted
     wanted = [len(names) - 1] if until.contact is None else wanted
@@ -203,6 +156,10 @@ def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) ->
     if until.contact is None:
         side = float(np.sign(until_distance(formation, until, z[None])[0])) or 1.0
     panels: list[Panel] = []
+
+    def end(s: float, text: str, reached: bool = False) -> Curve:
+        return Curve(formation, tuple(panels), s, text, reached)
+
     slip = formation.evaluate_slip(z[None])[0]
     step, start, tangent, guess = FIRST * rho, 0.0, heading, None
     while start < LONGEST * rho:
@@ -210,8 +167,7 @@ def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) ->
         step *= factor
         if panel is None:
             if step < 1e-6 * rho:
-                text = f"the contacts become dependent at {describe_pose(z)}"
-                return Curve(formation, tuple(panels), start, text, False)
+                return end(start, f"the contacts become dependent at {describe_pose(z)}")
             continue
         panels.append(panel)
         crossing = _first_crossing(panel, margins)
@@ -219,11 +175,9 @@ def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) ->
             s, active = crossing
             place = describe_pose(panel.interpolate(np.array([s]))[0][0])
             reached = [k for k in active if k in wanted]
-            text = f"{names[(reached or active)[0]]} at {place}"
-            return Curve(formation, tuple(panels), s, text, bool(reached))
+            return end(s, f"{names[(reached or active)[0]]} at {place}", bool(reached))
         start, z, tangent = panel.s[-1], panel.z[-1], panel.z_s[-1]
-    text = f"nothing happens up to {describe_pose(z)}"
-    return Curve(formation, tuple(panels), start, text, False)
+    return end(start, f"nothing happens up to {describe_pose(z)}")
 
 
 def until_distance(formation: Formation, until: Until, z: Array) -> Array:
@@ -241,20 +195,17 @@ def until_distance(formation: Formation, until: Until, z: Array) -> Array:
 def _first_crossing(
     panel: Panel, margins: Callable[[Array], Array]
 ) -> tuple[float, list[int]] | None:
-    """Where on the panel a margin first falls below zero, and which ones do so there.
-
-    Margins are in radii of gyration or radians.
-    """
+    """First arc length at which margins [rho or rad] fall below zero, and which ones do so."""
     grid = refine(panel.s, panel.s[-1])
     values = margins(panel.interpolate(grid)[0])
     for _ in range(CLOSER):
-        inner = _look_closer(grid, values)
+        inner = _refine_dips(grid, values)
         if not len(inner):
             break
+        values = np.vstack([values, margins(panel.interpolate(inner)[0])])
         grid = np.append(grid, inner)
         order = grid.argsort()
-        values = np.vstack([values, margins(panel.interpolate(inner)[0])])[order]
-        grid = grid[order]
+        grid, values = grid[order], values[order]
     # What starts closed (the contact just given up) has to open; rounding is not closing.
     broken = values < -ROUNDING
     if not broken.any():
@@ -276,12 +227,8 @@ def _first_crossing(
     return first, sorted(active)
 
 
-def _look_closer(grid: Array, values: Array) -> Array:
-    """More places around dips that may fall below zero between two places, shape (n,).
-
-    The gap of the fingers falls and rises again at a steady rate where a tip passes the other
-    link, so a dip is no deeper than half the second difference.
-    """
+def _refine_dips(grid: Array, values: Array) -> Array:
+    """Samples around minima that may fall below zero: no deeper than half the second difference."""
     before, here, after = values[:-2], values[1:-1], values[2:]
     dips = (here <= before) & (here <= after) & (here > ROUNDING)
     rows = np.flatnonzero((dips & (here < before - 2 * here + after)).any(axis=1))
@@ -293,7 +240,7 @@ def _look_closer(grid: Array, values: Array) -> Array:
 
 
 class Guess(NamedTuple):
-    """Points of a panel that is too long, as Chebyshev coefficients, shape (NODES, 5)."""
+    """Chebyshev coefficients, shape (NODES, 5), of a panel that is too long."""
 
     step: float
     coefficients: Array
@@ -313,14 +260,9 @@ def build_panel(
     step: float,
     guess: Guess | None,
 ) -> tuple[Panel | None, float, Guess | None]:
-    """Trace one panel of about `step` metres, or none when that is too far.
+    """Panel of about `step` metres, if it converges, factor on the next step, and guess for it.
 
     Rolling contacts keep the slip coordinates `slip`, shape (R,) [m].
-
-    Returns
-    -------
-    factor  by which the next step is to differ
-    guess   about where a shorter panel runs
     """
     unit, integrate, analyse = _chebyshev()
     metric = metric_weights(formation.scene)

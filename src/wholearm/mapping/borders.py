@@ -34,22 +34,15 @@ from ..contacts.closing import (
 from ..contacts.elemental import Contact
 from ..scene.model import Scene
 
-PARTS, DIVISIONS = 16, 13
-"""An interval in which the label changes is cut into so many parts, so often: to rounding."""
-CROWDED = 8
-"""Most changes that are told apart between two neighbouring places."""
+PARTS, DIVISIONS = 16, 13  # parts of an interval and repetitions of the search for a change
+CROWDED = 8  # most changes between two neighbouring places
+# Differences [rad] of a closed finger from a border's angle that count as none: where it touches
+# one of the border's contacts (at the ends of a link angles lose digits), and in general.
 SAME_ANGLE, ROUNDING = 1e-7, 1e-11
-"""Differences [rad] below which a closed finger that touches one of a border's contacts, and one
-that touches anything, is where the border has it: at the ends of a link angles lose digits."""
-ASIDE = 3e-8
-"""Distance beside a pointed tip at a vertex at which the two contacts that meet there are looked
-up, in radii of gyration."""
-LEVEL = 3e-11
-"""Height within which vertices lie on the line of a link, in radii of gyration."""
-LONGEST = 0.06
-"""Longest step in x between neighbouring points of a border, in radii of gyration."""
-NOWHERE = -1
-"""Fills the labels of places that are no border."""
+ASIDE = 3e-8  # step beside a pointed tip at a vertex to find both contacts, in radii of gyration
+LEVEL = 3e-11  # height of vertices that count as on the line of a link, in radii of gyration
+LONGEST = 0.06  # longest step in x between points of a border, in radii of gyration
+NOWHERE = -1  # fills the labels of places that are no border
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,14 +79,12 @@ class Track:
 
     # parameter of shape (n,) to (x, phi), each of shape (n,), NaN where there is none
     pose: Callable[[Array], tuple[Array, Array]]
-    # (x, phi) and the hand closed there to labels, shape (n, 6): indices of two contacts each with
-    # palm, finger 1 and finger 2, `NOWHERE` for the second where there is one contact only, and for
-    # all six where the place is no border
+    # (x, phi) and the hand closed there to labels, shape (n, 6): indices of two contacts each of
+    # palm, finger 1 and finger 2; `NOWHERE` for a second one that is missing, or for no border
     label: Callable[[Array, Array, ClosedFinger], Numbers]
     places: Array  # (n,): parameters to sample at, increasing
     step: float  # [m]: longest step in x between neighbouring points of what is drawn
-    # the finger (None for the palm) and the edge that lies flush on it; None where a contact only
-    # changes its name
+    # the finger (None for the palm) and its flush edge; None where a contact changes its name
     flush: tuple[int | None, int] | None = None
 
 
@@ -130,7 +121,11 @@ def list_tracks(scene: Scene, window: Window, samples: int) -> Iterator[Track]:
         for finger in (0, 1):
             for index in range(scene.polygon.n_vertices):
                 yield flush_track(scene, finger, index, vertex, places)
-                yield from _passing_tracks(scene, finger, index, vertex, places)
+                for branch in (-1.0, 1.0):
+                    yield _circle_track(scene, finger, index, None, branch, vertex, places)
+                    if scene.fingers[finger].radius > 0:
+                        for edge in ((index - 1) % scene.polygon.n_vertices, index):
+                            yield _circle_track(scene, finger, index, edge, branch, vertex, places)
 
 
 def palm_track(scene: Scene, edge: int, phi: float, places: Array) -> Track:
@@ -182,19 +177,6 @@ def flush_track(scene: Scene, finger: int, edge: int, vertex: int, places: Array
         return labels
 
     return Track(pose, label, places, LONGEST * scene.scales.length, (finger, edge))
-
-
-def _passing_tracks(
-    scene: Scene, finger: int, index: int, vertex: int, places: Array
-) -> Iterator[Track]:
-    """Curves on which a contact of `finger` with vertex `index` changes its name."""
-    link, count = scene.fingers[finger], scene.polygon.n_vertices
-    before = (index - 1) % count
-    for branch in (-1.0, 1.0):
-        yield _circle_track(scene, finger, index, None, branch, vertex, places)
-        if link.radius > 0:
-            for edge in (before, index):
-                yield _circle_track(scene, finger, index, edge, branch, vertex, places)
 
 
 def _circle_track(
@@ -277,8 +259,8 @@ def _is_closed(closed: ClosedFinger, finger: int, angle: Array, pair: Numbers) -
     """Whether a closed finger is at `angle`, where it would touch a pair of contacts."""
     with np.errstate(invalid="ignore"):
         off = np.abs(np.mod(closed.z[:, 3 + finger] - angle + np.pi, 2 * np.pi) - np.pi)
-        own = (closed.touched[:, [finger]] == pair).any(axis=1)
-        return np.asarray((off < ROUNDING) | (own & (off < SAME_ANGLE)))
+        touches = (closed.touched[:, [finger]] == pair).any(axis=1)
+        return np.asarray((off < ROUNDING) | (touches & (off < SAME_ANGLE)))
 
 
 def name_contacts(table: tuple[Contact, ...], label: Numbers) -> tuple[Contact, ...]:
@@ -287,7 +269,7 @@ def name_contacts(table: tuple[Contact, ...], label: Numbers) -> tuple[Contact, 
 
 
 class _Tracks(NamedTuple):
-    """Tracks that are looked at together: closing fingers at few poses takes as long as at many."""
+    """Tracks that are evaluated together (vectorized)."""
 
     scene: Scene
     tracks: Sequence[Track]
@@ -296,31 +278,27 @@ class _Tracks(NamedTuple):
     def label(self, owners: Numbers, places: Array) -> Numbers:
         """Labels, shape (n, 6), of places on tracks; the tracks' indices `owners` increase."""
         x, phi = np.empty((2, len(places)))
-        groups = [slice(a, b) for a, b in pairwise(np.searchsorted(owners, _list_ends(owners)))]
-        for own in groups:
-            x[own], phi[own] = self.tracks[owners[own.start]].pose(places[own])
+        starts = np.flatnonzero(np.diff(owners, prepend=-1)).tolist()
+        groups = [slice(a, b) for a, b in pairwise([*starts, len(owners)])]
+        for group in groups:
+            x[group], phi[group] = self.tracks[owners[group.start]].pose(places[group])
         inside = np.isfinite(x)
         if self.window is not None:
             inside &= (x >= self.window.x[0]) & (x <= self.window.x[1])
         labels = np.full((len(places), 6), NOWHERE)
         closed = close_fingers(self.scene, x[inside], phi[inside])
         rows = np.cumsum(inside) - 1
-        for own in groups:
-            (within,) = np.nonzero(inside[own])
+        for group in groups:
+            (within,) = np.nonzero(inside[group])
             if len(within):
-                at = own.start + within
+                at = group.start + within
                 part = ClosedFinger(*(values[rows[at]] for values in closed))
-                labels[at] = self.tracks[owners[own.start]].label(x[at], phi[at], part)
+                labels[at] = self.tracks[owners[group.start]].label(x[at], phi[at], part)
         return labels
 
 
 def cut(scene: Scene, tracks: Sequence[Track], window: Window | None = None) -> list[Piece]:
-    """Cut tracks into pieces with one label each, in the order of tracks and their parameters.
-
-    Parameters
-    ----------
-    window  leave out what is outside of it
-    """
+    """Cut tracks into pieces with one label each, by multisection; only those in the window."""
     every = _Tracks(scene, tracks, window)
     sizes = [len(track.places) for track in tracks]
     owners = np.repeat(np.arange(len(tracks)), sizes)
@@ -329,15 +307,15 @@ def cut(scene: Scene, tracks: Sequence[Track], window: Window | None = None) -> 
     changes = _find_changes(every, owners, places, labels)
     pieces, first = [], 0
     for index, (track, size) in enumerate(zip(tracks, sizes, strict=True)):
-        own, first = slice(first, first + size), first + size
-        if (labels[own] == NOWHERE).all():
+        rows, first = slice(first, first + size), first + size
+        if (labels[rows] == NOWHERE).all():
             continue
-        start, held = float(places[own][0]), labels[own][0]
+        start, held = float(places[rows][0]), labels[rows][0]
         parts = []
         for before, after, following in changes.get(index, ()):
             parts.append((start, before, held))
             start, held = after, following
-        parts.append((start, float(places[own][-1]), held))
+        parts.append((start, float(places[rows][-1]), held))
         pieces += [
             Piece(track, _fill(track, low, high), label)
             for low, high, label in parts
@@ -346,29 +324,14 @@ def cut(scene: Scene, tracks: Sequence[Track], window: Window | None = None) -> 
     return pieces
 
 
-def _list_ends(owners: Numbers) -> Numbers:
-    """Each owner once, and one beyond the last."""
-    return np.append(
-        owners[np.flatnonzero(np.diff(owners, prepend=-1))], np.iinfo(owners.dtype).max
-    )
-
-
 def _find_changes(
     every: _Tracks, owners: Numbers, places: Array, labels: Numbers
 ) -> dict[int, list[tuple[float, float, Numbers]]]:
-    """Where labels change, by track, in the order of its parameter.
-
-    The last place with the old one, the first with the new, and the new.
-    """
+    """Changes of labels by track: last place with the old one, first with the new, and the new."""
     within = owners[1:] == owners[:-1]
-    changed = np.flatnonzero(_differ(labels[1:], labels[:-1]) & within)
-    low, high, old, last = (
-        places[changed],
-        places[changed + 1],
-        labels[changed],
-        labels[changed + 1],
-    )
-    owner = owners[changed]
+    changed = np.flatnonzero((labels[1:] != labels[:-1]).any(axis=1) & within)
+    low, high, owner = places[changed], places[changed + 1], owners[changed]
+    old, last = labels[changed], labels[changed + 1]
     found: dict[int, list[tuple[float, float, Numbers]]] = {}
     for _ in range(CROWDED):
         if not len(low):
@@ -383,19 +346,15 @@ def _find_changes(
             rows = np.arange(len(ends))
             low, high = ends[rows, first], ends[rows, first + 1]
         new = every.label(owner, high)
-        for index, change in zip(
-            owner.tolist(), zip(low.tolist(), high.tolist(), new, strict=True), strict=True
+        for k, before, after, label in zip(
+            owner.tolist(), low.tolist(), high.tolist(), new, strict=True
         ):
-            found.setdefault(index, []).append(change)
+            found.setdefault(k, []).append((before, after, label))
         # A second change may hide behind the first.
-        more = _differ(new, last) & (high < stop)
+        more = (new != last).any(axis=1) & (high < stop)
         low, high, old, last = high[more], stop[more], new[more], last[more]
         owner = owner[more]
-    return {index: sorted(own, key=lambda change: change[0]) for index, own in found.items()}
-
-
-def _differ(labels: Numbers, others: Numbers) -> Flags:
-    return np.asarray((labels != others).any(axis=1))
+    return {k: sorted(changes, key=lambda change: change[0]) for k, changes in found.items()}
 
 
 def _fill(track: Track, low: float, high: float) -> Array:

@@ -21,7 +21,6 @@ from ..problem.definition import Problem, Until
 from ..scene.ranges import TURN, check_place
 from .borders import Window
 from .legs import (
-    Walked,
     describe_miss,
     describe_place,
     find_miss,
@@ -51,14 +50,12 @@ class Stretch:
 
 @dataclass(frozen=True, eq=False)
 class Route(Sequence[Stretch]):
-    """The stretches of a route, which load as the phases of a problem file."""
+    """The stretches of a route, which are the phases of a problem file."""
 
     stretches: tuple[Stretch, ...]
-    # flush edge and x [m] of the ``[start]`` that the route needs; None where it is the problem's
-    # own
+    # flush edge and x [m] of the route's ``[start]``; None: the problem's own
     start: tuple[int, float] | None = None
-    # what the reader should know, such as borders that were missed by little
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # such as borders that were missed by little
 
     def __len__(self) -> int:
         return len(self.stretches)
@@ -77,16 +74,14 @@ class Route(Sequence[Stretch]):
 def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
     """List the contact formations along a route of straight legs.
 
-    A leg with both ends near one border (`legs.NEAR`) follows the border, and ends that near a
-    change of contacts are moved to it. Each phase is carried out as when the list is loaded: on
-    a border along its curve, in a cell to the pose at which the leg ends, or before that to the
-    nearest end.
+    A leg with both ends near one border (`legs.NEAR`) follows the border; ends that near a change
+    of contacts are moved to it. Phases are carried out as in a plan: on a border along its curve,
+    in a cell to the nearest end, or to the pose at the end of the leg.
 
     Parameters
     ----------
-    *poses : [m, rad]  two or more: where the route starts, turns and stops. One that starts neither
-                       at the problem's start nor with an edge flush on the palm is led to from the
-                       problem's start.
+    *poses : [m, rad]  two or more corners of the route. Unless it starts with an edge flush on the
+                       palm, it is led from the problem's start to the first of them.
 
     Raises
     ------
@@ -94,19 +89,19 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
     """
     if len(poses) < 2:
         raise InputError("", "route", f"{len(poses)} pose given; two or more are needed")
-    given = [np.array(pose, dtype=float) for pose in poses]
-    for x, phi in given:
+    corners = [np.array(pose, dtype=float) for pose in poses]
+    for x, phi in corners:
         check_place(problem.scene, "route", float(x))
         TURN.check("route", math.degrees(phi), "degrees")
     near = tolerance(problem.scene)
-    for one, two in pairwise(given):
+    for one, two in pairwise(corners):
         if not (np.abs(two - one) > near).any():
             text = f"two poses at {describe_place(one)} are the same place"
             raise InputError("", "route", text)
-    z, start, given, notes = _begin(problem, given)
+    z, start, corners, notes = _begin(problem, corners)
     here, stretches, legs = z[[0, 2]], list[Stretch](), list[int]()
     origin = here
-    for leg, there in enumerate(given):
+    for leg, there in enumerate(corners):
         miss = find_miss(problem.scene, here, there)
         note = "" if miss is None else describe_miss(problem.scene, miss)
         try:
@@ -116,40 +111,32 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
             raise InputError("", "route", text) from None
         if note:
             notes.append(f"leg {leg + 1} goes through cells: {note}")
-        for entry in walked:
-            _append(stretches, legs, leg, z, entry, problem.scene.scales.length)
-            z = entry[2]
+        for _, (contacts, until), end in walked:
+            stretch = Stretch(contacts, until, z[[0, 2]], end[[0, 2]])
+            before = stretches[-1] if stretches and legs[-1] != leg else None
+            # On a border a leg may continue the one before; a reversal is a new phase.
+            if before is not None and len(contacts) == 4 and set(before.contacts) == set(contacts):
+                runs = (before.stop - before.start) * (stretch.stop - stretch.start)
+                onwards = (runs / [problem.scene.scales.length**2, 1]).sum() > 0
+                if onwards and before.until.contact is None:
+                    stretches.pop()
+                    stretch = replace(stretch, contacts=before.contacts, start=before.start)
+            stretches.append(stretch)
+            legs.append(leg)
+            z = end
         here = z[[0, 2]]
     # The end of a leg may be moved to a change of contacts, but not the start.
     stretches[0] = replace(stretches[0], start=origin)
     return Route(tuple(stretches), start, tuple(notes))
 
 
-def _append(
-    stretches: list[Stretch], legs: list[int], leg: int, z: Array, entry: Walked, length: float
-) -> None:
-    """Add the stretch of a phase that starts at `z`; `length` is the scene's, of poses."""
-    _, (contacts, until), end = entry
-    stretch = Stretch(contacts, until, z[[0, 2]], end[[0, 2]])
-    before = stretches[-1] if stretches and legs[-1] != leg else None
-    # On a border a leg may go on where the one before it stopped; a turn back is a phase.
-    if before is not None and len(contacts) == 4 and set(before.contacts) == set(contacts):
-        onwards = (before.stop - before.start) * (stretch.stop - stretch.start) / [length**2, 1]
-        if onwards.sum() > 0 and before.until.contact is None:
-            stretches.pop()
-            stretch = replace(stretch, contacts=before.contacts, start=before.start)
-    stretches.append(stretch)
-    legs.append(leg)
-
-
 def _begin(
-    problem: Problem, given: list[Array]
+    problem: Problem, corners: list[Array]
 ) -> tuple[Array, tuple[int, float] | None, list[Array], list[str]]:
     """Start configuration, its ``[start]``, the poses that follow and notes."""
-    scene, near, first = problem.scene, tolerance(problem.scene), given[0]
-    own = problem.start[[0, 2]]
-    if (np.abs(first - own) < near).all():
-        return problem.start, None, given[1:], []
+    scene, near, first = problem.scene, tolerance(problem.scene), corners[0]
+    if (np.abs(first - problem.start[[0, 2]]) < near).all():
+        return problem.start, None, corners[1:], []
     around = Window((0.0, 0.0), (float(first[1] - near[1]), float(first[1] + near[1])))
     for angle, edge in around.flush_angles(scene):
         q = place_flush(scene, edge, float(first[0]))
@@ -161,12 +148,12 @@ def _begin(
         # A problem starts with phi in one turn; so does the route.
         shift = np.array([0.0, float(q[2]) - angle])
         note = "the [start] below takes the place of the problem's own"
-        return z, (edge, float(first[0])), [pose + shift for pose in given[1:]], [note]
+        return z, (edge, float(first[0])), [pose + shift for pose in corners[1:]], [note]
     note = (
         f"starts with leg 1 from the problem's start to {describe_place(first)}, "
         "where no edge is flush on the palm"
     )
-    return problem.start, None, given, [note]
+    return problem.start, None, corners, [note]
 
 
 def format_route(route: Route) -> str:
@@ -194,5 +181,5 @@ def trace_problem(problem: Problem) -> list[Array]:
             paths.append(np.concatenate(parts)[:, [0, 2]])
             z = parts[-1][-1]
     except InputError:
-        pass  # The map is how phases that cannot be carried out are mended.
+        pass  # The map is drawn of infeasible phases, too.
     return paths

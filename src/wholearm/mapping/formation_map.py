@@ -1,7 +1,7 @@
 """The contact-formation map: the (x, phi) plane as cells, borders and crossings.
 
-With palm and both fingers touching, a configuration is a function of (x, phi). Inside a cell three
-contacts touch (two freedoms), on its borders four (one freedom), at crossings five.
+With palm and both fingers touching, a configuration is a function of (x, phi). Three contacts touch
+inside a cell (two degrees of freedom), four on its borders (one), five at crossings.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from ..mechanics.margin_key import UNIQUENESS
 from ..mechanics.metric import metric_weights
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN, find_minors
 from ..problem.definition import Problem
-from ..quasistatic.squeeze import Squeezing
+from ..quasistatic.squeeze import InternalForceLimits
 from ..scene.model import Scene
 from .borders import (
     NOWHERE,
@@ -44,28 +44,18 @@ from .borders import (
     list_tracks,
     name_contacts,
 )
-from .formation_list import Stretch, list_formations, trace_problem
+from .formation_list import trace_problem
 
-BEYOND = np.radians(6.0)
-"""Reach of the window beyond the flush angles next to the plan [rad]."""
-BESIDE = 0.25
-"""The same over half the distance of these angles, at most."""
-WAYS = ("+x", "-x", "+phi", "-phi")
-"""Directions of travel inside a cell."""
-REGULAR = 1e-9
-"""Least ratio of singular values of A at which contacts count as independent; least determinant of
-their wrenches, in radii of gyration, likewise."""
+BEYOND = np.radians(6.0)  # reach of the window beyond the flush angles next to the plan [rad]
+BESIDE = 0.25  # largest reach over half the distance of these angles
+WAYS = ("+x", "-x", "+phi", "-phi")  # directions of travel inside a cell
+REGULAR = 1e-9  # least ratio of singular values of independent contacts; least determinant likewise
 _WAYS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-Flush = tuple[int | None, int]
-"""A finger (None for the palm) and an edge that lies flush on it."""
-SAMPLES = 100
-"""Places per radian of the window, and least across it, at which borders are looked for."""
-ARROWS = 24
-"""Places across the map at which directions inside cells are checked."""
-CROSSED = -5
-"""Cell of the places where the closed fingers would overlap."""
-SAME_PLACE = 3e-5
-"""Distance, in radii of gyration and radians, below which ends of borders are one crossing."""
+Flush = tuple[int | None, int]  # a finger (None for the palm) and an edge that lies flush on it
+SAMPLES = 100  # samples of borders per radian of the window, and least number across it
+ARROWS = 24  # places across the map at which directions inside cells are checked
+CROSSED = -5  # cell of the places where the closed fingers would overlap
+SAME_PLACE = 3e-5  # distance of ends of borders that are one crossing, in radii of gyration and rad
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,19 +63,15 @@ class Border:
     """A stretch of a cell border with one contact formation."""
 
     contacts: tuple[Contact, ...]  # the four that touch
-    # the finger (None for the palm) and the edge that lies flush on it. None where a contact passes
-    # from the side of a link to its tip or along the tip: there two names stand for one contact and
-    # nothing holds the motion to the border.
+    # None where a contact passes from the side of a link to its tip or along the tip: there two
+    # names stand for one contact, which does not constrain the motion to the border
     flush: Flush | None
     along: str  # {"x", "phi"}: the coordinate that increases along the border
     points: Array  # (n, 2) [m, rad]: x and phi
     z: Array  # (n, 5): configurations there
-    # forth, back (n,): whether a quasistatic motion is possible with the coordinate increasing, and
-    # decreasing; all False where nothing is flush
-    forth: Flags
-    back: Flags
-    # (n,): whether it would be, one way or the other, if contact forces were the only ones
-    ambiguous: Flags
+    forth: Flags  # (n,): whether a quasistatic motion with increasing coordinate is feasible
+    back: Flags  # (n,): with decreasing coordinate; both False where nothing is flush
+    ambiguous: Flags  # (n,): feasible in some direction, but contact forces are not unique
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -100,8 +86,7 @@ class Crossing:
     point: Array  # (2,) [m, rad]: x and phi
     z: Array  # (5,)
     contacts: tuple[Contact, ...]
-    # what lies flush on the borders that meet, as in `Border`. With two or more, five contacts
-    # press at places of their own; with one, a contact changes its name on a border.
+    # flush edges of the borders that meet; with one alone, a contact changes its name on a border
     flush: tuple[Flush, ...]
 
 
@@ -119,15 +104,12 @@ class FormationMap(Drawn):
     borders: tuple[Border, ...]
     crossings: tuple[Crossing, ...]
     places: Array  # (m, 2) [m, rad]: where directions inside cells were checked
-    # (m, 4): whether a quasistatic motion is possible there with x increasing, x decreasing, phi
-    # increasing and phi decreasing while the other stays
-    possible: Flags
-    # (m,): whether one more of these would be possible, if contact forces were the only ones
-    ambiguous: Flags
+    possible: Flags  # (m, 4): whether quasistatic motions in the directions `WAYS` are feasible
+    ambiguous: Flags  # (m,): one more would be, but contact forces are not unique
 
     @property
     def headline(self) -> str:
-        """What there is, in a line."""
+        """Numbers of formations, borders and crossings, in a line."""
         return (
             f"{self.problem.name!r}, {len(self.formations)} formations, {len(self.borders)} "
             f"borders, {len(self.crossings)} crossings"
@@ -146,13 +128,10 @@ def build_map(
 
     Parameters
     ----------
-    problem            its phases only say which part of the plane is of interest
-    resolution         points of the grid each way, at least 10. Borders do not depend on it.
-    window             the part of the plane; by default all x at which both fingers reach the
-                       object, and phi from the flush angle below the plan to that above it
-    progress           receives a line of text now and then
-    uniqueness_margin  where the uniqueness margin of contact forces (`mechanics.uniqueness`) is
-                       less, motion is ambiguous
+    problem            its phases determine the default window
+    resolution         grid points in each direction, at least 10; borders do not depend on it
+    window             by default that of `choose_window`
+    uniqueness_margin  least uniqueness margin of contact forces (`mechanics.uniqueness`)
 
     Raises
     ------
@@ -167,8 +146,8 @@ def build_map(
     x, phi = np.linspace(*window.x, resolution), np.linspace(*window.phi, resolution)
     labels, obstacle = label_grid(scene, x, phi)
     triples = labels[..., [0, 2, 4]]
-    known, cell = np.unique(triples[obstacle == 0], axis=0, return_inverse=True)
-    if not len(known):
+    rows, cell = np.unique(triples[obstacle == 0], axis=0, return_inverse=True)
+    if not len(rows):
         raise InputError(problem.source, "", "the fingers reach the object nowhere in the window")
     cells = -obstacle
     cells[obstacle == 0] = cell.ravel()
@@ -184,7 +163,7 @@ def build_map(
         x,
         phi,
         cells,
-        tuple(name_contacts(table, row) for row in known),
+        tuple(name_contacts(table, row) for row in rows),
         tuple(borders),
         _find_crossings(scene, borders),
         *directions,
@@ -192,36 +171,34 @@ def build_map(
 
 
 def _build_borders(problem: Problem, pieces: Sequence[Piece], limit: float) -> list[Border]:
-    """Borders of pieces: what takes the same time for few places and many is done for all."""
+    """Borders of pieces, evaluated together (vectorized)."""
     if not pieces:
         return []
     scene = problem.scene
-    x, phi = (np.concatenate(part) for part in zip(*map(_place, pieces), strict=True))
+    x, phi = (
+        np.concatenate(part) for part in zip(*(p.track.pose(p.places) for p in pieces), strict=True)
+    )
     z = close_fingers(scene, x, phi).z
-    labels = np.concatenate([np.tile(own.label, (len(own.places), 1)) for own in pieces])
-    owner = np.repeat(np.arange(len(pieces)), [len(own.places) for own in pieces])
-    # Right at an end, rounding may leave a finger no way to close.
+    labels = np.concatenate([np.tile(piece.label, (len(piece.places), 1)) for piece in pieces])
+    owner = np.repeat(np.arange(len(pieces)), [len(piece.places) for piece in pieces])
+    # At an end, rounding may keep a finger from closing.
     closed = np.isfinite(z).all(axis=1)
     x, phi, z = x[closed], phi[closed], z[closed]
     labels, owner = labels[closed], owner[closed]
-    flush = np.array([own.track.flush is not None for own in pieces])[owner]
-    ways = np.zeros((3, len(z)), dtype=bool)
+    flush = np.array([piece.track.flush is not None for piece in pieces])[owner]
+    flags = np.zeros((3, len(z)), dtype=bool)
     if flush.any():
-        rows = np.array([0 if _along(own) == "x" else 2 for own in pieces])[owner[flush]]
+        rows = np.array([0 if _along(piece) == "x" else 2 for piece in pieces])[owner[flush]]
         chosen = labels[flush][labels[flush] != NOWHERE].reshape(-1, 4)
-        ways[:, flush] = check_border(scene, problem.epsilon, chosen, z[flush], rows, limit)
+        flags[:, flush] = check_border(scene, problem.epsilon, chosen, z[flush], rows, limit)
     table, found = contact_table(scene), []
     for index, piece in enumerate(pieces):
         mine = owner == index
         contacts = name_contacts(table, piece.label[piece.label != NOWHERE])
         points = np.column_stack([x[mine], phi[mine]])
-        own = Border(contacts, piece.track.flush, _along(piece), points, z[mine], *ways[:, mine])
-        found.append(own)
+        along, flags_here = _along(piece), flags[:, mine]
+        found.append(Border(contacts, piece.track.flush, along, points, z[mine], *flags_here))
     return found
-
-
-def _place(piece: Piece) -> tuple[Array, Array]:
-    return piece.track.pose(piece.places)
 
 
 def _along(piece: Piece) -> str:
@@ -231,12 +208,11 @@ def _along(piece: Piece) -> str:
 
 
 def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]:
-    """Where ends of borders meet, with the contacts of all of them, if these are five or more."""
+    """Places where ends of borders meet with five or more contacts in all."""
     ends = [(border, k) for border in borders for k in (0, -1)]
     points = np.array([border.points[k] for border, k in ends]).reshape(-1, 2)
     size = SAME_PLACE * np.array([scene.scales.length, 1.0])
     table = contact_table(scene)
-    place = {contact: k for k, contact in enumerate(table)}
     crossings, free = [], np.ones(len(points), dtype=bool)
     for k in range(len(points)):
         if not free[k]:
@@ -249,9 +225,8 @@ def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]
             continue
         border, end = ends[k]
         z = border.z[end]
-        # Borders also end where a finger's first touch jumps from one side of its joint to the
-        # other; what they touch there is not touched at once.
-        label = sorted(place[contact] for contact in met)
+        # Where a finger's first touch jumps across its joint, not all contacts touch at once.
+        label = sorted(table.index(contact) for contact in met)
         gaps = np.abs(evaluate_contacts(scene, label, z[None]).C[0])
         contacts = tuple(table[k] for k in np.array(label)[gaps < scene.touching])
         if len(contacts) >= 5:
@@ -261,7 +236,7 @@ def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]
 
 
 def _check_cells(problem: Problem, window: Window, limit: float) -> tuple[Array, Flags, Flags]:
-    """Directions of possible motion at the points of a lattice inside cells."""
+    """Feasible directions of motion at a lattice of places inside cells."""
     scene = problem.scene
     x, phi = (np.linspace(*ends, ARROWS + 1) for ends in (window.x, window.phi))
     x, phi = np.meshgrid((x[1:] + x[:-1]) / 2, (phi[1:] + phi[:-1]) / 2)
@@ -272,18 +247,6 @@ def _check_cells(problem: Problem, window: Window, limit: float) -> tuple[Array,
     return places, *check_cell(scene, problem.epsilon, triples, z, limit)
 
 
-__all__ = [
-    "Border",
-    "Crossing",
-    "FormationMap",
-    "Stretch",
-    "Window",
-    "build_map",
-    "choose_window",
-    "list_formations",
-]
-
-
 def check_border(
     scene: Scene,
     epsilon: float,
@@ -292,13 +255,12 @@ def check_border(
     coordinate: int | Numbers,
     uniqueness_margin: float = UNIQUENESS_MARGIN,
 ) -> tuple[Flags, Flags, Flags]:
-    """Whether a quasistatic motion along a border is possible, each way.
+    """Whether a quasistatic motion along a border is feasible, in each direction.
 
     Parameters
     ----------
     epsilon : [N]             least normal force
-    label : (4,) or (n, 4)    the four contacts, as indices into `closing.contact_table`: one
-                              border's, or each place's
+    label : (4,) or (n, 4)    the contacts, as indices into `closing.contact_table`
     z : (n, 5)                configurations on borders
     coordinate : (n,) {0, 2}  x or phi, whichever increases along the border
     uniqueness_margin         least uniqueness margin, as of `find_minors`
@@ -306,24 +268,28 @@ def check_border(
     Returns
     -------
     forth, back : (n,)  for travel with the coordinate increasing, and decreasing
-    ambiguous : (n,)    whether it would be, one way or the other, if contact forces were the only
-                        ones
+    ambiguous : (n,)    feasible in some direction, but contact forces are not unique
     """
     labels = np.broadcast_to(label, (len(z), 4))
     kinematics = evaluate_each(scene, labels, z)
     weights = np.sqrt(metric_weights(scene))
-    _, sizes, rows = np.linalg.svd(kinematics.A / weights)
-    z_s = rows[:, -1] / weights
+    _, sizes, right = np.linalg.svd(kinematics.A / weights)
+    z_s = right[:, -1] / weights
     along = z_s[np.arange(len(z)), coordinate]
     z_s *= np.where(along < 0, -1.0, 1.0)[:, None]
     regular = sizes[:, -1] > REGULAR * sizes[:, 0]
     held, unique = (np.zeros((2, len(z)), dtype=bool) for _ in range(2))
     for formation, mine in group_alike(scene, labels):
-        (own,) = np.nonzero(mine & regular)
-        part = Kinematics(*(array[own] for array in kinematics))
-        for row, sole, way in zip(held, unique, (z_s[own], -z_s[own]), strict=True):
-            row[own] = _check_path(formation, part, epsilon, z[own], way)
-            sole[own[row[own]]] = _are_unique(formation, part, way, row[own], uniqueness_margin)
+        (rows,) = np.nonzero(mine & regular)
+        part, still = Kinematics(*(array[rows] for array in kinematics)), np.zeros(len(rows))
+        for k, tangent in enumerate((z_s[rows], -z_s[rows])):
+            directions = Directions.of(part, tangent)
+            forces = inverse(formation, z[rows], tangent, np.zeros_like(tangent), directions, part)
+            squeezing = InternalForceLimits.of(formation, forces, tangent[:, 3:])
+            low, high = squeezing.find_span(still, still, epsilon)
+            held[k, rows] = feasible = low <= high
+            sole = _are_unique(formation, part, tangent, feasible, uniqueness_margin)
+            unique[k, rows[feasible]] = sole
     return held[0] & unique[0], held[1] & unique[1], np.any(held & ~unique, axis=0)
 
 
@@ -334,20 +300,19 @@ def check_cell(
     z: Array,
     uniqueness_margin: float = UNIQUENESS_MARGIN,
 ) -> tuple[Flags, Flags]:
-    """Whether a quasistatic motion from inside a cell is possible towards each of `WAYS`.
+    """Whether quasistatic motions inside cells are feasible in the directions `WAYS`.
 
     Parameters
     ----------
     epsilon : [N]           least normal force
-    label : (3,) or (n, 3)  the three contacts, as indices into `closing.contact_table`: palm,
-                            finger 1, finger 2
+    label : (3,) or (n, 3)  contacts of palm and fingers, as indices into `closing.contact_table`
     z : (n, 5)              configurations in cells
     uniqueness_margin       as of `check_border`
 
     Returns
     -------
     possible : (n, 4)
-    ambiguous : (n,)   whether one more of them would be, if contact forces were the only ones
+    ambiguous : (n,)   one more would be, but contact forces are not unique
     """
     labels = np.broadcast_to(label, (len(z), 3))
     kinematics = evaluate_each(scene, labels, z)
@@ -358,45 +323,30 @@ def check_cell(
     regular = np.abs(np.linalg.det(matrix)) > REGULAR * scene.scales.length**2
     part = Kinematics(*(array[regular] for array in kinematics))
     for formation, _ in group_alike(scene, labels):
-        for k, way in enumerate(_WAYS):
+        for k, direction in enumerate(_WAYS):
             right = np.zeros((regular.sum(), 5, 1))
-            right[:, 3:, 0] = way
+            right[:, 3:, 0] = direction
             z_s = np.linalg.solve(matrix[regular], right)[..., 0]
-            held[regular, k] = _check_balance(formation, part, epsilon, z_s)
-            own = _are_unique(formation, part, z_s, held[regular, k], uniqueness_margin)
-            unique[held[:, k], k] = own
+            # Contact forces and torques at rest, with friction that opposes z_s.
+            directions = Directions.of(part, z_s)
+            G = force_rows(formation, part, directions)
+            wrench = G[:, :, :3].transpose(0, 2, 1)
+            solvable = np.abs(np.linalg.det(wrench)) > REGULAR * scene.scales.length
+            wrench[~solvable] = np.eye(3)
+            right = np.broadcast_to(-scene.applied_force[:3, None], (len(G), 3, 1))
+            c_n = np.linalg.solve(wrench, right)[..., 0]
+            tau = scene.dry[3:] * directions.sigma - np.einsum("nij,ni->nj", G[:, :, 3:], c_n)
+            within = (c_n >= epsilon).all(axis=1) & (np.abs(tau) <= scene.torque_limit).all(axis=1)
+            held[regular, k] = feasible = within & solvable
+            sole = _are_unique(formation, part, z_s, feasible, uniqueness_margin)
+            unique[held[:, k], k] = sole
     return held & unique, np.any(held & ~unique, axis=1)
-
-
-def _check_path(
-    formation: Formation, kinematics: Kinematics, epsilon: float, z: Array, z_s: Array
-) -> Flags:
-    directions = Directions.of(kinematics, z_s)
-    forces = inverse(formation, z, z_s, np.zeros_like(z_s), directions, kinematics)
-    squeezing, still = Squeezing.of(formation, forces, z_s[:, 3:]), np.zeros(len(z))
-    low, high = squeezing.find_span(still, still, epsilon)
-    return np.asarray(low <= high)
-
-
-def _check_balance(
-    formation: Formation, kinematics: Kinematics, epsilon: float, z_s: Array
-) -> Flags:
-    scene, directions = formation.scene, Directions.of(kinematics, z_s)
-    G = force_rows(formation, kinematics, directions)
-    wrench = G[:, :, :3].transpose(0, 2, 1)
-    regular = np.abs(np.linalg.det(wrench)) > REGULAR * scene.scales.length
-    wrench[~regular] = np.eye(3)
-    right = np.broadcast_to(-scene.applied_force[:3, None], (len(G), 3, 1))
-    c_n = np.linalg.solve(wrench, right)[..., 0]
-    tau = scene.dry[3:] * directions.sigma - np.einsum("nij,ni->nj", G[:, :, 3:], c_n)
-    held = (c_n >= epsilon).all(axis=1) & (np.abs(tau) <= scene.torque_limit).all(axis=1)
-    return np.asarray(held & regular)
 
 
 def _are_unique(
     formation: Formation, kinematics: Kinematics, z_s: Array, rows: Flags, uniqueness_margin: float
 ) -> Flags:
-    """Whether contact forces of travel along `z_s` are the only ones, at those of the `rows`."""
+    """Whether contact forces of motions along `z_s` are unique, at some of the rows."""
     part = Kinematics(*(array[rows] for array in kinematics))
     Xi = Directions.of(part, z_s[rows]).Xi
     return np.asarray(find_minors(formation, part, Xi).ratios >= uniqueness_margin)
@@ -404,7 +354,7 @@ def _are_unique(
 
 @exclusive
 def choose_window(problem: Problem, phi_deg: tuple[float, float] | None = None) -> Window:
-    """All x that both fingers reach, and phi one flush angle beyond what the phases cover.
+    """Window of all x that both fingers reach, and of phi up to the flush angles around the phases.
 
     Parameters
     ----------
@@ -431,7 +381,7 @@ def choose_window(problem: Problem, phi_deg: tuple[float, float] | None = None) 
 
 
 def _cover_phases(problem: Problem) -> tuple[float, float]:
-    """Range of phi [rad] that reaches a little beyond the flush angles next to the phases."""
+    """Range of phi [rad] to a little beyond the flush angles around the phases."""
     angles = [float(problem.start[2])]
     angles += [float(phi) for path in trace_problem(problem) for phi in path[[0, -1], 1]]
     for phase in problem.phases:
@@ -441,9 +391,9 @@ def _cover_phases(problem: Problem) -> tuple[float, float]:
     low, high = min(angles), max(angles)
     around = Window((0.0, 0.0), (low - 2 * np.pi, high + 2 * np.pi)).flush_angles(problem.scene)
     flush = np.array([angle for angle, _ in around])
-    # What is flush at an end of the plan is not yet the next edge.
+    # An edge that is flush at an end of the plan does not count.
     before, after = float(flush[flush < low - 1e-6].max()), float(flush[flush > high + 1e-6].min())
-    # The next edge but one is not of interest, however many there are.
+    # The next edge but one stays outside.
     beyond = min(BEYOND, BESIDE * (after - before) / 2)
     return before - beyond, after + beyond
 

@@ -1,9 +1,10 @@
-"""A problem file to begin with: a regular polygon, a hand that suits it, and a slide."""
+"""Templates of problem files: a polygon, a hand scaled to it, and a slide on one edge."""
 
 from __future__ import annotations
 
 import math
 import tomllib
+from itertools import product
 
 import numpy as np
 
@@ -13,17 +14,14 @@ from ..problem.read import build_problem
 from ..scene.polygon import Polygon
 from .formation_list import format_route, list_formations
 
-_MOST = 50
-"""Corners of a polygon that a file still shows well."""
-_SIZE, _MASS = 0.05, 0.2
-"""Radius [m] and mass [kg] of the object whose hand is scaled to others of the same density."""
+_MOST = 50  # Corners of a polygon that a file still shows well
+_SIZE, _MASS = 0.05, 0.2  # radius [m] and mass [kg] of the reference object
+# x of the left joint and of the start over the size, of polygons with five and more corners and of
+# others; and the length of the slide. The right joint is at 1.6.
 _LEFT, _START, _SLIDE = (-1.6, -0.2), (0.3, 1.2), 0.4
-"""Left joint and start, over the size, of polygons with five and more corners and of others, whose
-fingers would meet above them; and how far they slide. The right joint is at 1.6."""
-_OTHERS = tuple((wide, start) for wide in (True, False) for start in (1.2, 0.8, 0.3, 0.0))
-"""Other hands and starts, where the corners are given and the first does not close on them."""
-_COMMENTS = 31
-"""Column of the comments."""
+# Other hands and starts for given vertices.
+_OTHERS = tuple(product((True, False), (1.2, 0.8, 0.3, 0.0)))
+_COMMENTS = 31  # Column of the comments
 
 
 def write_template(
@@ -39,8 +37,7 @@ def write_template(
     ----------
     size : [m]             from the centroid to the corners
     mass : [kg]            by default that of a plate as thick and heavy as those in `problems/`
-    vertices : (n, 2) [m]  corners, anticlockwise, in place of those of a regular polygon; they say
-                           the size, too
+    vertices : (n, 2) [m]  anticlockwise, in place of those of a regular polygon of that size
 
     Raises
     ------
@@ -70,7 +67,7 @@ def write_template(
 
 
 def _write(name: str, vertices: Array, size: float, weight: float, few: bool, start: float) -> str:
-    """The file for one of the hands and a start, over the size."""
+    """The file for one hand and a start, over the size."""
     corners, scale, heavy = len(vertices), size / _SIZE, weight / _MASS
     finger = {
         "length": ((0.22 if few else 0.14) * scale, "m, joint to tip centre"),
@@ -99,14 +96,10 @@ def _write(name: str, vertices: Array, size: float, weight: float, few: bool, st
     lines += ["\n[start]", _row("flush", "0", "this edge lies on the palm")]
     lines += [_row("x", _show(start * size), "m, centroid; both fingers close on the object")]
     text = "\n".join(lines) + "\n"
-    return text + "\n" + _list_phases(text, (start - _SLIDE) * size)
-
-
-def _list_phases(text: str, x: float) -> str:
-    """The ``[[phases]]`` of a slide from the start of a problem file to another x [m]."""
     problem = build_problem(tomllib.loads(text))
-    here, _, phi = (float(value) for value in problem.start[:3])
-    return format_route(list_formations(problem, (here, phi), (x, phi)))
+    x, _, phi = (float(value) for value in problem.start[:3])
+    route = list_formations(problem, (x, phi), ((start - _SLIDE) * size, phi))
+    return text + "\n" + format_route(route)
 
 
 def _row(key: str, value: str, comment: str) -> str:

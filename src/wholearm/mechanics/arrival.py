@@ -1,17 +1,16 @@
 """Constant torques that close a contact and then hold still with everything that touches.
 
-A motion that is to stop at a contact may end a little short of it. Torques are looked for that
+A motion that is to stop at a contact may end a little short of it. Torques have to
 
-* are in static balance with all that touches at the contact, every c_n at least epsilon and
-  |c_t| <= mu (c_n - epsilon), and set off in no way that gives one of these contacts up;
-* from rest, with the contact still open by a gap, drive the formation on towards it, beyond what
+* be in static balance with all that touches at the contact, every c_n at least epsilon and
+  |c_t| <= mu (c_n - epsilon), and start no motion that gives up one of these contacts;
+* from rest, with the contact still open by a gap, accelerate the formation towards it, beyond what
   friction can hold.
 
-At rest all of this is affine in the two torques. The firmest ones have the largest least margin of
-what holds, each over what is ample for it: a linear programme in three unknowns, solved by its
-vertices. Contacts of the formation may open on the way, as what presses them all together
-afterwards need not do so before: torques that keep them closed on the way are so weak that impacts
-on arrival go on for longer than the way takes.
+All of this is affine in the torques. Those with the largest least margin, each over its saturation
+value, solve a linear programme in three unknowns (vertex enumeration on an active set). Contacts of
+the formation may open on the way: torques that keep them closed are so weak that impacts on arrival
+last longer than the motion.
 """
 
 from __future__ import annotations
@@ -31,37 +30,25 @@ from .dynamics import Directions, force_rows
 from .impact import ViolationKind, compute_impact
 from .wedging import SURE, find_static_torques
 
-LEAST = 1e-2
-"""Margin over what is ample below which torques do not hold, or close, for sure."""
-AMPLE = 0.1
-"""Margin that is ample: of a normal force, a torque or an acceleration, over the scene's."""
-DRIVE = 0.02
-"""Least acceleration towards a contact that is still open, over the scene's."""
-SLOW = 0.2
-"""Least margin of torques that close a contact more slowly, over that of torques that only hold."""
-_CREEP = 0.02
-"""Ample acceleration of what slides and turns where the directions of sliding are assumed, over the
-scene's."""
-_STILL = 1e-9
-"""Rate of sliding or turning that counts as none, over how fast anything moves; change of a gap
-that counts as none, over how far everything moves."""
-_JAMS = 1e-6
-"""Determinant of K over that without friction, at which and below a way jams."""
-_INDEPENDENT = 1e-12
-"""Least Gram determinant of the rows of constraints, each of length one, that are independent."""
-_SMALL = 1e-9
-"""What counts as zero in the linear programme."""
-_FAR = 1e3
-"""Largest margin that is looked for, over what is ample."""
+LEAST = 1e-2  # least margin over saturation of torques that hold or close
+AMPLE = 0.1  # saturation of margins of forces, torques, accelerations, over the scene's
+DRIVE = 0.02  # least acceleration towards a contact that is still open, over the scene's
+SLOW = 0.2  # least margin of slowly closing torques, over that of torques that only hold
+_CREEP = 0.02  # saturation of sliding and turning with assumed signs, over the scene's
+_STILL = 1e-9  # relative rate of sliding, turning or opening that counts as none
+_JAMS = 1e-6  # determinant of K over the frictionless one, at and below which a mode jams
+_INDEPENDENT = 1e-12  # least Gram determinant of independent normalized constraints
+_SMALL = 1e-9  # what counts as zero in the linear programme
+_FAR = 1e3  # largest margin, over saturation
 
 
 class ArrivalPath(NamedTuple):
-    """A way in which a formation at rest may begin to move; rows are for (1, tau_1, tau_2)."""
+    """A start mode of a formation at rest; rows are for (1, tau_1, tau_2)."""
 
     acceleration: Array  # (5, 3): z''
     c_n: Array  # (n_c, 3) [N]
-    # (k, 3): accelerations of sliding contacts and of joints the way that their friction assumes,
-    # over the scene's; none with one freedom, where `heading` says it all
+    # (k, 3): accelerations of sliding contacts and of joints along their assumed signs, over the
+    # scene's; none with one freedom, where `heading` determines them
     consistent: Array
     heading: Array | None  # (5,): with one freedom, where to, of length one in the metric M5
 
@@ -88,21 +75,10 @@ class Hold(NamedTuple):
 
 
 def find_hold(place: Standstill, epsilon: float, gap: float, time: float) -> Hold | None:
-    """The firmest torques for a standstill, with the largest margin of what holds.
+    """Torques with the largest margin for a standstill; None if none hold c_n >= `epsilon` [N].
 
-    Where a contact is gained, they drive the formation on from `gap` before it, too, if any do: as
-    fast as is sure, or else as much as it takes to close it in `time`, or less.
-
-    Parameters
-    ----------
-    epsilon : [N]  least normal force
-    gap : [m]      by how much the contact may be open
-    time : [s]     for how long it is held
-
-    Returns
-    -------
-    Hold or None
-        None if no torques hold.
+    A gained contact, open by up to `gap` [m], is closed with the least acceleration `DRIVE` if any
+    torques do, or else with that which closes it in `time` [s].
     """
     rest = _list_holding(place, epsilon)
     best = maximise_margin(place.formation.scene, rest)
@@ -120,37 +96,27 @@ def find_hold(place: Standstill, epsilon: float, gap: float, time: float) -> Hol
 
 
 def _list_holding(place: Standstill, epsilon: float) -> Array:
-    """Rows of what has to be positive at rest, over what is ample, shape (k, 3)."""
+    """Rows that have to be positive at rest, over their saturation values, shape (k, 3)."""
     touching, z = place.touching, place.z
     scene = touching.scene
     static = find_static_torques([touching], z, epsilon)
     balance = np.column_stack([static.bounds, -static.normals]) / (AMPLE * scene.scales.torque)
     A = touching.evaluate(z[None], np.zeros((1, 5))).A[0]
     count = np.linalg.matrix_rank(A / np.sqrt(scene.mass_diagonal), tol=_SMALL)
-    away = []
+    away, ample = [], AMPLE * math.sqrt(scene.scales.mass) * scene.scales.acceleration
     for kept in combinations(range(len(A)), 4) if count == 5 else ():
         others = [k for k in range(len(A)) if k not in kept]
         part = Formation(scene, tuple(touching.contacts[k] for k in kept))
         away += [
-            -_drive(scene, way)
-            for way in list_ways(part, z)
-            if way.heading is not None and (A[others] @ way.heading >= -_SMALL).all()
+            -(mode.heading * scene.mass_diagonal) @ mode.acceleration / ample
+            for mode in list_modes(part, z)
+            if mode.heading is not None and (A[others] @ mode.heading >= -_SMALL).all()
         ]
     return np.vstack([balance, *away])
 
 
-def _drive(scene: Scene, way: ArrivalPath) -> Array:
-    """How strongly a way with one freedom accelerates, over what is ample, shape (3,)."""
-    assert way.heading is not None
-    drive = (way.heading * scene.mass_diagonal) @ way.acceleration
-    return np.asarray(drive / (AMPLE * math.sqrt(scene.scales.mass) * scene.scales.acceleration))
-
-
 def find_opening(place: Standstill) -> Array | None:
-    """By how z changes as the gained contact opens, per metre of its gap, shape (5,).
-
-    None if there is no such contact, or if nothing opens it: one that goes on as another feature.
-    """
+    """Rate of z per metre of the gained contact's gap, shape (5,); None if nothing opens it."""
     if place.gained is None:
         return None
     scene = place.formation.scene
@@ -168,48 +134,38 @@ def find_opening(place: Standstill) -> Array | None:
 def _find_closing(
     place: Standstill, rest: Array, opening: Array, gap: float, ample: float | None = None
 ) -> Hold | None:
-    """The firmest torques that drive the formation on, `gap` before the contact is closed.
+    """Torques of largest margin that accelerate the formation towards a contact open by `gap`.
 
-    If it is said which acceleration towards the contact is `ample` [m/s^2], it may be less, and is
-    one more margin.
+    With a saturation value `ample` [m/s^2] that acceleration is one more margin, not a bound.
     """
     assert place.gained is not None
     scene, z = place.formation.scene, place.z + gap * opening
     normal = Formation(scene, (place.gained,)).evaluate(z[None], np.zeros((1, 5))).A[0][0]
     least = np.array([DRIVE * scene.scales.acceleration, 0.0, 0.0])
     best: Hold | None = None
-    for way in list_ways(place.formation, z):
-        if way.heading is not None and normal @ way.heading >= 0:
+    for mode in list_modes(place.formation, z):
+        if mode.heading is not None and normal @ mode.heading >= 0:
             continue
-        closing, rows = -normal @ way.acceleration, np.vstack([rest, way.consistent])
+        closing, rows = -normal @ mode.acceleration, np.vstack([rest, mode.consistent])
         if ample is None:
-            found = maximise_margin(scene, rows, closing[None] - least)
+            solution = maximise_margin(scene, rows, closing[None] - least)
         else:
-            found = maximise_margin(scene, np.vstack([rows, closing / ample]))
-        if found is None or found[1] < max(LEAST, best.margin if best else 0.0):
+            solution = maximise_margin(scene, np.vstack([rows, closing / ample]))
+        if solution is None or solution[1] < max(LEAST, best.margin if best else 0.0):
             continue
-        tau = found[0]
-        if not _is_sure(place, z, tau):
+        tau, margin = solution
+        # Friction must not be able to hold the formation at rest before it is there.
+        held = find_static_torques([place.formation], z)
+        if held.measure(tau[None])[0] <= SURE * scene.scales.torque:
             continue
         a = float(closing @ [1.0, *tau])
-        v = way.acceleration @ [1.0, *tau] * math.sqrt(2 * gap / a)
-        best = Hold(tau, found[1], math.sqrt(2 * a * gap), find_parting(place, v))
+        v = mode.acceleration @ [1.0, *tau] * math.sqrt(2 * gap / a)
+        best = Hold(tau, margin, math.sqrt(2 * a * gap), find_parting(place, v))
     return best
 
 
-def _is_sure(place: Standstill, z: Array, tau: Array) -> bool:
-    """Whether no friction can hold the formation at rest before it is there."""
-    own = find_static_torques([place.formation], z)
-    return bool(own.measure(tau[None])[0] > SURE * place.formation.scene.scales.torque)
-
-
 def find_parting(place: Standstill, v: Array) -> tuple[str, ...]:
-    """Contacts that would have to pull for everything that touches to keep doing so in an impact.
-
-    Parameters
-    ----------
-    v : (5,)  velocity z' just before
-    """
+    """Contacts that would have to pull in a plastic impact at velocity `v`, shape (5,)."""
     try:
         impact = compute_impact(place.formation, place.touching, place.z, v)
     except np.linalg.LinAlgError:
@@ -217,8 +173,8 @@ def find_parting(place: Standstill, v: Array) -> tuple[str, ...]:
     return tuple(h.name for h in impact.violations if h.kind is ViolationKind.PULL)
 
 
-def list_ways(formation: Formation, z: Array) -> Iterator[ArrivalPath]:
-    """Every way in which a formation at rest at `z`, shape (5,), may begin to move."""
+def list_modes(formation: Formation, z: Array) -> Iterator[ArrivalPath]:
+    """Every start mode of a formation at rest at `z`, shape (5,)."""
     scene, n_c = formation.scene, formation.n_contacts
     kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
     P, inverse_mass = kinematics.P[0], 1 / scene.mass_diagonal
@@ -268,12 +224,9 @@ def _list_signs(
 def maximise_margin(
     scene: Scene, rows: Array, bounds: Array | None = None
 ) -> tuple[Array, float] | None:
-    """Torques within their limits with the largest least margin, and that margin; None if none.
+    """Torques within their limits that maximise the least of rows @ (1, tau), (k, 3), and that.
 
-    Parameters
-    ----------
-    rows : (k, 3)    margins are rows @ (1, tau_1, tau_2)
-    bounds : (l, 3)  what has to be positive, too, without a margin
+    Values of `bounds`, (l, 3), only have to be positive. None if there are no such torques.
     """
     limits, unit = scene.torque_limit, scene.scales.torque
     box = [[limit, *(-side * axis)] for limit, axis in zip(limits, np.eye(2), strict=True)

@@ -14,7 +14,7 @@ nothing rolls c is c_n, P is A and G = A - U Xi A_t. Three routes through the eq
 
 * forward, tau to (z'', c): c from K c = -P' z' - P M5^-1 (g + S tau - b), K = P M5^-1 G^T;
 * inverse, along a curve z(s) with speed s' and acceleration s'': the object's rows leave one free
-  number, the squeeze lambda, and the joints' rows then give tau;
+  number, the internal force lambda, and the joints' rows then give tau;
 * the paper's, Eqs. (6)-(16): everything but theta_1 eliminated (`verification.reduced`).
 
 Friction can make the reduced inertia vanish or turn negative (jamming). Its sign is that of
@@ -46,7 +46,7 @@ class Directions(NamedTuple):
 
 
 class PathForces(NamedTuple):
-    """Forces along a curve, affine in a = s'', b = s'^2, the squeeze and the speed.
+    """Forces along a curve, affine in a = s'', b = s'^2, the internal force lambda and the speed.
 
     c = C0 + Ca a + Cb b + Cl lambda + Cv sqrt(b), and the same with T for tau, with
     c = [c_n; c_t(rolling)] in N, tau in N m, lambda in N; arrays of shape (n, n_c + R) or (n, 2).
@@ -64,17 +64,19 @@ class PathForces(NamedTuple):
     Tv: Array
     Cv: Array
 
-    def c(self, a: Array, b: Array, squeeze: Array) -> Array:
-        """Contact forces, shape (n, n_c + R) [N], for a, b and squeeze of shape (n,)."""
-        speed = np.sqrt(np.maximum(b, 0.0))[:, None]
-        a, b, squeeze = a[:, None], b[:, None], squeeze[:, None]
-        return self.C0 + self.Ca * a + self.Cb * b + self.Cl * squeeze + self.Cv * speed
+    def c(self, a: Array, b: Array, internal: Array) -> Array:
+        """Contact forces, shape (n, n_c + R) [N], for a, b and lambda of shape (n,)."""
+        a, b, internal, speed = _stack_columns(a, b, internal)
+        return self.C0 + self.Ca * a + self.Cb * b + self.Cl * internal + self.Cv * speed
 
-    def tau(self, a: Array, b: Array, squeeze: Array) -> Array:
-        """Joint torques, shape (n, 2) [N m], for a, b and squeeze of shape (n,)."""
-        a, b, squeeze = a[:, None], b[:, None], squeeze[:, None]
-        affine = self.T0 + self.Ta * a + self.Tb * b + self.Tl * squeeze
-        return affine + self.Tv * np.sqrt(np.maximum(b, 0.0))
+    def tau(self, a: Array, b: Array, internal: Array) -> Array:
+        """Joint torques, shape (n, 2) [N m], for a, b and lambda of shape (n,)."""
+        a, b, internal, speed = _stack_columns(a, b, internal)
+        return self.T0 + self.Ta * a + self.Tb * b + self.Tl * internal + self.Tv * speed
+
+
+def _stack_columns(a: Array, b: Array, internal: Array) -> tuple[Array, ...]:
+    return a[:, None], b[:, None], internal[:, None], np.sqrt(np.maximum(b, 0.0))[:, None]
 
 
 def build_forward(formation: Formation) -> Expression:
@@ -106,13 +108,7 @@ def build_force_rows(
 
 
 def split_forces(formation: Formation, c: Array, Xi: Array) -> tuple[Array, Array]:
-    """Normal and tangential forces of every contact, shape (..., n_c) each, from c [N].
-
-    Parameters
-    ----------
-    c : (..., n_c + R) [N]  contact forces [c_n; c_t(rolling)]
-    Xi : (..., n_c)         sliding directions
-    """
+    """Normal and tangential forces of every contact, (..., n_c) each, from c (..., n_c + R) [N]."""
     n_c = formation.n_contacts
     c_n = c[..., :n_c]
     c_t = np.asarray(-formation.sliding_friction * Xi * c_n)
@@ -122,10 +118,7 @@ def split_forces(formation: Formation, c: Array, Xi: Array) -> tuple[Array, Arra
 
 
 def reduced_inertia(formation: Formation, kinematics: Kinematics, directions: Directions) -> Array:
-    """Reduced inertia over that without friction, shape (n,): jamming at zero and below.
-
-    Infinite or NaN where the contacts depend on each other.
-    """
+    """Reduced inertia over the frictionless, (n,): jamming at zero and below, or not finite."""
     inverse_mass = 1 / formation.scene.mass_diagonal
     P = kinematics.P
     G = force_rows(formation, kinematics, directions)
@@ -144,16 +137,11 @@ def inverse(
     directions: Directions,
     kinematics: Kinematics | None = None,
 ) -> PathForces:
-    """Forces that carry a formation along a curve, at n places.
+    """Forces that carry a formation along a curve, z' = z_s s', z'' = z_s s'' + z_ss s'^2.
 
-    The object's rows M q'' = g + [W_n - W_t U Xi, W_t(rolling)] c leave four numbers c one that is
-    free: the squeeze lambda, the component of c along a unit null vector. Three leave none.
-
-    Parameters
-    ----------
-    z, z_s, z_ss : (n, 5)  the curve: z' = z_s s' and z'' = z_s s'' + z_ss s'^2
-    directions             signs for motion along +s, one for all places or one row for each
-    kinematics             the formation at `z`, where it is known already
+    The object's rows M q'' = g + [W_n - W_t U Xi, W_t(rolling)] c leave four forces c one free
+    number: the internal force lambda along a unit null vector; three leave none. `directions` are
+    signs for motion along +s, in one row or n.
     """
     scene = formation.scene
     kinematics = kinematics or formation.evaluate(z, z_s)
@@ -175,18 +163,10 @@ def inverse(
         return np.asarray(np.einsum("nij,ni->nj", joint, c))
 
     dry = scene.dry[3:] * directions.sigma
-    return PathForces(
-        C0,
-        Ca,
-        Cb,
-        null,
-        T0=dry - reaction(C0),
-        Ta=mass[3:] * z_s[:, 3:] - reaction(Ca),
-        Tb=mass[3:] * z_ss[:, 3:] - reaction(Cb),
-        Tl=-reaction(null),
-        Tv=scene.viscous[3:] * z_s[:, 3:],
-        Cv=np.zeros_like(C0),
-    )
+    T0, Tl = dry - reaction(C0), -reaction(null)
+    Ta, Tb = mass[3:] * z_s[:, 3:] - reaction(Ca), mass[3:] * z_ss[:, 3:] - reaction(Cb)
+    Tv, Cv = scene.viscous[3:] * z_s[:, 3:], np.zeros_like(C0)
+    return PathForces(C0, Ca, Cb, null, T0, Ta, Tb, Tl, Tv, Cv)
 
 
 def energy(formation: Formation, z: Array, v: Array) -> Array:
@@ -197,11 +177,7 @@ def energy(formation: Formation, z: Array, v: Array) -> Array:
 
 
 def _null_vector(wrench: Array) -> Array:
-    """Unit null vector of each (3, 4) matrix, by its minors; NaN where its rank is below three.
-
-    Minors change continuously along a curve. A sign chosen place by place would not: where it
-    changes, a squeeze interpolated between two places would step.
-    """
+    """Unit null vector of each (3, 4) matrix, by its minors (continuous); NaN if not unique."""
     minors = [np.linalg.det(np.delete(wrench, k, axis=2)) for k in range(4)]
     null = np.stack([minors[0], -minors[1], minors[2], -minors[3]], axis=1)
     size = np.linalg.norm(null, axis=1)[:, None]
@@ -216,16 +192,3 @@ def force_rows(formation: Formation, kinematics: Kinematics, directions: Directi
     if formation.rolling:
         G = np.concatenate([G, kinematics.P[:, formation.n_contacts :]], axis=1)
     return G
-
-
-__all__ = [
-    "Directions",
-    "PathForces",
-    "build_force_rows",
-    "build_forward",
-    "energy",
-    "force_rows",
-    "inverse",
-    "reduced_inertia",
-    "split_forces",
-]

@@ -1,16 +1,12 @@
-"""Plastic impacts: a contact gained at speed throws the velocity onto the next formation.
+"""Plastic impacts: projection of the velocity onto the next formation, by impulses with friction.
 
-In no time at all, only impulses act: those of the contacts of the new formation, with friction by
-the sliding law. With v- and v+ the velocities z' before and after,
+With v- and v+ the velocities z' before and after and the rows P and G of the new formation
+(`mechanics.dynamics`), G with the sliding signs Xi of v+,
 
-    M5 (v+ - v-) = G^T p,   P v+ = 0,
+    M5 (v+ - v-) = G^T p,   P v+ = 0.
 
-where P and G are the constraint and force rows of the new formation (`mechanics.dynamics`): where
-nothing rolls P = A and G = A - U Xi A_t with the sliding directions Xi of v+. The impulses p are
-those of c, and have to obey the same inequalities: every contact presses, and those that roll stay
-in their friction cones. Joint torques, gravity and joint friction are finite and give no impulse.
-The energy lost is half (v+ - v-)^T M5 (v+ - v-) plus the work |v_t|^T U p against sliding friction,
-so it is never gained.
+The impulses p obey the inequalities of c: every contact presses, rolling ones stay in their cones.
+The energy lost is half (v+ - v-)^T M5 (v+ - v-) plus the work |v_t|^T U p against sliding friction.
 """
 
 from __future__ import annotations
@@ -29,25 +25,18 @@ from ..contacts.formation import Formation
 from .dynamics import Directions, force_rows, reduced_inertia
 from .metric import measure_speed, metric_weights
 
-ROUNDING = 1e-6
-"""Share of the momentum or of the speed, in the metric of curves, that counts as rounding."""
-_STEP = 1e-5
-"""Step of the difference quotient of limits, in radii of gyration or radians."""
+ROUNDING = 1e-6  # momentum or speed, in the metric of curves, that counts as rounding
+_STEP = 1e-5  # step of the difference quotient of limits, in radii of gyration or radians
 
 
 class ViolationKind(Enum):
     """What keeps an impact from throwing the velocity onto a formation."""
 
-    JAM = "jam"
-    """Friction makes the reduced inertia vanish or turn negative."""
-    HELD = "held"
-    """Friction holds a contact: no sliding directions are those of the velocity that they give."""
-    PULL = "pull"
-    """A contact would have to pull."""
-    SLIP = "slip"
-    """A rolling contact would leave its friction cone."""
-    CLOSING = "closing"
-    """Something that touches, but is not in the formation, would be driven into."""
+    JAM = "jam"  # friction makes the reduced inertia vanish or turn negative
+    HELD = "held"  # no sliding directions are those of the velocity that they give
+    PULL = "pull"  # a contact would have to pull
+    SLIP = "slip"  # a rolling contact would leave its friction cone
+    CLOSING = "closing"  # something that touches, but is not in the formation, would be driven into
 
 
 class ImpactViolation(NamedTuple):
@@ -98,13 +87,7 @@ class Impact:
 
 
 def compute_impact(before: Formation, after: Formation, z: Array, v: Array) -> Impact:
-    """Throw a velocity onto a formation.
-
-    Parameters
-    ----------
-    before, after  what the motion comes from and what it goes on with, all contacts closed
-    z, v : (5,)    configuration, and velocity z' just before
-    """
+    """Plastic impact of a velocity `v` at `z`, (5,) each, between closed formations."""
     kinematics = after.evaluate(z[None], v[None])
     P, A_t = kinematics.P[0], kinematics.A_t[0]
     slides = np.ones(after.n_contacts)
@@ -121,14 +104,14 @@ def compute_impact(before: Formation, after: Formation, z: Array, v: Array) -> I
         Xi = choice
         while Xi not in tried:
             tried[Xi] = impact = _compute_impact(before, after, z, v, np.array(Xi))
-            if _is_sound(impact):
+            if not {h.kind for h in impact.violations} & {ViolationKind.JAM, ViolationKind.HELD}:
                 return impact
             Xi = directions(impact.v)
     return tried[likely]
 
 
 def _compute_impact(before: Formation, after: Formation, z: Array, v: Array, Xi: Array) -> Impact:
-    """Throw a velocity onto a formation with given sliding directions."""
+    """Plastic impact of a velocity onto a formation with given sliding directions."""
     kinematics = after.evaluate(z[None], v[None])
     P, mass = kinematics.P[0], after.scene.mass_diagonal
     directions = Directions(Xi, np.ones(2))
@@ -141,10 +124,9 @@ def _compute_impact(before: Formation, after: Formation, z: Array, v: Array, Xi:
     momentum = float(np.abs(mass * v / np.sqrt(metric_weights(after.scene))).max())
     rolls = [after.names[row] for row in after.rolling_rows]
     normal, cones = np.split(force_limit_rows(after) @ p, [after.n_contacts])
+    along = Xi * (kinematics.A_t[0] @ v_after)
     found = [
-        *_list(
-            ViolationKind.HELD, after.names, Xi * (kinematics.A_t[0] @ v_after), ROUNDING * speed
-        ),
+        *_list(ViolationKind.HELD, after.names, along, ROUNDING * speed),
         *_list(ViolationKind.PULL, after.names, normal, ROUNDING * momentum),
         *_list(ViolationKind.SLIP, [*rolls, *rolls], cones, ROUNDING * momentum),
         *_list(ViolationKind.CLOSING, *_rates(before, after, z, v_after), ROUNDING * speed),
@@ -155,22 +137,11 @@ def _compute_impact(before: Formation, after: Formation, z: Array, v: Array, Xi:
 def solve_impulses(mass: Array, rows: Array, force_rows: Array, v: Array) -> tuple[Array, Array]:
     """Velocity and impulses p of the jump M5 (v+ - v) = force_rows^T p with rows v+ = 0.
 
-    Parameters
-    ----------
-    mass : (5,)                diagonal of M5
-    rows, force_rows : (r, 5)  constraints on the velocity after, and where the impulse of each
-                               acts: G = A without friction, and then v+ is the nearest velocity in
-                               the metric M5
-    v : (5,)
+    Without friction both (r, 5) are equal: v+ is nearest to v in the metric M5, `mass` (5,).
     """
     lift = force_rows.T / mass[:, None]
     p = -np.linalg.solve(rows @ lift, rows @ v)
     return np.asarray(v + lift @ p), np.asarray(p)
-
-
-def _is_sound(impact: Impact) -> bool:
-    """Whether the sliding directions are those of the velocity they give."""
-    return all(h.kind not in (ViolationKind.JAM, ViolationKind.HELD) for h in impact.violations)
 
 
 def _list(

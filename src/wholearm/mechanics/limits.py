@@ -1,14 +1,11 @@
-"""Limits of a motion: what contact forces, torques and joint speeds must keep at every instant.
+"""Motion limits, low <= rows (c, tau, theta') <= high: contact forces, torques and joint speeds.
 
-With y = (c, tau, theta'), every limit has the form low <= rows y <= high. A sliding contact has to
-press with c_n >= epsilon. A rolling one must not slip either, |c_t| <= mu c_n, which is kept as if
-the contact pressed with epsilon less: what c_n may lose before the contact is lost it may lose
-before the contact slips.
+A rolling contact does not slip, with the same reserve epsilon as a sliding one has to press with:
 
     c_n >= epsilon,    mu c_n - c_t >= mu epsilon,    mu c_n + c_t >= mu epsilon.
 
-`MAKERS` lists what makes the limits of a formation. Planners, checks between nodes, tightening and
-advice go through a `LimitSet`, so that another maker is all that another limit takes.
+Another limit takes another maker in `MAKERS`: planners, checks between nodes, tightening and advice
+go through a `LimitSet`.
 """
 
 from __future__ import annotations
@@ -29,8 +26,7 @@ from .dynamics import PathForces
 
 PRESS, CONE, TORQUE, SPEED = "press", "cone", "torque", "speed"
 """Kinds of limits: least normal forces, friction cones, torques and speeds of the joints."""
-EPSILON = "epsilon"
-"""Key of the least normal force."""
+EPSILON = "epsilon"  # key of the least normal force
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +40,7 @@ class MotionLimit:
     rows: Array  # (r, n_c + R + 4)
     low: Array  # low, high (r,): infinite where there is none
     high: Array
-    scale: float  # what is much for it: shortfalls and misses count in this
+    scale: float  # unit of shortfalls
     parameter: Parameter  # the single number whose change relaxes it
     weight: Array  # (r,): by how much its bounds give way per unit of that
     drags: bool = False  # whether its forces depend on the speed itself, and not only on its square
@@ -78,15 +74,12 @@ class LimitSet:
 
     @cached_property
     def scales(self) -> Array:
-        """What is much for each row, shape (m,)."""
+        """Units of the shortfalls of each row, shape (m,)."""
         return np.array([self.limits[k].scale for k in self.owners])
 
     @cached_property
     def sides(self) -> tuple[NDArray[np.int64], Array, Array]:
-        """Rows, signs and bounds of one-sided limits, sign (row y - bound) >= 0, shape (n,) each.
-
-        First those of all lower bounds, then those of all upper ones.
-        """
+        """Rows, signs, bounds (n,) of one-sided limits, sign (row y - bound) >= 0; lower first."""
         lows, highs = (np.flatnonzero(np.isfinite(bound)) for bound in (self.low, self.high))
         signs = np.repeat([1.0, -1.0], [len(lows), len(highs)])
         bounds = np.concatenate([self.low[lows], self.high[highs]])
@@ -153,20 +146,19 @@ def _make_force_limits(formation: Formation, epsilon: float) -> list[MotionLimit
     H = np.hstack([H, np.zeros((len(H), 4))])
 
     def make(kind: str, part: str, text: str, rows: Array, weight: Array) -> MotionLimit:
-        high = np.full(len(rows), np.inf)
-        low = epsilon * weight
+        low, high = epsilon * weight, np.full(len(rows), np.inf)
         return MotionLimit(kind, part, text, "N", rows, low, high, force, parameter, weight)
 
     least = f"epsilon = {epsilon:g} N"
-    found = [
+    made = [
         make(PRESS, name, f"c_n of {name} >= {least}", H[k : k + 1], np.ones(1))
         for k, name in enumerate(formation.names)
     ]
     for k, row in enumerate(formation.rolling_rows):
         mu, name = formation.friction[row], formation.names[row]
         text = f"friction cone of {name}, |c_t| <= {mu:g} (c_n - {epsilon:g} N),"
-        found.append(make(CONE, name, text, H[[n_c + k, n_c + R + k]], np.full(2, mu)))
-    return found
+        made.append(make(CONE, name, text, H[[n_c + k, n_c + R + k]], np.full(2, mu)))
+    return made
 
 
 def _make_joint_limits(formation: Formation, _: float) -> list[MotionLimit]:
@@ -196,7 +188,7 @@ MAKERS: list[Maker] = [_make_force_limits, _make_joint_limits]
 
 
 class SideTerms(NamedTuple):
-    """Slack of one-sided limits at n places, rest + b bend + s' drag + a rate + squeeze press.
+    """Slack of one-sided limits at n places: rest + b bend + s' drag + a rate + lambda press.
 
     With b = s'^2 and a = s''; each of shape (n, n_sides), over what is much for a side.
     """
@@ -209,13 +201,7 @@ class SideTerms(NamedTuple):
 
     @staticmethod
     def of(limits: LimitSet, forces: PathForces, rates: Array) -> SideTerms:
-        """The sides of some limits.
-
-        Parameters
-        ----------
-        forces          at n places
-        rates : (n, 2)  d theta / ds there
-        """
+        """The sides of some limits, from forces at n places and d theta / ds there, (n, 2)."""
         of_c, of_tau, of_rates = (part.T for part in limits.columns)
         rows, signs, bounds = limits.sides
         scale = signs / limits.scales[rows]
@@ -236,6 +222,6 @@ class SideTerms(NamedTuple):
         return SideTerms(*(part[rows] for part in self))
 
     def at(self, a: Array, b: Array) -> Array:
-        """The slack without squeeze, for accelerations and squares of speeds of shape (n,)."""
+        """Slack without internal force, for accelerations and squared speeds of shape (n,)."""
         a, b = a[:, None], b[:, None]
         return np.asarray(self.rest + self.bend * b + self.drag * np.sqrt(b) + self.rate * a)

@@ -14,8 +14,8 @@ MARGIN = """\
 """
 
 
-def _read_margin(given: object, key: str) -> float:
-    value = require_number(given, key)
+def _read_margin(margin: object, key: str) -> float:
+    value = require_number(margin, key)
     if value >= 1:
         raise InputError("", key, f"{value:g} given; allowed are numbers below 1")
     return value

@@ -1,21 +1,16 @@
-"""Uniqueness margin of contact forces: least principal minor of K over that without friction.
+"""Uniqueness margin of contact forces (P-matrix): least principal minor of K over the frictionless.
 
-Contacts only press, c_n >= 0, and only those that press keep their gaps closed. Which of them do is
-a complementarity problem with the matrix K = A M5^-1 (A - U Xi A_t)^T. It has exactly one solution,
-whatever acts, if and only if every principal minor of K is positive: det K_S > 0 for every set S of
-contacts (Cottle, Pang and Stone, "The linear complementarity problem", theorem 3.3.7). Without
-friction K is symmetric, and its minors are positive wherever the contacts of S are independent; the
-ratio of both says how much of that friction has left.
+Which contacts press is a complementarity problem with K = A M5^-1 (A - U Xi A_t)^T. It has one
+solution for all loads if and only if det K_S > 0 for every set S of contacts (Cottle, Pang and
+Stone, "The linear complementarity problem", theorem 3.3.7). Without friction the minors of
+independent contacts are positive; the ratio of both says how much of that friction has left.
 
-A contact that does not slide has modes of its own: it sticks, with its tangential row as one more
-constraint and c_t as its force, or it slips either way with c_t = -U c_n or U c_n. Every choice of
-contacts and of their modes then has a minor, and as no more than four modes meet in one place,
-positive ones are again necessary and sufficient (Kuhn and Loewen, "Piecewise affine bijections of
-R^n, and the equation Sx+ - Tx- = y", 1987). Joints that turn have constant friction, which does not
-enter K.
-
-With one contact that slides the ratio falls linearly with its friction: at a ratio r, friction may
-be 1 / (1 - r) times as large before forces cease to be unique.
+A contact that does not slide sticks, with its tangential row as one more constraint and c_t as its
+force, or slips with c_t = -U c_n or U c_n. Every choice of contacts and modes then has a minor;
+with up to four modes in one place positive ones are necessary and sufficient (Kuhn and Loewen,
+"Piecewise affine bijections of R^n, and the equation Sx+ - Tx- = y", 1987). Joint friction is
+constant and does not enter K. With one sliding contact and a ratio r, friction may be 1 / (1 - r)
+times as large before forces cease to be unique.
 """
 
 from __future__ import annotations
@@ -32,9 +27,7 @@ from ..contacts.formation import Formation, Kinematics
 from .margin_key import UNIQUENESS
 
 UNIQUENESS_MARGIN: float = UNIQUENESS.default
-_INDEPENDENT = 1e-12
-"""Least Gram determinant of the rows of contacts, each of length one, at which they are
-independent."""
+_INDEPENDENT = 1e-12  # least Gram determinant of independent normalized contact rows
 _SLIDES, _STICKS, _SLIPS = " ", " sticking", (" slipping +", " slipping -")
 
 
@@ -76,13 +69,9 @@ class _Choices(NamedTuple):
 def find_minors(
     formation: Formation, kinematics: Kinematics, Xi: Array, sticking: tuple[int, ...] = ()
 ) -> Minors:
-    """Find the least ratio of a principal minor to that without friction, at n configurations.
+    """Least ratio of a principal minor to that without friction, at n configurations.
 
-    Parameters
-    ----------
-    Xi : (n_c,) or (n, n_c)  sliding directions
-    sticking                 contacts that do not slide there, besides those that the formation lets
-                             roll
+    Signs Xi are (n_c,) or (n, n_c); `sticking` contacts do not slide, besides rolling ones.
     """
     held, friction = {*formation.rolling_rows, *sticking}, formation.friction
     kinds = tuple((k in held, own > 0) for k, own in enumerate(friction.tolist()))
@@ -114,7 +103,7 @@ def _list_choices(kinds: tuple[tuple[bool, bool], ...]) -> tuple[_Choices, ...]:
     Of each contact `kinds` says whether it does not slide, and whether it has friction.
     """
     count = len(kinds)
-    found: dict[int, list[tuple[tuple[str, ...], list[int], list[int]]]] = {}
+    groups: dict[int, list[tuple[tuple[str, ...], list[int], list[int]]]] = {}
     options = [("", _STICKS, *_SLIPS) if held else ("", _SLIDES) for held, _ in kinds]
     block = {_SLIDES: 0, _STICKS: 1, _SLIPS[0]: 3, _SLIPS[1]: 4}
     for modes in product(*options):
@@ -124,12 +113,8 @@ def _list_choices(kinds: tuple[tuple[bool, bool], ...]) -> tuple[_Choices, ...]:
             continue
         forces = [block[modes[k]] * count + k for k in normal] + [2 * count + k for k in stuck]
         rows = normal + [count + k for k in stuck]
-        found.setdefault(len(rows), []).append((modes, rows, forces))
+        groups.setdefault(len(rows), []).append((modes, rows, forces))
+    columns = (tuple(zip(*chosen, strict=True)) for chosen in groups.values())
     return tuple(
-        _Choices(
-            tuple(modes for modes, _, _ in chosen),
-            np.array([rows for _, rows, _ in chosen]),
-            np.array([forces for _, _, forces in chosen]),
-        )
-        for chosen in found.values()
+        _Choices(modes, np.array(rows), np.array(forces)) for modes, rows, forces in columns
     )

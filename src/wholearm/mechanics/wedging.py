@@ -1,14 +1,11 @@
-"""Torques under which friction can hold a formation at rest.
+"""Static torque polygon: torques under which friction can hold a formation at rest.
 
-At rest every contact force within its cone and every joint friction within [-D, D] is possible.
-With the edges of the cones as columns E and their amounts e >= 0, balance is
+With the edges of the friction cones as columns E, amounts e >= 0 and joint friction d, balance is
 
     g + S (tau - d) + E e = 0,   e >= 0,   |d| <= D.
 
-Projected onto the torques, what this linear programme allows is a convex polygon, perhaps without
-bounds. Its corners come from the basic solutions of the object's three rows, three edges each, its
-unbounded sides from combinations of edges that balance each other, the squeezes. Beyond the
-polygon, by its distance from tau, nothing can be held: a motion begins, whatever the forces are.
+Its projection onto the torques is a convex polygon, perhaps unbounded. Corners are basic solutions
+of the object's three rows, rays are internal forces. Beyond it a motion begins in any case.
 """
 
 from __future__ import annotations
@@ -26,11 +23,8 @@ from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..scene.model import Scene
 
-SURE = 1e-3
-"""Distance from torques that friction can hold, beyond which a motion begins for sure, relative to
-the scene's torque."""
-_TINY = 1e-9
-"""What counts as zero of numbers of the order of one."""
+SURE = 1e-3  # distance from torques that friction can hold, over the scene's, at which it moves
+_TINY = 1e-9  # what counts as zero of numbers of the order of one
 
 
 class StaticTorques(NamedTuple):
@@ -58,41 +52,30 @@ class StaticTorques(NamedTuple):
 def find_static_torques(
     touching: Sequence[Formation], z: Array, least: float = 0.0
 ) -> StaticTorques:
-    """Torques with which contact forces and joint friction can balance gravity at `z`, shape (5,).
+    """Torque polygon in which contact forces and joint friction can balance gravity at `z`, (5,).
 
-    Parameters
-    ----------
-    touching : sequence of Formation
-        With all contacts that touch, some perhaps in more than one.
-    z : ndarray, shape (5,)
-    least : float, [N]
-        Normal force of every contact at which its cone begins: c_n >= least and
-        |c_t| <= mu (c_n - least).
+    `touching` are formations with all contacts that touch; `least` [N] is the apex of every cone,
+    c_n >= least and |c_t| <= mu (c_n - least).
     """
     scene = touching[0].scene
-    edges, normals = _list_edges(touching, z)
-    given = scene.applied_force + least * normals.sum(axis=0)
-    static = _project(scene, edges, given)
-    return static._replace(bounds=static.bounds + np.abs(static.normals) @ scene.dry[3:])
-
-
-def _list_edges(touching: Sequence[Formation], z: Array) -> tuple[Array, Array]:
-    """Edges of all cones as forces on (q, theta), shape (2 n_c, 5), and the normals, (n_c, 5)."""
     rows: dict[Contact, tuple[Array, Array]] = {}
     for formation in touching:
         kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
         slip = formation.friction[:, None] * kinematics.A_t[0]
         rows |= dict(zip(formation.contacts, zip(kinematics.A[0], slip, strict=True), strict=True))
-    edges = np.array([normal + way * slip for normal, slip in rows.values() for way in (-1, 1)])
-    return edges, np.array([normal for normal, _ in rows.values()])
+    # Edges of all cones, (2 n_c, 5), and normals, (n_c, 5), as forces on (q, theta).
+    edges = np.array([normal + sign * slip for normal, slip in rows.values() for sign in (-1, 1)])
+    normals = np.array([normal for normal, _ in rows.values()])
+    static = _project(scene, edges, scene.applied_force + least * normals.sum(axis=0))
+    return static._replace(bounds=static.bounds + np.abs(static.normals) @ scene.dry[3:])
 
 
-def _project(scene: Scene, edges: Array, given: Array) -> StaticTorques:
-    """Torques that together with amounts of the edges balance what is given, shape (5,)."""
+def _project(scene: Scene, edges: Array, applied: Array) -> StaticTorques:
+    """Torques that balance an applied force, shape (5,), with nonnegative amounts of the edges."""
     scales = scene.scales
     # Forces count in the scene's force, torques in its torque.
     units = np.array([1.0, 1.0, *[scales.length] * 3])
-    edges, load = edges / units, given[:3] / (scales.force * units[:3])
+    edges, load = edges / units, applied[:3] / (scales.force * units[:3])
     E, joints = edges[:, :3], -edges[:, 3:]
     corners, rays = _find_corners(E, joints, load), _find_rays(E, joints)
     if not len(corners):
@@ -105,7 +88,7 @@ def _project(scene: Scene, edges: Array, given: Array) -> StaticTorques:
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     normals = normals[(normals @ rays.T <= _TINY).all(axis=1)]
     bounds = scales.torque * (normals @ hull.T).max(axis=1) if len(normals) else np.zeros(0)
-    return StaticTorques(normals, bounds - normals @ given[3:])
+    return StaticTorques(normals, bounds - normals @ applied[3:])
 
 
 def _find_corners(E: Array, joints: Array, load: Array) -> Array:
@@ -120,37 +103,34 @@ def _find_corners(E: Array, joints: Array, load: Array) -> Array:
 
 
 def _find_rays(E: Array, joints: Array) -> Array:
-    """Directions of the torques of squeezes, E^T e = 0 with e >= 0, shape (m, 2), length one."""
+    """Unit torques of internal forces, E^T e = 0 with e >= 0, shape (m, 2)."""
     chosen = _choose(len(E), 4)
     minors = [np.linalg.det(np.delete(E[chosen], k, axis=1)) for k in range(4)]
     null = np.stack([minors[0], -minors[1], minors[2], -minors[3]], axis=1)
     sizes = np.linalg.norm(null, axis=1)
     null, chosen = null[sizes > _TINY] / sizes[sizes > _TINY, None], chosen[sizes > _TINY]
     null *= np.where(null.sum(axis=1) < 0, -1.0, 1.0)[:, None]
-    squeezes = (null >= -_TINY).all(axis=1)
-    rays = np.einsum("ni,nij->nj", null[squeezes], joints[chosen[squeezes]])
+    internal = (null >= -_TINY).all(axis=1)
+    rays = np.einsum("ni,nij->nj", null[internal], joints[chosen[internal]])
     sizes = np.linalg.norm(rays, axis=1)
     return np.asarray(rays[sizes > _TINY] / sizes[sizes > _TINY, None])
 
 
 def _find_hull(points: Array) -> Array:
-    """Corners of the convex hull of points in the plane, one after the other, shape (m, 2)."""
+    """Corners of the convex hull of points in the plane, in order, (m, 2): Andrew's algorithm."""
     ordered = sorted(set(map(tuple, points.tolist())))
     halves = []
     for way in (ordered, ordered[::-1]):
         half: list[tuple[float, float]] = []
         for point in way:
-            while len(half) > 1 and _turn(half[-2], half[-1], point) <= 0:
+            while len(half) > 1:
+                (a, b), (c, d), (e, f) = half[-2], half[-1], point
+                if (c - a) * (f - b) - (d - b) * (e - a) > 0:
+                    break
                 half.pop()
             half.append(point)
         halves.append(half)
     return np.array((halves[0][:-1] + halves[1][:-1]) or ordered)
-
-
-def _turn(one: tuple[float, float], two: tuple[float, float], three: tuple[float, float]) -> float:
-    """Twice the area of a triangle, positive where it is anticlockwise."""
-    (a, b), (c, d), (e, f) = one, two, three
-    return (c - a) * (f - b) - (d - b) * (e - a)
 
 
 @lru_cache(maxsize=16)

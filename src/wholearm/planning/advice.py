@@ -1,7 +1,7 @@
-"""Why there is no plan, and which single change would make one possible.
+"""Violated limits of infeasible problems, and changes of a single parameter that are feasible.
 
-Nothing here depends on how plans are made. A planner shows the motion that misses limits least, and
-says how far a parameter of the limits would have to move, and whether it can plan with that.
+A planner supplies the motion of least violation, a value of each parameter at which it vanishes,
+and whether it can plan with a value; the value is rounded outwards and confirmed by a plan.
 """
 
 from __future__ import annotations
@@ -25,20 +25,12 @@ from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion, Trajectory, assemble
 from ..scene.model import Scene
 
-SHORT = 1e-4
-"""Least shortfall that counts, over what is much for a limit."""
-SHORT_OF = "misses limits least"
-"""Status in the `meta` of such a motion."""
-ROWS = 201
-"""Rows of each of its phases."""
-DIGITS = 3
-"""Significant digits of what is advised."""
+SHORT = 1e-4  # least violation that counts, over the scale of a limit
+ROWS = 201  # rows of each phase of a motion of least violation
+DIGITS = 3  # significant digits of advised values
 _BEYOND = (0.0, 0.005, 0.015, 0.05, 0.15, 0.5)
 """Relative distances beyond the least change to try: plans keep limits between nodes too."""
-_CLOSE = 0.02
-"""Relative excess over the least change that is good enough."""
-
-
+_CLOSE = 0.02  # relative excess over the least change that is good enough
 _unadvised: ContextVar[bool] = ContextVar("_unadvised", default=False)
 
 
@@ -62,32 +54,27 @@ class Advice(NamedTuple):
 def list_shortfalls(
     limits: LimitSet, values: Array, locate: Callable[[int], LimitPlace]
 ) -> list[Shortfall]:
-    """What a motion is short of, each limit where it is worst.
+    """Violations of limits, each where it is worst, from values of their rows, (n, m).
 
-    Parameters
-    ----------
-    values : (n, m)  what the limits are of at n places of the motion
-    locate           says where the k-th place is
+    `locate` gives the k-th of the n places.
     """
-    short = limits.fold(-limits.find_slack(values))
-    found = []
+    violation, shortfalls = limits.fold(-limits.find_slack(values)), []
     for k, limit in enumerate(limits.limits):
-        of_limit = short[:, limits.owners == k].max(axis=1)
+        of_limit = violation[:, limits.owners == k].max(axis=1)
         worst = int(of_limit.argmax())
         amount = float(of_limit[worst])
         if amount > SHORT * limit.scale:
-            share = amount / limit.scale
             what = (limit.kind, limit.part, limit.text, amount, limit.unit)
-            found.append(Shortfall(*what, locate(worst), share))
-    return found
+            shortfalls.append(Shortfall(*what, locate(worst), amount / limit.scale))
+    return shortfalls
 
 
 def assemble_least(
     motions: Sequence[Motion], torques: Sequence[TorqueProfile], formations: Sequence[Formation]
 ) -> Trajectory:
-    """The trajectory of a motion that misses limits, of the phases in which it does."""
+    """The trajectory of a motion of least violation."""
     meta = {
-        "status": SHORT_OF,
+        "status": "misses limits least",
         "rolling": [[contact.name for contact in own.rolling] for own in formations],
         "modes": plain([getattr(own, "modes", ()) for own in motions]),
     }
@@ -95,11 +82,10 @@ def assemble_least(
 
 
 def keep_worst(shortfalls: Iterable[Shortfall]) -> list[Shortfall]:
-    """Of several shortfalls of one limit, the largest."""
+    """Of several violations of one limit, the largest."""
     worst: dict[str, Shortfall] = {}
     for short in shortfalls:
-        if short.limit not in worst or short.amount > worst[short.limit].amount:
-            worst[short.limit] = short
+        worst[short.limit] = max(worst.get(short.limit, short), short, key=lambda s: s.amount)
     return list(worst.values())
 
 
@@ -119,22 +105,20 @@ def advise(
     replan: Callable[[Parameter, float], object] | None,
     seconds: float = math.inf,
 ) -> Advice:
-    """Why there is no plan, with the changes of a single parameter that make one possible.
+    """Text of an error with the changes of a single parameter that make a plan possible.
 
     Parameters
     ----------
-    text           what cannot be kept
-    parameters     what may be changed
+    text           the violated limits
     find_value     as of `find_changes`; NaN where it cannot tell
-    replan         plans with another value of a parameter, or raises; without it no change is
-                   looked for
+    replan         plans with another value of a parameter, or raises; None: no change is looked for
     seconds : [s]  processor time after which no further change is tried
     """
     if replan is None or _unadvised.get():
         return Advice(text, ())
     stop, undecided = time.thread_time() + seconds, list[Parameter]()
 
-    def look(parameter: Parameter) -> float | None:
+    def find(parameter: Parameter) -> float | None:
         least = math.nan if time.thread_time() > stop else find_value(parameter)
         if least is not None and math.isnan(least):
             undecided.append(parameter)
@@ -147,7 +131,7 @@ def advise(
             return False
         return succeeds(partial(replan, parameter, value))
 
-    changes = find_changes(parameters, look, can_plan)
+    changes = find_changes(parameters, find, can_plan)
     if undecided and not changes:
         return Advice(f"{text}; no single limit was found that makes it feasible", ())
     return Advice(f"{text}; {describe_changes(changes)}", tuple(changes))
@@ -163,7 +147,7 @@ def succeeds(plan: Callable[[], object]) -> bool:
 
 
 def change_scene(scene: Scene, key: str, value: float) -> Scene:
-    """The scene with another value of a parameter of its hand, such as `fingers.1.torque_limit`."""
+    """The scene with another value of a parameter, such as `fingers.1.torque_limit`."""
     where, *names = key.split(".")
     if where == "friction":
         return replace(scene, friction=replace(scene.friction, **{names[0]: value}))
@@ -190,37 +174,26 @@ def find_changes(
     find_value: Callable[[Parameter], float | None],
     can_plan: Callable[[Parameter, float], bool],
 ) -> list[Change]:
-    """Find the changes of a single parameter with which there is a plan.
+    """Changes of a single parameter with which there is a plan, to values rounded outwards.
 
     Parameters
     ----------
-    find_value  the value of a parameter at which its limits just let the others be kept, or None if
-                none does
-    can_plan    whether there is a plan with this value of a parameter
-
-    Returns
-    -------
-    list of Change
-        Each with a value, rounded outwards, that `can_plan` has confirmed.
+    find_value  the value of a parameter at which the other limits can just be kept, if there is one
+    can_plan    whether there is a plan with a value of a parameter
     """
     changes = []
     for parameter in parameters:
         least = find_value(parameter)
-        if least is None:
-            continue
-        value = _find_enough(least, parameter.sign, partial(can_plan, parameter))
-        if value is not None:
-            changes.append(Change(parameter, value))
+        if least is not None:
+            value = _find_enough(least, parameter.sign, partial(can_plan, parameter))
+            changes += [] if value is None else [Change(parameter, value)]
     return changes
 
 
 def bracket(
     own: Parameter, farthest: float, can_plan: Callable[[float], bool], halvings: int = 5
 ) -> float | None:
-    """A value that can be planned with, between a parameter's and `farthest`, as near as found.
-
-    For parameters that a planner cannot relax within one solve; None if `farthest` does not do.
-    """
+    """A feasible value between a parameter's and `farthest`, by bisection; None without one."""
     if farthest == own.value or not can_plan(farthest):
         return None
     enough, short = farthest, own.value
@@ -228,15 +201,12 @@ def bracket(
         middle = round_outwards((enough + short) / 2, own.sign)
         if middle in (enough, short):
             break
-        if can_plan(middle):
-            enough = middle
-        else:
-            short = middle
+        enough, short = (middle, short) if can_plan(middle) else (enough, middle)
     return enough
 
 
 def _find_enough(least: float, sign: int, can_plan: Callable[[float], bool]) -> float | None:
-    """A rounded value that can be planned with, as little beyond `least` as plans allow."""
+    """A feasible rounded value, as little beyond `least` as plans allow, by bisection."""
     failed: float | None = None
     tried = (round_outwards(least * (1 + sign * beyond), sign) for beyond in _BEYOND)
     for value in dict.fromkeys(tried):
@@ -249,10 +219,7 @@ def _find_enough(least: float, sign: int, can_plan: Callable[[float], bool]) -> 
         return None
     while failed is not None and abs(value - failed) > _CLOSE * abs(value):
         middle = round_outwards((value + failed) / 2, sign)
-        if can_plan(middle):
-            value = middle
-        else:
-            failed = middle
+        value, failed = (middle, failed) if can_plan(middle) else (value, middle)
     return value
 
 
@@ -268,7 +235,7 @@ def round_outwards(value: float, sign: int, digits: int = DIGITS) -> float:
     if value == 0 or not math.isfinite(value):
         return value
     place = digits - 1 - math.floor(math.log10(abs(value)))
-    # What already has so few digits stays, whatever its last bits are.
+    # Values of so few digits stay, whatever their last bits are.
     scaled = round(value * 10.0**place, 6)
     whole = math.ceil(scaled) if sign > 0 else math.floor(scaled)
     return float(f"{whole}e{-place}")

@@ -1,4 +1,4 @@
-"""Blocks of phases as they are planned."""
+"""Data of planned blocks of phases."""
 
 from __future__ import annotations
 
@@ -14,25 +14,22 @@ from .path_domain.impact_sequence import ImpactSequence
 from .phase_plan import Settled
 from .stops import Plans, end_of
 
-PLAIN = -1
-"""Number of doublings that stands for as many intervals as at first, and no search for modes."""
-BEGUN = -2
-"""The same for plans that are only begun: they may miss limits between points."""
-FINEST = 64
-"""Most intervals of a phase in the time domain that refining asks for."""
+PLAIN = -1  # refinement level: first number of intervals, no search for modes
+BEGUN = -2  # refinement level: coarse plans, which may miss limits between points
+FINEST = 64  # most intervals of a phase in the time domain after refinement
 
 
 @dataclass(frozen=True, eq=False)
 class BlockPlan:
-    """A block as it is planned."""
+    """A planned block."""
 
     phases: tuple[Phase, ...]
-    start: Array  # (5,): where it starts
-    finer: int  # how often its intervals are doubled, or `PLAIN` or `BEGUN`
-    duration: float | None  # [s]: its longest duration, for the objective `margin`
-    fastest: Plans  # plans of least duration from this start, if they were made for it
+    start: Array  # (5,)
+    finer: int  # refinement level: doublings of its intervals, or `PLAIN` or `BEGUN`
+    duration: float | None  # [s]: longest, for the objective `margin`
+    fastest: Plans  # time-optimal plans from this start, if they were made for it
     plans: Plans  # one for each of its phases
-    chain: ImpactSequence | None  # its curves; None if it is planned in the time domain
+    chain: ImpactSequence | None  # its curves; None in the time domain
 
     @property
     def end(self) -> Array:
@@ -43,7 +40,7 @@ class BlockPlan:
 
     @property
     def intervals(self) -> int:
-        """Most intervals of a phase in the time domain: each is a piece of the torques."""
+        """Most intervals of a phase in the time domain."""
         return max(len(plan.torque.coefficients) for plan in self.plans)
 
     @property
@@ -53,7 +50,7 @@ class BlockPlan:
 
     @property
     def is_finest(self) -> bool:
-        """Whether it is planned in the time domain with all the intervals that it may have."""
+        """Whether it is planned in the time domain on the finest intervals."""
         return self.chain is None and self.intervals >= FINEST
 
 
@@ -62,24 +59,18 @@ class Planning:
     """The plans of all phases of a problem."""
 
     problem: Problem
-    # those of the first phases: as far as geometry alone says where phases end
-    curves: tuple[Curve, ...]
+    curves: tuple[Curve, ...]  # of the first phases, as far as ends follow from geometry alone
     options: PlanOptions
     blocks: tuple[BlockPlan, ...]
-    # shares, allowed [s]: the longest duration of each phase, for the objective `margin`: in
-    # proportion to plans of least duration, and as used, where a block turned out to start from
-    # somewhere else
+    # shares, allowed [s]: longest duration of each phase, for the objective `margin`: in proportion
+    # to time-optimal plans, and as used after blocks turned out to start elsewhere
     shares: list[float | None]
     allowed: list[float | None]
-    # those plans of least duration; empty for other objectives
-    least: Plans = field(default_factory=list)
+    least: Plans = field(default_factory=list)  # these time-optimal plans
     pinned: bool = False  # whether blocks end where those plans do
-    # whether blocks end with regard to what follows them. Plans that durations are shared out by do
-    # not, as blocks for the objective `margin` cannot.
-    ahead: bool = True
-    # whether least times of what follows a block are those of a sweep, where it ends by them
-    sketches: bool = False
-    # [N]: by how much normal forces of blocks, by their indices, have to exceed epsilon, if at all
+    ahead: bool = True  # whether blocks end by the cost-to-go, which `margin` and `least` do not
+    sketches: bool = False  # whether least times-to-go are those of a speed sweep
+    # [N]: by how much c_n of blocks, by their indices, have to exceed epsilon, if at all
     more: dict[int, float] = field(default_factory=dict)
 
     @property
@@ -89,7 +80,7 @@ class Planning:
 
     @cached_property
     def settled(self) -> Settled:
-        """The plans with their ends held, where the problem asks for that."""
+        """The plans with dwells at their ends, where the problem asks for these."""
         plans, phases = self.plans, self.problem.phases
         if not self.problem.is_settled:
             return Settled(plans, (None,) * len(phases))
@@ -104,11 +95,6 @@ class Planning:
 
     def find_curve_before(self, phases: Sequence[Phase]) -> Curve | None:
         """The curve that ends at rest where some phases begin, if there is one."""
-        known = [block for block in self.blocks if block.phases[-1].index + 1 == phases[0].index]
-        chain = known[0].chain if known else None
+        before = [own for own in self.blocks if own.phases[-1].index + 1 == phases[0].index]
+        chain = before[0].chain if before else None
         return chain.curves[-1] if chain else None
-
-    def find_curve_after(self, phases: Sequence[Phase]) -> Curve | None:
-        """The curve that begins at rest where some phases end, if that is known."""
-        index = phases[-1].index + 1
-        return self.curves[index] if index < len(self.curves) else None

@@ -1,7 +1,7 @@
-"""Blocks of phases that are planned together, and how they are planned one after the other.
+"""Plans of all blocks of a problem, one after the other, in the path or the time domain.
 
-Phases joined smoothly or by impacts are one block. With one freedom they are planned along their
-curves, unless they are joined to others with more, and anything else in the time domain.
+Phases joined smoothly or by impacts are one block. Blocks of phases with one degree of freedom are
+planned along their curves, all others in the time domain.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -34,38 +35,21 @@ from .phase_plan import PhasePlan, add_up
 from .rate_limits import explain_motors, free_torques, require_steps
 from .stops import Plans, leads_on, runs_along_curves, split_blocks
 
-SKETCH = 24
-"""Intervals on which what follows a block is looked at where it is only sketched."""
-CLEAR = 0.05
-"""Least shortfall, over what is much for a limit, that no better plan of phases before mends."""
-COARSE = 80
-"""Intervals along a curve that refining doubles where none are asked for."""
-AMPLE = 1.1
-"""Ratio to the least normal force of other phases from which on more decides nothing."""
-MOVED = 1e-9
-"""Distance from which on a block starts somewhere else, in radii of gyration or radians."""
-APART = 1e-6
-"""The same, from which on its plans of least duration are others."""
-SHORT = 5e-7
-"""Largest shortfall of a margin below epsilon by rounding, over the scene's force."""
+SKETCH = 24  # intervals of the speed sweep for a least time-to-go
+CLEAR = 0.05  # relative violation above which no better plan of earlier phases helps
+COARSE = 80  # intervals along a curve that are doubled where none are given
+AMPLE = 1.1  # saturation of the margin, over the least normal force of other phases
+MOVED = 1e-9  # distance of two starts, in radii of gyration or radians
+APART = 1e-6  # the same, above which time-optimal plans are others
+SHORT = 5e-7  # largest shortfall of a margin below epsilon by rounding, over the scene's force
 
 
 def plan_blocks(
-    problem: Problem,
-    curves: tuple[Curve, ...],
-    options: PlanOptions,
-    report: Callable[[str], None],
+    problem: Problem, curves: tuple[Curve, ...], options: PlanOptions, report: Callable[[str], None]
 ) -> Planning:
-    """Plan every block of a problem, each from where the one before ends.
+    """Plan every block of a problem, each from where the one before ends; raises without a plan.
 
-    Parameters
-    ----------
-    curves  those of its first phases, as `trace_phases` finds them
-    report  told in a few words what is being done
-
-    Raises
-    ------
-    InputError, InfeasibleError, JammingError, SolverError  if there is no plan
+    `curves` are those of the first phases (`trace_phases`); `report` is told what is being done.
     """
     with name_source(problem.source):
         require_steps(problem, options)
@@ -78,17 +62,19 @@ def plan_blocks(
         try:
             return _require_margin(plan_each(planning, finer, report))
         except (InfeasibleError, InputError, SolverError):
-            # From where blocks of the largest margin end the next ones need not go on.
+            # Ends of blocks with the largest margin may leave the next ones without a plan.
             planning = replace(planning, pinned=True)
         return _require_margin(plan_each(planning, finer, report))
     return plan_each(_begin_each(planning, report), finer, report)
 
 
 def plan_alone(planning: Planning, report: Callable[[str], None]) -> Planning | None:
-    """Plan without regard to what follows a block; None if that has made no difference."""
+    """Plan without cost-to-go; None if there was none."""
     problem, options = planning.problem, planning.options
     blocks = split_blocks(problem)
-    if not planning.ahead or all(_look_ahead(planning, own, options) is None for own in blocks):
+    if not planning.ahead or all(
+        look_ahead(planning, own, options, plan_block) is None for own in blocks
+    ):
         return None
     alone = replace(planning, blocks=(), ahead=False)
     return _require_margin(plan_each(alone, [0] * len(blocks), report))
@@ -97,10 +83,7 @@ def plan_alone(planning: Planning, report: Callable[[str], None]) -> Planning | 
 def refine_block(
     planning: Planning, index: int, report: Callable[[str], None], plain: bool = False
 ) -> Planning:
-    """Plan one block anew, and those after it that then start elsewhere.
-
-    It has twice the intervals, or if it is to be `plain`, no search for modes.
-    """
+    """Plan a block on twice the intervals, or if `plain` without mode search; then those after."""
     finer = [block.finer for block in planning.blocks]
     finer[index] = PLAIN if plain else finer[index] + 1
     return _require_margin(plan_each(planning, finer, report))
@@ -109,43 +92,26 @@ def refine_block(
 def press_more(
     planning: Planning, index: int, force: float, report: Callable[[str], None]
 ) -> Planning:
-    """Plan one block anew with normal forces that are larger than asked for by `force` [N] more."""
+    """Plan a block anew with `force` [N] more normal force, and those after it."""
     more = planning.more | {index: planning.more.get(index, 0.0) + force}
-    finer, known = [own.finer for own in planning.blocks], dict(enumerate(planning.blocks))
-    known[index] = replace(known[index], finer=BEGUN)
-    return _require_margin(_plan_others(replace(planning, more=more), finer, known, report))
+    blocks = list(planning.blocks)
+    finer, blocks[index] = [own.finer for own in blocks], replace(blocks[index], finer=BEGUN)
+    planning = replace(planning, more=more, blocks=tuple(blocks))
+    return _require_margin(plan_each(planning, finer, report))
 
 
 def plan_each(planning: Planning, finer: Sequence[int], report: Callable[[str], None]) -> Planning:
-    """Plan block after block, but for those that are planned as wanted.
-
-    Where a block starts from somewhere else than in the plans of least duration, the allowed
-    durations are shared out again.
-    """
-    return _plan_others(planning, finer, dict(enumerate(planning.blocks)), report)
-
-
-def _plan_others(
-    planning: Planning,
-    finer: Sequence[int],
-    known: dict[int, BlockPlan],
-    report: Callable[[str], None],
-) -> Planning:
-    """Plan each block that is not `known`, by its index, as wanted."""
+    """Plan block after block at its refinement level, but for those that are planned so."""
     made = replace(planning, blocks=(), allowed=list(planning.shares))
-    for index, wanted in enumerate(finer):
-        made = plan_next(made, wanted, known.get(index), report)
+    for level, block in zip_longest(finer, planning.blocks):
+        made = plan_next(made, level, block, report)
     return made
 
 
 def _begin_each(planning: Planning, report: Callable[[str], None]) -> Planning:
-    """Begin to plan each block, as far as that succeeds: what is impossible later shows at once.
+    """Coarse plans of the blocks as far as they exist, if one in the time domain is followed.
 
-    Only where something follows a block in the time domain.
-
-    Raises
-    ------
-    InfeasibleError  if a block surely has no plan, wherever exactly the one before it ends
+    An error is raised only if it does not depend on where exactly the block before ends.
     """
     blocks, begun = split_blocks(planning.problem), planning
     over_time = [not runs_along_curves(own, planning.options) for own in blocks]
@@ -162,19 +128,18 @@ def _begin_each(planning: Planning, report: Callable[[str], None]) -> Planning:
 
 
 def _is_clear(error: WholearmError) -> bool:
-    """Whether what has no plan is far from having one."""
+    """Whether an error is of a large violation."""
     shortfalls = error.shortfalls if isinstance(error, InfeasibleError) else ()
-    return max((own.share for own in shortfalls), default=0.0) > CLEAR
+    return any(short.share > CLEAR for short in shortfalls)
 
 
 def plan_next(
     planning: Planning, finer: int, known: BlockPlan | None, report: Callable[[str], None]
 ) -> Planning:
-    """Plan the block after those that are planned, unless it is `known` as wanted.
+    """Plan the next block at a refinement level, unless `known` is that.
 
-    What is known of it may only be begun, as `BEGUN` says: then it is gone on with. Where it starts
-    from somewhere else than in the plans of least duration, the allowed durations are shared out
-    again.
+    A coarse one (`BEGUN`) is the guess. Where the block starts elsewhere than in the time-optimal
+    plans, the allowed durations are shared out again.
     """
     problem, options, least = planning.problem, planning.options, planning.least
     phases = split_blocks(problem)[len(planning.blocks)]
@@ -203,7 +168,7 @@ def plan_next(
                 z,
                 own,
                 allowed,
-                to_go=_look_ahead(planning, phases, own) if planning.ahead else None,
+                to_go=look_ahead(planning, phases, own, plan_block) if planning.ahead else None,
                 ample=find_ample(planning.blocks),
                 fastest=fastest or [least[phase.index] for phase in phases if least],
                 begun=known.plans if known and known.finer == BEGUN else (),
@@ -214,12 +179,12 @@ def plan_next(
 
 
 def find_ample(blocks: Sequence[BlockPlan]) -> float:
-    """Least normal force [N] that decides nothing in a block, as blocks before it keep less."""
+    """Saturation of the margin [N], as blocks before have less."""
     return AMPLE * min((plan.value for block in blocks for plan in block.plans), default=math.inf)
 
 
 def _refine(options: PlanOptions, known: BlockPlan | None, finer: int) -> PlanOptions:
-    """Options for a block whose intervals are doubled `finer` times."""
+    """Options for a block at a refinement level."""
     if finer in (0, BEGUN):
         return options
     if finer == PLAIN:
@@ -242,7 +207,7 @@ def plan_block(
 ) -> tuple[Plans, ImpactSequence | None]:
     """Plan a block from `z`, along its curves or in the time domain; also its curves.
 
-    What is `over_time` is given to `plan_with_impacts` alone.
+    `over_time` are arguments of `plan_with_impacts`.
     """
     plans: Plans = []
     problem, known = planning.problem, planning.curves
@@ -252,8 +217,9 @@ def plan_block(
 
         def plan(duration: float | None) -> Plans:
             pinned = planning.pinned or leads_on(problem, block, options)
-            given = (problem, block, z, options, duration)
-            return plan_with_impacts(*given, pinned=pinned, **over_time)
+            return plan_with_impacts(
+                problem, block, z, options, duration, pinned=pinned, **over_time
+            )
 
         def plan_other(other: Planning, phases: Sequence[Phase], own: PlanOptions) -> Plans:
             return plan_block(other, phases, z, own, allowed)[0]
@@ -286,12 +252,6 @@ def plan_block(
     return plans, chain
 
 
-def _look_ahead(
-    planning: Planning, block: Sequence[Phase], options: PlanOptions
-) -> CostToGo | None:
-    return look_ahead(planning, block, options, plan_block)
-
-
 def _require_margin(planning: Planning) -> Planning:
     """The planning, or an error for a phase that cannot keep epsilon in its duration."""
     if planning.options.goal is not Objective.MARGIN:
@@ -317,7 +277,7 @@ def _distance(scene: Scene, one: Array, other: Array) -> float:
 
 
 def _starts_off(scene: Scene, motion: Motion, z: Array) -> bool:
-    """Whether a motion starts somewhere else than at `z`."""
+    """Whether a motion does not start at `z`."""
     return _distance(scene, motion.evaluate(np.zeros(1)).z[0], z) > APART
 
 
@@ -327,8 +287,10 @@ def look_ahead(
     options: PlanOptions,
     plan_block: Callable[..., tuple[Plans, ImpactSequence | None]],
 ) -> CostToGo | None:
-    """What follows a block in the time domain, if that decides where on a curve it should end."""
-    # How much more what follows costs from farther away is nearly the same, and known soon.
+    """Cost-to-go of a block in the time domain with a free end on a curve.
+
+    Without limits of motors: its gradient is nearly the same, and soon known.
+    """
     problem, options = free_torques(planning.problem, options)
     planning, index = replace(planning, problem=problem), block[-1].index + 1
     if runs_along_curves(block, options) or index == len(problem.phases):
@@ -348,18 +310,14 @@ def look_ahead(
 
     def value(z: Array) -> float:
         if planning.sketches and options.goal is Objective.TIME:
-            return _sketch(phase, z, problem.epsilon)
+            try:
+                return look_along((trace_phase(phase, z),), problem.epsilon, SKETCH)
+            except NoMotionError:
+                text = f"phase {phase.number}: no motion keeps the limits"
+                raise SolverError(text) from None
         return sum(plan.value for plan in plan_block(planning, following, z, options)[0])
 
     return CostToGo(phase, value)
-
-
-def _sketch(phase: Phase, z: Array, epsilon: float) -> float:
-    """About the least time of a phase along its curve from `z` [s]."""
-    try:
-        return look_along((trace_phase(phase, z),), epsilon, SKETCH)
-    except NoMotionError:
-        raise SolverError(f"phase {phase.number}: no motion keeps the limits") from None
 
 
 def share_again(
@@ -368,7 +326,7 @@ def share_again(
     least: Sequence[PhasePlan[Motion]],
     fastest: Sequence[PhasePlan[Motion]],
 ) -> None:
-    """Give a block its share for another least duration, at the cost of the phases after it."""
+    """Scale a block's allowed durations to its least ones, at the cost of later phases."""
     later = range(block[-1].index + 1, len(allowed))
     rest = sum(allowed[k] or 0.0 for k in later)
     if not rest:
@@ -388,7 +346,7 @@ def share_again(
 def share_duration(
     least: Sequence[PhasePlan[Motion]], duration: float | None
 ) -> list[float | None]:
-    """Longest duration of each phase [s]: the whole, shared in proportion to the least times."""
+    """Longest duration of each phase [s], in proportion to the least times."""
     times = [plan.motion.duration for plan in least]
     total = 2 * sum(times) if duration is None else duration
     if total <= sum(times):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from ..results.certificate import Certificate, TimeBound
+from ..results.plan_record import Certificate, TimeBound
 from .block_plan import BlockPlan, Planning
 from .lower_bound.lower_bound import bound_least_time
 

@@ -1,4 +1,4 @@
-"""Columns of what an NLP and its kernels are given: declared once by name, found by that alone."""
+"""Named blocks of the vectors of an NLP and its kernels."""
 
 from __future__ import annotations
 
@@ -12,13 +12,7 @@ from ..common.arrays import Expression
 
 
 class Columns:
-    """Named blocks of a vector, one after the other.
-
-    Parameters
-    ----------
-    **sizes : int
-        How many entries each block has, in their order.
-    """
+    """Named blocks of a vector, one after the other, by their sizes."""
 
     def __init__(self, **sizes: int) -> None:
         self.sizes = sizes
@@ -40,14 +34,7 @@ class Columns:
         return ca.vertcat(ca.SX(0, 1), *(ca.vec(blocks[name]) for name in self.sizes))
 
     def join(self, **blocks: Any) -> Any:
-        """One array of shape (..., count) from those of the blocks, in whatever order.
-
-        Their other axes are broadcast against one another.
-
-        Raises
-        ------
-        ValueError  if a block is missing, unknown or of another size
-        """
+        """One array of shape (..., count) from those of all blocks, broadcast in other axes."""
         tables = {name: np.asarray(block) for name, block in blocks.items()}
         self._check({name: table.shape[-1] for name, table in tables.items()})
         shape = np.broadcast_shapes(*(table.shape[:-1] for table in tables.values()))

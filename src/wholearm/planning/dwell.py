@@ -1,10 +1,8 @@
-"""Ends of phases held by constant torques, after their blocks are planned.
+"""Dwells: constant torques that hold the ends of phases until contacts are closed.
 
-Where a phase stops, its plan is only as good as the place where it does: a little short of the
-contact that is gained there, the next phase's torques set off in another formation. Held for a
-while by torques that push everything together (`mechanics.arrival`), the contact closes first. How
-soon it does hangs on the impacts on the way: that is simulated from where the contact is still
-open, without telling which contacts hold.
+A phase that stops short of the contact to be gained leaves the next one in another formation.
+Torques that press all contacts together (`mechanics.arrival`) close it first; how soon depends on
+impacts, which are simulated without assumptions on contacts.
 """
 
 from __future__ import annotations
@@ -25,37 +23,33 @@ from ..problem.definition import Phase, Problem
 from ..results.dwell_record import SettledMotion, Settling
 from ..results.torque import TorqueProfile
 from ..results.torque_change import change_torques
-from ..results.trajectory import Motion
-from ..scene.model import Scene
 from ..simulation.sticking import close_contacts
 from ..simulation.tolerances import SLOW, is_slower
 from .path_domain.junction import begin_from
-from .phase_plan import PhasePlan, Settled
+from .phase_plan import Settled
 from .stops import Plans, end_of
 
-CLOSED = 0.01
-"""What is left of a gap that counts as closed, over the gap."""
+CLOSED = 0.01  # relative gap that counts as closed
 
 
 class DwellEnd(NamedTuple):
-    """An end at rest that is held."""
+    """A dwell at an end at rest."""
 
     place: Standstill
     time: float  # [s]
-    hold: Hold | None  # none if no torques hold it
-    firm: bool  # whether they are the firmest ones, whether or not they drive on what is still open
+    hold: Hold | None  # None if no torques hold it
+    firm: bool  # whether torques are of the largest margin, also if they do not close gaps
 
 
 class _Trial(NamedTuple):
-    """What torques do from where the contact is still open."""
+    """Simulation of a dwell from where the contact is still open."""
 
-    # [s]: from when on everything is closed; None if something is open at the end
-    closes: float | None
+    closes: float | None  # [s]: when all contacts are closed; None if one is open at the end
     left: float  # [m]: largest gap at the end
 
 
 def settle_plans(problem: Problem, plans: Plans) -> Settled:
-    """Hold the ends of those phases that come to rest and are to be held."""
+    """Add the dwells that the problem asks for to phases that come to rest."""
     if problem.settle_share:
         ends = share_time(problem, plans)
     else:
@@ -79,41 +73,37 @@ def find_places(problem: Problem, plans: Plans) -> list[Standstill | None]:
 def find_ends(
     problem: Problem, plans: Plans, times: Sequence[float], firm: bool = False
 ) -> list[DwellEnd | None]:
-    """Torques for ends at rest that are held for some time [s]; None for all others."""
-    found = list[DwellEnd | None]()
+    """Dwells of given times [s] at ends at rest; None for all others."""
+    ends = list[DwellEnd | None]()
     for place, time in zip(find_places(problem, plans), times, strict=True):
         if place is None or time <= 0:
-            found.append(None)
+            ends.append(None)
             continue
         goal = place._replace(gained=None) if firm else place
-        found.append(
-            DwellEnd(place, time, find_hold(goal, problem.epsilon, problem.gap, time), firm)
-        )
-    return found
+        hold = find_hold(goal, problem.epsilon, problem.gap, time)
+        ends.append(DwellEnd(place, time, hold, firm))
+    return ends
 
 
 def hold_plans(problem: Problem, plans: Plans, ends: Sequence[DwellEnd | None]) -> Plans:
-    """The plans with their ends held; torques that may not step change to what holds and back."""
+    """The plans with dwells; rate-limited torques change to those of the dwell and back."""
     held: Plans = []
     before: Array | None = None
     for phase, plan, end in zip(problem.phases, plans, ends, strict=True):
         if before is not None and problem.scene.has_slow_motors:
             plan = begin_from(plan, phase.formation, before)
-        held.append(_hold(problem.scene, plan, end))
         before = end.hold.tau if end is not None and end.hold is not None else None
+        if end is not None and before is not None:
+            change, ramp = None, 0.0
+            if problem.scene.has_slow_motors:
+                last = plan.torque.at(plan.torque.breaks[-1:])[0]
+                change = change_torques(problem.scene, last, before)
+                ramp = change.duration
+            motion = SettledMotion(plan.motion, ramp + end.time, before, change)
+            torque = TorqueProfile.chain([plan.torque, motion.torque])
+            plan = plan._replace(motion=motion, torque=torque)
+        held.append(plan)
     return held
-
-
-def _hold(scene: Scene, plan: PhasePlan[Motion], end: DwellEnd | None) -> PhasePlan[Motion]:
-    if end is None or end.hold is None:
-        return plan
-    change, ramp = None, 0.0
-    if scene.has_slow_motors:
-        change = change_torques(scene, plan.torque.at(plan.torque.breaks[-1:])[0], end.hold.tau)
-        ramp = change.duration
-    motion = SettledMotion(plan.motion, ramp + end.time, end.hold.tau, change)
-    torque = TorqueProfile.chain([plan.torque, motion.torque])
-    return plan._replace(motion=motion, torque=torque)
 
 
 def _describe(problem: Problem, phase: Phase, end: DwellEnd) -> Settling:
@@ -140,10 +130,7 @@ def _describe(problem: Problem, phase: Phase, end: DwellEnd) -> Settling:
 
 
 def _close(problem: Problem, place: Standstill, hold: Hold, time: float) -> _Trial | None:
-    """Simulate torques from rest where the contact is still open, free of assumptions, if any is.
-
-    None if there is none.
-    """
+    """Simulate a dwell from rest where the contact is still open; None if all are closed."""
     opening = find_opening(place)
     if opening is None:
         return None
@@ -153,15 +140,14 @@ def _close(problem: Problem, place: Standstill, hold: Hold, time: float) -> _Tri
         run = simulate_free(problem, torque, start=z)
     except (SimulationError, ArithmeticError):
         return _Trial(None, problem.gap)
-    at = place.touching.evaluate(run.z, run.z_dot)
-    gaps = np.abs(at.C).max(axis=1)
+    gaps = np.abs(place.touching.evaluate(run.z, run.z_dot).C).max(axis=1)
     still = np.flatnonzero(gaps > CLOSED * problem.gap)
     last = int(still[-1]) + 1 if len(still) else 0
     return _Trial(float(run.t[last]) if last < len(run.t) else None, float(gaps[-1]))
 
 
 def list_touching(problem: Problem, phase: Phase) -> Formation:
-    """All that touches where a phase has ended: its contacts, the one gained, and the next ones."""
+    """All contacts where a phase ends: its own, the one gained, and those of the next phase."""
     contacts = list(phase.formation.contacts)
     if phase.until.contact is not None:
         contacts.append(phase.until.contact)
@@ -171,13 +157,12 @@ def list_touching(problem: Problem, phase: Phase) -> Formation:
 
 
 class DwellAllocation(NamedTuple):
-    """A way to share time: what ends have that gain a contact, over most others of them."""
+    """Relative dwell times of ends that gain a contact."""
 
-    first: int  # how many of the first have more, or less
-    more: float  # what they have
-    last: float  # what the plan's last end has
-    # whether torques are the firmest ones, whether or not they drive on what is still open
-    firm: bool = False
+    first: int  # how many of the first have another time
+    more: float  # that time, over the others
+    last: float  # time of the plan's last end
+    firm: bool = False  # as of `DwellEnd`
 
 
 WAYS = (
@@ -188,22 +173,15 @@ WAYS = (
     DwellAllocation(2, 2.0, 1.0),
     DwellAllocation(1, 0.0, 0.0),
 )
-"""Ways to share that are tried, in this order, until a plan ends no farther off than its start."""
-
-
-STOP = 0.06
-"""Time for an end where nothing has to close, over that for a contact."""
-
-
-BETTER = 0.8
-"""How far off another way's end may be to be better, over that of the best one before."""
+"""Allocations in the order in which they are tried."""
+STOP = 0.06  # relative dwell time of an end that gains no contact
+BETTER = 0.8  # largest final error of a later allocation, over the best one before
 
 
 def share_time(problem: Problem, plans: Plans) -> list[DwellEnd | None]:
-    """How each end is held: the way to share time that ends best is taken.
+    """Dwells by the first allocation with a final error within `problem.gap`, or the best one.
 
-    The first one whose plan's end is no farther off than `problem.gap`, simulated by the clock from
-    the exact start and from starts moved along the palm by that to either side, or the best one.
+    Simulated with the plan's torques from the exact start and from it moved by the gap either way.
     """
     best, least = list[DwellEnd | None](), math.inf
     for way in WAYS:
@@ -217,7 +195,7 @@ def share_time(problem: Problem, plans: Plans) -> list[DwellEnd | None]:
 
 
 def _share(problem: Problem, plans: Plans, way: DwellAllocation) -> list[float]:
-    """For how long ends are held if time is shared in a way [s]."""
+    """Dwell time of each end by an allocation [s]."""
     times = [problem.settles(phase) for phase in problem.phases]
     weights, gained = np.zeros(len(times)), 0
     for k, place in enumerate(find_places(problem, plans)):
@@ -234,7 +212,7 @@ def _share(problem: Problem, plans: Plans, way: DwellAllocation) -> list[float]:
 
 
 def measure_off(problem: Problem, plans: Plans, ends: Sequence[DwellEnd | None]) -> float:
-    """How far off plans end at most [m] with ends held, turns counting by the scene's length."""
+    """Largest final error of plans with dwells [m], angles times the scene's length."""
     torque = TorqueProfile.chain([plan.torque for plan in hold_plans(problem, plans, ends)])
     goal, length = end_of(plans[-1])[0], problem.scene.scales.length
     most = 0.0

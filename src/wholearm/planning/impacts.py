@@ -1,7 +1,6 @@
-"""What became of the impacts that a problem asks for, and what they save over stopping.
+"""Impacts that a problem asks for, and the gain of each over a stop.
 
-A block is a run of phases that are planned together; both domains say of each impact in it whether
-the motion passes it at speed (`BlockImpact`) and how a part of the block is planned (`PlanPart`).
+Both domains list the impacts of a block (`BlockImpact`) and plan parts of it (`PlanPart`).
 """
 
 from __future__ import annotations
@@ -15,15 +14,14 @@ import numpy as np
 from ..common.errors import InfeasibleError, SolverError
 from ..mechanics.impact import Impact
 from ..problem.definition import Phase
+from ..results.plan_record import Transition
 from ..results.trajectory import Motion
-from ..results.transition import Transition
 from ..solvers.statistics import charge
 from .options import Objective, PlanOptions
 from .phase_plan import PhasePlan, add_up, combine
 from .stops import PlanPart, plan_stops
 
-PER_SPEED = " per m/s"
-"""Unit after impulses and rates of an impact: they are for one unit of speed before it."""
+PER_SPEED = " per m/s"  # unit after impulses and rates, which are for unit speed before an impact
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,18 +49,12 @@ def assess_impacts(
     allowed: Sequence[float | None],
     report: Callable[[str], None],
 ) -> list[Transition]:
-    """Assess every impact of a block: what it saves is found by planning a stop instead.
+    """Transitions of all impacts of a block, with what each saves over a planned stop.
 
-    Parameters
-    ----------
-    impacts        all that the block asks for
-    plans          of the block
-    plan_part      see `PlanPart`
-    allowed : [s]  longest duration of each phase of the problem, for the objective `margin`
-    report         told in a few words what is being done
+    `allowed` are the longest durations of the problem's phases [s], for the objective `margin`.
     """
-    stops = [0, *(own.before + 1 for own in impacts if not own.passed), len(block)]
-    found = []
+    stops = [0, *(impact.before + 1 for impact in impacts if not impact.passed), len(block)]
+    transitions = []
     for own in impacts:
         phase, at, saves = block[own.before], own.before + 1, math.nan
         if own.passed:
@@ -72,14 +64,9 @@ def assess_impacts(
             with charge(phase.number):
                 saves = _find_saving(plans, (start, at, stop), plan_part, options, duration)
         contact, impulse = own.impact.least
-        until = str(phase.until)
-        found.append(
-            Transition(
-                phase.number, until, own.passed, own.reason, own.ratio, impulse, contact,
-                own.speed, saves,
-            )
-        )  # fmt: skip
-    return found
+        what = phase.number, str(phase.until), own.passed, own.reason, own.ratio
+        transitions.append(Transition(*what, impulse, contact, own.speed, saves))
+    return transitions
 
 
 def _find_saving(
@@ -89,15 +76,13 @@ def _find_saving(
     options: PlanOptions,
     duration: float | None,
 ) -> float:
-    """What a stop at the middle one of `bounds` costs in phases in motion; NaN without a plan."""
-    start, _, stop = bounds
-    own = plans[start:stop]
-    z = own[0].motion.evaluate(np.zeros(1)).z[0]
+    """Cost of a stop at the middle one of `bounds` in phases in motion; NaN without a plan."""
+    moving = plans[bounds[0] : bounds[-1]]
+    z = moving[0].motion.evaluate(np.zeros(1)).z[0]
     try:
         stopped = plan_stops(plan_part, bounds, z, options, duration)
     except (InfeasibleError, SolverError):
         return math.nan
-    gain = combine(options.goal, [plan.value for plan in stopped]) - combine(
-        options.goal, [plan.value for plan in own]
-    )
+    values = [combine(options.goal, [plan.value for plan in own]) for own in (stopped, moving)]
+    gain = values[0] - values[1]
     return -gain if options.goal is Objective.MARGIN else gain

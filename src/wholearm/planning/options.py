@@ -1,4 +1,4 @@
-"""What to plan for, and how finely."""
+"""Options of the planner: objective, discretization, verification."""
 
 from __future__ import annotations
 
@@ -14,22 +14,16 @@ from ..mechanics.margin_key import UNIQUENESS
 
 
 class Objective(Enum):
-    """What a plan makes best."""
+    """Objective of a plan."""
 
-    TIME = "time"
-    """Least duration."""
-    EFFORT = "effort"
-    """Least integral of tau^T tau, plus a weight on time."""
-    MARGIN = "margin"
-    """Largest least normal force within a given duration."""
-    ELASTIC = "elastic"
-    """Least shortfall of the limits; used to explain why there is no plan."""
-    RELAX = "relax"
-    """Least relaxation of one limit; used to say what would make a plan possible."""
+    TIME = "time"  # least duration
+    EFFORT = "effort"  # least integral of tau^T tau, plus a weight on time
+    MARGIN = "margin"  # largest least normal force within a given duration
+    ELASTIC = "elastic"  # least shortfall of the limits; used to explain why there is no plan
+    RELAX = "relax"  # least relaxation of one limit; used to say what would make a plan possible
 
 
-CHOICES = ("time", "effort", "margin")
-"""Objectives that a user can ask for."""
+CHOICES = ("time", "effort", "margin")  # objectives that a user can ask for
 PLANNER = """\
 --objective NAME    time, effort or margin = time among time|effort|margin
 --accuracy          relative error of the objective below which refining ends = 1e-4 in 1e-8..0.1

@@ -1,7 +1,7 @@
-"""Torques that go on from block to block, where motors are not quick.
+"""Pauses in which rate-limited torques change at rest between blocks.
 
-What is planned over time begins and ends with the torques that its motion needs there. Those that
-came before change into them in a pause before it, while everything rests.
+A plan in the time domain begins and ends with the torques of its motion; those before it change
+into them in a pause.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from .stops import Plans, runs_along_curves, split_blocks
 def find_beside(
     planning: Planning, block: Sequence[Phase], end: Array, options: PlanOptions
 ) -> tuple[Curve | Array | None, Curve | Formation | None]:
-    """What is before and after a block along curves that ends at `end`, as `plan_slowly` asks."""
+    """Neighbours of a block along curves that ends at `end`, for `plan_slowly`."""
     index, later = block[-1].index + 1, planning.problem.phases[block[-1].index + 1 :]
     before: Curve | Array | None = planning.find_curve_before(block)
     if before is None:
@@ -47,41 +47,42 @@ def plan_with_pauses(
     plan: Callable[[float | None], Plans],
     duration: float | None,
 ) -> Plans:
-    """Plans of a block over time, which `plan` makes for a longest duration [s], and its pauses."""
+    """Plans of a block in the time domain by `plan` for a longest duration [s], with pauses."""
     plans = plan(duration)
-    joints = _list_joints(planning, block, plans)
-    pause = sum(joint.pause for joint in joints if joint)
+    junctions = _list_junctions(planning, block, plans)
+    pause = sum(junction.pause for junction in junctions if junction)
     if duration is not None and pause:
         plans = plan(duration - pause)
-        joints = _list_joints(planning, block, plans)
+        junctions = _list_junctions(planning, block, plans)
     paused: Plans = []
-    for own, joint, phase in zip(plans, joints, block, strict=True):
-        z = own.motion.evaluate(np.zeros(1)).z[0]
-        given = phase.formation, z, planning.options
-        paused.append(own if joint is None else add_pause(own, joint, *given))
+    for own, junction, phase in zip(plans, junctions, block, strict=True):
+        if junction is not None:
+            z = own.motion.evaluate(np.zeros(1)).z[0]
+            own = add_pause(own, junction, phase.formation, z, planning.options)
+        paused.append(own)
     return paused
 
 
-def _list_joints(planning: Planning, block: Sequence[Phase], plans: Plans) -> list[Joint | None]:
-    """Where each of the phases begins, if torques change there."""
+def _list_junctions(planning: Planning, block: Sequence[Phase], plans: Plans) -> list[Joint | None]:
+    """Starts of the phases at which torques change."""
     ends = [_find_torque_before(planning, block), *map(_find_last, plans[:-1])]
-    joints = list[Joint | None]()
+    junctions = list[Joint | None]()
     for end, own, phase in zip(ends, plans, block, strict=True):
-        begins, scene = own.torque.at(np.zeros(1))[0], planning.problem.scene
-        pause = 0.0 if end is None else float(find_change_times(scene, end, begins))
+        first, scene = own.torque.at(np.zeros(1))[0], planning.problem.scene
+        pause = 0.0 if end is None else float(find_change_times(scene, end, first))
         if end is None or not pause:
-            joints.append(None)
+            junctions.append(None)
             continue
         z = own.motion.evaluate(np.zeros(1)).z[0]
-        held = choose_joint(end, phase.formation, z, planning.problem.epsilon, phase.number)
-        joints.append(held._replace(after=begins, pause=pause))
-    return joints
+        junction = choose_joint(end, phase.formation, z, planning.problem.epsilon, phase.number)
+        junctions.append(junction._replace(after=first, pause=pause))
+    return junctions
 
 
 def _find_torque_before(planning: Planning, block: Sequence[Phase]) -> Array | None:
-    """The torques that the block before ends with, shape (2,) [N m], if that is planned."""
-    known = [own for own in planning.blocks if own.phases[-1].index + 1 == block[0].index]
-    return _find_last(known[0].plans[-1]) if known else None
+    """The last torques of the block before, shape (2,) [N m], if that is planned."""
+    before = [own for own in planning.blocks if own.phases[-1].index + 1 == block[0].index]
+    return _find_last(before[0].plans[-1]) if before else None
 
 
 def _find_last(plan: PhasePlan[Motion]) -> Array:

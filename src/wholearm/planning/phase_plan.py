@@ -1,4 +1,4 @@
-"""The plan of one phase, whichever NLP found it, and figures of several."""
+"""The plan of one phase in either domain, and objective and duration of several."""
 
 from __future__ import annotations
 
@@ -22,24 +22,19 @@ class PhasePlan(NamedTuple, Generic[M_co]):
     motion: M_co
     torque: TorqueProfile  # from the start of the phase
     value: float  # the phase's share of the objective: s, (N m)^2 s or N
-    # sequences of contact modes that were tried, of phases in one NLP booked to the first; none
-    # along curves
-    sequences: int = 0
-    # whether the search for contact modes has tried all that promised to be better
-    complete: bool = True
-    attempt: str = ""  # name of the guess that led to it; none along curves
-    # the stages that it was solved on, in the scene's own units; none along curves
-    stages: Sequence[object] = ()
-    # estimate of how far the value of all phases in one NLP is from their best, relative to it
-    error: float = math.nan
-    # what the solver has found, of the first of the phases in one NLP that are only begun
-    solution: object = None
-    # its value with torques that are not held over control periods, if they are
-    unheld: float = math.nan
+    sequences: int = (
+        0  # sequences of contact modes tried, of the first phase in one NLP; 0 on curves
+    )
+    complete: bool = True  # whether the mode search has tried all neighbours
+    attempt: str = ""  # name of its initial guess; none along curves
+    stages: Sequence[object] = ()  # of the NLP, in the scene's units; none along curves
+    error: float = math.nan  # estimated relative error of the value of all phases in one NLP
+    solution: object = None  # of the NLP, in the first of coarse plans
+    unheld: float = math.nan  # value with free torques, where they are held over control periods
 
 
 class Settled(NamedTuple):
-    """Plans of all phases with their ends held, and how; None where an end is not to be held."""
+    """Plans of all phases with their dwells; None at ends without one."""
 
     plans: list[PhasePlan[Motion]]
     settlings: tuple[Settling | None, ...]
@@ -47,15 +42,15 @@ class Settled(NamedTuple):
 
 @dataclass
 class Tried:
-    """What a search for contact modes has done."""
+    """Statistics of a mode search."""
 
     sequences: int = 1  # of modes that were tried
-    complete: bool = True  # whether none was left to try
+    complete: bool = True  # whether none was left
     iterations: int = 0  # of the solver
 
 
 def add_up(phases: Sequence[Phase], allowed: Sequence[float | None]) -> float | None:
-    """Longest duration of some phases in all [s], given that of each of the problem's phases."""
+    """Longest duration of some phases in all [s]; `allowed` is of all phases."""
     own = [allowed[phase.index] for phase in phases]
     return sum(time for time in own if time is not None) if None not in own else None
 

@@ -1,4 +1,4 @@
-"""Planning a problem: its blocks one after the other, their replay, and what impacts save."""
+"""Plan of a problem: all blocks, replay, gains of impacts, bounds, statistics."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -17,15 +17,15 @@ from ..common.errors import AmbiguityError, InfeasibleError, SolverError
 from ..common.plain import plain
 from ..common.sharing import exclusive
 from ..common.signals import OutOfTime, Reporter, limited
-from ..geometry.curve import Curve, describe_pose
+from ..geometry.curve import describe_pose
 from ..geometry.tracing import trace_phases
 from ..mechanics.uniqueness import describe_uniqueness
 from ..problem.check import require_phases
 from ..problem.definition import Problem
+from ..results.plan_record import Transition
 from ..results.report import UniquenessMargin
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory, assemble
-from ..results.transition import Transition
 from ..solvers.statistics import Ledger, open_ledger
 from ..verification.force_uniqueness import find_uniqueness_margin, find_wedged
 from .block_plan import Planning
@@ -41,8 +41,7 @@ if TYPE_CHECKING:
     from .replay_check import Checked
 
 
-_STILL = 1e-9
-"""Speed of a plan that is rest but for rounding, relative to the scene's."""
+_STILL = 1e-9  # relative speed of rest but for rounding
 
 
 def solve(
@@ -62,7 +61,7 @@ def solve(
         Least duration; least integral of tau^T tau plus `time_weight` times the duration; or the
         largest least normal force within `duration`.
     progress : callable, optional
-        Told in a few words what is being done.
+        Told what is being done.
     time_limit : float, optional, [s]
         Longest time that planning may take.
     **options : Any
@@ -113,7 +112,14 @@ def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]
         report("tracing the phases")
         curves = trace_phases(problem)
         traced = time.perf_counter()
-        planning = _plan(problem, curves, options, report)
+        try:
+            planning = plan_blocks(problem, curves, options, report)
+        except InfeasibleError as error:
+            # The motion of an error carries its problem, like that of a plan.
+            if error.motion is not None:
+                about = {"name": problem.name, "epsilon": problem.epsilon, "problem": problem.table}
+                error.motion = replace(error.motion, meta=error.motion.meta | about)
+            raise
         return finish_plan(planning, report, ledger, (started, traced))
 
 
@@ -124,27 +130,27 @@ def finish_plan(
     begun: tuple[float, float],
     checked: Checked | None = None,
 ) -> Plan:
-    """The plan that the plans of all blocks make, once its replay has shown that it holds.
+    """Verify the planned blocks by simulation, assess them, and collect the plan.
 
     Parameters
     ----------
-    report       told in a few words what is being done
-    ledger       what solving has cost so far, and what is booked from here on
+    ledger       statistics of the solver
     begun : [s]  when tracing the phases began and ended, by `time.perf_counter`
-    checked      the trajectory of the planning and what its replay has shown, if that is known
+    checked      trajectory and replay of the planning, if known
     """
     problem, options = planning.problem, planning.options
     trajectory, figures = checked.trajectory if checked else assemble_plan(planning), None
-    sure = check_sureness(problem, trajectory, options.uniqueness_margin)
+    unique = check_uniqueness(problem, trajectory, options.uniqueness_margin)
     planned = time.perf_counter()
     if options.replay:
         from .replay_check import replay_plan
 
         first = trajectory
-        given = planning, trajectory, assemble_plan, report, checked
-        planning, trajectory, figures = replay_plan(*given)
+        planning, trajectory, figures = replay_plan(
+            planning, trajectory, assemble_plan, report, checked
+        )
         if trajectory is not first:
-            sure = check_sureness(problem, trajectory, options.uniqueness_margin)
+            unique = check_uniqueness(problem, trajectory, options.uniqueness_margin)
     replayed = time.perf_counter()
     transitions = _assess(planning, report)
     assessed = time.perf_counter()
@@ -159,7 +165,7 @@ def finish_plan(
 
         report("bounding the least time from below")
         certificate = certify(planning)
-    phases = _list_phases(planning, ledger, sure)
+    phases = _list_phases(planning, ledger, unique)
     if certificate is not None:
         gaps = certificate.gaps
         phases = tuple(own._replace(error=gaps.get(own.number, own.error)) for own in phases)
@@ -192,36 +198,19 @@ def finish_plan(
     return replace(plan, trajectory=replace(trajectory, meta=write_meta(plan)))
 
 
-def _plan(
-    problem: Problem,
-    curves: tuple[Curve, ...],
-    options: PlanOptions,
-    report: Callable[[str], None],
-) -> Planning:
-    """Plan every block, and let an error's motion carry the problem along like a plan's."""
-    try:
-        return plan_blocks(problem, curves, options, report)
-    except InfeasibleError as error:
-        if error.motion is not None:
-            known = {"name": problem.name, "epsilon": problem.epsilon, "problem": problem.table}
-            error.motion = replace(error.motion, meta=error.motion.meta | known)
-        raise
-
-
 def assemble_plan(planning: Planning) -> Trajectory:
-    """The trajectory of a planning; of its `meta` only what the motion itself depends on."""
-    torque = TorqueProfile.chain([plan.torque for plan in planning.settled.plans])
-    phases = _list_phases(planning, Ledger(None))
+    """The trajectory of a planning; of its `meta` only rolling contacts and modes."""
+    plans, phases = planning.settled.plans, _list_phases(planning, Ledger(None))
     meta = {
         "rolling": [list(phase.rolling) for phase in phases],
         "modes": plain([phase.modes for phase in phases]),
     }
-    motions = [plan.motion for plan in planning.settled.plans]
-    return assemble(motions, torque, meta, planning.options.samples)
+    torque = TorqueProfile.chain([plan.torque for plan in plans])
+    return assemble([plan.motion for plan in plans], torque, meta, planning.options.samples)
 
 
 def _list_phases(
-    planning: Planning, ledger: Ledger, sure: Sequence[Sureness] = ()
+    planning: Planning, ledger: Ledger, unique: Sequence[Uniqueness] = ()
 ) -> tuple[PlannedPhase, ...]:
     settled = planning.settled
     return tuple(
@@ -236,7 +225,7 @@ def _list_phases(
             plan.attempt,
             plan.error,
             ledger.of(phase.number),
-            *(sure[phase.index] if sure else Sureness(None, None)),
+            *(unique[phase.index] if unique else (None, None)),
             settled.settlings[phase.index],
             None if math.isnan(plan.unheld) else plan.unheld,
         )
@@ -260,30 +249,25 @@ def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transitio
         else:
             impacts = sequence_plan.list_impacts(block.chain, block.plans)
             plan_part = sequence_plan.plan_parts_of(block.chain, planning.problem.epsilon)
-        given = block.phases, impacts, block.plans, plan_part
-        found += assess_impacts(*given, planning.options, planning.allowed, report)
+        found += assess_impacts(
+            block.phases,
+            impacts,
+            block.plans,
+            plan_part,
+            planning.options,
+            planning.allowed,
+            report,
+        )
     return found
 
 
-class Sureness(NamedTuple):
-    """The uniqueness margin of a phase, and for how long it may stay wedged; see `PlannedPhase`."""
-
-    uniqueness_margin: UniquenessMargin | None
-    wedged: float | None
+Uniqueness = tuple[UniquenessMargin | None, float | None]
+"""Uniqueness margin of a phase, and for how long it is possibly stuck; see `PlannedPhase`."""
 
 
-def check_sureness(problem: Problem, trajectory: Trajectory, least: float) -> list[Sureness]:
-    """Measure every phase of a plan.
-
-    Parameters
-    ----------
-    least  least uniqueness margin (`mechanics.uniqueness`)
-
-    Raises
-    ------
-    AmbiguityError  if a phase has a lesser one
-    """
-    found = []
+def check_uniqueness(problem: Problem, trajectory: Trajectory, least: float) -> list[Uniqueness]:
+    """Uniqueness of the contact forces in every phase; AmbiguityError below the `least` margin."""
+    found = list[Uniqueness]()
     for phase in problem.phases:
         rows = np.flatnonzero(trajectory.phase == phase.index)
         margin = find_uniqueness_margin(phase, trajectory, rows)
@@ -291,5 +275,5 @@ def check_sureness(problem: Problem, trajectory: Trajectory, least: float) -> li
             place = describe_pose(trajectory.z[np.searchsorted(trajectory.t, margin.time)])
             text = describe_uniqueness(margin.value, margin.contacts, place, least)
             raise AmbiguityError(f"phase {phase.number}: {text}")
-        found.append(Sureness(margin, find_wedged(problem, phase, trajectory, rows, _STILL)))
+        found.append((margin, find_wedged(problem, phase, trajectory, rows, _STILL)))
     return found

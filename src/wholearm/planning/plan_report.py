@@ -1,4 +1,4 @@
-"""What is said of a plan: its phases, its replay, its bounds and its torque table."""
+"""Report of a plan: phases, replay, bounds, ranges and torque table."""
 
 from __future__ import annotations
 
@@ -13,22 +13,15 @@ from .phase_plan import combine
 if TYPE_CHECKING:
     from .result import Plan
 
-_LEAST_ERROR = 1e-9
-"""Least estimate of a relative error that is printed: limits are kept to more than that."""
+_LEAST_ERROR = 1e-9  # least relative error that is printed: limits are kept to more than that
 
 
 def describe_plan(plan: Plan, output: str = "", table: Mapping[str, Any] | None = None) -> Document:
-    """What has been planned.
-
-    Parameters
-    ----------
-    output  the trajectory file, if one is written
-    table   name and figures of the torque table, if one is written; see `planning.table_check`
-    """
+    """Report of a plan, its trajectory file `output`, and the figures of its torque `table`."""
     figure = f"{plan.value:.6f}" if abs(plan.value) >= 1e-2 else f"{plan.value:.6g}"
     value = f"{plan.status.value}: {plan.options.goal.value} = {figure} {plan.unit}"
     if not math.isnan(plan.error):
-        # By the figure that is printed: one digit of an estimate.
+        # Compared as printed, with one digit.
         error = f"{max(plan.error, _LEAST_ERROR):.0e}"
         missed = float(error) > plan.options.accuracy
         text = f"; accuracy {plan.options.accuracy:g} not reached" if missed else ""
@@ -51,7 +44,6 @@ def describe_plan(plan: Plan, output: str = "", table: Mapping[str, Any] | None 
 
 
 def _list_phases(plan: Plan) -> Table:
-    # Six decimals of what is some hundredths of a newton, and of some newton metres.
     forces = fixed(plan.problem.epsilon or 0.05, 5)
     torques = fixed(float(plan.problem.scene.torque_limit.max()), 7)
     rows = []
@@ -90,19 +82,15 @@ def _list_transitions(plan: Plan) -> Table:
 
 
 def _list_settlings(plan: Plan) -> Iterator[str | Table]:
-    """The ends of phases that are held, and what that costs."""
+    """The dwells of phases, and their duration."""
     known = [phase.settling for phase in plan.phases if phase.settling is not None]
     if not known:
         return
-    rows = [
-        (own.phase, own.duration, own.tau, own.contact or "-")
-        + (
-            (own.gap, own.closes, own.left, own.speed, ", ".join(own.parts) or "-")
-            if own.contact
-            else ("",) * 5
-        )
-        for own in known
-    ]
+    rows = []
+    for own in known:
+        closing = (own.gap, own.closes, own.left, own.speed, ", ".join(own.parts) or "-")
+        row = (own.phase, own.duration, own.tau, own.contact or "-")
+        rows.append(row + (closing if own.contact else ("",) * 5))
     heads = ["phase:d", "held [ms]:.3g", "tau [N m]:8.4f", "closes", "from [mm]:.3g"]
     heads += ["in [ms]:.3g", "left [mm]:.2g", "at [mm/s]:.3g", "parts for a moment"]
     yield Table(heads, rows)
@@ -112,7 +100,7 @@ def _list_settlings(plan: Plan) -> Iterator[str | Table]:
 
 
 def _describe_held(plan: Plan) -> Iterator[str]:
-    """What it costs to hold torques over control periods."""
+    """Relative cost of torques held over control periods."""
     scene, free = plan.problem.scene, [own.unheld for own in plan.phases if own.unheld is not None]
     if len(free) == len(plan.phases):
         value = combine(plan.options.goal, free)
@@ -122,7 +110,7 @@ def _describe_held(plan: Plan) -> Iterator[str]:
 
 
 def _describe_replay(plan: Plan) -> str:
-    """What the replay of the plan has shown."""
+    """Least normal force and final errors of the replay."""
     replay, epsilon = plan.replay, plan.problem.epsilon
     if replay is None:
         return "the plan was not replayed"
@@ -140,7 +128,7 @@ def _describe_replay(plan: Plan) -> str:
 
 
 def _list_bounds(plan: Plan) -> Table:
-    """Lower bounds of the durations, and of all that have one together."""
+    """Lower bounds of the durations, and their sum."""
     rows, certificate = list[tuple[Any, ...]](), plan.certificate
     for part in certificate.parts if certificate else ():
         ends = dict.fromkeys((part.phases[0], part.phases[-1]))
@@ -155,7 +143,7 @@ def _list_bounds(plan: Plan) -> Table:
 
 
 def _describe_ranges(plan: Plan) -> Iterator[str]:
-    """What ranges cost, and how wide they may be."""
+    """Relative cost of ranges, and the largest feasible ones."""
     ranges = plan.ranges
     if ranges is None:
         return
@@ -179,7 +167,7 @@ def _describe_ranges(plan: Plan) -> Iterator[str]:
 
 
 def _list_table(table: Mapping[str, Any]) -> Iterator[str | Table]:
-    """The torque table, and what its replay does to the phases if it has samples at a rate."""
+    """The torque table, and the phases of its replay if it has samples at a rate."""
     sampled, replay = "sample_rate" in table, table["replay"]
     rate = f", {table['interpolation']} at {table['sample_rate']:g} Hz" if sampled else ""
     text = f"wrote {table['file']}: {table['rows']} rows{rate}"
@@ -195,7 +183,7 @@ def _list_table(table: Mapping[str, Any]) -> Iterator[str | Table]:
 
 
 def _describe_uniqueness(plan: Plan) -> str:
-    """Whether contact forces are the only ones, and for how long phases may stay wedged."""
+    """Uniqueness margin of contact forces, and for how long phases are possibly stuck."""
     margins = [(own.uniqueness_margin, own.number) for own in plan.phases if own.uniqueness_margin]
     if not margins:
         return ""

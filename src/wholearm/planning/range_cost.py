@@ -1,4 +1,4 @@
-"""What ranges cost a plan, and how wide they may be."""
+"""Cost of parametric ranges, and the largest factor of them with a plan."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from ..mechanics.metric import measure_speed
 from ..mechanics.wedging import SURE
 from ..problem.uncertainty import PARAMETERS
-from ..results.range_figures import RangeFigures
+from ..results.plan_record import RangeFigures
 from .block_plan import Planning
 from .blocks import plan_blocks
 from .options import Objective, PlanOptions
@@ -20,16 +20,13 @@ from .path_domain.range_factor import find_widest
 from .phase_plan import combine
 from .robust.robust_rows import Guide, list_holds, measure_holds
 
-WIDEST = 0.95
-"""Largest relative range that is tried."""
-_STILL = 1e-9
-"""Speed of a plan that is rest but for rounding, relative to the scene's."""
-_MOST = 1e3
-"""Largest factor that is tried."""
+WIDEST = 0.95  # largest relative range that is tried
+_STILL = 1e-9  # relative speed of rest but for rounding
+_MOST = 1e3  # largest factor that is tried
 
 
 def assess_ranges(planning: Planning, report: Callable[[str], None]) -> RangeFigures:
-    """Plan without ranges too, and look for the widest ones if that is asked for."""
+    """Plan without ranges, and if asked for find the widest ranges along curves."""
     options, problem = planning.options, planning.problem
     report("planning without ranges")
     bare = plan_blocks(problem, planning.curves, replace(options, ranges={}), report)
@@ -52,16 +49,14 @@ def assess_ranges(planning: Planning, report: Callable[[str], None]) -> RangeFig
         guides = [Guide(own.grid.s, *own.profile) for own in motions]
         widest = find_widest(curves, problem.epsilon, scale, numbers, guides, most)
         found |= dict.fromkeys(numbers, widest)
-    each = tuple(found.get(phase.number) for phase in problem.phases)
     if not found:
         return figures
-    return figures._replace(
-        largest=min(found.values()), phases=each, capped=min(found.values()) >= most
-    )
+    each, least = tuple(found.get(phase.number) for phase in problem.phases), min(found.values())
+    return figures._replace(largest=least, phases=each, capped=least >= most)
 
 
 def _list_held(planning: Planning) -> Iterator[int]:
-    """Numbers of phases that begin at rest, where friction within the ranges may hold them."""
+    """Numbers of phases that friction within the ranges may hold at rest at their start."""
     scales, ranges = planning.problem.scene.scales, planning.options.ranges
     for phase, plan in zip(planning.problem.phases, planning.plans, strict=True):
         first = plan.motion.evaluate(np.zeros(1))
@@ -75,7 +70,7 @@ def _list_held(planning: Planning) -> Iterator[int]:
 def _list_parts(
     planning: Planning,
 ) -> Iterator[tuple[Sequence[int], ImpactSequence, list[PathMotion]]]:
-    """What is planned along curves from rest to rest: phases, curves and motions."""
+    """Parts of blocks along curves from rest to rest: phases, curves and motions."""
     for block in planning.blocks:
         for part in block.chain.split() if block.chain is not None else ():
             numbers = [phase.number for phase in part.phases]

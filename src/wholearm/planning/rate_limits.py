@@ -1,4 +1,4 @@
-"""What is not planned with motors that are not quick, or with torques held over periods."""
+"""Restrictions with rate-limited or held torques, and errors that compare with free ones."""
 
 from __future__ import annotations
 
@@ -14,19 +14,12 @@ from .block_plan import Planning
 from .options import PlanOptions
 from .stops import Plans, runs_along_curves, split_blocks
 
-FREE = {"torque_rate_limit": None, "actuator_lag": None, "control_period": None}
-"""Changes of a problem after which motors are quick, and torques are not held."""
-_ROUGH = 1e-2
-"""Least accuracy of plans of which only matters that there are any."""
+FREE = {"torque_rate_limit": None, "actuator_lag": None, "control_period": None}  # free torques
+_ROUGH = 1e-2  # least accuracy where only the existence of a plan matters
 
 
 def require_steps(problem: Problem, options: PlanOptions) -> None:
-    """Refuse what is not planned with torques that may not step, or may only at some times.
-
-    Raises
-    ------
-    InputError  names the key that is given, and why it cannot be
-    """
+    """Raise an InputError for combinations with rate-limited or held torques without a planner."""
     given = [
         (f"{finger.name}.{key}", getattr(finger, key))
         for finger in problem.scene.fingers
@@ -48,7 +41,7 @@ def require_steps(problem: Problem, options: PlanOptions) -> None:
 
 
 def free_torques(problem: Problem, options: PlanOptions) -> tuple[Problem, PlanOptions]:
-    """The same with motors that are quick, and torques that are not held."""
+    """The same with free torques."""
     scene = problem.scene
     if scene.control_period:
         options = replace(options, transcription="auto")
@@ -58,7 +51,7 @@ def free_torques(problem: Problem, options: PlanOptions) -> tuple[Problem, PlanO
 
 
 def name_motors(scene: Scene) -> str:
-    """The keys that keep torques from stepping when they like, with their values."""
+    """The keys that limit rates or hold torques, with their values."""
     given = list[str]()
     if scene.control_period:
         given.append(f"control_period = {scene.control_period:g} s ({scene.control_hold})")
@@ -78,12 +71,7 @@ def explain_motors(
     error: InfeasibleError | SolverError,
     plan_block: Callable[[Planning, Sequence[Phase], PlanOptions], Plans],
 ) -> InfeasibleError | SolverError:
-    """What an error says of phases without a plan, and whether they have one without these keys.
-
-    Parameters
-    ----------
-    plan_block  plans the same phases of another problem; raises if there is no plan
-    """
+    """The error with whether the phases have a plan with free torques, found by `plan_block`."""
     keys = name_motors(planning.problem.scene)
     if not keys:
         return error
@@ -96,16 +84,12 @@ def explain_motors(
         phases = [free.phases[phase.index] for phase in block]
         found = plan_block(replace(planning, problem=free, curves=()), phases, own)
     except WholearmError as other:
-        return _say(error, f"{error}; without {keys} none was found either: {other}")
-    lasts = sum(plan.motion.duration for plan in found)
-    found_one = f"without {keys} there is a plan of {lasts:.4g} s for {where}"
-    return _say(error, f"{found_one}; with that, {error}")
-
-
-def _say(error: InfeasibleError | SolverError, text: str) -> InfeasibleError | SolverError:
-    """An error with another text."""
+        text = f"{error}; without {keys} none was found either: {other}"
+    else:
+        lasts = sum(plan.motion.duration for plan in found)
+        text = f"without {keys} there is a plan of {lasts:.4g} s for {where}; with that, {error}"
     if not isinstance(error, InfeasibleError):
         return SolverError(text)
-    other = InfeasibleError(text, error.shortfalls, error.changes)
-    other.motion = error.motion
-    return other
+    extended = InfeasibleError(text, error.shortfalls, error.changes)
+    extended.motion = error.motion
+    return extended

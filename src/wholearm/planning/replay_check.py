@@ -1,7 +1,6 @@
-"""What `solve` checks of its own plan, and how it refines what does not hold.
+"""Verification of a plan by simulation of its torques, and refinement where it fails.
 
-The plan is replayed in the simulator, which is told the torques and nothing else, and the equations
-of motion are written out anew for its samples (`verification.newton_euler`).
+The residual of the equations of motion is independent of the planner (`verification.newton_euler`).
 """
 
 from __future__ import annotations
@@ -12,15 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import (
-    InfeasibleError,
-    JammingError,
-    ReplayError,
-    SimulationError,
-    SolverError,
-)
+from ..common.errors import InfeasibleError, JammingError, ReplayError, SimulationError, SolverError
 from ..problem.definition import Problem
-from ..results.replay_figures import LeastForce, ReplayedPhase, ReplayFigures
+from ..results.plan_record import LeastForce, ReplayedPhase, ReplayFigures
 from ..results.report import Report
 from ..results.trajectory import Samples, Trajectory, assemble
 from ..scene.model import Scales
@@ -30,26 +23,17 @@ from ..verification.verify import judge, observe
 from .block_plan import PLAIN, BlockPlan, Planning
 from .blocks import plan_alone, press_more, refine_block
 
-REFINEMENTS = 3
-"""Most doublings of the intervals of a block."""
-ROUGH = 2
-"""Most doublings in the time domain, before contact modes are left as they come: a plan that hangs
-on a contact that comes to rest need not hold, however fine it is."""
-STRICT = 0.5
-"""Share of what `verify` allows that a plan may use, if another plan is to be had."""
-DIP = 2e-3
-"""Largest shortfall of a normal force, over the scene's force, that pressing more is to mend."""
-SPARE = 2.0
-"""How much more a plan is then to press, over that shortfall."""
-RESIDUAL = 1e-8
-"""Largest residual of the equations of motion, relative to the scene's force or torque, length or
-speed: rounding leaves 1e-13."""
-DENSE = 201
-"""Rows per phase for the equations of motion, if the trajectory has not half as many."""
+REFINEMENTS = 3  # most doublings of the intervals of a block
+ROUGH = 2  # the same in the time domain, before the mode search is left out: some modes never hold
+STRICT = 0.5  # share of the tolerances of `verify` that a plan may use, if there is another
+DIP = 2e-3  # largest shortfall of c_n, over the scene's force, that more normal force is to mend
+SPARE = 2.0  # additional normal force over that shortfall
+RESIDUAL = 1e-8  # largest relative residual of the equations of motion; rounding leaves 1e-13
+DENSE = 201  # rows per phase for the equations of motion, if the trajectory has not half as many
 
 
 class Residual(NamedTuple):
-    """What the equations of motion miss at worst."""
+    """Largest residual of the equations of motion."""
 
     size: float  # relative to the scene's force or torque, length or speed
     phase: int  # number of the phase
@@ -59,8 +43,7 @@ class Residual(NamedTuple):
 class ReplayCheck(NamedTuple):
     """A plan's own replay and its residual."""
 
-    # what the replay has shown, or what it has ended with, since it cannot go on
-    report: Report | JammingError | SimulationError
+    report: Report | JammingError | SimulationError  # an error ends the replay
     residual: Residual
 
     @property
@@ -78,11 +61,7 @@ class ReplayCheck(NamedTuple):
     def find_culprit(self, scales: Scales, allowance: Allowance, durations: Array) -> int:
         """Number of the phase to refine: the first that departs or does not stop, or that fails.
 
-        What is left of the speed at a stop must not carry the phase that follows away, either.
-
-        Parameters
-        ----------
-        durations : (n_phases,) [s]
+        Speed left at a stop times the duration of the next phase counts as a departure, too.
         """
         assert self.failure is not None
         following = dict(enumerate(durations[1:].tolist(), start=1))
@@ -100,11 +79,11 @@ class ReplayCheck(NamedTuple):
 
 
 class Checked(NamedTuple):
-    """What the replay of a planning has shown."""
+    """Replay of a planning."""
 
     trajectory: Trajectory
-    strictly: ReplayCheck  # with some of what `verify` allows to spare
-    usually: ReplayCheck  # by what it allows
+    strictly: ReplayCheck  # by stricter tolerances than those of `verify`
+    usually: ReplayCheck  # by those
     scales: Scales
 
     @staticmethod
@@ -130,19 +109,10 @@ def replay_plan(
     report: Callable[[str], None],
     checked: Checked | None = None,
 ) -> tuple[Planning, Trajectory, ReplayFigures]:
-    """Replay a plan, refine the blocks that do not hold, and return what does, with its figures.
+    """Replay a plan and refine blocks until it holds; ReplayError if it does not.
 
-    Parameters
-    ----------
-    trajectory  that of `planning`
-    build       gives the trajectory of another planning
-    report      told in a few words what is being done
-    checked     what the first replay has shown, if it is known. Then it is enough that it is
-                accepted.
-
-    Raises
-    ------
-    ReplayError  if a block does not hold with finer intervals either
+    `build` gives the trajectory of another planning. If the first replay is known (`checked`), the
+    tolerances of `verify` are enough for it.
     """
     problem = planning.problem
     simulations, known = 0, None
@@ -177,10 +147,10 @@ def replay_plan(
 def _improve(
     planning: Planning, number: int, fails: bool, report: Callable[[str], None]
 ) -> Planning | None:
-    """Another plan of the block with phase `number`, if any; `fails`: the plan is not accepted."""
+    """Another plan of the block with phase `number`, if any; `fails` by the usual tolerances."""
     alone = plan_alone(planning, report) if fails else None
     if alone is not None:
-        # Short phases that a landing leaves magnify what is left of the speed at its stop.
+        # Short phases after a landing magnify its residual speed.
         return alone
     index = planning.find_block(number)
     block, refined = planning.blocks[index], None
@@ -195,18 +165,16 @@ def _improve(
 def _press_more(
     planning: Planning, number: int, check: ReplayCheck, report: Callable[[str], None]
 ) -> Planning | None:
-    """A plan of the block with phase `number` in whose replay c_n may fall by what it does now.
+    """A plan of the block with phase `number` with more c_n, by the shortfall in its replay.
 
-    Where a contact slides the other way a replay may stick for an instant, with another force.
+    At a reversal a replay may stick for an instant, with another force.
     """
     index, problem = planning.find_block(number), planning.problem
     if not isinstance(check.report, Report) or index in planning.more:
         return None
     block, force = planning.blocks[index], problem.scene.scales.force
-    own = [
-        phase for phase in check.report.phases if problem.phases[phase.number - 1] in block.phases
-    ]
-    short = -min((c.margin for phase in own for c in phase.contacts), default=0.0)
+    phases = [p for p in check.report.phases if problem.phases[p.number - 1] in block.phases]
+    short = -min((c.margin for phase in phases for c in phase.contacts), default=0.0)
     if not 0.0 < short < DIP * force:
         return None
     try:
@@ -218,13 +186,7 @@ def _press_more(
 def check_plan(
     problem: Problem, trajectory: Trajectory, *allowances: Allowance
 ) -> list[ReplayCheck]:
-    """Replay a plan, and see what its samples leave of the equations of motion.
-
-    Returns
-    -------
-    list of Check
-        By each of the allowances.
-    """
+    """Replay of a plan by each of the tolerances, and residual of the equations of motion."""
     residual = find_residual(problem, trajectory)
     try:
         seen = observe(problem, trajectory.torque, trajectory)
@@ -234,12 +196,12 @@ def check_plan(
 
 
 def find_residual(problem: Problem, trajectory: Trajectory) -> Residual:
-    """What the samples of a trajectory leave of the equations of motion, at worst."""
+    """Largest residual of the equations of motion at the samples of a trajectory."""
     if len(trajectory.t) < DENSE / 2 * len(trajectory.motions):
         trajectory = assemble(trajectory.motions, trajectory.torque, {}, DENSE)
     worst = Residual(0.0, 1, "")
     for phase in problem.phases:
-        # Where it is held at its end forces are not determined.
+        # Forces are not determined in a dwell.
         rows = (trajectory.phase == phase.index) & ~trajectory.held
         formation, motion = phase.formation, trajectory.motions[phase.index]
         columns = [trajectory.contacts.index(name) for name in motion.contacts]
@@ -272,7 +234,7 @@ def _refine(
 
 
 def _describe(block: BlockPlan, number: int, check: ReplayCheck) -> str:
-    """The error for a plan that does not hold, from phase `number` of a block on."""
+    """Message on a plan that fails in phase `number`."""
     assert check.failure is not None
     reason = check.failure[1]
     finer = f", with {2**block.finer} times the intervals" if block.finer > 0 else ""
@@ -283,7 +245,7 @@ def _describe(block: BlockPlan, number: int, check: ReplayCheck) -> str:
 
 
 def _collect_figures(planning: Planning, check: ReplayCheck, simulations: int) -> ReplayFigures:
-    """What a plan keeps of its replay."""
+    """Figures of a replay for the plan."""
     assert isinstance(check.report, Report)
     found = [(find_least_force(phase), phase.number) for phase in check.report.phases]
     known = [(least, number) for least, number in found if least is not None]

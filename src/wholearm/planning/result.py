@@ -1,4 +1,4 @@
-"""The result of planning: a plan, what it was asked, what it has cost and what its replay shows."""
+"""The result of planning: a plan with its problem, options, statistics and replay."""
 
 from __future__ import annotations
 
@@ -14,14 +14,10 @@ from numpy.typing import ArrayLike
 
 from ..common.document import Document, Drawn, Result
 from ..problem.definition import Problem
-from ..results.certificate import Certificate
 from ..results.dwell_record import Settling
-from ..results.mode_names import ModeSpan
-from ..results.range_figures import RangeFigures
-from ..results.replay_figures import ReplayFigures
+from ..results.plan_record import Certificate, ModeSpan, RangeFigures, ReplayFigures, Transition
 from ..results.report import UniquenessMargin
 from ..results.trajectory import Samples, Trajectory
-from ..results.transition import Transition
 from ..solvers.statistics import SolverStatistics
 from .options import Objective, PlanOptions
 
@@ -54,32 +50,24 @@ class PlannedPhase(NamedTuple):
     duration: float  # [s]
     rolling: tuple[str, ...]  # contacts that the problem lets roll
     modes: tuple[ModeSpan, ...]  # contact modes in the time domain; none along a curve
-    # sequences of modes that were tried; of phases planned as one booked to the first
-    sequences: int
+    sequences: int  # of modes that were tried; of phases in one NLP booked to the first
     complete: bool  # whether every sequence of modes that promised to be better was tried
     attempt: str  # the guess that it was found from, in the time domain
-    # estimate of how far the value of the phases planned as one with this one is from their best,
-    # relative to it
-    error: float
-    # everything that was solved for this phase, or for phases planned as one from this one on: for
-    # the plan itself and on the way to it, for its refinement and to assess its impacts
-    statistics: SolverStatistics
+    error: float  # estimated relative error of the value, of all phases in one NLP with this one
+    statistics: SolverStatistics  # of all solves for this phase, or for a block from this one on
     # of its contact forces; None in files of earlier versions
     uniqueness_margin: UniquenessMargin | None = None
     # [s]: for how long friction could hold everything at rest; None if it does not begin so
     wedged: float | None = None
-    # how its end is held, if it is to be; `duration` includes that
-    settling: Settling | None = None
-    # `value` with torques that are not held over control periods, if they are
-    unheld: float | None = None
+    settling: Settling | None = None  # dwell at its end, included in `duration`
+    unheld: float | None = None  # `value` with free torques, if they are held over periods
 
 
 class Timings(NamedTuple):
     """Seconds that planning took."""
 
-    # trace, plan, replay, assess: tracing curves; everything up to the first plan; its replay, with
-    # what that made plan again, which is in `plan` where a search has replayed the parts of a
-    # route; what impacts save
+    # trace, plan, replay, assess: tracing curves; everything up to the first plan; its replay with
+    # refinements (in `plan` where a search has replayed parts of a route); gains of impacts
     trace: float
     build: float  # build, solve: building NLPs and solving them, in all of these
     solve: float

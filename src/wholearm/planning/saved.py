@@ -1,4 +1,4 @@
-"""Plans in files: what a plan is but for its motion, as the `meta` of its trajectory."""
+"""Plans in files: all of a plan but its motion, as the `meta` of its trajectory."""
 
 from __future__ import annotations
 
@@ -11,12 +11,9 @@ from ..common.errors import InputError
 from ..common.plain import plain, restore
 from ..problem.definition import Problem
 from ..problem.read import read_own_problem
-from ..results.certificate import Certificate
-from ..results.range_figures import RangeFigures
-from ..results.replay_figures import ReplayFigures
+from ..results.plan_record import Certificate, RangeFigures, ReplayFigures, Transition
 from ..results.trajectory import Trajectory
 from ..results.trajectory_file import load_trajectory
-from ..results.transition import Transition
 from ..solvers.statistics import SolverStatistics
 from .options import PlanOptions
 from .result import Plan, PlannedPhase, Status, Timings
@@ -41,12 +38,11 @@ _STATISTICS = {
     "solve_times": "solve_time",
 }  # fmt: skip
 """Likewise of solving; missing ones are zero."""
-_UNITS = ("m", "rad", "s")
-"""What files call the fields of deviations."""
+_UNITS = ("m", "rad", "s")  # what files call the fields of deviations
 
 
 def write_meta(plan: Plan) -> dict[str, Any]:
-    """What a plan is but for its motion, in plain values for its file."""
+    """All of a plan but its motion, in plain values."""
     phases, options = plan.phases, plan.options
     values: dict[str, Any] = plain(
         {
@@ -79,10 +75,7 @@ def write_meta(plan: Plan) -> dict[str, Any]:
 
 
 def load_plan(path: str | os.PathLike[str]) -> Plan:
-    """Read the plan that a trajectory file holds.
-
-    What files of earlier versions do not say is taken to be as by default: options, and numbers of
-    what was solved as none.
+    """Read the plan of a trajectory file, with defaults for values that older files do not have.
 
     Raises
     ------
@@ -142,7 +135,6 @@ def _read(trajectory: Trajectory, problem: Problem) -> Plan:
         for k in range(count)
     )
     replay, timings = meta.get("replay"), meta.get("timings", {})
-    certificate, ranges = meta.get("certificate"), meta.get("ranges")
     return Plan(
         problem,
         options,
@@ -154,6 +146,6 @@ def _read(trajectory: Trajectory, problem: Problem) -> Plan:
         None if replay is None else _read_replay(replay),
         Timings(*(float(timings.get(name, 0.0)) for name in Timings._fields)),
         dict(meta.get("versions", {})),
-        restore(Certificate | None, certificate),
-        restore(RangeFigures | None, ranges),
+        restore(Certificate | None, meta.get("certificate")),
+        restore(RangeFigures | None, meta.get("ranges")),
     )

@@ -1,4 +1,4 @@
-"""Phases that are planned with stops between some of them, in either domain."""
+"""Splitting of phases into blocks, and plans with stops inside a block."""
 
 from __future__ import annotations
 
@@ -29,21 +29,13 @@ def plan_stops(
     options: PlanOptions,
     duration: float | None = None,
 ) -> Plans:
-    """Plan phases of a block with a stop before some of them.
+    """Plan phases of a block with a stop before some of them; raises without a plan.
 
     Parameters
     ----------
-    plan_part       see `PlanPart`
-    bounds          indices in the block of the phases that start at rest, and what follows the last
-                    one
-    z : (5,)        where the first of them starts
-    duration : [s]  longest duration in all, for the objective `margin`: parts between stops share
-                    it in proportion to their least times
-
-    Raises
-    ------
-    InfeasibleError  if a part has no plan, or the duration is shorter than the least time
-    SolverError      if the solver stops without an answer
+    bounds          indices in the block of the phases that start at rest, and the end of the last
+    z : (5,)        start
+    duration : [s]  longest in all, for `margin`: shared in proportion to the parts' least times
     """
     parts = list(pairwise(bounds))
     allowed = [duration] * len(parts)
@@ -85,14 +77,8 @@ def end_of(plan: PhasePlan[Motion]) -> tuple[Array, Array]:
 
 def split_blocks(problem: Problem) -> list[tuple[Phase, ...]]:
     """Phases that have to be planned together: those joined smoothly or by impacts."""
-    blocks: list[tuple[Phase, ...]] = []
-    block: tuple[Phase, ...] = ()
-    for phase in problem.phases:
-        block = (*block, phase)
-        if phase.end is End.REST:
-            blocks.append(block)
-            block = ()
-    return blocks
+    rests = [k + 1 for k, phase in enumerate(problem.phases) if phase.end is End.REST]
+    return [problem.phases[start:stop] for start, stop in pairwise([0, *rests])]
 
 
 def runs_along_curves(block: Sequence[Phase], options: PlanOptions) -> bool:
@@ -110,10 +96,7 @@ def runs_along_curves(block: Sequence[Phase], options: PlanOptions) -> bool:
 
 
 def leads_on(problem: Problem, block: Sequence[Phase], options: PlanOptions) -> bool:
-    """Whether what follows a block in the time domain is planned there, too.
-
-    Where it can begin is then known of the plans of least duration alone.
-    """
+    """Whether a block in the time domain is followed by another one."""
     following = problem.phases[block[-1].index + 1 :]
     own = next((part for part in split_blocks(problem) if part[0] in following), None)
     return own is not None and not runs_along_curves(own, options)

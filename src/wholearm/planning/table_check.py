@@ -1,4 +1,4 @@
-"""Torque tables checked by replaying them: what rows, or samples at a rate, do to a plan."""
+"""Torque tables and sampled torques of a plan, verified by simulation."""
 
 from __future__ import annotations
 
@@ -18,19 +18,16 @@ from ..verification.margins import describe_motors, find_commands
 from ..verification.verdict import Allowance, find_least_force
 from ..verification.verify import judge, observe
 
-FINER = 8.0
-"""Divisor of the error of the rows of a table when its replay does not hold."""
-ATTEMPTS = 3
-"""Most tables that are tried."""
+FINER = 8.0  # divisor of the error of the rows of a table when its replay does not hold
+ATTEMPTS = 3  # most tables that are tried
 
 
 class TorqueTable(NamedTuple):
     """Rows of torques, and what their replay does."""
 
     rows: Array  # (n, 3) [s, N m, N m]: t, tau_1 and tau_2; a time given twice is a step
-    # plain values: number of rows, rate and interpolation of samples, and from the replay whether
-    # it holds, why, and the arrival and the least normal force of each phase beside those of the
-    # plan
+    # plain values: rows, rate, interpolation, and of the replay whether it holds, why, and arrival
+    # and least normal force of each phase and of the plan's
     figures: dict[str, Any]
     commands: Array | None = None  # (n, 2) [N m]: what motors that lag are told at these times
 
@@ -46,23 +43,18 @@ def _list_commands(problem: Problem, trajectory: Trajectory, rows: Array) -> Arr
 
 
 def make_table(problem: Problem, trajectory: Trajectory, replay: bool = True) -> TorqueTable:
-    """Rows from which a replay gives the plan back, as dense as that takes.
-
-    Parameters
-    ----------
-    replay  whether to replay them
+    """Rows as dense as a simulation of them needs to hold.
 
     Raises
     ------
-    ReplayError                    if the replay of the table loses a contact or misses the goal,
-                                   however dense its rows are
+    ReplayError                    if the replay loses a contact or misses the goal with any rows
     JammingError, SimulationError  if the simulation cannot go on
     """
     slow = problem.scene.has_slow_motors
     rate_limit = problem.scene.torque_rate_limit if slow else None
     least, error = ERROR / FINER ** (ATTEMPTS - 1), ERROR
     rows = place_rows(trajectory.torque, error, rate_limit)
-    # Commands step where the slopes of lines do: what motors can follow is known without a replay.
+    # Commands step where the slopes of lines do, so that motors' limits need no replay.
     while error > least and describe_motors(problem, read_rows(rows)):
         error /= 2
         rows = place_rows(trajectory.torque, error, rate_limit)
@@ -89,20 +81,9 @@ def make_table(problem: Problem, trajectory: Trajectory, replay: bool = True) ->
 
 
 def sample_table(
-    problem: Problem,
-    trajectory: Trajectory,
-    rate: float,
-    interpolation: str,
-    replay: bool = True,
+    problem: Problem, trajectory: Trajectory, rate: float, interpolation: str, replay: bool = True
 ) -> TorqueTable:
-    """Samples of a plan's torques at a rate [Hz], and what becomes of the motion with them.
-
-    That they lose contacts or miss the goal is a result and not an error.
-
-    Raises
-    ------
-    InputError  if the rate or the interpolation is not one that is allowed
-    """
+    """Samples of a plan's torques at a rate [Hz], and their replay, whose failure is no error."""
     rows = sample_rows(trajectory.torque, rate, interpolation)
     commands = _list_commands(problem, trajectory, rows)
     figures: dict[str, Any] = {
@@ -111,43 +92,31 @@ def sample_table(
         "interpolation": interpolation,
         "replay": None,
     }
-    if not replay:
-        return TorqueTable(rows, figures, _list_commands(problem, trajectory, rows))
-    try:
-        seen = observe(problem, read_rows(rows), trajectory)
-    except (JammingError, SimulationError) as error:
-        return TorqueTable(
-            rows, figures | {"replay": {"ok": False, "reason": str(error), "phases": []}}, commands
-        )
-    report = judge(seen._replace(plan=None), Allowance())
-    return TorqueTable(rows, figures | {"replay": _compare(trajectory, report)}, commands)
+    if replay:
+        try:
+            seen = observe(problem, read_rows(rows), trajectory)
+            report = judge(seen._replace(plan=None), Allowance())
+            figures["replay"] = _compare(trajectory, report)
+        except (JammingError, SimulationError) as error:
+            figures["replay"] = {"ok": False, "reason": str(error), "phases": []}
+    return TorqueTable(rows, figures, commands)
 
 
 def _compare(trajectory: Trajectory, report: Report) -> dict[str, Any]:
     """Arrival and least normal force of each phase of a replay, beside those of the plan."""
-    return {
-        "ok": report.ok,
-        "reason": report.reason,
-        "phases": [
-            _compare_phase(trajectory, index, report) for index in range(len(trajectory.motions))
-        ],
-    }
-
-
-def _compare_phase(trajectory: Trajectory, index: int, report: Report) -> dict[str, Any]:
-    c_n = trajectory.c_n[trajectory.phase == index]
-    found: dict[str, Any] = {
-        "phase": index + 1,
-        "planned_arrival": float(trajectory.phase_starts[index + 1]),
-        "arrival": None,
-        "planned_least_c_n": float(np.nanmin(c_n)),
-        "least_c_n": None,
-        "contact": None,
-    }
-    if index < len(report.phases):
-        phase = report.phases[index]
-        least = find_least_force(phase)
-        found["arrival"] = phase.arrival
-        if least is not None:
-            found |= {"least_c_n": least.least, "contact": least.contact}
-    return found
+    phases = []
+    for index in range(len(trajectory.motions)):
+        phase = report.phases[index] if index < len(report.phases) else None
+        least = find_least_force(phase) if phase else None
+        planned = trajectory.c_n[trajectory.phase == index]
+        phases.append(
+            {
+                "phase": index + 1,
+                "planned_arrival": float(trajectory.phase_starts[index + 1]),
+                "arrival": phase.arrival if phase else None,
+                "planned_least_c_n": float(np.nanmin(planned)),
+                "least_c_n": least.least if least else None,
+                "contact": least.contact if least else None,
+            }
+        )
+    return {"ok": report.ok, "reason": report.reason, "phases": phases}

@@ -1,20 +1,19 @@
-"""The law of a phase along a curve: joints say where on it the hand is, and how fast.
+"""Control laws of a policy: along a curve, over time, and with measured contact forces.
 
-A table over the arc length s has the joint angles, the reference b = s'^2, torques and limits; the
-last two are affine in a, b, s' and the squeeze (`curve_rows`). A step
+Along a curve a table over the arc length s has joint angles, the reference b = s'^2, torques and
+limits, affine in a, b, s' and the internal force (`curve_rows`). Each period of `CurveLaw`
 
-* projects the joint angles onto the table, next to where they were, and the joint speeds along it;
-* predicts both for the middle of the time in which its torques hold;
-* asks for a = the reference's mean a over that time + gains on the reference's speed less s';
-* takes the squeeze with the largest least level of all limits, and where that is below `LEVEL`
-  goes back from a towards the reference as far as it takes.
+* projects joint angles and speeds onto the table: s and s';
+* predicts both for the middle of the interval in which its torques are held;
+* asks for a = mean reference a + proportional and integral feedback on the speed;
+* takes the internal force with the largest least level of all limits and, if that level is below
+  `LEVEL`, moves a towards the reference until it is kept.
 
-At the end the motion goes on at touching speed, a little faster the longer it takes, until the
-joints stop and stay so while the drive rises, or until they are well beyond: the contact is made.
-From then on torques are those of the next law with no speed wanted, until the joints have stood
-still. Without a next law along a curve, torques that were found before hold in the same way.
+At the end the motion continues at touching speed until the joints stop while the drive rises, or
+until they are well beyond the end: the contact is made. The torques of the next law then hold the
+joints at rest; without one along a curve, stored torques do.
 
-Plain numbers and lists are several times as fast as arrays that are as short as these.
+Plain numbers and lists are several times as fast as arrays of this size.
 """
 
 from __future__ import annotations
@@ -24,87 +23,62 @@ from collections.abc import Mapping, Sequence
 from math import ceil, isfinite, sqrt
 from typing import Any, NamedTuple
 
-SAME = 1e-12
-"""Difference of levels that is none."""
-SMOOTH = 0.3
-"""Part of a bias that the last sample makes up."""
-FELT = 0.1
-"""Force with which a contact presses, over the mean of all."""
-FEW = 0.2
-"""Least force that is aimed at, over the mean of all: a part of less is no measure."""
-SHARE = 0.3
-"""Part of the torque limits that feedback adds at most."""
-END_INTEGRAL = 30.0
-"""Gain on the integral of what the angles are off at the end, over that on the angles [1/s]."""
+SAME = 1e-12  # difference of levels that counts as none
+SMOOTH = 0.3  # weight of the last sample in the bias of a force
+FELT = 0.1  # measured force of a closed contact, over the mean of all
+FEW = 0.2  # least reference force, over the mean of all
+SHARE = 0.3  # largest feedback torque, over the torque limit
+END_INTEGRAL = 30.0  # gain on the integral of the final angle error, over that on the error [1/s]
+# Level of limits below which feedback is reduced: absolute, and over that of the reference.
 LEVEL, PART = 1.0, 0.5
-"""Level of limits below which feedback gives way, in reserves: at most the first, and at most the
-second times that of the reference, which may have less."""
-LEAST = 0.3
-"""Level of limits at an arrival, of all contacts, that is worth another squeeze."""
-IGNORED = 1e6
-"""Level from which on a limit is none."""
-CORRECTION = 0.25
-"""Gain on the speed, times the period and the delay."""
-MEMORY = 0.2
-"""Gain on the integral of the speed, over the square of that on the speed."""
-LEAST_SPEED = 0.4
-"""Part of the touching speed below which braking never aims: friction turns round with motion."""
-SLOW = 0.5
-"""Part of the reference's speed below which the motion does not brake with it."""
-LAST = 0.02
-"""Part of the curve, at its end, on which standing still counts as having arrived."""
-STARTING = 10
-"""Periods in which the motion may start before standing still counts."""
-THERE = 1e-3
-"""How much before its end the curve counts as run through, over its length."""
-NEAR = 0.1
-"""Part of the curve, at its end, in which an impact may be, where the end is passed at speed."""
-LATE = 5.0
-"""Periods after which it counts as over, where the joints do not show it."""
-SHORT = 4.0
-"""How many times as long the joints have to stand still short of that."""
-CATCH = 10.0
-"""Way in which the reference's place becomes the motion's, over how far off the start is."""
-GROWTH, FASTEST = 0.01, 4.0
-"""Time over which the wanted speed grows with the way beyond the end [s], up to so many times the
-touching speed."""
-STOPPED = 0.3
-"""Part of the touching speed below which the joints have been stopped."""
-DRIVE, RISE = 0.3, 2
-"""Drive that joints withstand where a contact is made, over the largest a of the integral, and the
-periods in which it rises to that."""
-LONGEST = 3.0
-"""Times the least time of standing still after which joints are let creep."""
-BARRED = 0.1
-"""Deceleration along the next curve, likewise, from which on a contact stops the joints."""
+LEAST = 0.3  # least level with the gained contact that changes the internal force
+IGNORED = 1e6  # level from which on a limit is left out
+CORRECTION = 0.25  # gain on the speed, times the sum of period and delay
+MEMORY = 0.2  # gain on the integral of the speed, over the square of that on the speed
+LEAST_SPEED = 0.4  # least speed while braking, over the touching speed: no reversal of friction
+SLOW = 0.5  # speed over the reference's below which the motion does not brake with it
+LAST = 0.02  # last part of the curve, on which standing still counts as arrival
+STARTING = 10  # periods after the start in which standing still does not count
+THERE = 1e-3  # last part of the curve that counts as its end
+NEAR = 0.1  # last part of the curve in which an impact is expected, if the end is passed at speed
+LATE = 5.0  # periods after which an impact counts as over, if the joints do not show it
+SHORT = 4.0  # factor on the dwell time if the joints stop before the end
+CATCH = 10.0  # distance over which the reference is shifted, over the error of the start
+GROWTH = 0.01  # time over which the touching speed grows beyond the end [s]
+FASTEST = 4.0  # largest factor of that growth
+STOPPED = 0.3  # speed over the touching speed below which the joints have stopped
+DRIVE = 0.3  # drive that stopped joints have to withstand, over the largest a of the integral
+RISE = 2  # periods in which the drive rises to that
+LONGEST = 3.0  # least dwell times after which joints may creep
+BARRED = 0.1  # deceleration along the next curve, over the same, by which a contact stops joints
+# Distance beyond the end at which a contact is made, as time at touching speed [s]: if it does not
+# stop the joints, if it is there at the beginning, if it stops them.
 SOON, AHEAD, FAR = 0.02, 0.05, 0.3
-"""How far beyond the end a contact is surely made, in the way at touching speed in these times [s]:
-one that does not stop the joints, one that is there at the beginning, one that stops them."""
 Rows = list[list[float]]
 
 
 class CurveLaw:
-    """The law of one phase, of which none is passed before it is over.
+    """Control law of one phase along a curve.
 
     Parameters
     ----------
     tables  `s`, (n,); `theta`, (n, 2); `b`, (n,), at nodes; `levels`, (n - 1, 2, m, 5), and
-            `torque`, (n - 1, 2, 2, 5), at both ends of the intervals; `push`, (2,); `passes`, (1,),
-            not zero where the end is passed at speed; `keeps`, (1,), not zero where `push` is held
-            until the next law begins; `arrival`, (k, 5), levels of all contacts where they are made
+            `torque`, (n - 1, 2, 2, 5), at both ends of the intervals; `push`, (2,), final torques;
+            `passes`, (1,): the end is passed at speed; `keeps`, (1,): `push` is held until the next
+            law begins; `arrival`, (k, 5), levels of all contacts at the end
 
     Attributes
     ----------
-    over, pushes  whether the next phase may begin, and whether the contact is being pressed
+    over, pushes  whether the next phase may begin, and whether the contact has been made
     after         the law of the next phase, if it is along a curve
-    s, v, level   place and speed along the curve, and the least level, at the last step
+    s, v, level   arc length, speed and least level at the last step
     """
 
     count, passed = 1, 0
 
-    def __init__(self, tables: Mapping[str, Any], pace: LoopSettings) -> None:
+    def __init__(self, tables: Mapping[str, Any], settings: LoopSettings) -> None:
         self.passes = bool(tables["passes"][0])
-        self.pace, self.nodes = pace, tables["s"].tolist()
+        self.settings, self.nodes = settings, tables["s"].tolist()
         self.length = self.nodes[-1]
         self.theta, self.b = tables["theta"].tolist(), tables["b"].tolist()
         self.push = tuple(tables["push"].tolist())
@@ -120,8 +94,8 @@ class CurveLaw:
         self.levels, self.level_rises = _split(tables["levels"], IGNORED)
         self.torque, self.torque_rises = _split(tables["torque"])
         self.floor = self._find_floor()
-        self.gain = CORRECTION / (pace.period + pace.delay)
-        self.memory = MEMORY * self.gain**2 * pace.period
+        self.gain = CORRECTION / (settings.period + settings.delay)
+        self.memory = MEMORY * self.gain**2 * settings.period
         self.turn: tuple[float, float] | None = None
         self.after: CurveLaw | None = None
         self.beyond = 0.0
@@ -129,26 +103,25 @@ class CurveLaw:
         self.begin()
 
     def lead_to(self, after: CurveLaw) -> None:
-        """Let another law follow.
+        """Set the next law, and the distance beyond the end that shows the contact.
 
-        Where the torques with which a contact is made would go on along the next curve, the joints
-        are not stopped by it, and the way beyond the end that tells it is short.
+        It is short where the final torques drive the joints on along the next curve.
         """
         if self.passes:
             self.turn = after.chords[0]
         if self.passes or self.keeps:
             return
         self.after = after
-        tau = self._act(len(self.steps) - 1, 1.0, 0.0, 0.0, self.gain * self.pace.touch, True)
+        tau = self._act(len(self.steps) - 1, 1.0, 0.0, 0.0, self.gain * self.settings.touch, True)
         a, _ = find_motion(after.torque[0], tau)
-        self.beyond = (FAR if a < -BARRED * self.pace.most else SOON) * self.pace.touch
+        self.beyond = (FAR if a < -BARRED * self.settings.most else SOON) * self.settings.touch
 
     def begin(self, at_end: bool = False) -> None:
         """Start anew, at the beginning or just before the end."""
         self.j = len(self.steps) - 1 if at_end else 0
         self.over = self.pushes = False
         self.sum = self.a = self.ran = self.rested = self.drive = self.held = 0.0
-        self.limit = AHEAD * self.pace.touch if at_end else self.beyond
+        self.limit = AHEAD * self.settings.touch if at_end else self.beyond
         self.s, self.v, self.level = self.nodes[self.j], 0.0, 0.0
         self.off, self.fresh = 0.0, not at_end
         if self.sensing is not None:
@@ -159,16 +132,16 @@ class CurveLaw:
     ) -> tuple[float, float]:
         """Torques for joint angles and speeds [N m]."""
         self._measure(float(theta[0]), float(theta[1]), float(rates[0]), float(rates[1]))
-        pace, s, v, j = self.pace, self.s, self.v, self.j
+        settings, s, v, j = self.settings, self.s, self.v, self.j
         if self.pushes:
             return self._press(theta, rates)
         if self.sensing is not None:
             self.sensing.measure(forces)
         if self.fresh:
             self.fresh, self.off = False, s
-        self.ran += pace.period
-        half = 0.5 * pace.period
-        lead = pace.delay + half
+        self.ran += settings.period
+        half = 0.5 * settings.period
+        lead = settings.delay + half
         s += lead * (v + 0.5 * lead * self.a)
         v += lead * self.a
         if self.passes:
@@ -182,35 +155,37 @@ class CurveLaw:
         off = self.off
         place = s - off * max(1.0 - (s - off) / (CATCH * abs(off)), 0.0) if off else s
         b = self._look(j, place)
-        wanted = max(sqrt(b) if b > 0.0 else 0.0, pace.touch)
+        wanted = max(sqrt(b) if b > 0.0 else 0.0, settings.touch)
         if self.after is not None:
-            wanted += min(max(s - self.length, 0.0) / GROWTH, FASTEST * pace.touch)
+            wanted += min(max(s - self.length, 0.0) / GROWTH, FASTEST * settings.touch)
         error = wanted - v
-        way = half * max(v, pace.touch)
-        planned = (self._look(j, place + way) - self._look(j, place - way)) / (4.0 * way)
+        reach = half * max(v, settings.touch)
+        planned = (self._look(j, place + reach) - self._look(j, place - reach)) / (4.0 * reach)
         j, share = self._locate(j, s)
         if planned < 0.0 and v < SLOW * wanted:
             planned = 0.0
-        self.sum = min(max(self.sum + self.memory * error, -pace.most), pace.most)
+        self.sum = min(max(self.sum + self.memory * error, -settings.most), settings.most)
         a = planned + self.gain * error + self.sum + self.drive
-        slowest = (LEAST_SPEED * pace.touch - (v - half * self.a)) / (pace.period + pace.delay)
+        slowest = (LEAST_SPEED * settings.touch - (v - half * self.a)) / (
+            settings.period + settings.delay
+        )
         return self._act(j, share, v, planned, max(a, slowest), s >= self.length)
 
     def hold(self, theta: Sequence[float], rates: Sequence[float]) -> tuple[float, float]:
         """Torques that press this law's contacts and bring the joints to rest [N m]."""
         self._measure(float(theta[0]), float(theta[1]), float(rates[0]), float(rates[1]))
-        v = self.v + (self.pace.delay + 0.5 * self.pace.period) * self.a
+        v = self.v + (self.settings.delay + 0.5 * self.settings.period) * self.a
         j, share = self._locate(self.j, self.s)
         return self._act(j, share, v, 0.0, -self.gain * v)
 
     def _is_made(self, s: float, v: float) -> bool:
         """Whether the contact is made, or the end is reached; `s` and `v` are predicted."""
-        touch, near = self.pace.touch, s > (1.0 - LAST) * self.length
-        started = self.ran > STARTING * self.pace.period
+        touch, near = self.settings.touch, s > (1.0 - LAST) * self.length
+        started = self.ran > STARTING * self.settings.period
         if self.after is None:
-            slow = started and near and self.v < self.pace.still
+            slow = started and near and self.v < self.settings.still
             return slow or (s >= self.length and v < 3.0 * touch)
-        rise = DRIVE * self.pace.most
+        rise = DRIVE * self.settings.most
         if started and near and self.v < STOPPED * touch:
             self.drive += rise / RISE
         else:
@@ -220,15 +195,15 @@ class CurveLaw:
 
     def _measure(self, one: float, two: float, rate_one: float, rate_two: float) -> None:
         """Place and speed: the joints' projection on the chords next to the last one."""
-        j, last, way = self.j, len(self.chords) - 1, 0
+        j, last, sign = self.j, len(self.chords) - 1, 0
         while True:
             node, (e, f), square = self.theta[j], self.chords[j], self.squares[j]
             share = ((one - node[0]) * e + (two - node[1]) * f) / square
-            # At a bend two chords may point at one another: none is looked at twice.
-            if share > 1.0 and j < last and way >= 0:
-                j, way = j + 1, 1
-            elif share < 0.0 and j > 0 and way <= 0:
-                j, way = j - 1, -1
+            # At a bend two chords may point at one another: the search keeps its direction.
+            if share > 1.0 and j < last and sign >= 0:
+                j, sign = j + 1, 1
+            elif share < 0.0 and j > 0 and sign <= 0:
+                j, sign = j - 1, -1
             else:
                 break
         h = self.steps[j]
@@ -236,17 +211,17 @@ class CurveLaw:
         self.v = (rate_one * e + rate_two * f) / square * h
 
     def _has_turned(self, rates: Sequence[float]) -> bool:
-        """Whether an impact has turned the joints' motion to where the next curve leads them."""
+        """Whether an impact has turned the joint velocity to the direction of the next curve."""
         if self.s < (1.0 - NEAR) * self.length or self.turn is None:
             return False
-        if self.s > self.length + LATE * self.pace.period * self.v:
+        if self.s > self.length + LATE * self.settings.period * self.v:
             return True
         (e, f), (g, h), (one, two) = self.chords[-1], self.turn, rates
         across = abs(one * f - two * e) / sqrt(self.squares[-1])
         return bool(abs(one * h - two * g) / sqrt(g * g + h * h) < across)
 
     def _locate(self, j: int, s: float) -> tuple[int, float]:
-        """Interval of a place, looked for from interval `j` on, and the share of it, 0 to 1."""
+        """Interval of a place, searched from interval `j`, and the share of it, 0 to 1."""
         nodes, last = self.nodes, len(self.steps) - 1
         while j < last and s > nodes[j + 1]:
             j += 1
@@ -260,20 +235,22 @@ class CurveLaw:
         return float(self.b[j] + share * (self.b[j + 1] - self.b[j]))
 
     def _find_floor(self) -> list[float]:
-        """Level on each interval below which feedback gives way."""
+        """Level on each interval below which feedback is reduced."""
         found = []
         for j, h in enumerate(self.steps):
             b, after = self.b[j], self.b[j + 1]
             a, level = (after - b) / (2 * h), 1e30
-            for share, own in ((0.0, b), (1.0, after)):
-                level = min(level, choose_squeeze(*self._list_levels(j, share, sqrt(own)), a)[0])
+            for share, b_end in ((0.0, b), (1.0, after)):
+                level = min(
+                    level, choose_internal_force(*self._list_levels(j, share, sqrt(b_end)), a)[0]
+                )
             found.append(min(LEVEL, PART * level))
         return found
 
     def _list_levels(
         self, j: int, share: float, v: float
     ) -> tuple[list[float], list[float], list[float]]:
-        """Levels at a place and a speed without a and squeeze, and their changes with these."""
+        """Levels at a place and a speed, and their coefficients of a and internal force."""
         b = v * v
         base, rates, press = [], [], []
         for (c, cb, cv, ca, cl), (d, db, dv, da, dl) in zip(
@@ -287,27 +264,27 @@ class CurveLaw:
     def _act(
         self, j: int, share: float, v: float, planned: float, a: float, beyond: bool = False
     ) -> tuple[float, float]:
-        """Torques for an acceleration, as far as limits allow it; those of the arrival `beyond`."""
+        """Torques for an acceleration within limits; `beyond` the end with those of the arrival."""
         b = v * v
         base, rates, press = self._list_levels(j, share, v)
-        level, squeeze = choose_squeeze(base, rates, press, a)
+        level, internal = choose_internal_force(base, rates, press, a)
         floor = self.floor[j]
         if level < floor:
-            safe, other = choose_squeeze(base, rates, press, planned)
+            safe, other = choose_internal_force(base, rates, press, planned)
             if safe > floor:
-                # Least levels are concave in a: this part of the way keeps the level.
+                # The least level is concave in a: this interpolation keeps the floor.
                 a = planned + (safe - floor) / (safe - level) * (a - planned)
-                level, squeeze = choose_squeeze(base, rates, press, a)
+                level, internal = choose_internal_force(base, rates, press, a)
             elif safe > level:
-                a, level, squeeze = planned, safe, other
+                a, level, internal = planned, safe, other
         elif beyond:
             for c, cb, cv, ca, cl in self.arrival:
                 base.append(c + cb * b + cv * v)
                 rates.append(ca)
                 press.append(cl)
-            both, other = choose_squeeze(base, rates, press, a)
+            both, other = choose_internal_force(base, rates, press, a)
             if both > LEAST:
-                level, squeeze = both, other
+                level, internal = both, other
         self.a, self.level = a, level
         tau, low, high = list[tuple[float, float]](), -1e30, 1e30
         for (c, cb, cv, ca, cl), (d, db, dv, da, dl) in zip(
@@ -315,65 +292,64 @@ class CurveLaw:
         ):
             moving = c + share * d + (cb + share * db) * b + (cv + share * dv) * v
             tau.append((moving + (ca + share * da) * a, cl + share * dl))
-        one, two = self.pace.limit
+        one, two = self.settings.limit
         if self.sensing is not None and self.sensing.heard and not beyond:
             for (moving, by), most in zip(tau, (one, two), strict=True):
                 if by:
                     ends = sorted(((-most - moving) / by, (most - moving) / by))
-                    low, high = max(low, ends[0] - squeeze), min(high, ends[1] - squeeze)
+                    low, high = max(low, ends[0] - internal), min(high, ends[1] - internal)
             if low <= high:
-                squeeze += self.sensing.shift((j, share, v, a, squeeze), low, high)
-        first, second = (moving + by * squeeze for moving, by in tau)
+                internal += self.sensing.shift((j, share, v, a, internal), low, high)
+        first, second = (moving + by * internal for moving, by in tau)
         return min(max(first, -one), one), min(max(second, -two), two)
 
     def _press(self, theta: Sequence[float], rates: Sequence[float]) -> tuple[float, float]:
-        """The torques at the end, until the joints have stood still."""
-        pace, tau, v, dwell = self.pace, self.push, self.v, self.pace.dwell
+        """Torques at the end, until the joints have been at rest for the dwell time."""
+        settings, tau, v, dwell = self.settings, self.push, self.v, self.settings.dwell
         if self.after is not None:
             tau = self.after.hold(theta, rates)
-            # Where friction is less than it may be, the joints creep on.
-            self.held += pace.period
+            # With low friction the joints creep on.
+            self.held += settings.period
             v = 0.0 if self.held > LONGEST * dwell else self.after.v
         elif self.s < (1.0 - THERE) * self.length:
             dwell *= SHORT
-        self.rested = self.rested + pace.period if abs(v) < pace.still else 0.0
-        self.over = self.rested > dwell + pace.delay
+        self.rested = self.rested + settings.period if abs(v) < settings.still else 0.0
+        self.over = self.rested > dwell + settings.delay
         return tau
 
 
 def _split(table: Any, most: float | None = None) -> tuple[list[Rows], list[Rows]]:
-    """Rows at the start of each interval and what they rise by, without those that never count."""
+    """Rows at the start of each interval and their differences, without ignored ones."""
     first, rises = table[:, 0], table[:, 1] - table[:, 0]
     if most is None:
         return first.tolist(), rises.tolist()
     counts = table[:, :, :, 0].min(axis=1) < most
-    pairs = zip(first, rises, counts, strict=True)
-    kept = [(rows[own].tolist(), rise[own].tolist()) for rows, rise, own in pairs]
-    return [rows for rows, _ in kept], [rise for _, rise in kept]
+    kept = [[r[k].tolist() for r, k in zip(a, counts, strict=True)] for a in (first, rises)]
+    return kept[0], kept[1]
 
 
 class LoopSettings(NamedTuple):
-    """What the laws of all phases have in common."""
+    """Settings that the laws of all phases share."""
 
     period: float  # [s]: of the control loop
-    delay: float  # [s]: time from measuring to when torques take effect, as far as it is known
+    delay: float  # [s]: from measuring to applying torques, as far as known
     touch: float  # [m/s]: speed s' at which contacts are made
     still: float  # [m/s]: speed s' that counts as none
-    dwell: float  # [s]: how long the joints stand still before the next phase begins
+    dwell: float  # [s]: time at rest before the next phase begins
     most: float  # [m/s^2]: largest a of the integral
     limit: tuple[float, float]  # [N m]: of the torques
 
 
 class MotionLaw:
-    """The law of phases that pass into one another in motion.
+    """Control law of phases that pass into one another in motion: tracking over time.
 
     Parameters
     ----------
     tables  `starts`, (m,), of the phases [s]; `step`, (1,), of the samples that follow [s];
-            `theta`, `rates`, `tau`, (n, 2); `gain`, (n, 2, 4), torques over what angles and speeds
-            are off, the last ones for when the end is held; `push`, (2,); `still`, (1,), the joint
-            speed that counts as none [rad/s]; `ways`, (f, 2), what the joints show of displacements
-            that contacts leave at the end, orthonormal
+            `theta`, `rates`, `tau`, (n, 2); `gain`, (n, 2, 4), on errors of angles and speeds, the
+            last one to hold the end; `push`, (2,), torques there; `still`, (1,), joint speed that
+            counts as none [rad/s]; `ways`, (f, 2), orthonormal basis of free joint displacements at
+            the end
 
     Attributes
     ----------
@@ -383,8 +359,8 @@ class MotionLaw:
 
     passes = False
 
-    def __init__(self, tables: Mapping[str, Any], pace: LoopSettings) -> None:
-        self.pace, self.starts = pace, tables["starts"].tolist()
+    def __init__(self, tables: Mapping[str, Any], settings: LoopSettings) -> None:
+        self.settings, self.starts = settings, tables["starts"].tolist()
         self.every, self.still = float(tables["step"][0]), float(tables["still"][0])
         self.theta, self.rates = tables["theta"].tolist(), tables["rates"].tolist()
         self.tau, self.gain = tables["tau"].tolist(), tables["gain"].tolist()
@@ -409,17 +385,17 @@ class MotionLaw:
         self, theta: Sequence[float], rates: Sequence[float], forces: Mapping[str, float] | None
     ) -> tuple[float, float]:
         """Torques for joint angles and speeds [N m]."""
-        pace, now = self.pace, self.clock
-        self.clock = now + pace.period
+        settings, now = self.settings, self.clock
+        self.clock = now + settings.period
         last = self.passed + 1
-        if last < len(self.starts) and now >= self.starts[last] - 0.5 * pace.period:
+        if last < len(self.starts) and now >= self.starts[last] - 0.5 * settings.period:
             self.passed = last
         if now >= self.end:
             stands = max(abs(rates[0]), abs(rates[1])) < self.still
-            self.rested = self.rested + pace.period if stands else 0.0
-            self.over = self.rested > pace.dwell + pace.delay
+            self.rested = self.rested + settings.period if stands else 0.0
+            self.over = self.rested > settings.dwell + settings.delay
             self.settled = self.settled or self.over
-        lead = pace.delay + 0.5 * pace.period
+        lead = settings.delay + 0.5 * settings.period
         k, share = self._locate(now)
         (p, q), (u, w) = self.theta[k], self.theta[k + 1]
         (f, g), (c, d) = self.rates[k], self.rates[k + 1]
@@ -430,44 +406,44 @@ class MotionLaw:
         k, share = self._locate(now + lead)
         found = []
         if self.settled:
-            one, two = self._find_left(one, two)
+            one, two = self._add_integral(one, two)
         for row in (0, 1):
             first, after = self.tau[k][row], self.tau[k + 1][row]
             if now >= self.end:
                 first = after = self.push[row]
             a, b, c, d = self.gain[-1 if now >= self.end else k][row]
             feedback = a * one + b * two + c * fast_one + d * fast_two
-            most = pace.limit[row]
+            most = settings.limit[row]
             feedback = min(max(feedback, -SHARE * most), SHARE * most)
             tau = first + share * (after - first) - feedback
             found.append(min(max(tau, -most), most))
         return found[0], found[1]
 
-    def _find_left(self, one: float, two: float) -> tuple[float, float]:
-        """What is left of angles that are off, and what it adds up to until it is gone."""
+    def _add_integral(self, one: float, two: float) -> tuple[float, float]:
+        """Angle errors along free displacements, plus their integrals."""
         found_one = found_two = 0.0
         for k, (p, q) in enumerate(self.ways):
             off = p * one + q * two
-            self.left[k] += END_INTEGRAL * self.pace.period * off
+            self.left[k] += END_INTEGRAL * self.settings.period * off
             found_one += p * (off + self.left[k])
             found_two += q * (off + self.left[k])
         return found_one, found_two
 
     def _locate(self, t: float) -> tuple[int, float]:
-        """Sample before a time, and the share of the way to the next one."""
+        """Sample before a time, and the share of the interval after it."""
         place = min(t, self.end) / self.every
         k = min(int(place), len(self.theta) - 2)
         return k, min(place - k, 1.0)
 
 
 class Sensing:
-    """Biases of the forces of a phase's contacts.
+    """Filtered errors of the predicted contact forces of a phase.
 
     Parameters
     ----------
     names                       contacts, in the order of the table
     gained                      the contact that the phase ends with, if it does
-    table : (n, 2, n_c, 5) [N]  forces at both ends of intervals, of 1, s'^2, s', a and the squeeze
+    table : (n, 2, n_c, 5) [N]  forces at both ends of intervals, of 1, s'^2, s', a, internal force
     late                        delay of the torques, in periods
     """
 
@@ -486,11 +462,11 @@ class Sensing:
 
     @property
     def feels(self) -> bool:
-        """Whether the gained contact presses, in two samples one after the other."""
+        """Whether the gained contact has force in two consecutive samples."""
         return self.felt > 1
 
     def measure(self, forces: Mapping[str, float] | None) -> None:
-        """Take a sample; contacts that are not in it, or not a number, have no sensor."""
+        """Process a sample; contacts that are missing or NaN have no sensor."""
         self.heard = bool(forces)
         if not forces or len(self.expected) < self.lag:
             return
@@ -503,34 +479,31 @@ class Sensing:
                 self.bias[k] += SMOOTH * (force - known - self.bias[k])
 
     def shift(
-        self,
-        place: tuple[int, float, float, float, float],
-        low: float,
-        high: float,
+        self, place: tuple[int, float, float, float, float], low: float, high: float
     ) -> float:
-        """Change of the squeeze, from `low` to `high`.
+        """Change of the internal force within `low` and `high` that corrects measured errors.
 
-        `place` has the interval, the share of it, s', a and the squeeze that the law asks for.
+        `place` has the interval, the share of it, s', a and the internal force of the law.
         """
-        j, share, v, a, squeeze = place
+        j, share, v, a, internal = place
         plain, press = [], []
         for (c, cb, _, ca, cl), (d, db, _, da, dl) in zip(
             self.first[j], self.rises[j], strict=True
         ):
             by = cl + share * dl
             force = c + share * d + (cb + share * db) * v * v + (ca + share * da) * a
-            plain.append(force + by * squeeze)
+            plain.append(force + by * internal)
             press.append(by)
-        least = FEW * sum(abs(own) for own in plain) / len(plain)
-        sizes = [max(own, least) or 1.0 for own in plain]
-        parts = [(own + off) / size for own, off, size in zip(plain, self.bias, sizes, strict=True)]
-        rates = [own / size for own, size in zip(press, sizes, strict=True)]
+        least = FEW * sum(abs(f) for f in plain) / len(plain)
+        sizes = [max(f, least) or 1.0 for f in plain]
+        parts = [(f + off) / size for f, off, size in zip(plain, self.bias, sizes, strict=True)]
+        rates = [f / size for f, size in zip(press, sizes, strict=True)]
         change = min(max(self._choose(parts, rates), low), high)
-        self.expected.append([own + by * change for own, by in zip(plain, press, strict=True)])
+        self.expected.append([f + by * change for f, by in zip(plain, press, strict=True)])
         return change
 
     def _choose(self, parts: list[float], rates: list[float]) -> float:
-        """The least change with which all parts are 1, or the one with the largest least part."""
+        """The least change with which all ratios are at least 1, or else the max-min one."""
         low, high = -1e30, 1e30
         for part, rate in zip(parts, rates, strict=True):
             if rate > 0.0:
@@ -539,33 +512,33 @@ class Sensing:
                 high = min(high, (1.0 - part) / rate)
         if low <= high:
             return min(max(0.0, low), high)
-        return choose_squeeze(parts, [0.0] * len(parts), rates, 0.0)[1]
+        return choose_internal_force(parts, [0.0] * len(parts), rates, 0.0)[1]
 
 
-def choose_squeeze(
+def choose_internal_force(
     base: Sequence[float], rates: Sequence[float], press: Sequence[float], a: float
 ) -> tuple[float, float]:
-    """The largest least level of limits base + rates a + press squeeze, and its squeeze.
+    """Max-min level of limits base + rates a + press lambda, and its internal force lambda.
 
-    Of two limits that the squeeze moves to and fro, no squeeze has a larger least level than where
-    they meet. The limit that is least there takes the place of one of them, until it is one.
+    Active-set method: the optimum is where a rising and a falling line meet; the least line there
+    replaces one of them until none is less.
     """
     lines = [(p + rate * a, q) for p, rate, q in zip(base, rates, press, strict=True)]
-    ups, downs = [own for own in lines if own[1] > 0.0], [own for own in lines if own[1] < 0.0]
+    ups = [line for line in lines if line[1] > 0.0]
+    downs = [line for line in lines if line[1] < 0.0]
     flat = min([p for p, q in lines if q == 0.0], default=1e30)
     if not ups or not downs:
         return flat, 0.0
-    # Begun with those that meet where the squeeze is what it would be without either.
     (p, q), (u, w) = min(ups), min(downs)
-    level, squeeze = 1e30, 0.0
+    level, internal = 1e30, 0.0
     while True:
         meets = (u * q - p * w) / (q - w)
         if meets >= level:
             break
-        level, squeeze = meets, (u - p) / (q - w)
+        level, internal = meets, (u - p) / (q - w)
         least = level
         for c, d in lines:
-            value = c + d * squeeze
+            value = c + d * internal
             if value < least:
                 least, last = value, (c, d)
         if least > level - SAME * (1.0 + abs(level)):
@@ -576,11 +549,11 @@ def choose_squeeze(
             u, w = last
         else:
             break
-    return min(level, flat), squeeze
+    return min(level, flat), internal
 
 
 def find_motion(torque: Sequence[Sequence[float]], tau: Sequence[float]) -> tuple[float, float]:
-    """Acceleration and squeeze that torques lead to at rest, from rows of torques."""
+    """Acceleration and internal force from torques at rest, by rows of torques."""
     (one, _, _, c, d), (two, _, _, e, f) = torque
     first, second = tau[0] - one, tau[1] - two
     size = c * f - d * e

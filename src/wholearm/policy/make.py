@@ -1,4 +1,4 @@
-"""Making a policy of a plan."""
+"""Policies from plans: control laws of all phases, their references and margins."""
 
 from __future__ import annotations
 
@@ -23,50 +23,33 @@ from ..problem.uncertainty import PARAMETERS
 from ..results.adopt import Moved, adopt_motion
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion, Trajectory, assemble
-from .curve_law import LoopSettings, choose_squeeze
+from .curve_law import LoopSettings, choose_internal_force
 from .curve_rows import CurveLimitRows, find_forces, leave_one
 from .playback import Policy
 from .range_margins import WIDEST
 from .reference_motion import TOUCH, ReferencePiece, Reserve, trace_pieces
 from .regulator import RATE, ROOM, end_within, follow
 
-WIDEST_FACTOR = 64.0
-"""Largest factor that is tried."""
-SHARES = (1.0, 0.5, 0.25)
-"""Parts of the reserve that are tried, the largest first."""
-SLOWER = 1.5
-"""Duration over the plan's from which on a motion costs more than its reserve is worth."""
-SAME = 1e-5
-"""How far ends may be from the plan's to count as the same, over the scene's length and in rad."""
-Planner = Callable[[Problem], Trajectory]
-"""Makes a plan of a problem."""
-ENOUGH = 5.0
-"""Reserves beyond which more normal force is not asked for."""
-LEAST = 0.3
-"""Fewest reserves with which a contact counts as pressed."""
-DRIVE = 0.15
-"""Least acceleration with which a contact that is still open is closed, over the scene's unit."""
+WIDEST_FACTOR = 64.0  # largest factor on ranges
+SHARES = (1.0, 0.5, 0.25)  # shares of the margin that are tried
+SLOWER = 1.5  # largest duration of a motion with a margin, over the plan's
+SAME = 1e-5  # distance from the plan's end that counts as none, over the scene's length and in rad
+Planner = Callable[[Problem], Trajectory]  # makes a plan of a problem
+ENOUGH = 5.0  # largest useful margin of a normal force
+LEAST = 0.3  # least margin with which a contact counts as closed
+DRIVE = 0.15  # least acceleration that closes an open contact, over the scene's unit
+# Deceleration along the next curve per margin, over the scene's unit: the gained contact need not
+# block the motion.
 BRAKE = 0.3
-"""Deceleration along the next curve for each reserve, over the scene's unit: the contact that is
-gained need not be in the way of the motion."""
-FRICTION = (0.7, 1.0, 1.2)
-"""Parts of all friction with which the torques have to balance."""
-FULL = 0.98
-"""Part of the torque limits that is used."""
-STILL = 1e-3
-"""Speed along curves that counts as none, over the scene's."""
-USUAL = 2.5
-"""Reserve of normal forces where no ranges are known, in those of `curve_rows`."""
-DWELL = 3e-3
-"""How long joints stand still before the next phase begins [s]."""
-CLOSING = 0.02
-"""Time in which held torques are to close a contact [s]."""
-SHOWN = 1e-3
-"""Part of a displacement that joints have to show, over what they show at most."""
-WEAK = 10.0
-"""Torques over the dry friction of the joints, below which it decides what is at rest."""
-MOST = 0.5
-"""Largest acceleration of the integral, over the scene's."""
+FRICTION = (0.7, 1.0, 1.2)  # factors on all friction with which torques have to balance
+FULL = 0.98  # share of the torque limits that is used
+STILL = 1e-3  # speed along curves that counts as none, over the scene's
+USUAL = 2.5  # margin of normal forces where no ranges are known, in those of `curve_rows`
+DWELL = 3e-3  # time at rest before the next phase begins [s]
+CLOSING = 0.02  # time in which final torques are to close a contact [s]
+SHOWN = 1e-3  # least joint motion of a displacement, over the largest
+WEAK = 10.0  # torques over the dry friction of the joints, below which friction decides on rest
+MOST = 0.5  # largest acceleration of the integral, over the scene's
 
 
 def make_policy(
@@ -83,19 +66,15 @@ def make_policy(
 
     Parameters
     ----------
-    reserve               how much normal force is kept in reserve along the way. Where the plan was
-                          made for ranges of numbers, or the problem has them: for so many times
-                          these ranges (1). Otherwise in what numbers that are 5 % (masses), 10 %
-                          (friction) and 1 % (torques) off take away, one by one and summed as
-                          squares (2.5). Where the plan leaves less, the motion is slower; with 0 it
-                          is the plan's.
+    reserve               margin of normal forces. With ranges of numbers in plan or problem: factor
+                          on these ranges (1). Otherwise in units of the errors from masses that are
+                          5 %, friction that is 10 % and torques that are 1 % off, root sum square
+                          (2.5). Where the plan leaves less, the motion is slower; 0: as the plan
     period : [s]          of the control loop
-    delay : [s]           time from measuring to when torques take effect, as far as it is known
-    torque_limit : [N m]  of both fingers, if it is not the problem's: what a plan leaves to
-                          feedback, where it was made with less than the hand has
-    planner               makes a trajectory of a problem: phases with more freedoms are planned
-                          anew with it, where the plan leaves no reserve, unless `reserve` is 0; as
-                          they are if it is left out
+    delay : [s]           from measuring to applying torques, as far as known
+    torque_limit : [N m]  of both fingers, if the plan was made with less than the hand has
+    planner               replans phases with more degrees of freedom that leave no margin, unless
+                          `reserve` is 0
 
     Raises
     ------
@@ -115,43 +94,45 @@ def make_policy(
         limit = [require_number(torque_limit, "torque_limit", positive=True)] * 2
     speeds = TOUCH * scales.speed, STILL * scales.speed
     most = MOST * scales.acceleration
-    pace = LoopSettings(period, delay, *speeds, DWELL, most, (limit[0], limit[1]))
+    settings = LoopSettings(period, delay, *speeds, DWELL, most, (limit[0], limit[1]))
     blocks = split(problem.phases)
-    curves = [len(own) == 1 and runs_on_curve(own[0]) for own in blocks]
+    curves = [len(block) == 1 and runs_on_curve(block[0]) for block in blocks]
     starts = plan.phase_starts
     if reserve and planner is not None:
         plan = replan(planner, problem, blocks, curves, plan)
-    along = [own[0] if curve else None for own, curve in zip(blocks, curves, strict=True)]
+    along = [block[0] if curve else None for block, curve in zip(blocks, curves, strict=True)]
     pieces = trace_pieces(problem, along, plan, Reserve(reserve, ranges, delay))
     tables, about = list[dict[str, Array]](), list[dict[str, Any]]()
-    for own, piece, after in zip(blocks, pieces, [*pieces[1:], None], strict=True):
-        lasts = {phase.number: float(np.diff(starts)[phase.index]) for phase in own}
+    for block, piece, after in zip(blocks, pieces, [*pieces[1:], None], strict=True):
+        lasts = {phase.number: float(np.diff(starts)[phase.index]) for phase in block}
         found: list[dict[str, Any]] = [
             {"number": k, "plan": t, "duration": t, "share": 0.0} for k, t in lasts.items()
         ]
         if piece is None:
-            tables.append(_follow_motion(problem, own, plan, period))
+            tables.append(_tabulate_motion(problem, block, plan, period))
             ends = [*tables[-1]["starts"], tables[-1]["step"][0] * (len(tables[-1]["theta"]) - 1)]
             for one, span in zip(found, np.diff(ends).tolist(), strict=True):
                 one["duration"] = span
         else:
-            tables.append(_tabulate(piece, own[0], _end(problem, own[0], plan, piece, after)))
+            phase = block[0]
+            push = _find_end_torques(problem, phase, plan, piece, after)
+            tables.append(_tabulate_curve(piece, phase, push))
             found[0].update(duration=piece.duration, share=piece.share, reserves=piece.reserves)
-            gained = own[0].until.contact
+            gained = phase.until.contact
             found[0]["gained"] = "" if gained is None else gained.name
         if piece is None or not piece.passes:
             found[-1]["duration"] += DWELL + delay
         about += found
-    whole = sum(own["duration"] for own in about)
-    known: dict[str, Any] = {"name": problem.name, "duration": whole, "phases": about}
-    known["problem"] = problem.table
+    duration = sum(phase["duration"] for phase in about)
+    whole: dict[str, Any] = {"name": problem.name, "duration": duration, "phases": about}
+    whole["problem"] = problem.table
     if ranges is not None and reserve:
-        known.update(ranges=dict(ranges), reserve=reserve)
-    return Policy(tables, pace, known)
+        whole.update(ranges=dict(ranges), reserve=reserve)
+    return Policy(tables, settings, whole)
 
 
 def split(phases: Sequence[Phase]) -> list[tuple[Phase, ...]]:
-    """Phases that pass into one another in motion belong together, but for impacts along curves."""
+    """Blocks of phases that pass into one another in motion, except by impacts along curves."""
     blocks: list[list[Phase]] = []
     for phase in phases:
         before = blocks[-1][-1] if blocks else None
@@ -161,17 +142,17 @@ def split(phases: Sequence[Phase]) -> list[tuple[Phase, ...]]:
             blocks[-1].append(phase)
         else:
             blocks.append([phase])
-    return [tuple(own) for own in blocks]
+    return [tuple(block) for block in blocks]
 
 
-def _end(
+def _find_end_torques(
     problem: Problem,
     phase: Phase,
     plan: Trajectory,
     piece: ReferencePiece,
     after: ReferencePiece | None,
 ) -> Array:
-    """Torques at the end of a curve: those that the plan holds there, if it does."""
+    """Torques that hold the end of a curve: the plan's if it has any."""
     last = int(np.flatnonzero(plan.phase == phase.index)[-1])
     if np.isnan(plan.c_n[last]).all():
         return np.asarray(plan.tau[last])
@@ -183,16 +164,16 @@ def _end(
 
 
 def hold_end(problem: Problem, phase: Phase, z: Array) -> Array | None:
-    """Torques that hold all that touches where a phase ends, None if there are none."""
+    """Torques that hold all contacts at the end of a phase at rest, or None."""
     contact = phase.until.contact
-    gained = () if contact is None else (contact,)
-    touching = Formation(problem.scene, (*phase.formation.contacts, *gained))
+    contacts = phase.formation.contacts if contact is None else (*phase.formation.contacts, contact)
+    touching = Formation(problem.scene, contacts)
     place = Standstill(z, phase.formation, contact, touching)
     hold = find_hold(place, problem.epsilon, problem.gap, CLOSING)
     return None if hold is None else hold.tau
 
 
-def _follow_motion(
+def _tabulate_motion(
     problem: Problem, phases: tuple[Phase, ...], plan: Trajectory, period: float
 ) -> dict[str, Array]:
     """Arrays of `MotionLaw`."""
@@ -202,6 +183,9 @@ def _follow_motion(
     t = np.linspace(starts[0], starts[-1], count + 1)
     samples, last = plan.at(end_within(phases, plan, t)), phases[-1]
     hold = hold_end(problem, last, samples.z[-1])
+    inertia = np.diag([finger.inertia for finger in problem.scene.fingers])
+    # At the end each joint is critically damped, in contact or not.
+    final = np.hstack([RATE**2 * inertia, 2 * RATE * inertia])
     found = follow(problem, phases, plan, t)
     speed = np.sqrt(found.b)
     return {
@@ -210,24 +194,18 @@ def _follow_motion(
         "theta": samples.z[:, 3:],
         "rates": samples.z_dot[:, 3:] * speed,
         "tau": found.tau,
-        "gain": np.concatenate([found.gains[:-1], _hold_joints(problem)[None]]),
+        "gain": np.concatenate([found.gains[:-1], final[None]]),
         "push": samples.tau[-1] if hold is None else hold,
         "still": np.array([STILL * problem.scene.scales.rate]),
-        "ways": _list_ways(problem, last, samples.z[-1:]),
+        "ways": _list_free_joints(problem, last, samples.z[-1:]),
     }
 
 
-def _hold_joints(problem: Problem) -> Array:
-    """Gains that lead each joint to its place, in contact or not, critically damped, (2, 4)."""
-    inertia = np.diag([own.inertia for own in problem.scene.fingers])
-    return np.hstack([RATE**2 * inertia, 2 * RATE * inertia])
-
-
-def _list_ways(problem: Problem, phase: Phase, z: Array) -> Array:
-    """What joints show of displacements that all contacts at the end leave, orthonormal, (f, 2)."""
-    own, contact = phase.formation, phase.until.contact
-    contacts = own.contacts if contact is None else (*own.contacts, contact)
-    both = Formation(problem.scene, contacts, own.rolling)
+def _list_free_joints(problem: Problem, phase: Phase, z: Array) -> Array:
+    """Orthonormal basis of joint displacements that the contacts at the end leave free, (f, 2)."""
+    formation, contact = phase.formation, phase.until.contact
+    contacts = formation.contacts if contact is None else (*formation.contacts, contact)
+    both = Formation(problem.scene, contacts, formation.rolling)
     units = np.sqrt(metric_weights(problem.scene))
     P = both.evaluate(z, np.zeros_like(z)).P[0] / units
     left = np.linalg.svd(P)[2][len(P) :] / units
@@ -235,7 +213,7 @@ def _list_ways(problem: Problem, phase: Phase, z: Array) -> Array:
     return np.asarray(basis.T[sizes > SHOWN * (1.0 / units[3])])
 
 
-def _tabulate(piece: ReferencePiece, phase: Phase, push: Array) -> dict[str, Array]:
+def _tabulate_curve(piece: ReferencePiece, phase: Phase, push: Array) -> dict[str, Array]:
     """Arrays of `CurveLaw`."""
     rows, levels, contact = piece.rows, piece.rows.levels, phase.until.contact
     arrival, dry = np.zeros((0, 5)), phase.formation.scene.dry[3:]
@@ -256,7 +234,7 @@ def _tabulate(piece: ReferencePiece, phase: Phase, push: Array) -> dict[str, Arr
 
 
 def find_ranges(problem: Problem, plan: Trajectory) -> Mapping[str, float] | None:
-    """Half widths that the plan was made for, or those of the problem; None if there are none."""
+    """Half widths of the ranges of a plan, or else of its problem, or None."""
     figures = plan.meta.get("ranges")
     if figures:
         return dict(figures["radii"])
@@ -264,17 +242,17 @@ def find_ranges(problem: Problem, plan: Trajectory) -> Mapping[str, float] | Non
 
 
 def find_arrival(curve: Curve, gained: Contact, rows: CurveLimitRows) -> Array:
-    """Levels of all contacts, the gained one too, that balance at the end of a curve, (k, 5).
+    """Levels of all contacts, with the gained one, at rest at the end of a curve, (k, 5).
 
-    Affine as torques are there; there are none where forces at rest are not the only ones.
+    Empty where forces at rest are not unique.
     """
     formation = curve.formation
     both = Formation(formation.scene, (*formation.contacts, gained), formation.rolling)
     reserves = rows.unit[-1, : formation.n_contacts]
     reserves, found = np.append(reserves, reserves.max()), [np.zeros((0, 5))]
-    for own in _list_balances(curve, both, rows):
-        forces = own[: both.n_contacts, 1:] @ rows.torque[-1]
-        forces[:, 0] += own[: both.n_contacts, 0]
+    for balance in _list_balances(curve, both, rows):
+        forces = balance[: both.n_contacts, 1:] @ rows.torque[-1]
+        forces[:, 0] += balance[: both.n_contacts, 0]
         found.append(forces / reserves[:, None])
     return np.vstack(found)
 
@@ -282,16 +260,10 @@ def find_arrival(curve: Curve, gained: Contact, rows: CurveLimitRows) -> Array:
 def find_push(
     curve: Curve, gained: Contact, rows: CurveLimitRows, after: CurveLimitRows | None
 ) -> Array | None:
-    """Torques that balance at rest with the gained contact and drive on without it, shape (2,).
+    """Torques that balance with the gained contact and drive on without it, shape (2,), or None.
 
-    They are those for which the least normal force of all contacts is largest, in reserves; in the
-    balance friction is as it was in the motion. None where no torques do all of it, or forces at
-    rest are not the only ones.
-
-    Parameters
-    ----------
-    rows   along the curve
-    after  along the next one
+    Linear programme: the least normal force over its margin is largest. In the balance friction is
+    that of the motion. `rows` are along the curve, `after` along the next one.
     """
     formation, scene = curve.formation, curve.formation.scene
     both = Formation(scene, (*formation.contacts, gained), formation.rolling)
@@ -301,90 +273,84 @@ def find_push(
     count, unit = both.n_contacts, scene.scales.acceleration
     reserves = rows.unit[-1, : formation.n_contacts]
     reserves = np.append(reserves, reserves.max())
-    # Rows of (1, tau, level) >= 0: forces with all contacts, a without the gained one, forces then.
+    # Rows of (1, tau, level) >= 0: forces with all contacts; a and forces without the gained one.
     to_motion = _invert(rows.torque[-1])
     forces = rows.ends.reshape(-1, 5)
     open_forces = forces[:, 3:] @ to_motion
     open_forces[:, 0] += forces[:, 0]
     open_reserves = np.tile(reserves[:-1], len(rows.ends))
-    found = [
-        *(np.column_stack([own[:count], -reserves]) for own in balances),
+    limits = [
+        *(np.column_stack([balance[:count], -reserves]) for balance in balances),
         np.append(to_motion[0] - [DRIVE * unit, 0.0, 0.0], 0.0)[None],
         np.column_stack([open_forces, -open_reserves]),
     ]
-    # Where no torques do all of it, the next motion may be in the way.
-    tables = [found]
+    # First with a brake along the next curve; without it where that is infeasible.
+    tables = [limits]
     if after is not None:
-        tables.insert(0, [*found, np.append(-_invert(after.torque[0])[0], -BRAKE * unit)[None]])
-    for own in tables:
-        tau = _find_best(np.vstack(own), scene.torque_limit)
-        if tau is not None:
-            return tau
-    return None
+        tables.insert(0, [*limits, np.append(-_invert(after.torque[0])[0], -BRAKE * unit)[None]])
+    found = (_find_best(np.vstack(table), scene.torque_limit) for table in tables)
+    return next((tau for tau in found if tau is not None), None)
 
 
 def _find_best(rows: Array, limit: Array) -> Array | None:
-    """Torques with the largest level, and least effort among them; rows (1, tau, level) >= 0."""
+    """Torques with the largest level, then least effort; rows (1, tau, level) >= 0."""
     from scipy.optimize import linprog
 
-    # Effort, the largest torque over its limit, decides among equally good ones.
+    # The effort, the largest torque over its limit, is the last column.
     most = FULL * limit
     table = np.pad(rows, ((0, 0), (0, 1)))
     efforts = np.zeros((4, 5))
     efforts[:, 1:3] = np.vstack([np.diag(1 / most), np.diag(-1 / most)])
     efforts[:, 4] = 1.0
     table = np.vstack([table, efforts])
-    bounds = [*((-own, own) for own in most), (LEAST, ENOUGH), (0.0, 1.0)]
+    bounds = [*((-tau, tau) for tau in most), (LEAST, ENOUGH), (0.0, 1.0)]
     answer = linprog([0, 0, -1, 1], A_ub=-table[:, 1:], b_ub=table[:, 0], bounds=bounds)
     return np.asarray(answer.x[:2]) if answer.status == 0 else None
 
 
 def _list_balances(curve: Curve, both: Formation, rows: CurveLimitRows) -> list[Array]:
-    """Balances with friction, or scenes, that may be; none where forces are not the only ones."""
+    """Balances with factors of friction and in scenes of ranges; none if forces are not unique."""
     if both.n_constraints != 5:
         return []
     try:
-        found = [_balance(curve, both, part) for part in FRICTION]
-        scenes = [own for own in rows.scenes if own != curve.formation.scene]
-        return found + [_balance(curve, replace(both, scene=own), 1.0) for own in scenes]
+        found = [_balance(curve, both, factor) for factor in FRICTION]
+        scenes = [scene for scene in rows.scenes if scene != curve.formation.scene]
+        return found + [_balance(curve, replace(both, scene=scene), 1.0) for scene in scenes]
     except np.linalg.LinAlgError:
         return []
 
 
-def _balance(curve: Curve, both: Formation, part: float) -> Array:
-    """Forces of five constraints at the end of a curve, at rest, of (1, tau), shape (5, 3).
-
-    With a part of all friction.
-    """
+def _balance(curve: Curve, both: Formation, factor: float) -> Array:
+    """Constraint forces of (1, tau) at rest at the end of a curve, shape (5, 3)."""
     scene, last = curve.formation.scene, curve.segments[-1]
     point = curve.evaluate(np.array([curve.length]))
     kinematics = both.evaluate(point.z, point.z_s)
     slides = np.sign(kinematics.A_t[0] @ point.z_s[0])
     Xi = np.append(last.Xi, slides[-1])[None]
-    G = force_rows(both, kinematics, Directions(part * Xi, last.sigma[None]))[0]
-    known = np.zeros((5, 3))
-    known[:, 0] = -scene.applied_force
-    known[3:, 0] += scene.dry[3:] * last.sigma
-    known[3:, 1:] = -np.eye(2)
-    return np.asarray(np.linalg.solve(G.T, known))
+    G = force_rows(both, kinematics, Directions(factor * Xi, last.sigma[None]))[0]
+    right = np.zeros((5, 3))
+    right[:, 0] = -scene.applied_force
+    right[3:, 0] += scene.dry[3:] * last.sigma
+    right[3:, 1:] = -np.eye(2)
+    return np.asarray(np.linalg.solve(G.T, right))
 
 
 def _invert(torque: Array) -> Array:
-    """Acceleration and squeeze at rest of (1, tau), shape (2, 3), from rows of torques, (2, 5)."""
+    """Acceleration and internal force of (1, tau) at rest, (2, 3), from rows of torques, (2, 5)."""
     back = np.linalg.inv(torque[:, 3:])
     return np.column_stack([-back @ torque[:, 0], back])
 
 
 def find_still(curve: Curve) -> Array:
-    """Torques that hold the end of a curve at rest, in the middle of what friction bears, (2,)."""
+    """Torques that hold the end of a curve at rest without friction, (2,)."""
     formation, point = curve.formation, curve.evaluate(np.array([curve.length]))
     still = Directions(np.zeros((1, formation.n_contacts)), np.zeros((1, 2)))
     forces = inverse(formation, *point[:3], still, point.kinematics)
     limits = make_limits(formation, 0.0).only(PRESS, TORQUE)
     sides = SideTerms.of(limits, forces, point.z_s[:, 3:])
     base, press = sides.rest[0].tolist(), sides.press[0].tolist()
-    _, squeeze = choose_squeeze(base, [0.0] * len(base), press, 0.0)
-    return np.asarray((forces.T0 + squeeze * forces.Tl)[0])
+    _, internal = choose_internal_force(base, [0.0] * len(base), press, 0.0)
+    return np.asarray((forces.T0 + internal * forces.Tl)[0])
 
 
 def replan(
@@ -394,13 +360,13 @@ def replan(
     curves: Sequence[bool],
     plan: Trajectory,
 ) -> Trajectory:
-    """A plan in which blocks that are not along curves have a reserve where there is one."""
+    """A plan whose blocks off curves are replanned with a margin where possible."""
     motions, k = list(plan.motions), 0
     while k < len(blocks):
         after = k + 1
-        if not curves[k] and _lacks(problem, blocks[k], plan):
+        if not curves[k] and _lacks_margin(problem, blocks[k], plan):
             for share in SHARES:
-                found = _detour(planner, problem, blocks[k:], curves[k:], plan, share)
+                found = _replan_blocks(planner, problem, blocks[k:], curves[k:], plan, share)
                 if found is not None:
                     new, after = found[0], k + found[1]
                     first = blocks[k][0].index
@@ -415,16 +381,16 @@ def replan(
     return replace(rows, torque=TorqueProfile.join_rows(rows.t, rows.tau))
 
 
-def _lacks(problem: Problem, phases: Sequence[Phase], plan: Trajectory) -> bool:
-    """Whether phases of a plan leave less than the reserve of a normal force or a torque."""
-    own = (plan.phase >= phases[0].index) & (plan.phase <= phases[-1].index)
+def _lacks_margin(problem: Problem, phases: Sequence[Phase], plan: Trajectory) -> bool:
+    """Whether a normal force or torque in some phases is nearer to its limit than the margin."""
+    rows = (plan.phase >= phases[0].index) & (plan.phase <= phases[-1].index)
     scene = problem.scene
-    most = (np.abs(plan.tau[own]) / scene.torque_limit).max()
-    least = np.nanmin(plan.c_n[own]) / scene.scales.force
+    most = (np.abs(plan.tau[rows]) / scene.torque_limit).max()
+    least = np.nanmin(plan.c_n[rows]) / scene.scales.force
     return bool(min(least, 1 - most) < 0.99 * ROOM)
 
 
-def _detour(
+def _replan_blocks(
     planner: Planner,
     problem: Problem,
     blocks: Sequence[tuple[Phase, ...]],
@@ -432,18 +398,18 @@ def _detour(
     plan: Trajectory,
     share: float,
 ) -> tuple[list[Motion], int] | None:
-    """Motions with a part of the reserve until the plan is met again, and of how many blocks."""
+    """Motions with a share of the margin until the plan is reached again, and their blocks."""
     starts, found = plan.phase_starts, list[Motion]()
     z = plan.z[np.flatnonzero(plan.phase == blocks[0][0].index)[0]]
     blocks = [*blocks[:-1], (*blocks[-1][:-1], _pin(blocks[-1][-1], plan.z[-1]))]
-    for count, (own, curve) in enumerate(zip(blocks, curves, strict=True), start=1):
-        part = _solve(planner, problem, own, z, 0.0 if curve else share)
-        lasts = starts[own[-1].index + 1] - starts[own[0].index]
+    for count, (block, curve) in enumerate(zip(blocks, curves, strict=True), start=1):
+        part = _solve(planner, problem, block, z, 0.0 if curve else share)
+        lasts = starts[block[-1].index + 1] - starts[block[0].index]
         if part is None or (not curve and part.duration > SLOWER * lasts):
             return None
         found += part.motions
         z = part.z[-1]
-        away = np.abs(z - plan.z[np.flatnonzero(plan.phase == own[-1].index)[-1]])
+        away = np.abs(z - plan.z[np.flatnonzero(plan.phase == block[-1].index)[-1]])
         away[:2] /= problem.scene.scales.length
         if away.max() < SAME:
             return found, count
@@ -453,10 +419,12 @@ def _detour(
 def _solve(
     planner: Planner, problem: Problem, phases: Sequence[Phase], z: Array, share: float
 ) -> Trajectory | None:
-    """Phases from a configuration at rest, with a part of the reserve."""
+    """Plan of phases from a configuration at rest, with a share of the margin."""
     scene, room = problem.scene, share * ROOM
-    one, two = (replace(own, torque_limit=(1 - room) * own.torque_limit) for own in scene.fingers)
-    own = replace(
+    one, two = (
+        replace(link, torque_limit=(1 - room) * link.torque_limit) for link in scene.fingers
+    )
+    tightened = replace(
         problem,
         start=z,
         epsilon=max(problem.epsilon, room * scene.scales.force),
@@ -464,18 +432,18 @@ def _solve(
         phases=tuple(replace(phase, index=k) for k, phase in enumerate(phases)),
     )
     try:
-        return planner(own)
+        return planner(tightened)
     except WholearmError:
         return None
 
 
 def _pin(phase: Phase, z: Array) -> Phase:
-    """The phase with the pose of z, shape (5,), pinned where its end leaves it open."""
+    """The phase with terminal constraints on the free coordinates of the pose of z, shape (5,)."""
     until = phase.until
-    given = {row for row, _ in until.poses}
+    fixed = {row for row, _ in until.poses}
     gained = until.contact is not None
-    freedoms = len(z) - len(phase.formation.contacts) - gained - len(given)
-    names = [name for name in ("x", "phi") if ROWS[name] not in given][: max(freedoms, 0)]
+    freedoms = len(z) - len(phase.formation.contacts) - gained - len(fixed)
+    names = [name for name in ("x", "phi") if ROWS[name] not in fixed][: max(freedoms, 0)]
     pins = tuple((name, float(z[ROWS[name]])) for name in names)
     return replace(phase, until=replace(until, pins=until.pins + pins))
 
@@ -483,24 +451,16 @@ def _pin(phase: Phase, z: Array) -> Phase:
 def find_widest(problem: Problem, plan: Trajectory, delay: float) -> dict[int, float]:
     """The largest factor on the ranges of each phase along a curve, by its number.
 
-    It is at most `WIDEST_FACTOR`, and ends where a relative range would reach
-    `range_margins.WIDEST`. Its error is that of `range_margins.retime_within`.
-
-    Parameters
-    ----------
-    delay : [s]  of the torques, as far as it is known
-
-    Raises
-    ------
-    InputError  if neither plan nor problem have ranges
+    It is at most `WIDEST_FACTOR`, and no relative range exceeds `range_margins.WIDEST`. The delay
+    [s] is that of the torques, as far as known. InputError if neither plan nor problem have ranges.
     """
     ranges = find_ranges(problem, plan)
     if ranges is None:
         raise InputError("", "uncertainty", "is missing; without ranges none is the widest")
-    relative = max(ranges.get(own.name, 0.0) for own in PARAMETERS if not own.unit)
+    relative = max(ranges.get(p.name, 0.0) for p in PARAMETERS if not p.unit)
     most = min(WIDEST / relative, WIDEST_FACTOR) if relative > 0 else WIDEST_FACTOR
     blocks = split(problem.phases)
-    along = [own[0] if len(own) == 1 and runs_on_curve(own[0]) else None for own in blocks]
+    along = [b[0] if len(b) == 1 and runs_on_curve(b[0]) else None for b in blocks]
     pieces = trace_pieces(problem, along, plan, Reserve(most, ranges, delay))
     return {
         phase.number: most * piece.share

@@ -1,8 +1,7 @@
-"""The reference of a curve's law and its limits where the ranges of numbers are known.
+"""Reference of a curve's law and its limits within known parameter ranges.
 
-Limits hold in the worst corner of the ranges (`corners`) both under the torques of the motion and
-under those by which feedback makes the motion what it is to be. The worst corners depend on the
-motion, and how fast it may be depends on them: each is found from the other, a few times.
+Limits hold in the worst corner of the ranges (`corners`), both under nominal torques and with
+feedback that tracks the reference. Fixed-point iteration between worst corners and motion.
 """
 
 from __future__ import annotations
@@ -18,26 +17,27 @@ from ..mechanics.dynamics import Directions, inverse
 from ..mechanics.limits import CONE, PRESS, make_limits
 from ..scene.model import Scene
 from .corners import Corners, Motion, find_corners, list_scenes
-from .curve_rows import LATE, LEAST, NEAR, NEVER, SPARE, CurveLimitRows, find_squeeze, turn
+from .curve_rows import (
+    LATE,
+    LEAST,
+    NEAR,
+    NEVER,
+    SPARE,
+    CurveLimitRows,
+    blend_directions,
+    find_internal_force,
+)
 from .retiming import Reach, retime
 
-ROUNDS = 3
-"""How many times worst corners and motion are found from one another."""
-KEPT = 1.3
-"""Reserve of forces of the reference, in units: feedback may use what is above one."""
-ENOUGH = 0.5
-"""Part of these reserves without which ranges are too wide."""
-LESS, CLOSE, NONE = 0.8, 0.03, 0.02
-"""Factor by which ranges shrink where they are too wide, the error of how wide they may be, and a
-part of them that is as good as none."""
-WIDEST = 0.9
-"""Largest relative range."""
-WIDER = 1.01
-"""Least width of a reversal, over the distance to the next node."""
-STEP = 1e-4
-"""Step of differences along a curve, over its length."""
-AUTHORITY = 2.0
-"""Reserve of torques, in those of `curve_rows`: feedback adds to the motion."""
+ROUNDS = 3  # iterations between worst corners and motion
+KEPT = 1.3  # margin of the reference's forces, in units: feedback may use what is above one
+ENOUGH = 0.5  # least share of these margins; with less the ranges are too wide
+LESS = 0.8  # factor by which ranges shrink while they are too wide
+CLOSE, NONE = 0.03, 0.02  # relative accuracy of the widest ranges, and the least share of them
+WIDEST = 0.9  # largest relative range
+WIDER = 1.01  # least width of a reversal, over the distance to the next node
+STEP = 1e-4  # step of differences along a curve, over its length
+AUTHORITY = 2.0  # margin of torques for feedback, in those of `curve_rows`
 
 
 class Within(NamedTuple):
@@ -45,48 +45,48 @@ class Within(NamedTuple):
 
     s: Array  # (n,) [m]
     torque: Array  # (n, 2, 5) [N m]
-    left: Array  # (n, 4, 5) [N m]: how far torques are from their limits
-    # with friction as it is before the nearest reversal and after it
-    sides: tuple[Corners, Corners]
-    same: Array  # (n,): where these do not differ
-    unit: Array  # (m + 4,): reserves at level 1: of forces, and of torques
+    left: Array  # (n, 4, 5) [N m]: distances of torques from their limits
+    sides: tuple[Corners, Corners]  # with friction before and after the nearest reversal
+    same: Array  # (n,): where these are equal
+    unit: Array  # (m + 4,): margins at level 1, of forces and torques
     scenes: tuple[Scene, ...]  # in the corners of the ranges
 
     def at(self, motion: Motion) -> tuple[CurveLimitRows, Array, Array]:
-        """The law's limits near a motion; and those of a reference with their reserves."""
+        """The law's limits near a motion; those of the reference, and their margins."""
         motions = self._spread(motion)
         forces = self._pick(self.sides, motions)
-        closed = self._pick([own.close(self.left) for own in self.sides], motions)
+        closed = self._pick([side.close(self.left) for side in self.sides], motions)
         count, n = len(self.unit) - 4, len(self.s)
         slack = np.concatenate([forces, self.left], axis=1)
         copies = forces.shape[1] // count
         unit = np.concatenate([np.tile(self.unit[:count], copies), self.unit[count:]])
         table, ends = np.tile(unit, (n, 1)), self.sides[0].rows[:, -1]
         rows = CurveLimitRows(self.s, self.torque, slack, table, forces.shape[1], ends, self.scenes)
-        own = np.concatenate([KEPT * self.unit[:count], AUTHORITY * self.unit[count:]])
-        wanted = np.concatenate(
-            [np.tile(own[:count], copies), own[count:], np.tile(own, len(motions) * 2)]
-        )
+        kept = np.concatenate([KEPT * self.unit[:count], AUTHORITY * self.unit[count:]])
+        again = np.tile(kept, 2 * len(motions))
+        wanted = np.concatenate([np.tile(kept[:count], copies), kept[count:], again])
         whole = np.concatenate([slack, closed], axis=1)
         return rows, whole, np.tile(wanted, (n, 1))
 
     def _pick(self, sides: tuple[Corners, ...] | list[Corners], motions: list[Motion]) -> Array:
-        """Limits on both sides of reversals in the corners worst for motions, (n, rows, 5)."""
-        found = [np.concatenate([side.pick(own) for own in motions], axis=1) for side in sides]
+        """Limits on both sides of reversals in the worst corners of motions, (n, rows, 5)."""
+        found = [
+            np.concatenate([side.pick(motion) for motion in motions], axis=1) for side in sides
+        ]
         found[1][self.same] = np.array([NEVER, 0.0, 0.0, 0.0, 0.0])
         return np.concatenate(found, axis=1)
 
     def _spread(self, motion: Motion) -> list[Motion]:
-        """A motion with its squeeze, and with the least and the largest one that torques allow."""
-        a, b, squeeze = motion
-        known = np.column_stack([np.ones_like(a), b, np.sqrt(b), a])
-        base, press = np.einsum("nmq,nq->nm", self.left[..., :4], known), self.left[..., 4]
+        """A motion with its internal force, and with the least and largest one within torques."""
+        a, b, internal = motion
+        values = np.column_stack([np.ones_like(a), b, np.sqrt(b), a])
+        base, press = np.einsum("nmq,nq->nm", self.left[..., :4], values), self.left[..., 4]
         with np.errstate(divide="ignore", invalid="ignore"):
             ends = -base / press
         low = np.where(press > 0, ends, -np.inf).max(axis=1)
         high = np.where(press < 0, ends, np.inf).min(axis=1)
-        low, high = (np.where(np.isfinite(own), own, squeeze) for own in (low, high))
-        return [motion, (a, b, np.minimum(low, squeeze)), (a, b, np.maximum(high, squeeze))]
+        low, high = (np.where(np.isfinite(end), end, internal) for end in (low, high))
+        return [motion, (a, b, np.minimum(low, internal)), (a, b, np.maximum(high, internal))]
 
 
 def find_within(
@@ -94,14 +94,15 @@ def find_within(
 ) -> Within:
     """Limits along a curve within ranges, with forces of at least so much [N]."""
     formation, point = curve.formation, curve.evaluate(s)
-    # Between nodes limits are mixed: those next to a reversal have to know both directions.
+    # Limits are interpolated: nodes next to a reversal need both directions.
     gaps = np.pad(np.diff(s), 1)
-    mean, *sides = turn(curve, s, np.maximum(speed * NEAR, WIDER * np.maximum(gaps[1:], gaps[:-1])))
+    width = np.maximum(speed * NEAR, WIDER * np.maximum(gaps[1:], gaps[:-1]))
+    mean, *sides = blend_directions(curve, s, width)
     late = s - (LATE + widths.get("delay", 0.0)) * speed
-    asked, step = _find_torques(curve, s, mean), STEP * curve.length
-    ends = (_find_torques(curve, s + way * step, mean) for way in (-1, 1))
-    change = (-next(ends) + next(ends)) / (2 * step)
-    torques = asked, _find_torques(curve, late, mean), change
+    nominal, step = _find_torques(curve, s, mean), STEP * curve.length
+    before, after = (_find_torques(curve, s + sign * step, mean) for sign in (-1, 1))
+    change = (after - before) / (2 * step)
+    torques = nominal, _find_torques(curve, late, mean), change
     corners = [find_corners(formation, point, side, torques, widths) for side in sides]
     most = np.tile(formation.scene.torque_limit, 2)
     left = np.concatenate([-torques[0], torques[0]], axis=1)
@@ -116,8 +117,8 @@ def find_within(
 def _find_torques(curve: Curve, s: Array, directions: Directions) -> Array:
     """Torques at n places, shape (n, 2, 5)."""
     point = curve.evaluate(np.clip(s, 0.0, curve.length))
-    own = inverse(curve.formation, *point[:3], directions, point.kinematics)
-    return np.stack([own.T0, own.Tb, own.Tv, own.Ta, own.Tl], axis=2)
+    forces = inverse(curve.formation, *point[:3], directions, point.kinematics)
+    return np.stack([forces.T0, forces.Tb, forces.Tv, forces.Ta, forces.Tl], axis=2)
 
 
 def retime_within(
@@ -128,30 +129,38 @@ def retime_within(
     least: float,
     end: tuple[float, float] | None = None,
 ) -> tuple[tuple[CurveLimitRows, Reach] | None, float]:
-    """The fastest motion that keeps its limits within ranges, or as large a part of them as can be.
+    """The fastest motion that keeps its limits within the largest feasible share of ranges.
 
     Parameters
     ----------
     s : (n,) [m]  nodes
-    plan : (n,)   a, b and squeeze of a plan there; no motion is faster
-    widths        half widths of the ranges; the delay is what torques are late by without being
-                  known to be
+    plan : (n,)   a, b and internal force of a plan there; no motion is faster
+    widths        half widths of the ranges; that of the delay is its unknown part
     least : [N]   least normal force within them
     end           as of `retime`
 
     Returns
     -------
-    tuple  the law's limits and the motions, None if no part of the ranges has them; and that part
+    tuple  the law's limits and the motions, None if there are none; and the share of the ranges
     """
 
     def find(share: float) -> tuple[CurveLimitRows, Reach] | None:
-        own = {name: min(share * width, WIDEST) for name, width in widths.items()}
-        return _retime(find_within(curve, s, np.sqrt(plan[1]), own, least), plan, end)
+        scaled = {name: min(share * width, WIDEST) for name, width in widths.items()}
+        within, motion = find_within(curve, s, np.sqrt(plan[1]), scaled, least), plan
+        for _ in range(ROUNDS):
+            rows, whole, wanted = within.at(motion)
+            found = retime(s, whole, wanted, plan[1], end, ())
+            b = found.run(float(found.most[0]))
+            if found.share.min() < ENOUGH:
+                return None
+            a = np.gradient(b, s) / 2
+            motion = a, b, find_internal_force(rows, a, b)
+        return within.at(motion)[0], found
 
     low, high, best = 0.0, 1.0, find(1.0)
     if best is not None:
         return best, 1.0
-    # Downwards first, as most that are too wide are so by little.
+    # Downwards first: most ranges are only a little too wide.
     while high - low > CLOSE * high and high > NONE:
         share = LESS * high if best is None else (low + high) / 2
         found = find(share)
@@ -160,19 +169,3 @@ def retime_within(
         else:
             low, best = share, found
     return best, low
-
-
-def _retime(
-    within: Within, plan: Motion, end: tuple[float, float] | None
-) -> tuple[CurveLimitRows, Reach] | None:
-    """The motion within ranges, None if there is none."""
-    motion = plan
-    for _ in range(ROUNDS):
-        rows, whole, wanted = within.at(motion)
-        found = retime(within.s, whole, wanted, plan[1], end, ())
-        b = found.run(float(found.most[0]))
-        if found.share.min() < ENOUGH:
-            return None
-        a = np.gradient(b, within.s) / 2
-        motion = a, b, find_squeeze(rows, a, b)
-    return within.at(motion)[0], found

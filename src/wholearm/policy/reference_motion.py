@@ -1,4 +1,4 @@
-"""References along curves: a plan's motion, or a slower one, with something in reserve."""
+"""References along curves: a plan's motion, or a slower one, with robustness margins."""
 
 from __future__ import annotations
 
@@ -16,43 +16,42 @@ from ..mechanics.limits import CONE, PRESS, make_limits
 from ..mechanics.metric import metric_weights
 from ..problem.definition import End, Phase, Problem
 from ..results.trajectory import Trajectory
-from .curve_rows import CurveLimitRows, find_directions, find_squeeze, make_rows, measure_levels
+from .curve_rows import (
+    CurveLimitRows,
+    find_directions,
+    find_internal_force,
+    make_rows,
+    measure_levels,
+)
 from .range_margins import retime_within
 from .retiming import ENOUGH, Reach, retime
 
-INTERVALS = 120
-"""Intervals of a curve's table, dense at its ends."""
-PLACES = 400
-"""Places of a curve at which a plan's place is looked for first."""
-NEWTON = 4
-AUTHORITY = 2.0
-"""Reserve of torques along the way, in those of `curve_rows`: feedback adds to the motion."""
-TOUCH = 3e-3
-"""Speed along curves at which contacts are made, over the scene's."""
-ARRIVAL = 3e-3
-"""Time in which the rest of the way is run through at the end, a motion that fades away [s]."""
+INTERVALS = 120  # intervals of a curve's table, dense at its ends
+PLACES = 400  # places of a curve at which the nearest one is searched first
+NEWTON = 4  # iterations of that search
+AUTHORITY = 2.0  # margin of torques for feedback, in those of `curve_rows`
+TOUCH = 3e-3  # speed along curves at which contacts are made, over the scene's
+ARRIVAL = 3e-3  # time constant of the approach to the end [s]
+# Squared speeds over the plan's that are tried until there is a margin, or less of it: relative
+# errors of torques matter less where torques are small.
 SLOWER = (1.0, 0.5, 0.25, 0.12, 0.06)
-"""Squares of speeds over the plan's that are tried, the fastest first, until there is a reserve, or
-less of it: torques that are off by a part of themselves matter less where they are small."""
-REFINE = 2
-"""How often a slower motion's squeeze and what is in reserve for it are found from one another."""
+REFINE = 2  # iterations between a slower motion's internal force and its margins
 
 
 class ReferencePiece(NamedTuple):
-    """A phase along a curve."""
+    """The reference of a phase along a curve."""
 
     curve: Curve
     rows: CurveLimitRows
     reach: Reach
-    share: float  # least part of the reserve that is kept
+    share: float  # least share of the margin
     begins: float  # [m^2/s^2]: the plan's b at the start
-    # by what b is multiplied in the impact at the end; zero if the motion ends at rest
-    passes: float
+    passes: float  # ratio of b after and before the impact at the end; zero at rest
     b: Array  # (n,) [m^2/s^2]: the reference
 
     @property
     def duration(self) -> float:
-        """How long the reference takes [s]."""
+        """Duration of the reference [s]."""
         speeds = np.sqrt(self.b)
         return float((2 * np.diff(self.rows.s) / (speeds[1:] + speeds[:-1])).sum())
 
@@ -68,14 +67,14 @@ class ReferencePiece(NamedTuple):
 
 
 class Reserve(NamedTuple):
-    """What is kept in reserve: as `make_policy` says, for torques that are late as it knows [s]."""
+    """Margins as in `make_policy`, with the known delay of the torques [s]."""
 
     size: float
     ranges: Mapping[str, float] | None
     delay: float
 
     def scale(self) -> dict[str, float]:
-        """Half widths of the ranges that it is for; of the delay what is not known."""
+        """Half widths of the scaled ranges; of the delay its unknown part."""
         widths = {name: self.size * width for name, width in (self.ranges or {}).items()}
         late = widths.get("delay", 0.0)
         # Torques may be early as well: a delay is anything from none to its range.
@@ -85,7 +84,7 @@ class Reserve(NamedTuple):
 def trace_pieces(
     problem: Problem, phases: Sequence[Phase | None], plan: Trajectory, reserve: Reserve
 ) -> list[ReferencePiece | None]:
-    """Phases along curves, with motions that keep a reserve, or most of it; None for None."""
+    """References of phases along curves, with margins as large as possible; None for None."""
     pieces: list[ReferencePiece | None] = []
     for phase in reversed(phases):
         after = pieces[-1] if pieces else None
@@ -105,12 +104,12 @@ def trace_pieces(
 def _trace(
     problem: Problem, phase: Phase, plan: Trajectory, reserve: Reserve, after: ReferencePiece | None
 ) -> ReferencePiece:
-    """A phase's curve, and the motions along it that keep a reserve."""
-    own = np.flatnonzero((plan.phase == phase.index) & ~plan.held)
-    curve = trace_phase(phase, plan.z[own[0]], problem.phases[phase.index + 1 :])
-    places, *values = _follow(curve, plan, own)
+    """A phase's curve, and the controllable motions along it that keep margins."""
+    rows_of_phase = np.flatnonzero((plan.phase == phase.index) & ~plan.held)
+    curve = trace_phase(phase, plan.z[rows_of_phase[0]], problem.phases[phase.index + 1 :])
+    places, *values = _follow(curve, plan, rows_of_phase)
     s = _place_nodes(curve)
-    a, b, squeeze = (np.interp(s, places, value) for value in values)
+    a, b, internal = (np.interp(s, places, value) for value in values)
     touch, begins, passes, end = TOUCH * problem.scene.scales.speed, float(b[0]), 0.0, None
     if phase.end is End.IMPACT and after is not None and b[-1] > touch**2:
         passes = after.begins / float(b[-1])
@@ -118,16 +117,16 @@ def _trace(
     else:
         b = np.minimum(b, (touch + (curve.length - s) / ARRIVAL) ** 2)
     if reserve.ranges is not None and reserve.size:
-        planned = a, b, squeeze
+        planned = a, b, internal
         within, share = retime_within(curve, s, planned, reserve.scale(), problem.epsilon, end)
         if within is not None:
             return ReferencePiece(curve, *within, share, begins, passes, b)
     best: tuple[CurveLimitRows, Reach, float] | None = None
-    for part in SLOWER:
-        motion = part * a, part * b
-        rows = make_rows(curve, s, (*motion, squeeze))
-        for _ in range(REFINE if part < 1.0 else 0):
-            rows = make_rows(curve, s, (*motion, find_squeeze(rows, *motion)))
+    for factor in SLOWER:
+        motion = factor * a, factor * b
+        rows = make_rows(curve, s, (*motion, internal))
+        for _ in range(REFINE if factor < 1.0 else 0):
+            rows = make_rows(curve, s, (*motion, find_internal_force(rows, *motion)))
         wanted = reserve.size * rows.unit
         wanted[:, rows.presses :] = AUTHORITY * rows.unit[:, rows.presses :]
         found = retime(s, rows.slack, wanted, motion[1], end)
@@ -139,35 +138,35 @@ def _trace(
             break
     assert best is not None
     rows, found, share = best
-    # No part of ranges is kept by a reserve that knows of none.
+    # Margins without ranges keep no share of ranges.
     share = share if reserve.ranges is None else 0.0
     return ReferencePiece(curve, rows, found, share, begins, passes, b)
 
 
 def _follow(
-    curve: Curve, plan: Trajectory, own: NDArray[np.int64]
+    curve: Curve, plan: Trajectory, rows: NDArray[np.int64]
 ) -> tuple[Array, Array, Array, Array]:
-    """Places s, a, b and squeeze of a plan's rows along a curve."""
+    """Places s, a, b and internal force of a plan's rows along a curve."""
     formation, metric = curve.formation, metric_weights(curve.formation.scene)
-    z, grid = plan.z[own], np.linspace(0.0, curve.length, PLACES)
+    z, grid = plan.z[rows], np.linspace(0.0, curve.length, PLACES)
     away = (z[:, None] - curve.evaluate(grid).z[None]) ** 2 @ metric
     s = grid[away.argmin(axis=1)]
     for _ in range(NEWTON):
         point = curve.evaluate(s)
         s = np.clip(s + ((z - point.z) * point.z_s) @ metric, 0.0, curve.length)
     point = curve.evaluate(s)
-    v = (point.z_s * plan.z_dot[own]) @ metric
-    a = (point.z_s * plan.z_ddot[own]) @ metric
+    v = (point.z_s * plan.z_dot[rows]) @ metric
+    a = (point.z_s * plan.z_ddot[rows]) @ metric
     forces = inverse(formation, *point[:3], find_directions(curve, s), point.kinematics)
     columns = [plan.contacts.index(name) for name in formation.names]
     rolls = [columns[row] for row in formation.rolling_rows]
-    c = np.hstack([plan.c_n[own][:, columns], plan.c_t[own][:, rolls]])
-    # The other parts of the forces are orthogonal to that of the squeeze.
+    c = np.hstack([plan.c_n[rows][:, columns], plan.c_t[rows][:, rolls]])
+    # The other parts of the forces are orthogonal to that of the internal force.
     return s, a, v**2, np.asarray(np.einsum("ni,ni->n", c, forces.Cl))
 
 
 def _place_nodes(curve: Curve) -> Array:
-    """Places of a table, with all reversals."""
+    """Nodes of a table, with all reversals."""
     s = curve.length * (1 - np.cos(np.pi * np.linspace(0, 1, INTERVALS + 1))) / 2
     s = np.sort(np.concatenate([s, [part.stop for part in curve.segments[:-1]]]))
     return np.asarray(s[np.diff(s, prepend=-1.0) > 1e-7 * curve.length])

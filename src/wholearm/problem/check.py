@@ -1,7 +1,4 @@
-"""What a problem has to be, whether it comes from a file or was made of objects.
-
-Every message names the key that the value has in a file, says what was given and what is allowed.
-"""
+"""Validation of problems, from files or made of objects; messages name the key of a file."""
 
 from __future__ import annotations
 
@@ -46,7 +43,11 @@ def check_problem(problem: Problem) -> None:
             raise InputError("", f"phases[{index + 1}]", text)
         _check_formation(phase.formation, f"phases[{index + 1}].contacts")
         _check_until(problem.scene, phase, f"phases[{index + 1}].until")
-        _check_settle(problem.scene, phase, f"phases[{index + 1}].settle")
+        key, declared = f"phases[{index + 1}].settle", keys_of(Phase)["settle"]
+        declared.check(declared.read(phase.settle, key), key, problem.scene)
+        if phase.settle and phase.end is End.SMOOTH:
+            text = f"{phase.settle:g} given, but the phase has end = 'smooth'"
+            raise InputError("", key, text)
     for phase, following in zip_longest(problem.phases, problem.phases[1:]):
         _check_end(phase, following)
     for index, goal in enumerate(problem.goals):
@@ -88,13 +89,12 @@ def _check_formation(formation: Formation, key: str) -> None:
             text = f"{contacts[row]} cannot roll without friction, and friction.{part} is 0"
             raise InputError("", key, text)
     if formation.rolling and formation.n_constraints > 4:
-        raise InputError(
-            "",
-            key,
+        text = (
             f"{len(contacts)} contacts of which {formation.n_rolling} roll leave no freedom to "
             f"move: a rolling one counts twice, which makes {formation.n_constraints}; allowed are "
-            "up to 4",
+            "up to 4"
         )
+        raise InputError("", key, text)
 
 
 def _check_until(scene: Scene, phase: Phase, key: str) -> None:
@@ -112,14 +112,6 @@ def _check_until(scene: Scene, phase: Phase, key: str) -> None:
     if freedoms > 1 and (given := len(ends) + (until.contact is not None)) > freedoms:
         text = f"{until} gives {given} conditions; allowed are {freedoms}, as the contacts leave"
         raise InputError("", key, f"{text} {freedoms} freedoms")
-
-
-def _check_settle(scene: Scene, phase: Phase, key: str) -> None:
-    """Check for how long the end of a phase is held, if it says so itself."""
-    own = keys_of(Phase)["settle"]
-    own.check(own.read(phase.settle, key), key, scene)
-    if phase.settle and phase.end is End.SMOOTH:
-        raise InputError("", key, f"{phase.settle:g} given, but the phase has end = 'smooth'")
 
 
 def check_coordinate(scene: Scene, coordinate: str, given: float, key: str) -> None:
@@ -155,18 +147,13 @@ def _check_end(phase: Phase, following: Phase | None) -> None:
     before = {*phase.formation.contacts, until.contact}
     extra = [c.name for c in contacts if c not in before]
     if extra:
-        raise InputError(
-            "", key, f"{given}, but phase {following.number} has {', '.join(extra)} too"
-        )
+        text = f"{given}, but phase {following.number} has {', '.join(extra)} too"
+        raise InputError("", key, text)
     same = set(contacts) == set(phase.formation.contacts)
-    if (
-        until.is_release
-        and same
-        and set(following.formation.rolling) == set(phase.formation.rolling)
-    ):
-        raise InputError(
-            "", key, f"phase {following.number} releases no contact, and none rolls or slides anew"
-        )
+    same = same and set(following.formation.rolling) == set(phase.formation.rolling)
+    if until.is_release and same:
+        text = f"phase {following.number} releases no contact, and none rolls or slides anew"
+        raise InputError("", key, text)
 
 
 def _check_fingers(problem: Problem) -> None:
@@ -176,13 +163,11 @@ def _check_fingers(problem: Problem) -> None:
         return
     gap = float(evaluate_finger_gap(scene, problem.start[None])[0])
     if gap < -scene.touching:
-        raise InputError(
-            "",
-            "start.x",
+        text = (
             f"{problem.start[0]:g} closes the fingers into each other: their gap is {gap:.4g} m; "
             "allowed is 0 or more, unless fingers_collide = false; "
-            + name_reach(scene, float(problem.start[2])),
         )
+        raise InputError("", "start.x", text + name_reach(scene, float(problem.start[2])))
 
 
 def _check_first_formation(problem: Problem) -> None:
@@ -197,8 +182,5 @@ def _check_first_formation(problem: Problem) -> None:
     touching = find_touching(problem.scene, problem.start)
     first = formation.contacts
     if not set(first) <= set(touching):
-        raise InputError(
-            "",
-            "phases[1].contacts",
-            f"{describe(first)} given, but the closed fingers touch {describe(touching)}",
-        )
+        text = f"{describe(first)} given, but the closed fingers touch {describe(touching)}"
+        raise InputError("", "phases[1].contacts", text)

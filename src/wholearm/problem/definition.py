@@ -20,8 +20,7 @@ from .goal import Goal
 from .table import change_table, match_table, write_table
 from .uncertainty import read_widths
 
-ROWS = {"x": 0, "phi": 2}
-"""Rows of z that may be given where a phase ends."""
+ROWS = {"x": 0, "phi": 2}  # rows of z that may be given where a phase ends
 SETTLE_GAP = 3e-3
 """Gap that closes where the end of a phase is held, over the scene's length: 0.1 mm of 35 mm."""
 
@@ -42,8 +41,7 @@ def _name_contact(more: str = "") -> dict[str, str]:
     return {"type": "string", "pattern": f"^([ev][0-9]+-tip[12]|v[0-9]+-(palm|finger[12])){more}$"}
 
 
-CONTACT = _name_contact()
-"""JSON Schema of the name of a contact."""
+CONTACT = _name_contact()  # JSON Schema of the name of a contact
 DWELL = FieldKind(
     lambda given, key: (read_share if isinstance(given, str) else NONNEGATIVE.read)(given, key),
     {"anyOf": [NONNEGATIVE.schema, {"type": "string", "pattern": "^[^%]+%\\s*$"}]},

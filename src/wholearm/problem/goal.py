@@ -1,4 +1,4 @@
-"""Where an object shall come to lie, in place of the phases that lead there."""
+"""Goals of a problem: poses at rest that the object is to reach, in place of phases."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from ..common.fields import NUMBER, declare, key, leave
 from ..scene.model import Scene
 from ..scene.ranges import PLACE, TURN, check_place
 
-INDEX = leave({"type": "integer", "minimum": 0})
-"""Number of an edge."""
+INDEX = leave({"type": "integer", "minimum": 0})  # number of an edge
 _ALLOWED = "allowed is a table with flush or phi_deg, and x"
 
 
@@ -95,11 +94,8 @@ def read_goals(table: Mapping[str, Any]) -> tuple[Goal, ...]:
 
 def name_goal(goals: tuple[Goal, ...], index: int, table: Mapping[str, Any]) -> str:
     """The key of a goal, by its index from 0, as its file has it."""
-    return (
-        "goal"
-        if len(goals) == 1 and not isinstance(table.get("goal"), list)
-        else (f"goal[{index + 1}]")
-    )
+    alone = len(goals) == 1 and not isinstance(table.get("goal"), list)
+    return "goal" if alone else f"goal[{index + 1}]"
 
 
 def match_goals(goals: tuple[Goal, ...], table: Mapping[str, Any]) -> Any:

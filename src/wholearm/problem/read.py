@@ -29,11 +29,9 @@ from .goal import read_goals
 
 _T = TypeVar("_T")
 
-_THERE = 1e-3
-"""How far from a goal a plan may end, in radii of gyration and in rad."""
+_THERE = 1e-3  # how far from a goal a plan may end, in radii of gyration and in rad
 
-ROLLING = " rolling"
-"""Follows the name of a contact that rolls in a phase's `contacts`."""
+ROLLING = " rolling"  # follows the name of a contact that rolls in a phase's `contacts`
 
 
 def read_problem(path: str) -> Problem:
@@ -80,15 +78,16 @@ def _build_problem(table: Mapping[str, Any], source: str) -> Problem:
     given = table.get("phases", [])
     if not isinstance(given, list):
         raise InputError("", "phases", f"{given!r} is not a list of [[phases]]")
+    uncertainty = None
+    if "uncertainty" in table:
+        uncertainty = _table(table, "uncertainty", keys.UNCERTAINTY)
     return Problem(
         scene=scene,
         start=start,
         phases=tuple(_read_phase(scene, i, entry) for i, entry in enumerate(given)),
         source=source,
         table=table,
-        uncertainty=_table(table, "uncertainty", keys.UNCERTAINTY)
-        if "uncertainty" in table
-        else None,
+        uncertainty=uncertainty,
         goals=read_goals(table),
         **collect_keys(Problem, table),
     )
@@ -103,9 +102,8 @@ def read_own_problem(meta: Mapping[str, Any], source: str = "") -> Problem:
     """
     table = meta.get("problem")
     if not isinstance(table, Mapping) or not table:
-        raise InputError(
-            source, "meta.problem", "the trajectory does not hold its problem's tables"
-        )
+        text = "the trajectory does not hold its problem's tables"
+        raise InputError(source, "meta.problem", text)
     try:
         return build_problem(table)
     except InputError as error:
@@ -149,9 +147,8 @@ def _read_scene(table: Mapping[str, Any]) -> Scene:
 def _read_start(scene: Scene, start: Mapping[str, Any]) -> Array:
     edge, count = start["flush"], scene.polygon.n_vertices
     if not isinstance(edge, int) or isinstance(edge, bool) or not 0 <= edge < count:
-        raise InputError(
-            "", "start.flush", f"{edge!r} is not an edge; allowed are 0 to {count - 1}"
-        )
+        text = f"{edge!r} is not an edge; allowed are 0 to {count - 1}"
+        raise InputError("", "start.flush", text)
     return place_start(scene, edge, require_number(start["x"], "start.x"))
 
 
@@ -232,19 +229,15 @@ def read_until(scene: Scene, given: object) -> Until:
     allowed = "allowed are a contact name, or a table with contact, phi_deg or x, or several"
     if not isinstance(given, dict) or not given or not set(given) <= set(keys.UNTIL):
         raise InputError("", "", f"{given!r} does not end a phase; {allowed}")
-    pins = tuple(_read_pin(key, value) for key, value in given.items() if key != "contact")
+    pins = []
+    for key, number in ((key, require_number(given[key], "")) for key in given if key != "contact"):
+        if key == "phi_deg":
+            TURN.check("", number, "degrees")
+        pins.append((key, number) if key == "x" else ("phi", math.radians(number)))
     if "contact" in given:
-        return Until(contact=parse_contact(given["contact"], scene), pins=pins)
+        return Until(contact=parse_contact(given["contact"], scene), pins=tuple(pins))
     (coordinate, value), *others = pins
     return Until(None, coordinate, value, tuple(others))
-
-
-def _read_pin(key: str, value: object) -> tuple[str, float]:
-    number = require_number(value, "")
-    if key == "x":
-        return key, number
-    TURN.check("", number, "degrees")
-    return "phi", math.radians(number)
 
 
 def _at(key: str, read: Callable[[], _T]) -> _T:

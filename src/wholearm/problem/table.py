@@ -46,9 +46,8 @@ def change_table(
         if not dotted and name not in names:
             near = get_close_matches(name, names, 1, 0.5)
             hint = f"did you mean {near[0]!r}? " if near else ""
-            raise InputError(
-                "", name, f"unknown name; {hint}allowed are {', '.join(sorted(names))}"
-            )
+            text = f"unknown name; {hint}allowed are {', '.join(sorted(names))}"
+            raise InputError("", name, text)
         whole = name == "friction" and isinstance(value, Mapping)
         for key in (name,) if dotted or whole else names[name]:
             _set(changed, key, _to_plain(value))
@@ -129,17 +128,13 @@ def write_table(problem: Problem) -> Mapping[str, Any]:
     if start is None:
         return {}
     table: dict[str, Any] = {
-        **{
-            key: value
-            for key, value, own in _list_values(("", problem))
-            if own.required or value != own.shown_default
-        },
-        "object": {},
-        "fingers": {"1": {}, "2": {}},
-        "friction": {},
-        "start": start,
-        "phases": [_match_phase([], phase) for phase in problem.phases],
+        key: value
+        for key, value, own in _list_values(("", problem))
+        if own.required or value != own.shown_default
     }
+    phases = [_match_phase([], phase) for phase in problem.phases]
+    table |= {"object": {}, "fingers": {"1": {}, "2": {}}, "friction": {}}
+    table |= {"start": start, "phases": phases}
     if problem.uncertainty is not None:
         table["uncertainty"] = _to_plain(problem.uncertainty)
     if problem.goals:

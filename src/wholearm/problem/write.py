@@ -1,4 +1,4 @@
-"""Problems as files."""
+"""Problem files in TOML, written from the tables of a problem."""
 
 from __future__ import annotations
 
@@ -37,14 +37,12 @@ def write_toml(table: Mapping[str, Any], where: str = "") -> str:
         if isinstance(value, Mapping):
             inner.append(f"\n[{full}]\n{write_toml(value, f'{full}.')}")
         elif key in ("phases", "goal") and isinstance(value, list):
-            inner += [f"\n[[{full}]]\n{_write_lines(entry)}" for entry in value]
+            for entry in value:
+                lines = (f"{name} = {_write(item)}\n" for name, item in entry.items())
+                inner.append(f"\n[[{full}]]\n{''.join(lines)}")
         else:
             plain.append(f"{name} = {_write(value)}\n")
     return "".join(plain + inner)
-
-
-def _write_lines(table: Mapping[str, Any]) -> str:
-    return "".join(f"{key} = {_write(value)}\n" for key, value in table.items())
 
 
 def _write(value: Any) -> str:

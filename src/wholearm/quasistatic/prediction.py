@@ -1,4 +1,4 @@
-"""What is predicted of quasistatic motions at speed: numbers, text and plain values."""
+"""Report of a prediction: quasistatic motions, and the speeds up to which contacts hold."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class Place(NamedTuple):
 
 
 class Weakest(NamedTuple):
-    """What gives way first."""
+    """The limits that are missed first, and where."""
 
-    # one, or two of which either does with another squeeze; none where it is no contact
+    # one, or two of which either does with another internal force; none where it is no contact
     contacts: tuple[str, ...]
     others: tuple[str, ...]  # torques or speeds of fingers that keep it from pressing more
     place: Place
@@ -35,7 +35,7 @@ class Weakest(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What gives way, in words."""
+        """The limits in words."""
         parts = [" or ".join(self.contacts), " and ".join(self.others)]
         return ", by ".join(filter(None, parts)) or "jams"
 
@@ -43,9 +43,9 @@ class Weakest(NamedTuple):
 class Survival(NamedTuple):
     """Up to which speed one kind of motion keeps every contact."""
 
-    # "steady": at one speed throughout, with the best squeeze at each place; "rest to rest", "from
-    # rest", "to rest": as a cosine of time, or with constant acceleration, likewise; "own torques":
-    # at one speed, under the torques of the quasistatic motion
+    # "steady": at one speed, with the best internal force at each place; "rest to rest",
+    # "from rest", "to rest": as a cosine of time, or with constant acceleration, likewise; "own
+    # torques": at one speed, under the torques of the quasistatic motion
     motion: str
     # [m/s]: along the phase, its largest, from which on a contact presses with less than epsilon.
     # Zero where one does near rest, None where none does.
@@ -85,7 +85,7 @@ class PhasePrediction:
     # line in (x, phi)
     path: str
     length: float  # [m]
-    # what presses least in the quasistatic motion with the best squeeze; None if left out
+    # what presses least in the quasistatic motion with the best internal force; None if left out
     slow: Weakest | None = None
     # stretches where the quasistatic motion keeps every contact
     kept: tuple[tuple[Place, Place], ...] = ()
@@ -132,27 +132,18 @@ class Prediction(Result):
             parts = "; ".join(f"{a.to_text()} to {b.to_text()}" for a, b in phase.kept)
             kept, slow = "all along" if phase.is_kept else parts or "nowhere", phase.slow
             rows.append((*row, phase.length, slow.force, slow.name, slow.place.to_text(), kept))
-        heads = [
-            "phase:d",
-            "until",
-            "along",
-            "length [m]:.4g",
-            f"least c_n [N]:+{form}",
-            "of",
-            "at",
-        ]
-        return Table([*heads, "kept"], rows)
+        heads = ["phase:d", "until", "along", "length [m]:.4g", f"least c_n [N]:+{form}"]
+        return Table([*heads, "of", "at", "kept"], rows)
 
     def _list_speeds(self) -> Table:
         rows = []
-        for phase in self.phases:
-            for own in phase.survivals:
-                first = f"{own.first.name} at {own.first.place.to_text()}"
-                speeds = own.speed, own.lost
-                speed, lost = ("any speed" if v is None else f"{v:.4g}" for v in speeds)
-                if own.again is not None:
-                    speed = f"0; from {own.again:.4g} on"
-                row = phase.number, own.motion, speed, own.duration, lost
-                rows.append((*row, first if own.speed is not None else "nothing gives way"))
+        for phase, survival in ((p, own) for p in self.phases for own in p.survivals):
+            ends = survival.speed, survival.lost
+            speed, lost = ("any speed" if v is None else f"{v:.4g}" for v in ends)
+            if survival.again is not None:
+                speed = f"0; from {survival.again:.4g} on"
+            first = f"{survival.first.name} at {survival.first.place.to_text()}"
+            first = "nothing gives way" if survival.speed is None else first
+            rows.append((phase.number, survival.motion, speed, survival.duration, lost, first))
         heads = ["phase:d", "motion", "keeps epsilon to [m/s]:.4g", "lasting [s]:.4g"]
         return Table([*heads, "contacts to [m/s]:.4g", "first"], rows)

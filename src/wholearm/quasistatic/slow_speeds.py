@@ -1,4 +1,8 @@
-"""Whether quasistatic motions keep every contact, and up to which speed that lasts."""
+"""Speeds up to which motions along the paths of phases keep every contact, without planning.
+
+Inverse dynamics along a path at given s' and s''; the internal force is the best one at each place
+(`squeeze`), or that of quasistatic torques. Breaks are found by bisection over the speed.
+"""
 
 from __future__ import annotations
 
@@ -40,45 +44,35 @@ from .prediction import (
     Survival,
     Weakest,
 )
-from .squeeze import Squeezing
+from .squeeze import InternalForceLimits
 
-PLACES = 241
-"""About how many places of a phase are looked at."""
-_NEWTON = 20
-"""Most steps that close contacts."""
-_CLOSED = 1e-11
-"""Step that counts as none, in radii of gyration or radians."""
+PLACES = 241  # about how many places of a phase are looked at
+_NEWTON = 20  # most steps that close contacts
+_CLOSED = 1e-11  # step that counts as none, in radii of gyration or radians
 _SCALED_SPEEDS = np.geomspace(1e-2, 1e2, 49)
 """Speeds at which a break is looked for, over the scene's speed."""
-_HALVINGS = 24
-"""Steps of bisection."""
+_HALVINGS = 24  # steps of bisection
 SQUEEZE = 0.5
-"""How hard quasistatic torques squeeze: as hard as needs be at 0, as contacts press most at 1."""
-OWN = "own torques"
-"""Name of the motion under the torques of the quasistatic one."""
-_SPEEDS = 61
-"""Speeds of a curve."""
+"""Internal force of quasistatic torques: 0 least, 1 with the largest least normal force."""
+OWN = "own torques"  # name of the motion under the torques of the quasistatic one
+_SPEEDS = 61  # speeds of a curve
 _SHOWN = 1.4
 """Largest speed of curves over the largest at which something breaks; its cube for the least."""
-_ROWS = 8
-"""Every so many places of a phase quasistatic torques are kept."""
+_ROWS = 8  # every so many places of a phase quasistatic torques are kept
 
 
 @exclusive
 def predict(
-    problem: Problem,
-    *,
-    squeeze: float = SQUEEZE,
-    progress: Callable[[str], None] | None = None,
+    problem: Problem, *, squeeze: float = SQUEEZE, progress: Callable[[str], None] | None = None
 ) -> Prediction:
     """Predict quasistatic motions along the phases of a problem, and at which speed they break.
 
     Parameters
     ----------
-    squeeze   how hard quasistatic torques squeeze, from 0, the least torques that keep epsilon, to
+    squeeze   internal force of quasistatic torques, from 0, the least torques that keep epsilon, to
               1, those with which what presses least in the phase presses most. They are the least
               torques that keep a normal force that far between.
-    progress  told which phase is looked at
+    progress  called with the phase that is predicted
 
     Raises
     ------
@@ -86,19 +80,19 @@ def predict(
     """
     require_phases(problem)
     share = SHARE.read(squeeze, "squeeze")
-    found: list[PhasePrediction] = []
+    predictions: list[PhasePrediction] = []
     z, moving = problem.start, False
     with name_source(problem.source):
         for phase in problem.phases:
             if progress is not None:
                 progress(f"predicting phase {phase.number} of {len(problem.phases)}")
             later = problem.phases[phase.index + 1 :]
-            road = make_road(phase, z, later)
+            path = sample_path(phase, z, later)
             rests = not moving, phase.end is End.REST
-            found.append(_predict_phase(problem, phase, road, rests, share))
-            z = find_end(phase, z, later) if road is None else road.z[-1]
+            predictions.append(_predict_phase(problem, phase, path, rests, share))
+            z = find_end(phase, z, later) if path is None else path.z[-1]
             moving = phase.end is not End.REST
-    return Prediction(problem.name, problem.epsilon, tuple(found))
+    return Prediction(problem.name, problem.epsilon, tuple(predictions))
 
 
 def make_torques(prediction: Prediction, speed: float) -> TorqueProfile:
@@ -131,96 +125,93 @@ def make_torques(prediction: Prediction, speed: float) -> TorqueProfile:
 
 
 def _predict_phase(
-    problem: Problem, phase: Phase, road: Road | None, rests: tuple[bool, bool], share: float
+    problem: Problem, phase: Phase, path: PathSamples | None, rests: tuple[bool, bool], share: float
 ) -> PhasePrediction:
     names, until = phase.formation.names, str(phase.until)
-    if road is None:
+    if path is None:
         return PhasePrediction(phase.number, names, until, "left out", math.nan)
-    paced = ("moving", "to rest", "from rest", "rest to rest")[2 * rests[0] + rests[1]]
-    looks = {
-        "steady": (look_along(road, Pace.steady(road)), road.length),
-        paced: (look_along(road, pace := Pace.between(road, rests)), pace.way),
+    motion_name = ("moving", "to rest", "from rest", "rest to rest")[2 * rests[0] + rests[1]]
+    profile = UnitProfile.between(path, rests)
+    motions = {
+        "steady": (evaluate_best(path, UnitProfile.steady(path)), path.length),
+        motion_name: (evaluate_best(path, profile), profile.way),
     }
-    torques = find_torques(road, problem.epsilon, share)
+    torques = find_torques(path, problem.epsilon, share)
     if torques is not None:
-        looks[OWN] = (look_under(road, torques.tau), road.length)
+        motions[OWN] = (evaluate_torques(path, torques.tau), path.length)
     unit = problem.scene.scales.speed
     survivals = tuple(
-        _survive(road, name, look, way, problem.epsilon, unit)
-        for name, (look, way) in looks.items()
+        _survive(path, name, evaluate, way, problem.epsilon, unit)
+        for name, (evaluate, way) in motions.items()
     )
-    zero = np.zeros_like(road.s)
-    grasp = road.squeezing.find_best(zero, zero)
-    held = (grasp.least >= problem.epsilon) & (road.inertia > 0)
+    zero = np.zeros_like(path.s)
+    grasp = path.force_limits.find_best(zero, zero)
+    held = (grasp.least >= problem.epsilon) & (path.inertia > 0)
     return PhasePrediction(
         number=phase.number,
         contacts=names,
         until=until,
-        path="line" if road.curve is None else "curve",
-        length=road.length,
-        slow=_name(road, looks["steady"][0](0.0)),
-        kept=_list_stretches(road, held),
+        path="line" if path.curve is None else "curve",
+        length=path.length,
+        slow=_name(path, motions["steady"][0](0.0)),
+        kept=_list_stretches(path, held),
         survivals=survivals,
-        torques=None if torques is None else _thin_out(road, torques),
-        curves=_draw(survivals, looks, unit),
+        torques=None if torques is None else _thin_out(path, torques),
+        curves=_draw(survivals, motions, unit),
     )
 
 
-def find_torques(road: Road, epsilon: float, share: float) -> QuasistaticTorques | None:
-    """Torques that balance a quasistatic motion at all places of a road; None if some have none.
+def find_torques(path: PathSamples, epsilon: float, share: float) -> QuasistaticTorques | None:
+    """Torques that balance a quasistatic motion at all places of a path; None if some have none.
 
     Parameters
     ----------
     epsilon : [N]
-    share          how hard they squeeze; see `predict`
+    share          internal force; see `predict`
     """
-    zero = np.zeros_like(road.s)
-    best = road.squeezing.find_best(zero, zero)
-    if not (best.least >= epsilon).all() or not (road.inertia > 0).all():
+    zero = np.zeros_like(path.s)
+    best = path.force_limits.find_best(zero, zero)
+    if not (best.least >= epsilon).all() or not (path.inertia > 0).all():
         return None
     wanted = epsilon + share * float(best.least.min() - epsilon)
-    low, high = road.squeezing.find_span(zero, zero, wanted)
-    forces, size = road.forces, (road.forces.Tl**2).sum(axis=1)
+    low, high = path.force_limits.find_span(zero, zero, wanted)
+    forces, size = path.forces, (path.forces.Tl**2).sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         lightest = -(forces.T0 * forces.Tl).sum(axis=1) / size
     # At the largest least force the span is one point, but for rounding.
-    middle = np.where(low <= high, np.clip(lightest, low, high), best.squeeze)
-    squeeze = np.where(size > 0, middle, 0.0)
-    c = forces.c(zero, zero, squeeze)
-    c_n, _ = split_forces(road.phase.formation, c, road.directions.Xi)
-    return QuasistaticTorques(road.s, road.z, forces.tau(zero, zero, squeeze), c_n)
+    middle = np.where(low <= high, np.clip(lightest, low, high), best.internal_force)
+    internal = np.where(size > 0, middle, 0.0)
+    c = forces.c(zero, zero, internal)
+    c_n, _ = split_forces(path.phase.formation, c, path.directions.Xi)
+    return QuasistaticTorques(path.s, path.z, forces.tau(zero, zero, internal), c_n)
 
 
-def _thin_out(road: Road, torques: QuasistaticTorques) -> QuasistaticTorques:
+def _thin_out(path: PathSamples, torques: QuasistaticTorques) -> QuasistaticTorques:
     """Fewer places, with both ends and both sides of every reversal."""
-    ends = np.diff(road.s) == 0
+    ends = np.diff(path.s) == 0
     kept = np.append(True, ends) | np.append(ends, True)
     kept[::_ROWS] = True
     return QuasistaticTorques(*(part[kept] for part in torques))
 
 
 def _survive(
-    road: Road, name: str, look: Look, way: float, epsilon: float, unit: float
+    path: PathSamples, name: str, evaluate: Evaluate, way: float, epsilon: float, unit: float
 ) -> Survival:
-    thin = find_break(look, epsilon, unit)
-    lost = find_break(look, 0.0, unit, thin.speed if math.isfinite(thin.speed) else 0.0)
+    thin = find_break(evaluate, epsilon, unit)
+    lost = find_break(evaluate, 0.0, unit, thin.speed if math.isfinite(thin.speed) else 0.0)
     speed = None if math.isinf(thin.speed) else thin.speed
     return Survival(
         motion=name,
         speed=speed,
         duration=way / speed if speed else None,
         lost=None if math.isinf(lost.speed) else lost.speed,
-        again=_find_again(thin),
-        first=_name(road, thin.least),
+        again=thin.again if thin.speed == 0 and math.isfinite(thin.again) else None,
+        first=_name(path, thin.least),
     )
 
 
-def _find_again(found: Break) -> float | None:
-    return found.again if found.speed == 0 and math.isfinite(found.again) else None
-
-
-def _name(road: Road, least: Least) -> Weakest:
-    limits = [road.squeezing.limits.limits[k] for k in least.limits]
+def _name(path: PathSamples, least: Least) -> Weakest:
+    limits = [path.force_limits.limits.limits[k] for k in least.limits]
     contacts = dict.fromkeys(limit.part for limit in limits if limit.kind in (PRESS, CONE))
     kinds = dict.fromkeys(limit.kind for limit in limits if limit.kind not in (PRESS, CONE))
     others = (
@@ -228,45 +219,50 @@ def _name(road: Road, least: Least) -> Weakest:
         for kind in kinds
     )
     force = least.force if math.isfinite(least.force) else None
-    return Weakest(tuple(contacts), tuple(others), _place(road, least.place), force)
+    return Weakest(tuple(contacts), tuple(others), _place(path, least.place), force)
 
 
-def _place(road: Road, row: int) -> Place:
-    return Place(float(road.s[row]), float(road.z[row, 0]), float(road.z[row, 2]))
+def _place(path: PathSamples, row: int) -> Place:
+    return Place(float(path.s[row]), float(path.z[row, 0]), float(path.z[row, 2]))
 
 
-def _list_stretches(road: Road, held: NDArray[np.bool_]) -> tuple[tuple[Place, Place], ...]:
+def _list_stretches(path: PathSamples, held: NDArray[np.bool_]) -> tuple[tuple[Place, Place], ...]:
     """Stretches of places that are held, by both of their ends."""
     steps = np.flatnonzero(np.diff(np.concatenate([[0], held.astype(int), [0]])))
     pairs = steps.reshape(-1, 2)
-    return tuple((_place(road, a), _place(road, b - 1)) for a, b in pairs.tolist())
+    return tuple((_place(path, a), _place(path, b - 1)) for a, b in pairs.tolist())
 
 
 def _draw(
-    survivals: tuple[Survival, ...], looks: dict[str, tuple[Look, float]], unit: float
+    survivals: tuple[Survival, ...], motions: dict[str, tuple[Evaluate, float]], unit: float
 ) -> Curves:
     """Least forces over speed, about those at which something breaks."""
-    every = [speed for own in survivals for speed in (own.speed, own.lost, own.again) if speed]
+    every = [
+        speed
+        for survival in survivals
+        for speed in (survival.speed, survival.lost, survival.again)
+        if speed
+    ]
     ends = (min(every) / _SHOWN**3, _SHOWN * max(every)) if every else (0.1 * unit, 10 * unit)
     speeds = np.geomspace(*ends, _SPEEDS)
     forces = {
-        name: np.array([look(speed).force for speed in speeds.tolist()])
-        for name, (look, _) in looks.items()
+        name: np.array([evaluate(speed).force for speed in speeds.tolist()])
+        for name, (evaluate, _) in motions.items()
     }
     return Curves(speeds, forces)
 
 
 class Least(NamedTuple):
-    """What presses least along a phase at one speed."""
+    """Least normal force along a phase at one speed."""
 
     # [N]: the least normal force, or for a rolling contact the epsilon that its cone leaves; minus
-    # infinity where other limits are missed whatever the squeeze
+    # infinity where other limits are missed with any internal force
     force: float
-    place: int  # row of the road
-    limits: tuple[int, ...]  # what keeps it from being more, as indices into the limits of the road
+    place: int  # row of the path
+    limits: tuple[int, ...]  # what keeps it from being more, as indices into the limits of the path
 
 
-Look = Callable[[float], Least]
+Evaluate = Callable[[float], Least]
 """What presses least at a speed [m/s]."""
 
 
@@ -279,67 +275,67 @@ class Break(NamedTuple):
     again: float
 
 
-class Pace(NamedTuple):
-    """A motion along a phase whose largest speed is one: a = s'' and b = s'^2, shape (n,) each."""
+class UnitProfile(NamedTuple):
+    """Speed profile along a phase, of largest speed one: a = s'' and b = s'^2."""
 
     a: Array  # (n,) [1/m]
     b: Array  # (n,)
     way: float  # [m]: duration times the largest speed
 
     @staticmethod
-    def steady(road: Road) -> Pace:
+    def steady(path: PathSamples) -> UnitProfile:
         """At one speed throughout."""
-        return Pace(np.zeros_like(road.s), np.ones_like(road.s), road.length)
+        return UnitProfile(np.zeros_like(path.s), np.ones_like(path.s), path.length)
 
     @staticmethod
-    def between(road: Road, rests: tuple[bool, bool]) -> Pace:
+    def between(path: PathSamples, rests: tuple[bool, bool]) -> UnitProfile:
         """From rest or not, to rest or not: a cosine of time from rest to rest.
 
         With one end at rest s'' is constant, with none the speed is.
         """
-        x, length = road.s / road.length, road.length
+        x, length = path.s / path.length, path.length
         if rests == (True, True):
-            return Pace(2 * (1 - 2 * x) / length, 4 * x * (1 - x), np.pi / 2 * length)
+            return UnitProfile(2 * (1 - 2 * x) / length, 4 * x * (1 - x), np.pi / 2 * length)
         if not any(rests):
-            return Pace.steady(road)
-        sign = 1.0 if rests[0] else -1.0
-        return Pace(np.full_like(x, sign / (2 * length)), x if rests[0] else 1 - x, 2 * length)
+            return UnitProfile.steady(path)
+        sign, b = (1.0, x) if rests[0] else (-1.0, 1 - x)
+        return UnitProfile(np.full_like(x, sign / (2 * length)), b, 2 * length)
 
 
-def look_along(road: Road, pace: Pace) -> Look:
-    """What presses least along a road with the best squeeze at each place."""
+def evaluate_best(path: PathSamples, profile: UnitProfile) -> Evaluate:
+    """Least normal force along a path by speed, with the best internal force at each place."""
 
-    def look(speed: float) -> Least:
-        grasp = road.squeezing.find_best(speed**2 * pace.a, speed**2 * pace.b)
-        least = np.where(road.inertia > 0, grasp.least, -np.inf)
+    def evaluate(speed: float) -> Least:
+        grasp = path.force_limits.find_best(speed**2 * profile.a, speed**2 * profile.b)
+        least = np.where(path.inertia > 0, grasp.least, -np.inf)
         place = int(least.argmin())
-        owners = grasp.owners[place].tolist() if road.inertia[place] > 0 else []
+        owners = grasp.owners[place].tolist() if path.inertia[place] > 0 else []
         return Least(float(least[place]), place, tuple(owners))
 
-    return look
+    return evaluate
 
 
-def look_under(road: Road, tau: Array) -> Look:
-    """What presses least under given torques, shape (n, 2) [N m], at a steady speed."""
-    limits = road.squeezing.limits
+def evaluate_torques(path: PathSamples, tau: Array) -> Evaluate:
+    """Least normal force by a steady speed, under given torques, shape (n, 2) [N m]."""
+    limits = path.force_limits.limits
     of_c, _, of_rates = limits.columns
     owners, soft = limits.owners, limits.of("press", "cone")
     weights = np.concatenate([limit.weight for limit in limits.limits])
     fast = limits.of(SPEED)
 
-    def look(speed: float) -> Least:
-        c = road.press_under(tau, speed)
+    def evaluate(speed: float) -> Least:
+        c = path.press_under(tau, speed)
         force = (c @ of_c.T)[:, soft] / weights[soft]
-        rates = np.abs(speed * road.z_s[:, 3:] @ of_rates[fast].T)
+        rates = np.abs(speed * path.z_s[:, 3:] @ of_rates[fast].T)
         over = (rates > limits.high[fast]).any(axis=1)
         force[over] = -np.inf
         place, row = np.unravel_index(int(force.argmin()), force.shape)
         return Least(float(force[place, row]), int(place), (int(owners[soft[row]]),))
 
-    return look
+    return evaluate
 
 
-def find_break(look: Look, wanted: float, unit: float, above: float = 0.0) -> Break:
+def find_break(evaluate: Evaluate, wanted: float, unit: float, above: float = 0.0) -> Break:
     """The least speed at which less than a `wanted` force [N] is left.
 
     Parameters
@@ -348,10 +344,10 @@ def find_break(look: Look, wanted: float, unit: float, above: float = 0.0) -> Br
     unit : [m/s]   the scene's speed
     above : [m/s]  speed up to which more than that is known to be left, if it is at rest
     """
-    start, low = look(0.0), above
+    start, low = evaluate(0.0), above
     holds = start.force >= wanted
     for high in (unit * _SCALED_SPEEDS[unit * _SCALED_SPEEDS > above]).tolist():
-        least = look(high)
+        least = evaluate(high)
         if (least.force >= wanted) != holds:
             break
         low = high
@@ -359,7 +355,7 @@ def find_break(look: Look, wanted: float, unit: float, above: float = 0.0) -> Br
         return Break(np.inf, start, 0.0) if holds else Break(0.0, start, np.inf)
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
-        found = look(middle)
+        found = evaluate(middle)
         if (found.force >= wanted) == holds:
             low = middle
         else:
@@ -368,8 +364,8 @@ def find_break(look: Look, wanted: float, unit: float, above: float = 0.0) -> Br
 
 
 @dataclass(frozen=True, eq=False)
-class Road:
-    """Places along a phase, and what limits are of there."""
+class PathSamples:
+    """Path of a phase, sampled, with its limits."""
 
     phase: Phase
     curve: Curve | None  # none along a straight line
@@ -381,7 +377,7 @@ class Road:
     z_ss: Array
     directions: Directions  # one row for each place
     forces: PathForces
-    squeezing: Squeezing
+    force_limits: InternalForceLimits
     kinematics: Kinematics  # of the formation, for the velocity z_s
     # (n,): reduced inertia over that without friction: motions jam at zero and below
     inertia: Array
@@ -406,8 +402,8 @@ class Road:
         return np.asarray(np.linalg.solve(drop @ G.transpose(0, 2, 1), right[..., None])[..., 0])
 
 
-def make_road(phase: Phase, z: Array, later: Sequence[Phase]) -> Road | None:
-    """The places of a phase that starts at `z`, shape (5,); None with other than 1 or 2 freedoms.
+def sample_path(phase: Phase, z: Array, later: Sequence[Phase]) -> PathSamples | None:
+    """The path of a phase that starts at `z`, shape (5,); None with other than 1 or 2 freedoms.
 
     Raises
     ------
@@ -418,7 +414,7 @@ def make_road(phase: Phase, z: Array, later: Sequence[Phase]) -> Road | None:
         curve = trace_phase(phase, z, later)
         if phase.until.is_release:
             curve = replace(curve, length=RELEASE_AT * curve.length)
-        s, signs = _spread(curve)
+        s, signs = _sample_segments(curve)
         point = curve.evaluate(s)
         directions = Directions(signs[:, :-2], signs[:, -2:])
         return _measure(phase, curve, s, point[:3], point.kinematics, directions)
@@ -431,7 +427,7 @@ def make_road(phase: Phase, z: Array, later: Sequence[Phase]) -> Road | None:
     return _measure(phase, None, s, line, kinematics, directions)
 
 
-def _spread(curve: Curve) -> tuple[Array, Array]:
+def _sample_segments(curve: Curve) -> tuple[Array, Array]:
     """Places along a curve, both ends of each segment, and directions of contacts and joints."""
     places, signs = [], []
     for part in curve.segments:
@@ -450,12 +446,13 @@ def _measure(
     line: Sequence[Array],
     kinematics: Kinematics,
     directions: Directions,
-) -> Road:
+) -> PathSamples:
     z, z_s, z_ss = line
     forces = inverse(phase.formation, z, z_s, z_ss, directions, kinematics)
-    squeezing = Squeezing.of(phase.formation, forces, z_s[:, 3:])
+    limits = InternalForceLimits.of(phase.formation, forces, z_s[:, 3:])
     inertia = reduced_inertia(phase.formation, kinematics, directions)
-    return Road(phase, curve, s, z, z_s, z_ss, directions, forces, squeezing, kinematics, inertia)
+    line = s, z, z_s, z_ss
+    return PathSamples(phase, curve, *line, directions, forces, limits, kinematics, inertia)
 
 
 def _straighten(

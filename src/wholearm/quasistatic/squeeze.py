@@ -1,8 +1,8 @@
-"""How hard contacts can press at once: the largest least normal force over the squeeze.
+"""Internal force (squeeze) with the largest least normal force, at places of a path.
 
-At a place of a curve with a speed and an acceleration, every limit is affine in the squeeze. Those
-that epsilon sets, c_n >= epsilon and the cones of rolling contacts, can be kept up to some largest
-epsilon, while torques stay within their limits.
+At given s'^2 and s'' every limit is affine in the internal force. The largest epsilon of c_n >=
+epsilon and of the cones of rolling contacts, within the other limits, is a linear programme in two
+unknowns, solved by its vertices.
 """
 
 from __future__ import annotations
@@ -17,37 +17,35 @@ from ..contacts.formation import Formation
 from ..mechanics.dynamics import PathForces
 from ..mechanics.limits import CONE, PRESS, LimitSet, SideTerms, make_limits
 
-_FAR = 1e6
-"""Squeeze that stands for an infinite one, over the scene's force."""
+_FAR = 1e6  # internal force that stands for an infinite one, over the scene's force
 _LEVEL = 1e-12
-"""Slope over the squeeze below which a limit does not depend on it, over what is much for it."""
-_TIED = 1e-9
-"""Slack of a limit that counts as none, over what is much for it."""
+"""Slope over it below which a limit does not depend on it, over what is much for it."""
+_TIED = 1e-9  # slack of a limit that counts as none, over what is much for it
 
 
 class Grasp(NamedTuple):
-    """What presses least at n places, with the best squeeze."""
+    """Largest least normal force at n places."""
 
     # (n,) [N]: the largest epsilon that all contacts keep; minus infinity where other limits are
-    # missed whatever the squeeze
+    # missed with any internal force
     least: Array
-    squeeze: Array  # (n,) [N]
+    internal_force: Array  # (n,) [N]
     # (n, 2): limits, as indices into the set, that keep it from being larger, those of contacts
     # first
     owners: NDArray[np.int64]
 
 
-class Squeezing(NamedTuple):
-    """Limits at n places of a curve as functions of the squeeze."""
+class InternalForceLimits(NamedTuple):
+    """Limits at n places of a path as functions of the internal force."""
 
     limits: LimitSet  # for an epsilon of zero
     terms: SideTerms
 
     @staticmethod
-    def of(formation: Formation, forces: PathForces, rates: Array) -> Squeezing:
+    def of(formation: Formation, forces: PathForces, rates: Array) -> InternalForceLimits:
         """Those of a formation; see `SideTerms.of`."""
         limits = make_limits(formation, 0.0)
-        return Squeezing(limits, SideTerms.of(limits, forces, rates))
+        return InternalForceLimits(limits, SideTerms.of(limits, forces, rates))
 
     @property
     def force(self) -> float:
@@ -63,7 +61,7 @@ class Squeezing(NamedTuple):
         return soft, weights, self.limits.owners[rows]
 
     def find_span(self, a: Array, b: Array, epsilon: Array | float) -> tuple[Array, Array]:
-        """Least and largest squeeze with which all limits are kept, shape (n,) [N].
+        """Least and largest internal force with which all limits are kept, shape (n,) [N].
 
         The least is above the largest where there is none.
         """
@@ -72,7 +70,7 @@ class Squeezing(NamedTuple):
         return _intersect(offset, self.terms.press, _FAR * self.force)
 
     def find_best(self, a: Array, b: Array) -> Grasp:
-        """The squeeze with which every contact presses most, at places with a = s'', b = s'^2."""
+        """The internal force with the largest least normal force, at a = s'', b = s'^2."""
         soft, weights, owners = self._split()
         offset, slope = self.terms.at(a, b), self.terms.press
         low, high = _intersect(offset[:, ~soft], slope[:, ~soft], _FAR * self.force)
@@ -85,19 +83,19 @@ class Squeezing(NamedTuple):
         tried = np.clip(np.column_stack([low, high, corners]), low[:, None], high[:, None])
         least = (rest[:, None] + rise[:, None] * tried[..., None]).min(axis=2)
         k, best = np.arange(len(a)), least.argmax(axis=1)
-        squeeze, value = tried[k, best], np.where(low <= high, least[k, best], -np.inf)
-        slack = offset + slope * squeeze[:, None]
+        internal, value = tried[k, best], np.where(low <= high, least[k, best], -np.inf)
+        slack = offset + slope * internal[:, None]
         found = np.isfinite(value)
         slack[:, soft] -= np.where(found, value, 0.0)[:, None] * weights[soft]
         # Where other limits cannot be kept it is these that are to blame.
         slack[np.ix_(~found, soft)] = np.inf
         pair = np.argsort(np.where(found[:, None], np.abs(slack), slack), axis=1)[:, :2]
-        # Without a squeeze, only those that are missed.
+        # Where it has no effect, only those that are missed.
         bent = np.abs(np.take_along_axis(slope, pair, axis=1)) > _LEVEL
         free = np.take_along_axis(slack, pair, axis=1)[:, 1] > _TIED
         pair[:, 1] = np.where(free & ~bent.any(axis=1), pair[:, 0], pair[:, 1])
         rank = np.sort(owners[pair] + len(self.limits.limits) * ~soft[pair], axis=1)
-        return Grasp(value, squeeze, rank % len(self.limits.limits))
+        return Grasp(value, internal, rank % len(self.limits.limits))
 
 
 def _intersect(offset: Array, slope: Array, far: float) -> tuple[Array, Array]:

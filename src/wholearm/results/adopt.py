@@ -1,4 +1,4 @@
-"""What plans, replays, trajectories and torques have in common."""
+"""Torques and motions of plans, replays and trajectories, checked against a problem; saving."""
 
 from __future__ import annotations
 
@@ -56,6 +56,18 @@ def adopt_torques(
     if trajectory is not None:
         problem = adopt_phases(problem, trajectory.meta, trajectory.q[-1])
     return problem, torque, trajectory
+
+
+def require_same_contacts(problem: Problem, plan: Trajectory | None) -> None:
+    """Check that a plan, if there is one, has the contacts of a problem."""
+    odd = (
+        set()
+        if plan is None
+        else set(plan.contacts) ^ {contact.name for contact in problem.contacts}
+    )
+    if odd:
+        text = f"trajectory and problem differ in {', '.join(sorted(odd))}"
+        raise InputError("", "contacts", text)
 
 
 def require_same_phases(problem: Problem, plan: Trajectory) -> None:

@@ -1,4 +1,4 @@
-"""What holds the ends of phases, so that contacts close that are still open."""
+"""Dwell at the ends of phases: constant torques that close contacts and hold at rest."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether a plan or a policy was made for a problem, and what differs if it was not."""
+"""Provenance of plans and policies: differences of the problem that they were made for."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a replay of torques showed, phase by phase, as numbers and as tables."""
+"""Report of a replay: margins, ends, deviations and energies by phase, as tables."""
 
 from __future__ import annotations
 
@@ -222,7 +222,7 @@ class Report(Result):
         if gap is not None:
             lines.append(f"least gap of the fingers: {gap.least:.5g} m at t = {gap.time:.5g} s")
         # Epsilon with three digits, or a thousandth of the largest.
-        least = [own.least for phase in self.phases for own in phase.contacts]
+        least = [contact.least for phase in self.phases for contact in phase.contacts]
         largest = max((force for force in least if not math.isnan(force)), default=0.0)
         force = fixed(self.epsilon or 1e-3 * largest)
         forces = [

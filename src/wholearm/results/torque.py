@@ -49,6 +49,11 @@ class TorqueProfile:
         powers = x[:, None] ** np.arange(self.coefficients.shape[2])
         return np.asarray(np.einsum("njd,nd->nj", self.coefficients[piece], powers))
 
+    def at_places(self, x: Array) -> Array:
+        """Torques at places `x`, shape (n,) in [-1, 1], of every piece, as (k, 2, n) [N m]."""
+        powers = x[:, None] ** np.arange(self.coefficients.shape[2])
+        return np.asarray(self.coefficients @ powers.T)
+
     def integrate_squares(self) -> float:
         """Integral of tau^T tau over all pieces [(N m)^2 s]."""
         degree = self.coefficients.shape[2]

@@ -20,14 +20,11 @@ from ..common.arrays import Array
 from ..scene.model import Scene
 from .torque import TorqueProfile
 
-_STEP = 1e-6
-"""Largest step of torques that is none, over their limits."""
+_STEP = 1e-6  # largest step of torques that is none, over their limits
 _FLOOR = 5e-4
 """Least room that is counted on between a torque and its limit, over that: none takes for ever."""
-_QUICK = 1e12
-"""Rate of torques that stands for any, in their limits [1/s]."""
-_DEGREE = 6
-"""Degree of the polynomials in pieces that are as long as the shortest lag at most."""
+_QUICK = 1e12  # rate of torques that stands for any, in their limits [1/s]
+_DEGREE = 6  # degree of the polynomials in pieces that are as long as the shortest lag at most
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,13 +15,11 @@ from ..common.arrays import Array
 from ..common.errors import InputError, require_number
 from .torque import COLUMNS, TorqueProfile
 
-ERROR = 1e-5
-"""Largest error of the straight lines between rows, relative to the largest torque."""
+ERROR = 1e-5  # largest error of the straight lines between rows, relative to the largest torque
 STEP = 1e-6
 """Jump at a break from which on the rows keep it as a step, relative to the largest torque."""
 INTERPOLATIONS = ("linear", "hold")
-_PLACES = np.linspace(-1.0, 1.0, 17)
-"""Places in each piece of torques at which it is looked at."""
+_PLACES = np.linspace(-1.0, 1.0, 17)  # places in each piece of torques at which it is looked at
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(6)
 
 
@@ -54,7 +52,9 @@ def place_rows(
     ends = np.concatenate([breaks[:1], steps, breaks[-1:]])
     at = np.searchsorted(knots, ends)
     stretches = [knots[i : j + 1] for i, j in pairwise(at)]
-    rows = np.concatenate([np.column_stack([own, _fit_lines(torque, own)]) for own in stretches])
+    rows = np.concatenate(
+        [np.column_stack([stretch, _fit_lines(torque, stretch)]) for stretch in stretches]
+    )
     # Lines through a bend miss it on both sides; no limit is to be missed for that.
     peak = np.maximum(peak, np.abs(torque.at(knots)).max(axis=0))
     rows[:, 1:] = np.clip(rows[:, 1:], -peak, peak)

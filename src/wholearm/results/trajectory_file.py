@@ -12,7 +12,7 @@ import numpy as np
 from ..common.errors import InputError
 from ..common.files import read_arrays, require_ending, write_whole
 from ..common.plain import restore
-from .mode_names import ModeSpan
+from .plan_record import ModeSpan
 from .sampled import sample_phases
 from .torque import MOST, TorqueProfile
 from .trajectory import Trajectory

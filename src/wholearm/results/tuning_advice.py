@@ -1,4 +1,4 @@
-"""What helps to tune torques by hand: why contacts are lost, and which torques would keep them."""
+"""Advice for tuning by hand: forces at contact losses, and torques that prevent them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is not known exactly of a scene and of what carries torques out, and by how much."""
+"""Error model of a scene and its actuators: parametric ranges, sample-and-hold, gains, delay."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ from ..scene.model import Scene
 
 REACHED = 0.03
 """How far from the planned place a goal counts as reached, over the scene's length: 1 mm of 33."""
-TOLERANCE = 1e-6
-"""Of the simulations of samples, if no other is given, relative to the scene."""
+TOLERANCE = 1e-6  # of the simulations of samples, if no other is given, relative to the scene
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""One sample: what becomes of a plan when numbers are off."""
+"""Replay of a plan in a perturbed scene by complementarity simulation, compared with the plan."""
 
 from __future__ import annotations
 
@@ -26,8 +26,7 @@ PAUSE = 1e-3
 """Time for which a planned contact may be open, in the scene's unit of time, and still be kept."""
 CLOSING = 0.1
 """Time, likewise, in which a contact that is open when its phase begins has to close for good."""
-SNAPSHOTS = 24
-"""Poses of a motion that are kept for figures."""
+SNAPSHOTS = 24  # poses of a motion that are kept for figures
 
 
 class TimeWindow(NamedTuple):
@@ -82,7 +81,7 @@ class Trial:
             what = change_torques(self.torque, changes, rate, offset)
         else:
             gains = (1 + changes.get("gain1", 0.0), 1 + changes.get("gain2", 0.0))
-            delay = changes.get("delay", self.policy.pace.delay)
+            delay = changes.get("delay", self.policy.settings.delay)
             what = ClosedLoop(self.policy, self.windows[0].phase, delay, gains)
         try:
             simulation = self.simulate(changes, what, self.uncertainty.tolerance)
@@ -97,13 +96,10 @@ class Trial:
         end = float(simulation.t[-1])
         began = {number: time + loop.delay for number, time in loop.began.items()}
         last = self.windows[-1].phase
-        windows = [
-            own._replace(
-                start=began.get(own.phase, end),
-                stop=end if own.phase == last else began.get(own.phase + 1, math.inf),
-            )
-            for own in self.windows
-        ]
+        windows = []
+        for window in self.windows:
+            stop = end if window.phase == last else began.get(window.phase + 1, math.inf)
+            windows.append(window._replace(start=began.get(window.phase, end), stop=stop))
         return replace(self, windows=tuple(windows))
 
     def simulate(
@@ -138,18 +134,11 @@ class Trial:
         path = np.column_stack([np.interp(even, simulation.t, column) for column in simulation.z.T])
         near = distance <= self.uncertainty.find_distance(self.problem.scene)
         near = near and angle <= self.uncertainty.angle
-        return {
-            "distance": distance,
-            "angle": angle,
-            "reached": near and not given_up,
-            "kept": not lost and not given_up,
-            "lost": lost,
-            "phase": phase,
-            "time": time,
-            "least": least,
-            "path": path.tolist(),
-            "ended": simulation.outcome.text if given_up else "",
-        }
+        ended = simulation.outcome.text if given_up else ""
+        verdict = {"reached": near and not given_up, "kept": not lost and not given_up}
+        loss = {"lost": lost, "phase": phase, "time": time, "least": least}
+        ends = {"distance": distance, "angle": angle}
+        return ends | verdict | loss | {"path": path.tolist(), "ended": ended}
 
     def _follow(
         self, simulation: FreeSimulation, delay: float
@@ -162,13 +151,17 @@ class Trial:
         unit = self.problem.scene.scales.time
         began, losses, least = self.windows[0].start, list[tuple[float, int, str]](), math.inf
         for window in self.windows:
-            gains = [own.start for own in simulation.stretches if own.contact == window.gained]
+            gains = [
+                stretch.start
+                for stretch in simulation.stretches
+                if stretch.contact == window.gained
+            ]
             gain = min((time for time in gains if time > began), default=math.inf)
             # A phase ends when its contact is made, even if it bounces then.
             makes = [
-                own.time
-                for own in simulation.events
-                if own.contact == window.gained and own.kind is EventKind.GAINED
+                event.time
+                for event in simulation.events
+                if event.contact == window.gained and event.kind is EventKind.GAINED
             ]
             made = min((time for time in makes if time > began), default=gain)
             planned = window.stop + delay
@@ -200,7 +193,7 @@ def _find_loss(
     least = float(known.min()) if len(known) else math.inf
     pauses = list_pauses(simulation.stretches, name, start, stop)
     if pauses and pauses[0][0] <= start:
-        pauses = [own for own in pauses if own[1] > start + CLOSING * unit]
+        pauses = [pause for pause in pauses if pause[1] > start + CLOSING * unit]
     return next((first for first, after in pauses if after - first > PAUSE * unit), None), least
 
 
@@ -227,8 +220,8 @@ def make_trial(
         raise InputError("", "phases of the policy", given)
     first, last = (0, count - 1) if phase is None else (phase - 1, phase - 1)
     rows = np.flatnonzero((plan.phase >= first) & (plan.phase <= last))
-    speed = problem.scene.scales
-    units = np.array([speed.speed, speed.speed, *[speed.rate] * 3])
+    scales = problem.scene.scales
+    units = np.array([scales.speed, scales.speed, *[scales.rate] * 3])
     if np.abs(plan.z_dot[rows[0]] / units).max() > 1e-6:
         given = f"{phase} given; it does not start at rest, so that it is no trial of its own"
         raise InputError("", "--phase", given)
@@ -238,7 +231,7 @@ def make_trial(
             own.number,
             float(starts[own.index + 1]) - begin,
             tuple(own.formation.names),
-            own.until.contact.name if own.until.contact is not None else "",
+            "" if own.until.contact is None else own.until.contact.name,
         )
         for own in problem.phases[first : last + 1]
     )

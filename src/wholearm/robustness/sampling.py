@@ -1,4 +1,4 @@
-"""A study of samples: run, kept as they come, and counted."""
+"""Robustness by Latin-hypercube sampling: runs, shares with Wilson intervals, sensitivities."""
 
 from __future__ import annotations
 
@@ -33,26 +33,21 @@ from ..results.adopt import Torques, adopt_motion, require_same_phases
 from .error_model import Uncertainty, change_torques
 from .sample_run import TimeWindow, Trial, make_trial
 
-Z = 1.959963984540054
-"""Standard normal quantile of 0.975."""
-STEP = 1e-3
-"""Step of the differences, over the half width of a range."""
+Z = 1.959963984540054  # standard normal quantile of 0.975
+STEP = 1e-3  # step of the differences, over the half width of a range
 APART = 0.01
 """How far from events the instant is at which a force is looked at, over the duration: where a
 contact slides the other way forces step, at another time when numbers are off."""
 Task = tuple[int, tuple[float, ...]]
 """Number and values of a sample."""
-SAMPLES = Range(1, 10**6)
-"""Samples of a study."""
-DRAWN = 200
-"""Samples whose paths are kept, for figures."""
-_ROWS = 8
-"""Contacts lost first that the text lists; the others are counted."""
+SAMPLES = Range(1, 10**6)  # samples of a study
+DRAWN = 200  # samples whose paths are kept, for figures
+_ROWS = 8  # contacts lost first that the text lists; the others are counted
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Robustness(Result):
-    """What a plan bears."""
+    """Shares of samples that reach the goal, and sensitivities of the least normal force."""
 
     trial: Trial
     samples: Array  # (n, len(varied) + 1): as `Uncertainty.draw` gives them
@@ -81,18 +76,18 @@ class Robustness(Result):
     @property
     def reached(self) -> Share:
         """How many reach the goal, as near as the uncertainty says."""
-        return count_share(sum(own["reached"] for own in self.records), len(self.records))
+        return count_share(sum(record["reached"] for record in self.records), len(self.records))
 
     @property
     def kept(self) -> Share:
         """How many reach it and keep all planned contacts."""
-        good = sum(own["reached"] and own["kept"] for own in self.records)
+        good = sum(record["reached"] and record["kept"] for record in self.records)
         return count_share(good, len(self.records))
 
     @property
     def first_lost(self) -> dict[str, Share]:
         """Which contact goes first, by number of the phase and name, the most frequent first."""
-        names = Counter(_name_loss(own) for own in self.records if own["lost"])
+        names = Counter(_name_loss(record) for record in self.records if record["lost"])
         return {name: count_share(n, len(self.records)) for name, n in names.most_common()}
 
     @property
@@ -273,6 +268,31 @@ def use_processes(jobs: int | None = None) -> Executor:
     return ProcessPoolExecutor(jobs or os.cpu_count(), Spawning(), _end_with_parent)
 
 
+def connect(address: str, patience: float = 10.0) -> Executor:
+    """An executor on the workers of a Dask scheduler.
+
+    Parameters
+    ----------
+    address         such as ``tcp://10.0.0.1:8786``
+    patience : [s]  how long to wait for an answer
+
+    Raises
+    ------
+    InputError  if Dask is not installed, or no scheduler answers there
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        text = "Dask is not installed; pip install 'wholearm[cluster]' brings it"
+        raise InputError("", "--scheduler", text) from None
+    try:
+        client = Client(address, timeout=patience, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise InputError("", "--scheduler", f"{address}: {error}") from None
+    executor: Executor = client.get_executor(pure=False)
+    return executor
+
+
 def _end_with_parent() -> None:
     """Have this process end when the one that started it is killed, and can tell it no more."""
     parent = parent_process()
@@ -295,9 +315,9 @@ def _stamp(trial: Trial, seed: int) -> dict[str, Any]:
         "problem": trial.problem.table,
         "plan": _digest([trial.torque.breaks, trial.torque.coefficients, trial.state]),
         "policy": None if policy is None else _digest(known),
-        "pace": None if policy is None else policy.pace._asdict(),
+        "pace": None if policy is None else policy.settings._asdict(),
         "sensor": policy is not None and policy.sensor,
-        "phases": [own.phase for own in trial.windows],
+        "phases": [window.phase for window in trial.windows],
         "widths": trial.uncertainty.widths,
         "sample_rate": trial.uncertainty.sample_rate,
         "tolerance": trial.uncertainty.tolerance,
@@ -360,19 +380,19 @@ def find_least(
 ) -> tuple[str, float, float]:
     """The planned contact that presses least, when, and its c_n; none has no name."""
     t = simulation.t
-    events = np.array([0.0, t[-1], *(own.time for own in simulation.events)])
+    events = np.array([0.0, t[-1], *(event.time for event in simulation.events)])
     apart = np.abs(t[:, None] - events).min(axis=1) > APART * t[-1]
-    found, start = ("", math.nan, math.nan), 0.0
+    least, start = ("", math.nan, math.nan), 0.0
     for window in windows:
         for name in window.contacts:
             c_n = simulation.c_n[:, simulation.contacts.index(name)]
             here = np.flatnonzero(apart & (t > start) & (t < window.stop) & (c_n == c_n))
             if len(here):
                 row = here[c_n[here].argmin()]
-                if not c_n[row] >= found[2]:
-                    found = (name, float(t[row]), float(c_n[row]))
+                if not c_n[row] >= least[2]:
+                    least = (name, float(t[row]), float(c_n[row]))
         start = window.stop
-    return found
+    return least
 
 
 def _find_force(trial: Trial, name: str, change: float, contact: str, time: float) -> float:

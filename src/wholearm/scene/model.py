@@ -70,12 +70,9 @@ from .ranges import (
     VISCOUS,
 )
 
-LIGHT = 1e-4
-"""Weight, over what the weaker finger can press with, that is next to nothing."""
-HOLDS = ("constant", "linear")
-"""How torques may be held over control periods."""
-TOUCHING = 3e-6
-"""Gap below which features count as touching, in radii of gyration of the object."""
+LIGHT = 1e-4  # weight, over what the weaker finger can press with, that is next to nothing
+HOLDS = ("constant", "linear")  # how torques may be held over control periods
+TOUCHING = 3e-6  # gap below which features count as touching, in radii of gyration of the object
 
 
 @declare(
@@ -86,9 +83,7 @@ TOUCHING = 3e-6
     key(
         "viscous",
         "Viscous friction of the joint [N m s].",
-        NONNEGATIVE,
-        "drag",
-        VISCOUS,
+        *(NONNEGATIVE, "drag", VISCOUS),
         default=0.0,
     ),
     key("dry", "Dry friction of the joint [N m].", NONNEGATIVE, "torque", DRY, default=0.0),
@@ -238,11 +233,8 @@ class Scene:
         object.__setattr__(self, "fingers", fingers)
         right, left = (np.asarray(finger.base) for finger in self.fingers)
         if right[0] <= left[0]:
-            raise InputError(
-                "",
-                "fingers.1.base",
-                f"{right.tolist()} is not to the right of fingers.2.base {left.tolist()}",
-            )
+            text = f"{right.tolist()} is not to the right of fingers.2.base {left.tolist()}"
+            raise InputError("", "fingers.1.base", text)
 
     @cached_property
     def scales(self) -> Scales:

@@ -15,14 +15,10 @@ from .ranges import INERTIA, MASS
 
 SIZES = (1e-4, 1e3)
 """Least and largest distance between the two corners of a polygon that are farthest apart [m]."""
-FAR = 1e3
-"""Largest distance of given corners from the origin, over that distance."""
-SLENDER = 1e-3
-"""Least width of a polygon, over that distance."""
-SHORTEST_EDGE = 1e-4
-"""Least length of an edge, over that distance."""
-MOST_VERTICES = 500
-"""Most corners of a polygon."""
+FAR = 1e3  # largest distance of given corners from the origin, over that distance
+SLENDER = 1e-3  # least width of a polygon, over that distance
+SHORTEST_EDGE = 1e-4  # least length of an edge, over that distance
+MOST_VERTICES = 500  # most corners of a polygon
 
 
 def _read_corners(given: object, key: str) -> Array:
@@ -86,22 +82,15 @@ class Polygon:
         cross = cross_product(local, np.roll(local, -1, axis=0))
         area = cross.sum() / 2
         if area <= 0:
-            raise InputError(
-                "",
-                "object.vertices",
-                f"the polygon is clockwise or flat (signed area {area:.3g} m^2); "
-                "list its corners anticlockwise",
-            )
+            text = f"the polygon is clockwise or flat (signed area {area:.3g} m^2); "
+            raise InputError("", "object.vertices", f"{text}list its corners anticlockwise")
         turns = cross_product(np.roll(edges, 1, axis=0), edges)
         headings = np.arctan2(turns, np.sum(np.roll(edges, 1, axis=0) * edges, axis=1))
         reflex = np.flatnonzero(turns <= 1e-9 * area)
         if reflex.size:
-            raise InputError(
-                "",
-                f"object.vertices[{reflex[0]}]",
-                f"the polygon is not strictly convex at {corners[reflex[0]].tolist()}; "
-                "every corner must turn left",
-            )
+            text = f"the polygon is not strictly convex at {corners[reflex[0]].tolist()}; "
+            key = f"object.vertices[{reflex[0]}]"
+            raise InputError("", key, f"{text}every corner must turn left")
         _check_shape(corners, edges, size)
         if headings.sum() > 2 * np.pi + 1e-6:
             raise InputError("", "object.vertices", "the polygon crosses itself; it must be convex")

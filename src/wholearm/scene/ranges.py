@@ -39,8 +39,7 @@ GRAVITY = Range(1e-3, 1e5)
 FRICTION = Range(0.0, 10.0)
 PLACE = Range(-300.0, 300.0, lambda scene, _: scene.polygon.size, _SIZE)
 """Coordinates of joints and of the object."""
-TURN = Range(-3600.0, 3600.0)
-"""Angle of the object at which a phase ends [degrees]."""
+TURN = Range(-3600.0, 3600.0)  # angle of the object at which a phase ends [degrees]
 LENGTH = Range(0.03, 100.0, PLACE.scale, _SIZE)
 RADIUS = Range(1e-4, 1.0, lambda _, finger: finger.length, "times the length, or 0")
 JOINT = Range(

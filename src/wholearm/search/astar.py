@@ -1,9 +1,8 @@
-"""The search: routes from a place to a goal, the shortest first.
+"""Best-first search (lazy A*) for routes from a place to a goal.
 
-Places are settled in the order of what it costs to get there and at least, by a rule of thumb, from
-there on. Borders that lead on from a place are looked at when it is settled; cells, which take
-longer, are put off by what motions through them cost at least, by the same rule. One rule leads
-quickly to a first plan; one that expects less of what lies ahead finds others near the start.
+Links along borders are evaluated when their place is expanded; links through cells, which cost more
+time, wait in the queue with a heuristic lower bound. A greedy heuristic leads to a first plan, a
+more cautious one finds faster routes near the start.
 """
 
 from __future__ import annotations
@@ -24,57 +23,54 @@ from .goals import is_at, measure_turn
 from .places import Key, RoadmapPlace
 from .roadmap import Ahead, Roadmap
 
-CROSSING = 1.0
-"""Least time of a motion through a cell from a place, by a rule of thumb, in the scene's time."""
-OFTEN = 2
-"""How often a place is settled, on different ways."""
-MOST = 4000
-"""Most entries of the queue that are looked at."""
+CROSSING = 1.0  # heuristic least time of a motion through a cell, over the scene's time
+OFTEN = 2  # expansions of one place, on different routes
+MOST = 4000  # most entries that are taken from the queue
 
 
 class SearchRule(NamedTuple):
-    """A rule of thumb for what lies ahead, in the scene's time, and how far it is followed."""
+    """Heuristic cost to go, in the scene's time, and a limit of the search."""
 
-    turning: float  # time that turning by a radian takes
-    leaving: float  # that of a motion through a cell from somewhere along a border
-    most: int  # most places that are looked at
+    turning: float  # per radian that is left to turn
+    leaving: float  # through a cell from a place along a border
+    most: int  # most places that are expanded
 
 
 EAGER = SearchRule(14.0, 4.0, 130)
-"""Times as routes through cells take them: it leads to a first plan soon."""
+"""As routes through cells take: greedy, leads to a first plan soon."""
 CAREFUL = SearchRule(4.0, 2.5, 16)
-"""Times that hardly any route falls short of: it finds routes that set out the wrong way."""
+"""Hardly any route takes less: finds routes that start in the wrong direction."""
 
 
 @dataclass(frozen=True, eq=False)
 class RoadmapRoute:
-    """A way from a start, as links one after the other."""
+    """Links one after the other."""
 
     links: tuple[Link, ...]
 
     @property
     def duration(self) -> float:
-        """About how long it takes [s]."""
+        """Estimated duration [s]."""
         return sum(link.duration for link in self.links)
 
     @property
     def bound(self) -> float:
-        """How long it takes at least [s], with a stop where links meet."""
+        """Lower bound of the duration [s], with a stop where links meet."""
         return sum(link.bound for link in self.links)
 
     @property
     def in_cells(self) -> bool:
-        """Whether it leads through cells, which nothing bounds from below."""
+        """Whether it leads through cells, for which there is no lower bound."""
         return any(link.in_cell for link in self.links)
 
     @property
     def signature(self) -> tuple[object, ...]:
-        """By which routes differ."""
+        """Names of the contacts of each phase."""
         return tuple(part for link in self.links for part in link.signature)
 
     @property
     def key(self) -> object:
-        """What it is: its formations, and where it stops."""
+        """Its formations, and how phases end."""
         return self.signature, tuple(step.end for link in self.links for step in link.steps)
 
 
@@ -82,46 +78,44 @@ class RoadmapRoute:
 class RouteSearch:
     """Routes from a start to a goal."""
 
-    chart: Roadmap
+    roadmap: Roadmap
     start: RoadmapPlace
     goal: Goal
-    # links that no motion can take, as they are met
+    # blocked links, as they are met
     blocked: list[Blocked] = field(default_factory=list)
-    # routes to places that have been settled, the first to each, by their keys
+    # the first route to each expanded place, by its key
     reached: dict[Key, RoadmapRoute] = field(default_factory=dict)
     found: set[object] = field(default_factory=set)  # keys of routes that have been found
-    limit: float = math.inf  # cost from which on nothing is of interest [s]
-    sources: Sequence[RoadmapRoute] = ()  # ways to set out by, if not from the start itself
+    limit: float = math.inf  # largest cost of routes [s]
+    sources: Sequence[RoadmapRoute] = ()  # routes to start with, if not from the start itself
 
     @property
     def settled(self) -> int:
-        """How many places have been settled."""
+        """Number of expanded places."""
         return len(self.reached)
 
     def measure(self, place: RoadmapPlace, turning: float = 1.0) -> float:
-        """About the time from a place to the goal, where turning by a radian takes that [s]."""
-        return turning * self.chart.scene.scales.time * measure_turn(place, self.goal)
+        """Heuristic time from a place to the goal [s]; `turning` is that of a radian."""
+        return turning * self.roadmap.scene.scales.time * measure_turn(place, self.goal)
 
     def run(self, rule: SearchRule = EAGER) -> Iterator[RoadmapRoute]:
-        """Find routes that have not been found before, about in the order of their durations."""
-        time = self.chart.scene.scales.time
-        number, queue = (
-            count(),
-            list[tuple[float, int, float, RoadmapRoute, RoadmapPlace, object]](),
-        )
-        times: Counter[object] = Counter()
+        """Yield new routes, about in the order of their durations."""
+        time = self.roadmap.scene.scales.time
+        number, times = count(), Counter[object]()
+        queue = list[tuple[float, int, float, RoadmapRoute, RoadmapPlace, object]]()
 
         def put(route: RoadmapRoute, place: RoadmapPlace, work: object, more: float = 0.0) -> None:
             cost = route.duration
             least = cost + self.measure(place, rule.turning) + more
             heapq.heappush(queue, (least, next(number), cost, route, place, work))
 
-        def put_along(before: tuple[Link, ...], own: Ahead) -> None:
-            assert isinstance(own.link, Link)
-            put(RoadmapRoute((*before, own.link)), own.link.stop, own.chain if own.whole else None)
+        def put_along(before: tuple[Link, ...], ahead: Ahead) -> None:
+            assert isinstance(ahead.link, Link)
+            work = ahead.chain if ahead.whole else None
+            put(RoadmapRoute((*before, ahead.link)), ahead.link.stop, work)
 
-        for way in self.sources or (RoadmapRoute(()),):
-            put(way, way.links[-1].stop if way.links else self.start, None)
+        for source in self.sources or (RoadmapRoute(()),):
+            put(source, source.links[-1].stop if source.links else self.start, None)
         for _ in range(MOST):
             if not queue:
                 return
@@ -136,48 +130,45 @@ class RouteSearch:
                         yield route
                     continue
                 if work is not None:
-                    for own in self.chart.go_on(work, self.goal):
-                        put_along(route.links[:-1], own)
+                    for ahead in self.roadmap.go_on(work, self.goal):
+                        put_along(route.links[:-1], ahead)
                 key = place.key
                 if times[key] >= (1 if place.landed else OFTEN):
                     continue
                 times[key] += 1
                 self.reached.setdefault(key, route)
-                for own in self._set_out(route, place):
-                    if isinstance(own.link, Link):
-                        put_along(route.links, own)
-                    elif times[key] == 1 and own.link not in self.blocked:
-                        self.blocked.append(own.link)
+                for ahead in list(self.roadmap.set_out(place, self.goal)):
+                    if self._is_back(route, ahead.chain.borders[0]):
+                        continue
+                    if isinstance(ahead.link, Link):
+                        put_along(route.links, ahead)
+                    elif times[key] == 1 and ahead.link not in self.blocked:
+                        self.blocked.append(ahead.link)
                 if not place.landed:
-                    for index, (border, _) in enumerate(self.chart.follow(place)):
+                    for index, (border, _) in enumerate(self.roadmap.follow(place)):
                         if not self._is_back(route, border):
                             put(route, place, (border, index), rule.leaving * time)
                     put(route, place, "cells", CROSSING * time)
                 continue
             if isinstance(work, tuple):
                 border, index = work
-                links = self.chart.release(border, index)
-                links = [*links, *self.chart.land_at(links, self.goal)]
+                links = self.roadmap.release(border, index)
+                links = [*links, *self.roadmap.land_at(links, self.goal)]
             else:
-                links = [*self.chart.cross_cells(place), *self.chart.end_in_cell(place, self.goal)]
-                links += self.chart.land_at(links, self.goal)
+                links = [
+                    *self.roadmap.cross_cells(place),
+                    *self.roadmap.end_in_cell(place, self.goal),
+                ]
+                links += self.roadmap.land_at(links, self.goal)
             for link in links:
                 if isinstance(link, Link):
                     put(RoadmapRoute((*route.links, link)), link.stop, None)
                 elif link not in self.blocked:
                     self.blocked.append(link)
 
-    def _set_out(self, route: RoadmapRoute, place: RoadmapPlace) -> list[Ahead]:
-        """Links along borders from the end of a route, but not back."""
-        return [
-            own
-            for own in self.chart.set_out(place, self.goal)
-            if not self._is_back(route, own.chain.borders[0])
-        ]
-
     @staticmethod
     def _is_back(route: RoadmapRoute, border: BorderEdge) -> bool:
-        """Whether a border is the one that a route has just come along."""
+        """Whether a border is the one that a route has just followed."""
         if not route.links or route.links[-1].in_cell:
             return False
         last = route.links[-1].steps[-1].contacts

@@ -1,8 +1,4 @@
-"""What motions along a border may do, looked at once, at a few places of it.
-
-Whatever leads along a border, alone or as one of several that are passed without a stop, is timed
-by the same limits at the same places.
-"""
+"""Limits of motions along a border, at one place of each interval, shared by all edges along it."""
 
 from __future__ import annotations
 
@@ -13,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
-from ..contacts.formation import Formation, Kinematics
+from ..contacts.formation import Kinematics
 from ..geometry.curve import Curve, CurvePoint, describe_pose
 from ..mechanics.dynamics import Directions, reduced_inertia
 from ..mechanics.metric import metric_weights
@@ -22,55 +18,41 @@ from ..planning.lower_bound.path_terms import PathTerms
 from ..planning.lower_bound.rows import PathLimitRows, limit_along
 from ..planning.lower_bound.speed_sweep import NoMotionError, add_up, find_steady
 
-INTERVALS = 24
-"""Intervals of the grid on which the fastest motion along a border is looked for."""
-CHECKED = 12
-"""Places of a segment at which jamming and ambiguous forces are looked for, besides those."""
-INDEPENDENT = 1e-12
-"""Least Gram determinant of the rows of contacts, each of length one."""
+INTERVALS = 24  # intervals of the speed sweep along a border
+CHECKED = 12  # further places of each segment that are checked for jamming and uniqueness
+INDEPENDENT = 1e-12  # least Gram determinant of unit rows of independent contacts
 DEPENDENT = "its contacts depend on each other"
 
 
 class Unstopped(str):
-    """Why no motion along curves ends at rest, though one that goes on beyond them may be."""
+    """Reason why no motion along curves ends at rest; one that passes on may be possible."""
 
 
-class Ground(NamedTuple):
-    """Limits of motions along a border, or along the first part of one."""
+class BorderLimits(NamedTuple):
+    """Limits of motions along a border or its first part; reasons are empty without one."""
 
-    # why nothing passes it: friction jams it, or contact forces are not the only ones. Empty where
-    # there is no such reason, as of the others.
-    closed: str
-    clear: float  # [m]: up to where there is none
-    # begins, ends: why no motion begins at rest at its start, or ends at rest at its end
-    begins: str
-    ends: str
-    z: Array  # (n, 5): a place in each of some intervals
+    closed: str  # why nothing passes: friction jams it, or contact forces are not unique
+    clear: float  # [m]: length of the first part that is not closed
+    begins: str  # why no motion begins at rest at the start
+    ends: str  # why no motion ends at rest at the end
+    z: Array  # (n, 5): a place in each interval
     rows: PathLimitRows  # limits there
-    # steps, part (n,): lengths of the intervals [m], and which part of each is before its place
-    steps: Array
-    part: Array
+    steps: Array  # (n,) [m]: lengths of the intervals
+    part: Array  # (n,): share of each interval before its place
 
-    def with_speed_ratio(self, ratio: float) -> Ground:
-        """The same by a parameter that runs through it at another ratio."""
+    def with_speed_ratio(self, ratio: float) -> BorderLimits:
+        """The same with the path parameter scaled by `ratio`."""
         a, b, v, one, cap = self.rows
         rows = PathLimitRows(a * ratio, b * ratio**2, v * ratio, one, cap / ratio**2)
         return self._replace(rows=rows, steps=self.steps / ratio)
 
 
-def survey(curve: Curve, epsilon: float, uniqueness_margin: float) -> Ground:
-    """Look at a border.
-
-    Parameters
-    ----------
-    curve              by its arc length
-    epsilon : [N]      least normal force
-    uniqueness_margin  see `PlanOptions`
-    """
-    way = PathTerms((curve,), epsilon)
-    grid = way.make_grid(INTERVALS)
-    nodes, count = way.place(grid.angles), len(grid.owners) + 2
-    middles = way.place((grid.angles[1:] + grid.angles[:-1]) / 2)
+def find_border_limits(curve: Curve, epsilon: float, uniqueness_margin: float) -> BorderLimits:
+    """Limits along a curve with arc length as parameter; epsilon [N] is the least normal force."""
+    terms = PathTerms((curve,), epsilon)
+    grid = terms.make_grid(INTERVALS)
+    nodes, count = terms.place(grid.angles), len(grid.owners) + 2
+    middles = terms.place((grid.angles[1:] + grid.angles[:-1]) / 2)
     last = len(curve.segments) - 1
     checked = [
         np.linspace(part.start, min(part.stop, curve.length), CHECKED) for part in curve.segments
@@ -81,11 +63,13 @@ def survey(curve: Curve, epsilon: float, uniqueness_margin: float) -> Ground:
     try:
         at = curve.evaluate(s)
         closed, clear = _find_ambiguity(curve, s, at, owners, uniqueness_margin)
-        rows = limit_along(curve, epsilon, _pick(at, slice(count)), owners[:count])
+        first = Kinematics(*(array[:count] for array in at.kinematics))
+        nodes_at = CurvePoint(at.z[:count], at.z_s[:count], at.z_ss[:count], first)
+        rows = limit_along(curve, epsilon, nodes_at, owners[:count])
     except np.linalg.LinAlgError:
         none = np.zeros((len(steps), 1))
         rows = PathLimitRows(none, none, none, none - 1, none[:, 0])
-        return Ground(DEPENDENT, 0.0, "", "", none, rows, steps, none[:, 0])
+        return BorderLimits(DEPENDENT, 0.0, "", "", none, rows, steps, none[:, 0])
     begins, ends = (
         "" if _is_held(sign * rows.a[k], rows.one[k]) else f"no motion {what} at rest at {place}"
         for k, sign, what, place in (
@@ -95,35 +79,24 @@ def survey(curve: Curve, epsilon: float, uniqueness_margin: float) -> Ground:
     )
     inner = slice(2, count)
     part = (middles - nodes[:-1]) / steps
-    return Ground(closed, clear, begins, ends, at.z[inner], rows.pick(inner), steps, part)
+    return BorderLimits(closed, clear, begins, ends, at.z[inner], rows.pick(inner), steps, part)
 
 
-def sketch(grounds: Sequence[Ground]) -> float | str:
-    """About how long motions along borders take, from rest to rest, or why there is none [s].
+def estimate_duration(limits: Sequence[BorderLimits]) -> float | str:
+    """Estimated duration [s] of a motion along borders from rest to rest, or why there is none.
 
-    Parameters
-    ----------
-    grounds  with such speed ratios that the speed is the same on both sides of where two of them
-             meet
+    Speed sweep with the limits of one place in each interval. `limits` have such speed ratios that
+    the speed is continuous where two borders meet.
     """
-    rows = PathLimitRows(
-        *(np.concatenate(part) for part in zip(*(own.rows for own in grounds), strict=True))
-    )
-    steps, part = (
-        np.concatenate([getattr(own, key) for own in grounds]) for key in ("steps", "part")
+    rows = PathLimitRows(*(np.concatenate(c) for c in zip(*(b.rows for b in limits), strict=True)))
+    steps, part, z = (
+        np.concatenate([getattr(b, key) for b in limits]) for key in ("steps", "part", "z")
     )
     caps: Array = np.minimum(np.append(rows.cap, np.inf), np.append(np.inf, rows.cap))
     try:
         return add_up(find_steady(rows, steps, part, caps).b, steps)
     except NoMotionError as error:
-        place = np.concatenate([own.z for own in grounds])[min(error.interval, len(steps) - 1)]
-        return f"no motion keeps its limits at {describe_pose(place)}"
-
-
-def _pick(at: CurvePoint, rows: slice) -> CurvePoint:
-    """Some places of a curve."""
-    kinematics = Kinematics(*(part[rows] for part in at.kinematics))
-    return CurvePoint(at.z[rows], at.z_s[rows], at.z_ss[rows], kinematics)
+        return f"no motion keeps its limits at {describe_pose(z[min(error.interval, len(z) - 1)])}"
 
 
 def _is_held(a: Array, one: Array) -> bool:
@@ -137,20 +110,17 @@ def _is_held(a: Array, one: Array) -> bool:
 def _find_ambiguity(
     curve: Curve, s: Array, at: CurvePoint, owners: NDArray[np.int64], least: float
 ) -> tuple[str, float]:
-    """Why contact forces along a curve are not the only ones, and up to where they are [m].
-
-    Empty, and the length of the curve, where they are.
+    """Why contact forces along a curve are not unique (else empty), and up to where they are [m].
 
     Parameters
     ----------
-    s : (n,)       where to look
-    at             the curve there
-    owners : (n,)  which segment each place is looked at as part of
-    least          least ratio of a minor
+    s, at : (n,)   places, and the curve there
+    owners : (n,)  the segment of each place
+    least          uniqueness margin (P-matrix)
     """
     formation = curve.formation
     Xi, sigma = (
-        np.array([getattr(own, key) for own in curve.segments])[owners] for key in ("Xi", "sigma")
+        np.array([getattr(part, key) for part in curve.segments])[owners] for key in ("Xi", "sigma")
     )
     rows = at.kinematics.P / np.sqrt(metric_weights(formation.scene))
     rows = rows / np.linalg.norm(rows, axis=2, keepdims=True)
@@ -165,20 +135,15 @@ def _find_ambiguity(
     least_place = int(np.where(bad, s, np.inf).argmin())
     clear = float(s[s < first].max(initial=0.0))
     if lost[s == first].any():
-        return _describe_dependence(formation, at.z[least_place]), clear
+        z = at.z[least_place]
+        values = formation.evaluate_limits(z[None])[0]
+        met = [
+            f": {limit.text}"
+            for limit, value in zip(formation.limits, values, strict=True)
+            if abs(value) < formation.scene.touching
+        ]
+        return f"{DEPENDENT} at {describe_pose(z)}{''.join(met[:1])}", clear
     if inertia[~lost].min() <= 0:
         return "friction jams it", clear
     ratio, names, row = minors.find_least()
     return f"{names} ambiguous: uniqueness margin {ratio:.2f} at {describe_pose(at.z[row])}", clear
-
-
-def _describe_dependence(formation: Formation, z: Array) -> str:
-    """Where contacts depend on each other, and which limit of theirs is met there."""
-    values = formation.evaluate_limits(z[None])[0]
-    met = [
-        limit.text
-        for limit, value in zip(formation.limits, values, strict=True)
-        if abs(value) < formation.scene.touching
-    ]
-    reason = f": {met[0]}" if met else ""
-    return f"{DEPENDENT} at {describe_pose(z)}{reason}"

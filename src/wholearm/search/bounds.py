@@ -1,4 +1,7 @@
-"""How much longer a plan may take than the best one along borders."""
+"""Lower bound of the duration of all routes along borders, by Dijkstra's algorithm.
+
+Edge costs are bounds on a coarse grid, refined until those of the shortest route all are.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +16,13 @@ from .edges import ROUGHLY, Link
 from .goals import is_at
 from .places import Key, RoadmapPlace
 
-MOST = 240
-"""Most places that are settled to bound routes from below."""
+MOST = 240  # Most places that are settled to bound routes from below
 
 
 class BorderBound(NamedTuple):
-    """A lower bound of what routes take that follow borders.
+    """A lower bound of the duration of routes along borders.
 
-    Where these meet they stop, or go on at speed where the law of impacts lets them.
+    They stop where borders meet, or pass through by a plastic impact that is possible.
     """
 
     value: float  # [s]: no such route takes less
@@ -29,30 +31,27 @@ class BorderBound(NamedTuple):
     complete: bool
 
     def up_to(self, enough: float) -> BorderBound:
-        """What it is if no more than that is asked for [s]."""
+        """The bound, at most `enough` [s]."""
         return self if self.value < enough else BorderBound(enough, True)
 
 
 def bound_borders(search: RouteSearch, enough: float = math.inf) -> BorderBound:
-    """Bound every route along borders from below, up to `enough` [s].
-
-    Links have their bounds on a coarse grid, until those of the shortest route are all refined.
-    """
-    refined, known = set[Link](), dict[Key, list[Link]]()
+    """Bound every route along borders from below, up to `enough` [s]."""
+    refined, links_from = set[Link](), dict[Key, list[Link]]()
     while True:
-        found, links = _find_shortest(search, enough, refined, known)
+        bound, links = _find_shortest(search, enough, refined, links_from)
         if refined.issuperset(links):
-            return found
+            return bound
         refined.update(links)
 
 
 def _find_shortest(
-    search: RouteSearch, enough: float, refined: set[Link], known: dict[Key, list[Link]]
+    search: RouteSearch, enough: float, refined: set[Link], links_from: dict[Key, list[Link]]
 ) -> tuple[BorderBound, tuple[Link, ...]]:
     """The shortest route along borders by bounds of its links, and these; none from `enough` on."""
-    number, settled = count(), set[Key]()
+    order, settled = count(), set[Key]()
     queue: list[tuple[float, int, RoadmapPlace, tuple[Link, ...]]] = [
-        (0.0, next(number), search.start, ())
+        (0.0, next(order), search.start, ())
     ]
     while queue:
         beat()
@@ -66,10 +65,10 @@ def _find_shortest(
         if len(settled) >= MOST:
             return BorderBound(cost, False), ()
         settled.add(place.key)
-        if place.key not in known:
-            every = search.chart.list_along(place, search.goal)
-            known[place.key] = [link for _, link in every if isinstance(link, Link)]
-        for link in known[place.key]:
-            own = link.fine_bound if link in refined else ROUGHLY * link.bound
-            heapq.heappush(queue, (cost + own, next(number), link.stop, (*links, link)))
+        if place.key not in links_from:
+            pairs = search.roadmap.list_along(place, search.goal)
+            links_from[place.key] = [link for _, link in pairs if isinstance(link, Link)]
+        for link in links_from[place.key]:
+            bound = link.fine_bound if link in refined else ROUGHLY * link.bound
+            heapq.heappush(queue, (cost + bound, next(order), link.stop, (*links, link)))
     return BorderBound(enough, True), ()

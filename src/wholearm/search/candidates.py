@@ -1,4 +1,4 @@
-"""Routes without a plan, and plans of phases whose landings are known, which are kept."""
+"""Routes without a plan, and a cache of plans of routes whose phases all have given ends."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .feasibility import SINGULAR
 
 @dataclass(frozen=True, eq=False)
 class FailedCandidate:
-    """A route that has no plan after all."""
+    """A route that has no plan."""
 
     route: RoadmapRoute
     reason: str
@@ -28,30 +28,29 @@ class FailedCandidate:
 class Lost(str):
     """Why a route has no plan, with the links for which that is so on every route."""
 
-    # the one that has no plan, or whose plan does not hold, behind the one that lands where it
-    # starts, if any
+    # the one whose planning or replay fails, after the one that lands at its start, if any
     links: tuple[Link, ...] = ()
 
     @classmethod
     def at(cls, links: tuple[Link, ...], reason: str) -> Lost:
-        """A reason that some links are to blame for."""
+        """A reason together with the links that cause it."""
         lost = cls(reason)
         lost.links = links
         return lost
 
 
 def plan_phases(
-    problem: Problem, options: PlanOptions, kept: dict[object, Plan | str]
+    problem: Problem, options: PlanOptions, cache: dict[object, Plan | str]
 ) -> Plan | str:
-    """The plan of a route's phases, or why there is none; `kept` has those made before."""
+    """The plan of a route's phases, or why there is none; `cache` has those made before."""
     phases = tuple((phase.formation.names, phase.until, phase.end) for phase in problem.phases)
     key = (tuple(np.round(problem.start, 12).tolist()), phases, repr(options))
-    if key not in kept:
+    if key not in cache:
         try:
             with unadvised():
-                kept[key] = solve_with(problem, options)
+                cache[key] = solve_with(problem, options)
         except WholearmError as error:
-            kept[key] = str(error)
+            cache[key] = str(error)
         except np.linalg.LinAlgError:
-            kept[key] = SINGULAR
-    return kept[key]
+            cache[key] = SINGULAR
+    return cache[key]

@@ -1,8 +1,7 @@
-"""Straight ways in x and phi through cells: whether motions set out along them, and their times.
+"""Least times of straight paths in (x, phi) through cells, by a vectorized speed sweep.
 
-With three contacts, forces and torques along a way follow from speed and acceleration, as there is
-no squeeze, and a sweep over the phase plane gives the least time. All cells have one contact each
-with palm and fingers, so that ways through different ones are looked at together.
+With three contacts there is no internal force: forces and torques follow from speed and
+acceleration. Each cell has one contact of palm and each finger: all paths share one `LimitSet`.
 """
 
 from __future__ import annotations
@@ -21,22 +20,20 @@ from ..planning.lower_bound.rows import PathLimitRows, limit
 from ..scene.model import Scene
 from .travel_times import find_durations
 
-NODES = 12
-"""Intervals of a way."""
+NODES = 12  # intervals of a path
 
 _ENDS = (1 - np.cos(np.linspace(0, np.pi, NODES + 1))) / 2
-MIDDLES = (_ENDS[1:] + _ENDS[:-1]) / 2
-"""Shares of a way that are behind at its places, where limits are kept."""
+MIDDLES = (_ENDS[1:] + _ENDS[:-1]) / 2  # places where limits are kept, over the path's length
 
 
 def list_middles(starts: Array, ends: Array) -> Array:
-    """Poses at the places of ways between poses (n, 2), shape (n, NODES, 2)."""
+    """Poses at `MIDDLES` of paths between poses (n, 2), shape (n, NODES, 2)."""
     return np.asarray(starts[:, None] + MIDDLES[:, None] * (ends - starts)[:, None])
 
 
-def can_set_out(scene: Scene, epsilon: float, labels: Numbers, poses: Array, ways: Array) -> Flags:
-    """Whether motions along straight ways can begin from rest, shape (n,); see `time_ways`."""
-    rows = _evaluate(scene, epsilon, labels, poses, ways)
+def can_start(scene: Scene, epsilon: float, labels: Numbers, poses: Array, runs: Array) -> Flags:
+    """Whether motions along straight paths can start from rest, shape (n,); see `time_paths`."""
+    rows = _evaluate(scene, epsilon, labels, poses, runs)
     with np.errstate(divide="ignore", invalid="ignore"):
         bounds = -rows.one / rows.a
         least = np.where(rows.a > 0, bounds, 0.0).max(axis=1)
@@ -45,8 +42,8 @@ def can_set_out(scene: Scene, epsilon: float, labels: Numbers, poses: Array, way
     return np.asarray((np.maximum(least, 0.0) < most) & ~never)
 
 
-def time_ways(scene: Scene, epsilon: float, labels: Numbers, starts: Array, ends: Array) -> Array:
-    """Least times of straight ways inside cells from rest to rest, infinite without, shape (n,).
+def time_paths(scene: Scene, epsilon: float, labels: Numbers, starts: Array, ends: Array) -> Array:
+    """Least times of straight paths inside cells from rest to rest, or infinite, shape (n,).
 
     Parameters
     ----------
@@ -58,17 +55,17 @@ def time_ways(scene: Scene, epsilon: float, labels: Numbers, starts: Array, ends
     if not len(ends):
         return np.zeros(0)
     poses = list_middles(starts, ends).reshape(-1, 2)
-    labels, ways = np.repeat(labels, NODES, axis=0), np.repeat(ends - starts, NODES, axis=0)
-    rows = _evaluate(scene, epsilon, labels, poses, ways)
+    labels, runs = np.repeat(labels, NODES, axis=0), np.repeat(ends - starts, NODES, axis=0)
+    rows = _evaluate(scene, epsilon, labels, poses, runs)
     rows = PathLimitRows(*(part.reshape(-1, NODES, *part.shape[1:]) for part in rows))
     return find_durations(rows, np.diff(_ENDS), (MIDDLES - _ENDS[:-1]) / np.diff(_ENDS))
 
 
 def _evaluate(
-    scene: Scene, epsilon: float, labels: Numbers, poses: Array, ways: Array
+    scene: Scene, epsilon: float, labels: Numbers, poses: Array, runs: Array
 ) -> PathLimitRows:
-    """Limits at n places of straight ways, as what they are of acceleration and speed."""
-    at, (formation, limits) = move(scene, labels, poses, ways), _make_limits(scene, epsilon)
+    """Limits of acceleration and speed at n places of straight paths."""
+    at, (formation, limits) = move(scene, labels, poses, runs), _make_limits(scene, epsilon)
     directions, kinematics = Directions.of(at.kinematics, at.z_u), at.kinematics
     try:
         forces = inverse(formation, at.z, at.z_u, at.z_uu, directions, kinematics)
@@ -78,7 +75,7 @@ def _evaluate(
         kinematics = kinematics._replace(A=np.where(unheld, np.nan, kinematics.A))
         forces = inverse(formation, at.z, at.z_u, at.z_uu, directions, kinematics)
     rows = limit(limits, forces, at.z_u[:, 3:])
-    # Three contacts that do not hold the object let nothing through.
+    # No motion where three contacts cannot balance the object.
     held = np.asarray(np.isfinite(rows.a + rows.b + rows.v + rows.one).all(axis=1))[:, None]
     a, b, v = (np.where(held, part, 0.0) for part in (rows.a, rows.b, rows.v))
     return PathLimitRows(
@@ -88,7 +85,7 @@ def _evaluate(
 
 @lru_cache(maxsize=8)
 def _make_limits(scene: Scene, epsilon: float) -> tuple[Formation, LimitSet]:
-    """Three contacts that slide, and their limits: the same wherever on palm and fingers."""
+    """Three sliding contacts and their limits, which are the same for all such formations."""
     some = (0, first_contact(scene, 0), first_contact(scene, 1))
     formation = Formation(scene, tuple(contact_table(scene)[k] for k in some))
     return formation, make_limits(formation, epsilon)

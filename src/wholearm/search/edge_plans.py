@@ -1,7 +1,7 @@
-"""Routes put together from their links, each planned once from rest to rest, and kept.
+"""Plans of routes, joined from plans of their links, each from rest to rest.
 
-What ends at rest says nothing of what follows but where that starts, so that links are planned one
-by one. Where a link lands on a border is left open: it is chosen with regard to the next link.
+The plan of a link depends on the others only by the configurations at its ends. Where a link
+through a cell lands on a border is optimized together with the first phase of the next link.
 """
 
 from __future__ import annotations
@@ -39,37 +39,28 @@ from .edges import EdgeStep, Link, describe_steps, find_headings, point_out
 from .feasibility import SINGULAR, Measured, make_phases
 from .places import measure_apart
 
-OFF = 1e-4
-"""Distance from the end of a border's link from which on it is another end, in radii of gyration or
-radians."""
-PINNED = 1e-9
-"""Coordinates at which landings are pinned are rounded to this, in the same unit."""
-SAME = 9
-"""Decimals of configurations that are one, in the same unit."""
+# Distances are in radii of gyration and radians.
+OFF = 1e-4  # distance of a traced end from a border's end that makes it another one
+PINNED = 1e-9  # pinned coordinates of landings are rounded to this, in the same unit
+SAME = 9  # decimals of configurations that count as equal, in the same unit
+MET = 1e-8  # distance of planned from traced ends of borders that count as equal, in the same unit
 Key = tuple[object, ...]
-MET = 1e-8
-"""Largest distance of a border's end as planned from the same end as found, in radii of gyration or
-radians."""
 T = TypeVar("T")
 Links = Sequence[tuple[Link, Sequence[Measured]]]
-"""Links of a route, with the ways in which those through cells can be gone."""
-Chosen = tuple[Link, Measured | None]
-"""A link, and what is begun of it."""
+"""Links of a route, each with the plans of it that are known, the fastest first."""
+Chosen = tuple[Link, Measured | None]  # a link, and a plan of it as initial guess
 
 
 @dataclass
-class Aside(Generic[T]):
-    """What is done beside planning, where there is a process for it, and else is not."""
+class BackgroundTask(Generic[T]):
+    """A task that runs beside planning if there is more than one process, and else not at all."""
 
     task: Task[T]  # without arguments
     result: T | None = None  # what it has returned
 
 
 def can_join(problem: Problem, options: PlanOptions) -> bool:
-    """Whether plans from rest to rest make the plan that is asked for.
-
-    Only of least time, where torques may change at any instant, and at once.
-    """
+    """Whether plans from rest to rest can be joined: for least time with torques free to jump."""
     scene = problem.scene
     return options.goal.value == "time" and not (scene.has_slow_motors or scene.control_period)
 
@@ -79,56 +70,63 @@ def join_route(
     problem: Problem,
     links: Links,
     options: PlanOptions,
-    kept: Kept,
+    cache: Cache,
     report: Callable[[str], None],
     jobs: int = 1,
-    aside: Aside[Any] | None = None,
+    background: BackgroundTask[Any] | None = None,
 ) -> Plan | str:
-    """The plan of a route, from plans of its links, or why there is none.
+    """The plan of a route, joined from plans of its links, or why there is none.
 
     Parameters
     ----------
-    links  one after the other from the problem's start, with the ways in which those through cells
-           can be gone, the best first. Where a plan does not hold, or nothing leads on from where
-           it lands, the next one is taken, and at last one that is planned from guesses of its own,
-           with regard to the link after it.
-    kept   plans of links that were made before, to which others are added
-    jobs   most processes that plan links at the same time
-    aside  what else is to be done then
+    links       one after the other from the problem's start. Where a guess of a link has no plan,
+                or nothing leads on from where it lands, the next one is tried, and at last none,
+                with regard to the link after it.
+    cache       plans of links that were made before, to which others are added
+    jobs        most processes that plan links at the same time
+    background  a task for one of these processes
     """
     options = options.scale_ranges(problem.ranges)
-    begun = time.perf_counter()
-    ways, culprit = [[*measured, None] for _, measured in links], None
+    start = time.perf_counter()
+    guesses, culprit = [[*measured, None] for _, measured in links], None
     try:
         with unadvised():
-            first = [(link, way[0]) for (link, _), way in zip(links, ways, strict=True)]
-            _plan_ahead(problem, first, options, kept, report, jobs, aside)
+            first = [(link, plans[0]) for (link, _), plans in zip(links, guesses, strict=True)]
+            if jobs > 1:
+                _plan_parallel(problem, first, options, cache, report, jobs, background)
             while True:
-                own = [(link, way[0]) for (link, _), way in zip(links, ways, strict=True)]
-                planned, reason = _plan_links(problem, own, options, kept, report)
+                chosen = [(link, plans[0]) for (link, _), plans in zip(links, guesses, strict=True)]
+                planned, reason = _plan_links(problem, chosen, options, cache, report)
                 if reason:
                     culprit = len(planned)
-                    if _try_other(links, ways, culprit):
-                        continue
-                    return Lost.at(_blame(links, culprit), reason)
-                made, checked = _put_together(problem, planned, options), None
+                    blamed = range(culprit, culprit - len(_blame(links, culprit)), -1)
+                    if (other := next((k for k in blamed if len(guesses[k]) > 1), None)) is None:
+                        return Lost.at(_blame(links, culprit), reason)
+                    guesses[other].pop(0)
+                    continue
+                planning, checked = _assemble(problem, planned, options), None
                 if options.replay:
                     report("replaying the plan")
-                    checked = Checked.of(made.problem, assemble_plan(made))
-                    owners = [k for k, own in enumerate(planned) for _ in own.phases]
+                    checked = Checked.of(planning.problem, assemble_plan(planning))
+                    owners = [k for k, link in enumerate(planned) for _ in link.phases]
                     culprit = None if checked.culprit is None else owners[checked.culprit - 1]
                     holds = checked.usually.failure is None
-                    if culprit is not None and not holds and len(ways[culprit]) > 1:
-                        ways[culprit].pop(0)
+                    if culprit is not None and not holds and len(guesses[culprit]) > 1:
+                        guesses[culprit].pop(0)
                         continue
                 try:
                     with open_ledger() as ledger:
-                        for number, cost in enumerate((c for own in planned for c in own.costs), 1):
+                        costs = (cost for link in planned for cost in link.costs)
+                        for number, cost in enumerate(costs, 1):
                             ledger.add(number, cost)
-                        return finish_plan(made, report, ledger, (begun, begun), checked)
+                        return finish_plan(planning, report, ledger, (start, start), checked)
                 except ReplayError:
-                    if culprit is None or not _land_anew(links, ways, culprit):
+                    # A landing may be replanned with regard to the border after it.
+                    if culprit is None or len(_blame(links, culprit)) == 1:
                         raise
+                    if len(guesses[culprit - 1]) == 1:
+                        raise
+                    del guesses[culprit - 1][:-1]
     except WholearmError as error:
         return str(error) if culprit is None else Lost.at(_blame(links, culprit), str(error))
     except np.linalg.LinAlgError:
@@ -136,56 +134,36 @@ def join_route(
 
 
 def _blame(links: Links, culprit: int) -> tuple[Link, ...]:
-    """A link that has no plan, behind the one that lands where it starts, if any."""
+    """A link that has no plan, after the one that lands at its start, if any."""
     first = culprit - 1 if culprit and links[culprit - 1][0].in_cell else culprit
     return tuple(link for link, _ in links[first : culprit + 1])
 
 
-def _try_other(links: Links, ways: list[list[Measured | None]], culprit: int) -> bool:
-    """Go on to another way of a link that has no plan, or of the one that lands where it starts."""
-    for k in range(culprit, culprit - len(_blame(links, culprit)), -1):
-        if len(ways[k]) > 1:
-            ways[k].pop(0)
-            return True
-    return False
-
-
-def _land_anew(links: Links, ways: list[list[Measured | None]], culprit: int) -> bool:
-    """Choose a landing with regard to the border after it, whose plan does not hold, if one is."""
-    landing = culprit - 1
-    if len(_blame(links, culprit)) == 1 or len(ways[landing]) == 1:
-        return False
-    del ways[landing][:-1]
-    return True
-
-
-def _plan_ahead(
+def _plan_parallel(
     problem: Problem,
     links: Sequence[Chosen],
     options: PlanOptions,
-    kept: Kept,
+    cache: Cache,
     report: Callable[[str], None],
     jobs: int,
-    aside: Aside[Any] | None,
+    background: BackgroundTask[Any] | None,
 ) -> None:
-    """Keep plans of all links whose starts are known, and of those after them, at the same time."""
-    if jobs == 1:
-        return
+    """Plan links in parallel: each part begins with a link whose start is known."""
     starts = [0, *(k + 1 for k, (link, _) in enumerate(links[:-1]) if not link.in_cell)]
     parts = [range(*ends) for ends in zip(starts, [*starts[1:], len(links)], strict=True)]
-    # What takes longest comes first.
-    cells = [own for own in parts if any(links[k][0].in_cell for k in own)]
-    parts = [*cells, *(own for own in parts if own not in cells)]
+    # The longest tasks first.
+    cells = [part for part in parts if any(links[k][0].in_cell for k in part)]
+    parts = [*cells, *(part for part in parts if part not in cells)]
     report(f"planning {len(links)} parts of the route")
     tasks: list[Task[Any]]
-    tasks = [partial(_plan_part, problem, links, own, options, kept) for own in parts]
-    if aside:
-        tasks.insert(len(cells), aside.task)
+    tasks = [partial(_plan_part, problem, links, part, options, cache) for part in parts]
+    if background:
+        tasks.insert(len(cells), background.task)
     found = share(tasks, jobs, (problem, problem.scene))
-    if aside:
-        aside.result = found.pop(len(cells))
-    for own in found:
-        kept.update(own)
+    if background:
+        background.result = found.pop(len(cells))
+    for plans in found:
+        cache.update(plans)
 
 
 def _plan_part(
@@ -193,34 +171,33 @@ def _plan_part(
     links: Sequence[Chosen],
     part: Sequence[int],
     options: PlanOptions,
-    kept: Kept,
+    cache: Cache,
 ) -> dict[Key, PlannedLink | str]:
-    """What there is to keep of links, by their numbers, planned one after the other."""
-    # What is planned here is kept at once: an interrupt loses none of it.
-    before, z = set(kept), links[part[0]][0].start.z if part[0] else problem.start
+    """New entries of the cache after planning some links one after the other."""
+    # Each plan is stored at once, so that an interrupt loses none.
+    before, z = set(cache), links[part[0]][0].start.z if part[0] else problem.start
     for k in part:
-        planned = _plan_one(problem, links, k, z, options, kept, lambda _: None)
+        planned = _plan_cached(problem, links, k, z, options, cache, lambda _: None)
         if isinstance(planned, str):
             break
         z = planned.end
-    return {key: kept[key] for key in set(kept) - before}
+    return {key: cache[key] for key in set(cache) - before}
 
 
 def _plan_links(
     problem: Problem,
     links: Sequence[Chosen],
     options: PlanOptions,
-    kept: Kept,
+    cache: Cache,
     report: Callable[[str], None],
 ) -> tuple[list[PlannedLink], str]:
-    """Plans of links one after the other, from what is begun of them, and why the next has none."""
+    """Plans of links one after the other, and why the next one has none, if so."""
     z, found = problem.start, list[PlannedLink]()
     for k, (link, _) in enumerate(links):
         apart = measure_apart(problem.scene, z, link.start.z)
         if k and not links[k - 1][0].in_cell and apart < MET:
-            # Wherever it began, a border ends at the same place.
-            z = link.start.z
-        planned = _plan_one(problem, links, k, z, options, kept, report)
+            z = link.start.z  # A border ends at the same place from wherever it starts.
+        planned = _plan_cached(problem, links, k, z, options, cache, report)
         if isinstance(planned, str):
             return found, f"{describe_steps(link.steps)}: {planned}"
         found.append(planned)
@@ -228,30 +205,43 @@ def _plan_links(
     return found, ""
 
 
-def _plan_one(
+def _plan_cached(
     problem: Problem,
     links: Sequence[Chosen],
     k: int,
     z: Array,
     options: PlanOptions,
-    kept: Kept,
+    cache: Cache,
     report: Callable[[str], None],
 ) -> PlannedLink | str:
-    """The plan of one of some links, from `z`."""
-    link, measured = links[k]
-    ahead = links[k + 1][0] if k + 1 < len(links) else None
-    own = link if measured is None else replace(link, steps=measured.steps)
-    return keep_link(problem, own, ahead, measured, z, options, kept, report)
+    """The plan of link number k from `z`, from the cache if it is there."""
+    link, guess = links[k]
+    following = links[k + 1][0] if k + 1 < len(links) else None
+    link = link if guess is None else replace(link, steps=guess.steps)
+    # A landing is planned with the border that follows, as if that ended at rest.
+    lands = link.in_cell and following is not None and not following.in_cell
+    follows = (following.steps[0]._replace(end=End.REST),) if following and lands else ()
+    place, settings = key_configuration(problem.scene, z), repr(replace(options, samples=2))
+    key = (place, key_steps(link.steps), key_steps(follows), guess is None, settings)
+    if key not in cache:
+        report(f"planning {describe_steps(link.steps)}")
+        try:
+            cache[key] = _plan_link(problem, link, follows, guess, z, options, report)
+        except WholearmError as error:
+            cache[key] = str(error)
+        except np.linalg.LinAlgError:
+            cache[key] = SINGULAR
+    return cache[key]
 
 
-def _put_together(problem: Problem, links: Sequence[PlannedLink], options: PlanOptions) -> Planning:
+def _assemble(problem: Problem, links: Sequence[PlannedLink], options: PlanOptions) -> Planning:
     """The planning of a route whose links are planned."""
     phases, blocks = list[Phase](), list[BlockPlan]()
     for link in links:
-        moved = [replace(own, index=own.index + len(phases)) for own in link.phases]
+        moved = [replace(phase, index=phase.index + len(phases)) for phase in link.phases]
         for block in link.blocks:
-            own = tuple(moved[phase.index] for phase in block.phases)
-            blocks.append(replace(block, phases=own))
+            numbered = tuple(moved[phase.index] for phase in block.phases)
+            blocks.append(replace(block, phases=numbered))
         phases += moved
     whole = replace(problem, phases=tuple(phases), goals=())
     none = list[float | None]([None] * len(phases))
@@ -260,63 +250,35 @@ def _put_together(problem: Problem, links: Sequence[PlannedLink], options: PlanO
 
 @dataclass(frozen=True, eq=False)
 class PlannedLink:
-    """A link as it is planned."""
+    """The plan of a link."""
 
     phases: tuple[Phase, ...]  # counted from the first of the link
     blocks: tuple[BlockPlan, ...]
-    costs: tuple[SolverStatistics, ...]  # what solving has cost, for each phase
+    costs: tuple[SolverStatistics, ...]  # of the solver, for each phase
 
     @property
     def end(self) -> Array:
-        """Where it ends, shape (5,)."""
+        """Configuration at the end, shape (5,)."""
         return self.blocks[-1].end
 
     @property
     def duration(self) -> float:
-        """How long it takes [s]."""
-        return sum(plan.motion.duration for own in self.blocks for plan in own.plans)
+        """Duration [s]."""
+        return sum(plan.motion.duration for block in self.blocks for plan in block.plans)
 
 
-Kept = MutableMapping[Key, PlannedLink | str]
-"""Plans of links, or why there are none."""
+Cache = MutableMapping[Key, PlannedLink | str]  # plans of links, or why there are none
 
 
 def key_configuration(scene: Scene, z: Array) -> tuple[float, ...]:
-    """The same for configurations that are one."""
+    """A configuration, rounded."""
     length = scene.scales.length
     return tuple(np.round(z / [length, length, 1, 1, 1], SAME).tolist())
 
 
 def key_steps(steps: Sequence[EdgeStep]) -> Key:
-    """The same for phases that are the same."""
-    return tuple((tuple(c.name for c in own.contacts), own.until, own.end.value) for own in steps)
-
-
-def keep_link(
-    problem: Problem,
-    link: Link,
-    ahead: Link | None,
-    begun: Measured | None,
-    z: Array,
-    options: PlanOptions,
-    kept: Kept,
-    report: Callable[[str], None],
-) -> PlannedLink | str:
-    """The plan of a link from `z`, made now, from what is begun, if it is not kept."""
-    # Where a link lands, the next one goes on along a border, looked at as if it stopped there.
-    lands = link.in_cell and ahead is not None and not ahead.in_cell
-    follows = (ahead.steps[0]._replace(end=End.REST),) if ahead is not None and lands else ()
-    place, own = key_configuration(problem.scene, z), repr(replace(options, samples=2))
-    key = (place, key_steps(link.steps), key_steps(follows), begun is None, own)
-    if key not in kept:
-        report(f"planning {describe_steps(link.steps)}")
-        try:
-            kept[key] = _plan_link(problem, link, follows, begun, z, options, report)
-        except WholearmError as error:
-            kept[key] = str(error)
-        except np.linalg.LinAlgError:
-            kept[key] = SINGULAR
-    return kept[key]
+    """Contacts and ends of phases."""
+    return tuple((tuple(c.name for c in s.contacts), s.until, s.end.value) for s in steps)
 
 
 def _plan_link(
@@ -328,45 +290,38 @@ def _plan_link(
     options: PlanOptions,
     report: Callable[[str], None],
 ) -> PlannedLink:
+    """Plan a link and the phases that follow, of which only the link is kept."""
     steps = (*link.steps, *follows)
     phases, curves = make_phases(problem, steps), list[Curve]()
     if not link.in_cell and len(phases) == 1:
         phases[0], curve = _aim(phases[0], z, link)
         curves.append(curve)
-    own = replace(problem, start=z, phases=tuple(phases), goals=())
+    single = replace(problem, start=z, phases=tuple(phases), goals=())
     count = len(phases) - len(follows)
     none = list[float | None]([None] * len(phases))
-    made = Planning(own, tuple(curves), options, (), none, none, sketches=True)
+    planning = Planning(single, tuple(curves), options, (), none, none, sketches=True)
     with open_ledger(apart=True) as ledger, name_source(problem.source):
-        for part in split_blocks(own):
-            if part[0].index >= count:
+        for part in split_blocks(single):
+            first, guess = part[0], None
+            if first.index >= count:
                 break
-            begun = None
-            if (
-                measured
-                and measured.begun
-                and (part[0].end is not End.REST or part[0].index == count - 1)
-            ):
-                start = made.blocks[-1].end if made.blocks else z
-                begun = BlockPlan(part, start, BEGUN, None, [], list(measured.begun), None)
-            made = plan_next(made, 0, begun, report)
+            ends = first.end is not End.REST or first.index == count - 1
+            if measured and measured.begun and ends:
+                start = planning.blocks[-1].end if planning.blocks else z
+                guess = BlockPlan(part, start, BEGUN, None, [], list(measured.begun), None)
+            planning = plan_next(planning, 0, guess, report)
     costs = tuple(ledger.of(phase.number) for phase in phases[:count])
     pinned = [
         pin_landing(phase, end_of(plan)[0])
-        for phase, plan in zip(phases[:count], made.plans, strict=True)
+        for phase, plan in zip(phases[:count], planning.plans, strict=True)
     ]
-    return PlannedLink(tuple(pinned), made.blocks, costs)
+    return PlannedLink(tuple(pinned), planning.blocks, costs)
 
 
 def pin_landing(phase: Phase, z: Array) -> Phase:
-    """The phase with a coordinate of the pose at its end, where a contact leaves that open.
+    """Add a terminal constraint on x or phi to a phase with two freedoms that lands on a border.
 
-    That is the one which changes most along the border on which a phase with two freedoms lands. It
-    is rounded as a problem file has it.
-
-    Parameters
-    ----------
-    z : (5,)  where it ends
+    It is the coordinate that changes most along the border, at the end z (5,), rounded.
     """
     until, formation = phase.until, phase.formation
     if until.contact is None or until.pins or count_freedoms(formation, z) < 2:
@@ -380,9 +335,9 @@ def pin_landing(phase: Phase, z: Array) -> Phase:
 
 
 def _aim(phase: Phase, z: Array, link: Link) -> tuple[Phase, Curve]:
-    """The phase of a border's link from `z`, so that it ends where the link does, and its curve.
+    """The phase of a border's link from `z` and its curve, which ends where the link does.
 
-    A contact may be gained both ways along a border; x or phi tells which is meant.
+    A contact may be gained both ways along a border; then the end is given by x or phi.
     """
     try:
         curve = trace_phase(phase, z)
@@ -390,6 +345,5 @@ def _aim(phase: Phase, z: Array, link: Link) -> tuple[Phase, Curve]:
             return phase, curve
     except InputError:
         pass
-    until = point_out(phase.formation.contacts, link.stop.z)
-    other = replace(phase, until=until)
+    other = replace(phase, until=point_out(phase.formation.contacts, link.stop.z))
     return other, trace_phase(other, z)

@@ -1,4 +1,4 @@
-"""Links between places: phases along borders, and through cells, with about how long they take."""
+"""Links between places: phases along borders and through cells, with estimated durations."""
 
 from __future__ import annotations
 
@@ -19,21 +19,23 @@ from ..mechanics.metric import metric_weights
 from ..planning.lower_bound.lower_bound import bound_least_time, bound_roughly
 from ..planning.lower_bound.rows import PathLimitRows, evaluate_rows
 from ..problem.definition import End, Until
-from .border_limits import INTERVALS, Ground, Unstopped, sketch, survey
+from .border_limits import (
+    INTERVALS,
+    BorderLimits,
+    Unstopped,
+    estimate_duration,
+    find_border_limits,
+)
 from .places import RoadmapPlace, make_place
 from .travel_times import find_durations
 
-BARRED = 0.01
-"""By how much limits are missed a little way on, over that way, where no border leads on."""
-ROUGHLY = 0.999
-"""Share of a bound on a coarse grid that is one: its quadrature errs by 2e-5 at most, measured over
-the borders of seven scenes."""
-PARTED = 16
-"""Intervals on which the fastest motion along a part of a border is looked for."""
+BARRED = 0.01  # violation of a limit a small step ahead, over the step, where a border ends
+ROUGHLY = 0.999  # safety factor of coarse bounds; quadrature errors are up to 2e-5 in seven scenes
+PARTED = 16  # intervals of the speed sweep along a part of a border
 
 
 class Terms(NamedTuple):
-    """What motions have to keep: the least normal force [N], and the least ratio of minors."""
+    """Least normal force [N], and least uniqueness margin (P-matrix)."""
 
     epsilon: float
     uniqueness_margin: float
@@ -49,46 +51,46 @@ class EdgeStep(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """A way from one place to another, from rest to rest."""
+    """An edge of the roadmap: phases from rest at one place to rest at another."""
 
     start: RoadmapPlace
     stop: RoadmapPlace
     steps: tuple[EdgeStep, ...]
-    duration: float  # [s]: about how long it takes
-    # whether it leads through a cell. Then the planner chooses where it ends, the duration is that
-    # of straight ways, and nothing bounds it from below.
+    duration: float  # [s]: estimated
+    # whether it leads through a cell: then the planner optimizes its end, the duration is that of
+    # straight paths, and the bound is zero
     in_cell: bool = False
     left: Curve | None = None  # the border that it leaves for the cell
-    share: float = 0.0  # which part of that it follows
+    share: float = 0.0  # the part of that which it follows
     borders: tuple[BorderEdge, ...] = ()  # those that it follows, if it leads through no cell
-    # their speed ratios, with which the speed is the same on both sides of where two meet
-    ratios: tuple[float, ...] = ()
+    ratios: tuple[float, ...] = ()  # their speed ratios, with which the speed is continuous
 
     @cached_property
     def bound(self) -> float:
-        """How long it takes at least [s]."""
+        """Lower bound of the duration on a coarse grid [s]."""
         if self.in_cell:
             return 0.0
-        own = zip(self.borders, self.ratios, strict=True)
-        curves = [border.curve.with_speed_ratio(ratio) for border, ratio in own]
-        return max(0.0, bound_roughly(curves, self.borders[0].terms.epsilon, INTERVALS))
+        return max(0.0, bound_roughly(self._curves, self.borders[0].terms.epsilon, INTERVALS))
 
     @cached_property
     def fine_bound(self) -> float:
-        """The same on a grid that is refined: no more than the least time, but by rounding [s]."""
-        own = zip(self.borders, self.ratios, strict=True)
-        curves = [border.curve.with_speed_ratio(ratio) for border, ratio in own]
-        found = bound_least_time(curves, self.borders[0].terms.epsilon)
+        """Lower bound on a refined grid, up to rounding [s]."""
+        found = bound_least_time(self._curves, self.borders[0].terms.epsilon)
         return max(ROUGHLY * self.bound, found.value if found else 0.0)
 
     @property
+    def _curves(self) -> list[Curve]:
+        pairs = zip(self.borders, self.ratios, strict=True)
+        return [border.curve.with_speed_ratio(ratio) for border, ratio in pairs]
+
+    @property
     def signature(self) -> tuple[tuple[str, ...], ...]:
-        """The contacts of its phases, by which routes differ."""
+        """Names of the contacts of each phase."""
         return tuple(tuple(sorted(c.name for c in step.contacts)) for step in self.steps)
 
 
 class Blocked(NamedTuple):
-    """A link that no motion can take."""
+    """A link without a feasible motion."""
 
     start: RoadmapPlace
     steps: tuple[EdgeStep, ...]
@@ -98,41 +100,39 @@ class Blocked(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BorderEdge:
-    """A border followed one way from a place, as far as its formation holds."""
+    """A border followed from a place in one direction, as far as its formation holds."""
 
     start: RoadmapPlace
     curve: Curve
-    gained: Contact | None  # what is gained at its end; None where it ends at an obstacle
+    gained: Contact | None  # at its end; None at an obstacle
     terms: Terms
 
     def __getstate__(self) -> dict[str, Any]:
-        # What is seen of a border is large, and soon seen again.
-        return {name: value for name, value in self.__dict__.items() if name != "ground"}
+        # Limits are large, and soon computed again.
+        return {name: value for name, value in self.__dict__.items() if name != "limits"}
 
     @cached_property
     def stop(self) -> RoadmapPlace:
-        """Where it ends."""
+        """The place at its end."""
         return make_place(self.formation.scene, self.curve.end)
 
     @cached_property
-    def ground(self) -> Ground:
-        """What motions along it may do."""
-        return survey(self.curve, *self.terms)
+    def limits(self) -> BorderLimits:
+        """Limits of motions along it."""
+        return find_border_limits(self.curve, *self.terms)
 
     @property
     def formation(self) -> Formation:
-        """The contacts that touch along it."""
+        """The formation along it."""
         return self.curve.formation
 
 
 def follow_borders(
     place: RoadmapPlace, formation: Formation, terms: Terms, known: list[Curve]
 ) -> list[BorderEdge]:
-    """The border of a formation from a place, one way and the other, as far as it leads on.
+    """The border of a formation from a place, in both directions.
 
-    Parameters
-    ----------
-    known  whole borders of these contacts, to which those that are traced are added
+    Whole borders of the formation are taken from `known`, to which newly traced ones are added.
     """
     least = HELD * place.scene.scales.length
     for whole in known:
@@ -147,25 +147,25 @@ def follow_borders(
 
 
 def _trace(formation: Formation, z: Array, known: list[Curve]) -> list[Curve]:
-    """The curves of a formation from a place; the whole of them is added to those known."""
+    """The curves of a formation from a configuration; joined, they are added to `known`."""
     headings = find_headings(formation, z)
     if not headings:
         return []
-    least, ways = HELD * formation.scene.scales.length, list[Curve | None]()
-    # Most end where they begin, which limits a little way on tell.
+    least, traced = HELD * formation.scene.scales.length, list[Curve | None]()
+    # Most borders end where they start: then a limit is violated a small step ahead.
     ahead = formation.evaluate_limits(z + least * np.array(headings)).min(axis=1)
     for heading, limit in zip(headings, ahead.tolist(), strict=True):
         barred = limit < -BARRED * least
         curve = None if barred else trace_curve(formation, z, heading, Until())
-        ways.append(curve if curve is not None and curve.length > least else None)
-    curves = [curve for curve in ways if curve is not None and _is_regular(curve)]
-    if curves and len(curves) == 2 - ways.count(None):
-        known.append(join(*ways[::-1]))
+        traced.append(curve if curve is not None and curve.length > least else None)
+    curves = [curve for curve in traced if curve is not None and _is_regular(curve)]
+    if curves and len(curves) == 2 - traced.count(None):
+        known.append(join(*traced[::-1]))
     return curves
 
 
 def find_headings(formation: Formation, z: Array) -> tuple[Array, ...]:
-    """Both unit tangents of a formation's curve at `z`; none where it has more than one."""
+    """Both unit tangents of a formation's curve at `z`; none where the curve is singular."""
     metric = np.sqrt(metric_weights(formation.scene))
     P = formation.evaluate(z[None], np.zeros((1, 5))).P[0] / metric
     _, values, right = np.linalg.svd(P)
@@ -187,7 +187,7 @@ def _find_gained(curve: Curve) -> Contact | None:
     formation = curve.formation
     values = np.abs(formation.evaluate_limits(np.array([curve.start, curve.end])))
     met = values[1] < formation.scene.touching
-    # What is closed from the start, such as the end of a flush edge, is not what is waited for.
+    # A contact that is closed at the start, such as the end of a flush edge, is not gained.
     opened = values[0] > HELD * formation.scene.scales.length
     for rows in (met & opened, met):
         for k in np.flatnonzero(rows):
@@ -197,14 +197,14 @@ def _find_gained(curve: Curve) -> Contact | None:
 
 
 def point_out(contacts: Sequence[Contact], z: Array) -> Until:
-    """A place on a border by the coordinate that changes along it."""
+    """The coordinate that changes along a border, as the end of a phase there."""
     if sum(contact.finger is None for contact in contacts) == 2:
         return Until(coordinate="x", value=float(z[0]))
     return Until(coordinate="phi", value=float(z[2]))
 
 
 def leave_at(link: Link, share: float) -> tuple[EdgeStep, ...]:
-    """The phases of a link that leaves a border, with the border left somewhere else."""
+    """The phases of a link that leaves a border at a share of its length."""
     assert link.left is not None
     z = link.left.evaluate(np.array([share * link.left.length])).z[0]
     first, *rest = link.steps
@@ -224,26 +224,22 @@ def cut_curve(curve: Curve, length: float) -> Curve:
 
 
 def time_parts(border: BorderEdge, shares: Array) -> Array:
-    """About the least times along first parts of a border, from rest to rest, shape (n,) [s].
+    """Estimated least times along first parts of a border, from rest to rest, shape (n,) [s].
 
-    Infinite where no motion keeps the limits, none begins at rest, or contact forces are not the
-    only ones.
-
-    Parameters
-    ----------
-    shares : (n,)  lengths of the parts, increasing, over that of the border
+    Infinite where there is no motion, or contact forces are not unique. Lengths of the parts over
+    that of the border are `shares`, increasing.
     """
     curve, times = border.curve, np.full(len(shares), np.inf)
     lengths = shares * curve.length
-    lengths = lengths[lengths <= border.ground.clear]
-    if not len(lengths) or border.ground.begins:
+    lengths = lengths[lengths <= border.limits.clear]
+    if not len(lengths) or border.limits.begins:
         return times
     nodes = (1 - np.cos(np.linspace(0, np.pi, PARTED + 1))) / 2
     places, steps = (nodes[1:] + nodes[:-1]) / 2, np.diff(nodes)
     s, size = lengths[:, None] * places, lengths[:, None]
     stops = np.array([part.stop for part in curve.segments[:-1]])
     rows = evaluate_rows(curve, border.terms.epsilon, s.ravel(), np.searchsorted(stops, s.ravel()))
-    # By the share of each part that is behind, not by its length.
+    # With the share of each part as path parameter.
     a, b, v, one, cap = (part.reshape(*s.shape, *part.shape[1:]) for part in rows)
     scale = size[..., None]
     scaled = PathLimitRows(scale * a, scale**2 * b, scale * v, one, cap / size**2)
@@ -257,19 +253,17 @@ def link_along(
     steps: tuple[EdgeStep, ...],
     stop: RoadmapPlace,
 ) -> Link | Blocked:
-    """The link along borders that are passed without a stop, at rest at the end of the last one.
+    """The link along borders without a stop between; motions can pass all but the last one.
 
-    Parameters
-    ----------
-    borders  those before the last one are known to let motions pass
-    ratios   their speed ratios, with which the speed is the same on both sides of where two meet
+    With speed `ratios` the speed is continuous where two borders meet.
     """
-    start, last = borders[0].start, borders[-1].ground
+    start, last = borders[0].start, borders[-1].limits
     reason = last.closed or ("" if len(borders) > 1 else last.begins)
     if reason:
         return Blocked(start, steps, reason, stop)
-    grounds = zip(borders, ratios, strict=True)
-    found = last.ends or sketch([own.ground.with_speed_ratio(ratio) for own, ratio in grounds])
+    pairs = zip(borders, ratios, strict=True)
+    limits = [border.limits.with_speed_ratio(ratio) for border, ratio in pairs]
+    found = last.ends or estimate_duration(limits)
     if isinstance(found, str):
         return Blocked(start, steps, Unstopped(found), stop)
     return Link(start, stop, steps, found, borders=borders, ratios=ratios)

@@ -1,4 +1,4 @@
-"""Links through cells planned for themselves: on few intervals, to see whether and how they go."""
+"""Feasibility of links through cells: each planned alone, on few intervals."""
 
 from __future__ import annotations
 
@@ -22,20 +22,19 @@ from ..planning.time_domain.time_motion import TimeMotion
 from ..problem.definition import End, Phase, Problem, Until
 from .border_limits import INTERVALS
 from .edges import EdgeStep, Link
-from .places import settle
+from .places import close_place
 
-ROUGH = 1e-2
-"""Accuracy of plans of which only matters about how long they take."""
+ROUGH = 1e-2  # accuracy of plans that only estimate durations
 SINGULAR = "its contacts depend on each other"
-"""Why there is no plan where the equations of motion have no single solution."""
+"""Reason where the equations of motion have no single solution."""
 
 
 class Measured(NamedTuple):
-    """What came of planning a link through a cell for itself."""
+    """The plan of one link through a cell."""
 
     duration: float  # [s]
-    steps: tuple[EdgeStep, ...]  # its phases, in the way that was planned
-    # plans of those in the cell, and of the border that is left in motion, on few intervals
+    steps: tuple[EdgeStep, ...]  # its phases as planned
+    # initial guesses: plans in the cell and of a border that is left in motion, on few intervals
     begun: list[PhasePlan[TimeMotion]]
 
 
@@ -54,33 +53,28 @@ def measure_link(
     options: PlanOptions,
     further: int = 0,
     straight: bool = True,
-    hurried: bool = False,
+    first_only: bool = False,
 ) -> Measured | str:
-    """Plan a link through a cell for itself, on few intervals.
+    """Plan a link through a cell alone, on few intervals; the plan, or why there is none.
 
     Parameters
     ----------
-    steps     its own, or others that lead the same way
-    further   guesses beyond the first ones, if these lead nowhere
-    straight  whether a cell is first guessed to be crossed straight, or to the nearest end of the
-              phase
-    hurried   whether there is one guess alone
-
-    Returns
-    -------
-    Measured, or why there is no plan.
+    steps       the link's, or others between the same places
+    further     number of guesses beyond the first ones, if these fail
+    straight    first guess: straight through the cell; otherwise to the nearest end of the phase
+    first_only  whether only the first guess is tried
     """
     from ..planning.time_domain.time_plan import try_phases
 
     rough = replace(options, objective=Objective.TIME, duration=None, accuracy=ROUGH)
     phases, z, spent = make_phases(problem, steps), link.start.z, 0.0
     try:
-        own = replace(problem, goals=(), phases=tuple(phases))
+        single = replace(problem, goals=(), phases=tuple(phases))
         if len(phases) > 1 and phases[0].end is End.REST:
             curve = trace_phase(phases[0], z)
             spent = look_along((curve,), problem.epsilon, INTERVALS)
             z, phases = curve.end, phases[1:]
-        goal = settle(link.stop) if len(phases) == 1 else None
+        goal = close_place(link.stop) if len(phases) == 1 else None
         if goal is None:
             goal = replace(link.stop, z=find_end(phases[0], z, phases[1:]))
         moved = metric_weights(problem.scene) @ (goal.z - z) ** 2
@@ -88,7 +82,7 @@ def measure_link(
             return f"{phases[0].until} holds already where it starts"
         alone = len(phases) == 1
         towards = goal.z if straight and alone else None
-        plans = try_phases(own, phases, z, rough, towards, further if alone else 0, hurried)
+        plans = try_phases(single, phases, z, rough, towards, further if alone else 0, first_only)
     except NoMotionError:
         return "no motion keeps its limits along the border"
     except WholearmError as error:
@@ -101,6 +95,6 @@ def measure_link(
 
 
 def leave_in_motion(steps: tuple[EdgeStep, ...]) -> tuple[EdgeStep, ...]:
-    """Phases that leave a border in motion, at a place that the planner chooses."""
+    """Phases that leave a border in motion, where the planner chooses."""
     first, *rest = steps
     return (EdgeStep(first.contacts, Until(), End.SMOOTH), *rest)

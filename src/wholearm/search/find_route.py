@@ -1,4 +1,7 @@
-"""From a problem with goals to a plan: search, planning of what is found, and what bounds it."""
+"""Plans to goals: search over the roadmap, planning of the routes found, and lower bounds.
+
+Where no route exists, single numbers of the problem are varied until one does.
+"""
 
 from __future__ import annotations
 
@@ -37,8 +40,7 @@ from ..problem.goal import Goal, name_goal
 from ..problem.table import describe_scene
 from ..scene.model import Scene
 from .astar import EAGER, RoadmapRoute, RouteSearch
-from .candidates import FailedCandidate
-from .cuts import Gate, Opening, list_gates, list_openings, pass_gate
+from .cuts import Opening, list_cut_borders, list_openings, pass_cut
 from .edges import Blocked, point_out
 from .feasibility import ROUGH, SINGULAR
 from .goals import is_at
@@ -47,26 +49,20 @@ from .result import Alternative, Answer, describe_block
 from .roadmap import Roadmap
 from .route_choice import NEARBY, Chooser
 
-LARGEST = 200_000_000
-"""Most bytes that a chart is written with."""
-_RECURSION = 20_000
-"""Depth of recursion that pickling a chart may take."""
-NEAR = 1e-4
-"""How far beside a goal the hand may close instead, in radii of gyration."""
-TRIED = 3
-"""Most numbers with which the goal is looked for."""
-SYMMETRIC = 1e-9
-"""Relative difference of lengths and bases up to which the hand is symmetric."""
+LARGEST = 200_000_000  # Most bytes of a stored roadmap
+_RECURSION = 20_000  # Depth of recursion that pickling a roadmap
+NEAR = 1e-4  # How far beside a goal the hand may close instead, in radii of gyration
+TRIED = 3  # Most numbers with which the goal is looked for
+SYMMETRIC = 1e-9  # Relative difference of lengths and bases up to which the hand is symmetric
 HANDS = (1.05, 0.95, 1.1, 0.9, 1.2, 0.8)
-"""Lengths of fingers and distances of their bases that are tried, over those given."""
+"""Lengths of fingers and distances of their bases that are tried, relative to the problem's."""
 TIMES, AT_LEAST = 4.0, 20.0
-"""Processor time up to which other hands are begun, over that of the search, and at least [s]."""
+"""Limit of processor time for other hands: over that of the search, and at least [s]."""
 Try = Callable[[Change, Sequence[int], bool], tuple[float, Sequence[int]] | None]
 """Looks for the goal with a change, beyond some borders: about how long the route takes [s], which
 is planned if that is asked for, and over which of the borders it leads."""
-CHARTS = 4
-"""Scenes whose charts are kept."""
-_charts: OrderedDict[object, Roadmap] = OrderedDict()
+ROADMAPS = 4  # scenes whose roadmaps are kept in memory
+_roadmaps: OrderedDict[object, Roadmap] = OrderedDict()
 
 
 def find_route(
@@ -111,10 +107,11 @@ def find_route(
     """
     if jobs < 1:
         raise InputError("", "jobs", f"{jobs} given; allowed is 1 or more")
-    own = PlanOptions(objective=objective, **options)
+    chosen = PlanOptions(objective=objective, **options)
     folder = None if cache is None else Path(cache)
-    given = problem, own, alternatives, progress, folder, jobs
-    return find_route_with(*given, time_limit=time_limit)
+    return find_route_with(
+        problem, chosen, alternatives, progress, folder, jobs, time_limit=time_limit
+    )
 
 
 @exclusive
@@ -135,103 +132,58 @@ def find_route_with(
     which `hurry` is called before. Without it KeyboardInterrupt is raised.
     """
     with limited(time_limit):
-        return _find(problem, options, alternatives, Reporter(progress), cache, jobs, hurry)
+        report = Reporter(progress)
+        if not problem.goals:
+            reason = "is missing; allowed is flush or phi_deg, and x"
+            raise InputError(problem.source, "goal", reason)
+        if cache is not None:
+            require_folder(cache)
+        roadmap, before = get_roadmap(problem, options, cache), list[RoadmapRoute]()
+        for index, goal in enumerate(problem.goals):
+            start = problem.start if not before else before[-1].links[-1].stop.z
+            place = make_place(problem.scene, start)
+            if is_at(place, goal):
+                key = name_goal(problem.goals, index, problem.table)
+                reason = f"{goal} holds already where the motion starts"
+                raise InputError(problem.source, key, reason)
+            require_reach(problem.scene, goal, float(start[2]))
+            search = RouteSearch(roadmap, place, goal)
+            count = alternatives if index + 1 == len(problem.goals) else 0
+            answer = _plan_to_goal(problem, before, search, options, count, report, jobs, hurry)
+            before = [*before, answer.route]
+        if cache is not None:
+            try:
+                store_roadmap(cache, describe_key(problem, options), roadmap)
+            except InputError as error:
+                # The result counts, with or without a copy for later searches.
+                warnings.warn(str(error), stacklevel=2)
+        return answer
 
 
-def _find(
-    problem: Problem,
-    options: PlanOptions,
-    alternatives: int,
-    report: Reporter,
-    cache: Path | None,
-    jobs: int,
-    hurry: Callable[[], None] | None,
-) -> Answer:
-    """Find a route from goal to goal."""
-    if not problem.goals:
-        raise InputError(problem.source, "goal", "is missing; allowed is flush or phi_deg, and x")
-    if cache is not None:
-        require_folder(cache)
-    chart, before = get_chart(problem, options, cache), list[RoadmapRoute]()
-    for index, goal in enumerate(problem.goals):
-        start = problem.start if not before else before[-1].links[-1].stop.z
-        place = make_place(problem.scene, start)
-        if is_at(place, goal):
-            key = name_goal(problem.goals, index, problem.table)
-            raise InputError(problem.source, key, f"{goal} holds already where the motion starts")
-        require_reach(problem.scene, goal, float(start[2]))
-        search = RouteSearch(chart, place, goal)
-        wanted = alternatives if index + 1 == len(problem.goals) else 0
-        answer = _choose(problem, before, search, options, wanted, report, jobs, hurry)
-        before = [*before, answer.route]
-    if cache is not None:
-        try:
-            store_chart(cache, key_chart(problem, options), chart)
-        except InputError as error:
-            # What was found counts, with or without a copy for later searches.
-            warnings.warn(str(error), stacklevel=2)
-    return answer
+def describe_key(problem: Problem, options: PlanOptions) -> str:
+    """Everything that the roadmap of a problem depends on, as JSON."""
+    key = describe_scene(problem.scene) | {"": (problem.epsilon, options.uniqueness_margin)}
+    return json.dumps(key, sort_keys=True)
 
 
-def key_chart(problem: Problem, options: PlanOptions) -> str:
-    """What a chart depends on, in words."""
-    known = describe_scene(problem.scene) | {"": (problem.epsilon, options.uniqueness_margin)}
-    return json.dumps(known, sort_keys=True)
+def get_roadmap(problem: Problem, options: PlanOptions, cache: Path | None = None) -> Roadmap:
+    """The roadmap of a problem's scene, from memory, from a folder, or a new one."""
+    key = describe_key(problem, options)
+    roadmap = _roadmaps.pop(key, None)
+    if roadmap is None and cache is not None:
+        roadmap = load_roadmap(cache, key)
+    _roadmaps[key] = roadmap = roadmap or Roadmap(problem, options.uniqueness_margin)
+    while len(_roadmaps) > ROADMAPS:
+        _roadmaps.popitem(last=False)
+    return roadmap
 
 
-def get_chart(problem: Problem, options: PlanOptions, cache: Path | None = None) -> Roadmap:
-    """The chart of a problem's scene, kept from one search to the next, in a folder if asked."""
-    key = key_chart(problem, options)
-    chart = _charts.pop(key, None)
-    if chart is None and cache is not None:
-        chart = load_chart(cache, key)
-    chart = chart or Roadmap(problem, options.uniqueness_margin)
-    _charts[key] = chart
-    while len(_charts) > CHARTS:
-        _charts.popitem(last=False)
-    return chart
+def forget_roadmaps() -> None:
+    """Empty the memory of roadmaps."""
+    _roadmaps.clear()
 
 
-def forget_charts() -> None:
-    """Forget what is known of scenes."""
-    _charts.clear()
-
-
-def _refuse(
-    problem: Problem,
-    search: RouteSearch,
-    options: PlanOptions,
-    failures: list[FailedCandidate],
-    seconds: float,
-    report: Reporter,
-    hurry: Callable[[], None] | None,
-) -> InfeasibleError:
-    """Why nothing leads to a goal, which took so many seconds to see, and what opens the way."""
-    opening, changes, why = "", tuple[Change, ...](), partial(explain, problem, options)
-    try:
-        with yielding():
-            opening, changes = find_opening(search, problem, options, seconds, report)
-            text = describe_block(search, failures, opening, why)
-    except KeyboardInterrupt as error:
-        if hurry is None and not isinstance(error, OutOfTime):
-            raise
-        # That nothing leads there is known; what would help, and why, is not looked for any more.
-        text = describe_block(search, failures, opening)
-    return InfeasibleError(text, changes=changes)
-
-
-def _describe_missing(chooser: Chooser, doing: str) -> str:
-    """What a search that is out of time has found, and what it was at."""
-    text = f"the time limit is over, and there is no plan yet: {chooser.search.settled} places"
-    text += " looked at"
-    if chooser.found:
-        best = min(chooser.found, key=chooser.estimate)
-        count = sum(len(link.steps) for link in best.links)
-        text += f", a route of {count} phases found, of about {chooser.estimate(best):.3g} s"
-    return f"{text}; what it was at: {doing}"
-
-
-def _choose(
+def _plan_to_goal(
     problem: Problem,
     before: list[RoadmapRoute],
     search: RouteSearch,
@@ -241,8 +193,8 @@ def _choose(
     jobs: int,
     hurry: Callable[[], None] | None,
 ) -> Answer:
-    """Plan routes to one goal, and say how good the best one is."""
-    begun = time.process_time()
+    """Plan routes to one goal, with a lower bound of the best one."""
+    start = time.process_time()
     chooser, complete = Chooser(problem, before, search, options, jobs), True
     try:
         with yielding():
@@ -258,18 +210,28 @@ def _choose(
         complete = False
         if not chooser.made:
             hurry()
-            chooser.hurried = True
+            chooser.first_only = True
             chooser.plan(1, report)
     except np.linalg.LinAlgError:
-        # Contacts depend on each other at a place that the search came to.
+        # Dependent contacts at a place that the search has reached.
         complete = False
         if not chooser.made:
             chooser.plan(1, report)
-    made, margin = chooser.made, options.goal is Objective.MARGIN
+    made = chooser.made
     if not made:
-        spent = time.process_time() - begun
-        raise _refuse(problem, search, options, chooser.failures, spent, report, hurry)
-    made.sort(key=lambda own: -own[0].value if margin else own[0].value)
+        spent, failed = time.process_time() - start, chooser.failures
+        opening, changes, reason = "", tuple[Change, ...](), partial(explain, problem, options)
+        try:
+            with yielding():
+                opening, changes = find_opening(search, problem, options, spent, report)
+                text = describe_block(search, failed, opening, reason)
+        except KeyboardInterrupt as error:
+            if hurry is None and not isinstance(error, OutOfTime):
+                raise
+            text = describe_block(search, failed, opening)
+        raise InfeasibleError(text, changes=changes)
+    sign = -1 if options.goal is Objective.MARGIN else 1
+    made.sort(key=lambda pair: sign * pair[0].value)
     plan, route = made[0]
     bound = None
     if complete and not before:
@@ -280,17 +242,22 @@ def _choose(
             if hurry is None and not isinstance(error, OutOfTime):
                 raise
             complete = False
+    others = tuple(Alternative(other, other.problem) for other, _ in made[1 : 1 + alternatives])
+    failures, blocked = tuple(chooser.failures), tuple(search.blocked)
     return Answer(
-        plan,
-        plan.problem,
-        route,
-        bound,
-        tuple(Alternative(own[0], own[0].problem) for own in made[1 : 1 + alternatives]),
-        tuple(chooser.failures),
-        tuple(search.blocked),
-        search.settled,
-        complete,
+        plan, plan.problem, route, bound, others, failures, blocked, search.settled, complete
     )
+
+
+def _describe_missing(chooser: Chooser, doing: str) -> str:
+    """What a search that is out of time has found, and its last step."""
+    text = f"the time limit is over, and there is no plan yet: {chooser.search.settled} places"
+    text += " looked at"
+    if chooser.found:
+        best = min(chooser.found, key=chooser.estimate)
+        count = sum(len(link.steps) for link in best.links)
+        text += f", a route of {count} phases found, of about {chooser.estimate(best):.3g} s"
+    return f"{text}; what it was at: {doing}"
 
 
 def find_opening(
@@ -311,19 +278,30 @@ def find_opening(
     seconds : [s]  processor time that this has taken
     """
     report("looking for a number that opens the way")
-    gates = list_gates(search)
+    cuts = list_cut_borders(search)
 
     def find(
         change: Change, beyond: Sequence[int], planned: bool
     ) -> tuple[float, Sequence[int]] | None:
-        own = {k: gates[k] for k in beyond}
-        return _look_beyond(search, problem, options, change, own, planned)
+        try:
+            changed = problem.with_(change.values)
+        except InputError:
+            return None
+        routes = {k: pass_cut(search, cuts[k], change) for k in beyond}
+        sources = [route for route in routes.values() if route is not None]
+        if not sources:
+            return None
+        found = _search_changed(changed, search.start.z, search.goal, options, planned, sources)
+        if found is None:
+            return None
+        last = {k: route.links[-1] for k, route in routes.items() if route}
+        return found[1], [k for k, link in last.items() if link in found[0].links]
 
-    text, changes = choose_opening(list_openings(gates), find)
+    text, changes = choose_opening(list_openings(cuts), find)
     if changes:
         return text, changes
-    shut, changes = find_hand(search, problem, options, seconds, report)
-    return shut if changes or not text else f"{text}; {shut}", changes
+    hands, changes = find_hand(search, problem, options, seconds, report)
+    return hands if changes or not text else f"{text}; {hands}", changes
 
 
 def choose_opening(openings: Sequence[Opening], find: Try) -> tuple[str, tuple[Change, ...]]:
@@ -331,11 +309,10 @@ def choose_opening(openings: Sequence[Opening], find: Try) -> tuple[str, tuple[C
     tried = list[str]()
     for opening in openings[:TRIED]:
         most = opening.open_all()
-        beyond = opening.list_open(most)
-        seen = find(most, beyond, False)
-        # What else it opens may be needed beyond those borders over which the way leads.
-        least = most if seen is None else opening.open_all(seen[1])
-        for change in dict.fromkeys((least, most)) if seen else ():
+        route = find(most, opening.list_open(most), False)
+        # Borders beyond those that the route crosses may need the larger change.
+        least = most if route is None else opening.open_all(route[1])
+        for change in dict.fromkeys((least, most)) if route else ():
             found = find(change, opening.list_open(change), True)
             if found is not None:
                 return _describe_reached(change, found[0]), (change,)
@@ -347,31 +324,7 @@ def _describe_reached(change: Change, duration: float) -> str:
     return f"with {change} the goal is reached, in about {duration:.3g} s"
 
 
-def _look_beyond(
-    search: RouteSearch,
-    problem: Problem,
-    options: PlanOptions,
-    change: Change,
-    gates: dict[int, Gate],
-    planned: bool,
-) -> tuple[float, list[int]] | None:
-    """Look for the goal in a changed scene, beyond borders that are open there."""
-    try:
-        changed = problem.with_(change.values)
-    except InputError:
-        return None
-    ways = {k: pass_gate(search, gate, change) for k, gate in gates.items()}
-    sources = [way for way in ways.values() if way is not None]
-    if not sources:
-        return None
-    found = _look_in(changed, search.start.z, search.goal, options, planned, sources)
-    if found is None:
-        return None
-    route, duration = found
-    return duration, [k for k, way in ways.items() if way and way.links[-1] in route.links]
-
-
-def _look_in(
+def _search_changed(
     changed: Problem,
     z: Array,
     goal: Goal,
@@ -382,13 +335,13 @@ def _look_in(
 ) -> tuple[RoadmapRoute, float] | None:
     """Look for any route from `z` in a changed scene, and about how long it takes [s]."""
     changed = replace(changed, start=z)
-    chart = Roadmap(changed, options.uniqueness_margin)
-    search = RouteSearch(chart, make_place(changed.scene, z), goal, sources=sources)
+    roadmap = Roadmap(changed, options.uniqueness_margin)
+    search = RouteSearch(roadmap, make_place(changed.scene, z), goal, sources=sources)
     rough = replace(options, objective=Objective.TIME, duration=None, accuracy=ROUGH, robust=0.0)
     rough = replace(rough, mode_search=False, certify=False, replay=False)
-    chooser = Chooser(changed, [], search, rough, hurried=True)
+    chooser = Chooser(changed, [], search, rough, first_only=True)
     try:
-        route = chooser.glance(lambda _: None, most)
+        route = chooser.find_first(lambda _: None, most)
         if route is None:
             return None
         if not planned:
@@ -414,28 +367,21 @@ def find_hand(
                 break
             report(f"looking for routes with {change}")
             tried += 1
-            duration = _look_with(search, problem, options, change)
-            if duration is not None:
-                return _describe_reached(change, duration), (change,)
+            try:
+                changed = problem.with_(change.values)
+                require_reach(changed.scene, search.goal, float(search.start.z[2]))
+            except (InputError, InfeasibleError):
+                continue
+            closed = close_fingers(changed.scene, *search.start.z[[0, 2], None])
+            if closed.obstacle.any():
+                continue
+            z, goal = closed.z[0], search.goal
+            found = _search_changed(changed, z, goal, options, True, most=EAGER.most)
+            if found is not None:
+                return _describe_reached(change, found[1]), (change,)
     most = f"{100 * (max(HANDS) - 1):.0f} %"
     text = f"the goal is not reached with {tried} other lengths or bases of the fingers"
     return f"{text}, up to {most} off", ()
-
-
-def _look_with(
-    search: RouteSearch, problem: Problem, options: PlanOptions, change: Change
-) -> float | None:
-    """About how long a planned route to the goal takes with another hand [s], if there is one."""
-    try:
-        changed = problem.with_(change.values)
-        require_reach(changed.scene, search.goal, float(search.start.z[2]))
-    except (InputError, InfeasibleError):
-        return None
-    closed = close_fingers(changed.scene, *search.start.z[[0, 2], None])
-    if closed.obstacle.any():
-        return None
-    found = _look_in(changed, closed.z[0], search.goal, options, True, most=EAGER.most)
-    return found and found[1]
 
 
 def list_hands(scene: Scene) -> list[Change]:
@@ -444,7 +390,7 @@ def list_hands(scene: Scene) -> list[Change]:
     (first, _), (second, _) = np.asarray(right.base).tolist(), np.asarray(left.base).tolist()
     half, base = (first - second) / 2, "fingers.{}.base[1]"
     given: list[tuple[str, float, float, tuple[str, ...]]]
-    # Where fingers stand has decided more often than how long they are.
+    # Bases first: they have decided more often than lengths.
     if math.isclose(first, -second, rel_tol=SYMMETRIC):
         keys = base.format(1), base.format(2)
         given = [("x of base 1, mirrored for base 2,", first, half, keys)]
@@ -467,15 +413,15 @@ def list_hands(scene: Scene) -> list[Change]:
 
 
 def explain(problem: Problem, options: PlanOptions, blocked: Blocked) -> str:
-    """What a motion along a border of the cut is short of, in words."""
+    """The violated limit of a motion along a border of the cut, in words."""
     (step,) = blocked.steps
-    # A contact may touch at the start already, or be gained both ways; a place says which is meant.
+    # A contact may touch at the start already, or be gained both ways; a coordinate is unique.
     for until in (step.until, point_out(step.contacts, blocked.stop.z)):
         phase = Phase(0, Formation(problem.scene, step.contacts), until)
-        own = replace(problem, start=blocked.start.z, phases=(phase,), goals=())
+        single = replace(problem, start=blocked.start.z, phases=(phase,), goals=())
         try:
             with unadvised():
-                solve_with(own, replace(options, replay=False))
+                solve_with(single, replace(options, replay=False))
         except InputError:
             continue
         except InfeasibleError as error:
@@ -512,50 +458,41 @@ def require_reach(scene: Scene, goal: Goal, near: float) -> None:
 
 
 def require_folder(folder: Path) -> None:
-    """Check that charts can be kept in a folder, which is made if it is not there.
-
-    Raises
-    ------
-    InputError  if not
-    """
+    """Make a folder for roadmaps; InputError if that fails."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError("", "--cache", f"{folder}: {error.strerror}") from None
 
 
-def load_chart(folder: Path, key: str) -> Roadmap | None:
-    """The chart of a scene, by the key of this; None where there is none, or the file is damaged.
+def load_roadmap(folder: Path, key: str) -> Roadmap | None:
+    """The stored roadmap of a scene; None where there is none, or the file is damaged.
 
-    Files are pickles, which can do anything when they are read: a folder that others write to is
-    not safe.
+    Files are pickles, which can execute code: a folder that others write to is not safe.
     """
     try:
-        written = _name(folder, key).read_bytes()
-        digest, body = written[:32], written[32:]
-        if hashlib.sha256(body).digest() != digest:
-            return None
-        chart = pickle.loads(body)
+        content = _name_file(folder, key).read_bytes()
+        digest, body = content[:32], content[32:]
+        roadmap = pickle.loads(body) if hashlib.sha256(body).digest() == digest else None
     except Exception:
-        # A file of whatever kind that cannot be read is one that is not there.
-        return None
-    return chart if isinstance(chart, Roadmap) else None
+        return None  # A file that cannot be read counts as missing.
+    return roadmap if isinstance(roadmap, Roadmap) else None
 
 
-def store_chart(folder: Path, key: str, chart: Roadmap) -> None:
-    """Write the chart of a scene, in place of what was there; the last one who writes it wins."""
-    deepest = sys.getrecursionlimit()
-    sys.setrecursionlimit(max(deepest, _RECURSION))
+def store_roadmap(folder: Path, key: str, roadmap: Roadmap) -> None:
+    """Write the roadmap of a scene in place of the one before."""
+    depth = sys.getrecursionlimit()
+    sys.setrecursionlimit(max(depth, _RECURSION))
     try:
-        body = pickle.dumps(chart, protocol=pickle.HIGHEST_PROTOCOL)
+        body = pickle.dumps(roadmap, protocol=pickle.HIGHEST_PROTOCOL)
     finally:
-        sys.setrecursionlimit(deepest)
+        sys.setrecursionlimit(depth)
     if len(body) <= LARGEST:
         digest = hashlib.sha256(body).digest()
-        write_whole(_name(folder, key), lambda stream: stream.write(digest + body))
+        write_whole(_name_file(folder, key), lambda stream: stream.write(digest + body))
 
 
-def _name(folder: Path, key: str) -> Path:
+def _name_file(folder: Path, key: str) -> Path:
     """The file of a scene: another one for other versions."""
     versions = f"{__version__} {ca.__version__} {np.__version__} {sys.version}"
     return folder / f"{hashlib.sha256(f'{versions} {key}'.encode()).hexdigest()[:32]}.chart"

@@ -1,8 +1,6 @@
-"""Where goals are: at places, along curves and inside cells."""
+"""Goals at places, along curves and inside cells of the roadmap."""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 
@@ -14,8 +12,7 @@ from ..problem.goal import Goal
 from ..scene.model import Scene
 from .places import RoadmapPlace, unit_steps
 
-ACROSS = np.linspace(-1.5, 1.5, 13)
-"""Where a goal that leaves x open is looked for inside a cell, in radii of gyration."""
+ACROSS = np.linspace(-1.5, 1.5, 13)  # sampled x of goals without x, in radii of gyration
 
 
 def is_flush(place: RoadmapPlace, edge: int) -> bool:
@@ -37,9 +34,9 @@ def is_at(place: RoadmapPlace, goal: Goal) -> bool:
 
 
 def measure_along(curve: Curve, goal: Goal) -> tuple[float, Until] | None:
-    """Where along a curve a goal is first met inside it [m], and what ends the phase there.
+    """First place inside a curve at which a goal is met [m], and the end of a phase there.
 
-    A flush goal without x is met where the edge comes to lie on the palm: at an end of the curve.
+    A flush goal without x is met only at the ends of curves.
     """
     scene = curve.formation.scene
     if goal.flush is not None:
@@ -73,20 +70,20 @@ def _find_first(curve: Curve, row: int, value: float) -> float | None:
     k = int(changes[0])
     if off[k + 1] == 0:
         return float(grid[k + 1])
-
-    def miss(s: float) -> float:
-        return float(curve.interpolate(np.array([s]))[0][0, row]) - value
-
-    return find_root(miss, float(grid[k]), float(grid[k + 1]))
+    return find_root(
+        lambda s: float(curve.interpolate(np.array([s]))[0][0, row]) - value,
+        float(grid[k]),
+        float(grid[k + 1]),
+    )
 
 
 def list_pins(goal: Goal) -> tuple[tuple[str, float], ...]:
-    """What a phase through a cell has to pin where it ends at a goal."""
+    """Terminal constraints of a phase through a cell that ends at a goal."""
     return () if goal.x is None else (("x", goal.x),)
 
 
 def list_poses(scene: Scene, z: Array, goal: Goal) -> Array:
-    """Poses (x, phi) where a goal may be met in a cell near a configuration, shape (n, 2)."""
+    """Candidate poses (x, phi) of a goal inside a cell near a configuration, shape (n, 2)."""
     if goal.phi is None:
         return np.zeros((0, 2))
     if goal.x is not None:
@@ -96,6 +93,6 @@ def list_poses(scene: Scene, z: Array, goal: Goal) -> Array:
 
 
 def measure_turn(place: RoadmapPlace, goal: Goal) -> float:
-    """How far the object has still to turn, at least [rad]."""
-    angle = goal.find_angle(place.scene, float(place.z[2]))
-    return math.fabs(angle - float(place.z[2]))
+    """Least angle that the object has to turn to the goal [rad]."""
+    phi = float(place.z[2])
+    return abs(goal.find_angle(place.scene, phi) - phi)

@@ -1,4 +1,4 @@
-"""Places at which a motion may stop, and the borders that lead on from them."""
+"""Places of the roadmap: configurations at rest, and the formations that hold there."""
 
 from __future__ import annotations
 
@@ -15,10 +15,8 @@ from ..geometry.curve import describe_pose
 from ..geometry.explore import close_contacts
 from ..scene.model import Scene
 
-FINE = 1e-4
-"""Grid on which places with the same contacts are one, in radii of gyration and radians."""
-COARSE = 0.25
-"""The same of places where a motion through a cell lands, which the planner chooses anew."""
+FINE = 1e-4  # Grid on which places with the same contacts are one, in radii of gyration and radians
+COARSE = 0.25  # the same for landings after a cell, which the planner optimizes
 
 Key = tuple[tuple[str, ...], int, int]
 
@@ -30,11 +28,11 @@ class RoadmapPlace:
     scene: Scene
     z: Array  # (5,)
     contacts: tuple[Contact, ...]  # all that touch
-    landed: bool = False  # whether it is about where a motion through a cell lands: not a crossing
+    landed: bool = False  # whether a path through a cell ends about here: not a crossing
 
     @property
     def key(self) -> Key:
-        """The same for places that are one."""
+        """Contacts and rounded pose."""
         step = COARSE if self.landed else FINE
         x = round(float(self.z[0]) / self.scene.scales.length / step)
         return tuple(c.name for c in self.contacts), x, round(float(self.z[2]) / step)
@@ -44,28 +42,28 @@ class RoadmapPlace:
 
 
 def make_place(scene: Scene, z: Array, landed: bool = False) -> RoadmapPlace:
-    """The place of a configuration, with what touches there."""
+    """The place of a configuration, with all contacts that touch there."""
     return RoadmapPlace(scene, z, find_touching(scene, z), landed)
 
 
-def settle(place: RoadmapPlace) -> RoadmapPlace | None:
+def close_place(place: RoadmapPlace) -> RoadmapPlace | None:
     """A place with all of its contacts closed exactly; None where they do not close."""
-    # In the order in which formations at the place have them, whose functions it shares.
-    own = sorted(place.contacts, key=lambda c: -1 if c.finger is None else c.finger)
-    formation = Formation(place.scene, tuple(own))
+    # In the order of the formations at the place, to share their compiled functions.
+    contacts = sorted(place.contacts, key=lambda c: -1 if c.finger is None else c.finger)
+    formation = Formation(place.scene, tuple(contacts))
     z = close_contacts(formation, place.z, np.zeros(0))
     return None if z is None else replace(place, z=z)
 
 
 def list_formations_at(place: RoadmapPlace, count: int) -> Iterator[Formation]:
-    """Formations of three or four contacts that touch at a place: palm and both fingers are there.
+    """Formations of three or four contacts that hold at a place, with palm and both fingers.
 
-    Of four, two are the ends of an edge that lies flush; two names of one contact are none.
+    Of four, two are the ends of an edge that lies flush.
     """
-    parts = [[c for c in place.contacts if c.finger == own] for own in (None, 0, 1)]
+    parts = [[c for c in place.contacts if c.finger == part] for part in (None, 0, 1)]
     vertices = place.scene.polygon.n_vertices
     for sizes in ((1, 1, 1),) if count == 3 else ((2, 1, 1), (1, 2, 1), (1, 1, 2)):
-        chosen = [combinations(own, size) for own, size in zip(parts, sizes, strict=True)]
+        chosen = [combinations(part, size) for part, size in zip(parts, sizes, strict=True)]
         for groups in product(*chosen):
             pair = next((group for group in groups if len(group) == 2), None)
             if pair is None or _is_flush(pair, vertices):
@@ -73,7 +71,7 @@ def list_formations_at(place: RoadmapPlace, count: int) -> Iterator[Formation]:
 
 
 def _is_flush(pair: tuple[Contact, ...], vertices: int) -> bool:
-    """Whether two contacts with one part of the hand are those of an edge that lies flush."""
+    """Whether two contacts with one part of the hand are the ends of a flush edge."""
     sides = [c for c in pair if c.surface != "tip"]
     if len(sides) == 2:
         return abs(pair[0].index - pair[1].index) in (1, vertices - 1)

@@ -1,4 +1,4 @@
-"""What a search for a route has found, in words."""
+"""Result of a search for routes, and the message where nothing leads to the goal."""
 
 from __future__ import annotations
 
@@ -19,8 +19,7 @@ from .chains import LONGEST
 from .cuts import list_cut
 from .edges import Blocked, describe_steps
 
-LISTED, FAILED = 2, 1
-"""Most reasons that a message names, and most of them of routes without a plan."""
+LISTED, FAILED = 2, 1  # most reasons in a message, and most of routes without a plan
 NOT_CONSIDERED = (
     "not considered: rolling contacts, formations without the palm or without one of the fingers, "
     f"more than {LONGEST} borders passed without a stop, impacts out of or into cells, motions "
@@ -38,12 +37,12 @@ class Alternative(Result):
 
     @property
     def headline(self) -> str:
-        """What it is, in a line."""
+        """Value, duration and number of phases, in a line."""
         return f"{self.plan.headline}, phases: {len(self.problem.phases)}"
 
     @property
     def document(self) -> Document:
-        """The phases of the route, under what is known of it."""
+        """The lines of `describe`, and the phases of the route."""
         rows = [
             (phase.number, ", ".join(phase.formation.names), str(phase.until), phase.end.value)
             for phase in self.problem.phases
@@ -52,12 +51,12 @@ class Alternative(Result):
         return Document("", parts=[*self.describe(), route])
 
     def describe(self) -> list[str]:
-        """What is known of it, in lines."""
+        """Value and duration, in lines."""
         return [f"{self.plan.value:.6f} {self.plan.unit}, {self.plan.duration:.6f} s"]
 
     @property
     def values(self) -> dict[str, Any]:
-        """Everything that JSON has."""
+        """The content of JSON files."""
         phases = list(self.problem.table.get("phases", []))
         return {"value": self.plan.value, "duration": self.plan.duration, "phases": phases}
 
@@ -73,8 +72,7 @@ class Answer(Alternative):
     """
 
     route: RoadmapRoute  # to the last goal
-    # what every route along borders takes at least; None with several goals, and where the search
-    # was interrupted
+    # lower bound of routes along borders; None with several goals or an interrupted search
     bound: BorderBound | None
     alternatives: tuple[Alternative, ...]
     failures: tuple[FailedCandidate, ...]  # routes that were planned, or tried, in vain
@@ -84,10 +82,9 @@ class Answer(Alternative):
 
     @property
     def gap(self) -> float | None:
-        """How much longer the plan takes than the bound, over the bound.
+        """Relative gap of the duration to the bound.
 
-        None without a bound, of a route through cells, as the bound is of others, and of a plan
-        that is not of least time.
+        None without a bound, for routes through cells, and for other objectives.
         """
         timed = self.plan.options.goal is Objective.TIME
         if self.bound is None or self.bound.value <= 0 or self.route.in_cells or not timed:
@@ -107,7 +104,7 @@ class Answer(Alternative):
         return "\n".join(lines).rstrip() + "\n"
 
     def describe(self) -> list[str]:
-        """What is known of it, in lines."""
+        """Value, bound and statistics of the search, in lines."""
         plan, count = self.plan, len(self.problem.phases)
         lines = [
             f"{count} phase{'s'[: count != 1]}, {plan.options.goal.value} = {plan.value:.6f} "
@@ -117,7 +114,7 @@ class Answer(Alternative):
             lines.append("the search ended early: the best route so far")
         if self.bound is not None:
             text = "no route along borders, with stops or impacts, "
-            # In place of a larger bound stands the duration of the plan.
+            # The bound is at most the duration of the plan.
             none = self.route.in_cells and self.bound.value >= plan.duration
             text += "is faster" if none else f"takes less than {self.bound.value:.6f} s"
             text += "" if self.gap is None else f": gap {100 * self.gap:.2g} %"
@@ -131,7 +128,7 @@ class Answer(Alternative):
 
     @property
     def values(self) -> dict[str, Any]:
-        """Everything that JSON has."""
+        """The content of JSON files."""
         return {
             **super().values,
             "unit": self.plan.unit,
@@ -141,13 +138,13 @@ class Answer(Alternative):
             "in_cells": self.route.in_cells,
             "alternatives": [other.values for other in self.alternatives],
             "failures": [failure.reason for failure in self.failures],
-            "blocked": [_describe_blocked(own) for own in self.blocked],
+            "blocked": [f"{_describe_border(b)}: {b.reason}" for b in self.blocked],
             "not_considered": NOT_CONSIDERED,
         }
 
 
 def format_phases(problem: Problem) -> str:
-    """The phases of a problem as its file has them."""
+    """The phases of a problem as `[[phases]]` of a problem file."""
     lines = []
     for phase in problem.phases:
         names = ", ".join(f'"{name}"' for name in phase.formation.names)
@@ -162,9 +159,9 @@ def describe_block(
     search: RouteSearch,
     failures: Sequence[FailedCandidate],
     opening: str = "",
-    explain: Callable[[Blocked], str] = lambda own: own.reason,
+    explain: Callable[[Blocked], str] = lambda blocked: blocked.reason,
 ) -> str:
-    """Why nothing leads to a goal: the cut, what is short there, and what would open the way."""
+    """Why nothing leads to a goal: the cut, its violated limits, and the change that opens it."""
     cut, count = list_cut(search), search.settled
     text = f"nothing leads from {search.start} to {search.goal}: {count} place{'s'[: count != 1]}"
     text += f" reached, touching {describe(search.start.contacts)} at the start; "
@@ -174,15 +171,11 @@ def describe_block(
         many = len(cut) != 1
         text += f"{len(cut)} border{'s'[:many]} lead{'s'[many:]} on from there, "
         text += "all of them blocked" if many else "and is blocked"
-    # What would help beside the plan itself is in the first part of a reason.
-    reasons = list(dict.fromkeys(own.reason.split("; ")[0] for own in failures))[:FAILED]
-    reasons += [f"{_describe_way(own)}: {explain(own)}" for own in cut[: LISTED - len(reasons)]]
+    # After the first part, reasons give advice on the plan.
+    reasons = list(dict.fromkeys(failure.reason.split("; ")[0] for failure in failures))[:FAILED]
+    reasons += [f"{_describe_border(b)}: {explain(b)}" for b in cut[: LISTED - len(reasons)]]
     return "; ".join([text, *reasons, *([opening] if opening else [])])
 
 
-def _describe_way(own: Blocked) -> str:
-    return f"{describe_steps(own.steps)} from {own.start}"
-
-
-def _describe_blocked(own: Blocked) -> str:
-    return f"{_describe_way(own)}: {own.reason}"
+def _describe_border(blocked: Blocked) -> str:
+    return f"{describe_steps(blocked.steps)} from {blocked.start}"

@@ -1,4 +1,4 @@
-"""Which of the routes that a search finds are planned: those first that seem best."""
+"""Planning of the routes that a search finds, in the order of their estimated durations."""
 
 from __future__ import annotations
 
@@ -14,23 +14,17 @@ from ..problem.definition import Problem
 from .astar import CAREFUL, EAGER, RoadmapRoute, RouteSearch, SearchRule
 from .bounds import BorderBound, bound_borders
 from .candidates import FailedCandidate, Lost, plan_phases
-from .edge_plans import Aside, can_join, join_route
+from .edge_plans import BackgroundTask, can_join, join_route
 from .edges import Link, describe_steps
 from .feasibility import Measured
-from .refinement import Polisher
+from .refinement import EdgeRefiner
 
-FASTER = 0.7
-"""Share of the time of straight ways through cells that plans take at least, by experience."""
-TRIED = 6
-"""Most routes that are looked at, or planned in vain, beyond those that are asked for."""
-OTHERS = 2
-"""Most slower ways through a cell that are tried where the plan of the fastest does not hold."""
-BEYOND = 1.1
-"""Times of routes, by the search, over that of the best one, from which on they are left out."""
-NEARBY = 30
-"""Most places that are looked at in a glance."""
-MEASURED, MORE = 24, 8
-"""Most links through cells that are planned for themselves, until there is a route and after it."""
+FASTER = 0.7  # least ratio of planned to straight-path durations through cells; by experience
+TRIED = 6  # most routes without a plan, beyond those asked for
+OTHERS = 2  # most slower plans of a link that are tried if the fastest fails the replay
+BEYOND = 1.1  # largest estimate of a route over that of the best one
+NEARBY = 30  # most places of `find_first`
+MEASURED, MORE = 24, 8  # most links planned until there is a route, and after it
 
 
 class Chooser:
@@ -38,15 +32,14 @@ class Chooser:
 
     Parameters
     ----------
-    before   to the goals before
-    jobs     most processes at the same time
-    hurried  whether any plan will do: routes are planned as they are found
+    before      routes to the goals before
+    jobs        most processes at the same time
+    first_only  whether any plan will do: then links are not refined
 
     Attributes
     ----------
-    found     whose ways through cells have plans
-    made
-    failures
+    found           routes whose links through cells have plans
+    made, failures  plans of routes, and routes without one
     """
 
     def __init__(
@@ -56,21 +49,21 @@ class Chooser:
         search: RouteSearch,
         options: PlanOptions,
         jobs: int = 1,
-        hurried: bool = False,
+        first_only: bool = False,
     ) -> None:
-        self.hurried = hurried
+        self.first_only = first_only
         self.problem, self.before, self.search = problem, before, search
-        self.options, self.chart, self.jobs = options, search.chart, jobs
+        self.options, self.roadmap, self.jobs = options, search.roadmap, jobs
         self.found: list[RoadmapRoute] = []
         self.made: list[tuple[Plan, RoadmapRoute]] = []
         self.failures: list[FailedCandidate] = []
-        self._polisher = Polisher(problem, search.chart, options, jobs)
+        self._refiner = EdgeRefiner(problem, search.roadmap, options, jobs)
         self._measurements = 0
-        self._bound: tuple[float, Aside[BorderBound]] | None = None
+        self._bound: tuple[float, BackgroundTask[BorderBound]] | None = None
         self._lost: list[tuple[Link, ...]] = []
 
     def run(self, wanted: int, report: Callable[[str], None]) -> None:
-        """Look for routes and plan them, for as long as there are fewer than `wanted` plans."""
+        """Search and plan until there are `wanted` plans, or no more routes."""
         for _ in range(TRIED):
             failed = len(self.failures)
             self._look_by(EAGER, wanted, report)
@@ -80,11 +73,11 @@ class Chooser:
             self.plan(wanted, report)
             if len(self.made) >= wanted or len(self.failures) == failed:
                 return
-            # What had no plan bounds nothing.
+            # A route without a plan bounds nothing.
             self.search.limit = math.inf
 
-    def glance(self, report: Callable[[str], None], most: int = NEARBY) -> RoadmapRoute | None:
-        """Look for any route over few places whose ways through cells have plans."""
+    def find_first(self, report: Callable[[str], None], most: int = NEARBY) -> RoadmapRoute | None:
+        """The first route over few places whose links through cells have plans."""
         self._look_by(EAGER._replace(most=most), 1, report)
         return self.found[0] if self.found else None
 
@@ -96,9 +89,9 @@ class Chooser:
             if self._is_lost(route):
                 self.found.remove(route)
                 continue
-            if not self.hurried:
-                self._polisher.polish(route, report)
-            report(f"planning a route of {sum(len(own.steps) for own in route.links)} phases")
+            if not self.first_only:
+                self._refiner.refine(route, report)
+            report(f"planning a route of {sum(len(link.steps) for link in route.links)} phases")
             plan = self._plan(route, report)
             # An interrupted one is still there, to be planned then.
             self.found.remove(route)
@@ -110,51 +103,47 @@ class Chooser:
                 self.made.append((plan, route))
 
     def _plan(self, route: RoadmapRoute, report: Callable[[str], None]) -> Plan | str:
-        """The plan of a route: what its links make or, of another kind, where these land."""
-        problem, options, ways = self.problem, self.options, self._list_ways
+        """The plan of a route from its links or, if these cannot be joined, from their ends."""
+        problem, options = self.problem, self.options
         joins = can_join(problem, options)
         if not joins:
             options = replace(options, objective=Objective.TIME, duration=None, replay=False)
             problem, options = free_torques(problem, options)
+        links = [(link, self._list_plans(link)) for r in (*self.before, route) for link in r.links]
         if problem is not self.problem:
-            # What was begun of them is of other motors.
-            ways = self._list_unbegun
-        links = [(own, ways(own)) for part in (*self.before, route) for own in part.links]
-        given = options, self.chart.joined, report, self.jobs, self._bound_aside(route)
-        joined = join_route(problem, links, *given)
+            # Their guesses are of other motors.
+            links = [(link, [m._replace(begun=[]) for m in plans]) for link, plans in links]
+        background = None
+        if self.jobs > 1 and not self.before and self._bound is None:
+            # A bound up to more than the plan will take, computed beside it.
+            enough = BEYOND * self.estimate(route)
+            background = BackgroundTask(partial(bound_borders, self.search, enough))
+            self._bound = enough, background
+        joined = join_route(
+            problem, links, options, self.roadmap.joined, report, self.jobs, background
+        )
         if joins or isinstance(joined, str):
             return joined
-        own = replace(self.problem, phases=joined.problem.phases, goals=())
-        return plan_phases(own, self.options, self.chart.plans)
-
-    def _bound_aside(self, route: RoadmapRoute) -> Aside[BorderBound] | None:
-        """A bound of routes along borders, up to more than a plan of a route will take."""
-        if self.jobs == 1 or self.before or self._bound is not None:
-            return None
-        enough = BEYOND * self.estimate(route)
-        self._bound = enough, Aside(partial(bound_borders, self.search, enough))
-        return self._bound[1]
+        problem = replace(self.problem, phases=joined.problem.phases, goals=())
+        return plan_phases(problem, self.options, self.roadmap.plans)
 
     def bound(self, duration: float, in_cells: bool) -> BorderBound:
-        """Bound every route along borders from below; beside one `in_cells`, up to its duration."""
-        enough, aside = self._bound or (0.0, None)
-        known = aside.result if aside else None
+        """Lower bound of all routes along borders; up to `duration` of a plan `in_cells`."""
+        enough, task = self._bound or (0.0, None)
+        known = task.result if task else None
         wanted = duration if in_cells else math.inf
         if known is None or min(enough, wanted) <= known.value < wanted:
             return bound_borders(self.search, wanted)
         return known.up_to(wanted)
 
-    def _list_ways(self, link: Link) -> list[Measured]:
-        """Ways in which a link through a cell can be gone, the fastest first."""
-        best = self.chart.measured.get(link)
-        others = sorted(self.chart.others.get(link, []), key=lambda own: own.duration)
+    def _list_plans(self, link: Link) -> list[Measured]:
+        """Plans of a link through a cell, the fastest first."""
+        best = self.roadmap.measured.get(link)
+        others = sorted(self.roadmap.others.get(link, []), key=lambda plan: plan.duration)
         return [best, *others[:OTHERS]] if isinstance(best, Measured) else []
 
-    def _list_unbegun(self, link: Link) -> list[Measured]:
-        return [own._replace(begun=[]) for own in self._list_ways(link)]
-
     def _look_by(self, rule: SearchRule, wanted: int, report: Callable[[str], None]) -> None:
-        """Look at routes as one rule of thumb leads to them, while one may be better."""
+        """Collect routes by one heuristic, while a better one is possible."""
         looked, most = 0, self._measurements + MEASURED
         for route in self.search.run(rule):
             enough = len(self.found) >= wanted
@@ -172,27 +161,27 @@ class Chooser:
     @property
     def _best(self) -> float:
         """About the least time of a route that is found [s]."""
-        return min((self.estimate(own) for own in self.found), default=float("inf"))
+        return min((self.estimate(route) for route in self.found), default=float("inf"))
 
     def _measure(self, route: RoadmapRoute, report: Callable[[str], None]) -> bool:
         """Plan the links of a route that lead through cells; whether all have a plan."""
-        known = self.chart.measured
+        known = self.roadmap.measured
         if self._is_lost(route):
             return False
-        self._polisher.begin([own for own in route.links if own.in_cell and own not in known])
+        self._refiner.prefetch([link for link in route.links if link.in_cell and link not in known])
         for link in route.links:
             if not link.in_cell:
                 continue
             if link not in known:
                 self._measurements += 1
                 report(f"planning {describe_steps(link.steps)}")
-                known[link] = self._polisher.measure(link)
+                known[link] = self._refiner.measure(link)
             if isinstance(known[link], str):
                 return False
         return True
 
     def _is_lost(self, route: RoadmapRoute) -> bool:
-        """Whether a route has links for which another one had no plan."""
+        """Whether a route contains links that had no plan on another one."""
         return any(
             route.links[k : k + len(lost)] == lost
             for lost in self._lost
@@ -202,8 +191,8 @@ class Chooser:
     def estimate(self, route: RoadmapRoute) -> float:
         """About the least time that a plan along all routes may take [s]."""
         total = 0.0
-        for link in (link for own in (*self.before, route) for link in own.links):
-            known = self.chart.measured.get(link)
+        for link in (link for r in (*self.before, route) for link in r.links):
+            known = self.roadmap.measured.get(link)
             if isinstance(known, Measured):
                 total += known.duration
             else:

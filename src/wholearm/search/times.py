@@ -1,4 +1,4 @@
-"""About the least times along the borders of a map, each way, from rest to rest."""
+"""Estimated least times along the borders of a map in both directions, from rest to rest."""
 
 from __future__ import annotations
 
@@ -19,14 +19,13 @@ from ..planning.lower_bound.rows import PathLimitRows, limit
 from ..problem.definition import Problem
 from .travel_times import find_durations
 
-NODES = 24
-"""Intervals of a border."""
+NODES = 24  # intervals of a border
 
 
 def time_borders(problem: Problem, borders: Sequence[Border]) -> Array:
-    """About the least times along borders, from rest at one end to rest at the other one.
+    """Estimated least times along borders, from rest at one end to rest at the other one.
 
-    Limits are kept at one place of each of a few intervals, with any squeeze.
+    Limits are kept at one place of each interval, with any internal force.
 
     Parameters
     ----------
@@ -37,30 +36,30 @@ def time_borders(problem: Problem, borders: Sequence[Border]) -> Array:
     -------
     ndarray, shape (n, 2), [s]
         With the coordinate along which points are ordered increasing, and decreasing; infinite
-        where no motion keeps the limits, friction jams or forces are not the only ones.
+        where no motion keeps the limits, friction jams or contact forces are not unique.
     """
     if not borders:
         return np.zeros((0, 2))
     nodes = (1 - np.cos(np.linspace(0, np.pi, NODES + 1))) / 2
     places = (nodes[1:] + nodes[:-1]) / 2
-    rows = _follow(problem, borders, places)
+    rows = _evaluate(problem, borders, places)
     times = find_durations(rows, np.diff(nodes), (places - nodes[:-1]) / np.diff(nodes))
     return times.reshape(-1, 2)
 
 
-def _follow(problem: Problem, borders: Sequence[Border], places: Array) -> PathLimitRows:
-    """Limits at places of borders, each forth and back, by the share of it that is behind."""
+def _evaluate(problem: Problem, borders: Sequence[Border], places: Array) -> PathLimitRows:
+    """Limits at places of borders, in both directions, with the share of length as parameter."""
     scene, weights = problem.scene, metric_weights(problem.scene)
     count, table = len(places), contact_table(scene)
     z, chord, length = _interpolate(borders, places, weights)
-    own = [[table.index(contact) for contact in border.contacts] for border in borders]
-    labels = np.repeat(np.array(own), count, axis=0)
-    # Straight between points of the map the contacts do not quite touch.
+    indices = [[table.index(contact) for contact in border.contacts] for border in borders]
+    labels = np.repeat(np.array(indices), count, axis=0)
+    # One Newton step: between points of the map the contacts do not quite close.
     at = evaluate_each(scene, labels, z)
     z -= (np.linalg.pinv(at.P) @ at.C[..., None])[..., 0]
-    way = length * chord / np.sqrt(chord**2 @ weights)[:, None]
-    at = evaluate_each(scene, labels, z, way)
-    z_s, z_ss = solve_tangent(at.P, at.P_dot_v, way, weights)
+    run = length * chord / np.sqrt(chord**2 @ weights)[:, None]
+    at = evaluate_each(scene, labels, z, run)
+    z_s, z_ss = solve_tangent(at.P, at.P_dot_v, run, weights)
     tangent, curvature = length * z_s, length**2 * z_ss
     found = [np.empty(0)] * len(PathLimitRows._fields)
     for formation, mine in group_alike(scene, labels):
@@ -74,7 +73,7 @@ def _follow(problem: Problem, borders: Sequence[Border], places: Array) -> PathL
             inertia = reduced_inertia(formation, part, directions)
             ratios = find_minors(formation, part, directions.Xi).ratios
             closed = ~(inertia > 0) | (ratios < UNIQUENESS_MARGIN)
-            # Nothing moves there.
+            # No motion there.
             for values in rows:
                 values[closed] = 0.0
             chosen = mine.reshape(-1, count)[:, 0]
@@ -83,7 +82,7 @@ def _follow(problem: Problem, borders: Sequence[Border], places: Array) -> PathL
                 if not found[k].size:
                     found[k] = np.empty((len(borders), 2, *split.shape[1:]))
                 found[k][chosen, back] = split[:, ::-1] if back else split
-    return PathLimitRows(*(own.reshape(-1, *own.shape[2:]) for own in found))
+    return PathLimitRows(*(array.reshape(-1, *array.shape[2:]) for array in found))
 
 
 def _interpolate(

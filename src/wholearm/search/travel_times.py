@@ -1,7 +1,7 @@
-"""The fastest motion along many ways at once, without squeeze, from rest to rest.
+"""Least times along many paths at once, from rest to rest, without internal force.
 
-The same sweep as `planning.lower_bound.sweep`, over all ways together: backwards for the largest
-b = s'^2 from which rest at the end can still be reached, forwards as fast as that allows.
+Vectorized form of `planning.lower_bound.speed_sweep` (backward and forward reachability in the
+phase plane, TOPP-RA, Pham and Pham 2018).
 """
 
 from __future__ import annotations
@@ -12,12 +12,11 @@ from ..common.arrays import Array
 from ..contacts.closing import Flags
 from ..planning.lower_bound.rows import PathLimitRows
 
-PAIRS = 200_000
-"""Pairs of rows that are looked at together."""
+PAIRS = 200_000  # pairs of rows in one vectorized operation
 
 
 def find_durations(rows: PathLimitRows, steps: Array, part: Array) -> Array:
-    """Least durations of ways, infinite where no motion keeps the limits, shape (w,).
+    """Least durations of paths, infinite where no motion keeps the limits, shape (w,).
 
     Parameters
     ----------
@@ -28,8 +27,8 @@ def find_durations(rows: PathLimitRows, steps: Array, part: Array) -> Array:
     b = _sweep(rows, steps, part, None)
     if rows.v.any():
         # No row bounds b where a motion is closed; case: the map of a rolling octagon.
-        known = np.where(np.isfinite(b), b, 0.0)
-        near = np.maximum(known[:, :-1] + part * np.diff(known), 0.0)
+        finite = np.where(np.isfinite(b), b, 0.0)
+        near = np.maximum(finite[:, :-1] + part * np.diff(finite), 0.0)
         b = _sweep(rows, steps, part, near)
     speeds = np.sqrt(np.maximum(b, 0.0))
     moving = (b[:, 1:-1] > 0).all(axis=1)
@@ -39,7 +38,7 @@ def find_durations(rows: PathLimitRows, steps: Array, part: Array) -> Array:
 
 
 def _sweep(rows: PathLimitRows, steps: Array, part: Array, near: Array | None) -> Array:
-    """B at the nodes, shape (w, n + 1); with viscous friction linearised about `near`."""
+    """Largest b at the nodes, shape (w, n + 1); viscous friction linearized about `near`."""
     of_b, one = rows.b, rows.one
     if near is not None:
         speed = np.sqrt(near)[..., None]
@@ -48,19 +47,19 @@ def _sweep(rows: PathLimitRows, steps: Array, part: Array, near: Array | None) -
     of_a = rows.a / (2 * steps)[:, None]
     before = (1 - part)[:, None] * of_b - of_a
     after = part[:, None] * of_b + of_a
-    count, ways = len(steps), len(of_b)
-    # A few ways at a time, so that their pairs of rows stay in the cache.
+    count, paths = len(steps), len(of_b)
+    # A few paths at a time, so that their pairs of rows stay in the cache.
     some = max(1, PAIRS // (count * before.shape[2] ** 2))
-    cuts = [slice(k, k + some) for k in range(0, ways, some)]
+    cuts = [slice(k, k + some) for k in range(0, paths, some)]
     corners = [_find_corners(before[k], after[k], one[k]) for k in cuts]
     most = np.minimum(np.concatenate(corners), rows.cap).T
-    largest = np.zeros((count + 1, ways))
-    # Rows that a small b' breaks let b be the larger, the larger b' may be.
+    largest = np.zeros((count + 1, paths))
+    # Backward: rows that bound b by the next one.
     starts, slopes = _solve(before, after, one, (before < 0) & (after > 0))
     for k in range(count - 1, -1, -1):
         bounds = _bound(starts[k], slopes[k], largest[k + 1])
         largest[k] = np.maximum(np.minimum(bounds, most[k]), 0.0)
-    b = np.zeros((count + 1, ways))
+    b = np.zeros((count + 1, paths))
     starts, slopes = _solve(after, before, one, after < 0)
     for k in range(count):
         bounds = _bound(starts[k], slopes[k], b[k])
@@ -68,29 +67,29 @@ def _sweep(rows: PathLimitRows, steps: Array, part: Array, near: Array | None) -
     return b.T
 
 
-def _solve(own: Array, other: Array, one: Array, used: Flags) -> tuple[Array, Array]:
-    """Rows own p + other q + one >= 0 that are used, as p <= start + slope q, shape (n, w, m)."""
+def _solve(p: Array, q: Array, one: Array, used: Flags) -> tuple[Array, Array]:
+    """Used rows own p + other q + one >= 0 as p <= start + slope q, shape (n, w, m)."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        starts, slopes = np.where(used, one / -own, np.inf), np.where(used, other / -own, 0.0)
+        starts, slopes = np.where(used, one / -p, np.inf), np.where(used, q / -p, 0.0)
     return np.ascontiguousarray(starts.swapaxes(0, 1)), np.ascontiguousarray(slopes.swapaxes(0, 1))
 
 
 def _bound(starts: Array, slopes: Array, other: Array) -> Array:
-    """Largest p that all rows of a place let it be where q is `other`, maybe infinite, (w,)."""
+    """Largest p within all rows of a place at q = `other`, maybe infinite, shape (w,)."""
     with np.errstate(invalid="ignore"):
         more = np.where(slopes == 0, 0.0, slopes * other[:, None])
     return np.asarray((starts + more).min(axis=1))
 
 
 def _find_corners(before: Array, after: Array, one: Array) -> Array:
-    """Largest b from which rows leave some b' >= 0, however large, shape (w, n)."""
+    """Largest b for which some next b >= 0 keeps the rows, shape (w, n)."""
     none = np.zeros((*one.shape[:-1], 1))
-    rise, own, rest = (
+    rise, fixed, rest = (
         np.concatenate([part, none + more], axis=-1)[..., :, None]
         for part, more in ((after, 1), (before, 0), (one, 0))
     )
     rise, fall = np.maximum(rise, 0), np.maximum(-after, 0)[..., None, :]
-    slope = fall * own + rise * before[..., None, :]
+    slope = fall * fixed + rise * before[..., None, :]
     value = fall * rest + rise * one[..., None, :]
     bounded = (rise > 0) & (fall > 0) & (slope < 0)
     with np.errstate(divide="ignore", invalid="ignore"):

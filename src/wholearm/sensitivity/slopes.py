@@ -1,21 +1,15 @@
-"""How contact forces change with numbers that are off, at one state and torques.
+"""Parametric sensitivity of contact forces, by differentiating the equations of motion.
 
-With z, z' and tau given, the equations of motion (`mechanics.dynamics`)
-
-    M5 z'' + b(z') = g + S tau + G^T c,    P z'' + P' z' = 0
-
-are linear in z'' and c. Their derivative by a number p is linear in dz''/dp and dc/dp, with the
-same matrices:
+With z, z' and tau fixed, M5 z'' + b(z') = g + S tau + G^T c and P z'' + P' z' = 0 are linear in z''
+and c. The derivative by a number p is linear in dz''/dp and dc/dp, with the same matrices:
 
     M5 dz'' - G^T dc = dg + S dtau - db - dM5 z'' + dG^T c,    P dz'' = -dP z'' - d(P' z').
 
-Along a curve z'' = z_s a + z_ss b, and c and tau are affine in a = s'', b = s'^2, the squeeze and
-s'. So dc/dp is affine in them too.
+Along a curve z'' = z_s a + z_ss b, and c, tau and dc/dp are affine in a = s'', b = s'^2, the
+internal force lambda and s'.
 
-Where geometry is off other places are possible. The nearest one counts as the same, and so does
-the nearest velocity: along a curve these have the same s and s'. Contacts of a finger depend on
-where the object is from the finger's joint, so that a joint that moves is like an object that moves
-back.
+With other geometry the nearest place and velocity correspond: along a curve these have the same s
+and s'. A joint that moves is like an object that moves back.
 """
 
 from __future__ import annotations
@@ -33,22 +27,16 @@ from ..mechanics.dynamics import Directions, PathForces, force_rows
 from ..mechanics.metric import metric_weights
 from ..results.trajectory import Samples
 
-COUNT = 5
-"""Number of coefficients: of 1, a, b, the squeeze and s'."""
-_STEP = 1e-5
-"""Step of the differences of kinematics, over the scene's length."""
-_LOOSE = 1e-6
-"""Weight of the fingers' angles where they follow the object."""
+COUNT = 5  # number of coefficients: of 1, a, b, the internal force and s'
+_STEP = 1e-5  # step of the differences of kinematics, over the scene's length
+_LOOSE = 1e-6  # weight of the fingers' angles where they follow the object
 
 
 class _Change(NamedTuple):
-    """The right sides of the derivative: of Newton's and Euler's laws, and of the constraints.
+    """Right sides of the derivative: of Newton's and Euler's laws, and of the constraints."""
 
-    Shapes (n, 5, COUNT) and (n, n_c + R, COUNT).
-    """
-
-    load: Array
-    bend: Array
+    load: Array  # (n, 5, COUNT)
+    bend: Array  # (n, n_c + R, COUNT)
 
 
 def find_force_slopes(
@@ -58,19 +46,10 @@ def find_force_slopes(
     forces: PathForces,
     names: Sequence[str],
 ) -> Array:
-    """Derivatives of the contact forces by some numbers, at n places of a curve.
+    """Derivatives of contact forces by uncertain numbers, (n, n_c + R, len(names), COUNT).
 
-    Parameters
-    ----------
-    directions  one row for each place
-    forces      of the formation there
-    names       of the numbers, as in `problem.uncertainty`: relative ones, or lengths in m.
-                `start_x` is how far the object is along the curve. `delay` has no derivative.
-
-    Returns
-    -------
-    ndarray, shape (n, n_c + R, len(names), COUNT)
-        dc/dp = sum of coefficients times (1, a, b, squeeze, s') [N per unit of p].
+    They are coefficients of (1, a, b, lambda, s') [N per unit]. Names are of `problem.uncertainty`:
+    relative numbers, or lengths in m; `start_x` is the place along the curve.
     """
     return _along(formation, point, directions, forces).find_slopes(names)
 
@@ -78,11 +57,7 @@ def find_force_slopes(
 def find_shifts(
     formation: Formation, point: CurvePoint, directions: Directions, forces: PathForces, name: str
 ) -> Array:
-    """By how much joints seem to be further along a curve than they are, where geometry is off.
-
-    Joint angles of the nearest place are others than on the curve; what is along it is taken for
-    progress. Per unit of the number of a name, shape (n,); as `find_force_slopes` otherwise.
-    """
+    """Apparent progress along a curve by joint angles, per unit of a length error, (n,)."""
     dz, rates = _along(formation, point, directions, forces).displace(name), point.z_s[:, 3:]
     square = np.maximum((rates**2).sum(axis=1), 1e-30)
     return np.asarray((dz[:, 3:] * rates).sum(axis=1) / square)
@@ -99,8 +74,8 @@ def _along(
     acceleration[..., 1], acceleration[..., 2] = point.z_s, point.z_ss
     size = np.sqrt(point.z_s[:, :3] ** 2 @ metric_weights(formation.scene)[:3])[:, None]
     along = point.z_s / size, point.z_ss / size
-    given = point.z, point.z_s, point.kinematics, directions, c, tau, acceleration
-    return _State(formation, *given, along)
+    places = point.z, point.z_s, point.kinematics
+    return _State(formation, *places, directions, c, tau, acceleration, along)
 
 
 def find_slopes_at(
@@ -120,8 +95,8 @@ def find_slopes_at(
     metric = metric_weights(formation.scene) * np.array([1, 1, 1, *[_LOOSE] * 2])
     unit = np.broadcast_to(np.eye(5)[0], z.shape)
     dz = unit + _move_least(kinematics.P, -kinematics.P[..., 0], metric)
-    given = z, v, kinematics, directions, c, tau, acceleration
-    state = _State(formation, *given, (dz, np.zeros_like(dz)))
+    along = dz, np.zeros_like(dz)
+    state = _State(formation, z, v, kinematics, directions, c, tau, acceleration, along)
     state = state._replace(along=(dz, state.turn("", dz)))
     slopes = state.find_slopes(names)
     # The velocity is that of the motion: s' = 1 along a tangent that is z'.

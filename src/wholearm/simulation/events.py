@@ -1,4 +1,4 @@
-"""What a simulation returns: states, forces, energies, events and how it ended."""
+"""Results of a simulation: states, forces, energies, events and outcome."""
 
 from __future__ import annotations
 
@@ -19,52 +19,32 @@ from ..results.sampled import sample_phases
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from .layout import Outputs
-from .runge_kutta import GLIMPSES, NODES
+from .runge_kutta import INNER_STAGES, NODES
 
-REPLAYED = "replayed"
-"""Status in the `meta` of such a trajectory."""
+REPLAYED = "replayed"  # status in the `meta` of such a trajectory
 
 
 class EventKind(Enum):
     """What happens at an instant of a simulation."""
 
-    START = "start"
-    """The object starts to move from rest."""
-    REST = "rest"
-    """The object comes to rest short of the end of the phase."""
-    STICK = "stick"
-    """Friction holds a contact or a joint while the rest moves, or the object stays at rest."""
-    REVERSAL = "reversal"
-    """A contact's sliding or a joint changes direction."""
-    TORQUE_STEP = "torque step"
-    """The torques jump."""
-    ARRIVAL = "arrival"
-    """The end of the phase is reached, and the next formation taken."""
-    IMPACT = "impact"
-    """The velocity jumps onto the next formation, which is taken if every contact presses."""
-    RELEASE = "release"
-    """The contacts that the next phase does not have are let go, and its formation is taken."""
-    CONTACT_LOST = "contact lost"
-    """A normal force falls to zero."""
-    SLIP = "slip"
-    """Friction no longer holds a contact or a joint; if the phase lets that contact roll the motion
-    ends."""
-    LIMIT = "limit"
-    """The formation stops being valid in another way."""
-    END = "end"
-    """The torques end before the goal."""
-    GAINED = "contact gained"
-    """A contact that nothing was said about presses from here on."""
-    PASS = "pass"
-    """A contact goes on as one of a neighbouring feature."""
-    CHATTER = "chatter"
-    """Impacts that come ever faster are over: the contact stays closed."""
-    AMBIGUOUS = "ambiguous"
-    """The laws of contact allow several motions; the one nearest to the last is taken."""
-    INCONSISTENT = "inconsistent"
-    """They allow none with finite forces: an impact without a collision."""
-    GIVEN_UP = "given up"
-    """Events come without time passing, or steps do not get anywhere."""
+    START = "start"  # the object starts to move from rest
+    REST = "rest"  # the object comes to rest short of the end of the phase
+    STICK = "stick"  # friction holds a contact or joint, or the object stays at rest
+    REVERSAL = "reversal"  # a contact's sliding or a joint changes direction
+    TORQUE_STEP = "torque step"  # the torques jump
+    ARRIVAL = "arrival"  # the end of the phase is reached, and the next formation taken
+    IMPACT = "impact"  # the velocity jumps onto the next formation
+    RELEASE = "release"  # contacts that the next phase does not have are let go
+    CONTACT_LOST = "contact lost"  # a normal force falls to zero
+    SLIP = "slip"  # friction no longer holds a contact or joint; a rolling one ends the motion
+    LIMIT = "limit"  # the formation stops being valid in another way
+    END = "end"  # the torques end before the goal
+    GAINED = "contact gained"  # a contact that nothing was said about presses from here on
+    PASS = "pass"  # a contact goes on as one of a neighbouring feature
+    CHATTER = "chatter"  # impacts that come ever faster are over: the contact stays closed
+    AMBIGUOUS = "ambiguous"  # several motions are possible; the one nearest to the last is taken
+    INCONSISTENT = "inconsistent"  # no motion has finite forces: an impact without a collision
+    GIVEN_UP = "given up"  # events come without time passing, or steps do not get anywhere
 
 
 class Event(NamedTuple):
@@ -92,8 +72,7 @@ class OutcomeKind(Enum):
     HELD = "held"
     LIMIT_REACHED = "limit reached"
     GOAL_MISSED = "goal missed"
-    ENDED = "ended"
-    """A simulation that is told no contacts came to its end."""
+    ENDED = "ended"  # a simulation that is told no contacts came to its end
     GIVEN_UP = "given up"
 
 
@@ -128,7 +107,7 @@ class Energies(NamedTuple):
 
 
 class Glimpses(NamedTuple):
-    """Normal forces within steps, as good as the stages of Runge-Kutta steps know the state."""
+    """Normal forces within steps, to the accuracy of Runge-Kutta stages."""
 
     t: Array  # (k,) [s]
     phase: NDArray[np.int64]  # (k,)
@@ -137,10 +116,7 @@ class Glimpses(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Simulation(Drawn):
-    """A simulated motion, at every accepted step and every instant asked for.
-
-    A phase boundary and a step of the torques are there twice, since forces jump.
-    """
+    """A simulated motion at every accepted step and requested instant, twice where forces jump."""
 
     t: Array  # (n,) [s]
     z: Array  # z, z_dot, z_ddot (n, 5):
@@ -171,7 +147,7 @@ class Simulation(Drawn):
 
     @property
     def trajectory(self) -> Trajectory:
-        """The simulated motion as a trajectory, to be saved and drawn like a plan."""
+        """The simulated motion as a trajectory, as of a plan."""
         return make_trajectory(self)
 
     def find(self, kind: EventKind) -> tuple[Event, ...]:
@@ -264,9 +240,9 @@ def collect(
 
 
 def list_glimpses(problem: Problem, sections: Sequence[Section]) -> Glimpses:
-    """What the stages of all steps have seen."""
+    """Normal forces at the stages of all steps."""
     contacts = problem.contacts
-    nodes = np.array(NODES)[list(GLIMPSES)]
+    nodes = np.array(NODES)[list(INNER_STAGES)]
     columns = [(np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros((0, len(contacts))))]
     for section in sections:
         if not section.steps:
@@ -275,7 +251,7 @@ def list_glimpses(problem: Problem, sections: Sequence[Section]) -> Glimpses:
         places = np.array([(step.t, step.h) for step in section.steps])
         t = (places[:, :1] + nodes * places[:, 1:]).ravel()
         c_n = np.full((len(t), len(contacts)), np.nan)
-        seen = np.array([step.row[section.to.glimpses] for step in section.steps])
+        seen = np.array([step.row[section.to.stage_forces] for step in section.steps])
         where = [contacts.index(contact) for contact in own]
         c_n[:, where] = seen.reshape(len(t), len(own))
         columns.append((t, np.full(len(t), section.phase.index), c_n))
@@ -283,23 +259,15 @@ def list_glimpses(problem: Problem, sections: Sequence[Section]) -> Glimpses:
 
 
 def make_trajectory(simulation: Simulation) -> Trajectory:
-    """The motion of a simulation with every recorded instant, for files and figures.
-
-    A phase that is entered in its last instant only is left out.
-
-    Raises
-    ------
-    SimulationError  if the simulation ended where it started, so that there is no motion
-    """
+    """Trajectory without phases of one instant; `SimulationError` if there is no motion."""
     rows, problem = _choose_rows(simulation), simulation.problem
     if not len(rows):
         raise SimulationError(f"there is no motion to keep: {simulation.outcome.text}")
-    z, z_dot, z_ddot = (getattr(simulation, name)[rows] for name in ("z", "z_dot", "z_ddot"))
-    arrays: dict[str, Any] = {
-        name: getattr(simulation, name)[rows] for name in ("t", "tau", "c_n", "c_t", "phase")
-    }
-    arrays |= {"q": z[:, :3], "q_dot": z_dot[:, :3], "q_ddot": z_ddot[:, :3]}
-    arrays |= {"theta": z[:, 3:], "theta_dot": z_dot[:, 3:], "theta_ddot": z_ddot[:, 3:]}
+    names = ("t", "tau", "c_n", "c_t", "phase")
+    arrays: dict[str, Any] = {name: getattr(simulation, name)[rows] for name in names}
+    for suffix in ("", "_dot", "_ddot"):
+        z = getattr(simulation, f"z{suffix}")[rows]
+        arrays |= {f"q{suffix}": z[:, :3], f"theta{suffix}": z[:, 3:]}
     motions = sample_phases(arrays, simulation.contacts)
     rolling = [phase.formation.rolling for phase in problem.phases[: len(motions)]]
     meta = {
@@ -318,14 +286,14 @@ def make_trajectory(simulation: Simulation) -> Trajectory:
 
 def _choose_rows(simulation: Simulation) -> NDArray[np.int64]:
     """Rows whose times increase in each phase, but for one repetition where forces step."""
-    chosen: list[int] = []
+    chosen = [np.zeros(0, dtype=np.int64)]
     for index in range(int(simulation.phase[-1]) + 1):
-        own = np.flatnonzero(simulation.phase == index)
-        t = simulation.t[own]
+        rows = np.flatnonzero(simulation.phase == index)
+        t = simulation.t[rows]
         before, after = np.append(True, np.diff(t) > 0), np.append(np.diff(t) > 0, True)
         # At the end of a phase what comes before the last step stands for its last instant.
-        kept = own[before | (after & (t < t[-1]))]
+        kept = rows[before | (after & (t < t[-1]))]
         if len(kept) < 2:
             break
-        chosen += kept.tolist()
-    return np.array(chosen, dtype=np.int64)
+        chosen.append(kept)
+    return np.concatenate(chosen)

@@ -1,4 +1,4 @@
-"""Instants at which forces jump: reversals, torque steps, contacts let go or held by friction."""
+"""Instants at which forces jump: reversals, torque steps, release, stick-slip transitions."""
 
 from __future__ import annotations
 
@@ -16,9 +16,7 @@ from .sliding_signs import choose_mode, note_change
 from .stepper import ModeStepper
 from .tolerances import REACHED, SETTLING, SLOW, is_slower, measure_units
 
-_FAR = 100.0
-"""Ratio of speed and its change, in the scene's units, from which on nothing can turn: slopes and
-lever arms make the change of a contact's sliding a few times that of the velocities."""
+_FAR = 100.0  # speed over its change at which nothing reverses: lever arms are below that
 
 
 class Arrival(NamedTuple):
@@ -29,7 +27,7 @@ class Arrival(NamedTuple):
     window: float
     strikes: bool = False  # whether it takes an impact to go on
     # [s]: time in which a motion whose deceleration fades would have come to rest
-    left: float = 0.0
+    remaining: float = 0.0
 
 
 class Released(NamedTuple):
@@ -42,7 +40,7 @@ class Switched(NamedTuple):
     """A contact comes to rest, or slips, as the next phase has it."""
 
     contact: str
-    way: float = 0.0  # direction in which it slips; 0 if it comes to rest
+    sign: float = 0.0  # direction in which it slips; 0 if it comes to rest
 
 
 class Rested:
@@ -52,16 +50,12 @@ class Rested:
 Ending = Arrival | Released | Switched | Rested | Outcome
 
 
-def look_again(
+def restart(
     run: Replay, turned: Sequence[int] = (), *, time: float | None = None, enters: bool = False
 ) -> Ending | None:
-    """Record the forces after they jump; what ends the motion, if that does.
+    """Choose contact modes after forces jump and record them; what ends the motion, if that does.
 
-    Parameters
-    ----------
-    turned      contacts and then joints that have just come to rest
-    time : [s]  when that was, if not at present
-    enters      whether a formation has just been entered
+    `turned`: contacts, then joints, that came to rest at `time` [s]; `enters`: a new formation.
     """
     stuck = run.stuck
     if _decide(run, turned, time=time, enters=enters):
@@ -72,8 +66,14 @@ def look_again(
     s = run.stepper
     if not s.outputs[s.to.ratio] > 0:
         run.fail_to_step(float(s.outputs[s.to.ratio]))
-    if _holds(run, stuck, enters):
-        return _hold(run)
+    if not enters and run.resting and run.resting <= run.stuck:
+        # A planned motion may all but come to rest a little before the torques step; until they do
+        # it may slip and stick again.
+        window = min(run.tolerances.longest_window, run.t - run.last_step)
+        rested = run.resting <= stuck
+        if run.has_slid if rested else not steps_within(run, window):
+            return _hold(run)
+        run.has_slid |= not rested
     slipping = {s.mode.holders[k][0] for k in find_slipping(s)}
     pulling = np.flatnonzero(s.outputs[s.to.c_n] < -run.tolerances.force)
     # Whether anything pulls where a contact slips by plan, its next formation says.
@@ -85,9 +85,9 @@ def look_again(
 def _decide(
     run: Replay, turned: Sequence[int], *, time: float | None = None, enters: bool = False
 ) -> bool:
-    """Find how contacts and joints at rest go on; whether all motion has ended.
+    """Choose the modes of contacts and joints at rest; whether all motion has ended.
 
-    With a single freedom whatever slides and turns does so for as long as there is motion.
+    With one freedom whatever slides or turns does so for as long as there is motion.
     """
     if run.phase.formation.n_constraints < 4:
         return choose_mode(run, turned, time=time, enters=enters)
@@ -101,24 +101,10 @@ def _decide(
 
 
 def come_to_rest(run: Replay) -> Rested | Switched:
-    """All motion ends; so does the phase if a contact was to come to rest."""
+    """End all motion, and the phase if a contact was to come to rest."""
     if not is_there(run):
         run.note(EventKind.REST, f"the object comes to rest {run.when()}")
     return _hold(run) if run.resting else Rested()
-
-
-def _holds(run: Replay, stuck: set[int], enters: bool) -> bool:
-    """Whether contacts have come to rest, of which `stuck` did before, where that ends the phase.
-
-    A planned motion may all but come to rest a little before the torques step; until they do it may
-    slip and stick again.
-    """
-    if enters or not run.resting or not run.resting <= run.stuck:
-        return False
-    if run.resting <= stuck:
-        return run.has_slid
-    run.has_slid = True
-    return not steps_within(run, min(run.tolerances.longest_window, run.t - run.last_step))
 
 
 def _hold(run: Replay) -> Switched:
@@ -126,10 +112,7 @@ def _hold(run: Replay) -> Switched:
 
 
 def let_go(run: Replay, contacts: Sequence[int]) -> Released | Outcome:
-    """End because contacts would have to pull: a release if that is planned of one of them.
-
-    The next formation then decides whether the others press, and whether the released ones part.
-    """
+    """End as contacts would have to pull: a release if that is planned of one of them."""
     s = run.stepper
     forces = dict(zip(s.formation.names, s.outputs[s.to.c_n].tolist(), strict=True))
     pulling = [s.formation.names[k] for k in contacts]
@@ -162,20 +145,17 @@ def slip(run: Replay) -> Released | Switched | Outcome:
 
 
 def let_slip(run: Replay, events: Sequence[int]) -> Ending | None:
-    """Go on after friction has reached its bound for some of what it holds.
-
-    A contact that the phase lets roll must not slip.
-    """
+    """Go on after friction has reached its bound; a prescribed rolling contact must not slip."""
     s = run.stepper
     count = len(s.mode.holders)
-    held = {(k - s.rows.cone.start) % count for k in events if k in _list_rows(s.rows.cone)}
-    if any(s.mode.declares(k) for k in held):
+    cone = range(s.rows.cone.start, s.rows.cone.stop)
+    if any(s.mode.declares((k - cone.start) % count) for k in events if k in cone):
         return slip(run)
-    return look_again(run, [k - s.rows.slide.start for k in events if k in _turning(s)])
+    return restart(run, [k - s.rows.slide.start for k in events if k in _turning(s)])
 
 
 def _measure_reserves(s: ModeStepper) -> list[float]:
-    """What friction still has to give for each of what it holds [N, N m]."""
+    """Friction margin of each contact and joint that sticks [N, N m]."""
     cones = s.outputs[s.to.events][s.rows.cone].reshape(2, -1)
     return [float(least) for least in cones.min(axis=0)]
 
@@ -188,22 +168,29 @@ def find_slipping(s: ModeStepper) -> list[int]:
 
 
 def turn(run: Replay, events: Sequence[int]) -> Ending | None:
-    """Go on where contacts or joints have come to rest; None if the motion goes on.
-
-    Planned torques step where friction does. If the step comes a little later, by rounding, it is
-    waited for with the old friction.
-    """
-    s = run.stepper
+    """Go on where contacts or joints have come to rest; None if the motion goes on."""
+    s, window = run.stepper, run.tolerances.rest_window
     s.inputs[s.at.t] = now = run.t
     rows = [k - s.rows.slide.start for k in events if k in _turning(s)]
-    if s.formation.n_constraints < 4 and _is_settled(run):
-        return Arrival(-float(s.outputs[s.to.until_rate]), run.tolerances.rest_window)
-    stepped = steps_within(run, run.tolerances.settling)
-    if stepped:
-        coast_to_step(run, hide=True)
-        run.drop()
-        run.note(EventKind.TORQUE_STEP, f"the torques step {run.when()}")
-    return look_again(run, rows, time=now)
+    # With two freedoms the last speeds fall to zero one after the other by rounding.
+    if (
+        s.formation.n_constraints < 4
+        and run.phase.end is End.REST
+        and is_there(run)
+        and is_slower(run.problem.scene, run.y[5:10], SLOW)
+        and run.breaks[run.piece + 1] - now <= window
+    ):
+        return Arrival(-float(s.outputs[s.to.until_rate]), window)
+    if steps_within(run, run.tolerances.settling):
+        _finish_piece(run)
+    return restart(run, rows, time=now)
+
+
+def _finish_piece(run: Replay) -> None:
+    """Step to the torque step, without a record of the forces on the way."""
+    coast_to_step(run, hide=True)
+    run.drop()
+    run.note(EventKind.TORQUE_STEP, f"the torques step {run.when()}")
 
 
 def steps_within(run: Replay, window: float) -> bool:
@@ -241,32 +228,12 @@ def is_there(run: Replay) -> bool:
     return abs(run.value(run.stepper.rows.until)) < REACHED * run.until_unit
 
 
-def _is_settled(run: Replay) -> bool:
-    """Whether everything has all but stopped at the end of the phase, just before a torque break.
-
-    With two freedoms the last speeds fall to zero one after the other by rounding.
-    """
-    return (
-        run.phase.end is End.REST
-        and is_there(run)
-        and is_slower(run.problem.scene, run.y[5:10], SLOW)
-        and run.breaks[run.piece + 1] - run.t <= run.tolerances.rest_window
-    )
-
-
 def _bridge(run: Replay) -> bool:
-    """Pass over the instant between a reversal and the step of the torques that goes with it.
-
-    Planned torques step where friction does, but by rounding the two come one after the other, and
-    in between the forces are those of neither. That instant is integrated like any other, but its
-    forces are not recorded. Returns whether all motion has ended.
-    """
+    """Integrate from a reversal to its torque step, unrecorded; whether all motion has ended."""
     s = run.stepper
     if steps_within(run, run.tolerances.settling):
         run.drop()
-        coast_to_step(run, hide=True)
-        run.drop()
-        run.note(EventKind.TORQUE_STEP, f"the torques step {run.when()}")
+        _finish_piece(run)
         rows: list[int] = []
     elif _goes_on(run):
         return False
@@ -279,7 +246,9 @@ def _bridge(run: Replay) -> bool:
             s.look()
             return False
         rows = [k - s.rows.slide.start for k in events]
-        _cross(run, run.t + float(s.inputs[s.at.h]))
+        run.drop()
+        coast(run, run.t + float(s.inputs[s.at.h]), hide=True)
+        run.drop()
     ended = _decide(run, rows)
     run.record()
     return ended
@@ -299,17 +268,6 @@ def _goes_on(run: Replay) -> bool:
     return all(not x or rate > low for x, rate, low in zip(signs, turning, least, strict=True))
 
 
-def _cross(run: Replay, stop: float) -> None:
-    """Step to `stop` without a record of the forces on the way, the present ones included."""
-    run.drop()
-    coast(run, stop, hide=True)
-    run.drop()
-
-
 def _turning(s: ModeStepper) -> range:
     """Rows of the event values that change sign at a reversal."""
     return range(s.rows.slide.start, s.rows.joint.stop)
-
-
-def _list_rows(rows: slice) -> range:
-    return range(rows.start, rows.stop)

@@ -1,15 +1,13 @@
-"""What slides, what sticks and what is held in a formation that moves.
+"""Contact modes of a moving formation: what slides, what sticks, and the equations of motion.
 
-A formation with two or more freedoms goes on moving while friction holds some of its sliding
-contacts, or joints with dry friction. A stuck contact is integrated like a rolling one, v_t = 0
-with c_t free, and a held joint with theta_i' = 0 and a friction torque f that is free:
+A stuck contact is integrated like a rolling one, v_t = 0 with c_t free, and a held joint with
+theta_i' = 0 and a free friction torque f:
 
     P = [A; A_t(rolling); A_t(stuck); e(held)],    |c_t| <= mu c_n,    |f| <= D.
 
-The vertices of an edge that lies flush slide and stick as one, since their v_t is one and the same.
-Only the sum T of their c_t is determined, and may be as large as their cones together, |T| <= sum
-mu c_n. It is shared out in proportion to c_n, which does not matter for the motion.
-A contact that lies flush with one which its phase lets roll has no friction of its own.
+Vertices of a flush edge slide and stick as one. Only the sum T of their c_t is determined, with
+|T| <= sum mu c_n; it is distributed in proportion to c_n, which does not affect the motion. A
+contact flush with a rolling one has no friction of its own.
 """
 
 from __future__ import annotations
@@ -26,12 +24,10 @@ from ..common.arrays import Array, Expression
 from ..contacts.formation import Formation
 from ..mechanics.dynamics import build_force_rows
 
-INDEPENDENT = 1e-9
-"""Least singular value of constraints, each of length one, for forces to be determined."""
+INDEPENDENT = 1e-9  # least singular value of normalized constraints that are independent
 
 
-FIXED = 1e-7
-"""Share of a contact's or joint's freedom that constraints leave, below which they leave none."""
+FIXED = 1e-7  # share of a freedom below which constraints leave none
 
 
 @dataclass(frozen=True)
@@ -46,8 +42,7 @@ class Grips:
         return len(self.contacts) + len(self.joints)
 
 
-FREE = Grips()
-"""Nothing is held."""
+FREE = Grips()  # nothing is held
 
 
 class Unit(NamedTuple):
@@ -70,10 +65,7 @@ def list_units(formation: Formation) -> tuple[Unit, ...]:
 
 
 def find_grips(formation: Formation, signs: Array) -> Grips:
-    """What is held where `signs`, shape (n_c + 2,), of its sliding and turning are zero.
-
-    With a single freedom nothing can be held while the rest moves.
-    """
+    """What sticks where `signs`, shape (n_c + 2,), are zero; nothing with a single freedom."""
     if formation.n_constraints >= 4:
         return FREE
     held = [unit.rows for unit in list_units(formation) if signs[unit.rows[0]] == 0]
@@ -172,7 +164,7 @@ class Mode:
         return c_t
 
     def read_kept(self, z: Array) -> Array:
-        """What rolling and stuck contacts and held joints keep from `z`, shape (K,) [m, rad]."""
+        """Slip coordinates and angles that rolling, stuck and held ones keep, (K,) [m, rad]."""
         slip = self.rolled.evaluate_slip(z[None])[0]
         return np.concatenate([slip, z[[3 + joint for joint in self.grips.joints]]])
 
@@ -203,13 +195,9 @@ class Response(NamedTuple):
 
 
 def respond(mode: Mode, signs: Array, rows: ModeRows, v: Array) -> Response | None:
-    """Solve the equations of motion; None if the constraints are not independent.
+    """Solve the equations of motion at velocity v, (5,); None for dependent constraints.
 
-    Parameters
-    ----------
-    signs : (n_c + 2,)  directions of contacts and joints, zero for what is held or rolls
-    rows                at the state
-    v : (5,)            its velocity
+    `signs`, (n_c + 2,), are those of contacts and joints, zero for what is held or rolls.
     """
     formation, scene = mode.formation, mode.formation.scene
     count, rolling = formation.n_contacts, list(mode.rolled.rolling_rows)
@@ -223,8 +211,11 @@ def respond(mode: Mode, signs: Array, rows: ModeRows, v: Array) -> Response | No
         held = np.vstack([rows.A_t[rolling], np.eye(5)[joints]])
         P, G = np.vstack([P, held]), np.vstack([G, held])
         bend = np.concatenate([bend, rows.A_t_dot_v[rolling], np.zeros(len(joints))])
-    if mode.grips and not _are_independent(P * np.sqrt(inverse_mass)):
-        return None
+    if mode.grips:
+        lines = P * np.sqrt(inverse_mass)
+        lines /= np.linalg.norm(lines, axis=1)[:, None]
+        if len(P) > 5 or np.linalg.svd(lines, compute_uv=False)[-1] <= INDEPENDENT:
+            return None
     applied = np.zeros((5, 3))
     applied[:, 0] = scene.applied_force - scene.viscous * v
     applied[3:, 0] -= scene.dry[3:] * signs[count:]
@@ -247,12 +238,7 @@ def respond(mode: Mode, signs: Array, rows: ModeRows, v: Array) -> Response | No
 
 
 def find_fixed(mode: Mode, A: Array, A_t: Array) -> NDArray[np.bool_]:
-    """Which contacts, then joints, the constraints of a mode let not slide or turn, (n_c + 2,).
-
-    Parameters
-    ----------
-    A, A_t : (n_c, 5)
-    """
+    """Which contacts, then joints, a mode keeps fixed, (n_c + 2,), from A and A_t, (n_c, 5)."""
     joints = np.eye(5)[3:]
     root = np.sqrt(mode.formation.scene.mass_diagonal)
     held = [A, A_t[list(mode.rolled.rolling_rows)], joints[list(mode.grips.joints)]]
@@ -262,11 +248,3 @@ def find_fixed(mode: Mode, A: Array, A_t: Array) -> NDArray[np.bool_]:
     basis = np.linalg.svd(P / np.linalg.norm(P, axis=1)[:, None], full_matrices=False)[2]
     rest = free - (free @ basis.T) @ basis
     return np.asarray(np.linalg.norm(rest, axis=1) < FIXED * length)
-
-
-def _are_independent(rows: Array) -> bool:
-    """Whether rows, in the metric of masses, leave forces that are determined."""
-    if len(rows) > 5:
-        return False
-    unit = rows / np.linalg.norm(rows, axis=1)[:, None]
-    return bool(np.linalg.svd(unit, compute_uv=False)[-1] > INDEPENDENT)

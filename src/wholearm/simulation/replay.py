@@ -13,34 +13,28 @@ from ..contacts.formation import Formation
 from ..problem.definition import Phase, Problem
 from ..results.torque import TorqueProfile
 from .events import Event, EventKind, Outcome, OutcomeKind, Section
-from .layout import STATE
+from .layout import STATE, find_torque_steps
 from .modes import FREE, Grips
 from .stepper import ModeStepper, build_stepper
 from .tolerances import find_tolerances
 
 
 class Replay:
-    """A simulation under way: the state, where it is in the torques, and what is recorded.
+    """State, piece of the torques and records of a running simulation.
 
     Attributes
     ----------
-    t : [s]
+    t, h : [s]               present time, and the step to try next
     y : (STATE,)             z, z', then work, viscous, dry and contact losses
-    h : [s]                  the step to try next
-    piece                    piece of the torques
-    has_slid                 whether those that come to rest have slid in the phase
-    ways                     directions in which contacts, by name, have just begun to slip
-    side                     sign of (coordinate - value) before the end of the phase, if that is a
-                             coordinate's value
-    tolerances               those of the scene
+    has_slid                 whether contacts that come to rest have slid in the phase
+    slip_signs               signs of contacts, by name, that have just begun to slip
+    side                     sign of (coordinate - value) before the end of the phase
     until_unit : [m or rad]  unit of the distance to the end of the phase
-    passes                   whether a motion may pass the end of the phase at any speed, without an
-                             impact
-    moving                   whether the motion goes on into the phase that is entered
-    left                     that of the last phase which has ended at rest
+    passes                   whether the end may be passed at any speed, without an impact
+    moving                   whether the motion goes on into the next phase
+    previous                 formation of the last phase that has ended at rest
     wanted                   instants at which steps have to end; infinity is last
-    stuck                    contacts, then joints, of the phase's formation that stay while the
-                             rest moves
+    stuck                    contacts, then joints, that stick while the rest moves
     """
 
     stepper: ModeStepper  # of the phase's formation
@@ -53,24 +47,24 @@ class Replay:
     slipping: frozenset[int]
 
     def __init__(
-        self,
-        problem: Problem,
-        torque: TorqueProfile,
-        tolerance: float,
-        wanted: Array,
+        self, problem: Problem, torque: TorqueProfile, tolerance: float, wanted: Array
     ) -> None:
         self.problem, self.torques, self.tolerance = problem, torque, tolerance
         self.tolerances = find_tolerances(problem.scene)
         self.until_unit = 1.0
         self.breaks = [float(b) for b in torque.breaks]
         self.coefficients = torque.coefficients
-        self.steps_at = _find_steps(torque, self.tolerances.torque_step)
+        parts, least = torque.coefficients, self.tolerances.torque_step
+        self.steps_at: list[bool] = [
+            True,
+            *find_torque_steps(parts[:-1], parts[1:], least).tolist(),
+        ]
         ends = torque.breaks[:-1], torque.breaks[1:]
         flat = self.coefficients.reshape(len(self.coefficients), -1)
         self.pieces = np.column_stack([*ends, flat])
         self.step_times = [b for b, s in zip(self.breaks, self.steps_at, strict=False) if s]
-        known = wanted[(wanted >= self.breaks[0]) & (wanted <= self.breaks[-1])]
-        self.wanted = [*known.tolist(), math.inf]
+        within = wanted[(wanted >= self.breaks[0]) & (wanted <= self.breaks[-1])]
+        self.wanted = [*within.tolist(), math.inf]
         self.next_wanted = 0
         self.t, self.piece = self.breaks[0], 0
         self.y = np.zeros(STATE)
@@ -79,11 +73,11 @@ class Replay:
         self.held_until = self.settled_by = -math.inf
         self.impact = 0.0
         self.passes = self.moving = False
-        self.left: Formation | None = None
+        self.previous: Formation | None = None
         self.side = 1.0
         self.stuck: set[int] = set()
         self.has_slid = False
-        self.ways: dict[str, float] = {}
+        self.slip_signs: dict[str, float] = {}
         self.decided = (-math.inf, 0)
         self.sections: list[Section] = []
         self.steppers: list[ModeStepper] = []
@@ -100,14 +94,6 @@ class Replay:
         s.inputs[s.at.tolerance] = self.tolerance
         s.inputs[s.at.kept] = s.mode.read_kept(self.y[:5])
         self.load_piece()
-
-    def count_decision(self, most: int) -> None:
-        """Count one decision of friction; raise an error if there are `most` at one instant."""
-        count = self.decided[1] + 1 if self.t <= self.decided[0] else 1
-        self.decided = (self.t, count)
-        if count > most:
-            names = " ".join(self.phase.formation.names)
-            raise SimulationError(f"sticking and slipping of {names} do not end {self.where()}")
 
     def accept(self, t: float) -> Array:
         """Take the step just made, to time `t`, and record its end."""
@@ -163,8 +149,8 @@ class Replay:
 
     def repeats(self) -> bool:
         """Whether the last two records are of the same instant of one phase, but for rounding."""
-        own = [section for section in self.sections if section.phase is self.phase]
-        times = [time for section in own[-2:] for time in section.times[-2:]]
+        sections = [section for section in self.sections if section.phase is self.phase]
+        times = [time for section in sections[-2:] for time in section.times[-2:]]
         return len(times) > 1 and self.t - times[-2] <= self.tolerances.settling
 
     def note(
@@ -197,32 +183,27 @@ class Replay:
 
     def run_out(self) -> Outcome:
         """End because the torques end."""
-        if self.phase.until.is_release:
-            text = f"the torques end {self.when()}, before {self.describe_end()}"
-            self.note(EventKind.END, text)
-            return Outcome(OutcomeKind.GOAL_MISSED, text)
-        distance = self.value(self.stepper.rows.until)
-        unit = "rad" if self.phase.until.coordinate == "phi" else "m"
-        text = f"the torques end {self.when()}, {distance:.3g} {unit} short of {self.phase.until}"
+        until, distance = self.phase.until, math.nan
+        if until.is_release:
+            names = self.phase.formation.names
+            ends = [(self.resting, "comes to rest"), (self.slipping, "slips")]
+            texts = [f"{', '.join(names[k] for k in sorted(rows))} {t}" for rows, t in ends if rows]
+            if self.releasable:
+                texts = [f"{', '.join(self.releasable)} is released"]
+            text = f"the torques end {self.when()}, before {' or '.join(texts)}"
+        else:
+            distance = self.value(self.stepper.rows.until)
+            unit = "rad" if until.coordinate == "phi" else "m"
+            text = f"the torques end {self.when()}, {distance:.3g} {unit} short of {until}"
         self.note(EventKind.END, text, "", distance)
         return Outcome(OutcomeKind.GOAL_MISSED, text)
-
-    def describe_end(self) -> str:
-        """What ends a phase without an `until`, to follow "before"."""
-        names = self.phase.formation.names
-        rest, slip = (
-            ", ".join(names[k] for k in sorted(rows)) for rows in (self.resting, self.slipping)
-        )
-        if self.releasable:
-            return f"{', '.join(self.releasable)} is released"
-        return " or ".join([f"{rest} comes to rest"] * bool(rest) + [f"{slip} slips"] * bool(slip))
 
     def value(self, row: int) -> float:
         """One of the event values at the present state."""
         return float(self.stepper.outputs[self.stepper.to.events.start + row])
 
     def load_piece(self) -> None:
-        """Hand the present piece of the torques to the stepper."""
+        """Set the stepper's inputs for the present piece of the torques."""
         s = self.stepper
         s.inputs[s.at.piece.start : s.at.torque.stop] = self.pieces[self.piece]
 
@@ -245,15 +226,8 @@ class Replay:
         """When the torques last stepped, at their start or later [s]."""
         return self.step_times[bisect_left(self.step_times, self.breaks[self.piece + 1]) - 1]
 
-    def torque(self, t: float) -> Array:
-        """Torques of the present piece at time `t`, also beyond its end, shape (2,) [N m]."""
-        start, stop = self.breaks[self.piece], self.breaks[self.piece + 1]
-        coefficients = self.coefficients[self.piece]
-        x = (2 * t - start - stop) / (stop - start)
-        return np.asarray(coefficients @ x ** np.arange(coefficients.shape[1]))
-
     def fraction(self, t: float) -> float:
-        """Where time `t` is on the present piece, from -1 to 1."""
+        """Coordinate of time `t` on the present piece, from -1 to 1."""
         start, stop = self.breaks[self.piece], self.breaks[self.piece + 1]
         return min(1.0, max(-1.0, (2 * t - start - stop) / (stop - start)))
 
@@ -276,10 +250,3 @@ class Replay:
         scene, v = self.problem.scene, self.y[5:10]
         height = scene.polygon.mass * scene.gravity * self.y[1]
         return float(0.5 * v**2 @ scene.mass_diagonal + height)
-
-
-def _find_steps(torque: TorqueProfile, least: float) -> list[bool]:
-    """Whether the torques step by more than `least` at the start of each of k pieces."""
-    alternate = (-1.0) ** np.arange(torque.coefficients.shape[2])
-    jump = (torque.coefficients[1:] @ alternate) - torque.coefficients[:-1].sum(axis=2)
-    return [True, *(np.abs(jump).max(axis=1) > least).tolist()]

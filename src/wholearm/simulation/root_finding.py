@@ -1,4 +1,4 @@
-"""The first event within a step, found by repeating the step with other lengths."""
+"""Event location within a step: root finding on steps of other lengths."""
 
 from __future__ import annotations
 
@@ -12,13 +12,9 @@ from .replay import Replay
 
 
 def find_first(run: Replay, start: Array, h: float, among: range | None = None) -> list[int]:
-    """Shorten the step just tried to the first event within it; returns the event's rows.
+    """Shorten the step just tried, of length h [s], to its first event; returns the event's rows.
 
-    Parameters
-    ----------
-    start    outputs at the start of the step
-    h : [s]
-    among    the rows to look at
+    `start` are the outputs at its start, `among` the rows to look at.
     """
     s = run.stepper
     rows, among = s.rows, among or range(s.rows.size)
@@ -69,8 +65,7 @@ def find_root(
 ) -> float:
     """Root in [low, high] of a function that falls from f_low >= 0 to f_high < 0.
 
-    Regula falsi as of Anderson and Bjorck, which converges like secants on the smooth functions
-    here, until it moves by `near` at most or the function is within `flat` of zero.
+    Regula falsi of Anderson and Bjorck, until it moves by `near` or the function is within `flat`.
     """
     if f_low <= 0:
         return low
@@ -99,15 +94,9 @@ def find_crossing(
     near: float,
     flat: float,
 ) -> float:
-    """Root of a function that falls from f >= 0 at `low` to f < 0 at `high`, by its slopes.
+    """Root of x -> f, f' that falls from `low` to `high`, each (x, f, f'); as `find_root`.
 
-    Newton's method from the root of the cubic through both ends, within a bracket that shrinks.
-
-    Parameters
-    ----------
-    look        x -> f(x), f'(x)
-    low, high   x, f, f'
-    near, flat  as of `find_root`
+    Newton's method from the root of the cubic through both ends, within a bracket.
     """
     (left, f_left, slope), (right, f_right, _) = low, high
     if f_left <= 0:

@@ -1,19 +1,15 @@
-"""Forward simulation: joint torques in, motion and contact forces out.
+"""Forward simulation of prescribed contact formations: joint torques in, motion and forces out.
 
-The motion starts at rest in the first phase's formation. While it moves, the constrained equations
-of motion are integrated to a given tolerance with the friction of the sliding directions; every
-step ends at the latest where a torque's polynomial piece ends, and events are located by repeating
-a step with another length. At rest the formation waits until it can start (`sticking`).
+Event-driven integration (DOP853) from rest in the first formation. Friction has the sliding signs
+of the current mode; steps end where a polynomial piece of the torques ends, and events are located
+by repeating the step with another length. At rest the formation waits until it can start
+(`sticking`).
 
-When the end of a phase is reached the motion stops, if the phase ends at rest, and goes on from
-rest in the next phase's formation. If it ends smoothly the motion goes on with its velocity, less
-what the contacts of the next formation do not let through; contacts that this formation does not
-have are let go. A phase without an end of its own is over where that happens, where a contact slips
-that slides in the next phase, or where contacts come to rest that roll there. If a phase ends with
-an impact, impulses of the next formation's contacts change the velocity, and all of them have to
-press (`mechanics.impact`).
-
-Nothing here is shared with the planner but the contacts and the scene.
+A phase that ends at rest stops the motion. After a smooth end the velocity is projected onto the
+next formation, and contacts that it does not have are released. A phase without an `until` ends at
+that release, where a contact slips that slides in the next phase, or where contacts come to rest
+that roll there. After an impact every contact of the next formation has to press
+(`mechanics.impact`).
 """
 
 from __future__ import annotations
@@ -39,7 +35,6 @@ from .events import (
     Glimpses,
     Outcome,
     OutcomeKind,
-    Section,
     Simulation,
     Step,
     collect,
@@ -57,7 +52,7 @@ from .jumps import (
     is_there,
     let_go,
     let_slip,
-    look_again,
+    restart,
     steps_within,
     turn,
 )
@@ -89,14 +84,11 @@ _OUTCOMES = {
     ViolationKind.CLOSING: OutcomeKind.LIMIT_REACHED,
     ViolationKind.HELD: OutcomeKind.HELD,
 }
-_GROWTH = 40.0
-"""Largest growth of a step: at order 8 an error of 1e-13 of the tolerance allows it."""
-_HELD_AT = 5
-"""Places of a piece of the torques at which they have to hold the object."""
-ROUNDS = 8
-"""Most simulations, each with more steps that end where something showed within those before."""
+_GROWTH = 40.0  # largest growth of a step: at order 8 an error of 1e-13 of the tolerance allows it
+_HELD_AT = 5  # places of a piece of the torques at which they have to hold the object
+ROUNDS = 8  # most simulations, each with steps that end at events missed before
 Closer = Callable[[Simulation, Glimpses, int], ArrayLike]
-"""Gives, from what is known and the number of looks so far, instants to look at too, or none."""
+"""Simulation, forces within its steps and number of calls so far -> further instants to check."""
 
 
 @exclusive
@@ -117,10 +109,9 @@ def simulate(
                       length, 1 rad, speed and angular speed (`Scene.scales`) where these are more
     times : (n,) [s]  instants at which the state is wanted; steps end there. Those outside the
                       torques' time are left out.
-    closer            takes the simulation, glimpses of forces within its steps and the number of
-                      looks so far, from 0, and gives instants within steps that are to be seen,
-                      too, shape (n,) [s], until it gives none. That changes no step, unless
-                      something shows there that ends of steps do not.
+    closer            simulation, forces within its steps and number of calls so far -> instants
+                      (n,) [s] within steps to evaluate too, until there are none. Steps change
+                      only if an event shows there that their ends miss.
     progress          receives a line at the start of each phase
 
     Returns
@@ -139,36 +130,28 @@ def simulate(
     if not 1e-14 <= tolerance <= 1e-2:
         raise InputError("", "tolerance", f"{tolerance!r} is not between 1e-14 and 1e-2")
     wanted = _sort_times(times)
-    for left in range(ROUNDS, 0, -1):
+    for attempts in range(ROUNDS, 0, -1):
         run = Replay(problem, profile, tolerance, wanted)
-        found, missed = _look_closer(run, _simulate(run, progress), closer)
-        if not missed or left == 1:
+        outcome, missed_by = _simulate(run, progress)
+        simulation, missed, calls = _collect(run, outcome, missed_by), list[float](), 0
+        glimpses = list_glimpses(problem, run.sections if closer else ())
+        while closer and not missed:
+            times = _sort_times(closer(simulation, glimpses, calls))
+            if not len(times):
+                break
+            missed, calls = look_within(run, times), calls + 1
+            simulation = _collect(run, outcome, missed_by)
+        if not missed or attempts == 1:
             break
         wanted, progress = _sort_times([*wanted, *missed]), None
-    return found
+    return simulation
 
 
-def _sort_times(given: ArrayLike | None) -> Array:
-    """Instants that are asked for, increasing, shape (n,) [s]."""
-    if given is None:
-        return np.zeros(0)
-    times = np.asarray(given, dtype=float)
+def _sort_times(instants: ArrayLike | None) -> Array:
+    times = np.asarray(() if instants is None else instants, dtype=float)
     if not np.isfinite(times).all():
         raise InputError("", "times", "holds numbers that are not finite")
     return sort_unique(times)
-
-
-def _look_closer(
-    run: Replay, ended: tuple[Outcome, float], closer: Closer | None
-) -> tuple[Simulation, list[float]]:
-    """What is recorded, and instants within steps at which something showed that they missed."""
-    found, looks = _collect(run, *ended), 0
-    missed: list[float] = []
-    glimpses = list_glimpses(run.problem, run.sections if closer else ())
-    while closer and not missed and len(wanted := _sort_times(closer(found, glimpses, looks))):
-        missed = look_within(run, wanted)
-        found, looks = _collect(run, *ended), looks + 1
-    return found, missed
 
 
 def _simulate(run: Replay, progress: Callable[[str], None] | None) -> tuple[Outcome, float]:
@@ -197,7 +180,7 @@ def _play(run: Replay, phase: Phase, following: Phase | None) -> Outcome | None:
     if run.moving:
         ending = go_on(run) or move(run)
     brief = 0
-    while True:
+    while isinstance(ending, Rested | StartDeparture):
         if isinstance(ending, Rested):
             ending = _rest(run)
         if isinstance(ending, StartDeparture):
@@ -208,16 +191,20 @@ def _play(run: Replay, phase: Phase, following: Phase | None) -> Outcome | None:
             brief = brief + 1 if run.t - started < 100 * run.tolerances.shortest_step else 0
             if brief > 20:
                 raise SimulationError(f"starting and stopping do not end {run.where()}")
-        if isinstance(ending, Outcome):
-            return ending
-        if isinstance(ending, Arrival):
-            return _arrive(run, ending, following)
-        if isinstance(ending, Released):
-            _release(run, ending)
-            return None
-        if isinstance(ending, Switched):
-            _switch(run, ending)
-            return None
+    if isinstance(ending, Outcome):
+        return ending
+    if isinstance(ending, Arrival):
+        return _arrive(run, ending, following)
+    if isinstance(ending, Released):
+        names = ", ".join(run.releasable)
+        run.note(EventKind.RELEASE, f"{names} released {run.when()}", names, ending.c_n)
+    else:
+        contact, sign = ending
+        text = f"{contact} {'slips' if sign else 'comes to rest'} {run.when()}"
+        run.note(EventKind.ARRIVAL, text, contact)
+        run.slip_signs = {contact: sign} if sign else {}
+    run.moving = True
+    return None
 
 
 def _arrive(run: Replay, arrival: Arrival, following: Phase | None) -> Outcome | None:
@@ -231,46 +218,24 @@ def _arrive(run: Replay, arrival: Arrival, following: Phase | None) -> Outcome |
     run.moving = run.phase.end is End.SMOOTH
     if run.moving:
         return None
-    before, run.left = run.stored, run.phase.formation
+    before, run.previous = run.stored, run.phase.formation
     run.y[5:10] = 0.0
     run.impact += before - run.stored
     # The torques of the phase that has ended go on until they step, or end.
     coming = min(run.coming_step, run.breaks[-1])
     run.held_until = coming if coming - run.t <= arrival.window else run.t
     if run.problem.scene.has_slow_motors:
-        _await_torques(run, arrival)
+        # Rate-limited torques do not step. A motion whose deceleration fades comes early by about
+        # the cube root of its error: the old torques act until it was to end.
+        early = run.breaks[run.piece] < run.t < run.breaks[run.piece + 1]
+        remaining = arrival.remaining if early else 0.0
+        run.held_until = max(run.held_until, min(run.t + remaining, run.breaks[-1]))
+        run.settled_by = run.held_until + run.tolerances.rest_window
     return None
 
 
-def _await_torques(run: Replay, arrival: Arrival) -> None:
-    """Let the phase that has ended keep its torques, which do not step, until it was to end.
-
-    A motion whose deceleration fades comes early by about the cube root of its error. The time that
-    it would still have taken is twice its speed over its deceleration.
-    """
-    early = run.breaks[run.piece] < run.t < run.breaks[run.piece + 1]
-    left = arrival.left if early else 0.0
-    run.held_until = max(run.held_until, min(run.t + left, run.breaks[-1]))
-    run.settled_by = run.held_until + run.tolerances.rest_window
-
-
-def _release(run: Replay, release: Released) -> None:
-    """End the phase where the next one's formation lets contacts go."""
-    names = ", ".join(run.releasable)
-    run.note(EventKind.RELEASE, f"{names} released {run.when()}", names, release.c_n)
-    run.moving = True
-
-
-def _switch(run: Replay, switch: Switched) -> None:
-    """End the phase where a contact goes on as the next one has it."""
-    does = "slips" if switch.way else "comes to rest"
-    run.note(EventKind.ARRIVAL, f"{switch.contact} {does} {run.when()}", switch.contact)
-    run.ways = {switch.contact: switch.way} if switch.way else {}
-    run.moving = True
-
-
 def _rest(run: Replay) -> StartDeparture | Arrival | Released | Switched | Outcome:
-    """Wait at rest until the formation can start, the goal is near or something gives way."""
+    """Wait at rest until the formation can start, the goal is near or balance is lost."""
     y = run.y
     before = run.stored
     y[5:10] = 0.0
@@ -294,8 +259,12 @@ def _rest(run: Replay) -> StartDeparture | Arrival | Released | Switched | Outco
             if isinstance(change, StartDeparture):
                 _advance(run, run.time(change.x))
                 return change
-            if isinstance(change, Collapse) and not _settles(run, change) and not _touches(run):
-                return _collapse(run, rest, change)
+            if isinstance(change, Collapse):
+                # Balance may be lost where the torques are about to step or to be the next phase's.
+                t = run.time(change.x)
+                soon = run.coming_step - t <= run.tolerances.rest_window
+                if not (t < run.settled_by or soon or _touches(run)):
+                    return _collapse(run, rest, change)
         stop = run.breaks[run.piece + 1]
         if run.t < run.settled_by < stop:
             _advance(run, run.settled_by)
@@ -304,25 +273,15 @@ def _rest(run: Replay) -> StartDeparture | Arrival | Released | Switched | Outco
             run.next_piece()
 
 
-def _settles(run: Replay, change: Collapse) -> bool:
-    """Whether the torques step, or become those of the next phase, before a contact could part."""
-    t = run.time(change.x)
-    return t < run.settled_by or run.coming_step - t <= run.tolerances.rest_window
-
-
 def _touches(run: Replay) -> bool:
-    """Whether contacts of the phase that has ended help to hold this piece of the torques.
-
-    That counts where torques do not step: they pass from the ones to the others.
-    """
-    if run.left is None or not run.problem.scene.has_slow_motors:
+    """Whether the contacts of both phases balance rate-limited torques on the present piece."""
+    if run.previous is None or not run.problem.scene.has_slow_motors:
         return False
-    contacts = dict.fromkeys((*run.phase.formation.contacts, *run.left.contacts))
+    contacts = dict.fromkeys((*run.phase.formation.contacts, *run.previous.contacts))
     coefficients = run.coefficients[run.piece]
     x = np.linspace(run.fraction(run.t), 1.0, _HELD_AT)[:, None]
     torques = x ** np.arange(coefficients.shape[1]) @ coefficients.T
-    given = run.problem.scene, tuple(contacts), run.y[:5]
-    return all(balances(*given, tau) for tau in torques)
+    return all(balances(run.problem.scene, tuple(contacts), run.y[:5], tau) for tau in torques)
 
 
 def _advance(run: Replay, stop: float) -> None:
@@ -354,12 +313,8 @@ def _collapse(run: Replay, rest: Rest, change: Collapse) -> Released | Switched 
 
 
 def _collect(run: Replay, outcome: Outcome, missed_by: float) -> Simulation:
-    """Put everything recorded together."""
     counts = (run.steps, run.rejected)
     return collect(run.problem, run.sections, run.events, run.torques, outcome, missed_by, counts)
-
-
-__all__ = ["simulate"]
 
 
 def move(run: Replay) -> Ending:
@@ -388,10 +343,7 @@ def move(run: Replay) -> Ending:
 
 
 def _accept(run: Replay, t: float, arrives: bool = False) -> Array:
-    """Take the step just made, to time `t`; `arrives`: the end of the phase is passed by rounding.
-
-    It is kept, so that more can be seen of what lies within it.
-    """
+    """Accept and keep the step to time `t`; `arrives`: it passes the phase's end by rounding."""
     begin, inputs = run.t, run.stepper.inputs.copy()
     row = run.accept(t)
     run.sections[-1].steps.append(Step(begin, t - begin, inputs, row, run.impact, arrives))
@@ -424,20 +376,18 @@ def _try_step(run: Replay, target: float) -> tuple[float, bool]:
 
 
 def _is_at_end(run: Replay, t: float) -> bool:
-    """Whether the step just tried ends at the end of the phase, and at a torque break.
+    """Whether the step just tried ends the phase, at a torque break and but for rounding.
 
-    By rounding a planned motion ends a little beyond the end of its phase, or has just turned back.
-    It has to be at rest there, or to reach a contact softly; a coordinate, or the end of a
-    contact's range, is passed at any speed, just then, and an impact comes at any, with the step of
-    the torques that goes with it, or as they end. A motion that is about to stop instead may step
-    its torques before it is there.
+    It has to be at rest there or to reach a contact softly. A coordinate, or the end of a contact's
+    range, is passed at any speed; an impact comes at any, with its torque step or at their end.
     """
     s = run.stepper
     if t != run.breaks[run.piece + 1] or not is_there(run) or _comes_later(run):
         return False
     speed = abs(_measure_rate(run))
     if run.passes:
-        speed = 0.0 if _is_passing(run) else math.inf
+        distance = abs(run.value(s.rows.until)) / run.until_unit
+        speed = 0.0 if distance <= SETTLING * speed else math.inf
     elif run.phase.end is End.IMPACT and _strikes(run):
         coming = run.piece + 1
         speed = 0.0 if coming >= len(run.steps_at) or run.steps_at[coming] else speed
@@ -448,19 +398,8 @@ def _is_at_end(run: Replay, t: float) -> bool:
     return speed < SLOW and bool(pressing.min() >= -run.tolerances.force) and not find_slipping(s)
 
 
-def _is_passing(run: Replay) -> bool:
-    """Whether a motion that passes the end of a phase is there but for rounding of the time."""
-    distance = abs(run.value(run.stepper.rows.until)) / run.until_unit
-    return distance <= SETTLING * abs(_measure_rate(run))
-
-
 def _comes_later(run: Replay) -> bool:
-    """Whether a motion whose deceleration fades still comes nearer, at a break that is not its end.
-
-    It is slow, and near the end of its phase, long before it is there. What slow motors do not make
-    step may have breaks anywhere, as tables of torques do. What comes within the time for which
-    a formation is held at rest may as well be there.
-    """
+    """Whether a motion with fading deceleration still approaches, at a break before its end."""
     coming = run.piece + 1
     if not run.problem.scene.has_slow_motors or run.phase.end is not End.REST:
         return False
@@ -484,7 +423,7 @@ def _pass_break(run: Replay) -> Ending | None:
     if not run.next_piece():
         return None
     run.note(EventKind.TORQUE_STEP, f"the torques step {run.when()}")
-    return look_again(run)
+    return restart(run)
 
 
 def _stop_at_event(run: Replay, start: Array, h: float) -> Ending | None:
@@ -516,9 +455,10 @@ def _reach(run: Replay) -> Arrival:
     rate = -float(s.outputs[s.to.until_rate])
     # A planned motion that comes this early by its error would have stopped v / a later.
     stopping = 2 * _time_to_stop(run)
-    left = min(stopping, run.tolerances.longest_window) if stopping < math.inf else 0.0
+    remaining = min(stopping, run.tolerances.longest_window) if stopping < math.inf else 0.0
     slow = abs(_measure_rate(run)) < SLOW
-    return Arrival(rate, max(left, run.tolerances.settling) if slow else left, left=left)
+    window = max(remaining, run.tolerances.settling) if slow else remaining
+    return Arrival(rate, window, remaining=remaining)
 
 
 def _measure_rate(run: Replay) -> float:
@@ -537,26 +477,18 @@ def _time_to_stop(run: Replay) -> float:
 
 
 def _strikes(run: Replay) -> bool:
-    """Whether the phase ends with an impact here, and not at rest but for an error of the motion.
-
-    Where impulses do not allow an impact a planned motion stops instead.
-    """
+    """Whether the phase ends here with an impact, and not at rest but for an error."""
     rate, time = -_measure_rate(run), _time_to_stop(run) / run.problem.scene.scales.time
     stops = rate < SLOW or rate * time / 2 < REACHED
     return run.phase.end is End.IMPACT and not stops
 
 
 def _pass_on(run: Replay) -> Arrival:
-    """The end of a phase is reached that the motion passes.
-
-    If a planned motion comes early by its error, the torques of the next formation have still to
-    come. Until then the old one's contacts go on, while the gap dips below zero by that error.
-    """
+    """The end of a phase is passed; the torques of the next one may still have to come."""
     s = run.stepper
     s.inputs[s.at.t] = run.t
-    rate, settling = -float(s.outputs[s.to.until_rate]), run.tolerances.settling
-    window = settling
-    strikes = run.phase.end is End.IMPACT
+    window = settling = run.tolerances.settling
+    rate, strikes = -float(s.outputs[s.to.until_rate]), run.phase.end is End.IMPACT
     if run.passes and rate > 0:
         # A motion that is off by rounding comes the earlier the slower it is.
         early = PASSED * run.until_unit / rate
@@ -572,7 +504,11 @@ def _pass_on(run: Replay) -> Arrival:
 
 
 def enter(run: Replay, phase: Phase, following: Phase | None) -> None:
-    """Take the formation of `phase`; what it does not let the motion keep is lost to impact."""
+    """Enter the formation of `phase`; the energy that its projection takes is lost to impact.
+
+    A phase without an `until` ends where a contact of `releasable` parts, or else where contacts
+    of `resting` come to rest, as they roll in the next phase, or one of `slipping` slips.
+    """
     run.phase = phase
     before = run.stored
     run.y[:5] = _close(run, phase.formation)
@@ -587,22 +523,25 @@ def enter(run: Replay, phase: Phase, following: Phase | None) -> None:
         run.side = math.copysign(1.0, run.y[0 if until.coordinate == "x" else 2] - until.value)
     run.stuck = set()
     run.until_unit = measure_until(run.problem.scene, until)
-    run.passes = _is_passed(phase)
+    # At any speed a contact can be gained only where it goes on for another one.
+    gained, formation = until.contact, phase.formation
+    run.passes = phase.end is End.SMOOTH and (
+        gained is None or takes_over(gained, formation.scene, formation.contacts)
+    )
     run.take()
-    run.limits = [limit.text for limit in open_limits(phase.formation, until)]
-    run.releasable = find_releasable(phase, following)
-    run.resting, run.slipping = find_switching(phase, following)
+    run.limits = [limit.text for limit in open_limits(formation, until)]
+    run.releasable, run.resting, run.slipping = (), frozenset(), frozenset()
     run.has_slid = False
-
-
-def _is_passed(phase: Phase) -> bool:
-    """Whether a motion may pass the end of a phase at any speed, without an impact.
-
-    A contact can be gained so where it goes on for another one, and softly elsewhere.
-    """
-    gained, own = phase.until.contact, phase.formation
-    smooth = phase.end is End.SMOOTH
-    return smooth and (gained is None or takes_over(gained, own.scene, own.contacts))
+    if phase.end is End.REST or following is None or not until.is_release:
+        return
+    names, kept = formation.names, following.formation.names
+    rolled, rolls = ({c.name for c in p.formation.rolling} for p in (phase, following))
+    run.releasable = tuple(name for name in names if name not in kept)
+    if not run.releasable:
+        run.resting = frozenset(k for k, name in enumerate(names) if name in rolls - rolled)
+    run.slipping = frozenset(
+        k for k, name in enumerate(names) if name in rolled - rolls and name in kept
+    )
 
 
 def _close(run: Replay, formation: Formation) -> Array:
@@ -614,7 +553,7 @@ def _close(run: Replay, formation: Formation) -> Array:
 
 
 def collide(run: Replay, following: Phase) -> Outcome | None:
-    """Throw the velocity onto the next formation; what ends the motion if that is not possible."""
+    """Plastic impact onto the next formation; the outcome if it is not possible."""
     z = _close(run, following.formation)
     impact = compute_impact(run.phase.formation, following.formation, z, run.y[5:10])
     name, least = impact.least
@@ -634,28 +573,6 @@ def collide(run: Replay, following: Phase) -> Outcome | None:
     return None
 
 
-def find_releasable(phase: Phase, following: Phase | None) -> tuple[str, ...]:
-    """Names of the contacts whose release ends the phase."""
-    if phase.end is End.REST or following is None or not phase.until.is_release:
-        return ()
-    kept = following.formation.names
-    return tuple(name for name in phase.formation.names if name not in kept)
-
-
-def find_switching(phase: Phase, following: Phase | None) -> tuple[frozenset[int], frozenset[int]]:
-    """Contacts that come to rest, as they roll in the next phase, and that slip, as they slide.
-
-    A phase without an `until` ends there; if it lets a contact go, then where that happens.
-    """
-    if phase.end is End.REST or following is None or not phase.until.is_release:
-        return frozenset(), frozenset()
-    own, coming = ({c.name for c in p.formation.rolling} for p in (phase, following))
-    names, kept = phase.formation.names, following.formation.names
-    rests = {k for k, name in enumerate(names) if name in coming - own}
-    slips = {k for k, name in enumerate(names) if name in own - coming and name in kept}
-    return frozenset() if set(names) - set(kept) else frozenset(rests), frozenset(slips)
-
-
 def project_velocity(formation: Formation, z: Array, v: Array) -> Array:
     """Velocity nearest to `v` in the metric M5 that keeps every constraint, shape (5,)."""
     P = formation.evaluate(z[None], v[None]).P[0]
@@ -663,7 +580,7 @@ def project_velocity(formation: Formation, z: Array, v: Array) -> Array:
 
 
 def set_off(run: Replay, departure: StartDeparture) -> None:
-    """Give the stepper the directions of a motion that starts from rest."""
+    """Set the friction signs of a motion that starts from rest."""
     formation = run.phase.formation
     grips = find_grips(formation, np.concatenate(departure.directions))
     if formation.n_constraints < 4:
@@ -679,11 +596,7 @@ def set_off(run: Replay, departure: StartDeparture) -> None:
 
 
 def go_on(run: Replay) -> Ending | None:
-    """Give the stepper the directions of the present velocity; what ends the motion at once.
-
-    Friction decides for what does not slide or turn here; with one freedom that takes the first
-    direction that does not jam, as it has to go one way just after.
-    """
+    """Set the friction signs of the present velocity; what ends the motion at once, if anything."""
     s = run.stepper
     y, formation = run.y, run.phase.formation
     s.inputs[s.at.y], s.inputs[s.at.t] = y, run.t
@@ -693,52 +606,46 @@ def go_on(run: Replay) -> Ending | None:
     rates = np.concatenate([formation.evaluate(y[None, :5], v[None]).A_t[0] @ v, v[3:]])
     signs = np.where(rates < 0, -1.0, 1.0)
     for row, name in enumerate(formation.names):
-        signs[row] = run.ways.get(name, signs[row])
-    run.ways = {}
-    signs[[row for row in range(len(signs)) if row not in _list_rows(formation)]] = 0.0
-    _point(run, signs)
+        signs[row] = run.slip_signs.get(name, signs[row])
+    run.slip_signs = {}
+    movable = {row for unit in list_units(formation) for row in unit.rows}
+    signs[[row for row in range(len(signs)) if row not in movable]] = 0.0
+    _set_signs(run, signs)
     if s.is_free:
-        return look_again(run, enters=True)
+        return restart(run, enters=True)
     slow = STANDING * measure_rates(run.problem.scene, formation.n_contacts)
     still = np.flatnonzero((np.abs(rates) < slow) & (signs != 0)).tolist()
     for choice in product((1.0, -1.0), repeat=len(still)):
         tried = signs.copy()
         tried[still] *= choice
-        _point(run, tried)
+        _set_signs(run, tried)
         if s.outputs[s.to.ratio] > 0:
             break
     else:
-        _point(run, signs)
-    return look_again(run)
+        _set_signs(run, signs)
+    return restart(run)
 
 
-def _list_rows(formation: Formation) -> set[int]:
-    """Contacts and joints that may slide or turn."""
-    return {row for unit in list_units(formation) for row in unit.rows}
-
-
-def _point(run: Replay, signs: Array) -> None:
-    """Look with the given directions of contacts and joints, shape (n_c + 2,)."""
+def _set_signs(run: Replay, signs: Array) -> None:
+    """Evaluate the state with friction signs of contacts and joints, shape (n_c + 2,)."""
     s = run.stepper
     s.inputs[s.at.Xi], s.inputs[s.at.sigma] = signs[:-2], signs[-2:]
     s.look()
 
 
 def look_within(run: Replay, times: Array) -> list[float]:
-    """Record the states at increasing instants, shape (n,) [s], within steps that have been made.
-
-    Instants that lie within none are left out.
-
-    Returns
-    -------
-    list of float, [s]
-        Where something has happened that the steps missed.
-    """
+    """Record states at increasing instants, (n,) [s], within steps; those of missed events."""
     missed: list[float] = []
+    scene, scales = run.problem.scene, run.problem.scene.scales
     for section, stepper in zip(run.sections, run.steppers, strict=True):
         if not section.steps:
             continue
-        at, slack = stepper.at, _measure_slack(run, section, stepper)
+        # Within a step more counts as rounding than at its end.
+        at, rows, slack = stepper.at, stepper.rows, stepper.slack.copy()
+        slack[rows.slide] = slack[rows.speed] = STANDING * scales.speed
+        slack[rows.speed] *= scales.mass**0.5
+        slack[rows.joint] = STANDING / scales.time
+        slack[rows.until] = ROUNDING_LIMIT * measure_until(scene, section.phase.until)
         begins = np.array([step.t for step in section.steps])
         owners = np.searchsorted(begins, times, side="left") - 1
         for time, owner in zip(times.tolist(), owners.tolist(), strict=True):
@@ -757,21 +664,8 @@ def look_within(run: Replay, times: Array) -> list[float]:
     return missed
 
 
-def _measure_slack(run: Replay, section: Section, stepper: ModeStepper) -> Array:
-    """How far below zero each event value counts as rounding within a step."""
-    rows, slack, scales = stepper.rows, stepper.slack.copy(), run.problem.scene.scales
-    slack[rows.slide] = slack[rows.speed] = STANDING * scales.speed
-    slack[rows.speed] *= scales.mass**0.5
-    slack[rows.joint] = STANDING / scales.time
-    slack[rows.until] = ROUNDING_LIMIT * measure_until(run.problem.scene, section.phase.until)
-    return slack
-
-
 def shows(step: Step, stepper: ModeStepper, slack: Array) -> bool:
-    """Whether something happens in a step up to the place just looked at.
-
-    One that ends with the phase may have passed its end, and turned back.
-    """
+    """Whether an event lies in a step before the instant just evaluated; its end may be passed."""
     short = stepper.outputs[stepper.to.events] + slack < 0
     if step.arrives:
         rows = stepper.rows

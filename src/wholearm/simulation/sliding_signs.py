@@ -1,20 +1,15 @@
-"""Whether what comes to rest in a moving formation sticks, turns back or goes on: Coulomb's law.
+"""Contact mode after a sliding or joint velocity reaches zero: stick, reverse or continue.
 
-Where a sliding speed or a joint's speed is zero, friction is whatever is consistent: a contact may
-slide either way if it then accelerates that way, or stick if its c_t stays in the cone; a joint
-likewise. Each combination for everything that stands still is one linear system, and the contacts
-have to press. Each is judged a moment later, by what its accelerations and forces lead to until
-then, so that a force that leaves its cone is told from one that comes back into it.
+A contact at rest may slide with a sign if it then accelerates with it, or stick if its c_t stays in
+the cone; a joint likewise. Each combination is one linear system, and every contact has to press.
+Forces are evaluated a short time later, which tells one that leaves its cone from one that returns.
+The first combination that is consistent by more than rounding is taken, or else the one with the
+largest margin. What has just come to rest tries to reverse, then to stick, then to continue; all
+else tries its present mode, or to slip if its cone is just reached.
 
-Where friction is moderate exactly one combination is consistent. The first one is taken that is so
-by more than rounding. What has just come to rest tries to turn back, then to stick, then to go on;
-all else tries to go on as it does, and what friction holds, if its cone is just reached, to slip.
-If none is clear the best one is taken.
-
-Where what is stuck lets something else not move either, as a finger that leans on a stuck object,
-that has no independent constraint. Its friction is indeterminate, and may be taken as that of
-either direction: some such choice is consistent for as long as any friction is, since what friction
-has left elsewhere is a monotonic function of each. It counts as stuck, too.
+What cannot move because something else sticks has no independent constraint. Its friction is
+indeterminate and has either sign: margins elsewhere are monotonic in it, so some sign is consistent
+for as long as any friction is. It counts as stuck.
 """
 
 from __future__ import annotations
@@ -29,41 +24,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
-from ..common.errors import JammingError
+from ..common.errors import JammingError, SimulationError
 from ..contacts.formation import Formation
 from ..scene.model import Scene
 from .events import EventKind
+from .layout import evaluate_piece
 from .modes import Mode, ModeRows, Response, Unit, find_fixed, find_grips, list_units, respond
 from .replay import Replay
 from .tolerances import STANDING, is_slower
 
-CLEAR = 1e-8
-"""Least margin of a clear decision, relative to the scene's forces, torques or accelerations."""
-TRIES = 50
-"""Most decisions in a row without any time passing."""
+CLEAR = 1e-8  # least margin of a clear decision, over the scene's units
+TRIES = 50  # most decisions in a row without any time passing
 
 
 class Choice(NamedTuple):
-    """A combination of directions, and how far it is from being inconsistent."""
+    """Combination of friction signs, with its margins."""
 
     signs: Array  # (n_c + 2,): directions of contacts and joints, zero for what is held or rolls
-    # (n_c + 2,): whether each is held, or cannot move for what else is held
-    fixed: NDArray[np.bool_]
-    # least of the relative accelerations along the directions and reserves of friction
-    margin: float
+    fixed: NDArray[np.bool_]  # (n_c + 2,): held, or immobile because of what else is held
+    margin: float  # least relative acceleration along the signs or friction margin
     pressing: float  # least c_n over the scene's force
 
 
 def choose_mode(
     run: Replay, turned: Sequence[int] = (), *, time: float | None = None, enters: bool = False
 ) -> bool:
-    """Let friction decide for everything that stands still; whether the motion has ended.
+    """Choose the friction signs of all that stands still; whether the motion has ended.
 
-    Parameters
-    ----------
-    turned      contacts, then joints, whose speed has just come to zero
-    time : [s]  when that was, if not at present
-    enters      whether the directions so far are a guess, as a formation is entered
+    Parameters as of `jumps.restart`.
     """
     s = run.stepper
     formation, scene = run.phase.formation, run.problem.scene
@@ -83,7 +71,11 @@ def choose_mode(
         return False
     if is_slower(scene, run.y[5:10], STANDING):
         return True
-    run.count_decision(TRIES)
+    count = run.decided[1] + 1 if run.t <= run.decided[0] else 1
+    run.decided = (run.t, count)
+    if count > TRIES:
+        names = " ".join(formation.names)
+        raise SimulationError(f"sticking and slipping of {names} do not end {run.where()}")
     orders = [_list_options(run, unit, float(signs[unit.rows[0]]), turned) for unit in still]
     choice = _choose(run, signs, still, orders)
     _take(run, choice.signs, still)
@@ -130,63 +122,61 @@ def _list_options(
     s = run.stepper
     holder = s.mode.holders.index(unit.rows)
     low, high = s.outputs[s.to.events][s.rows.cone].reshape(2, -1)[:, holder]
-    way = 1.0 if high < low else -1.0
+    sign = 1.0 if high < low else -1.0
     # Friction is at the edge of its cone and opposes the slip to come.
     edge = min(low, high) < s.slack[s.rows.cone.start + holder]
-    return (way, -way, 0.0) if edge else (0.0, way, -way)
+    return (sign, -sign, 0.0) if edge else (0.0, sign, -sign)
 
 
 def _choose(
     run: Replay, signs: Array, still: Sequence[Unit], orders: Sequence[tuple[float, ...]]
 ) -> Choice:
-    """The directions of the first clear combination, or of the best.
-
-    Raises
-    ------
-    JammingError  if no combination is consistent, and it is not that a contact would have to pull
-    """
-    judge = _Judge(run, still)
-    found: list[Choice] = []
+    """Signs of the first clear combination or of the best; `JammingError` if none is consistent."""
+    evaluation = _Evaluation(run, still)
+    choices: list[Choice] = []
     for options in product(*orders):
         tried = signs.copy()
         for unit, sign in zip(still, options, strict=True):
             tried[list(unit.rows)] = sign
-        choice = judge.judge(tried)
+        choice = evaluation.measure(tried)
         if choice is None:
             continue
         if choice.margin > CLEAR and choice.pressing > -CLEAR:
             return choice
-        found.append(choice)
-    pressing = [choice for choice in found if choice.pressing > -CLEAR]
+        choices.append(choice)
+    pressing = [choice for choice in choices if choice.pressing > -CLEAR]
     best = max(pressing, key=lambda choice: choice.margin, default=None)
     if best is not None and best.margin > -CLEAR:
         return best
     # A contact is about to be lost, and its forces say which.
-    pulling = [choice for choice in found if choice.pressing <= -CLEAR]
+    pulling = [choice for choice in choices if choice.pressing <= -CLEAR]
     if pulling:
         return max(pulling, key=lambda choice: choice.margin)
-    if judge.worst <= 0:
-        run.fail_to_step(judge.worst)
+    if evaluation.worst <= 0:
+        run.fail_to_step(evaluation.worst)
     names = " ".join(run.phase.formation.names)
     raise JammingError(
         f"{names} jams {run.where()}: no combination of sliding and sticking is consistent"
     )
 
 
-class _Judge:
-    """Looks at combinations of directions at the present state."""
+class _Evaluation:
+    """Margins of combinations of friction signs at the present state."""
 
     def __init__(self, run: Replay, still: Sequence[Unit]) -> None:
         self.formation, self.still = run.phase.formation, still
         self.scene = run.problem.scene
         self.h = run.tolerances.settling
         self.z, self.v = run.y[:5].copy(), run.y[5:10].copy()
-        self.load, self.later = (np.array([1.0, *run.torque(t)]) for t in (run.t, run.t + self.h))
+        piece = run.torques, run.piece
+        self.load, self.later = (
+            np.array([1.0, *evaluate_piece(*piece, t)]) for t in (run.t, run.t + self.h)
+        )
         self.rows = evaluate_rows(self.formation, self.z, self.v)
         self.worst = 1.0
 
-    def judge(self, signs: Array) -> Choice | None:
-        """Judge one combination; None if it jams or leaves its forces open."""
+    def measure(self, signs: Array) -> Choice | None:
+        """Margins of one combination; None if it jams or leaves its forces undetermined."""
         mode = Mode(self.formation, find_grips(self.formation, signs))
         if mode.n_constraints > 4:
             return None
@@ -199,17 +189,6 @@ class _Judge:
         then = self._respond(mode, signs, evaluate_rows(self.formation, z, v), v)
         if then is None:
             return None
-        return self._measure(mode, signs, now, then)
-
-    def _respond(self, mode: Mode, signs: Array, rows: ModeRows, v: Array) -> Response | None:
-        response = respond(mode, signs, rows, v)
-        if response is not None and not response.ratio > 0:
-            self.worst = min(self.worst, response.ratio)
-            return None
-        return response
-
-    def _measure(self, mode: Mode, signs: Array, now: Response, then: Response) -> Choice:
-        """Compare accelerations with directions, and what friction gives with what it can give."""
         scales, count = self.scene.scales, self.formation.n_contacts
         gained = (now.rates @ self.load + then.rates @ self.later) / 2
         gained = signs * gained / (measure_rates(self.scene, count) / scales.time)
@@ -224,9 +203,15 @@ class _Judge:
                 margins.append(cones[mode.holders.index(unit.rows)] / force)
             elif abs(gained[row]) > CLEAR:
                 margins.append(gained[row])
-        return Choice(
-            signs, fixed, float(min(margins)), float(force_limits[:count].min() / scales.force)
-        )
+        pressing = float(force_limits[:count].min() / scales.force)
+        return Choice(signs, fixed, float(min(margins)), pressing)
+
+    def _respond(self, mode: Mode, signs: Array, rows: ModeRows, v: Array) -> Response | None:
+        response = respond(mode, signs, rows, v)
+        if response is not None and not response.ratio > 0:
+            self.worst = min(self.worst, response.ratio)
+            return None
+        return response
 
 
 def evaluate_rows(formation: Formation, z: Array, v: Array) -> ModeRows:

@@ -1,17 +1,16 @@
-"""The ways in which a formation at rest could start to move.
+"""Start modes of a formation at rest: friction signs and sticking, with affine accelerations.
 
-With one freedom these are the two ways along the free direction. With more, each choice of the
-directions in which contacts slide and joints turn, and of what sticks and is held, makes the
-accelerations affine in the torques. A choice is consistent if contacts and joints then accelerate
-in those directions, friction can hold the others, every contact presses, and nothing that touches
-closes further. Choices in which nothing is held are tried first.
+With one freedom these are both directions along it. With more, each choice of signs of sliding and
+turning, and of what sticks, makes the accelerations affine in the torques. It is consistent if
+contacts and joints accelerate with those signs, friction can hold the others, every contact presses
+and nothing that touches closes further. Choices without sticking are tried first.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import product
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,13 +21,9 @@ from ..mechanics.dynamics import Directions
 from .modes import Mode, ModeRows, Response, find_grips, list_units, respond, share_mode
 from .tolerances import ROUNDING_FORCE, Tolerances, find_tolerances, measure_units
 
-_STEP = 3e-5
-"""Step of the difference quotient, in units of the scene."""
-_KINK = 1e-2
-"""Rise of a limit both ways, over the step, from which it has a kink and no gradient."""
-_GRAZE = 1e-3
-"""Acceleration with which a gap may close, over those of sliding and turning in all: planned
-motions that graze a link between their nodes do. How far it then closes is looked at on the way."""
+_STEP = 3e-5  # step of the difference quotient, in units of the scene
+_KINK = 1e-2  # rise of a limit both ways, over the step, from which it has a kink and no gradient
+_GRAZE = 1e-3  # largest closing acceleration of a gap that grazes, over sliding and turning
 
 
 class StartDeparture(NamedTuple):
@@ -39,45 +34,10 @@ class StartDeparture(NamedTuple):
     directions: Directions
 
 
-class StartPath(Protocol):
-    """One way in which a formation at rest could start to move."""
-
-    @property
-    def directions(self) -> Directions:
-        """Directions of contacts and joints, zero for what friction holds."""
-
-    @property
-    def force_limits(self) -> Array:
-        """Rows with H c = force_limits @ (1, tau_1, tau_2), positive where the contacts hold.
-
-        Shape (n_c + 2 R, 3) [N]; the first n_c are the normal forces.
-        """
-
-    @property
-    def ratio(self) -> float:
-        """Reduced inertia over that without friction; jammed at zero and below."""
-
-    @property
-    def margins(self) -> list[tuple[Array, float]]:
-        """Rows r and offsets d with r @ (1, tau_1, tau_2) + d >= 0 while it moves this way."""
-
-    def drive(self, tau: Array) -> float:
-        """How strongly it accelerates this way, in the metric M5."""
-
-    def slides(self, tau: Array) -> bool:
-        """Whether it accelerates this way, if every contact can press or pull."""
-
-    def moves(self, tau: Array) -> bool:
-        """Whether the formation starts to move this way under torques `tau`, shape (2,)."""
-
-    def depart(self, x: float, tau: Array) -> StartDeparture:
-        """Start this way at `x` of a piece, where the torques are `tau`."""
-
-
 class RestDirection(NamedTuple):
-    """One way in which a formation at rest could move."""
+    """Start mode with one freedom."""
 
-    heading: Array  # (5,): the direction, of length one in the metric M5
+    heading: Array  # (5,): direction, of length one in the metric M5
     directions: Directions  # the friction that opposes it
     acceleration: Array  # (3,): acceleration along `heading` is acceleration @ (1, tau_1, tau_2)
     # (n_c + 2 R, 3): likewise what has to be positive for the contacts to hold, H c [N]
@@ -89,31 +49,31 @@ class RestDirection(NamedTuple):
 
     @property
     def margins(self) -> list[tuple[Array, float]]:
-        """Rows r and offsets d with r @ (1, tau_1, tau_2) + d >= 0 while it moves this way."""
+        """Rows r and offsets d with r @ (1, tau_1, tau_2) + d >= 0 where it is consistent."""
         rounding = self.tolerances
         force_limits = [(row, rounding.force) for row in self.force_limits]
         return [(self.acceleration, -rounding.drive), *force_limits]
 
     def drive(self, tau: Array) -> float:
-        """How strongly it accelerates this way, in the metric M5."""
+        """Acceleration along `heading`, in the metric M5."""
         return float(self.acceleration @ [1.0, *tau])
 
     def slides(self, tau: Array) -> bool:
-        """Whether it accelerates this way, if every contact can press or pull."""
+        """Whether it accelerates along `heading`, if every contact can press or pull."""
         return self.drive(tau) > self.tolerances.drive and not self.closes
 
     def moves(self, tau: Array) -> bool:
-        """Whether the formation starts to move this way under torques `tau`, shape (2,)."""
+        """Whether the formation starts in this mode under torques `tau`, shape (2,)."""
         keeps = float((self.force_limits @ [1.0, *tau]).min()) >= -self.tolerances.force
         return self.ratio > 0 and keeps and self.slides(tau)
 
     def depart(self, x: float, tau: Array) -> StartDeparture:
-        """Start this way at `x` of a piece; the torques do not matter."""
+        """Start at `x` of a piece, whatever the torques."""
         return StartDeparture(x, self.heading, self.directions)
 
 
 class Slack(NamedTuple):
-    """What counts as rounding in the rows of a pattern of the same names."""
+    """Rounding of the rows of the same names of a `ModeChoice`."""
 
     drive: float
     slips: Array
@@ -123,12 +83,9 @@ class Slack(NamedTuple):
 
 
 class Touching:
-    """What touches at a configuration `z` but is not in the formation: the limits `near` zero.
+    """Limits `near` zero at `z` of what touches outside the formation, with gradient (k, 5).
 
-    Attributes
-    ----------
-    gradient : (k, 5)  of those that have one. Where a pointed tip is at a vertex the gap of an edge
-                       has none.
+    A pointed tip at a vertex has a kink instead.
     """
 
     def __init__(self, formation: Formation, z: Array, near: NDArray[np.bool_]) -> None:
@@ -157,7 +114,7 @@ class Touching:
 
 
 class ModeChoice(NamedTuple):
-    """A choice of directions; quantities at rest are rows @ (1, tau_1, tau_2)."""
+    """Start mode with more freedoms; quantities at rest are rows @ (1, tau_1, tau_2)."""
 
     directions: Directions  # zero for what friction holds
     mass: Array  # (5,): diagonal of M5
@@ -177,23 +134,18 @@ class ModeChoice(NamedTuple):
 
     @property
     def margins(self) -> list[tuple[Array, float]]:
-        """Rows r and offsets d with r @ (1, tau_1, tau_2) + d >= 0 while it moves this way."""
-        kinds = (
-            (self.slips, self.slack.slips),
-            (self.openings, self.slack.openings),
-            (self.force_limits, self.slack.force_limits),
-            (self.grips, self.slack.grips),
-        )
-        pairs = (pair for kind in kinds for pair in zip(*kind, strict=True))
-        return [(row, float(offset)) for row, offset in pairs]
+        """As of `RestDirection`."""
+        kinds = ("slips", "openings", "force_limits", "grips")
+        pairs = [(getattr(self, kind), getattr(self.slack, kind)) for kind in kinds]
+        return [(row, float(offset)) for pair in pairs for row, offset in zip(*pair, strict=True)]
 
     def drive(self, tau: Array) -> float:
-        """How strongly it accelerates, in the metric M5."""
+        """Acceleration in the metric M5."""
         acceleration = self.acceleration @ [1.0, *tau]
         return float(np.sqrt(self.mass @ acceleration**2))
 
     def slides(self, tau: Array) -> bool:
-        """Whether contacts and joints accelerate in their directions and nothing closes."""
+        """Whether contacts and joints accelerate with their signs and nothing closes."""
         load, slack = [1.0, *tau], self.slack
         return (
             self.ratio > 0
@@ -205,28 +157,25 @@ class ModeChoice(NamedTuple):
         )
 
     def moves(self, tau: Array) -> bool:
-        """Whether it slides this way and every contact presses."""
-        return bool(
-            (self.force_limits @ [1.0, *tau] >= -self.slack.force_limits).all()
-        ) and self.slides(tau)
+        """Whether it slides and every contact presses."""
+        presses = (self.force_limits @ [1.0, *tau] >= -self.slack.force_limits).all()
+        return bool(presses) and self.slides(tau)
 
     def depart(self, x: float, tau: Array) -> StartDeparture:
-        """Start this way at `x` of a piece, where the torques are `tau`."""
+        """Start at `x` of a piece, where the torques are `tau`."""
         heading = self.acceleration @ [1.0, *tau] / self.drive(tau)
         return StartDeparture(x, heading, self.directions)
+
+
+StartMode = RestDirection | ModeChoice
 
 
 def find_patterns(
     formation: Formation, z: Array, near: NDArray[np.bool_], held: bool
 ) -> Iterator[ModeChoice]:
-    """Yield every choice of directions at a configuration at rest; contacts that roll have none.
+    """Yield every start mode at `z`, (5,), where limits `near`, (n_limits,), are zero.
 
-    Parameters
-    ----------
-    z : (5,)
-    near : (n_limits,)  which limits of the formation are zero at `z`
-    held                whether to yield those in which friction holds something, the least first,
-                        or the others
+    `held`: only those with sticking, the least first, or else the others.
     """
     kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
     touching = Touching(formation, z, near)
@@ -239,15 +188,14 @@ def find_patterns(
         signs = np.zeros(formation.n_contacts + 2)
         for unit, sign in zip(units, options, strict=True):
             signs[list(unit.rows)] = sign
-        grips = find_grips(formation, signs)
-        mode = share_mode(formation, grips)
+        mode = share_mode(formation, find_grips(formation, signs))
         pattern = _build_pattern(mode, signs, kinematics, touching)
         if pattern is not None:
             yield pattern
 
 
 def respond_at_rest(mode: Mode, signs: Array, kinematics: Kinematics) -> Response | None:
-    """How a mode at rest answers to torques; None if its forces are not determined."""
+    """Accelerations and forces of a mode at rest; None if its forces are not determined."""
     none = np.zeros(mode.formation.n_contacts)
     rows = ModeRows(kinematics.A[0], kinematics.A_t[0], none, none)
     return respond(mode, signs, rows, np.zeros(5))

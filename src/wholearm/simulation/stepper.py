@@ -1,8 +1,4 @@
-"""Steps of the simulation, compiled for one contact formation and what friction holds in it.
-
-A whole Runge-Kutta step, with the projection on the contacts and everything that events are found
-from, is one CasADi function of one packed vector, so that a step costs one call.
-"""
+"""Compiled steps of a contact mode: Runge-Kutta, projection and events in one CasADi function."""
 
 from __future__ import annotations
 
@@ -18,26 +14,14 @@ from ..contacts.elemental import GapLimit, build_features, build_gap
 from ..contacts.formation import Formation
 from ..problem.definition import Until
 from ..scene.model import Scene
-from .layout import MOVING, STATE, EventRows, Inputs, Outputs, lay_out
+from .layout import MOVING, STATE, EventRows, Inputs, Outputs, bind, build_torque, lay_out
 from .modes import FREE, Grips, Mode
-from .runge_kutta import GLIMPSES, build_error, build_step
+from .runge_kutta import INNER_STAGES, build_error, build_step
 from .tolerances import ROUNDING_FORCE, find_tolerances, measure_units
 
 
-class Compiled(NamedTuple):
-    """What all steppers of a formation share."""
-
-    mode: Mode
-    at: Inputs  # at, to: layouts of the packed vectors
-    to: Outputs
-    rows: EventRows
-    slack: Array  # (n_events,): how far below zero each event value counts as rounding
-    step: Expression  # step, look: of the packed inputs
-    look: Expression
-
-
 class ModeStepper(NamedTuple):
-    """The compiled steps of one formation, with what sticks and is held in it.
+    """Compiled steps of one contact mode.
 
     Calling `step` or `look` reads `inputs` and overwrites `outputs`. Each simulation has its own.
     """
@@ -67,31 +51,17 @@ class ModeStepper(NamedTuple):
 def build_stepper(
     formation: Formation, until: Until, side: float, degree: int, grips: Grips = FREE
 ) -> ModeStepper:
-    """Return the steps of a formation for torques of a polynomial degree, compiled when first used.
+    """Steps of a formation for torques of a polynomial degree, compiled when first used.
 
-    Parameters
-    ----------
-    until   what ends the phase
-    side    +1 or -1: the sign of (coordinate - value) before the end, when `until` is a coordinate
-    degree  of the torque's polynomials
-    grips   what friction holds meanwhile
+    `side` is the sign of (coordinate - value) before the end of the phase, `until`.
     """
-    c = _compile(formation, until, side, degree, grips)
-    inputs, results = np.zeros(c.at.size), np.zeros(c.to.size)
-    buffers = [function.buffer() for function in (c.step, c.look)]
-    for buffer, _ in buffers:
-        buffer.set_arg(0, inputs.data)
-        buffer.set_res(0, results.data)
-    step, look = (call for _, call in buffers)
-    known = c.mode, inputs, results, c.at, c.to, c.rows, c.slack
-    return ModeStepper(*known, step, look, buffers)
+    mode, at, to, rows, slack, functions = _compile(formation, until, side, degree, grips)
+    inputs, outputs, *calls = bind(at.size, to.size, functions)
+    return ModeStepper(mode, inputs, outputs, at, to, rows, slack, *calls)
 
 
 class _Equations:
-    """Equations of a formation, as expressions of one packed vector.
-
-    They only say what calls what, which is quicker to compile than writing out every stage.
-    """
+    """Equations of a formation, as calls on one packed vector: stages are not expanded."""
 
     def __init__(
         self, formation: Formation, until: Until, side: float, degree: int, grips: Grips
@@ -100,7 +70,11 @@ class _Equations:
         self.mechanics = share_mechanics(mode, degree)
         self.short = find_tolerances(formation.scene).short
         self._measure = _build_measure(formation, until, side, self.short)
-        self._stage = _build_stage(mode, self.mechanics)
+        inputs = [
+            ca.SX.sym(n, k) for n, k in (("y", MOVING), ("t", 1), ("p", self.mechanics.at.size))
+        ]
+        _, *rows = mode.build_constraints(inputs[0][:5], inputs[0][5:10])
+        self._stage = ca.Function("stage", inputs, self.mechanics.stage(*inputs, *rows))
         self.packed = ca.MX.sym("packed", self.mechanics.at.size)
         self.least: list[Expression] = []
         self.c_n: list[Expression] = []
@@ -113,51 +87,54 @@ class _Equations:
         return rates
 
     def report(self, state: Expression, time: Expression, *errors: Expression) -> Expression:
-        """Outputs at a state, with error, dip and glimpses of the step that led there."""
+        """Outputs at a state, with error, dip and stage forces of the step that led there."""
         mechanics, packed = self.mechanics, self.packed
         _, *constraints = self.mode.build_constraints(state[:5], state[5:10])
         outputs, events, speed, least = mechanics.report(state, time, packed, *constraints)
         values, distance, approach, closest = self._measure(state[:5], state[5:10])
-        error, dip, glimpses = errors
+        error, dip, stage_forces = errors
         worst = ca.fmin(least, closest)
         return ca.vertcat(
-            outputs, error, worst, dip, glimpses, approach, events, values, distance, speed
+            outputs, error, worst, dip, stage_forces, approach, events, values, distance, speed
         )
 
-    def project(self, state: Expression) -> Expression:
-        """The state moved onto the contacts and what friction keeps."""
-        return _project(self.mode, self.mechanics, state, self.packed[self.mechanics.at.kept])
+    def project(self, y: Expression) -> Expression:
+        """Move z onto the constraints and z' to P z' = 0, the shortest way in metric M5.
+
+        A step leaves gaps of the size of its error, so one Newton iteration closes them.
+        """
+        z, v, mode, mechanics = y[:5], y[5:10], self.mode, self.mechanics
+        values, P, _, _ = mode.build_constraints(z, v)
+        kept = ca.vertcat(ca.DM(mode.formation.n_contacts, 1), self.packed[mechanics.at.kept])
+        z = z - mechanics.correct(P, values - kept)
+        _, P, _, _ = mode.build_constraints(z, v)
+        v = v - mechanics.correct(P, P @ v)
+        return ca.vertcat(z, v, y[10:])
 
 
 @lru_cache(maxsize=64)
 def _compile(
     formation: Formation, until: Until, side: float, degree: int, grips: Grips
-) -> Compiled:
-    own = _Equations(formation, until, side, degree, grips)
-    mechanics, mode, packed = own.mechanics, own.mode, own.packed
+) -> tuple[Mode, Inputs, Outputs, EventRows, Array, tuple[Expression, Expression]]:
+    """What all steppers of a formation share: mode, layouts, slack, functions step and look."""
+    equations = _Equations(formation, until, side, degree, grips)
+    mechanics, mode, packed = equations.mechanics, equations.mode, equations.packed
     at, n_c, held = mechanics.at, formation.n_contacts, len(mode.holders)
     limits = len(open_limits(formation, until))
     rows = EventRows(*lay_out(n_c, 2 * held, n_c, 2, limits, None, None))
-    brief = len(GLIMPSES) * n_c
+    brief = len(INNER_STAGES) * n_c
     to = Outputs(*lay_out(STATE, 5, n_c, n_c, 2, 5, None, None, None, None, brief, None, rows.size))
-    slack = np.concatenate([mechanics.slack, np.full(limits, own.short), [0.0, mechanics.stall]])
+    short = np.full(limits, equations.short)
+    slack = np.concatenate([mechanics.slack, short, [0.0, mechanics.stall]])
     y, t, h = packed[at.y], packed[at.t], packed[at.h]
-    end, fifth, third = build_step(own.rate, y, t, h, MOVING)
+    end, fifth, third = build_step(equations.rate, y, t, h, MOVING)
     error = mechanics.error(fifth, third, packed)
-    glimpses = ca.vertcat(*(own.c_n[stage] for stage in GLIMPSES))
-    dip = ca.mmin(ca.vertcat(*own.least))
-    seen = own.report(own.project(end), t + h, error, dip, glimpses)
-    step = ca.Function("step", [packed], [seen])
-    look = ca.Function("look", [packed], [own.report(y, t, 0, 0, ca.DM.zeros(brief))])
-    return Compiled(mode, at, to, rows, slack, step, look)
-
-
-def _build_stage(mode: Mode, mechanics: Mechanics) -> Expression:
-    """CasADi function (state, time, packed) -> (its rates, the least that holds it, c_n)."""
-    state, time = ca.SX.sym("state", MOVING), ca.SX.sym("time")
-    packed = ca.SX.sym("packed", mechanics.at.size)
-    _, *rows = mode.build_constraints(state[:5], state[5:10])
-    return ca.Function("stage", [state, time, packed], mechanics.stage(state, time, packed, *rows))
+    stage_forces = ca.vertcat(*(equations.c_n[stage] for stage in INNER_STAGES))
+    dip = ca.mmin(ca.vertcat(*equations.least))
+    outputs = equations.report(equations.project(end), t + h, error, dip, stage_forces)
+    step = ca.Function("step", [packed], [outputs])
+    look = ca.Function("look", [packed], [equations.report(y, t, 0, 0, ca.DM.zeros(brief))])
+    return mode, at, to, rows, slack, (step, look)
 
 
 def _build_measure(formation: Formation, until: Until, side: float, short: float) -> Expression:
@@ -183,20 +160,6 @@ def _build_measure(formation: Formation, until: Until, side: float, short: float
 def open_limits(formation: Formation, until: Until) -> tuple[GapLimit, ...]:
     """Limits that end a phase early: all but that of the contact to be gained."""
     return tuple(limit for limit in formation.limits if not limit.gains(until.contact))
-
-
-def _project(mode: Mode, mechanics: Mechanics, y: Expression, kept: Expression) -> Expression:
-    """Move z to closed gaps and what is kept, and z' to P z' = 0, the shortest way in metric M5.
-
-    A step leaves gaps of the size of its error, so one Newton iteration closes them to rounding.
-    """
-    z, v = y[:5], y[5:10]
-    held, P, _, _ = mode.build_constraints(z, v)
-    wanted = ca.vertcat(ca.DM(mode.formation.n_contacts, 1), kept)
-    z = z - mechanics.correct(P, held - wanted)
-    _, P, _, _ = mode.build_constraints(z, v)
-    v = v - mechanics.correct(P, P @ v)
-    return ca.vertcat(z, v, y[10:])
 
 
 @dataclass(frozen=True)
@@ -271,40 +234,32 @@ class _Model:
         )
         inputs = [self.t, self.packed, *self.rows]
         rates, c, v_t, tau, K, P = self._move()
-        held, c_n = self._hold(c), c[: self.mode.formation.n_contacts]
-        least = ca.mmin(held / self.mode.force_limit_units)
-        report = self._report(rates, c, v_t, tau, K, P, held, slack, stall)
+        H, h = self.mode.force_limit_rows
+        margins, c_n = ca.sparsify(ca.DM(H)) @ c + ca.DM(h), c[: self.mode.formation.n_contacts]
+        least = ca.mmin(margins / self.mode.force_limit_units)
+        report = self._report(rates, c, v_t, tau, K, P, margins, slack, stall)
+        row, r = self.rows[0], ca.SX.sym("r", self.mode.n_constraints)
+        lift = ca.DM(1 / scene.mass_diagonal) * row.T
+        correction = ca.densify(lift @ ca.solve(row @ lift, r))
+        fifth, third = ca.SX.sym("fifth", MOVING), ca.SX.sym("third", MOVING)
+        start, tolerance = self.packed[self.at.y][:MOVING], self.packed[self.at.tolerance]
+        error = build_error(fifth, third, start, ca.DM(measure_units(scene)), tolerance)
         return Mechanics(
             self.at,
             ca.Function("stage", [self.y[:MOVING], *inputs], [rates, least, c_n]),
             ca.Function("report", [self.y, *inputs], report),
-            self._build_correction(),
-            self._build_error(),
+            ca.Function("correct", [row, r], [correction]),
+            ca.Function("error", [fifth, third, self.packed], [error]),
             slack,
             stall,
         )
-
-    def _hold(self, c: Expression) -> Expression:
-        """What has to be positive for everything to hold, from the forces c."""
-        H, h = self.mode.force_limit_rows
-        return ca.sparsify(ca.DM(H)) @ c + ca.DM(h)
-
-    def _torque(self) -> Expression:
-        """Torques at the time, shape (2,)."""
-        start, stop = self.packed[self.at.piece][0], self.packed[self.at.piece][1]
-        x = (2 * self.t - start - stop) / (stop - start)
-        coefficients = ca.reshape(self.packed[self.at.torque], -1, 2)
-        value = coefficients[-1, :]
-        for power in range(coefficients.shape[0] - 2, -1, -1):
-            value = value * x + coefficients[power, :]
-        return value.T
 
     def _move(self) -> list[Expression]:
         """Rates of the state, c, v_t, tau, K and P at (z, z') = y[:10]."""
         mode, scene = self.mode, self.mode.formation.scene
         v = self.y[5:10]
         P, bend, A_t = self.rows
-        tau = self._torque()
+        tau = build_torque(self.t, self.packed[self.at.piece], self.packed[self.at.torque])
         inverse_mass = ca.DM(1 / scene.mass_diagonal)
         G = mode.build_force_rows(P, A_t, self.Xi)
         viscous = ca.DM(scene.viscous[3:]) * v[3:]
@@ -327,7 +282,7 @@ class _Model:
         tau: Expression,
         K: Expression,
         P: Expression,
-        held: Expression,
+        margins: Expression,
         slack: Array,
         stall: float,
     ) -> list[Expression]:
@@ -340,18 +295,6 @@ class _Model:
         c_n, c_t = c[: mode.formation.n_contacts], mode.build_tangential(c, self.Xi)
         ratio = ca.det(K) / ca.det(frictionless)
         outputs = ca.vertcat(y, rates[5:10], c_n, c_t, tau, heading, ratio)
-        events = ca.vertcat(held, self.Xi * v_t, self.sigma * v[3:])
+        events = ca.vertcat(margins, self.Xi * v_t, self.sigma * v[3:])
         least = ca.fmin(ca.mmin(events + ca.DM(slack)), speed + stall)
         return [ca.densify(part) for part in (outputs, events, speed, least)]
-
-    def _build_correction(self) -> Expression:
-        P, r = self.rows[0], ca.SX.sym("r", self.mode.n_constraints)
-        lift = ca.DM(1 / self.mode.formation.scene.mass_diagonal) * P.T
-        return ca.Function("correct", [P, r], [ca.densify(lift @ ca.solve(P @ lift, r))])
-
-    def _build_error(self) -> Expression:
-        fifth, third = ca.SX.sym("fifth", MOVING), ca.SX.sym("third", MOVING)
-        units = ca.DM(measure_units(self.mode.formation.scene))
-        start, tolerance = self.packed[self.at.y][:MOVING], self.packed[self.at.tolerance]
-        error = build_error(fifth, third, start, units, tolerance)
-        return ca.Function("error", [fifth, third, self.packed], [error])

@@ -1,8 +1,4 @@
-"""The simulator's tolerances, each relative to a scale of the scene (`Scene.scales`).
-
-Lengths are counted in the scene's length, angles in rad, forces and torques in its force and
-torque, and so on: the same motion told in other units is simulated with the same tolerances.
-"""
+"""Tolerances of the simulator, each relative to a scale of the scene (`Scene.scales`)."""
 
 from __future__ import annotations
 
@@ -15,46 +11,23 @@ from ..common.arrays import Array
 from ..problem.definition import Until
 from ..scene.model import Scene
 
-ROUNDING_FORCE = 1e-9
-"""Largest shortfall of a force, a torque or what friction has left that counts as rounding."""
-ROUNDING_SPEED = 2e-13
-"""Largest negative speed that counts as rounding."""
-ROUNDING_LIMIT = 3e-8
-"""Largest overlap that counts as rounding: the contact just given up starts at zero."""
-SHORT = 3e-5
-"""Largest overlap at the start of a phase: one may end at rest this much short of the place where
-the next one's formation begins."""
-REACHED = 3e-5
-"""Distance to the end of a phase that counts as there, when at rest."""
-PASSED = 1e-5
-"""Distance beyond the end of a phase that is passed at speed, for which a formation may still be
-taken for the one before, until the torques step: an error of a long motion before it."""
-SLOW = 2e-4
-"""Speed that counts as rest at the end of a phase."""
-CREEPING = 1e-7
-"""Speed of a motion that fades at the end of its phase, from which on it is not yet there: more
-than what the integration and a table of torques leave there."""
-STANDING = 1e-9
-"""Speed that counts as none where friction decides: the integration's error may give it either
-sign."""
-SETTLING = 2e-5
-"""Longest time before a torque break at which a planned arrival or reversal may come by
-rounding."""
-REST_WINDOW = 2e-3
-"""Time before a torque break in which a formation at rest is held, whatever the torques: too short
-for its contacts to part by more than what counts as touching."""
-LONGEST_WINDOW = 2e-2
-"""Longest time before a torque break at which an arrival at a speed still belongs to it."""
-FIRST_STEP = 2e-2
-"""Length of the first step tried from rest."""
-SHORTEST_STEP = 1e-13
-"""Step below which the integration gives up, relative to the scene's time and the time gone by."""
-STEP_OF_TORQUE = 2e-8
-"""Jump of the torques at a break that counts as one."""
-STILL = 1e-10
-"""Acceleration that counts as rounding."""
-CLOSING = 1e-7
-"""Acceleration of a gap that counts as rounding: its gradient is a difference quotient."""
+ROUNDING_FORCE = 1e-9  # shortfall of a force, torque or friction margin that is rounding
+ROUNDING_SPEED = 2e-13  # largest negative speed that counts as rounding
+ROUNDING_LIMIT = 3e-8  # overlap that is rounding: the contact just given up starts at zero
+SHORT = 3e-5  # largest overlap at the start of a phase: one may end this much short
+REACHED = 3e-5  # distance to the end of a phase that counts as there, when at rest
+PASSED = 1e-5  # distance past the end of a phase at speed: error of a long motion before it
+SLOW = 2e-4  # speed that counts as rest at the end of a phase
+CREEPING = 1e-7  # speed of a fading motion that is not there yet: above integration error
+STANDING = 1e-9  # speed that counts as none in friction: either sign by integration error
+SETTLING = 2e-5  # longest time by which rounding moves a planned event before a torque break
+REST_WINDOW = 2e-3  # time of rest before a torque break: too short for contacts to part
+LONGEST_WINDOW = 2e-2  # longest time between an arrival at speed and its torque break
+FIRST_STEP = 2e-2  # length of the first step tried from rest
+SHORTEST_STEP = 1e-13  # underflow of a step, over the scene's time and the elapsed time
+STEP_OF_TORQUE = 2e-8  # jump of the torques at a break that counts as one
+STILL = 1e-10  # acceleration that counts as rounding
+CLOSING = 1e-7  # acceleration of a gap that is rounding: a difference quotient
 
 
 class Tolerances(NamedTuple):

@@ -1,4 +1,4 @@
-"""Ipopt as every NLP of this package uses it."""
+"""Ipopt with the options of all NLPs of this package; it stops on signals and records its runs."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from ..common.arrays import Expression
 from ..common.signals import beat, check
 from .statistics import SolverStatistics, book
 
-STOPPED = "User_Requested_Stop"
-"""Status of a solver that an interrupt stopped: nothing else asks it to."""
+STOPPED = "User_Requested_Stop"  # status of a solver after an interrupt, and of no other
 _OPTIONS = {
     "print_level": 0,
     "sb": "yes",
@@ -39,19 +38,14 @@ def build_solver(
     derivatives: dict[str, Expression] | None = None,
     **options: Any,
 ) -> Solver:
-    """Return what solves an NLP with Ipopt.
+    """An Ipopt solver of an NLP.
 
     Parameters
     ----------
-    name : str
-    nlp : dict
-        Expressions of x, p, f and g.
-    push : float
-        How far a given start is kept from its bounds; small to start at a solution.
-    derivatives : dict, optional
-        Functions that CasADi would derive otherwise: `jac_g` and `hess_lag`.
-    **options
-        Ipopt's, over those that all NLPs share.
+    nlp          expressions of x, p, f and g
+    push         distance of an initial point from its bounds; small to start at a solution
+    derivatives  functions that CasADi would derive otherwise: `jac_g` and `hess_lag`
+    **options    of Ipopt, over those that all NLPs share
     """
     kinds = ("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac", "mult_bound_push")
     pushes = {f"warm_start_{kind}": push for kind in kinds}
@@ -77,10 +71,8 @@ class IpoptRun(NamedTuple):
 
     unknowns: int
     rows: int
-    # jacobian_nonzeros, hessian_nonzeros: of the rows, and of the upper triangle of the
-    # Lagrangian's Hessian
-    jacobian_nonzeros: int
-    hessian_nonzeros: int
+    jacobian_nonzeros: int  # of the rows
+    hessian_nonzeros: int  # of the upper triangle of the Lagrangian's Hessian
     iterations: int
     seconds: float  # [s]: processor time
 
@@ -114,8 +106,8 @@ class Solver:
         """
         beat()
         # CasADi takes lists in three times as fast as arrays.
-        given = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in arguments.items()}
-        result: dict[str, Expression] = self.function(**given)
+        lists = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in arguments.items()}
+        result: dict[str, Expression] = self.function(**lists)
         stats = self.function.stats()
         # A solver that was stopped does not always say what it has done.
         cost = stats.get("iter_count", 0), stats.get("t_wall_total", 0.0)
@@ -133,9 +125,7 @@ class Solver:
         return statistics
 
     def _describe_run(self, stats: dict[str, Any]) -> IpoptRun:
-        jacobian, hessian = (
-            self.function.get_function(f"nlp_{key}") for key in ("jac_g", "hess_l")
-        )
+        jacobian, hessian = map(self.function.get_function, ("nlp_jac_g", "nlp_hess_l"))
         return IpoptRun(
             self.function.size1_in("x0"),
             self.function.size1_in("lbg"),

@@ -1,30 +1,25 @@
-"""What solving costs, counted where it is done and booked to the phase that it is done for.
-
-Plans are found by way of others: of least time, with stops, on finer intervals, for advice. Counted
-by the solver itself, nothing is left out or counted twice.
-"""
+"""Iterations and times of NLP solves, recorded by the solver and charged to phases."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, fields
+from dataclasses import astuple, dataclass
+from operator import add
 
 
 @dataclass(frozen=True)
 class SolverStatistics:
-    """What solving has cost."""
+    """Cost of solving."""
 
     iterations: int = 0  # of Ipopt
     solves: int = 0  # how often it ran
-    # build_time, solve_time [s]: of building NLPs that were not at hand yet, and of Ipopt
-    build_time: float = 0.0
-    solve_time: float = 0.0
+    build_time: float = 0.0  # [s]: of NLPs that were not cached
+    solve_time: float = 0.0  # [s]: of Ipopt
 
     def __add__(self, other: SolverStatistics) -> SolverStatistics:
-        names = [field.name for field in fields(self)]
-        return SolverStatistics(*(getattr(self, name) + getattr(other, name) for name in names))
+        return SolverStatistics(*map(add, astuple(self), astuple(other)))
 
 
 class Ledger:
@@ -35,7 +30,7 @@ class Ledger:
         self._entries: dict[int, SolverStatistics] = {}
 
     def of(self, phase: int) -> SolverStatistics:
-        """What a phase has cost."""
+        """Cost of a phase."""
         return self._entries.get(phase, SolverStatistics())
 
     def add(self, phase: int, cost: SolverStatistics) -> None:

@@ -1,4 +1,4 @@
-"""What tuning has found: torques, how they came about, and what the free simulation says."""
+"""Result of tuning: torques, their changes and trials by phase, and their free simulation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One trial: torques from rest to rest, simulated without telling which contacts hold."""
+"""Trials of torques from rest to rest, by complementarity simulation: end reached, contact lost."""
 
 from __future__ import annotations
 
@@ -27,12 +27,11 @@ LASTS = 40.0
 """How long a trial goes on after its last step of the torques, relative to the scene's time."""
 _BACK = 1e-6
 """Share of the way by which the end is farther away than before once the motion has turned back."""
-_NUDGE = 1e-6
-"""Time over which a rate is a difference, relative to the scene's."""
+_NUDGE = 1e-6  # time over which a rate is a difference, relative to the scene's
 
 
 class TrialOutcome(Enum):
-    """What a trial comes to."""
+    """Outcome of a trial."""
 
     RESTS = "rests"
     """The object does not begin to slide, stops short of the end of the phase, or turns back."""
@@ -52,7 +51,7 @@ class TuningStep(NamedTuple):
 
 
 class TuningTrial(NamedTuple):
-    """What torques of a phase do."""
+    """Torques of a phase, and the motion that they cause."""
 
     steps: tuple[TuningStep, ...]  # the torques
     outcome: TrialOutcome
@@ -80,7 +79,7 @@ class TuningTrial(NamedTuple):
 
 
 class Landing(NamedTuple):
-    """What becomes of a phase whose end is reached."""
+    """The object held at the end of a phase."""
 
     z: Array  # (5,): where it is held
     rests: bool  # whether everything rests there in the end
@@ -95,7 +94,7 @@ def make_rows(steps: Sequence[TuningStep], end: float) -> Array:
 
 
 class Bench:
-    """Makes trials of one passage from one start, and counts them.
+    """Trials of one passage from one start.
 
     Parameters
     ----------
@@ -139,14 +138,10 @@ class Bench:
     def run(self, steps: Sequence[TuningStep]) -> TuningTrial:
         """Simulate torques until the end of the passage, or what keeps it from coming."""
         end = steps[-1].time + LASTS * self.problem.scene.scales.time
-        found = simulate_free(
-            self.problem,
-            read_rows(make_rows(steps, end)),
-            start=self.z,
-            halt=self._is_over,
-        )
+        torque = read_rows(make_rows(steps, end))
+        simulation = simulate_free(self.problem, torque, start=self.z, halt=self._is_over)
         self.simulations += 1
-        self.trials.append(self._judge(tuple(steps), found))
+        self.trials.append(self._judge(tuple(steps), simulation))
         return self.trials[-1]
 
     def land(self, steps: Sequence[TuningStep], arrival: float, pause: float) -> Landing:
@@ -159,21 +154,23 @@ class Bench:
         """
         self.simulations += 1
         end, passage = arrival + pause, self.passage
-        found = simulate_free(self.problem, read_rows(make_rows(steps, end)), start=self.z)
-        stretches = found.stretches
+        simulation = simulate_free(self.problem, read_rows(make_rows(steps, end)), start=self.z)
+        stretches = simulation.stretches
         if passage.passed:
             # Whichever of the two presses where they meet.
             stretches = tuple(
-                own._replace(contact=passage.passed) if own.contact == self.until else own
-                for own in stretches
+                stretch._replace(contact=passage.passed)
+                if stretch.contact == self.until
+                else stretch
+                for stretch in stretches
             )
         later = passage.after or passage.phases[-1]
         names = later.formation.names
         pauses = {name: list_pauses(stretches, name, arrival, end) for name in names}
         parted = {name: max((b - a for a, b in own), default=0.0) for name, own in pauses.items()}
         worst = max(parted, key=parted.__getitem__)
-        rests = not found.z_dot[-1].any() and found.t[-1] == end
-        return Landing(found.z[-1], rests, parted[worst], worst)
+        rests = not simulation.z_dot[-1].any() and simulation.t[-1] == end
+        return Landing(simulation.z[-1], rests, parted[worst], worst)
 
     def _is_over(self, run: FreeRun) -> bool:
         if run.t == 0:
@@ -186,47 +183,49 @@ class Bench:
         gap = float(self.measure(run.z[None])[0])
         return gap > (1 + _BACK) * self.way or (self.pair is None and gap <= 0)
 
-    def _judge(self, steps: tuple[TuningStep, ...], found: FreeSimulation) -> TuningTrial:
-        gaps = self.measure(found.z)
-        ends, lost = self.passage.follow(found.events)
+    def _judge(self, steps: tuple[TuningStep, ...], simulation: FreeSimulation) -> TuningTrial:
+        gaps = self.measure(simulation.z)
+        ends, lost = self.passage.follow(simulation.events)
         arrival = ends[-1] if len(ends) == len(self.passage.phases) else math.inf
         if self.pair is None and gaps.min() <= 0:
-            arrival = self._find_passing(found, int(np.flatnonzero(gaps <= 0)[0]))
-        begun = self._find_last(ends)
-        turn = self._find_turn(found, gaps, begun)
+            from scipy.optimize import brentq
+
+            row, motion = int(np.flatnonzero(gaps <= 0)[0]), simulation.trajectory
+            a, b = (float(t) for t in simulation.t[row - 1 : row + 1])
+            arrival = float(brentq(lambda t: self.measure(motion.at([t]).z)[0], a, b, xtol=1e-14))
+        before = len(self.passage.phases) - 1
+        start = [0.0, *ends][before] if len(ends) >= before else math.inf  # of the last phase
+        turn = self._find_turn(simulation, gaps, start)
         losses = [] if lost is None else [(lost.time, lost.contact)]
-        stop = min(arrival, turn, float(found.t[-1]))
-        losses = [loss for loss in losses + self._list_losses(found, ends, stop) if loss[0] < stop]
+        stop = min(arrival, turn, float(simulation.t[-1]))
+        losses = [
+            loss for loss in losses + self._list_losses(simulation, ends, stop) if loss[0] < stop
+        ]
         time, contact = min(losses, default=(stop, ""))
-        at = int(np.searchsorted(found.t, time))
-        least, weakest, row = self._find_least(found, ends, at)
-        short = float(gaps[: at + 1][found.t[: at + 1] >= begun].min(initial=math.inf))
+        at = int(np.searchsorted(simulation.t, time))
+        least, weakest, row = self._find_least(simulation, ends, at)
+        short = float(gaps[: at + 1][simulation.t[: at + 1] >= start].min(initial=math.inf))
         if losses:
             outcome = TrialOutcome.LOSES
         elif least < self.problem.epsilon:
-            outcome, contact, time = TrialOutcome.LOSES, weakest, float(found.t[row])
+            outcome, contact, time = TrialOutcome.LOSES, weakest, float(simulation.t[row])
         elif arrival == stop:
             outcome = TrialOutcome.ARRIVES
         else:
-            rests = turn == stop or not found.z_dot[at].any()
+            rests = turn == stop or not simulation.z_dot[at].any()
             outcome = TrialOutcome.RESTS if rests else TrialOutcome.LASTS
-        rate, slowing, z = self._close(found, time, at)
+        rate, slowing, z = self._close(simulation, time, at)
         return TuningTrial(steps, outcome, time, contact, rate, slowing, short, least, weakest, z)
 
-    def _find_last(self, ends: Sequence[float]) -> float:
-        """When the last phase begins [s], infinite if it does not."""
-        before = len(self.passage.phases) - 1
-        return [0.0, *ends][before] if len(ends) >= before else math.inf
-
-    def _find_turn(self, found: FreeSimulation, gaps: Array, begun: float) -> float:
+    def _find_turn(self, simulation: FreeSimulation, gaps: Array, start: float) -> float:
         """When the end, once nearer, is farther away again [s], infinite if it never is."""
-        rows = np.flatnonzero(found.t >= begun)
+        rows = np.flatnonzero(simulation.t >= start)
         risen = gaps[rows] - np.minimum.accumulate(gaps[rows]) if len(rows) else gaps[:0]
         back = np.flatnonzero(risen > _BACK * abs(self.way))
-        return float(found.t[rows[back[0]]]) if len(back) else math.inf
+        return float(simulation.t[rows[back[0]]]) if len(back) else math.inf
 
     def _list_losses(
-        self, found: FreeSimulation, ends: Sequence[float], stop: float
+        self, simulation: FreeSimulation, ends: Sequence[float], stop: float
     ) -> list[tuple[float, str]]:
         """When contacts of its phases part, also those that never press; and which."""
         starts = [0.0, *ends][: len(self.passage.phases)]
@@ -234,47 +233,35 @@ class Bench:
         return [
             (loss.time, loss.contact)
             for phase, first, last in zip(self.passage.phases, starts, stops, strict=False)
-            for loss in find_losses(self.problem, found, phase, first, last, DEPARTURE)
+            for loss in find_losses(self.problem, simulation, phase, first, last, DEPARTURE)
         ]
 
     def _find_least(
-        self, found: FreeSimulation, ends: Sequence[float], at: int
+        self, simulation: FreeSimulation, ends: Sequence[float], at: int
     ) -> tuple[float, str, int]:
         """The least normal force up to a row, of which contact, and in which row."""
         phases = self.passage.phases
-        of = np.minimum(np.searchsorted(ends, found.t[: at + 1], side="left"), len(phases) - 1)
+        of = np.minimum(np.searchsorted(ends, simulation.t[: at + 1], side="left"), len(phases) - 1)
         best = (math.inf, phases[0].formation.names[0], 0)
         for index in range(len(phases)):
             rows = np.flatnonzero(of == index)
             names = self.passage.list_pressed(index)
-            own = [found.contacts.index(name) for name in names]
-            c_n = np.nan_to_num(found.c_n[rows][:, own], nan=math.inf)
+            own = [simulation.contacts.index(name) for name in names]
+            c_n = np.nan_to_num(simulation.c_n[rows][:, own], nan=math.inf)
             if c_n.min(initial=math.inf) < best[0]:
                 row, column = np.unravel_index(int(c_n.argmin()), c_n.shape)
                 best = (float(c_n[row, column]), names[int(column)], int(rows[row]))
         return best
 
-    def _find_passing(self, found: FreeSimulation, row: int) -> float:
-        """When a coordinate passes its value, before a row [s]."""
-        from scipy.optimize import brentq
-
-        motion = found.trajectory
-        a, b = float(found.t[row - 1]), float(found.t[row])
-        return float(brentq(lambda t: self.measure(motion.at([t]).z)[0], a, b, xtol=1e-14))
-
-    def _close(self, found: FreeSimulation, time: float, at: int) -> tuple[float, float, Array]:
+    def _close(self, run: FreeSimulation, time: float, at: int) -> tuple[float, float, Array]:
         """How fast the end closes, by how much that becomes less, and where."""
         if self.pair is None and time > 0:
-            row = found.trajectory.at([time])
+            row = run.trajectory.at([time])
             v, a = row.z_dot[0, self.column], row.z_ddot[0, self.column]
             return -self.sign * float(v), self.sign * float(a), row.z[0]
-        z, v, a = found.z[at], found.z_dot[at], found.z_ddot[at]
+        z, v, a = run.z[at], run.z_dot[at], run.z_ddot[at]
         if self.pair is None:
-            return (
-                -self.sign * float(v[self.column]),
-                self.sign * float(a[self.column]),
-                z,
-            )
+            return (-self.sign * float(v[self.column]), self.sign * float(a[self.column]), z)
         if self.passage.passed:
             step = _NUDGE * self.problem.scene.scales.time
             back, _, on = (float(x) for x in self.measure(z + np.outer([-step, 0, step], v)))
@@ -328,15 +315,15 @@ class Passage:
 
 def split_passages(problem: Problem) -> list[Passage]:
     """The phases of a problem, those together that are carried in one motion."""
-    found: list[Passage] = []
+    passages: list[Passage] = []
     own: list[Phase] = []
     for phase, after in zip(problem.phases, (*problem.phases[1:], None), strict=True):
         own.append(phase)
         moves = after is not None and bool(_find_predecessor(phase, after))
         if after is None or (phase.end is End.REST and not moves):
-            found.append(Passage(tuple(own), after))
+            passages.append(Passage(tuple(own), after))
             own = []
-    return found
+    return passages
 
 
 def name_numbers(first: int, last: int) -> str:

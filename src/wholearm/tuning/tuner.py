@@ -1,4 +1,8 @@
-"""Tune the torques of a problem, from rest to rest, by the 10 % rule."""
+"""Torques from rest to rest by trial and error in steps of 10 %.
+
+Constant torques of a phase start from quasistatic ones. The acting torque is raised until the end
+is reached; the instant of a brake is found by false position in the arrival speed.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +19,7 @@ from ..common.fields import SHARE
 from ..common.sharing import exclusive
 from ..problem.check import require_phases
 from ..problem.definition import End, Phase, Problem, Until
-from ..quasistatic.slow_speeds import SQUEEZE, find_torques, make_road
+from ..quasistatic.slow_speeds import SQUEEZE, find_torques, sample_path
 from ..results.torque_table import read_rows
 from ..simulation.tolerances import REST_WINDOW
 from ..verification.free import verify_free
@@ -27,44 +31,28 @@ FACTOR = 1.1
 SLOW = 3e-5
 """Speed at which the end of a phase may be reached by a brake, relative to the scene's: contacts
 part for less than a moment then."""
-_ROUGH = 50.0
-"""How much faster than that an end is reached while brakes are compared."""
-_RAISED = 60
-"""Most times a torque is raised or lowered: a factor of 300."""
-_SUPPORT = 3
+_COARSE_SPEED = 50.0  # how much faster than that an end is reached while brakes are compared
+_MAX_RAISES = 60  # most times a torque is raised or lowered: a factor of 300
+_SUPPORT_STEP = 3
 """So many times the supporting torque is raised at once, by a third, as each needs searches."""
-ENOUGH = 600
-"""Simulations from one start after which no further drive, brake or support is tried."""
-_SUPPORTED = 13
-"""It is raised fewer times than this."""
-_SOONER = 0.02
-"""Share of the time by which another 10 % has to bring the end sooner."""
-_COARSE = 2
-"""So many times the acting torque is lowered at once while it brakes too little."""
-_PLACES = 16
-"""Instants to brake at that are looked at, where each of them lets the object arrive."""
-_CLOSER = 45
-"""Most steps to the one at which it arrives most slowly, by golden sections."""
+MAX_SIMULATIONS = 600  # simulations from one start, after which nothing further is tried
+_MAX_SUPPORT = 13  # it is raised fewer times than this
+_MIN_GAIN = 0.02  # share of the time by which another 10 % has to bring the end sooner
+_COARSE_STEP = 2  # so many times the acting torque is lowered at once while it brakes too little
+_GRID = 16  # instants to brake at that are looked at, where each of them lets the object arrive
+_MAX_SECTIONS = 45  # most steps to the one at which it arrives most slowly, by golden sections
 _GOLDEN = (3 - math.sqrt(5)) / 2
-_MISSES = 2
-"""So many torques that stop nothing end that, once one has."""
-_SEARCH = 24
-"""Most trials that look for the instant to brake."""
-_NARROW = 1e-3
+_MAX_FAILURES = 2  # so many torques that stop nothing end that, once one has
+_MAX_TRIALS = 24  # most trials that look for the instant to brake
+_MIN_BRACKET = 1e-3
 """Share of the time in which the end is either reached at speed or not at all: what starts the
 motion again, or lets it turn back, is not a matter of when to brake."""
-_FAR, _FAST = 0.02, 0.1
-"""Shares of the way and of the drive's speed that are much for that."""
-_SOON = 1e-3
-"""Share of a drive's time: where the end is reached with a brake that early it is none."""
-_LOSSES = 4
-"""Most of them that may lose a contact."""
-PAUSE = 0.2
-"""How long the object is held at the end of each phase, relative to the scene's time."""
-MOST_STOPS = 7
-"""Stops of a phase that may be allowed at most: halves of halves of halves."""
-_LOWERED = 6
-"""How many times the acting torque is lowered for that, less one."""
+_FAR, _FAST = 0.02, 0.1  # shares of the way and of the drive's speed that are much for that
+_EARLIEST = 1e-3  # share of a drive's time, before which a brake is none
+_MAX_LOSSES = 4  # most of them that may lose a contact
+PAUSE = 0.2  # how long the object is held at the end of each phase, relative to the scene's time
+MOST_STOPS = 7  # stops of a phase that may be allowed at most: halves of halves of halves
+_HOLD_STEPS = 6  # how many times the acting torque is lowered for that, less one
 
 
 @exclusive
@@ -88,7 +76,7 @@ def tune(
     brake     whether each phase may have one more step of its torques, which stops it at its end
     stops     how often a phase that does not succeed with a brake may stop on its way, 0 to 7:
               halfway, then again in the halves that do not succeed
-    squeeze   how hard the quasistatic torques squeeze; as of `predict`
+    squeeze   internal force of the quasistatic torques; as of `predict`
     share     which of the raises that reach the end of a phase is taken, from the first, 0, to the
               last that keeps every contact, 1
     progress  shown each trial, in words
@@ -99,37 +87,30 @@ def tune(
     """
     require_phases(problem)
     squeeze, share = SHARE.read(squeeze, "squeeze"), SHARE.read(share, "share")
-    _require_stops(stops, brake)
-    found: list[PhaseTuning] = []
+    if isinstance(stops, bool) or not isinstance(stops, int) or not 0 <= stops <= MOST_STOPS:
+        raise InputError("", "stops", f"{stops!r} given; allowed are 0 to {MOST_STOPS}")
+    if stops and not brake:
+        raise InputError("", "stops", f"{stops} given without a brake; allowed then is 0")
+    tell = progress or (lambda text: None)
+    tuned: list[PhaseTuning] = []
     steps: list[TuningStep] = []
     z, clock = problem.start, 0.0
     with name_source(problem.source):
         for passage in split_passages(problem):
-            setting = _Setting(problem, passage, brake, squeeze, share, progress or _ignore)
+            setting = _Setting(problem, passage, brake, squeeze, share, tell)
             parts, end, reason = _carry(setting, z, stops)
-            found += parts
+            tuned += parts
             if end is None:
                 title = parts[-1].title
                 reason = f"phase{'s' if '-' in title else ''} {title}: {reason}"
-                return Tuning(problem.name, tuple(found), None, None, reason)
+                return Tuning(problem.name, tuple(tuned), None, None, reason)
             for own in parts:
                 steps += [step._replace(time=clock + step.time) for step in own.steps]
                 clock += own.duration + setting.pause
             z = end
     rows = make_rows(steps, clock)
     report = verify_free(problem, read_rows(rows))
-    return Tuning(problem.name, tuple(found), rows, report, report.reason)
-
-
-def _require_stops(stops: int, brake: bool) -> None:
-    if isinstance(stops, bool) or not isinstance(stops, int) or not 0 <= stops <= MOST_STOPS:
-        raise InputError("", "stops", f"{stops!r} given; allowed are 0 to {MOST_STOPS}")
-    if stops and not brake:
-        raise InputError("", "stops", f"{stops} given without a brake; allowed then is 0")
-
-
-def _ignore(text: str) -> None:
-    """Where nobody looks."""
+    return Tuning(problem.name, tuple(tuned), rows, report, report.reason)
 
 
 def _carry(setting: _Setting, z: Array, stops: int) -> tuple[list[PhaseTuning], Array | None, str]:
@@ -148,14 +129,14 @@ def _carry(setting: _Setting, z: Array, stops: int) -> tuple[list[PhaseTuning], 
 
 
 class _Balance(NamedTuple):
-    """What a quasistatic motion needs along a passage."""
+    """Torques of a quasistatic motion along a passage."""
 
     tau: Array  # (n, 2) [N m]
-    acting: int  # the finger behind the motion: the index of the torque that works most
+    acting: int  # index of the torque with the most work: the finger behind the motion
 
 
 _Attempt = tuple[PhaseTuning, Array | None, str]
-"""What tuning came to, where it ends at rest if it does, and why not."""
+"""The tuned phase, its end at rest if it is reached, and else the reason."""
 
 
 class _Setting(NamedTuple):
@@ -175,18 +156,18 @@ class _Setting(NamedTuple):
 
     def halve(self, z: Array) -> tuple[_Setting, _Setting] | None:
         """Both halves of the way from `z`, the first until x or phi is what it is there."""
-        phases, roads = self.passage.phases, []
+        phases, paths = self.passage.phases, []
         for phase in phases:
-            road = make_road(phase, z, self.problem.phases[phase.index + 1 :])
-            if road is None:
+            path = sample_path(phase, z, self.problem.phases[phase.index + 1 :])
+            if path is None:
                 return None
-            roads.append(road)
-            z = road.z[-1]
-        ends = np.cumsum([road.length for road in roads])
+            paths.append(path)
+            z = path.z[-1]
+        ends = np.cumsum([path.length for path in paths])
         k = int(np.searchsorted(ends, ends[-1] / 2))
-        road, left = roads[k], ends[k] - ends[-1] / 2
-        middle = road.z[int(np.searchsorted(road.s, road.length - left))]
-        way = abs(middle - road.z[0])
+        path, left = paths[k], ends[k] - ends[-1] / 2
+        middle = path.z[int(np.searchsorted(path.s, path.length - left))]
+        way = abs(middle - path.z[0])
         turns = way[2] * self.problem.scene.scales.length > way[0]
         name, value = ("phi", middle[2]) if turns else ("x", middle[0])
         until = Until(coordinate=name, value=float(value))
@@ -200,11 +181,7 @@ class _Setting(NamedTuple):
         phases = self.passage.phases
         own = PhaseTuning(phases[0].number, phases[-1].number, str(self.passage.until))
         if any(phase.until.value is not None for phase in phases[:-1]):
-            return (
-                own,
-                None,
-                "a coordinate is passed in motion; the rule tunes phases to rest",
-            )
+            return (own, None, "a coordinate is passed in motion; the rule tunes phases to rest")
         found = self._balance(phases, z)
         if found is None:
             return (
@@ -224,20 +201,15 @@ class _Setting(NamedTuple):
         """Tune it by the torque of one finger, with supporting torques until one serves."""
         title = f"phase {self.passage.title} of {len(self.problem.phases)}, finger {acting + 1}"
         best: _Attempt | None = None
+        tell: Callable[[str], None] = lambda text: self.tell(f"{title}: {text}")  # noqa: E731
         for tau in list_starts(balance.tau, acting):
-            rule = TuningRule(
-                bench,
-                tau,
-                balance.tau[-1],
-                acting,
-                lambda text: self.tell(f"{title}: {text}"),
-            )
-            found = self._tune_from(rule, replace(own, acting=acting + 1))
-            if found[1] is not None:
-                return found
+            rule = TuningRule(bench, tau, balance.tau[-1], acting, tell)
+            attempt = self._tune_from(rule, replace(own, acting=acting + 1))
+            if attempt[1] is not None:
+                return attempt
             if best is None or best[0].raised is None:
-                best = found
-            if rule.is_enough:
+                best = attempt
+            if rule.is_exhausted:
                 break
         assert best is not None
         return best
@@ -264,14 +236,12 @@ class _Setting(NamedTuple):
         self, own: PhaseTuning, rule: TuningRule, drives: Sequence[TuningDrive]
     ) -> _Attempt:
         """The fastest drive that is held where it arrives; the slowest arrives most gently."""
-        kept: _Attempt | None = None
+        kept: list[_Attempt] = []
         for drive in drives:
-            last = self._hold(replace(own, raised=drive.raised), rule, drive.trial)
-            if last[1] is None:
-                return last if kept is None else kept
-            kept = last
-        assert kept is not None
-        return kept
+            kept.append(self._hold(replace(own, raised=drive.raised), rule, drive.trial))
+            if kept[-1][1] is None:
+                break
+        return kept[-2] if kept[-1][1] is None and kept[1:] else kept[-1]
 
     def _hold(self, own: PhaseTuning, rule: TuningRule, trial: TuningTrial) -> _Attempt:
         """Hold the object where a trial has arrived: as it is, or lowered for the next phase."""
@@ -281,9 +251,8 @@ class _Setting(NamedTuple):
             steps = trial.steps if tau is None else (*trial.steps, TuningStep(trial.time, tau))
             landing = rule.bench.land(steps, trial.time, self.pause)
             own = replace(own, steps=steps, simulations=rule.bench.simulations)
-            rate = f"{until} is reached at {trial.rate:.3g}"
-            rate += " rad/s" if rule.bench.is_angle else " m/s"
-            rate += f" at t = {trial.time:.5g} s, and "
+            unit = "rad/s" if rule.bench.is_angle else "m/s"
+            rate = f"{until} is reached at {trial.rate:.3g} {unit} at t = {trial.time:.5g} s, and "
             if landing.parted > REST_WINDOW * self.problem.scene.scales.time:
                 reason = f"{rate}{landing.contact} parts for {1e3 * landing.parted:.3g} ms"
             elif not landing.rests:
@@ -301,18 +270,18 @@ class _Setting(NamedTuple):
         after = self.passage.after
         acting, (first, second) = rule.acting, (float(tau) for tau in rule.last)
         if after is not None:
-            found = self._balance((after,), trial.z)
-            if found is None:
+            balance = self._balance((after,), trial.z)
+            if balance is None:
                 return [None]
-            acting, (first, second) = found.acting, (float(tau) for tau in found.tau[0])
+            acting, (first, second) = balance.acting, (float(tau) for tau in balance.tau[0])
         lowered = [
             (first / FACTOR**n, second) if acting == 0 else (first, second / FACTOR**n)
-            for n in range(1, _LOWERED)
+            for n in range(1, _HOLD_STEPS)
         ]
         if after is None:
             arrived = np.array(trial.steps[-1].tau)
-            arrived[1 - acting] /= FACTOR**_LOWERED
-            held = [tuple((arrived / FACTOR ** (_LOWERED * n)).tolist()) for n in range(3)]
+            arrived[1 - acting] /= FACTOR**_HOLD_STEPS
+            held = [tuple((arrived / FACTOR ** (_HOLD_STEPS * n)).tolist()) for n in range(3)]
             return [None, *lowered, *held]
         return [None, *lowered]
 
@@ -321,15 +290,15 @@ class _Setting(NamedTuple):
         tau: list[Array] = []
         work: list[Array] = []
         for phase in phases:
-            road = make_road(phase, z, self.problem.phases[phase.index + 1 :])
-            if road is None:
+            path = sample_path(phase, z, self.problem.phases[phase.index + 1 :])
+            torques = None
+            if path is not None:
+                torques = find_torques(path, self.problem.epsilon, self.squeeze)
+            if path is None or torques is None:
                 break
-            found = find_torques(road, self.problem.epsilon, self.squeeze)
-            if found is None:
-                break
-            tau.append(found.tau)
-            work.append(found.tau * road.z_s[:, 3:])
-            z = road.z[-1]
+            tau.append(torques.tau)
+            work.append(torques.tau * path.z_s[:, 3:])
+            z = path.z[-1]
         if not tau:
             return None
         return _Balance(np.vstack(tau), int(np.vstack(work).mean(axis=0).argmax()))
@@ -357,19 +326,12 @@ def _explain(bench: Bench) -> str:
 
 
 class TuningDrive(NamedTuple):
-    """What sets the object in motion until the end of the phase."""
+    """Torques that reach the end of the phase, with a brake or without."""
 
-    raised: int  # how many times the acting torque was raised
-    trial: TuningTrial
-
-
-class Brake(NamedTuple):
-    """What stops it there."""
-
-    # how many times the acting torque is raised from the quasistatic one; lowered if negative
+    # how many times the acting torque (that of the brake) is raised; lowered if negative
     raised: int
-    supported: int  # how many times the supporting torque is raised; lowered if negative
     trial: TuningTrial
+    supported: int = 0  # how many times the supporting torque is raised in the brake
 
 
 class TuningRule:
@@ -384,12 +346,7 @@ class TuningRule:
     """
 
     def __init__(
-        self,
-        bench: Bench,
-        tau: Array,
-        last: Array,
-        acting: int,
-        tell: Callable[[str], None],
+        self, bench: Bench, tau: Array, last: Array, acting: int, tell: Callable[[str], None]
     ) -> None:
         self.bench, self.acting, self.tell = bench, acting, tell
         self.tau, self.last = tau, last
@@ -399,9 +356,9 @@ class TuningRule:
         self.time = scales.time
 
     @property
-    def is_enough(self) -> bool:
+    def is_exhausted(self) -> bool:
         """Whether there have been so many simulations that no other torques are tried."""
-        return self.bench.simulations > ENOUGH
+        return self.bench.simulations > MAX_SIMULATIONS
 
     @property
     def is_free(self) -> bool:
@@ -421,11 +378,9 @@ class TuningRule:
         The last trial says what was lost, or that the object did not slide.
         """
         found = []
-        for raised in range(_RAISED):
+        for raised in range(_MAX_RAISES):
             tau = self.scale(raised)
-            if self.is_enough:
-                break
-            if abs(tau[self.acting]) > self.limit[self.acting]:
+            if self.is_exhausted or abs(tau[self.acting]) > self.limit[self.acting]:
                 break
             trial = self._run([TuningStep(0.0, tau)], f"raised {raised} times")
             if trial.outcome is TrialOutcome.ARRIVES:
@@ -434,7 +389,7 @@ class TuningRule:
                 break
         return found
 
-    def brake(self, drives: Sequence[TuningDrive]) -> tuple[TuningDrive, Brake] | None:
+    def brake(self, drives: Sequence[TuningDrive]) -> tuple[TuningDrive, TuningDrive] | None:
         """Stop a drive at the end of the phase, the fastest that lets itself be stopped.
 
         The acting torque is lowered to less than the slowest drive's and than balances the object
@@ -447,11 +402,13 @@ class TuningRule:
         last = self._count_steps(1 - self.acting)
         # With two freedoms either torque sets the object in motion again, if it is too much there.
         likely = [last, 0] if self.is_free else [0, last]
-        for supported in dict.fromkeys([*likely, *range(_SUPPORT, _SUPPORTED, _SUPPORT)]):
+        for supported in dict.fromkeys(
+            [*likely, *range(_SUPPORT_STEP, _MAX_SUPPORT, _SUPPORT_STEP)]
+        ):
             if abs(self.scale(0, supported)[1 - self.acting]) > self.limit[1 - self.acting]:
                 continue
             for drive in chosen:
-                if self.is_enough:
+                if self.is_exhausted:
                     return None
                 found = self._lower(drive.trial, first, supported)
                 if found is not None:
@@ -461,24 +418,24 @@ class TuningRule:
     def _count_steps(self, finger: int) -> int:
         """How many times a torque is raised, lowered if negative, until it is that of the end."""
         share = float(self.last[finger] / self.tau[finger]) if self.tau[finger] else 1.0
-        return math.floor(math.log(max(share, FACTOR**-_RAISED)) / math.log(FACTOR))
+        return math.floor(math.log(max(share, FACTOR**-_MAX_RAISES)) / math.log(FACTOR))
 
-    def _lower(self, drive: TuningTrial, first: int, supported: int) -> Brake | None:
+    def _lower(self, drive: TuningTrial, first: int, supported: int) -> TuningDrive | None:
         """Lower the acting torque while that brings the end sooner; None if nothing stops there."""
-        best: Brake | None = None
+        best: TuningDrive | None = None
         raised, missed = first, 0
-        while raised > -_RAISED and missed < _MISSES and not self.is_enough:
+        while raised > -_MAX_RAISES and missed < _MAX_FAILURES and not self.is_exhausted:
             steps = [*drive.steps, TuningStep(0.0, self.scale(raised, supported))]
-            trial = self._place(steps, drive, best and best.trial, _ROUGH * self.slow)
+            trial = self._place(steps, drive, best and best.trial, _COARSE_SPEED * self.slow)
             if trial is None:
                 if best is None and self.bench.trials[-1].outcome is TrialOutcome.LOSES:
                     break
                 missed += best is not None
-                raised -= _COARSE
+                raised -= _COARSE_STEP
                 continue
-            if best and trial.time > (1 - _SOONER) * best.trial.time:
+            if best and trial.time > (1 - _MIN_GAIN) * best.trial.time:
                 break
-            best = Brake(raised, supported, trial)
+            best = TuningDrive(raised, trial, supported)
             if trial.rate < self.slow:
                 return best
             raised -= 1
@@ -499,27 +456,24 @@ class TuningRule:
         at, side, losses = 0.5 * high, 0, 0
         short, rate = self.bench.way, drive.rate
         if near is not None and slow == self.slow:
-            at, high, above = (
-                near.steps[-1].time * (1 - 1e-4),
-                near.steps[-1].time,
-                self._overshoot(near, slow),
-            )
+            high, above = near.steps[-1].time, self._overshoot(near, slow)
+            at = high * (1 - 1e-4)
         elif near is not None:
             at = min(1.02 * near.steps[-1].time, 0.5 * (near.steps[-1].time + high))
-        for count in range(_SEARCH):
+        for count in range(_MAX_TRIALS):
             steps = [*steps[:-1], steps[-1]._replace(time=at)]
             trial = self._run(steps, f"brake at {at:.5g} s")
             if trial.outcome is TrialOutcome.ARRIVES:
                 if trial.rate < slow:
                     return trial
-                if at < _SOON * drive.time:
+                if at < _EARLIEST * drive.time:
                     return self._graze(steps, drive) if self.is_free else None
                 high, above, rate = at, self._overshoot(trial, slow), trial.rate
                 below /= 2 if side < 0 else 1
                 side = -1
             else:
                 losses += trial.outcome is TrialOutcome.LOSES
-                if losses > _LOSSES:
+                if losses > _MAX_LOSSES:
                     return None
                 low, short = at, trial.short
                 # How far it is through several phases is not known.
@@ -527,7 +481,7 @@ class TuningRule:
                 above /= 2 if side > 0 else 1
                 side = 1
             jumps = short > _FAR * self.bench.way and rate > _FAST * drive.rate
-            if jumps and high - low < _NARROW * high:
+            if jumps and high - low < _MIN_BRACKET * high:
                 return None
             share = below / (below + above) if count % 4 != 3 else 0.5
             at = low + (high - low) * min(max(share, 0.02), 0.98)
@@ -547,17 +501,17 @@ class TuningRule:
             trial = self._run(again, f"brake at {at:.5g} s")
             return trial.rate if trial.outcome is TrialOutcome.ARRIVES else math.inf, trial
 
-        grid = [drive.time * (k + 1) / (_PLACES + 1) for k in range(_PLACES)]
+        grid = [drive.time * (k + 1) / (_GRID + 1) for k in range(_GRID)]
         found = [run(at) for at in grid]
-        k = min(range(1, _PLACES - 1), key=lambda k: found[k][0])
+        k = min(range(1, _GRID - 1), key=lambda k: found[k][0])
         low, at, high = grid[k - 1 : k + 2]
         rate, best = found[k]
         if rate > min(found[k - 1][0], found[k + 1][0]):
             return None
-        for count in range(_CLOSER):
+        for count in range(_MAX_SECTIONS):
             if rate < self.slow:
                 return best
-            if count == _PLACES and rate > 2 * _ROUGH * self.slow:
+            if count == _GRID and rate > 2 * _COARSE_SPEED * self.slow:
                 return None
             left = at - low > high - at
             other = at - _GOLDEN * (at - low) if left else at + _GOLDEN * (high - at)
@@ -590,8 +544,8 @@ def list_starts(tau: Array, acting: int) -> list[Array]:
     hard = float(tau[:, 0].max() if acting else tau[:, 1].min())
     values = list(dict.fromkeys([start, hard]))
     if start and hard / start > 1:
-        count = math.ceil(math.log(hard / start) / math.log(FACTOR) / _SUPPORT)
-        values += [start * FACTOR ** (_SUPPORT * n) for n in range(1, count)]
+        count = math.ceil(math.log(hard / start) / math.log(FACTOR) / _SUPPORT_STEP)
+        values += [start * FACTOR ** (_SUPPORT_STEP * n) for n in range(1, count)]
     found = np.tile(tau[0], (len(values), 1))
     found[:, other] = values
     return list(found)

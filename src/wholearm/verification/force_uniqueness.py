@@ -1,4 +1,4 @@
-"""Whether contact forces of a motion are the only ones, and whether it surely leaves rest."""
+"""Uniqueness margin of contact forces (P-matrix), and static indeterminacy of a start."""
 
 from __future__ import annotations
 
@@ -19,8 +19,7 @@ from .verdict import measure_speed
 
 PLACES = 33
 """Instants of a phase at which uniqueness margins are looked at, and at which torques are."""
-_LEANS = 1 - 1e-6
-"""Share of U c_n from which on a tangential force is that of sliding."""
+_LEANS = 1 - 1e-6  # share of U c_n from which on a tangential force is that of sliding
 
 
 def find_uniqueness_margin(
@@ -36,29 +35,29 @@ def find_uniqueness_margin(
     """
     formation, rows = phase.formation, rows[:: -(-len(rows) // PLACES)]
     columns = [motion.contacts.index(name) for name in formation.names]
-    known = ~np.isnan(motion.c_n[rows][:, columns]).any(axis=1)
-    rows = rows[known]
+    determined = ~np.isnan(motion.c_n[rows][:, columns]).any(axis=1)
+    rows = rows[determined]
     if not len(rows):
         return None
     c_n, c_t = (forces[rows][:, columns] for forces in (motion.c_n, motion.c_t))
     slides = np.abs(c_t) >= _LEANS * formation.friction * np.abs(c_n)
     Xi = -np.sign(c_t * c_n)
     kinematics = formation.evaluate(motion.z[rows], motion.z_dot[rows])
-    found = []
+    margins = []
     for pattern in np.unique(slides, axis=0):
-        own = np.flatnonzero((slides == pattern).all(axis=1))
-        part = Kinematics(*(array[own] for array in kinematics))
+        rows_of = np.flatnonzero((slides == pattern).all(axis=1))
+        part = Kinematics(*(array[rows_of] for array in kinematics))
         sticking = tuple(np.flatnonzero(~pattern).tolist())
-        ratio, names, row = find_minors(formation, part, Xi[own], sticking).find_least()
-        found.append(UniquenessMargin(ratio, names, float(motion.t[rows[own[row]]])))
-    return min(found)
+        ratio, names, row = find_minors(formation, part, Xi[rows_of], sticking).find_least()
+        margins.append(UniquenessMargin(ratio, names, float(motion.t[rows[rows_of[row]]])))
+    return min(margins)
 
 
 def find_departure(simulation: Simulation, torque: TorqueProfile, index: int) -> float:
-    """When the torques set a phase in motion: the last break before it starts, if it does [s]."""
+    """Last break of the torques before a phase starts to move, -inf if it does not [s]."""
     starts = [e.time for e in simulation.find(EventKind.START) if e.phase == index]
-    known = [b for b in torque.breaks.tolist() if starts and b <= starts[0]]
-    return max(known, default=-math.inf)
+    breaks = [b for b in torque.breaks.tolist() if starts and b <= starts[0]]
+    return max(breaks, default=-math.inf)
 
 
 def find_wedged(
@@ -69,10 +68,10 @@ def find_wedged(
     slow: float,
     start: float = -np.inf,
 ) -> float | None:
-    """For how long a phase that begins at rest may stay so, wedged by friction [s]; else None.
+    """Time for which friction may hold a phase that begins at rest (static indeterminacy) [s].
 
-    That is until the torques are such that no contact forces within their cones, of all that
-    touches, balance them and gravity: see `mechanics.wedging`.
+    Until no contact forces within their cones, of all contacts that touch, balance torques and
+    gravity: see `mechanics.wedging`. None if the phase does not begin at rest.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""Check torques by simulating them without being told which contacts hold.
+"""Verification by complementarity simulation, without telling which contacts hold.
 
-A plan is simulated whole, from the exact start and by the clock, and phase by phase, each from its
-planned start; the verdict is about the phases, as the joints between them are knife edges. Torques
-alone are followed by what happens: a phase ends where its `until` is reached.
+A plan is simulated whole, open loop from the exact start, and phase by phase, each from its planned
+start. The verdict is about the phases: the junctions between them are unstable to arrival errors.
+With torques alone a phase ends where its `until` is reached.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from ..common.errors import InputError, require_number
+from ..common.errors import require_number
 from ..common.sharing import exclusive
 from ..free_simulation.free_simulate import simulate_free, simulate_phases
 from ..free_simulation.hand import build_system
 from ..free_simulation.result import FreeSimulation, list_pauses
 from ..geometry.curve import describe_pose
 from ..problem.definition import Phase, Problem
-from ..results.adopt import Torques, adopt_torques
+from ..results.adopt import Torques, adopt_torques, require_same_contacts
 from ..results.report import Deviation
 from ..results.trajectory import Trajectory
 from ..simulation.events import EventKind, OutcomeKind
@@ -39,7 +39,7 @@ def verify_free(
     restitution: float = 0.0,
     progress: Callable[[str], None] | None = None,
 ) -> FreeReport:
-    """Simulate torques without being told which contacts hold, and report what happens.
+    """Simulate torques without telling which contacts hold, and report what happens.
 
     Parameters
     ----------
@@ -58,10 +58,7 @@ def verify_free(
     """
     problem, torque, plan = adopt_torques(problem, what)
     allowed = require_number(departure, "departure", positive=True)
-    names = {contact.name for contact in problem.contacts}
-    if plan is not None and set(plan.contacts) != names:
-        odd = ", ".join(sorted(set(plan.contacts) ^ names))
-        raise InputError("", "contacts", f"trajectory and problem differ in {odd}")
+    require_same_contacts(problem, plan)
     options: dict[str, Any] = {"tolerance": tolerance, "restitution": restitution}
     if progress is not None:
         progress("simulating the whole")
@@ -72,12 +69,12 @@ def verify_free(
         return FreeReport(problem.name, whole, (), phases, tuple(failures), tuple(warnings))
     failures, alone = [], []
     for part in simulate_phases(problem, plan, progress=progress, **options):
-        own = range(part.first, part.last + 1)
-        found = _compare(problem, plan, part.simulation, own, allowed)
-        alone += found
-        title = f"phases {found[0].number} to {found[-1].number}" if found[1:] else ""
-        warnings += warn(f"{title or f'phase {found[0].number}'} alone", part.simulation)
-        failures += _fail(problem, part.simulation, found, allowed)
+        indices = range(part.first, part.last + 1)
+        compared = _compare(problem, plan, part.simulation, indices, allowed)
+        alone += compared
+        title = f"phases {compared[0].number} to {compared[-1].number}" if compared[1:] else ""
+        warnings += warn(f"{title or f'phase {compared[0].number}'} alone", part.simulation)
+        failures += _fail(problem, part.simulation, compared, allowed)
     every = range(len(plan.phase_starts) - 1)
     by_clock = _compare(problem, plan, whole, every, allowed)
     return FreeReport(
@@ -112,32 +109,40 @@ def warn(title: str, simulation: FreeSimulation) -> list[str]:
 
 
 def _compare(
-    problem: Problem,
-    plan: Trajectory,
-    simulation: FreeSimulation,
-    indices: range,
-    allowed: float,
+    problem: Problem, plan: Trajectory, simulation: FreeSimulation, indices: range, allowed: float
 ) -> list[FreePhase]:
     """Phases by the clock: where each ends, and which of its contacts are lost meanwhile."""
-    found, starts = [], plan.phase_starts
-    for index in indices:
-        phase = problem.phases[index]
-        start, stop = float(starts[index]), float(starts[index + 1])
+    compared, starts = [], plan.phase_starts
+    for phase in (problem.phases[index] for index in indices):
+        start, stop = float(starts[phase.index]), float(starts[phase.index + 1])
         losses = find_losses(problem, simulation, phase, start, stop, allowed)
-        row = int(np.searchsorted(simulation.t, stop, side="right")) - 1
-        last = int(np.flatnonzero(plan.phase == index)[-1])
-        away = np.abs(simulation.z[row] - plan.z[last])
-        reached = bool(simulation.t[row] == stop)
-        end = Deviation(float(away[:2].max()), float(away[2:].max()), float(simulation.t[row]))
-        found.append(FreePhase(phase.number, start, stop, reached, tuple(losses), end))
-    return found
+        end = measure_end(simulation, plan, phase.index, stop)
+        reached = end.time == stop
+        compared.append(FreePhase(phase.number, start, stop, reached, tuple(losses), end))
+    return compared
+
+
+def measure_end(simulation: FreeSimulation, plan: Trajectory, index: int, stop: float) -> Deviation:
+    """Difference of the configuration at an instant from the planned end of a phase."""
+    row = int(np.searchsorted(simulation.t, stop, side="right")) - 1
+    away = np.abs(simulation.z[row] - plan.z[np.flatnonzero(plan.phase == index)[-1]])
+    return Deviation(float(away[:2].max()), float(away[2:].max()), float(simulation.t[row]))
+
+
+def describe_losses(phase: FreePhase) -> list[str]:
+    """Sentences on contacts of a phase that open."""
+    return [
+        f"{loss.contact} is lost at t = {loss.time:.5g} s, phase {phase.number}, and opens by "
+        f"{loss.gap:.2g} m"
+        for loss in phase.losses
+    ]
 
 
 def _follow(
     problem: Problem, simulation: FreeSimulation, allowed: float
 ) -> tuple[tuple[FreePhase, ...], list[str]]:
     """Phases of torques alone: each until what ends it has happened."""
-    found: list[FreePhase] = []
+    phases: list[FreePhase] = []
     failures: list[str] = []
     start = float(simulation.t[0])
     following: Sequence[Phase | None] = [*problem.phases[1:], None]
@@ -145,12 +150,8 @@ def _follow(
         stop = _find_end(simulation, phase, after, start)
         last = float(simulation.t[-1]) if stop is None else stop
         losses = find_losses(problem, simulation, phase, start, last, allowed)
-        found.append(FreePhase(phase.number, start, last, stop is not None, tuple(losses), None))
-        failures += [
-            f"{loss.contact} is lost at t = {loss.time:.5g} s, phase {phase.number}, and opens by "
-            f"{loss.gap:.2g} m"
-            for loss in losses
-        ]
+        phases.append(FreePhase(phase.number, start, last, stop is not None, tuple(losses), None))
+        failures += describe_losses(phases[-1])
         if stop is None:
             failures.append(f"phase {phase.number} does not end: {phase.until} is not reached")
             break
@@ -160,7 +161,7 @@ def _follow(
                 f"phase {phase.number} ends at {describe_pose(z)}, and not with {phase.until}"
             )
         start = stop
-    return tuple(found), failures
+    return tuple(phases), failures
 
 
 def _find_end(
@@ -171,8 +172,8 @@ def _find_end(
     later = [event for event in simulation.events if event.time >= start]
     if until.contact is not None:
         times = [e.time for e in later if e.contact == until.contact.name]
-        own = [s for s in simulation.stretches if s.contact == until.contact.name]
-        times += [max(s.start, start) for s in own if s.stop > start]
+        closed = [s for s in simulation.stretches if s.contact == until.contact.name]
+        times += [max(s.start, start) for s in closed if s.stop > start]
     elif until.value is not None:
         values = simulation.z[:, 0 if until.coordinate == "x" else 2] - until.value
         rows = np.flatnonzero(simulation.t >= start)
@@ -195,12 +196,12 @@ def find_losses(
     allowed: float,
 ) -> list[LostContact]:
     """Contacts of a phase that open by more than is allowed, over the scene's length."""
-    system, found = build_system(problem.scene), []
+    system, losses = build_system(problem.scene), []
     for name in phase.formation.names:
         for first, after in list_pauses(simulation.stretches, name, start, stop):
             rows = np.flatnonzero((simulation.t >= first) & (simulation.t <= after))
             gaps = system.measure(simulation.z[rows])[0][:, system.names.index(name)]
             if gaps.max(initial=0.0) > allowed * problem.scene.scales.length:
-                found.append(LostContact(name, first, float(gaps.max())))
+                losses.append(LostContact(name, first, float(gaps.max())))
                 break
-    return sorted(found, key=lambda loss: loss.time)
+    return sorted(losses, key=lambda loss: loss.time)

@@ -10,8 +10,7 @@ from ..free_simulation.result import FreeSimulation
 from ..results.report import Deviation
 from ..results.trajectory import Trajectory
 
-MOST = 60
-"""Most events that the text lists; `to_dict` has all."""
+MOST = 60  # most events that the text lists; `to_dict` has all
 
 
 class LostContact(NamedTuple):

@@ -1,8 +1,9 @@
-"""Least values over time of what a simulation recorded: normal forces and margins to slipping."""
+"""Least normal forces, slip margins and link gaps of a replay, refined by parabolas in time."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -19,17 +20,13 @@ from ..scene.model import Scene
 from ..simulation.events import EventKind, Simulation
 from ..simulation.tolerances import SETTLING
 
-HURRIED = 1e-3
-"""Largest relative miss of a torque's rate, or of a command, that is not reported."""
-STEPPED = 1e-5
-"""Largest step of a torque that is none, over its limit."""
-_LOOKS = 33
-"""Instants of each piece of the torques that are looked at."""
+_RATE_MISS = 1e-3  # largest relative miss of a torque's rate, or of a command, that is not reported
+STEPPED = 1e-5  # largest step of a torque that is none, over its limit
+_LOOKS = 33  # instants of each piece of the torques that are looked at
 SHORTEST = 2 * SETTLING
 """Interval below which forces may jump, and rounding spoils a parabola, relative to the scene's
 time."""
-MISSED = 1e-6
-"""Miss of a limit, over what is much for it, from which on it is reported."""
+MISSED = 1e-6  # miss of a limit, over what is much for it, from which on it is reported
 
 
 class Parabolas(NamedTuple):
@@ -79,34 +76,42 @@ def list_contact_margins(
     problem: Problem, simulation: Simulation, rows: NDArray[np.int64], phase: Phase, breaks: Array
 ) -> tuple[ContactMargin, ...]:
     """Least normal forces in a phase, which the simulation has at `rows`."""
-    lost = {e.contact: e for e in simulation.find(EventKind.CONTACT_LOST) if e.phase == phase.index}
-    shortest, contacts = SHORTEST * problem.scene.scales.time, []
-    for name, values in list_normal_forces(problem, simulation, phase, rows).items():
-        least, time = find_lowest(simulation.t[rows], values, breaks, shortest)
-        if name in lost and not least <= lost[name].value:
-            least, time = lost[name].value, lost[name].time
-        contacts.append(ContactMargin(name, least, time, least - problem.epsilon))
-    return tuple(contacts)
+    forces = list_normal_forces(problem, simulation, phase, rows)
+    least = _find_least(phase, simulation, rows, breaks, forces, EventKind.CONTACT_LOST)
+    return tuple(ContactMargin(name, c_n, t, c_n - problem.epsilon) for name, c_n, t in least)
 
 
 def list_slip_margins(
     phase: Phase, simulation: Simulation, rows: NDArray[np.int64], breaks: Array
 ) -> tuple[SlipMargin, ...]:
     """Least margins to slipping in a phase, which the simulation has at `rows`."""
-    slipped = {e.contact: e for e in simulation.find(EventKind.SLIP) if e.phase == phase.index}
-    shortest, margins = SHORTEST * phase.formation.scene.scales.time, []
-    for name, values in list_slips(simulation, phase, rows).items():
+    slips = list_slips(simulation, phase, rows)
+    least = _find_least(phase, simulation, rows, breaks, slips, EventKind.SLIP)
+    return tuple(SlipMargin(*margin) for margin in least)
+
+
+def _find_least(
+    phase: Phase,
+    simulation: Simulation,
+    rows: NDArray[np.int64],
+    breaks: Array,
+    series: dict[str, Array],
+    kind: EventKind,
+) -> Iterator[tuple[str, float, float]]:
+    """Least value of each contact and its time; that of an event of its loss where it is less."""
+    events = {e.contact: e for e in simulation.find(kind) if e.phase == phase.index}
+    shortest = SHORTEST * phase.formation.scene.scales.time
+    for name, values in series.items():
         least, time = find_lowest(simulation.t[rows], values, breaks, shortest)
-        if name in slipped and not least <= slipped[name].value:
-            least, time = slipped[name].value, slipped[name].time
-        margins.append(SlipMargin(name, least, time))
-    return tuple(margins)
+        if name in events and not least <= events[name].value:
+            least, time = events[name].value, events[name].time
+        yield name, least, time
 
 
 def describe_misses(
     phase: Phase, simulation: Simulation, rows: NDArray[np.int64], torque: TorqueProfile
 ) -> list[str]:
-    """Sentences on limits other than those of forces and torques alone that a phase exceeds."""
+    """Sentences on limits that a phase exceeds, other than those of forces and torques alone."""
     formation, t = phase.formation, simulation.t[rows]
     limits = make_limits(formation, 0.0).without(PRESS, CONE, TORQUE)
     if not limits.limits:
@@ -153,12 +158,12 @@ def find_lowest(
         return math.nan, math.nan
     first = int(np.nanargmin(values))
     least, time = float(values[first]), float(t[first])
-    found = fit_parabolas(t, values, breaks, shortest)
+    parabolas = fit_parabolas(t, values, breaks, shortest)
     # Where the middle is not the least of three, a curve that flattens out would seem to dip.
-    lowest = np.where(found.dips, found.lowest, math.inf)
+    lowest = np.where(parabolas.dips, parabolas.lowest, math.inf)
     if len(lowest) and lowest.min() < least:
         k = int(lowest.argmin())
-        least, time = float(lowest[k]), float(found.time[k])
+        least, time = float(lowest[k]), float(parabolas.time[k])
     return least, time
 
 
@@ -173,7 +178,7 @@ def fit_parabolas(t: Array, values: Array, breaks: Array, shortest: float = 0.0)
     shortest : [s]  interval below which the function may jump
     """
     left, right = np.diff(t)[:-1], np.diff(t)[1:]
-    smooth = (left > shortest) & (right > shortest) & ~_is_among(t[1:-1], breaks)
+    smooth = (left > shortest) & (right > shortest) & ~np.isin(t[1:-1], breaks)
     smooth &= ~np.isnan(values[:-2] + values[1:-1] + values[2:])
     left, right, time, middle = left[smooth], right[smooth], t[1:-1][smooth], values[1:-1][smooth]
     fall = (values[1:-1] - values[:-2])[smooth] / left
@@ -189,32 +194,25 @@ def fit_parabolas(t: Array, values: Array, breaks: Array, shortest: float = 0.0)
     return Parabolas(time - left, time + right, time + shift, lowest, dips)
 
 
-def _is_among(t: Array, breaks: Array) -> NDArray[np.bool_]:
-    """Whether each of `t` is one of the increasing `breaks`."""
-    near = np.minimum(np.searchsorted(breaks, t), len(breaks) - 1)
-    return np.asarray(breaks[near] == t)
-
-
 def find_commands(torque: TorqueProfile, lag: Array) -> TorqueProfile:
     """Commands that motors with some lags, shape (2,) [s], make torques of: tau + lag tau'."""
-    order = np.arange(torque.coefficients.shape[2])
+    order = np.arange(1, torque.coefficients.shape[2])
     slopes = np.zeros_like(torque.coefficients)
-    slopes[..., :-1] = torque.coefficients[..., 1:] * order[1:]
+    slopes[..., :-1] = torque.coefficients[..., 1:] * order
     slopes *= (2 / np.diff(torque.breaks))[:, None, None]
     return TorqueProfile(torque.breaks, torque.coefficients + lag[:, None] * slopes)
 
 
 def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float, str]]:
-    """What motors cannot follow, with the time of the worst place of each kind [s]."""
+    """What misses cannot follow, with the time of the worst place of each kind [s]."""
     scene = problem.scene
     if not scene.has_slow_motors:
         return []
-    x = np.linspace(-1, 1, _LOOKS)[:, None] ** np.arange(torque.coefficients.shape[2])
-    values = torque.coefficients @ x.T
-    ones = find_commands(torque, np.ones(2)).coefficients @ x.T
+    x = np.linspace(-1, 1, _LOOKS)
+    values, ones = torque.at_places(x), find_commands(torque, np.ones(2)).at_places(x)
     rates, commands = ones - values, values + scene.actuator_lag[:, None] * (ones - values)
     steps = np.abs(values[1:, :, 0] - values[:-1, :, -1])
-    found = list[tuple[float, str]]()
+    misses = list[tuple[float, str]]()
     limits = zip(scene.torque_limit, scene.torque_rate_limit, scene.actuator_lag, strict=True)
     for joint, (limit, fastest, lag) in enumerate(limits):
         name = f"tau_{joint + 1}"
@@ -227,7 +225,7 @@ def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float
             why = (
                 f"its rate limit is {fastest:g} N m/s" if np.isfinite(fastest) else "its motor lags"
             )
-            found.append((t, f"{text}, where {why}"))
+            misses.append((t, f"{text}, where {why}"))
         kinds = (
             (rates[:, joint], fastest, "changes at {:.4g} N m/s, above its rate limit {:g} N m/s"),
             (commands[:, joint], limit, "takes a command of {:.4g} N m, above its limit {:g} N m"),
@@ -235,9 +233,9 @@ def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float
         for of, most, text in kinds:
             size = np.abs(of)
             piece, look = np.unravel_index(int(size.argmax()), size.shape)
-            if size[piece, look] > most * (1 + HURRIED):
+            if size[piece, look] > most * (1 + _RATE_MISS):
                 start, stop = torque.breaks[[piece, piece + 1]]
                 t = float(start + (stop - start) * look / (_LOOKS - 1))
                 said = text.format(size[piece, look], most)
-                found.append((t, f"{name} {said}, at t = {t:.5g} s"))
-    return found
+                misses.append((t, f"{name} {said}, at t = {t:.5g} s"))
+    return misses

@@ -16,12 +16,9 @@ from ..problem.definition import Problem
 from ..results.report import ReducedState
 from ..simulation.events import Simulation
 
-ROWS = 5
-"""Instants of every phase at which the equation is set up."""
-MOVING = 1e-4
-"""Least speed of everything that slides or turns there, over the scene's."""
-_OTHERS = [0, 1, 2, 4]
-"""Degrees of freedom that are eliminated: q and theta_2."""
+ROWS = 5  # instants of every phase at which the equation is set up
+MOVING = 1e-4  # least speed of everything that slides or turns there, over the scene's
+_OTHERS = [0, 1, 2, 4]  # degrees of freedom that are eliminated: q and theta_2
 
 
 def list_reduced_states(problem: Problem, simulation: Simulation) -> tuple[ReducedState, ...]:
@@ -29,10 +26,9 @@ def list_reduced_states(problem: Problem, simulation: Simulation) -> tuple[Reduc
 
     At each instant theta_1 turns and every contact that the formation lets slide does so.
     """
-    found = []
+    states = []
     for index in range(int(simulation.phase[-1]) + 1):
-        formation = problem.phases[index].formation
-        rows = np.flatnonzero(simulation.phase == index)
+        formation, rows = problem.phases[index].formation, np.flatnonzero(simulation.phase == index)
         if formation.n_constraints != 4:
             continue
         z, v = simulation.z[rows], simulation.z_dot[rows]
@@ -43,8 +39,8 @@ def list_reduced_states(problem: Problem, simulation: Simulation) -> tuple[Reduc
         moving = rows[np.abs(speeds).min(axis=1) > MOVING * scales.speed]
         chosen = np.unique(np.linspace(0, len(moving) - 1, ROWS).round().astype(int))
         for row in moving[chosen] if len(moving) else ():
-            found.append(_reduce_row(formation, simulation, int(row)))
-    return tuple(found)
+            states.append(_reduce_row(formation, simulation, int(row)))
+    return tuple(states)
 
 
 def _reduce_row(formation: Formation, simulation: Simulation, row: int) -> ReducedState:

@@ -28,8 +28,7 @@ if TYPE_CHECKING:
     from ..contacts.elemental import Contact
     from ..results.trajectory import Samples
 
-STILL = 1e-4
-"""Speed that counts as none, relative to the scene's speed."""
+STILL = 1e-4  # speed that counts as none, relative to the scene's speed
 BODIES = (
     "the object along x",
     "the object along y",
@@ -37,11 +36,10 @@ BODIES = (
     "finger 1",
     "finger 2",
 )
-"""Names of the five equations."""
 
 
 class Balance(NamedTuple):
-    """What the equations of motion miss at n instants."""
+    """Residuals of the equations of motion and contact conditions at n instants."""
 
     forces: Array  # (n, 5): left over in each of `BODIES`, relative to the scene's force or torque
     gaps: Array  # (n, n_c): of the contacts, relative to the scene's length
@@ -67,13 +65,8 @@ class Balance(NamedTuple):
         row, column = divmod(int(np.abs(table).argmax()), table.shape[1])
         unit = ("the scene's force or torque", "the scene's length", "the scene's speed")[worst]
         text = text.format(names[column], sizes[worst], unit)
-        turned = [
-            name
-            for name, wrong in zip(
-                (*contacts, "joint 1", "joint 2"), self.against[row], strict=True
-            )
-            if wrong
-        ]
+        names = (*contacts, "joint 1", "joint 2")
+        turned = [name for name, wrong in zip(names, self.against[row], strict=True) if wrong]
         if worst == 0 and turned:
             text += f", as {' and '.join(turned)} moves against the sense that its friction assumes"
         return sizes[worst], row, text
@@ -94,7 +87,7 @@ def balance(
     samples: Samples,
     still: float = STILL,
 ) -> Balance:
-    """What a motion with its forces leaves of the equations of motion.
+    """Residuals of a motion with its forces in the Newton-Euler equations.
 
     Parameters
     ----------
@@ -114,7 +107,8 @@ def balance(
     for k, contact in enumerate(contacts):
         touch = _touch(scene, contact, z)
         n, t = touch.normal, -_quarter(touch.normal)
-        arm, lever = touch.point - z[:, :2], _lever(scene, contact, touch)
+        base = (0.0, 0.0) if contact.finger is None else scene.fingers[contact.finger].base
+        arm, lever = touch.point - z[:, :2], touch.point - np.asarray(base)
         slip = v[:, :2] + v[:, 2:3] * _quarter(arm)
         if contact.finger is not None:
             slip = slip - v[:, 3 + contact.finger, None] * _quarter(lever)
@@ -143,12 +137,6 @@ def balance(
     left /= np.array([scales.force] * 2 + [scales.torque] * 3)
     names = tuple(contact.name for contact in contacts)
     return Balance(left, gaps / scales.length, rates / scales.speed, against, names)
-
-
-def _lever(scene: Scene, contact: Contact, touch: _ContactForce) -> Array:
-    """From the joint of the link that a contact is on to its point, shape (n, 2) [m]."""
-    base = (0.0, 0.0) if contact.finger is None else scene.fingers[contact.finger].base
-    return np.asarray(touch.point - np.asarray(base))
 
 
 def _touch(scene: Scene, contact: Contact, z: Array) -> _ContactForce:

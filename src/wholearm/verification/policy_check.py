@@ -1,10 +1,8 @@
-"""Check a policy by simulating it without being told which contacts hold."""
+"""Verification of a policy by complementarity simulation of the closed loop."""
 
 from __future__ import annotations
 
 import math
-
-import numpy as np
 
 from ..common.errors import InputError, require_number
 from ..common.sharing import exclusive
@@ -14,10 +12,9 @@ from ..policy.closed_loop import ROOM, ClosedLoop
 from ..policy.playback import Policy
 from ..problem.definition import Phase, Problem
 from ..results.adopt import Moved, adopt_motion
-from ..results.report import Deviation
 from ..results.trajectory import Trajectory
 from ..simulation.events import OutcomeKind
-from .free import find_losses, warn
+from .free import describe_losses, find_losses, measure_end, warn
 from .free_report import FreePhase, FreeReport
 from .verdict import DEPARTURE
 
@@ -35,7 +32,7 @@ def verify_policy(
     departure: float = DEPARTURE,
     restitution: float = 0.0,
 ) -> FreeReport:
-    """Simulate a policy from the problem's start, and report what becomes of each phase.
+    """Simulate the closed loop from the problem's start, and report the end of each phase.
 
     A contact of a phase counts from when the phase begins until the one that it gains presses.
 
@@ -65,14 +62,10 @@ def verify_policy(
         if phase.number in loop.began
     )
     failures = [] if whole.outcome.kind is OutcomeKind.ENDED else [whole.outcome.text]
-    for own in phases:
-        failures += [
-            f"{loss.contact} is lost at t = {loss.time:.5g} s, phase {own.number}, and opens by "
-            f"{loss.gap:.2g} m"
-            for loss in own.losses
-        ]
-        if not own.reached:
-            failures.append(f"phase {own.number} does not end within {until:.4g} s")
+    for phase in phases:
+        failures += describe_losses(phase)
+        if not phase.reached:
+            failures.append(f"phase {phase.number} does not end within {until:.4g} s")
     end = phases[-1].deviation
     assert end is not None
     far = end.position / problem.scene.scales.length > REACHED or end.angle > TURNED
@@ -91,18 +84,16 @@ def _judge(
     phase: Phase,
     allowed: float,
 ) -> FreePhase:
-    """What becomes of a phase."""
+    """Losses and end of a phase."""
     start, contact = loop.began[phase.number], phase.until.contact
     last = phase is problem.phases[-1]
     stop = float(whole.t[-1]) if last else loop.began.get(phase.number + 1, float(whole.t[-1]))
     gains = [
-        own.start
-        for own in whole.stretches
-        if contact is not None and own.contact == contact.name and own.start > start
+        closed.start
+        for closed in whole.stretches
+        if contact is not None and closed.contact == contact.name and closed.start > start
     ]
     reached = last or phase.number + 1 in loop.began
     losses = find_losses(problem, whole, phase, start, min([stop, *gains]), allowed)
-    row = int(np.searchsorted(whole.t, stop, side="right")) - 1
-    away = np.abs(whole.z[row] - plan.z[np.flatnonzero(plan.phase == phase.index)[-1]])
-    end = Deviation(float(away[:2].max()), float(away[2:].max()), float(whole.t[row]))
+    end = measure_end(whole, plan, phase.index, stop)
     return FreePhase(phase.number, start, stop, reached, tuple(losses), end)

@@ -1,8 +1,7 @@
-"""What helps to tune torques by hand, from a replay: what would mend losses, and how near it came.
+"""Least changes of the torques that prevent the contact losses of a replay.
 
-A loss is looked at in the state in which it happens: there z'' and c are affine in the torques. A
-change of the torques that mends it is one from that instant on; made earlier, it changes the motion
-up to there as well.
+In the state of a loss z'' and c are affine in the torques. A change holds from that instant on;
+made earlier, it changes the motion up to there as well.
 """
 
 from __future__ import annotations
@@ -24,35 +23,33 @@ from ..results.tuning_advice import Approach, ForceAt, Loss, TorqueAdvice, Tunin
 from ..simulation.events import EventKind, Simulation
 from ..simulation.modes import find_grips, list_units, respond, share_mode
 from ..simulation.sliding_signs import evaluate_rows, measure_rates
-from ..simulation.start_modes import StartPath
+from ..simulation.start_modes import StartMode
 from ..simulation.sticking import find_rest
 from .margins import find_lowest
 from .verdict import Allowance
 
-KEPT = 1e-9
-"""Shortfall of a limit that counts as none, over what is much for it."""
+KEPT = 1e-9  # shortfall of a limit that counts as none, over the scale of it
 FLAT = 1e-9
-"""What a limit's slack changes with a torque below which it does not depend on it, in what is much
+"""What a limit's slack changes with a torque below which it does not depend on it, in what is unit
 for each."""
 SLOW = 1e-6
 """Speed below which the direction of friction is looked for, relative to the scene's speed."""
-_TORQUES = ((0,), (1,), (0, 1))
-"""Which torques change: one alone, or both."""
+_TORQUES = ((0,), (1,), (0, 1))  # which torques change: one alone, or both
 _KINDS = {EventKind.CONTACT_LOST: "lost", EventKind.SLIP: "slips"}
-LEAST = 1e-3
-"""Least normal force to aim at, over the scene's force, where epsilon is less."""
-TURNED = 1e-6
-"""Speed from which on a motion counts as going one way, relative to the scene's speed."""
+LEAST = 1e-3  # least normal force to aim at, over the scene's force, where epsilon is less
+MIN_SPEED = 1e-6  # speed above which a direction of motion counts, over the scene's speed
 
 
 def find_help(
     problem: Problem, simulation: Simulation, phases: tuple[PhaseReport, ...], allowance: Allowance
 ) -> TuningHelp:
-    """What helps to mend a replay: losses with changes of the torques, and how near it came."""
+    """Losses with changes of the torques that prevent them, and the approach to a missed end."""
+    rolling = [{own.name for own in phase.formation.rolling} for phase in problem.phases]
     events = [
         (event.phase, event.contact, _KINDS[event.kind], event.time)
         for event in simulation.events
-        if _is_loss(problem, event.kind, event.phase, event.contact)
+        if event.kind is EventKind.CONTACT_LOST
+        or (event.kind is EventKind.SLIP and event.contact in rolling[event.phase])
     ]
     ended = {event[:2] for event in events}
     allowed = allowance.measure_stray(problem)
@@ -62,20 +59,15 @@ def find_help(
         for margin in phase.contacts
         if margin.margin < -allowed and (phase.number - 1, margin.contact) not in ended
     ]
-    losses = (_look_at(problem, simulation, *event) for event in events)
+    losses = (_examine_loss(problem, simulation, *event) for event in events)
     approach = None if simulation.outcome.reached else find_approach(problem, simulation)
     return TuningHelp(tuple(loss for loss in losses if loss is not None), approach)
 
 
-def _is_loss(problem: Problem, kind: EventKind, phase: int, contact: str) -> bool:
-    rolling = {own.name for own in problem.phases[phase].formation.rolling}
-    return kind is EventKind.CONTACT_LOST or (kind is EventKind.SLIP and contact in rolling)
-
-
-def _look_at(
+def _examine_loss(
     problem: Problem, simulation: Simulation, index: int, contact: str, kind: str, time: float
 ) -> Loss | None:
-    """A loss with what would mend it; None if the phase does not have the contact."""
+    """A loss with changes that prevent it; None if the phase does not have the contact."""
     phase = problem.phases[index]
     formation = phase.formation
     if contact not in formation.names:
@@ -83,14 +75,14 @@ def _look_at(
     row = _find_row(simulation, index, contact, kind, time)
     z, v, tau = simulation.z[row], simulation.z_dot[row], simulation.tau[row]
     epsilon = max(problem.epsilon, LEAST * problem.scene.scales.force)
-    way = _measure_way(phase, z[None], v[None])
+    distance = _measure_distance(phase, z[None], v[None])
     columns = [simulation.contacts.index(name) for name in formation.names]
     rests = bool(np.isnan(simulation.c_n[row, columns]).all())
     if rests:
-        ways = list_ways(formation, z)
-        instant = find_worst(formation, ways, z, tau)
-        gradient = None if way is None else way[1][0]
-        changes = find_resting_changes(formation, ways, epsilon, z, tau, gradient)
+        paths = find_rest(formation, z).modes
+        instant = find_worst(formation, paths, z, tau)
+        gradient = None if distance is None else distance[1][0]
+        changes = find_resting_changes(formation, paths, epsilon, z, tau, gradient)
     else:
         instant = find_moving(formation, z, v, tau, simulation.z_ddot[row])
         changes = () if instant is None else list_changes(instant, epsilon, contact, tau)
@@ -102,9 +94,9 @@ def _look_at(
             ForceAt(name, float(c_n @ load), float(c_t @ load), (float(c_n[1]), float(c_n[2])))
             for name, c_n, c_t in zip(formation.names, instant.c_n, instant.c_t, strict=True)
         )
-    if instant is not None and way is not None:
-        rows = -way[1][0] @ instant.acceleration
-        closing = (float(rows @ load - way[2][0]), float(rows[1]), float(rows[2]))
+    if instant is not None and distance is not None:
+        rows = -distance[1][0] @ instant.acceleration
+        closing = (float(rows @ load - distance[2][0]), float(rows[1]), float(rows[2]))
     when = float(simulation.t[row])
     return Loss(phase.number, contact, kind, when, rests, forces, closing, changes)
 
@@ -112,16 +104,16 @@ def _look_at(
 def list_changes(
     instant: Instant, epsilon: float, contact: str, tau: Array
 ) -> tuple[TorqueAdvice, ...]:
-    """Changes of the torques of a motion that mend a contact, and what else lets go with it."""
+    """Changes of the torques of a motion that prevent a contact, and what else lets go with it."""
     formation = instant.formation
-    much, load = formation.scene.scales.torque, np.array([1.0, *tau])
+    unit, load = formation.scene.scales.torque, np.array([1.0, *tau])
     limits, bare = make_limits(formation, epsilon), make_limits(formation, 0.0)
     forces = (PRESS, CONE)
     own = [limit.part == contact and limit.kind in forces for limit in limits.limits]
     missed = np.array(own)[limits.owners][limits.sides[0]]
     gone = instant.find_sides(bare) @ load < -KEPT * limits.scales[limits.sides[0]]
     missed |= gone & np.isin(limits.sides[0], limits.of(*forces))
-    return find_changes(limits, instant.find_sides(limits), missed, tau, much)
+    return find_changes(limits, instant.find_sides(limits), missed, tau, unit)
 
 
 def _find_row(simulation: Simulation, index: int, contact: str, kind: str, time: float) -> int:
@@ -138,14 +130,16 @@ def find_approach(problem: Problem, simulation: Simulation) -> Approach | None:
     phase, scales = problem.phases[int(simulation.phase[-1])], problem.scene.scales
     rows = np.flatnonzero(simulation.phase == phase.index)
     t, v = simulation.t[rows], simulation.z_dot[rows]
-    way = _measure_way(phase, simulation.z[rows], v)
-    if way is None:
+    distance = _measure_distance(phase, simulation.z[rows], v)
+    if distance is None:
         return None
     is_angle = phase.until.coordinate == "phi"
-    distance, gradient, _ = way
+    gaps, gradient, _ = distance
     rates = -np.einsum("ni,ni->n", gradient, v)
-    least, time = find_lowest(t, distance, simulation.torque.breaks)
-    going = np.flatnonzero(np.abs(rates) > TURNED * (1 / scales.time if is_angle else scales.speed))
+    least, time = find_lowest(t, gaps, simulation.torque.breaks)
+    going = np.flatnonzero(
+        np.abs(rates) > MIN_SPEED * (1 / scales.time if is_angle else scales.speed)
+    )
     turns = going[np.flatnonzero(np.diff(np.sign(rates[going])))]
     return Approach(
         phase=phase.number,
@@ -158,7 +152,7 @@ def find_approach(problem: Problem, simulation: Simulation) -> Approach | None:
     )
 
 
-def _measure_way(phase: Phase, z: Array, v: Array) -> tuple[Array, Array, Array] | None:
+def _measure_distance(phase: Phase, z: Array, v: Array) -> tuple[Array, Array, Array] | None:
     """Distance to the end of a phase at n states, its gradient, (n, 5), and its bend, (n,).
 
     The bend is what the velocity alone adds to its second derivative, towards the end.
@@ -178,25 +172,22 @@ def _measure_way(phase: Phase, z: Array, v: Array) -> tuple[Array, Array, Array]
     return side * offset, gradient, np.zeros(len(z))
 
 
-def list_ways(formation: Formation, z: Array) -> Sequence[StartPath]:
-    """The ways in which a formation at rest at `z` could begin to move."""
-    return find_rest(formation, z).all_ways
-
-
 def find_worst(
-    formation: Formation, ways: Sequence[StartPath], z: Array, tau: Array
+    formation: Formation, paths: Sequence[StartMode], z: Array, tau: Array
 ) -> Instant | None:
-    """Forces as torques begin a motion in the way that holds worst; None if they begin none."""
+    """Forces at the start of the motion with the least margin; None if torques begin none."""
     load = np.array([1.0, *tau])
-    free = [way for way in ways if way.slides(tau)]
+    free = [path for path in paths if path.slides(tau)]
     if not free:
         return None
-    return _answer(formation, z, min(free, key=lambda way: float((way.force_limits @ load).min())))
+    return _answer(
+        formation, z, min(free, key=lambda path: float((path.force_limits @ load).min()))
+    )
 
 
 def find_resting_changes(
     formation: Formation,
-    ways: Sequence[StartPath],
+    paths: Sequence[StartMode],
     epsilon: float,
     z: Array,
     tau: Array,
@@ -208,55 +199,57 @@ def find_resting_changes(
 
     Parameters
     ----------
-    ways              see `list_ways`
+    paths             directions in which the formation could begin to move
     epsilon : [N]
     z : (5,)
     tau : (2,) [N m]
     gradient : (5,)   of the distance to the end of the phase, if that is known
     """
-    moved = [_move(formation, way, epsilon, z, tau, gradient) for way in ways]
-    found: list[TorqueAdvice] = []
+    moved = [_move(formation, path, epsilon, z, tau, gradient) for path in paths]
+    resting_changes: list[TorqueAdvice] = []
     for k, free in enumerate(_TORQUES):
         known = [change for own in moved if (change := own[k]) is not None]
-        if len(free) == 2 and found:
+        if len(free) == 2 and resting_changes:
             break
         held = None if known else _hold(formation, epsilon, z, tau, free)
         if known:
-            found.append(tell(min(known, key=np.linalg.norm), tau))
+            resting_changes.append(make_advice(min(known, key=np.linalg.norm), tau))
         elif held is not None:
-            found.append(tell(held, tau, holds=True))
-    return tuple(sorted(found, key=lambda change: (change.holds, np.hypot(*change.change))))
+            resting_changes.append(make_advice(held, tau, holds=True))
+    return tuple(
+        sorted(resting_changes, key=lambda change: (change.holds, np.hypot(*change.change)))
+    )
 
 
-def _answer(formation: Formation, z: Array, way: StartPath) -> Instant | None:
-    return answer(formation, z, np.zeros(5), np.concatenate(way.directions))
+def _answer(formation: Formation, z: Array, path: StartMode) -> Instant | None:
+    return answer(formation, z, np.zeros(5), np.concatenate(path.directions))
 
 
 def _move(
     formation: Formation,
-    way: StartPath,
+    path: StartMode,
     epsilon: float,
     z: Array,
     tau: Array,
     gradient: Array | None,
 ) -> list[Array | None]:
     """Least changes of one torque, the other and both with which it begins to move one way."""
-    instant, much = _answer(formation, z, way), formation.scene.scales.torque
+    instant, unit = _answer(formation, z, path), formation.scene.scales.torque
     if instant is None:
         return [None] * len(_TORQUES)
     limits = make_limits(formation, epsilon)
-    rows = [row + np.array([offset, 0.0, 0.0]) for row, offset in way.margins]
+    rows = [row + np.array([offset, 0.0, 0.0]) for row, offset in path.margins]
     rows += [] if gradient is None else [-gradient @ instant.acceleration]
-    sizes = np.abs(rows) @ [1.0, much, much]
+    sizes = np.abs(rows) @ [1.0, unit, unit]
     scale = np.concatenate([limits.scales[limits.sides[0]], np.where(sizes > 0, sizes, 1.0)])
     sides = np.vstack([instant.find_sides(limits), *rows])
-    slack, slope = normalise(sides, scale, tau, much)
+    slack, slope = normalise(sides, scale, tau, unit)
     tried = (change_one(slack, slope, 0), change_one(slack, slope, 1), change_both(slack, slope))
 
     def keep(change: Array | None) -> Array | None:
         if change is None or (slack + slope @ change < -KEPT).any():
             return None
-        return much * change if way.moves(tau + much * change) else None
+        return unit * change if path.moves(tau + unit * change) else None
 
     return [keep(change) for change in tried]
 
@@ -343,15 +336,15 @@ def find_moving(
     still = [unit for unit in list_units(formation) if slow[list(unit.rows)].all()]
     holds = formation.n_constraints < 4
     options = [(1.0, -1.0, 0.0) if holds and unit.grips else (1.0, -1.0) for unit in still]
-    found: list[tuple[float, Instant]] = []
+    candidates: list[tuple[float, Instant]] = []
     for choice in product(*options):
         for unit, sign in zip(still, choice, strict=True):
             signs[list(unit.rows)] = sign
         instant = answer(formation, z, v, signs)
         if instant is not None:
             misfit = instant.acceleration @ [1.0, *tau] - acceleration
-            found.append((float(scene.mass_diagonal @ misfit**2), instant))
-    return min(found, key=lambda pair: pair[0])[1] if found else None
+            candidates.append((float(scene.mass_diagonal @ misfit**2), instant))
+    return min(candidates, key=lambda pair: pair[0])[1] if candidates else None
 
 
 def answer(formation: Formation, z: Array, v: Array, signs: Array) -> Instant | None:
@@ -374,22 +367,22 @@ def answer(formation: Formation, z: Array, v: Array, signs: Array) -> Instant | 
 
 
 def find_changes(
-    limits: LimitSet, sides: Array, missed: NDArray[np.bool_], tau: Array, much: float
+    limits: LimitSet, sides: Array, missed: NDArray[np.bool_], tau: Array, unit: float
 ) -> tuple[TorqueAdvice, ...]:
-    """Least changes of each torque alone that mend some limits, and of both where those spoil some.
+    """Least changes of each torque alone that keep some limits, or of both if that misses others.
 
     Other limits have to be kept; what they miss already they must not miss by more.
 
     Parameters
     ----------
     sides : (n_sides, 3)  slack of its one-sided limits is sides @ (1, tau_1, tau_2)
-    missed : (n_sides,)   which sides are to be mended
+    missed : (n_sides,)   which sides are to be kept
     tau : (2,) [N m]
-    much : [N m]          what is much for a torque
+    unit : [N m]          the scale of a torque
     """
     owners = limits.owners[limits.sides[0]]
     scale = limits.scales[limits.sides[0]]
-    slack, slope = normalise(sides, scale, tau, much)
+    slack, slope = normalise(sides, scale, tau, unit)
     slack = np.where(missed, slack, np.maximum(slack, 0.0))
 
     def describe(change: Array) -> TorqueAdvice:
@@ -398,22 +391,22 @@ def find_changes(
         if short[worst] > KEPT:
             limit = limits.limits[owners[worst]]
             but = f"{limit.text} is {short[worst] * scale[worst]:.3g} {limit.unit} short"
-        return tell(much * change, tau, but)
+        return make_advice(unit * change, tau, but)
 
     singles = [change_one(slack, slope, joint) for joint in range(2)]
-    found = [describe(one) for one in singles if one is not None]
-    both = change_both(slack, slope) if all(change.but for change in found) else None
-    found += [] if both is None else [describe(both)]
-    return tuple(sorted(found, key=lambda change: (bool(change.but), np.hypot(*change.change))))
+    changes = [describe(one) for one in singles if one is not None]
+    both = change_both(slack, slope) if all(change.but for change in changes) else None
+    changes += [] if both is None else [describe(both)]
+    return tuple(sorted(changes, key=lambda change: (bool(change.but), np.hypot(*change.change))))
 
 
-def normalise(sides: Array, scale: Array, tau: Array, much: float) -> tuple[Array, Array]:
-    """Slack under torques `tau` and its slope, (n,) and (n, 2), in what is much for each."""
+def normalise(sides: Array, scale: Array, tau: Array, unit: float) -> tuple[Array, Array]:
+    """Slack under torques `tau` and its slope, (n,) and (n, 2), in the scale of each."""
     slack = sides @ np.array([1.0, *tau]) / scale
-    return np.asarray(slack), sides[:, 1:] * (much / scale)[:, None]
+    return np.asarray(slack), sides[:, 1:] * (unit / scale)[:, None]
 
 
-def tell(change: Array, tau: Array, but: str = "", holds: bool = False) -> TorqueAdvice:
+def make_advice(change: Array, tau: Array, but: str = "", holds: bool = False) -> TorqueAdvice:
     """A change of torques `tau`, shape (2,) [N m]."""
     (first, second), (one, other) = change.tolist(), (tau + change).tolist()
     return TorqueAdvice((first, second), (one, other), but, holds)

@@ -1,7 +1,4 @@
-"""Whether a replay holds, and the reasons why not, in words.
-
-Nothing is decided by a sign: each limit has a tolerance, relative to the scene's scales.
-"""
+"""Verdict on a replay: limits with tolerances relative to the scene, and their messages."""
 
 from __future__ import annotations
 
@@ -24,20 +21,17 @@ from ..simulation.events import EventKind, OutcomeKind, Simulation
 
 DEPARTURE = 1e-3
 """Largest distance of a replay from its plan, relative to the scene's length, and in rad."""
-REST_SPEED = 2e-2
-"""Speed at the end of a phase that passes for rest, relative to the scene's speed."""
+REST_SPEED = 2e-2  # speed at the end of a phase that passes for rest, relative to the scene's speed
 STRAY = 2e-3
 """Largest shortfall of a normal force of a plan below epsilon, relative to epsilon: a replay
 strays."""
-ROUNDING = 5e-7
-"""The same by rounding, relative to the scene's force."""
+ROUNDING = 5e-7  # the same by rounding, relative to the scene's force
 GOAL = 3e-4
 """Distance to the end of the last phase that counts as there, relative to the scene's length, and
 in rad."""
 ROUGH_UNIQUENESS = 1e-3
 """By how much uniqueness margins of a replay may be less than those of its plan."""
-OVERLAP = 3e-5
-"""Overlap of the links that passes for touching, relative to the scene's length."""
+OVERLAP = 3e-5  # overlap of the links that passes for touching, relative to the scene's length
 
 
 @declare(

@@ -1,4 +1,4 @@
-"""Check torques by replaying them open loop: margins between nodes, goal, deviation and energy."""
+"""Verification of torques by open-loop replay: margins between nodes, goal, deviation, energy."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import InputError
 from ..common.sharing import exclusive
 from ..contacts.links import evaluate_finger_gap
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN
 from ..problem.definition import End, Phase, Problem
-from ..results.adopt import Torques, adopt_torques
+from ..results.adopt import Torques, adopt_torques, require_same_contacts
 from ..results.report import (
     Deviation,
     EnergyBalance,
@@ -61,11 +60,9 @@ from .verdict import (
 ROWS = 20
 """About how many rows of each phase of a trajectory its replay is compared with; without one, about
 how many even parts of each phase are looked at."""
-POINTS = 8
-"""Instants around what seems to be a dip."""
-LOOKS = 3
-"""How often what the looks before leave open is looked at closer."""
-WORTH = 1e-7
+POINTS = 8  # instants around what seems to be a dip
+LOOKS = 3  # how often what the looks before leave open is looked at closer
+_DIP = 1e-7
 """How far below all that is known a dip has to seem, relative to the scene's force or length."""
 Dips = list[tuple[float, float]]
 """Where something seems to dip, from start to end [s]."""
@@ -74,7 +71,7 @@ _CHANGES = {EventKind.STICK: "sticks", EventKind.SLIP: "slips", EventKind.REVERS
 
 
 class Observation(NamedTuple):
-    """A replay, and what was seen of it, whatever is allowed."""
+    """A replay and its measurements, before tolerances are applied."""
 
     problem: Problem
     torque: TorqueProfile
@@ -122,21 +119,14 @@ def verify(
     """
     problem, torque, plan = adopt_torques(problem, what)
     allowance = Allowance(departure, rest_speed, uniqueness_margin=uniqueness_margin)
-    names = {contact.name for contact in problem.contacts}
-    if plan is not None and set(plan.contacts) != names:
-        odd = ", ".join(sorted(set(plan.contacts) ^ names))
-        raise InputError("", "contacts", f"trajectory and problem differ in {odd}")
+    require_same_contacts(problem, plan)
     seen = observe(problem, torque, plan, tolerance, True)
     report = judge(seen, allowance, reduced)
-    return report if report.ok and not report.warnings else _help(seen, report, allowance)
-
-
-def _help(seen: Observation, report: Report, allowance: Allowance) -> Report:
-    """The report with what helps to tune the torques."""
+    if report.ok and not report.warnings:
+        return report
     from .torque_advice import find_help
 
-    found = find_help(seen.problem, seen.simulation, seen.phases, allowance)
-    return replace(report, help=found)
+    return replace(report, help=find_help(problem, seen.simulation, seen.phases, allowance))
 
 
 def observe(
@@ -144,15 +134,15 @@ def observe(
     torque: TorqueProfile,
     plan: Trajectory | None,
     tolerance: float = 1e-9,
-    sure: bool = False,
+    uniqueness: bool = False,
 ) -> Observation:
-    """Replay torques and look at what happens, closer where that may decide something.
+    """Replay torques and record forces and gaps, more densely near their minima.
 
     Parameters
     ----------
-    plan       what to compare the replay with
-    tolerance  of the simulation
-    sure       whether to see if contact forces are the only ones, and starts sure
+    plan        what to compare the replay with
+    tolerance   of the simulation
+    uniqueness  whether to find uniqueness margins, and static indeterminacy of starts
 
     Raises
     ------
@@ -161,7 +151,7 @@ def observe(
     times, closer = choose_times(problem, torque, plan), make_closer(problem, torque.breaks)
     simulation = simulate(problem, torque, tolerance=tolerance, times=times, closer=closer)
     phases = tuple(
-        _report_phase(problem, simulation, torque, plan, index, sure)
+        _report_phase(problem, simulation, torque, plan, index, uniqueness)
         for index in range(int(simulation.phase[-1]) + 1)
     )
     gap = find_finger_gap(problem.scene, simulation, torque.breaks)
@@ -169,7 +159,7 @@ def observe(
 
 
 def judge(seen: Observation, allowance: Allowance, reduced: bool = False) -> Report:
-    """Say whether a replay holds; see `verify`."""
+    """Apply tolerances to a replay; see `verify`."""
     problem, simulation, phases, gap = seen.problem, seen.simulation, seen.phases, seen.gap
     reached, outcome = judge_end(problem, simulation, allowance)
     failures = [] if reached else [Failure(len(phases), outcome)]
@@ -191,6 +181,11 @@ def judge(seen: Observation, allowance: Allowance, reduced: bool = False) -> Rep
         failures += thin + describe_departures(problem, phases, allowance)
     else:
         warnings += [failure.text for failure in thin]
+    states: tuple[ReducedState, ...] = ()
+    if reduced:
+        from .minimal_coordinates import list_reduced_states
+
+        states = list_reduced_states(problem, simulation)
     return Report(
         name=problem.name,
         epsilon=problem.epsilon,
@@ -210,15 +205,9 @@ def judge(seen: Observation, allowance: Allowance, reduced: bool = False) -> Rep
             for e in simulation.events
             if e.kind in _CHANGES and e.contact
         ),
-        reduced=_list_reduced(problem, simulation) if reduced else (),
+        reduced=states,
         replay=simulation,
     )
-
-
-def _list_reduced(problem: Problem, simulation: Simulation) -> tuple[ReducedState, ...]:
-    from .minimal_coordinates import list_reduced_states
-
-    return list_reduced_states(problem, simulation)
 
 
 def _report_phase(
@@ -227,7 +216,7 @@ def _report_phase(
     torque: TorqueProfile,
     plan: Trajectory | None,
     index: int,
-    sure: bool,
+    uniqueness: bool,
 ) -> PhaseReport:
     phase = problem.phases[index]
     rows = np.flatnonzero(simulation.phase == index)
@@ -235,7 +224,9 @@ def _report_phase(
     impacts = [e for e in simulation.find(EventKind.IMPACT) if e.phase == index]
     stops = bool(arrivals) and phase.end is End.REST
     moves = find_departure(simulation, torque, index)
-    end = worst = None
+    end = worst = held = None
+    if uniqueness:
+        held = find_wedged(problem, phase, simulation, rows, REST_SPEED, moves)
     if plan is not None:
         # A motion that goes on is compared when its phase was planned to end, not when it did.
         passes, length = phase.end is not End.REST, problem.scene.scales.length
@@ -253,18 +244,13 @@ def _report_phase(
         impact=LeastImpulse(impacts[0].contact, impacts[0].value) if impacts else None,
         end_deviation=end,
         deviation=worst,
-        uniqueness_margin=find_uniqueness_margin(phase, simulation, rows) if sure else None,
-        wedged=find_wedged(problem, phase, simulation, rows, REST_SPEED, moves) if sure else None,
+        uniqueness_margin=find_uniqueness_margin(phase, simulation, rows) if uniqueness else None,
+        wedged=held,
     )
 
 
 def _compare(
-    simulation: Simulation,
-    plan: Trajectory,
-    index: int,
-    arrived: bool,
-    passes: bool,
-    length: float,
+    simulation: Simulation, plan: Trajectory, index: int, arrived: bool, passes: bool, length: float
 ) -> tuple[Deviation | None, Deviation | None]:
     """Difference from the plan at the end of a phase and at worst."""
     planned = np.flatnonzero(plan.phase == index)
@@ -303,8 +289,7 @@ def _describe_end(events: list[Event], phase: Phase) -> str:
 
 def _describe_torques(problem: Problem, torque: TorqueProfile) -> list[str]:
     """Sentences on torques beyond their limits."""
-    powers = np.linspace(-1, 1, 9)[:, None] ** np.arange(torque.coefficients.shape[2])
-    peaks = np.abs(torque.coefficients @ powers.T).max(axis=2)
+    peaks = np.abs(torque.at_places(np.linspace(-1, 1, 9))).max(axis=2)
     texts = []
     for joint, limit in enumerate(problem.scene.torque_limit):
         piece = int(peaks[:, joint].argmax())
@@ -328,17 +313,7 @@ def _balance(problem: Problem, simulation: Simulation) -> EnergyBalance:
     work, residual = float(energies.work[-1]), float(energies.residual[-1])
     scale = abs(work) + abs(kinetic) + abs(potential) + sum(map(abs, losses.values()))
     relative = abs(residual) / scale if scale > 0 else 0.0
-    return EnergyBalance(
-        work=work,
-        kinetic=kinetic,
-        potential=potential,
-        **losses,
-        residual=residual,
-        relative=relative,
-    )
-
-
-__all__ = ["Report", "verify"]
+    return EnergyBalance(work, kinetic, potential, **losses, residual=residual, relative=relative)
 
 
 def choose_times(problem: Problem, torque: TorqueProfile, plan: Trajectory | None) -> Array:
@@ -351,7 +326,7 @@ def choose_times(problem: Problem, torque: TorqueProfile, plan: Trajectory | Non
 
 
 class Series(NamedTuple):
-    """What a replay has shown in a phase of a force, a margin or a gap."""
+    """Recorded values of a force, a margin or a gap in a phase."""
 
     name: str
     t: Array  # t, values (n,) [s], [N or m]: at recorded instants
@@ -360,7 +335,7 @@ class Series(NamedTuple):
     more: Array
     breaks: Array  # [s]: where it may have a kink
     shortest: float  # [s]: interval below which it may jump
-    worth: float  # [N or m]: how far below the least value a dip has to seem
+    depth: float  # [N or m]: how far below the least value a dip has to seem
 
     def find_dips(self) -> Dips:
         """Places where it seems to be lower than anywhere recorded, with and without glimpses."""
@@ -374,14 +349,14 @@ class Series(NamedTuple):
         return self._fit(self.t[within], self.values[within])
 
     def _fit(self, t: Array, values: Array) -> Dips:
-        found = fit_parabolas(t, values, self.breaks, self.shortest)
-        least = np.nanmin(self.values, initial=np.inf) - self.worth
-        low = np.flatnonzero(found.lowest < least).tolist()
-        return [(float(found.start[k]), float(found.stop[k])) for k in low]
+        parabolas = fit_parabolas(t, values, self.breaks, self.shortest)
+        least = np.nanmin(self.values, initial=np.inf) - self.depth
+        low = np.flatnonzero(parabolas.lowest < least).tolist()
+        return [(float(parabolas.start[k]), float(parabolas.stop[k])) for k in low]
 
 
 def make_closer(problem: Problem, breaks: Array) -> Closer:
-    """What looks closer at a replay where a force, a margin to slipping or a gap seems to dip.
+    """Instants to add to a replay, near the minima of forces, slip margins and gaps.
 
     Parameters
     ----------
@@ -409,16 +384,16 @@ def make_closer(problem: Problem, breaks: Array) -> Closer:
 def _list_series(
     problem: Problem, simulation: Simulation, glimpses: Glimpses, phase: Phase, breaks: Array
 ) -> Iterator[Series]:
-    """All that may dip in a phase; margins and gaps have no jumps, and hardly a kink."""
+    """Forces, slip margins and gaps of a phase; margins and gaps have no jumps."""
     scales, rows = problem.scene.scales, np.flatnonzero(simulation.phase == phase.index)
     t, none, shortest = simulation.t[rows], np.zeros(0), SHORTEST * scales.time
     own = np.flatnonzero(glimpses.phase == phase.index)
-    worth = WORTH * scales.force
+    least = _DIP * scales.force
     for name, values in list_normal_forces(problem, simulation, phase, rows).items():
         more = glimpses.c_n[own, simulation.contacts.index(name)]
-        yield Series(name, t, values, glimpses.t[own], more, breaks, shortest, worth)
+        yield Series(name, t, values, glimpses.t[own], more, breaks, shortest, least)
     for name, values in list_slips(simulation, phase, rows).items():
-        yield Series(f"{name} rolling", t, values, none, none, t[:1], shortest, worth)
+        yield Series(f"{name} rolling", t, values, none, none, t[:1], shortest, least)
     if problem.scene.fingers_collide:
         gaps = evaluate_finger_gap(problem.scene, simulation.z[rows])
-        yield Series("gap", t, gaps, none, none, t[:1], shortest, WORTH * scales.length)
+        yield Series("gap", t, gaps, none, none, t[:1], shortest, _DIP * scales.length)

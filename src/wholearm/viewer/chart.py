@@ -1,4 +1,4 @@
-"""The map of contact formations in a page, and what can be clicked on it."""
+"""The map of contact formations as SVG, with the cells, borders and crossings to click."""
 
 from __future__ import annotations
 
@@ -37,27 +37,20 @@ from ..figures.map_lines import (
     trace_plan,
 )
 from ..mapping.formation_list import trace_problem
-from ..mapping.formation_map import CROSSED, Border, Crossing, FormationMap
+from ..mapping.formation_map import CROSSED, Border, FormationMap
 from ..results.trajectory import Trajectory
 from ..search.times import time_borders
 from .motion_data import count_places, describe_hand
 
 SHEET = (1000.0, 620.0)
 """Width and height of the drawing, in its own units; texts are 11 of these high."""
-BOX = (58.0, 44.0, 868.0, 566.0)
-"""The axes: left, bottom, width, height."""
-_ASIDE = 3.0
-"""Offset of directed lines from the border."""
-_ARROW = 8.0
-"""Length of the arrows inside cells."""
-_LETTER, _HEIGHT = 6.2, 13.0
-"""Size of a letter of a label."""
-_DISC = 18.0
-"""Room for the number of a phase."""
-_CLEAR = 9.0
-"""Distance of labels from the plan."""
-_MOST = 40
-"""Points of a line that is clicked; more cannot be told apart."""
+BOX = (58.0, 44.0, 868.0, 566.0)  # the axes: left, bottom, width, height
+_ASIDE = 3.0  # offset of directed lines from the border
+_ARROW = 8.0  # length of the arrows inside cells
+_LETTER, _HEIGHT = 6.2, 13.0  # size of a letter of a label
+_DISC = 18.0  # room for the number of a phase
+_CLEAR = 9.0  # distance of labels from the plan
+_MOST = 40  # points of a line that is clicked; more cannot be told apart
 
 
 class MapChart(NamedTuple):
@@ -82,20 +75,26 @@ def describe_map(chart: FormationMap, plan: Trajectory | None = None) -> MapChar
     middles = np.array([[chart.x[column], chart.phi[row]] for row, column, _ in rooms])
     poses = close_fingers(scene, *middles.T).z
     cells = [
-        _describe(chart.formations[index], _describe_cell(point), z[None])
+        _describe(
+            chart.formations[index],
+            f"a cell, two freedoms; its middle is at {_name_place(point)}",
+            z[None],
+        )
         for (index, _), point, z in zip(parts, middles, poses, strict=True)
     ]
     held = [border for border in chart.borders if border.flush is not None]
-    few = [
-        np.unique(np.linspace(0, len(own.points) - 1, _MOST).round().astype(int)) for own in held
-    ]
+    counts = [len(border.points) for border in held]
+    few = [np.unique(np.linspace(0, n - 1, _MOST).round().astype(int)) for n in counts]
     times = time_borders(chart.problem, held)
     borders = [
         _describe(border.contacts, _describe_border(border, own), border.z[rows])
         for border, own, rows in zip(held, times, few, strict=True)
     ]
     crossings = [
-        _describe(own.contacts, _describe_crossing(own), own.z[None]) for own in chart.crossings
+        _describe(
+            crossing.contacts, f"a crossing at {_name_place(crossing.point)}", crossing.z[None]
+        )
+        for crossing in chart.crossings
     ]
     drawing = draw_map(
         chart,
@@ -125,17 +124,13 @@ def _name_place(point: Array) -> str:
     return f"x = {1e3 * x:.2f} mm, phi = {math.degrees(phi):.2f} deg"
 
 
-def _describe_cell(point: Array) -> str:
-    return f"a cell, two freedoms; its middle is at {_name_place(point)}"
-
-
 def _describe_border(border: Border, times: Array) -> str:
     """Where a border runs, and what motions along it are possible each way."""
     ways = zip(("increasing", "decreasing"), (border.forth, border.back), times, strict=True)
-    possible = [
-        f"{border.along} {way}: {_name_time(time)}, slow motions {_name_share(share.mean())}"
-        for way, share, time in ways
-    ]
+    possible = []
+    for way, flags, time in ways:
+        where = "all along" if flags.all() else "on parts" if flags.any() else "nowhere"
+        possible.append(f"{border.along} {way}: {_name_time(time)}, slow motions {where}")
     (x, phi), (x_end, phi_end) = border.points[0], border.points[-1]
     return (
         f"a border, one freedom, x {1e3 * x:.1f} to {1e3 * x_end:.1f} mm, phi "
@@ -143,18 +138,9 @@ def _describe_border(border: Border, times: Array) -> str:
     )
 
 
-def _name_share(share: float) -> str:
-    """Where along a border slow motions are possible."""
-    return "all along" if share == 1 else "on parts" if share > 0 else "nowhere"
-
-
 def _name_time(time: float) -> str:
     """How long the fastest motion from one end to the other takes."""
     return f"least time about {time:.3f} s" if math.isfinite(time) else "no motion from end to end"
-
-
-def _describe_crossing(crossing: Crossing) -> str:
-    return f"a crossing at {_name_place(crossing.point)}"
 
 
 def draw_map(
@@ -189,8 +175,11 @@ def draw_map(
             *_draw_borders(chart, paper),
             *_draw_paths(paper, paths),
             *_write_labels(chart, paper, paths, parts),
-            *(f'<polyline class="hit" points="{write_line(paper.place(own))}"/>' for own in lines),
-            *_draw_crossings(paper, points),
+            *(f'<polyline class="hit" points="{_join(paper.place(line))}"/>' for line in lines),
+            *(
+                f'<circle class="hit" cx="{x:.1f}" cy="{SHEET[1] - y:.1f}" r="3.4" fill="{INK}"/>'
+                for x, y in paper.place(points)
+            ),
             *_number_paths(paper, paths),
             f'</g>{clip} fill="none" stroke="{INK}" stroke-width="0.8"/>',
             *_draw_axes(chart, paper),
@@ -213,7 +202,7 @@ def draw_legend(chart: FormationMap, with_path: bool) -> str:
     ]
     if (chart.cell == CROSSED).any():
         entries.append(('<rect width="26" height="10" fill="url(#crossed)"/>', "fingers overlap"))
-    if chart.ambiguous.any() or any(own.ambiguous.any() for own in chart.borders):
+    if chart.ambiguous.any() or any(border.ambiguous.any() for border in chart.borders):
         text = "contact forces would not be unique"
         entries.append((_swatch(AMBIGUOUS, dashes="3 3"), text))
     if with_path:
@@ -306,7 +295,7 @@ def _draw_paths(paper: Paper, paths: Sequence[Array]) -> Iterable[str]:
 
 
 def _number_paths(paper: Paper, paths: Sequence[Array]) -> Iterable[str]:
-    lines = [paper.place(own) for own in paths]
+    lines = [paper.place(path) for path in paths]
     corners = np.array([BOX[:2], np.add(BOX[:2], BOX[2:])])
     places = place_discs(lines, _DISC, *corners)
     for number, (own, (x, y)) in enumerate(zip(lines, places, strict=True), start=1):
@@ -317,10 +306,7 @@ def _number_paths(paper: Paper, paths: Sequence[Array]) -> Iterable[str]:
 
 
 def _write_labels(
-    chart: FormationMap,
-    paper: Paper,
-    paths: Sequence[Array],
-    parts: Sequence[tuple[int, Flags]],
+    chart: FormationMap, paper: Paper, paths: Sequence[Array], parts: Sequence[tuple[int, Flags]]
 ) -> Iterable[str]:
     x, y = _grid(chart, paper)
     clear = np.ones(chart.cell.shape, dtype=bool)
@@ -338,11 +324,6 @@ def _write_labels(
         row, column, room = find_room(free, np.array([y[1] - y[0], x[1] - x[0]]) / half)
         if room >= 1.15:
             yield write_text(text, (x[column], y[row] - 4.0), f' class="name{look}"')
-
-
-def _draw_crossings(paper: Paper, points: Array) -> Iterable[str]:
-    for x, y in paper.place(points):
-        yield f'<circle class="hit" cx="{x:.1f}" cy="{SHEET[1] - y:.1f}" r="3.4" fill="{INK}"/>'
 
 
 def _draw_axes(chart: FormationMap, paper: Paper) -> Iterable[str]:
@@ -394,11 +375,6 @@ def turn(points: Array) -> Array:
 def write_path(lines: Iterable[Array], closed: bool = False) -> str:
     """What a path of polylines, each of shape (n, 2), draws."""
     return "".join(f"M{_join(line)}{'z' if closed else ''}" for line in lines)
-
-
-def write_line(line: Array) -> str:
-    """A polyline's points."""
-    return _join(line)
 
 
 def write_text(text: str, place: Iterable[float], look: str = "") -> str:

@@ -15,10 +15,8 @@ from ..search.solve import solve
 from ..verification.verify import verify
 from .movie import Movie, write_movie
 
-_WIDTH, _DOTS = 8.0, 110
-"""Of figures [in] and [dots per inch]."""
-_LASTS, _RESOLUTION = 2.0, 50
-"""Of movies [s] and [dots per inch]."""
+_WIDTH, _DOTS = 8.0, 110  # of figures [in] and [dots per inch]
+_LASTS, _RESOLUTION = 2.0, 50  # of movies [s] and [dots per inch]
 _HEADS = ["problem", "phases:d", "least time [s]:.6f", "least c_n [N]:.4f", "finger gap [mm]:.1f"]
 
 
@@ -71,7 +69,10 @@ def _list_figures(name: str, plan: Plan) -> tuple[object, ...]:
     report = verify(plan.problem, plan)
     gap = "" if report.finger_gap is None else report.finger_gap.least
     least = min(
-        own.least for phase in report.phases for own in phase.contacts if own.least == own.least
+        contact.least
+        for phase in report.phases
+        for contact in phase.contacts
+        if contact.least == contact.least
     )
     verdict = "ok" if report.ok else "FAILED"
     return name, len(plan.phases), plan.value, least, gap, verdict

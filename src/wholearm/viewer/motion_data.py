@@ -1,4 +1,4 @@
-"""A motion as what is drawn of it: outlines, and where contacts are and push at each instant."""
+"""Data of a motion for players: outlines, contact points and forces by sample."""
 
 from __future__ import annotations
 
@@ -20,10 +20,8 @@ from ..problem.definition import Problem
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
 
-_DIGITS = 6
-"""Significant digits of numbers in a page: more than a screen shows."""
-MOST = 4000
-"""Samples of a motion in a page."""
+_DIGITS = 6  # significant digits of numbers in a page: more than a screen shows
+MOST = 4000  # samples of a motion in a page
 
 
 class Pushes(NamedTuple):
@@ -40,7 +38,7 @@ class Pushes(NamedTuple):
 def place_pushes(scene: Scene, trajectory: Trajectory) -> Pushes:
     """Contacts and their forces at the samples of a trajectory."""
     places = [build_geometry(parse_contact(name, scene), scene) for name in trajectory.contacts]
-    rows = [ca.vertcat(own.point, own.normal) for own in places]
+    rows = [ca.vertcat(place.point, place.normal) for place in places]
     evaluate = ca.Function("places", [build_features(scene).z], [ca.vertcat(*rows)])
     values = evaluate(trajectory.z.T).full().T.reshape(len(trajectory.t), -1, 4)
     points, normals = values[..., :2], values[..., 2:]
@@ -50,10 +48,7 @@ def place_pushes(scene: Scene, trajectory: Trajectory) -> Pushes:
 
 
 def describe_motion(
-    trajectory: Trajectory,
-    problem: Problem,
-    ghost: Trajectory | None = None,
-    most: int = MOST,
+    trajectory: Trajectory, problem: Problem, ghost: Trajectory | None = None, most: int = MOST
 ) -> dict[str, Any]:
     """Everything that a page needs to play a motion, as plain values.
 
@@ -108,12 +103,12 @@ def _list_spans(
     c = np.column_stack([trajectory.c_n[rows, index], trajectory.c_t[rows, index]])
     return [
         {
-            "first": own.start,
-            "point": _fix(pushes.points[rows[own], index], scene),
-            "normal": _fix(pushes.normals[rows[own], index], scene),
-            "c": _round(c[own]),
+            "first": run.start,
+            "point": _fix(pushes.points[rows[run], index], scene),
+            "normal": _fix(pushes.normals[rows[run], index], scene),
+            "c": _round(c[run]),
         }
-        for own in find_runs(np.isfinite(c).all(axis=1))
+        for run in find_runs(np.isfinite(c).all(axis=1))
     ]
 
 

@@ -45,21 +45,15 @@ from ..problem.definition import Problem
 from ..results.trajectory import Trajectory
 from .motion_data import place_pushes
 
-FRAMES = 25
-"""Frames in a second of the movie."""
-_MOST = 3000
-"""Frames of a movie: two minutes."""
+FRAMES = 25  # frames in a second of the movie
+_MOST = 3000  # frames of a movie: two minutes
 _SIZE = (8.0, 7.4)
-RESOLUTION = 90
-"""Dots per inch of a movie that is 8 inches wide."""
-_REACH = 0.3
-"""Length of the largest force's arrow, over the picture's."""
-_BEYOND = 1.15
-"""Length of friction cones over that of the arrows in them."""
+RESOLUTION = 90  # dots per inch of a movie that is 8 inches wide
+_REACH = 0.3  # length of the largest force's arrow, over the picture's
+_BEYOND = 1.15  # length of friction cones over that of the arrows in them
 BODY, TURNS, GHOST = "#fbf3df", "#D55E00", "#bbbbbb"
 """Colours of the object, of torques and the cursor, and of what is drawn behind."""
-_TURN = 1.5 * math.pi
-"""Angle of the arc of a torque at its limit."""
+_TURN = 1.5 * math.pi  # angle of the arc of a torque at its limit
 
 
 class _Scene:
@@ -248,9 +242,8 @@ class Movie:
         frames = math.ceil(trajectory.duration / speed * FRAMES) + 1
         if frames > _MOST:
             least = trajectory.duration * FRAMES / _MOST
-            raise InputError(
-                "", "--speed", f"{speed:g} given; from {least:.2g} on, movies are short enough"
-            )
+            text = f"{speed:g} given; from {least:.2g} on, movies are short enough"
+            raise InputError("", "--speed", text)
         self.times = np.linspace(0.0, trajectory.duration, max(2, frames))
         self._problem, self._trajectory, self._ghost = problem, trajectory, ghost
         self._resolution = resolution
@@ -272,11 +265,8 @@ class Movie:
                 list_contacts(axes, 72 * _SIZE[1] * room, 8.0)
             margins.set_ylabel(f"margin {unit_of(margins)}")
             margins.tick_params(labelbottom=False)
-            torques.set(
-                xlabel="time $t$ [s]",
-                ylabel=rf"$\tau$ {unit_of(torques)}",
-                xlim=(0.0, own.duration),
-            )
+            label = rf"$\tau$ {unit_of(torques)}"
+            torques.set(xlabel="time $t$ [s]", ylabel=label, xlim=(0.0, own.duration))
             figure.align_ylabels([margins, torques])
             cursors = [axes.axvline(0.0, color=TURNS, lw=1.3) for axes in (margins, torques)]
             clock = figure.text(0.02, 0.975, "", va="top", fontsize=10.5, fontweight="bold")
@@ -348,9 +338,8 @@ def _encode(pictures: Iterator[Array], path: str | os.PathLike[str]) -> bytes:
     """An MP4 of pictures."""
     program = shutil.which("ffmpeg")
     if program is None:
-        raise InputError(
-            str(path), "", "MP4 needs ffmpeg, which is not there; .gif and .html do not"
-        )
+        text = "MP4 needs ffmpeg, which is not there; .gif and .html do not"
+        raise InputError(str(path), "", text)
     first = next(pictures)
     height, width = first.shape[:2]
     raw = ["-f", "rawvideo", "-pix_fmt", "rgba", "-s", f"{width}x{height}", "-r", str(FRAMES)]

@@ -18,10 +18,8 @@ from . import page
 from .chart import describe_map
 from .motion_data import describe_motion
 
-_SAMPLES = 8000
-"""Of all motions in a page, which they leave at some 3 MB."""
-_RESOLUTION = 90
-"""Grid of the map: its borders are exact, only cells are drawn by it."""
+_SAMPLES = 8000  # of all motions in a page, which they leave at some 3 MB
+_RESOLUTION = 90  # grid of the map: its borders are exact, only cells are drawn by it
 
 
 def build_report(
@@ -44,6 +42,8 @@ def build_report(
     ------
     InputError  if a file cannot be read, or is one of another problem; names the file
     """
+    from .. import __version__
+
     comparison = compare(problem, paths, progress)
     parts = [comparison.summary.to_html()]
     for contender in comparison.contenders:
@@ -52,15 +52,14 @@ def build_report(
     first = next((own.planned for own in comparison.contenders if own.planned is not None), None)
     progress("map")
     chart = chart or build_map(problem, _RESOLUTION, choose_window(problem, None))
+    machine = f"Python {platform.python_version()}, {platform.machine()}"
     parts += [
         page.write_heading("Contact formations"),
         page.write_chart(*describe_map(chart, first)),
-    ]
-    parts += [
         page.write_heading("Problem"),
         page.write_text(text or str(problem), "the problem file"),
+        Document(f"wholearm {__version__}, {machine}").to_html(),
     ]
-    parts += [Document(_name_versions()).to_html()]
     return page.build_page(problem.name, parts)
 
 
@@ -88,12 +87,6 @@ def _describe(contender: Contender, most: int) -> list[str]:
     if contender.report is not None:
         parts.append(page.fold(contender.report.document.to_html(), "what verify says"))
     return parts
-
-
-def _name_versions() -> str:
-    from .. import __version__
-
-    return f"wholearm {__version__}, Python {platform.python_version()}, {platform.machine()}"
 
 
 def list_phases(problem: Problem, trajectory: Trajectory) -> Table:

@@ -1,16 +1,19 @@
-"""The phases that a study runs on, and what peers are given of them.
+"""Phases of one freedom, on four sliding contacts, that methods run on, and the timing of runs.
 
-Phases are those of one freedom, on four sliding contacts. Peers get the equations of motion, and a
-slow motion to start from.
+Peers get the equations of motion, and a slow motion as first guess.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import statistics
+import time
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -28,6 +31,15 @@ from ...problem.definition import End, Problem
 from ...problem.read import read_problem
 from ...results.torque import TorqueProfile
 from ...results.trajectory import Samples
+
+REPEATS = 3  # largest number of runs that a median is of
+BUDGET = 0.3  # time after which a run is not repeated any more [s]
+SHIFT = 0.01  # shift of the geometric means [s]
+SHORT = 0.05  # time up to which something is done several times over, in about this time [s]
+MOST = 200  # largest number of times
+SOLVED = "solved"
+
+_Answer = TypeVar("_Answer")
 
 
 class Instance(NamedTuple):
@@ -56,22 +68,17 @@ def list_instances(paths: tuple[str, ...], drag: bool = True) -> tuple[Instance,
 
     Without `drag` joints have no viscous friction.
     """
-    found: dict[object, Instance] = {}
+    instances: dict[object, Instance] = {}
     for path in paths:
         read = read_problem(path)
         problem = keep_curves(read if drag else read.with_(viscous=0.0))
-        for instance in isolate(problem, Path(path).stem) if problem else ():
-            found.setdefault(_identify(instance), instance)
-    return tuple(found.values())
-
-
-def isolate(problem: Problem, name: str) -> list[Instance]:
-    """Each phase of a problem as a problem of its own."""
-    found = []
-    for phase, curve in zip(problem.phases, trace_phases(problem), strict=True):
-        alone = replace(problem, start=curve.start, phases=(replace(phase, index=0),))
-        found.append(Instance(f"{name} {phase.number}", alone, curve))
-    return found
+        if problem is None:
+            continue
+        for phase, curve in zip(problem.phases, trace_phases(problem), strict=True):
+            alone = replace(problem, start=curve.start, phases=(replace(phase, index=0),))
+            instance = Instance(f"{Path(path).stem} {phase.number}", alone, curve)
+            instances.setdefault(_identify(instance), instance)
+    return tuple(instances.values())
 
 
 def _identify(instance: Instance) -> object:
@@ -83,18 +90,12 @@ def _identify(instance: Instance) -> object:
     return scene.equations, limits, phase.formation.names, tuple(places)
 
 
-def find_files(folder: str) -> tuple[str, ...]:
-    """Problem files of a folder."""
-    return tuple(str(path) for path in sorted(Path(folder).glob("*.toml")))
+def pick(name: str, paths: tuple[str, ...], drag: bool = True) -> Instance:
+    """The phase of a name, of problem files."""
+    return next(instance for instance in list_instances(paths, drag) if instance.name == name)
 
 
-def pick(instances: Sequence[Instance], name: str) -> Instance:
-    """The instance of a name."""
-    return next(instance for instance in instances if instance.name == name)
-
-
-OPTIMUM = "Solve_Succeeded"
-"""Ipopt's status of a solution."""
+OPTIMUM = "Solve_Succeeded"  # Ipopt's status of a solution
 
 
 class PeerPlan(NamedTuple):
@@ -146,7 +147,7 @@ def list_stretches(curve: Curve) -> list[PhaseStretch]:
 def sample_slow_motion(instance: Instance, counts: list[int]) -> list[tuple[Array, Samples]]:
     """Times from its start and samples of each stretch of a slow motion, at so many instants.
 
-    It keeps all limits, with its squeeze amid the range that they allow.
+    It keeps all limits, with its internal force amid its range.
     """
     curve = instance.curve
     grid = Mesh().make_grid(curve, 5 + len(curve.segments))
@@ -154,15 +155,75 @@ def sample_slow_motion(instance: Instance, counts: list[int]) -> list[tuple[Arra
     motion = PathMotion(curve, data.grid, guess(data)[0])
     last = np.flatnonzero(np.diff(motion.grid.segment, append=-1))
     marks = np.append(0.0, motion.times[last])
-    found = []
+    stretches = []
     for start, stop, count in zip(marks, marks[1:], counts, strict=False):
-        # Ends of a stretch are looked at from within it.
+        # The ends of a stretch are evaluated within it.
         t = np.linspace(start, stop, count)
         inside = np.clip(t, start + 1e-9 * (stop - start), stop - 1e-9 * (stop - start))
-        found.append((t - start, motion.evaluate(inside)))
-    return found
+        stretches.append((t - start, motion.evaluate(inside)))
+    return stretches
 
 
-def count_intervals(stretches: list[PhaseStretch], intervals: int, least: int = 4) -> list[int]:
-    """About so many intervals, shared among the stretches of a phase."""
-    return [max(least, round(intervals * stretch.share)) for stretch in stretches]
+class Median(NamedTuple):
+    """The runs of one setting: medians of their times [s], and the worst of the rest."""
+
+    build: float  # build, solve [s]: time to build, and to simulate or solve
+    solve: float
+    # of the state, relative to the scene; of plans those of the phase time, of the replayed end
+    # state, and the worst violation of a limit between nodes
+    errors: tuple[float, ...]
+    outcome: str = SOLVED  # `SOLVED`, or what failed
+
+    def reaches(self, target: float, count: int | None = None) -> bool:
+        """Whether it is solved and its errors, or the first few of them, are below a target."""
+        return self.outcome == SOLVED and max(map(abs, self.errors[:count])) <= target
+
+
+def measure(
+    build: Callable[[], Callable[[], _Answer]],
+    judge: Callable[[_Answer], tuple[tuple[float, ...], str]],
+) -> Median:
+    """Build and run as often as the time allows; `judge` gives the errors and the outcome."""
+    builds, solves, errors, outcomes = [], [], [], []
+    with warnings.catch_warnings():
+        # Warnings of peers are not ours.
+        warnings.simplefilter("ignore")
+        began = time.process_time()
+        for _ in range(REPEATS):
+            built, run = _time(build)
+            took, answer = _time(run)
+            builds.append(built)
+            solves.append(took)
+            enough = time.process_time() - began > BUDGET
+            found, outcome = judge(answer)
+            errors.append(found)
+            outcomes.append(outcome)
+            if enough:
+                break
+    worst = tuple(max(column, key=abs) for column in zip(*errors, strict=True))
+    outcome = next((outcome for outcome in outcomes if outcome != SOLVED), SOLVED)
+    return Median(statistics.median(builds), statistics.median(solves), worst, outcome)
+
+
+def _time(work: Callable[[], _Answer]) -> tuple[float, _Answer]:
+    """Processor time that something takes [s], and its answer.
+
+    Other work on the machine hardly changes it. What is too short for its clock is done several
+    times over.
+    """
+    wall, processor = time.perf_counter(), time.process_time()
+    answer = work()
+    wall, processor = time.perf_counter() - wall, time.process_time() - processor
+    if wall > SHORT:
+        return processor, answer
+    count = math.ceil(SHORT / max(wall, SHORT / MOST))
+    processor = time.process_time()
+    for _ in range(count):
+        work()
+    return (time.process_time() - processor) / count, answer
+
+
+def find_mean(seconds: Sequence[float]) -> float:
+    """Shifted geometric mean [s]."""
+    logs = [math.log(value + SHIFT) for value in seconds]
+    return math.exp(math.fsum(logs) / len(logs)) - SHIFT

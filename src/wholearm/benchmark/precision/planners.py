@@ -1,4 +1,8 @@
-"""Planners that are compared: both domains of ours, and public tools."""
+"""Planners that are compared: both domains of ours, toppra and yapss.
+
+toppra: minimum-time parametrisation, with the internal force eliminated from the limits. yapss:
+pseudospectral collocation.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +12,15 @@ from functools import lru_cache, partial
 from importlib.util import find_spec
 from typing import Any, NamedTuple
 
+import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
+from ...common.arrays import Array
+from ...mechanics.dynamics import PathForces, inverse
+from ...mechanics.limits import make_limits
 from ...planning.lower_bound.lower_bound import bound_least_time
+from ...planning.lower_bound.rows import directions_of
 from ...planning.options import Objective, PlanOptions
 from ...planning.path_domain.path_data import prepare
 from ...planning.path_domain.path_mesh import Mesh
@@ -19,17 +29,28 @@ from ...planning.path_domain.path_plan import plan_path
 from ...planning.path_domain.terms import LimitShape
 from ...planning.phase_plan import PhasePlan
 from ...planning.time_domain.time_plan import plan_phases
-from .peers import build_toppra, build_yapss
-from .phases import OPTIMUM, Instance, PeerPlan, list_instances, list_stretches, pick
-from .reference_check import check_plan
-from .runs import Median, measure
+from ...results.torque import TorqueProfile
+from .phases import (
+    NO_PLAN,
+    OPTIMUM,
+    Instance,
+    Median,
+    PeerPlan,
+    build_plant,
+    list_stretches,
+    measure,
+    pick,
+    sample_slow_motion,
+)
+from .simulators import check_plan
 
 LEAST_TIME, NO_DRAG = "least time", "least time without viscous friction"
 """Studies: all phases, and the same without viscous friction."""
 FINE = 1e-7
 """Accuracy of a plan along a curve whose duration is the reference where there is no bound."""
-NEAR = 1e-7
-"""Distance over the duration in which a step of the torques is that of a reversal."""
+NEAR = 1e-7  # distance over the duration in which a step of the torques is that of a reversal
+APART = 1e-7  # distance of grid points from a reversal between them, over the curve's length
+TORQUE_NODES = 5  # instants in an interval that its torque's polynomial goes through
 
 
 class Planner(NamedTuple):
@@ -45,7 +66,7 @@ class Planner(NamedTuple):
 
 def run_planner(study: str, name: str, method: str, setting: str, files: tuple[str, ...]) -> Median:
     """Run one setting of one planner on one phase, and check its plans."""
-    instance = pick(list_instances(files, study != NO_DRAG), name)
+    instance = pick(name, files, study != NO_DRAG)
     if module := PLANNERS[method].module:
         # No timing is to include the import.
         __import__(module)
@@ -61,7 +82,7 @@ def run_planner(study: str, name: str, method: str, setting: str, files: tuple[s
 
 @lru_cache(maxsize=4)
 def _find_least_time(name: str, study: str, files: tuple[str, ...]) -> float:
-    return find_least_time(pick(list_instances(files, study != NO_DRAG), name))
+    return find_least_time(pick(name, files, study != NO_DRAG))
 
 
 def find_least_time(instance: Instance) -> float:
@@ -120,6 +141,240 @@ def _convert(instance: Instance, plan: PhasePlan[Any]) -> PeerPlan:
         nearest = float(breaks[np.abs(breaks - high).argmin()])
         marks.append(nearest if abs(nearest - high) < NEAR * motion.duration else high)
     return PeerPlan(OPTIMUM, motion.duration, plan.torque, tuple(marks))
+
+
+class _PeerRows:
+    """Limits at places of a curve, as constant + a s'' + b s'^2 + q lambda >= 0."""
+
+    def __init__(self, instance: Instance, s: Array, owner: NDArray[np.int64]) -> None:
+        curve = instance.curve
+        self.forces = inverse(curve.formation, *curve.evaluate(s)[:3], directions_of(curve, owner))
+        limits = make_limits(curve.formation, instance.problem.epsilon)
+        rows, signs, bounds = limits.sides
+        of_c, of_tau, _ = (part[rows].T * signs for part in limits.columns)
+
+        def collect(c: Array, tau: Array) -> Array:
+            return np.asarray(c @ of_c + tau @ of_tau)
+
+        forces = self.forces
+        self.constant = collect(forces.C0, forces.T0) - signs * bounds
+        self.a, self.b = collect(forces.Ca, forces.Ta), collect(forces.Cb, forces.Tb)
+        self.q = collect(forces.Cl, forces.Tl)
+
+    def eliminate(self) -> tuple[Array, Array, Array]:
+        """Rows in s'' and s'^2 alone: a, b and constant, shape (n, pairs) each."""
+        one, other = np.triu_indices(self.q.shape[1], 1)
+        first, second = self.q[:, one], self.q[:, other]
+        opposite = first * second < 0
+        weigh = np.where(opposite, np.abs(second), 0.0), np.where(opposite, np.abs(first), 0.0)
+        size = np.maximum(weigh[0] + weigh[1], 1e-300)
+
+        def combine(rows: Array) -> Array:
+            return np.asarray((weigh[0] * rows[:, one] + weigh[1] * rows[:, other]) / size)
+
+        kept = opposite.any(axis=0)
+        # A row that is none at some places holds there whatever the motion.
+        constant = np.where(opposite, combine(self.constant), 1.0)
+        return combine(self.a)[:, kept], combine(self.b)[:, kept], constant[:, kept]
+
+    def middle(self, a: Array, b: Array) -> Array:
+        """Internal force amid the range that limits leave, shape (n,) [N]."""
+        rest = self.constant + self.a * a[:, None] + self.b * b[:, None]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            bound = -rest / self.q
+        low = np.where(self.q > 0, bound, -np.inf).max(axis=1)
+        high = np.where(self.q < 0, bound, np.inf).min(axis=1)
+        return np.asarray((low + high) / 2)
+
+
+def build_toppra(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
+    """Limits on a grid that is fine towards the ends, kept at both ends of every interval."""
+    import toppra
+    from toppra.constraint import DiscretizationType, LinearConstraint
+    from toppra.constraint.linear_constraint import canlinear_colloc_to_interpolate
+
+    toppra.setup_logging("ERROR")
+    length = instance.curve.length
+    grid = length * (1 - np.cos(np.linspace(0.0, np.pi, int(setting) + 1))) / 2
+    for part in instance.curve.segments[:-1]:
+        near = np.abs(grid - part.stop) > 4 * APART * length
+        grid = np.append(grid[near], part.stop + APART * length * np.array([-1.0, 1.0]))
+        grid.sort()
+    stops = [part.stop for part in instance.curve.segments[:-1]]
+    a, b, constant = _PeerRows(instance, grid, np.searchsorted(stops, grid)).eliminate()
+    below, zero = -np.eye(a.shape[1]), np.zeros(a.shape[1])
+
+    class Limits(LinearConstraint):  # type: ignore[misc]
+        """Limits with the internal force eliminated."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.identical = True
+            self.set_discretization_type(DiscretizationType.Interpolation)
+
+        def compute_constraint_params(self, *_: Any) -> Any:
+            rows = a, b, constant, below, zero
+            return canlinear_colloc_to_interpolate(*rows, None, None, grid, identical=True)
+
+    path = toppra.SplineInterpolator(grid, grid[:, None])
+    planner = toppra.algorithm.TOPPRA(
+        [Limits()],
+        path,
+        gridpoints=grid,
+        solver_wrapper="seidel",
+        parametrizer="ParametrizeConstAccel",
+    )
+
+    def run() -> PeerPlan:
+        _, speeds, _ = planner.compute_parameterization(0.0, 0.0)
+        if speeds is None or not np.isfinite(speeds).all():
+            return NO_PLAN._replace(status="no feasible parametrisation")
+        return _make_plan(instance, grid, np.asarray(speeds))
+
+    return run
+
+
+def _make_plan(instance: Instance, grid: Array, speeds: Array) -> PeerPlan:
+    """Torques by inverse dynamics, with the internal force linear between grid points.
+
+    The two points beside a reversal become one, with a step of the torques.
+    """
+    stops = np.array([part.stop for part in instance.curve.segments[:-1]])
+    for stop in stops:
+        k = int(np.searchsorted(grid, stop)) - 1
+        speed = (speeds[k] + speeds[k + 1]) / 2
+        grid, speeds = (
+            np.concatenate([part[:k], [middle], part[k + 2 :]])
+            for part, middle in ((grid, stop), (speeds, speed))
+        )
+    steps, b = np.diff(grid), speeds**2
+    a = np.diff(b) / (2 * steps)
+    times = np.append(0.0, np.cumsum(2 * steps / (speeds[1:] + speeds[:-1])))
+    owner = np.searchsorted(stops, (grid[1:] + grid[:-1]) / 2)
+    ends = [
+        _PeerRows(instance, grid[p], owner).middle(a, b[p]) for p in (slice(-1), slice(1, None))
+    ]
+
+    def torque(t: Array) -> Array:
+        k = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(a) - 1)
+        local = t - times[k]
+        run = np.clip(local * (speeds[k] + a[k] * local / 2), 0.0, steps[k])
+        part = run / steps[k]
+        internal = ends[0][k] * (1 - part) + ends[1][k] * part
+        forces: PathForces = _PeerRows(instance, grid[k] + run, owner[k]).forces
+        return forces.tau(a[k], (speeds[k] + a[k] * local) ** 2, internal)
+
+    profile = TorqueProfile.fit(times, torque, TORQUE_NODES - 1)
+    marks = times[np.searchsorted(grid, stops)]
+    return PeerPlan(OPTIMUM, float(times[-1]), profile, tuple(marks))
+
+
+IPOPT = {
+    "print_level": 0, "sb": "yes", "tol": 1e-8, "bound_relax_factor": 0.0, "max_iter": 1000,
+    "mu_strategy": "adaptive",
+}  # fmt: skip
+LEAST = 4  # intervals of a stretch, at least
+POINTS = 2  # collocation points of a segment
+
+
+def build_yapss(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
+    """A phase for every stretch, with contact forces among the controls, on Legendre-Gauss points.
+
+    The slow motion is the first guess.
+    """
+    import yapss
+
+    curve, stretches = instance.curve, list_stretches(instance.curve)
+    counts = [max(LEAST, round(int(setting) * stretch.share)) for stretch in stretches]
+    guesses = sample_slow_motion(instance, [POINTS * count + 1 for count in counts])
+    n_c, k = curve.formation.n_contacts, len(stretches)
+    ocp = yapss.Problem(
+        name="phase", nx=k * [10], nu=k * [2 + n_c], nh=k * [n_c], nq=k * [0], nd=11 * (k - 1)
+    )
+    _write_functions(ocp, instance)
+    limit = curve.formation.scene.torque_limit
+    for index, (stretch, count) in enumerate(zip(stretches, counts, strict=True)):
+        bounds, guess = ocp.bounds.phase[index], ocp.guess.phase[index]
+        bounds.control.lower[:] = [*-limit, *n_c * [instance.problem.epsilon]]
+        bounds.control.upper[:2] = limit
+        bounds.path.lower[:] = bounds.path.upper[:] = 0.0
+        bounds.duration.lower = 1e-3
+        ends = bounds.final_state
+        ends.lower[stretch.progress] = ends.upper[stretch.progress] = stretch.target
+        t, slow = guesses[index]
+        before = sum(float(times[-1]) for times, _ in guesses[:index])
+        guess.time = t + before
+        guess.state = np.hstack([slow.z, slow.z_dot]).T
+        guess.control = np.hstack([slow.tau, slow.c_n]).T
+        ocp.mesh.phase[index].collocation_points = count * [POINTS]
+        ocp.mesh.phase[index].fraction = count * [1 / count]
+    first, last = ocp.bounds.phase[0], ocp.bounds.phase[k - 1]
+    first.initial_time.lower = first.initial_time.upper = 0.0
+    first.initial_state.lower[:] = first.initial_state.upper[:] = [*curve.start, *5 * [0.0]]
+    still = 5 + stretches[-1].progress
+    last.final_state.lower[still] = last.final_state.upper[still] = 0.0
+    ocp.bounds.discrete.lower[:] = ocp.bounds.discrete.upper[:] = 0.0
+    ocp.derivatives.method, ocp.derivatives.order = "auto", "second"
+    ocp.spectral_method = "lg"
+    for name, value in IPOPT.items():
+        setattr(ocp.ipopt_options, name, value)
+
+    def run() -> PeerPlan:
+        return _read(ocp.solve())
+
+    return run
+
+
+def _write_functions(ocp: Any, instance: Instance) -> None:
+    """Objective, dynamics and the links of phases, traced by yapss with CasADi's symbols."""
+    from yapss.math.wrapper import SXW
+
+    curve, plant = instance.curve, build_plant(instance.curve.formation)
+
+    def objective(arg: Any) -> None:
+        arg.objective = arg.phase[len(curve.segments) - 1].final_time
+
+    def continuous(arg: Any) -> None:
+        for index in arg.phase_list:
+            phase, part = arg.phase[index], curve.segments[index]
+            state, control = ([_strip(x) for x in own] for own in (phase.state, phase.control))
+            z, v = ca.vertcat(*state[:5]), ca.vertcat(*state[5:])
+            tau, c_n = ca.vertcat(*control[:2]), ca.vertcat(*control[2:])
+            acceleration, missed = plant(z, v, tau, c_n, part.Xi, part.sigma)
+            rates = [*phase.state[5:], *(SXW(x) for x in ca.vertsplit(acceleration))]
+            phase.dynamics[:] = tuple(rates)
+            phase.path[:] = tuple(SXW(x) for x in ca.vertsplit(missed))
+
+    def discrete(arg: Any) -> None:
+        links = []
+        for before, after in zip(arg.phase, arg.phase[1:], strict=False):
+            links += [after.initial_time - before.final_time]
+            links += [*(after.initial_state - before.final_state)]
+        arg.discrete = links
+
+    ocp.functions.objective, ocp.functions.continuous = objective, continuous
+    if len(curve.segments) > 1:
+        ocp.functions.discrete = discrete
+
+
+def _strip(symbol: Any) -> Any:
+    """The CasADi symbol in a wrapper."""
+    return symbol._value if hasattr(symbol, "_value") else symbol.item()._value
+
+
+def _read(solution: Any) -> PeerPlan:
+    """The torques linear between collocation points: their polynomials swing wide in between."""
+    status = solution.nlp_info.ipopt_status
+    if status != 0:
+        return NO_PLAN._replace(status=str(solution.nlp_info.ipopt_status_message))
+    times, rows, marks = [], [], []
+    for phase in solution.phase:
+        tau = np.asarray(phase.control)[:2].T
+        times.append([phase.initial_time, *np.ravel(phase.time_c), phase.final_time])
+        rows.append(np.vstack([tau[:1], tau, tau[-1:]]))
+        marks.append(float(phase.final_time))
+    torque = TorqueProfile.join_rows(np.concatenate(times), np.concatenate(rows))
+    return PeerPlan(OPTIMUM, marks[-1], torque, tuple(marks[:-1]))
 
 
 _CURVE = ("1e-2", "1e-3", "1e-4", "1e-5", "1e-6")

@@ -1,25 +1,222 @@
-"""``wholearm bench precision``: run time against error, of planners and simulators."""
+"""``wholearm bench precision``: run time against error, of planners and simulators, as tables."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
 
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from ...common.errors import InputError
 from ...common.fields import Range
-from ..study import Case, Row, Study
-from .phases import find_files, list_instances
+from ...figures.style import PALETTE
+from ..study import Case, Row, Study, finish_axes
+from .phases import BUDGET, REPEATS, SHIFT, SHORT, SOLVED, Median, find_mean, list_instances
 from .planners import LEAST_TIME, NO_DRAG, PLANNERS, is_installed, run_planner
 from .simulators import FEW, MANY, SIMULATORS, TOLERANCES, run_simulator
-from .tables import draw_medians, format_report, read_medians
 
-METHODS = [*SIMULATORS, *PLANNERS]
-"""Names of all methods, in the order of the tables."""
-REFERENCE = 120.0
-"""Processor time that the reference of a phase may take on top [s]."""
+Key = tuple[str, str, str, str]
+"""Study, instance, method and setting: what one median is of."""
+Medians = dict[Key, Median]
+MARKERS = "osD^vP*Xdh<>"  # markers of the methods of a panel
+SMALLEST = 1e-16  # error that is drawn for none at all
+
+
+class PeerComparison(NamedTuple):
+    """What one table compares."""
+
+    study: str
+    title: str
+    ours: str  # method that others are compared with
+    targets: tuple[float, ...]  # errors that run times are compared at
+    building: bool  # whether the time to build counts
+    errors: int | None  # how many of the errors have to be below a target; None for all
+
+
+COMPARISONS = (
+    *(
+        PeerComparison(own, own, "wholearm", (1e-6, 1e-9, 1e-11), False, None)
+        for own in (FEW, MANY)
+    ),
+    *(
+        PeerComparison(own, f"{own}, {which}", "wholearm, curve", (1e-2, 1e-3, 1e-4), True, count)
+        for own in (LEAST_TIME, NO_DRAG)
+        for count, which in ((1, "by the error of the phase time"), (None, "by all three errors"))
+    ),
+)
+"""Tables of times at equal error."""
+
+
+def read_medians(rows: Iterable[Row]) -> Medians:
+    """The medians of a study's rows."""
+    return {
+        (row["study"], row["phase"], row["method"], row["setting"]): Median(
+            row["build"], row["solve"], tuple(row["errors"]), row["outcome"]
+        )
+        for row in rows
+        if "errors" in row
+    }
+
+
+def format_report(medians: Medians, limit: float) -> str:
+    """All tables as Markdown."""
+    lines = [
+        f"Times are medians of processor time over up to {REPEATS} runs (one where that takes over "
+        f"{BUDGET:g} s) in one thread; what takes less than {SHORT:g} s is averaged over that "
+        f"time. Means are geometric ones, shifted by {1e3 * SHIFT:g} ms, over the phases of all "
+        "problems, each with the setting that reaches the error soonest; what does not reach it "
+        f"counts with the time limit, {limit:g} s.",
+        "",
+        "Phases whose slow motion would lose a contact have no few pieces of torque, and where a "
+        "method was not run on a phase, ours does not count there either.",
+        "",
+        "Errors of states are relative to the scene's length and time. A plan counts as solved if "
+        "its torques, replayed open loop by other equations than its own, keep every contact and "
+        "end within 1e-2 of the end. Its three errors are those of the phase time, against the "
+        "lower bound of `solve --certify`, of the replayed end state, and the worst violation "
+        "between nodes, over the object's weight or the torque limit.",
+        "",
+    ]
+    for comparison in COMPARISONS:
+        lines += _format_targets(medians, comparison, limit)
+    for study in (LEAST_TIME, NO_DRAG):
+        lines += _format_settings(medians, study)
+    lines += ["## Settings", "", "| method | settings |", "|---|---|"]
+    lines += [f"| {name} | {own.settings} |" for name, own in (SIMULATORS | PLANNERS).items()]
+    return "\n".join([*lines, ""])
+
+
+def find_times(
+    medians: Medians, method: str, own: PeerComparison, target: float
+) -> dict[str, float]:
+    """Times in which a method reaches an error on each phase that it has runs on [s].
+
+    Infinite where it does not.
+    """
+    times: dict[str, float] = {}
+    for (study, name, which, _), median in medians.items():
+        if (study, which) == (own.study, method):
+            took = median.solve + own.building * median.build
+            reached = took if median.reaches(target, own.errors) else math.inf
+            times[name] = min(times.get(name, math.inf), reached)
+    return times
+
+
+def list_methods(medians: Medians, study: str) -> list[str]:
+    """Methods that a study has runs of, in their order."""
+    given = {key[2] for key in medians if key[0] == study}
+    return [name for name in SIMULATORS | PLANNERS if name in given]
+
+
+def _format_targets(medians: Medians, own: PeerComparison, limit: float) -> list[str]:
+    """Times to reach errors, and how many times as long as ours that is."""
+    methods = list_methods(medians, own.study)
+    if own.ours not in methods:
+        return []
+    lines = [f"## {own.title[0].upper()}{own.title[1:]}", ""]
+    heads = [f"{target:g} [s] | reached | times ours" for target in own.targets]
+    lines += [f"| method | {' | '.join(heads)} |", "|---|" + "---:|---:|---:|" * len(heads)]
+    for method in methods:
+        cells = [method]
+        for target in own.targets:
+            times, ours = (find_times(medians, m, own, target) for m in (method, own.ours))
+            names = times.keys() & ours.keys()
+            reached = sum(math.isfinite(times[name]) for name in names)
+            mean, least = (
+                find_mean([min(part[name], limit) for name in names] or [math.nan])
+                for part in (times, ours)
+            )
+            shown = (f"{mean:.4f}", f"{mean / least:.2g}") if reached else ("-", "-")
+            cells += [shown[0], f"{reached} of {len(names)}", shown[1]]
+        lines.append(f"| {' | '.join(cells)} |")
+    return [*lines, ""]
+
+
+def group_settings(medians: Medians, study: str, method: str) -> dict[str, list[Median]]:
+    """Medians of a method on all phases of a study, by setting."""
+    found: dict[str, list[Median]] = {}
+    for key, median in medians.items():
+        if (key[0], key[2]) == (study, method):
+            found.setdefault(key[3], []).append(median)
+    return found
+
+
+def _format_settings(medians: Medians, study: str) -> list[str]:
+    """What each setting of each planner gives: medians of errors, means of times."""
+    methods = list_methods(medians, study)
+    if not methods:
+        return []
+    lines = [f"## {study[0].upper()}{study[1:]}: medians over phases of each setting", ""]
+    lines += ["| method | setting | solved | phase time | end state | violation | building [s] |"]
+    lines[-1] += " solving [s] | what failed |"
+    lines += ["|---|---:|---:|---:|---:|---:|---:|---:|---|"]
+    for method in methods:
+        for setting, group in group_settings(medians, study, method).items():
+            errors = [np.abs(own.errors) for own in group if len(own.errors) == 3]
+            middle = np.median(errors, axis=0) if errors else np.full(3, np.nan)
+            shown = " | ".join(f"{value:.1e}" for value in middle)
+            failed = dict.fromkeys(own.outcome for own in group if own.outcome != SOLVED)
+            solved = sum(own.outcome == SOLVED for own in group)
+            built, took = (
+                find_mean([t for t in part if math.isfinite(t)] or [math.nan])
+                for part in ([own.build for own in group], [own.solve for own in group])
+            )
+            cells = f"{solved} of {len(group)} | {shown} | {built:.4f} | {took:.4f}"
+            lines.append(f"| {method} | {setting} | {cells} | {'; '.join(failed)} |")
+    return [*lines, ""]
+
+
+def draw_medians(medians: Medians) -> Figure:
+    """Mean run time over the error that half of the phases keep, one line for each method."""
+    figure = Figure(figsize=(11.0, 9.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    studies = (LEAST_TIME, NO_DRAG, FEW, MANY)
+    for axes, study in zip(figure.subplots(2, 2).flat, studies, strict=True):
+        _draw_study(axes, medians, study)
+    return figure
+
+
+def _draw_study(axes: Axes, medians: Medians, study: str) -> None:
+    """One panel; hollow markers are settings with which some phases are not solved."""
+    planning = study in (LEAST_TIME, NO_DRAG)
+    for index, method in enumerate(list_methods(medians, study)):
+        points, full = [], []
+        for group in group_settings(medians, study, method).values():
+            found = [own for own in group if np.isfinite(own.errors[0])]
+            if 2 * len(found) < len(group):
+                continue
+            error = float(np.median([abs(own.errors[0]) for own in found]))
+            seconds = find_mean([own.solve + planning * own.build for own in found])
+            points.append((max(error, SMALLEST), seconds))
+            full.append(all(own.outcome == SOLVED for own in group))
+        if not points:
+            continue
+        look: Any = {"color": PALETTE[index % len(PALETTE)], "marker": MARKERS[index]}
+        look |= {"linestyle": "-" if index < len(PALETTE) else "--", "markersize": 5}
+        axes.plot(*zip(*points, strict=True), label=method, **look)
+        hollow = [point for point, whole in zip(points, full, strict=True) if not whole]
+        if hollow:
+            look |= {"markerfacecolor": "white", "linestyle": "", "zorder": 3}
+            axes.plot(*zip(*hollow, strict=True), **look)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_title(study[0].upper() + study[1:])
+    what = "relative error of the phase time" if planning else "error of z and z' in scene units"
+    axes.set_xlabel(f"{what}, median over phases [-]")
+    axes.set_ylabel(f"{'build and solve' if planning else 'run'} time, mean over phases [s]")
+    if axes.lines:
+        finish_axes(axes, fontsize=8, ncols=2)
+
+
+METHODS = [*SIMULATORS, *PLANNERS]  # names of all methods, in the order of the tables
+REFERENCE = 120.0  # processor time that the reference of a phase may take on top [s]
 
 
 class Precision(Study):
@@ -44,7 +241,7 @@ class Precision(Study):
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
         """Study, phase, method, setting, and the files that phases are from."""
         self.allowed = options.limit
-        files = find_files(options.problems)
+        files = tuple(map(str, sorted(Path(options.problems).glob("*.toml"))))
         if not files:
             text = f"{options.problems} has no problem files (*.toml)"
             raise InputError("", "--problems", text)
@@ -52,7 +249,10 @@ class Precision(Study):
             if method not in METHODS:
                 text = f"{method!r} given; allowed are {'; '.join(METHODS)}"
                 raise InputError("", "--peers", text)
-        every = {drag: [own.name for own in list_instances(files, drag)] for drag in (True, False)}
+        every = {
+            drag: [instance.name for instance in list_instances(files, drag)]
+            for drag in (True, False)
+        }
         if options.part != "planning":
             for study, phase, method in product((FEW, MANY), every[True], SIMULATORS):
                 if method in options.peers:
@@ -76,9 +276,9 @@ class Precision(Study):
     def run(self, case: Case) -> Row:
         """Measure one setting."""
         run = run_simulator if case[0] in (FEW, MANY) else run_planner
-        found = run(*case)
-        row = dict(zip(("study", "phase", "method", "setting"), case, strict=False))
-        return row if found is None else row | found._asdict()
+        median = run(*case)
+        row = dict(zip(self.columns[:4], case, strict=False))
+        return row if median is None else row | median._asdict()
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
         """All tables."""

@@ -142,12 +142,10 @@ def _touch(scene: Scene, contact: Contact, z: Array, z_dot: Array) -> tuple[Arra
     return tip - finger.radius * outward, -outward, bend
 
 
-COLUMNS = 9
-"""Columns of the extrapolation."""
+COLUMNS = 9  # columns of the extrapolation
 TOLERANCE = 1e-17
 """Largest difference of the last two columns, over each entry or 1 where that is more."""
-LOOSER = 1e4
-"""Factor on the tolerance of the run that the own error is found with."""
+LOOSER = 1e4  # factor on the tolerance of the run that the own error is found with
 _SMALLEST = 1e-9
 
 Extended = Any

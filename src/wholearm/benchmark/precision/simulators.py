@@ -1,11 +1,13 @@
-"""Simulators that are compared: ours, SciPy's and CasADi's; and the courses that they run.
+"""Simulators that are compared, the motions that they run, and the replay that checks plans.
 
-All but ours are told when directions reverse, from the reference, and start anew there and where
-the torques step.
+All but ours are told when directions reverse, from the reference, and are restarted there and where
+the torques step. Plans are replayed open loop from rest by fixed steps of the classical Runge-Kutta
+method; directions reverse when the plan says so, and lost contacts pull by what is measured.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
@@ -24,22 +26,24 @@ from ...planning.path_domain.path_motion import PathMotion
 from ...planning.path_domain.path_plan import plan_path
 from ...results.torque import TorqueProfile
 from ...simulation.simulate import simulate
-from .phases import Instance, list_instances, pick
+from .phases import OPTIMUM, SOLVED, Instance, Median, PeerPlan, measure, pick
 from .reference import Course, Span, evaluate_piece, find_course, measure_error, solve_motion
-from .runs import SOLVED, Median, measure
 
 FEW, MANY = "simulation, few pieces", "simulation, many pieces"
 """Studies: torques in a few long pieces, and planned torques in eighty."""
 TOLERANCES = {FEW: tuple(10.0**-k for k in (4, *range(6, 14))), MANY: (1e-6, 1e-9, 1e-12)}
 """Tolerances of each study."""
-DEGREES = {FEW: 14, MANY: 6}
-"""Degrees of the torques' polynomials."""
+DEGREES = {FEW: 14, MANY: 6}  # degrees of the torques' polynomials
 SLOW = 0.3
 """Square of the speed of the motion with few pieces, over that of a first guess of a plan."""
-LOOKS = 201
-"""Instants at which contact forces of a motion are looked at."""
+LOOKS = 201  # instants at which contact forces of a motion are looked at
 STOP = 0.95
 """Share of the last stretch between reversals that is run: just before a stop all is ill-posed."""
+
+STEPS = 1000  # least number of steps of a replay
+CLOSE = 1e-2
+"""Error of the end state, and of torques over their limits, up to which a plan counts as one."""
+PLACES = 9  # instants of every piece of the torques at which their limits are looked at
 
 Rates = Callable[[float, Array], Array]
 Runner = Callable[[], Array]
@@ -57,8 +61,8 @@ def build_own(course: Course, tolerance: float) -> Runner:
     """Our simulator; what it keeps of a formation is built by a first run."""
 
     def run() -> Array:
-        found = simulate(course.problem, course.torque, tolerance=tolerance)
-        return np.append(found.z[-1], found.z_dot[-1])
+        simulation = simulate(course.problem, course.torque, tolerance=tolerance)
+        return np.append(simulation.z[-1], simulation.z_dot[-1])
 
     run()
     return run
@@ -73,11 +77,11 @@ def build_scipy(course: Course, tolerance: float, callback: Callable[..., Any]) 
     def run() -> Array:
         state = np.append(course.problem.start, np.zeros(5))
         for span in course.spans:
-            given = {"method": "DOP853", "rtol": tolerance, "atol": tolerance}
-            found = solve_ivp(choose(span), (span.start, span.stop), state, **given)
-            if found.status:
-                raise RuntimeError(found.message)
-            state = found.y[:, -1]
+            options = {"method": "DOP853", "rtol": tolerance, "atol": tolerance}
+            solution = solve_ivp(choose(span), (span.start, span.stop), state, **options)
+            if solution.status:
+                raise RuntimeError(solution.message)
+            state = solution.y[:, -1]
         return np.asarray(state)
 
     return run
@@ -154,28 +158,27 @@ def pack_span(course: Course, span: Span) -> Array:
     return np.concatenate([span.Xi, span.sigma, coefficients.ravel("F"), ends])
 
 
+def pack_course(course: Course) -> tuple[Expression, Expression]:
+    """State at the start, and a column of parameters, with both ends, for each stretch."""
+    columns = [[*pack_span(course, span), span.start, span.stop] for span in course.spans]
+    return ca.DM(np.append(course.problem.start, np.zeros(5))), ca.DM(np.array(columns).T)
+
+
 def build_cvodes(course: Course, tolerance: float) -> Runner:
     """CasADi's interface to cvodes; all stretches are one call, by `mapaccum`."""
     t, y, p, ode, _ = write_rates(course)
     ends, x = ca.SX.sym("ends", 2), ca.SX.sym("x")
     half, now = (ends[1] - ends[0]) / 2, (ends[0] + ends[1] + x * (ends[1] - ends[0])) / 2
     system = {"x": y, "t": x, "p": ca.vertcat(p, ends), "ode": half * ca.substitute(ode, t, now)}
-    given = {
-        "abstol": tolerance,
-        "reltol": tolerance,
-        "max_num_steps": 100000,
-        "linear_multistep_method": "adams",
-        "nonlinear_solver_iteration": "functional",
-    }
-    step = ca.integrator("step", "cvodes", system, -1.0, 1.0, given)
+    options: dict[str, Any] = {"abstol": tolerance, "reltol": tolerance, "max_num_steps": 100000}
+    options |= {"linear_multistep_method": "adams", "nonlinear_solver_iteration": "functional"}
+    step = ca.integrator("step", "cvodes", system, -1.0, 1.0, options)
     chain = step.mapaccum(len(course.spans))
-    columns = [[*pack_span(course, span), span.start, span.stop] for span in course.spans]
-    parameters = ca.DM(np.array(columns).T)
-    start = ca.DM(np.append(course.problem.start, np.zeros(5)))
+    start, parameters = pack_course(course)
 
     def run() -> Array:
-        found = chain(x0=start, p=parameters)["xf"]
-        return np.asarray(found[:, -1].full()[:, 0])
+        states = chain(x0=start, p=parameters)["xf"]
+        return np.asarray(states[:, -1].full()[:, 0])
 
     return run
 
@@ -215,7 +218,7 @@ def run_simulator(
 
 @lru_cache(maxsize=4)
 def _get_course(name: str, study: str, files: tuple[str, ...]) -> Course | None:
-    return make_course(pick(list_instances(files), name), study)
+    return make_course(pick(name, files), study)
 
 
 def make_course(instance: Instance, study: str) -> Course | None:
@@ -241,8 +244,74 @@ def make_course(instance: Instance, study: str) -> Course | None:
 
 
 def make_slow_motion(curve: Curve, epsilon: float) -> PathMotion:
-    """A slow smooth motion with its squeeze amid the range that limits allow."""
+    """A slow smooth motion with its internal force amid the range that limits allow."""
     data = prepare(curve, epsilon, Mesh().make_grid(curve, 2 + len(curve.segments)), 0)
     profile, _ = guess(data)
     calm = profile._replace(a=SLOW * profile.a, b=SLOW * profile.b)
     return PathMotion(curve, data.grid, calm)
+
+
+class ReferenceCheck(NamedTuple):
+    """What a replay has shown."""
+
+    end: float  # error of the end state, relative to the scene
+    # worst violation of c_n >= epsilon, over the scene's force, or of a torque limit, over it
+    violation: float
+    outcome: str  # `SOLVED`, or why the plan is none
+
+
+def check_plan(instance: Instance, plan: PeerPlan) -> ReferenceCheck:
+    """Replay a plan."""
+    if plan.status != OPTIMUM:
+        return ReferenceCheck(math.nan, math.nan, plan.status)
+    problem = instance.problem
+    spans = _split(instance, plan)
+    course = Course(problem, plan.torque, spans, np.zeros(10), 0.0)
+    step = _build_step(course).mapaccum(len(spans))
+    states, forces = (part.full() for part in step(*pack_course(course)))
+    rest = np.append(instance.curve.end, np.zeros(5))
+    end = measure_error(problem, states[:, -1], rest)
+    limit = problem.scene.torque_limit
+    places = np.cos(np.linspace(0.0, np.pi, PLACES))
+    excess = float((np.abs(plan.torque.at_places(places)) / limit[:, None] - 1).max())
+    missing = (problem.epsilon - float(forces.min())) / problem.scene.scales.force
+    violation = max(0.0, excess, missing)
+    tests = (
+        (forces.min() > 0, "a contact is lost between nodes"),
+        (end <= CLOSE, "the replay ends elsewhere"),
+        (excess <= CLOSE, "a torque limit is missed between nodes"),
+    )
+    outcome = next((text for holds, text in tests if not holds), SOLVED)
+    return ReferenceCheck(end, violation, outcome)
+
+
+def _split(instance: Instance, plan: PeerPlan) -> tuple[Span, ...]:
+    """Steps of the replay: within pieces of the torques, and between reversals."""
+    breaks, stop = plan.torque.breaks, plan.torque.breaks[-1]
+    inner = np.append(breaks, plan.marks)
+    even = np.linspace(0.0, stop, STEPS + 1)
+    ends = np.unique(np.concatenate([inner, even[1:-1]]))
+    ends = ends[np.append(np.diff(ends) > 1e-12 * stop, True)]
+    middle = (ends[1:] + ends[:-1]) / 2
+    pieces = np.clip(np.searchsorted(breaks, middle, side="right") - 1, 0, len(breaks) - 2)
+    owners = np.searchsorted(plan.marks, middle)
+    parts = instance.curve.segments
+    return tuple(
+        Span(float(start), float(end), int(piece), parts[owner].Xi, parts[owner].sigma)
+        for start, end, piece, owner in zip(ends[:-1], ends[1:], pieces, owners, strict=True)
+    )
+
+
+def _build_step(course: Course) -> Expression:
+    """CasADi function (y, parameters) -> (y at the end, contact forces at start and end)."""
+    t, y, p, ode, forces = write_rates(course)
+    rates = ca.Function("rates", [t, y, p], [ode, forces])
+    ends = ca.SX.sym("ends", 2)
+    h, middle = ends[1] - ends[0], (ends[0] + ends[1]) / 2
+    k1, before = rates(ends[0], y, p)
+    k2, _ = rates(middle, y + h / 2 * k1, p)
+    k3, _ = rates(middle, y + h / 2 * k2, p)
+    k4, _ = rates(ends[1], y + h * k3, p)
+    after = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    _, then = rates(ends[1], after, p)
+    return ca.Function("step", [y, ca.vertcat(p, ends)], [after, ca.vertcat(before, then)])

@@ -1,4 +1,4 @@
-"""Curves through a cell of the map, and the best motion along any of them.
+"""Random search for the curve through a cell of the map with the largest motion margin.
 
 A motion with two freedoms from rest to the end of its phase follows some curve x(u), phi(u), and
 whether any motion along a given curve keeps all limits is a linear programme, whatever its speeds
@@ -21,28 +21,18 @@ from .event_tracing import weights
 from .newton import clearances, locate
 from .slow_motion import fast_margin, rest_margin
 
-PLACES = 40
-"""Configurations along a curve."""
-INSIDE = 1e-4
-"""Overlap, and distance beyond a feature, that passes, over the radius of gyration."""
-DRAWN = 400
-"""Curves that are drawn at first; most leave the cell."""
-TRIED = 40
-"""Curves of these that are looked at."""
-BENT = (6, 10)
-"""Rounds in which the best curves are bent, and curves in each."""
-BEST = 3
-"""Curves that are bent further in each round."""
+PLACES = 40  # configurations along a curve
+INSIDE = 1e-4  # overlap, and distance beyond a feature, that passes, over the radius of gyration
+DRAWN = 400  # curves that are drawn at first; most leave the cell
+TRIED = 40  # curves of these whose margins are found
+BENT = (6, 10)  # rounds in which the best curves are bent, and curves in each
+BEST = 3  # curves that are bent further in each round
 LOOSE = 0.01
 """Rate of sliding over that of the whole below which a contact may stick: nearby curves roll."""
-ENDS = 16
-"""Most places of the end on either side of the nearest one."""
-STEP = 0.08
-"""Distance of the nearest of these, over the radius of gyration."""
-GROWTH = 1.12
-"""Ratio of each distance to the one before."""
-ENOUGH = 1e-3
-"""Margin with which a curve is as good as wanted."""
+ENDS = 16  # most places of the end on either side of the nearest one
+STEP = 0.08  # distance of the nearest of these, over the radius of gyration
+GROWTH = 1.12  # ratio of each distance to the one before
+SUFFICIENT = 1e-3  # margin with which a curve is as good as wanted
 
 Flags = NDArray[np.bool_]
 
@@ -61,9 +51,8 @@ def list_ends(scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]) -
     """Places at which a phase with two freedoms ends, those near the pose `stop`, shape (n, 5)."""
     # A joint may turn far on the way there, so that contacts are followed step by step.
     line = z[[0, 2]] + np.linspace(0.0, 1.0, 4)[:, None] * (np.array(stop) - z[[0, 2]])
-    first = _settle(scene, phase, bend(scene, phase, z, line[None])[0, -1])
-    if first is None:
-        first = _settle(scene, phase, z)
+    first = _project_end(scene, phase, bend(scene, phase, z, line[None])[0, -1])
+    first = _project_end(scene, phase, z) if first is None else first
     if first is None:
         return np.zeros((0, 5))
     scale = np.sqrt(weights(scene))
@@ -77,7 +66,7 @@ def list_ends(scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]) -
                 tangent = way * tangent
             elif (tangent * scale) @ (ahead * scale) < 0:
                 tangent = -tangent
-            after = _settle(scene, phase, here + step * tangent)
+            after = _project_end(scene, phase, here + step * tangent)
             if after is None or np.linalg.norm((after - here) * scale) > 3 * step:
                 break
             here, ahead = after, tangent
@@ -89,7 +78,7 @@ def list_ends(scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]) -
 def find_best(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: Array) -> Best:
     """Look for the curve from `z` to one of `ends` along which a motion keeps limits best.
 
-    The search stops at a curve with the margin `ENOUGH`.
+    The search stops at a curve with the margin `SUFFICIENT`.
     """
     rng = np.random.default_rng(0)
     start, size = z[[0, 2]], np.array([scene.scales.length, 1.0])
@@ -99,9 +88,8 @@ def find_best(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: Array)
         """Control points of cubic curves, shape (count, 4, 2), the first of them straight."""
         last = goals[rng.integers(len(goals), size=count)]
         points = start + np.linspace(0, 1, 4)[:, None] * (last - start)[:, None]
-        points[:, 1:3] += (
-            spread * rng.uniform(size=(count, 1, 1)) * size * rng.normal(size=(count, 2, 2))
-        )
+        width = spread * rng.uniform(size=(count, 1, 1)) * size
+        points[:, 1:3] += width * rng.normal(size=(count, 2, 2))
         return points
 
     best: list[tuple[float, float, Array, Array]] = []
@@ -116,7 +104,7 @@ def find_best(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: Array)
             best.append((*margins, controls[k], curves[k]))
         count += len(kept)
         best = sorted(best, key=lambda one: -max(one[0], one[1]))[:BEST]
-        return any(one[0] > ENOUGH for one in best)
+        return any(one[0] > SUFFICIENT for one in best)
 
     straight = np.linspace(0, 1, 4)[:, None] * (goals - start)[:, None] + start
     if not look(straight, len(straight)) and not look(draw(DRAWN, 0.5), TRIED):
@@ -220,7 +208,7 @@ def _end_rows(scene: Scene, phase: Phase, z: Array) -> tuple[Array, Array]:
     return np.array([*gaps, z[row] - value]), np.array([*rows, np.eye(5)[row]])
 
 
-def _settle(scene: Scene, phase: Phase, z: Array) -> Array | None:
+def _project_end(scene: Scene, phase: Phase, z: Array) -> Array | None:
     """The nearest configuration at which a phase ends, or None."""
     scale, size = np.sqrt(weights(scene)), scene.scales.length
     for _ in range(20):
@@ -230,6 +218,3 @@ def _settle(scene: Scene, phase: Phase, z: Array) -> Array | None:
         if np.abs(step * scale).max() < 1e-13 * size:
             break
     return z if np.abs(_end_rows(scene, phase, z)[0]).max() < 1e-9 * size else None
-
-
-__all__ = ["Best", "best_end", "find_best", "list_ends"]

@@ -18,6 +18,7 @@ import warnings
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,6 +26,7 @@ import numpy as np
 from ...planning.plan import solve
 from ...problem.read import build_problem
 
+Random = np.random.Generator
 BASE: dict[str, Any] = {
     "name": "square",
     "epsilon": 0.05,
@@ -93,8 +95,7 @@ def base_files() -> tuple[bytes, bytes, bytes]:
         plan.save_torques(table)
         with np.load(npz) as data:
             arrays = {name: data[name] for name in data.files}
-        with open(table, "rb") as stream:
-            torques = stream.read()
+        torques = Path(table).read_bytes()
     # Timings and dates would make every run's files different.
     meta = json.loads(str(arrays["meta"]))
     none = [0.0] * len(meta["solves"])
@@ -109,7 +110,7 @@ def draw_mutant(seed: int, number: int) -> Mutant:
     k = (0, 0, 1, 2, 2)[number % 5]
     kind, ending = ("problem", "torque", "trajectory")[k], (".toml", ".csv", ".npz")[k]
     base = base_files()[k]
-    own: Callable[[np.random.Generator, bytes], tuple[str, bytes | None]]
+    own: Callable[[Random, bytes], tuple[str, bytes | None]]
     own = (_damage_problem, _damage_torques, _damage_archive)[k]
     what, content = (_damage_bytes if rng.uniform() < 0.25 else own)(rng, base)
     if rng.uniform() < 0.01:
@@ -117,12 +118,12 @@ def draw_mutant(seed: int, number: int) -> Mutant:
     return Mutant(kind, what, ending, content)
 
 
-def pick(rng: np.random.Generator, options: Sequence[Any]) -> Any:
+def pick(rng: Random, options: Sequence[Any]) -> Any:
     """One of some options."""
     return options[int(rng.integers(len(options)))]
 
 
-def _damage_bytes(rng: np.random.Generator, base: bytes) -> tuple[str, bytes | None]:
+def _damage_bytes(rng: Random, base: bytes) -> tuple[str, bytes | None]:
     """Damage that knows nothing of the format."""
     at, length = int(rng.integers(len(base))), int(10.0 ** rng.uniform(0, 3))
     noise = rng.integers(0, 256, size=length).astype(np.uint8).tobytes()
@@ -147,7 +148,7 @@ def _damage_bytes(rng: np.random.Generator, base: bytes) -> tuple[str, bytes | N
     return what, changed[what]
 
 
-def change_tree(rng: np.random.Generator, table: Any) -> str:
+def change_tree(rng: Random, table: Any) -> str:
     """Change one value or key of nested tables and lists in place; says what."""
     path = pick(rng, _list_places(table))
     parent, key = table, path[-1]
@@ -177,7 +178,7 @@ def _list_places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]
     return [at for key, part in items for at in ((*path, key), *_list_places(part, (*path, key)))]
 
 
-def _damage_problem(rng: np.random.Generator, base: bytes) -> tuple[str, bytes]:
+def _damage_problem(rng: Random, base: bytes) -> tuple[str, bytes]:
     if rng.uniform() < 0.7:
         table = copy.deepcopy(BASE)
         done = [change_tree(rng, table) for _ in range(int(rng.integers(1, 3)))]
@@ -196,7 +197,7 @@ def _damage_problem(rng: np.random.Generator, base: bytes) -> tuple[str, bytes]:
     return f"line {at} is {text[:30]!r} of {len(text)}", "\n".join(lines).encode()
 
 
-def _damage_torques(rng: np.random.Generator, base: bytes) -> tuple[str, bytes]:
+def _damage_torques(rng: Random, base: bytes) -> tuple[str, bytes]:
     rows = [line.split(",") for line in base.decode().strip().split("\n")]
     rows = rows[:1] + rows[1 :: max(1, len(rows) // 40)]
     at, other = (int(row) for row in rng.integers(len(rows), size=2))
@@ -215,11 +216,8 @@ def _damage_torques(rng: np.random.Generator, base: bytes) -> tuple[str, bytes]:
         "long": [*rows[:at], row * many, *rows[at + 1 :]],
         "column": [own[:column] + own[column + 1 :] for own in rows],
         "scale": [
-            rows[0],
-            *(
-                [*own[:column], repr(float(own[column]) * factor), *own[column + 1 :]]
-                for own in rows[1:]
-            ),
+            [*row[:column], repr(float(row[column]) * factor), *row[column + 1 :]] if k else row
+            for k, row in enumerate(rows)
         ],
         "few": rows[: int(rng.integers(1, 4))],
         "blank": [*rows[:at], *[[""]] * many, *rows[at:]],
@@ -230,7 +228,7 @@ def _damage_torques(rng: np.random.Generator, base: bytes) -> tuple[str, bytes]:
     return f"{what} in row {at}, column {column}", text.encode("utf-8", "surrogatepass")
 
 
-def _damage_archive(rng: np.random.Generator, base: bytes) -> tuple[str, bytes]:
+def _damage_archive(rng: Random, base: bytes) -> tuple[str, bytes]:
     """A trajectory file with one array, its `meta` or the archive itself changed."""
     with np.load(io.BytesIO(base)) as data:
         arrays: dict[str, Any] = {name: data[name] for name in data.files}
@@ -261,13 +259,11 @@ def _damage_archive(rng: np.random.Generator, base: bytes) -> tuple[str, bytes]:
     return f"archive with {member}", _pack(arrays, member, b"abc")
 
 
-def _change_array(rng: np.random.Generator, array: Any) -> tuple[str, Any]:
+def _change_array(rng: Random, array: Any) -> tuple[str, Any]:
     if array.dtype.kind in "iuf" and array.size and rng.uniform() < 0.5:
         new = pick(rng, [np.nan, np.inf, -np.inf, 1e308, -1e308, 0.0, -1.0, 1e30, 1e-30, 7.0])
-        changed, count = (
-            array.astype(float),
-            pick(rng, [1, 1, max(1, array.size // 10), array.size]),
-        )
+        changed = array.astype(float)
+        count = pick(rng, [1, 1, max(1, array.size // 10), array.size])
         changed.flat[rng.integers(array.size, size=count)] = new
         return f"{new} in", changed
     makers: list[Callable[[], Any]] = [
@@ -335,10 +331,8 @@ def _value(value: Any) -> str:
 
 
 STATUSES = (0, 1, 2)
-LONGEST = 2000
-"""Longest line on stderr that still counts as clear."""
-PROGRESS = re.compile(r"wholearm: \d+ s: ")
-"""Lines that tell how long work goes on already."""
+LONGEST = 2000  # longest line on stderr that still counts as clear
+PROGRESS = re.compile(r"wholearm: \d+ s: ")  # lines that tell how long work goes on already
 
 
 def run_file(seed: int, number: int) -> dict[str, Any]:
@@ -348,25 +342,20 @@ def run_file(seed: int, number: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         command = write_case(mutant, folder, rng)
         status, findings = run_command(command, folder)
-    return {
-        "kind": mutant.kind,
-        "what": mutant.what,
-        "command": " ".join([command[0], *map(os.path.basename, command[1:])]),
-        "status": status,
-        "findings": findings,
-    }
+    text = " ".join([command[0], *map(os.path.basename, command[1:])])
+    answer = {"command": text, "status": status, "findings": findings}
+    return {"kind": mutant.kind, "what": mutant.what, **answer}
 
 
-def write_case(mutant: Mutant, folder: str, rng: np.random.Generator) -> list[str]:
+def write_case(mutant: Mutant, folder: str, rng: Random) -> list[str]:
     """Write a mutant and what its command needs into a folder; return the command's arguments."""
-    path = os.path.join(folder, f"mutant{mutant.ending}")
+    path, own = os.path.join(folder, f"mutant{mutant.ending}"), os.path.join(folder, "problem.toml")
     if mutant.content is None:
         os.mkdir(path)
     else:
-        _write(path, mutant.content)
+        Path(path).write_bytes(mutant.content)
     problem, torques, _ = base_files()
-    own = os.path.join(folder, "problem.toml")
-    _write(own, problem)
+    Path(own).write_bytes(problem)
     share, out = float(rng.uniform()), os.path.join(folder, "out")
     if mutant.kind == "problem":
         if share < 0.6:
@@ -374,7 +363,7 @@ def write_case(mutant: Mutant, folder: str, rng: np.random.Generator) -> list[st
             return ["solve", path, "-o", f"{out}.npz", "--intervals", "20", *extra]
         if share < 0.8:
             table = os.path.join(folder, "torques.csv")
-            _write(table, torques)
+            Path(table).write_bytes(torques)
             return ["verify", path, table]
         if share < 0.97:
             return ["map", path, "--list", "0.02,0", "-0.01,0"]
@@ -386,11 +375,6 @@ def write_case(mutant: Mutant, folder: str, rng: np.random.Generator) -> list[st
     if share < 0.97:
         return ["plot", path, "-o", f"{out}.svg"]
     return ["map", own, "--plan", path, "-o", f"{out}.png", "--phi=-10,10"]
-
-
-def _write(path: str, content: bytes) -> None:
-    with open(path, "wb") as stream:
-        stream.write(content)
 
 
 def run_command(command: list[str], folder: str) -> tuple[int | None, list[tuple[str, str]]]:

@@ -1,4 +1,4 @@
-"""A second way to follow the curve of a phase: small steps and plain overlap tests.
+"""Curve of a phase by small predictor-corrector steps and overlap tests, apart from the planner.
 
 It knows neither C-functions nor limits of formations. The motion ends where a contact leaves the
 feature that it slides on, where two bodies run into each other, or at the phase's `until`.
@@ -7,6 +7,7 @@ feature that it slides on, where two bodies run into each other, or at the phase
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -16,14 +17,11 @@ from ...problem.definition import Phase, Until
 from ...scene.model import Scene
 from .newton import clearances, locate
 
-STEP = 0.02
-"""Length of a step over the radius of gyration."""
-LONGEST = 60.0
-"""Longest curve, over the radius of gyration: several turns of the object."""
+STEP = 0.02  # length of a step over the radius of gyration
+LONGEST = 60.0  # longest curve, over the radius of gyration: several turns of the object
 OVERLAP = 1e-6
 """Overlap over the radius of gyration from which on two bodies count as running into each other."""
-MET = 1e-5
-"""Distance over the radius of gyration (or angle) that counts as having reached `until`."""
+MET = 1e-5  # distance over the radius of gyration (or angle) that counts as having reached `until`
 
 
 class Trace(NamedTuple):
@@ -103,20 +101,19 @@ def _march(scene: Scene, phase: Phase, z: Array, tangent: Array) -> Trace:
 
 def _end(scene: Scene, phase: Phase, points: list[Array], beyond: Array) -> Trace:
     """Bisect for the first event between the last point and one beyond it."""
-    last, low, high = points[-1], 0.0, 1.0
-    here = last
-    for _ in range(40):
-        middle = (low + high) / 2
-        z = close(scene, phase, last + middle * (beyond - last), last)
-        stops = z is None or bool(_overlaps(scene, phase, z))
-        if z is not None and not stops:
-            stops = _passes(scene, phase.until, last, z)
-        if stops:
-            high = middle
-        else:
-            low, here = middle, z if z is not None else here
+    last = points[-1]
+
+    def place(share: float) -> Array | None:
+        return close(scene, phase, last + share * (beyond - last), last)
+
+    def stops(share: float) -> bool:
+        z = place(share)
+        return z is None or bool(_overlaps(scene, phase, z)) or _passes(scene, phase.until, last, z)
+
+    low, high = _bisect(stops, 40)
+    here = _or(place(low), last) if low else last
     met = _meets(scene, phase.until, here)
-    after = close(scene, phase, last + high * (beyond - last), last)
+    after = place(high)
     names = set() if after is None else _overlaps(scene, phase, after)
     text = str(phase.until) if met else ", ".join(sorted(names)) or "the contacts become dependent"
     return Trace(np.array([*points, here]), text, met)
@@ -211,13 +208,22 @@ def _turns(scene: Scene, phase: Phase, z: Array, z_s: Array) -> Array:
 
 def _find_turn(scene: Scene, phase: Phase, first: Array, last: Array) -> Array:
     """Bisect for the first place between two where a rate changes its sign."""
-    low, high, here = 0.0, 1.0, first
-    for _ in range(30):
+
+    def place(share: float) -> Array:
+        return _or(close(scene, phase, first + share * (last - first), first), first)
+
+    def turns(share: float) -> bool:
+        pair = np.array([first, place(share), last])
+        return bool(_turns(scene, phase, pair[:2], _orient(scene, phase, pair)[:2])[0])
+
+    low, _ = _bisect(turns, 30)
+    return place(low) if low else first
+
+
+def _bisect(test: Callable[[float], bool], count: int) -> tuple[float, float]:
+    """Bracket in [0, 1] of where a test becomes true, after `count` halvings."""
+    low, high = 0.0, 1.0
+    for _ in range(count):
         middle = (low + high) / 2
-        z = _or(close(scene, phase, first + middle * (last - first), first), first)
-        pair = np.array([first, z, last])
-        if _turns(scene, phase, pair[:2], _orient(scene, phase, pair)[:2])[0]:
-            high = middle
-        else:
-            low, here = middle, z
-    return here
+        low, high = (low, middle) if test(middle) else (middle, high)
+    return low, high

@@ -77,15 +77,10 @@ def locate(scene: Scene, name: str, z: Array) -> Touch:
 
 
 def _touch(
-    scene: Scene,
-    z: Array,
-    finger: int | None,
-    point: Array,
-    normal: Array,
-    gap: Array,
-    low: Array,
-    high: Array,
+    scene: Scene, z: Array, finger: int | None, point: Array, normal: Array, *sides: Array
 ) -> Touch:
+    """A contact with its `sides`: gap, low and high."""
+    gap, low, high = sides
     tangent = np.stack([normal[:, 1], -normal[:, 0]], axis=1)
     rows = []
     for direction in (normal, tangent):

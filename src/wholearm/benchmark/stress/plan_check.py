@@ -1,4 +1,4 @@
-"""An independent look at a plan: every instant against Newton, Euler, Coulomb and plain overlap."""
+"""Independent check of plans at many instants: Newton, Euler, Coulomb, and overlaps."""
 
 from __future__ import annotations
 
@@ -12,14 +12,10 @@ from .newton import Touch, balance, clearances, locate
 
 INSTANTS = 401
 """Instants of a phase that are looked at, besides some in short pieces of its torques."""
-BRIEF = 1e-6
-"""Share of a phase below which a piece of its torques has no length."""
-ROUNDING = 1e-6
-"""What may be left of an equation, over the largest of its terms."""
-OVERLAP = 1e-6
-"""Overlap and open gaps that pass for rounding, over the radius of gyration."""
-STILL = 1e-5
-"""Speed over the scene's own below which friction may point either way."""
+BRIEF = 1e-6  # share of a phase below which a piece of its torques has no length
+ROUNDING = 1e-6  # what may be left of an equation, over the largest of its terms
+OVERLAP = 1e-6  # overlap and open gaps that pass for rounding, over the radius of gyration
+STILL = 1e-5  # speed over the scene's own below which friction may point either way
 THIN = 2e-3
 """What a normal force may lack of epsilon, over epsilon: what `verification.verify` allows."""
 
@@ -72,15 +68,13 @@ def _check_phase(problem: Problem, phase: Phase, rows: Samples) -> list[str]:
         if gap.min() < -OVERLAP * size:
             texts.append(f"{pair} overlap by {-gap.min():.3g} m")
     texts += _check_forces(problem, phase, rows, touches)
-    rest = balance(
-        scene, touches, (rows.z_dot, rows.z_ddot), rows.tau, np.stack([rows.c_n, rows.c_t])
-    )
+    motion, forces = (rows.z_dot, rows.z_ddot), np.stack([rows.c_n, rows.c_t])
+    rest = balance(scene, touches, motion, rows.tau, forces)
     # A joint that all but stands still is held by any dry friction up to its own.
     still = np.abs(rows.z_dot) < STILL * speed / np.append(np.ones(2), np.full(3, size))
     slack = np.where(still, 2 * scene.dry, 0.0)
-    biggest = np.maximum(
-        np.abs(scene.mass_diagonal * rows.z_ddot).max(axis=0), scene.scales.force * _arms(scene)
-    )
+    arms = scene.scales.force * np.array([1.0, 1.0, size, size, size])
+    biggest = np.maximum(np.abs(scene.mass_diagonal * rows.z_ddot).max(axis=0), arms)
     biggest[3:] = np.maximum(biggest[3:], np.abs(rows.tau).max(axis=0))
     excess = (np.abs(rest) - slack).max(axis=0) / biggest / ROUNDING
     for k in np.flatnonzero(excess > 1):
@@ -91,11 +85,6 @@ def _check_phase(problem: Problem, phase: Phase, rows: Samples) -> list[str]:
             f"at instant {at}"
         )
     return texts
-
-
-def _arms(scene: Scene) -> Array:
-    length = scene.scales.length
-    return np.array([1.0, 1.0, length, length, length])
 
 
 def _check_forces(problem: Problem, phase: Phase, rows: Samples, touches: list[Touch]) -> list[str]:
@@ -121,8 +110,13 @@ def _check_forces(problem: Problem, phase: Phase, rows: Samples, touches: list[T
         if wrong > scale:
             texts.append(f"friction at {name} is {wrong:.3g} N off Coulomb's for its sliding")
     over = np.abs(rows.tau).max(axis=0) / scene.torque_limit - 1
+    fast = np.abs(rows.z_dot[:, 3:]).max(axis=0) / scene.speed_limit - 1
+    excesses = (("tau_{} exceeds its limit", over), ("joint {} exceeds its speed", fast))
     texts += [
-        f"tau_{j + 1} exceeds its limit by {over[j]:.2g} of it" for j in (0, 1) if over[j] > 1e-5
+        f"{text.format(j + 1)} by {share[j]:.2g} of it"
+        for text, share in excesses
+        for j in (0, 1)
+        if share[j] > 1e-5
     ]
     quick = np.abs(rows.z_dot[:, 3:]).max(axis=0) / scene.speed_limit - 1
     texts += [

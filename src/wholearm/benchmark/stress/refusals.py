@@ -1,4 +1,4 @@
-"""Whether a refusal is right, by arguments that share nothing with the planner."""
+"""Second opinions on refusals, by arguments that share nothing with the planner."""
 
 from __future__ import annotations
 
@@ -17,14 +17,10 @@ from .cell_curves import best_end, find_best, list_ends
 from .event_tracing import Trace, follow, resample, weights
 from .slow_motion import fast_margin, inertia_ratio, rest_margin, slow_margin
 
-PLACES = 60
-"""Places along a curve at which limits are looked at."""
-CLEAR = 1e-3
-"""Margin over the scene's weight, or a torque limit, from which a motion surely exists."""
-UNABLE = -1e-7
-"""Margin below which none exists."""
-FREE = 0.02
-"""Reduced inertia over that without friction above which nothing jams."""
+PLACES = 60  # places along a curve at which limits are looked at
+CLEAR = 1e-3  # margin over the scene's weight, or a torque limit, from which a motion surely exists
+UNABLE = -1e-7  # margin below which none exists
+FREE = 0.02  # reduced inertia over that without friction above which nothing jams
 
 SURE = 0.02
 """What the best of many curves misses limits by, as a margin, where surely none keeps them."""
@@ -52,33 +48,32 @@ def judge(
     Phases after one with two freedoms begin where the plan of the phases before ends, for the
     `objective` that was asked for.
     """
-    number = _find_phase(str(error))
+    match = re.search(r"phases? (\d+)|phases\[(\d+)\]", str(error))
+    number = int(match[1] or match[2]) if match else None
     z = problem.start
     open_end = Verdict("open", "")
     planned = False
     for phase in problem.phases:
-        own = number in (None, phase.number)
-        if planned and not own:
+        concerned = number in (None, phase.number)
+        if planned and not concerned:
             continue
         if phase.formation.n_constraints == 4 and not phase.until.is_release:
             trace = _reach(problem.scene, phase, z)
-            if (
-                len(trace.z) < 3
-                and _length(problem.scene, trace) < HELD * problem.scene.scales.length
-            ):
+            length = np.sqrt(np.diff(trace.z, axis=0) ** 2 @ weights(problem.scene)).sum()
+            if len(trace.z) < 3 and length < HELD * problem.scene.scales.length:
                 return Verdict("close", f"phase {phase.number} has nothing to do")
             if not trace.reached:
                 return Verdict("confirmed", f"phase {phase.number}: {trace.ending}")
-            if own:
+            if concerned:
                 verdict = _judge_curve(problem, phase, trace)
                 if verdict.kind != "refuted" or number is not None:
                     return verdict
                 open_end = verdict
             z = trace.z[-1]
             continue
-        if own and phase.index < len(stops):
+        if concerned and phase.index < len(stops):
             return _judge_cell(problem, phase, z, stops[phase.index])
-        before = None if own or number is None else _find_start(problem, number, objective)
+        before = None if concerned or number is None else _find_start(problem, number, objective)
         if before is None:
             return Verdict("open", f"phase {phase.number} ends where the planner chooses")
         z, planned = before, True
@@ -104,21 +99,13 @@ def _find_start(problem: Problem, number: int, objective: str) -> Array | None:
     return np.asarray(motion.evaluate(np.array([motion.duration])).z[0])
 
 
-def _length(scene: Scene, trace: Trace) -> float:
-    steps = np.diff(trace.z, axis=0)
-    return float(np.sqrt(steps**2 @ weights(scene)).sum())
-
-
-def _find_phase(text: str) -> int | None:
-    match = re.search(r"phases? (\d+)|phases\[(\d+)\]", text)
-    return int(match[1] or match[2]) if match else None
-
-
 def _reach(scene: Scene, phase: Phase, z: Array) -> Trace:
-    """The way that reaches the phase's end, or the longer one if none does."""
-    ways = follow(scene, phase, z)
-    reached = [way for way in ways if way.reached]
-    return min(reached or ways, key=lambda way: len(way.z) if way.reached else -len(way.z))
+    """The curve that reaches the phase's end, or the longer one if none does."""
+    traces = follow(scene, phase, z)
+    reached = [trace for trace in traces if trace.reached]
+    return min(
+        reached or traces, key=lambda trace: len(trace.z) if trace.reached else -len(trace.z)
+    )
 
 
 def _judge_curve(problem: Problem, phase: Phase, trace: Trace) -> Verdict:

@@ -32,20 +32,18 @@ from .newton import locate
 from .slow_motion import slow_margin
 
 Table = dict[str, Any]
+Random = np.random.Generator
 
 SIZES, MASSES = (-3.0, 1.0), (-4.0, 3.0)
 """Powers of ten: radius of the object [m], and its mass [kg]."""
 DECADES = (-6.0, 0.0)
 """Powers of ten: joint inertia, viscous and dry friction, over what the object has of them."""
-POINTED = 0.5
-"""Share of the scenes whose fingers have no thickness."""
-TRIES = 200
-"""Hands that are drawn for one object before another object is."""
-PLACES = 60
-"""Places along a border at which a route looks for its ends."""
+POINTED = 0.5  # share of the scenes whose fingers have no thickness
+TRIES = 200  # hands that are drawn for one object before another object is
+PLACES = 60  # places along a border at which a route looks for its ends
 
 
-def random_scene(rng: np.random.Generator) -> Table:
+def random_scene(rng: Random) -> Table:
     """Draw the nested tables of a problem file whose fingers close on the object at the start.
 
     The object has 3 to 12 vertices and is anything from a needle to a disc; the only phase names
@@ -66,7 +64,7 @@ def random_scene(rng: np.random.Generator) -> Table:
             return table
 
 
-def _draw_polygon(rng: np.random.Generator, size: float) -> Array:
+def _draw_polygon(rng: Random, size: float) -> Array:
     """Corners of a convex polygon within `size` of its middle, shape (n_v, 2) [m]."""
     count, regular = int(rng.integers(3, 13)), rng.uniform() < 0.25
     apart = 0.0 if regular else rng.uniform(0.1, 0.45)
@@ -78,7 +76,7 @@ def _draw_polygon(rng: np.random.Generator, size: float) -> Array:
     return size * np.column_stack([c * across - s * along, s * across + c * along])
 
 
-def _draw_hand(rng: np.random.Generator, body: Table, size: float) -> Table:
+def _draw_hand(rng: Random, body: Table, size: float) -> Table:
     """A problem with fingers, friction, and a start that may turn out to be impossible."""
     mass, gravity = body["mass"], 9.81
     reach = rng.uniform(1.2, 5.0)
@@ -124,7 +122,7 @@ def name_first(table: Table) -> list[str]:
     return [contact.name for contact in find_touching(scene, z)]
 
 
-def random_route(rng: np.random.Generator, problem: Problem) -> list[tuple[float, float]]:
+def random_route(rng: Random, problem: Problem) -> list[tuple[float, float]]:
     """Draw poses (x, phi) [m, rad] of a route through the map, from the problem's start.
 
     Legs follow borders, turn back on them, end at crossings, lead through cells from border to
@@ -172,26 +170,22 @@ def _find_pieces(problem: Problem) -> list[Piece]:
 
 
 def _draw_leg(
-    rng: np.random.Generator, problem: Problem, pieces: list[Piece], poses: list[Array], kind: str
+    rng: Random, problem: Problem, pieces: list[Piece], poses: list[Array], kind: str
 ) -> Array | None:
     """End of a leg of one kind, or None where there is no such leg."""
     scene, here = problem.scene, poses[-1]
     size = np.array([scene.scales.length, 1.0])
     if kind == "back":
-        if len(poses) < 2:
-            return None
-        share = rng.uniform(0.1, 1.2)
-        return here + share * (poses[-2] - here)
+        return here + rng.uniform(0.1, 1.2) * (poses[-2] - here) if len(poses) > 1 else None
     if kind == "cell":
         there = here + rng.normal(0.0, 0.5, 2) * size
         inside = label_cells(scene, there[:1], there[1:])[0, 0] != NOWHERE
         return there if inside else None
-    own = [piece for piece in pieces if _distance(piece, here, size) < 0.02]
-    if kind == "border":
-        own = pieces
-    if not own:
+    near = [piece for piece in pieces if _distance(piece, here, size) < 0.02]
+    choice = pieces if kind == "border" else near
+    if not choice:
         return None
-    piece = own[int(rng.integers(len(own)))]
+    piece = choice[int(rng.integers(len(choice)))]
     track, (low, high) = piece.track, piece.places[[0, -1]]
     place = rng.uniform(low, high)
     if kind == "end":
@@ -210,14 +204,10 @@ def _distance(piece: Piece, here: Array, size: Array) -> float:
     return float(np.hypot(*((points - here) / size).T).min())
 
 
-LISTS = 4
-"""Routes that are drawn for one scene before another scene is."""
-LOOKS = 4
-"""Places of a stretch at which it is looked whether a slow motion is possible."""
-WILLING = 0.7
-"""Share of the cases whose route a slow motion can probably follow."""
-SCENES = 6
-"""Scenes that are drawn for one case before its last list is taken as it is."""
+LISTS = 4  # routes that are drawn for one scene before another scene is
+LOOKS = 4  # places of a stretch at which it is looked whether a slow motion is possible
+WILLING = 0.7  # share of the cases whose route a slow motion can probably follow
+SCENES = 6  # scenes that are drawn for one case before its last list is taken as it is
 
 
 @dataclass(frozen=True)
@@ -239,7 +229,8 @@ def draw_case(seed: int, number: int) -> Case:
     willing, last = rng.uniform() < WILLING, None
     for _ in range(SCENES):
         try:
-            table = _refit(TWISTS[kind](rng, random_scene(rng)))
+            table = TWISTS[kind](rng, random_scene(rng))
+            table = {**table, "phases": [{"contacts": name_first(table), "until": {"x": 0.0}}]}
             problem = build_problem(table)
         except InputError:
             continue
@@ -281,16 +272,7 @@ def can_move(problem: Problem, stretches: Sequence[Stretch]) -> bool:
     return True
 
 
-def _refit(table: Table) -> Table:
-    """A scene whose first phase names what touches at the start."""
-    return {**table, "phases": [{"contacts": name_first(table), "until": {"x": 0.0}}]}
-
-
-def _keep(rng: np.random.Generator, table: Table) -> Table:
-    return table
-
-
-def _near_end(rng: np.random.Generator, table: Table) -> Table:
+def _near_end(rng: Random, table: Table) -> Table:
     """A link that touches the object near its tip, or near its base."""
     key = str(rng.integers(1, 3))
     finger, problem = table["fingers"][key], build_problem(table)
@@ -309,7 +291,7 @@ def _near_end(rng: np.random.Generator, table: Table) -> Table:
     return {**table, "fingers": {**table["fingers"], key: finger}}
 
 
-def _mirror(rng: np.random.Generator, table: Table) -> Table:
+def _mirror(rng: Random, table: Table) -> Table:
     """A regular object between fingers alike: events of both coincide, or all but do."""
     count = int(rng.integers(3, 13))
     size = float(np.abs(np.array(table["object"]["vertices"])).max())
@@ -321,16 +303,11 @@ def _mirror(rng: np.random.Generator, table: Table) -> Table:
     friction = dict(table["friction"], finger2=table["friction"]["finger1"])
     x = 0.0 if rng.uniform() < 0.5 else table["start"]["x"]
     body = {"vertices": corners.tolist(), "mass": table["object"]["mass"]}
-    return {
-        **table,
-        "object": body,
-        "fingers": {"1": right, "2": left},
-        "friction": friction,
-        "start": {"flush": 0, "x": x},
-    }
+    changed = {"object": body, "fingers": {"1": right, "2": left}, "friction": friction}
+    return {**table, **changed, "start": {"flush": 0, "x": x}}
 
 
-def _rough(rng: np.random.Generator, table: Table) -> Table:
+def _rough(rng: Random, table: Table) -> Table:
     """Friction near one and joints heavy against the object: contacts jam."""
     parts = {part: float(rng.uniform(0.6, 1.0)) for part in table["friction"]}
     heavy = {
@@ -340,14 +317,14 @@ def _rough(rng: np.random.Generator, table: Table) -> Table:
     return {**table, "friction": parts, "fingers": heavy}
 
 
-def _smooth(rng: np.random.Generator, table: Table) -> Table:
+def _smooth(rng: Random, table: Table) -> Table:
     """Little friction, so that much is possible."""
     parts = {part: float(rng.uniform(0.0, 0.15)) for part in table["friction"]}
     return {**table, "friction": parts}
 
 
-TWISTS: dict[str, Callable[[np.random.Generator, Table], Table]] = {
-    "any": _keep,
+TWISTS: dict[str, Callable[[Random, Table], Table]] = {
+    "any": lambda rng, table: table,
     "near a link's end": _near_end,
     "mirrored": _mirror,
     "rough": _rough,
@@ -357,17 +334,14 @@ TWISTS: dict[str, Callable[[np.random.Generator, Table], Table]] = {
 
 Phases = list[dict[str, Any]]
 Stops = list[tuple[float, float]]
+Route = tuple[Phases, Stops, str]
 
 
-def _at_rest(
-    rng: np.random.Generator, problem: Problem, phases: Phases, stops: Stops
-) -> tuple[Phases, Stops, str]:
+def _at_rest(rng: Random, problem: Problem, phases: Phases, stops: Stops) -> Route:
     return phases, stops, "from the map"
 
 
-def _struck(
-    rng: np.random.Generator, problem: Problem, phases: Phases, stops: Stops
-) -> tuple[Phases, Stops, str]:
+def _struck(rng: Random, problem: Problem, phases: Phases, stops: Stops) -> Route:
     """Impacts wherever a contact is gained that the next phase has."""
     changed = [
         dict(phase, end="impact")
@@ -380,9 +354,7 @@ def _struck(
     return [*changed, phases[-1]], stops, "impacts"
 
 
-def _joined(
-    rng: np.random.Generator, problem: Problem, phases: Phases, stops: Stops
-) -> tuple[Phases, Stops, str]:
+def _joined(rng: Random, problem: Problem, phases: Phases, stops: Stops) -> Route:
     """Smooth ends wherever a phase passes into one with three contacts or fewer freedoms."""
     changed = []
     for phase, following in itertools.pairwise(phases):
@@ -393,9 +365,7 @@ def _joined(
     return [*changed, phases[-1]], stops, "smooth"
 
 
-def _split(
-    rng: np.random.Generator, problem: Problem, phases: Phases, stops: Stops
-) -> tuple[Phases, Stops, str]:
+def _split(rng: Random, problem: Problem, phases: Phases, stops: Stops) -> Route:
     """A stop right before the end of a phase: two events that all but coincide."""
     k = int(rng.integers(len(phases)))
     begin = np.array(stops[k - 1] if k else problem.start[[0, 2]])
@@ -410,9 +380,7 @@ def _split(
     return changed, where, "stopped short"
 
 
-def _rolled(
-    rng: np.random.Generator, problem: Problem, phases: Phases, stops: Stops
-) -> tuple[Phases, Stops, str]:
+def _rolled(rng: Random, problem: Problem, phases: Phases, stops: Stops) -> Route:
     """A slide on the palm, then the object rolls over a vertex between two links."""
     first = phases[0]
     palm = [name for name in first["contacts"] if name.endswith("-palm")]

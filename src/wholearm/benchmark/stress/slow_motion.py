@@ -1,4 +1,4 @@
-"""Linear programmes that decide whether a motion along a curve can exist, or begin from rest.
+"""Existence of motions along a curve, or from rest, by linear programmes.
 
 Along a curve z(s) the speed squared b = s'^2 and the acceleration a = s'' enter every force
 linearly, and so do the contact forces: whether any motion keeps all limits is a linear programme,
@@ -23,12 +23,12 @@ Forces are from bodies and points alone (`benchmark.stress.newton`).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linprog
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 
 from ...common.arrays import Array
 from ...contacts.closing import Numbers
@@ -39,8 +39,7 @@ from .newton import Touch, locate
 
 Bounds = list[tuple[float | None, float | None]]
 
-FASTEST = 1e3
-"""Largest speed that is considered, over the scene's own."""
+FASTEST = 1e3  # largest speed that is considered, over the scene's own
 TANGENTS = np.geomspace(1e-6, 1.0, 13)
 """Places of the tangents that bound sqrt(b), over the largest b."""
 
@@ -69,7 +68,11 @@ def slow_margin(
         for sign in signs[max(k - 1, 0) : k + 1]:
             at = slice(k, k + 1)
             forces = _limits(scene, phase, epsilon, z[at], z_s[at], np.zeros((1, 5)), sign[None])
-            margin = _solve_one(forces)
+            rows, equal = forces.rows[0, :, 3:], forces.equal[0, :, 3:]
+            upper = np.column_stack([-rows, forces.share]), -forces.least[0]
+            object_laws = np.column_stack([equal, np.zeros(3)]), forces.equal_to[0]
+            bounds: Bounds = [(None, None)] * rows.shape[1] + [(None, 1.0)]
+            margin = np.nan_to_num(_maximise(*upper, *object_laws, bounds), nan=-np.inf)
             if margin < worst:
                 worst, place = margin, k
     return worst, place
@@ -124,7 +127,7 @@ def fast_margin(
     for end, rest in zip((0, count - 1), rests, strict=True):
         if rest:
             bounds[end] = bounds[count + end] = (0.0, 0.0)
-    return _maximise(total, upper, equal, bounds)
+    return _maximise(*upper.build(), *equal.build(), bounds)
 
 
 def _add_limits(
@@ -266,22 +269,6 @@ def _push(touches: Sequence[Touch], rolling: Sequence[int], signs: Array, loose:
     return np.stack(pushes, axis=2)
 
 
-def _solve_one(forces: Forces) -> float:
-    """Margin of one place at rest."""
-    rows, equal = forces.rows[0, :, 3:], forces.equal[0, :, 3:]
-    cost = np.append(np.zeros(rows.shape[1]), -1.0)
-    answer = linprog(
-        cost,
-        A_ub=np.column_stack([-rows, forces.share]),
-        b_ub=-forces.least[0],
-        A_eq=np.column_stack([equal, np.zeros(3)]),
-        b_eq=forces.equal_to[0],
-        bounds=[(None, None)] * rows.shape[1] + [(None, 1.0)],
-        method="highs",
-    )
-    return float(-answer.fun) if answer.status == 0 else -np.inf
-
-
 class _Rows:
     """Rows of a sparse matrix with their right sides, collected piece by piece."""
 
@@ -300,35 +287,24 @@ class _Rows:
         """Add one entry to each of some rows."""
         self._entries.append((row, column, np.broadcast_to(value, row.shape)))
 
-    def build(self) -> tuple[coo_array, Array]:
+    def build(self) -> tuple[csr_array, Array]:
         """The matrix and the right sides."""
         row, column, value = (np.concatenate(part) for part in zip(*self._entries, strict=True))
-        return coo_array((value, (row, column)), (self.count, self.width)), np.concatenate(
-            self._right
-        )
+        shape = self.count, self.width
+        return coo_array((value, (row, column)), shape).tocsr(), np.concatenate(self._right)
 
 
-def _maximise(total: int, upper: _Rows, equal: _Rows, bounds: Bounds) -> float:
-    cost = np.zeros(total)
-    cost[-1] = -1.0
-    A_ub, b_ub = upper.build()
-    A_eq, b_eq = equal.build()
-    answer = linprog(
-        cost, A_ub.tocsr(), b_ub, A_eq.tocsr(), b_eq, bounds=bounds, method="highs",
-        options={"time_limit": 20.0},
-    )  # fmt: skip
-    if answer.status == 0:
-        return float(-answer.fun)
-    return -np.inf if answer.status == 2 else np.nan
-
-
-__all__ = ["fast_margin", "inertia_ratio", "slow_margin"]
+def _maximise(A_ub: Any, b_ub: Any, A_eq: Any, b_eq: Any, bounds: Bounds) -> float:
+    """Largest value of the last unknown; -inf where infeasible, NaN where nothing is known."""
+    cost = -np.eye(1, len(bounds), len(bounds) - 1)[0]
+    options = {"time_limit": 20.0}
+    answer = linprog(cost, A_ub, b_ub, A_eq, b_eq, bounds, method="highs", options=options)
+    return float(-answer.fun) if answer.status == 0 else -np.inf if answer.status == 2 else np.nan
 
 
 TOUCHES = 1e-6
 """Gap over the radius of gyration below which a contact touches that the phase does without."""
-STILL = 1e-9
-"""Rate over the largest one below which something stands still."""
+STILL = 1e-9  # rate over the largest one below which something stands still
 
 
 def rest_margin(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: bool = False) -> float:
@@ -368,13 +344,13 @@ def rest_margin(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: bool
 def list_others(scene: Scene, phase: Phase, z: Array) -> list[Touch]:
     """Contacts that touch at `z` but are none of the phase's: they may only open."""
     names = set(phase.formation.names)
-    found = []
+    others = []
     for name in sorted(_every_name(scene) - names):
         touch = locate(scene, name, z[None])
         near = TOUCHES * scene.scales.length
         if abs(touch.gap[0]) < near and min(touch.low[0], touch.high[0]) > near:
-            found.append(touch)
-    return found
+            others.append(touch)
+    return others
 
 
 def _every_name(scene: Scene) -> set[str]:
@@ -446,7 +422,7 @@ def _solve(
         rows.append(-row + share * np.eye(total)[-1])
         most.append(-least)
 
-    bounds: list[tuple[float | None, float | None]] = [(None, None)] * (f + 2 * n_c)
+    bounds: Bounds = [(None, None)] * (f + 2 * n_c)
     for k, sign in enumerate(signs):
         if sign:
             at_least(np.append(sign * slip[k], np.zeros(total - f)), 0.0, 0.0)
@@ -471,7 +447,4 @@ def _solve(
     for row in apart:
         at_least(np.append(row, np.zeros(total - f)), 0.0, 0.0)
     bounds.append((None, 1.0))
-    answer = linprog(
-        -np.eye(total)[-1], np.array(rows), most, np.array(equal), equal_to, bounds, method="highs"
-    )
-    return float(-answer.fun) if answer.status == 0 else -np.inf if answer.status == 2 else np.nan
+    return _maximise(np.array(rows), most, np.array(equal), equal_to, bounds)

@@ -11,7 +11,7 @@ import copy
 import os
 import traceback
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -36,14 +36,11 @@ from .scenes import draw_case
 OBJECTIVES = ("time", "effort", "margin")
 LIMITS = {"scene": 30.0, "file": 20.0, "problem": 60.0}
 """Processor time that a scene and an objective (two plans), a file and a problem may take [s]."""
-NOISE = 1e-10
-"""Relative change of the masses that must not change an answer."""
-SAME = 1e-6
-"""Relative difference of two values that rounding may make."""
+NOISE = 1e-10  # relative change of the masses that must not change an answer
+SAME = 1e-6  # relative difference of two values that rounding may make
 TRIALS = {"noise": 8, "change": 20}
 """Times that noise is added to the masses, and that masses, friction, drag and limits change."""
-SPREAD = 0.1
-"""Largest relative change."""
+SPREAD = 0.1  # largest relative change
 _FINGER = ("inertia", "viscous", "dry", "torque_limit")
 
 Finding = tuple[str, str]
@@ -105,10 +102,9 @@ class Stress(Study):
 
     def run(self, case: Case) -> Row:
         """Run one case."""
-        kind, *given = case
-        if kind == "scene":
-            return run_scene(*given)
-        return run_file(*given) if kind == "file" else run_trial(*given)
+        kind, *arguments = case
+        runs: dict[str, Callable[..., Row]] = {"scene": run_scene, "file": run_file}
+        return runs.get(kind, run_trial)(*arguments)
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
         """Tables of each part, and every finding."""

@@ -1,8 +1,8 @@
-"""A lower bound of the least time from rest to rest along curves, with an estimate of its error.
+"""Lower bound of the least time from rest to rest along curves, by weak duality, and its error.
 
-A sweep finds about the fastest motion, the costate of that motion gives the bound, and the grid is
-refined where the bound loses most. How near the motion is to the fastest one matters to second
-order only, and never to whether the bound is one. What has an error is the quadrature.
+A reachability sweep gives a nearly minimum-time profile, whose costate gives the bound. The grid is
+refined where the bound loses most. Errors of the profile lower the bound in second order and leave
+it a bound; only the quadrature has an error.
 """
 
 from __future__ import annotations
@@ -19,37 +19,30 @@ from .path_terms import PathGrid, PathTerms
 from .rows import Extreme, PathLimitRows
 from .speed_sweep import NoMotionError, Sweep, SweepMode, add_up, find_fastest, find_steady
 
-_NEAR = 6
-"""Intervals from a switch within which a row that it turns about is looked for."""
-_STIFF = 4.0
-"""Growth in an interval from which on the trapezoidal rule is left for the exponential one."""
-_TOLERANCE = 3e-8
-"""What the bound may lose, and its error, relative to the time."""
-GRID_INTERVALS = 100
-"""Of the first grid."""
-_ROUNDS = 16
-"""Most grids: where motions hardly pass a place losses fall by 64 from one to the next."""
+_NEAR = 6  # intervals from a switch within which its row may change sign in a
+_STIFF = 4.0  # growth in an interval from which the exponential rule replaces the trapezoidal one
+_TOLERANCE = 3e-8  # loss of the bound, and its error, relative to the time
+GRID_INTERVALS = 100  # of the first grid
+_ROUNDS = 16  # most grids: losses fall by 64 from one to the next where speeds are very low
+# Intervals on each side of a blocked one that are split, into how many, and how often; case: the
+# border of an octagon's flip, passed at a tenth of the speed beside it.
 _NARROW, _PARTS, _TRIES = 2, 4, 4
-"""Intervals on each side of the one that no motion passes which are split, into how many, and how
-often: the border of an octagon's flip is passed at a tenth of the speed beside it."""
-_MOST = 1500
-"""Most intervals."""
-_SAFETY = 2.0
-"""Factor on the difference of two rules of quadrature; where limits take turns both err alike."""
+_MOST = 1500  # most intervals
+_SAFETY = 2.0  # factor on the difference of two quadratures, which err alike at switches
 _RULES = tuple(np.polynomial.legendre.leggauss(count) for count in (2, 3))
+# Left end, middle, right end and the nodes of both rules in an interval.
 _PLACES = np.concatenate([[0.0, 0.5, 1.0], *((1 + nodes) / 2 for nodes, _ in _RULES)])
-"""Left end, middle, right end and the nodes of both rules in an interval."""
 
 
 class LowerBound(NamedTuple):
     """A lower bound of the least time."""
 
     value: float  # [s]: the bound, less the estimate of its error
-    error: float  # [s]: that estimate: of the quadrature, by rules of two orders
+    error: float  # [s]: that estimate, by quadratures of two orders
 
 
 class _Round(NamedTuple):
-    """The bound on a grid, what each interval may lose, (N,) [s], and the motion it is from."""
+    """The bound on a grid, the loss in each interval, (N,) [s], and the profile it is from."""
 
     bound: LowerBound
     losses: Array
@@ -58,29 +51,28 @@ class _Round(NamedTuple):
 
 
 def bound_least_time(curves: Sequence[Curve], epsilon: float) -> LowerBound | None:
-    """Bound the time of motions along curves from below; None where no motion is found.
+    """Lower bound of the time along curves; None where no motion is found.
 
     Parameters
     ----------
-    curves         with such speed ratios that the speed is the same on both sides of where two of
-                   them meet
+    curves         with speed ratios that make the speed continuous where two of them meet
     epsilon : [N]  least normal force
     """
-    way = PathTerms(curves, epsilon)
-    grid, near, found, tries = way.make_grid(GRID_INTERVALS), None, None, 0
+    path = PathTerms(curves, epsilon)
+    grid, b_guess, result, tries = path.make_grid(GRID_INTERVALS), None, None, 0
     for _ in range(_ROUNDS):
         try:
-            found = _bound(way, grid, near)
+            result = _bound(path, grid, b_guess)
         except NoMotionError as error:
             tries += 1
             if tries > _TRIES:
                 break
             parts = np.ones(len(grid.owners), dtype=np.int64)
             parts[max(error.interval - _NARROW, 0) : error.interval + _NARROW + 1] = _PARTS
-            grid, near = grid.split(parts), None
+            grid, b_guess = grid.split(parts), None
             continue
-        share = found.losses / (_TOLERANCE * found.time)
-        # What switches or kinks lose falls with the square or the third power of the interval.
+        share = result.losses / (_TOLERANCE * result.time)
+        # Losses at switches and kinks fall with the square or the third power of the interval.
         parts = np.clip(np.ceil(np.cbrt(share * len(share))), 1, 8).astype(np.int64)
         # If not all can be split, those that lose most are.
         order = np.argsort(-share)
@@ -89,42 +81,39 @@ def bound_least_time(curves: Sequence[Curve], epsilon: float) -> LowerBound | No
             break
         finer = grid.split(parts)
         middles = (finer.angles[1:] + finer.angles[:-1]) / 2
-        near = np.interp(way.place(middles), way.place(grid.angles), found.motion.b)
+        b_guess = np.interp(path.place(middles), path.place(grid.angles), result.motion.b)
         grid = finer
-    return found and found.bound
+    return result and result.bound
 
 
 def bound_roughly(curves: Sequence[Curve], epsilon: float, intervals: int) -> float:
-    """Bound the time of motions along curves from below on one coarse grid; see `bound_least_time`.
-
-    Zero where no motion is found on that grid.
-    """
-    way = PathTerms(curves, epsilon)
+    """Lower bound on one coarse grid; see `bound_least_time`. Zero where no motion is found."""
+    path = PathTerms(curves, epsilon)
     try:
-        return _bound(way, way.make_grid(intervals), None).bound.value
+        return _bound(path, path.make_grid(intervals), None).bound.value
     except NoMotionError:
         return 0.0
 
 
 def look_along(curves: Sequence[Curve], epsilon: float, intervals: int) -> float:
-    """About how long the fastest motion along curves takes, from rest to rest [s].
+    """Estimated least time along curves from rest to rest [s]; see `bound_least_time`.
 
-    It keeps the limits at one place of each interval of a coarse grid; see `bound_least_time`.
+    Limits are kept at one place of each interval of a coarse grid.
 
     Raises
     ------
     NoMotionError  if there is no motion on that grid
     """
-    way = PathTerms(curves, epsilon)
-    grid = way.make_grid(intervals)
-    ends, angles = way.place(grid.angles), (grid.angles[1:] + grid.angles[:-1]) / 2
-    rows = way.evaluate(angles[:, None], grid.owners).pick((slice(None), 0))
+    path = PathTerms(curves, epsilon)
+    grid = path.make_grid(intervals)
+    ends, angles = path.place(grid.angles), (grid.angles[1:] + grid.angles[:-1]) / 2
+    rows = path.evaluate(angles[:, None], grid.owners).pick((slice(None), 0))
     cap = np.full(len(ends), np.inf)
     if np.isfinite(rows.cap).any():
         sides = np.column_stack([grid.angles[:-1], grid.angles[1:]])
-        cap = _join_caps(*way.evaluate(sides, grid.owners).cap.T)
+        cap = _join_caps(*path.evaluate(sides, grid.owners).cap.T)
     steps = np.diff(ends)
-    motion = find_steady(rows, steps, (way.place(angles) - ends[:-1]) / steps, cap)
+    motion = find_steady(rows, steps, (path.place(angles) - ends[:-1]) / steps, cap)
     return add_up(motion.b, steps)
 
 
@@ -133,35 +122,35 @@ def _join_caps(left: Array, right: Array) -> Array:
     return np.asarray(np.minimum(np.append(left, np.inf), np.append(np.inf, right)))
 
 
-def _bound(way: PathTerms, grid: PathGrid, near: Array | None) -> _Round:
-    """The bound on a grid; `near` is what b in its intervals is about."""
+def _bound(path: PathTerms, grid: PathGrid, b_guess: Array | None) -> _Round:
+    """The bound on a grid; viscous friction is linearised about b = `b_guess` in its intervals."""
     h = np.diff(grid.angles)[:, None]
     angles = grid.angles[:-1, None] + _PLACES * h
-    rows = way.evaluate(angles, grid.owners)
+    rows = path.evaluate(angles, grid.owners)
     left, middle, right = (rows.pick((slice(None), k)) for k in range(3))
-    s = way.place(grid.angles)
-    part = (way.place(angles) - s[:-1, None]) / np.diff(s)[:, None]
+    s = path.place(grid.angles)
+    part = (path.place(angles) - s[:-1, None]) / np.diff(s)[:, None]
     cap, places = _join_caps(left.cap, right.cap), part[:, 1]
-    if near is None:
+    if b_guess is None:
         motion = find_steady(middle, np.diff(s), places, cap)
     else:
-        motion = find_fastest(middle, np.diff(s), places, cap, near)
+        motion = find_fastest(middle, np.diff(s), places, cap, b_guess)
     b = motion.b[:-1, None] + part * np.diff(motion.b)[:, None]
-    costate = find_costate(way, grid, left, right, motion)
+    costate = find_costate(path, grid, left, right, motion)
     shape = len(h), len(_PLACES) - 3
-    p, slope = (part.ravel() for part in costate.interpolate(way, grid, _PLACES[3:]))
+    p, slope = (part.ravel() for part in costate.interpolate(path, grid, _PLACES[3:]))
     inner = rows.pick((slice(None), slice(3, None)))
-    inner = PathLimitRows(*(part.reshape(shape[0] * shape[1], *part.shape[2:]) for part in inner))
+    inner = PathLimitRows(*(part.reshape(-1, *part.shape[2:]) for part in inner))
     least = find_least(inner, p, slope)
     excess = evaluate(inner, p, slope, b[:, 3:].ravel()) - least
-    stretch = way.length / 2 * np.sin(angles[:, 3:])
+    stretch = path.length / 2 * np.sin(angles[:, 3:])
     least, excess = least.reshape(shape) * stretch, excess.reshape(shape) * stretch
     # Along a limit of the speed nothing is lost, however b is interpolated.
     at_cap = motion.b == cap
     excess[at_cap[:-1] & at_cap[1:]] = 0.0
     coarse, fine = (
-        h[:, 0] / 2 * (least[:, own] @ weights)
-        for own, (_, weights) in zip((slice(2), slice(2, None)), _RULES, strict=True)
+        h[:, 0] / 2 * (least[:, nodes] @ weights)
+        for nodes, (_, weights) in zip((slice(2), slice(2, None)), _RULES, strict=True)
     )
     error = np.abs(fine - coarse)
     losses = error + np.abs(h[:, 0] / 2 * (excess[:, 2:] @ _RULES[1][1]))
@@ -184,7 +173,7 @@ class Costate(NamedTuple):
     y: Array
     slopes: Array
 
-    def interpolate(self, way: PathTerms, grid: PathGrid, fractions: Array) -> tuple[Array, Array]:
+    def interpolate(self, path: PathTerms, grid: PathGrid, fractions: Array) -> tuple[Array, Array]:
         """The costate p and p' = dp/ds at `fractions` of every interval, shape (N, n)."""
         t, h = fractions, np.diff(grid.angles)[:, None]
         (start, stop), (first, last) = self.y.T[..., None], h * self.slopes.T[..., None]
@@ -192,7 +181,7 @@ class Costate(NamedTuple):
         bow = first + last - 2 * rise
         y = start + t * (first + t * (rise - first - bow + t * bow))
         y_t = first + t * (2 * (rise - first - bow) + 3 * t * bow)
-        # No sign but those at the ends: only one side of a is extreme there.
+        # Only the signs at the ends, which say whether the largest or least a is optimal.
         wrong = ((y > 0) & (self.y.max(axis=1) <= 0)[:, None]) | (
             (y < 0) & (self.y.min(axis=1) >= 0)[:, None]
         )
@@ -201,7 +190,7 @@ class Costate(NamedTuple):
         angles = grid.angles[:-1, None] + t * h
         sine = np.sin(angles)
         p_angle = (y_t / h - y / np.tan(angles)) / sine
-        return y / sine, p_angle / (way.length / 2 * sine)
+        return y / sine, p_angle / (path.length / 2 * sine)
 
     def jumps(self, grid: PathGrid) -> Array:
         """By how much p falls at each inner node, shape (N - 1,)."""
@@ -209,10 +198,10 @@ class Costate(NamedTuple):
 
 
 def find_costate(
-    way: PathTerms, grid: PathGrid, left: PathLimitRows, right: PathLimitRows, found: Sweep
+    path: PathTerms, grid: PathGrid, left: PathLimitRows, right: PathLimitRows, motion: Sweep
 ) -> Costate:
-    """The costate of a motion, from the limits at the left and right ends of intervals."""
-    b, modes = found.b, found.modes.copy()
+    """The costate of a profile, from the limits at the left and right ends of intervals."""
+    b, modes = motion.b, motion.modes.copy()
     pushes, brakes = (
         (left.extreme(b[:-1], largest), right.extreme(b[1:], largest)) for largest in (True, False)
     )
@@ -226,10 +215,10 @@ def find_costate(
             modes[turn[0] + 1 : high + 1] = SweepMode.BRAKE
             modes[turn[0]] = SweepMode.SWITCH
         index = k if turn is None else turn[0]
-        y[index] = _switch(way, grid, left, right, b, (pushed, braked), index, turn)
-    rates, forces = _linearise(way, grid, b, modes, pushes, brakes)
+        y[index] = _switch(path, grid, left, right, b, (pushed, braked), index, turn)
+    rates, forces = _linearise(path, grid, b, modes, pushes, brakes)
     ends = float(pushes[0].a[0]), float(brakes[1].a[-1])
-    _integrate(way, grid, modes, rates, forces, ends, y)
+    _integrate(path, grid, modes, rates, forces, ends, y)
     slopes = np.where((modes == SweepMode.HELD)[:, None], 0.0, forces + rates * y)
     # At rest only the value is known.
     secant = np.diff(y, axis=1)[:, 0] / np.diff(grid.angles)
@@ -241,9 +230,9 @@ def find_costate(
 def _find_turn(
     left: PathLimitRows, right: PathLimitRows, row: int, k: int
 ) -> tuple[int, int] | None:
-    """The interval near k in which a row turns from a bound above a to one below, and that row.
+    """The interval near k in which a row turns from an upper to a lower bound of a, and that row.
 
-    There the motion runs along that row on both sides, and the costate is zero where it turns.
+    The profile runs along that row on both sides, and the costate is zero there.
     """
     near = np.arange(max(k - _NEAR, 0), min(k + _NEAR + 1, len(left.cap)))
     turns = near[(left.a[near, row] < 0) & (right.a[near, row] >= 0)]
@@ -251,7 +240,7 @@ def _find_turn(
 
 
 def _switch(
-    way: PathTerms,
+    path: PathTerms,
     grid: PathGrid,
     left: PathLimitRows,
     right: PathLimitRows,
@@ -261,7 +250,7 @@ def _switch(
     turn: tuple[int, int] | None,
 ) -> Array:
     """The costate, y, at both ends of the interval k with a switch, shape (2,)."""
-    start, stop = way.place(grid.angles[k : k + 2])
+    start, stop = path.place(grid.angles[k : k + 2])
     (before, after), h = b[k : k + 2], stop - start
     if turn is None:
         pushed, braked = extremes
@@ -276,7 +265,7 @@ def _switch(
 
 
 def _linearise(
-    way: PathTerms,
+    path: PathTerms,
     grid: PathGrid,
     b: Array,
     modes: NDArray[np.int64],
@@ -292,7 +281,7 @@ def _linearise(
     angles = np.column_stack([grid.angles[:-1], grid.angles[1:]])
     speed = np.sqrt(np.column_stack([b[:-1], b[1:]]))
     inner = speed > 0
-    sine, stretch = np.sin(angles), way.length / 2 * np.sin(angles)
+    sine, stretch = np.sin(angles), path.length / 2 * np.sin(angles)
     force = np.zeros(slope.shape)
     force[inner] = -(stretch * sine)[inner] / (2 * speed[inner] ** 3)
     rate = np.zeros(slope.shape)
@@ -301,7 +290,7 @@ def _linearise(
 
 
 def _integrate(
-    way: PathTerms,
+    path: PathTerms,
     grid: PathGrid,
     modes: NDArray[np.int64],
     rates: Array,
@@ -309,9 +298,9 @@ def _integrate(
     ends: tuple[float, float],
     y: Array,
 ) -> None:
-    """Follow y from switches and held stretches, back where pushed and forth where braked."""
+    """Integrate y from switches and speed limits, back where accelerating, forth where braking."""
     h, last = np.diff(grid.angles), len(modes) - 1
-    at_rest = [np.sign(a) / (2 * abs(a) * np.sqrt(abs(a) * way.length / 2)) for a in ends]
+    at_rest = [np.sign(a) / (2 * abs(a) * np.sqrt(abs(a) * path.length / 2)) for a in ends]
     for mode, order, near, far in (
         (SweepMode.PUSH, range(last, -1, -1), 1, 0),
         (SweepMode.BRAKE, range(last + 1), 0, 1),
@@ -320,9 +309,9 @@ def _integrate(
         for k in order:
             if modes[k] != mode:
                 continue
-            beside = k - step
-            goes_on = 0 <= beside <= last and modes[beside] in (mode, SweepMode.SWITCH)
-            y[k, near] = y[beside, far] if goes_on else 0.0
+            previous = k - step
+            goes_on = 0 <= previous <= last and modes[previous] in (mode, SweepMode.SWITCH)
+            y[k, near] = y[previous, far] if goes_on else 0.0
             if k == (last if far else 0):
                 y[k, far] = at_rest[far]
             else:
@@ -332,7 +321,7 @@ def _integrate(
 
 
 def _follow(y: float, h: float, force: Array, rate: Array) -> float:
-    """One step of y' = force + rate y from the first to the second of two places."""
+    """One step of y' = force + rate y: trapezoidal rule, or exponential where stiff."""
     if np.abs(rate * h).max() < _STIFF:
         return float((y + h / 2 * (force.sum() + rate[0] * y)) / (1 - h / 2 * rate[1]))
     growth = float(np.clip(h * rate.mean(), -60, 60))
@@ -344,14 +333,14 @@ def find_least(rows: PathLimitRows, p: Array, slope: Array) -> Array:
     least = _find_least(rows, p, slope)
     lost = np.flatnonzero(~np.isfinite(least))
     if len(lost):
-        own = rows.pick(lost)
-        own = own._replace(cap=own.highest())
-        least[lost] = _find_least(own, p[lost], slope[lost])
+        bounded = rows.pick(lost)
+        bounded = bounded._replace(cap=bounded.highest())
+        least[lost] = _find_least(bounded, p[lost], slope[lost])
     return least
 
 
 def evaluate(rows: PathLimitRows, p: Array, slope: Array, b: Array) -> Array:
-    """The integrand at n places for a motion with some b and the best a."""
+    """The integrand at n places for some b and the best a."""
     share, rest = _weigh(rows, p), rows.rest(b)
     push = np.where(share < 0, share * rest, -np.inf).max(axis=1)
     return np.asarray(1 / np.sqrt(b) - slope * b + np.where(p == 0, 0.0, push))
@@ -367,7 +356,7 @@ def _find_least(rows: PathLimitRows, p: Array, slope: Array) -> Array:
 
 
 def _weigh(rows: PathLimitRows, p: Array) -> Array:
-    """What a row's rest counts in the integrand if it alone bounds p a; 0 if it cannot."""
+    """Weight of a row's rest in the integrand if it alone bounds p a; 0 if it cannot."""
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         share = 2 * p[:, None] / rows.a
         return np.where((share < 0) & np.isfinite(share), share, 0.0)
@@ -389,14 +378,7 @@ def _minimise(c: Array, g: Array, cap: Array) -> Array:
             root = np.where(g == 0, root, x)
         v = np.sqrt(cap)
         inner = np.where(root > 0, np.minimum(1 / root, v), v)
-        values = [
-            np.where(np.isfinite(own), 1 / own + g * own + c * own**2, _far(c, g))
-            for own in (inner, v)
-        ]
+        first = np.where(c == 0, g, c)
+        limit = np.where(first == 0, 0.0, np.copysign(np.inf, first))
+        values = [np.where(np.isfinite(x), 1 / x + g * x + c * x**2, limit) for x in (inner, v)]
         return np.where(c > 0, values[0], np.minimum(*values))
-
-
-def _far(c: Array, g: Array) -> Array:
-    """Limit of 1/v + g v + c v^2 for a large v."""
-    first = np.where(c == 0, g, c)
-    return np.where(first == 0, 0.0, np.copysign(np.inf, first))

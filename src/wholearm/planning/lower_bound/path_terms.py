@@ -1,7 +1,7 @@
-"""The way along one or more curves, and grids on it that are fine towards its ends.
+"""Limits along one or more curves joined to a path, and grids on it that are fine at its ends.
 
-Places are given by an angle from 0 to pi: s = length (1 - cos angle) / 2. Near rest the speed goes
-with the root of the way, and so does the angle.
+Places are given by an angle from 0 to pi: s = length (1 - cos angle) / 2. Near rest the speed is
+proportional to the root of s, and so is the angle.
 """
 
 from __future__ import annotations
@@ -44,10 +44,9 @@ class PathGrid(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PathTerms:
-    """Curves that are run through one after the other, with the speed going on."""
+    """Curves that are run through one after the other at speed."""
 
-    # with such speed ratios that the speed is the same on both sides of where two of them meet
-    curves: Sequence[Curve]
+    curves: Sequence[Curve]  # with speed ratios that make the speed continuous
     epsilon: float  # [N]
 
     @cached_property
@@ -64,15 +63,13 @@ class PathTerms:
     def pieces(self) -> tuple[PathPiece, ...]:
         """The segments of all curves."""
         return tuple(
-            PathPiece(
-                index, number, self.offsets[index] + part.start, self.offsets[index] + part.stop
-            )
-            for index, curve in enumerate(self.curves)
+            PathPiece(index, number, offset + part.start, offset + part.stop)
+            for index, (curve, offset) in enumerate(zip(self.curves, self.offsets, strict=False))
             for number, part in enumerate(curve.segments)
         )
 
     def place(self, angles: Array) -> Array:
-        """Places along the way at some angles [m]."""
+        """Places along the path at some angles [m]."""
         return np.asarray(self.length * np.sin(angles / 2) ** 2)
 
     def make_grid(self, intervals: int) -> PathGrid:
@@ -88,12 +85,10 @@ class PathTerms:
         parts = []
         for index, curve in enumerate(self.curves):
             mine = np.array([piece.curve == index for piece in self.pieces])[owners]
-            own = [self.pieces[k] for k in owners[mine]]
-            low, high = (
-                np.array([[getattr(p, name)] for p in own]) for name in PathPiece._fields[2:]
-            )
+            pieces = [self.pieces[k] for k in owners[mine]]
+            low, high = (np.array([[piece[k]] for piece in pieces]) for k in (2, 3))
             local = np.clip(s[mine], low, high) - self.offsets[index]
-            segment = np.repeat([piece.segment for piece in own], shape[1])
+            segment = np.repeat([piece.segment for piece in pieces], shape[1])
             local = np.clip(local.ravel(), 0.0, curve.length)
             parts.append(evaluate_rows(curve, self.epsilon, local, segment))
         stacked = (np.concatenate(column) for column in zip(*parts, strict=True))

@@ -1,8 +1,7 @@
-"""Limits along curves in which the squeeze is eliminated.
+"""Limits along curves with the internal force lambda eliminated (Fourier-Motzkin).
 
-At a place of a curve every limit is affine in a = s'', b = s'^2, v = s' and the squeeze. Two of
-them whose squeezes have opposite signs, added so that these cancel, leave a limit without it; all
-such pairs together say which (a, b) some squeeze allows.
+At a place of a curve every limit is affine in a = s'', b = s'^2, v = s' and lambda. Two limits with
+lambda of opposite signs combine to one without it; all such pairs bound (a, b) exactly.
 """
 
 from __future__ import annotations
@@ -17,11 +16,8 @@ from ...geometry.curve import Curve, CurvePoint
 from ...mechanics.dynamics import Directions, PathForces, inverse
 from ...mechanics.limits import SPEED, LimitSet, SideTerms, make_limits
 
-GIVE = 2.5e-7
-"""By how much limits give way, over what is much for each: a plan may miss as much of them."""
-TIED = 1e-9
-"""Difference of two bounds below which they are one, over the largest of their terms: where a limit
-has no squeeze, all its pairs say the same but for rounding."""
+GIVE = 2.5e-7  # relaxation of limits over their scales: a plan may violate them as much
+TIED = 1e-9  # relative difference of two bounds that is rounding: pairs of a limit without lambda
 
 
 class Extreme(NamedTuple):
@@ -49,12 +45,12 @@ class PathLimitRows(NamedTuple):
         return PathLimitRows(*(part[index] for part in self))
 
     def rest(self, b: Array) -> Array:
-        """What the rows are but for their part in a, shape (..., m), at each b."""
+        """The rows at a = 0, shape (..., m), at each b."""
         b = b[..., None]
         return np.asarray(self.b * b + self.v * np.sqrt(b) + self.one)
 
     def extreme(self, b: Array, largest: bool) -> Extreme:
-        """The largest or least a at n places for some b, shape (n,): of tied rows by the first."""
+        """The largest or least a at n places for b of shape (n,): of tied rows by the first."""
         sign = -1.0 if largest else 1.0
         with np.errstate(divide="ignore", invalid="ignore"):
             bounds = -self.rest(b) / self.a
@@ -81,17 +77,72 @@ class PathLimitRows(NamedTuple):
         return np.asarray(np.minimum(largest**2, self.cap))
 
 
+class LimitSides(NamedTuple):
+    """Sides of limits, slack = rest + b bend + s' drag + a rate + lambda press, at n places.
+
+    Each of shape (n, n_sides), over its scale (`SideTerms`). `cap` is the b that speed limits
+    allow, shape (n,) [m^2/s^2].
+    """
+
+    rest: Array
+    bend: Array
+    drag: Array
+    rate: Array
+    press: Array
+    cap: Array
+
+    def pick(self, rows: Any) -> LimitSides:
+        """Some of the places."""
+        return LimitSides(*(part[rows] for part in self))
+
+    def eliminate(self) -> PathLimitRows:
+        """Limits without lambda, one for each pair of sides, ordered as `triu_indices(k, 1)`."""
+        i, j = np.triu_indices(self.press.shape[1], 1)
+        opposite = self.press[:, i] * self.press[:, j] <= 0
+        first, second = (np.where(opposite, np.abs(self.press[:, k]), 0) for k in (j, i))
+        # Other pairs are 0 >= -1.
+        left = first + second > 0
+        size = np.where(left, first + second, 1)
+        rate, bend, drag, rest = (
+            np.asarray((first * part[:, i] + second * part[:, j]) / size)
+            for part in (self.rate, self.bend, self.drag, self.rest)
+        )
+        return PathLimitRows(rate, bend, drag, np.where(left, rest, 1.0), self.cap)
+
+    def at(self, b: Array) -> Array:
+        """The sides at a = 0 and lambda = 0 for b of shape (n,)."""
+        return np.asarray(self.rest + self.bend * b[:, None] + self.drag * np.sqrt(b)[:, None])
+
+    def find_slack(self, a: Array, b: Array, lam: Array) -> Array:
+        """Slack of each side for a motion, shape (n, n_sides)."""
+        return np.asarray(self.at(b) + a[:, None] * self.rate + lam[:, None] * self.press)
+
+    def pair(self, row: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The sides that a row of `eliminate` combines, shape (..., 2)."""
+        return np.asarray(np.stack(np.triu_indices(self.rest.shape[1], 1), axis=1)[row])
+
+    def meet(
+        self, b: Array, sides: NDArray[np.int64], slack: float | Array = 0.0
+    ) -> tuple[Array, Array]:
+        """The a and lambda, (n,) each, at which two sides, (n, 2) or (2,), have a slack, (n, 2)."""
+        k = np.arange(len(b))[:, None]
+        rest, rate, press = (part[k, sides] for part in (self.at(b), self.rate, self.press))
+        (one, other), (r1, r2), (p1, p2) = (rest - slack).T, rate.T, press.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            det = r1 * p2 - r2 * p1
+            return (other * p1 - one * p2) / det, (one * r2 - other * r1) / det
+
+
+def directions_of(curve: Curve, segment: NDArray[np.int64]) -> Directions:
+    """Directions at n places, given the segment that each belongs to."""
+    signs = ([getattr(part, name) for part in curve.segments] for name in ("Xi", "sigma"))
+    return Directions(*(np.array(sign)[segment] for sign in signs))
+
+
 def evaluate_rows(
     curve: Curve, epsilon: float, s: Array, segment: NDArray[np.int64]
 ) -> PathLimitRows:
-    """Limits at n places of a curve, each taken as part of a segment; see `GIVE`.
-
-    Parameters
-    ----------
-    epsilon : [N]
-    s : (n,)
-    segment : (n,)
-    """
+    """Limits at n places of a curve, each taken as part of a segment; see `GIVE`."""
     return limit_along(curve, epsilon, curve.evaluate(s), segment)
 
 
@@ -99,50 +150,23 @@ def limit_along(
     curve: Curve, epsilon: float, point: CurvePoint, segment: NDArray[np.int64]
 ) -> PathLimitRows:
     """Limits at n places of a curve that have been evaluated; see `evaluate_rows`."""
-    signs = ([getattr(part, name) for part in curve.segments] for name in ("Xi", "sigma"))
-    directions = Directions(*(np.array(sign)[segment] for sign in signs))
+    directions = directions_of(curve, segment)
     forces = inverse(curve.formation, *point[:3], directions, point.kinematics)
     return limit(make_limits(curve.formation, epsilon), forces, point.z_s[:, 3:])
 
 
 def limit(every: LimitSet, forces: PathForces, rates: Array) -> PathLimitRows:
-    """Limits at n places of curves or of other ways, from the forces that motions along them take.
+    """Limits along a path from its inverse dynamics and rates d theta / ds, shape (n, 2).
 
-    Parameters
-    ----------
-    rates : (n, 2)  d theta / ds
-
-    Returns
-    -------
-    Rows  without the squeeze, which three contacts do not have
+    Without lambda, which three contacts do not have.
     """
     terms = SideTerms.of(every.without(SPEED), forces, rates)
     cap = np.full(len(rates), np.inf)
-    for own in every.only(SPEED).limits:
-        turned = np.abs(rates @ own.rows[0, -2:])
+    for speed in every.only(SPEED).limits:
         with np.errstate(divide="ignore"):
-            cap = np.minimum(cap, (own.high[0] / turned) ** 2 * (1 + GIVE))
-    one = terms.rest + GIVE
+            largest = (speed.high[0] / np.abs(rates @ speed.rows[0, -2:])) ** 2
+        cap = np.minimum(cap, largest * (1 + GIVE))
+    sides = LimitSides(terms.rest + GIVE, *terms[1:], cap)
     if terms.press.any():
-        return eliminate(terms.press, terms.rate, terms.bend, terms.drag, one, cap)
-    return PathLimitRows(terms.rate, terms.bend, terms.drag, one, cap)
-
-
-def eliminate(
-    squeeze: Array, a: Array, b: Array, v: Array, one: Array, cap: Array
-) -> PathLimitRows:
-    """Rows without the squeeze, one for each pair of limits, of limits with it, (n, k) each.
-
-    Pairs are in the order of `numpy.triu_indices(k, 1)`.
-    """
-    i, j = np.triu_indices(squeeze.shape[1], 1)
-    opposite = squeeze[:, i] * squeeze[:, j] <= 0
-    first, second = (np.where(opposite, np.abs(squeeze[:, k]), 0) for k in (j, i))
-    # A pair that leaves nothing is 0 >= -1.
-    left = first + second > 0
-    size = np.where(left, first + second, 1)
-
-    def combine(of_limits: Array) -> Array:
-        return np.asarray((first * of_limits[:, i] + second * of_limits[:, j]) / size)
-
-    return PathLimitRows(combine(a), combine(b), combine(v), np.where(left, combine(one), 1.0), cap)
+        return sides.eliminate()
+    return PathLimitRows(sides.rate, sides.bend, sides.drag, sides.rest, cap)

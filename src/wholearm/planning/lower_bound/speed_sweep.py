@@ -1,8 +1,8 @@
-"""The fastest motion along curves, by a sweep back and one forth over the plane of s and b = s'^2.
+"""Minimum-time speed profile along a path: backward and forward reachability sweep in (s, b).
 
-The larger of two motions that keep the limits keeps them too, so the fastest one is the largest
-everywhere. Backwards: from which b can rest at the end still be reached? Forwards: as fast as
-limits and that allow. In an interval a is constant and the limits are kept at one place.
+The backward pass finds the largest b = s'^2 from which rest at the end can be reached, the forward
+pass the largest reachable one below it (TOPP-RA, Pham and Pham 2018). In an interval a = s'' is
+constant and the limits are kept at one place.
 """
 
 from __future__ import annotations
@@ -16,47 +16,29 @@ from numpy.typing import NDArray
 from ...common.arrays import Array
 from .rows import PathLimitRows
 
+_ROUNDING = 1e-12  # negative b at the end that is rounding, over the largest b
+_SPEEDS = 4  # most sweeps until viscous friction is linearised about the right speed
+_SETTLED = 2e-3  # relative change of b then: the error is about its square
+
 
 class SweepMode(IntEnum):
-    """What sets a in an interval."""
+    """Active bound in an interval."""
 
-    PUSH = 0
-    """The largest a."""
-    SWITCH = 1
-    """First the largest, then the least a."""
-    BRAKE = 2
-    """The least a."""
-    HELD = 3
-    """A limit of b."""
-
-
-_PUSH, _SWITCH, _BRAKE, _HELD = (int(mode) for mode in SweepMode)
+    PUSH = 0  # the largest a
+    SWITCH = 1  # first the largest, then the least a
+    BRAKE = 2  # the least a
+    HELD = 3  # a limit of b
 
 
 class Sweep(NamedTuple):
-    """The fastest motion on a grid: b at its nodes, (N + 1,), and modes of its intervals, (N,)."""
+    """Minimum-time profile: b at the nodes, (N + 1,), and `SweepMode` of the intervals, (N,)."""
 
     b: Array
     modes: NDArray[np.int64]
 
 
-_ROUNDING = 1e-12
-"""Largest b below zero at the end that is rounding, over the largest b."""
-
-
-_SPEEDS = 4
-"""Most sweeps until viscous friction is linearised about the right speed."""
-_SETTLED = 2e-3
-"""Change of b, over the largest, from which on it is: the next one would be about its square."""
-
-
 class NoMotionError(ValueError):
-    """No motion keeps the limits on this grid.
-
-    Attributes
-    ----------
-    interval  where none does
-    """
+    """No motion keeps the limits in an `interval` of this grid."""
 
     def __init__(self, interval: int) -> None:
         super().__init__()
@@ -64,21 +46,20 @@ class NoMotionError(ValueError):
 
 
 def find_fastest(
-    rows: PathLimitRows, steps: Array, part: Array, cap: Array, near: Array | None
+    rows: PathLimitRows, steps: Array, part: Array, cap: Array, b_guess: Array | None
 ) -> Sweep:
-    """Sweep over a grid, from rest to rest.
+    """Minimum-time speed profile on a grid, from rest to rest.
 
     Parameters
     ----------
     rows                at a place of each interval
     steps, part : (N,)  lengths of the intervals, and which part of each is before its place
     cap : (N + 1,)      largest b at the nodes
-    near : (N,)         what b at the places is about: there the speed is linearised; without it or
-                        at rest, left out
+    b_guess : (N,)      b about which the speed is linearised; without it, or at rest, neglected
     """
     of_b, one = rows.b, rows.one
-    if near is not None:
-        speed = np.sqrt(np.maximum(near, 0.0))[:, None]
+    if b_guess is not None:
+        speed = np.sqrt(np.maximum(b_guess, 0.0))[:, None]
         drag = np.divide(rows.v, 2 * speed, out=np.zeros_like(rows.v), where=speed > 0)
         of_b, one = of_b + drag, one + rows.v * speed / 2
     of_a = rows.a / (2 * steps)[:, None]
@@ -95,14 +76,14 @@ def find_fastest(
     largest, braked = [0.0] * (count + 1), [False] * count
     following = 0.0
     for k in range(count - 1, -1, -1):
-        found = float(least(brake_slopes[k] * following + brake_values[k]))
-        pushed = float(least(push_slopes[k] * found + push_values[k])) if found < caps[k] else 0.0
-        braked[k] = found < caps[k] and pushed >= following
+        b_k = float(least(brake_slopes[k] * following + brake_values[k]))
+        pushed = float(least(push_slopes[k] * b_k + push_values[k])) if b_k < caps[k] else 0.0
+        braked[k] = b_k < caps[k] and pushed >= following
         if not braked[k]:
-            found = min(_find_corner(before[k], after[k], one[k], following), caps[k])
-        if not found > 0 and (k or found < 0):
+            b_k = min(_find_corner(before[k], after[k], one[k], following), caps[k])
+        if not b_k > 0 and (k or b_k < 0):
             raise NoMotionError(k)
-        largest[k] = following = found
+        largest[k] = following = b_k
     b, reaches = [0.0] * (count + 1), [False] * (count + 1)
     reached = 0.0
     for k in range(count):
@@ -114,32 +95,27 @@ def find_fastest(
     if b[-1] < -_ROUNDING * max(b):
         raise NoMotionError(count - 1)
     b[-1] = max(b[-1], 0.0)
-    modes = [
-        _PUSH if not after else _SWITCH if not before else _BRAKE if brake else _HELD
-        for before, after, brake in zip(reaches[:-1], reaches[1:], braked, strict=True)
-    ]
-    return Sweep(np.array(b), np.array(modes))
+    slower = ~np.array(reaches)
+    modes = np.where(braked, SweepMode.BRAKE, SweepMode.HELD)
+    modes = np.where(slower[:-1], SweepMode.SWITCH, modes)
+    return Sweep(np.array(b), np.where(slower[1:], SweepMode.PUSH, modes))
 
 
 def find_steady(rows: PathLimitRows, steps: Array, part: Array, cap: Array) -> Sweep:
-    """Sweep until viscous friction is linearised about the speeds that are found.
-
-    Parameters are those of `find_fastest`.
-    """
+    """Sweep until viscous friction is linearised about the resulting speeds; see `find_fastest`."""
     motion = find_fastest(rows, steps, part, cap, None)
     if not rows.v.any():
         return motion
     for _ in range(_SPEEDS - 1):
         before = motion.b
-        near = before[:-1] + part * np.diff(before)
-        motion = find_fastest(rows, steps, part, cap, near)
+        motion = find_fastest(rows, steps, part, cap, before[:-1] + part * np.diff(before))
         if np.abs(motion.b - before).max() < _SETTLED * motion.b.max():
             break
     return motion
 
 
 def add_up(b: Array, steps: Array) -> float:
-    """Duration of a motion with b at the nodes of a grid, a being constant in intervals [s]."""
+    """Duration of a profile with constant a in intervals [s]."""
     speeds = np.sqrt(np.maximum(b, 0.0))
     return float((2 * steps / (speeds[1:] + speeds[:-1])).sum())
 

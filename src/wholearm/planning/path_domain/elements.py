@@ -1,13 +1,12 @@
-"""Elements of a curve: stretches on which s'' and the squeeze are polynomials, with steps between.
+"""Finite elements of a curve: s'' and internal force are polynomials, with steps between elements.
 
 An element has `DEGREE` + 1 nodes, the Lobatto points of a local variable y from 0 to 1. Inside a
-motion s is linear in y. Next to rest s is quadratic in it, measured from where the motion rests:
-there the speed, and with it viscous friction, goes with the root of the way, and is smooth in y.
-Where torques may not step the motion starts and ends without acceleration, and s is cubic in y.
-What follows such a start is bent: its part of the way is (1 - c) y + c y^2, with c such that the
-root of the way from about where a motion with acceleration at once would have started is linear
-in y; c is negative before such an end. With b = s'^2 and b' = 2 s'' (dash: d/ds), b is a
-polynomial in y too.
+motion s is linear in y. Next to rest s is quadratic in y, measured from the place of rest: the
+speed, and viscous friction with it, is the root of s there, and smooth in y. Where torques may not
+step, the motion starts and ends without acceleration and s is cubic in y. Elements after such a
+start are bent: s is (1 - c) y + c y^2 of the length, with c such that the root of the distance from
+a virtual start with acceleration is linear in y; c is negative before such an end. With b = s'^2
+and b' = 2 s'' (dash: d/ds), b is a polynomial in y too.
 """
 
 from __future__ import annotations
@@ -19,33 +18,23 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
-from ...common.arrays import Array
-from ...common.quadrature import jacobi_nodes
+from ...common.arrays import Array, jacobi_nodes
 
-DEGREE = 4
-"""Degree of the polynomials."""
-INSIDE, FROM_REST, TO_REST, FROM_HOLD, TO_HOLD = 0, 1, 2, 3, 4
-"""Kinds of elements: amid a motion, at its start and at its end, and there without acceleration."""
-POWERS = np.array([1, 2, 2, 3, 3])
-"""Power of y that s goes with in each kind."""
-SIGNS = np.array([1.0, 1.0, -1.0, 1.0, -1.0])
-"""Whether y grows or falls with time in each kind."""
+DEGREE = 4  # degree of the polynomials
+# Kinds of elements: amid a motion, at its start and end, and there without acceleration.
+INSIDE, FROM_REST, TO_REST, FROM_HOLD, TO_HOLD = range(5)
+POWERS = np.array([1, 2, 2, 3, 3])  # power of y in s, of each kind
+SIGNS = np.array([1.0, 1.0, -1.0, 1.0, -1.0])  # sign of dy/dt in each kind
 
 
 class Basis(NamedTuple):
-    """What nodal values of each kind of element mean."""
+    """Polynomial basis of each kind of element, from values at its nodes."""
 
     y: Array  # (5, p + 1): the nodes, from 0 to 1; for `TO_REST` and `TO_HOLD` from 1 to 0
-    # (5, p + 1, p + 1): coefficients of the powers of y of a polynomial from its values at the
-    # nodes
-    to_powers: Array
-    # (5, p, p + 1): by how much b rises from each node to the next, over the element's length, for
-    # s'' at the nodes
-    links: Array
+    to_powers: Array  # (5, p + 1, p + 1): coefficients of powers of y
+    links: Array  # (5, p, p + 1): rise of b between nodes, over the element's length, from s''
     weights: Array  # (p + 1,): of Lobatto's quadrature over y
-    # (p + 1, p + 1): coefficients of Legendre polynomials from values at the nodes of an element
-    # amid a motion
-    modes: Array
+    modes: Array  # (p + 1, p + 1): Legendre coefficients in an element amid a motion
 
 
 @lru_cache(maxsize=8)
@@ -54,31 +43,25 @@ def find_basis(degree: int = DEGREE) -> Basis:
     x = (np.concatenate([[-1.0], jacobi_nodes(degree - 1, 1, 1), [1.0]]) + 1) / 2
     y = np.stack([x, x, 1 - x, x, 1 - x])
     powers = np.arange(degree + 1)
-    to_powers = np.linalg.inv(y[..., None] ** powers)
+    to_powers = np.asarray(np.linalg.inv(y[..., None] ** powers), dtype=float)
     plain = 2 * np.diff(y[0][:, None] ** (powers + 1), axis=0) / (powers + 1)
     rooted = 4 * np.diff(y[1:3, :, None] ** (powers + 2), axis=1) / (powers + 2)
     cubic = 6 * np.diff(y[3:, :, None] ** (powers + 3), axis=1) / (powers + 3)
     rises = np.stack([plain, rooted[0], -rooted[1], cubic[0], -cubic[1]])
     weights = (1 / (powers + 1)) @ to_powers[0]
-    modes = np.linalg.inv(legendre.legvander(2 * x - 1, degree))
-    links = np.asarray(rises @ to_powers, dtype=float)
-    return Basis(
-        y, np.asarray(to_powers, dtype=float), links, weights, np.asarray(modes, dtype=float)
-    )
+    vandermonde = legendre.legvander(2 * x - 1, degree)
+    modes = np.asarray(np.linalg.inv(vandermonde), dtype=float)
+    return Basis(y, to_powers, rises @ to_powers, weights, modes)
 
 
 class Grid(NamedTuple):
     """Nodes on a curve."""
 
-    # (N + 1,) [m]: those of one element after the other, never decreasing: equal where two elements
-    # meet
-    s: Array
-    # (N + 1,): the segment of the curve that each node's forces belong to
-    segment: NDArray[np.int64]
+    s: Array  # (N + 1,) [m]: element by element, equal where two elements meet
+    segment: NDArray[np.int64]  # (N + 1,): of the curve, for each node's forces
     rests: tuple[bool, bool] = (True, True)  # whether the motion starts and ends at rest
     held: bool = False  # whether it does so without acceleration
-    # the c of each element, shape (E,), for elements of the kind `INSIDE`; None for zeros
-    bends: Array | None = None
+    bends: Array | None = None  # (E,): c of the elements of the kind `INSIDE`; None for zeros
 
     @property
     def steps(self) -> Array:
@@ -100,38 +83,37 @@ class Grid(NamedTuple):
     def kinds(self) -> NDArray[np.int64]:
         """Kind of each element, shape (E,)."""
         kinds = np.full(len(self.s) // (DEGREE + 1), INSIDE)
-        start, stop = (FROM_HOLD, TO_HOLD) if self.held else (FROM_REST, TO_REST)
-        kinds[0] = start if self.rests[0] else INSIDE
-        kinds[-1] = stop if self.rests[1] else kinds[-1]
+        ends = (FROM_HOLD, TO_HOLD) if self.held else (FROM_REST, TO_REST)
+        for at in (0, -1):
+            kinds[at] = ends[at] if self.rests[at] else kinds[at]
         return kinds
 
     @property
     def sizes(self) -> Array:
-        """What b at the nodes is like, over the largest, shape (N + 1,): 1 unless motions are held.
+        """Scale of b at the nodes over the largest, shape (N + 1,): 1 unless motions are `held`.
 
-        It goes with the way from rest and to rest, and there with the fourth power of y.
+        Proportional to the distance from rest, and to y^4 in elements next to rest.
         """
+        sizes = np.ones_like(self.s)
         if not self.held:
-            return np.ones_like(self.s)
-        found = np.ones_like(self.s)
-        for rest, at, way in ((0, 0, self.s - self.s[0]), (1, -1, self.s[-1] - self.s)):
+            return sizes
+        for rest, at, far in ((0, 0, self.s - self.s[0]), (1, -1, self.s[-1] - self.s)):
             if self.rests[rest]:
                 first = np.diff(self.edges)[at, 0]
-                own = np.where(way < first, first * (way / first) ** (4 / 3), way)
-                found = np.minimum(found, 2 * own / (self.s[-1] - self.s[0]))
+                b = np.where(far < first, first * (far / first) ** (4 / 3), far)
+                sizes = np.minimum(sizes, 2 * b / (self.s[-1] - self.s[0]))
         # The two ends are no unknowns.
-        return np.maximum(found, np.finfo(float).tiny)
+        return np.maximum(sizes, np.finfo(float).tiny)
 
     @property
     def link_sizes(self) -> Array:
-        """What the rows of b' = 2 a are over, shape (N,)."""
+        """Scale of the rows of b' = 2 a, shape (N,)."""
         return np.asarray(np.maximum(self.sizes[1:], self.sizes[:-1]))
 
     @property
     def weights(self) -> Array:
-        """Length that each node stands for, shape (N + 1,) [m]."""
-        steps = self.steps
-        return np.asarray(np.append(0.0, steps) + np.append(steps, 0.0))
+        """Length of both intervals at each node, shape (N + 1,) [m]."""
+        return np.asarray(np.append(0.0, self.steps) + np.append(self.steps, 0.0))
 
     def interpolate(self, values: Array, other: Grid) -> Array:
         """Values at the nodes of another grid of the same curves, linear between those here."""
@@ -165,11 +147,12 @@ def lay_out(
     """The grid of elements with these edges, shape (E, 2) [m], on segments of shape (E,)."""
     grid = Grid(np.repeat(edges[:, 0], DEGREE + 1), np.repeat(segment, DEGREE + 1), rests, held)
     kinds, y = grid.kinds[:, None], find_basis().y[grid.kinds]
-    way = y ** POWERS[kinds]
-    share = np.where(SIGNS[kinds] > 0, way, 1 - way)
+    share = y ** POWERS[kinds]
+    share = np.where(SIGNS[kinds] > 0, share, 1 - share)
     if held:
         grid = grid._replace(bends=_find_bends(edges, rests))
-        share = np.where(kinds == INSIDE, _bend(grid.bends, y), share)
+        c = np.asarray(grid.bends)[:, None]
+        share = np.where(kinds == INSIDE, (1 - c) * y + c * y**2, share)
     s = edges[:, :1] + share * np.diff(edges)
     s[:, -1] = edges[:, 1]
     return grid._replace(s=s.ravel())
@@ -177,43 +160,35 @@ def lay_out(
 
 def _find_bends(edges: Array, rests: tuple[bool, bool]) -> Array:
     """Bends of elements with these edges, each for the nearer one of the ends at rest."""
-    length, found = edges[-1, 1] - edges[0, 0], np.zeros(len(edges))
+    length, bends = edges[-1, 1] - edges[0, 0], np.zeros(len(edges))
     early = edges.mean(axis=1) - edges[0, 0] < length / 2
-    for sign, at, rest, own in ((1, 0, rests[0], early), (-1, -1, rests[1], ~early)):
-        if not rest:
-            continue
-        way = np.abs(edges[own] - edges[at, at])
-        # A ramp of s'' takes four thirds of the way that its end's speed takes with its end's s''.
-        way -= np.diff(edges)[at, 0] / 4
-        near, far = np.sqrt(np.maximum(way, 0.0))[:, ::sign].T
-        found[own] = sign * (far - near) / (far + near)
-    return found
-
-
-def _bend(bends: Array | None, y: Array) -> Array:
-    """The part of the way that is done at y of bent elements, shapes (E,) and (E, m)."""
-    c = np.zeros((len(y), 1)) if bends is None else bends[:, None]
-    return np.asarray((1 - c) * y + c * y**2)
+    for sign, at, half in ((1, 0, early), (-1, -1, ~early)):
+        if rests[at]:
+            # A ramp of s'' takes 4/3 of the distance of constant s'' to the same speed.
+            distance = np.abs(edges[half] - edges[at, at]) - np.diff(edges)[at, 0] / 4
+            near, far = np.sqrt(np.maximum(distance, 0.0))[:, ::sign].T
+            bends[half] = sign * (far - near) / (far + near)
+    return bends
 
 
 class Profile(NamedTuple):
-    """Motion at n places of a curve: a = s'' [m/s^2], b = s'^2 [m^2/s^2] and squeeze [N]."""
+    """Motion at n places of a curve: a = s'' [m/s^2], b = s'^2 [m^2/s^2], internal force [N]."""
 
     a: Array
     b: Array
-    squeeze: Array
+    lam: Array
 
 
-def follow(grid: Grid, a: Array, squeeze: Array) -> Profile:
-    """The motion with these s'' and squeezes at its nodes, s'' such that it comes to rest."""
+def follow(grid: Grid, a: Array, lam: Array) -> Profile:
+    """The motion with these s'' and internal forces, s'' corrected so that it ends at rest."""
     spread = np.ones_like(a)
     if grid.held:
         spread = np.cbrt(np.maximum(grid.s * (grid.s[-1] - grid.s), 0.0))
     a = a - grid.integrate(a)[-1] / grid.integrate(spread)[-1] * spread
-    # Where phases are joined at next to no speed, rounding can take b below zero.
+    # At junctions with nearly no speed b may round to less than zero.
     b = np.maximum(grid.integrate(a), 0.0)
     b[-1] = 0.0
-    return Profile(a, b, squeeze)
+    return Profile(a, b, lam)
 
 
 class Elements:
@@ -229,7 +204,7 @@ class Elements:
         basis, kinds = find_basis(), grid.kinds
         self._y = basis.y[kinds].ravel()
         self._rooted, self._power = kinds > 0, POWERS[kinds]
-        table = np.stack([profile.a, profile.squeeze], axis=-1)
+        table = np.stack([profile.a, profile.lam], axis=-1)
         table = table.reshape(len(kinds), DEGREE + 1, 2)
         self._motion = basis.to_powers[kinds] @ table
         powers = np.arange(DEGREE + 1)[:, None]
@@ -242,70 +217,59 @@ class Elements:
         later = 6 * sign * a[:, 1:] / (powers[:-1] + 4)
         cubic = np.concatenate([later, np.zeros_like(a[:, :2])], axis=1)
         rooted = np.where(self._power[:, None, None] == 3, cubic, rooted)
-        found = np.where(self._rooted[:, None, None], rooted, plain)[..., 0]
+        b = np.where(self._rooted[:, None, None], rooted, plain)[..., 0]
         self._bends = None if grid.bends is None else grid.bends * (kinds == INSIDE)
         if self._bends is not None:
             c = self._bends[:, None]
             further = c * np.hstack([0 * first[..., 0], (4 * a / (powers + 2))[..., 0]])
-            found[:, 1:] *= 1 - c
-            found = np.hstack([found, np.zeros_like(c)])
-            found[:, 1:] += further
-        self._b = found
-
-    @property
-    def local(self) -> Array:
-        """The local variable at the nodes, shape (N + 1,)."""
-        return np.asarray(self._y)
+            b[:, 1:] *= 1 - c
+            b = np.hstack([b, np.zeros_like(c)])
+            b[:, 1:] += further
+        self._b = b
 
     @property
     def stretch(self) -> Array:
-        """The way over the element's length that a rise of y takes at the nodes, (E, p + 1)."""
+        """Slope ds/dy at the nodes over the element's length, (E, p + 1)."""
         y = self._y.reshape(-1, DEGREE + 1)
         c = 0.0 if self._bends is None else self._bends[:, None]
         power = self._power[:, None]
         return np.asarray(power * y ** (power - 1) * (1 - c + 2 * c * y))
 
     def find_y(self, k: NDArray[np.int64], done: Array, left: Array) -> Array:
-        """Local variable where a part of an interval is done and one is left, which add up to 1."""
+        """Local variable where parts of an interval, which add up to 1, are done and left."""
         element = k // (DEGREE + 1)
         power = self._power[element]
         y, later = self._y[k], self._y[k + 1]
         squares = np.sqrt(np.maximum(left * y**2 + done * later**2, 0.0))
-        found = np.where(power == 2, squares, left * y + done * later)
+        here = np.where(power == 2, squares, left * y + done * later)
         if self._bends is not None:
             c = self._bends[element]
-            way = left * ((1 - c) * y + c * y**2) + done * ((1 - c) * later + c * later**2)
-            root = np.sqrt(np.maximum((1 - c) ** 2 + 4 * c * way, 0.0))
-            bent = 2 * way / np.maximum(1 - c + root, np.finfo(float).tiny)
-            found = np.where(c != 0, bent, found)
+            part = left * ((1 - c) * y + c * y**2) + done * ((1 - c) * later + c * later**2)
+            root = np.sqrt(np.maximum((1 - c) ** 2 + 4 * c * part, 0.0))
+            bent = 2 * part / np.maximum(1 - c + root, np.finfo(float).tiny)
+            here = np.where(c != 0, bent, here)
         if self.grid.held:
-            found = np.where(power == 3, np.cbrt(left * y**3 + done * later**3), found)
-        return found
+            here = np.where(power == 3, np.cbrt(left * y**3 + done * later**3), here)
+        return here
 
     def find_cubic(self, k: NDArray[np.int64], w: Array) -> tuple[NDArray[np.bool_], Array, Array]:
-        """Which intervals k are in elements cubic in y, and y and its rise where w of it is done.
-
-        w is a part of the rise of y in each interval, not of the way.
-        """
+        """Whether s is cubic in y in intervals k, y at a part w of its rise there, and the rise."""
         y, later = self._y[k], self._y[k + 1]
         return self._power[k // (DEGREE + 1)] == 3, y + w * (later - y), later - y
 
     def evaluate(self, k: NDArray[np.int64], y: Array) -> tuple[Profile, Array]:
         """Profile and speed [m/s] at places y of intervals k."""
         element = k // (DEGREE + 1)
-        a, squeeze = self._motion[element, -1].T
+        motion = self._motion[element, -1].T
         for power in reversed(range(DEGREE)):
-            a, squeeze = (
-                a * y + self._motion[element, power, 0],
-                squeeze * y + (self._motion[element, power, 1]),
-            )
+            motion = motion * y + self._motion[element, power].T
         b = self._b[element, -1]
         for power in reversed(range(self._b.shape[1] - 1)):
             b = b * y + self._b[element, power]
         speed = np.sqrt(np.maximum(b, 0.0)) * np.where(self._rooted[element], y, 1.0)
         if self.grid.held:
             speed = speed * np.where(self._power[element] == 3, y, 1.0)
-        return Profile(a, speed**2, squeeze), speed
+        return Profile(motion[0], speed**2, motion[1]), speed
 
     def at(self, fractions: Array) -> Profile:
         """Profile at `fractions` of every interval inside elements, interval by interval."""

@@ -1,4 +1,4 @@
-"""First guesses of motions along curves, and the units that fit them."""
+"""Initial guesses along curves (b a parabola in s, internal force amid its range), and units."""
 
 from __future__ import annotations
 
@@ -10,27 +10,23 @@ from .path_data import PhaseData
 from .path_nlp import Units
 from .rate_terms import exceeds_rates
 
-_SLOW = -12
-"""Height of the slowest guess, as a power of two times that of a fall."""
-_QUICK = 30.0
-"""Largest square of the speed of a guess, over that which the torque limits alone allow."""
-_FIRM = 40.0
-"""Largest range of the squeeze that a guess is amid, over the scene's force or the least of it."""
-_LIGHT = 0.5
-"""Least unit of force, over the scene's: where forces are next to nothing they do not count."""
+_SLOW = -12  # height of the slowest guess over that of a fall, as a power of two
+_QUICK = 30.0  # largest b of a guess, over that which the torque limits alone allow
+_FIRM = 40.0  # largest range of lambda in a guess, over the scene's force or its least value
+_LIGHT = 0.5  # least unit of force, over the scene's
 
 
 def guess(data: PhaseData, time_weight: float = 0.0) -> tuple[Profile, Units]:
-    """Guess a motion: b a parabola in s as high as limits allow, the squeeze amid its range.
+    """A guess with b as high as limits allow, by bisection.
 
-    Where limits forbid even a slow one, it is as quick as a fall: a plan, if there is one, is not
-    slow, and in units of a slow one the costs that choose among equals would weigh too much.
+    Where limits forbid even the slowest one, it is as quick as a fall: in units of a slow one the
+    regularization would weigh too much.
     """
     b_max = data.largest_b(data.nodes)
     fall = _fall(data)
 
     def possible(height: float) -> bool:
-        low, high = find_squeeze_range(data, height)
+        low, high = find_internal_force_range(data, height)
         a, b = _parabola(data, height)
         kept = bool(((low <= high) & (low < np.inf)).all() and (b <= b_max).all())
         return kept and not exceeds_rates(data, Profile(a, b, _find_middle(data, low, high)))
@@ -48,7 +44,7 @@ def guess(data: PhaseData, time_weight: float = 0.0) -> tuple[Profile, Units]:
 
 
 def guess_slowly(data: PhaseData) -> tuple[Profile, Units]:
-    """Guess a slow motion, whatever limits say."""
+    """A slow guess, whatever the limits."""
     return _guess_at(data, 0.7 * _fall(data) * 2.0**_SLOW)
 
 
@@ -58,22 +54,18 @@ def _fall(data: PhaseData) -> float:
     fall = 2 * data.curve.formation.scene.scales.acceleration * length
 
     def usual(coefficients: Array) -> float:
-        """Where this coefficient alone would take a joint to its torque limit."""
+        """Value at which this coefficient alone takes a joint to its torque limit."""
         return 1 / max(float((np.abs(coefficients) / data.torque_limit).max(axis=1).mean()), 1e-100)
 
-    b_max = data.largest_b(data.nodes)
+    # The upper median; NumPy's takes 10 ms to import what it needs.
+    b_max, middle = data.largest_b(data.nodes), len(data.grid.s) // 2
+    median = float(np.partition(b_max, middle)[middle])
     inertia, drag = 2 * length * usual(forces.Ta), usual(forces.Tv) ** 2
-    return min(fall, _QUICK * min(inertia, drag, _find_median(b_max)))
-
-
-def _find_median(values: Array) -> float:
-    """Median, the upper one of two; that of numpy takes 10 ms to import what it needs."""
-    middle = values.size // 2
-    return float(np.partition(values.ravel(), middle)[middle])
+    return min(fall, _QUICK * min(inertia, drag, median))
 
 
 def _parabola(data: PhaseData, height: float) -> tuple[Array, Array]:
-    """The a and b of a parabola in s of this height; its power 4/3 where a is to begin at zero."""
+    """The a and b of a parabola in s of this height; its power 4/3 where a starts at zero."""
     length = data.grid.s[-1]
     x = data.grid.s / length
     if data.grid.held:
@@ -83,15 +75,14 @@ def _parabola(data: PhaseData, height: float) -> tuple[Array, Array]:
     return height * 2 * (1 - 2 * x) / length, height * 4 * x * (1 - x)
 
 
-def find_squeeze_range(data: PhaseData, height: float) -> tuple[Array, Array]:
-    """Least and largest squeeze that limits allow at each node."""
+def find_internal_force_range(data: PhaseData, height: float) -> tuple[Array, Array]:
+    """Least and largest internal force that limits allow at each node."""
     a, b = _parabola(data, height)
     slack = data.slack(data.nodes, Profile(a, b, np.zeros_like(a)))
     rows, signs, _ = data.limits.sides
-    rate = signs * data.find_terms().squeeze[:, rows]
+    rate = signs * data.find_terms().lam[:, rows]
     with np.errstate(divide="ignore", invalid="ignore"):
         bound = -slack / rate
-    # What no squeeze mends leaves no range.
     never = np.where((rate == 0) & (slack < 0), np.inf, -np.inf)
     low = np.where(rate > 0, bound, never).max(axis=1)
     high = np.where(rate < 0, bound, np.inf).min(axis=1)
@@ -99,19 +90,18 @@ def find_squeeze_range(data: PhaseData, height: float) -> tuple[Array, Array]:
 
 
 def _find_middle(data: PhaseData, low: Array, high: Array) -> Array:
-    """The squeeze amid its range, or none where that is empty or has no end."""
+    """The internal force amid its range, at most `_FIRM`; zero where that is empty or infinite."""
     weight = data.curve.formation.scene.scales.force
-    open_ = np.isfinite(low + high) & (low <= high)
-    # A strong hand could press far harder than any motion needs.
+    finite = np.isfinite(low + high) & (low <= high)
     high = np.minimum(high, low + _FIRM * np.maximum(weight, np.abs(low)))
-    return np.where(open_, (low + high) / 2, 0.0)
+    return np.where(finite, (low + high) / 2, 0.0)
 
 
 def _guess_at(data: PhaseData, height: float, time_weight: float = 0.0) -> tuple[Profile, Units]:
-    low, high = find_squeeze_range(data, height)
+    low, high = find_internal_force_range(data, height)
     weight = data.curve.formation.scene.scales.force
-    open_ = np.isfinite(low + high) & (low <= high)
-    press = float(np.abs(np.where(open_, (low + high) / 2, 0.0)).mean())
+    finite = np.isfinite(low + high) & (low <= high)
+    press = float(np.abs(np.where(finite, (low + high) / 2, 0.0)).mean())
     middle = _find_middle(data, low, high)
     length = float(data.grid.s[-1])
     duration = np.pi / 2 * length / np.sqrt(height)

@@ -1,11 +1,10 @@
-"""One-freedom phases that impacts or smooth ends join: curves run through without a stop.
+"""Phases along curves that impacts or smooth ends join: sequences run through without a stop.
 
-At the end of a curve the velocity is z_s s', and the impact makes it a multiple of the next curve's
-tangent, whatever the speed: v+ = ratio s' z_s. So whether an impact is possible is known before
-anything is planned, and with a parameter that runs `ratio` times as fast on the next curve the
-speed is continuous: the curves are planned as one. Where an impact is not possible the motion has
-to stop, and the chain ends. A smooth end is passed at speed where the next curve goes on along the
-same tangent.
+At the end of a curve the velocity is z_s s'. The impact makes it a multiple of the next curve's
+tangent at any speed: v+ = ratio s' z_s. So whether an impact is possible is known before planning,
+and with a parameter that runs `ratio` times as fast on the next curve the speed is continuous: the
+curves are planned as one. Otherwise the motion has to stop, and the sequence is split. A smooth end
+is passed at speed where the tangents are the same.
 """
 
 from __future__ import annotations
@@ -21,13 +20,12 @@ from ...mechanics.metric import metric_weights
 from ...problem.definition import End, Phase
 from ..impacts import PER_SPEED
 
-BEND = 1e-6
-"""Largest cosine short of one at which a curve goes on along the tangent of the one before."""
+BEND = 1e-6  # largest 1 - cosine between tangents that count as the same
 
 
 @dataclass(frozen=True, eq=False)
 class CurveImpact:
-    """Impact between two curves, or none if they join smoothly, for unit speed along the first."""
+    """Impact between two curves for unit speed along the first; none if they join smoothly."""
 
     phase: Phase  # the one that it ends
     impact: Impact  # velocities per m/s, hence without unit and in rad/m; impulses in N s per m/s
@@ -56,8 +54,7 @@ def compute_curve_impact(phase: Phase, before: Curve, after: Curve) -> CurveImpa
         impact = Impact(after.formation, v, none, none, ())
         return CurveImpact(phase, impact, float(v * metric @ heading > 1 - BEND))
     impact = compute_impact(before.formation, after.formation, after.start, v)
-    ratio = float(impact.v * metric @ heading)
-    return CurveImpact(phase, impact, ratio)
+    return CurveImpact(phase, impact, float(impact.v * metric @ heading))
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,9 +67,8 @@ class ImpactSequence:
 
     def part(self, start: int, stop: int) -> ImpactSequence:
         """Phases `start` to `stop`, without the latter."""
-        return ImpactSequence(
-            self.phases[start:stop], self.curves[start:stop], self.impacts[start : stop - 1]
-        )
+        impacts = self.impacts[start : stop - 1]
+        return ImpactSequence(self.phases[start:stop], self.curves[start:stop], impacts)
 
     def split(self) -> list[ImpactSequence]:
         """Split where an impact is not possible."""
@@ -92,7 +88,5 @@ class ImpactSequence:
 
 def make_sequence(phases: Sequence[Phase], curves: Sequence[Curve]) -> ImpactSequence:
     """Chain phases along their curves."""
-    pairs = zip(phases[:-1], curves[:-1], curves[1:], strict=True)
-    return ImpactSequence(
-        tuple(phases), tuple(curves), tuple(compute_curve_impact(*pair) for pair in pairs)
-    )
+    impacts = map(compute_curve_impact, phases[:-1], curves[:-1], curves[1:])
+    return ImpactSequence(tuple(phases), tuple(curves), tuple(impacts))

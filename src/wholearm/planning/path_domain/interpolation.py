@@ -1,4 +1,4 @@
-"""Torques of motions along curves, as polynomials in time."""
+"""Piecewise polynomial torque in time of a motion along a curve."""
 
 from __future__ import annotations
 
@@ -10,25 +10,18 @@ from ...results.torque import TorqueProfile
 from .path_data import PhaseData, Places
 from .path_motion import PathMotion
 
-TORQUE_ERROR = 5e-7
-"""Largest error of the torque's polynomials between the knots, over the torque limit."""
-PLACES = 13
-"""Places that they go through where that is exceeded."""
+TORQUE_ERROR = 5e-7  # largest error of the polynomials between knots, over the torque limit
+PLACES = 13  # interpolation points where that is exceeded
 
 
 class StalledError(SolverError):
-    """The motion takes no time, or for ever, between two nodes: the grid is too coarse."""
+    """The motion nearly stops, or takes no time, between two nodes: the grid is too coarse."""
 
 
 def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, float]:
-    """Torque of a motion as one polynomial in time per interval, through its values at the knots.
+    """Torque of a motion, one polynomial in time per interval, and its effort [(N m)^2 s].
 
-    Where that misses the torque between the knots, it goes through more places. Also returns the
-    integral of tau^T tau [(N m)^2 s].
-
-    Raises
-    ------
-    StalledError  if the motion takes no time, or for ever, between two nodes
+    Through the knots, or through `PLACES` points if that misses the torque between them.
     """
     knots, checks = data.sampling
     torque = _fit(data, motion, data.knots, knots)

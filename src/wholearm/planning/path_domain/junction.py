@@ -1,11 +1,10 @@
-"""Torques where one phase ends at rest and the next one begins, for motors that are not quick.
+"""Torques at a junction at rest between two phases, under torque rate limits and lag.
 
-A motion begins and ends with torques that hold the object on the verge of it: with no acceleration
-and the friction of its directions. There the squeeze is free, so these torques are a line for the
-phase that ends and another one for the phase that begins. Those nearest to each other in time are
-taken, and torques go straight from the ones to the others while everything rests. The former have
-to hold the object in the formation that begins, too; then so do all in between, as forces that
-balance and are within their cones make a convex set.
+A motion starts and ends with torques at the limit of static equilibrium: without acceleration, with
+the friction of its directions. There the internal force is free, so these torques are a line for
+each of the two phases. The pair that is the nearest in time is taken, and torques change linearly
+between them while everything rests. The former also have to hold the object in the next formation;
+then so do all in between, as balanced forces within their cones are a convex set.
 """
 
 from __future__ import annotations
@@ -20,32 +19,27 @@ from ...common.errors import InfeasibleError
 from ...contacts.formation import Formation
 from ...geometry.curve import Curve
 from ...mechanics.wedging import find_static_torques
-from ...results.mode_names import ModeSpan
+from ...results.plan_record import ModeSpan
 from ...results.torque import TorqueProfile
 from ...results.torque_change import TorqueChange, change_torques, find_change_times
 from ...results.trajectory import Motion, Samples
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
-from .first_guess import find_squeeze_range
+from .first_guess import find_internal_force_range
 from .path_data import PhaseData, prepare
 from .path_mesh import Mesh
 
-_PLACES = 129
-"""Squeezes that are looked at on each side of a joint."""
-_WIDEST = 40.0
-"""Largest range of them, over the scene's force."""
-_INSIDE = 0.01
-"""Part of the range at both of its ends that is left out."""
-_ELEMENTS = 3
-"""Elements of a grid of which only the ends count."""
-_VERGE = 1e-6
-"""Distance over the scene's torque beyond those that friction can hold, that is rounding."""
+_PLACES = 129  # internal forces tried on each side of a junction
+_WIDEST = 40.0  # largest range of them, over the scene's force
+_INSIDE = 0.01  # part of the range left out at both ends
+_ELEMENTS = 3  # elements of a grid of which only the ends count
+_VERGE = 1e-6  # distance beyond what friction can hold that is rounding, over the scene's torque
 
 
 class Joint(NamedTuple):
-    """Squeezes [N] and torques, shape (2,) [N m], of both sides, and the pause between [s].
+    """Internal forces [N] and torques, (2,) [N m], of both sides, and the pause between [s].
 
-    Squeezes are NaN of what is planned over time.
+    Internal forces are NaN for phases planned in the time domain.
     """
 
     ends: float
@@ -62,11 +56,9 @@ def choose_joint(
 
     Parameters
     ----------
-    ending : (2,) [N m]  what ends there, or the torques that it ends with if it is planned over
-                         time
-    beginning            what begins there, or its formation if it is planned over time: then the
-                         torques to end with are those that friction holds most firmly in it
-    z : (5,)
+    ending : (2,) [N m]  curve that ends, or final torques of a phase planned in the time domain
+    beginning            curve that begins, or its formation in the time domain: then the final
+                         torques before are those that friction holds with the largest margin
 
     Notes
     -----
@@ -75,14 +67,12 @@ def choose_joint(
 
     Raises
     ------
-    InfeasibleError  if no torques hold the object at the end of the one phase, or at the start of
-                     the other
+    InfeasibleError  if no torques hold the object at one of the two ends
     """
-    before, ends = (
-        _list_torques(ending, epsilon, phase - 1, -1)
-        if isinstance(ending, Curve)
-        else (ending[None], np.full(1, np.nan))
-    )
+    if isinstance(ending, Curve):
+        before, ends = _list_torques(ending, epsilon, phase - 1, -1)
+    else:
+        before, ends = ending[None], np.full(1, np.nan)
     formation = beginning.formation if isinstance(beginning, Curve) else beginning
     scene, static = formation.scene, find_static_torques([formation], z)
     beyond = static.measure(before)
@@ -96,29 +86,29 @@ def choose_joint(
     after, begins = _list_torques(beginning, epsilon, phase, 0)
     times = find_change_times(scene, before[held][:, None], after[None])
     p, q = np.unravel_index(int(times.argmin()), times.shape)
-    given = float(ends[held][p]), float(begins[q]), before[held][p], after[q]
-    return Joint(*given, float(times[p, q]))
+    forces = float(ends[held][p]), float(begins[q])
+    return Joint(*forces, before[held][p], after[q], float(times[p, q]))
 
 
 def _list_torques(curve: Curve, epsilon: float, phase: int, place: int) -> tuple[Array, Array]:
-    """Torques at an end of a curve on the verge of motion, (n, 2) [N m], and squeezes, (n,) [N]."""
+    """Torques at an end of a curve at the limit of rest, (n, 2) [N m], and internal forces [N]."""
     data = prepare(curve, epsilon, Mesh().make_grid(curve, _ELEMENTS, held=True), phase)
     low, high = require_hold(data, phase, place)
     high = min(high, low + _WIDEST * curve.formation.scene.scales.force)
     share = np.linspace(_INSIDE, 1 - _INSIDE, _PLACES)
-    squeezes = low + share * (high - low)
+    lams = low + share * (high - low)
     forces = data.nodes.forces
-    return forces.T0[place] + np.outer(squeezes, forces.Tl[place]), squeezes
+    return forces.T0[place] + np.outer(lams, forces.Tl[place]), lams
 
 
 def require_hold(data: PhaseData, phase: int, place: int) -> tuple[float, float]:
-    """The range of squeezes that hold the object at an end of a phase [N].
+    """The range of internal forces that hold the object at an end of a phase [N].
 
     Raises
     ------
     InfeasibleError  if there is none
     """
-    low, high = (float(bound[place]) for bound in find_squeeze_range(data, 0.0))
+    low, high = (float(bound[place]) for bound in find_internal_force_range(data, 0.0))
     if low <= high:
         return low, high
     where = "end" if place else "start"
@@ -153,23 +143,22 @@ class PausedMotion:
 
     @property
     def modes(self) -> tuple[ModeSpan, ...]:
-        """Its contact modes, if it is planned over time: the first begin with the pause."""
-        own = getattr(self.motion, "modes", ())
-        late = (span._replace(start=span.start + self.pause) for span in own)
-        late = (span._replace(stop=span.stop + self.pause) for span in late)
-        return tuple(s._replace(start=0.0) if k == 0 else s for k, s in enumerate(late))
+        """Its contact modes, if planned in the time domain: the first start with the pause."""
+        return tuple(
+            span._replace(start=span.start + self.pause if k else 0.0, stop=span.stop + self.pause)
+            for k, span in enumerate(getattr(self.motion, "modes", ()))
+        )
 
     def evaluate(self, t: Array) -> Samples:
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""
         t = np.asarray(t, dtype=float)
-        found = self.motion.evaluate(np.maximum(t - self.pause, 0.0))
+        samples = self.motion.evaluate(np.maximum(t - self.pause, 0.0))
         left = np.where(t < self.pause, 1 - self.change.share(t), 0.0)[:, None]
-        first = self.change.before, *self.forces
         mixed = (
-            np.where(left > 0, left * own + (1 - left) * now, now)
-            for own, now in zip(first, found[3:], strict=True)
+            np.where(left > 0, left * first + (1 - left) * now, now)
+            for first, now in zip((self.change.before, *self.forces), samples[3:], strict=True)
         )
-        return Samples(*found[:3], *mixed)
+        return Samples(*samples[:3], *mixed)
 
 
 def add_pause(
@@ -180,15 +169,19 @@ def add_pause(
         return plan
     forces = find_static_forces(formation, z, joint.before)
     change = change_torques(formation.scene, joint.before, joint.after)
-    ramp = change.torque
+    effort = change.torque.integrate_squares() + options.time_weight * joint.pause
     value = {
         Objective.TIME: plan.value + joint.pause,
-        Objective.EFFORT: plan.value + ramp.integrate_squares() + options.time_weight * joint.pause,
+        Objective.EFFORT: plan.value + effort,
         Objective.MARGIN: float(np.fmin(plan.value, forces[0].min())),
     }[options.goal]
+    return _pause(plan, change, forces)._replace(value=value)
+
+
+def _pause(plan: PhasePlan[Motion], change: TorqueChange, forces: Array) -> PhasePlan[Motion]:
     motion = PausedMotion(plan.motion, change, forces)
-    torque = TorqueProfile.chain([ramp, plan.torque])
-    return plan._replace(motion=motion, torque=torque, value=value)
+    torque = TorqueProfile.chain([change.torque, plan.torque])
+    return plan._replace(motion=motion, torque=torque)
 
 
 def begin_from(plan: PhasePlan[Motion], formation: Formation, before: Array) -> PhasePlan[Motion]:
@@ -196,24 +189,19 @@ def begin_from(plan: PhasePlan[Motion], formation: Formation, before: Array) -> 
 
     Its value stays as it is.
     """
-    motion, torque = plan.motion, plan.torque
-    if isinstance(motion, PausedMotion):
-        torque = TorqueProfile.chain([torque.cut(motion.pause, float(torque.breaks[-1]))])
-        motion = motion.motion
-    after = torque.at(np.zeros(1))[0]
-    change = change_torques(formation.scene, before, after)
-    if change.duration:
-        # What touches beside the phase's contacts may hold the object, too, until it moves.
-        forces = np.full((2, formation.n_contacts), np.nan)
-        motion = PausedMotion(motion, change, forces)
-        torque = TorqueProfile.chain([change.torque, torque])
-    return plan._replace(motion=motion, torque=torque)
+    if isinstance(motion := plan.motion, PausedMotion):
+        torque = plan.torque.cut(motion.pause, float(plan.torque.breaks[-1]))
+        plan = plan._replace(motion=motion.motion, torque=TorqueProfile.chain([torque]))
+    change = change_torques(formation.scene, before, plan.torque.at(np.zeros(1))[0])
+    # Other contacts than the phase's may help to hold the object until it moves.
+    forces = np.full((2, formation.n_contacts), np.nan)
+    return _pause(plan, change, forces) if change.duration else plan
 
 
 def find_static_forces(formation: Formation, z: Array, tau: Array) -> Array:
     """Contact forces that hold a formation at rest with the largest least c_n, (2, n_c) [N].
 
-    NaN where none do, as others that still touch help to hold it.
+    By linear programme; NaN where none do, as other contacts help to hold it.
     """
     from scipy.optimize import linprog
 

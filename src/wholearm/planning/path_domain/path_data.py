@@ -1,7 +1,7 @@
-"""What phases give the planner: forces along their curves, at nodes and between them.
+"""Inverse dynamics and limits along the curves of phases, at nodes and between them.
 
-Forces are evaluated at the nodes and at a few places of every interval, the knots. They are smooth
-there, so polynomials through the knots give them at all places where limits are checked.
+Coefficients of forces are evaluated at the nodes and at a few knots of every interval. Polynomials
+through the knots give them where limits are checked.
 """
 
 from __future__ import annotations
@@ -12,59 +12,53 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...common.arrays import Array
+from ...common.arrays import Array, find_minima
 from ...common.errors import InputError, JammingError
-from ...common.quadrature import find_minima
 from ...common.shortfalls import Parameter
 from ...geometry.curve import Curve, describe_pose
 from ...mechanics.dynamics import PathForces, inverse, reduced_inertia
-from ...mechanics.limits import CONE, PRESS, SPEED, TORQUE, LimitSet, make_limits
-from ..robust.robust_rows import Spread, spread_limits
+from ...mechanics.limits import CONE, PRESS, SPEED, TORQUE, LimitSet, SideTerms, make_limits
+from ..lower_bound.rows import LimitSides, directions_of
+from ..robust.robust_rows import RobustLimits, spread_limits
 from .elements import Elements, Grid, Profile
-from .path_motion import directions_of
 
 
 class Sampling(NamedTuple):
-    """Where in an interval forces are evaluated and limits looked at, its ends included."""
+    """Knots of forces and places of checks in an interval, from 0 to 1, its ends included."""
 
     knots: Array
     checks: Array
 
 
 class Places(NamedTuple):
-    """Forces and rates of the joints, d theta / ds with shape (n, 2), at n places of a curve.
-
-    And what ranges change of the force limits there (`robust.rows`), with none in it if there are
-    no ranges.
-    """
+    """Inverse dynamics at n places of a curve."""
 
     forces: PathForces
-    rates: Array
-    swings: Array
+    rates: Array  # (n, 2): d theta / ds
+    variations: Array  # (n, m, p, 5): parametric bounds (`robust_rows`), or none of shape (n, 0)
 
     def pick(self, rows: Any) -> Places:
         """Return the places that `rows` indexes."""
-        forces = PathForces(*(part[rows] for part in self.forces))
-        return Places(forces, self.rates[rows], self.swings[rows])
+        return self.map(lambda table: table[rows])
 
     def map(self, change: Callable[[Array], Array]) -> Places:
         """The same with every table changed."""
         forces = PathForces(*map(change, self.forces))
-        return Places(forces, change(self.rates), change(self.swings))
+        return Places(forces, change(self.rates), change(self.variations))
 
 
 class LimitTerms(NamedTuple):
-    """What limits are of, constant + a s'' + b s'^2 + squeeze lambda + speed s', (n, m) each."""
+    """Limited values, constant + a s'' + b s'^2 + lam lambda + speed s', (n, m) each."""
 
     constant: Array
     a: Array
     b: Array
-    squeeze: Array
+    lam: Array
     speed: Array
 
 
 class PhaseData(NamedTuple):
-    """What one phase, or several that are joined, gives the NLP."""
+    """Limits and inverse dynamics of one phase, or several that are joined, on a grid."""
 
     curve: Curve  # the first one's where phases are joined
     epsilon: float  # [N]
@@ -76,7 +70,7 @@ class PhaseData(NamedTuple):
     knots: Places  # at the knots of every solid interval, interval by interval
     checks: Places  # at the checks of every solid interval, interval by interval
     rate_limit: Array  # (2,) [N m/s]: of torques, infinite where they may step
-    spread: Spread | None = None  # what ranges make of the force limits, if there are any
+    spread: RobustLimits | None = None  # robust force limits, if there are ranges
 
     @property
     def nonempty(self) -> NDArray[np.int64]:
@@ -90,11 +84,11 @@ class PhaseData(NamedTuple):
 
     @property
     def spans(self) -> Array:
-        """What is much for each side of the limits, shape (n_sides,)."""
+        """Scale of each side of the limits, shape (n_sides,)."""
         return self.limits.scales[self.limits.sides[0]]
 
     def find_terms(self) -> LimitTerms:
-        """What limits are of at the nodes."""
+        """Coefficients of the limited values at the nodes."""
         of_c, of_tau, of_rates = (part.T for part in self.limits.columns)
         forces = self.nodes.forces
         return LimitTerms(
@@ -106,36 +100,37 @@ class PhaseData(NamedTuple):
         )
 
     def evaluate(self, places: Places, profile: Profile) -> Array:
-        """What the limits are of, shape (n, m) [N, N m]."""
+        """The limited values, shape (n, m) [N, N m]."""
         of_c, of_tau, of_rates = (part.T for part in self.limits.columns)
         values = places.forces.c(*profile) @ of_c + places.forces.tau(*profile) @ of_tau
         if of_rates.any():
             values += places.rates * np.sqrt(profile.b)[:, None] @ of_rates
         if self.spread is not None:
-            least = self.spread.evaluate(places.forces, places.swings, profile)
+            least = self.spread.evaluate(places.forces, places.variations, profile)
             rows = self.limits.of(PRESS, CONE)
             values[:, rows] = np.repeat(least, len(rows) // least.shape[1], axis=1)
         return np.asarray(values)
 
     def slack(self, places: Places, profile: Profile, margin: float = 0.0) -> Array:
-        """How far each side of the limits is from being missed, shape (n, n_sides) [N, N m].
-
-        Less `margin` for normal forces.
-        """
+        """Slack of each side, less a `margin` of normal forces, shape (n, n_sides) [N, N m]."""
         values = self.evaluate(places, profile)
         values[:, self.limits.of(PRESS)] -= margin
         return self.limits.find_slack(values)
 
-    def largest_b(self, places: Places, spared: Parameter | None = None) -> Array:
-        """Largest b that the joints' speed limits allow, shape (n,) [m^2/s^2].
+    def list_sides(self, places: Places, margin: float) -> LimitSides:
+        """The sides of the limits for a margin of normal forces over epsilon [N]."""
+        terms = SideTerms.of(self.limits, places.forces, places.rates)
+        normal = np.isin(self.limits.sides[0], self.limits.of(PRESS))
+        rest = terms.rest - margin * normal / self.spans
+        return LimitSides(rest, *terms[1:], self.largest_b(places))
 
-        Without the one that the parameter `spared` sets, if one is given.
-        """
+    def largest_b(self, places: Places, spared: Parameter | None = None) -> Array:
+        """Largest b by the joints' speed limits but a `spared` one, shape (n,) [m^2/s^2]."""
         largest = np.full(len(places.rates), np.inf)
         for limit in self.speeds.limits:
             if spared is None or limit.parameter.key != spared.key:
                 rates = np.abs(places.rates @ limit.rows[0, -2:])
-                # A joint that stands still has no limit, but dividing by zero would warn.
+                # No division by zero for a joint at rest.
                 rates = np.maximum(rates, np.finfo(float).tiny ** 0.25)
                 largest = np.minimum(largest, (limit.high[0] / rates) ** 2)
         return largest
@@ -153,10 +148,9 @@ class PhaseData(NamedTuple):
         return Elements(self.grid, profile).at(fractions)
 
     def misses(self, profile: Profile, margin: float) -> tuple[Array, Array, Array]:
-        """What limits miss inside each solid interval, shape (n_solid, n_sides) [N, N m].
+        """Violations in each solid interval, and least slack, (n_solid, n_sides) [N, N m] each.
 
-        How far b is beyond what the speed limits allow, shape (n_solid,), relative. And how far
-        limits are from being missed there.
+        Second comes the relative violation of the largest b, (n_solid,).
         """
         here = self.interpolate(profile, self.sampling.checks)
         speed_slack = 1 - here.b / self.largest_b(self.checks)
@@ -187,16 +181,14 @@ def prepare(
     epsilon: float,
     grid: Grid,
     phase: int,
-    spread: Spread | None = None,
+    spread: RobustLimits | None = None,
 ) -> PhaseData:
-    """Evaluate a curve's forces at the nodes of a grid and between them.
-
-    With a `spread`, force limits are those for all ranges.
+    """Evaluate inverse dynamics and limits, with a `spread` robust ones, along a curve.
 
     Raises
     ------
-    InputError    if contacts depend on each other anywhere
-    JammingError  if friction makes the reduced inertia vanish or turn negative anywhere
+    InputError    if contacts are linearly dependent anywhere
+    JammingError  if friction makes the reduced inertia vanish or negative anywhere
     """
     nonempty = grid.nonempty
     sampling = choose_sampling(len(grid.s))
@@ -218,18 +210,20 @@ def prepare(
             f"friction makes the reduced inertia {inertia[worst]:.3g} of its frictionless value"
         )
     forces = inverse(formation, *point[:3], directions, point.kinematics)
-    swings = np.zeros((len(s), 0))
+    variations = np.zeros((len(s), 0))
     if spread is not None:
-        swings = spread.find_swings(formation, point, directions, forces, epsilon)
-    every = Places(forces, point.z_s[:, 3:], swings)
-    own = len(grid.s) + np.arange(len(between)).reshape(len(nonempty), -1)
-    order = np.hstack([nonempty[:, None], own, nonempty[:, None] + 1])
+        variations = spread.find_variations(formation, point, directions, forces, epsilon)
+    every = Places(forces, point.z_s[:, 3:], variations)
+    added = len(grid.s) + np.arange(len(between)).reshape(len(nonempty), -1)
+    order = np.hstack([nonempty[:, None], added, nonempty[:, None] + 1])
     knots = every.pick(order.ravel())
 
-    powers = np.arange(len(sampling.knots))
     # Powers on [-1, 1]: on [0, 1] thirteen knots would cost nine digits.
-    checks_x, knots_x = 2 * sampling.checks - 1, 2 * sampling.knots - 1
-    through = checks_x[:, None] ** powers @ np.linalg.inv(knots_x[:, None] ** powers)
+    to_checks, to_knots = (
+        (2 * places[:, None] - 1) ** np.arange(len(sampling.knots))
+        for places in (sampling.checks, sampling.knots)
+    )
+    through = to_checks @ np.linalg.inv(to_knots)
 
     def interpolate(values: Array) -> Array:
         table = values.reshape(len(nonempty), len(sampling.knots), -1)
@@ -243,23 +237,21 @@ def prepare(
         steps = sampling.checks * grid.steps[nonempty, None]
         inside = (grid.s[nonempty, None] + steps).ravel()
         owners = np.repeat(grid.segment[nonempty], len(sampling.checks))
-        nodes = _widen(spread, nodes, grid.s, grid.segment)
-        checks = _widen(spread, checks, inside, owners)
+        nodes, checks = (
+            each._replace(
+                forces=spread.extend(each.forces, each.variations, spread.pick_signs(*at))
+            )
+            for each, at in ((nodes, (grid.s, grid.segment)), (checks, (inside, owners)))
+        )
     kept = limits.without(SPEED), limits.only(SPEED)
     rates = formation.scene.torque_rate_limit
     return PhaseData(curve, epsilon, *kept, grid, nodes, sampling, knots, checks, rates, spread)
 
 
-def _widen(spread: Spread, places: Places, s: Array, segment: NDArray[np.int64]) -> Places:
-    """Places with forces for the limits within ranges too."""
-    signs = spread.pick_signs(s, segment)
-    return places._replace(forces=spread.extend(places.forces, places.swings, signs))
-
-
 def join(parts: Sequence[PhaseData]) -> PhaseData:
-    """Put phases one after the other, each with as many nodes and the same rows of limits.
+    """Phases one after the other, each with as many nodes and the same rows of limits.
 
-    Where two meet, the grid has an interval of length zero, as where a direction reverses.
+    Where two meet, as at a reversal, the grid has an interval of length zero.
     """
     if len(parts) == 1:
         return parts[0]
@@ -273,18 +265,18 @@ def join(parts: Sequence[PhaseData]) -> PhaseData:
         return np.concatenate([array + first for array, first in pairs])
 
     def stack(places: Sequence[Places]) -> Places:
-        columns = zip(*(own.forces for own in places), strict=True)
-        forces = PathForces(*(np.concatenate(column) for column in columns))
-        tables = ([own.rates for own in places], [own.swings for own in places])
-        return Places(forces, *map(np.concatenate, tables))
+        forces, *tables = zip(*places, strict=True)
+        columns = zip(*forces, strict=True)
+        return Places(PathForces(*map(np.concatenate, columns)), *map(np.concatenate, tables))
 
+    bends = [part.grid.bends for part in parts if part.grid.bends is not None]
     return parts[0]._replace(
         grid=Grid(
             chain((part.grid.s for part in parts), starts),
             chain((part.grid.segment for part in parts), segments),
             (parts[0].grid.rests[0], parts[-1].grid.rests[1]),
             parts[0].grid.held,
-            _join_bends([part.grid for part in parts]),
+            np.concatenate(bends) if bends else None,
         ),
         nodes=stack([part.nodes for part in parts]),
         knots=stack([part.knots for part in parts]),
@@ -292,24 +284,17 @@ def join(parts: Sequence[PhaseData]) -> PhaseData:
     )
 
 
-def _join_bends(grids: Sequence[Grid]) -> Array | None:
-    """Bends of the elements of grids one after the other."""
-    bends = [grid.bends for grid in grids if grid.bends is not None]
-    return np.concatenate(bends) if bends else None
-
-
 def cut(parts: Sequence[PhaseData], profile: Profile) -> list[Profile]:
     """Return the profile of each of several joined phases."""
     ends = np.cumsum([len(part.grid.s) for part in parts])[:-1]
     columns = (np.split(values, ends) for values in profile)
-    return [Profile(*own) for own in zip(*columns, strict=True)]
+    return [Profile(*part) for part in zip(*columns, strict=True)]
 
 
 def choose_sampling(nodes: int) -> Sampling:
-    """Choose more knots and checks where intervals are long.
+    """More knots and checks where intervals are long.
 
-    Looks are as the cosine of evenly spaced angles: near rest the speed, and with it viscous
-    friction, goes with the root of the way.
+    Checks are at cosines of even angles: near rest the speed is proportional to the root of s.
     """
     knots, checks = (5, 25) if nodes > 64 else (9, 33)
     angles = np.linspace(0.0, np.pi, checks)

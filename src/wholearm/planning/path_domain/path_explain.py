@@ -1,7 +1,7 @@
-"""Why phases along curves have no plan, and which single limit would have to give way.
+"""Diagnosis of infeasible phases along curves: elastic mode, then one relaxation at a time.
 
 All limits are made soft and their shortfalls ranked. Then each limit alone is relaxed as little as
-the others allow, and a plan with that limit is asked for: only what was planned is advised.
+the others allow, and a plan with that limit is made: only what was planned is advised.
 """
 
 from __future__ import annotations
@@ -51,18 +51,13 @@ from .speed_profile import is_hopeless
 from .task import Task
 from .terms import LimitShape
 
-_TRIED = (2.0, 10.0, 100.0)
-"""Factors on the rates of motors with which a plan is looked for."""
-_ROUGH = 4.0
-"""Largest factor on the friction of a rolling contact."""
-_TORQUE = 15.0
-"""Unit of the torques' shortfalls, over the scene's torque: as bad as one of its force."""
-_FORCE = 5.0
-"""Largest unit of force when a limit is relaxed, over the scene's."""
-FRICTION = "friction"
-"""Beginning of the keys of frictions."""
+_TRIED = (2.0, 10.0, 100.0)  # factors on torque rate limits with which plans are tried
+_ROUGH = 4.0  # largest factor on the friction of a rolling contact
+_TORQUE = 15.0  # unit of shortfalls of torques, over the scene's torque: as bad as one of its force
+_FORCE = 5.0  # largest unit of force when a limit is relaxed, over the scene's
+FRICTION = "friction"  # beginning of the keys of frictions
+# Plans the phases along curves with a least normal force [N]; raises if there is no plan.
 Replan = Callable[[Sequence[Curve], float], object]
-"""Plans the phases along curves with a least normal force [N]; raises if there is no plan."""
 
 
 def explain(
@@ -73,7 +68,7 @@ def explain(
     stopped: str,
     replan: Replan,
 ) -> InfeasibleError | SolverError:
-    """Say why phases have no plan and what would change that.
+    """The error for phases without a plan, with what would change that.
 
     Parameters
     ----------
@@ -82,23 +77,27 @@ def explain(
     stopped  how the solver ended, in words
     """
     data = join(parts)
-    torque = _TORQUE * data.curve.formation.scene.scales.torque
-    units = units._replace(torque=np.full(2, torque))
+    scales = data.curve.formation.scene.scales
+    units = units._replace(torque=np.full(2, _TORQUE * scales.torque))
     elastic = _solve_elastic(data, profile, units)
     if elastic is None:
         return SolverError(stopped)
     shortfalls = [
         short
-        for part, own, phase in zip(parts, cut(parts, elastic), phases, strict=True)
-        for short in _list_shortfalls(part, own, phase, len(phases) > 1)
+        for part, each, phase in zip(parts, cut(parts, elastic), phases, strict=True)
+        for short in _list_shortfalls(part, each, phase, len(phases) > 1)
     ]
     if not shortfalls:
         text = f"{stopped} although limits can be kept; try other --intervals or --accuracy"
         return SolverError(text)
-    units = _quicken(data, units)
+    # In units of a slow motion, or of an absurd epsilon, the regularization would outweigh what is
+    # relaxed: units of a fall, and of forces that a hand may have.
+    fall = float(np.sqrt(float(data.grid.s[-1]) / scales.acceleration))
+    largest = _FORCE * scales.force
+    units = units._replace(time=min(units.time, fall), force=min(units.force, largest))
     may_change = [*data.speeds.parameters, *data.limits.parameters]
     if len(parts) == 1:
-        # Where impacts join phases, their velocities depend on friction too.
+        # Velocities after impacts between phases would depend on friction too.
         may_change += list_frictions(data.curve.formation)
     curves = [part.curve for part in parts]
 
@@ -118,11 +117,11 @@ def explain(
 
 
 def _make_trajectory(parts: Sequence[PhaseData], profiles: Sequence[Profile]) -> Trajectory | None:
-    """The motion that misses limits least; None if it takes for ever."""
+    """The motion with the least shortfalls; None if it stalls."""
     pairs = zip(parts, profiles, strict=True)
-    motions = [PathMotion(part.curve, part.grid, own) for part, own in pairs]
+    motions = [PathMotion(part.curve, part.grid, profile) for part, profile in pairs]
     try:
-        torques = [fit_torque(part, own)[0] for part, own in zip(parts, motions, strict=True)]
+        torques = [fit_torque(*pair)[0] for pair in zip(parts, motions, strict=True)]
     except SolverError:
         return None
     return assemble_least(motions, torques, [part.curve.formation for part in parts])
@@ -154,47 +153,35 @@ def _replan_with(
 
 def change_curve(curve: Curve, key: str, value: float) -> Curve:
     """The curve with another parameter of the hand."""
-    formation = curve.formation
-    return replace(
-        curve, formation=replace(formation, scene=change_scene(formation.scene, key, value))
-    )
+    scene = change_scene(curve.formation.scene, key, value)
+    return replace(curve, formation=replace(curve.formation, scene=scene))
 
 
 def list_frictions(formation: Formation) -> list[Parameter]:
     """Friction of what is touched: to be lowered, and where a contact rolls to be raised."""
     parts = dict.fromkeys(contact.finger for contact in formation.contacts)
     rolls = {contact.finger for contact in formation.rolling}
-    found = []
+    frictions = []
     for finger in parts:
         name = "palm" if finger is None else f"finger {finger + 1}"
         key, value = f"{FRICTION}.{name.replace(' ', '')}", formation.scene.friction.of(finger)
         signs = (-1, 1) if finger in rolls else (-1,)
-        found += [Parameter(f"friction of {name}", value, "", sign, key) for sign in signs]
-    return found
+        frictions += [Parameter(f"friction of {name}", value, "", sign, key) for sign in signs]
+    return frictions
 
 
 def _search_friction(parameter: Parameter, plan: Callable[[float], object]) -> float | None:
-    """A coefficient that can be planned with, lower or higher than the given one."""
+    """A lower or higher coefficient with which there is a plan."""
     farthest = 0.0 if parameter.sign < 0 else _ROUGH * parameter.value
     return bracket(parameter, farthest, lambda value: succeeds(partial(plan, value)))
 
 
-def _quicken(data: PhaseData, units: Units) -> Units:
-    """Units for motions as quick as a fall, with forces that a hand may have.
-
-    In units of a slow motion, or of an absurd epsilon, the small costs that choose among equals
-    would outweigh what is relaxed.
-    """
-    length, scales = float(data.grid.s[-1]), data.curve.formation.scene.scales
-    fall = float(np.sqrt(length / scales.acceleration))
-    return units._replace(time=min(units.time, fall), force=min(units.force, _FORCE * scales.force))
-
-
 def _solve_elastic(data: PhaseData, profile: Profile, units: Units) -> Profile | None:
     """The motion with the least shortfalls when every limit is soft."""
-    short = np.maximum(_find_shortfalls(data, profile), 0.0) + 0.05 * data.limits.scales
-    found = _solve_soft(data, profile, units, short / units.of(data.limits), None)
-    return found[0] if found else None
+    short = data.limits.fold(-data.slack(data.nodes, profile))
+    short = np.maximum(short, 0.0) + 0.05 * data.limits.scales
+    solution = _solve_soft(data, profile, units, short / units.of(data.limits), None)
+    return solution[0] if solution else None
 
 
 def _relax(data: PhaseData, profile: Profile, units: Units, parameter: Parameter) -> float | None:
@@ -202,13 +189,13 @@ def _relax(data: PhaseData, profile: Profile, units: Units, parameter: Parameter
     if is_hopeless(data, parameter):
         return None
     step = units.force if parameter.unit == "N" else parameter.value
-    short = _find_shortfalls(data, profile).max(axis=0)
+    short = data.limits.fold(-data.slack(data.nodes, profile)).max(axis=0)
     weights = step * data.limits.weigh(parameter)
     needed = np.divide(short, weights, out=np.zeros_like(short), where=weights > 0)
     relaxation = Relaxation(parameter, step)
-    begun = max(1.0, 1.5 * float(needed.max()))
-    found = _solve_soft(data, profile, units, begun, relaxation)
-    return relaxation.move(found[1]) if found else None
+    start = max(1.0, 1.5 * float(needed.max()))
+    solution = _solve_soft(data, profile, units, start, relaxation)
+    return relaxation.move(solution[1]) if solution else None
 
 
 def _solve_soft(
@@ -218,7 +205,7 @@ def _solve_soft(
     extra: float | Array,
     relaxation: Relaxation | None,
 ) -> tuple[Profile, float] | None:
-    """Solve with limits that give way, from a profile and how far they do so there."""
+    """Solve with soft limits, from a profile and the relaxation `extra` there."""
     goal = Objective.RELAX if relaxation else Objective.ELASTIC
     nlp = build_path_nlp(LimitShape.of(data.limits), len(data.grid.s) - 1, goal)
     result = nlp.solver(
@@ -229,11 +216,6 @@ def _solve_soft(
     if not nlp.solver.stats()["success"]:
         return None
     return unpack(nlp, data.grid, result["x"].full()[:, 0], units)
-
-
-def _find_shortfalls(data: PhaseData, profile: Profile) -> Array:
-    """By how much limits are missed at the nodes, shape (n, m) [N, N m]."""
-    return data.limits.fold(-data.slack(data.nodes, profile))
 
 
 def _list_shortfalls(
@@ -249,23 +231,25 @@ def _list_shortfalls(
     return list_shortfalls(data.limits, data.evaluate(data.nodes, profile), locate)
 
 
-def explain_motors(
+def explain_rate_limits(
     task: Task, parts: Sequence[PhaseData], reason: str, plan: Callable[..., Any]
 ) -> WholearmError:
-    """The error for phases that `plan`, which is `plan_curves`, has found no plan for.
+    """The error for phases without a plan under rate limits and lags.
 
-    It is that of quick motors if these have none either. Otherwise quicker ones are tried.
+    It is that of unlimited rates if there is no plan with these either. Otherwise larger limits
+    are tried with `plan`, which is `plan_curves`.
     """
-    given = task.epsilon, task.options, task.phases, task.duration
+    rest = task.epsilon, task.options, task.phases, task.duration
     try:
         require_hold(parts[0], task.phases[0], 0)
         require_hold(parts[-1], task.phases[-1], -1)
-        plan([_raise_rate_limits(curve, np.inf) for curve in task.curves], *given)
+        plan([_raise_rate_limits(curve, np.inf) for curve in task.curves], *rest)
     except WholearmError as error:
         return error
     for factor in _TRIED:
         try:
-            plan([_raise_rate_limits(own, factor) for own in task.curves], *given, False, task.pins)
+            curves = [_raise_rate_limits(curve, factor) for curve in task.curves]
+            plan(curves, *rest, False, task.pins)
         except WholearmError:
             continue
         change = f"feasible with motors {factor:g} times as quick"
@@ -279,8 +263,8 @@ def explain_motors(
 
 
 def _raise_rate_limits(curve: Curve, factor: float) -> Curve:
-    """The curve in a scene whose motors are quicker by a factor."""
-    formation, scene = curve.formation, curve.formation.scene
+    """The curve in a scene with torque rate limits and 1 / lags times a factor."""
+    scene = curve.formation.scene
     right, left = (
         replace(
             finger,
@@ -290,4 +274,4 @@ def _raise_rate_limits(curve: Curve, factor: float) -> Curve:
         for finger in scene.fingers
     )
     scene = replace(scene, fingers=(right, left))
-    return replace(curve, formation=replace(formation, scene=scene))
+    return replace(curve, formation=replace(curve.formation, scene=scene))

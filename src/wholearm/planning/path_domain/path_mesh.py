@@ -1,8 +1,7 @@
-"""Elements where a plan needs them: ends at its switches, and more of them where limits are dear.
+"""Mesh adaptation: elements end at switches, and are denser where violations between nodes cost.
 
-What limits miss between nodes costs their multipliers times that, to first order, once they are
-tightened: the price. It falls with the sixth power of an element's length where the plan is smooth,
-so elements end where it switches.
+The price of a violation is the multiplier times it: the first-order cost of tightening the limit.
+It falls with the sixth power of an element's length where the plan is smooth.
 """
 
 from __future__ import annotations
@@ -20,41 +19,31 @@ from .elements import Grid, Profile, lay_out
 from .path_data import PhaseData
 from .switches import Switch, find_switches
 
-START, SOFT = 10, 20
-"""Elements of a phase to begin with, and where plans switch more softly, for least effort."""
-MOST = 80
-"""Elements of a phase from which on they are not doubled."""
-SLOW_MOST = 40
-"""The same for slow motors, unless a high accuracy is asked for."""
-SHIFTED = 0.02
-"""Relative loss of an end of an element that is so far from a switch, over the curve's length."""
-_ORDER = 6
-"""Power of an element's length that its price falls with."""
-_APART = 1e-5
-"""Least length of an element that switches lead to, over the curve's."""
-_CLOSE = 1e-10
-"""The same for slow motors: next to rest little of the way is passed while a torque changes."""
-_NEAR = 0.02
-"""Distance at which a switch is the one that a break was for, over the curve's length."""
-_ENDS = 0.1
-"""Share of elements of the first and the last stretch where s is cubic in the first and last."""
-_CHEAP = 1e-3
-"""Least price of a stretch that counts, over that of all."""
+START, SOFT = 10, 20  # initial elements of a phase, and those for smoother plans of least effort
+MOST = 80  # elements of a phase from which they are not doubled
+SLOW_MOST = 40  # the same under rate limits, unless a high accuracy is asked for
+SHIFTED = 0.02  # relative loss by a break's distance from its switch, over the curve's length
+_ORDER = 6  # power of an element's length that its price falls with
+_APART = 1e-5  # least length of an element that switches lead to, over the curve's
+_CLOSE = 1e-10  # the same under rate limits: ramps next to rest are short in s
+_NEAR = 0.02  # distance at which a switch belongs to a break, over the curve's length
+_ENDS = 0.1  # factor on the elements of the first and last stretch under rate limits
+_CHEAP = 1e-3  # least price of a stretch that counts, over that of all
 
 
 class Mesh(NamedTuple):
     """The elements of one phase."""
 
-    breaks: Array = np.zeros(0)  # [m]: where elements end for the plan's sake, increasing
-    # how many elements each stretch between breaks and reversals gets, as a ratio; None for as many
-    # as its part of a half turn, fine towards the ends
+    breaks: Array = np.zeros(0)  # [m]: where elements end at switches, increasing
+    # elements of each stretch between breaks and reversals, as a ratio; None for as many as its
+    # part of a half turn, fine towards the ends
     weights: Array | None = None
 
     @staticmethod
     def of(curve: Curve, switches: Sequence[Switch], held: bool = False) -> Mesh:
         """The mesh for a motion that switches at some places."""
         if held:
-            return Mesh(_space(switches, curve))
+            return Mesh(_keep_apart([place for place, _ in switches], curve, _CLOSE))
         return Mesh(_match(np.zeros(0), switches, curve)[0])
 
     def make_grid(
@@ -77,7 +66,7 @@ class Mesh(NamedTuple):
         edges = curve.length * (1 - np.cos(starts)) / 2
         edges[done == 0] = ends[:-1]
         if held and len(weights) > 2:
-            # After a cubic start the speed is a root of the way, which even lengths suit better.
+            # After a cubic start the speed is a root of s, which even lengths suit better.
             for k in {0, len(counts) - 1}:
                 edges[places == k] = ends[k] + done[places == k] * (ends[k + 1] - ends[k])
         pairs = np.stack([edges, np.append(edges[1:], ends[-1])], axis=1)
@@ -101,13 +90,11 @@ def find_ends(curve: Curve, breaks: Array) -> Array:
 
 
 class Better(NamedTuple):
-    """A mesh that suits what has been found on another."""
+    """A mesh adapted to a solution on another."""
 
     mesh: Mesh
-    # how far breaks are from where they were, over the curve's length; infinite if there is one
-    # where s'' jumps from one extreme to the other and none was
-    shift: float
-    price: float  # what tightening is likely to cost on it with as many elements
+    shift: float  # of breaks, over the curve's length; infinite for a new one at a jump of s''
+    price: float  # estimated cost of tightening on it with as many elements
 
 
 def adapt(
@@ -118,16 +105,7 @@ def adapt(
     prices: Array,
     before: Mesh,
 ) -> Better:
-    """A mesh for what has been found on another.
-
-    Parameters
-    ----------
-    goal          none where switches are not to be looked for
-    part          of the phase
-    margin : [N]
-    prices        of each node
-    before        the other one
-    """
+    """Adapt a mesh to a profile and the prices of its nodes; without a goal, not to switches."""
     breaks, shift = before.breaks, 0.0
     if goal in (Objective.TIME, Objective.MARGIN) and not part.grid.held:
         breaks, shift = _match(before.breaks, find_switches(part, profile, margin), part.curve)
@@ -144,33 +122,30 @@ def adapt(
     return Better(Mesh(breaks, weights), shift, float((price * finer**_ORDER).sum()))
 
 
-def _match(known: Array, switches: Sequence[Switch], curve: Curve) -> tuple[Array, float]:
-    """Breaks that have moved to switches near them, with those that are new, and their shift.
+def _match(breaks: Array, switches: Sequence[Switch], curve: Curve) -> tuple[Array, float]:
+    """Breaks moved to switches near them, with new ones, and their shift.
 
-    None is given up: on an element's end a switch may not show.
+    None is given up: a switch at an element's end may not show.
     """
     fixed, least = find_ends(curve, np.zeros(0)), _APART * curve.length
     moved, fresh, shift = dict[int, float](), list[float](), 0.0
     for place, jumps in switches:
-        far = np.abs(known - place)
+        far = np.abs(breaks - place)
         far[list(moved)] = np.inf
         if far.min(initial=np.inf) < _NEAR * curve.length:
             moved[int(far.argmin())] = place
             shift = max(shift, float(far.min()) / curve.length)
-        elif np.abs(np.concatenate([fixed, known, fresh]) - place).min() > least:
+        elif np.abs(np.concatenate([fixed, breaks, fresh]) - place).min() > least:
             fresh.append(place)
-            shift = np.inf if jumps or not len(known) else shift
-    kept = list[float]()
-    for place in sorted([*(moved.get(k, place) for k, place in enumerate(known)), *fresh]):
-        if np.abs(np.append(fixed, kept) - place).min() > least:
-            kept.append(place)
-    return np.array(kept), shift
+            shift = np.inf if jumps or not len(breaks) else shift
+    every = sorted([*(moved.get(k, place) for k, place in enumerate(breaks)), *fresh])
+    return _keep_apart(every, curve, _APART), shift
 
 
-def _space(switches: Sequence[Switch], curve: Curve) -> Array:
-    """Breaks at switches, but where there is an end close to it."""
+def _keep_apart(places: Sequence[float], curve: Curve, least: float) -> Array:
+    """Places with a least distance, over the curve's length, to reversals and to each other [m]."""
     fixed, kept = find_ends(curve, np.zeros(0)), list[float]()
-    for place, _ in switches:
-        if np.abs(np.append(fixed, kept) - place).min() > _CLOSE * curve.length:
+    for place in places:
+        if np.abs(np.append(fixed, kept) - place).min() > least * curve.length:
             kept.append(place)
     return np.array(sorted(kept))

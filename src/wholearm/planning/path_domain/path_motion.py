@@ -1,8 +1,8 @@
-"""Motion along a curve: speed and squeeze at the nodes of a grid, the rest at any instant.
+"""Motion along a curve as a function of time, from the profile at the nodes of a grid.
 
-Inside an element a = s'' and the squeeze are polynomials, and so is b = s'^2; s(t) follows by
-quadrature of 1 / s'. z, tau and the contact forces follow from s, s' and s'' by inverse dynamics,
-hence the equations of motion hold at every instant.
+Inside an element a = s'' and the internal force are polynomials, and so is b = s'^2; s(t) follows
+by Gauss quadrature of 1 / s'. z, tau and the contact forces follow from s, s' and s'' by inverse
+dynamics: the equations of motion hold at every instant.
 """
 
 from __future__ import annotations
@@ -16,32 +16,21 @@ from numpy.typing import NDArray
 
 from ...common.arrays import Array
 from ...geometry.curve import Curve
-from ...mechanics.dynamics import Directions, inverse, split_forces
+from ...mechanics.dynamics import inverse, split_forces
 from ...results.trajectory import Samples
+from ..lower_bound.rows import directions_of
 from .elements import DEGREE, Elements, Grid, Profile
 
-_POINTS = 12
-"""Gauss points for the time in an interval between nodes."""
-_STALLED = 100.0
-"""Speed that the ends of an interval suggest over the one inside at which a motion stalls."""
-_TINY = 1e-100
-"""Least speed [m/s] that is divided by."""
-_NEWTON = 5
-"""Steps of Newton's method from a time to a place: rates of time differ little in an interval."""
+_POINTS = 12  # Gauss points for the time in an interval between nodes
+_STALLED = 100.0  # speed interpolated from an interval's ends over the one inside when it stalls
+_TINY = 1e-100  # least speed [m/s] that is divided by
+_NEWTON = 5  # iterations from a time to a place
 
 
-def _integrals() -> tuple[Array, Array]:
-    """Gauss points x, and what takes values there to Legendre coefficients of the integral.
-
-    Of the polynomial through them, from -1 to x.
-    """
-    x, weights = legendre.leggauss(_POINTS)
-    to_modes = legendre.legvander(x, _POINTS - 1) * weights[:, None]
-    to_modes *= (2 * np.arange(_POINTS) + 1) / 2
-    return x, np.asarray(legendre.legint(to_modes, lbnd=-1, axis=1), dtype=float)
-
-
-_GAUSS = _integrals()
+# Gauss points, and the matrix from values there to Legendre coefficients of the integral.
+_GAUSS, _WEIGHTS = legendre.leggauss(_POINTS)
+_MODES = legendre.legvander(_GAUSS, _POINTS - 1) * _WEIGHTS[:, None]
+_INTEGRAL = legendre.legint(_MODES * ((2 * np.arange(_POINTS) + 1) / 2), lbnd=-1, axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,61 +61,53 @@ class PathMotion:
 
     @cached_property
     def _slowness(self) -> Array:
-        """What the speed would be were s'' constant, over what it is, at Gauss points of w, (n, m).
+        """Speed at constant s'' over the true one, at Gauss points of each solid interval, (n, m).
 
-        w is in which that speed is linear, in each interval inside elements.
+        Of the variable w from 0 to 1 in which the speed at constant s'' is linear.
         """
         k, (v0, v1) = self.grid.nonempty, (speed[:, None] for speed in self._ends)
-        w = (1 + _GAUSS[0]) / 2
+        w = (1 + _GAUSS) / 2
         done, left = _share(v0, v1, w)
         every = np.repeat(k, len(w))
         y = self.elements.find_y(every, done.ravel(), left.ravel())
         plain = v0 * (1 - w) + v1 * w
         if self.grid.held:
-            cubic, ahead, rise = self.elements.find_cubic(every, np.tile(w, len(k)))
-            y = np.where(cubic, ahead, y)
+            cubic, y_cubic, rise = self.elements.find_cubic(every, np.tile(w, len(k)))
+            y = np.where(cubic, y_cubic, y)
             length = np.diff(self.grid.edges)[every // (DEGREE + 1), 0]
             mean = np.repeat(self.grid.steps[k] / np.maximum(v0 + v1, _TINY)[:, 0], len(w))
-            own = 1.5 * np.abs(rise) * length * ahead**2 / mean
-            plain = np.where(cubic.reshape(done.shape), own.reshape(done.shape), plain)
+            slow = 1.5 * np.abs(rise) * length * y_cubic**2 / mean
+            plain = np.where(cubic.reshape(done.shape), slow.reshape(done.shape), plain)
         speed = self.elements.evaluate(every, y)[1].reshape(done.shape)
         return np.asarray(plain / np.maximum(speed, np.maximum(plain / _STALLED, _TINY)))
 
     @property
     def stalls(self) -> bool:
-        """Whether the motion all but stops between two nodes."""
+        """Whether the motion nearly stops between two nodes."""
         v0, v1 = self._ends
         return bool((v0 + v1 <= _TINY).any() or self._slowness.max() >= _STALLED)
 
     @cached_property
     def _clock(self) -> Array:
-        """Legendre coefficients of the time since the start of each such interval, (n, m + 1).
-
-        They are of w, from -1 to 1.
-        """
+        """Legendre coefficients in 2 w - 1 of the time since each interval's start, (n, m + 1)."""
         v0, v1 = self._ends
         mean = self.grid.steps[self.grid.nonempty] / np.maximum(v0 + v1, _TINY)
-        return np.asarray(mean[:, None] * (self._slowness @ _GAUSS[1]))
+        return np.asarray(mean[:, None] * (self._slowness @ _INTEGRAL))
 
     def durations(self, fractions: Array) -> Array:
         """Time from the start of each interval inside elements to a fraction of it, (n, m) [s]."""
         v0, v1 = (speed[:, None] for speed in self._ends)
         here = np.sqrt(v0**2 * (1 - fractions) + v1**2 * fractions)
         w = fractions * (v0 + v1) / np.maximum(v0 + here, _TINY)
-        w = self._find_cubic_share(fractions, w)
+        if self.grid.held:
+            # Where s is cubic in y, w is the part of y's rise.
+            k = np.repeat(self.grid.nonempty, len(fractions))
+            done = np.tile(fractions, len(w))
+            cubic, start, rise = self.elements.find_cubic(k, np.zeros(len(k)))
+            share = np.clip((self.elements.find_y(k, done, 1 - done) - start) / rise, 0.0, 1.0)
+            w = np.where(cubic, share, w.ravel()).reshape(w.shape)
         powers = legendre.legvander(2 * w - 1, _POINTS)
         return np.asarray(np.einsum("nmp,np->nm", powers, self._clock))
-
-    def _find_cubic_share(self, fractions: Array, w: Array) -> Array:
-        """`w` at fractions of every interval, but the part of y's rise where s is cubic in y."""
-        if not self.grid.held:
-            return w
-        k, count = self.grid.nonempty, len(fractions)
-        every, done = np.repeat(k, count), np.tile(fractions, len(k))
-        cubic, start, rise = self.elements.find_cubic(every, np.zeros(len(every)))
-        here = self.elements.find_y(every, done, 1 - done)
-        share = np.clip((here - start) / rise, 0.0, 1.0)
-        return np.where(cubic, share, w.ravel()).reshape(w.shape)
 
     @property
     def duration(self) -> float:
@@ -155,41 +136,34 @@ class PathMotion:
         done, left = _share(v0, v1, w)
         y = self.elements.find_y(k, done, left)
         if self.grid.held:
-            cubic, ahead, rise = self.elements.find_cubic(k, w)
-            start = ahead - w * rise
-            way = (ahead**3 - start**3) / ((start + rise) ** 3 - start**3)
-            done, y = np.where(cubic, way, done), np.where(cubic, ahead, y)
+            cubic, y_cubic, rise = self.elements.find_cubic(k, w)
+            start = y_cubic - w * rise
+            part = (y_cubic**3 - start**3) / ((start + rise) ** 3 - start**3)
+            done, y = np.where(cubic, part, done), np.where(cubic, y_cubic, y)
         here, _ = self.elements.evaluate(k, y)
         s = self.grid.s[k] + done * self.grid.steps[k]
         return s, self.grid.segment[k], here
 
     def evaluate(self, t: Array) -> Samples:
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""
-        s, segment, (a, b, squeeze) = self.locate(np.asarray(t, dtype=float))
+        s, segment, (a, b, lam) = self.locate(np.asarray(t, dtype=float))
         point = self.curve.evaluate(s)
         directions = directions_of(self.curve, segment)
         formation = self.curve.formation
         forces = inverse(formation, *point[:3], directions, point.kinematics)
-        c_n, c_t = split_forces(formation, forces.c(a, b, squeeze), directions.Xi)
+        c_n, c_t = split_forces(formation, forces.c(a, b, lam), directions.Xi)
         return Samples(
             point.z,
             point.z_s * np.sqrt(b)[:, None],
             point.z_s * a[:, None] + point.z_ss * b[:, None],
-            forces.tau(a, b, squeeze),
+            forces.tau(a, b, lam),
             c_n,
             c_t,
         )
 
 
 def _share(v0: Array, v1: Array, w: Array) -> tuple[Array, Array]:
-    """Which parts of the way are done and left where the speed is at w between two, from 0 to 1."""
+    """Parts of an interval done and left where the speed is v0 + w (v1 - v0) at constant s''."""
     total = np.maximum(v0 + v1, _TINY)
     done = w * (v0 * (2 - w) + v1 * w) / total
     return done, (1 - w) * (v1 * (1 + w) + v0 * (1 - w)) / total
-
-
-def directions_of(curve: Curve, segment: NDArray[np.int64]) -> Directions:
-    """Directions at n places, given the segment that each belongs to."""
-    Xi = np.array([part.Xi for part in curve.segments])
-    sigma = np.array([part.sigma for part in curve.segments])
-    return Directions(Xi[segment], sigma[segment])

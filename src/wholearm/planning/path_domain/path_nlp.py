@@ -1,8 +1,7 @@
-"""The planning NLP of one-freedom phases in the path domain: building, bounds, packing.
+"""The planning NLP in the path domain: building, parameters, bounds, packing.
 
-`terms` has its expressions. Built once for some contacts, intervals and an objective,
-it serves every phase: grid, coefficients and limits are its parameters and bounds. Phases that
-impacts join have an interval of length zero between them (`chain`).
+`terms` has its expressions. Built once for some contacts, intervals and an objective, it serves
+every phase: grid, coefficients and limits are its parameters and bounds.
 """
 
 from __future__ import annotations
@@ -35,11 +34,11 @@ class Units(NamedTuple):
     force: float  # [N]
     torque: Array  # (2,) [N m]: of each joint
     power: float  # [(N m)^2]: of the effort's integrand
-    press: float  # [N]: what the hand can press with: a squeeze so large is nothing to be avoided
+    press: float  # [N]: typical internal force, in the regularization
 
     @property
     def profile(self) -> Array:
-        """Units of (b, a, squeeze), shape (3,)."""
+        """Units of (b, a, internal force), shape (3,)."""
         speed = self.length / self.time
         return np.array([speed**2, speed / self.time, self.force])
 
@@ -50,7 +49,7 @@ class Units(NamedTuple):
 
 
 class Relaxation(NamedTuple):
-    """Which number gives way, and by how much when the relaxation of the NLP grows by 1."""
+    """The relaxed parameter, and its change per unit relaxation of the NLP."""
 
     parameter: Parameter
     step: float  # in its unit; that of a speed is of its square, relatively
@@ -64,14 +63,13 @@ class Relaxation(NamedTuple):
 
 
 class Tightening(NamedTuple):
-    """By how much limits at the nodes are tightened so that they hold between nodes too."""
+    """Tightening of limits at the nodes so that they hold between nodes too."""
 
     limits: Array  # (N + 1, n_sides) [N, N m]: of each side of the limits
     speed_share: Array  # (N + 1,): factor on the largest b
     duration: float | None  # [s]: longest duration, if there is one
-    missed: Array  # (N + 1, n_sides) [N, N m]: the part of `limits` beyond what was slack anyway
-    # (N + 1, 2, 2): factors on the largest rates of torques, and on the largest commands
-    motors: Array
+    missed: Array  # (N + 1, n_sides) [N, N m]: the part of `limits` beyond the slack at nodes
+    motors: Array  # (N + 1, 2, 2): factors on torque rate limits and on the largest commands
 
     @staticmethod
     def none(data: PhaseData, duration: float | None) -> Tightening:
@@ -81,22 +79,24 @@ class Tightening(NamedTuple):
         return Tightening(limits, np.ones(count), duration, limits, np.ones((count, 2, 2)))
 
     def ease(self, spare: Array) -> Tightening:
-        """Tighten less, by what limits are from being missed about each node."""
+        """Tighten less, by the `spare` slack about each node."""
         eased = np.minimum(self.missed, spare)
         return self._replace(limits=self.limits - eased, missed=self.missed - eased)
 
     def by(
         self, reach: Array, limits: Array, speed_share: Array, late: float, motors: Array
     ) -> Tightening:
-        """Tighten further: limits by so much, b, duration and motors by a relative amount.
+        """Tighten further: limits absolutely, b, duration and torque rates relatively.
 
-        Limits are first raised to `reach`, as what is slack already would not feel the rest.
+        Limits are first raised to `reach`, the slack at nodes, which would absorb the rest.
         """
-        duration = None if self.duration is None else self.duration * (1 - late)
-        raised = np.maximum(self.limits, reach) + limits
-        share = self.speed_share * (1 - speed_share)
-        missed, quick = self.missed + limits, self.motors * (1 - motors)
-        return Tightening(raised, share, duration, missed, quick)
+        return Tightening(
+            np.maximum(self.limits, reach) + limits,
+            self.speed_share * (1 - speed_share),
+            None if self.duration is None else self.duration * (1 - late),
+            self.missed + limits,
+            self.motors * (1 - motors),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,11 +123,11 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     started = time.perf_counter()
     nlp = write_terms(shape, intervals, objective)
     book(SolverStatistics(build_time=time.perf_counter() - started))
-    # Started from nowhere near their optimum, these need the more robust strategy.
+    # Soft NLPs start far from their optimum, and need the more robust strategy.
     strategy: dict[str, Any]
     strategy = {"mu_strategy": "monotone"} if objective in SOFT else {"mu_oracle": "probing"}
     if shape.motors.slow:
-        # Next to rest slopes of the time are large, by which it would count for little.
+        # Large gradients of the time next to rest would scale the objective down.
         strategy |= {"nlp_scaling_method": "none"}
     solver = build_solver("path_nlp", nlp, 1e-9, max_iter=300, **strategy)
     columns = list_columns(shape, intervals, objective)
@@ -146,7 +146,7 @@ def parameters(
     blocks = {
         "a": terms.a * a_unit / unit,
         "b": terms.b * b_unit / unit,
-        "squeeze": terms.squeeze * force / unit,
+        "lam": terms.lam * force / unit,
         "speed": (terms.speed * np.sqrt(b_unit) / unit)[:, nlp.shape.fast],
     }
     torque, motors = unit[list(nlp.shape.torques)], nlp.shape.motors
@@ -189,13 +189,13 @@ def make_bounds(
     n, node = len(data.grid.s), nlp.columns.node
     low, high = np.full((n, node.count), -np.inf), np.full((n, node.count), np.inf)
     b_max = data.largest_b(data.nodes, relaxation.parameter if relaxation else None)
-    # Next to rest b goes with the way: of the least s'' it is twice as much.
+    # Next to rest b is 2 s times the least s''.
     s, length = data.grid.s, data.grid.s[-1]
     low[:, 0] = LEAST_B * np.minimum(s, length - s) / length
     high[:, 0] = np.maximum(b_max * speed_share / units.profile[0], 2 * LEAST_B)
     if data.grid.held:
         low[:, 0], high[:, 0] = LEAST_B, high[:, 0] / data.grid.sizes
-    # From rest and to rest, with no way back.
+    # From rest to rest, without reversal.
     if nlp.shape.motors.slow:
         low[[0, -1], node["a"]] = high[[0, -1], node["a"]] = 0.0
     else:
@@ -203,16 +203,14 @@ def make_bounds(
     if start is not None:
         _, a_unit, force = units.profile
         low[0, node["a"]] = max(start.least_a / a_unit, LEAST_B)
-        low[0, node["squeeze"]], high[0, node["squeeze"]] = start.low / force, start.high / force
+        low[0, node["lam"]], high[0, node["lam"]] = start.low / force, start.high / force
     for place, pin in zip((0, -1), pins, strict=True):
         if pin is not None:
-            low[place, node["squeeze"]] = high[place, node["squeeze"]] = pin / units.profile[2]
+            low[place, node["lam"]] = high[place, node["lam"]] = pin / units.profile[2]
     low[:, node["extra"]] = -np.inf if nlp.objective is Objective.MARGIN else 0.0
     rows, signs, bounds = data.limits.sides
-    # The constant part of what limits are of is on this side.
-    sides = (bounds + signs * tight - data.find_terms().constant[:, rows]) / units.of(data.limits)[
-        rows
-    ]
+    sides = bounds + signs * tight - data.find_terms().constant[:, rows]
+    sides /= units.of(data.limits)[rows]
     side = np.arange(len(rows)) if nlp.objective in SOFT else rows
     width = nlp.columns.g.sizes["limits"] // n
     rows_low, rows_high = np.full((n, width), -np.inf), np.full((n, width), np.inf)
@@ -223,26 +221,19 @@ def make_bounds(
     late = nlp.columns.g.sizes["duration"]
     equal = np.zeros(nlp.columns.g["limits"].start)
     longest = np.full(late, (duration or np.inf) / units.time)
-    quick_low, quick_high = _bound_motors(nlp, data, units, tightening.motors)
+    rates, commands = map(list, nlp.shape.motors)
+    torque, sizes = units.of(data.limits)[list(nlp.shape.torques)], nlp.columns.g.sizes
+    quickest, most = tightening.motors[:, 0], tightening.motors[:, 1] * data.torque_limit / torque
+    joins, begins = np.zeros(sizes["joins"]), np.full(sizes["begins"] // 2, LEAST_B)
+    within = np.concatenate([quickest[:, rates].ravel("F"), most[:, commands].ravel("F")])
+    motors_low = -within, joins, begins, -np.inf * begins
+    motors_high = within, joins, np.inf * begins, -begins
     return {
         "lbx": low[nlp.free],
         "ubx": high[nlp.free],
-        "lbg": np.concatenate([equal, rows_low.ravel(), np.full(late, -np.inf), quick_low]),
-        "ubg": np.concatenate([equal, rows_high.ravel(), longest, quick_high]),
+        "lbg": np.concatenate([equal, rows_low.ravel(), np.full(late, -np.inf), *motors_low]),
+        "ubg": np.concatenate([equal, rows_high.ravel(), longest, *motors_high]),
     }
-
-
-def _bound_motors(
-    nlp: PathNLP, data: PhaseData, units: Units, shares: Array
-) -> tuple[Array, Array]:
-    """Bounds of the rows of `motor_terms`."""
-    rates, commands = map(list, nlp.shape.motors)
-    sizes, torque = nlp.columns.g.sizes, units.of(data.limits)[list(nlp.shape.torques)]
-    most = shares[:, 1] * data.torque_limit / torque
-    within = np.concatenate([shares[:, 0, rates].ravel("F"), most[:, commands].ravel("F")])
-    joins, begins = np.zeros(sizes["joins"]), np.full(sizes["begins"] // 2, LEAST_B)
-    low = np.concatenate([-within, joins, begins, -np.inf * begins])
-    return low, np.concatenate([within, joins, np.inf * begins, -begins])
 
 
 def pack(
@@ -252,14 +243,13 @@ def pack(
     extra: float | Array,
     sizes: Array | float = 1.0,
 ) -> Array:
-    """Unknowns of the NLP, in its units, from a profile and what its objective adds.
+    """Unknowns of the NLP, in its units, from a profile, with the `sizes` of b on its grid.
 
-    That is the least margin [N], the relaxation, or shortfalls in the units of the limits. With
-    the `sizes` of b on its grid.
+    `extra` is the least margin [N], the relaxation, or shortfalls in the units of the limits.
     """
     table = np.empty(nlp.free.shape)
     table[:, nlp.columns.node["extra"]] = extra / _margin_unit(nlp, units)
-    table[:, :3] = np.column_stack([profile.b, profile.a, profile.squeeze]) / units.profile
+    table[:, :3] = np.column_stack([profile.b, profile.a, profile.lam]) / units.profile
     table[:, 0] /= sizes
     return np.asarray(table[nlp.free])
 
@@ -269,12 +259,12 @@ def _margin_unit(nlp: PathNLP, units: Units) -> float:
 
 
 def unpack(nlp: PathNLP, grid: Grid, x: Array, units: Units) -> tuple[Profile, float]:
-    """Profile of a solution, and the least margin [N] or the relaxation if that is an unknown.
+    """Profile of a solution, and the least margin [N] or the relaxation, if any.
 
-    b is integrated again from a, so that b' = 2 a holds to rounding and not to Ipopt's tolerance.
+    b is integrated again from a: b' = 2 a to rounding, not to Ipopt's tolerance.
     """
     table = np.zeros(nlp.free.shape)
     table[nlp.free] = x
-    a, squeeze = table[:, 1] * units.profile[1], table[:, 2] * units.profile[2]
+    a, lam = table[:, 1] * units.profile[1], table[:, 2] * units.profile[2]
     margin = x[-1] * _margin_unit(nlp, units) if nlp.objective in CHAINED else 0.0
-    return follow(grid, a, squeeze), float(margin)
+    return follow(grid, a, lam), float(margin)

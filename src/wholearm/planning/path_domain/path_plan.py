@@ -1,10 +1,8 @@
-"""Planning one-freedom phases: first guess, NLP, and limits that hold between nodes too.
+"""Minimum-time, minimum-effort and maximum-margin plans of phases with one degree of freedom.
 
-The NLP of `nlp` keeps the limits at its nodes. It is solved on few elements first. What it switches
-there says where elements should end, and what its limits miss between nodes, whether more of them
-are needed (`mesh`). Then limits are tightened by what they miss and the NLP is solved again from
-where it was, until nothing misses more than `MISS`. What that costs is an estimate of the error:
-the untightened solution is too good about as much as the tightened one is too bad.
+Direct collocation along the curve (`path_nlp`) with mesh refinement. Elements are made to end where
+the solution switches, and doubled where it violates limits between nodes (`refine`). Then limits
+are tightened by their violations until none exceeds `MISS`. The cost of that estimates the error.
 """
 
 from __future__ import annotations
@@ -25,49 +23,36 @@ from ..robust.robust_rows import Guide
 from .first_guess import guess_slowly
 from .interpolation import StalledError
 from .path_data import PhaseData, join
+from .path_mesh import SHIFTED
 from .path_motion import PathMotion
-from .refine import Plans, Round
+from .refine import Iterate, Plans
 from .speed_profile import is_hopeless
-from .task import Pins, Task
+from .task import Pins, Task, require_unique
 from .unique_start import WORTH, find_sure_start
-from .violations import MISS, ROUNDS
+from .violations import MISS, SOLVES
 
-_MESHES = 6
-"""Most times that the mesh is changed before limits are tightened."""
-_SLOW_MESHES = 3
-"""The same with slow motors, whose switches matter less the more there are."""
-_AGAIN = 3
-"""Most times that limits are tightened, each on a mesh that is finer than the one before."""
-_FINER = (1, 2, 4)
-"""Elements to try, over those that are asked for."""
-_SPREADS = 3
-"""Most plans within ranges, each with rows for the speed of the one before."""
-_WASTED = 0.02
-"""Share of the accuracy that limits may cost by being tightened more than they need."""
-_ROUGH = 1e-2
-"""Accuracy of plans that are made to see whether there are any."""
+_MESHES = 6  # most mesh changes before limits are tightened
+_RATE_LIMITED_MESHES = 3  # the same under rate limits
+_AGAIN = 3  # most times that limits are tightened, each on a finer mesh
+_REFINEMENTS = (1, 2, 4)  # factors on the wanted number of elements
+_LINEARIZATIONS = 3  # most robust plans, each with rows for the speed of the one before
+_WASTED = 0.02  # share of the accuracy that excessive tightening may cost
+ROUGH = 1e-2  # accuracy of plans that only have to exist
 
 
 class Stuck(NamedTuple):
-    """What has come instead of a plan."""
+    """Failure of a plan."""
 
     parts: list[PhaseData]  # the phases on their grids
     reason: str
-    # whether limits can be kept at the nodes, but not between them on so coarse a grid
-    between: bool
+    between: bool  # whether limits can be kept at the nodes of this grid, but not between them
 
 
 class _Solved(NamedTuple):
     """Plans of all phases, and the mesh and solution that they come from."""
 
     plans: Plans
-    round_: Round
-
-    @property
-    def guides(self) -> tuple[Guide, ...]:
-        """The motion along each curve."""
-        motions = [plan.motion for plan in self.plans]
-        return tuple(Guide(own.grid.s, *own.profile) for own in motions)
+    iterate: Iterate
 
 
 def plan_path(
@@ -94,142 +79,139 @@ def plan_curves(
 
     Parameters
     ----------
-    curves          with such speed ratios that the speed is the same on both sides of where two of
-                    them meet
+    curves          with speed ratios that make the speed continuous where two of them meet
     epsilon : [N]   least normal force
     phases          the phases' numbers, for messages
     duration : [s]  longest duration of all, for the objective `margin`
     explained       whether to find out why there is no plan, which takes longer than planning
-    pins : [N]      the squeeze at both ends, where it is given
+    pins : [N]      prescribed internal force at both ends, if any
 
     Raises
     ------
-    InfeasibleError  if no motion keeps the limits; names what is short, where, and what would have
-                     to change
-    JammingError     if friction jams a formation somewhere on its curve; an AmbiguityError if it
-                     lets other contact forces be possible
-    SolverError      if the solver stops without an answer
+    InfeasibleError  if no motion keeps the limits; names the violated ones and what would have to
+                     change
+    JammingError     if friction jams a formation somewhere on its curve; an AmbiguityError if
+                     contact forces are not unique
+    SolverError      if the solver does not converge
     """
     task = Task(curves, epsilon, options, phases, duration, pins=pins)
-    guides = tuple[Guide, ...]()
+    references = tuple[Guide, ...]()
 
     def replan(changed: Sequence[Curve], least: float) -> object:
-        changes = replace(task, curves=changed, epsilon=least, options=_roughen(options))
-        changes = replace(changes, guides=guides)
+        options = _roughen(task.options)
+        changes = replace(task, curves=changed, epsilon=least, options=options, guides=references)
         return _insist(_plan_finer(changes, insist=False))
 
     try:
-        found, guides = plan_within(task)
+        result, references = plan_within(task)
     except JammingError as jam:
         if not explained or len(curves) > 1:
             raise
         from .path_explain import explain_jam
 
         raise explain_jam(curves[0], epsilon, jam, replan) from None
-    if isinstance(found, Stuck):
+    if isinstance(result, Stuck):
         if not explained:
-            raise SolverError(found.reason)
-        error = explain_stuck(task, found, replan)
-        if guides and isinstance(error, SolverError):
-            # What guides is a plan without ranges; case: the block of two landings of a pentagon.
+            raise SolverError(result.reason)
+        error = explain_stuck(task, result, replan)
+        if references and isinstance(error, SolverError):
+            # The reference is a plan without ranges; case: the block of two landings of a pentagon.
             raise SolverError(
-                f"{found.reason} within the ranges of numbers; without them there is a plan: try "
+                f"{result.reason} within the ranges of numbers; without them there is a plan: try "
                 f"--robust {options.robust / 2:g}, or narrower [uncertainty], where 0 leaves a "
                 "number as it is"
             )
         raise error
-    if options.goal is Objective.MARGIN and found.plans[0].value < task.lost:
+    if options.goal is Objective.MARGIN and result.plans[0].value < task.lost:
         least = SolverError(f"{task.name}: the margin found is below epsilon")
         raise _explain_duration(task) or least
-    found = _bound_error(task, found)
-    # Slow motors begin a motion as they leave what holds the object.
+    plans = _bound_error(task, result.plans)
+    # Rate-limited torques start at the limit of what friction can hold.
     surely = task.is_held or (options.goal is Objective.TIME and not options.ranges)
-    return found.plans if surely else _leave_rest(found)
+    return plans if surely else _leave_rest(plans, result.iterate)
 
 
-def _bound_error(task: Task, found: _Solved) -> _Solved:
-    """The plans with the gap to a lower bound of their time as their error, where that says more.
+def _bound_error(task: Task, plans: Plans) -> Plans:
+    """The plans, with the gap to a lower bound of the least time as error where that says more.
 
-    Limits are tightened and switches moved by estimates alone. They are checked where they are
-    above the accuracy, or where that is below that of the default.
+    Estimated errors are checked above the accuracy, or where that is below the default.
     """
-    options, error = task.options, found.plans[0].error
-    if options.goal is not Objective.TIME or options.ranges or task.is_held or task.quick:
-        return found
+    options, error = task.options, plans[0].error
+    if options.goal is not Objective.TIME or options.ranges or task.is_held or task.unlimited:
+        return plans
     if error <= options.accuracy and options.accuracy >= DEFAULT_ACCURACY:
-        return found
+        return plans
     from ..lower_bound.lower_bound import bound_least_time
 
     bound = bound_least_time(task.curves, task.epsilon)
     if bound is None or bound.value <= 0:
-        return found
-    # Limits may be missed a little, by which a plan can be below the bound.
-    gap = max(sum(plan.value for plan in found.plans) / bound.value - 1, 0.0)
-    return found._replace(plans=[plan._replace(error=gap) for plan in found.plans])
+        return plans
+    # A plan may be below the bound by the violations that it is allowed.
+    gap = max(sum(plan.value for plan in plans) / bound.value - 1, 0.0)
+    return [plan._replace(error=gap) for plan in plans]
 
 
 def explain_stuck(
-    task: Task, found: Stuck, replan: Callable[[Sequence[Curve], float], object]
+    task: Task, stuck: Stuck, replan: Callable[[Sequence[Curve], float], object]
 ) -> WholearmError:
-    """Why there is no plan: slow motors, the duration, or what is short."""
-    from .path_explain import explain, explain_motors
+    """Why there is no plan: torque rate limits, the duration, or other limits."""
+    from .path_explain import explain, explain_rate_limits
 
     if task.is_held:
-        return explain_motors(task, found.parts, found.reason, plan_curves)
-    late, slow = _explain_duration(task), guess_slowly(join(found.parts))
-    return late or explain(found.parts, *slow, task.phases, found.reason, replan)
+        return explain_rate_limits(task, stuck.parts, stuck.reason, plan_curves)
+    late, slow = _explain_duration(task), guess_slowly(join(stuck.parts))
+    return late or explain(stuck.parts, *slow, task.phases, stuck.reason, replan)
 
 
 def plan_within(task: Task) -> tuple[_Solved | Stuck, tuple[Guide, ...]]:
-    """Plan within the ranges that there are, from the plan without them on; also near what.
+    """Plan within ranges by successive linearization, and the reference of the last one.
 
-    Rows are those for the speed of the plan before. What other signs than theirs would miss is
-    tightened, and where that costs more than it may, the next plan has better ones.
+    The first reference is a plan without ranges. Each next plan has rows for the speed of the one
+    before. Violations by other signs than theirs are tightened; if that costs too much, again.
     """
-    options = task.options
+    options, references = task.options, tuple[Guide, ...]()
     if not options.ranges:
-        return _plan_finer(task), ()
-    bare = replace(_roughen(options), ranges={})
-    found, guides = _plan_finer(replace(task, options=bare)), tuple[Guide, ...]()
+        return _plan_finer(task), references
+    result = _plan_finer(replace(task, options=replace(_roughen(options), ranges={})))
     best: _Solved | None = None
-    for _ in range(_SPREADS):
-        if isinstance(found, Stuck):
+    for _ in range(_LINEARIZATIONS):
+        if isinstance(result, Stuck):
             break
-        guides = found.guides
-        found = _plan_finer(replace(task, guides=guides))
-        if isinstance(found, _Solved):
-            best = found
-            if found.plans[0].error <= options.accuracy:
+        motions = [plan.motion for plan in result.plans]
+        references = tuple(Guide(motion.grid.s, *motion.profile) for motion in motions)
+        result = _plan_finer(replace(task, guides=references))
+        if isinstance(result, _Solved):
+            best = result
+            if result.plans[0].error <= options.accuracy:
                 break
-    return best or found, guides
+    return best or result, references
 
 
-def _leave_rest(found: _Solved) -> Plans:
-    """The plans, or others with a start that friction cannot hold, if it can hold theirs.
+def _leave_rest(plans: Plans, iterate: Iterate) -> Plans:
+    """The plans, or if friction can hold their start, others with one that it cannot hold.
 
-    Those of least time push off as hard as limits allow, but not as if friction were larger.
+    Those of least time start with the largest s'', but not as if friction were larger.
     """
-    plans, task = found.plans, found.round_.task
-    data, margin = found.round_.parts[0], 0.0
-    if task.options.goal is Objective.MARGIN:
+    task, margin = iterate.task, 0.0
+    goal, ranges = task.options.goal, task.options.ranges
+    if goal is Objective.MARGIN:
         margin = plans[0].value - task.epsilon
-    ranges = task.options.ranges
-    start = find_sure_start(data, plans[0].motion.profile, margin, ranges)
+    start = find_sure_start(iterate.parts[0], plans[0].motion.profile, margin, ranges)
     if start is None:
         return plans
-    bounded = replace(found.round_, task=replace(task, start=start)).solve()
+    bounded = replace(iterate, task=replace(task, start=start)).solve()
     other = bounded if isinstance(bounded, str) else _enforce_between(bounded)
     if not isinstance(other, _Solved):
         return plans
-    loss = sum(own.value for own in plans) - sum(own.value for own in other.plans)
-    if task.options.goal is Objective.EFFORT:
+    value = sum(plan.value for plan in plans)
+    loss = value - sum(plan.value for plan in other.plans)
+    if goal is Objective.EFFORT:
         loss = -loss
-    most = np.inf if ranges else WORTH * sum(own.value for own in plans)
-    return other.plans if loss <= most else plans
+    return other.plans if loss <= (np.inf if ranges else WORTH * value) else plans
 
 
 def _explain_duration(task: Task) -> InfeasibleError | None:
-    """Say so if the duration is shorter than the least time, and which one would do."""
+    """The error if the duration is shorter than the least time, with one that would do."""
     duration = task.duration
     if duration is None:
         return None
@@ -241,7 +223,6 @@ def _explain_duration(task: Task) -> InfeasibleError | None:
     least = sum(plan.value for plan in plans)
     if least <= duration:
         return None
-
     rough = replace(task, options=_roughen(task.options))
 
     def can_plan(_: Parameter, value: float) -> bool:
@@ -250,8 +231,9 @@ def _explain_duration(task: Task) -> InfeasibleError | None:
         except SolverError:
             return False
 
-    own = Parameter("duration", duration, "s", 1, "duration")
-    changes = find_changes([own], lambda _: least, can_plan)
+    changes = find_changes(
+        [Parameter("duration", duration, "s", 1, "duration")], lambda _: least, can_plan
+    )
     return InfeasibleError(
         f"{name_phases(task.phases, 'infeasible')}: duration = {duration:g} s is "
         f"{least - duration:.3g} s shorter than the least time; {describe_changes(changes)}",
@@ -260,106 +242,105 @@ def _explain_duration(task: Task) -> InfeasibleError | None:
 
 
 def _roughen(options: PlanOptions) -> PlanOptions:
-    """Options for plans of which only matters that there are any."""
-    return replace(options, accuracy=max(options.accuracy, _ROUGH))
+    """Options for plans that only have to exist."""
+    return replace(options, accuracy=max(options.accuracy, ROUGH))
 
 
-def _insist(found: _Solved | Stuck) -> Plans:
+def _insist(result: _Solved | Stuck) -> Plans:
     """The plans, or an error."""
-    if isinstance(found, Stuck):
-        raise SolverError(found.reason)
-    return found.plans
+    if isinstance(result, Stuck):
+        raise SolverError(result.reason)
+    return result.plans
 
 
 def _plan_finer(task: Task, insist: bool = True) -> _Solved | Stuck:
-    """Plan, on a finer grid where limits that hold between the nodes leave nothing, or no time.
+    """Plan, with two and four times the elements if tightened limits leave no motion, or no time.
 
-    What so few elements cannot keep at their nodes, twice as many may: they are tried if that is
-    insisted on. What is said of why there is no plan is said of the fewer.
+    If limits cannot be kept at the nodes, twice as many are tried only to `insist`. The failure
+    reported is that of the fewer elements.
     """
-    task.require_unique()
+    for curve, phase in zip(task.curves, task.phases, strict=True):
+        require_unique(curve, task.options.uniqueness_margin, phase)
     stuck: Stuck | None = None
-    for finer in _FINER:
-        found = _plan(task, finer, insist)
-        if isinstance(found, Stuck):
-            if not found.between and (stuck or not insist):
-                return stuck or found
-            stuck = found
-        elif task.options.goal is not Objective.MARGIN or found.plans[0].value >= task.lost:
+    for refinement in _REFINEMENTS:
+        result = _plan(task, refinement, insist)
+        if isinstance(result, Stuck):
+            if not result.between and (stuck or not insist):
+                return stuck or result
+            stuck = result
+        elif task.options.goal is not Objective.MARGIN or result.plans[0].value >= task.lost:
             break
-    return found
+    return result
 
 
-def _plan(task: Task, finer: int = 1, insist: bool = True) -> _Solved | Stuck:
-    """Solve on meshes that suit the plan more and more, and make limits hold between nodes too.
-
-    If that is not insisted on, only where a sweep has found a motion.
-    """
-    round_ = Round.begin(task, finer)
-    if not round_.is_kept and (not insist or is_hopeless(round_.data)):
-        return Stuck(round_.parts, f"{task.name}: no motion keeps the limits", between=False)
-    kept = Stuck(round_.parts, "", between=False)
-    for found in round_.solve_first():
-        if isinstance(found, str):
-            kept = Stuck(round_.parts, f"{task.name}: {found}", between=False)
+def _plan(task: Task, refinement: int = 1, insist: bool = True) -> _Solved | Stuck:
+    """Solve with mesh refinement; unless to `insist`, only where a sweep has found a motion."""
+    first = Iterate.begin(task, refinement)
+    if not first.is_kept and (not insist or is_hopeless(first.data)):
+        return Stuck(first.parts, f"{task.name}: no motion keeps the limits", between=False)
+    result: _Solved | Stuck = Stuck(first.parts, "", between=False)
+    for solved in first.solve_first():
+        if isinstance(solved, str):
+            result = Stuck(first.parts, f"{task.name}: {solved}", between=False)
             continue
-        refined = _refine(found)
-        if isinstance(refined, _Solved):
-            return refined
-        kept = refined
-    return kept
+        result = _refine(solved)
+        if isinstance(result, _Solved):
+            break
+    return result
 
 
-def _refine(found: Round) -> _Solved | Stuck:
-    """Suit the mesh to a solution until limits hold between nodes, at no more than it may cost."""
+def _refine(iterate: Iterate) -> _Solved | Stuck:
+    """Adapt the mesh and tighten limits between nodes until the estimated error is small enough."""
     best: _Solved | Stuck | None = None
     for _ in range(_AGAIN):
-        found = _suit(found)
-        kept = _enforce_between(found)
-        if best is not None and isinstance(kept, Stuck):
+        iterate = _adapt_mesh(iterate)
+        result = _enforce_between(iterate)
+        if best is not None and isinstance(result, Stuck):
             return best
-        best = kept
-        if isinstance(kept, Stuck) or kept.plans[0].error <= found.task.options.accuracy:
+        best = result
+        if isinstance(result, Stuck) or result.plans[0].error <= iterate.task.options.accuracy:
             break
-        better = found.adapt(dearer=True)[1]
-        if better is not None and better.elements == found.elements and found.data.grid.held:
+        better = iterate.adapt(dearer=True)[1]
+        if better is not None and better.elements == iterate.elements and iterate.data.grid.held:
             break
         refined = better.solve() if better else ""
         if isinstance(refined, str):
             break
-        found = refined
+        iterate = refined
     assert best is not None
     return best
 
 
-def _suit(found: Round) -> Round:
-    """Change the mesh until switches stay where they are and little is missed between nodes."""
-    for _ in range(_SLOW_MESHES if found.data.grid.held else _MESHES):
-        found, better = found.adapt()
+def _adapt_mesh(iterate: Iterate) -> Iterate:
+    """Adapt the mesh until switches converge and violations between nodes cost little."""
+    for _ in range(_RATE_LIMITED_MESHES if iterate.data.grid.held else _MESHES):
+        iterate, better = iterate.adapt()
         if better is None:
             break
         refined = better.solve()
         if isinstance(refined, str):
-            return replace(found, shift=better.shift)
-        if found.is_split and refined.merit > found.merit:
-            return found.keep_before(refined)
-        found = refined
-    return found
+            return replace(iterate, shift=better.shift)
+        if iterate.is_split and refined.merit > iterate.merit:
+            # Its breaks, off the switches, lose no more than the two differ by.
+            loss = (refined.merit - iterate.merit) / iterate.value
+            return replace(iterate, shift=min(refined.shift, loss / SHIFTED))
+        iterate = refined
+    return iterate
 
 
-def _enforce_between(round_: Round) -> _Solved | Stuck:
+def _enforce_between(iterate: Iterate) -> _Solved | Stuck:
     """Tighten limits until they hold between nodes too."""
-    task, data = round_.task, round_.data
-    wasteful = float(round_.wasted.sum()) > _WASTED * task.options.accuracy
-    for _ in range(ROUNDS):
-        misses = round_.misses
-        if misses.find_worst(data) <= MISS and not wasteful:
+    task, data = iterate.task, iterate.data
+    excessive = float(iterate.wasted.sum()) > _WASTED * task.options.accuracy
+    for _ in range(SOLVES):
+        misses = iterate.misses
+        if misses.find_worst(data) <= MISS and not excessive:
             try:
-                return _Solved(round_.summarise(), round_)
+                return _Solved(iterate.summarise(), iterate)
             except StalledError as stall:
-                return Stuck(round_.parts, f"{task.name}: {stall}", between=True)
-        found = round_.tighten(wasteful).solve()
-        if isinstance(found, str):
-            return Stuck(round_.parts, f"{task.name}: {found}", between=True)
-        round_, wasteful = found, False
-    return Stuck(round_.parts, f"{task.name}: {misses.describe(data)}", between=True)
+                return Stuck(iterate.parts, f"{task.name}: {stall}", between=True)
+        solved = iterate.tighten(excessive).solve()
+        if isinstance(solved, str):
+            return Stuck(iterate.parts, f"{task.name}: {solved}", between=True)
+        iterate, excessive = solved, False
+    return Stuck(iterate.parts, f"{task.name}: {misses.describe(data)}", between=True)

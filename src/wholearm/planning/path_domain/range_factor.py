@@ -1,4 +1,7 @@
-"""How wide ranges may be along curves: as wide as a sweep finds a motion, and then a plan."""
+"""Largest factor on ranges with which phases have a plan, by bisection.
+
+The minimum-time sweep decides each step; then plans are tried with ever smaller factors.
+"""
 
 from __future__ import annotations
 
@@ -11,19 +14,14 @@ from ...common.errors import InfeasibleError, SolverError
 from ...geometry.curve import Curve
 from ..options import PlanOptions
 from ..robust.robust_rows import Guide
-from .path_plan import plan_curves
-from .refine import Round
+from .path_plan import ROUGH, plan_curves
+from .refine import Iterate
 from .speed_profile import Fastest
 from .task import Task
 
-_CLOSE = 0.01
-"""Error of the factor, relatively."""
-_LESS = 0.98
-"""Factor from one plan that is tried to the next."""
-_TRIES = 8
-"""Most plans that are tried."""
-_ROUGH = 1e-2
-"""Accuracy of plans that are made to see whether there are any."""
+_CLOSE = 0.01  # error of the factor, relatively
+_LESS = 0.98  # factor from one tried plan to the next
+_TRIES = 8  # most plans that are tried
 
 
 def find_widest(
@@ -44,22 +42,17 @@ def find_widest(
     guides         a motion along each curve
     most           the largest factor that is tried
     """
-
-    def find_motion(factor: float, near: Sequence[Guide]) -> tuple[Guide, ...] | None:
-        task = Task(curves, epsilon, scale(factor), phases, None, guides=tuple(near))
-        found = Round.begin(task, 1).fastest
-        return None if found is None else _cut(found, curves)
-
-    low, high, near, middle = 0.0, np.inf, tuple(guides), min(1.0, most)
+    low, high, middle = 0.0, np.inf, min(1.0, most)
     while low < most and (np.isinf(high) or high - low > _CLOSE * high):
-        found = find_motion(middle, near)
-        if found is None:
+        task = Task(curves, epsilon, scale(middle), phases, None, guides=tuple(guides))
+        fastest = Iterate.begin(task, 1).fastest
+        if fastest is None:
             high = middle
         else:
-            low, near = middle, found
+            low, guides = middle, _cut(fastest, curves)
         middle = min(2 * low, most) if np.isinf(high) else (low + high) / 2
     for _ in range(_TRIES):
-        options = replace(scale(low), accuracy=_ROUGH)
+        options = replace(scale(low), accuracy=ROUGH)
         try:
             plan_curves(curves, epsilon, options, phases, explained=False)
         except (InfeasibleError, SolverError):
@@ -69,12 +62,12 @@ def find_widest(
     return 0.0
 
 
-def _cut(found: Fastest, curves: Sequence[Curve]) -> tuple[Guide, ...]:
-    """A fastest motion along each curve."""
+def _cut(fastest: Fastest, curves: Sequence[Curve]) -> list[Guide]:
+    """A minimum-time profile along each curve."""
     guides, start = [], 0.0
     for curve in curves:
-        s = np.linspace(0.0, curve.length, len(found.s))
-        b, none = np.interp(s + start, found.s, found.b), np.zeros_like(s)
+        s = np.linspace(0.0, curve.length, len(fastest.s))
+        b, none = np.interp(s + start, fastest.s, fastest.b), np.zeros_like(s)
         guides.append(Guide(s, none, b, none))
         start += curve.length
-    return tuple(guides)
+    return guides

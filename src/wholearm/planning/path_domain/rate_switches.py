@@ -1,8 +1,8 @@
-"""Where the rates of torques step along a motion with slow motors.
+"""Switches of torque rates along a motion under rate limits, and ramps for a plan without them.
 
-Between switches torques are smooth in time, those at their largest rate straight lines. An element
-in which a torque begins or ends such a line has a polynomial instead of a step of the rate. The
-step has to be where the line meets what goes on beside it.
+Between switches torques are smooth in time, and straight lines at the largest rate. An element in
+which such a ramp starts or ends has a polynomial instead of a step of the rate: the switch is where
+the line meets the torque beside it.
 """
 
 from __future__ import annotations
@@ -19,34 +19,22 @@ from .path_motion import PathMotion
 from .rate_terms import find_torques
 from .switches import Switch
 
-_LONGER = 1.05
-"""Factor on the least time of ramps, so that they are inside the limits."""
-_STEP = 1e-2
-"""Least step of a torque that gets a ramp, over its limit."""
-_LAGS = 3.0
-"""Time that a lag takes for a step of the size of the torque limit, over the lag."""
-_BRIEF = 0.3
-"""Largest part of the motion's time that all ramps may take together."""
-_RAMP_REACH = 0.3
-"""Least way between a ramp and another end of an element, over that of the ramp."""
-_HALF = 0.5
-"""Rate, over the largest one, from which on a torque is on its way to change at that."""
-_SLOW = 0.1
-"""Rate, over the largest one, up to which it is not."""
-_KINK = 2.0
-"""Least step of a rate that no motor limits, over the torque limit in the motion's time."""
-_NEAR = 0.06
-"""Least time between two switches, over that in which a torque changes by its limit."""
-_APART = 4e-3
-"""The same, over the duration, where that is less."""
-_LATE = 0.4
-"""Least part of the ramp at an end that an element takes: a short one there hides what it holds."""
-_MOST = 24
-"""Most switches of a phase: those beyond flicker."""
+_LONGER = 1.05  # factor on the least time of ramps, so that they are inside the limits
+_STEP = 1e-2  # least step of a torque that gets a ramp, over its limit
+_LAGS = 3.0  # time of a step by the torque limit, over the lag
+_BRIEF = 0.3  # largest share of all ramps in the duration
+_RAMP_REACH = 0.3  # least distance of a break from a ramp, over the ramp's length
+_RAMPED = 0.5  # rate, over the largest one, above which a torque is in a ramp
+_FLAT = 0.1  # rate, over the largest one, up to which it is not
+_KINK = 2.0  # least step of a rate that counts, times the duration, over the torque limit
+_NEAR = 0.06  # least time between switches, over that of a ramp by the torque limit
+_APART = 4e-3  # the same over the duration, where that is less
+_LATE = 0.4  # least length of a first or last element, over that of the ramp there
+_MOST = 24  # most switches of a phase
 
 
-def find_motor_switches(part: PhaseData, profile: Profile) -> list[Switch]:
-    """Where torques of a phase begin to change at other rates, as places along its curve."""
+def find_rate_switches(part: PhaseData, profile: Profile) -> list[Switch]:
+    """Places along a phase's curve where torque rates step."""
     motion = PathMotion(part.curve, part.grid, profile)
     if motion.stalls:
         return []
@@ -57,34 +45,33 @@ def find_motor_switches(part: PhaseData, profile: Profile) -> list[Switch]:
     most = np.maximum(np.abs(rates).max(axis=(0, 1)), part.torque_limit / motion.duration)
     largest = np.where(np.isfinite(part.rate_limit), part.rate_limit, most)
     shares = (rates / largest).reshape(-1, 2)
-    torques = torques.reshape(-1, 2)
     owner = np.repeat(part.nonempty // (DEGREE + 1), len(looks))
-    given = zip(torques.T, shares.T, largest, strict=True)
-    steps = [_find_ramps(t, owner, *own) for own in given]
+    columns = zip(torques.reshape(-1, 2).T, shares.T, largest, strict=True)
+    steps = [_find_ramps(t, owner, *column) for column in columns]
     ends = np.arange(len(looks) - 1, len(t) - 1, len(looks))
     jumps = np.abs(rates.reshape(-1, 2)[ends + 1] - rates.reshape(-1, 2)[ends])
     kinks = t[ends[(jumps * motion.duration > _KINK * part.torque_limit).any(axis=1)]]
     quickest = float((part.torque_limit / largest).min())
     apart = min(_NEAR * quickest, _APART * motion.duration)
     every = _clear_ends(np.concatenate([*steps, kinks]), motion.duration, quickest)
-    found = _thin_out(every, motion.duration, apart)[:_MOST]
-    if not len(found):
-        return []
-    return [Switch(float(place), True) for place in _locate(part, motion, profile, found)]
+    times = _thin_out(every, motion.duration, apart)[:_MOST]
+    return [Switch(float(s), True) for s in _locate(part, motion, times)] if len(times) else []
 
 
 def _find_ramps(
     t: Array, owner: NDArray[np.int64], tau: Array, shares: Array, largest: float
 ) -> Array:
-    """When a torque begins and ends to change at its largest rate, of which rates are `shares`.
+    """Times at which ramps of a torque start and end.
 
-    Instants lie in elements that are their `owner`.
+    Parameters
+    ----------
+    t, owner, tau, shares : (n,)  samples: time, element, torque, and rate over the `largest`
     """
-    level = np.where(np.abs(shares) > _HALF, np.sign(shares), 0.0)
+    level = np.where(np.abs(shares) > _RAMPED, np.sign(shares), 0.0)
     ends = np.flatnonzero(np.diff(np.concatenate([[0.0], level, [0.0]])))
     starts, stops = ends[:-1], ends[1:] - 1
     ramps = level[starts] != 0
-    starts, stops, found = starts[ramps], stops[ramps], list[float]()
+    starts, stops, switches = starts[ramps], stops[ramps], list[float]()
     borders = np.concatenate([[0], starts, stops, [len(t) - 1]])
     for first, last in zip(starts.tolist(), stops.tolist(), strict=True):
         k = first + int(np.abs(shares[first : last + 1]).argmax())
@@ -95,23 +82,22 @@ def _find_ramps(
             if not len(beyond):
                 continue
             looks = np.arange(end, beyond[np.abs(beyond - end).argmin()] + step, step)
-            calm = np.abs(shares[looks])
-            # An element in which the line ends swings: others are believed first.
-            slow = calm < _SLOW
-            steady = slow & ~np.isin(owner[looks], owner[looks][~slow])
-            slow = steady if steady.any() else slow
-            beside = looks[int(np.argmax(slow) if slow.any() else calm.argmin())]
-            rise = tau[beside] - level - slope * largest * (t[beside] - middle)
-            change = (slope - shares[beside]) * largest
+            rate = np.abs(shares[looks])
+            # The polynomial of an element with a switch oscillates: others are preferred.
+            flat = rate < _FLAT
+            steady = flat & ~np.isin(owner[looks], owner[looks][~flat])
+            flat = steady if steady.any() else flat
+            neighbour = looks[int(np.argmax(flat) if flat.any() else rate.argmin())]
+            rise = tau[neighbour] - level - slope * largest * (t[neighbour] - middle)
+            change = (slope - shares[neighbour]) * largest
             if change:
-                found.append(float(t[beside] + rise / change))
-    return np.array(found)
+                switches.append(float(t[neighbour] + rise / change))
+    return np.array(switches)
 
 
-def _locate(part: PhaseData, motion: PathMotion, profile: Profile, t: Array) -> Array:
-    """Places that are passed at some times within a motion [m]."""
+def _locate(part: PhaseData, motion: PathMotion, t: Array) -> Array:
+    """Places at some times within a motion [m]; ends of elements without rounding."""
     places, edges = motion.locate(t)[0], part.grid.edges[1:, 0]
-    # Ends of elements stay where they are, whatever rounding makes of the way there and back.
     ends = motion.times.reshape(len(edges) + 1, -1)[1:, 0]
     near = np.abs(t[:, None] - ends).argmin(axis=1)
     same = np.abs(t - ends[near]) < 1e-9 * motion.duration
@@ -119,79 +105,72 @@ def _locate(part: PhaseData, motion: PathMotion, profile: Profile, t: Array) -> 
 
 
 def _clear_ends(t: Array, duration: float, quickest: float) -> Array:
-    """Instants without those early in the ramps at both ends of a motion."""
+    """Times without those early in the ramps at both ends of a motion."""
     for left in (t, duration - t):
         longest = left[left < min(quickest, duration / 2)].max(initial=0.0)
         t = np.where(left < _LATE * longest, np.nan, t)
     return t[np.isfinite(t)]
 
 
-def _thin_out(found: Array, duration: float, apart: float) -> Array:
-    """Instants within a motion, increasing, none of which is near another one."""
+def _thin_out(times: Array, duration: float, apart: float) -> Array:
+    """Times within a motion, increasing, none of which is near another one."""
     kept = list[float]()
-    for t in found.tolist():
-        near = min(abs(t - own) for own in [0.0, duration, *kept])
-        if near > apart:
+    for t in times.tolist():
+        if min(abs(t - other) for other in [0.0, duration, *kept]) > apart:
             kept.append(t)
     return np.sort(kept)
 
 
 class Ramped(NamedTuple):
-    """What a plan of quick motors says about one of slow ones."""
+    """Ramps in place of the torque steps of a plan without rate limits."""
 
-    spans: Array  # (r, 2) [m]: where ramps begin and end
-    holds: Array  # (2,) [N]: the squeeze before and after the motion
+    spans: Array  # (r, 2) [m]: where ramps start and end, along all curves
+    holds: Array  # (2,) [N]: the internal force before and after the motion
 
-    def find_breaks(self, known: Array) -> list[Switch]:
-        """Where elements are to end: with ramps, and where they did, at `known` places, but near.
-
-        All of it along all curves [m].
-        """
-        way = np.diff(self.spans)
-        near = (known > self.spans[:, :1] - _RAMP_REACH * way) & (
-            known < self.spans[:, 1:] + _RAMP_REACH * way
-        )
-        places = np.concatenate([self.spans.ravel()[1:-1], known[~near.any(axis=0)]])
+    def find_breaks(self, breaks: Array) -> list[Switch]:
+        """Breaks at the ends of ramps, and the former ones that are not near a ramp [m]."""
+        reach = _RAMP_REACH * np.diff(self.spans)
+        near = (breaks > self.spans[:, :1] - reach) & (breaks < self.spans[:, 1:] + reach)
+        places = np.concatenate([self.spans.ravel()[1:-1], breaks[~near.any(axis=0)]])
         return [Switch(float(place), True) for place in np.sort(places)]
 
     def guess(self, old: Grid, profile: Profile, new: Grid) -> Profile:
-        """The quick plan, a `profile` on a grid, with ramps on another grid."""
-        a, _, squeeze = Elements(old, profile).move(new)
-        found = [a.copy(), squeeze.copy()]
+        """A `profile` on a grid, with ramps, on another grid."""
+        a, _, lam = Elements(old, profile).move(new)
+        ramped, holds = (a.copy(), lam.copy()), ((0.0, 0.0), self.holds.tolist())
         middles = np.repeat(new.edges.mean(axis=1), DEGREE + 1)
         for k, (start, stop) in enumerate(self.spans.tolist()):
-            own = np.flatnonzero((middles > start) & (middles < stop))
-            if not len(own):
+            inside = np.flatnonzero((middles > start) & (middles < stop))
+            if not len(inside):
                 continue
-            beside = np.clip([own[0] - 1, own[-1] + 1], 0, len(a) - 1)
-            share = (new.s[own] - start) / (stop - start)
-            values, presses = a[beside], squeeze[beside]
-            if k == 0:
-                share = np.cbrt(share)
-                values[0], presses[0] = 0.0, self.holds[0]
-            elif k == len(self.spans) - 1:
-                share = 1 - np.cbrt(1 - share)
-                values[1], presses[1] = 0.0, self.holds[1]
-            found[0][own] = values[0] + share * (values[1] - values[0])
-            found[1][own] = presses[0] + share * (presses[1] - presses[0])
-        return follow(new, *found)
+            neighbour = np.clip([inside[0] - 1, inside[-1] + 1], 0, len(a) - 1)
+            share = (new.s[inside] - start) / (stop - start)
+            end = 0 if k == 0 else 1 if k == len(self.spans) - 1 else None
+            if end is not None:
+                share = 1 - np.cbrt(1 - share) if end else np.cbrt(share)
+            for column, hold in zip(ramped, holds, strict=True):
+                values = column[neighbour]
+                if end is not None:
+                    values[end] = hold[end]
+                column[inside] = values[0] + share * (values[1] - values[0])
+        return follow(new, *ramped)
 
 
 def ramp_up(
     data: PhaseData,
     profile: Profile,
-    lasts: float,
+    duration: float,
     pins: tuple[float | None, float | None],
 ) -> Ramped | None:
-    """Ramps in place of the steps of a plan of quick motors; None if they would take too long.
+    """Ramps in place of the torque steps of a `profile`; None if they would take too long.
 
     Parameters
     ----------
-    profile      at its nodes
-    lasts : [s]  the duration of that
-    pins : [N]   squeezes before and after the motion, where these are given
+    duration : [s]  of the profile
+    pins : [N]      prescribed internal forces before and after the motion, if any
     """
-    slowness = _find_slowness(data)
+    lag = _LAGS * data.curve.formation.scene.actuator_lag / data.torque_limit
+    slowness = _LONGER * np.maximum(1 / data.rate_limit, lag)  # (2,) [s/(N m)]: least, of a step
     tau = data.nodes.forces.tau(*profile).reshape(-1, DEGREE + 1, 2)
     holds = [_hold(data, tau[place, place], slowness, place, pins[place]) for place in (0, -1)]
     first = np.vstack([holds[0][1][None], tau[:, -1]])
@@ -199,12 +178,12 @@ def ramp_up(
     steps = np.abs(last - first)
     times = (steps * slowness).max(axis=1)
     large = (steps / data.torque_limit).max(axis=1) > _STEP
-    if times[large].sum() > _BRIEF * lasts:
+    if times[large].sum() > _BRIEF * duration:
         return None
     inner = np.flatnonzero(large[1:-1])
     s, speed = data.grid.edges[1:, 0], np.sqrt(profile.b.reshape(-1, DEGREE + 1)[1:, 0])
     half = speed[inner] * times[1:-1][inner] / 2
-    ways = np.abs(profile.a[[0, -1]]) * np.maximum(times[[0, -1]], 1e-4 * lasts) ** 2 / 6
+    ways = np.abs(profile.a[[0, -1]]) * np.maximum(times[[0, -1]], 1e-4 * duration) ** 2 / 6
     length = data.grid.s[-1]
     inside = np.stack([s[inner] - half, s[inner] + half], axis=1).tolist()
     spans = [[0.0, ways[0]]]
@@ -218,17 +197,10 @@ def ramp_up(
     return Ramped(np.array(spans), np.array([hold[0] for hold in holds]))
 
 
-def _find_slowness(data: PhaseData) -> Array:
-    """Least time for a step of each torque, over the step, shape (2,) [s/(N m)]."""
-    lag = _LAGS * data.curve.formation.scene.actuator_lag / data.torque_limit
-
-    return np.asarray(_LONGER * np.maximum(1 / data.rate_limit, lag))
-
-
 def _hold(
     data: PhaseData, tau: Array, slowness: Array, place: int, pin: float | None
 ) -> tuple[float, Array]:
-    """The squeeze that holds the object at an end with torques near `tau`, and these torques."""
+    """The internal force that holds the object at an end with torques near `tau`, and those."""
     forces = data.nodes.forces
     level, press = forces.T0[place], forces.Tl[place]
     if pin is None:

@@ -1,9 +1,8 @@
-"""Rows of the planning NLP for motors that are not infinitely quick.
+"""Rows of the planning NLP for torque rate limits and actuator lag.
 
 With the local variable y of an element (`elements`), d tau / dt = (d tau / dy) (dy / dt). At the
-nodes d tau / dy is that of the polynomial through the torques there, and dy / dt the pace over the
-element's length. Where two elements meet the torques are the same: there, and where a direction
-reverses, s'' and the squeeze take the steps that friction takes.
+nodes d tau / dy is that of the polynomial through the torques there. Torques are continuous where
+two elements meet; there, and where a direction reverses, s'' and the internal force may step.
 """
 
 from __future__ import annotations
@@ -37,13 +36,12 @@ if TYPE_CHECKING:
     from ..columns import Symbols
 
 
-_LOOKS = 21
-"""Instants of each interval at which rates are looked at."""
+_LOOKS = 21  # samples of the rates in each interval
 _NODES = DEGREE + 1
 
 
 class MotorShape(NamedTuple):
-    """Joints whose torques have a largest rate, and those whose torques follow a command."""
+    """Joints with a torque rate limit, and those whose torques lag behind a command."""
 
     rates: tuple[int, ...] = ()
     commands: tuple[int, ...] = ()
@@ -52,9 +50,9 @@ class MotorShape(NamedTuple):
     def of(scene: Scene) -> MotorShape:
         """The shape of a scene's motors."""
         if not scene.has_slow_motors:
-            return QUICK
+            return UNLIMITED
         limited, lags = np.isfinite(scene.torque_rate_limit), scene.actuator_lag > 0
-        return MotorShape(*(tuple(np.flatnonzero(own).tolist()) for own in (limited, lags)))
+        return MotorShape(*(tuple(np.flatnonzero(mask).tolist()) for mask in (limited, lags)))
 
     @property
     def slow(self) -> tuple[int, ...]:
@@ -72,18 +70,17 @@ class MotorShape(NamedTuple):
         }
 
 
-QUICK = MotorShape()
-"""Motors whose torques may step."""
+UNLIMITED = MotorShape()  # motors whose torques may step
 
 
 def list_kinds(count: int, held: bool) -> list[int]:
-    """Kinds of so many elements from rest to rest."""
+    """Kinds of `count` elements from rest to rest."""
     start, stop = (FROM_HOLD, TO_HOLD) if held else (FROM_REST, TO_REST)
     return [start, *[INSIDE] * (count - 2), stop]
 
 
 def find_first_slopes(a: Expression) -> tuple[Expression, Expression]:
-    """How s'' grows with y where the motion starts and where it ends, measured from there."""
+    """Slopes of s'' over y at the start, and at the end backwards."""
     basis = find_basis()
     start = ca.DM(basis.to_powers[FROM_HOLD][1]).T @ a[:_NODES]
     return start, ca.DM(basis.to_powers[TO_HOLD][1]).T @ a[-_NODES:]
@@ -91,7 +88,7 @@ def find_first_slopes(a: Expression) -> tuple[Expression, Expression]:
 
 def write_motor_rows(
     shape: MotorShape,
-    given: Symbols,
+    symbols: Symbols,
     torques: Expression,
     a: Expression,
     paces: Expression,
@@ -101,18 +98,16 @@ def write_motor_rows(
 
     Parameters
     ----------
-    given             of the parameters `quick`, one over each largest rate, and `lags`
-    torques : (n, 2)
-    a : (n,)
+    symbols                              parameters `quick`, 1 / rate limit, and `lags`
+    torques, a : (n, 2), (n,)
     paces, lengths : (p + 1, E), (1, E)  dy/dt times the element's length, and that
     """
     if not shape.slow:
-        none = ca.SX(0, 1)
-        return {"rates": none, "commands": none, "joins": none, "begins": none}
+        return dict.fromkeys(shape.list_sizes(0), ca.SX(0, 1))
     rates = {joint: _differentiate(torques[:, joint], paces, lengths) for joint in shape.slow}
-    rows = [given.quick[k] * rates[joint] for k, joint in enumerate(shape.rates)]
+    rows = [symbols.quick[k] * rates[joint] for k, joint in enumerate(shape.rates)]
     lagged = [
-        torques[:, joint] + given.lags[k] * rates[joint] for k, joint in enumerate(shape.commands)
+        torques[:, joint] + symbols.lags[k] * rates[joint] for k, joint in enumerate(shape.commands)
     ]
     joins = [torques[_NODES::_NODES, j] - torques[DEGREE:-1:_NODES, j] for j in shape.slow]
     return {
@@ -132,24 +127,20 @@ def _differentiate(values: Expression, paces: Expression, lengths: Expression) -
 
 
 def list_slopes() -> list[Array]:
-    """What takes values at the nodes of each kind of element to their slopes over y there.
-
-    Over 1 - y where y falls with time.
-    """
+    """Differentiation matrices at the nodes of each kind of element, over y in forward time."""
     basis, powers = find_basis(), np.arange(_NODES)
-    slopes = []
-    for sign, y, to_powers in zip(SIGNS, basis.y, basis.to_powers, strict=True):
-        rises = powers * y[:, None] ** np.maximum(powers - 1, 0)
-        slopes.append(sign * rises @ to_powers)
-    return slopes
+    return [
+        sign * (powers * y[:, None] ** np.maximum(powers - 1, 0)) @ to_powers
+        for sign, y, to_powers in zip(SIGNS, basis.y, basis.to_powers, strict=True)
+    ]
 
 
 def find_torques(
     data: PhaseData, profile: Profile, motions: Sequence[PathMotion]
 ) -> tuple[Array, Array]:
-    """Torques and their rates, shape (n_solid, looks, 2) [N m, N m/s], at evenly spaced instants.
+    """Torques and their rates, (n_solid, _LOOKS, 2) [N m, N m/s], at evenly spaced times.
 
-    Of the polynomials in time through torques within each interval.
+    By Chebyshev interpolation in time through torques within each interval.
     """
     checks = data.sampling.checks
     every = (len(checks) - 1) // (PLACES - 1)
@@ -170,31 +161,24 @@ def find_torques(
 
 
 def find_hurry(data: PhaseData, profile: Profile, motions: Sequence[PathMotion]) -> Array:
-    """By how much rates and commands are beyond their limits in each interval, relatively.
-
-    Shape (n_solid, 2, 2): of rates, then of commands, of each joint.
-    """
-    scene = data.curve.formation.scene
+    """Relative violations of rates and commands of each joint in each interval, (n_solid, 2, 2)."""
     if not data.grid.held:
         return np.zeros((len(data.nonempty), 2, 2))
     torques, rates = find_torques(data, profile, motions)
     rate = np.abs(rates).max(axis=1) / data.rate_limit
-    lags = scene.actuator_lag
+    lags = data.curve.formation.scene.actuator_lag
     command = np.abs(torques + lags * rates).max(axis=1) / data.torque_limit
     return np.asarray(np.maximum(np.stack([rate, command * (lags > 0)], axis=1) - 1, 0.0))
 
 
 def exceeds_rates(data: PhaseData, profile: Profile) -> bool:
-    """Whether torques change too fast, or commands are too large, at the nodes of a motion."""
-    scene = data.curve.formation.scene
-    if not data.grid.held:
+    """Whether torque rates or commands are beyond their limits at the nodes of a motion."""
+    grid, lags = data.grid, data.curve.formation.scene.actuator_lag
+    if not grid.held:
         return False
-    grid, nodes = data.grid, DEGREE + 1
-    kinds, stretch = grid.kinds, Elements(grid, profile).stretch
-    speed = np.sqrt(profile.b).reshape(-1, nodes)
-    pace = speed / np.maximum(stretch, 1e-6) / np.diff(grid.edges)
-    tau = data.nodes.forces.tau(*profile).reshape(-1, nodes, 2)
-    rates = np.stack(list_slopes())[kinds] @ tau * pace[..., None]
-    command = np.abs(tau + scene.actuator_lag * rates)
-    quick = (np.abs(rates) > data.rate_limit).any()
-    return bool(quick or (command * (scene.actuator_lag > 0) > data.torque_limit).any())
+    speed = np.sqrt(profile.b).reshape(-1, _NODES)
+    y_t = speed / np.maximum(Elements(grid, profile).stretch, 1e-6) / np.diff(grid.edges)
+    tau = data.nodes.forces.tau(*profile).reshape(-1, _NODES, 2)
+    rates = np.stack(list_slopes())[grid.kinds] @ tau * y_t[..., None]
+    command = np.abs(tau + lags * rates) * (lags > 0)
+    return bool((np.abs(rates) > data.rate_limit).any() or (command > data.torque_limit).any())

@@ -1,4 +1,7 @@
-"""Solving along curves on a mesh, and what a solution says of a better mesh."""
+"""Mesh refinement of the path-domain NLP: solve, estimate the error, adapt the mesh, solve again.
+
+First solutions start from the minimum-time speed profile, with multipliers near the central path.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
-from ..lower_bound.rows import PathLimitRows
+from ..lower_bound.rows import LimitSides, PathLimitRows
 from ..lower_bound.speed_sweep import SweepMode
 from ..options import Objective
 from ..phase_plan import PhasePlan
@@ -32,52 +35,35 @@ from .path_data import PhaseData, cut
 from .path_mesh import MOST, SHIFTED, SLOW_MOST, Mesh, adapt
 from .path_motion import PathMotion
 from .path_nlp import PathNLP, Tightening, Units, make_bounds, pack, parameters, unpack
-from .rate_switches import find_motor_switches, ramp_up
+from .rate_switches import find_rate_switches, ramp_up
 from .speed_profile import Fastest, find_fastest
-from .switches import LimitSides
 from .task import EARLY, Task
 from .terms import LEAST_B
 from .violations import Misses, PathSolution, anticipate, price
 
-_COLD_MU = 1e-7
-"""Complementarity of the multipliers: the barrier parameter to start from."""
-_COLD_INSIDE = 1e-2
-"""Largest slack of a limit that is kept with none, in the units of the NLP; others count as it."""
-_FAR_MU, _FAR_INSIDE = 1e-2, 1e-3
-"""The same two where nothing is known of a solution."""
-_PLAIN = 1e-10
-"""What is added to the squares of rows that may depend on each other, over the mean of all."""
-_PICARD = 2
-"""Rounds in which speeds and corners are made to agree."""
-_WILD = 10.0
-"""How much larger than usual s'' is in a corner of limits that hardly cross there."""
+_COLD_MU = 1e-7  # initial barrier parameter: complementarity of the multipliers
+_COLD_INSIDE = 1e-2  # larger slacks count as this one [units of the NLP]
+_FAR_MU, _FAR_INSIDE = 1e-2, 1e-3  # the same two without a speed profile
+_DAMPING = 1e-10  # of normal equations with dependent rows, over their mean diagonal
+_PICARD = 2  # Picard iterations between speeds and vertices
+_WILD = 10.0  # s'' over its median above which a vertex is of nearly parallel limits
 _NODES = DEGREE + 1
-_MU, _INSIDE = 1e-6, 1e-4
-"""Least complementarity to start slow motors from, and the least slack that it is for."""
-_SHARE = 0.5
-"""Share of the accuracy that is allowed for shifted switches."""
+_MU, _INSIDE = 1e-6, 1e-4  # least initial complementarity, and its least slack, under rate limits
+_SHARE = 0.5  # share of the accuracy for shifted switches
+# Share of the accuracy for missed limits, to first order: efforts have other errors.
 _DEAR = {Objective.TIME: 1.0, Objective.MARGIN: 1.0, Objective.EFFORT: 0.2}
-"""Share of the accuracy that missed limits may cost by first order: efforts have other errors."""
-_LIKELY = 0.2
-"""Share of that which as many elements, placed better, may be likely to cost."""
-_LONGER = 0.2
-"""Most that the NLP's duration may be allowed to be longer, relatively."""
-_SETTLED = 0.1
-"""Share of the accuracy below which switches are not looked for again."""
-_FIRST_EASE = 1e-2
-"""By how much limits are tightened for a plan of quick motors, over what is much for each."""
-_EASE = 5e-4
-"""The same for a first plan of slow ones."""
-_FINELY = 10.0
-"""Over how much less for a second one, where a high accuracy is asked for."""
-_EASIER = 10.0
-"""By how much more rates and commands are."""
+_LIKELY = 0.2  # share of that beyond which the elements are doubled, not only moved
+_LONGER = 0.2  # most that the NLP's duration may be allowed to be longer, relatively
+_SETTLED = 0.1  # share of the accuracy below which switches are not looked for again
+_UNLIMITED_TIGHTENING = 1e-2  # of limits in a plan without rate limits, over their scales
+_FIRST_TIGHTENINGS = (5e-4, 5e-5)  # the same with rate limits; the second for a high accuracy
+_RATE_TIGHTENING = 10.0  # of rates and commands, over that
 Plans = list[PhasePlan[PathMotion]]
 
 
 @dataclass(frozen=True)
-class Round:
-    """A mesh, and what is known on it."""
+class Iterate:
+    """A mesh with its NLP, and the solution on it or the point to start from."""
 
     task: Task
     elements: int  # of each phase
@@ -86,158 +72,148 @@ class Round:
     data: PhaseData  # all phases as one
     nlp: PathNLP
     units: Units
-    solution: PathSolution  # the last one, or where to start
-    tightening: Tightening  # by how much limits are tightened for that
-    fastest: Fastest | None  # the motion of a sweep, near which plans are looked for
-    # [s]: what the NLP may take for the duration, which is longer than allowed if it errs so
-    duration: float | None
-    # how far switches seem to be from the mesh's breaks, over the curve's length
-    shift: float = np.inf
-    # what other meshes start from with slow motors: a solution inside the limits
-    eased: Round | None = None
+    solution: PathSolution  # the last one, or the point to start from
+    tightening: Tightening  # of the limits for that
+    fastest: Fastest | None  # minimum-time speed profile, near which plans are looked for
+    duration: float | None  # [s]: bound in the NLP, raised by the error of its quadrature
+    shift: float = np.inf  # estimated distance of switches from breaks, over the curve's length
+    interior: Iterate | None = None  # under rate limits: strictly feasible, to restart from
 
     @staticmethod
-    def begin(task: Task, finer: int) -> Round:
-        """A first guess on elements that know of nothing but reversals, or a quick plan's."""
-        quick = Round._slow_down(task, finer) if task.is_held else None
-        if quick is not None:
-            return quick
-        meshes = tuple(Mesh() for _ in task.curves)
-        elements, parts, data, nlp = task.lay_out(meshes, finer * task.elements)
+    def begin(task: Task, refinement: int) -> Iterate:
+        """Initial guess on elements that end at reversals alone, or from an unlimited plan."""
+        ramped = Iterate._add_ramps(task, refinement) if task.is_held else None
+        if ramped is not None:
+            return ramped
+        layout = task.lay_out(tuple(Mesh() for _ in task.curves), refinement * task.elements)
+        data, nlp = layout[3:]
         profile, units = guess(data, task.options.time_weight)
-        sought = task.options.goal is not Objective.EFFORT and not data.grid.held
-        found = find_fastest(data, task.duration) if sought else None
-        fastest = found if isinstance(found, Fastest) else None
-        multipliers = balance(nlp, data, units, profile)
-        start, none = PathSolution(profile, 0.0, multipliers), Tightening.none(data, task.duration)
-        known = elements, meshes, parts, data, nlp, units, start, none
-        begun = Round(task, *known, fastest, task.duration)
-        if found is None:
-            return begun
+        sweeps = task.options.goal is not Objective.EFFORT and not data.grid.held
+        fastest = find_fastest(data, task.duration) if sweeps else None
+        start = PathSolution(profile, 0.0, balance(nlp, data, units, profile))
+        none = Tightening.none(data, task.duration)
+        profiled = fastest if isinstance(fastest, Fastest) else None
+        first = Iterate(task, *layout, units, start, none, profiled, task.duration)
+        if fastest is None:
+            return first
         # Where it is not the duration that limits a margin, switches are not looked for.
-        shift = np.inf if fastest else 0.0
-        meshes = task.place_breaks(found.switches)
-        return begun._restart(meshes, finer * task.elements, shift)
+        meshes = task.place_breaks(fastest.switches)
+        return first._restart(meshes, refinement * task.elements, np.inf if profiled else 0.0)
 
     @staticmethod
-    def _slow_down(task: Task, finer: int) -> Round | None:
-        """A first guess for slow motors from a plan of quick ones, if they are not too slow."""
-        begun = Round.begin(replace(task, quick=True, pins=(None, None)), finer)
-        quick = begun.ease_in(_FIRST_EASE).solve()
-        if isinstance(quick, str):
+    def _add_ramps(task: Task, refinement: int) -> Iterate | None:
+        """Initial guess under rate limits: a plan without them, with ramps for torque steps."""
+        unlimited = Iterate.begin(replace(task, unlimited=True, pins=(None, None)), refinement)
+        plan = unlimited.tighten_all(_UNLIMITED_TIGHTENING).solve()
+        if isinstance(plan, str):
             return None
-        lasts = sum(motion.duration for motion in quick.motions)
-        ramped = ramp_up(quick.data, quick.solution.profile, lasts, task.pins)
+        duration = sum(motion.duration for motion in plan.motions)
+        ramped = ramp_up(plan.data, plan.solution.profile, duration, task.pins)
         if ramped is None:
             return None
         starts = np.cumsum([0.0, *(curve.length for curve in task.curves)])
-        places = np.concatenate(
-            [mesh.breaks + start for mesh, start in zip(quick.meshes, starts, strict=False)]
-        )
-        meshes = task.place_breaks(ramped.find_breaks(places))
-        elements, parts, data, nlp = task.lay_out(meshes, finer * task.elements)
-        profile = ramped.guess(quick.data.grid, quick.solution.profile, data.grid)
-        old = quick.solution.multipliers
-        multipliers = move_multipliers(quick.nlp, nlp, old, quick.data.grid, data.grid)
-        none = Tightening.none(data, task.duration)
-        multipliers = center(nlp, data, quick.units, profile, multipliers, task)
-        start = PathSolution(profile, 0.0, multipliers)
-        known = elements, meshes, parts, data, nlp, quick.units, start, none
-        return Round(task, *known, None, task.duration)
+        breaks = [mesh.breaks + start for mesh, start in zip(plan.meshes, starts, strict=False)]
+        meshes = task.place_breaks(ramped.find_breaks(np.concatenate(breaks)))
+        layout = task.lay_out(meshes, refinement * task.elements)
+        data, nlp = layout[3:]
+        profile = ramped.guess(plan.data.grid, plan.solution.profile, data.grid)
+        multipliers = plan.move_multipliers(nlp, data)
+        multipliers = center(nlp, data, plan.units, profile, multipliers, task)
+        start, none = PathSolution(profile, 0.0, multipliers), Tightening.none(data, task.duration)
+        return Iterate(task, *layout, plan.units, start, none, None, task.duration)
 
-    def ease_in(self, share: float) -> Round:
-        """The round with limits that are tightened a little, which later ones start inside of."""
-        tight = self.tightening
-        limits, motors = (
-            tight.limits + share * self.data.spans,
-            tight.motors * (1 - _EASIER * share),
-        )
-        return replace(self, tightening=tight._replace(limits=limits, motors=motors))
+    def tighten_all(self, share: float) -> Iterate:
+        """The iterate with all limits tightened, so that its solution is strictly feasible."""
+        tight, scale = self.tightening, 1 - _RATE_TIGHTENING * share
+        limits = tight.limits + share * self.data.spans
+        tight = tight._replace(limits=limits, motors=tight.motors * scale)
+        return replace(self, tightening=tight)
 
-    def refit(self) -> Round:
-        """The round on a mesh for its solution, with limits as they are."""
-        pairs = zip(self.parts, self.motions, strict=True)
+    def refit(self) -> Iterate:
+        """The iterate on a mesh for its solution, with limits as they are."""
         meshes = tuple(
-            Mesh.of(part.curve, find_motor_switches(part, motion.profile), True)
-            for part, motion in pairs
+            Mesh.of(part.curve, find_rate_switches(part, motion.profile), True)
+            for part, motion in zip(self.parts, self.motions, strict=True)
         )
-        return replace(self, eased=self)._restart(meshes, self.elements, 0.0)
+        return replace(self, interior=self)._restart(meshes, self.elements, 0.0)
 
-    def _restart(self, meshes: tuple[Mesh, ...], elements: int, shift: float) -> Round:
-        """Start on other meshes, from the fastest motion if that is known, or from this one."""
-        task, source = self.task, self.eased or self
-        solution = source.solution
-        elements, parts, data, nlp = task.lay_out(meshes, elements)
-        allowed = self.allowed
+    def _restart(self, meshes: tuple[Mesh, ...], elements: int, shift: float) -> Iterate:
+        """Start on other meshes, from the minimum-time speed profile or else from this iterate."""
+        task, source, allowed = self.task, self.interior or self, self.allowed
+        layout = task.lay_out(meshes, elements)
+        data, nlp = layout[3:]
         tightening = Tightening.none(data, allowed)
         if self.fastest is None:
-            old, new = source.data.grid, data.grid
-            profile = Elements(old, solution.profile).move(new)
-            multipliers = move_multipliers(source.nlp, nlp, solution.multipliers, old, new)
-            if new.held:
-                profile = follow(new, profile.a, profile.squeeze)
+            profile = Elements(source.data.grid, source.solution.profile).move(data.grid)
+            multipliers = source.move_multipliers(nlp, data)
+            if data.grid.held:
+                profile = follow(data.grid, profile.a, profile.lam)
                 multipliers = center(nlp, data, self.units, profile, multipliers, task)
-            start = solution._replace(profile=profile, multipliers=multipliers)
+            start = source.solution._replace(profile=profile, multipliers=multipliers)
         else:
-            start, corners = start_at(nlp, data, self.units, self.fastest)
+            start, vertices = start_at(nlp, data, self.units, self.fastest)
             if task.options.accuracy >= EARLY:
-                tightening = anticipate(data, start._replace(profile=corners), tightening)
-        known = elements, meshes, parts, data, nlp, self.units, start, tightening
-        return Round(task, *known, self.fastest, allowed, shift, self.eased)
+                tightening = anticipate(data, start._replace(profile=vertices), tightening)
+        first = Iterate(task, *layout, self.units, start, tightening, self.fastest, allowed)
+        return replace(first, shift=shift, interior=self.interior)
+
+    def move_multipliers(self, nlp: PathNLP, data: PhaseData) -> dict[str, Array]:
+        """Multipliers of the solution on another grid of the same curves."""
+        old = self.solution.multipliers
+        return move_multipliers(self.nlp, nlp, old, self.data.grid, data.grid)
 
     @cached_property
     def motions(self) -> list[PathMotion]:
         """The motion of each phase."""
         pairs = zip(self.parts, cut(self.parts, self.solution.profile), strict=True)
-        return [PathMotion(part.curve, part.grid, own) for part, own in pairs]
+        return [PathMotion(part.curve, part.grid, profile) for part, profile in pairs]
 
     @cached_property
     def misses(self) -> Misses:
-        """What limits miss between nodes."""
+        """Violations of limits between nodes."""
         return Misses.of(self.data, self.solution, self.motions, self.task.duration)
 
     @property
     def value(self) -> float:
-        """What errors of the cost are relative to."""
+        """Scale of the cost's error."""
         if self.task.options.goal is Objective.MARGIN:
             return max(abs(self.task.epsilon + self.solution.margin) / self.units.force, 1e-9)
         return max(abs(self.solution.cost), 1e-9)
 
     @cached_property
     def due(self) -> Array:
-        """What tightening limits by what they miss would cost at each node, relatively."""
+        """Relative cost at each node of tightening limits by their violations."""
         missed = self.misses.short, self.misses.speeding, self.misses.hurry
-        short, speeding, hurry = (self.data.spread_to_nodes(part) for part in missed)
-        return self._price((short, speeding, hurry))
+        return self._price(*map(self.data.spread_to_nodes, missed))
 
     @cached_property
     def paid(self) -> Array:
-        """What having tightened them costs at each node, relatively."""
+        """Relative cost at each node of the tightening so far."""
         tight = self.tightening
-        return self._price((tight.missed, 1 - tight.speed_share, 1 - tight.motors))
+        return self._price(tight.missed, 1 - tight.speed_share, 1 - tight.motors)
 
     @cached_property
     def wasted(self) -> Array:
-        """What it costs at each node that limits are tightened more than they need, relatively."""
+        """Relative cost at each node of tightening limits more than needed."""
         spare = np.minimum(self.tightening.missed, self.misses.find_spare(self.data))
-        return self._price((spare, np.zeros(len(spare)), np.zeros((len(spare), 2, 2))))
+        return self._price(spare, np.zeros(len(spare)), np.zeros((len(spare), 2, 2)))
 
-    def _price(self, tightened: tuple[Array, Array, Array]) -> Array:
-        found = price(self.nlp, self.data, self.units, self.solution, tightened)
-        return np.asarray(found / self.value)
+    def _price(self, *tightened: Array) -> Array:
+        costs = price(self.nlp, self.data, self.units, self.solution, *tightened)
+        return np.asarray(costs / self.value)
 
     @property
     def allowed(self) -> float | None:
-        """What the NLP may take for the duration so that it is the one that is allowed [s]."""
-        wanted, lasts = self.task.duration, self.solution.lasts
-        if not wanted or not lasts:
+        """Bound of the NLP's duration with which the motion's is the allowed one [s]."""
+        wanted, duration = self.task.duration, self.solution.duration
+        if not wanted or not duration:
             return wanted
         total = sum(motion.duration for motion in self.motions)
-        return wanted * (1 + min(max(lasts / total - 1, 0.0), _LONGER))
+        return wanted * (1 + min(max(duration / total - 1, 0.0), _LONGER))
 
     @property
     def unspent(self) -> float:
-        """What the time that is left would gain, to first order, relatively."""
+        """Relative gain of using the time that is left, to first order."""
         if self.task.duration is None:
             return 0.0
         left = self.task.duration - sum(motion.duration for motion in self.motions)
@@ -246,20 +222,12 @@ class Round:
 
     @property
     def merit(self) -> float:
-        """What the cost is likely to be once limits hold between nodes."""
+        """Estimated cost once limits hold between nodes."""
         return self.solution.cost + self.value * float(self.due.sum())
-
-    def keep_before(self, better: Round) -> Round:
-        """The round, as another one with breaks at its switches has turned out to be no better.
-
-        What its own breaks lose by being elsewhere is no more than the two differ by.
-        """
-        differ = abs(better.merit - self.merit) / self.value
-        return replace(self, shift=min(better.shift, differ / SHIFTED))
 
     @property
     def is_kept(self) -> bool:
-        """Whether a motion is known that keeps limits at nodes, or negative margins would do."""
+        """Whether some motion is known to keep limits at nodes, or negative margins would do."""
         if self.fastest is not None or self.task.options.goal is Objective.MARGIN:
             return True
         return bool(self.data.slack(self.data.nodes, self.solution.profile).min() >= 0)
@@ -269,78 +237,88 @@ class Round:
         """Whether elements end where the plan switches."""
         return any(len(mesh.breaks) for mesh in self.meshes)
 
-    def solve(self) -> Round | str:
-        """Solve on this mesh; in words how the solver ended if there is no solution."""
-        weight = self.task.options.time_weight
-        given = self.nlp, self.data, self.units, self.tightening, self.solution, weight
-        found = solve(*given, self.task)
-        return found if isinstance(found, str) else replace(self, solution=found)
+    def solve(self) -> Iterate | str:
+        """Solve on this mesh; why the solver ended if there is no solution."""
+        nlp, data, units, start, task = self.nlp, self.data, self.units, self.solution, self.task
+        bounds = make_bounds(nlp, data, units, self.tightening, start=task.start, pins=task.pins)
+        if (bounds["lbg"] > bounds["ubg"]).any():
+            return "limits that hold between the nodes too leave nothing"
+        result = nlp.solver(
+            x0=pack(nlp, start.profile, units, start.margin, data.grid.sizes),
+            p=parameters(nlp, data, units, task.options.time_weight),
+            **bounds,
+            **start.multipliers,
+        )
+        stats = nlp.solver.stats()
+        if not stats["success"]:
+            return f"Ipopt stopped with {stats['return_status']}"
+        profile, margin = unpack(nlp, data.grid, result["x"].full()[:, 0], units)
+        multipliers = {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")}
+        duration = float(result["g"][-1]) * units.time if self.tightening.duration else 0.0
+        solution = PathSolution(profile, margin, multipliers, float(result["f"]), duration)
+        return replace(self, solution=solution)
 
-    def solve_first(self) -> Iterator[Round | str]:
-        """First solutions; with slow motors also on a mesh for one with tighter limits."""
+    def solve_first(self) -> Iterator[Iterate | str]:
+        """First solutions; under rate limits also on a mesh for one with tighter limits."""
         if self.data.grid.held:
-            finely = self.task.options.accuracy < EARLY
-            begun = self
-            for share in (_EASE, _EASE / _FINELY)[: 1 + finely]:
-                eased = begun.ease_in(share).solve()
-                if isinstance(eased, str):
+            accurate, first = self.task.options.accuracy < EARLY, self
+            for share in _FIRST_TIGHTENINGS[: 1 + accurate]:
+                interior = first.tighten_all(share).solve()
+                if isinstance(interior, str):
                     break
-                begun = eased.refit()
-            if begun is not self:
-                yield begun.solve()
+                first = interior.refit()
+            if first is not self:
+                yield first.solve()
         yield self.solve()
 
-    def tighten(self, ease: bool) -> Round:
-        """The round with limits tightened by what they miss, and to `ease` no more than needed."""
+    def tighten(self, ease: bool) -> Iterate:
+        """The iterate with limits tightened by their violations, eased first where too tight."""
         tight = self.tightening
         tight = tight.ease(self.misses.find_spare(self.data)) if ease else tight
         return replace(self, tightening=self.misses.tighten(self.data, tight, self.solution))
 
-    def adapt(self, dearer: bool = False) -> tuple[Round, Round | None]:
-        """The round with its shift, and a better one to go on from; None if this one will do.
+    def adapt(self, dearer: bool = False) -> tuple[Iterate, Iterate | None]:
+        """The iterate with its shift, and one on a better mesh; None if this one will do.
 
         Parameters
         ----------
-        dearer  whether tightening limits has turned out to be dearer than it may be
+        dearer  whether tightening limits has cost more than the accuracy
         """
         task, most = self.task, self.task.options.accuracy
         prices = self.due + self.paid - self.wasted
         shares = np.split(prices, np.cumsum([len(part.grid.s) for part in self.parts])[:-1])
         most_elements = SLOW_MOST if self.data.grid.held and most >= EARLY else MOST
         coarse = self.elements < most_elements and task.options.intervals is None
-        enough = _DEAR[task.options.goal] * most
-        dear = dearer or bool(prices.sum() > enough)
-        # Once switches have settled they need not be looked for, and where much is missed they are
-        # not better known than by a sweep.
+        allowed = _DEAR[task.options.goal] * most
+        dear = dearer or bool(prices.sum() > allowed)
+        # Converged switches need not be looked for. Where much is violated they are not better
+        # known than by a sweep.
         settled = SHIFTED * self.shift < _SETTLED * most
         settled = settled or self.data.grid.held or (self.fastest is not None and dear and coarse)
-        goal = None if settled else task.options.goal
-        found = [
-            adapt(goal, part, motion.profile, self.solution.margin, share, mesh)
-            for part, motion, share, mesh in zip(
-                self.parts, self.motions, shares, self.meshes, strict=True
-            )
+        goal, margin = None if settled else task.options.goal, self.solution.margin
+        phases = zip(self.parts, self.motions, shares, self.meshes, strict=True)
+        better = [
+            adapt(goal, part, motion.profile, margin, share, mesh)
+            for part, motion, share, mesh in phases
         ]
-        shift = self.shift if settled else max(better.shift for better in found)
-        moved = SHIFTED * shift > _SHARE * most
-        # What is missed where elements do not end at switches yet says little.
-        begun = dearer or self.is_split or not np.isinf(shift)
-        moved = moved and not self.data.grid.held
-        dear = dear and begun and coarse
+        shift = self.shift if settled else max(each.shift for each in better)
+        moved = SHIFTED * shift > _SHARE * most and not self.data.grid.held
+        # Violations say little before elements end at switches.
+        dear = dear and coarse and (dearer or self.is_split or not np.isinf(shift))
         if not (moved or dear):
             if self.unspent <= _SHARE * most:
                 return replace(self, shift=shift), None
             longer = self.tightening._replace(duration=self.allowed)
             return self, replace(self, tightening=longer, duration=self.allowed, shift=shift)
-        more = (dearer and coarse) or (
-            dear and sum(better.price for better in found) > _LIKELY * enough
-        )
-        meshes = tuple(better.mesh for better in found)
-        return self, self._restart(meshes, self.elements * (2 if more else 1), shift)
+        expected = sum(each.price for each in better)
+        double = (dearer and coarse) or (dear and expected > _LIKELY * allowed)
+        meshes = tuple(each.mesh for each in better)
+        return self, self._restart(meshes, self.elements * (2 if double else 1), shift)
 
     def summarise(self) -> Plans:
         """The plan of each phase."""
         options = self.task.options
+        error = float(self.paid.sum() + SHIFTED * min(self.shift, 1.0) + self.unspent)
         plans: Plans = []
         for part, motion in zip(self.parts, self.motions, strict=True):
             torque, squares = fit_torque(part, motion)
@@ -349,37 +327,8 @@ class Round:
                 Objective.EFFORT: squares + options.time_weight * motion.duration,
                 Objective.MARGIN: self.task.epsilon + self.solution.margin,
             }[options.goal]
-            error = float(self.paid.sum() + SHIFTED * min(self.shift, 1.0) + self.unspent)
             plans.append(PhasePlan(motion, torque, value, error=error))
         return plans
-
-
-def solve(
-    nlp: PathNLP,
-    data: PhaseData,
-    units: Units,
-    tightening: Tightening,
-    start: PathSolution,
-    time_weight: float,
-    task: Task,
-) -> PathSolution | str:
-    """Solve once; the solution, or in words how the solver ended."""
-    bounds = make_bounds(nlp, data, units, tightening, start=task.start, pins=task.pins)
-    if (bounds["lbg"] > bounds["ubg"]).any():
-        return "limits that hold between the nodes too leave nothing"
-    result = nlp.solver(
-        x0=pack(nlp, start.profile, units, start.margin, data.grid.sizes),
-        p=parameters(nlp, data, units, time_weight),
-        **bounds,
-        **start.multipliers,
-    )
-    stats = nlp.solver.stats()
-    if not stats["success"]:
-        return f"Ipopt stopped with {stats['return_status']}"
-    profile, margin = unpack(nlp, data.grid, result["x"].full()[:, 0], units)
-    multipliers = {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")}
-    lasts = float(result["g"][-1]) * units.time if tightening.duration else 0.0
-    return PathSolution(profile, margin, multipliers, float(result["f"]), lasts)
 
 
 def center(
@@ -390,22 +339,19 @@ def center(
     multipliers: dict[str, Array],
     task: Task,
 ) -> dict[str, Array]:
-    """Multipliers with which a motion inside its limits is near the central path.
-
-    At least those of a small complementarity.
-    """
+    """Multipliers of a strictly feasible motion, raised to those of a small complementarity."""
     bounds = make_bounds(nlp, data, units, Tightening.none(data, task.duration), pins=task.pins)
     x = pack(nlp, profile, units, 0.0, data.grid.sizes)
     p = parameters(nlp, data, units, task.options.time_weight)
     g = nlp.solver.function.get_function("nlp_g")(x, p).full()[:, 0]
-    found = {}
+    centered = {}
     for key, here in (("x", x), ("g", g)):
-        low, high, known = bounds[f"lb{key}"], bounds[f"ub{key}"], multipliers[f"lam_{key}0"]
+        low, high, old = bounds[f"lb{key}"], bounds[f"ub{key}"], multipliers[f"lam_{key}0"]
         slack = np.maximum(high - here, _INSIDE), np.maximum(here - low, _INSIDE)
         push = _MU / slack[0] - _MU / slack[1]
-        weak = (low < high) & (np.abs(known) < np.abs(push))
-        found[f"lam_{key}0"] = np.where(weak, push, known)
-    return found
+        weak = (low < high) & (np.abs(old) < np.abs(push))
+        centered[f"lam_{key}0"] = np.where(weak, push, old)
+    return centered
 
 
 def move_multipliers(
@@ -418,10 +364,9 @@ def move_multipliers(
         columns = [last * old.interpolate(column / first, new) for column in table.T]
         return np.column_stack(columns) if columns else np.zeros((len(new.s), 0))
 
-    on_x, on_g, rows = multipliers["lam_x0"], multipliers["lam_g0"], before.columns.g
-    weights = old.weights, new.weights
+    on_g, rows, weights = multipliers["lam_g0"], before.columns.g, (old.weights, new.weights)
     table = np.zeros(before.free.shape)
-    table[before.free] = on_x
+    table[before.free] = multipliers["lam_x0"]
     table[:, 0] /= old.sizes
     blocks = {name: on_g[rows[name]] for name in rows.sizes}
     blocks["links"] = blocks["links"] / old.link_sizes
@@ -436,7 +381,7 @@ def move_multipliers(
     if rows.sizes["joins"]:
         joins = blocks["joins"].reshape(-1, len(old.edges) - 1)
         places = new.edges[1:, 0], old.edges[1:, 0]
-        blocks["joins"] = np.concatenate([np.interp(*places, own) for own in joins])
+        blocks["joins"] = np.concatenate([np.interp(*places, values) for values in joins])
     for name, size in after.columns.g.sizes.items():
         if name in ("rates", "commands", "joins", "begins") and not rows.sizes[name]:
             blocks[name] = np.zeros(size)
@@ -447,38 +392,41 @@ def move_multipliers(
 
 
 def balance(nlp: PathNLP, data: PhaseData, units: Units, profile: Profile) -> dict[str, Array]:
-    """Multipliers with which any motion is near the central path, if it keeps limits at all."""
+    """Multipliers with which a feasible motion is near the central path."""
     slack = data.slack(data.nodes, profile) / units.of(data.limits)[data.limits.sides[0]]
     on_b = -_FAR_MU / np.maximum(profile.b / units.profile[0], _FAR_INSIDE)
     return _join(nlp, data, _FAR_MU / np.maximum(slack, _FAR_INSIDE), on_b)
 
 
 def start_at(
-    nlp: PathNLP, data: PhaseData, units: Units, found: Fastest
+    nlp: PathNLP, data: PhaseData, units: Units, fastest: Fastest
 ) -> tuple[PathSolution, Profile]:
-    """A motion near a fastest one on the grid of `data`, with multipliers near those of a plan.
+    """Start near the minimum-time profile with estimated multipliers, and that profile itself.
 
-    And that in the corners themselves.
+    The profile is at vertices of the polygon of s'' and internal force that limits allow.
     """
-    sides = LimitSides.of(data, data.nodes, found.margin)
-    corners = _Corners.at(data.grid, sides, found)
+    sides = data.list_sides(data.nodes, fastest.margin)
+    vertices = _Vertices.at(data.grid, sides, fastest)
     rows = data.limits.sides[0]
     scale = data.spans / units.of(data.limits)[rows]
-    on_links, kept = _find_multipliers(data.grid, sides, corners, scale, units)
+    on_links, kept = _find_multipliers(data.grid, sides, vertices, scale, units)
     rate = 1.0
     if nlp.objective is Objective.MARGIN:
-        presses = np.isin(rows[corners.sides], nlp.shape.presses) & ~corners.held[:, None]
-        # So much does the margin change with the duration.
+        presses = np.isin(rows[vertices.sides], nlp.shape.presses) & ~vertices.held[:, None]
+        # Slope of the margin over the duration.
         rate = 1 / max(float((kept * presses).sum()), _COLD_MU)
     on_links, kept = rate * on_links, np.maximum(rate * kept, _COLD_MU / _COLD_INSIDE)
-    moved = corners.move_inside(sides, _COLD_MU / kept / scale[corners.sides])
-    on_sides = _COLD_MU / np.maximum(sides.find_slack(moved) * scale, _COLD_INSIDE)
-    free = np.flatnonzero(~corners.held)
-    on_sides[free[:, None], corners.sides[free]] = kept[free]
+    (a, b, lam), slack = vertices.profile, _COLD_MU / kept / scale[vertices.sides]
+    inner_a, inner_lam = sides.meet(b, vertices.sides, slack)
+    stay = vertices.held | ~(np.isfinite(inner_a) & np.isfinite(inner_lam))
+    moved = Profile(np.where(stay, a, inner_a), b, np.where(stay, lam, inner_lam))
+    on_sides = _COLD_MU / np.maximum(sides.find_slack(*moved) * scale, _COLD_INSIDE)
+    free = np.flatnonzero(~vertices.held)
+    on_sides[free[:, None], vertices.sides[free]] = kept[free]
     on_b = -_COLD_MU / np.maximum(moved.b / units.profile[0], _COLD_INSIDE)
-    on_b[corners.held] += kept[corners.held, 0]
+    on_b[vertices.held] += kept[vertices.held, 0]
     multipliers = _join(nlp, data, on_sides, on_b, on_links, rate)
-    return PathSolution(moved, found.margin, multipliers), corners.profile
+    return PathSolution(moved, fastest.margin, multipliers), vertices.profile
 
 
 def _join(
@@ -489,14 +437,14 @@ def _join(
     on_links: Array | float = 0.0,
     rate: float = 0.0,
 ) -> dict[str, Array]:
-    """The NLP's multipliers from those of sides, (n, n_sides), of b, of links and the duration."""
+    """Multipliers of the NLP from those of sides, (n, n_sides), b, links and duration."""
     (rows, signs, _), sizes = data.limits.sides, nlp.columns.g.sizes
     on_rows = np.zeros((len(on_sides), nlp.shape.rows))
     for side, row in enumerate(rows.tolist()):
         on_rows[:, row] -= signs[side] * on_sides[:, side]
     on_x = np.zeros(nlp.free.shape)
     on_x[:, 0] = on_b
-    # The margin at each node is held by what presses from there on.
+    # The chain's multiplier at a node is the sum of those of normal forces from there on.
     chain = -1 - np.cumsum(on_rows[:, list(nlp.shape.presses)].sum(axis=1))[:-1]
     on_g = nlp.columns.g.join(
         links=on_links + np.zeros(sizes["links"]),
@@ -508,26 +456,26 @@ def _join(
     return {"lam_x0": on_x[nlp.free], "lam_g0": on_g}
 
 
-class _Corners(NamedTuple):
-    """A motion in corners of limits."""
+class _Vertices(NamedTuple):
+    """A motion at vertices of the polygon of s'' and internal force that limits allow."""
 
     profile: Profile
     sides: NDArray[np.int64]  # (n, 2): which meet there
-    held: NDArray[np.bool_]  # (n,): where it is the speed that has a limit instead
+    held: NDArray[np.bool_]  # (n,): where a speed limit is active instead
     jumps: NDArray[np.int64]  # elements after which s'' jumps from its largest to its least
 
     @staticmethod
-    def at(grid: Grid, sides: LimitSides, found: Fastest) -> _Corners:
-        """The corners that a fastest motion is in.
+    def at(grid: Grid, sides: LimitSides, fastest: Fastest) -> _Vertices:
+        """The vertices of a minimum-time profile.
 
-        Speeds are integrated forwards where it has the largest s'', and backwards where the least.
+        Speeds are integrated forwards where s'' is the largest, and backwards where the least.
         """
-        modes = found.find_modes(grid.edges.mean(axis=1))
+        modes = fastest.find_modes(grid.edges.mean(axis=1))
         of_nodes = np.repeat(modes, _NODES)
         runs = np.split(np.arange(len(of_nodes)), np.flatnonzero(np.diff(of_nodes)) + 1)
         held, pushed = of_nodes == SweepMode.HELD, of_nodes == SweepMode.PUSH
-        wanted = np.interp(grid.s, (found.s[1:] + found.s[:-1]) / 2, found.slopes)
-        b, rows = np.interp(grid.s, found.s, found.b), sides.eliminate()
+        wanted = np.interp(grid.s, (fastest.s[1:] + fastest.s[:-1]) / 2, fastest.slopes)
+        b, rows = np.interp(grid.s, fastest.s, fastest.b), sides.eliminate()
         for _ in range(_PICARD):
             most, least = (_find_pairs(sides, rows, b, largest) for largest in (True, False))
             (high, press), (low, other) = (sides.meet(b, pair) for pair in (most, least))
@@ -535,12 +483,12 @@ class _Corners(NamedTuple):
                 share = np.nan_to_num(np.clip((wanted - low) / (high - low), 0.0, 1.0))
             a = np.where(held, wanted, np.where(pushed, high, low))
             between = share * press + (1 - share) * other
-            squeeze = np.where(held, between, np.where(pushed, press, other))
-            # Rows within ranges may coincide, and then meet nowhere: those are no corner either.
-            wild = ~(np.abs(a) <= _WILD * np.median(np.abs(found.slopes))) | ~np.isfinite(squeeze)
+            lam = np.where(held, between, np.where(pushed, press, other))
+            # Rows within ranges may coincide, and then meet nowhere: no vertex either.
+            wild = ~(np.abs(a) <= _WILD * np.median(np.abs(fastest.slopes))) | ~np.isfinite(lam)
             if wild.any() and not wild.all():
                 a = np.where(wild, wanted, a)
-                squeeze[wild] = np.interp(grid.s[wild], grid.s[~wild], squeeze[~wild])
+                lam[wild] = np.interp(grid.s[wild], grid.s[~wild], lam[~wild])
             rise = grid.integrate(a)
             for run in runs:
                 end = run[0] if pushed[run[0]] else run[-1]
@@ -548,22 +496,15 @@ class _Corners(NamedTuple):
                     b[run] = np.maximum(b[end] + rise[run] - rise[end], 0.0)
         jumps = np.flatnonzero((modes[:-1] == SweepMode.PUSH) & (modes[1:] == SweepMode.BRAKE))
         pair = np.where(pushed[:, None], most, least)
-        return _Corners(Profile(a, b, squeeze), pair, held, jumps)
-
-    def move_inside(self, sides: LimitSides, slack: Array) -> Profile:
-        """The motion with some slack of the sides that meet, shape (n, 2)."""
-        a, b, squeeze = self.profile
-        inner_a, inner_squeeze = sides.meet(b, self.sides, slack)
-        stay = self.held | ~(np.isfinite(inner_a) & np.isfinite(inner_squeeze))
-        return Profile(np.where(stay, a, inner_a), b, np.where(stay, squeeze, inner_squeeze))
+        return _Vertices(Profile(a, b, lam), pair, held, jumps)
 
 
 def _find_pairs(
     sides: LimitSides, rows: PathLimitRows, b: Array, largest: bool
 ) -> NDArray[np.int64]:
-    """The sides that meet at the largest or the least s'' of each node, shape (n, 2).
+    """The sides that meet at the largest or least s'' of each node, shape (n, 2).
 
-    Where elements meet other sides may take over. There those that meet at the next node inside do.
+    Other sides may take over at element ends: there those of the next node inside are taken.
     """
     row = rows.extreme(b, largest).row.reshape(-1, _NODES)
     row[:, 0], row[:, -1] = row[:, 1], row[:, -2]
@@ -571,76 +512,72 @@ def _find_pairs(
 
 
 def _find_multipliers(
-    grid: Grid, sides: LimitSides, corners: _Corners, scale: Array, units: Units
+    grid: Grid, sides: LimitSides, vertices: _Vertices, scale: Array, units: Units
 ) -> tuple[Array, Array]:
-    """Multipliers of the links, shape (N,), and of the sides that meet, shape (n, 2).
+    """Least-squares multipliers of the links, (N,), and of the sides that meet, (n, 2).
 
-    Of a speed limit instead of the first of them where there is one. The duration is stationary
-    with them but for what no multipliers can balance. Unknowns and rows are put together by
-    elements, of which only neighbours have to do with each other.
+    Where a speed limit is active, its multiplier is in the first column. The normal equations of
+    stationarity of the duration are block tridiagonal in elements: block Gaussian elimination.
     """
-    own, across = _list_rows(grid, sides, corners, scale, units)
-    slope = _find_slopes(grid, corners.profile, units)
-    ahead = np.concatenate([own[1:], np.zeros_like(own[:1])])
-    squares = own @ own.transpose(0, 2, 1) + across @ across.transpose(0, 2, 1)
-    squares += _PLAIN * np.trace(squares, axis1=1, axis2=2).mean() * np.eye(own.shape[1])
-    beside = across @ ahead.transpose(0, 2, 1)
-    pull = -(own @ slope[..., None])
+    local, across = _list_rows(grid, sides, vertices, scale, units)
+    slope = _find_slopes(grid, vertices.profile, units)
+    following = np.concatenate([local[1:], np.zeros_like(local[:1])])
+    squares = local @ local.transpose(0, 2, 1) + across @ across.transpose(0, 2, 1)
+    squares += _DAMPING * np.trace(squares, axis1=1, axis2=2).mean() * np.eye(local.shape[1])
+    coupling = across @ following.transpose(0, 2, 1)
+    pull = -(local @ slope[..., None])
     pull[:-1] -= across[:-1] @ slope[1:, :, None]
-    for e in range(len(own) - 1):
-        solved = np.linalg.solve(squares[e], np.hstack([beside[e], pull[e]]))
-        squares[e + 1] -= beside[e].T @ solved[:, :-1]
-        pull[e + 1] -= beside[e].T @ solved[:, -1:]
-        beside[e], pull[e] = solved[:, :-1], solved[:, -1:]
+    for e in range(len(local) - 1):
+        solved = np.linalg.solve(squares[e], np.hstack([coupling[e], pull[e]]))
+        squares[e + 1] -= coupling[e].T @ solved[:, :-1]
+        pull[e + 1] -= coupling[e].T @ solved[:, -1:]
+        coupling[e], pull[e] = solved[:, :-1], solved[:, -1:]
     pull[-1] = np.linalg.solve(squares[-1], pull[-1])
-    for e in reversed(range(len(own) - 1)):
-        pull[e] -= beside[e] @ pull[e + 1]
-    found = pull[..., 0]
-    on_sides = -found[:, _NODES:].reshape(-1, 2, _NODES).transpose(0, 2, 1)
-    return found[:, :_NODES].ravel()[:-1], on_sides.reshape(-1, 2)
+    for e in reversed(range(len(local) - 1)):
+        pull[e] -= coupling[e] @ pull[e + 1]
+    values = pull[..., 0]
+    on_sides = -values[:, _NODES:].reshape(-1, 2, _NODES).transpose(0, 2, 1)
+    return values[:, :_NODES].ravel()[:-1], on_sides.reshape(-1, 2)
 
 
 def _list_rows(
-    grid: Grid, sides: LimitSides, corners: _Corners, scale: Array, units: Units
+    grid: Grid, sides: LimitSides, vertices: _Vertices, scale: Array, units: Units
 ) -> tuple[Array, Array]:
-    """Rows of each element, and what they are of the next one's unknowns, (E, 3 p + 3, 3 p + 3).
+    """Jacobian of each element's rows in its and in the next one's unknowns, (E, 3 p + 3, 3 p + 3).
 
-    Unknowns are b, a and the squeeze at its nodes; rows are the links to each next node and the
-    sides that meet at its nodes.
+    Unknowns are b, a and the internal force at its nodes. Rows are the links to each next node
+    and the sides that meet at its nodes.
     """
     count, inner = len(grid.kinds), np.arange(DEGREE)
     lengths = np.diff(grid.edges) / units.length
-    own = np.zeros((count, 3 * _NODES, 3 * _NODES))
-    across = np.zeros_like(own)
-    own[:, inner, inner], own[:, inner, inner + 1] = -1.0, 1.0
-    own[:, :DEGREE, _NODES : 2 * _NODES] = -lengths[..., None] * find_basis().links[grid.kinds]
-    own[:-1, DEGREE, DEGREE], across[:-1, DEGREE, 0] = -1.0, 1.0
+    local = np.zeros((count, 3 * _NODES, 3 * _NODES))
+    across = np.zeros_like(local)
+    local[:, inner, inner], local[:, inner, inner + 1] = -1.0, 1.0
+    local[:, :DEGREE, _NODES : 2 * _NODES] = -lengths[..., None] * find_basis().links[grid.kinds]
+    local[:-1, DEGREE, DEGREE], across[:-1, DEGREE, 0] = -1.0, 1.0
     # Where s'' jumps the duration does not depend on the speed.
-    own[corners.jumps, DEGREE], across[corners.jumps, DEGREE] = 0.0, 0.0
+    local[vertices.jumps, DEGREE], across[vertices.jumps, DEGREE] = 0.0, 0.0
     k = np.arange(len(grid.s))[:, None]
-    speed = np.sqrt(np.maximum(corners.profile.b, LEAST_B * units.profile[0]))[:, None]
-    of_b = (sides.bend + sides.drag / (2 * speed))[k, corners.sides]
-    parts = np.stack([of_b, sides.rate[k, corners.sides], sides.press[k, corners.sides]], axis=-1)
-    parts *= scale[corners.sides][..., None] * units.profile
-    parts[corners.held] = 0.0
-    parts[corners.held, 0, 0] = -1.0
+    speed = np.sqrt(np.maximum(vertices.profile.b, LEAST_B * units.profile[0]))[:, None]
+    of_b = (sides.bend + sides.drag / (2 * speed))[k, vertices.sides]
+    parts = np.stack([of_b, sides.rate[k, vertices.sides], sides.press[k, vertices.sides]], axis=-1)
+    parts *= scale[vertices.sides][..., None] * units.profile
+    parts[vertices.held] = 0.0
+    parts[vertices.held, 0, 0] = -1.0
     parts = parts.reshape(count, _NODES, 2, 3)
     node = np.arange(_NODES)
     for side in range(2):
         for unknown in range(3):
             rows, columns = node + (1 + side) * _NODES, node + unknown * _NODES
-            own[:, rows, columns] = parts[:, :, side, unknown]
-    own[0, :, 0] = own[-1, :, DEGREE] = 0.0
-    return own, across
+            local[:, rows, columns] = parts[:, :, side, unknown]
+    local[0, :, 0] = local[-1, :, DEGREE] = 0.0
+    return local, across
 
 
 def _find_slopes(grid: Grid, profile: Profile, units: Units) -> Array:
-    """How the duration depends on b and a at the nodes of each element, (E, 3 p + 3).
-
-    Of the quadrature of `terms`.
-    """
+    """Gradient of the NLP's duration at the nodes of each element, (E, 3 p + 3)."""
     basis, count = find_basis(), len(grid.kinds)
-    b, a = (profile.b / units.profile[0], profile.a / units.profile[1])
+    b, a = profile.b / units.profile[0], profile.a / units.profile[1]
     weights = basis.weights * np.diff(grid.edges) / units.length
     y = np.where((grid.kinds == INSIDE)[:, None], 0.5, basis.y[grid.kinds])
     slope = np.zeros((count, 3, _NODES))

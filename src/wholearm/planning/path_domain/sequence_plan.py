@@ -1,4 +1,4 @@
-"""Planning sequences of one-freedom phases that impacts join."""
+"""Plans of sequences of phases along curves that impacts join, at speed or with pauses."""
 
 from __future__ import annotations
 
@@ -34,11 +34,7 @@ def plan_sequence(
 
     Parameters
     ----------
-    epsilon : [N]
-    duration : [s]  longest duration of all, for the objective `margin`; the phases share it as is
-                    best
-    explained       whether to find out why there is no plan
-    pins : [N]      the squeeze at both ends, where it is given
+    epsilon, duration, explained, pins  see `plan_curves`
     """
     phases = [phase.number for phase in sequence.phases]
     curves = sequence.continuous_curves
@@ -47,48 +43,47 @@ def plan_sequence(
 
 def plan_slowly(
     parts: Sequence[ImpactSequence],
-    beside: tuple[Curve | Array | None, Curve | Formation | None],
+    neighbours: tuple[Curve | Array | None, Curve | Formation | None],
     epsilon: float,
     options: PlanOptions,
     durations: Sequence[float | None],
 ) -> Plans:
-    """Plan sequences one after the other whose torques may not step, with pauses between them.
+    """Plan sequences one after the other under rate limits, with pauses between them.
 
     Parameters
     ----------
-    beside           the curves before and after all of them, or where these are planned over time,
-                     the torques that the former end with, and the formation of the latter; None
-                     where there is nothing
-    epsilon : [N]
+    neighbours       the curves before and after all of them, if any; in the time domain the final
+                     torques of the former, and the formation of the latter
     durations : [s]  the longest duration of each, for the objective `margin`
     """
     plans: Plans = []
-    firsts: list[Curve | Formation | None] = [*(part.curves[0] for part in parts[1:]), beside[1]]
+    firsts: list[Curve | Formation | None] = [
+        *(part.curves[0] for part in parts[1:]),
+        neighbours[1],
+    ]
     joint: Joint | None = None
-    before: Curve | Array | None = beside[0]
+    before: Curve | Array | None = neighbours[0]
     for part, after, duration in zip(parts, firsts, durations, strict=True):
-        number = part.phases[0].number
+        number, first, last = part.phases[0].number, part.curves[0], part.curves[-1]
         if before is not None and joint is None:
-            first = part.curves[0]
             joint = choose_joint(before, first, first.start, epsilon, number)
-        last, following, coming = part.curves[-1], part.phases[-1].number + 1, None
+        following = None
         if after is not None:
-            coming = choose_joint(last, after, last.end, epsilon, following)
-        pins = joint.begins if joint else None, coming.ends if coming else None
+            following = choose_joint(last, after, last.end, epsilon, part.phases[-1].number + 1)
+        pins = joint.begins if joint else None, following.ends if following else None
         if duration is not None and joint is not None:
             duration -= joint.pause
         with charge(number):
-            own: Plans = [*plan_sequence(part, epsilon, options, duration, pins=pins)]
+            plan: Plans = [*plan_sequence(part, epsilon, options, duration, pins=pins)]
         if joint is not None:
-            first = part.curves[0]
-            own[0] = add_pause(own[0], joint, first.formation, first.start, options)
-        plans += own
-        joint, before = coming, last
+            plan[0] = add_pause(plan[0], joint, first.formation, first.start, options)
+        plans += plan
+        joint, before = following, last
     return plans
 
 
 def plan_parts_of(sequence: ImpactSequence, epsilon: float) -> PlanPart:
-    """How parts of a sequence are planned."""
+    """The planner of parts of a sequence."""
 
     def plan_part(
         start: int, stop: int, z: Array, options: PlanOptions, duration: float | None
@@ -100,11 +95,10 @@ def plan_parts_of(sequence: ImpactSequence, epsilon: float) -> PlanPart:
 
 def list_impacts(sequence: ImpactSequence, plans: Sequence[PhasePlan[Motion]]) -> list[BlockImpact]:
     """The impacts of a sequence, with the speeds that its plans pass them at."""
-    found = []
-    for k, own in enumerate(sequence.impacts):
-        if own.phase.end is not End.IMPACT:
-            continue
-        scene = own.phase.formation.scene
-        speed = measure_speed(scene, end_of(plans[k])[1]) if own.possible else 0.0
-        found.append(BlockImpact(k, own.impact, own.ratio, own.reason, speed))
-    return found
+    impacts = []
+    for k, join in enumerate(sequence.impacts):
+        if join.phase.end is End.IMPACT:
+            scene = join.phase.formation.scene
+            speed = measure_speed(scene, end_of(plans[k])[1]) if join.possible else 0.0
+            impacts.append(BlockImpact(k, join.impact, join.ratio, join.reason, speed))
+    return impacts

@@ -1,4 +1,4 @@
-"""What is planned along curves, and how it is laid out on meshes."""
+"""Planning task along curves, its discretization, and the uniqueness check of contact forces."""
 
 from __future__ import annotations
 
@@ -10,39 +10,32 @@ import numpy as np
 
 from ...common.errors import AmbiguityError
 from ...geometry.curve import Curve, describe_pose
-from ...mechanics.dynamics import Directions, reduced_inertia
+from ...mechanics.dynamics import reduced_inertia
 from ...mechanics.uniqueness import describe_uniqueness, find_minors
 from ..advice import name_phases
+from ..lower_bound.rows import directions_of
 from ..options import Objective, PlanOptions
-from ..robust.robust_rows import Guide, Spread, spread
+from ..robust.robust_rows import Guide, RobustLimits, spread
 from .elements import DEGREE
 from .path_data import PhaseData, join, prepare
 from .path_mesh import SOFT, START, Mesh, find_ends
 from .path_nlp import PathNLP, build_path_nlp
-from .rate_terms import QUICK, MotorShape
+from .rate_terms import UNLIMITED, MotorShape
 from .switches import Switch
 from .terms import LimitShape
 from .unique_start import SureStart
 from .violations import MISS
 
-LOOKS = 17
-"""Places of a stretch without reversals at which contact forces are looked at."""
-Pins = tuple[float | None, float | None]
-"""Squeezes at the start and the end of a motion, where they are given [N]."""
-EARLY = 1e-5
-"""Accuracy from which on few elements will do, and limits are tightened before all solves."""
-_BESIDES = 8
-"""Elements with slow motors beside the one of each stretch."""
-_STEPS = 5
-"""What numbers of elements are multiples of with slow motors."""
+LOOKS = 17  # places of a segment at which uniqueness is checked
+Pins = tuple[float | None, float | None]  # prescribed internal force at start and end [N]
+EARLY = 1e-5  # accuracy from which few elements will do, and limits are tightened before any solve
+_EXTRA = 8  # elements beyond one for each stretch, under rate limits
+_STEPS = 5  # their number is a multiple of it: fewer different NLPs to build
 
 
 @dataclass(frozen=True)
 class Task:
-    """What is planned: see `plan_curves`; with ranges, near `guides`, one for each curve.
-
-    Motors may be taken to be `quick`. The squeeze at both ends is as `pins` say [N], where they do.
-    """
+    """Arguments of `plan_curves`; with ranges also a reference for each curve."""
 
     curves: Sequence[Curve]
     epsilon: float
@@ -51,21 +44,21 @@ class Task:
     duration: float | None
     start: SureStart | None = None
     guides: tuple[Guide, ...] = ()
-    quick: bool = False
+    unlimited: bool = False  # whether torque rates and lags are left out
     pins: Pins = (None, None)
 
     @cached_property
-    def spreads(self) -> list[Spread | None]:
-        """What ranges make of the force limits of each curve."""
+    def spreads(self) -> list[RobustLimits | None]:
+        """Robust force limits of each curve, None without ranges."""
         if not self.guides:
             return [None] * len(self.curves)
-        pairs = zip(self.curves, self.guides, strict=True)
-        return [spread(curve, self.epsilon, self.options.ranges, own) for curve, own in pairs]
+        args = self.epsilon, self.options.ranges
+        return [spread(*pair, *args) for pair in zip(self.curves, self.guides, strict=True)]
 
     @property
     def is_held(self) -> bool:
-        """Whether motions begin and end without acceleration, as torques may not step."""
-        return self.curves[0].formation.scene.has_slow_motors and not self.quick
+        """Whether motions start and end without acceleration, as torques may not step."""
+        return self.curves[0].formation.scene.has_slow_motors and not self.unlimited
 
     @property
     def name(self) -> str:
@@ -74,71 +67,58 @@ class Task:
 
     @property
     def lost(self) -> float:
-        """Least normal force below which a margin is none [N]."""
+        """Least acceptable c_n of a plan of largest margin [N]."""
         return self.epsilon - MISS * self.curves[0].formation.scene.scales.force
 
     @property
     def elements(self) -> int:
-        """Elements of each phase to begin with."""
+        """Initial number of elements of each phase."""
         intervals = self.options.intervals
         if intervals is None:
             few = START if self.options.accuracy >= EARLY else 2 * START
             return max(few, SOFT) if self.is_held or self.options.goal is Objective.EFFORT else few
         return max(-(-intervals // DEGREE), 3)
 
-    def require_unique(self) -> None:
-        """Require contact forces to be the only ones; see `task.require_unique`."""
-        for curve, phase in zip(self.curves, self.phases, strict=True):
-            require_unique(curve, self.options.uniqueness_margin, phase)
-
     def lay_out(
-        self, meshes: Sequence[Mesh], wanted: int
-    ) -> tuple[int, list[PhaseData], PhaseData, PathNLP]:
-        """Each phase on its mesh, all as one, and the NLP for that.
+        self, meshes: tuple[Mesh, ...], wanted: int
+    ) -> tuple[int, tuple[Mesh, ...], list[PhaseData], PhaseData, PathNLP]:
+        """Elements of each phase, meshes, each phase on its mesh, all joined, and their NLP.
 
-        Each has as many elements, also returned, as are wanted if that is enough for its ends.
+        There are as many elements as wanted, if that is enough for the breaks.
         """
-        pairs = zip(self.curves, meshes, strict=True)
+        pairs = list(zip(self.curves, meshes, strict=True))
         ends = max(len(find_ends(curve, mesh.breaks)) for curve, mesh in pairs)
         if self.is_held and self.options.intervals is None:
-            # Ramps take elements that the rest is not to lack; few numbers of them are built for.
-            ends = -(-(ends + _BESIDES) // _STEPS) * _STEPS
-        elements = max(wanted, ends)
-        parts = self.prepare(meshes, elements)
+            ends = -(-(ends + _EXTRA) // _STEPS) * _STEPS
+        elements, parts, last = max(wanted, ends), list[PhaseData](), len(meshes) - 1
+        for k, (curve, mesh) in enumerate(pairs):
+            grid = mesh.make_grid(curve, elements, (k == 0, k == last), self.is_held)
+            parts.append(prepare(curve, self.epsilon, grid, self.phases[k], self.spreads[k]))
         data = join(parts)
-        motors = MotorShape.of(self.curves[0].formation.scene) if self.is_held else QUICK
+        motors = MotorShape.of(self.curves[0].formation.scene) if self.is_held else UNLIMITED
         shape = LimitShape.of(data.limits, motors)
         nlp = build_path_nlp(shape, len(data.grid.steps), self.options.goal)
-        return elements, parts, data, nlp
+        return elements, meshes, parts, data, nlp
 
     def place_breaks(self, switches: Sequence[Switch]) -> tuple[Mesh, ...]:
-        """Meshes with elements that end at switches, which are at places along all curves.
+        """Meshes with breaks at switches, which are at places along all curves.
 
-        Where a fixed number of elements is too few for that, they do not.
+        None on a curve where a fixed number of elements is too few for them.
         """
         starts = np.cumsum([0.0, *(curve.length for curve in self.curves)])
         of_curve = np.searchsorted(starts[1:-1], [place for place, _ in switches])
         meshes = list[Mesh]()
         for k, curve in enumerate(self.curves):
             pairs = zip(switches, of_curve, strict=True)
-            own = [Switch(place - starts[k], jumps) for (place, jumps), at in pairs if at == k]
-            meshes.append(Mesh.of(curve, own, self.is_held))
-            ends = find_ends(curve, meshes[-1].breaks)
-            if self.options.intervals and len(ends) > self.elements:
-                meshes[-1] = Mesh()
+            local = [Switch(place - starts[k], jumps) for (place, jumps), at in pairs if at == k]
+            mesh = Mesh.of(curve, local, self.is_held)
+            few = self.options.intervals and len(find_ends(curve, mesh.breaks)) > self.elements
+            meshes.append(Mesh() if few else mesh)
         return tuple(meshes)
-
-    def prepare(self, meshes: Sequence[Mesh], elements: int) -> list[PhaseData]:
-        """What each phase gives the NLP on its grid."""
-        found, last = [], len(meshes) - 1
-        for k, (curve, mesh) in enumerate(zip(self.curves, meshes, strict=True)):
-            grid = mesh.make_grid(curve, elements, (k == 0, k == last), self.is_held)
-            found.append(prepare(curve, self.epsilon, grid, self.phases[k], self.spreads[k]))
-        return found
 
 
 def require_unique(curve: Curve, least: float, phase: int) -> None:
-    """Require contact forces to be the only ones along a curve.
+    """Require unique contact forces along a curve.
 
     Parameters
     ----------
@@ -152,15 +132,15 @@ def require_unique(curve: Curve, least: float, phase: int) -> None:
     formation, segments = curve.formation, curve.segments
     if not formation.friction.any():
         return
-    s = np.concatenate([np.linspace(own.start, own.stop, LOOKS) for own in segments])
+    s = np.concatenate([np.linspace(part.start, part.stop, LOOKS) for part in segments])
     point = curve.evaluate(s)
-    Xi = np.repeat([own.Xi for own in segments], LOOKS, axis=0)
+    directions = directions_of(curve, np.repeat(np.arange(len(segments)), LOOKS))
+    Xi = directions.Xi
     still = (formation.sliding_friction > 0) & (Xi == 0).all(axis=0)
     sticking = tuple(np.flatnonzero(still).tolist())
     ratio, names, row = find_minors(formation, point.kinematics, Xi, sticking).find_least()
     if ratio >= least:
         return
-    sigma = np.repeat([own.sigma for own in segments], LOOKS, axis=0)
-    if reduced_inertia(formation, point.kinematics, Directions(Xi, sigma)).min() > 0:
+    if reduced_inertia(formation, point.kinematics, directions).min() > 0:
         text = describe_uniqueness(ratio, names, describe_pose(point.z[row]), least)
         raise AmbiguityError(f"phase {phase}: {text}")

@@ -1,18 +1,16 @@
-"""The expressions of the planning NLP of one-freedom phases.
+"""Expressions of the planning NLP in the path domain: direct collocation along a curve.
 
-On a curve z(s) everything is affine in a = s'', b = s'^2 and the squeeze lambda, but for viscous
-friction (`mechanics.dynamics.PathForces`). The unknowns are a_k, b_k and lambda_k at the nodes s_k
-of `elements`: inside each, a and lambda are polynomials, and b' = 2 a (dash: d/ds) is exact,
+On a curve z(s) everything is affine in a = s'', b = s'^2 and the internal force lambda, but for
+viscous friction (`PathForces`). Unknowns are a_k, b_k and lambda_k at the nodes s_k of `elements`.
+Inside each, a and lambda are polynomials, and b' = 2 a (dash: d/ds) is exact,
 
     b_k+1 = b_k + h sum of links_kj a_j over the nodes j of the element of length h,
     low <= rows (c, tau, theta') <= high at every node (`mechanics.limits`),
-    T = sum of h weights_k / sqrt(b_k) (next to rest as said in `_find_paces`).
+    T = sum of h weights_k / sqrt(b_k) (next to rest as in `_find_paces`).
 
-Where two elements meet, b is the same and a and lambda may jump, unless motors are slow
-(`motor_terms`).
-
-The least margin, and the relaxation of a limit, have an unknown at every node with m_k+1 = m_k. A
-column through all rows would make building the Jacobian quadratic in the number of nodes.
+b is continuous where two elements meet; a and lambda may step, unless torques are rate-limited
+(`rate_terms`). The least margin, and the relaxation of a limit, have a copy at every node with
+m_k+1 = m_k: a dense column would make building the Jacobian quadratic in the number of nodes.
 """
 
 from __future__ import annotations
@@ -27,83 +25,66 @@ from ...mechanics.limits import PRESS, TORQUE, LimitSet
 from ..columns import Columns, Symbols
 from ..options import Objective
 from .elements import DEGREE, FROM_REST, INSIDE, POWERS, SIGNS, find_basis
-from .rate_terms import QUICK, MotorShape, find_first_slopes, list_kinds, write_motor_rows
+from .rate_terms import UNLIMITED, MotorShape, find_first_slopes, list_kinds, write_motor_rows
 
-CHAINED = (Objective.MARGIN, Objective.RELAX)
-"""Objectives with one more unknown, which every node has a copy of."""
-SOFT = (Objective.ELASTIC, Objective.RELAX)
-"""Objectives for which limits give way, so that each side of a limit has a row of its own."""
-LEAST_B = 1e-8
-"""Least s'' at rest, in units of the typical one, and least b far away from it; next to rest b goes
-with the way. Keeps the square root differentiable."""
-_CALM = 1e-6
-"""Weight of the squeeze against the objective: picks one among equally good ones."""
-_ROUGH = 0.1
-"""Weight of the highest polynomial of a and lambda in each element: rules out that they bend at a
-single node towards other limits than around it. It falls fast where the plan is smooth."""
-_EVEN = 1e-4
-"""Weight of changes of a from node to node where limits give way."""
-_STIFF = 1e3
-"""The same, over that, where limits give way, for s'' that is not linear in an element, or next to
-rest not constant."""
+CHAINED = (Objective.MARGIN, Objective.RELAX)  # with one more unknown, copied at every node
+SOFT = (Objective.ELASTIC, Objective.RELAX)  # with a row for each side of the soft limits
+LEAST_B = 1e-8  # least |s''| at rest and b elsewhere, over typical ones: sqrt(b) is differentiable
+_CALM = 1e-6  # regularization by lambda^2: selects among equally good plans
+_ROUGH = 0.1  # regularization by the highest Legendre coefficients: no oscillation within elements
+_EVEN = 1e-4  # regularization by changes of a between nodes, in elastic mode
+_STIFF = 1e3  # `_ROUGH` for nonlinear s'', next to rest nonconstant, in elastic mode, over that
 
 
 class LimitShape(NamedTuple):
-    """What an NLP has to know of limits, whatever they are of."""
+    """Structure of the limits that an NLP is built for."""
 
     rows: int  # number m of rows
-    # row and sign of each side, in the order of `LimitSet.sides`
-    sides: tuple[tuple[int, float], ...]
-    # presses, torques, fast: rows of the least normal forces and of the torques, and those that
-    # know of the speed
-    presses: tuple[int, ...]
-    torques: tuple[int, ...]
-    fast: tuple[int, ...]
-    motors: MotorShape = QUICK
+    sides: tuple[tuple[int, float], ...]  # row and sign of each, in the order of `LimitSet.sides`
+    presses: tuple[int, ...]  # rows of the least normal forces
+    torques: tuple[int, ...]  # rows of the torques
+    fast: tuple[int, ...]  # rows that depend on s'
+    motors: MotorShape = UNLIMITED
 
     @staticmethod
-    def of(limits: LimitSet, motors: MotorShape = QUICK) -> LimitShape:
+    def of(limits: LimitSet, motors: MotorShape = UNLIMITED) -> LimitShape:
         """The shape of a set of limits."""
         rows, signs, _ = limits.sides
-        known = [part.any(axis=1) for part in limits.columns[1:]]
+        of_tau, of_rates = (part.any(axis=1) for part in limits.columns[1:])
         drags = np.array([limits.limits[k].drags for k in limits.owners])
         return LimitShape(
             len(limits.low),
             tuple(zip(rows.tolist(), signs.tolist(), strict=True)),
             tuple(limits.of(PRESS).tolist()),
             tuple(limits.of(TORQUE).tolist()),
-            tuple(np.flatnonzero(known[0] | known[1] | drags).tolist()),
+            tuple(np.flatnonzero(of_tau | of_rates | drags).tolist()),
             motors,
         )
 
 
 class NLPColumns(NamedTuple):
-    """What the vectors of an NLP consist of."""
+    """Blocks of the vectors of an NLP."""
 
-    # unknowns of each node: b over its size (none at the two ends), a, squeeze, and what the
-    # objective adds: shortfalls of the limits for `elastic`, the least margin, or the relaxation
-    # for `relax`
+    # unknowns of each node: b over its size (none at the two ends), a, internal force, and `extra`:
+    # shortfalls for `elastic`, the least margin, or the relaxation for `relax`
     node: Columns
-    # the speeds at the `ends`; the `steps`; the `weight` of time; what the unit of squeeze counts
-    # for where it is kept `calm`; column by column, coefficients of the limits at the nodes but for
-    # the constant ones, which are part of the bounds; for `effort` and slow motors the constant
-    # torques; for `effort` the weight of each joint; for `relax` by how much each limit gives way
-    # with the relaxation, and b's coefficients in the speed limit; for slow motors one over their
-    # largest rates, their lags, the bends of elements and the `sizes` of b
+    # speeds at the `ends`, `steps`, `weight` of time, unit of internal force in the regularization;
+    # coefficients of the limits at the nodes, column by column (the constant ones are part of the
+    # bounds); constant torques and weights of joints for `effort`; how limits and b's one give way
+    # for `relax`; 1 / rate limits, lags, bends of elements and `sizes` of b for rate limits
     p: Columns
-    # the N of b' = 2 a; those that `chain` the margin or the relaxation; node by node the `limits`,
-    # side by side where they are soft, and the speed for `relax`; the `duration` for `margin`; the
-    # rows of motors
+    # b' = 2 a; the `chain` of the margin or the relaxation; node by node the `limits`, side by side
+    # where they are soft, and the speed for `relax`; the `duration` for `margin`; rate limits
     g: Columns
 
 
 def list_columns(shape: LimitShape, intervals: int, objective: Objective) -> NLPColumns:
-    """List what the vectors of an NLP consist of."""
+    """The blocks of the vectors of an NLP."""
     n, m, relax = intervals + 1, shape.rows, objective is Objective.RELAX
-    chained, fast = objective in CHAINED, len(shape.fast)
+    chained = objective in CHAINED
     extra = m if objective is Objective.ELASTIC else int(chained)
     p = {"ends": 2, "steps": intervals, "weight": 1, "calm": 1, "a": n * m, "b": n * m}
-    p |= {"squeeze": n * m, "speed": n * fast}
+    p |= {"lam": n * m, "speed": n * len(shape.fast)}
     if objective is Objective.EFFORT or shape.motors.slow:
         p |= {"torque": n * 2}
     if objective is Objective.EFFORT:
@@ -116,7 +97,7 @@ def list_columns(shape: LimitShape, intervals: int, objective: Objective) -> NLP
     rows = (len(shape.sides) if objective in SOFT else m) + relax
     g = {"links": intervals, "chain": intervals * chained, "limits": n * rows}
     g |= {"duration": int(objective is Objective.MARGIN)} | shape.motors.list_sizes(intervals)
-    return NLPColumns(Columns(b=1, a=1, squeeze=1, extra=extra), Columns(**p), Columns(**g))
+    return NLPColumns(Columns(b=1, a=1, lam=1, extra=extra), Columns(**p), Columns(**g))
 
 
 def write_terms(shape: LimitShape, intervals: int, objective: Objective) -> dict[str, Expression]:
@@ -127,31 +108,35 @@ def write_terms(shape: LimitShape, intervals: int, objective: Objective) -> dict
     dict  expressions of x, p, f and g
     """
     n, columns = intervals + 1, list_columns(shape, intervals, objective)
-    given = columns.p.make_symbols()
-    b_inner, a, squeeze = ca.SX.sym("b", n - 2), ca.SX.sym("a", n), ca.SX.sym("squeeze", n)
-    extra, h, ends = (
-        ca.SX.sym("extra", n, columns.node.sizes["extra"]),
-        given.steps,
-        given.ends,
-    )
-    # Where motors are slow, b next to rest is many orders of magnitude below what it is elsewhere.
-    bends, sizes = (given.bends.T, given.sizes) if shape.motors.slow else (None, ca.DM.ones(n))
+    symbols = columns.p.make_symbols()
+    b_inner, a, lam = ca.SX.sym("b", n - 2), ca.SX.sym("a", n), ca.SX.sym("lam", n)
+    extra = ca.SX.sym("extra", n, columns.node.sizes["extra"])
+    h, ends, fast = symbols.steps, symbols.ends, list(shape.fast)
+    # Under rate limits b is scaled: next to rest it is many orders of magnitude smaller.
+    bends, sizes = (symbols.bends.T, symbols.sizes) if shape.motors.slow else (None, ca.DM.ones(n))
     b = ca.vertcat(ends[0] ** 2, b_inner * sizes[1:-1], ends[1] ** 2)
     speed = ca.vertcat(ends[0], ca.sqrt(b[1:-1]), ends[1])
     largest = ca.fmax(sizes[1:], sizes[:-1])
     lengths, paces = _find_lengths(h), _find_paces(a, speed, h, bends)
     times = ca.vec(ca.DM(find_basis().weights) @ lengths / paces)
-    values = _write_values(shape, given, (a, b, squeeze, speed))
+
+    def scale(name: str, column: Expression) -> Expression:
+        table = ca.reshape(getattr(symbols, name), n, -1)
+        return table * ca.repmat(column, 1, table.shape[1])
+
+    # Limits but for their constant part, which is in the bounds.
+    values = scale("a", a) + scale("b", b) + scale("lam", lam)
+    values[:, fast] += scale("speed", speed)
     torques = values[:, list(shape.torques)]
     if objective is Objective.EFFORT or shape.motors.slow:
-        torques += ca.reshape(given.torque, n, 2)
-    # What is relaxed has to be as little as possible, whatever the motion is like.
+        torques += ca.reshape(symbols.torque, n, 2)
+    # The relaxation has to outweigh the regularization.
     share = 1e-3 if objective is Objective.RELAX else 1.0
-    squeezed, node_weights = given.calm * squeeze, ca.vertcat(0, h) + ca.vertcat(h, 0)
-    node_costs = share * _CALM * node_weights * squeezed**2
-    rough = _find_bends(a, DEGREE) + _find_bends(squeezed, DEGREE)
+    scaled_lam, node_weights = symbols.calm * lam, ca.vertcat(0, h) + ca.vertcat(h, 0)
+    node_costs = share * _CALM * node_weights * scaled_lam**2
+    rough = _find_bends(a, DEGREE) + _find_bends(scaled_lam, DEGREE)
     if objective is Objective.ELASTIC:
-        # Limits that give way would otherwise be spared by motions that turn back between nodes.
+        # Soft limits would otherwise be avoided by motions that reverse between nodes.
         slopes, bends = _find_bends(a, 1), _find_bends(a, 2)
         rough += _STIFF * ca.horzcat(slopes[0], bends[1:-1], slopes[-1])
         node_costs[:-1] += _EVEN * (a[1:] - a[:-1]) ** 2
@@ -159,29 +144,28 @@ def write_terms(shape: LimitShape, intervals: int, objective: Objective) -> dict
     if objective is Objective.TIME:
         node_costs += times
     elif objective is Objective.EFFORT:
-        node_costs += times * (torques**2 @ given.joints + given.weight)
+        node_costs += times * (torques**2 @ symbols.joints + symbols.weight)
     elif objective is Objective.MARGIN:
         node_costs[0] -= extra[0]
     elif objective is Objective.ELASTIC:
-        # Every node counts alike: where intervals are short, being short must not be cheap.
-        node_costs += ca.sum2(extra) / n
-        node_costs += 1e-4 * times
+        # Not weighted by lengths, or shortfalls at short intervals would be cheap.
+        node_costs += ca.sum2(extra) / n + 1e-4 * times
     else:
         node_costs[0] += extra[0]
         node_costs += 1e-5 * times
-    nodes = ca.horzcat(ca.vertcat(0, b_inner, 0), a, squeeze, extra).T
+    nodes = ca.horzcat(ca.vertcat(0, b_inner, 0), a, lam, extra).T
     chained, late = objective in CHAINED, objective is Objective.MARGIN
-    rows = _write_limits(shape, objective, given, values, extra, b)
+    rows = _write_limits(shape, objective, symbols, values, extra, b)
     return {
         "x": ca.vertcat(nodes[1:, 0], ca.vec(nodes[:, 1:-1]), nodes[1:, -1]),
-        "p": given.every,
+        "p": symbols.every,
         "f": ca.sum1(node_costs),
         "g": columns.g.write(
             links=(b[1:] - b[:-1] - _write_rises(a, h, bends)) / largest,
             chain=extra[1:] - extra[:-1] if chained else ca.SX(0, 1),
             limits=rows.T,
             duration=ca.sum1(times) if late else ca.SX(0, 1),
-            **write_motor_rows(shape.motors, given, torques, a, paces, lengths),
+            **write_motor_rows(shape.motors, symbols, torques, a, paces, lengths),
         ),
     }
 
@@ -192,7 +176,7 @@ def _find_lengths(h: Expression) -> Expression:
 
 
 def _write_rises(a: Expression, h: Expression, bends: Expression | None) -> Expression:
-    """By how much b rises from each node to the next, shape (N,); `bends` where motors are slow."""
+    """Rise of b from each node to the next, shape (N,); with `bends` under rate limits."""
     table, lengths = ca.reshape(a, DEGREE + 1, -1), _find_lengths(h)
     count = lengths.numel()
     links, kinds = find_basis().links, list_kinds(count, bends is not None)
@@ -207,7 +191,7 @@ def _write_rises(a: Expression, h: Expression, bends: Expression | None) -> Expr
 def _find_paces(
     a: Expression, speed: Expression, h: Expression, bends: Expression | None
 ) -> Expression:
-    """How fast the local variable is at each node, times the element's length, (p + 1, E)."""
+    """Rate dy/dt of the local variable at each node, times the element's length, (p + 1, E)."""
     basis, held = find_basis(), bends is not None
     lengths = _find_lengths(h)
     count = lengths.numel()
@@ -216,7 +200,7 @@ def _find_paces(
         c = ca.repmat(bends[1:-1], DEGREE + 1, 1)
         paces[:, 1:-1] /= 1 - c + 2 * c * ca.repmat(ca.DM(basis.y[INSIDE]), 1, count - 2)
     slopes = find_first_slopes(a) if held else (a[0], a[-1])
-    # Next to rest the speed is a power of the local variable but for a factor that is smooth.
+    # Next to rest the speed is a power of the local variable times a smooth factor.
     for e, kind in ((0, list_kinds(count, held)[0]), (count - 1, list_kinds(count, held)[-1])):
         rest, power = 0 if SIGNS[kind] > 0 else DEGREE, int(POWERS[kind])
         for j, y in enumerate(basis.y[kind].tolist()):
@@ -232,23 +216,10 @@ def _find_bends(values: Expression, degree: int) -> Expression:
     return ca.sum1(modes**2)
 
 
-def _write_values(shape: LimitShape, given: Symbols, motion: tuple[Expression, ...]) -> Expression:
-    """What limits are of, but for the constant part, shape (n, m)."""
-    a, b, squeeze, speed = motion
-    n, m, fast = a.numel(), shape.rows, list(shape.fast)
-
-    def scale(name: str, column: Expression, count: int) -> Expression:
-        return ca.reshape(getattr(given, name), n, count) * ca.repmat(column, 1, count)
-
-    values = scale("a", a, m) + scale("b", b, m) + scale("squeeze", squeeze, m)
-    values[:, fast] += scale("speed", speed, len(fast))
-    return values
-
-
 def _write_limits(
     shape: LimitShape,
     objective: Objective,
-    given: Symbols,
+    symbols: Symbols,
     values: Expression,
     extra: Expression,
     b: Expression,
@@ -260,8 +231,8 @@ def _write_limits(
     if objective not in SOFT:
         return values
     relax = objective is Objective.RELAX
-    short = extra @ given.gives.T if relax else extra
+    short = extra @ symbols.gives.T if relax else extra
     rows = [values[:, row] + sign * short[:, row] for row, sign in shape.sides]
     if relax:
-        rows.append(given.rates * b - short[:, shape.rows])
+        rows.append(symbols.rates * b - short[:, shape.rows])
     return ca.horzcat(*rows)

@@ -1,9 +1,8 @@
-"""Starts that friction cannot hold: where on its first node a plan along a curve has to be.
+"""Bounds of a plan's first node with which static friction cannot hold the start.
 
-At rest the torques are affine in s'' and the squeeze, tau = T0 + Ta s'' + Tl lambda. What friction
-can hold there is a polygon of them too (`mechanics.wedging`). A plan that begins inside it is
-planned again with its first node beyond one of the polygon's sides: at the nearest place that keeps
-every limit, or farther from that side.
+At rest the torques are affine in s'' and internal force, tau = T0 + Ta s'' + Tl lambda. Those that
+friction can hold are a polygon (`mechanics.wedging`). A plan that starts inside it is planned again
+with its first node beyond one of the sides: at the nearest place that keeps every limit, or beyond.
 """
 
 from __future__ import annotations
@@ -20,18 +19,14 @@ from ..robust.robust_rows import RobustHold, list_holds, measure_holds
 from .elements import Profile
 from .path_data import PhaseData
 
-BEYOND = 10.0
-"""How far beyond, over what is enough, the first node is placed."""
-WORTH = 0.02
-"""Share of the objective of its phases that a sure start may cost."""
-_SHARES = (0.0, 0.002, 0.005, 0.01, WORTH)
-"""Shares of a margin that are given up for it, as little as will do."""
-_KEPT = 1e-9
-"""What passes for keeping a limit, over what is much for it."""
+BEYOND = 10.0  # distance of the first node beyond the side, over the least sure one
+WORTH = 0.02  # largest relative cost of such a start
+_SHARES = (0.0, 0.002, 0.005, 0.01, WORTH)  # shares of a margin given up for it, in this order
+_KEPT = 1e-9  # violation of a limit that is rounding, over its scale
 
 
 class SureStart(NamedTuple):
-    """Bounds of the first node: s'' from `least_a` up, and the squeeze from `low` to `high`."""
+    """Bounds of the first node: s'' from `least_a` up, internal force from `low` to `high`."""
 
     least_a: float
     low: float
@@ -41,16 +36,16 @@ class SureStart(NamedTuple):
 def find_sure_start(
     data: PhaseData, profile: Profile, margin: float, ranges: Mapping[str, float]
 ) -> SureStart | None:
-    """Bounds with which a motion surely leaves rest; None if it does, or if nothing helps.
+    """Bounds with which a motion leaves rest; None if it does anyway, or if nothing helps.
 
     Parameters
     ----------
-    margin : [N]  by which normal forces are above epsilon
-    ranges        of numbers, within all of which it is to be sure
+    margin : [N]  of normal forces over epsilon
+    ranges        of parameters, within all of which it has to leave rest
     """
     formation, forces = data.curve.formation, data.nodes.forces
     holds = list_holds(formation, data.curve.start, ranges)
-    here = np.array([profile.a[0], profile.squeeze[0]])
+    here = np.array([profile.a[0], profile.lam[0]])
     T0, T = forces.T0[0], np.column_stack([forces.Ta[0], forces.Tl[0]])
     unit = formation.scene.scales.torque
     if measure_holds(holds, T0 + T @ here) > SURE * unit:
@@ -58,12 +53,12 @@ def find_sure_start(
     rows, signs, bounds = data.limits.sides
     presses = np.isin(rows, data.limits.of(PRESS)) & (signs > 0)
     terms = data.find_terms()
-    slopes = signs[:, None] * np.column_stack([terms.a[0], terms.squeeze[0]])[rows]
+    slopes = signs[:, None] * np.column_stack([terms.a[0], terms.lam[0]])[rows]
     scales = formation.scene.scales
     units = np.array([scales.acceleration, scales.force])
     for share in _SHARES if margin > 0 else _SHARES[:1]:
         offsets = signs * (terms.constant[0, rows] - bounds) - (1 - share) * margin * presses
-        best, found = np.inf, None
+        best, start = np.inf, None
         for side, bound in _list_sides(holds, BEYOND * SURE * unit):
             normal = side @ T
             if normal[0] <= 0:
@@ -74,14 +69,14 @@ def find_sure_start(
                 away = float(np.abs(T @ (place - here)).max())
                 if kept and away < best:
                     ends = (place[1], np.inf) if normal[1] > 0 else (-np.inf, place[1])
-                    best, found = away, SureStart(float(place[0]), *map(float, ends))
-        if found is not None:
-            return found
+                    best, start = away, SureStart(float(place[0]), *map(float, ends))
+        if start is not None:
+            return start
     return None
 
 
 def _list_sides(holds: Sequence[RobustHold], beyond: float) -> Iterator[tuple[Array, float]]:
-    """Sides of what can be held, each with its bound, as far beyond [N m]."""
+    """Sides of the torques that can be held, each with its bound and a distance beyond [N m]."""
     for static, gains in holds:
         for normal, bound in zip(static.normals, static.bounds, strict=True):
             yield normal * gains, float(bound) + beyond

@@ -1,4 +1,4 @@
-"""What limits miss between the nodes of a solution, and how they are tightened by that."""
+"""Violations of limits between the nodes of a solution, and the tightening that removes them."""
 
 from __future__ import annotations
 
@@ -14,42 +14,31 @@ from .path_motion import PathMotion
 from .path_nlp import PathNLP, Tightening, Units
 from .rate_terms import find_hurry
 
-MISS = 2.5e-7
-"""Largest miss of a limit between nodes.
-
-Over the scene's force for contact forces, relative for torques, the square of speeds and time.
-"""
-HURRIED = 1e-4
-"""Largest relative miss of the torques' rates and of commands between nodes."""
-ROUNDS = 40
-"""Most times that the NLP is solved for one phase."""
-OVER = 1.05
-"""Factor on the miss by which a limit is tightened."""
-_NEAR = 1e-3
-"""Least miss of a start that plans do not have, over what is much."""
+MISS = 2.5e-7  # largest violation between nodes, over the limits' scales; relative for b and time
+_RATE_MISS = 1e-4  # the same, relative, for torque rates and commands
+SOLVES = 40  # most solves while limits are tightened
+OVER = 1.05  # tightening over the violation
+_NEAR = 1e-3  # violations of a start beyond this are its own, not those of a plan, over the scales
 
 
 class PathSolution(NamedTuple):
-    """What the solver has found, or where it is to start."""
+    """A solution of the NLP, or the point to start from."""
 
     profile: Profile
     margin: float  # [N]: over epsilon
     multipliers: dict[str, Array]
     cost: float = np.inf  # in the units of the NLP
-    lasts: float = 0.0  # [s]: what the NLP takes the duration for, where that has a bound
+    duration: float = 0.0  # [s]: by the quadrature of the NLP, where it is bounded
 
 
 class Misses(NamedTuple):
-    """What limits miss between nodes: see `PhaseData.misses`; and the duration, relatively.
+    """Violations between nodes."""
 
-    And motors, see `find_hurry`.
-    """
-
-    short: Array
+    short: Array  # short, speeding, spare: see `PhaseData.misses`
     speeding: Array
     spare: Array
-    late: float
-    hurry: Array
+    late: float  # of the duration, relative
+    hurry: Array  # see `find_hurry`
 
     @staticmethod
     def of(
@@ -58,7 +47,7 @@ class Misses(NamedTuple):
         motions: Sequence[PathMotion],
         duration: float | None,
     ) -> Misses:
-        """Misses of a solution, which is one motion for each phase."""
+        """Violations of a solution, one motion for each phase."""
         late = 0.0
         if duration:
             late = max(0.0, sum(motion.duration for motion in motions) / duration - 1)
@@ -66,14 +55,14 @@ class Misses(NamedTuple):
         return Misses(*data.misses(solution.profile, solution.margin), late, hurry)
 
     def find_worst(self, data: PhaseData) -> float:
-        """The largest, over what is much."""
-        hurried = self.hurry.max() * (MISS / HURRIED)
+        """The largest, over the scales."""
+        hurried = self.hurry.max() * (MISS / _RATE_MISS)
         return float(max((self.short / data.spans).max(), self.speeding.max(), self.late, hurried))
 
     def tighten(
         self, data: PhaseData, tightening: Tightening, solution: PathSolution
     ) -> Tightening:
-        """Limits that are tightened by somewhat more than they miss."""
+        """Limits tightened by somewhat more than their violations."""
         reach = data.slack_at_neighbours(solution.profile, solution.margin, self.short)
         short, speeding = data.spread_to_nodes(self.short), data.spread_to_nodes(self.speeding)
         if data.grid.held:
@@ -87,11 +76,11 @@ class Misses(NamedTuple):
         )
 
     def find_spare(self, data: PhaseData) -> Array:
-        """How far each side is from being missed about each node, shape (n, n_sides)."""
+        """Slack of each side in the intervals about each node, shape (n, n_sides)."""
         return -data.spread_to_nodes(-self.spare, -np.inf)
 
     def describe(self, data: PhaseData) -> str:
-        """What is still missed after all solves."""
+        """Violations that remain after all solves, for a message."""
         worst = int((self.short / data.spans).max(axis=0).argmax())
         limits = data.limits
         unit = limits.limits[limits.owners[limits.sides[0][worst]]].unit
@@ -102,13 +91,13 @@ class Misses(NamedTuple):
             if over <= MISS:
                 over = self.hurry.max()
                 missed = f"the torque rate limit is still exceeded by {over:.2g} of it"
-        return f"after {ROUNDS} solves {missed}; plan with more intervals"
+        return f"after {SOLVES} solves {missed}; plan with more intervals"
 
 
 def _taper(short: Array, grid: Grid) -> Array:
-    """Misses at nodes, shape (n, n_sides), so that they are the same where two elements meet.
+    """Violations at nodes, (n, n_sides), made continuous where two elements meet, as torques are.
 
-    Torques are, too, and a polynomial that is held back at one end alone would swing.
+    A polynomial tightened at one end alone would oscillate.
     """
     table = short.reshape(-1, DEGREE + 1, short.shape[1])
     ends = np.zeros((len(table) + 1, short.shape[1]))
@@ -120,7 +109,7 @@ def _taper(short: Array, grid: Grid) -> Array:
 
 
 def anticipate(data: PhaseData, start: PathSolution, tightening: Tightening) -> Tightening:
-    """Tighten by what a start misses, but for speeds and what it alone misses."""
+    """Tighten by the violations of a start, but for those of speeds and those beyond `_NEAR`."""
     short, speeding, spare = data.misses(start.profile, start.margin)
     short = np.where(short < _NEAR * data.spans, short, 0.0)
     hurry = np.zeros((len(short), 2, 2))
@@ -132,24 +121,24 @@ def price(
     data: PhaseData,
     units: Units,
     solution: PathSolution,
-    tightened: tuple[Array, Array, Array],
+    limits: Array,
+    speed_share: Array,
+    motors: Array,
 ) -> Array:
-    """What tightening costs at each node, to first order, in the NLP's units, shape (n,).
+    """First-order cost of tightening at each node, in the NLP's units, shape (n,).
 
-    That is multipliers times by how much limits, (n, n_sides), b, (n,), and motors, (n, 2, 2), are
-    `tightened`.
+    The sum of multipliers times the tightening of limits, (n, n_sides), b, (n,), and torque rates
+    and commands, (n, 2, 2).
     """
     rows, signs, _ = data.limits.sides
-    on_limits = solution.multipliers["lam_g0"][nlp.columns.g["limits"]].reshape(
-        len(data.grid.s), -1
-    )
+    on_g, count = solution.multipliers["lam_g0"], len(data.grid.s)
+    on_limits = on_g[nlp.columns.g["limits"]].reshape(count, -1)
     on_sides = np.maximum(-signs * on_limits[:, rows], 0.0) / units.of(data.limits)[rows]
     on_b = np.zeros(nlp.free.shape)
     on_b[nlp.free] = solution.multipliers["lam_x0"]
     on_b = np.maximum(on_b[:, 0], 0.0) * solution.profile.b / data.grid.sizes / units.profile[0]
-    found = (on_sides * tightened[0]).sum(axis=1) + on_b * tightened[1]
+    costs = (on_sides * limits).sum(axis=1) + on_b * speed_share
     for kind, (name, joints) in enumerate(nlp.shape.motors._asdict().items()):
-        on_rows = solution.multipliers["lam_g0"][nlp.columns.g[name]]
-        on_rows = np.abs(on_rows).reshape(len(joints), len(data.grid.s)).T
-        found += (on_rows * tightened[2][:, kind, list(joints)]).sum(axis=1)
-    return np.asarray(found)
+        on_rows = np.abs(on_g[nlp.columns.g[name]]).reshape(len(joints), count).T
+        costs += (on_rows * motors[:, kind, list(joints)]).sum(axis=1)
+    return np.asarray(costs)

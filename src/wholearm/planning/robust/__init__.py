@@ -1,1 +1,1 @@
-"""Ranges of numbers that are not known exactly, as limits of a plan."""
+"""Robust limits of plans over ranges of uncertain parameters."""

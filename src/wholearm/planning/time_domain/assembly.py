@@ -1,9 +1,7 @@
-"""NLPs made of small functions that repeat, with derivatives assembled entry by entry.
+"""NLPs assembled from repeated expressions with their derivatives.
 
-Most constraints of a discretised motion are the same few expressions at many places. A `Kernel` is
-such an expression with its Jacobian and Hessian; a `Block` says to which unknowns and rows each of
-its copies belongs. The Jacobian of the constraints is then a selection of the kernels' entries, the
-Hessian a sum of them: expanding or differentiating the whole NLP is not needed.
+Constraints of a discretized motion are copies of a few expressions (`Kernel`), each with its
+columns and rows (`Block`). The Jacobian selects entries of those of the kernels, the Hessian sums.
 """
 
 from __future__ import annotations
@@ -27,8 +25,7 @@ class Kernel:
 
     function: Expression  # (x, p) -> y
     jacobian: Expression  # (x, p) -> the entries dy_i / dx_j at `jacobian_at`
-    # (x, p, lam) -> the entries of the Hessian of lam^T y at `hessian_at`, i <= j
-    hessian: Expression
+    hessian: Expression  # (x, p, lam) -> entries of the Hessian of lam^T y at `hessian_at`, i <= j
     jacobian_at: Indices  # jacobian_at, hessian_at (2, n): row and column of each entry
     hessian_at: Indices
 
@@ -62,8 +59,7 @@ class Block(NamedTuple):
 
     kernel: Kernel
     columns: Indices  # (n, n_x): the unknowns that are each copy's x, no one twice
-    # (n, n_y): the constraints that are each copy's y; shape (n, 0) if y is a share of the cost
-    rows: Indices
+    rows: Indices  # (n, n_y): the constraints that are its y; shape (n, 0) if y is part of the cost
     parameters: Array  # (n, n_p)
 
 
@@ -79,46 +75,31 @@ class Assembled(NamedTuple):
     """An NLP ready for a solver."""
 
     nlp: dict[str, Expression]  # expressions of x, f and g
-    # the functions `jac_g` and `hess_lag`, as options of CasADi's solvers
-    derivatives: dict[str, Expression]
+    derivatives: dict[str, Expression]  # `jac_g` and `hess_lag`, options of CasADi's solvers
 
 
 def assemble_nlp(
     size: int, linear: Triplets, n_linear: Indices, blocks: Sequence[Block], cost: Array
 ) -> Assembled:
-    """Assemble an NLP.
+    """Assemble an NLP of `size` unknowns from linear rows, blocks, and a linear cost, (size,).
 
-    Parameters
-    ----------
-    size            number of unknowns
-    linear          entries of the linear constraints
-    n_linear        rows that are linear, with or without entries. Every other row belongs to one
-                    block.
-    cost : (size,)  linear part of the cost
+    `n_linear` are all linear rows; every other row belongs to one block.
     """
-    x = ca.MX.sym("x", size)
-    p = ca.MX.sym("p", 0)
-    lam_f = ca.MX.sym("lam_f")
+    x, p, lam_f = ca.MX.sym("x", size), ca.MX.sym("p", 0), ca.MX.sym("lam_f")
     rows_of = [n_linear] + [block.rows.ravel() for block in blocks]
     order = np.argsort(np.concatenate(rows_of), kind="stable")
     lam_g = ca.MX.sym("lam_g", len(order))
     inputs = [_select(x, block.columns) for block in blocks]
     given = [ca.DM(block.parameters.T) for block in blocks]
-    counts = [len(block.columns) for block in blocks]
     values = [
-        block.kernel.function.map(n)(here, p_)
-        for block, n, here, p_ in zip(blocks, counts, inputs, given, strict=True)
+        block.kernel.function.map(len(block.columns))(here, p_)
+        for block, here, p_ in zip(blocks, inputs, given, strict=True)
     ]
     f = ca.dot(ca.DM(cost), x)
     position = np.full(len(order), -1)
     position[n_linear] = np.arange(len(n_linear))
-    L = ca.DM.triplet(
-        position[linear.rows].tolist(),
-        linear.columns.tolist(),
-        ca.DM(linear.values),
-        len(n_linear),
-        size,
-    )
+    entries = position[linear.rows].tolist(), linear.columns.tolist(), ca.DM(linear.values)
+    L = ca.DM.triplet(*entries, len(n_linear), size)
     parts = [L @ x]
     for block, value in zip(blocks, values, strict=True):
         if block.rows.size:

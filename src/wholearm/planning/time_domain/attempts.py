@@ -1,4 +1,8 @@
-"""Guesses that phases are planned from, one after the other, and what each leads to."""
+"""Initial guesses of phases in the time domain, their order, and the solution from each.
+
+Contact modes come from the guess or from a homotopy in the friction, regularized by tanh(rate /
+onset). Torques held over control periods are a second NLP, from the plan with free torques.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import groupby, islice, pairwise
+from itertools import groupby, islice, pairwise, product
 from typing import NamedTuple
 
 import numpy as np
@@ -22,84 +26,59 @@ from .collocation import Scheme, make_scheme
 from .initial_path import PacedWay, list_ways, pace_straight
 from .mode_search import drop_gone, improve
 from .search import Price, TimeSearch, TimeSolution
-from .stage import Stage, StagePoints
+from .stage import Stage
 from .stage_modes import LEAST_INTERVALS, StageMode, drop, in_mode, link, merge, mode_of
 from .stages import guess_stages
 from .tightening import DEARER, PATIENCE, enforce_between, is_hopeless
 from .time_mesh import halve, resample, with_controls
 
 _TRIES = ((1.01, 2), (1.03, 2), (1.07, 3), (1.15, 4), (1.3, 6), (1.6, 8))
-"""Durations of phases with held torques to try, over those with free ones, and least periods."""
-_PATIENCE = 80
-"""Most iterations of one solve."""
-_SLIVER = 0.5
-"""Duration of a stage, over a period, below which it is first left out."""
-_BRIEF = 1e-3
-"""Share of a period below which it counts as nothing."""
-_SHORTER = 4
-"""Most times that a period is left out."""
-ONSETS = (0.1, 0.03)
-"""Rates at which friction sets in, one after the other, in the scene's unit."""
-HOMOTOPY_ITERATIONS = 50
-"""Most iterations of the solver for each of them."""
-MOST = 9
-"""Turns beyond which modes are those of a motion that trembles."""
-SLOW = 1e-5
-"""Rate over the largest one at the same instant below which its sign says nothing."""
-STILL = 1e-4
-"""Largest rate at an instant, over that of all, below which none of them says anything."""
-BRIEF = 0.02
-"""Least share of its stage's duration that a piece of it has."""
-ROUNDS = 4
-"""Most times that the cost-to-go is expanded."""
-GAIN = 1e-4
-"""Least gain of moving the end, over the cost of the stages."""
-FIRST = 10
-"""Most intervals of a phase to start with."""
-NEAREST = "a motion to the nearest end of the phase"
-"""Name of the first guess."""
-GRADUAL = " with friction that sets in gradually"
-"""What is added to the name of a guess whose modes are found that way."""
-NEAR = -0.3
-"""Margin of a way from which on a motion beside it may keep its limits."""
-WAYS = 3
-"""Most ways along which a motion is guessed."""
-ATTEMPT = 50
-"""Most iterations of the first run of the solver from a guess: where it leads to a plan it takes 25
-or less in one phase."""
-FEW = 35
-"""The same where a plan is known, and others may be better: of up to two phases."""
-SPLIT = 80
-"""The same in modes that friction has shown which sets in gradually, with many stages, and straight
-to a place: phase 4 of query 3 (`benchmark.queries`) takes 65."""
-MUCH_DEARER = 3.0
-"""Cost of a plan, over that with friction that sets in gradually, with which it is none."""
-ROUNDING = 5e-7
-"""Largest shortfall of a margin below epsilon by rounding, over the weight of the object."""
-FALLS = (2.0, 4.0, 1.0)
-"""Guessed durations to try, over that of a fall over the length of the outlines."""
+"""Durations with held torques to try, over those with free ones, and least numbers of periods."""
+_PATIENCE = 80  # most solver iterations with held torques
+_SLIVER = 0.5  # duration of a stage, over a period, below which it is first left out
+_BRIEF = 1e-3  # duration, over a period, that counts as zero
+_SHORTER = 4  # most times that a period is left out
+ONSETS = (0.1, 0.03)  # rates of the friction homotopy, in the scene's unit
+HOMOTOPY_ITERATIONS = 50  # most solver iterations for each of them
+MOST = 9  # reversals beyond which modes are those of a chattering motion
+SLOW = 1e-5  # rate over the largest at the same instant below which its sign is undetermined
+STILL = 1e-4  # largest rate at an instant, over that of all, below which all signs are undetermined
+BRIEF = 0.02  # least duration of a piece over that of its stage
+ROUNDS = 4  # most expansions of the cost-to-go
+GAIN = 1e-4  # least relative gain of moving the end
+FIRST = 10  # most intervals of a phase to start with
+NEAREST = "a motion to the nearest end of the phase"  # name of the first guess
+GRADUAL = " with friction that sets in gradually"  # suffix of names where modes are found so
+NEAR = -0.3  # margin of a path above which a motion near it may keep its limits
+WAYS = 3  # most paths along which a motion is guessed
+ATTEMPT = 50  # most iterations of the first solve from a guess; successes take up to 25
+FEW = 35  # the same where a plan is known, of up to two phases
+SPLIT = 80  # the same in modes of the homotopy and straight to a place; query 3, phase 4: 65
+MUCH_DEARER = 3.0  # cost of a plan, over that of the friction homotopy, above which it is rejected
+ROUNDING = 5e-7  # largest shortfall of a margin below epsilon by rounding, over the object's weight
+FALLS = (2.0, 4.0, 1.0)  # guessed durations, over that of a fall over the path's length
 
 
 class Attempt(NamedTuple):
-    """A guess to plan from."""
+    """An initial guess."""
 
     name: str
-    halvings: int  # how often its intervals are to be halved
+    halvings: int  # of its intervals, after the first solve
     stages: list[Stage]
-    gradual: bool = False  # whether friction first sets in gradually, which shows its modes
-    before: TimeSolution | None = None  # what has led to the stages
-    most: int = ATTEMPT  # most iterations of the first run of the solver
+    homotopy: bool = False  # whether its modes come from the friction homotopy
+    before: TimeSolution | None = None  # solution that the stages are from
+    most: int = ATTEMPT  # most solver iterations of the first solve
 
 
 @dataclass(frozen=True, eq=False)
 class Attempts:
-    """The attempts to plan phases as one NLP, in their order."""
+    """Initial guesses of phases that are one NLP, in their order."""
 
     problem: Problem
     phases: Sequence[Phase]
-    z: Array  # (5,): where they start
+    z: Array  # (5,): start
     search: TimeSearch
-    to_go: CostToGo | None  # what follows them
+    to_go: CostToGo | None
     patient: bool  # whether there are others after the first
 
     @cached_property
@@ -107,63 +86,56 @@ class Attempts:
         """To the nearest end."""
         return Attempt(NEAREST, self._halvings, self._guess(self._halvings, FALLS[0]))
 
-    def resume(self, found: TimeSolution) -> Attempt:
-        """From what was found from nearly the same place."""
-        first = found.stages[0].guess
-        nodes = first.nodes.copy()
+    def resume(self, solution: TimeSolution) -> Attempt:
+        """From a solution with nearly the same start."""
+        first, *others = solution.stages
+        nodes = first.guess.nodes.copy()
         nodes[0, 0] = self.first.stages[0].guess.nodes[0, 0]
-        stages = [replace(found.stages[0], guess=first._replace(nodes=nodes)), *found.stages[1:]]
-        return Attempt("", self._halvings, self._leave_room(stages), before=found)
+        stages = [replace(first, guess=first.guess._replace(nodes=nodes)), *others]
+        return Attempt("", self._halvings, self._leave_room(stages), before=solution)
 
     def begin(self, goal: Array | None = None) -> list[Attempt]:
-        """Straight to the end of a single phase, shape (5,), given or pinned, and to the nearest.
-
-        Not straight where no motion that way is near its limits.
-        """
+        """Straight to the given or pinned end of a single phase if limits allow; the nearest."""
         phase = self.phases[0]
         if len(self.phases) > 1 or (goal is None and not phase.until.pins):
             return [self.first]
         goal = find_end(phase, self.z) if goal is None else goal
         way = pace_straight(self.problem, phase, self.z, goal)
-        near = way is not None and way.margin > NEAR
-        straight = [self._follow(way)._replace(most=SPLIT)] if way and near else []
-        return [*straight, self.first]
+        if way is None or way.margin <= NEAR:
+            return [self.first]
+        return [self._follow(way)._replace(most=SPLIT), self.first]
 
     def _follow(self, way: PacedWay) -> Attempt:
-        """Along a way, in its modes."""
-        stages = self._guess(self._halvings, FALLS[0], way=way)
-        return Attempt(
-            f"a straight path that keeps limits with {way.margin:.3g} to spare",
-            self._halvings,
-            stages,
-        )
+        """Along a path, in its modes."""
+        name = f"a straight path that keeps limits with {way.margin:.3g} to spare"
+        return Attempt(name, self._halvings, self._guess(self._halvings, FALLS[0], way=way))
 
     @cached_property
     def ways(self) -> list[PacedWay]:
-        """Ways that a single phase may take, the best first."""
+        """Paths of a single phase, the best first."""
         if not self.patient or len(self.phases) > 1:
             return []
         return list_ways(self.problem, self.phases[0], self.z, WAYS)
 
     @property
     def are_far(self) -> bool:
-        """Whether no way comes near to keeping limits, which shows at once what is short."""
+        """Whether limits are missed by much along all paths."""
         return bool(self.ways) and all(way.margin <= NEAR for way in self.ways)
 
     def __iter__(self) -> Iterator[Attempt]:
-        """To the nearest end in modes that this leads to, and along ways that keep limits.
+        """To the nearest end by friction homotopy, and along paths that keep limits.
 
-        Then along ways in modes that these lead to, along others in their own, to the nearest end,
-        and there or further ahead of other durations.
+        Then along paths by friction homotopy, along others in their modes, to the nearest end, and
+        there or further ahead with other durations.
         """
         if self.patient:
-            yield self.first._replace(name=f"{self.first.name}{GRADUAL}", gradual=True)
+            yield self.first._replace(name=f"{self.first.name}{GRADUAL}", homotopy=True)
         near = [way for way in self.ways if way.margin > NEAR] or self.ways[:1]
         guesses = [self._follow(way) for way in near]
         sure = sum(way.margin > 0 for way in near)
         yield from guesses[:sure]
         for guess in [] if self.are_far else guesses:
-            yield guess._replace(name=f"{guess.name}{GRADUAL}", gradual=True)
+            yield guess._replace(name=f"{guess.name}{GRADUAL}", homotopy=True)
         yield from guesses[sure:]
         yield self.first
         onwards = len(self.phases) > 1
@@ -175,12 +147,12 @@ class Attempts:
                     yield Attempt(name, halvings, self._guess(halvings, falls, onwards))
 
     def list_further(self, most: int) -> Iterator[Attempt]:
-        """So many of the attempts to be made after the first, which is not made again."""
-        return (own for own in islice(self, most) if own is not self.first)
+        """At most so many of the guesses, without the first."""
+        return (attempt for attempt in islice(self, most) if attempt is not self.first)
 
     @property
     def _intervals(self) -> int:
-        """Intervals of each phase: a phase with one freedom has fewer unknowns in each."""
+        """Intervals of each phase: more with one degree of freedom, which has fewer unknowns."""
         alone = len(self.phases) == 1 and self.phases[0].formation.n_constraints == 4
         return self.search.options.time_intervals or (32 if alone else 10)
 
@@ -200,37 +172,36 @@ class Attempts:
         return self._leave_room(stages)
 
     def _leave_room(self, stages: list[Stage]) -> list[Stage]:
-        """The stages, with an end from which what follows has a way to go."""
+        """The stages, with an end clear of the contact that ends what follows."""
         if self.to_go is None:
             return stages
         return [*stages[:-1], keep_apart(stages[-1], self.to_go.phase.until.contact)]
 
 
 def solve_attempt(search: TimeSearch, attempt: Attempt) -> TimeSolution:
-    """Solve, find modes and intervals, halve these, and make limits hold in between."""
-    stages, least = attempt.stages, math.nan
-    if attempt.gradual:
-        found = find_modes(search, stages)
-        if not found.success:
-            return found
-        stages, least = found.stages, found.cost
-    patience = SPLIT if attempt.gradual else attempt.most
+    """Solve, search modes, choose a free end, refine intervals, and enforce limits in between."""
+    stages, least, patience = attempt.stages, math.nan, attempt.most
+    if attempt.homotopy:
+        solution = find_modes(search, stages)
+        if not solution.success:
+            return solution
+        stages, least, patience = solution.stages, solution.cost, SPLIT
     solution = search.solve(stages, attempt.before, search.wait(patience))
-    if solution.success and solution.margin < -ROUNDING:
-        # A way that presses too little may be far from one that presses enough.
-        return solution._replace(success=False, status="the largest c_n is below epsilon")
     if not solution.success:
         return solution
+    if solution.margin < -ROUNDING:
+        # A motion that presses too little may be far from one that presses enough.
+        return solution._replace(success=False, status="the largest c_n is below epsilon")
     if 0 < MUCH_DEARER * least < solution.cost or is_hopeless(search, solution):
         return solution._replace(success=False, status=DEARER)
-    plain = not search.options.mode_search or search.has_ample(solution)
-    better = solution if plain else improve(search, solution)
+    if search.options.mode_search and not search.has_ample(solution):
+        solution = improve(search, solution)
     if search.only_begins:
-        return better
-    search, solution = choose_end(search, better)
+        return solution
+    search, solution = choose_end(search, solution)
     wanted = 2**attempt.halvings * sum(stage.intervals for stage in attempt.stages)
     for _ in range(attempt.halvings):
-        # Modes that were found may have asked for more intervals than the guess has.
+        # The mode search may have added intervals.
         if solution.success and sum(stage.intervals for stage in solution.stages) < wanted:
             finer = halve(solution.stages, search.scheme)
             solution = search.solve(finer, solution, most=search.wait(PATIENCE))
@@ -248,7 +219,7 @@ def solve_attempt(search: TimeSearch, attempt: Attempt) -> TimeSolution:
 def choose_end(search: TimeSearch, solution: TimeSolution) -> tuple[TimeSearch, TimeSolution]:
     """Add the cost-to-go at the end, expanded to first order, and solve again while that gains.
 
-    Returns the search with the price of the last end, too.
+    Also returns the search with the price of the last end.
     """
     best, least, to_go = (search, solution), None, search.to_go
     if to_go is None:
@@ -270,51 +241,52 @@ def choose_end(search: TimeSearch, solution: TimeSolution) -> tuple[TimeSearch, 
 
 
 def keep_apart(stage: Stage, contact: Contact | None) -> Stage:
-    """The stage, clear of the contact that ends what comes next: that has a way to go."""
-    own = [k for k, limit in enumerate(stage.formation.limits) if limit.gains(contact)]
-    return replace(stage, apart=tuple(own), monitored=tuple(sorted({*stage.monitored, *own})))
+    """The stage, with its end clear of the contact that ends the next one."""
+    rows = [k for k, limit in enumerate(stage.formation.limits) if limit.gains(contact)]
+    return replace(stage, apart=tuple(rows), monitored=tuple(sorted({*stage.monitored, *rows})))
 
 
 def find_modes(search: TimeSearch, stages: Sequence[Stage]) -> TimeSolution:
-    """Solve with friction that sets in gradually; a solution has stages in the modes of that."""
-    mode = [mode_of(next(own for own in stages if own.phase == stage.phase)) for stage in stages]
-    plain = [in_mode(stage, own) for stage, own in zip(stages, mode, strict=True)]
-    joined = link(merge(plain))
-    before: TimeSolution | None = None
+    """Solution by friction homotopy, with stages in its modes."""
+    modes = [mode_of(next(s for s in stages if s.phase == stage.phase)) for stage in stages]
+    stages = link(merge([in_mode(*pair) for pair in zip(stages, modes, strict=True)]))
+    solution: TimeSolution | None = None
     for onset in ONSETS:
-        begun = joined if before is None else before.stages
-        gradual = [replace(stage, onset=onset) for stage in begun]
-        solution = search.solve(gradual, before, most=HOMOTOPY_ITERATIONS)
+        regular = [replace(stage, onset=onset) for stage in stages]
+        solution = search.solve(regular, solution, most=HOMOTOPY_ITERATIONS)
         if not solution.success:
             return solution
-        before = solution
-    settled = [replace(stage, onset=0.0) for stage in solution.stages]
-    pieces = [piece for stage in settled for piece in split_by_senses(stage, search.scheme)]
-    stages = link(merge(pieces))
-    if len(stages) > MOST + len(settled):
+        stages = solution.stages
+    assert solution is not None
+    exact = [replace(stage, onset=0.0) for stage in stages]
+    split = link(
+        merge([piece for stage in exact for piece in split_by_senses(stage, search.scheme)])
+    )
+    if len(split) > MOST + len(exact):
         status = "with friction that sets in gradually things turn too often"
         return solution._replace(status=status, success=False)
-    return solution._replace(stages=stages)
+    return solution._replace(stages=split)
 
 
 class _Turn(NamedTuple):
-    """Rows of (contacts, joints) that turn, and at which share of the stage's duration."""
+    """Rows of (contacts, joints) that reverse, and at which share of the stage's duration."""
 
     place: float
     rows: tuple[int, ...]
 
 
 def split_by_senses(stage: Stage, scheme: Scheme) -> list[Stage]:
-    """Pieces of a stage in each of which everything moves one way, one turning after the other.
-
-    They have to be linked.
-    """
+    """Pieces of a stage without reversals, which have to be linked."""
     part, given = stage.guess, np.array(mode_of(stage).signs)
     rates = stage.measure_senses(part.z.reshape(-1, 5), part.v.reshape(-1, 5))
     rates *= np.concatenate(stage.directions)
     signs, turns = _find_turns(stage, scheme, rates)
     signs[given == 0] = 0.0
-    edges, pieces = _spread([turn.place for turn in turns]), list[Stage]()
+    # Reversals that coincide are moved apart.
+    widths = np.diff([0.0, *(turn.place for turn in turns), 1.0])
+    widths = np.maximum(widths, min(BRIEF, 0.5 / len(widths)))
+    edges = [0.0, *np.cumsum(widths / widths.sum())[:-1].tolist(), 1.0]
+    pieces = list[Stage]()
     for k, (begin, stop) in enumerate(pairwise(edges)):
         count = max(LEAST_INTERVALS, round((stop - begin) * stage.intervals))
         guess = resample(part, scheme, np.linspace(0.0, 1.0, count + 1), begin, stop)
@@ -328,25 +300,22 @@ def split_by_senses(stage: Stage, scheme: Scheme) -> list[Stage]:
 
 
 def _find_turns(stage: Stage, scheme: Scheme, rates: Array) -> tuple[Array, list[_Turn]]:
-    """The signs of rates, shape (n, n_c + 2), at first, and what turns after that, in its order.
-
-    Of rates that are next to nothing beside others at the same instant the sign says nothing.
-    """
+    """Initial signs of rates, shape (n, n_c + 2), and reversals in order of time."""
     places, z = stage.guess.places(scheme.points).ravel(), stage.guess.z.reshape(-1, 5)
     sizes = np.abs(rates).max(axis=1)
     clear = (np.abs(rates) > SLOW * sizes[:, None]) & (sizes > STILL * sizes.max())[:, None]
-    signs, found = np.concatenate(stage.directions), list[tuple[float, int]]()
-    for row, own in enumerate(rates.T):
-        known = np.flatnonzero(clear[:, row])
-        if not len(known) or row in stage.formation.rolling_rows:
+    signs, zeros = np.concatenate(stage.directions), list[tuple[float, int]]()
+    for row, rate in enumerate(rates.T):
+        points = np.flatnonzero(clear[:, row])
+        if not len(points) or row in stage.formation.rolling_rows:
             continue
-        signs[row] = np.sign(own[known[0]])
-        for one, other in pairwise(known.tolist()):
-            if own[one] * own[other] < 0:
-                share = own[one] / (own[one] - own[other])
-                found.append((float(places[one] + share * (places[other] - places[one])), row))
+        signs[row] = np.sign(rate[points[0]])
+        for i, j in pairwise(points.tolist()):
+            if rate[i] * rate[j] < 0:
+                share = rate[i] / (rate[i] - rate[j])
+                zeros.append((float(places[i] + share * (places[j] - places[i])), row))
     turns, near = list[_Turn](), 2 * float(np.diff(places).max())
-    for place, row in sorted(found):
+    for place, row in sorted(zeros):
         last = turns[-1] if turns else None
         at = int(np.abs(places - place).argmin())
         together = find_tied(stage.formation, z[at], row)
@@ -354,55 +323,39 @@ def _find_turns(stage: Stage, scheme: Scheme, rates: Array) -> tuple[Array, list
             turns[-1] = last._replace(rows=(*last.rows, row))
         else:
             turns.append(_Turn(place, (row,)))
-    return signs, _join_stops(turns, near, rates.shape[1] - stage.formation.n_rolling)
-
-
-def _join_stops(turns: list[_Turn], near: float, count: int) -> list[_Turn]:
-    """The turns, those as one where all `count` rows turn `near` each other: there motion stops."""
-    joined = list[_Turn]()
+    # Where all rows reverse near each other motion stops: that is one reversal.
+    joined, count = list[_Turn](), rates.shape[1] - stage.formation.n_rolling
     while turns:
-        own = [turn for turn in turns if turn.place < turns[0].place + near]
-        rows = tuple(row for turn in own for row in turn.rows)
+        close = [turn for turn in turns if turn.place < turns[0].place + near]
+        rows = tuple(row for turn in close for row in turn.rows)
         if len(rows) == len(set(rows)) == count:
-            joined.append(_Turn(own[len(own) // 2].place, rows))
-            turns = turns[len(own) :]
+            joined.append(_Turn(close[len(close) // 2].place, rows))
+            turns = turns[len(close) :]
         else:
-            joined.append(turns[0])
-            turns = turns[1:]
-    return joined
-
-
-def _spread(places: Sequence[float]) -> list[float]:
-    """Ends of pieces between 0 and 1 that turn at `places`, moved apart where these coincide."""
-    widths = np.maximum(np.diff([0.0, *places, 1.0]), min(BRIEF, 0.5 / (len(places) + 1)))
-    return [0.0, *np.cumsum(widths / widths.sum())[:-1].tolist(), 1.0]
+            joined.append(turns.pop(0))
+    return signs, joined
 
 
 def hold_torques(search: TimeSearch, free: TimeSolution) -> TimeSolution:
-    """A plan with torques held over periods, from one with free torques.
-
-    Where none is found the status says so.
-    """
-    scene = search.problem.scene
-    options, count = search.options, 2 if scene.control_hold == "linear" else 1
-    held = replace(search, scheme=make_scheme(options.scheme, options.degree, count))
+    """Plan with torques held over control periods, from one with free torques."""
+    scene, options = search.problem.scene, search.options
+    controls = 2 if scene.control_hold == "linear" else 1
+    held = replace(search, scheme=make_scheme(options.scheme, options.degree, controls))
     whole = drop_brief(free.stages)
     others = [free.stages] if len(whole) < len(free.stages) else []
-    tries = [(known, *own) for known in (whole, *others) for own in _TRIES]
-    for known, stretch, least in tries:
-        stages = cut_periods(known, held.scheme, stretch, least)
-        solution = held.solve(stages, most=search.wait(_PATIENCE))
-        if not solution.success:
-            continue
-        kept = enforce_between(held, _leave_out(held, solution))
-        if kept.success:
-            return kept._replace(error=free.error, free=free)
+    for stages, (stretch, least) in product((whole, *others), _TRIES):
+        periods = cut_periods(stages, held.scheme, stretch, least)
+        solution = held.solve(periods, most=search.wait(_PATIENCE))
+        if solution.success:
+            solution = enforce_between(held, _leave_out(held, solution))
+            if solution.success:
+                return solution._replace(error=free.error, free=free)
     status = f"no torques held over {scene.control_hold} periods were found"
     return free._replace(status=status, success=False)
 
 
 def _leave_out(held: TimeSearch, solution: TimeSolution) -> TimeSolution:
-    """A solution with fewer periods, where the last one of a phase has shrunk to nothing."""
+    """The solution without last periods of phases whose duration has vanished."""
     for _ in range(_SHORTER):
         stages, changed = list(solution.stages), False
         for k, (stage, coming) in enumerate(zip(stages, [*stages[1:], None], strict=True)):
@@ -423,21 +376,18 @@ def _leave_out(held: TimeSearch, solution: TimeSolution) -> TimeSolution:
 def _drop_last(stage: Stage) -> Stage:
     """A stage without its last interval, whose end is that of the one before."""
     part = stage.guess
-    nodes = part.nodes[:-1].copy()
-    nodes[-1] = part.nodes[-1]
     left = 1 - part.fractions[-1]
-    tables = {name: getattr(part, name)[:-1] for name in ("z", "v", "a", "forces", "tau")}
     guess = part._replace(
+        **{name: getattr(part, name)[:-1] for name in ("z", "v", "a", "forces", "tau")},
         duration=part.duration * left,
         fractions=part.fractions[:-1] / left,
-        nodes=nodes,
-        **tables,
+        nodes=np.delete(part.nodes, -2, axis=0),
     )
     return replace(stage, guess=guess, periods=stage.periods[:-1])
 
 
 def drop_brief(stages: Sequence[Stage]) -> list[Stage]:
-    """Stages without those that are much shorter than a period, as far as phases have others."""
+    """Stages without those much shorter than a period, as far as phases have others."""
     left = list(stages)
     for stage in stages:
         if stage.guess.duration < _SLIVER * stage.formation.scene.control_period:
@@ -449,9 +399,9 @@ def drop_brief(stages: Sequence[Stage]) -> list[Stage]:
 def cut_periods(
     stages: Sequence[Stage], scheme: Scheme, stretch: float, least: int = 1
 ) -> list[Stage]:
-    """Stages whose intervals are periods, or parts of them, at a duration that is stretched.
+    """Stages whose intervals are periods or parts of them, stretched in time.
 
-    From rest to rest they last at least as many periods as the `least` number, but for a half.
+    From rest to rest they last at least half a period less than `least` periods.
     """
     cut = list[Stage]()
     period = stages[0].formation.scene.control_period
@@ -461,26 +411,18 @@ def cut_periods(
         start = 0.0
         for stage in own:
             stop = start + stretch * stage.guess.duration
-            cut.append(_cut(stage, scheme, (start, stop), period, stretch))
+            ticks = period * np.arange(math.floor(start / period), math.ceil(stop / period) + 1)
+            near = _BRIEF * period
+            edges = np.array([start, *ticks[(ticks > start + near) & (ticks < stop - near)], stop])
+            numbers = tuple(math.floor((a + b) / 2 / period) for a, b in pairwise(edges.tolist()))
+            part = resample(stage.guess, scheme, (edges - start) / (stop - start))
+            guess = part._replace(
+                duration=stop - start,
+                nodes=part.nodes / np.array([[1.0], [stretch]]),
+                v=part.v / stretch,
+                a=part.a / stretch**2,
+            )
+            guess = with_controls(guess, scheme.controls)
+            cut.append(replace(stage, guess=guess, periods=numbers))
             start = stop
     return cut
-
-
-def _cut(
-    stage: Stage, scheme: Scheme, span: tuple[float, float], period: float, stretch: float
-) -> Stage:
-    """One stage, from when to when in its phase."""
-    start, stop = span
-    ticks = period * np.arange(math.floor(start / period), math.ceil(stop / period) + 1)
-    near = _BRIEF * period
-    edges = np.array([start, *ticks[(ticks > start + near) & (ticks < stop - near)], stop])
-    numbers = tuple(math.floor((a + b) / 2 / period) for a, b in pairwise(edges.tolist()))
-    breaks = (edges - start) / (stop - start)
-    part = resample(stage.guess, scheme, breaks)
-    guess = _slow_down(part, stretch)._replace(duration=stop - start)
-    return replace(stage, guess=with_controls(guess, scheme.controls), periods=numbers)
-
-
-def _slow_down(part: StagePoints, stretch: float) -> StagePoints:
-    rate: Array = np.array([[1.0], [stretch]])
-    return part._replace(nodes=part.nodes / rate, v=part.v / stretch, a=part.a / stretch**2)

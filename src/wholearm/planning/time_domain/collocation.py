@@ -1,4 +1,4 @@
-"""Collocation schemes as data: points in an interval, and integrals of what passes through them."""
+"""Collocation schemes: points, integration matrices, and Bernstein polynomials of torques."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...common.arrays import Array
-from ...common.quadrature import jacobi_nodes
+from ...common.arrays import Array, jacobi_nodes
 
 
 class Scheme(NamedTuple):
@@ -17,8 +16,7 @@ class Scheme(NamedTuple):
 
     name: str
     points: Array  # (d,): increasing
-    # (d, d): row j integrates, from 0 to point j, the polynomial through values at the points
-    integrals: Array
+    integrals: Array  # (d, d): row j integrates the interpolating polynomial from 0 to point j
     weights: Array  # (d,): the same from 0 to 1
     order: int  # of the error at the end of an interval
     controls: int  # number of control points of the torques in an interval
@@ -65,17 +63,8 @@ def fit_controls(places: Array, values: Array, count: int) -> Array:
 def make_scheme(name: str, degree: int, controls: int = 2) -> Scheme:
     """Radau IIA points, order 2 d - 1, or Gauss-Legendre points, order 2 d.
 
-    Radau points are the zeros of P_d - P_d-1, 1 among them, Legendre points those of P_d.
-
-    Parameters
-    ----------
-    name : {"radau", "legendre"}
-    degree                        number of points d
-    controls                      of torques that are linear by default
-
-    Notes
-    -----
-    Source: E. Hairer and G. Wanner, Solving Ordinary Differential Equations II, section IV.5.
+    Zeros of P_d - P_d-1, 1 among them, or of P_d (E. Hairer and G. Wanner, Solving Ordinary
+    Differential Equations II, section IV.5). `controls` are control points of torques.
     """
     if name == "radau":
         points = (np.append(jacobi_nodes(degree - 1, 1, 0), 1.0) + 1) / 2

@@ -1,4 +1,4 @@
-"""What holds in a stage of the time-domain NLP, and from one stage to the next."""
+"""Constraints of the time-domain NLP in a stage and between stages."""
 
 from __future__ import annotations
 
@@ -8,53 +8,44 @@ import numpy as np
 
 from ...common.arrays import Array
 from ...geometry.curve import find_tied, tangent_basis
+from . import stage_kernels as kernels
 from .assembly import Indices
 from .collocation import Scheme, blend
 from .nlp_layout import MARGIN, NlpRows, StageLayout, V, Z
 from .stage import Stage
-from .stage_kernels import (
-    collocation_kernel,
-    end_kernel,
-    goal_kernel,
-    impact_kernel,
-    monitor_kernel,
-    opening_kernel,
-    point_kernel,
-)
 from .time_limits import LimitRows, Target, add_limits
 from .time_rate_limits import MotorRows, add_motors, join_motors
 
-SLIDING = 1e-5
-"""Least sliding, over the radius of gyration, and least speed of a joint, in the scene's unit of
-time: what does not move at all would have no sense."""
+SLIDING = 1e-5  # least rate of sliding contacts, over the radius of gyration, and of joints
 
 
 @dataclass(frozen=True, eq=False)
 class StageRows:
     """Rows of one stage, interval by interval."""
 
-    # (K, m): how a margin goes on, and contacts at the end of an interval, if no point is there
-    chain: Indices
+    chain: (
+        Indices  # (K, m): constant margin, and contacts at ends of intervals without a point there
+    )
     states: Indices  # (K, 2, rungs, f): collocation of z and of z', along the columns of `bases`
-    bases: Array  # (K, 5, f): the tangent space of each interval
-    shares: Indices  # what keeps the lengths of intervals to one another
-    points: Indices  # (K, d, m): what holds at the points
+    bases: Array  # (K, 5, f): tangent space of each interval
+    shares: Indices  # ratios of intervals
+    points: Indices  # (K, d, m): equations and inequalities at the points
     balance: Indices  # (K, d, 5): of these, the equations of motion
-    senses: Indices  # (K, d, n_rubbing): and the senses of contacts that slide with friction
+    senses: Indices  # (K, d, n_rubbing): and the sliding directions of contacts with friction
     limits: LimitRows
     monitor_rows: Indices  # (K, d, m): limits of the formation
-    motors: MotorRows | None  # if motors are not quick
+    motors: MotorRows | None  # of rate-limited torques
 
     @property
     def even(self) -> tuple[Indices, ...]:
-        """Those whose multipliers go with the length of an interval."""
+        """Those whose multipliers are proportional to the length of an interval."""
         return (self.chain, self.points, *self.limits.groups, self.monitor_rows)
 
 
 def add_stage(
     rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool, target: Target
 ) -> StageRows:
-    """What holds in a stage."""
+    """Add the constraints of a stage."""
     formation = stage.formation
     node, ends = layout.nodes[:-1], layout.nodes[1:]
     chain = rows.linear(*node[:, MARGIN:].shape)
@@ -65,17 +56,17 @@ def add_stage(
     points, balance, senses = _balance(rows, stage, layout, scheme, last)
     first = node[:, Z] if formation.rolling else node[:, :0]
     if not scheme.ends:
-        kernel = end_kernel(formation)
+        kernel = kernels.end_kernel(formation)
         own = rows.nonlinear(stage.intervals, kernel.outputs)
         rows.add_copies(kernel, kernel.x.join(z=ends[:, Z], v=ends[:, V], first=first), own)
         chain = np.hstack([chain, own])
     monitor_rows = _add_monitor_rows(rows, stage, layout, scheme)
     gained = [formation.limits[k].gained for k in stage.released]
     slow = formation.scene.has_slow_motors
-    # What is let go while torques go on has no acceleration at first.
+    # With continuous torques a released contact has no acceleration at first.
     opening = stage.opening * (scheme.points[:, None] if slow else 1.0)
     for contact in [c for c in gained if c is not None and stage.opens]:
-        kernel = opening_kernel(formation, contact)
+        kernel = kernels.opening_kernel(formation, contact)
         columns = kernel.x.join(z=layout.z[0], v=layout.v[0], a=layout.a[0])
         own = rows.nonlinear(scheme.degree, kernel.outputs, low=opening, high=np.inf)
         rows.add_copies(kernel, columns, own)
@@ -89,44 +80,43 @@ def add_stage(
         turns, gained_softly = (), None
         N = tangent_basis(formation, stage.guess.nodes[-1, 0])
         rows.add_entries(rows.linear(N.shape[1])[:, None], layout.nodes[-1, V], N.T)
-    goal = goal_kernel(formation, until, turns, gained_softly)
+    goal = kernels.goal_kernel(formation, until, turns, gained_softly)
     if goal is not None:
         end = layout.nodes[-1]
         rows.add_copies(goal, goal.x.join(z=end[Z], v=end[V]), rows.nonlinear(goal.outputs))
     limits = add_limits(rows, stage, layout, scheme, target)
     motors = add_motors(rows, stage, layout, scheme) if slow else None
-    given = chain, states, bases, shares, points, balance, senses
-    return StageRows(*given, limits, monitor_rows, motors)
+    return StageRows(
+        chain, states, bases, shares, points, balance, senses, limits, monitor_rows, motors
+    )
 
 
 def _list_free_turns(stage: Stage) -> tuple[int, ...]:
-    """One of each that turn together: equations said twice spoil the solver's steps."""
-    formation, end = stage.formation, stage.guess.nodes[-1, 0]
-    told, found = set[int](), list[int]()
+    """One of each set of tied rows that reverse: dependent equations spoil the solver's steps."""
+    tied, free = set[int](), list[int]()
     for row in stage.turns:
-        if row not in told:
-            found.append(row)
-            told.update(find_tied(formation, end, row))
-    return tuple(found)
+        if row not in tied:
+            free.append(row)
+            tied.update(find_tied(stage.formation, stage.guess.nodes[-1, 0], row))
+    return tuple(free)
 
 
 def _stops(stage: Stage) -> bool:
-    """Whether everything stops at the end of a stage: rates turn there that are not tied.
+    """Whether everything stops at the end of a stage, as independent rates reverse there.
 
-    With one freedom or two these are two; one alone may have a zero of its own.
+    With one degree of freedom these are two, as one alone may have a zero.
     """
-    freedoms = 5 - stage.formation.n_constraints
-    return len(_list_free_turns(stage)) >= max(2, freedoms)
+    return len(_list_free_turns(stage)) >= max(2, 5 - stage.formation.n_constraints)
 
 
 def _collocate(
     rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme
 ) -> tuple[Indices, Array]:
-    """Collocate z and z' along the tangent space, and the bases of that."""
+    """Collocation of z and z' along the tangent space, and its bases."""
     middles = stage.guess.z[:, scheme.degree // 2]
     bases = np.array([tangent_basis(stage.formation, z) for z in middles])
     K, _, f = bases.shape
-    kernel = collocation_kernel(scheme.name, scheme.degree, f)
+    kernel = kernels.collocation_kernel(scheme.name, scheme.degree, f)
     parameters, collected = bases.transpose(0, 2, 1).reshape(K, -1), []
     if not f:
         return np.zeros((K, 2, len(scheme.rungs), 0), dtype=np.int64), bases
@@ -145,11 +135,11 @@ def _collocate(
 
 
 def _share(rows: NlpRows, stage: Stage, layout: StageLayout) -> Indices:
-    """Intervals keep their shares of the stage, unless they are parts of control periods."""
+    """Constant ratios of intervals, unless they are parts of control periods."""
     if stage.periods:
         return np.zeros(0, dtype=np.int64)
     own = rows.linear(stage.intervals - 1)
-    # In shares of an even interval, rows are of the size of others.
+    # Scaled like other rows.
     shares = stage.intervals * stage.guess.fractions
     rows.add_entries(own, layout.h[:-1], shares[1:])
     rows.add_entries(own, layout.h[1:], -shares[:-1])
@@ -159,37 +149,28 @@ def _share(rows: NlpRows, stage: Stage, layout: StageLayout) -> Indices:
 def _balance(
     rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool
 ) -> tuple[Indices, Indices, Indices]:
-    """The equations of motion, constraints and senses at every point, shape (K, d, n).
+    """Equations of motion, contacts and sliding directions at the points, (K, d, n).
 
-    And the rows of the equations of motion and of the senses alone.
+    Also those of the equations of motion and of the sliding directions alone.
     """
     formation, shape = stage.formation, layout.z.shape[:2]
-    gradual = stage.onset > 0
-    kernel, node = point_kernel(formation, scheme.controls, gradual), layout.nodes[:-1, None]
-    columns = kernel.x.join(
-        z=layout.z,
-        v=layout.v,
-        a=layout.a,
-        forces=layout.forces,
-        tau=layout.tau[:, None],
-        first=node[..., Z] if formation.rolling else node[..., :0],
-    )
+    homotopy, node = stage.onset > 0, layout.nodes[:-1, None]
+    kernel = kernels.point_kernel(formation, scheme.controls, homotopy)
+    first = node[..., Z] if formation.rolling else node[..., :0]
+    state = {"z": layout.z, "v": layout.v, "a": layout.a}
+    columns = kernel.x.join(**state, forces=layout.forces, tau=layout.tau[:, None], first=first)
     least = least_senses(stage, stage.guess.places(scheme.points))[..., : formation.n_contacts]
     parameters = kernel.p.join(
         Xi=stage.directions.Xi,
         sigma=stage.directions.sigma,
         shares=blend(scheme.points, scheme.controls),
         least=np.maximum(least, 0.0),
-        onset=np.full(1 * gradual, stage.onset),
+        onset=np.full(1 * homotopy, stage.onset),
     )
-    still = find_still(stage, last) if scheme.ends else set()
-    senses, low, high = (
-        kernel.y["senses"],
-        np.zeros((*shape, kernel.outputs)),
-        np.zeros(kernel.outputs),
-    )
+    still, senses = find_still(stage, last) if scheme.ends else set(), kernel.y["senses"]
+    low, high = np.zeros((*shape, kernel.outputs)), np.zeros(kernel.outputs)
     high[senses] = np.inf
-    low[..., senses] = -np.inf if gradual else 0.0
+    low[..., senses] = -np.inf if homotopy else 0.0
     low[-1, -1, senses][[k in still for k in formation.rubbing_rows]] = -np.inf
     own = rows.nonlinear(*shape, kernel.outputs, low=low, high=high)
     rows.add_copies(kernel, columns, own, parameters)
@@ -199,9 +180,8 @@ def _balance(
 def least_rates(stage: Stage, places: Array) -> Array:
     """Least rate at `places`, shares of a stage's duration, in their shape.
 
-    It is nothing where motion starts, stops or turns, and in a stage with one freedom: there all
-    moves together, and friction cannot hold one contact alone. Where friction sets in gradually
-    any rate will do.
+    Zero at both ends, and with one degree of freedom, where friction cannot hold one contact alone;
+    none in the friction homotopy.
     """
     if stage.onset:
         return np.full(np.shape(places), -np.inf)
@@ -212,7 +192,7 @@ def least_rates(stage: Stage, places: Array) -> Array:
 def least_senses(stage: Stage, places: Array) -> Array:
     """Least rates of (contacts, joints) at `places`, in their shape and one more axis.
 
-    Of two contacts of one vertex one is enough: the rate of the other may have a zero of its own.
+    Zero for the second contact of a vertex.
     """
     contacts, least = stage.formation.contacts, least_rates(stage, places)[..., None]
     vertices = [contact.index if contact.feature == "v" else None for contact in contacts]
@@ -230,7 +210,7 @@ def find_still(stage: Stage, last: bool) -> set[int]:
 
 
 def _add_monitor_rows(rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:
-    """Keep limits positive, but for the one that is reached at the end, shape (K, d, m)."""
+    """Nonnegative limits of the formation, but for the end's there, shape (K, d, m)."""
     formation, (K, d) = stage.formation, layout.z.shape[:2]
     if not stage.monitored:
         return np.zeros((K, d, 0), dtype=np.int64)
@@ -241,7 +221,7 @@ def _add_monitor_rows(rows: NlpRows, stage: Stage, layout: StageLayout, scheme: 
     if scheme.ends:
         low[-1, -1, reached] = -np.inf
     own = rows.nonlinear(K, d, len(stage.monitored), low=low, high=np.inf)
-    kernel = monitor_kernel(formation, stage.monitored)
+    kernel = kernels.monitor_kernel(formation, stage.monitored)
     rows.add_copies(kernel, kernel.x.join(z=layout.z), own)
     return own
 
@@ -252,7 +232,7 @@ def join_stages(
     layouts: tuple[StageLayout, StageLayout],
     scheme: Scheme,
 ) -> None:
-    """Position and velocity go on from one stage to the next; an impact changes the velocity."""
+    """Continuous position and velocity from one stage to the next, or an impact."""
     (stage, coming), layout = pair, layouts[0]
     last, first = layout.nodes[-1], layouts[1].nodes[0]
     if stage.formation.scene.has_slow_motors:
@@ -262,7 +242,7 @@ def join_stages(
     rows.add_entries(own, first[same], 1.0)
     rows.add_entries(own, last[same], -1.0)
     if stage.ends_in_impact:
-        kernel = impact_kernel(stage.formation, coming.formation)
+        kernel = kernels.impact_kernel(stage.formation, coming.formation)
         high = np.zeros(kernel.outputs)
         high[kernel.y["leaving"]] = high[kernel.y["cones"]] = np.inf
         columns = kernel.x.join(after=first[V], before=last[V], z=last[Z], impulses=layout.impulses)

@@ -1,9 +1,8 @@
-"""Ways to the end of a phase with two freedoms along which a motion keeps its limits.
+"""Initial paths of a phase with two degrees of freedom, ranked by their largest margin of limits.
 
-The nearest end is not always one that contacts can reach: pushed that way, some would have to pull.
-Ends beside it are looked at too, and straight ways to them are ranked by the largest margin that
-any motion along them can have (`planning.time_domain.way_pace`). Where none keeps its limits, the
-best of them are bent.
+Straight and bent paths to several ends are compared. The largest uniform margin along a fixed path
+is a linear programme in the squared speed at the nodes, contact forces in the intervals, and the
+margin. Friction signs are those of the path; viscous friction is neglected.
 """
 
 from __future__ import annotations
@@ -24,52 +23,43 @@ from ...mechanics.limits import CONE, PRESS, TORQUE
 from ...mechanics.metric import metric_weights
 from ...problem.definition import Phase, Problem
 from .resting import list_headings
-from .units import in_own_units, scale_state
+from .units import in_own_units, scale_state, unit_lengths
 
-FASTEST = 9.0
-"""Largest square of the speed, over gravity times the radius of gyration."""
-BRISK = 0.5
-"""Share of a positive margin that a brisk motion keeps."""
-GIVES = 0.02
-"""What a brisk motion may lose of a negative margin."""
-LEAST = 1e-4
-"""Least square of the speed, in the same unit, that a duration is taken from."""
-STEP = 0.15
-"""How far apart ends are looked at, over the length of the way to the nearest end."""
-GROWTH = 1.2
-"""By how much more each of these is apart from the one before."""
-STEPS = 12
-"""Most ends on either side of the nearest one."""
-HEADINGS = 1
-"""In how many other ways motions are looked at that set out."""
-BENT = 4
-"""How many of the best ways are bent, twice; the best one alone after that."""
-SCALES = (1.0, 0.4, 0.3, 0.2, 0.1)
-"""How far ways are bent in each round, over `BENDS`."""
-CLOSE = -0.2
-"""Margin from which on it is worth to go on."""
+FASTEST = 9.0  # largest squared speed, over gravity times the radius of gyration
+BRISK = 0.5  # share of a positive margin that the speed profile keeps
+GIVES = 0.02  # what it may lose of a negative margin
+LEAST = 1e-4  # least squared speed, in the same unit, that a duration is taken from
+STEP = 0.15  # distance of ends, over the length of the path to the nearest end
+GROWTH = 1.2  # ratio of successive distances
+STEPS = 12  # most ends on either side of the nearest one
+HEADINGS = 1  # number of other initial directions
+BENT = 4  # number of the best paths that are bent, in two rounds; one after that
+SCALES = (1.0, 0.4, 0.3, 0.2, 0.1)  # bending in each round, over `BENDS`
+CLOSE = -0.2  # margin below which a path is not bent further
 BENDS = ((0.4, 0.0), (-0.4, 0.0), (0.8, 0.0), (-0.8, 0.0), (0.0, 0.3), (0.0, -0.3))
-"""How ways are bent: parts of one arc and of two, over their length."""
-_STRETCHES = 6
-"""Most stretches of a way, between which something turns."""
-_SHORTEST = 2
-"""Fewest configurations, after its first, of a stretch that is not merged into another."""
-SURE = 1e-3
-"""Margin from which a motion surely keeps its limits."""
+"""Amplitudes of one arc and of two, over the path's length."""
+_STRETCHES = 6  # most pieces between reversals
+_SHORTEST = 2  # fewest steps of a piece that is not merged into another
+SURE = 1e-3  # margin above which a motion keeps its limits
 Way = list[PathGuess]
 
 
 class PacedWay(NamedTuple):
-    """A way, the largest margin of a motion along it, and a motion that is brisk."""
+    """A path, its largest margin, and a fast speed profile with nearly that."""
 
     stretches: Way
     margin: float
-    pace: PathSpeed | None
-    forces: WayForces  # what says so
+    profile: PathSpeed | None
+    forces: WayForces  # the linear programme
+
+    @staticmethod
+    def of(way: Way, forces: WayForces, margin: float) -> PacedWay:
+        """The path with its speed profile."""
+        return PacedWay(way, margin, forces.find_profile(margin), forces)
 
 
 class _Bent(NamedTuple):
-    """A way to a goal with its bends, and its margin."""
+    """A bent path to a goal, and its margin."""
 
     goal: Array
     bends: tuple[float, float]
@@ -80,19 +70,15 @@ class _Bent(NamedTuple):
 
     @property
     def rank(self) -> tuple[float, float]:
-        """Ways that keep limits are better the shorter they are, others the less they miss."""
+        """Feasible paths by their length, others by their margin."""
         length = float(self.forces.runs.sum())
         return (-SURE, length) if self.margin > SURE else (-self.margin, length)
 
 
 def list_ways(problem: Problem, phase: Phase, z: Array, most: int) -> list[PacedWay]:
-    """Ways of a phase, in different modes, those on which motions keep limits best first.
+    """At most so many paths of a phase from `z`, (5,), in different modes, the best first.
 
-    Parameters
-    ----------
-    phase     of other than two freedoms, and of one that ends by a release, there are none
-    z : (5,)  where it starts
-    most      how many at most
+    None of a phase that ends by a release or has other than two degrees of freedom.
     """
     formation = phase.formation
     if phase.until.is_release or tangent_basis(formation, z).shape[1] != 2:
@@ -100,7 +86,7 @@ def list_ways(problem: Problem, phase: Phase, z: Array, most: int) -> list[Paced
     (nearest,) = guess_phase(phase, z)
     found: list[_Bent] = []
 
-    def look(goal: Array, bends: tuple[float, float], heading: Array | None = None) -> None:
+    def add(goal: Array, bends: tuple[float, float], heading: Array | None = None) -> None:
         way = split_way(connect(formation, z, goal, bends, heading))
         forces = WayForces(way, problem.epsilon) if _is_free(way) else None
         if forces is not None and np.isfinite(margin := forces.find_margin()):
@@ -108,39 +94,34 @@ def list_ways(problem: Problem, phase: Phase, z: Array, most: int) -> list[Paced
 
     def spread(heading: Array | None) -> None:
         for goal in goals:
-            look(goal, (0.0, 0.0), heading)
+            add(goal, (0.0, 0.0), heading)
         for turn, scale in enumerate(SCALES):
-            own = sorted((b for b in found if b.heading is heading), key=lambda bent: bent.rank)
-            near = bool(own) and (turn < 2 or own[0].margin > CLOSE)
-            if not near or own[0].margin > SURE:
+            ranked = sorted((b for b in found if b.heading is heading), key=lambda b: b.rank)
+            if not ranked or not (-np.inf if turn < 2 else CLOSE) < ranked[0].margin <= SURE:
                 break
-            for bent in own[: BENT if turn < 2 else 1]:
+            for bent in ranked[: BENT if turn < 2 else 1]:
                 for one, two in BENDS:
                     bends = bent.bends[0] + scale * one, bent.bends[1] + scale * two
-                    look(bent.goal, bends, heading)
+                    add(bent.goal, bends, heading)
 
     goals = list_goals(phase, z, nearest.z[-1])
     spread(None)
     if all(bent.margin <= CLOSE for bent in found):
-        # Contacts may keep motions from setting out straight.
-        for heading in _list_headings(problem, phase, z)[:HEADINGS]:
-            spread(heading)
+        # Contacts may exclude motions that begin straight.
+        own, scales = in_own_units(problem), problem.scene.scales
+        start = own.phases[phase.index].formation, scale_state(z, scales), own.epsilon
+        for heading in list_headings(*start)[:HEADINGS]:
+            spread(unit_lengths(scales) * heading)
     found.sort(key=lambda bent: bent.rank)
     best: dict[tuple[float, ...], _Bent] = {}
     for bent in found:
         signs = [np.concatenate(part.directions) for part in bent.way]
         best.setdefault(tuple(np.concatenate(signs).tolist()), bent)
-    return [
-        PacedWay(bent.way, bent.margin, bent.forces.find_pace(bent.margin), bent.forces)
-        for bent in list(best.values())[:most]
-    ]
+    return [PacedWay.of(b.way, b.forces, b.margin) for b in list(best.values())[:most]]
 
 
 def pace_straight(problem: Problem, phase: Phase, z: Array, goal: Array) -> PacedWay | None:
-    """The straight way of a phase to an end, with the largest margin of a motion along it.
-
-    None where something is in the way, or along a phase that has not two freedoms.
-    """
+    """The straight path of a phase with two degrees of freedom to an end; None if obstructed."""
     if phase.until.is_release or tangent_basis(phase.formation, z).shape[1] != 2:
         return None
     way = split_way(connect(phase.formation, z, goal))
@@ -148,19 +129,11 @@ def pace_straight(problem: Problem, phase: Phase, z: Array, goal: Array) -> Pace
         return None
     forces = WayForces(way, problem.epsilon)
     margin = forces.find_margin()
-    return PacedWay(way, margin, forces.find_pace(margin), forces) if margin > -np.inf else None
-
-
-def _list_headings(problem: Problem, phase: Phase, z: Array) -> list[Array]:
-    """Ways in which motions begin at `z`, those that press most first."""
-    own, scales = in_own_units(problem), problem.scene.scales
-    formation = own.phases[phase.index].formation
-    units = np.array([scales.length, scales.length, 1.0, 1.0, 1.0])
-    return [units * way for way in list_headings(formation, scale_state(z, scales), own.epsilon)]
+    return PacedWay.of(way, forces, margin) if margin > -np.inf else None
 
 
 def _is_free(way: Way) -> bool:
-    """Whether nothing is in a way, and it moves all along, in few stretches with their contacts."""
+    """Whether a path is free of collisions and stops, in few pieces."""
     if len(way) > _STRETCHES or not all(np.diff(part.z, axis=0).any(axis=1).all() for part in way):
         return False
     touching = way[0].formation.scene.touching
@@ -175,7 +148,7 @@ def list_goals(phase: Phase, z: Array, nearest: Array) -> list[Array]:
     slip, ends = formation.evaluate_slip(z[None])[0], list_ends(phase)
     N = tangent_basis(formation, nearest) * metric[2] / metric[:, None] ** 2
 
-    def settle(guess: Array, last: Array, step: float) -> Array | None:
+    def project(guess: Array, last: Array, step: float) -> Array | None:
         for end in ends:
             goal = close_contacts(end.formation, guess, slip, end.fixed, end.active)
             if goal is None or not is_inside(end.formation, goal):
@@ -185,30 +158,27 @@ def list_goals(phase: Phase, z: Array, nearest: Array) -> list[Array]:
         return None
 
     sides: list[Array] = []
-    for way in (*N.T, *-N.T):
-        goal = settle(nearest + step * way, nearest, step)
-        # Directions across the ends lead back to those that are known.
+    for direction in (*N.T, *-N.T):
+        goal = project(nearest + step * direction, nearest, step)
+        # Directions across the ends lead back to the same.
         if goal is not None and all((goal - nearest) @ (s - nearest) <= 0 for s in sides):
             sides.append(goal)
     for goal in sides:
-        last, own = nearest, step
+        last, length = nearest, step
         for _ in range(STEPS):
             goals.append(goal)
-            ahead = (goal - last) * metric
-            own *= GROWTH
-            ahead = own * ahead / np.linalg.norm(ahead) / metric
-            found = settle(goal + ahead, goal, own)
-            if found is None:
+            secant = (goal - last) * metric
+            length *= GROWTH
+            secant = length * secant / np.linalg.norm(secant) / metric
+            following = project(goal + secant, goal, length)
+            if following is None:
                 break
-            last, goal = goal, found
+            last, goal = goal, following
     return goals
 
 
 def split_way(outline: PathGuess) -> Way:
-    """A way as stretches without a reversal, between which one thing turns at a time.
-
-    Where two turned at once a motion with two freedoms would have to stop.
-    """
+    """A path as pieces between reversals, of which no two coincide: there motion would stop."""
     z, formation = outline.z, outline.formation
     steps, middles = np.diff(z, axis=0), (z[1:] + z[:-1]) / 2
     slip = np.einsum("nij,nj->ni", formation.evaluate(middles, steps).A_t, steps)
@@ -230,10 +200,11 @@ def split_way(outline: PathGuess) -> Way:
         turning = list[tuple[int, ...]]()
         if stop < len(signs):
             turning = _order_turns(formation, z[stop], own, signs[stop], rates[stop - 1 : stop + 1])
-        # They turn within the steps before and after the cut.
+        # The reversals are within the steps before and after the cut.
         places = stop - 0.5 + (np.arange(len(turning)) + 1) / (len(turning) + 1)
         for rows, place in zip(turning, places, strict=True):
-            end = _interpolate(z, place) if len(turning) > 1 else z[stop]
+            k = int(place)
+            end = z[k] + (place - k) * (z[k + 1] - z[k]) if len(turning) > 1 else z[stop]
             if len(part) == 1:
                 part = np.stack([part[0], (part[0] + end) / 2])
             way.append(_make_stretch(formation, np.vstack([part, end]), own, rows))
@@ -252,7 +223,7 @@ def _make_stretch(formation: Formation, z: Array, signs: Array, rows: Sequence[i
 def _order_turns(
     formation: Formation, z: Array, before: Array, after: Array, rates: Array
 ) -> list[tuple[int, ...]]:
-    """Rows that turn between two stretches, those together that have to, the first ones first."""
+    """Rows that reverse between two pieces, tied ones together, in order of time."""
     rows = np.flatnonzero(before != after).tolist()
     groups = {tuple(sorted(i for i in find_tied(formation, z, k) if i in rows)) for k in rows}
 
@@ -263,26 +234,19 @@ def _order_turns(
     return sorted(groups, key=lambda group: (cross(group), group))
 
 
-def _interpolate(z: Array, place: float) -> Array:
-    index = int(place)
-    return np.asarray(z[index] + (place - index) * (z[index + 1] - z[index]))
-
-
 class PathSpeed(NamedTuple):
-    """When a motion is where on a way."""
+    """Speed profile along a path."""
 
     t: Array  # (n,) [s]
     s: Array  # (n,): share of the length
-    v: Array  # (n,) [1/s]: its rate, which is linear in time in between
-    forces: Array  # (n - 1, n_c + R): in between, over the weight of the object
+    v: Array  # (n,) [1/s]: its rate, piecewise linear in time
+    forces: Array  # (n - 1, n_c + R): in the intervals, over the weight of the object
 
 
 class WayForces:
-    """The linear programme of one way: x = (b at nodes, c in intervals, margin), over scales.
+    """Largest margin along a path by a linear programme in x = (b at nodes, c, margin), scaled.
 
-    Attributes
-    ----------
-    kinds  kind of the limit that each row belongs to, and the contact or finger
+    `kinds` are the kind of each row's limit, and its contact or finger.
     """
 
     def __init__(self, way: Sequence[PathGuess], epsilon: float) -> None:
@@ -303,28 +267,25 @@ class WayForces:
             ]
         )
         sigma = np.repeat([part.directions.sigma for part in way], np.diff(parts), axis=0)
-        force, length, square = scene.scales.force, scene.scales.length, scene.scales.speed**2
-        width = G.shape[1]
+        force, square, width = scene.scales.force, scene.scales.speed**2, G.shape[1]
+        units = force * np.array([1.0, 1.0, scene.scales.length])
         self.square, self.size = square, m + 1 + m * width + 1
         drive = np.zeros((m, 5, self.size))
         k = np.arange(m)
         mass = scene.mass_diagonal * square
-        drive[k, :, k] = mass * (z_ss / 2 - z_s / (2 * self.runs[:, None]))
-        drive[k, :, k + 1] = mass * (z_ss / 2 + z_s / (2 * self.runs[:, None]))
+        slope = z_s / (2 * self.runs[:, None])
+        drive[k, :, k], drive[k, :, k + 1] = mass * (z_ss / 2 - slope), mass * (z_ss / 2 + slope)
         own = m + 1 + k[:, None] * width + np.arange(width)
         drive[k[:, None], :, own] = -force * G
         drive[:, 3:] /= scene.torque_limit[:, None]
-        drive[:, :3] /= force * np.array([1.0, 1.0, length])[:, None]
-        load = scene.applied_force[:3] / (force * np.array([1.0, 1.0, length]))
+        drive[:, :3] /= units[:, None]
         self.equal = drive[:, :3].reshape(-1, self.size)
-        self.equal_to = np.tile(load, m)
+        self.equal_to = np.tile(scene.applied_force[:3] / units, m)
         torque = drive[:, 3:].reshape(-1, self.size)
         dry = (scene.dry[3:] * sigma / scene.torque_limit).ravel()
         press = -np.eye(self.size)[own[:, : self.n_c].ravel()]
-        rows, most = (
-            [torque, -torque, press],
-            [1 - dry, 1 + dry, np.full(len(press), -epsilon / force)],
-        )
+        rows = [torque, -torque, press]
+        most = [1 - dry, 1 + dry, np.full(len(press), -epsilon / force)]
         self.kinds = [(TORQUE, "finger 1"), (TORQUE, "finger 2")] * (2 * m)
         self.kinds += [(PRESS, name) for name in formation.names] * m
         for i, row in enumerate(formation.rolling_rows):
@@ -346,15 +307,15 @@ class WayForces:
         return -np.inf if answer is None else float(answer.x[-1])
 
     def find_critical(self) -> tuple[str, str]:
-        """Kind of the limit that most keeps the margin from being larger, and what it limits."""
+        """Kind and part of the limit with the largest sum of multipliers."""
         answer = self._maximise(np.eye(self.size)[-1], -np.inf)
         shares = dict.fromkeys(self.kinds, 0.0)
         for kind, share in zip(self.kinds, np.abs(answer.ineqlin.marginals), strict=True):
             shares[kind] += float(share)
         return max(shares, key=lambda kind: shares[kind])
 
-    def find_pace(self, margin: float) -> PathSpeed | None:
-        """A brisk motion whose margin is not much less than the largest one, `margin`."""
+    def find_profile(self, margin: float) -> PathSpeed | None:
+        """A fast speed profile whose margin is not much less than the largest, `margin`."""
         speed = np.zeros(self.size)
         speed[: len(self.top)] = 1.0
         answer = self._maximise(speed, min(BRISK * margin, margin - GIVES))
@@ -369,7 +330,7 @@ class WayForces:
         return PathSpeed(t, length / length[-1], v / length[-1], forces)
 
     def _maximise(self, gain: Array, least: float) -> Any:
-        """What SciPy finds, None if that is no solution."""
+        """SciPy's result, None without a solution."""
         from scipy.optimize import linprog
 
         forces = self.size - len(self.top) - 1

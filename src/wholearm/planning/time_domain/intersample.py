@@ -1,4 +1,4 @@
-"""What a motion in the time domain misses between its collocation points."""
+"""Limits missed by a motion in the time domain between its collocation points."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...common.arrays import Array
-from ...common.quadrature import find_minima
+from ...common.arrays import Array, find_minima
 from ...mechanics.limits import PRESS, LimitSet, make_limits
 from ...results.trajectory import Samples
 from .equations import SLIDING, least_senses
@@ -21,32 +20,21 @@ from .time_motion import StageMotion
 from .time_nlp import TimeNLP
 from .time_rate_limits import find_relieved
 
-MISS = 2.5e-7
-"""Largest miss of a force limit between points, over the weight of the object."""
-GRAZE = 3e-7
-"""Deepest overlap between points, over the radius of gyration."""
-FALTER = 0.1
-"""Deepest fall of a rate below half of the least one between points, over the least one: friction
-might hold in a replay what turns there for an instant."""
-CHECKS = 25
-"""Places per interval at which limits are checked."""
-_OVER = 1.5
-"""Factor on the miss by which a limit is tightened at first."""
-_AMPLE = 1e3
-"""Slack, over what is much for a limit, of what does not count."""
-_MOST = (_OVER, 4.0, 4.0)
-"""The same at most, of forces, gaps and senses, where tightening has made the miss little less:
-forces have a price."""
+MISS = 2.5e-7  # largest miss of a force limit between points, over the weight of the object
+GRAZE = 3e-7  # deepest overlap between points, over the radius of gyration
+FALTER = 0.1  # largest miss of half of a least rate between points, over it: a replay might stick
+CHECKS = 25  # places per interval at which limits are checked
+_OVER = 1.5  # factor on the miss by which a limit is tightened at first
+_AMPLE = 1e3  # slack, over what is much for a limit, of what does not count
+_MOST = (_OVER, 4.0, 4.0)  # the same at most, of forces, gaps and rates
 
 
 class IntersampleLimits(NamedTuple):
-    """Amounts by which limits of one stage are missed or raised, never negative."""
+    """Nonnegative amounts by which limits of one stage are missed or raised."""
 
-    # (K, n_sides): of each side of the limits of forces, torques and speeds, over what is much for
-    # it
-    held: Array
+    held: Array  # (K, n_sides): of limits of forces, torques and speeds, over their scales
     gap: Array  # (K, n_monitored)
-    sense: Array  # (K, n_c + 2): of the rates of contacts and joints; nothing of rolling contacts
+    sense: Array  # (K, n_c + 2): of the rates of contacts and joints; zero for rolling contacts
 
     @staticmethod
     def none(stage: Stage) -> IntersampleLimits:
@@ -58,27 +46,27 @@ class IntersampleLimits(NamedTuple):
 
     @property
     def worst(self) -> float:
-        """The largest, over what is allowed."""
+        """The largest, over its tolerance."""
         return float(self._over.max(initial=0.0))
 
     def list_missed(self) -> NDArray[np.bool_]:
-        """Which intervals miss more than is allowed, shape (K,)."""
+        """Which intervals miss more than the tolerance, shape (K,)."""
         return np.asarray(self._over > 1.0)
 
     @property
     def _over(self) -> Array:
-        """The largest of each interval, over what is allowed, shape (K,)."""
+        """The largest of each interval, over its tolerance, shape (K,)."""
         allowed = (MISS, GRAZE, FALTER * SLIDING)
         parts = (t.max(axis=1, initial=0.0) / a for t, a in zip(self, allowed, strict=True))
         return np.asarray(np.max(list(parts), axis=0))
 
 
 class Raised(NamedTuple):
-    """What limits of one stage are raised by, and what has led to that."""
+    """Tightening of the limits of one stage."""
 
-    limits: IntersampleLimits  # by how much they are raised
-    missed: IntersampleLimits  # by how much they were missed before they were raised last
-    added: IntersampleLimits  # by how much they were raised then
+    limits: IntersampleLimits  # in all
+    missed: IntersampleLimits  # misses before the last tightening
+    added: IntersampleLimits  # the last tightening
 
     @staticmethod
     def none(stage: Stage) -> Raised:
@@ -86,10 +74,10 @@ class Raised(NamedTuple):
         return Raised(*(3 * [IntersampleLimits.none(stage)]))
 
     def further(self, misses: IntersampleLimits) -> Raised:
-        """Raised by more than the misses, as much as the last time has shown to be needed."""
+        """Raised by the misses times a factor from the effect of the last time."""
         limits, added = list[Array](), list[Array]()
         for raised, before, last, miss, most in zip(*self, misses, _MOST, strict=True):
-            # What was raised before has made the miss less by this share of it.
+            # Reduction of the miss over the last tightening.
             share = np.divide(before - miss, last, out=np.ones_like(miss), where=last > 0)
             added.append(miss * np.clip(1 / np.maximum(share, 1 / most), _OVER, most))
             limits.append(raised + added[-1])
@@ -116,26 +104,26 @@ def find_misses(
     check: CheckPlaces,
     epsilon: float,
     margin: float = 0.0,
-    swings: Array | float = 0.0,
+    deviations: Array | float = 0.0,
 ) -> IntersampleLimits:
-    """By how much limits are missed in each interval, at worst.
+    """Largest misses of limits in each interval.
 
-    Parameters
-    ----------
-    epsilon, margin               least c_n, and what c_n but no friction cone has to exceed it by
-    swings : (K CHECKS, n_sides)  what each side has to exceed its bound by too, over what is much
-                                  for it
+    c_n, but not friction cones, have to exceed epsilon by `margin`, and each side its bound by
+    `deviations` times its scale, shape (K CHECKS, n_sides).
     """
     samples, limits = check.samples, make_limits(stage.formation, epsilon)
     clear = stage.list_clearances(check.places, after=1 / 2) / 2
-    # What a stage is short of where it starts, no bound within it can mend.
+    # Misses at the start of a stage do not depend on it.
     values = check.limits[:, list(stage.monitored)]
     values = values - np.minimum(values[:1], 0.0)
+    senses, formation = stage.measure_senses(samples.z, samples.z_dot), stage.formation
+    # Only contacts with friction have a sliding direction.
+    senses[:, np.delete(np.arange(formation.n_contacts), formation.rubbing_rows)] = 1.0
     relieved = np.repeat(np.where(find_relieved(stage, limits), _AMPLE, 0.0), CHECKS, axis=0)
     tables = (
-        _find_slack(stage, limits, samples, margin) - swings + relieved,
+        _find_slack(stage, limits, samples, margin) - deviations + relieved,
         values - clear,
-        _measure_senses(stage, samples) - 0.5 * least_senses(stage, check.places),
+        senses - 0.5 * least_senses(stage, check.places),
     )
     shape = (stage.intervals, CHECKS)
     slack = (find_minima(table.reshape(*shape, table.shape[1])) for table in tables)
@@ -143,10 +131,7 @@ def find_misses(
 
 
 def _find_slack(stage: Stage, limits: LimitSet, samples: Samples, margin: float) -> Array:
-    """How far each side of the limits is from being missed, over what is much, shape (n, n_sides).
-
-    Torques alone are linear between places where they are bounded, and miss nothing.
-    """
+    """Slack of each side of the limits, over its scale, (n, n_sides); zero for torques alone."""
     c = [samples.c_n, samples.c_t[:, list(stage.formation.rolling_rows)]]
     values = np.hstack([*c, samples.tau, samples.z_dot[:, 3:]]) @ limits.rows.T
     values[:, limits.of(PRESS)] -= margin
@@ -157,15 +142,8 @@ def _find_slack(stage: Stage, limits: LimitSet, samples: Samples, margin: float)
     return slack
 
 
-def _measure_senses(stage: Stage, samples: Samples) -> Array:
-    """Rates in a stage's directions, shape (n, n_c + 2); 1 for contacts that do not rub."""
-    senses, formation = stage.measure_senses(samples.z, samples.z_dot), stage.formation
-    senses[:, np.delete(np.arange(formation.n_contacts), formation.rubbing_rows)] = 1.0
-    return senses
-
-
 def monitor_missed(stages: Sequence[Stage], checks: Sequence[CheckPlaces]) -> list[Stage] | None:
-    """Stages that also monitor the limits which are broken between points; None if none is."""
+    """Stages with limits added that are violated between points; None if none is."""
     changed = []
     for stage, check in zip(stages, checks, strict=True):
         values = check.limits.reshape(stage.intervals, CHECKS, -1)
@@ -190,7 +168,7 @@ def raise_bounds(
         kept = own.limits.limits
         rows, signs, values = kept.sides
         more = raised.held * kept.scales[rows]
-        # What passes from or to no force keeps that alone.
+        # Forces that vanish or set in are only nonnegative.
         more = np.where(find_relieved(stage, kept), -signs * values, more)
         pressed = own.limits.pressed
         floor = values[pressed] + more[:, pressed]
@@ -216,7 +194,7 @@ def raise_bounds(
 def _free_equal(
     stage: Stage, rows: LimitRows, layout: StageLayout, lows: tuple[Array, Array]
 ) -> None:
-    """Take bounds away, in place, where equations say what a force is."""
+    """Remove bounds, in place, of forces that are given by equations."""
     if not stage.formation.scene.has_slow_motors:
         return
     low_x, low = lows

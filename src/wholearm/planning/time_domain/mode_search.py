@@ -1,4 +1,4 @@
-"""The search for the modes of stages: moves, each solved, until none makes the plan better."""
+"""Local search for contact modes: each neighbouring mode sequence is solved, the better kept."""
 
 from __future__ import annotations
 
@@ -17,58 +17,48 @@ from .search import TimeSearch, TimeSolution
 from .stage import Stage
 from .stage_modes import drop, link, merge, mode_of, release_earlier, sign_sequence, split
 
-_STALLED = 1e-6
-"""Rate over the largest one at which a direction of friction counts as held back."""
-_SLOW = 1e-2
-"""Rate over the largest one below which what is held back stays in all of an interval."""
-_LEANS = 1e-4
-"""Margin to the friction cone over mu c_n at which a rolling contact counts as leaning on it."""
-WORTH = 1e-4
-"""Least gain of a move over the cost; dropping what has shrunk to nothing may cost as much."""
-_GONE = 2e-4
-"""Mean duration of an interval, in the scene's unit of time, below which its stage counts as shrunk
-to nothing."""
-MOST = 12
-"""Most sequences of modes to try from one start."""
-LOST = 3
-"""Sequences that led to nothing since the last gain after which no more are tried."""
-PATIENCE = 50
-"""Most iterations of one of them."""
+_STALLED = 1e-6  # rate over the largest at which a sliding direction counts as held
+_SLOW = 1e-2  # rate over the largest below which it is held in all of an interval
+_LEANS = 1e-4  # margin to the cone, over mu c_n, at which a rolling contact is about to slide
+WORTH = 1e-4  # least relative gain of a move; dropping a vanished stage may cost as much
+_GONE = 2e-4  # mean duration of intervals, in the scene's unit, below which a stage has vanished
+MOST = 12  # most sequences of modes to try from one start
+LOST = 3  # most failed sequences since the last gain
+PATIENCE = 50  # most solver iterations for one of them
 
 
 def improve(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
-    """Change the modes of a solution for as long as that makes it better."""
-    known = {sign_sequence(solution.stages)}
+    """Change the modes of a solution while that decreases the cost."""
+    seen = {sign_sequence(solution.stages)}
     waiting, tried, lost = list_neighbours(search, solution), 1, 0
-    beside = set[tuple[object, ...]]()
+    recent = set[tuple[object, ...]]()
     while waiting and tried < MOST and lost < LOST:
         moved = waiting.pop(0)
         signs = sign_sequence(moved)
-        # A stage that has shrunk to nothing may have gained by the intervals beside it alone.
-        if signs in known and (signs in beside or len(moved) >= len(solution.stages)):
+        # A vanished stage may have gained by the intervals of its neighbours alone.
+        if signs in seen and (signs in recent or len(moved) >= len(solution.stages)):
             continue
-        known.add(signs)
-        beside.add(signs)
+        seen.add(signs)
+        recent.add(signs)
         tried += 1
         other = search.solve(moved, most=PATIENCE)
         search.tried.sequences += 1
         if not other.success:
             lost += 1
             continue
-        gain = solution.cost - other.cost
         least = WORTH if len(moved) >= len(solution.stages) else -WORTH
-        if gain > least * abs(solution.cost):
+        if solution.cost - other.cost > least * abs(solution.cost):
             solution, waiting, lost = other, list_neighbours(search, other), 0
-            beside = set()
+            recent = set()
         elif _rolls(moved) > _rolls(solution.stages):
             # No better by itself, but it tells which way its contacts would slide.
             waiting = [*list_neighbours(search, other, leaning=True), *waiting]
-    search.tried.complete = all(sign_sequence(moved) in known for moved in waiting)
+    search.tried.complete = all(sign_sequence(moved) in seen for moved in waiting)
     return solution
 
 
 def drop_gone(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
-    """Leave out stages that have shrunk to nothing on finer intervals: replays of them diverge."""
+    """Leave out stages that have vanished on finer intervals: their replays diverge."""
     for moved in list_dropped(solution.stages):
         other = search.solve(moved, most=PATIENCE)
         if other.success and other.cost - solution.cost < WORTH * abs(solution.cost):
@@ -79,11 +69,12 @@ def drop_gone(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
 def list_neighbours(
     search: TimeSearch, solution: TimeSolution, leaning: bool = False
 ) -> list[list[Stage]]:
-    """Sequences of stages that one move leads to from those of a solution."""
-    own = [search.problem.phases[stage.phase].formation for stage in solution.stages]
-    worth = [solution.price_friction(k) / abs(solution.cost) for k in range(len(own))]
-    given = (solution.stages, search.scheme, own, search.problem.epsilon, leaning)
-    return list(list_moves(*given, savings=worth))
+    """Mode sequences one move away from that of a solution."""
+    formations = [search.problem.phases[stage.phase].formation for stage in solution.stages]
+    cost = abs(solution.cost)
+    savings = [solution.price_friction(k) / cost for k in range(len(formations))]
+    epsilon, scheme = search.problem.epsilon, search.scheme
+    return list(list_moves(solution.stages, scheme, formations, epsilon, leaning, savings))
 
 
 def _rolls(stages: list[Stage]) -> int:
@@ -91,15 +82,13 @@ def _rolls(stages: list[Stage]) -> int:
 
 
 class ModeRun(NamedTuple):
-    """A stretch of a stage over which something is at its limit."""
+    """Consecutive intervals of a stage in which a rate or a friction force is at its limit."""
 
     row: int  # of (contacts, joints)
     begin: int  # begin, stop: its intervals
     stop: int
-    # direction, of a rolling contact that leans on its cone, in which it would slide; 0 for one
-    # that its least rate holds back
-    sign: float
-    share: float  # [s]: how long it lasts
+    sign: float  # direction in which a rolling contact would slide; 0 at a least rate
+    share: float  # [s]: its duration
 
 
 def list_moves(
@@ -110,23 +99,16 @@ def list_moves(
     leaning: bool = False,
     savings: Sequence[Array] = (),
 ) -> Iterator[list[Stage]]:
-    """Sequences of stages that a solution asks for, the most promising ones first.
+    """Mode sequences suggested by a solution, the guesses of stages; the most promising first.
 
-    Parameters
-    ----------
-    stages                 with the solution as guesses
-    own                    the formation that each stage's phase asks for: what rolls there has to
-    leaning                whether only contacts count that lean on their cones
-    savings : (K, d, n_c)  what friction the other way is worth in each stage over the cost, if that
-                           is known
+    `own` are the formations of the stages' phases, whose rolling contacts have to roll; `leaning`:
+    only contacts at their cones count; `savings` are those of `TimeSolution.price_friction`.
     """
+    slides = [_find_leaning(stage, scheme, own[k], epsilon) for k, stage in enumerate(stages)]
     if leaning:
-        runs = [
-            (run, k)
-            for k, stage in enumerate(stages)
-            for run in _find_leaning(stage, scheme, own[k], epsilon)
-        ]
-        yield from _apply(stages, scheme, own, runs)
+        yield from _apply(
+            stages, scheme, own, [(run, k) for k in range(len(stages)) for run in slides[k]]
+        )
         return
     yield from list_dropped(stages)
     for index in range(len(stages)):
@@ -139,13 +121,12 @@ def list_moves(
             held = _find_held(stage, scheme, slow)
             if savings:
                 held = [run for run in held if _pays(run, stage, savings[index])]
-            leaning_too = _find_leaning(stage, scheme, own[index], epsilon)
-            runs += [(run, index) for run in [*held, *leaning_too]]
+            runs += [(run, index) for run in [*held, *slides[index]]]
         yield from _apply(stages, scheme, own, runs)
 
 
 def list_dropped(stages: Sequence[Stage]) -> Iterator[list[Stage]]:
-    """The stages without one that has shrunk to nothing, for each of these."""
+    """The stages without a vanished one, for each of these."""
     for index, stage in enumerate(stages):
         if stage.guess.duration < _GONE * stage.intervals:
             left = drop(stages, index)
@@ -159,71 +140,68 @@ def _apply(
     own: Sequence[Formation],
     runs: list[tuple[ModeRun, int]],
 ) -> Iterator[list[Stage]]:
-    """Stages in which what is at its limit over a run moves in another way.
+    """Stages in another mode over a run.
 
-    First over runs that go on from one stage to the next: changed in one of them alone, what is
-    held back there would have to turn where the stages meet. Then over whole stages.
+    First over runs that continue from stage to stage, which would have to reverse in between if
+    changed in one alone; then over whole stages that are mostly such a run; then over single runs.
     """
-    wide = [
+    whole = [
         [(run._replace(begin=0, stop=stages[k].intervals), k)]
         for run, k in runs
-        if _is_most(run, stages[k])
+        if 2 * run.share > stages[k].guess.duration
     ]
-    across, single = _list_across(stages, runs), [[own] for own in runs]
-    for group in (across, wide, single):
-        group.sort(key=lambda found: -sum(run.share for run, _ in found))
-    for found in [*across, *wide, *single]:
-        pieces = [_turn(stages, index, run, own, scheme) for run, index in found]
-        first, last = found[0][1], found[-1][1]
-        if None not in pieces:
-            own_stages = (stage for piece in pieces for stage in piece or ())
-            yield link(merge([*stages[:first], *own_stages, *stages[last + 1 :]]))
+    groups = (_list_across(stages, runs), whole, [[pair] for pair in runs])
+    for group in groups:
+        for chain in sorted(group, key=lambda chain: -sum(run.share for run, _ in chain)):
+            pieces = [_turn(stages, index, run, own, scheme) for run, index in chain]
+            first, last = chain[0][1], chain[-1][1]
+            if None not in pieces:
+                changed = (stage for piece in pieces for stage in piece or ())
+                yield link(merge([*stages[:first], *changed, *stages[last + 1 :]]))
 
 
 def _list_across(
     stages: Sequence[Stage], runs: Sequence[tuple[ModeRun, int]]
 ) -> list[list[tuple[ModeRun, int]]]:
-    """Runs of one thing that meet where stages of a phase do, without other runs beside them."""
-    known = {(k, run.row, run.sign, _sign(stages[k], run)): run for run, k in runs}
-    found = []
-    for (k, row, sign, way), run in known.items():
+    """Runs of one row that meet where stages of a phase do."""
+    by_key = {(k, run.row, run.sign, _sign(stages[k], run)): run for run, k in runs}
+    chains = []
+    for (k, row, sign, side), run in by_key.items():
         chain = [(run, k)]
-        while (own := chain[-1])[0].stop == stages[own[1]].intervals:
-            after = known.get((own[1] + 1, row, sign, way))
-            if after is None or after.begin or stages[own[1] + 1].phase != stages[k].phase:
+        while (end := chain[-1])[0].stop == stages[end[1]].intervals:
+            after = by_key.get((end[1] + 1, row, sign, side))
+            if after is None or after.begin or stages[end[1] + 1].phase != stages[k].phase:
                 break
-            chain.append((after, own[1] + 1))
+            chain.append((after, end[1] + 1))
         if len(chain) > 1:
-            found.append(chain)
-    return found
+            chains.append(chain)
+    return chains
 
 
 def _sign(stage: Stage, run: ModeRun) -> float:
-    """Which way what is at its limit moves in a stage."""
+    """Direction of a run's row in a stage."""
     return float(mode_of(stage).signs[run.row])
 
 
 def _turn(
     stages: Sequence[Stage], index: int, run: ModeRun, own: Sequence[Formation], scheme: Scheme
 ) -> list[Stage] | None:
-    """Pieces of a stage in which what is at its limit over a run moves in another way, if any."""
+    """Pieces of a stage in another mode over a run: rolling if possible, else reversed."""
     signs = [run.sign] if run.sign else [0.0, -_sign(stages[index], run)]
     if _comes_to_rest(stages, index, own, run.row):
         signs = [sign for sign in signs if sign]
     pieces = [_change(stages, index, run, sign, scheme) for sign in signs]
-    # What can roll turns by rolling first.
     return next((piece for piece in pieces if piece is not None), None)
 
 
 def _pays(run: ModeRun, stage: Stage, savings: Array) -> bool:
-    """Whether what is held back in a run might gain by rolling there, if it can."""
-    if not _can_roll(stage, run):
-        return True
-    return float(savings[run.begin : run.stop, :, run.row].clip(min=0.0).sum()) > WORTH
+    """Whether rolling over a run might gain, if the contact can roll."""
+    own = (slice(run.begin, run.stop), slice(None), run.row)
+    return not _can_roll(stage, run) or float(savings[own].clip(min=0.0).sum()) > WORTH
 
 
 def _can_roll(stage: Stage, run: ModeRun) -> bool:
-    """Whether what is held back in a run may roll: by itself, with friction and freedoms left."""
+    """Whether a run's row is a contact that may roll by itself, with friction and freedoms left."""
     formation = stage.formation
     if run.row >= formation.n_contacts or formation.n_constraints >= 4:
         return False
@@ -233,7 +211,7 @@ def _can_roll(stage: Stage, run: ModeRun) -> bool:
 
 
 def _comes_to_rest(stages: Sequence[Stage], index: int, own: Sequence[Formation], row: int) -> bool:
-    """Whether a contact slides until its phase ends, since the next phase lets it roll."""
+    """Whether a contact slides until its phase ends, since it rolls in the next one."""
     stage = stages[index]
     last = max(k for k, other in enumerate(stages) if other.phase == stage.phase)
     if row >= stage.formation.n_contacts or last + 1 == len(stages):
@@ -241,22 +219,16 @@ def _comes_to_rest(stages: Sequence[Stage], index: int, own: Sequence[Formation]
     return stage.formation.contacts[row] in set(own[last + 1].rolling) - set(own[index].rolling)
 
 
-def _is_most(run: ModeRun, stage: Stage) -> bool:
-    """Whether a run is more than half of its stage."""
-    return 2 * run.share > stage.guess.duration
-
-
 def _change(
     stages: Sequence[Stage], index: int, run: ModeRun, sign: float, scheme: Scheme
 ) -> list[Stage] | None:
-    """Pieces of a stage with another direction in a run, or None if that cannot be."""
-    stage, formation = stages[index], stages[index].formation
-    middle = stage.guess.z[(run.begin + run.stop) // 2, 0]
-    rows = find_tied(formation, middle, run.row)
+    """Pieces of a stage with another direction over a run, or None if that cannot be."""
+    stage = stages[index]
     if sign == 0 and not _can_roll(stage, run):
         return None
-    mode = mode_of(stage).changed(rows, sign)
-    # Where the neighbour is in that mode already, the place between them has been chosen.
+    middle = stage.guess.z[(run.begin + run.stop) // 2, 0]
+    mode = mode_of(stage).changed(find_tied(stage.formation, middle, run.row), sign)
+    # Where the neighbour has that mode already, the instant between them is optimal.
     at_start, at_end = run.begin == 0, run.stop == stage.intervals
     if not (at_start and at_end):
         near = [stages[index - 1]] if at_start and index else []
@@ -267,10 +239,10 @@ def _change(
 
 
 def _find_held(stage: Stage, scheme: Scheme, slow: bool) -> list[ModeRun]:
-    """Stretches over which a least rate holds something back.
+    """Runs over which a least rate is active.
 
-    A polynomial that is held back touches the least rate at few points of an interval, so whole
-    intervals count that touch it and are `slow` throughout, or else those that touch it twice.
+    A polynomial touches its bound at few points of an interval, so whole intervals count that touch
+    it and are `slow` throughout, or else those that touch it twice.
     """
     formation, part = stage.formation, stage.guess
     z, v = part.z.reshape(-1, 5), part.v.reshape(-1, 5)
@@ -289,7 +261,7 @@ def _find_held(stage: Stage, scheme: Scheme, slow: bool) -> list[ModeRun]:
 
 
 def _find_leaning(stage: Stage, scheme: Scheme, own: Formation, epsilon: float) -> list[ModeRun]:
-    """Stretches over which a contact that need not roll leans on one side of its cone."""
+    """Runs over which a contact that need not roll is at one side of its cone."""
     formation, n_c = stage.formation, stage.formation.n_contacts
     runs = []
     for k, row in enumerate(formation.rolling_rows):
@@ -311,7 +283,7 @@ def _find_runs(
     flags: NDArray[np.bool_], stage: Stage, scheme: Scheme, signs: Array
 ) -> list[ModeRun]:
     """Longest run of True in each column, of shape (K d, n), if it is an interval long."""
-    found = []
+    longest, breaks = [], stage.guess.breaks
     for row, column in enumerate(flags.T):
         edges = np.flatnonzero(np.diff(np.concatenate([[0], column.astype(int), [0]])))
         runs = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
@@ -321,7 +293,6 @@ def _find_runs(
         if last - first < scheme.degree:
             continue
         begin, stop = first // scheme.degree, -(-last // scheme.degree)
-        breaks = stage.guess.breaks
         share = float(breaks[stop] - breaks[begin]) * stage.guess.duration
-        found.append(ModeRun(row, begin, stop, float(signs[row]), share))
-    return found
+        longest.append(ModeRun(row, begin, stop, float(signs[row]), share))
+    return longest

@@ -1,4 +1,4 @@
-"""Where the unknowns of the time-domain NLP are: interval after interval, stage after stage."""
+"""Indices of the unknowns of the time-domain NLP, interval by interval, and its rows."""
 
 from __future__ import annotations
 
@@ -23,9 +23,7 @@ STATE, MARGIN = 10, 10
 class StageLayout:
     """Indices of one stage's unknowns."""
 
-    # (K + 1, n): z and z' at the start and at the end of each interval: those of its last point, if
-    # that is there. With a margin, that follows.
-    nodes: Indices
+    nodes: Indices  # (K + 1, n): z and z' at the ends of intervals, and a margin if there is one
     h: Indices  # (K,): durations of the intervals
     tau: Indices  # (K, 2 m): control points of the torques in each interval, one after the other
     z: Indices  # z, v, a (K, d, 5): z, z' and z'' at the collocation points
@@ -34,9 +32,9 @@ class StageLayout:
     forces: Indices  # (K, d, n_f)
     short: Indices  # (K, n) or (K, 0): shortfalls of limits in each interval
     impulses: Indices  # of the impact that leads to the next stage, if one does
-    # begin, finish: forces that hold the object at rest before the first stage and after the last
-    # one, if torques must not step there
-    begin: Indices
+    begin: (
+        Indices  # begin, finish: forces at rest at both ends of the motion, of continuous torques
+    )
     finish: Indices
 
     @property
@@ -52,13 +50,9 @@ def lay_out(
     shortfalls: Sequence[int] | None = None,
     held: bool = False,
 ) -> list[StageLayout]:
-    """Lay out the unknowns of stages that follow one another.
+    """Indices of the unknowns of successive stages.
 
-    Parameters
-    ----------
-    with_margin  whether nodes have a margin
-    shortfalls   how many shortfalls each interval of a stage has, if any
-    held         whether torques must not step at both ends
+    `shortfalls` are numbers of them in each interval of a stage; `held`: torques hold both ends.
     """
     layouts: list[StageLayout] = []
     stop, d = 0, scheme.degree
@@ -115,21 +109,13 @@ def pack(points: Sequence[StagePoints], layouts: Sequence[StageLayout], margin: 
 def unpack(x: Array, layouts: Sequence[StageLayout]) -> list[StagePoints]:
     """What `pack` put together."""
     parts = []
-    for layout in layouts:
-        duration = float(x[layout.h].sum())
-        parts.append(
-            StagePoints(
-                duration,
-                x[layout.h] / duration,
-                x[layout.nodes[:, :STATE]].reshape(-1, 2, 5),
-                x[layout.z],
-                x[layout.v],
-                x[layout.a],
-                x[layout.forces],
-                x[layout.tau].reshape(len(layout.tau), -1, 2),
-                x[layout.impulses],
-            )
-        )
+    for own in layouts:
+        duration = float(x[own.h].sum())
+        nodes = x[own.nodes[:, :STATE]].reshape(-1, 2, 5)
+        z, v, a, forces = (x[part] for part in (own.z, own.v, own.a, own.forces))
+        tau = x[own.tau].reshape(len(own.tau), -1, 2)
+        fractions, impulses = x[own.h] / duration, x[own.impulses]
+        parts.append(StagePoints(duration, fractions, nodes, z, v, a, forces, tau, impulses))
     return parts
 
 

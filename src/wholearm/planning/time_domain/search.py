@@ -1,4 +1,4 @@
-"""Solving for stages: one NLP after another, until no limit is broken at the points."""
+"""Solution of the time-domain NLP of stages by Ipopt, with warm starts on refined intervals."""
 
 from __future__ import annotations
 
@@ -20,46 +20,38 @@ from .collocation import Scheme, make_scheme
 from .equations import StageRows
 from .intersample import IntersampleLimits, raise_bounds
 from .nlp_layout import MARGIN, pack, unpack
-from .stage import Stage, StagePoints
+from .stage import Stage
 from .time_limits import Target
 from .time_mesh import adopt, monitor_violated, with_controls
 from .time_nlp import TimeNLP, bound_unknowns, build_time_nlp
-from .time_rate_limits import MotorRows
 from .units import in_own_units, scale_options, unit_lengths, unit_of
 
-FIRST_SIZE = 1e-2
-"""Multipliers of a first guess."""
-Multipliers = dict[str, Array]
-"""Of the unknowns' bounds, `lam_x0`, and of the rows, `lam_g0`."""
-_ITERATIONS = {Objective.ELASTIC: 90, Objective.RELAX: 50}
-"""Most iterations of one solve, if not 150."""
-_SLOWER = 2
-"""Factor on the most iterations of one solve, where rates of torques are limited."""
-_CAP = 1.1
-"""Largest margin that is looked for, over the one from which on more decides nothing."""
+FIRST_SIZE = 1e-2  # multipliers of a first guess
+Multipliers = dict[str, Array]  # of the unknowns' bounds, `lam_x0`, and of the rows, `lam_g0`
+_ITERATIONS = {Objective.ELASTIC: 90, Objective.RELAX: 50}  # most of one solve, else 150
+_SLOWER = 2  # factor on the most iterations of one solve with rate-limited torques
+_CAP = 1.1  # upper bound of the margin, over the one at which it saturates
 
 
 class Price(NamedTuple):
-    """What the end of stages costs: `gradient` @ (z - `origin`), both of shape (5,)."""
+    """Linear cost of the end of stages: `gradient` @ (z - `origin`), both of shape (5,)."""
 
     gradient: Array
     origin: Array
 
 
 class TimeSolution(NamedTuple):
-    """Stages with what the solver found as their guess."""
+    """Stages with the solution as their guess."""
 
     stages: list[Stage]
     cost: float  # objective
     margin: float  # least c_n over epsilon, if that is an unknown
-    status: str  # how it ended, in words
+    status: str  # how the solver ended, in words
     success: bool
-    nlp: TimeNLP  # what was solved
-    multipliers: Multipliers  # what it ended with
-    # estimate of what better torques would gain, over the cost; not known of all
-    error: float = math.nan
-    # what it has come from, with torques that are not held over control periods
-    free: TimeSolution | None = None
+    nlp: TimeNLP
+    multipliers: Multipliers
+    error: float = math.nan  # estimated gain of better torques, over the cost; not always known
+    free: TimeSolution | None = None  # with free torques, where they are held over control periods
 
     @property
     def end(self) -> Array:
@@ -67,48 +59,37 @@ class TimeSolution(NamedTuple):
         return np.asarray(self.stages[-1].guess.nodes[-1, 0])
 
     def price_friction(self, k: int) -> Array:
-        """What friction at full strength the other way would save to first order, (K, d, n_c).
+        """First-order saving by full friction the other way at the points of a stage, (K, d, n_c).
 
-        Of each contact of stage `k`, at every point; for one that its sense holds back, this bounds
-        what it saves to let it roll.
+        For a contact held at its least rate this bounds what rolling saves.
         """
         stage = self.stages[k]
         formation, part = stage.formation, stage.guess
         A_t = formation.evaluate(part.z.reshape(-1, 5), part.v.reshape(-1, 5)).A_t
-        pull = self.multipliers["lam_g0"][self.nlp.rows_of[k].balance].reshape(-1, 5)
+        lam = self.multipliers["lam_g0"][self.nlp.rows_of[k].balance].reshape(-1, 5)
         c_n = part.forces[..., : formation.n_contacts]
-        price = np.einsum("nij,nj->ni", A_t, pull).reshape(c_n.shape)
+        price = np.einsum("nij,nj->ni", A_t, lam).reshape(c_n.shape)
         return np.asarray(2 * price * stage.directions.Xi * formation.friction * c_n)
 
     @property
     def is_lost(self) -> bool:
-        """Whether it was one on coarse intervals, and did not hold on finer ones."""
+        """Whether it failed on finer intervals than the first."""
         return not self.success and not self.status.startswith("Ipopt")
-
-    @property
-    def monitored(self) -> list[tuple[int, ...]]:
-        """Limits that each stage monitors."""
-        return [stage.monitored for stage in self.stages]
 
 
 @dataclass
 class TimeSearch:
-    """A search for a plan: what stays the same from solve to solve, and what it has cost.
-
-    It works in the scene's own units.
-    """
+    """Data common to all solves for a plan, in the scene's own units, and their statistics."""
 
     problem: Problem
     options: PlanOptions
     scheme: Scheme
     duration: float | None  # longest duration, for the objective `margin`
     goal: Objective
-    relaxation: Parameter | None = None  # what gives way, for the objective `relax`
-    # what follows costs from where stages end, and its gradient, each by the objective
-    to_go: Callable[[Array], tuple[float, Array]] | None = None
+    relaxation: Parameter | None = None  # the relaxed limit, for the objective `relax`
+    to_go: Callable[[Array], tuple[float, Array]] | None = None  # cost-to-go and its gradient at z
     price: Price | None = None
-    # least normal force from which on more decides nothing, for the objective `margin`
-    ample: float = math.inf
+    ample: float = math.inf  # normal force at which the objective `margin` saturates
     only_begins: bool = False  # whether plans may miss limits between points
     tried: Tried = field(default_factory=Tried)  # shared by all searches for one plan
 
@@ -121,7 +102,7 @@ class TimeSearch:
         ample: float = math.inf,
         only_begins: bool = False,
     ) -> TimeSearch:
-        """A search for what `plan_phases` is given, in SI units."""
+        """A search with the arguments of `plan_phases`, in SI units."""
         scales = problem.scene.scales
         lengths, unit = unit_lengths(scales), unit_of(options.goal, scales)
 
@@ -144,60 +125,61 @@ class TimeSearch:
     def aiming(self, goal: Objective, relaxation: Parameter | None = None) -> TimeSearch:
         """The same search with another objective.
 
-        Where limits give way torques are linear: others might keep them at the points alone.
+        Soft limits go with linear torques: others might keep them at the points alone.
         """
         name, degree = self.scheme.name, self.scheme.degree
-        straight = goal in (Objective.ELASTIC, Objective.RELAX)
-        scheme = make_scheme(name, degree, 2 if straight else degree)
-        own = replace(self, goal=goal, relaxation=relaxation, scheme=scheme)
-        return replace(own, duration=None, to_go=None, price=None)
+        linear = goal in (Objective.ELASTIC, Objective.RELAX)
+        scheme = make_scheme(name, degree, 2 if linear else degree)
+        return replace(
+            self,
+            goal=goal,
+            relaxation=relaxation,
+            scheme=scheme,
+            duration=None,
+            to_go=None,
+            price=None,
+        )
 
     def wait(self, iterations: int) -> int:
-        """Iterations to wait for the solver: where rates of torques are limited it takes more."""
+        """Most solver iterations: more with rate-limited torques."""
         return iterations * (_SLOWER if self.problem.scene.has_slow_motors else 1)
 
     def charge(self, z: Array) -> float:
-        """What it costs to end at `z`, shape (5,)."""
+        """Price of an end at `z`, shape (5,)."""
         return float(self.price.gradient @ (z - self.price.origin)) if self.price else 0.0
 
     def has_ample(self, solution: TimeSolution) -> bool:
-        """Whether c_n is as large as another phase allows anyway, for the objective `margin`."""
+        """Whether the objective `margin` is saturated."""
         return self.goal is Objective.MARGIN and solution.margin > self.most_margin
 
     @property
     def most_margin(self) -> float:
-        """What c_n has over epsilon where it is ample."""
+        """Margin at which the objective saturates."""
         return self.ample - self.problem.epsilon
 
     def solve(
-        self,
-        stages: list[Stage],
-        before: TimeSolution | None = None,
-        most: int = 150,
+        self, stages: list[Stage], before: TimeSolution | None = None, most: int = 150
     ) -> TimeSolution:
-        """Solve from the stages' guesses, until no limit is broken at the points.
+        """Solve from the stages' guesses in at most `most` iterations.
 
-        Parameters
-        ----------
-        most  most iterations
+        Formation limits violated at the points are added, and the NLP is solved again.
         """
         controls = self.scheme.controls
         if stages[0].guess.tau.shape[1] != controls:
-            stages = [replace(own, guess=with_controls(own.guess, controls)) for own in stages]
+            stages = [replace(s, guess=with_controls(s.guess, controls)) for s in stages]
         while True:
-            nlp = self.build(stages, most)
-            multipliers = None
-            if before is not None and before.monitored == [stage.monitored for stage in stages]:
+            nlp, multipliers = self.build(stages, most), None
+            if before and [s.monitored for s in before.stages] == [s.monitored for s in stages]:
                 multipliers = carry_multipliers(
                     before.multipliers, before.nlp, nlp, self.scheme, before.stages, stages
                 )
-            plain = [IntersampleLimits.none(stage) for stage in stages]
+            raised = [IntersampleLimits.none(stage) for stage in stages]
             margin = before.margin if before else 0.0
-            solution = self.run(nlp, stages, plain, multipliers, margin)
-            monitoring = monitor_violated(solution.stages) if solution.success else None
-            if monitoring is None:
+            solution = self.run(nlp, stages, raised, multipliers, margin)
+            extended = monitor_violated(solution.stages) if solution.success else None
+            if extended is None:
                 return solution
-            stages = monitoring
+            stages = extended
 
     def build(self, stages: Sequence[Stage], most: int = 150) -> TimeNLP:
         """Build the NLP."""
@@ -205,8 +187,7 @@ class TimeSearch:
         target = Target(
             self.goal, self.problem.epsilon, self.options.time_weight, self.relaxation, gradient
         )
-        most = _ITERATIONS.get(self.goal, most)
-        return build_time_nlp(stages, self.scheme, target, most)
+        return build_time_nlp(stages, self.scheme, target, _ITERATIONS.get(self.goal, most))
 
     def run(
         self,
@@ -222,7 +203,7 @@ class TimeSearch:
         if self.duration is not None and nlp.duration_row >= 0:
             high_g[nlp.duration_row] = self.duration
         if self.goal is Objective.MARGIN:
-            # Beyond what is ample there is nothing to look for, and it takes long.
+            # Solving for more than the saturated margin takes long.
             high[nlp.layouts[-1].nodes[-1, MARGIN]] = _CAP * self.most_margin
         if (low > high).any():
             status = "limits that hold between points too leave nothing"
@@ -254,12 +235,7 @@ class TimeSearch:
 def first_multipliers(
     bounds: Sequence[Array], row_bounds: Sequence[Array], size: float = FIRST_SIZE
 ) -> Multipliers:
-    """Multipliers of one size for all inequalities.
-
-    Parameters
-    ----------
-    bounds, row_bounds  lower and upper bounds of unknowns and rows
-    """
+    """Multipliers of one size for all inequalities, by lower and upper bounds."""
     (low, high), (low_g, high_g) = bounds, row_bounds
     bounded = np.isfinite(high).astype(float) - np.isfinite(low)
     return {"lam_x0": size * bounded, "lam_g0": np.where(high_g > low_g, -size, 0.0)}
@@ -275,66 +251,56 @@ def carry_multipliers(
 ) -> Multipliers:
     """Multipliers of the same stages on other intervals.
 
-    What is said at points goes with the length of an interval, as the sum over time matters. Those
-    of collocation are costates, which are continuous.
+    Those of points are proportional to the interval's length; those of collocation are costates.
     """
     on_x, on_g = multipliers["lam_x0"], multipliers["lam_g0"]
     lam_x, lam_g = np.zeros(new.layouts[-1].stop), np.zeros(len(new.rows.bounds[0]))
     once = [_list_once(nlp) for nlp in (new, old)]
     if len(once[0]) == len(once[1]):
         lam_g[once[0]] = on_g[once[1]]
+
+    def spread(values: Array, share: Array) -> Array:
+        return np.asarray(values * share.reshape(-1, *[1] * (values.ndim - 1)))
+
     for k, (before, after) in enumerate(zip(old_stages, new_stages, strict=True)):
-        part, finer = before.guess, after.guess
-        middles = finer.breaks[:-1] + finer.fractions / 2
-        parent = np.searchsorted(part.breaks, middles, side="right") - 1
-        share = finer.fractions / part.fractions[parent]
+        coarse, fine = before.guess, after.guess
+        middles = fine.breaks[:-1] + fine.fractions / 2
+        parent = np.searchsorted(coarse.breaks, middles, side="right") - 1
+        share = fine.fractions / coarse.fractions[parent]
         for name in ("tau", "v", "forces"):
-            mine, theirs = getattr(new.layouts[k], name), getattr(old.layouts[k], name)
-            values = on_x[theirs[parent]]
-            lam_x[mine] = values * share.reshape(-1, *[1] * (values.ndim - 1))
-        rows, known = new.rows_of[k], old.rows_of[k]
-        for mine, theirs in zip(rows.even, known.even, strict=True):
-            values = on_g[theirs[parent]]
-            lam_g[mine] = values * share.reshape(-1, *[1] * (values.ndim - 1))
-        if rows.motors is not None and known.motors is not None:
-            _carry_motors(lam_g, on_g, (known.motors, rows.motors), (part, finer), parent)
-        costate = find_costate(known, on_g, scheme)[parent]
-        places = (finer.places(scheme.points) - part.breaks[parent, None]) / part.fractions[
-            parent, None
-        ]
-        moved = np.stack(
-            [scheme.interpolate(x) @ own for x, own in zip(places, costate, strict=True)]
-        )
+            columns = getattr(old.layouts[k], name)[parent]
+            lam_x[getattr(new.layouts[k], name)] = spread(on_x[columns], share)
+        rows, old_rows = new.rows_of[k], old.rows_of[k]
+        for mine, theirs in zip(rows.even, old_rows.even, strict=True):
+            lam_g[mine] = spread(on_g[theirs[parent]], share)
+        if rows.motors is not None and old_rows.motors is not None:
+            motors, old_motors = rows.motors, old_rows.motors
+            lam_g[motors.rates] = on_g[old_motors.rates[parent]]
+            lam_g[motors.commands] = on_g[old_motors.commands[parent]]
+            # Multipliers of continuous torques are a costate.
+            for joint in range(2 if len(coarse.breaks) > 2 else 0):
+                costate = on_g[old_motors.joins[:, joint]]
+                lam_g[motors.joins[:, joint]] = np.interp(
+                    fine.breaks[1:-1], coarse.breaks[1:-1], costate
+                )
+        costate = find_costate(old_rows, on_g, scheme)[parent]
+        start, length = coarse.breaks[parent, None], coarse.fractions[parent, None]
+        places = (fine.places(scheme.points) - start) / length
+        moved = np.stack([scheme.interpolate(x) @ c for x, c in zip(places, costate, strict=True)])
         along = np.einsum("kdf,ksjd->ksjf", rows.bases, moved * scheme.weights[:, None])
         lam_g[rows.states] = np.linalg.pinv(scheme.rungs.T) @ along
     return {"lam_x0": lam_x, "lam_g0": lam_g}
 
 
 def find_costate(rows: StageRows, on_g: Array, scheme: Scheme) -> Array:
-    """What z and z' at the points are worth, by the multipliers of rows, shape (K, 2, d, 5)."""
+    """Costate of z and z' at the points from multipliers of collocation, shape (K, 2, d, 5)."""
     shares = scheme.rungs.T @ on_g[rows.states] / scheme.weights[:, None]
     return np.asarray(np.einsum("kdf,ksjf->ksjd", rows.bases, shares))
 
 
-def _carry_motors(
-    lam_g: Array,
-    on_g: Array,
-    rows: tuple[MotorRows, MotorRows],
-    parts: tuple[StagePoints, StagePoints],
-    parent: Indices,
-) -> None:
-    """Multipliers of rates and commands, and of torques that go on: their costate."""
-    known, own = rows
-    lam_g[own.rates], lam_g[own.commands] = on_g[known.rates[parent]], on_g[known.commands[parent]]
-    old, new = (part.breaks[1:-1] for part in parts)
-    if len(old):
-        for joint in range(2):
-            lam_g[own.joins[:, joint]] = np.interp(new, old, on_g[known.joins[:, joint]])
-
-
 def _list_once(nlp: TimeNLP) -> Indices:
-    """Rows that are there once, and not in each interval."""
-    own = [part.ravel() for r in nlp.rows_of for part in (*r.even, r.states, r.shares)]
+    """Rows that do not belong to intervals."""
+    rows = [part.ravel() for r in nlp.rows_of for part in (*r.even, r.states, r.shares)]
     slow = [r.motors for r in nlp.rows_of if r.motors is not None]
-    own += [part.ravel() for m in slow for part in (m.joins, m.rates, m.commands)]
-    return np.delete(np.arange(len(nlp.rows.bounds[0])), np.concatenate(own))
+    rows += [part.ravel() for m in slow for part in (m.joins, m.rates, m.commands)]
+    return np.delete(np.arange(len(nlp.rows.bounds[0])), np.concatenate(rows))

@@ -1,4 +1,4 @@
-"""Stages: stretches of a motion in the time domain, on one formation with fixed friction."""
+"""Stages: parts of a motion in the time domain with one formation and fixed contact modes."""
 
 from __future__ import annotations
 
@@ -24,9 +24,7 @@ class StagePoints(NamedTuple):
     v: Array
     a: Array
     forces: Array  # (K, d, n_c + R) [N]: c_n of all contacts, then c_t of the rolling ones
-    # (K, m, 2) [N m]: control points of each interval: torques are polynomials of degree m - 1
-    # there
-    tau: Array
+    tau: Array  # (K, m, 2) [N m]: control points of torques, of degree m - 1 in each interval
     impulses: Array  # (n_c + R,) [N s]: of the impact with which the stage ends, if it does
 
     @property
@@ -43,40 +41,36 @@ class StagePoints(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """A stretch on one formation with fixed directions of friction."""
+    """A part of a motion with one formation and fixed directions of friction."""
 
-    phase: int  # index of the phase it belongs to
+    phase: int  # index of its phase
     formation: Formation
     directions: Directions
-    guess: StagePoints  # where the search starts; its intervals are those of the NLP
-    # what is reached at the end; None if the stage ends by a reversal or a release
-    until: Until | None = None
+    guess: StagePoints  # initial guess; its intervals are those of the NLP
+    until: Until | None = None  # reached at the end; None if it ends by a reversal or a release
     turns: tuple[int, ...] = ()  # rows of (contacts, joints) whose rate is zero at the end
-    # the next stage's formation where that has a constraint more, which is gained softly
-    gained: Formation | None = None
-    # contacts that the next stage lets go, with 0, or lets slip, with their direction then
+    gained: Formation | None = None  # the next stage's, if a constraint of it is gained softly
+    # contacts that the next stage releases, with 0, or lets slide, with their direction then
     fading: tuple[tuple[int, float], ...] = ()
     growing: tuple[int, ...] = ()  # contacts that the stage before does not have
-    ends_in_impact: bool = False  # whether an impact leads to the next stage
-    monitored: tuple[int, ...] = ()  # limits of the formation that are kept positive at every point
-    released: tuple[int, ...] = ()  # limits of the contacts that were let go where the phase began
-    opens: bool = False  # whether they are let go at the start of this stage
-    # least acceleration with which the gaps of contacts that are let go open, over gravity
-    opening: float = OPENING
-    # what these gaps are at least after a third of the first stage, over the radius of gyration
-    clearance: float = CLEARANCE
-    # monitored limits that are as clear at the end: what comes next ends by closing them
-    apart: tuple[int, ...] = ()
-    # row of z, the value that it has where the phase ends, and from which side it comes there:
-    # reached before, that would be the end
+    ends_in_impact: bool = False
+    monitored: tuple[int, ...] = ()  # limits of the formation that are constraints at the points
+    released: tuple[int, ...] = ()  # limits of the contacts released where the phase began
+    opens: bool = False  # whether they are released at the start of this stage
+    opening: float = OPENING  # least acceleration of their gaps, over gravity
+    clearance: float = (
+        CLEARANCE  # least gap after a third of the stage, over the radius of gyration
+    )
+    apart: tuple[
+        int, ...
+    ] = ()  # limits that are as clear at the end, as the next phase closes them
+    # row of z, its value where the phase ends, and the side from which it comes there
     ahead: tuple[int, float, float] | None = None
-    # (5,): where the last stage ends, if that is given: with two freedoms its end leaves one open
-    stop: Array | None = None
-    # the control period of its phase that each interval is part of, if torques are held
-    periods: tuple[int, ...] = ()
-    # rate of contacts and joints, in the scene's unit, at which three quarters of their friction
-    # has set in, against whatever way they move; nothing if friction has the given directions
-    onset: float = 0.0
+    stop: Array | None = None  # (5,): the given end of the last stage
+    periods: tuple[int, ...] = ()  # control period of each interval, if torques are held
+    onset: float = (
+        0.0  # rate of the friction homotopy, tanh(rate / onset), in the scene's unit; or 0
+    )
 
     @property
     def intervals(self) -> int:
@@ -86,8 +80,8 @@ class Stage:
     def list_clearances(self, places: Array, after: float) -> Array:
         """Least values of monitored limits at `places`, shape (n,), of the stage: (n, n_monitored).
 
-        From the share `after` of the stage on, but for contacts that were let go before it. Where
-        torques go on, so do accelerations, and gaps open with the third power of time.
+        From the share `after` of the stage on, but for contacts released before it. With continuous
+        torques gaps open with the third power of time.
         """
         slow = self.formation.scene.has_slow_motors
         late = (np.minimum(places / after, 1.0) ** 3 if slow else places > after)[:, None]
@@ -98,12 +92,7 @@ class Stage:
     def measure_senses(self, z: Array, v: Array) -> Array:
         """Rates of contacts and joints in the stage's directions, shape (n, n_c + 2) [rad/s].
 
-        Those of contacts are over the radius of gyration; what moves against its direction has a
-        negative one.
-
-        Parameters
-        ----------
-        z, v : (n, 5)  configurations and velocities
+        Those of contacts are over the radius of gyration; z and v have the shape (n, 5).
         """
         slip = np.einsum("nij,nj->ni", self.formation.evaluate(z, v).A_t, v)
         rates = np.hstack([slip / self.formation.scene.polygon.gyration_radius, v[:, 3:]])

@@ -1,7 +1,6 @@
-"""The equations of the time-domain NLP: at a point, over an interval, from stage to stage.
+"""Kernels of the time-domain NLP: at a point, over an interval, between stages.
 
-Every kernel declares the columns that it takes and gives by name. Kernels of a formation serve all
-that have the same equations, whatever their limits are.
+Their columns have names. Formations with the same equations share kernels.
 """
 
 from __future__ import annotations
@@ -42,13 +41,12 @@ class _Alike:
 
     def __init__(self, formation: Formation) -> None:
         self.formation = formation
-        self.key = formation.equations
 
     def __hash__(self) -> int:
-        return hash(self.key)
+        return hash(self.formation.equations)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Alike) and self.key == other.key
+        return isinstance(other, _Alike) and self.formation.equations == other.formation.equations
 
 
 def share(size: int) -> Callable[[Callable[..., _K]], Callable[..., _K]]:
@@ -76,22 +74,20 @@ def name_kernel(x: Symbols, p: Symbols, **y: Expression) -> NamedKernel:
 
 
 @share(32)
-def point_kernel(formation: Formation, controls: int, gradual: bool = False) -> NamedKernel:
-    """Equations and inequalities at a collocation point.
+def point_kernel(formation: Formation, controls: int, homotopy: bool = False) -> NamedKernel:
+    """Contact constraints, equations of motion, and rates of sliding contacts at a point.
 
-    `tau` is made of the control points of the torques, `shares` of theirs at the point; `first` is
-    z at the start of the interval if a contact rolls, and `least` the least rates. The contacts'
-    constraints, in position, velocity and acceleration, and the five equations of motion are zero;
-    the senses of contacts that slide with friction must not be negative. Friction that sets in
-    `gradual`ly, at the rate `onset`, goes against the motion whichever way that is.
+    `tau` are the control points of the torques, `shares` their Bernstein polynomials, `first` is z
+    at the start of the interval if a contact rolls, `least` are the least rates. In the `homotopy`
+    friction is regularized by tanh(rate / onset).
     """
     scene, n_c, rolls = formation.scene, formation.n_contacts, bool(formation.rolling)
     x = Columns(z=5, v=5, a=5, forces=formation.n_constraints, tau=2 * controls, first=5 * rolls)
     s = x.make_symbols()
-    p = Columns(Xi=n_c, sigma=2, shares=controls, least=n_c, onset=1 * gradual).make_symbols()
+    p = Columns(Xi=n_c, sigma=2, shares=controls, least=n_c, onset=1 * homotopy).make_symbols()
     gaps, P, P_dot_v, A_t = formation.build_constraints(s.z, s.v)
     Xi, sigma = p.Xi, p.sigma
-    if gradual:
+    if homotopy:
         Xi, sigma = ca.tanh(A_t @ s.v / p.onset), ca.tanh(s.v[3:] / p.onset)
     if rolls:
         gaps[n_c:] -= formation.roll_function(s.first, s.v)[0]
@@ -127,9 +123,7 @@ def end_kernel(formation: Formation) -> NamedKernel:
 def collocation_kernel(name: str, degree: int, freedoms: int) -> NamedKernel:
     """Collocation along the tangent space: N^T (s_j - s_0 - h sum_l a_jl r_l).
 
-    s is the state at the `start`, at the points and, if no point is there, at the `end`, and r are
-    the `rates` at the points. There is a row for each freedom at each point and end; p is made of
-    the columns of N.
+    s are the states at the `start`, the points and, if no point is there, the `end`; r are `rates`.
     """
     scheme: Scheme = make_scheme(name, degree)
     table, rungs = scheme.rungs, len(scheme.rungs)
@@ -161,16 +155,13 @@ def opening_kernel(formation: Formation, contact: Contact) -> NamedKernel:
 def goal_kernel(
     formation: Formation, until: Until | None, turns: tuple[int, ...], gained: Formation | None
 ) -> NamedKernel | None:
-    """What is zero at the end of a stage; None if nothing is.
-
-    The end of the phase is reached, rates turn, and what is gained is approached without speed.
-    """
+    """End of a phase, zero rates of reversals, and zero speeds of contacts gained; None if none."""
     scene = formation.scene
     x = Columns(z=5, v=5).make_symbols(z=build_features(scene).z)
     z, v = x.z, x.v
     parts: list[Expression] = []
     if until is not None and until.contact is not None:
-        # Where a contact changes its name its gap has no slope, but the end of its range has.
+        # Where a contact changes its name its gap has no gradient, but the end of its range has.
         ranges = [limit for c in formation.contacts for limit in build_limits(c, scene)]
         ends = [limit.value for limit in ranges if limit.gains(until.contact)]
         parts.append(ends[0] if len(ends) == 1 else build_gap(until.contact, scene))
@@ -207,7 +198,7 @@ def effort_kernel(controls: int) -> NamedKernel:
 
 @lru_cache(maxsize=8)
 def bend_kernel(controls: int) -> NamedKernel:
-    """What bends of torques within an interval cost, by second differences of control points."""
+    """Cost of second differences of the control points of torques."""
     x, p = Columns(tau=2 * controls, h=1).make_symbols(), Columns(weight=2).make_symbols()
     tau = ca.reshape(x.tau, 2, controls)
     bends = tau[:, 2:] - 2 * tau[:, 1:-1] + tau[:, :-2]
@@ -221,10 +212,9 @@ def find_leaving(formation: Formation, following: Formation) -> list[int]:
 
 @share(32)
 def impact_kernel(formation: Formation, following: Formation) -> NamedKernel:
-    """A plastic impact M5 (v+ - v-) = G+^T p, P+ v+ = 0 onto the next formation.
+    """A plastic impact M5 (v+ - v-) = G+^T p, P+ v+ = 0 onto the next formation, `Xi` after it.
 
-    `Xi` are the sliding directions after it. The rates of the gaps that open, and the friction
-    cones of rolling contacts, must not be negative; the rest is zero.
+    Rates of gaps that open, and friction cones of rolling contacts, are nonnegative.
     """
     scene, n_c = following.scene, following.n_contacts
     x = Columns(after=5, before=5, z=5, impulses=following.n_constraints).make_symbols()

@@ -1,8 +1,6 @@
-"""Modes of stages: which way each contact slides and each joint turns, and what rolls.
+"""Contact modes of stages: sliding directions, rotation of joints, rolling; splitting and merging.
 
-A sequence of stages is linked by what their modes say of the places between them: a contact that
-slides the other way in the next stage, or rolls there, has come to rest, and so has a joint that
-turns the other way.
+Where the modes of successive stages differ, rates are zero in between (`link`).
 """
 
 from __future__ import annotations
@@ -23,19 +21,16 @@ from .stage import Stage, StagePoints
 from .stage_kernels import new_rows
 from .time_mesh import resample
 
-LEAST_INTERVALS = 3
-"""Fewest intervals of a stage."""
+LEAST_INTERVALS = 3  # fewest intervals of a stage
 
 
 class StageMode(NamedTuple):
-    """How the contacts and joints of a stage move."""
+    """Contact mode of a stage."""
 
-    # directions in which contacts slide and joints turn, by rows of (contacts, joints); zero for
-    # what rolls
-    signs: tuple[float, ...]
+    signs: tuple[float, ...]  # of the rates of (contacts, joints); zero for rolling contacts
 
     def changed(self, rows: Sequence[int], sign: float) -> StageMode:
-        """The mode with another direction of rows, that of the first one; others turn with it."""
+        """The mode with another sign of tied rows, given for the first of them."""
         turn = sign * self.signs[rows[0]]
         return StageMode(
             tuple((turn * s or sign) if k in rows else s for k, s in enumerate(self.signs))
@@ -50,25 +45,24 @@ def mode_of(stage: Stage) -> StageMode:
 
 
 def sign_sequence(stages: Sequence[Stage]) -> tuple[tuple[int, StageMode], ...]:
-    """What tells sequences of modes apart: the phase and the mode of each stage."""
+    """Phase and mode of each stage."""
     return tuple((stage.phase, mode_of(stage)) for stage in stages)
 
 
 @lru_cache(maxsize=64)
 def _roll(scene: Scene, contacts: tuple[Contact, ...], rows: tuple[int, ...]) -> Formation:
-    """A formation by its rolling contacts; always the same object, since kernels are kept by it."""
+    """The formation with rolling contacts."""
     return Formation(scene, contacts, tuple(contacts[k] for k in rows))
 
 
 def in_mode(stage: Stage, mode: StageMode) -> Stage:
-    """A stage in another mode; the tangential forces of what rolls are those that it has."""
+    """A stage in another mode, with its tangential forces."""
     if mode == mode_of(stage):
         return stage
     formation, part = stage.formation, stage.guess
     n_c = formation.n_contacts
     signs = np.array(mode.signs)
     rows = tuple(k for k in range(n_c) if signs[k] == 0)
-    # Without a direction there is none that friction could push against.
     directions = Directions(np.where(signs[:n_c] == 0, 1.0, signs[:n_c]), signs[n_c:])
     if rows != formation.rolling_rows:
         c_n, c_t = split_forces(formation, part.forces, stage.directions.Xi)
@@ -78,7 +72,7 @@ def in_mode(stage: Stage, mode: StageMode) -> Stage:
 
 
 def link(stages: Sequence[Stage]) -> list[Stage]:
-    """Stages of which each ends as its mode and that of the next one ask for."""
+    """Stages with ends that follow from their modes."""
     linked = list[Stage]()
     for stage, coming in zip(stages, [*stages[1:], None], strict=True):
         turns: tuple[int, ...] = ()
@@ -93,19 +87,15 @@ def link(stages: Sequence[Stage]) -> list[Stage]:
 
 
 def find_turns(stage: Stage, coming: Stage) -> tuple[int, ...]:
-    """Rows of (contacts, joints) of a stage that move the other way in the next one."""
-    formation = stage.formation
-    after = dict(zip(coming.formation.names, mode_of(coming).signs, strict=False))
-    own = mode_of(stage).signs
-    turns = [k for k, name in enumerate(formation.names) if own[k] * after.get(name, 0.0) < 0]
-    n_c = formation.n_contacts
-    joints = coming.directions.sigma
-    turns += [n_c + k for k in range(2) if stage.directions.sigma[k] * joints[k] < 0]
-    return tuple(turns)
+    """Rows of (contacts, joints) of a stage that reverse in the next one."""
+    joints = ("joint 1", "joint 2")
+    after = dict(zip((*coming.formation.names, *joints), mode_of(coming).signs, strict=True))
+    rows = enumerate(zip((*stage.formation.names, *joints), mode_of(stage).signs, strict=True))
+    return tuple(k for k, (name, sign) in rows if sign * after.get(name, 0.0) < 0)
 
 
 def find_passing(stage: Stage, coming: Stage) -> tuple[tuple[int, float], ...]:
-    """Contacts that a stage lets go at its end, with 0, or lets slip, with their direction then."""
+    """`Stage.fading`: contacts that the next stage releases, with 0, or lets slide, with a sign."""
     formation, passing = stage.formation, list[tuple[int, float]]()
     for k, contact in enumerate(formation.contacts):
         if contact not in coming.formation.contacts:
@@ -123,10 +113,7 @@ def find_fresh(stage: Stage, coming: Stage) -> tuple[int, ...]:
 
 
 def split(stage: Stage, scheme: Scheme, begin: int, stop: int, mode: StageMode) -> list[Stage]:
-    """Pieces of a stage, of which the intervals `begin` to `stop` are in another mode.
-
-    They have to be linked again.
-    """
+    """Pieces of a stage with intervals `begin` to `stop` in another mode, to be linked."""
     own = mode_of(stage)
     pieces: list[Stage] = []
     for first, last, signs in ((0, begin, own), (begin, stop, mode), (stop, stage.intervals, own)):
@@ -140,7 +127,7 @@ def split(stage: Stage, scheme: Scheme, begin: int, stop: int, mode: StageMode) 
 
 
 def merge(stages: Sequence[Stage]) -> list[Stage]:
-    """Stages of which those that follow one another in one mode and phase are one."""
+    """Stages with successive ones of the same mode and phase merged."""
     merged: list[Stage] = [stages[0]]
     for stage in stages[1:]:
         before = merged[-1]
@@ -154,10 +141,9 @@ def merge(stages: Sequence[Stage]) -> list[Stage]:
 
 
 def release_earlier(stages: Sequence[Stage], index: int) -> list[Stage] | None:
-    """Stages of which one belongs to the next phase, or None if that cannot be.
+    """Stages with the last, but not only, one of a phase that ends by a release in the next phase.
 
-    It has to be the last but not the only one of a phase that ends by a release. Where torques must
-    not step what is let go earlier goes on next to the contact: nothing is gained.
+    None if that cannot be; with continuous torques it gains nothing.
     """
     stage = stages[index]
     if stage.formation.scene.has_slow_motors:
@@ -189,27 +175,24 @@ def drop(stages: Sequence[Stage], index: int) -> list[Stage] | None:
     if stage.opens:
         left[index + 1] = replace(stages[index + 1], opens=True)
     if index > 0 and (index - 1 in others) and (index + 1 not in others):
-        # The last one of its phase: the one before ends the phase.
-        impulses = stage.guess.impulses
-        guess = stages[index - 1].guess._replace(impulses=impulses)
-        before = replace(
-            stages[index - 1], guess=guess, until=stage.until, ends_in_impact=stage.ends_in_impact
-        )
-        left[index - 1] = before
+        # The stage before ends the phase.
+        before = stages[index - 1]
+        guess = before.guess._replace(impulses=stage.guess.impulses)
+        ends = stage.ends_in_impact
+        left[index - 1] = replace(before, guess=guess, until=stage.until, ends_in_impact=ends)
     del left[index]
     return left
 
 
 def _join(first: StagePoints, second: StagePoints) -> StagePoints:
-    """Two stretches of one stage as one."""
+    """Two successive parts of one stage as one."""
     total = first.duration + second.duration
-    shares = (first.duration / total, second.duration / total)
-    fractions = np.concatenate([first.fractions * shares[0], second.fractions * shares[1]])
+    fractions = [part.fractions * (part.duration / total) for part in (first, second)]
     nodes = np.concatenate([first.nodes[:-1], second.nodes])
-    z, v, a, forces, tau = (
-        np.concatenate(pair) for pair in zip(first[3:8], second[3:8], strict=True)
-    )
-    return StagePoints(total, fractions, nodes, z, v, a, forces, tau, second.impulses)
+    pairs = zip(first[3:8], second[3:8], strict=True)
+    z, v, a, forces, tau = (np.concatenate(pair) for pair in pairs)
+    shares = np.concatenate(fractions)
+    return StagePoints(total, shares, nodes, z, v, a, forces, tau, second.impulses)
 
 
 def _cut(part: StagePoints, scheme: Scheme, begin: int, stop: int) -> StagePoints:

@@ -1,4 +1,4 @@
-"""Which stages a motion has at first: those of its outlines, with a first guess on each."""
+"""Initial stages of a motion from its initial paths, with an initial guess of states and forces."""
 
 from __future__ import annotations
 
@@ -18,12 +18,9 @@ from .stage import Stage, StagePoints
 from .stage_modes import LEAST_INTERVALS, link
 from .units import in_own_units, scale_state
 
-PRESS = 0.5
-"""Normal forces that a first guess is near, over the weight of the object."""
-_NEAR = 0.02
-"""Distance over the radius of gyration at which a limit is monitored from the start."""
-_TOUCHES = 1e-5
-"""Gap over the radius of gyration below which a contact touches that a phase lets go."""
+PRESS = 0.5  # normal forces of an initial guess, over the weight of the object
+_NEAR = 0.02  # distance over the radius of gyration at which a limit is monitored from the start
+_TOUCHES = 1e-5  # gap over the radius of gyration below which a released contact is closed
 
 
 def guess_stages(
@@ -37,28 +34,28 @@ def guess_stages(
     release_at: float = RELEASE_AT,
     way: PacedWay | None = None,
 ) -> list[Stage]:
-    """Stages of phases that are planned as one, with a first guess, in the scene's own units.
+    """Stages of phases in one NLP, with an initial guess, in the scene's own units.
 
-    The guessed duration is `falls` times that of a fall over the length of the outlines. With
-    `onwards`, phases that go on in motion may end farther away where that takes fewer reversals.
-    A phase that ends by a release is guessed to do so at the share `release_at` of its curve.
-    A single phase may be guessed to go a way of its own instead, at the pace of that.
+    The guessed duration is `falls` times that of a fall over the length of the initial paths. With
+    `onwards`, phases joined in motion may end farther away where that takes fewer reversals. A
+    release is guessed at the share `release_at` of a curve. A single phase may follow a given path
+    with its speed profile instead.
     """
     parts = _list_parts(problem, phases, z, onwards, release_at, way)
     lengths = np.array([outline.length for _, outline, _ in parts])
     ends = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()
-    # The guess runs as (1 - cos) over all stages, so each has its own share of the time.
-    total, pace = falls * float(np.sqrt(lengths.sum())), None if way is None else way.pace
+    # The path parameter of the guess is (1 - cos) / 2 over all stages.
+    total, profile = falls * float(np.sqrt(lengths.sum())), None if way is None else way.profile
     clock = np.arccos(1 - 2 * np.clip(ends, 0.0, 1.0)) / np.pi
-    if pace is not None:
-        total = float(pace.t[-1]) / problem.scene.scales.time
-        clock = np.interp(ends, pace.s, pace.t / pace.t[-1])
+    if profile is not None:
+        total = float(profile.t[-1]) / problem.scene.scales.time
+        clock = np.interp(ends, profile.s, profile.t / profile.t[-1])
     stages: list[Stage] = []
     released: tuple[int, ...] = ()
     for k, (phase, outline, last) in enumerate(parts):
         whole = lengths[[own is phase for own, _, _ in parts]].sum()
         count = max(LEAST_INTERVALS, round(lengths[k] / whole * intervals))
-        guess = _guess(outline, scheme, count, clock[k : k + 2], ends[k : k + 2], total, pace)
+        guess = _guess(outline, scheme, count, clock[k : k + 2], ends[k : k + 2], total, profile)
         ends_in_impact = last and phase.end is End.IMPACT and k + 1 < len(parts)
         if ends_in_impact:
             guess = guess._replace(impulses=np.zeros(parts[k + 1][0].formation.n_constraints))
@@ -77,16 +74,16 @@ def guess_stages(
                 monitored=tuple(sorted({*_choose_monitored(phase, outline), *released})),
                 released=released,
                 opens=opens,
-                ahead=_look_ahead(phase, parts),
+                ahead=_find_value_ahead(phase, parts),
             )
         )
     return link(stages)
 
 
-def _look_ahead(
+def _find_value_ahead(
     phase: Phase, parts: Sequence[tuple[Phase, PathGuess, bool]]
 ) -> tuple[int, float, float] | None:
-    """The coordinate with whose value a phase ends, if that is its end."""
+    """`Stage.ahead` of a phase that ends at the value of a coordinate."""
     if phase.until.value is None:
         return None
     row, value = 0 if phase.until.coordinate == "x" else 2, phase.until.value
@@ -102,7 +99,7 @@ def _list_parts(
     release_at: float,
     way: PacedWay | None,
 ) -> list[tuple[Phase, PathGuess, bool]]:
-    """Phases with their outlines, in own units, and whether each is the last of its phase."""
+    """Phases with their initial paths, in own units, and whether each is the last of its phase."""
     parts: list[tuple[Phase, PathGuess, bool]] = []
     for k, phase in enumerate(phases):
         outlines = list(
@@ -114,10 +111,11 @@ def _list_parts(
                 outlines = _go_straight(phase, outlines, parts[-1][1])
         parts += [(phase, outline, outline is outlines[-1]) for outline in outlines]
         z = outlines[-1].z[-1]
-    own, scaled = in_own_units(problem), []
+    scaled = []
     for phase, outline, last in parts:
-        scaled_phase, z = own.phases[phase.index], scale_state(outline.z, problem.scene.scales)
-        scaled.append((scaled_phase, replace(outline, formation=scaled_phase.formation, z=z), last))
+        own = in_own_units(problem).phases[phase.index]
+        z = scale_state(outline.z, problem.scene.scales)
+        scaled.append((own, replace(outline, formation=own.formation, z=z), last))
     return scaled
 
 
@@ -128,15 +126,11 @@ def _guess(
     clock: Array,
     ends: Array,
     total: float,
-    pace: PathSpeed | None,
+    profile: PathSpeed | None,
 ) -> StagePoints:
-    """Motion along an outline, without accelerations and with every contact pressed alike.
+    """Motion along an initial path, with equal normal forces where it has no speed profile.
 
-    Parameters
-    ----------
-    clock, ends : (2,)  shares of all stages' time and length at the start and the end
-    total : [s]         duration of all stages
-    pace                when they are where, if not as (1 - cos)
+    `clock` and `ends` are shares of the time `total` [s] and length of all stages at both ends.
     """
     knots = np.linspace(0.0, 1.0, len(outline.z))
     slopes = np.gradient(outline.z, knots, axis=0)
@@ -146,7 +140,7 @@ def _guess(
     def follow(share: Array) -> tuple[Array, Array, Array]:
         passed = clock[0] + share * (clock[1] - clock[0])
         span = max(ends[1] - ends[0], 1e-12)
-        place, rate, gain = _run(passed) if pace is None else _run_at(pace, passed)
+        place, rate, gain = _evaluate_profile(profile, passed)
         place = (place - ends[0]) / span
         rate, gain = rate[..., None] / (span * total), gain[..., None] / (span * total**2)
         z, slope, bend = (
@@ -157,12 +151,12 @@ def _guess(
 
     at = breaks[:-1, None] + scheme.points / count
     z, v, a = follow(at)
-    if pace is None:
+    if profile is None:
         forces = _press(outline, z, v, a)
     else:
         passed = clock[0] + at * (clock[1] - clock[0])
-        own = np.searchsorted(pace.t / pace.t[-1], passed) - 1
-        forces = pace.forces[np.clip(own, 0, len(pace.forces) - 1)]
+        own = np.searchsorted(profile.t / profile.t[-1], passed) - 1
+        forces = profile.forces[np.clip(own, 0, len(profile.forces) - 1)]
     tau = _balance(outline, scheme, z, v, a, forces)
     return StagePoints(
         total * (clock[1] - clock[0]),
@@ -177,24 +171,21 @@ def _guess(
     )
 
 
-def _run(passed: Array) -> tuple[Array, Array, Array]:
-    """Share of the length at shares of the time, and its derivatives, from rest to rest."""
-    angle = np.pi * passed
-    return (1 - np.cos(angle)) / 2, np.pi / 2 * np.sin(angle), np.pi**2 / 2 * np.cos(angle)
-
-
-def _run_at(pace: PathSpeed, passed: Array) -> tuple[Array, Array, Array]:
-    """The same at a pace of its own."""
-    total = pace.t[-1]
-    own = np.clip(np.searchsorted(pace.t, passed * total) - 1, 0, len(pace.forces) - 1)
-    begin, since = pace.v[own], passed * total - pace.t[own]
-    gain = (np.diff(pace.v) / np.diff(pace.t))[own]
-    place = pace.s[own] + since * (begin + gain * since / 2)
+def _evaluate_profile(profile: PathSpeed | None, passed: Array) -> tuple[Array, Array, Array]:
+    """Share of the length at shares of the time, and its derivatives, without a profile by cos."""
+    if profile is None:
+        angle = np.pi * passed
+        return (1 - np.cos(angle)) / 2, np.pi / 2 * np.sin(angle), np.pi**2 / 2 * np.cos(angle)
+    total = profile.t[-1]
+    k = np.clip(np.searchsorted(profile.t, passed * total) - 1, 0, len(profile.forces) - 1)
+    begin, since = profile.v[k], passed * total - profile.t[k]
+    gain = (np.diff(profile.v) / np.diff(profile.t))[k]
+    place = profile.s[k] + since * (begin + gain * since / 2)
     return place, total * (begin + gain * since), total**2 * gain
 
 
 def _lack(outline: PathGuess, z: Array, v: Array, a: Array) -> tuple[Array, Array]:
-    """What contact forces c and torques have to do, G^T c + S tau: rows of G, and the sum."""
+    """Rows of G, and the sum G^T c + S tau that the equations of motion require."""
     scene, flat = outline.formation.scene, [table.reshape(-1, 5) for table in (z, v, a)]
     G = force_rows(outline.formation, outline.formation.evaluate(*flat[:2]), outline.directions)
     applied = scene.applied_force - scene.dry * np.append(np.zeros(3), outline.directions.sigma)
@@ -202,11 +193,7 @@ def _lack(outline: PathGuess, z: Array, v: Array, a: Array) -> tuple[Array, Arra
 
 
 def _press(outline: PathGuess, z: Array, v: Array, a: Array) -> Array:
-    """Forces of a motion, shape (K, d, n_c + R).
-
-    The object's equations of motion leave forces of which the ones nearest to a light press are
-    taken.
-    """
+    """Contact forces of a motion nearest to equal normal forces, shape (K, d, n_c + R)."""
     formation, (G, needed) = outline.formation, _lack(outline, z, v, a)
     light = np.zeros(formation.n_constraints)
     light[: formation.n_contacts] = PRESS
@@ -232,17 +219,17 @@ def _balance(
 
 
 def _go_straight(phase: Phase, nearest: list[PathGuess], before: PathGuess) -> list[PathGuess]:
-    """Of outlines to the nearest end and to ends ahead, those with the fewest reversals."""
+    """Of paths to the nearest end and to farther ones, those with the fewest reversals."""
     ahead = [_turn_first(other, before) for other in guess_onwards(phase, before)]
     return min([nearest, *ahead], key=lambda way: (len(way), sum(part.length for part in way)))
 
 
 def _turn_first(outline: PathGuess, before: PathGuess) -> list[PathGuess]:
-    """Split an outline so that it starts with the directions of the one that it goes on from.
+    """Split a path so that it starts in the sliding directions of the one before.
 
-    Velocities are continuous, so what slides the other way in the outline has to turn on the way.
+    Velocities are continuous, so that other directions need reversals along the path.
     """
-    # What rolled has no direction to keep.
+    # Rolling contacts have no direction to keep.
     slides = np.delete(np.arange(before.formation.n_contacts), before.formation.rolling_rows)
     known = {before.formation.names[k]: before.directions.Xi[k] for k in slides}
     own, formation = np.concatenate(outline.directions), outline.formation
@@ -268,8 +255,7 @@ def _turn_first(outline: PathGuess, before: PathGuess) -> list[PathGuess]:
 
 
 def _choose_monitored(phase: Phase, outline: PathGuess) -> tuple[int, ...]:
-    """Limits that are near zero along the outline, and the phase's own end."""
-    values = outline.formation.evaluate_limits(outline.z)
-    near = values.min(axis=0) < _NEAR
-    mine = np.array([limit.gains(phase.until.contact) for limit in outline.formation.limits])
-    return tuple(np.flatnonzero(near | mine).tolist())
+    """Limits that are near zero along the path, and that of the phase's end."""
+    near = outline.formation.evaluate_limits(outline.z).min(axis=0) < _NEAR
+    ends = np.array([limit.gains(phase.until.contact) for limit in outline.formation.limits])
+    return tuple(np.flatnonzero(near | ends).tolist())

@@ -1,4 +1,4 @@
-"""Why phases have no plan in the time domain, and which single limit would have to give way."""
+"""Reasons of infeasibility in the time domain by the elastic problem, and changes of one limit."""
 
 from __future__ import annotations
 
@@ -14,39 +14,25 @@ from ...geometry.curve import describe_pose
 from ...geometry.path_guess import count_freedoms
 from ...mechanics.limits import EPSILON, PRESS, make_limits
 from ...problem.definition import Phase, Problem
-from ...results.trajectory import Trajectory
 from ...scene.model import Scales
 from .. import advice
-from ..advice import (
-    advise,
-    assemble_least,
-    change_scene,
-    describe_shortfalls,
-    keep_worst,
-    name_phases,
-    rank_shortfalls,
-)
 from ..options import Objective, PlanOptions
 from ..stops import runs_along_curves
 from .collocation import Scheme, blend
 from .initial_path import PacedWay
 from .search import TimeSearch
 from .stage import Stage, StagePoints
-from .time_motion import TimeMotion, make_motions
+from .time_motion import make_phase_motions
 from .units import to_si
 
-MISSED = 0.02
-"""Least share by which limits are missed along a way that is no way."""
-MET = 0.98
-"""Share of a limit from which on a motion meets it."""
-ADVICE = 0.6
-"""Processor time [s] after which no further change of a limit is tried."""
-Replan = Callable[[Problem], object]
-"""Plans the same phases of another problem; raises if there is no plan."""
+MISSED = 0.02  # least margin by which limits are missed along an infeasible path
+MET = 0.98  # share of a limit above which it is active
+ADVICE = 0.6  # processor time [s] after which no further change of a limit is tried
+Replan = Callable[[Problem], object]  # plans the same phases of another problem, or raises
 
 
 def solve_elastic(search: TimeSearch, stages: Sequence[Stage]) -> list[Stage] | None:
-    """The motion with the least shortfalls when every limit is soft, or None."""
+    """The motion of least violation with soft limits, or None."""
     solution = search.aiming(Objective.ELASTIC).solve(list(stages))
     return solution.stages if solution.success else None
 
@@ -58,14 +44,10 @@ def refuse(
     stages: Sequence[Stage],
     replan: Replan | None,
 ) -> None:
-    """Raise an error if no motion can begin from rest at the start, or come to rest at the end.
+    """Raise an InfeasibleError if no motion can begin from rest, or come to rest at the end.
 
-    The end counts where it is one point: where a single phase with one freedom leads. `replan` is
-    as for `explain`.
-
-    Raises
-    ------
-    InfeasibleError  with the contact that would have to pull, and what single change would do
+    The end counts if it is one point, of a single phase with one degree of freedom. `replan` is as
+    for `explain`.
     """
     from .resting import find_block, find_change
 
@@ -93,8 +75,9 @@ def refuse(
         limit = f"c_n of {blocked.contact} >= epsilon = {problem.epsilon:g} N"
         text += f": {limit} is {amount:.3g} N short at best"
         place = LimitPlace(phase.number, math.nan, where)
-        given = (PRESS, blocked.contact, limit, amount, "N", place, blocked.short)
-        shortfalls = [Shortfall(*given)]
+        shortfalls.append(
+            Shortfall(PRESS, blocked.contact, limit, amount, "N", place, blocked.short)
+        )
     else:
         text += " within the torque limits"
     ends, z = node == -1, stage.guess.nodes[node, 0]
@@ -110,7 +93,7 @@ def refuse(
 
 
 def _refuse_pushed(problem: Problem, phase: Phase, stages: Sequence[Stage]) -> None:
-    """Raise an error if what touches pushes the object one way, all along the guess to its end."""
+    """Raise an error if contacts can push the object only one way, along all of the guess."""
     from .resting import pushes_one_way
 
     if not stages or stages[0].formation.n_constraints > 2:
@@ -126,7 +109,7 @@ def _refuse_pushed(problem: Problem, phase: Phase, stages: Sequence[Stage]) -> N
 
 
 def _refuse_unheld(problem: Problem, phase: Phase, stage: Stage, node: int) -> None:
-    """Raise an error if torques that may not step cannot hold the object at rest at an end."""
+    """Raise an error if rate-limited torques cannot hold the object at rest at an end."""
     from ...mechanics.wedging import find_static_torques
 
     z, limit = to_si(stage, problem).guess.nodes[node, 0], problem.scene.torque_limit
@@ -151,60 +134,58 @@ def explain(
     status: str,
     replan: Replan | None,
 ) -> InfeasibleError | SolverError:
-    """Say why phases have no plan and what would change that.
+    """Error that says why phases have no plan and what would change that.
 
     Parameters
     ----------
     problem  in SI units
-    short    what `solve_elastic` found from different guesses, where that is short of something
+    short    elastic solutions that violate limits, from different guesses
     status   how the solver ended, in words
-    replan   when left out, no change is looked for
+    replan   None: no change is looked for
     """
     numbers = [phase.number for phase in phases]
     if not short:
         names = " and ".join(" ".join(phase.formation.names) for phase in phases)
-        text = f"no plan for {name_phases(numbers)} ({names}, until {phases[-1].until}): {status}"
+        where = advice.name_phases(numbers)
+        text = f"no plan for {where} ({names}, until {phases[-1].until}): {status}"
         usual = search.options.transcription == "time" and not problem.scene.control_period
         if usual and runs_along_curves(phases, PlanOptions()):
             return SolverError(f"{text}; leave out --transcription time, which plans along curves")
         return SolverError(f"{text}; try another number of intervals per phase (--time-intervals)")
 
-    def sum_up(stages: list[Stage]) -> float:
-        return sum(
-            shortfall.amount for shortfall in list_shortfalls(problem, stages, search.scheme)
-        )
-
-    elastic = min(short, key=sum_up)
-
-    ranked = rank_shortfalls(list_shortfalls(problem, elastic, search.scheme))
-    solved = [to_si(stage, problem).guess for stage in elastic]
+    lists = [list_shortfalls(problem, stages, search.scheme) for stages in short]
+    sums = [sum(shortfall.amount for shortfall in shortfalls) for shortfalls in lists]
+    best = sums.index(min(sums))
+    elastic, ranked = short[best], advice.rank_shortfalls(lists[best])
+    stages = [to_si(stage, problem) for stage in elastic]
 
     def find_value(parameter: Parameter) -> float | None:
-        if not is_met(parameter, solved, ranked):
+        if not is_met(parameter, [stage.guess for stage in stages], ranked):
             return np.nan
-        aim = search.aiming(Objective.RELAX, parameter)
-        solution = aim.solve(elastic)
-        # A limit that may be tighter is not what keeps the others from being kept.
+        solution = search.aiming(Objective.RELAX, parameter).solve(elastic)
+        # A limit that may be tighter is not in conflict with the others.
         if not solution.success or solution.cost < 0.0:
             return np.nan
         unit = _unit_of(parameter, problem.scene.scales)
         return parameter.value + parameter.sign * unit * solution.cost
 
-    text = f"{name_phases(numbers, 'infeasible')}: {describe_shortfalls(ranked)}"
+    text = f"{advice.name_phases(numbers, 'infeasible')}: {advice.describe_shortfalls(ranked)}"
     error = _advise(problem, phases[0], text, find_value, replan, ranked)
-    error.motion = _make_trajectory(problem, phases, search, elastic)
+    motions = make_phase_motions(stages, search.scheme, phases)
+    torques = [motion.torque for motion in motions]
+    error.motion = advice.assemble_least(motions, torques, [phase.formation for phase in phases])
     return error
 
 
 def is_met(
     parameter: Parameter, motion: Sequence[StagePoints], shortfalls: Sequence[Shortfall]
 ) -> bool:
-    """Whether the motion that misses limits least is held back by the limit of a parameter.
+    """Whether the limit of a parameter is active in the elastic motion.
 
-    Epsilon is what holds it back if no normal force is short of more than that.
+    That of epsilon is if no normal force is short of more than epsilon.
     """
     if parameter.key == EPSILON:
-        return all(own.amount < parameter.value for own in shortfalls if own.kind == PRESS)
+        return all(each.amount < parameter.value for each in shortfalls if each.kind == PRESS)
     finger = int(parameter.key.split(".")[1]) - 1
     tables = [part.v[..., 3:] if parameter.is_speed else part.tau for part in motion]
     most = max(float(np.abs(table[..., finger]).max()) for table in tables)
@@ -212,22 +193,14 @@ def is_met(
 
 
 def refuse_ways(problem: Problem, phase: Phase, ways: Sequence[PacedWay]) -> None:
-    """Raise an error if on every way to the end of a phase a limit is missed at any speed.
-
-    Where no motion with least shortfalls is found either, the way that misses least says why.
-
-    Raises
-    ------
-    InfeasibleError  with the limit that is missed there
-    """
+    """Raise an InfeasibleError with the critical limit if along every path one is missed."""
     if not ways or (best := max(ways, key=lambda way: way.margin)).margin > -MISSED:
         return
     critical = best.forces.find_critical()
     limits = make_limits(phase.formation, problem.epsilon).limits
-    limit = next(own for own in limits if (own.kind, own.part) == critical)
-    place = LimitPlace(phase.number, math.nan, "the best of them")
-    given = (*critical, limit.text, -best.margin * limit.scale, limit.unit, place, -best.margin)
-    shortfall = Shortfall(*given)
+    limit = next(limit for limit in limits if (limit.kind, limit.part) == critical)
+    place, missed = LimitPlace(phase.number, math.nan, "the best of them"), -best.margin
+    shortfall = Shortfall(*critical, limit.text, missed * limit.scale, limit.unit, place, missed)
     raise InfeasibleError(
         f"phase {phase.number} is infeasible along all ways to its end that were looked at, "
         f"straight ones and bent ones, at any speed: {shortfall}",
@@ -235,23 +208,9 @@ def refuse_ways(problem: Problem, phase: Phase, ways: Sequence[PacedWay]) -> Non
     )
 
 
-def _make_trajectory(
-    problem: Problem, phases: Sequence[Phase], search: TimeSearch, stages: Sequence[Stage]
-) -> Trajectory:
-    """The motion of stages."""
-    solved = [to_si(stage, problem) for stage in stages]
-    pieces = make_motions(solved, search.scheme)
-    motions = [
-        TimeMotion([p for p, own in zip(pieces, solved, strict=True) if own.phase == phase.index])
-        for phase in phases
-    ]
-    return assemble_least(motions, [own.torque for own in motions], [p.formation for p in phases])
-
-
 def _unit_of(parameter: Parameter, scales: Scales) -> float:
-    """What one of a parameter is in SI units, of one in the scene's own."""
-    units = {"N": scales.force, "N m": scales.torque, "rad/s": 1 / scales.time}
-    return units[parameter.unit]
+    """The scene's unit of a parameter in SI units."""
+    return {"N": scales.force, "N m": scales.torque, "rad/s": 1 / scales.time}[parameter.unit]
 
 
 def _advise(
@@ -262,14 +221,9 @@ def _advise(
     replan: Replan | None,
     shortfalls: Sequence[Shortfall],
 ) -> InfeasibleError:
-    """The error with `text` and what single change of a limit would make a plan possible.
+    """Error with `text` and the changes of a single limit that make a plan possible.
 
-    Parameters
-    ----------
-    phase       one of those that have no plan
-    find_value  as for `planning.advice.advise`
-    replan      without it no change is looked for
-    shortfalls  what `text` tells of, as data
+    `shortfalls` are the data of the text; for the others see `planning.advice.advise`.
     """
 
     def change(parameter: Parameter, value: float) -> object:
@@ -277,45 +231,35 @@ def _advise(
         return replan(change_limit(problem, parameter.key, value))
 
     parameters = make_limits(phase.formation, problem.epsilon).parameters
-    found = advise(text, parameters, find_value, change if replan else None, ADVICE)
+    found = advice.advise(text, parameters, find_value, change if replan else None, ADVICE)
     return InfeasibleError(found.text, shortfalls, found.changes)
 
 
 def list_shortfalls(problem: Problem, stages: Sequence[Stage], scheme: Scheme) -> list[Shortfall]:
-    """What the motion of stages is short of, each limit where it is worst.
+    """Violations of limits by the motion of stages in the scene's units, each where it is worst.
 
-    Parameters
-    ----------
-    problem  in SI units, as the answers are; the stages are in the scene's own
+    They are looked at in SI units, at the collocation points, torques also at ends of intervals.
     """
-    found, passed = list[Shortfall](), 0.0
-    for own in stages:
-        stage = to_si(own, problem)
-        found += _list_of_stage(problem, stage, scheme, passed)
-        passed += stage.guess.duration
-    return keep_worst(found)
-
-
-def _list_of_stage(
-    problem: Problem, stage: Stage, scheme: Scheme, passed: float
-) -> list[Shortfall]:
-    """Shortfalls at the points, and of torques at both ends of intervals."""
-    limits, part = make_limits(stage.formation, problem.epsilon), stage.guess
+    shortfalls, passed = list[Shortfall](), 0.0
     pick = np.array([0, *range(scheme.degree), scheme.degree - 1])
     at = np.concatenate([[0.0], scheme.points, [1.0]])
-    tau = blend(at, part.tau.shape[1]) @ part.tau
-    y = np.concatenate([part.forces[:, pick], tau, part.v[:, pick, 3:]], axis=2)
-    middles = passed + part.duration * (part.breaks[:-1] + part.fractions / 2)
-
-    def locate(row: int) -> LimitPlace:
-        t, phase = float(middles[row // len(pick)]), stage.phase + 1
-        return LimitPlace(phase, t, f"t = {t:.4f} s, phase {phase}")
-
-    return advice.list_shortfalls(limits, (y @ limits.rows.T).reshape(-1, len(limits.low)), locate)
+    for stage in (to_si(stage, problem) for stage in stages):
+        limits, part = make_limits(stage.formation, problem.epsilon), stage.guess
+        tau = blend(at, part.tau.shape[1]) @ part.tau
+        y = np.concatenate([part.forces[:, pick], tau, part.v[:, pick, 3:]], axis=2)
+        middles = passed + part.duration * (part.breaks[:-1] + part.fractions / 2)
+        places = [
+            LimitPlace(stage.phase + 1, t, f"t = {t:.4f} s, phase {stage.phase + 1}")
+            for t in np.repeat(middles, len(pick)).tolist()
+        ]
+        values = (y @ limits.rows.T).reshape(-1, len(limits.low))
+        shortfalls += advice.list_shortfalls(limits, values, places.__getitem__)
+        passed += part.duration
+    return advice.keep_worst(shortfalls)
 
 
 def change_limit(problem: Problem, key: str, value: float) -> Problem:
     """The problem with another value of a parameter of its limits."""
     if key == EPSILON:
         return replace(problem, epsilon=value)
-    return replace(problem, scene=change_scene(problem.scene, key, value))
+    return replace(problem, scene=advice.change_scene(problem.scene, key, value))

@@ -1,7 +1,6 @@
-"""Impacts among phases that are planned in the time domain.
+"""Impacts between phases in the time domain.
 
-A plan that stops at each of them shows from where the motion comes; impacts that are not possible
-from there stay stops, and the phases beside the others are planned as one.
+A plan with stops shows the velocity before each impact; impacts that are impossible stay stops.
 """
 
 from __future__ import annotations
@@ -26,8 +25,7 @@ from ..phase_plan import PhasePlan
 from ..stops import PlanPart, Plans, end_of, plan_stops
 from .time_plan import plan_phases
 
-AT_REST = 1e-4
-"""Speed below which an impact counts as a stop, in the scene's own units."""
+AT_REST = 1e-4  # speed below which an impact counts as a stop, in the scene's own units
 
 
 def plan_with_impacts(
@@ -45,26 +43,16 @@ def plan_with_impacts(
 ) -> Plans:
     """Plan a block with the impacts that are possible, or else with stops.
 
-    Parameters
-    ----------
-    z : (5,)
-    duration : [s]  longest duration of the block, for the objective `margin`
-    to_go           what follows a block without impacts
-    ample, fastest, pinned, begun, only_begin  as of `plan_phases`; a block with impacts makes its
-        own, and plans as a whole
-
-    Raises
-    ------
-    InputError, InfeasibleError, SolverError  as `plan_phases` does
+    The arguments are those of `plan_phases`; after `ample` they are for blocks without impacts.
     """
     ends = _find_impacts(block)
     if not ends:
-        own = partial(plan_phases, problem, block, z, options, duration, to_go=to_go, ample=ample)
-        going_on = partial(own, begun=begun or (), only_begin=only_begin)
-        return [*going_on(fastest=fastest or (), pinned=pinned)]
+        plan = partial(plan_phases, to_go=to_go, ample=ample, pinned=pinned, only_begin=only_begin)
+        plan = partial(plan, fastest=fastest or (), begun=begun or ())
+        return [*plan(problem, block, z, options, duration)]
     explained = plan_parts_of(problem, block, ample, explained=True)
     if duration is not None and fastest and all(_is_stop(problem, fastest[k - 1]) for k in ends):
-        # Where least time has not led through an impact, nor will a longer duration.
+        # Without an impact in least time there is none in a longer duration.
         return plan_stops(explained, [0, *ends, len(block)], z, options, duration)
     # A duration that is too short for stops need not be so without them.
     probe = (
@@ -88,23 +76,19 @@ def plan_with_impacts(
 def plan_parts_of(
     problem: Problem, block: Sequence[Phase], ample: float = math.inf, explained: bool = False
 ) -> PlanPart:
-    """How parts of a block are planned; `explained`: looking further where there is no plan.
-
-    Otherwise from the first guess alone: there is a plan with stops.
-    """
+    """Planner of parts of a block: from all guesses with reasons (`explained`) or the first one."""
 
     def plan_part(
         start: int, stop: int, z: Array, options: PlanOptions, duration: float | None
     ) -> Plans:
-        part = block[start:stop]
-        own = partial(plan_phases, problem, part, z, options, duration, ample=ample)
-        return [*own(explained=explained, patient=explained)]
+        plan = partial(plan_phases, ample=ample, explained=explained, patient=explained)
+        return [*plan(problem, block[start:stop], z, options, duration)]
 
     return plan_part
 
 
 def list_impacts(block: Sequence[Phase], plans: Sequence[PhasePlan[Motion]]) -> list[BlockImpact]:
-    """The impacts that a block asks for, passed at speed or not."""
+    """The impacts of a block, at speed or with a stop."""
     found = []
     for k in _find_impacts(block):
         (z, v), scene, reason = end_of(plans[k - 1]), block[0].formation.scene, ""
@@ -128,14 +112,12 @@ def _is_stop(problem: Problem, plan: PhasePlan[Motion]) -> bool:
 
 
 def _find_impacts(block: Sequence[Phase]) -> list[int]:
-    """Indices in the block of the phases that an impact leads to."""
+    """Indices in the block of the phases after impacts."""
     return [k + 1 for k, phase in enumerate(block) if phase.end is End.IMPACT]
 
 
 def _impact_at_stop(phase: Phase, following: Phase, plan: PhasePlan[Motion]) -> Impact:
     """The impact for unit speed in the direction in which a phase comes to its stop."""
-    duration = plan.motion.duration
-    z = end_of(plan)[0]
-    v = plan.motion.evaluate(np.array([duration * (1 - 1e-3)])).z_dot[0]
+    v = plan.motion.evaluate(np.array([plan.motion.duration * (1 - 1e-3)])).z_dot[0]
     v = v / measure_speed(phase.formation.scene, v)
-    return compute_impact(phase.formation, following.formation, z, v)
+    return compute_impact(phase.formation, following.formation, end_of(plan)[0], v)

@@ -1,4 +1,4 @@
-"""Rows and bounds of the time-domain NLP that limits of the motion make (`mechanics.limits`)."""
+"""Rows and bounds of the time-domain NLP for the limits of `mechanics.limits`."""
 
 from __future__ import annotations
 
@@ -18,18 +18,17 @@ from .nlp_layout import MARGIN, NlpRows, StageLayout
 from .stage import Stage
 
 _WITHIN = np.array([0.3, 0.4, 0.5, 0.75, 0.85, 0.93])
-"""Places between points at which c_n is bounded too where rates of torques are limited: there it
-turns within an interval."""
+"""Places at which c_n is also bounded with rate-limited torques: minima are inside intervals."""
 
 
 class Target(NamedTuple):
-    """What an NLP is to find."""
+    """Objective of an NLP."""
 
     objective: Objective
     epsilon: float  # [N]: least normal force
     time_weight: float = 0.0  # [(N m)^2]: for `effort`
-    relaxation: Parameter | None = None  # what gives way, for `relax`
-    price: Array | None = None  # (5,): what z at the end costs
+    relaxation: Parameter | None = None  # the relaxed limit, for `relax`
+    price: Array | None = None  # (5,): linear cost of z at the end
 
     @property
     def chained(self) -> bool:
@@ -47,11 +46,9 @@ class LimitRows:
     """Limits of one stage, as rows and as bounds of unknowns."""
 
     limits: LimitSet
-    # (K, m, n_c): c_n, at the start of each interval, where torques may step, and wherever a bound
-    # of the unknown itself does not do
+    # (K, m, n_c): c_n at the start of each interval, and where bounds of unknowns are not enough
     presses: Indices
-    # (K, d, n): at the points, sides of limits that are of more than one unknown: friction cones
-    others: Indices
+    others: Indices  # (K, d, n): at the points, sides of limits of several unknowns: friction cones
     sides: NDArray[np.int64]  # (n,): which sides of the limits these are
     bounded: tuple[int, ...]  # sides that are bounds of an unknown
     alone: bool  # whether c_n are bounded at the points themselves
@@ -68,7 +65,7 @@ class LimitRows:
 
 
 class _Gives(NamedTuple):
-    """By which unknown of each interval, shape (K,), a row gives way, and how much of it."""
+    """Slack of a row: an unknown of each interval, shape (K,), and its weight."""
 
     unknowns: Indices
     weight: float
@@ -91,8 +88,8 @@ def add_limits(
     own, signs, bounds = limits.sides
     single = find_single(limits, stage.formation.n_constraints)[own]
     others = np.flatnonzero(~np.isin(own, presses) & (single < 0))
-    given = [gives[row] for row in presses], stage.formation.scene.has_slow_motors
-    pressed = _add_presses(rows, limits, layout, scheme, *given)
+    soft, slow = [gives[row] for row in presses], stage.formation.scene.has_slow_motors
+    pressed = _add_presses(rows, limits, layout, scheme, soft, slow)
     added = rows.linear(*layout.z.shape[:2], len(others), high=np.inf)
     for k, side in enumerate(others):
         row = own[side]
@@ -104,11 +101,10 @@ def add_limits(
             bounded.append(int(side))
             continue
         unknowns = _find_unknowns(layout, stage.formation.n_constraints, single[side])
-        soft = rows.linear(*unknowns.shape, low=signs[side] * bounds[side], high=np.inf)
-        rows.add_entries(soft, unknowns, signs[side])
-        _add_gives(rows, soft, gives[own[side]])
-    alone = not any(given[0])
-    return LimitRows(limits, pressed, added, others, tuple(bounded), alone)
+        added_row = rows.linear(*unknowns.shape, low=signs[side] * bounds[side], high=np.inf)
+        rows.add_entries(added_row, unknowns, signs[side])
+        _add_gives(rows, added_row, gives[own[side]])
+    return LimitRows(limits, pressed, added, others, tuple(bounded), alone=not any(soft))
 
 
 def bound_by_limits(
@@ -129,11 +125,9 @@ def bound_by_limits(
 
 
 def price_sides(rows: LimitRows, layout: StageLayout, on_x: Array, on_g: Array) -> Array:
-    """What raising each side of the limits costs in each interval, shape (K, n_sides).
+    """Multiplier of each side of the limits in each interval, shape (K, n_sides).
 
-    Parameters
-    ----------
-    on_x, on_g  sizes of the multipliers of the unknowns' bounds and of the rows
+    `on_x` and `on_g` are absolute multipliers of the unknowns' bounds and of the rows.
     """
     own, n_forces = rows.limits.sides[0], layout.forces.shape[2]
     single = find_single(rows.limits, n_forces)[own]
@@ -147,7 +141,7 @@ def price_sides(rows: LimitRows, layout: StageLayout, on_x: Array, on_g: Array) 
 
 
 def _list_gives(limits: LimitSet, layout: StageLayout, target: Target) -> list[_Gives | None]:
-    """By what each row gives way, if it does."""
+    """Slack of each row, if it has one."""
     gives: list[_Gives | None] = [None] * len(limits.low)
     chain = layout.nodes[:-1, MARGIN:].ravel()
     if target.objective is Objective.MARGIN:

@@ -1,4 +1,4 @@
-"""Carrying a stage's motion from one set of intervals to another."""
+"""Mesh of a stage: interpolation on other intervals, and how often to halve them."""
 
 from __future__ import annotations
 
@@ -12,50 +12,29 @@ from ...common.arrays import Array
 from .collocation import Scheme, blend, fit_controls
 from .stage import Stage, StagePoints
 
-DEFECT = 2e-8
-"""Largest error of z and z' by collocation at the end of an interval, in the scene's own units."""
-DEAR = 1e-5
-"""Largest price of limits that are raised in an interval, over the cost, without halving it."""
-AT_ONCE = 2
-"""Most times that an interval is halved at once."""
-_LESS = 4.0
-"""Factor by which a halving makes what better torques would gain less."""
-_CHEAPER = 3
-"""Power of two by which a halving makes misses of limits cheaper."""
-_BROKEN = 1e-6
-"""Distance below zero from which on a limit is broken, over the radius of gyration."""
-_HAIR = 1e-12
-"""Share of a duration that rounding may move a place by."""
+DEFECT = 2e-8  # largest collocation error of z and z' in an interval, in the scene's own units
+DEAR = 1e-5  # largest relative cost of raised limits in an interval
+AT_ONCE = 2  # most times that an interval is halved at once
+_LESS = 4.0  # reduction by a halving of the gain of better torques
+_CHEAPER = 3  # power of two of the reduction of the cost of missed limits
+_BROKEN = 1e-6  # violation of a formation limit that counts, over the radius of gyration
+_HAIR = 1e-12  # rounding of a place, as share of the duration
 
 
 def resample(
     part: StagePoints, scheme: Scheme, breaks: Array, begin: float = 0.0, stop: float = 1.0
 ) -> StagePoints:
-    """Part of a stage on other intervals.
-
-    Parameters
-    ----------
-    scheme             of both
-    breaks : (K + 1,)  where the new intervals start and end, from 0 to 1
-    begin, stop        which part of the stage, as shares of its duration
-    """
+    """Part of a stage from `begin` to `stop`, on intervals with `breaks`, (K + 1,), in [0, 1]."""
     span = stop - begin
     fractions = np.diff(breaks)
     inner = breaks[:-1, None] + fractions[:, None] * scheme.points
-    z, v, a, forces = _interpolate(part, scheme, (begin + span * inner).ravel())
-    node_z, node_v, _, _ = _interpolate(part, scheme, begin + span * breaks)
     shape = (len(fractions), scheme.degree, -1)
-    return StagePoints(
-        part.duration * span,
-        fractions,
-        np.stack([node_z, node_v], axis=1),
-        z.reshape(shape),
-        v.reshape(shape),
-        a.reshape(shape),
-        forces.reshape(shape),
-        _torques(part, begin + span * breaks),
-        part.impulses if stop == 1.0 else part.impulses[:0],
-    )
+    points = _interpolate(part, scheme, (begin + span * inner).ravel())
+    nodes = np.stack(_interpolate(part, scheme, begin + span * breaks)[:2], axis=1)
+    z, v, a, forces = (table.reshape(shape) for table in points)
+    tau = _torques(part, begin + span * breaks)
+    impulses = part.impulses if stop == 1.0 else part.impulses[:0]
+    return StagePoints(part.duration * span, fractions, nodes, z, v, a, forces, tau, impulses)
 
 
 def bisect(part: StagePoints, scheme: Scheme, times: NDArray[np.int64]) -> StagePoints:
@@ -68,26 +47,25 @@ def bisect(part: StagePoints, scheme: Scheme, times: NDArray[np.int64]) -> Stage
 def _interpolate(part: StagePoints, scheme: Scheme, places: Array) -> tuple[Array, ...]:
     """z, z', z'' and forces at shares of the duration, by the polynomials of the intervals."""
     count, degree = len(part.fractions), scheme.degree
-    # An interval's last point is its own, and not the next one's start: z'' and forces may step.
+    # z'' and forces may step after the last point of an interval.
     k = np.clip(np.searchsorted(part.breaks, places - _HAIR) - 1, 0, count - 1)
     x = (places - part.breaks[k]) / part.fractions[k]
-    known = np.append(0.0, scheme.points)
     powers = np.arange(degree + 1)
-    wide = x[:, None] ** powers @ np.linalg.inv(known[:, None] ** powers)
-    narrow = scheme.interpolate(x)
+    wide = x[:, None] ** powers @ np.linalg.inv(np.append(0.0, scheme.points)[:, None] ** powers)
     z, v = (
         np.einsum("nj,njd->nd", wide, np.concatenate([first[k, None], table[k]], axis=1))
         for first, table in ((part.nodes[:-1, 0], part.z), (part.nodes[:-1, 1], part.v))
     )
+    narrow = scheme.interpolate(x)
     a, forces = (np.einsum("nj,njd->nd", narrow, table[k]) for table in (part.a, part.forces))
     return z, v, a, forces
 
 
 def with_controls(part: StagePoints, count: int) -> StagePoints:
     """A stage's points with another number of control points of torques."""
-    known = part.tau.shape[1]
-    at = np.linspace(0.0, 1.0, max(count, known))
-    return part._replace(tau=fit_controls(at, blend(at, known) @ part.tau, count))
+    old = part.tau.shape[1]
+    at = np.linspace(0.0, 1.0, max(count, old))
+    return part._replace(tau=fit_controls(at, blend(at, old) @ part.tau, count))
 
 
 def _torques(part: StagePoints, breaks: Array) -> Array:
@@ -128,27 +106,18 @@ def halve(stages: Sequence[Stage], scheme: Scheme) -> list[Stage]:
 
 
 def count_halvings(prices: Array, defects: Array, scheme: Scheme) -> NDArray[np.int64]:
-    """How often to halve each interval and its parts, shape (K,).
+    """How often to halve each interval, by its relative cost of misses and collocation error, (K,).
 
-    So often that what is too much will not be, by what a halving makes of it: defects shrink with
-    the scheme's order, and what misses of limits cost, to less than a tenth.
-
-    Parameters
-    ----------
-    prices : (K,)        what raising limits by their misses would cost, over the cost
-    defects : (K, 2, 5)  what collocation misses at the end of an interval
+    Errors of collocation decrease with the scheme's order, costs to less than a tenth.
     """
-    dear = np.maximum(prices / DEAR, 1.0)
-    off = np.maximum(np.abs(defects).max(axis=(1, 2)) / DEFECT, 1.0)
-    times = np.maximum(np.log2(dear) / _CHEAPER, np.log2(off) / scheme.order)
+    price = np.maximum(prices / DEAR, 1.0)
+    error = np.maximum(np.abs(defects).max(axis=(1, 2)) / DEFECT, 1.0)
+    times = np.maximum(np.log2(price) / _CHEAPER, np.log2(error) / scheme.order)
     return np.asarray(np.clip(np.ceil(times), 0, AT_ONCE), dtype=np.int64)
 
 
 def spread_halvings(shares: Sequence[Array], most: float) -> list[NDArray[np.int64]]:
-    """How often to halve intervals, (K,) each, so that their shares of an error sum up to `most`.
-
-    The largest are halved first, which leaves a quarter of what they have.
-    """
+    """How often to halve intervals, (K,) each, the largest first, until errors sum up to `most`."""
     left, times = np.concatenate(shares), np.zeros(sum(map(len, shares)), dtype=np.int64)
     even = most / len(left)
     while left.sum() > most:
@@ -167,7 +136,7 @@ def cap_halvings(times: list[NDArray[np.int64]], most: int) -> list[NDArray[np.i
 
 
 def monitor_violated(stages: Sequence[Stage]) -> list[Stage] | None:
-    """Stages that also watch the limits which their guesses break, or None if they break none."""
+    """Stages with limits added that their guesses violate, or None if there are none."""
     changed = []
     for stage in stages:
         values = stage.formation.evaluate_limits(stage.guess.z.reshape(-1, 5))

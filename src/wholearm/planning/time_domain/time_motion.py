@@ -1,4 +1,4 @@
-"""Motion of a phase planned in the time domain, at any instant."""
+"""Motion of a phase in the time domain as a function of time, by integration of its torques."""
 
 from __future__ import annotations
 
@@ -16,24 +16,23 @@ from ...contacts.elemental import Contact
 from ...contacts.formation import Formation
 from ...mechanics.dynamics import Directions, build_forward, split_forces
 from ...mechanics.metric import metric_weights
-from ...results.mode_names import ROLLS, ModeSpan
+from ...problem.definition import Phase
+from ...results.plan_record import ROLLS, ModeSpan
 from ...results.torque import TorqueProfile
 from ...results.trajectory import Samples
 from .collocation import Scheme, blend
 from .stage import Stage, StagePoints
 
-_NODES = 8
-"""Places per interval at which the equations of motion are solved."""
-_SWEEPS = 6
-"""Times that accelerations are improved. Each gains one to two digits."""
+_NODES = 8  # places per interval at which the equations of motion are solved
+_SWEEPS = 6  # times that accelerations are improved. Each gains one to two digits.
+# Forward dynamics of formations.
 _FORWARDS = Store(
     lambda formation: Batch(build_forward(formation)), lambda formation: formation.equations
 )
-"""Forward dynamics of formations."""
 
 
 class MotionResponse(NamedTuple):
-    """A motion at n instants, and how it changes with its torques, by which all is affine."""
+    """A motion at n instants, and its derivatives by the torques, in which it is affine."""
 
     z: Array  # z, v (n, 5):
     v: Array
@@ -46,9 +45,9 @@ class MotionResponse(NamedTuple):
 class StageMotion:
     """One stage as a function of time.
 
-    tau is a polynomial in each interval. z is what it leads to from the interval's start, pulled
-    onto the contacts, and z' its derivative; z'' and the forces follow by forward dynamics. So the
-    equations of motion and the contacts hold at any instant.
+    tau is a polynomial in each interval. z is its integral, projected onto the contacts, and z' the
+    derivative; z'' and the forces follow by forward dynamics. The equations of motion and the
+    contacts hold at any instant.
     """
 
     formation: Formation
@@ -80,24 +79,17 @@ class StageMotion:
         return _FORWARDS(self.formation)
 
     @property
-    def _pieces(self) -> Array:
-        """Powers of x in [-1, 1] that give z over each interval, shape (K, 5, n)."""
-        return self._integrated[0]
-
-    @property
     def defects(self) -> Array:
-        """By how much collocation misses z and z' at the end of each interval, shape (K, 2, 5)."""
+        """Collocation error of z and z' at the end of each interval, shape (K, 2, 5)."""
         return self._integrated[1]
 
     @cached_property
     def _integrated(self) -> tuple[Array, Array]:
-        """The pieces and the defects.
+        """Powers of x in [-1, 1] that give z over each interval, shape (K, 5, n), and the defects.
 
-        The accelerations at an interval's points are integrated twice from its start, and those
-        that follow there by forward dynamics again, until they are one motion (Picard iteration).
-        It diverges where B h / J is large: such intervals keep the accelerations whose residual
-        is the least. What is left at the end, the error of collocation, is distributed over the
-        interval.
+        Accelerations are integrated twice and replaced by forward dynamics (Picard iteration);
+        where it diverges, as B h / J is large, those of least residual are kept. The defect at the
+        end is distributed over the interval.
         """
         nodes, half = self.points.nodes, np.diff(self.breaks)[:, None, None] / 2
         z, v = nodes[:, 0], nodes[:, 1]
@@ -137,7 +129,7 @@ class StageMotion:
         piece = np.clip(np.searchsorted(breaks, t, side="right") - 1, 0, len(breaks) - 2)
         half = np.diff(breaks)[piece] / 2
         x = (t - breaks[piece]) / half - 1
-        places = self._pieces[piece]
+        places = self._integrated[0][piece]
         rates = np.polynomial.polynomial.polyder(places, axis=2) / half[:, None, None]
         powers = x[:, None] ** np.arange(places.shape[2])
         z = np.einsum("njd,nd->nj", places, powers)
@@ -223,7 +215,7 @@ class TimeMotion:
 
     @property
     def modes(self) -> tuple[ModeSpan, ...]:
-        """What slides and turns which way and what rolls in each stage, from when to when."""
+        """Contact modes of the stages with their times."""
         found = []
         for stage, start in zip(self.stages, self.starts[:-1].tolist(), strict=True):
             formation, (Xi, sigma) = stage.formation, stage.directions
@@ -240,17 +232,22 @@ class TimeMotion:
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""
         t = np.asarray(t, dtype=float)
         owner = np.clip(np.searchsorted(self.starts, t, side="right") - 1, 0, len(self.stages) - 1)
-        tables: list[Array] = []
+        order, parts = np.argsort(owner, kind="stable"), list[Samples]()
         for index, stage in enumerate(self.stages):
-            mine = owner == index
-            if not mine.any():
-                continue
-            part = stage.evaluate(t[mine] - self.starts[index])
-            if not tables:
-                tables = [np.empty((len(t), table.shape[1])) for table in part]
-            for table, values in zip(tables, part, strict=True):
-                table[mine] = values
-        return Samples(*tables)
+            if (owner == index).any():
+                parts.append(stage.evaluate(t[owner == index] - self.starts[index]))
+        inverse = np.argsort(order)
+        return Samples(*(np.concatenate(tables)[inverse] for tables in zip(*parts, strict=True)))
+
+
+def make_phase_motions(
+    stages: Sequence[Stage], scheme: Scheme, phases: Sequence[Phase]
+) -> list[TimeMotion]:
+    """The motion of each phase from the stages' guesses."""
+    pairs = list(zip(make_motions(stages, scheme), stages, strict=True))
+    return [
+        TimeMotion([own for own, stage in pairs if stage.phase == phase.index]) for phase in phases
+    ]
 
 
 def make_motions(stages: Sequence[Stage], scheme: Scheme) -> list[StageMotion]:
@@ -262,7 +259,7 @@ def make_motions(stages: Sequence[Stage], scheme: Scheme) -> list[StageMotion]:
         formation = stage.formation
         slip = formation.evaluate_slip(stage.guess.nodes[0, :1])[0]
         rolling = [formation.contacts[row] for row in formation.rolling_rows]
-        # What has rolled in this phase before keeps where it is.
+        # Contacts that have rolled before in this phase keep their coordinate.
         before = kept if stage.phase == phase else {}
         kept = {c: before.get(c, s) for c, s in zip(rolling, slip.tolist(), strict=True)}
         slip, phase = np.array([kept[c] for c in rolling]), stage.phase

@@ -1,25 +1,21 @@
-"""The planning NLP in the time domain, for formations with any number of freedoms.
+"""NLP of stages in the time domain by direct collocation, for any number of degrees of freedom.
 
-A stage is a stretch on one formation with fixed directions of friction, in K intervals of unknown
-durations h with d collocation points each. Torques are linear in each interval and may step
-between. Unknowns are z and z' at the nodes between intervals, h of each interval, and z, z', z''
-and the contact forces c at every point, where
+A stage has one formation and fixed directions of friction, in K intervals of unknown durations h
+with d collocation points. Torques are polynomials in each interval and may step between. Unknowns
+are z and z' at the nodes, h, and z, z', z'' and the contact forces c at every point, where
 
     C(z) = 0,  P z' = 0,  P z'' + P' z' = 0,
     M5 z'' + B z' = g - D sigma + S tau + G^T c,
     c_n >= epsilon,  |tau| <= limit,  Xi A_t z' >= 0,  sigma theta' >= 0,
     |c_t| <= mu (c_n - epsilon) (rolling).
 
-So contacts hold at every point, without drift, and friction never pushes the wrong way. Along the
-contacts' tangent space alone, with an orthonormal basis N of the null space of P at a guess of
-each interval, the differential equations are collocated:
+Contacts hold without drift, and friction opposes motion. With an orthonormal basis N of the null
+space of P at a guess of each interval, the differential equations are collocated by
 
     N^T (z_j - z_0 - h sum_l a_jl z'_l) = 0,  N^T (z'_j - z'_0 - h sum_l a_jl z''_l) = 0.
 
-Nothing but these rows knows of durations, so that a stage may shrink to nothing. The intervals of a
-stage keep their shares of it. Unknowns and rows are in the order of time. What stands still at an
-instant has no sense of friction there: an inequality that equations keep at zero would leave the
-solver no interior. All quantities are in units that fit the scene.
+No other row has h, so that a stage may vanish. Rates that equations keep at zero have no sign
+constraint, which would leave the solver no interior. All quantities are in the scene's units.
 """
 
 from __future__ import annotations
@@ -48,34 +44,24 @@ from .stage_kernels import NamedKernel, bend_kernel, effort_kernel, name_kernel
 from .time_limits import Target, bound_by_limits
 from .time_rate_limits import hold_ends
 
-SHORTEST = 1e-6
-"""Least duration of an interval, in the scene's unit: next to nothing, and not nothing."""
-_BEND = 1e-2
-"""Weight of the bends of torques within intervals, over their limits, against time or the margin:
-where those leave torques open for a while, they would ring between the points."""
-_HURRY = 3e-4
-"""Weight of time against shortfalls: keeps a motion that is short of something brisk."""
-CLEAR = 1e-3
-"""Distance that a coordinate keeps in the scene's unit from the value that ends a phase; towards
-the end it is less, as where things come to rest."""
-LONGEST = 120.0
-"""Most processor time of one run of the solver [s]: iterations need not end by themselves."""
-NEAR, FAR = 1e-6, 1e-2
-"""Distance that a start keeps from its bounds: a solution, and a first guess."""
+SHORTEST = 1e-6  # least duration of an interval, in the scene's unit
+_BEND = 1e-2  # weight of second differences of torques over their limits, which else may ring
+_HURRY = 3e-4  # weight of time against violations
+CLEAR = 1e-3  # distance of a coordinate from its value at the phase's end; less near the end
+LONGEST = 120.0  # most processor time of one solve [s]
+NEAR, FAR = 1e-6, 1e-2  # distance of a start from its bounds: a solution, and a first guess
 
 
 @dataclass(frozen=True, eq=False)
 class TimeNLP:
     """A built NLP."""
 
-    # none in copies and from files: CasADi's objects belong to one process. What is left says which
-    # unknowns and rows there are.
-    assembled: Assembled | None
+    assembled: Assembled | None  # None in copies and files: CasADi's objects belong to one process
     max_iter: int  # most iterations of the solver
     layouts: list[StageLayout]
     rows: NlpRows
     rows_of: list[StageRows]
-    duration_row: int  # row of the whole duration, if something gives way; otherwise -1
+    duration_row: int  # row of the whole duration with a margin or a relaxation; otherwise -1
 
     def __getstate__(self) -> dict[str, Any]:
         known = {own.name: getattr(self, own.name) for own in fields(self)}
@@ -92,33 +78,19 @@ class TimeNLP:
         return self._build(FAR)
 
     def _build(self, push: float) -> Expression:
-        built = self.assembled
-        assert built is not None
-        return build_solver(
-            "time_nlp",
-            built.nlp,
-            push,
-            built.derivatives,
-            max_iter=self.max_iter,
-            max_cpu_time=LONGEST,
-        )
+        assert self.assembled is not None
+        nlp, derivatives = self.assembled
+        most = {"max_iter": self.max_iter, "max_cpu_time": LONGEST}
+        return build_solver("time_nlp", nlp, push, derivatives, **most)
 
 
 def build_time_nlp(
-    stages: Sequence[Stage],
-    scheme: Scheme,
-    target: Target,
-    max_iter: int,
+    stages: Sequence[Stage], scheme: Scheme, target: Target, max_iter: int
 ) -> TimeNLP:
-    """Build the NLP of stages that follow one another and end at rest.
-
-    Parameters
-    ----------
-    max_iter  most iterations of the solver
-    """
+    """Build the NLP of successive stages that end at rest."""
     started = time.perf_counter()
     shortfalls = [target.count_shortfalls(stage) for stage in stages]
-    # Friction that sets in gradually holds nothing at rest.
+    # Regularized friction holds nothing at rest.
     held = stages[0].formation.scene.has_slow_motors and not stages[0].onset
     layouts = lay_out(stages, scheme, target.chained, shortfalls, held)
     rows, cost = NlpRows(), np.zeros(layouts[-1].stop)
@@ -128,8 +100,7 @@ def build_time_nlp(
     for k, (stage, layout) in enumerate(zip(stages, layouts, strict=True)):
         rows_of.append(add_stage(rows, stage, layout, scheme, stage is stages[-1], target))
         if k + 1 < len(stages):
-            pair, own = (stage, stages[k + 1]), (layout, layouts[k + 1])
-            join_stages(rows, pair, own, scheme)
+            join_stages(rows, (stage, stages[k + 1]), (layout, layouts[k + 1]), scheme)
         _add_costs(rows, cost, stage, layout, scheme, target)
     duration_row, last, end = -1, stages[-1], layouts[-1].nodes[-1]
     if stages[0].periods:
@@ -154,7 +125,7 @@ def build_time_nlp(
 def _add_costs(
     rows: NlpRows, cost: Array, stage: Stage, layout: StageLayout, scheme: Scheme, target: Target
 ) -> None:
-    """What a stage costs."""
+    """Add the cost of a stage."""
     if target.objective is Objective.EFFORT:
         kernel = effort_kernel(scheme.controls)
         rows.add_cost(kernel, kernel.x.join(tau=layout.tau, h=layout.h[:, None]))
@@ -162,11 +133,7 @@ def _add_costs(
         kernel, weight = bend_kernel(scheme.controls), stage.formation.scene.torque_limit**-2.0
         given = np.tile(_BEND * weight, (stage.intervals, 1))
         rows.add_cost(kernel, kernel.x.join(tau=layout.tau, h=layout.h[:, None]), given)
-    of_time = {
-        Objective.TIME: 1.0,
-        Objective.EFFORT: target.time_weight,
-        Objective.ELASTIC: _HURRY,
-    }
+    of_time = {Objective.TIME: 1.0, Objective.EFFORT: target.time_weight, Objective.ELASTIC: _HURRY}
     cost[layout.h] = of_time.get(target.objective, 0.0)
     cost[layout.short] = 1 / stage.intervals
 
@@ -199,20 +166,19 @@ def bound_unknowns(nlp: TimeNLP, stages: Sequence[Stage], scheme: Scheme) -> tup
 def _stay_short(
     stage: Stage, layout: StageLayout, scheme: Scheme, bounds: tuple[Array, Array]
 ) -> None:
-    """Keep a coordinate, in place, from the value with which the phase would end too early."""
+    """Bound a coordinate, in place, before the value at which the phase ends."""
     if stage.ahead is None:
         return
     row, value, side = stage.ahead
     left = 1.0 - stage.guess.places(scheme.points) * (stage.until is not None)
     most = value - side * CLEAR * np.minimum(1.0, (2 * left) ** 2)
-    # Where the phase ends an equation says so.
     if stage.until is not None and scheme.ends:
         most[-1, -1] = side * np.inf
     bounds[int(side > 0)][layout.z[..., row]] = most
 
 
 class _Piece(NamedTuple):
-    """An interval as a part of a period: its stage, number there, share of it, and unknowns."""
+    """An interval as a part of a period: stage, period, share of the stage, and unknowns."""
 
     stage: int
     period: int
@@ -222,10 +188,7 @@ class _Piece(NamedTuple):
 
 
 def add_periods(rows: NlpRows, stages: Sequence[Stage], layouts: Sequence[StageLayout]) -> None:
-    """Intervals of one period last as long as it and have its torques, constant or linear.
-
-    Linear torques go on from period to period.
-    """
+    """Durations of control periods, and their torques, constant or linear and continuous."""
     scene = stages[0].formation.scene
     linear, goes_on = scene.control_hold == "linear", scene.has_slow_motors
     pieces = [
@@ -266,7 +229,7 @@ def _add_period(
 
 @lru_cache(maxsize=1)
 def slope_kernel() -> NamedKernel:
-    """What differs of the slopes of linear torques in two intervals, times both durations."""
+    """Difference of the slopes of linear torques in two intervals, times both durations."""
     x = Columns(before=4, after=4, h=1, coming=1).make_symbols()
     slopes = (x.before[2:] - x.before[:2]) * x.coming - (x.after[2:] - x.after[:2]) * x.h
     return name_kernel(x, Columns().make_symbols(), slopes=slopes)

@@ -1,12 +1,8 @@
-"""Planning phases in the time domain: guesses, friction, intervals and limits between points.
+"""Plans of phases in the time domain by direct collocation, from a sequence of initial guesses.
 
-Phases that pass into one another in motion are one NLP. It starts from the phases' outlines, with
-the directions of friction that these have, on few intervals; these are then halved, each time
-starting from the solution before. Where the solution would rather slide the other way (a sense of
-friction is at its least over a stretch), the stage is split and the NLP solved again. Limits are
-looked at between points: intervals that miss them by much are halved, and what is then left is
-added to the limits. Where no guess leads to a plan, the motion that misses limits least is found:
-it is a better guess, or says why there is no plan.
+Phases joined in motion are one NLP, first solved on few intervals in the sliding directions of the
+guess; contact modes and intervals are then refined (`attempts.solve_attempt`). Where no guess leads
+to a plan, the elastic problem (least violation of limits) gives a better guess or the reason.
 """
 
 from __future__ import annotations
@@ -41,35 +37,23 @@ from .search import TimeSearch, TimeSolution
 from .stage import Stage
 from .stage_modes import LEAST_INTERVALS
 from .time_mesh import halve, resample
-from .time_motion import StageMotion, TimeMotion, make_motions
-from .units import to_si, unit_of
+from .time_motion import TimeMotion, make_motions, make_phase_motions
+from .units import in_own_units, to_si, unit_of
 
 if TYPE_CHECKING:
     from .time_explain import Replan
 
-
-_ROUNDS = 20
-"""Most solves."""
-_SWINGS = 5
-"""The first of them, in which limits are raised by what ranges change, and not by more."""
-_OVER = 1.2
-"""Factor on what is missed after that."""
-MOVED = "a plan that chooses where it ends"
-"""Name of the guess."""
-FURTHER = 4
-"""Guesses, beyond the first one, from which such a plan is looked for."""
-PATIENCE = 50
-"""Most iterations of the solver for one step."""
-SHORTEST = 1 / 16
-"""Shortest step of the end, over its whole way."""
-NEARER = (0.3, 0.1)
-"""Shares of the way that is left, after which it is asked what motions are short of."""
-CONVINCING = 2
-"""Motions that miss limits least, from different guesses, after which there seems to be no plan."""
-BUDGET = 400
-"""Iterations of the solver after which no further guess is begun: of one block."""
-ROUGH = 1e-2
-"""Least accuracy of plans of which only matters that there are any."""
+_ROUNDS = 20  # most solves for ranges
+_PARAMETRIC = 5  # the first of them, in which limits are raised by what ranges change alone
+_OVER = 1.2  # factor on the misses by which limits are raised after that
+MOVED = "a plan that chooses where it ends"  # name of the guess
+FURTHER = 4  # guesses, beyond the first one, for a plan with free end
+PATIENCE = 50  # most solver iterations for one continuation step
+SHORTEST = 1 / 16  # shortest continuation step
+NEARER = (0.3, 0.1)  # shares of the remaining continuation at which violations are looked for
+CONVINCING = 2  # infeasible elastic solutions, from different guesses, that end the search
+BUDGET = 400  # solver iterations of one block after which no further guess is tried
+ROUGH = 1e-2  # least accuracy where only the existence of a plan matters
 
 
 def plan_phases(
@@ -94,41 +78,53 @@ def plan_phases(
     ----------
     phases, z : (5,)  all but the last phase end in motion
     duration : [s]    longest duration of all these phases, for `margin`
-    to_go             what follows, where the phases leave open where they end
-    ample : [N]       least normal force from which on more decides nothing, as other phases keep
-                      less anyway
-    fastest           plans of least time from `z`, for `margin`: it starts from them, or is them
-    pinned            whether it ends there
-    begun             what has come of them when they were only begun, from nearly the same `z`
-    only_begin        whether to find modes on few intervals alone: limits may be missed between
-                      points
-    explained         whether to look for a change that would make a plan possible, where there is
-                      none
-    patient           whether to try further guesses where the first one leads nowhere
+    to_go             cost-to-go at a free end
+    ample : [N]       saturation of the objective `margin`, as other phases keep less anyway
+    fastest           time-optimal plans from `z`, as guess and fallback for `margin`
+    pinned            whether the motion ends where these do
+    begun             coarse plans (`only_begin`) from nearly the same `z`, to start from
+    only_begin        whether to find modes on few intervals alone, without limits between points
+    explained         whether to look for a change of the problem that makes a plan possible
+    patient           whether to try further guesses after the first
 
     Raises
     ------
     InputError, InfeasibleError, SolverError  if a phase's contacts do not touch, its end cannot be
         reached, or there is no plan
     """
+    from .time_explain import refuse
+
     search = TimeSearch.of(problem, options, duration, to_go, ample, only_begin)
     attempts = Attempts(problem, phases, z, search, to_go, patient)
-    known = _go_on(search, attempts, begun[0]) if begun else None
-    if known is not None:
-        return list_plans(problem, search, phases, known, begun[0].attempt)
-    begin = attempts.begin()
-    for attempt in begin:
-        first, name = _begin(search, attempt, fastest, pinned)
+    resumed = _resume(search, attempts, begun[0]) if begun else None
+    if resumed is not None:
+        return list_plans(problem, search, phases, resumed, begun[0].attempt)
+    guesses = attempts.begin()
+    for attempt in guesses:
+        first, name = _solve_first(search, attempt, fastest, pinned)
         if first.success:
             break
     # Straight to a pinned end modes may be found that are not the best: phase 3 of query 33.
-    enough = first.success and (len(begin) == 1 or bool(fastest))
+    enough = first.success and (len(guesses) == 1 or bool(fastest))
     moved = ContinuedEnd() if enough else approach(search, problem, phases, z)
-    found = [(own, how) for own, how in ((first, name), (moved.solution, MOVED)) if own]
-    if any(own.success for own, _ in found):
-        best = min((own for own in found if own[0].success), key=lambda own: own[0].cost)
-        return list_plans(problem, search, phases, *best)
-    return _look_further(search, attempts, problem, phases, first, moved, explained)
+    plans = [(first, name)] if first.success else []
+    plans += [(moved.solution, MOVED)] if moved.solution else []
+    if plans:
+        solution, name = min(plans, key=lambda pair: pair[0].cost)
+        return list_plans(problem, search, phases, solution, name)
+
+    def replan(other: Problem) -> object:
+        rough = replace(search.options, accuracy=max(search.options.accuracy, ROUGH))
+        same = [other.phases[phase.index] for phase in phases]
+        return plan_phases(other, same, z, rough, explained=False, patient=False)
+
+    refuse(search, problem, phases, attempts.first.stages, replan if explained else None)
+    *_, last = outcomes = _try_all(search, problem, attempts, first)
+    if last.solution.success:
+        return list_plans(problem, search, phases, last.solution, last.name)
+    if not any(outcome.short for outcome in outcomes):
+        refuse_pinned(search, problem, phases, moved)
+    raise explain_lost(search, problem, attempts, outcomes, replan if explained else None)
 
 
 def try_phases(
@@ -138,153 +134,108 @@ def try_phases(
     options: PlanOptions,
     goal: Array | None = None,
     further: int = 0,
-    hurried: bool = False,
+    single_guess: bool = False,
 ) -> list[PhasePlan[TimeMotion]] | None:
-    """Begin to plan phases from the first guesses, and from a few further ones if these fail.
-
-    As `plan_phases` with `only_begin`, without a search for contact modes; None where these lead
-    nowhere, without looking for reasons.
+    """Coarse plans of phases (`only_begin` of `plan_phases`), without a mode search or reasons.
 
     Parameters
     ----------
-    goal : (5,)  a single phase is first guessed to go straight there; otherwise to its nearest end
-    further      how many guesses are looked at beyond
-    hurried      whether there is one guess alone, straight to the goal if there is one, for few
-                 iterations
+    goal : (5,)  end of the first, straight guess of a single phase; otherwise its nearest end
+    further      number of further guesses
+    single_guess      whether to solve from one guess alone, for few iterations
     """
-    own = replace(options, mode_search=False)
-    search = TimeSearch.of(problem, own, None, None, math.inf, True)
+    search = TimeSearch.of(problem, replace(options, mode_search=False), only_begins=True)
     attempts = Attempts(problem, phases, z, search, None, further > 0)
-    begin = attempts.begin(goal)[: None if further else 1]
-    if hurried:
-        begin = [own._replace(most=FEW) for own in begin]
-    for attempt in chain(begin, attempts.list_further(further)):
-        solution = solve_attempt(search, attempt)
+    guesses = attempts.begin(goal)[: None if further else 1]
+    if single_guess:
+        guesses = [attempt._replace(most=FEW) for attempt in guesses]
+    for attempt in chain(guesses, attempts.list_further(further)):
+        solution, name = solve_attempt(search, attempt), attempt.name
         if solution.success:
-            return _list_begun(problem, search, phases, solution, attempt.name, options)
-    moved = None if hurried else approach(search, problem, phases, z).solution
-    return moved and _list_begun(problem, search, phases, moved, MOVED, options)
-
-
-def _list_begun(
-    problem: Problem,
-    search: TimeSearch,
-    phases: Sequence[Phase],
-    solution: TimeSolution,
-    name: str,
-    options: PlanOptions,
-) -> list[PhasePlan[TimeMotion]]:
-    """The plans of phases whose contact modes may yet have to be looked for."""
+            break
+    else:
+        moved = None if single_guess else approach(search, problem, phases, z).solution
+        if moved is None:
+            return None
+        solution, name = moved, MOVED
     first, *others = list_plans(problem, search, phases, solution, name)
     return [first._replace(complete=not options.mode_search), *others]
 
 
-def _look_further(
-    search: TimeSearch,
-    attempts: Attempts,
-    problem: Problem,
-    phases: Sequence[Phase],
-    first: TimeSolution,
-    moved: ContinuedEnd,
-    explained: bool,
-) -> list[PhasePlan[TimeMotion]]:
-    """Make further attempts where the first one has led nowhere, or say why there is no plan."""
-    from .time_explain import refuse
-
-    def replan(other: Problem) -> object:
-        own = [other.phases[phase.index] for phase in phases]
-        rough = replace(search.options, accuracy=max(search.options.accuracy, ROUGH))
-        return plan_phases(other, own, attempts.z, rough, explained=False, patient=False)
-
-    refuse(search, problem, phases, attempts.first.stages, replan if explained else None)
-    *_, last = outcomes = _try_all(search, problem, attempts, first)
-    if last.solution.success:
-        return list_plans(problem, search, phases, last.solution, last.name)
-    if not any(own.short for own in outcomes):
-        refuse_pinned(search, problem, phases, moved)
-    raise explain_lost(search, problem, attempts, outcomes, replan if explained else None)
-
-
-def _begin(
+def _solve_first(
     search: TimeSearch, first: Attempt, fastest: Sequence[PhasePlan[Motion]], pinned: bool
 ) -> tuple[TimeSolution, str]:
-    """What the first guess leads to, or for a margin plans of least time, and the guess's name."""
+    """Solution from the first guess, or for `margin` from time-optimal plans, and its name."""
     slows = search.goal is Objective.MARGIN
-    known = [stage for plan in fastest for stage in plan.stages if isinstance(stage, Stage)]
-    if known and slows:
+    stages = [stage for plan in fastest for stage in plan.stages if isinstance(stage, Stage)]
+    if stages and slows:
         usual = fastest[0].attempt == first.name
-        slowed = _slow_down(search, known, first, usual, pinned)
+        slowed = _slow_down(search, stages, first, usual, pinned)
         if slowed is not None:
             return slowed, fastest[0].attempt
-    begun = solve_attempt(search, first)
-    if slows and not begun.success:
+    solution = solve_attempt(search, first)
+    if slows and not solution.success:
         quick = solve_attempt(search.aiming(Objective.TIME), first)
         if quick.success:
-            begun = _slow_down(search, quick.stages, first, False, pinned) or begun
-    return begun, first.name
+            solution = _slow_down(search, quick.stages, first, False, pinned) or solution
+    return solution, first.name
 
 
-def _go_on(search: TimeSearch, attempts: Attempts, begun: PhasePlan[Motion]) -> TimeSolution | None:
-    """Go on from plans that were only begun, in their modes; None if that leads to nothing."""
-    if not isinstance(begun.solution, TimeSolution):
+def _resume(
+    search: TimeSearch, attempts: Attempts, coarse: PhasePlan[Motion]
+) -> TimeSolution | None:
+    """Solution from a coarse plan, in its modes; None without success."""
+    if not isinstance(coarse.solution, TimeSolution):
         return None
-    own = search
-    if begun.complete or begun.sequences > 1:
-        search.tried.sequences, search.tried.complete = begun.sequences, begun.complete
-        own = replace(search, options=replace(search.options, mode_search=False))
-    solution = solve_attempt(own, attempts.resume(begun.solution))
+    if coarse.complete or coarse.sequences > 1:
+        search.tried.sequences, search.tried.complete = coarse.sequences, coarse.complete
+        search = replace(search, options=replace(search.options, mode_search=False))
+    solution = solve_attempt(search, attempts.resume(coarse.solution))
     return solution if solution.success else None
 
 
 class _Outcome(NamedTuple):
-    """What has come of an attempt."""
+    """Result of an attempt."""
 
     name: str
     solution: TimeSolution
-    short: list[Stage]  # the motion that misses limits least, if it misses any; empty otherwise
+    short: list[Stage]  # the elastic solution, if it violates limits; empty otherwise
 
 
 def _try_all(
-    search: TimeSearch, problem: Problem, attempts: Attempts, begun: TimeSolution
+    search: TimeSearch, problem: Problem, attempts: Attempts, first: TimeSolution
 ) -> list[_Outcome]:
-    """Make one attempt after the other, until one leads to a plan or there seems to be none.
+    """Solve from one guess after the other until one succeeds or enough are infeasible.
 
-    Parameters
-    ----------
-    begun  what the first attempt has led to
+    `first` is the solution from the first guess.
     """
     stop = search.tried.iterations + BUDGET
     far, count, outcomes = False, 0, list[_Outcome]()
     for attempt in attempts:
-        far = far or (not attempt.gradual and attempts.are_far)
-        # What is far from any plan, or like what is short, is first asked what it is short of.
-        plain = far or count or attempt is attempts.first
-        known = begun if plain and not attempt.gradual else None
-        outcomes.append(_try(search, problem, attempt, known))
+        far = far or (not attempt.homotopy and attempts.are_far)
+        # Far from any plan, or after a violation, the elastic problem is solved at once.
+        elastic = far or count or attempt is attempts.first
+        solved = first if elastic and not attempt.homotopy else None
+        outcomes.append(_try(search, problem, attempt, solved))
         count += bool(outcomes[-1].short)
         late = search.tried.iterations > stop
         if outcomes[-1].solution.success or late or count == (1 if far else CONVINCING):
             break
-    looked = not begun.is_lost and any(own.name == NEAREST for own in outcomes)
-    if not (looked or outcomes[-1].solution.success or any(own.short for own in outcomes)):
+    looked = not first.is_lost and any(outcome.name == NEAREST for outcome in outcomes)
+    if not (looked or outcomes[-1].solution.success or any(each.short for each in outcomes)):
         short = find_short(search, problem, attempts.first.stages)[1]
-        outcomes.append(_Outcome(NEAREST, begun, short))
+        outcomes.append(_Outcome(NEAREST, first, short))
     return outcomes
 
 
 def _try(
-    search: TimeSearch, problem: Problem, attempt: Attempt, known: TimeSolution | None
+    search: TimeSearch, problem: Problem, attempt: Attempt, solved: TimeSolution | None
 ) -> _Outcome:
-    """Solve, and for least shortfalls where that leads nowhere: from there, too.
-
-    Parameters
-    ----------
-    known  what solving leads to, if it is known
-    """
-    solution = solve_attempt(search, attempt) if known is None else known
-    if solution.success or attempt.gradual:
+    """Solve, unless `solved`; without success solve the elastic problem, and again from there."""
+    solution = solve_attempt(search, attempt) if solved is None else solved
+    if solution.success or attempt.homotopy:
         return _Outcome(attempt.name, solution, [])
-    # What coarse intervals are not short of, finer ones may be.
+    # Finer intervals may show violations that coarse ones do not.
     lost = solution.is_lost
     stages = halve(solution.stages, search.scheme) if lost else attempt.stages
     elastic, short = find_short(search, problem, stages)
@@ -298,7 +249,7 @@ def _try(
 def find_short(
     search: TimeSearch, problem: Problem, stages: list[Stage]
 ) -> tuple[list[Stage] | None, list[Stage]]:
-    """The motion with the least shortfalls, if one is found, and again if it is short at all."""
+    """The elastic solution, if there is one, and again if it violates limits."""
     from .time_explain import list_shortfalls, solve_elastic
 
     elastic = solve_elastic(search, stages)
@@ -314,15 +265,15 @@ def explain_lost(
     outcomes: Sequence[_Outcome],
     replan: Replan | None,
 ) -> InfeasibleError | SolverError:
-    """Why none of the attempts has led to a plan; `replan` as for `explain`."""
+    """Error that says why no attempt has led to a plan; `replan` as for `explain`."""
     from .time_explain import explain, refuse_ways
 
-    tried = dict.fromkeys([NEAREST, *(own.name for own in outcomes)])
+    count = len({NEAREST, *(outcome.name for outcome in outcomes)})
     reason = (
         "the solver found neither a plan nor a motion that misses limits least, from "
-        f"{len(tried)} guess{'es' * (len(tried) > 1)} of the motion"
+        f"{count} guess{'es' * (count > 1)} of the motion"
     )
-    short = [own.short for own in outcomes if own.short]
+    short = [outcome.short for outcome in outcomes if outcome.short]
     if not short:
         refuse_ways(problem, attempts.phases[0], attempts.ways)
     return explain(search, problem, attempts.phases, short, reason, replan)
@@ -331,35 +282,30 @@ def explain_lost(
 def _slow_down(
     search: TimeSearch, fastest: list[Stage], attempt: Attempt, usual: bool, pinned: bool
 ) -> TimeSolution | None:
-    """Solve for the largest margin from the stages of least time, `pinned` to where these end.
+    """Solve for the largest margin from time-optimal stages, `pinned` to where these end.
 
-    Before that from the `usual` guess, if that has led to them.
-
-    Those keep epsilon within any duration that is no shorter, and are a plan if nothing better is
-    found. None if they take longer.
+    The `usual` guess comes first if it has led to these. They keep epsilon within any duration that
+    is no shorter, and are the plan if no better is found. None if they take longer.
     """
     lasts, most = sum(stage.guess.duration for stage in fastest), search.duration
     if most is None or lasts > most:
         return None
-    whole, first = len({stage.phase for stage in fastest}), attempt.stages
-    count = sum(stage.intervals for stage in first) / whole
-    coarse = list[Stage]()
+    first, coarse = attempt.stages, list[Stage]()
+    count = sum(stage.intervals for stage in first) / len({stage.phase for stage in fastest})
     for stage in fastest:
-        shares = [own.guess.duration for own in fastest if own.phase == stage.phase]
-        own = max(LEAST_INTERVALS, round(count * stage.guess.duration / sum(shares)))
-        breaks = np.linspace(0.0, 1.0, own + 1)
+        phase = sum(each.guess.duration for each in fastest if each.phase == stage.phase)
+        intervals = max(LEAST_INTERVALS, round(count * stage.guess.duration / phase))
+        breaks = np.linspace(0.0, 1.0, intervals + 1)
         coarse.append(replace(stage, guess=resample(stage.guess, search.scheme, breaks)))
-    end = coarse[-1].guess.nodes[-1, 0]
-    # What has led to the least time is tried first.
+    end = coarse[-1].guess.nodes[-1, 0] if pinned else None
     tries = ((first, False), (coarse, False)) if usual else ((coarse, False), (first, True))
-    for stages, gradual in tries:
-        given = [*stages[:-1], replace(stages[-1], stop=end if pinned else None)]
-        solution = solve_attempt(search, attempt._replace(stages=given, gradual=gradual))
+    for stages, homotopy in tries:
+        stages = [*stages[:-1], replace(stages[-1], stop=end)]
+        solution = solve_attempt(search, attempt._replace(stages=stages, homotopy=homotopy))
         if solution.success:
             return solution
     search.tried.complete = False
-    nlp = search.build(fastest)
-    return TimeSolution(fastest, 0.0, 0.0, solution.status, True, nlp, {})
+    return TimeSolution(fastest, 0.0, 0.0, solution.status, True, search.build(fastest), {})
 
 
 def list_plans(
@@ -369,92 +315,67 @@ def list_plans(
     solution: TimeSolution,
     attempt: str,
 ) -> list[PhasePlan[TimeMotion]]:
-    """The plan of each phase; the sequences of modes that were tried count for the first.
-
-    Where there are ranges, one that keeps its limits within them: see `widening`.
-    """
+    """The plan of each phase, with limits within the ranges if there are any (`keep_within`)."""
     if search.options.ranges and not search.only_begins:
         solution = keep_within(search, solution, phases)
-    plans, tried = [], search.tried
-    motions = _list_motions(problem, search, phases, solution)
-    free = solution.free and _list_motions(problem, search, phases, solution.free)
-    for k, (phase, motion) in enumerate(zip(phases, motions, strict=True)):
-        value = _measure(problem, search, solution, motion)
-        own = [stage for stage in solution.stages if stage.phase == phase.index]
-        plan = PhasePlan(motion, motion.torque, value, attempt=attempt, stages=own)
-        if free and solution.free:
-            plan = plan._replace(unheld=_measure(problem, search, solution.free, free[k]))
-        plans.append(plan._replace(error=solution.error))
+
+    def evaluate(solution: TimeSolution) -> list[tuple[TimeMotion, float]]:
+        """Motion and share of the objective of each phase."""
+        stages, scales = [to_si(stage, problem) for stage in solution.stages], problem.scene.scales
+        motions = make_phase_motions(stages, search.scheme, phases)
+        if search.goal is Objective.MARGIN:
+            value = problem.epsilon + unit_of(search.goal, scales) * solution.margin
+            return [(motion, value) for motion in motions]
+        if search.goal is Objective.TIME:
+            return [(motion, motion.duration) for motion in motions]
+        weight = search.options.time_weight * scales.torque**2
+        return [(m, weight * m.duration + m.torque.integrate_squares()) for m in motions]
+
+    free = [value for _, value in evaluate(solution.free)] if solution.free else []
+    plans, tried = list[PhasePlan[TimeMotion]](), search.tried
+    for k, (phase, (motion, value)) in enumerate(zip(phases, evaluate(solution), strict=True)):
+        stages = [stage for stage in solution.stages if stage.phase == phase.index]
+        plan = PhasePlan(motion, motion.torque, value, attempt=attempt, stages=stages)
+        plans.append(plan._replace(error=solution.error, unheld=free[k] if free else plan.unheld))
     plans[0] = plans[0]._replace(sequences=tried.sequences, complete=tried.complete)
     if search.only_begins:
         plans[0] = plans[0]._replace(solution=solution)
     return plans
 
 
-def _list_motions(
-    problem: Problem, search: TimeSearch, phases: Sequence[Phase], solution: TimeSolution
-) -> list[TimeMotion]:
-    """The motion of each phase, in SI units."""
-    solved = [to_si(stage, problem) for stage in solution.stages]
-    made = list(zip(make_motions(solved, search.scheme), solved, strict=True))
-    return [
-        TimeMotion([own for own, stage in made if stage.phase == phase.index]) for phase in phases
-    ]
-
-
-def _measure(
-    problem: Problem, search: TimeSearch, solution: TimeSolution, motion: TimeMotion
-) -> float:
-    """A phase's share of the objective."""
-    scales = problem.scene.scales
-    if search.goal is Objective.MARGIN:
-        return problem.epsilon + unit_of(search.goal, scales) * solution.margin
-    if search.goal is Objective.TIME:
-        return motion.duration
-    weight = search.options.time_weight * scales.torque**2
-    return weight * motion.duration + motion.torque.integrate_squares()
-
-
 class ContinuedEnd(NamedTuple):
-    """What moving ends to where they are pinned has led to."""
+    """Result of moving ends to where they are pinned, by continuation."""
 
-    # a plan that ends there; None where nothing is pinned, or the place is not reached so
-    solution: TimeSolution | None = None
-    nearest: TimeSolution | None = (
-        None  # otherwise the plan that comes nearest to it, if there is any
-    )
-    # where each phase ended at first, by its index
-    ends: Mapping[int, Array] = MappingProxyType({})
-    share: float = 0.0  # how far the nearest plan has moved from there
+    solution: TimeSolution | None = None  # a plan that ends there; None if there is none
+    nearest: TimeSolution | None = None  # the plan that comes nearest instead
+    ends: Mapping[int, Array] = MappingProxyType({})  # where each phase, by its index, ended free
+    share: float = 0.0  # of the continuation from there, that the nearest plan has reached
 
 
 def approach(
     search: TimeSearch, problem: Problem, phases: Sequence[Phase], z: Array
 ) -> ContinuedEnd:
-    """Plan phases with ends that are left open, then move these to where they are pinned.
+    """Plan phases with free ends, then move these to where they are pinned, by continuation.
 
-    Parameters
-    ----------
-    search            for the phases as they are
-    phases, z : (5,)  planned as one, from `z`
+    `search` is for the phases as they are, which start at `z`, shape (5,).
     """
     free = [_set_free(phase) for phase in phases]
-    if all(own is phase for own, phase in zip(free, phases, strict=True)):
+    if all(one is other for one, other in zip(free, phases, strict=True)):
         return ContinuedEnd()
-    every = [_set_free(phase) for phase in problem.phases]
+    freed = replace(problem, phases=tuple(_set_free(phase) for phase in problem.phases))
     goal = find_end(phases[0], z) if len(phases) == 1 else None
-    begun = _plan_free_end(search, replace(problem, phases=tuple(every)), free, z, goal)
-    if begun is None:
+    solution = _plan_free_end(search, freed, free, z, goal)
+    if solution is None:
         return ContinuedEnd()
-    ends = {stage.phase: stage.guess.nodes[-1, 0] for stage in begun.stages}
-    solution, reached, step = begun, 0.0, 1.0
+    ends = {stage.phase: stage.guess.nodes[-1, 0] for stage in solution.stages}
+    reached, step = 0.0, 1.0
     while reached < 1.0:
         share = min(1.0, reached + step)
         stages = [_pin(search, stage, ends[stage.phase], share) for stage in solution.stages]
         moved = search.solve(stages, solution, most=search.wait(PATIENCE))
         if moved.success:
-            plain = share == 1.0 or not search.options.mode_search
-            solution, reached = moved if plain else improve(search, moved), share
+            final = share == 1.0 or not search.options.mode_search
+            solution, reached = moved if final else improve(search, moved), share
         elif (step := step / 4) < SHORTEST:
             return ContinuedEnd(None, solution, ends, reached)
     if search.only_begins:
@@ -465,28 +386,25 @@ def approach(
 
 
 def refuse_pinned(
-    search: TimeSearch, problem: Problem, phases: Sequence[Phase], found: ContinuedEnd
+    search: TimeSearch, problem: Problem, phases: Sequence[Phase], moved: ContinuedEnd
 ) -> None:
-    """Raise an error on what motions are short of whose ends are moved on to where they are pinned.
+    """Raise an error with the limits that an elastic motion to the pinned end violates.
 
-    Where none is found that ends there, one that ends nearer to it than any plan says why.
-
-    Raises
-    ------
-    InfeasibleError  with the limits that are missed, and where the motion ends
+    Without one, a motion that ends nearer to it than any plan says why.
     """
     from .time_explain import list_shortfalls, solve_elastic
 
-    if found.nearest is None:
+    if moved.nearest is None:
         return
     for part in (1.0, *NEARER):
-        share = found.share + part * (1.0 - found.share)
-        stages = [_pin(search, own, found.ends[own.phase], share) for own in found.nearest.stages]
+        share = moved.share + part * (1.0 - moved.share)
+        nearest = moved.nearest.stages
+        stages = [_pin(search, stage, moved.ends[stage.phase], share) for stage in nearest]
         elastic = solve_elastic(search, stages)
         ranked = rank_shortfalls(list_shortfalls(problem, elastic or [], search.scheme))
         if ranked and elastic:
-            lasts = (to_si(own[-1], problem) for own in (found.nearest.stages, elastic))
-            ends = [describe_pose(own.guess.nodes[-1, 0]) for own in lasts]
+            lasts = (to_si(own[-1], problem) for own in (nearest, elastic))
+            ends = [describe_pose(last.guess.nodes[-1, 0]) for last in lasts]
             text = name_phases([phase.number for phase in phases], "infeasible")
             raise InfeasibleError(
                 f"{text}: a plan ends at {ends[0]} at the nearest, and at {ends[1]} "
@@ -498,34 +416,29 @@ def refuse_pinned(
 def _plan_free_end(
     search: TimeSearch, free: Problem, phases: Sequence[Phase], z: Array, goal: Array | None
 ) -> TimeSolution | None:
-    """A plan on few intervals that chooses where it ends."""
-    own = replace(
-        search,
-        problem=TimeSearch.of(free, search.options).problem,
-        only_begins=True,
-        to_go=None,
-        price=None,
-    )
-    attempts = Attempts(free, phases, z, own, None, True)
+    """A coarse plan that chooses where it ends."""
+    scaled = in_own_units(free)
+    search = replace(search, problem=scaled, only_begins=True, to_go=None, price=None)
+    attempts = Attempts(free, phases, z, search, None, True)
     try:
         for attempt in chain(attempts.begin(goal), attempts.list_further(FURTHER)):
-            solution = solve_attempt(own, attempt)
+            solution = solve_attempt(search, attempt)
             if solution.success:
                 return solution
     except InputError:
-        pass  # An end that is left open may be out of reach from the outlines.
+        pass  # A free end may be out of reach of the initial paths.
     return None
 
 
 def _set_free(phase: Phase) -> Phase:
-    """The phase with what its contacts leave open, if it has pins that mean anything."""
+    """The phase without pins; unchanged where they have no effect."""
     if not phase.until.pins or phase.formation.n_constraints >= 4:
         return phase
     return replace(phase, until=replace(phase.until, pins=()))
 
 
 def _pin(search: TimeSearch, stage: Stage, end: Array, share: float) -> Stage:
-    """A stage whose pins are a share of the way from where it ended at first."""
+    """A stage with its pins moved by a share of the continuation from its free `end`."""
     until = search.problem.phases[stage.phase].until
     if stage.until is None or not until.pins:
         return stage
@@ -536,83 +449,55 @@ def _pin(search: TimeSearch, stage: Stage, end: Array, share: float) -> Stage:
     return replace(stage, until=replace(until, pins=pins))
 
 
-class _Look(NamedTuple):
-    """What ranges change in each interval, over what is much, and what is missed with that."""
-
-    swings: Array
-    misses: IntersampleLimits
-
-
 def keep_within(
     search: TimeSearch, solution: TimeSolution, phases: Sequence[Phase]
 ) -> TimeSolution:
-    """Go on from a plan until its limits hold within the ranges of its options.
+    """Tighten limits until they hold, to first order, within the ranges of the options.
 
-    Parameters
-    ----------
-    solution  accurate, with limits that hold between points
-
-    Raises
-    ------
-    SolverError  if there is no such plan
+    `solution` is accurate, with limits that hold between points; SolverError without a plan.
     """
-    found = _widen(search, solution)
-    if not found.success:
-        raise SolverError(f"{name_phases([own.number for own in phases])}: {found.status}")
-    return found
-
-
-def _widen(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
     raised = [IntersampleLimits.none(stage) for stage in solution.stages]
-    error = solution.error
-    for turn in range(_ROUNDS):
+    error, epsilon, ranges = solution.error, search.problem.epsilon, search.options.ranges
+    where = name_phases([phase.number for phase in phases])
+    for iterate in range(_ROUNDS):
+        deviations, misses = list[Array](), list[IntersampleLimits]()
         motions = make_motions(solution.stages, search.scheme)
-        pairs = zip(solution.stages, motions, strict=True)
-        looks = [_look(search, solution, *pair) for pair in pairs]
-        if turn and max(own.misses.worst for own in looks) <= 1:
+        for stage, motion in zip(solution.stages, motions, strict=True):
+            check = check_between(stage, motion)
+            deviation = find_deviations(stage, check, epsilon, ranges)
+            misses.append(find_misses(stage, check, epsilon, solution.margin, deviation))
+            table = deviation.reshape(stage.intervals, CHECKS, -1).max(axis=1)
+            deviations.append(np.where(table > MISS, table, 0.0))
+        if iterate and max(miss.worst for miss in misses) <= 1:
             return solution._replace(error=error)
-        if turn < _SWINGS:
+        if iterate < _PARAMETRIC:
             raised = [
-                old._replace(held=own.swings, gap=old.gap + own.misses.gap)
-                for old, own in zip(raised, looks, strict=True)
+                old._replace(held=deviation, gap=old.gap + miss.gap)
+                for old, deviation, miss in zip(raised, deviations, misses, strict=True)
             ]
         else:
-            pairs_of = zip(raised, looks, strict=True)
             raised = [
-                IntersampleLimits(*(a + _OVER * b for a, b in zip(old, own.misses, strict=True)))
-                for old, own in pairs_of
+                IntersampleLimits(*(a + _OVER * b for a, b in zip(old, miss, strict=True)))
+                for old, miss in zip(raised, misses, strict=True)
             ]
-        given = solution.nlp, solution.stages, raised, solution.multipliers, solution.margin
-        solution = search.run(*given)
+        solution = search.run(
+            solution.nlp, solution.stages, raised, solution.multipliers, solution.margin
+        )
         if not solution.success:
             text = f"limits cannot be kept within the ranges: {solution.status}"
-            return solution._replace(status=text)
-    text = f"limits are still missed within the ranges after {_ROUNDS} solves"
-    return solution._replace(status=text, success=False)
+            raise SolverError(f"{where}: {text}")
+    raise SolverError(f"{where}: limits are still missed within the ranges after {_ROUNDS} solves")
 
 
-def _look(search: TimeSearch, solution: TimeSolution, stage: Stage, motion: StageMotion) -> _Look:
-    epsilon, check = search.problem.epsilon, check_between(stage, motion)
-    swings = find_swings_at(stage, check, epsilon, search.options.ranges)
-    misses = find_misses(stage, check, epsilon, solution.margin, swings)
-    table = swings.reshape(stage.intervals, CHECKS, -1).max(axis=1)
-    return _Look(np.where(table > MISS, table, 0.0), misses)
-
-
-def find_swings_at(
+def find_deviations(
     stage: Stage, check: CheckPlaces, epsilon: float, ranges: Mapping[str, float]
 ) -> Array:
-    """What all ranges together change of each side of the limits, over what is much, (n, n_sides).
-
-    Parameters
-    ----------
-    epsilon : [N]
-    """
+    """Change of each side of the limits by all ranges, relative to its scale, (n, n_sides)."""
     formation, count = stage.formation, len(check.places)
     names = [name for name, radius in ranges.items() if radius > 0 and name != "delay"]
     limits = make_limits(formation, epsilon)
-    own = limits.of(PRESS, CONE)
-    rows = limits.rows[own][:, : formation.n_constraints]
+    forces = limits.of(PRESS, CONE)
+    rows = limits.rows[forces][:, : formation.n_constraints]
     signs = (np.broadcast_to(part, (count, *part.shape)) for part in stage.directions)
     slopes = find_slopes_at(formation, check.samples, Directions(*signs), names)
     c_t = check.samples.c_t[:, list(formation.rolling_rows)]
@@ -623,6 +508,6 @@ def find_swings_at(
         edges = find_edges(formation, rows, name)
         if edges is not None:
             change = change + c @ edges.T - epsilon * edges.sum(axis=1)
-        total[:, own] += ranges[name] * np.abs(change)
+        total[:, forces] += ranges[name] * np.abs(change)
     sides = limits.sides[0]
     return np.asarray(total[:, sides] / limits.scales[sides])

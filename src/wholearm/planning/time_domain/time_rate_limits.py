@@ -1,18 +1,14 @@
-"""Rows of the time-domain NLP for motors that are not quick.
+"""Rows of the time-domain NLP for rate-limited torques and actuator lag.
 
-Torques are polynomials in each interval, by their control points c_0 ... c_n. They go on where
-intervals and stages meet, and with the largest rate R and the lag of a motor
+Torques have control points c_0 ... c_n in each interval and are continuous; with rate limit R
 
     |c_k+1 - c_k| n <= R h,
     |h c_k + lag (k (c_k - c_k-1) + (n - k) (c_k+1 - c_k))| <= limit h
 
-hold throughout, as derivatives and commands lie between their own control points. Torques begin and
-end with ones that hold the object at rest, on the verge of its motion: with no acceleration and the
-friction of its directions.
-
-Contact forces go on with the torques. So a contact that is let go, or gained softly, passes all
-forces from or to none, and a rolling one that begins to slip comes to the edge of its cone: within
-one interval each that is not kept from them.
+bound derivatives and commands throughout by their own control points. At both ends the torques hold
+the object at rest, with friction in the directions of motion. Contact forces are continuous, too:
+those of a contact that is released or gained softly vanish or set in within one interval, and a
+rolling contact that begins to slide comes to the edge of its cone.
 """
 
 from __future__ import annotations
@@ -29,7 +25,6 @@ from ...common.arrays import Array, Expression
 from ...contacts.formation import Formation
 from ...mechanics.dynamics import build_force_rows
 from ...mechanics.limits import CONE, PRESS, LimitSet
-from ...scene.model import Scene
 from ..columns import Columns
 from .assembly import Indices
 from .collocation import Scheme
@@ -37,15 +32,14 @@ from .nlp_layout import NlpRows, StageLayout, Z
 from .stage import Stage
 from .stage_kernels import NamedKernel, name_kernel, opening_kernel, share
 
-_ROOM = 0.05
-"""Most room between a torque that a lagging motor comes to at rest and its limit, over that."""
+_ROOM = 0.05  # most relative distance of a lagging motor's torque at rest from its limit
 
 
 @dataclass(frozen=True, eq=False)
 class MotorRows:
-    """Rows of one stage for its motors."""
+    """Rows of one stage for rate-limited torques."""
 
-    joins: Indices  # (K - 1, 2): torques go on from one interval to the next
+    joins: Indices  # (K - 1, 2): continuous torques
     rates: Indices  # rates, commands (K, n): limits of rates, and of commands
     commands: Indices
 
@@ -80,7 +74,7 @@ def add_motors(rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme)
 def join_motors(
     rows: NlpRows, stage: Stage, layouts: tuple[StageLayout, StageLayout], scheme: Scheme
 ) -> None:
-    """Torques, and what follows them, go on from a stage to the next."""
+    """Continuous torques, forces and accelerations from a stage to the next."""
     layout, coming = layouts
     formation, own = stage.formation, rows.linear(2)
     _go_on(rows, own, layout.tau[-1, -2:], coming.tau[0, :2], formation.scene.torque_limit)
@@ -118,7 +112,13 @@ def hold_ends(
         rows.add_copies(kernel, columns, rows.nonlinear(kernel.outputs), given)
         formation = stage.formation
         if not k and stage.phase:
-            _leave_room(rows, formation.scene, layout.tau[0, :2])
+            # A command approaches a torque limit only asymptotically in the pause before.
+            scene, first = formation.scene, layout.tau[0, :2]
+            for joint in np.flatnonzero(scene.actuator_lag):
+                limit = scene.torque_limit[joint]
+                fastest = scene.torque_rate_limit[joint] * scene.actuator_lag[joint] / limit
+                most = 1 - min(_ROOM, float(fastest))
+                rows.add_entries(rows.linear(1, low=-most, high=most), first[joint], 1 / limit)
         for r, row in enumerate(formation.rolling_rows):
             mu = float(formation.friction[row])
             own = rows.linear(2, low=mu * epsilon, high=np.inf)
@@ -126,20 +126,8 @@ def hold_ends(
             rows.add_entries(own, forces[formation.n_contacts + r], np.array([1.0, -1.0]))
 
 
-def _leave_room(rows: NlpRows, scene: Scene, tau: Indices) -> None:
-    """Torques that are changed into at rest stay off limits that a command only creeps to."""
-    for joint in np.flatnonzero(scene.actuator_lag):
-        limit = scene.torque_limit[joint]
-        fastest = scene.torque_rate_limit[joint] * scene.actuator_lag[joint] / limit
-        most = 1 - min(_ROOM, float(fastest))
-        rows.add_entries(rows.linear(1, low=-most, high=most), tau[joint], 1 / limit)
-
-
 def find_relieved(stage: Stage, limits: LimitSet) -> NDArray[np.bool_]:
-    """Sides of limits that do not count in each interval, shape (K, n_sides).
-
-    Of contacts whose forces pass from or to none, or to the edge of the cone.
-    """
+    """Sides without effect in each interval, as forces vanish or set in or slip, (K, n_sides)."""
     relieved = np.zeros((stage.intervals, len(limits.sides[0])), dtype=bool)
     if not stage.formation.scene.has_slow_motors:
         return relieved
@@ -158,7 +146,7 @@ def find_relieved(stage: Stage, limits: LimitSet) -> NDArray[np.bool_]:
 
 @lru_cache(maxsize=8)
 def command_kernel(controls: int, joints: tuple[int, ...]) -> NamedKernel:
-    """What is left of torque limits, over them and times h, beside the commands' control points."""
+    """Slack of the commands' control points to torque limits, over these and times h."""
     x, n = Columns(tau=2 * controls, h=1).make_symbols(), controls - 1
     p = Columns(lag=2, limit=2).make_symbols()
     tau = ca.reshape(x.tau, 2, controls)

@@ -1,8 +1,7 @@
-"""The scene's own units, in which phases are planned: whatever a problem is written in, the same.
+"""Scaling of problems, options and stages to the scene's own units, and back.
 
-The unit of length is the object's radius of gyration, that of force its weight, that of mass its
-mass; the unit of time follows (`scene.model.Scales`). Everything that is tolerated, guessed or
-weighed in the time domain counts in these.
+Length is the object's radius of gyration, force its weight, mass its mass; time follows
+(`scene.model.Scales`). Tolerances and guesses of the time domain are in these.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from ...problem.uncertainty import PARAMETERS
 from ...scene.model import Scales, Scene
 from ...scene.polygon import Polygon
 from ..options import Objective, PlanOptions
-from .stage import Stage, StagePoints
+from .stage import Stage
 
 
 @lru_cache(maxsize=16)
@@ -84,13 +83,13 @@ def scale_options(options: PlanOptions, scales: Scales) -> PlanOptions:
 
 
 def unit_of(goal: Objective, scales: Scales) -> float:
-    """What one unit of an objective is in SI units."""
+    """Unit of an objective in SI units."""
     efforts = scales.torque**2 * scales.time
     return {Objective.TIME: scales.time, Objective.EFFORT: efforts}.get(goal, scales.force)
 
 
 def unit_lengths(scales: Scales) -> Array:
-    """What one unit of each coordinate of z is in SI units, shape (5,)."""
+    """Units of the coordinates of z in SI units, shape (5,)."""
     return np.array([scales.length, scales.length, 1.0, 1.0, 1.0])
 
 
@@ -98,16 +97,15 @@ def to_si(stage: Stage, problem: Problem) -> Stage:
     """A stage in SI units, of the same problem in SI units."""
     scales, part = problem.scene.scales, stage.guess
     lengths, unit = unit_lengths(scales), scales.time
-    points = StagePoints(
-        part.duration * unit,
-        part.fractions,
-        part.nodes * lengths / np.array([[1.0], [unit]]),
-        part.z * lengths,
-        part.v * lengths / unit,
-        part.a * lengths / unit**2,
-        part.forces * scales.force,
-        part.tau * scales.torque,
-        part.impulses * scales.force * unit,
+    points = part._replace(
+        duration=part.duration * unit,
+        nodes=part.nodes * lengths / np.array([[1.0], [unit]]),
+        z=part.z * lengths,
+        v=part.v * lengths / unit,
+        a=part.a * lengths / unit**2,
+        forces=part.forces * scales.force,
+        tau=part.tau * scales.torque,
+        impulses=part.impulses * scales.force * unit,
     )
     formation = problem.phases[stage.phase].formation
     rolling = stage.formation.rolling
