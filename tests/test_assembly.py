@@ -9,7 +9,7 @@ import pytest
 from wholearm.common.arrays import Array, Expression
 from wholearm.common.batch import FEW, SIZE, SOME, Batch
 from wholearm.planning.columns import Columns
-from wholearm.planning.time_domain.assembly import (
+from wholearm.planning.time_domain.nlp_layout import (
     Block,
     Kernel,
     Triplets,

@@ -25,7 +25,7 @@ from wholearm.geometry.curve import find_tied, tangent_basis
 from wholearm.geometry.explore import close_contacts
 from wholearm.geometry.path_guess import find_end, list_ends
 from wholearm.geometry.tracing import trace_phases
-from wholearm.mechanics.metric import metric_weights
+from wholearm.mechanics.dynamics import metric_weights
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain import time_explain as explain

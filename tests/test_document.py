@@ -22,11 +22,9 @@ from wholearm.common.plain import plain, restore
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
 from wholearm.planning.plan_report import describe_plan
-from wholearm.planning.result import Plan, Status
-from wholearm.planning.saved import load_plan, write_meta
+from wholearm.planning.result import Plan, Status, load_plan, write_meta
 from wholearm.problem.definition import Problem
-from wholearm.solvers.ipopt import Solver
-from wholearm.solvers.statistics import SolverStatistics, book, charge, open_ledger
+from wholearm.solvers.ipopt import Solver, SolverStatistics, book, charge, open_ledger
 from wholearm.verification.verify import verify
 
 

@@ -30,8 +30,7 @@ from wholearm.results.trajectory import Trajectory, assemble
 from wholearm.scene.model import Finger, Friction, Scene
 from wholearm.scene.polygon import Polygon
 from wholearm.simulation.events import EventKind, OutcomeKind
-from wholearm.verification.free import verify_free
-from wholearm.verification.free_report import FreeReport
+from wholearm.verification.free import FreeReport, verify_free
 
 DURATION = 0.4
 """Of a random run [s]."""

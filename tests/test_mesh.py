@@ -18,7 +18,7 @@ from wholearm.planning.time_domain.attempts import GAIN, choose_end
 from wholearm.planning.time_domain.collocation import Scheme, make_scheme
 from wholearm.planning.time_domain.nlp_layout import pack
 from wholearm.planning.time_domain.search import TimeSearch, TimeSolution, carry_multipliers
-from wholearm.planning.time_domain.stage import Stage, StagePoints
+from wholearm.planning.time_domain.stage import Stage, StagePoints, in_own_units
 from wholearm.planning.time_domain.stage_modes import LEAST_INTERVALS
 from wholearm.planning.time_domain.stages import guess_stages
 from wholearm.planning.time_domain.tightening import find_least
@@ -32,7 +32,6 @@ from wholearm.planning.time_domain.time_mesh import (
 )
 from wholearm.planning.time_domain.time_motion import StageMotion
 from wholearm.planning.time_domain.time_plan import try_phases
-from wholearm.planning.time_domain.units import in_own_units
 from wholearm.problem.definition import Problem
 
 SCHEMES = [("radau", 2), ("radau", 4), ("legendre", 3)]

@@ -20,7 +20,7 @@ from wholearm.results.torque_change import change_torques, find_change_times
 from wholearm.simulation.events import EventKind, OutcomeKind
 from wholearm.simulation.sticking import balances
 from wholearm.simulation.tolerances import find_tolerances
-from wholearm.verification.margins import describe_motors, find_commands
+from wholearm.verification.verify import describe_motors, find_commands
 
 
 @pytest.fixture(scope="module")

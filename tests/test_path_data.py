@@ -11,11 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 from wholearm.common.arrays import Array, find_minima
-from wholearm.geometry.cost_to_go import CostToGo
+from wholearm.geometry.arcs import CostToGo
 from wholearm.geometry.curve import Curve, Segment
 from wholearm.geometry.tracing import trace_phase, trace_phases
-from wholearm.mechanics.dynamics import PathForces, inverse
-from wholearm.mechanics.metric import metric_weights
+from wholearm.mechanics.dynamics import PathForces, inverse, metric_weights
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
 from wholearm.planning.lower_bound.rows import directions_of
 from wholearm.planning.options import Objective, PlanOptions

@@ -34,7 +34,7 @@ from wholearm.planning.plan import solve
 from wholearm.problem.definition import Problem
 from wholearm.results.trajectory import Samples
 from wholearm.scene.model import Friction, Scene
-from wholearm.solvers.statistics import open_ledger
+from wholearm.solvers.ipopt import open_ledger
 
 PHASES = range(5)
 OBJECTIVES = ["time", "effort", "margin"]

@@ -20,7 +20,6 @@ from wholearm.free_simulation.free_simulate import simulate_free
 from wholearm.geometry.tracing import trace_phase
 from wholearm.mechanics.dynamics import build_forward
 from wholearm.planning.result import Plan
-from wholearm.policy.corners import list_scenes
 from wholearm.policy.curve_law import (
     CurveLaw,
     LoopSettings,
@@ -28,6 +27,7 @@ from wholearm.policy.curve_law import (
     Sensing,
     choose_internal_force,
 )
+from wholearm.policy.curve_rows import list_scenes
 from wholearm.policy.make import SAME, find_widest, hold_end, make_policy
 from wholearm.policy.playback import Policy
 from wholearm.policy.range_margins import find_within, retime_within

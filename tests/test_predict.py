@@ -17,11 +17,12 @@ from wholearm.common.errors import InputError
 from wholearm.contacts.cones import force_limit_rows
 from wholearm.mechanics.dynamics import force_rows
 from wholearm.problem.definition import Problem
-from wholearm.quasistatic.prediction import Prediction, Survival
 from wholearm.quasistatic.slow_speeds import (
     OWN,
     Least,
     PathSamples,
+    Prediction,
+    Survival,
     UnitProfile,
     find_break,
     find_torques,

@@ -24,8 +24,7 @@ from wholearm.problem.goal import Goal
 from wholearm.search.border_limits import estimate_duration, find_border_limits
 from wholearm.search.cell_paths import can_start, time_paths
 from wholearm.search.edges import Link, cut_curve, time_parts
-from wholearm.search.goals import is_at
-from wholearm.search.places import RoadmapPlace, list_formations_at, make_place, unit_steps
+from wholearm.search.places import RoadmapPlace, is_at, list_formations_at, make_place, unit_steps
 from wholearm.search.roadmap import BESIDE, Rays, Roadmap, shoot
 from wholearm.search.times import time_borders
 

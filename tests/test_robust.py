@@ -14,8 +14,7 @@ from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.path_guess import load
 from wholearm.geometry.tracing import trace_phases
-from wholearm.mechanics.dynamics import Directions, build_forward, inverse
-from wholearm.mechanics.metric import metric_weights
+from wholearm.mechanics.dynamics import Directions, build_forward, inverse, metric_weights
 from wholearm.mechanics.wedging import find_static_torques
 from wholearm.planning.lower_bound.rows import directions_of
 from wholearm.planning.options import PlanOptions

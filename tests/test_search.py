@@ -22,12 +22,11 @@ from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phase
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.saved import load_plan
+from wholearm.planning.result import load_plan
 from wholearm.problem.definition import Phase, Problem
 from wholearm.problem.goal import Goal
 from wholearm.problem.read import build_problem
 from wholearm.search.astar import RoadmapRoute, RouteSearch
-from wholearm.search.bounds import bound_borders
 from wholearm.search.cuts import Opening, link_changed, list_cut, list_cut_borders, list_openings
 from wholearm.search.edges import Link
 from wholearm.search.find_route import (
@@ -42,7 +41,7 @@ from wholearm.search.find_route import (
     store_roadmap,
 )
 from wholearm.search.places import list_formations_at, make_place
-from wholearm.search.result import describe_block
+from wholearm.search.result import bound_borders, describe_block
 from wholearm.search.roadmap import Roadmap, cross, go_to
 from wholearm.verification.verify import verify
 

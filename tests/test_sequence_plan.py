@@ -9,8 +9,8 @@ import pytest
 
 from plane import measure_gaps, measure_slip, unbalance
 from shipped import HEPTAGON, IMPACTS, plan_of, problem_of
+from wholearm.mechanics.dynamics import metric_weights
 from wholearm.mechanics.impact import compute_impact
-from wholearm.mechanics.metric import metric_weights
 from wholearm.planning.plan import solve
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem

@@ -22,8 +22,7 @@ from wholearm.planning import dwell as shares
 from wholearm.planning.dwell import DwellEnd, list_touching, settle_plans
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan_report import describe_plan
-from wholearm.planning.result import Plan
-from wholearm.planning.saved import load_plan, write_meta
+from wholearm.planning.result import Plan, load_plan, write_meta
 from wholearm.planning.stops import Plans
 from wholearm.problem.definition import Problem
 from wholearm.results.torque import TorqueProfile

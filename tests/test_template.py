@@ -15,7 +15,7 @@ from wholearm.cli.command import main
 from wholearm.common.errors import InputError
 from wholearm.comparison.metrics import compare
 from wholearm.geometry.path_guess import load
-from wholearm.mapping.template import write_template
+from wholearm.mapping.formation_list import write_template
 from wholearm.planning.plan import solve
 from wholearm.problem.definition import Problem
 from wholearm.problem.goal import Goal

@@ -13,8 +13,8 @@ from shipped import IMPACTS, LANDING, plan_of, problem_of
 from wholearm.common.arrays import Array
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phases
+from wholearm.mechanics.dynamics import metric_weights
 from wholearm.mechanics.impact import compute_impact
-from wholearm.mechanics.metric import metric_weights
 from wholearm.planning.plan import solve
 from wholearm.planning.result import Plan
 from wholearm.problem.definition import End, Problem

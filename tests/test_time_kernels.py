@@ -14,8 +14,8 @@ from wholearm.contacts.formation import Formation
 from wholearm.mechanics.dynamics import split_forces
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.time_domain import stage_kernels as kernels
-from wholearm.planning.time_domain.assembly import Kernel
 from wholearm.planning.time_domain.collocation import blend, make_scheme
+from wholearm.planning.time_domain.nlp_layout import Kernel
 from wholearm.planning.time_domain.search import TimeSearch
 from wholearm.planning.time_domain.stage_kernels import (
     bend_kernel,

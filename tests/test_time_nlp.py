@@ -16,8 +16,7 @@ from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve, tangent_basis
 from wholearm.geometry.path_guess import load
 from wholearm.geometry.tracing import trace_phases
-from wholearm.mechanics.dynamics import Directions
-from wholearm.mechanics.metric import metric_weights
+from wholearm.mechanics.dynamics import Directions, metric_weights
 from wholearm.planning.options import Objective
 from wholearm.planning.time_domain.collocation import Scheme, make_scheme
 from wholearm.planning.time_domain.intersample import IntersampleLimits, raise_bounds

@@ -9,8 +9,14 @@ from numpy.typing import ArrayLike
 
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
-from wholearm.results.torque import TorqueProfile, read_torque_csv
-from wholearm.results.torque_table import ERROR, place_rows, read_rows, sample_rows
+from wholearm.results.torque import (
+    ERROR,
+    TorqueProfile,
+    place_rows,
+    read_rows,
+    read_torque_csv,
+    sample_rows,
+)
 
 GOOD = "t,tau1,tau2\n0,1,-1\n0.5,2,-2\n0.5,4,0\n2,1,3\n"
 

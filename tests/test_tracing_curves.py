@@ -27,7 +27,7 @@ from wholearm.contacts.closing import close_finger, place_flush
 from wholearm.contacts.formation import Formation, find_touching
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_curve, trace_phases
-from wholearm.mechanics.metric import metric_weights
+from wholearm.mechanics.dynamics import metric_weights
 from wholearm.problem.definition import Problem, Until
 from wholearm.problem.read import build_problem
 from wholearm.scene.model import Scene

@@ -23,8 +23,8 @@ from wholearm.mechanics.wedging import find_static_torques
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.path_plan import plan_curves
 from wholearm.planning.time_domain.resting import find_block, list_ways, pushes_one_way
+from wholearm.planning.time_domain.stage import in_own_units, scale_state
 from wholearm.planning.time_domain.time_plan import plan_phases
-from wholearm.planning.time_domain.units import in_own_units, scale_state
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.results.torque import TorqueProfile
 from wholearm.scene.model import Friction, Scene

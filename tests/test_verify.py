@@ -18,12 +18,10 @@ from tipping import PALM, box, scale, tipped
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, ReplayError
 from wholearm.planning.table_check import make_table, sample_table
-from wholearm.results.torque import TorqueProfile
-from wholearm.results.torque_table import read_rows
+from wholearm.results.torque import TorqueProfile, read_rows
 from wholearm.simulation.simulate import simulate
-from wholearm.verification.margins import find_lowest, list_normal_forces
 from wholearm.verification.verdict import Allowance
-from wholearm.verification.verify import verify
+from wholearm.verification.verify import find_lowest, list_normal_forces, verify
 
 
 def test_a_good_plan_passes() -> None:

@@ -18,7 +18,7 @@ from wholearm.cli.command import main
 from wholearm.common.errors import InputError
 from wholearm.contacts.closing import contact_table, evaluate_contacts
 from wholearm.figures.style import choose_styles
-from wholearm.mapping.template import write_template
+from wholearm.mapping.formation_list import write_template
 from wholearm.viewer import page
 from wholearm.viewer.chart import describe_map
 from wholearm.viewer.motion_data import describe_motion, place_pushes

@@ -40,15 +40,13 @@ if TYPE_CHECKING:
     from .mapping.formation_list import format_route, list_formations
     from .mapping.formation_map import FormationMap, build_map
     from .planning.options import Objective, PlanOptions
-    from .planning.result import Plan, Status
-    from .planning.saved import load_plan
+    from .planning.result import Plan, Status, load_plan
     from .policy.make import make_policy
     from .policy.playback import Policy
     from .problem.definition import End, Phase, Problem, Until
     from .problem.goal import Goal
     from .problem.read import place_start, read_formation, read_until
-    from .quasistatic.prediction import Prediction
-    from .quasistatic.slow_speeds import predict
+    from .quasistatic.slow_speeds import Prediction, predict
     from .results.adopt import save
     from .results.report import Report
     from .results.torque import TorqueProfile, read_torque_csv
@@ -63,10 +61,9 @@ if TYPE_CHECKING:
     from .search.solve import solve
     from .simulation.events import Simulation
     from .simulation.simulate import simulate
-    from .tuning.result import Tuning
+    from .tuning.trial import Tuning
     from .tuning.tuner import tune
-    from .verification.free import verify_free
-    from .verification.free_report import FreeReport
+    from .verification.free import FreeReport, verify_free
     from .verification.policy_check import verify_policy
     from .verification.verify import verify
 
@@ -83,7 +80,7 @@ _HOMES = {
     "Finger": "scene.model",
     "Formation": "contacts.formation",
     "FormationMap": "mapping.formation_map",
-    "FreeReport": "verification.free_report",
+    "FreeReport": "verification.free",
     "FreeSimulation": "free_simulation.result",
     "Friction": "scene.model",
     "Goal": "problem.goal",
@@ -97,7 +94,7 @@ _HOMES = {
     "Policy": "policy.playback",
     "PolicyReport": "engines.feedback",
     "Polygon": "scene.polygon",
-    "Prediction": "quasistatic.prediction",
+    "Prediction": "quasistatic.slow_speeds",
     "Problem": "problem.definition",
     "ReplayError": "common.errors",
     "Report": "results.report",
@@ -110,7 +107,7 @@ _HOMES = {
     "Status": "planning.result",
     "TorqueProfile": "results.torque",
     "Trajectory": "results.trajectory",
-    "Tuning": "tuning.result",
+    "Tuning": "tuning.trial",
     "Uncertainty": "robustness.error_model",
     "Until": "problem.definition",
     "WholearmError": "common.errors",
@@ -122,7 +119,7 @@ _HOMES = {
     "format_route": "mapping.formation_list",
     "list_formations": "mapping.formation_list",
     "load": "geometry.path_guess",
-    "load_plan": "planning.saved",
+    "load_plan": "planning.result",
     "load_trajectory": "results.trajectory_file",
     "make_policy": "policy.make",
     "place_start": "problem.read",

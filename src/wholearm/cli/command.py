@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from ..results.report import Report
     from ..results.torque import TorqueProfile
     from ..results.trajectory import Trajectory
-    from ..verification.free_report import FreeReport
+    from ..verification.free import FreeReport
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -162,7 +162,7 @@ def _check_sampling(options: argparse.Namespace) -> None:
         return
     if options.torques is None:
         raise InputError("", "--sample-rate", "needs --torques FILE, the table to write")
-    from ..results.torque_table import require_sampling
+    from ..results.torque import require_sampling
 
     require_sampling(options.sample_rate, options.interpolation or "linear")
 

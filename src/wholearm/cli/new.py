@@ -14,7 +14,7 @@ def write(options: argparse.Namespace) -> int:
     """Write a problem file."""
     from ..common.errors import InputError, name_source
     from ..common.files import require_writable, write_text
-    from ..mapping.template import write_template
+    from ..mapping.formation_list import write_template
 
     output = f"{options.name.removesuffix('.toml')}.toml"
     require_writable(output)

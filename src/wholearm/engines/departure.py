@@ -49,7 +49,7 @@ class Departure(NamedTuple):
     reason: str  # the cause; empty without one
 
 
-class _Change(NamedTuple):
+class _PressChange(NamedTuple):
     """A deviation of a contact and its interval [s]."""
 
     start: float
@@ -146,7 +146,9 @@ def _average(plan: Trajectory, part: _Part, run: EngineRun) -> list[Force]:
     return [Force(part.phase.number, *row) for row in rows]
 
 
-def _list_changes(problem: Problem, part: _Part, run: EngineRun, reach: float) -> Iterator[_Change]:
+def _list_changes(
+    problem: Problem, part: _Part, run: EngineRun, reach: float
+) -> Iterator[_PressChange]:
     """Deviations of contacts from the plan in a phase."""
     scales, formation, rows = problem.scene.scales, part.phase.formation, part.rows
     actual = formation.evaluate(run.z[rows], run.z_dot[rows])
@@ -169,8 +171,8 @@ def _list_changes(problem: Problem, part: _Part, run: EngineRun, reach: float) -
         yield from _find_runs(times, hits, f"{run.pairs[column]} presses, which is not planned,")
 
 
-def _find_runs(t: Array, happens: NDArray[np.bool_], what: str) -> Iterator[_Change]:
+def _find_runs(t: Array, happens: NDArray[np.bool_], what: str) -> Iterator[_PressChange]:
     """Intervals in which a flag is set."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], happens, [False]]).astype(int)))
     for first, last in zip(edges[::2], edges[1::2] - 1, strict=True):
-        yield _Change(float(t[first]), float(t[last]), what)
+        yield _PressChange(float(t[first]), float(t[last]), what)

@@ -15,7 +15,7 @@ import numpy as np
 from ..common.arrays import Array
 from ..problem.definition import Problem
 from ..results.adopt import Moved, adopt_motion
-from ..results.torque_table import place_rows
+from ..results.torque import place_rows
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
 from .shapes import LINKS, OBJECT, PALM, find_rounding, list_pairs, list_shapes

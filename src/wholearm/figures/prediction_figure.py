@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from ..common.sharing import exclusive
-from ..quasistatic.prediction import PhasePrediction, Prediction, Survival
+from ..quasistatic.slow_speeds import PhasePrediction, Prediction, Survival
 from .style import GRID, INK, LOST, LOW, PALETTE, STYLE, write_title
 
 _COLUMNS = 3  # most panels side by side

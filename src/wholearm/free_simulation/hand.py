@@ -27,9 +27,9 @@ import numpy as np
 
 from ..common.arrays import Array, Expression
 from ..common.sharing import exclusive
+from ..contacts.contact_limits import build_apart
 from ..contacts.elemental import build_features, rotate_quarter
 from ..contacts.links import FINGERS_TOUCH, build_finger_gap
-from ..contacts.obstacles import build_apart
 from ..scene.model import Scene
 from .system import ContactPair, Structure, System
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..common.arrays import Array
-from ..mechanics.metric import metric_weights
+from ..mechanics.dynamics import metric_weights
+from ..problem.definition import Phase
 from .curve import Curve, Panel, Segment
+from .tracing import trace_phase
 
+_STEP = 1e-2  # step of the difference quotient, over the length of the curve that follows
 NEAR = 0.2  # distance from nodes, in radii of gyration, beyond which a place is off a curve
 ON = 1e-9  # distance from a curve, in radii of gyration, up to which a place is on it
 ROUNDS = 8  # most steps of Newton's method to the nearest place of a curve
@@ -97,3 +101,22 @@ def _make(curve: Curve, panels: list[Panel], segments: list[Segment], length: fl
     # Reversals are where they were.
     part.__dict__["segments"] = tuple(segments)
     return part
+
+
+@dataclass(frozen=True, eq=False)
+class CostToGo:
+    """The cost of the phases that follow, the first of them with one freedom."""
+
+    phase: Phase  # the first of them. Its curve is where the motion before it may end.
+    # their least cost from a configuration z, shape (5,). Raises a `WholearmError` without a plan
+    # from there.
+    value: Callable[[Array], float]
+
+    def expand(self, z: Array) -> tuple[float, Array]:
+        """The cost from `z`, shape (5,), and its gradient along the curve, shape (5,)."""
+        curve = trace_phase(self.phase, z)
+        step = _STEP * curve.length
+        point = curve.evaluate(np.array([0.0, step]))
+        here, ahead = (self.value(place) for place in point.z)
+        slope = (ahead - here) / step
+        return here, slope * metric_weights(self.phase.formation.scene) * point.z_s[0]

@@ -18,7 +18,7 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..contacts.formation import Formation, Kinematics
-from ..mechanics.metric import metric_weights
+from ..mechanics.dynamics import metric_weights
 
 REFINE = 3  # places per node of a panel at which limits and reversals are looked for
 _TIED = 1e-6  # relative error of two rates that are proportional, and relative rate of none

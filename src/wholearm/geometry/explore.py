@@ -9,7 +9,7 @@ import numpy as np
 from ..common.arrays import Array
 from ..contacts.closing import close_fingers, find_reach, lower
 from ..contacts.formation import Formation
-from ..mechanics.metric import metric_weights
+from ..mechanics.dynamics import metric_weights
 
 GRID = (120, 60)  # places across x and phi at which a formation is looked at
 SEEDS = 24  # most places from which an end is looked for: those that are nearest to it

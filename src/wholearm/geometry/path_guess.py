@@ -12,8 +12,7 @@ from ..common.errors import InputError, name_source
 from ..common.sharing import exclusive
 from ..contacts.contact_limits import build_limits
 from ..contacts.formation import Formation
-from ..mechanics.dynamics import Directions
-from ..mechanics.metric import metric_weights
+from ..mechanics.dynamics import Directions, metric_weights
 from ..problem.definition import Phase, Problem
 from ..problem.read import read_problem
 from .curve import Curve, tangent_basis

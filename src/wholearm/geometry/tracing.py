@@ -17,7 +17,7 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.errors import InputError, name_source
 from ..contacts.formation import Formation, describe, find_touching
-from ..mechanics.metric import metric_weights
+from ..mechanics.dynamics import metric_weights
 from ..problem.definition import End, Phase, Problem, Until
 from ..scene.model import TOUCHING
 from .curve import Curve, Panel, border, describe_pose, find_root, refine

@@ -27,9 +27,8 @@ from ..contacts.closing import (
 )
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, Kinematics
-from ..mechanics.dynamics import Directions, force_rows, inverse
+from ..mechanics.dynamics import Directions, force_rows, inverse, metric_weights
 from ..mechanics.margin_key import UNIQUENESS
-from ..mechanics.metric import metric_weights
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN, find_minors
 from ..problem.definition import Problem
 from ..quasistatic.squeeze import InternalForceLimits

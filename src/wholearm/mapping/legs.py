@@ -26,7 +26,7 @@ from ..contacts.formation import Formation, find_touching
 from ..geometry.curve import describe_pose
 from ..geometry.explore import STILL, is_inside
 from ..geometry.path_guess import find_end
-from ..mechanics.metric import metric_weights
+from ..mechanics.dynamics import metric_weights
 from ..problem.definition import Phase, Problem, Until
 from ..scene.model import Scene
 from .borders import (

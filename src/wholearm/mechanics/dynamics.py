@@ -30,6 +30,7 @@ import numpy as np
 
 from ..common.arrays import Array, Expression
 from ..contacts.formation import Formation, Kinematics
+from ..scene.model import Scene
 
 
 class Directions(NamedTuple):
@@ -192,3 +193,14 @@ def force_rows(formation: Formation, kinematics: Kinematics, directions: Directi
     if formation.rolling:
         G = np.concatenate([G, kinematics.P[:, formation.n_contacts :]], axis=1)
     return G
+
+
+def metric_weights(scene: Scene) -> Array:
+    """Diagonal of the metric of arc length, shape (5,): 1 for lengths, rho^2 for angles."""
+    rho = scene.polygon.gyration_radius
+    return np.array([1.0, 1.0, rho**2, rho**2, rho**2])
+
+
+def measure_speed(scene: Scene, v: Array) -> float:
+    """Speed of a velocity, shape (5,), in the metric of curves [m/s]."""
+    return float(np.sqrt(metric_weights(scene) @ v**2))

@@ -22,8 +22,7 @@ import numpy as np
 from ..common.arrays import Array
 from ..contacts.cones import force_limit_rows
 from ..contacts.formation import Formation
-from .dynamics import Directions, force_rows, reduced_inertia
-from .metric import measure_speed, metric_weights
+from .dynamics import Directions, force_rows, measure_speed, metric_weights, reduced_inertia
 
 ROUNDING = 1e-6  # momentum or speed, in the metric of curves, that counts as rounding
 _STEP = 1e-5  # step of the difference quotient of limits, in radii of gyration or radians

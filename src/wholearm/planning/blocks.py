@@ -17,14 +17,14 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.errors import InfeasibleError, InputError, SolverError, WholearmError, name_source
 from ..common.shortfalls import Change, Parameter
-from ..geometry.cost_to_go import CostToGo
+from ..geometry.arcs import CostToGo
 from ..geometry.curve import Curve
 from ..geometry.tracing import trace_phase
-from ..mechanics.metric import measure_speed
+from ..mechanics.dynamics import measure_speed
 from ..problem.definition import Phase, Problem
 from ..results.trajectory import Motion
 from ..scene.model import Scene
-from ..solvers.statistics import charge
+from ..solvers.ipopt import charge
 from .block_plan import BEGUN, FINEST, PLAIN, BlockPlan, Planning
 from .lower_bound.lower_bound import look_along
 from .lower_bound.speed_sweep import NoMotionError

@@ -16,7 +16,7 @@ from ..mechanics.impact import Impact
 from ..problem.definition import Phase
 from ..results.plan_record import Transition
 from ..results.trajectory import Motion
-from ..solvers.statistics import charge
+from ..solvers.ipopt import charge
 from .options import Objective, PlanOptions
 from .phase_plan import PhasePlan, add_up, combine
 from .stops import PlanPart, plan_stops

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -22,25 +22,27 @@ from ..geometry.tracing import trace_phases
 from ..mechanics.uniqueness import describe_uniqueness
 from ..problem.check import require_phases
 from ..problem.definition import Problem
-from ..results.plan_record import Transition
+from ..results.plan_record import Certificate, TimeBound, Transition
 from ..results.report import UniquenessMargin
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory, assemble
-from ..solvers.statistics import Ledger, open_ledger
+from ..solvers.ipopt import Ledger, open_ledger
 from ..verification.force_uniqueness import find_uniqueness_margin, find_wedged
-from .block_plan import Planning
+from .block_plan import BlockPlan, Planning
 from .blocks import plan_blocks
 from .impacts import assess_impacts
+from .lower_bound.lower_bound import bound_least_time
 from .options import PlanOptions
 from .path_domain import sequence_plan
 from .phase_plan import combine
-from .result import Plan, PlannedPhase, Status, Timings
-from .saved import write_meta
+from .result import Plan, PlannedPhase, Status, Timings, write_meta
 
 if TYPE_CHECKING:
     from .replay_check import Checked
 
 
+OVER_TIME = "planned over time"
+NO_MOTION = "the sweep over the phase plane finds no motion"
 _STILL = 1e-9  # relative speed of rest but for rounding
 
 
@@ -161,8 +163,6 @@ def finish_plan(
         ranges = assess_ranges(planning, report)
     certificate = None
     if options.certify:
-        from .certify import certify
-
         report("bounding the least time from below")
         certificate = certify(planning)
     phases = _list_phases(planning, ledger, unique)
@@ -277,3 +277,27 @@ def check_uniqueness(problem: Problem, trajectory: Trajectory, least: float) -> 
             raise AmbiguityError(f"phase {phase.number}: {text}")
         found.append((margin, find_wedged(problem, phase, trajectory, rows, _STILL)))
     return found
+
+
+def certify(planning: Planning) -> Certificate:
+    """Bound the least time of every part of a planning that is run through from rest to rest."""
+    parts = (part for block in planning.blocks for part in _bound(block, planning.problem.epsilon))
+    return Certificate(tuple(parts))
+
+
+def _bound(block: BlockPlan, epsilon: float) -> Iterator[TimeBound]:
+    numbers = [phase.number for phase in block.phases]
+    durations = [plan.motion.duration for plan in block.plans]
+    if block.chain is None:
+        yield TimeBound(tuple(numbers), sum(durations), None, None, OVER_TIME)
+        return
+    # The chain of a link of a route has numbers of its own: its phases are told by their order.
+    first = 0
+    for part in block.chain.split():
+        own = slice(first, first := first + len(part.phases))
+        phases, duration = tuple(numbers[own]), sum(durations[own])
+        found = bound_least_time(part.continuous_curves, epsilon)
+        if found is None:
+            yield TimeBound(phases, duration, None, None, NO_MOTION)
+        else:
+            yield TimeBound(phases, duration, *found)

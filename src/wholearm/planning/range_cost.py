@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..mechanics.metric import measure_speed
+from ..mechanics.dynamics import measure_speed
 from ..mechanics.wedging import SURE
 from ..problem.uncertainty import PARAMETERS
 from ..results.plan_record import RangeFigures

@@ -12,11 +12,10 @@ from ..common.errors import JammingError, ReplayError, SimulationError
 from ..common.files import write_text
 from ..problem.definition import Problem
 from ..results.report import Report
-from ..results.torque_table import ERROR, format_rows, place_rows, read_rows, sample_rows
+from ..results.torque import ERROR, format_rows, place_rows, read_rows, sample_rows
 from ..results.trajectory import Trajectory
-from ..verification.margins import describe_motors, find_commands
 from ..verification.verdict import Allowance, find_least_force
-from ..verification.verify import judge, observe
+from ..verification.verify import describe_motors, find_commands, judge, observe
 
 FINER = 8.0  # divisor of the error of the rows of a table when its replay does not hold
 ATTEMPTS = 3  # most tables that are tried

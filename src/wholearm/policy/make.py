@@ -15,9 +15,8 @@ from ..contacts.formation import Formation
 from ..geometry.curve import Curve
 from ..geometry.tracing import runs_on_curve
 from ..mechanics.arrival import Standstill, find_hold
-from ..mechanics.dynamics import Directions, force_rows, inverse
+from ..mechanics.dynamics import Directions, force_rows, inverse, metric_weights
 from ..mechanics.limits import PRESS, TORQUE, SideTerms, make_limits
-from ..mechanics.metric import metric_weights
 from ..problem.definition import ROWS, End, Phase, Problem
 from ..problem.uncertainty import PARAMETERS
 from ..results.adopt import Moved, adopt_motion

@@ -16,16 +16,19 @@ from ..geometry.curve import Curve
 from ..mechanics.dynamics import Directions, inverse
 from ..mechanics.limits import CONE, PRESS, make_limits
 from ..scene.model import Scene
-from .corners import Corners, Motion, find_corners, list_scenes
 from .curve_rows import (
     LATE,
     LEAST,
     NEAR,
     NEVER,
     SPARE,
+    Corners,
     CurveLimitRows,
+    Motion,
     blend_directions,
+    find_corners,
     find_internal_force,
+    list_scenes,
 )
 from .retiming import Reach, retime
 

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from ..common.arrays import Array
 from ..geometry.curve import Curve
 from ..geometry.tracing import trace_phase
-from ..mechanics.dynamics import inverse
+from ..mechanics.dynamics import inverse, metric_weights
 from ..mechanics.limits import CONE, PRESS, make_limits
-from ..mechanics.metric import metric_weights
 from ..problem.definition import End, Phase, Problem
 from ..results.trajectory import Trajectory
 from .curve_rows import (

@@ -17,8 +17,7 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.batch import Batch
 from ..contacts.formation import Formation
-from ..mechanics.dynamics import Directions, PathForces, build_forward, inverse
-from ..mechanics.metric import metric_weights
+from ..mechanics.dynamics import Directions, PathForces, build_forward, inverse, metric_weights
 from ..problem.definition import Phase, Problem
 from ..results.trajectory import Trajectory
 

@@ -95,7 +95,7 @@ def save(what: Torques | Problem, path: str | os.PathLike[str]) -> None:
         return save_problem(what, path)
     torque, trajectory = narrow(what)
     if require_ending(path, ".npz", ".csv") == ".csv":
-        from .torque_table import format_rows, place_rows
+        from .torque import format_rows, place_rows
 
         write_text(path, format_rows(place_rows(torque)))
     elif trajectory is None:

@@ -172,7 +172,7 @@ class Trajectory(Drawn):
         ------
         InputError  if the file cannot be written
         """
-        from .torque_table import format_rows, place_rows
+        from .torque import format_rows, place_rows
 
         require_ending(path, ".csv")
         write_text(path, format_rows(place_rows(self.torque)))

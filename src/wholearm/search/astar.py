@@ -17,11 +17,9 @@ from typing import NamedTuple
 
 from ..common.signals import beat
 from ..problem.goal import Goal
-from .chains import Chain
 from .edges import Blocked, BorderEdge, Link
-from .goals import is_at, measure_turn
-from .places import Key, RoadmapPlace
-from .roadmap import Ahead, Roadmap
+from .places import Key, RoadmapPlace, is_at, measure_turn
+from .roadmap import Ahead, Chain, Roadmap
 
 CROSSING = 1.0  # heuristic least time of a motion through a cell, over the scene's time
 OFTEN = 2  # expansions of one place, on different routes

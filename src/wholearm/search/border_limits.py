@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from ..common.arrays import Array
 from ..contacts.formation import Kinematics
 from ..geometry.curve import Curve, CurvePoint, describe_pose
-from ..mechanics.dynamics import Directions, reduced_inertia
-from ..mechanics.metric import metric_weights
+from ..mechanics.dynamics import Directions, metric_weights, reduced_inertia
 from ..mechanics.uniqueness import find_minors
 from ..planning.lower_bound.path_terms import PathTerms
 from ..planning.lower_bound.rows import PathLimitRows, limit_along

@@ -17,7 +17,7 @@ from ..planning.advice import bracket
 from ..planning.path_domain.path_explain import change_curve, list_frictions
 from .astar import RoadmapRoute, RouteSearch
 from .edges import Blocked, BorderEdge, Link, cut_curve, link_along
-from .goals import measure_along
+from .places import measure_along
 
 CUT = 16  # Most borders that are looked at with other numbers, those nearest to the goal
 FARTHEST = 10.0  # Most times that a number is made larger or smaller; friction may go to zero

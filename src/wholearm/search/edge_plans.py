@@ -33,7 +33,7 @@ from ..planning.result import Plan
 from ..planning.stops import end_of, split_blocks
 from ..problem.definition import ROWS, End, Phase, Problem
 from ..scene.model import Scene
-from ..solvers.statistics import SolverStatistics, open_ledger
+from ..solvers.ipopt import SolverStatistics, open_ledger
 from .candidates import Lost
 from .edges import EdgeStep, Link, describe_steps, find_headings, point_out
 from .feasibility import SINGULAR, Measured, make_phases

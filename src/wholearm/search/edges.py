@@ -15,7 +15,7 @@ from ..contacts.formation import Formation
 from ..geometry.arcs import find_on, join, take
 from ..geometry.curve import Curve
 from ..geometry.tracing import HELD, trace_curve
-from ..mechanics.metric import metric_weights
+from ..mechanics.dynamics import metric_weights
 from ..planning.lower_bound.lower_bound import bound_least_time, bound_roughly
 from ..planning.lower_bound.rows import PathLimitRows, evaluate_rows
 from ..problem.definition import End, Until

@@ -13,7 +13,7 @@ from ..contacts.formation import Formation
 from ..geometry.explore import STILL
 from ..geometry.path_guess import find_end
 from ..geometry.tracing import trace_phase
-from ..mechanics.metric import metric_weights
+from ..mechanics.dynamics import metric_weights
 from ..planning.lower_bound.lower_bound import look_along
 from ..planning.lower_bound.speed_sweep import NoMotionError
 from ..planning.options import Objective, PlanOptions

@@ -43,8 +43,7 @@ from .astar import EAGER, RoadmapRoute, RouteSearch
 from .cuts import Opening, list_cut_borders, list_openings, pass_cut
 from .edges import Blocked, point_out
 from .feasibility import ROUGH, SINGULAR
-from .goals import is_at
-from .places import make_place
+from .places import is_at, make_place
 from .result import Alternative, Answer, describe_block
 from .roadmap import Roadmap
 from .route_choice import NEARBY, Chooser

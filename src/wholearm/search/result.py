@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import heapq
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from itertools import count
+from typing import Any, NamedTuple
 
 from ..common.document import Document, Result, Table
+from ..common.signals import beat
 from ..contacts.formation import describe
 from ..mapping.legs import format_until
 from ..planning.options import Objective
 from ..planning.result import Plan
 from ..problem.definition import End, Problem
 from .astar import EAGER, RoadmapRoute, RouteSearch
-from .bounds import BorderBound
 from .candidates import FailedCandidate
-from .chains import LONGEST
 from .cuts import list_cut
-from .edges import Blocked, describe_steps
+from .edges import ROUGHLY, Blocked, Link, describe_steps
+from .places import Key, RoadmapPlace, is_at
+from .roadmap import LONGEST
 
+MOST = 240  # Most places that are settled to bound routes from below
 LISTED, FAILED = 2, 1  # most reasons in a message, and most of routes without a plan
 NOT_CONSIDERED = (
     "not considered: rolling contacts, formations without the palm or without one of the fingers, "
@@ -179,3 +184,58 @@ def describe_block(
 
 def _describe_border(blocked: Blocked) -> str:
     return f"{describe_steps(blocked.steps)} from {blocked.start}"
+
+
+class BorderBound(NamedTuple):
+    """A lower bound of the duration of routes along borders.
+
+    They stop where borders meet, or pass through by a plastic impact that is possible.
+    """
+
+    value: float  # [s]: no such route takes less
+    # whether it is that of a route, or larger than what was asked for; otherwise more would have
+    # had to be looked at
+    complete: bool
+
+    def up_to(self, enough: float) -> BorderBound:
+        """The bound, at most `enough` [s]."""
+        return self if self.value < enough else BorderBound(enough, True)
+
+
+def bound_borders(search: RouteSearch, enough: float = math.inf) -> BorderBound:
+    """Bound every route along borders from below, up to `enough` [s]."""
+    refined, links_from = set[Link](), dict[Key, list[Link]]()
+    while True:
+        bound, links = _find_shortest(search, enough, refined, links_from)
+        if refined.issuperset(links):
+            return bound
+        refined.update(links)
+
+
+def _find_shortest(
+    search: RouteSearch, enough: float, refined: set[Link], links_from: dict[Key, list[Link]]
+) -> tuple[BorderBound, tuple[Link, ...]]:
+    """The shortest route along borders by bounds of its links, and these; none from `enough` on."""
+    order, settled = count(), set[Key]()
+    queue: list[tuple[float, int, RoadmapPlace, tuple[Link, ...]]] = [
+        (0.0, next(order), search.start, ())
+    ]
+    while queue:
+        beat()
+        cost, _, place, links = heapq.heappop(queue)
+        if cost >= enough:
+            return BorderBound(enough, True), ()
+        if is_at(place, search.goal):
+            return BorderBound(cost, True), links
+        if place.key in settled:
+            continue
+        if len(settled) >= MOST:
+            return BorderBound(cost, False), ()
+        settled.add(place.key)
+        if place.key not in links_from:
+            pairs = search.roadmap.list_along(place, search.goal)
+            links_from[place.key] = [link for _, link in pairs if isinstance(link, Link)]
+        for link in links_from[place.key]:
+            bound = link.fine_bound if link in refined else ROUGHLY * link.bound
+            heapq.heappush(queue, (cost + bound, next(order), link.stop, (*links, link)))
+    return BorderBound(enough, True), ()

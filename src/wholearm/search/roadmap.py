@@ -7,7 +7,7 @@ share it. Links through cells follow rays, straight lines in (x, phi), to the co
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -22,13 +22,14 @@ from ..contacts.formation import Formation
 from ..geometry.curve import Curve
 from ..geometry.explore import close_contacts, is_inside
 from ..mapping.borders import NOWHERE, label_cells
+from ..mechanics.dynamics import metric_weights
+from ..planning.path_domain.impact_sequence import BEND, compute_curve_impact
 from ..planning.result import Plan
-from ..problem.definition import End, Problem, Until
+from ..problem.definition import End, Phase, Problem, Until
 from ..problem.goal import Goal
 from ..scene.model import Scene
 from .border_limits import Unstopped
 from .cell_paths import MIDDLES, can_start, list_middles, time_paths
-from .chains import LONGEST, Chain
 from .edges import (
     Blocked,
     BorderEdge,
@@ -37,18 +38,30 @@ from .edges import (
     Terms,
     cut_curve,
     follow_borders,
+    link_along,
     link_border,
     point_out,
     time_parts,
 )
 from .feasibility import Measured
-from .goals import is_flush, list_pins, list_poses, measure_along
-from .places import Key, RoadmapPlace, close_place, list_formations_at, make_place, unit_steps
+from .places import (
+    Key,
+    RoadmapPlace,
+    close_place,
+    is_flush,
+    list_formations_at,
+    list_pins,
+    list_poses,
+    make_place,
+    measure_along,
+    unit_steps,
+)
 
 if TYPE_CHECKING:
     from .edge_plans import PlannedLink
 
 
+LONGEST = 6  # Most borders that are passed in one go
 AROUND = 64
 """Grid places per turn of phi; steps of x in radii of gyration are the same."""
 HEADINGS = 36  # directions of rays from a place
@@ -519,3 +532,56 @@ def map_labels(scene: Scene) -> LabelMap:
     labels = label_cells(scene, np.repeat(x, len(phi)), np.tile(phi, len(x)))[:, [0, 2, 4]]
     every, which = np.unique(labels, axis=0, return_inverse=True)
     return LabelMap(float(least), steps, every, which.reshape(len(x), len(phi)))
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """Borders that are followed to their ends in motion, and one after them."""
+
+    steps: tuple[EdgeStep, ...]  # phases along those that are followed whole
+    borders: tuple[BorderEdge, ...]  # these, and the last one
+    ratios: tuple[float, ...]  # speed ratios of all borders: the speed is continuous
+
+    @classmethod
+    def of(cls, border: BorderEdge) -> Chain:
+        """A chain of one border."""
+        return cls((), (border,), (1.0,))
+
+    def can_enter(self, formation: Formation) -> bool:
+        """Whether a formation keeps the gained contact and has no others that are new."""
+        last = self.borders[-1]
+        contacts, held = set(formation.contacts), set(last.formation.contacts)
+        return last.gained in contacts and contacts <= {*held, last.gained}
+
+    def extend(self, following: BorderEdge) -> Chain | None:
+        """The chain with another border entered in motion; None if impossible."""
+        last, gained = self.borders[-1], self.borders[-1].gained
+        if not self.can_enter(following.formation):
+            return None
+        (v,) = last.curve.interpolate(np.array([last.curve.length]))[1]
+        (heading,) = following.curve.interpolate(np.zeros(1))[1]
+        continues = v * metric_weights(last.formation.scene) @ heading > 1 - 2 * BEND
+        ends = (End.SMOOTH, End.IMPACT) if continues else (End.IMPACT,)
+        for end in ends:
+            phase = Phase(0, last.formation, Until(contact=gained), end)
+            join = compute_curve_impact(phase, last.curve, following.curve)
+            if join.possible and np.isfinite(join.ratio):
+                return Chain(
+                    (*self.steps, EdgeStep(last.formation.contacts, phase.until, end)),
+                    (*self.borders, following),
+                    (*self.ratios, self.ratios[-1] * join.ratio),
+                )
+        return None
+
+    def link(self, step: EdgeStep, last: BorderEdge) -> Link | Blocked:
+        """The link along the chain, at rest at the end of the last border or of a part of it."""
+        borders, steps = (*self.borders[:-1], last), (*self.steps, step)
+        return link_along(borders, self.ratios, steps, last.stop)
+
+    def link_whole(self) -> Link | Blocked | None:
+        """The link along all of it; None where the last border ends at an obstacle."""
+        last = self.borders[-1]
+        if last.gained is None:
+            return None
+        step = EdgeStep(last.formation.contacts, Until(contact=last.gained))
+        return self.link(step, last)

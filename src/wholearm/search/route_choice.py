@@ -12,12 +12,12 @@ from ..planning.rate_limits import free_torques
 from ..planning.result import Plan
 from ..problem.definition import Problem
 from .astar import CAREFUL, EAGER, RoadmapRoute, RouteSearch, SearchRule
-from .bounds import BorderBound, bound_borders
 from .candidates import FailedCandidate, Lost, plan_phases
 from .edge_plans import BackgroundTask, can_join, join_route
 from .edges import Link, describe_steps
 from .feasibility import Measured
 from .refinement import EdgeRefiner
+from .result import BorderBound, bound_borders
 
 FASTER = 0.7  # least ratio of planned to straight-path durations through cells; by experience
 TRIED = 6  # most routes without a plan, beyond those asked for

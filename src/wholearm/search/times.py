@@ -11,9 +11,8 @@ from ..contacts.closing import contact_table, evaluate_each, group_alike
 from ..contacts.formation import Kinematics
 from ..geometry.curve import solve_tangent
 from ..mapping.formation_map import Border
-from ..mechanics.dynamics import Directions, inverse, reduced_inertia
+from ..mechanics.dynamics import Directions, inverse, metric_weights, reduced_inertia
 from ..mechanics.limits import make_limits
-from ..mechanics.metric import metric_weights
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN, find_minors
 from ..planning.lower_bound.rows import PathLimitRows, limit
 from ..problem.definition import Problem

@@ -23,8 +23,7 @@ import numpy as np
 from ..common.arrays import Array
 from ..contacts.formation import Formation, Kinematics
 from ..geometry.curve import CurvePoint
-from ..mechanics.dynamics import Directions, PathForces, force_rows
-from ..mechanics.metric import metric_weights
+from ..mechanics.dynamics import Directions, PathForces, force_rows, metric_weights
 from ..results.trajectory import Samples
 
 COUNT = 5  # number of coefficients: of 1, a, b, the internal force and s'

@@ -10,10 +10,9 @@ import numpy as np
 
 from ..problem.definition import End
 from .events import EventKind, Outcome
-from .replay import Replay
 from .root_finding import find_first
 from .sliding_signs import choose_mode, note_change
-from .stepper import ModeStepper
+from .stepper import ModeStepper, Replay
 from .tolerances import REACHED, SETTLING, SLOW, is_slower, measure_units
 
 _FAR = 100.0  # speed over its change at which nothing reverses: lever arms are below that

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ..common.arrays import Array
-from .replay import Replay
+from .stepper import Replay
 
 
 def find_first(run: Replay, start: Array, h: float, among: range | None = None) -> list[int]:

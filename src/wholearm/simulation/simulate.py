@@ -57,12 +57,11 @@ from .jumps import (
     turn,
 )
 from .modes import find_fixed, find_grips, list_units, share_mode
-from .replay import Replay
 from .root_finding import find_first
 from .runge_kutta import ORDER
 from .sliding_signs import measure_rates
 from .start_modes import StartDeparture
-from .stepper import ModeStepper, open_limits
+from .stepper import ModeStepper, Replay, open_limits
 from .sticking import Collapse, Rest, balances, close_contacts, find_rest
 from .tolerances import (
     CREEPING,

@@ -30,7 +30,7 @@ from ..scene.model import Scene
 from .events import EventKind
 from .layout import evaluate_piece
 from .modes import Mode, ModeRows, Response, Unit, find_fixed, find_grips, list_units, respond
-from .replay import Replay
+from .stepper import Replay
 from .tolerances import STANDING, is_slower
 
 CLEAR = 1e-8  # least margin of a clear decision, over the scene's units

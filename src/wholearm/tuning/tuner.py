@@ -20,11 +20,20 @@ from ..common.sharing import exclusive
 from ..problem.check import require_phases
 from ..problem.definition import End, Phase, Problem, Until
 from ..quasistatic.slow_speeds import SQUEEZE, find_torques, sample_path
-from ..results.torque_table import read_rows
+from ..results.torque import read_rows
 from ..simulation.tolerances import REST_WINDOW
 from ..verification.free import verify_free
-from .result import PhaseTuning, Tuning
-from .trial import Bench, Passage, TrialOutcome, TuningStep, TuningTrial, make_rows, split_passages
+from .trial import (
+    Bench,
+    Passage,
+    PhaseTuning,
+    TrialOutcome,
+    Tuning,
+    TuningStep,
+    TuningTrial,
+    make_rows,
+    split_passages,
+)
 
 FACTOR = 1.1
 """What raises a torque by 10 %; lowering divides by it, so that each torque comes again."""

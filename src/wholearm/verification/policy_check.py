@@ -14,8 +14,7 @@ from ..problem.definition import Phase, Problem
 from ..results.adopt import Moved, adopt_motion
 from ..results.trajectory import Trajectory
 from ..simulation.events import OutcomeKind
-from .free import describe_losses, find_losses, measure_end, warn
-from .free_report import FreePhase, FreeReport
+from .free import FreePhase, FreeReport, describe_losses, find_losses, measure_end, warn
 from .verdict import DEPARTURE
 
 REACHED, TURNED = 0.03, math.radians(1.0)

@@ -25,8 +25,8 @@ from ..simulation.modes import find_grips, list_units, respond, share_mode
 from ..simulation.sliding_signs import evaluate_rows, measure_rates
 from ..simulation.start_modes import StartMode
 from ..simulation.sticking import find_rest
-from .margins import find_lowest
 from .verdict import Allowance
+from .verify import find_lowest
 
 KEPT = 1e-9  # shortfall of a limit that counts as none, over the scale of it
 FLAT = 1e-9

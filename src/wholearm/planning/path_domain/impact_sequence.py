@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...geometry.curve import Curve
+from ...mechanics.dynamics import metric_weights
 from ...mechanics.impact import Impact, compute_impact
-from ...mechanics.metric import metric_weights
 from ...problem.definition import End, Phase
 from ..impacts import PER_SPEED
 

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from ...common.arrays import Array, Expression
 from ...common.shortfalls import Parameter
 from ...mechanics.limits import LimitSet
-from ...solvers.ipopt import build_solver
-from ...solvers.statistics import SolverStatistics, book
+from ...solvers.ipopt import SolverStatistics, book, build_solver
 from ..options import Objective
 from .elements import Grid, Profile, follow
 from .path_data import PhaseData

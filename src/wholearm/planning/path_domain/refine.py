@@ -35,7 +35,7 @@ from .path_data import PhaseData, cut
 from .path_mesh import MOST, SHIFTED, SLOW_MOST, Mesh, adapt
 from .path_motion import PathMotion
 from .path_nlp import PathNLP, Tightening, Units, make_bounds, pack, parameters, unpack
-from .rate_switches import find_rate_switches, ramp_up
+from .rate_terms import find_rate_switches, ramp_up
 from .speed_profile import Fastest, find_fastest
 from .task import EARLY, Task
 from .terms import LEAST_B

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from ...common.arrays import Array
 from ...contacts.formation import Formation
 from ...geometry.curve import Curve
-from ...mechanics.metric import measure_speed
+from ...mechanics.dynamics import measure_speed
 from ...problem.definition import End
 from ...results.trajectory import Motion
-from ...solvers.statistics import charge
+from ...solvers.ipopt import charge
 from ..impacts import BlockImpact
 from ..options import PlanOptions
 from ..phase_plan import PhasePlan

@@ -17,7 +17,7 @@ from ..lower_bound.rows import PathLimitRows
 from ..lower_bound.speed_sweep import NoMotionError, SweepMode, add_up
 from ..lower_bound.speed_sweep import find_fastest as sweep
 from .path_data import PhaseData
-from .switches import Samples, Switch
+from .path_mesh import LimitSamples, Switch
 
 # Distance of s'' from its largest, over the range that limits allow.
 _SHARES = {SweepMode.PUSH: 0.0, SweepMode.SWITCH: 0.0, SweepMode.BRAKE: 1.0, SweepMode.HELD: 0.5}
@@ -64,13 +64,13 @@ def find_fastest(data: PhaseData, duration: float | None) -> Fastest | Narrow | 
 
     None if there is no motion.
     """
-    samples, margin = Samples.of(data, 0.0), 0.0
+    samples, margin = LimitSamples.of(data, 0.0), 0.0
     try:
         if duration is not None:
             largest = _find_margin(data, samples, duration)
             if largest is None or isinstance(largest, Narrow):
                 return largest
-            samples, margin = Samples.of(data, largest), largest
+            samples, margin = LimitSamples.of(data, largest), largest
         return _find_at(samples, margin)
     except NoMotionError:
         return None
@@ -78,7 +78,7 @@ def find_fastest(data: PhaseData, duration: float | None) -> Fastest | Narrow | 
 
 def is_hopeless(data: PhaseData, spared: Parameter | None = None) -> bool:
     """Whether no motion keeps slightly relaxed limits, without those of a `spared` parameter."""
-    samples, free = Samples.of(data, 0.0), np.zeros(len(data.spans), dtype=bool)
+    samples, free = LimitSamples.of(data, 0.0), np.zeros(len(data.spans), dtype=bool)
     if spared is not None:
         free = data.limits.weigh(spared)[data.limits.sides[0]] > 0
     cap = np.inf if spared is not None and spared.is_speed else 1 + _WIDER
@@ -96,7 +96,7 @@ def is_hopeless(data: PhaseData, spared: Parameter | None = None) -> bool:
     return False
 
 
-def _find_at(samples: Samples, margin: float) -> Fastest:
+def _find_at(samples: LimitSamples, margin: float) -> Fastest:
     s, b, modes, b_middle = _sweep(samples, samples.rows, 1, None)
     steps, middle = np.diff(s), samples.rows.pick(slice(1, None, 2))
     pushed, braked = (middle.extreme(b_middle, largest).a for largest in (True, False))
@@ -115,7 +115,7 @@ def _find_at(samples: Samples, margin: float) -> Fastest:
 
 
 def _sweep(
-    samples: Samples, rows: PathLimitRows, stride: int, b_guess: Array | None
+    samples: LimitSamples, rows: PathLimitRows, stride: int, b_guess: Array | None
 ) -> tuple[Array, Array, NDArray[np.int64], Array]:
     """Sweep with the middle of an interval every `2 stride` places, for limits `rows` there.
 
@@ -135,10 +135,10 @@ def _sweep(
     return s, motion.b, motion.modes, (1 - part) * motion.b[:-1] + part * motion.b[1:]
 
 
-def _find_margin(data: PhaseData, samples: Samples, duration: float) -> float | Narrow | None:
+def _find_margin(data: PhaseData, samples: LimitSamples, duration: float) -> float | Narrow | None:
     """The margin [N] with which the minimum time is a duration [s]: Illinois false position."""
     force, rows = data.curve.formation.scene.scales.force, samples.rows
-    rate = (Samples.of(data, force).rows.one - rows.one) / force
+    rate = (LimitSamples.of(data, force).rows.one - rows.one) / force
 
     def evaluate(margin: float, stride: int, b_guess: Array | None) -> tuple[float, Array]:
         """Relative excess of the squared mean speed, nearly linear in the margin, and b."""

@@ -18,10 +18,9 @@ from ..options import Objective, PlanOptions
 from ..robust.robust_rows import Guide, RobustLimits, spread
 from .elements import DEGREE
 from .path_data import PhaseData, join, prepare
-from .path_mesh import SOFT, START, Mesh, find_ends
+from .path_mesh import SOFT, START, Mesh, Switch, find_ends
 from .path_nlp import PathNLP, build_path_nlp
 from .rate_terms import UNLIMITED, MotorShape
-from .switches import Switch
 from .terms import LimitShape
 from .unique_start import SureStart
 from .violations import MISS

@@ -18,7 +18,7 @@ import numpy as np
 from ...common.arrays import Array
 from ...common.errors import WholearmError
 from ...contacts.elemental import Contact
-from ...geometry.cost_to_go import CostToGo
+from ...geometry.arcs import CostToGo
 from ...geometry.curve import find_tied
 from ...geometry.path_guess import find_end
 from ...problem.definition import Phase, Problem

@@ -9,9 +9,8 @@ import numpy as np
 from ...common.arrays import Array
 from ...geometry.curve import find_tied, tangent_basis
 from . import stage_kernels as kernels
-from .assembly import Indices
 from .collocation import Scheme, blend
-from .nlp_layout import MARGIN, NlpRows, StageLayout, V, Z
+from .nlp_layout import MARGIN, Indices, NlpRows, StageLayout, V, Z
 from .stage import Stage
 from .time_limits import LimitRows, Target, add_limits
 from .time_rate_limits import MotorRows, add_motors, join_motors

@@ -18,12 +18,11 @@ from ...contacts.formation import Formation
 from ...geometry.curve import find_tied, tangent_basis
 from ...geometry.explore import close_contacts, is_inside
 from ...geometry.path_guess import PathGuess, connect, guess_phase, list_ends
-from ...mechanics.dynamics import Directions, force_rows
+from ...mechanics.dynamics import Directions, force_rows, metric_weights
 from ...mechanics.limits import CONE, PRESS, TORQUE
-from ...mechanics.metric import metric_weights
 from ...problem.definition import Phase, Problem
 from .resting import list_headings
-from .units import in_own_units, scale_state, unit_lengths
+from .stage import in_own_units, scale_state, unit_lengths
 
 FASTEST = 9.0  # largest squared speed, over gravity times the radius of gyration
 BRISK = 0.5  # share of a positive margin that the speed profile keeps

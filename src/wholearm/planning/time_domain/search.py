@@ -11,20 +11,18 @@ import numpy as np
 
 from ...common.arrays import Array
 from ...common.shortfalls import Parameter
-from ...geometry.cost_to_go import CostToGo
+from ...geometry.arcs import CostToGo
 from ...problem.definition import Problem
 from ..options import Objective, PlanOptions
 from ..phase_plan import Tried
-from .assembly import Indices
 from .collocation import Scheme, make_scheme
 from .equations import StageRows
 from .intersample import IntersampleLimits, raise_bounds
-from .nlp_layout import MARGIN, pack, unpack
-from .stage import Stage
+from .nlp_layout import MARGIN, Indices, pack, unpack
+from .stage import Stage, in_own_units, scale_options, unit_lengths, unit_of
 from .time_limits import Target
 from .time_mesh import adopt, monitor_violated, with_controls
 from .time_nlp import TimeNLP, bound_unknowns, build_time_nlp
-from .units import in_own_units, scale_options, unit_lengths, unit_of
 
 FIRST_SIZE = 1e-2  # multipliers of a first guess
 Multipliers = dict[str, Array]  # of the unknowns' bounds, `lam_x0`, and of the rows, `lam_g0`

@@ -20,8 +20,8 @@ from ...contacts.formation import Formation
 from ...mechanics.dynamics import build_force_rows
 from ...problem.definition import Until
 from ..columns import Columns, Symbols
-from .assembly import Kernel, build_kernel
 from .collocation import Scheme, make_scheme
+from .nlp_layout import Kernel, build_kernel
 
 _K = TypeVar("_K")
 _NOTHING = Columns().make_symbols()

@@ -14,9 +14,8 @@ from ...mechanics.dynamics import Directions, force_rows
 from ...problem.definition import End, Phase, Problem
 from .collocation import Scheme
 from .initial_path import PacedWay, PathSpeed
-from .stage import Stage, StagePoints
+from .stage import Stage, StagePoints, in_own_units, scale_state
 from .stage_modes import LEAST_INTERVALS, link
-from .units import in_own_units, scale_state
 
 PRESS = 0.5  # normal forces of an initial guess, over the weight of the object
 _NEAR = 0.02  # distance over the radius of gyration at which a limit is monitored from the start

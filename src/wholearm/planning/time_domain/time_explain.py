@@ -21,9 +21,8 @@ from ..stops import runs_along_curves
 from .collocation import Scheme, blend
 from .initial_path import PacedWay
 from .search import TimeSearch
-from .stage import Stage, StagePoints
+from .stage import Stage, StagePoints, to_si
 from .time_motion import make_phase_motions
-from .units import to_si
 
 MISSED = 0.02  # least margin by which limits are missed along an infeasible path
 MET = 0.98  # share of a limit above which it is active

@@ -14,9 +14,9 @@ import numpy as np
 
 from ...common.arrays import Array
 from ...common.errors import InfeasibleError, SolverError
-from ...geometry.cost_to_go import CostToGo
+from ...geometry.arcs import CostToGo
+from ...mechanics.dynamics import measure_speed
 from ...mechanics.impact import Impact, compute_impact
-from ...mechanics.metric import measure_speed
 from ...problem.definition import End, Phase, Problem
 from ...results.trajectory import Motion
 from ..impacts import PER_SPEED, BlockImpact

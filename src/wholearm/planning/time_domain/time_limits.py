@@ -12,9 +12,8 @@ from ...common.arrays import Array
 from ...common.shortfalls import Parameter
 from ...mechanics.limits import PRESS, SPEED, LimitSet, make_limits
 from ..options import Objective
-from .assembly import Indices
 from .collocation import Scheme, blend
-from .nlp_layout import MARGIN, NlpRows, StageLayout
+from .nlp_layout import MARGIN, Indices, NlpRows, StageLayout
 from .stage import Stage
 
 _WITHIN = np.array([0.3, 0.4, 0.5, 0.75, 0.85, 0.93])

@@ -14,8 +14,7 @@ from ...common.batch import Batch
 from ...common.sharing import Store
 from ...contacts.elemental import Contact
 from ...contacts.formation import Formation
-from ...mechanics.dynamics import Directions, build_forward, split_forces
-from ...mechanics.metric import metric_weights
+from ...mechanics.dynamics import Directions, build_forward, metric_weights, split_forces
 from ...problem.definition import Phase
 from ...results.plan_record import ROLLS, ModeSpan
 from ...results.torque import TorqueProfile

@@ -31,14 +31,23 @@ import numpy as np
 
 from ...common.arrays import Array, Expression
 from ...geometry.curve import tangent_basis
-from ...solvers.ipopt import build_solver
-from ...solvers.statistics import SolverStatistics, book
+from ...solvers.ipopt import SolverStatistics, book, build_solver
 from ..columns import Columns
 from ..options import Objective
-from .assembly import Assembled, Indices, assemble_nlp
 from .collocation import Scheme
 from .equations import StageRows, add_stage, find_still, join_stages, least_senses
-from .nlp_layout import MARGIN, STATE, NlpRows, StageLayout, V, Z, lay_out
+from .nlp_layout import (
+    MARGIN,
+    STATE,
+    Assembled,
+    Indices,
+    NlpRows,
+    StageLayout,
+    V,
+    Z,
+    assemble_nlp,
+    lay_out,
+)
 from .stage import Stage
 from .stage_kernels import NamedKernel, bend_kernel, effort_kernel, name_kernel
 from .time_limits import Target, bound_by_limits

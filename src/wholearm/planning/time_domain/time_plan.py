@@ -18,7 +18,7 @@ import numpy as np
 
 from ...common.arrays import Array
 from ...common.errors import InfeasibleError, InputError, SolverError
-from ...geometry.cost_to_go import CostToGo
+from ...geometry.arcs import CostToGo
 from ...geometry.curve import describe_pose
 from ...geometry.path_guess import find_end
 from ...mechanics.dynamics import Directions
@@ -34,11 +34,10 @@ from .attempts import FEW, NEAREST, Attempt, Attempts, solve_attempt
 from .intersample import CHECKS, MISS, CheckPlaces, IntersampleLimits, check_between, find_misses
 from .mode_search import improve
 from .search import TimeSearch, TimeSolution
-from .stage import Stage
+from .stage import Stage, in_own_units, to_si, unit_of
 from .stage_modes import LEAST_INTERVALS
 from .time_mesh import halve, resample
 from .time_motion import TimeMotion, make_motions, make_phase_motions
-from .units import in_own_units, to_si, unit_of
 
 if TYPE_CHECKING:
     from .time_explain import Replan

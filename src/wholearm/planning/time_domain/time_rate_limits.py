@@ -26,9 +26,8 @@ from ...contacts.formation import Formation
 from ...mechanics.dynamics import build_force_rows
 from ...mechanics.limits import CONE, PRESS, LimitSet
 from ..columns import Columns
-from .assembly import Indices
 from .collocation import Scheme
-from .nlp_layout import NlpRows, StageLayout, Z
+from .nlp_layout import Indices, NlpRows, StageLayout, Z
 from .stage import Stage
 from .stage_kernels import NamedKernel, name_kernel, opening_kernel, share
 
