@@ -95,7 +95,9 @@ def _find_corners(E: Array, joints: Array, load: Array) -> Array:
     """Torques of the basic solutions of E^T e = -load with e >= 0, shape (m, 2)."""
     chosen = _choose(len(E), 3)
     matrix = E[chosen].transpose(0, 2, 1)
-    regular = np.abs(np.linalg.det(matrix)) > _TINY
+    # Elimination of a singular matrix may divide by zero; its determinant is zero, or not a number.
+    with np.errstate(all="ignore"):
+        regular = np.abs(np.linalg.det(matrix)) > _TINY
     matrix, chosen = matrix[regular], chosen[regular]
     amounts = np.linalg.solve(matrix, np.broadcast_to(-load[:, None], (len(matrix), 3, 1)))[..., 0]
     held = (amounts >= -_TINY).all(axis=1)
