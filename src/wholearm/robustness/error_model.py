@@ -80,17 +80,7 @@ class Uncertainty:
 
 
 def change_problem(problem: Problem, changes: Mapping[str, float]) -> Problem:
-    """The problem in a scene whose numbers are off; its start is left as it is.
-
-    Parameters
-    ----------
-    changes  by name of the parameter: relative, or in the parameter's unit. Those of torques and of
-             the start do nothing here.
-
-    Raises
-    ------
-    InputError  if a number makes no sense any more
-    """
+    """The problem in the scene that `change_scene` makes; its start is left as it is."""
     return replace(problem, scene=change_scene(problem.scene, changes))
 
 
