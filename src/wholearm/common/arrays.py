@@ -1,4 +1,4 @@
-"""Types of arrays and expressions; quadrature nodes, and minima of sampled functions."""
+"""Types of arrays and expressions; runs of flags, quadrature nodes, minima of samples."""
 
 from __future__ import annotations
 
@@ -20,6 +20,13 @@ def sort_unique(values: Array) -> Array:
     """
     ordered = np.sort(values, axis=None)
     return ordered[np.diff(ordered, prepend=-np.inf) > 0]
+
+
+def find_runs(flags: NDArray[np.bool_], least: int = 1) -> list[slice]:
+    """Runs of True in flags, shape (n,), of `least` places or more."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]]))).tolist()
+    pairs = zip(edges[::2], edges[1::2], strict=True)
+    return [slice(first, stop) for first, stop in pairs if stop - first >= least]
 
 
 def jacobi_nodes(count: int, alpha: int = 0, beta: int = 0) -> Array:

@@ -1,60 +1,65 @@
-"""The contact-formation map as a figure; nothing is shown and no global state is touched."""
+"""The contact-formation map as a figure; nothing is shown and no global state is touched.
+
+In its SVG what can be clicked in a page has the id ``place-k``: parts of cells in the order of
+`split`, then borders with an edge flush, then crossings.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
+from itertools import count
 from typing import Any
 
 import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import ListedColormap
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
+from matplotlib.patches import Patch, PathPatch
+from matplotlib.path import Path
 from matplotlib.patheffects import withStroke
 
-from ..common.arrays import Array
+from ..common.arrays import Array, find_runs
 from ..common.sharing import exclusive
-from ..contacts.closing import Flags
+from ..contacts.closing import Flags, Numbers
+from ..contacts.elemental import Contact
 from ..mapping.formation_list import trace_problem
-from ..mapping.formation_map import CROSSED, Border, FormationMap
+from ..mapping.formation_map import CROSSED, FormationMap
 from ..results.adopt import Moved, adopt_motion
 from ..results.trajectory import Trajectory
-from .map_lines import (
-    AMBIGUOUS,
-    BACK,
-    CROSSED_LOOK,
-    FORTH,
-    FREE,
-    INK,
-    LINE,
-    LOST,
-    TINTS,
-    UNREACHED,
-    choose_tints,
-    find_middle,
-    find_room,
-    find_runs,
-    name_palm_lines,
-    place_discs,
-    place_heads,
-    shift,
-    shorten,
-    split,
-    trace_plan,
-)
-from .style import STYLE, write_title
+from .style import INK, STYLE, write, write_title
 
 SIZE = (11.0, 7.9)  # in
-_BOX = (0.75, 1.0, 9.4, 6.2)  # axes: left, bottom, width, height [in]
-_ASIDE = 2.6  # offset of directed lines from the border [points]
-_ARROW = 8.0  # length of the arrows inside cells [points]
-_DISC = 16.0  # room for the number of a phase [points]
-_LETTER, _HEIGHT = 4.4, 9.0  # size of a letter of a label [points]
+BOX = (0.75, 1.0, 9.4, 6.2)  # axes: left, bottom, width, height [in]
+PLACE = "place-"
+_LINE, _FREE, _AMBIGUOUS = "#9aa1ab", "#7a838f", "#AA3377"
+_WAYS: Any = (("#0072B2", 1.0, "forth"), ("#D55E00", -1.0, "back"))
+_LOST: Any = {"fc": "#ececec", "ec": "#b8b8b8", "hatch": "////", "lw": 0.0}
+_OVERLAP: Any = {"fc": "#f6e3ee", "ec": "#CC79A7", "hatch": "\\\\\\\\", "lw": 0.0}
+_UNREACHED = {
+    "finger 1 too short": -1,
+    "finger 2 too short": -2,
+    "joint 1 in or above the object": -3,
+    "joint 2 in or above the object": -4,
+    "fingers overlap": CROSSED,
+}
+"""What is written where nothing can be reached, and its code in `FormationMap.cell`."""
+_TINTS = ("#f3f6fb", "#fbf6ea", "#eef7f0", "#f9eff4", "#f4f1fb", "#eef6f8", "#f7f7ee")
+_PASSING: Any = {"lw": 0.7, "ls": (0, (1, 1.6))}
+_DOTTED: Any = {"lw": 2.2, "ls": (0, (1.5, 1.5))}
+_PLAN: Any = {"color": INK, "lw": 5.0, "alpha": 0.42, "solid_capstyle": "round"}
+# All that follow are in printer's points.
+_ASIDE = 2.6  # offset of directed lines from the border
+_SPACING = 42.0  # distance between arrow heads on a directed line
+_HEAD = np.array([[3.4, 0.0], [-2.6, 2.5], [-2.6, -2.5]])  # of directed lines
+_DISC = 16.0  # room for the number of a phase
+_LETTER, _HEIGHT = 4.4, 9.0  # size of a letter of a label
+_CLEAR = 8.0  # distance of labels from the plan
+_ARROW = np.array(
+    [[1.2, 0.5], [5.4, 0.5], [5.2, 2.0], [9.2, 0.0], [5.2, -2.0], [5.4, -0.5], [1.2, -0.5]]
+)  # inside cells, from the place on
 
 
 @exclusive
@@ -70,29 +75,20 @@ def draw_map(chart: FormationMap, plan: Trajectory | Moved | None = None) -> Fig
     -------
     Figure  with one axes: x [mm] and phi [deg]
     """
+    problem = chart.problem
+    path = None if plan is None else adopt_motion(problem, plan)[1]
+    paths = trace_problem(problem) if path is None else trace_plan(path)
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=SIZE)
         FigureCanvasAgg(figure)
-        left, bottom, width, height = _BOX
-        place: Any = (left / SIZE[0], bottom / SIZE[1], width / SIZE[0], height / SIZE[1])
-        axes = figure.add_axes(place)
-        x, phi = 1e3 * chart.x, np.degrees(chart.phi)
-        axes.set(xlim=(x[0], x[-1]), ylim=(phi[0], phi[-1]))
-        axes.set(xlabel="$x$ of the centroid [mm]", ylabel=r"orientation $\phi$ [deg]")
-        _draw_cells(axes, chart, x, phi)
-        path = None if plan is None else adopt_motion(chart.problem, plan)[1]
-        paths = trace_problem(chart.problem) if path is None else trace_plan(path)
-        boxes = _draw_labels(axes, chart, x, phi, paths)
-        _draw_directions(axes, chart, boxes)
-        _draw_borders(axes, chart.borders)
-        flush = [c for c in chart.crossings if len(c.flush) >= 2]
-        points = _to_axes(np.array([c.point for c in flush]).reshape(-1, 2))
-        axes.plot(*points.T, "o", ms=3.6, mfc=INK, mec="white", mew=0.5, zorder=6, ls="none")
-        _draw_paths(axes, paths)
-        ambiguous = chart.ambiguous.any() or any(border.ambiguous.any() for border in chart.borders)
-        _draw_legend(figure, bool(paths), bool((chart.cell == CROSSED).any()), bool(ambiguous))
-        _name_palm_lines(axes, chart)
-        problem = chart.problem
+        drawing = _Drawing(figure, chart, paths)
+        drawing.draw_cells()
+        drawing.draw_directions(drawing.draw_labels())
+        drawing.draw_borders()
+        drawing.draw_crossings()
+        drawing.draw_paths()
+        drawing.name_palm_lines()
+        drawing.draw_legend()
         limits = " and ".join(dict.fromkeys(f"{v:g}" for v in problem.scene.torque_limit))
         title = f"{problem.name}  \u00b7  contact formations with palm and both fingers touching"
         text = f"{title}  \u00b7  \u03b5 = {problem.epsilon:g} N, |\u03c4| \u2264 {limits} N m"
@@ -100,186 +96,314 @@ def draw_map(chart: FormationMap, plan: Trajectory | Moved | None = None) -> Fig
     return figure
 
 
+class _Drawing:
+    """A map on axes in mm and deg."""
+
+    def __init__(self, figure: Figure, chart: FormationMap, paths: Sequence[Array]) -> None:
+        self.figure, self.chart, self.paths = figure, chart, [_to_axes(path) for path in paths]
+        self.x, self.phi = 1e3 * chart.x, np.degrees(chart.phi)
+        left, bottom, width, height = np.array(BOX) / np.tile(SIZE, 2)
+        self.axes = figure.add_axes((left, bottom, width, height))
+        self.axes.set(xlim=self.x[[0, -1]], xlabel="x of the centroid [mm]")
+        self.axes.set(ylim=self.phi[[0, -1]], ylabel="orientation \u03c6 [deg]")
+        # Points per mm and per deg.
+        self.scale = 72.0 * np.array(BOX[2:]) / [np.ptp(self.x), np.ptp(self.phi)]
+        self.parts = list(split(chart.cell))
+        self.gids = (f"{PLACE}{k}" for k in count())
+
+    def draw_cells(self) -> None:
+        """Fill the cells, and hatch what cannot be reached."""
+        tints, cell = choose_tints(self.chart.cell, len(_TINTS)), self.chart.cell
+        for index, region in self.parts:
+            face, gid = _TINTS[tints[index]], next(self.gids)
+            self._add(self._outline(region), fc=face, lw=0, aa=False, gid=gid, zorder=0)
+        for region, look in (((cell < 0) & (cell != CROSSED), _LOST), (cell == CROSSED, _OVERLAP)):
+            if region.any():
+                self._add(self._outline(region), zorder=0.5, **look)
+
+    def _outline(self, region: Flags) -> Array:
+        """Rectangles around the places of the grid in a region, shape (n, 4, 2): runs of rows."""
+        edges = np.diff(np.pad(region.astype(int), ((0, 0), (1, 1))), axis=1)
+        rows, first = np.nonzero(edges == 1)
+        columns = np.stack([first, np.nonzero(edges == -1)[1]])[[0, 1, 1, 0]] - 0.5
+        lines = rows + np.array([-0.5, -0.5, 0.5, 0.5])[:, None]
+        step = np.array([self.x[1] - self.x[0], self.phi[1] - self.phi[0]])
+        return np.asarray(np.stack([columns, lines]).T * step + [self.x[0], self.phi[0]])
+
+    def _add(self, polygons: Array, **look: Any) -> None:
+        """Draw polygons of n corners, shape (m, n, 2), as one."""
+        self.axes.add_artist(PathPatch(Path.make_compound_path_from_polys(polygons), **look))
+
+    def _add_line(self, points: Array, **look: Any) -> None:
+        self.axes.add_artist(Line2D(*points.T, **look))
+
+    def _add_lines(self, lines: Sequence[Array], color: str, **look: Any) -> None:
+        self.axes.add_artist(LineCollection(lines, colors=color, **look))
+
+    def _write(self, place: Array, text: str, **look: Any) -> None:
+        self.axes.text(float(place[0]), float(place[1]), text, ha="center", va="center", **look)
+
+    def draw_labels(self) -> list[Array]:
+        """Name the cells; returns the corners (low, high) of what was written over, each (2, 2)."""
+        clear = np.ones(self.chart.cell.shape, dtype=bool)
+        for path in self.paths:
+            across = (np.subtract.outer(self.x, path[:, 0]) * self.scale[0]) ** 2
+            upright = (np.subtract.outer(self.phi, path[:, 1]) * self.scale[1]) ** 2
+            clear &= (across[None] + upright[:, None]).min(axis=2) > _CLEAR**2
+        names = [" | ".join(map(_shorten, own)) for own in self.chart.formations]
+        boxes = [self._write_inside(names[k], region & clear) for k, region in self.parts]
+        look: Any = {"color": "#666666", "style": "italic"}
+        look["path_effects"] = [withStroke(linewidth=2.2, foreground="white")]  # over the hatching
+        for name, code in _UNREACHED.items():
+            self._write_inside(name, self.chart.cell == code, **look)
+        return [box for box in boxes if box is not None]
+
+    def _write_inside(self, text: str, region: Flags, **look: Any) -> Array | None:
+        """Write in the widest place of a region, if there is room; returns the text's corners."""
+        if not region.any():
+            return None
+        step = np.array([self.phi[1] - self.phi[0], self.x[1] - self.x[0]]) * self.scale[::-1]
+        flat = np.array([_HEIGHT / 2 + 2.0, _LETTER * len(text) / 2 + 1.0])
+        # Measured in half labels, the room around a place is the largest label that fits. Cells of
+        # discs are narrow: there it stands upright.
+        for half, turn in ((flat, 0), (flat[::-1], 90)):
+            row, column, room = find_room(region, step / half)
+            if room >= 1.15:
+                place = np.array([self.x[column], self.phi[row]])
+                size = (half[::-1] + 3) / self.scale
+                own: Any = {"fontsize": 7.6, "color": INK, "zorder": 7, "rotation": turn} | look
+                self._write(place, text, **own)
+                return np.stack([place - size, place + size])
+        return None
+
+    def draw_directions(self, boxes: Sequence[Array]) -> None:
+        """Small arrows towards which a quasistatic motion inside a cell is possible."""
+        places = _to_axes(self.chart.places)
+        free = np.ones(len(places), dtype=bool)
+        for low, high in boxes:
+            free &= ~((places > low) & (places < high)).all(axis=1)
+        for k, way in enumerate(np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])):
+            arrow = _ARROW @ np.array([way, way[::-1]]) / self.scale
+            starts = places[free & self.chart.possible[:, k], None]
+            self._add(starts + arrow, fc=_FREE, lw=0, zorder=2)
+        crosses = places[free & self.chart.ambiguous]
+        self._add_line(crosses, marker="x", ms=3.5, ls="none", color=_AMBIGUOUS, zorder=2)
+
+    def draw_borders(self) -> None:
+        """Borders, with lines beside them to where motions are possible, and what can be hit."""
+        flush = [own for own in self.chart.borders if own.flush is not None]
+        passing = [_to_axes(own.points) for own in self.chart.borders if own.flush is None]
+        every = [_to_axes(own.points) for own in flush]
+        self._add_lines(passing, _LINE, zorder=3, **_PASSING)
+        self._add_lines(every, _LINE, lw=0.9, zorder=3)
+
+        def cut(lines: Sequence[Array], name: str) -> Iterator[Array]:
+            for border, points in zip(flush, lines, strict=True):
+                yield from (points[run] for run in find_runs(getattr(border, name), least=2))
+
+        for colour, way, name in _WAYS:
+            strips = [shift(run * self.scale, way * _ASIDE) for run in cut(every, name)]
+            self._add_lines([own / self.scale for own in strips], colour, lw=1.3, zorder=4)
+            heads = np.concatenate([np.empty((0, 3, 2)), *(place_heads(s, way) for s in strips)])
+            self._add(heads / self.scale, fc=colour, lw=0, zorder=5)
+        self._add_lines(list(cut(every, "ambiguous")), _AMBIGUOUS, zorder=4, **_DOTTED)
+        for points in every:
+            self._add_line(points, lw=9, alpha=0.0, zorder=5.5, gid=next(self.gids))
+
+    def draw_crossings(self) -> None:
+        """Dots; those where only a contact changes its name on a border are small."""
+        for own in self.chart.crossings:
+            look: Any = {"marker": "o", "mfc": INK, "mec": "white", "mew": 0.5, "zorder": 6}
+            look |= {"ls": "none", "gid": next(self.gids)}
+            look["ms"] = 3.6 if len(own.flush) >= 2 else 2.4
+            self._add_line(_to_axes(own.point[None]), **look)
+
+    def draw_paths(self) -> None:
+        """The plan, each phase with its number on or beside it."""
+        corners = np.array([[self.x[0], self.phi[0]], [self.x[-1], self.phi[-1]]]) * self.scale
+        lines = [path * self.scale for path in self.paths]
+        look: Any = {"fontsize": 8.0, "color": "white", "fontweight": "bold", "zorder": 9}
+        look["bbox"] = {"boxstyle": "circle,pad=0.22", "fc": INK, "ec": "white", "lw": 0.8}
+        places = place_discs(lines, _DISC, *corners)
+        for number, (line, place) in enumerate(zip(lines, places, strict=True), start=1):
+            self._add_line(line / self.scale, zorder=3.5, **_PLAN)
+            leader = np.array([find_middle(line), place]) / self.scale
+            self._add_line(leader, color=INK, lw=0.8, zorder=8.5)
+            self._write(leader[1], str(number), **look)
+
+    def name_palm_lines(self) -> None:
+        """Say beside the axes which edge lies on the palm."""
+        look: Any = {"ha": "left", "va": "center", "fontsize": 7.6}
+        edges = {b.points[0, 1]: b.contacts[0].index for b in self.chart.borders if b.along == "x"}
+        for angle, edge in edges.items():
+            place = self.x[-1], np.degrees(angle)
+            write(self.axes, f"edge {edge} on\nthe palm", place, (4, 0), **look)
+
+    def draw_legend(self) -> None:
+        """What lines and colours mean."""
+        arrow: Any = {"marker": ">", "ms": 5, "lw": 1.4}
+        line, chart = partial(Line2D, [], []), self.chart
+        (forth, *_), (back, *_) = _WAYS
+        handles: list[Any] = [
+            line(color=forth, label="quasistatic motion possible, +x or +\u03c6", **arrow),
+            line(color=back, label="possible, \u2212x or \u2212\u03c6", **arrow),
+            line(color=_LINE, lw=0.9, label="border: an edge flush, four contacts"),
+            line(color=_LINE, label="side of the link gives way to its tip", **_PASSING),
+            line(color=INK, marker="o", ms=4, ls="none", label="crossing: five contacts"),
+            line(color=_FREE, marker=">", ms=4, lw=1, label="possible ways inside a cell"),
+        ]
+        if self.paths:
+            handles.append(line(label="plan, by phase", **_PLAN))
+        handles.append(Patch(label="cannot be reached", **_LOST))
+        if (chart.cell == CROSSED).any():
+            handles.append(Patch(label="the fingers would overlap", **_OVERLAP))
+        if chart.ambiguous.any() or any(border.ambiguous.any() for border in chart.borders):
+            look = {"color": _AMBIGUOUS, "marker": "x", "ms": 4, **_DOTTED}
+            handles.append(line(label="contact forces would not be unique", **look))
+        note = (
+            "Cells: what touches the palm | finger 1 (right) | finger 2 (left); "
+            "v vertex, e edge touched by the tip, * vertex on the tip's arc"
+        )
+        self.figure.text(0.2 / SIZE[0], 1 - 0.38 / SIZE[1], note, va="top", fontsize=8.5)
+        look = {"loc": "lower center", "ncols": 4, "bbox_to_anchor": (0.5, 0.004), "fontsize": 8.0}
+        self.figure.legend(handles=handles, **look)
+
+
 def _to_axes(points: Array) -> Array:
     """From m and rad to the units of the axes, mm and deg."""
     return np.column_stack([1e3 * points[:, 0], np.degrees(points[:, 1])])
 
 
-def _points_per_unit(axes: Axes) -> Array:
-    """Printer's points per mm and per deg."""
-    spans = [np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())]
-    return np.asarray(72.0 * np.array(_BOX[2:]) / np.array(spans))
+def _shorten(contact: Contact) -> str:
+    """The name of a contact in a cell's label."""
+    rounded = contact.surface == "tip" and contact.feature == "v"
+    return f"{contact.corner}{'*' if rounded else ''}"
 
 
-def _draw_cells(axes: Axes, chart: FormationMap, x: Array, phi: Array) -> None:
-    tints = choose_tints(chart.cell, len(TINTS))
-    shown = np.where(chart.cell >= 0, tints[chart.cell], -1)
-    look: Any = {"shading": "nearest", "rasterized": True, "zorder": 0}
-    shown = np.ma.masked_less(shown, 0)
-    axes.pcolormesh(x, phi, shown, cmap=ListedColormap(TINTS), vmin=0, vmax=len(TINTS), **look)
-    crossed = chart.cell == CROSSED
-    for region, (face, edge, hatch) in (
-        ((chart.cell < 0) & ~crossed, LOST),
-        (crossed, CROSSED_LOOK),
-    ):
-        if region.any():
-            field = axes.contourf(
-                x, phi, region.astype(float), [0.5, 1.5], colors=[face], hatches=[hatch], zorder=0.5
-            )
-            field.set(edgecolor=edge, linewidth=0.0)
-    for name, code in UNREACHED.items():
-        if (chart.cell == code).any():
-            _write_inside(axes, name, chart.cell == code, x, phi, color="#666666", italic=True)
+def trace_plan(plan: Trajectory) -> list[Array]:
+    """Path of each phase of a trajectory, (n, 2) [m, rad]."""
+    return [plan.q[plan.phase == k][:, [0, 2]] for k in np.unique(plan.phase)]
 
 
-def _draw_directions(axes: Axes, chart: FormationMap, boxes: Sequence[Array]) -> None:
-    """Small arrows towards which a quasistatic motion inside a cell is possible."""
-    places = _to_axes(chart.places)
-    free = np.ones(len(places), dtype=bool)
-    for low, high in boxes:
-        free &= ~((places > low) & (places < high)).all(axis=1)
-    places, possible = places[free], chart.possible[free]
-    ways = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    for k, way in enumerate(ways):
-        mine = places[possible[:, k]]
-        gap = 1.2 * way / _points_per_unit(axes)
-        look: Any = {"units": "inches", "scale_units": "inches", "scale": 72 / _ARROW, "zorder": 2}
-        look |= {"width": 0.95 / 72, "headwidth": 4.2, "headlength": 4.2, "headaxislength": 3.8}
-        u, v = np.broadcast_to(way[:, None], (2, len(mine)))
-        axes.quiver(*(mine + gap).T, u, v, color=FREE, **look)
-    axes.plot(*places[chart.ambiguous[free]].T, "x", ms=3.5, color=AMBIGUOUS, zorder=2)
+def _head(run: Array) -> Array:
+    """Unit vectors along `run`, (n, 2), zero where it is."""
+    return np.asarray(run / np.maximum(np.hypot(*run.T), 1e-12)[:, None])
 
 
-def _draw_borders(axes: Axes, borders: Sequence[Border]) -> None:
-    scale = _points_per_unit(axes)
-    passing = [_to_axes(b.points) for b in borders if b.flush is None]
-    flush = [b for b in borders if b.flush is not None]
-    lines = LineCollection(passing, colors=LINE, linewidths=0.7, linestyles=(0, (1, 1.6)), zorder=3)
-    axes.add_collection(lines)
-    every = [_to_axes(b.points) for b in flush]
-    axes.add_collection(LineCollection(every, colors=LINE, linewidths=0.9, zorder=3))
-    for colour, way, name in ((FORTH, 1.0, "forth"), (BACK, -1.0, "back")):
-        strips = [
-            shift((points * scale)[run], way * _ASIDE)
-            for border, points in zip(flush, every, strict=True)
-            for run in find_runs(getattr(border, name))
-        ]
-        lines = LineCollection(
-            [strip / scale for strip in strips], colors=colour, linewidths=1.3, zorder=4
-        )
-        axes.add_collection(lines)
-        heads = [head / scale for strip in strips for head in place_heads(strip, way)]
-        axes.add_collection(PolyCollection(heads, facecolors=colour, linewidths=0, zorder=5))
-    runs = [
-        points[run]
-        for border, points in zip(flush, every, strict=True)
-        for run in find_runs(border.ambiguous)
-    ]
-    dots: Any = {"linestyles": (0, (1.5, 1.5)), "linewidths": 2.2, "zorder": 4}
-    axes.add_collection(LineCollection(runs, colors=AMBIGUOUS, **dots))
+def shift(points: Array, distance: float) -> Array:
+    """A polyline moved to its right, seen along it with the second coordinate upwards."""
+    run = _head(np.gradient(points, axis=0))
+    return np.asarray(points + distance * np.column_stack([run[:, 1], -run[:, 0]]))
 
 
-def _draw_labels(
-    axes: Axes, chart: FormationMap, x: Array, phi: Array, paths: Sequence[Array]
-) -> list[Array]:
-    """Name the cells; returns the corners (low, high) of what was written over, each (2, 2)."""
-    boxes = []
-    cell, scale = chart.cell.copy(), _points_per_unit(axes)
-    for points in map(_to_axes, paths):
-        # Labels keep clear of the plan and the numbers on it.
-        far = (np.subtract.outer(x, points[:, 0]) * scale[0])[None] ** 2
-        far = far + (np.subtract.outer(phi, points[:, 1]) * scale[1])[:, None] ** 2
-        cell[far.min(axis=2) < 8.0**2] = -9
-    for index, region in split(cell):
-        text = " | ".join(map(shorten, chart.formations[index]))
-        box = _write_inside(axes, text, region, x, phi)
-        boxes += [] if box is None else [box]
-    return boxes
+def _measure(points: Array) -> Array:
+    """Lengths of a polyline up to its points, shape (n,)."""
+    return np.append(0.0, np.hypot(*np.diff(points, axis=0).T).cumsum())
 
 
-def _write_inside(
-    axes: Axes,
-    text: str,
-    region: Flags,
-    x: Array,
-    phi: Array,
-    color: str = INK,
-    italic: bool = False,
-) -> Array | None:
-    """Write in the widest place of a region, if there is room; returns the text's corners."""
-    scale = _points_per_unit(axes)
-    step = np.array([phi[1] - phi[0], x[1] - x[0]]) * scale[::-1]
-    flat = np.array([_HEIGHT / 2 + 2.0, _LETTER * len(text) / 2 + 1.0])
-    # Measured in half labels, the room around a place is the largest label that fits.
-    tried = ((find_room(region, step / half), half, turn) for half, turn in _turn(flat))
-    found = next((own for own in tried if own[0][2] >= 1.15), None)
-    if found is None:
-        return None
-    (row, column, _), half, turn = found
-    look: Any = {"ha": "center", "va": "center", "fontsize": 7.6, "color": color, "zorder": 7}
-    look |= {"path_effects": [withStroke(linewidth=2.2, foreground="white")]}
-    look |= {"style": "italic" if italic else "normal", "rotation": turn}
-    axes.text(x[column], phi[row], text, **look)
-    place, size = np.array([x[column], phi[row]]), (half[::-1] + 3.0) / scale
-    return np.stack([place - size, place + size])
+def _find_along(points: Array, s: Array, places: Array) -> Array:
+    """Points of a polyline at lengths along it, shape (n, 2); `s` are those of its points."""
+    return np.column_stack([np.interp(places, s, column) for column in points.T])
 
 
-def _turn(half: Array) -> tuple[tuple[Array, float], tuple[Array, float]]:
-    """Half of a label as it is, and upright, with the angle [deg]: cells of discs are narrow."""
-    return (half, 0.0), (half[::-1], 90.0)
+def find_middle(points: Array, share: float = 0.5) -> Array:
+    """The place half way along a polyline, or a share of it, shape (2,)."""
+    s = _measure(points)
+    return np.asarray(_find_along(points, s, share * s[-1:])[0])
 
 
-def _draw_paths(axes: Axes, paths: Sequence[Array]) -> None:
-    scale, every = _points_per_unit(axes), [_to_axes(path) for path in paths]
-    corners = scale * np.array([axes.get_xlim(), axes.get_ylim()]).T
-    places = place_discs([points * scale for points in every], _DISC, *corners) / scale
-    for number, (points, middle) in enumerate(zip(every, places, strict=True), start=1):
-        axes.plot(*points.T, color=INK, lw=5.0, alpha=0.42, solid_capstyle="round", zorder=3.5)
-        ends = np.array([find_middle(points * scale) / scale, middle])
-        axes.plot(*ends.T, color=INK, lw=0.8, zorder=8.5)
-        look: Any = {"ha": "center", "va": "center", "fontsize": 8.0, "color": "white"}
-        look |= {"fontweight": "bold", "zorder": 9}
-        look["bbox"] = {"boxstyle": "circle,pad=0.22", "fc": INK, "ec": "white", "lw": 0.8}
-        axes.text(float(middle[0]), float(middle[1]), str(number), **look)
+def place_heads(points: Array, way: float) -> Array:
+    """Corners of arrow heads on a polyline, shape (n, 3, 2)."""
+    s = _measure(points)
+    number = int(s[-1] // _SPACING) + int(s[-1] > 12.0)
+    places = (np.arange(number) + 0.5) * s[-1] / max(number, 1)
+    k = np.searchsorted(s, places)
+    run = _head(way * (points[k] - points[k - 1]))
+    frame = np.stack([run, np.column_stack([-run[:, 1], run[:, 0]])], axis=1)
+    return np.asarray(_find_along(points, s, places)[:, None] + _HEAD @ frame)
 
 
-def _name_palm_lines(axes: Axes, chart: FormationMap) -> None:
-    right = axes.get_xlim()[1]
-    look: Any = {"va": "center", "fontsize": 7.6}
-    for angle, edge in name_palm_lines(chart.borders).items():
-        place, text = (right, np.degrees(angle)), f"edge {edge} on\nthe palm"
-        axes.annotate(text, place, (4, 0), textcoords="offset points", **look)
+def place_discs(paths: Sequence[Array], size: float, low: Array, high: Array) -> Array:
+    """Places for the numbers of paths, on them or beside them, none over another, shape (m, 2).
+
+    Parameters
+    ----------
+    paths : (n, 2)    in units of the paper
+    size              diameter of the discs
+    low, high : (2,)  corners of the paper
+    """
+    angles = np.pi / 8 * (np.arange(16) + 4)
+    ring = np.column_stack([np.cos(angles), np.sin(angles)])
+    aside = np.concatenate([radius * size * ring for radius in (1.0, 1.6, 2.3, 3.2, 4.2)])
+    discs = np.empty((0, 2))
+    for path in paths:
+        on = [find_middle(path, share) for share in (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8)]
+        every = np.concatenate([on, on[0] + aside])
+        clear = np.hypot(*(every[:, None] - discs[None]).transpose(2, 0, 1)) >= size
+        inside = ((every >= low + size / 2) & (every <= high - size / 2)).all(axis=1)
+        discs = np.vstack([discs, every[(clear.all(axis=1) & inside).argmax()]])
+    return discs
 
 
-def _patch(look: tuple[str, str, str], label: str) -> Patch:
-    face, edge, hatch = look
-    return Patch(fc=face, ec=edge, hatch=hatch, lw=0, label=label)
+def split(cell: Numbers) -> Iterator[tuple[int, Flags]]:
+    """The parts of a grid that hang together by sides of its places, each with whose it is.
+
+    `cell` says for each place whose it is, negative: nobody's. Parts come by owner, from below.
+    """
+    number = np.arange(cell.size).reshape(cell.shape)
+    before = None
+    # The least number of each part spreads along rows and columns until nothing changes.
+    while before is None or (number != before).any():
+        before = number
+        number = _spread(_spread(number, cell).T, cell.T).T
+    parts, first = np.unique(number, return_index=True)
+    owners = cell.ravel()[first]
+    for k in np.argsort(owners, kind="stable"):
+        if owners[k] >= 0:
+            yield int(owners[k]), number == parts[k]
 
 
-def _draw_legend(figure: Figure, with_path: bool, crossed: bool, ambiguous: bool) -> None:
-    arrow: Any = {"marker": ">", "ms": 5, "lw": 1.4}
-    line = partial(Line2D, [], [])
-    handles: list[Any] = [
-        line(color=FORTH, label="quasistatic motion possible, +x or +\u03c6", **arrow),
-        line(color=BACK, label="possible, \u2212x or \u2212\u03c6", **arrow),
-        line(color=LINE, lw=0.9, label="border: an edge flush, four contacts"),
-        line(color=LINE, lw=0.7, ls=(0, (1, 1.6)), label="side of the link gives way to its tip"),
-        line(color=INK, marker="o", ms=4, ls="none", label="crossing: five contacts"),
-        line(color=FREE, marker="$\u2194$", ms=8, ls="none", label="possible ways inside a cell"),
-        _patch(LOST, "cannot be reached"),
-    ]
-    if crossed:
-        handles.append(_patch(CROSSED_LOOK, "the fingers would overlap"))
-    if ambiguous:
-        look: Any = {"marker": "x", "ms": 4, "lw": 2.2, "ls": (0, (1.5, 1.5))}
-        handles.append(line(color=AMBIGUOUS, label="contact forces would not be unique", **look))
-    if with_path:
-        handles.insert(6, line(color=INK, lw=5, alpha=0.42, label="plan, by phase"))
-    note = (
-        "Cells: what touches the palm | finger 1 (right) | finger 2 (left); "
-        "v vertex, e edge touched by the tip, * vertex on the tip's arc"
-    )
-    figure.text(0.2 / SIZE[0], 1 - 0.38 / SIZE[1], note, va="top", fontsize=8.5)
-    figure.legend(
-        handles=handles, loc="lower center", ncols=4, bbox_to_anchor=(0.5, 0.004), fontsize=8.0
-    )
+def _spread(number: Numbers, cell: Numbers) -> Numbers:
+    """The least number of each stretch of a row with one owner for all of it."""
+    starts = np.ones(cell.shape, dtype=bool)
+    starts[:, 1:] = cell[:, 1:] != cell[:, :-1]
+    stretch = np.cumsum(starts.ravel()) - 1
+    least = np.minimum.reduceat(number.ravel(), np.flatnonzero(starts.ravel()))
+    return np.asarray(least[stretch].reshape(cell.shape))
+
+
+def find_room(region: Flags, step: Array) -> tuple[int, int, float]:
+    """Where a region is widest: row, column, and the distance to its edge there.
+
+    `step` are the distances of rows and of columns, shape (2,). What lies beyond the grid
+    is outside of the region.
+    """
+    rows, columns = np.flatnonzero(region.any(axis=1)), np.flatnonzero(region.any(axis=0))
+    low = np.array([rows[0], columns[0]])
+    padded = np.pad(region[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], 1)
+    # Along columns first, then the nearest over all columns.
+    place = np.arange(len(padded))[:, None]
+    below = np.maximum.accumulate(np.where(padded, -np.inf, place), axis=0)
+    above = np.minimum.accumulate(np.where(padded, np.inf, place)[::-1], axis=0)[::-1]
+    upright = (step[0] * np.minimum(place - below, above - place)) ** 2
+    apart = (step[1] * np.subtract.outer(*(np.arange(padded.shape[1]),) * 2)) ** 2
+    room = np.array([(apart + row).min(axis=1) for row in upright])
+    row, column = np.unravel_index(int(room.argmax()), room.shape)
+    return int(row + low[0] - 1), int(column + low[1] - 1), float(np.sqrt(room[row, column]))
+
+
+def choose_tints(cell: Numbers, tints: int) -> Numbers:
+    """A tint for each cell, different from its neighbours' as far as there are enough.
+
+    `cell` says for each place of a grid whose it is, negative: nobody's.
+    """
+    size = int(cell.max()) + 1
+    touching = np.zeros((size, size), dtype=bool)
+    for one, other in ((cell[1:], cell[:-1]), (cell[:, 1:], cell[:, :-1])):
+        both = (one >= 0) & (other >= 0) & (one != other)
+        touching[one[both], other[both]] = touching[other[both], one[both]] = True
+    chosen = np.full(size, -1)
+    for k in np.argsort(-touching.sum(axis=1), kind="stable"):
+        used = set(chosen[touching[k]].tolist())
+        chosen[k] = next((tint for tint in range(tints) if tint not in used), 0)
+    return chosen

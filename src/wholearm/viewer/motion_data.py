@@ -9,11 +9,10 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from ..common.arrays import Array
+from ..common.arrays import Array, find_runs
 from ..common.sharing import exclusive
 from ..contacts.closing import Numbers
 from ..contacts.elemental import build_features, build_geometry, parse_contact
-from ..figures.map_lines import find_runs
 from ..figures.plot_data import find_steps
 from ..figures.style import FINGERS, choose_styles
 from ..problem.definition import Problem
@@ -108,7 +107,7 @@ def _list_spans(
             "normal": _fix(pushes.normals[rows[run], index], scene),
             "c": _round(c[run]),
         }
-        for run in find_runs(np.isfinite(c).all(axis=1))
+        for run in find_runs(np.isfinite(c).all(axis=1), least=2)
     ]
 
 

@@ -46,12 +46,12 @@ def write_player(motion: dict[str, Any]) -> str:
     return f'<div class="{PLAYER}">{_embed(motion)}</div>'
 
 
-def write_chart(drawing: str, legend: str, places: dict[str, Any]) -> str:
+def write_chart(drawing: str, places: dict[str, Any]) -> str:
     """A map whose places can be clicked; see `chart.describe_map`."""
     hint = "Click a cell, a border or a crossing to see what touches there."
     told = f'<div class="choice"><p>{hint}</p><div class="pose"></div></div>'
     wide = f'<div class="scroll"><div class="map">{drawing}</div></div>'
-    return f'<div class="{CHART}">{wide}{legend}{told}{_embed(places)}</div>'
+    return f'<div class="{CHART}">{wide}{told}{_embed(places)}</div>'
 
 
 def _embed(value: dict[str, Any]) -> str:

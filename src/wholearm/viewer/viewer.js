@@ -413,22 +413,18 @@ function showPose(parent, hand, own, z) {
 
 function makeMap(parent, chart) {
   const [text, pose] = parent.querySelector(".choice").children;
-  parent.querySelectorAll(".hit").forEach((element, k) => {
-    const own = chart.places[k];
+  chart.places.forEach((own, k) => {
+    const element = parent.querySelector(`#${chart.id}${k}`);
+    element.classList.add("hit");
     element.addEventListener("click", (event) => {
       parent.querySelectorAll(".chosen").forEach((old) => old.classList.remove("chosen"));
       element.classList.add("chosen");
-      let nearest = 0;
-      if (element.points) {
-        const to = element.getScreenCTM(), far = Array.from(element.points, (p) => {
-          const on = p.matrixTransform(to);
-          return Math.hypot(on.x - event.clientX, on.y - event.clientY);
-        });
-        nearest = far.indexOf(Math.min(...far));
-      }
-      const clicked = own.wide && closeHand(chart.hand, own, ...read(chart.axes, element, event));
-      const z = clicked || own.z[nearest], given = [1e3 * z[0], z[2] * 180 / Math.PI];
-      const at = `x = ${given[0].toPrecision(4)} mm, phi = ${given[1].toPrecision(4)} deg`;
+      const [x, phi] = read(chart.axes, element, event), { low, high } = chart.axes;
+      const far = own.z.map((z) => Math.hypot(1e3 * (z[0] - x) / (high[0] - low[0]),
+                                              (z[2] - phi) * 180 / Math.PI / (high[1] - low[1])));
+      const clicked = own.wide && closeHand(chart.hand, own, x, phi);
+      const z = clicked || own.z[far.indexOf(Math.min(...far))];
+      const at = `x = ${(1e3 * z[0]).toPrecision(4)} mm, phi = ${(z[2] * 180 / Math.PI).toPrecision(4)} deg`;
       const shown = clicked || own.z.length > 1 ? `; drawn at ${at}` : "";
       text.textContent = `${own.contacts.join(" ")}: ${own.text}${shown}`;
       showPose(pose, chart.hand, own, z);
