@@ -232,6 +232,17 @@ def test_a_vertex_goes_on_from_link_to_tip_at_speed(early: float) -> None:
     assert np.allclose(simulation.z[-1], simulate(problem, torque).z[-1], atol=1e-6, rtol=0)
 
 
+@pytest.mark.parametrize("early", (1e-7, 5e-7))
+def test_of_breaks_near_each_other_a_phase_ends_at_the_nearest(early: float) -> None:
+    problem, torque, end = plan_passing(0.066)
+    parts = torque.cut(0.0, end - early), torque.cut(end - early, torque.duration)
+    breaks = np.append(parts[0].breaks, parts[1].breaks[1:])
+    coefficients = np.concatenate([part.coefficients for part in parts])
+    simulation = simulate(problem, TorqueProfile(breaks, coefficients))
+    arrival = simulation.find(EventKind.ARRIVAL)[0]
+    assert arrival.phase == 0 and arrival.time == pytest.approx(end, rel=1e-12)
+
+
 def slide_to_the_tip(until: str) -> Problem:
     """The hexagon slides until v5 is at the pointed tip of a short finger 2, and back."""
     table = tomllib.loads(HEXAGON.read_text(encoding="utf-8"))

@@ -220,3 +220,10 @@ def test_a_report_holds_what_was_given(tmp_path: Path) -> None:
     for words in ("plan.npz", "ok: ", "v3-finger1", "[fingers.1]", "what verify says"):
         assert words in text
     assert len(text) < 5e6
+
+
+def test_a_report_says_which_contact_torques_lose_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "torques.csv"
+    path.write_text("t,tau1,tau2\n0,3,2.1\n0.5,3,2.1\n", encoding="utf-8")
+    text = build_report(problem_of(HEPTAGON), [str(path)], chart=chart())
+    assert "FAILED: c_n of v5-finger2 falls to " in text and "what verify says" in text

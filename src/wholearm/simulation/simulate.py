@@ -385,8 +385,12 @@ def _is_at_end(run: Replay, t: float) -> bool:
         return False
     speed = abs(_measure_rate(run))
     if run.passes:
-        distance = abs(run.value(s.rows.until)) / run.until_unit
-        speed = 0.0 if distance <= SETTLING * speed else math.inf
+        distance = run.value(s.rows.until) / run.until_unit
+        # Of several breaks as near as that, the nearest is the one at which the phase ends.
+        later = run.breaks[run.piece + 2 : run.piece + 3]
+        apart = (later[0] - t) / run.problem.scene.scales.time if len(later) else math.inf
+        early = min(SETTLING, apart / 2)
+        speed = 0.0 if -SETTLING * speed <= distance <= early * speed else math.inf
     elif run.phase.end is End.IMPACT and _strikes(run):
         coming = run.piece + 1
         speed = 0.0 if coming >= len(run.steps_at) or run.steps_at[coming] else speed

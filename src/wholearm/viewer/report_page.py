@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 import platform
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 import numpy as np
 
 from ..common.document import Document, Table, fixed, show
+from ..common.errors import SimulationError
 from ..comparison.metrics import compare
 from ..comparison.side_by_side import Contender
 from ..mapping.formation_map import FormationMap, build_map, choose_window
@@ -71,19 +73,22 @@ def _describe(contender: Contender, most: int) -> list[str]:
     problem, planned = contender.problem, contender.planned
     parts = [page.write_heading(contender.name)]
     parts.append(Document("", contender.verdict, contender.reason).to_html())
-    replayed = None if contender.report is None else contender.report.trajectory
+    replayed = None
+    if contender.report is not None:
+        # Torques that lose a contact at once leave no motion to show.
+        with suppress(SimulationError):
+            replayed = contender.report.trajectory
     shown = planned or replayed
-    if shown is None or problem is None:
-        return parts
-    ghost = replayed if planned is not None else None
-    parts.append(page.write_player(describe_motion(shown, problem, ghost, most)))
-    timings = shown.meta.get("timings")
-    # Routes are planned from parts that are replayed before: then nothing is left of a step.
-    known = timings.items() if isinstance(timings, dict) else ()
-    took = [(str(name), value) for name, value in known if value and value >= 1e-3]
-    tables = [list_phases(problem, shown), list_joints(shown)]
-    tables.append(Table(["planning took", "[s]:.4g"], took))
-    parts.append(Document("", parts=tables).to_html())
+    if shown is not None and problem is not None:
+        ghost = replayed if planned is not None else None
+        parts.append(page.write_player(describe_motion(shown, problem, ghost, most)))
+        timings = shown.meta.get("timings")
+        # Routes are planned from parts that are replayed before: then nothing is left of a step.
+        known = timings.items() if isinstance(timings, dict) else ()
+        took = [(str(name), value) for name, value in known if value and value >= 1e-3]
+        tables = [list_phases(problem, shown), list_joints(shown)]
+        tables.append(Table(["planning took", "[s]:.4g"], took))
+        parts.append(Document("", parts=tables).to_html())
     if contender.report is not None:
         parts.append(page.fold(contender.report.document.to_html(), "what verify says"))
     return parts
