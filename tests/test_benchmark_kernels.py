@@ -9,8 +9,7 @@ import pytest
 
 from shipped import SQUARE, problem_of, solved
 from wholearm.benchmark.kernels import LARGEST, STUDY, Environment, compare, perturb_scenes
-from wholearm.benchmark.pool import CaseAnswer
-from wholearm.benchmark.study import Case
+from wholearm.benchmark.study import Case, Row
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
 from wholearm.problem.read import read_problem
@@ -45,10 +44,10 @@ def test_answers_come_from_the_environment() -> None:
 def test_the_command_stores_answers_and_fails_where_they_differ(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def answer_all(_: object, cases: list[Case], *__: object) -> list[CaseAnswer]:
-        return [CaseAnswer(case, "done", dict(GOOD), "", 0.0, 0.0, 0.0) for case in cases]
+    def answer_all(_: object, cases: list[Case], *__: object) -> list[tuple[Case, Row]]:
+        return [(case, dict(GOOD)) for case in cases]
 
-    monkeypatch.setattr("wholearm.benchmark.study.run_tasks", answer_all)
+    monkeypatch.setattr("wholearm.benchmark.study.run_all", answer_all)
     stored, table = tmp_path / "answers.json", tmp_path / "table.md"
     command = ["bench", "kernels", "a.toml", "--answers", str(stored), "--jobs", "1"]
     assert main(command) == 2

@@ -522,3 +522,6 @@ def test_shells_complete(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["completion", "bash"]) == 0
     text = capsys.readouterr().out
     assert "--time-weight" in text and "wholearm" in text
+    # Studies add their options when they are used.
+    assert "_shtab_wholearm_bench_stress___output_COMPGEN=_shtab_compgen_dirs" in text
+    assert "_shtab_wholearm_bench_growth_pos_0_COMPGEN=_shtab_compgen_files" in text

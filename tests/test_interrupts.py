@@ -199,15 +199,11 @@ def test_planning_is_interrupted(delay: float, tmp_path: Path) -> None:
 
 WORKS = """
 import time
-from concurrent.futures import ProcessPoolExecutor
-from functools import partial
 import wholearm.__main__ as m
-from wholearm.common.crowd import run_all
-from wholearm.common.workers import Spawning
+from wholearm.common.crowd import Processes, run_all
 
 def work():
-    pool = partial(ProcessPoolExecutor, 2, Spawning())
-    for _ in run_all(time.sleep, [0, 60, 60, 60, 60], pool):
+    for _ in run_all(time.sleep, [0, 60, 60, 60, 60], Processes(2)):
         print("ready", flush=True)
         {then}
     return 0

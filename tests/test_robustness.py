@@ -19,7 +19,7 @@ import pytest
 
 import wholearm
 from wholearm.cli.command import main
-from wholearm.common.crowd import run_all
+from wholearm.common.crowd import connect, run_all
 from wholearm.common.errors import InputError
 from wholearm.planning.result import Plan
 from wholearm.problem.definition import Problem
@@ -32,7 +32,6 @@ from wholearm.robustness.sampling import (
     Robustness,
     Z,
     assess_robustness,
-    connect,
     count_share,
     measure_sensitivities,
 )
@@ -272,7 +271,7 @@ def wait_and_square(number: int) -> tuple[int, int]:
 def test_a_worker_that_is_killed_loses_and_doubles_no_task() -> None:
     distributed = pytest.importorskip("distributed", reason="Dask is not installed")
     with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster:
-        answers = run_all(wait_and_square, range(100), lambda: connect(cluster.scheduler_address))
+        answers = run_all(wait_and_square, range(100), connect(cluster.scheduler_address))
         found = [next(answers) for _ in range(10)]
         os.kill(found[-1][1][1], signal.SIGKILL)
         found += answers

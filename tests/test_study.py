@@ -5,15 +5,16 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from misbehaving import allow, misbehave
 from wholearm.benchmark import STUDIES
-from wholearm.benchmark.pool import run_tasks
-from wholearm.benchmark.study import Study, digest_source
+from wholearm.benchmark.study import Case, Row, Study, digest_source, measure_case
 from wholearm.cli.bench import load_study
 from wholearm.cli.command import main
+from wholearm.common.crowd import Processes, run_all
 from wholearm.common.errors import InputError
 from wholearm.common.journal import Journal
 
@@ -100,37 +101,38 @@ def test_a_folder_that_cannot_be_made_is_named(
     assert "cannot be made" in capsys.readouterr().err
 
 
-def test_a_worker_that_hangs_or_dies_is_replaced() -> None:
-    tasks = ["fine", "hang", "die", "raise", "warn", "print", "well"]
-    answers = {answer.task: answer for answer in run_tasks(misbehave, tasks, 1, allow)}
-    assert {task: answer.ended for task, answer in answers.items()} == {
-        "fine": "done",
-        "hang": "late",
-        "die": "died",
-        "raise": "raised",
-        "warn": "raised",
-        "print": "done",
-        "well": "done",
-    }
-    assert "KeyError" in answers["raise"].result
-    assert "RuntimeWarning" in answers["warn"].result
-    assert answers["print"].printed == "CasADi - WARNING\n"
-    assert answers["die"].result == 3
+def ask(tasks: list[str], **options: Any) -> dict[str, Any]:
+    return dict(run_all(misbehave, tasks, Processes(1, allow, **options), ahead=1))
 
 
-def test_tasks_of_one_kind_come_after_another_in_one_worker() -> None:
-    """A worker keeps what it has drawn for a scene until another one comes."""
-    tasks = ["a1", "b1", "a2", "b2", "c1", "a3"]
-    answers = run_tasks(misbehave, tasks, 1, allow, lambda task: task[0])
-    assert [answer.task for answer in answers] == ["a1", "a2", "a3", "b1", "b2", "c1"]
+def test_a_process_that_hangs_or_dies_is_replaced() -> None:
+    answers = ask(["fine", "hang", "die", "raise", "well"])
+    assert (answers["fine"], answers["well"]) == ("fine", "well")
+    assert answers["hang"].late and str(answers["hang"]).startswith("time limit after ")
+    assert not answers["die"].late and str(answers["die"]).endswith(" s: exit status 3")
+    assert isinstance(answers["raise"], KeyError)
+    assert "raise KeyError(how)" in answers["raise"].__notes__[0]
 
 
-def test_what_a_task_takes_is_its_own() -> None:
-    answers = {
-        own.task: own for own in run_tasks(misbehave, ["fine", "large"], 1, allow, alone=True)
-    }
-    assert 40 < answers["large"].memory < 100 and answers["fine"].memory < 10
-    assert 0 < answers["large"].seconds < answers["large"].elapsed + 1
+class Misbehaving(Study):
+    strict = True
+
+    def run(self, case: Case) -> Row:
+        return {"how": misbehave(*case)}
+
+
+def measure(how: str) -> Row:
+    """Here a case is measured in a process of its own."""
+    return measure_case(Misbehaving(), (how,))
+
+
+def test_what_a_case_prints_and_takes_is_recorded() -> None:
+    rows = dict(run_all(measure, ["fine", "print", "warn", "large"], Processes(1, alone=True)))
+    assert "printed" not in rows["fine"] and rows["print"]["printed"] == "CasADi - WARNING"
+    assert rows["warn"]["failed"].startswith("traceback after 0 s: ")
+    assert "RuntimeWarning: careful" in rows["warn"]["failed"]
+    assert 40 < rows["large"]["memory"] < 100 and rows["fine"]["memory"] < 10
+    assert 0 < rows["large"]["seconds"] < 10
 
 
 def test_a_journal_goes_on_after_half_a_line(tmp_path: Path) -> None:

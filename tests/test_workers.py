@@ -6,14 +6,13 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from functools import partial
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from wholearm.common.crowd import DiedError, run_all
+from wholearm.common.crowd import Processes, run_all
 from wholearm.common.workers import can_fork, count_cores, share
 
 PARENT = os.getpid()
@@ -118,7 +117,7 @@ def square(number: int) -> int:
 
 
 def test_every_task_is_answered_once() -> None:
-    answers = list(run_all(square, range(200), partial(ThreadPoolExecutor, 3)))
+    answers = list(run_all(square, range(200), ThreadPoolExecutor(3)))
     assert sorted(task for task, _ in answers) == list(range(200))
     for task, answer in answers:
         if task == 13:
@@ -135,41 +134,21 @@ def test_tasks_are_given_a_few_at_a_time() -> None:
             given.append(number)
             yield number
 
-    answers = run_all(square, draw(1000), partial(ThreadPoolExecutor, 1), ahead=4)
+    answers = run_all(square, draw(1000), ThreadPoolExecutor(1), ahead=4)
     for _ in range(5):
         next(answers)
     assert len(given) <= 5 + 4
 
 
-class Breaking(Executor):
-    """Runs tasks at once, and breaks with every one that is deadly, as a pool of processes does."""
-
-    def __init__(self, deadly: Callable[[int], bool]) -> None:
-        self.deadly, self.broken = deadly, False
-        self.waiting: list[tuple[Future[Any], Any, int]] = []
-
-    def submit(self, fn: Any, task: Any, /) -> Future[Any]:  # type: ignore[override]
-        if self.broken:
-            raise BrokenProcessPool
-        future: Future[Any] = Future()
-        if self.deadly(task):
-            self.broken = True
-            future.set_exception(BrokenProcessPool())
-        else:
-            future.set_result(fn(task))
-        return future
+def die_once(path: str) -> str:
+    """Die of the first task at a path."""
+    if not os.path.exists(path):
+        open(path, "x").close()
+        stop()
+    return path
 
 
-@pytest.mark.parametrize("ahead", [1, 7])
-def test_what_workers_die_of_is_found(ahead: int) -> None:
-    """Of 20 always, of 5 once; the others are answered, once each."""
-    often = {5: 1}
-
-    def deadly(task: int) -> bool:
-        often[task] = often.get(task, 0) - 1
-        return task == 20 or often[task] >= 0
-
-    answers = list(run_all(abs, range(30), lambda: Breaking(deadly), ahead))
-    assert sorted(task for task, _ in answers) == list(range(30))
-    died = [task for task, answer in answers if isinstance(answer, DiedError)]
-    assert died == [20]
+def test_a_process_that_is_killed_loses_and_doubles_no_task(tmp_path: Path) -> None:
+    paths = [str(tmp_path / f"{k}") for k in range(4)]
+    assert sorted(run_all(die_once, paths, Processes(2))) == [(path, path) for path in paths]
+    assert not multiprocessing.active_children()

@@ -12,18 +12,22 @@ import hashlib
 import io
 import os
 import platform
+import sys
+import tempfile
 import time
+import traceback
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 from .. import __version__
+from ..common.crowd import Processes, run_all
 from ..common.fields import Range
 from ..common.files import make_folder, together, write_text
 from ..common.journal import Journal
-from .pool import CaseAnswer, run_tasks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,7 +42,6 @@ Added are `case`, the `seconds` of processor time, and `memory`, by which it has
 its process [MB].
 """
 PACKAGES = ("casadi", "numpy", "scipy")
-FAILED = {"raised": "traceback", "late": "time limit", "died": "crash"}
 
 
 class StudyReport(NamedTuple):
@@ -106,10 +109,6 @@ class Study:
         """Processor time that a case may take [s]."""
         return 60.0
 
-    def group(self, case: Case) -> Any:
-        """Cases for which this is equal are run by one process, one after the other."""
-        return case
-
 
 def name_case(row: Row) -> str:
     """A case in words."""
@@ -136,25 +135,30 @@ def run_study(
 ) -> StudyReport:
     """Run a study, or what is left of it, and write its table."""
     cases = list(dict.fromkeys(study.list_cases(options)))
-    if not study.keeps:
-        known = {_key(row["case"]): row for row in _run(study, cases, cases, options, progress)}
-        text, findings = _report(study, [known[case] for case in cases], options)
-        return StudyReport(text, findings, [])
-    make_folder(options.output)
-    stem = os.path.join(options.output, f"bench_{study.name}")
-    stamp = {"study": study.name, "version": __version__, **study.stamp(options)}
-    fresh = options.fresh
-    if study.of_code:
-        stamp["source"] = digest_source(study.list_inputs(options))
-        fresh = fresh or not _continues(f"{stem}.jsonl", stamp["source"])
-    with Journal(f"{stem}.jsonl", stamp, fresh, options.again) as journal:
-        done = journal.done("case", _key)
+    stem, path, stamp, fresh, again = "", os.devnull, dict[str, Any](), False, False
+    if study.keeps:
+        make_folder(options.output)
+        stem = os.path.join(options.output, f"bench_{study.name}")
+        stamp = {"study": study.name, "version": __version__, **study.stamp(options)}
+        path, fresh, again = f"{stem}.jsonl", options.fresh, options.again
+        if study.of_code:
+            stamp["source"] = digest_source(study.list_inputs(options))
+            fresh = fresh or not _continues(path, stamp["source"])
+    with Journal(path, stamp, fresh, again) as journal:
+        done = {_key(row["case"]): row for row in journal.records}
         left = [case for case in cases if case not in done]
-        for row in _run(study, cases, left, options, progress):
+        begun, found = time.monotonic(), 0
+        for count, (case, row) in enumerate(_run(study, left, options), start=1):
             journal.add(row)
-        known = {_key(row["case"]): row for row in journal.records}
-    rows = [known[case] for case in cases]
+            done[case] = row
+            found += bool(row.get("findings"))
+            ahead = (time.monotonic() - begun) / count * (len(left) - count) / 60
+            text = f"{study.name}: {len(cases) - len(left) + count} of {len(cases)} cases"
+            progress(f"{text}, {found} with findings, {ahead:.0f} min left")
+    rows = [done[case] for case in cases]
     text, findings = _report(study, rows, options)
+    if not study.keeps:
+        return StudyReport(text, findings, [])
     written = [f"{stem}.md"]
     with together():
         write_text(written[0], text)
@@ -224,56 +228,71 @@ def _continues(path: str, source: str) -> bool:
 
 
 def _run(
-    study: Study,
-    cases: Sequence[Case],
-    left: Sequence[Case],
-    options: argparse.Namespace,
-    report: Callable[[str], None],
-) -> Iterator[Row]:
-    """Rows of the cases that are left, as they come."""
-    begun, found = time.monotonic(), 0
-    jobs = 1 if study.timed else options.jobs
-    with _one_thread():
-        answers = run_tasks(
-            study.run, left, jobs, study.limit, study.group, study.strict, study.alone
-        )
-        for count, answer in enumerate(answers, start=1):
-            row = _record(answer)
-            found += bool(row.get("findings"))
-            yield row
-            ahead = (time.monotonic() - begun) / count * (len(left) - count) / 60
-            text = f"{study.name}: {len(cases) - len(left) + count} of {len(cases)} cases"
-            report(f"{text}, {found} with findings, {ahead:.0f} min left")
+    study: Study, cases: Sequence[Case], options: argparse.Namespace
+) -> Iterator[tuple[Case, Row]]:
+    """Cases with their rows, as they end."""
+    # Each process has one thread of OpenBLAS.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    jobs = min(1 if study.timed else options.jobs, len(cases) or 1)
+    run = partial(measure_case, study)
+    for case, answer in run_all(run, cases, Processes(jobs, study.limit, study.alone), jobs):
+        row = _fail(str(answer)) if isinstance(answer, Exception) else answer
+        yield case, {"case": list(case), **row}
 
 
-def _record(answer: CaseAnswer) -> Row:
-    own = dict(answer.result) if answer.ended == "done" else {}
-    if answer.ended != "done":
-        text = str(answer.result or "").strip()[-1500:]
-        own = {"failed": f"{FAILED[answer.ended]} after {answer.elapsed:.0f} s: {text}"}
-        own["findings"] = [own["failed"]]
-    if answer.printed.strip():
-        own["printed"] = answer.printed.strip()[:500]
-    taken = {"seconds": round(answer.seconds, 4), "memory": round(answer.memory, 2)}
-    return {"case": list(answer.task), **own, **taken}
+def measure_case(study: Study, case: Case) -> Row:
+    """Run a case in a process of a study, with what that took."""
+    printed = _redirect()
+    peak, started, begun = find_peak(), time.process_time(), time.monotonic()
+    try:
+        with warnings.catch_warnings():
+            if study.strict:
+                warnings.simplefilter("error")
+            row = dict(study.run(case))
+    except Exception:
+        text = traceback.format_exc().strip()[-1500:]
+        row = _fail(f"traceback after {time.monotonic() - begun:.0f} s: {text}")
+    seconds, memory = time.process_time() - started, find_peak() - peak
+    sys.stdout.flush()
+    sys.stderr.flush()
+    printed.seek(0)
+    if text := printed.read().decode(errors="replace").strip():
+        row["printed"] = text[:500]
+    printed.seek(0)
+    printed.truncate()
+    return row | {"seconds": round(seconds, 4), "memory": round(memory, 2)}
+
+
+def _fail(text: str) -> Row:
+    return {"failed": text, "findings": [text]}
+
+
+@cache
+def _redirect() -> IO[bytes]:
+    """A file that this process writes to instead of stdout and stderr, libraries included."""
+    printed = tempfile.TemporaryFile()
+    for stream in (1, 2):
+        os.dup2(printed.fileno(), stream)
+    return printed
+
+
+def find_peak() -> float:
+    """Peak of the memory that this process has had in use [MB]."""
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        import resource
+
+        unit = 1 if sys.platform == "darwin" else 1024
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+    # Where there is `/proc`, the other figure starts from that of the parent.
+    (peak,) = (line.split()[1] for line in lines if line.startswith("VmHWM:"))
+    return int(peak) * 1024 / 1e6
 
 
 def _key(case: Any) -> Any:
     """A case as it was before it was written."""
     return tuple(map(_key, case)) if isinstance(case, list | tuple) else case
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Processes that are started have one thread of OpenBLAS each."""
-    name = "OPENBLAS_NUM_THREADS"
-    before = os.environ.get(name)
-    os.environ.setdefault(name, "1")
-    try:
-        yield
-    finally:
-        if before is None:
-            os.environ.pop(name, None)
 
 
 def _write_csv(rows: Iterable[Row], columns: Sequence[str]) -> str:

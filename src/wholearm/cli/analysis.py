@@ -152,8 +152,8 @@ def _read_ranges(options: argparse.Namespace, problem: Problem) -> Uncertainty:
 
 
 def _choose_executor(options: argparse.Namespace) -> Callable[[], Executor] | None:
-    from ..robustness.sampling import connect, use_processes
+    from ..common.crowd import Processes, connect
 
     if options.scheduler is not None:
         return partial(connect, options.scheduler)
-    return partial(use_processes, options.jobs)
+    return partial(Processes, options.jobs)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from ..common.errors import InputError
+from .bench import StudyParser
 
 SHELLS = ("bash", "zsh", "tcsh")
 
@@ -28,14 +29,16 @@ def complete(options: argparse.Namespace) -> int:
 
 def _complete_files(parser: argparse.ArgumentParser, files: object, folders: object) -> None:
     """Let all arguments that name files or folders be completed so."""
+    if isinstance(parser, StudyParser):
+        parser.complete()
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for own in action.choices.values():
                 _complete_files(own, files, folders)
-        elif action.metavar in ("FILE", "PLAN") or action.dest in _FILES:
-            action.complete = files  # type: ignore[attr-defined]
         elif action.metavar == "DIR":
             action.complete = folders  # type: ignore[attr-defined]
+        elif action.metavar in ("FILE", "PLAN") or (action.dest in _FILES and not action.type):
+            action.complete = files  # type: ignore[attr-defined]
 
 
 _FILES = {"problem", "plan", "trajectory", "torques", "files", "output"}

@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import os
 import stat
-from collections.abc import Callable, Iterator, Mapping
-from itertools import islice
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, BinaryIO, NamedTuple
 
 from .errors import InputError
@@ -23,7 +22,7 @@ class Journal:
     """A file of one JSON object per line, begun by a line that says what the study is.
 
     Nothing in the file is lost unless that is asked for. While the journal exists nobody else can
-    have one of the same file.
+    have one of the same file. Only a regular file has records: `os.devnull` stands for none.
 
     Parameters
     ----------
@@ -49,7 +48,8 @@ class Journal:
                     _lock(self._stream.fileno(), path)
                     if fresh:
                         self._stream.truncate(0)
-                    self._begin(self._read(), again)
+                    self._stream.seek(0)
+                    self._begin(self._stream.read(), again)
             except BaseException:
                 self.close()
                 raise
@@ -79,27 +79,18 @@ class Journal:
         except OSError as error:
             raise self._fail(error) from None
 
-    def done(self, key: str, name: Callable[[Any], Any] = lambda value: value) -> set[Any]:
-        """The tasks that have a record under `key`."""
-        return {name(record[key]) for record in self.records if key in record}
-
-    def _read(self) -> bytes:
-        self._stream.seek(0)
-        return self._stream.read()
-
     def _begin(self, given: bytes, again: bool) -> None:
         """Take the records that are there, and leave whole lines, begun by the stamp."""
         head = _to_line(self._stamp)
+        whole = head
         # Half of the first line is what a full disk leaves.
         if not head.startswith(given):
             self._require_stamp(given)
-            lines = given[: given.rfind(b"\n") + 1].splitlines(keepends=True)
-            known = [(line, _parse(line)) for line in lines[1:]]
+            first, *lines = given[: given.rfind(b"\n") + 1].splitlines(keepends=True)
+            known = [(line, _parse(line)) for line in lines]
             kept = [own for own in known if not (again and (own[1] or {}).get("findings"))]
             self.records = [record for _, record in kept if record is not None]
-            whole = b"".join([lines[0], *(line for line, _ in kept)])
-        else:
-            whole = head
+            whole = b"".join([first, *(line for line, _ in kept)])
         with held():
             if given.startswith(whole):
                 self._stream.truncate(len(whole))
@@ -109,16 +100,15 @@ class Journal:
 
     def _require_stamp(self, given: bytes) -> None:
         """Check that the file is one of this study."""
-        other, own = _parse(given.split(b"\n", 1)[0]), self._stamp
-        kind = own.get("study", "")
-        if other is None or other.get("study") != kind:
-            text = f"holds no {kind} study; --fresh begins anew, or choose another with -o"
-            raise InputError(self.path, "", text)
-        differences = find_differences(other, own)
-        text = describe_differences(differences, "in the file", "now")
-        if text:
-            what = f"holds another study: {text}; --fresh begins anew, or choose another with -o"
-            raise InputError(self.path, "", what)
+        other, kind = _parse(given.split(b"\n", 1)[0]) or {}, self._stamp["study"]
+        if other.get("study") != kind:
+            text = f"no {kind} study"
+        elif differences := list(find_differences(other, self._stamp)):
+            text = f"another study: {describe_differences(differences, 'in the file', 'now')}"
+        else:
+            return
+        what = f"holds {text}; --fresh begins anew, or choose another with -o"
+        raise InputError(self.path, "", what)
 
     def _write(self, line: bytes) -> None:
         left = memoryview(line)
@@ -196,9 +186,8 @@ def _write(value: Any) -> str:
     return text if len(text) <= 40 else f"{text[:37]}..."
 
 
-def describe_differences(found: Iterator[Difference], one: str, other: str) -> str:
+def describe_differences(found: Iterable[Difference], one: str, other: str) -> str:
     """The first differences in words; `one` and `other` say where the values stand."""
-    shown = list(islice(found, _SHOWN))
-    rest = sum(1 for _ in found)
-    parts = [f"{own.key} ({own.one} {one}, {own.other} {other})" for own in shown]
-    return ", ".join(parts) + (f", and {rest} more" if rest else "")
+    shown, rest = (parts := list(found))[:_SHOWN], parts[_SHOWN:]
+    text = ", ".join(f"{own.key} ({own.one} {one}, {own.other} {other})" for own in shown)
+    return text + (f", and {len(rest)} more" if rest else "")

@@ -6,26 +6,21 @@ import hashlib
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import nullcontext
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property, partial
-from multiprocessing import parent_process
-from multiprocessing.connection import wait
-from threading import Thread
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from .. import __version__
 from ..common.arrays import Array
-from ..common.crowd import DiedError, run_all
+from ..common.crowd import DiedError, Processes, run_all
 from ..common.document import Document, Result, Table
 from ..common.errors import InputError, SimulationError
 from ..common.fields import Range
 from ..common.journal import Journal
-from ..common.workers import Spawning
 from ..free_simulation.result import FreeSimulation
 from ..policy.playback import Policy
 from ..problem.definition import Problem
@@ -191,8 +186,7 @@ def assess_robustness(
                  where it was stopped, and ends the same to the last bit, unless it is to be
                  `fresh`.
     fresh        begin the file anew, whatever it holds
-    start        makes a `concurrent.futures.Executor`, anew when its workers have died; processes
-                 on all cores if left out
+    start        makes a `concurrent.futures.Executor`; processes on all cores if left out
 
     Raises
     ------
@@ -204,28 +198,28 @@ def assess_robustness(
     require_same_phases(problem, trajectory)
     own = uncertainty or Uncertainty(problem.ranges)
     trial = make_trial(problem, trajectory, own, phase, policy)
-    journal = None if path is None else Journal(os.fspath(path), _stamp(trial, seed), fresh)
-    with journal or nullcontext():
-        kept = [] if journal is None else journal.records
-        sizes = [record["samples"] for record in kept if "samples" in record]
-        known = {record["sample"]: record for record in kept if "sample" in record}
+    with Journal(os.fspath(path or os.devnull), _stamp(trial, seed), fresh) as journal:
+        sizes = [record["samples"] for record in journal.records if "samples" in record]
+        known = {record["sample"]: record for record in journal.records if "sample" in record}
         if samples > sum(sizes):
             sizes.append(samples - sum(sizes))
-            if journal is not None:
-                journal.add({"samples": sizes[-1]})
+            journal.add({"samples": sizes[-1]})
         found = {k: record for k, record in known.items() if k < samples}
         drawn = _draw(own, sizes, seed)[:samples]
         tasks = ((k, tuple(drawn[k].tolist())) for k in range(samples) if k not in found)
         good = sum(record["reached"] for record in found.values())
-        for record in list_records(trial, tasks, start or use_processes):
-            found[record["sample"]] = record
-            good += record["reached"]
-            if journal is not None:
-                journal.add(record)
+        for (number, _), answer in run_all(partial(_run, trial), tasks, (start or Processes)()):
+            if isinstance(answer, DiedError):
+                answer = {"ended": str(answer), "reached": False, "kept": False, "lost": "worker"}
+            elif isinstance(answer, Exception):
+                raise answer
+            found[number] = {"sample": number, **answer}
+            good += answer["reached"]
+            journal.add(found[number])
             if progress is not None:
                 progress(f"{len(found)} of {samples} samples, {good} reach the goal")
     records = tuple(found[number] for number in range(samples))
-    known_now = 0 if journal is None else len({*known, *found})
+    known_now = 0 if path is None else len({*known, *found})
     return Robustness(trial, drawn, seed, records, known_now)
 
 
@@ -236,73 +230,12 @@ def _draw(uncertainty: Uncertainty, sizes: Sequence[int], seed: int) -> Array:
     return np.vstack([uncertainty.draw(n, (seed, k) if k else seed) for k, n in parts])
 
 
-class Runs(Protocol):
-    """What runs a sample, here or in another process."""
-
-    def run(self, sample: Array) -> dict[str, Any]:
-        """What becomes of a sample, as plain values; as of `Trial`."""
-
-
-def list_records(
-    trial: Runs, tasks: Iterable[Task], start: Callable[[], Executor]
-) -> Iterator[dict[str, Any]]:
-    """Records as they come; a sample that workers die of has one that says so."""
-    for (number, _), answer in run_all(partial(_run, trial), tasks, start):
-        if isinstance(answer, DiedError):
-            answer = {"ended": str(answer), "reached": False, "kept": False, "lost": "worker"}
-        elif isinstance(answer, Exception):
-            raise answer
-        yield {"sample": number, **answer}
-
-
-def _run(trial: Runs, task: Task) -> dict[str, Any]:
+def _run(trial: Trial, task: Task) -> dict[str, Any]:
     number, sample = task
     record = trial.run(np.array(sample))
     if number >= DRAWN:
         record.pop("path", None)
     return record
-
-
-def use_processes(jobs: int | None = None) -> Executor:
-    """Processes of one thread each, on all cores or as many as `jobs` says."""
-    return ProcessPoolExecutor(jobs or os.cpu_count(), Spawning(), _end_with_parent)
-
-
-def connect(address: str, patience: float = 10.0) -> Executor:
-    """An executor on the workers of a Dask scheduler.
-
-    Parameters
-    ----------
-    address         such as ``tcp://10.0.0.1:8786``
-    patience : [s]  how long to wait for an answer
-
-    Raises
-    ------
-    InputError  if Dask is not installed, or no scheduler answers there
-    """
-    try:
-        from distributed import Client
-    except ImportError:
-        text = "Dask is not installed; pip install 'wholearm[cluster]' brings it"
-        raise InputError("", "--scheduler", text) from None
-    try:
-        client = Client(address, timeout=patience, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise InputError("", "--scheduler", f"{address}: {error}") from None
-    executor: Executor = client.get_executor(pure=False)
-    return executor
-
-
-def _end_with_parent() -> None:
-    """Have this process end when the one that started it is killed, and can tell it no more."""
-    parent = parent_process()
-    if parent is not None:
-
-        def watch() -> None:
-            wait([parent.sentinel])
-            os._exit(1)
-
-        Thread(target=watch, daemon=True).start()
 
 
 def _stamp(trial: Trial, seed: int) -> dict[str, Any]:

@@ -268,11 +268,6 @@ class Precision(Study):
         """The time allowed, and that of the reference."""
         return self.allowed + REFERENCE
 
-    def group(self, case: Case) -> object:
-        """Simulators share the reference of a phase, runs of a planner what it imports."""
-        study, phase, method, *_ = case
-        return (study, phase) if study in (FEW, MANY) else method
-
     def run(self, case: Case) -> Row:
         """Measure one setting."""
         run = run_simulator if case[0] in (FEW, MANY) else run_planner

@@ -96,10 +96,6 @@ class Stress(Study):
         """By the kind of the case."""
         return LIMITS[case[0]]
 
-    def group(self, case: Case) -> Any:
-        """A worker that goes on with a scene need not draw it again."""
-        return case[:3] if case[0] == "scene" else case
-
     def run(self, case: Case) -> Row:
         """Run one case."""
         kind, *arguments = case
