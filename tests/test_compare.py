@@ -17,7 +17,7 @@ from wholearm.cli.command import main
 from wholearm.common.errors import InputError
 from wholearm.comparison.metrics import compare
 from wholearm.figures import plots
-from wholearm.figures.comparison import draw_comparison
+from wholearm.figures.analysis_figures import draw_comparison
 from wholearm.problem.definition import Problem
 from wholearm.problem.keys import name_keys
 from wholearm.problem.table import change_table

@@ -20,8 +20,10 @@ import tipping
 from wholearm import plots
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
+from wholearm.figures.curves import draw_torques
 from wholearm.figures.plot_data import choose_snapshots, find_steps
-from wholearm.figures.style import WIDTH
+from wholearm.figures.snapshots import choose_numbers, draw_snapshot
+from wholearm.figures.style import WIDTH, choose_styles
 from wholearm.problem.definition import Problem
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Trajectory, assemble
@@ -147,7 +149,7 @@ def test_strip_has_one_scale_and_its_bar(figure: Figure) -> None:
 def test_numbers_at_vertices_stand_apart(count: int, thin: float) -> None:
     angles = 2 * np.pi * (np.arange(count) + 0.5) / count
     vertices = 40 * np.column_stack([np.cos(angles), thin * np.sin(angles)])
-    found = plots.choose_numbers(vertices, [1])
+    found = choose_numbers(vertices, [1])
     places = {str(k): vertices[k] + own for k, own in found.items()}
     for (one, a), (other, b) in itertools.combinations(places.items(), 2):
         wide = 0.32 * 8 * (len(one) + len(other))
@@ -163,7 +165,7 @@ def test_numbers_at_vertices_stand_apart(count: int, thin: float) -> None:
 )
 def test_units_suit_the_size(axes: Axes, size: float, prefix: str) -> None:
     torque = TorqueProfile(np.array([0.0, 1.0]), np.full((1, 2, 1), 0.5 * size))
-    plots.draw_torques(axes, torque, np.array([size, size]))
+    draw_torques(axes, torque, np.array([size, size]))
     axes.figure.canvas.draw()
     assert f"[{prefix}N m]" in axes.get_ylabel()
     labels = [tick.get_text() for tick in axes.get_yticklabels()]
@@ -206,7 +208,7 @@ def test_torque_lines_have_both_ends_of_every_step(axes: Axes) -> None:
         np.array([0.0, 0.5, 2.0]),
         np.array([[[0.25, 0.25, 0.0], [1.0, 0.0, 0.0]], [[-1.0, 0.0, 0.5], [1.0, 0.0, 0.0]]]),
     )
-    line, other = plots.draw_torques(axes, profile, np.array([2.0, 2.0]))
+    line, other = draw_torques(axes, profile, np.array([2.0, 2.0]))
     t, tau = data_of(line)
     np.testing.assert_allclose(tau[t == 0.5], [0.5, -0.5])
     inside = t != 0.5
@@ -225,8 +227,8 @@ def test_planned_torques_are_drawn_exactly(figure: Figure, planned: Trajectory) 
 @pytest.mark.parametrize("row", [0, 320, -1])
 def test_snapshot_is_to_scale(axes: Axes, planned: Trajectory, problem: Problem, row: int) -> None:
     z, names = planned.z[row], planned.motions[planned.phase[row]].contacts
-    scene, styles = problem.scene, plots.choose_styles(planned.contacts)
-    _, *links, body = plots.draw_snapshot(axes, scene, z, names, styles)[:4]
+    scene, styles = problem.scene, choose_styles(planned.contacts)
+    _, *links, body = draw_snapshot(axes, scene, z, names, styles)[:4]
     c, s = np.cos(z[2]), np.sin(z[2])
     corners = [(z[0] + c * x - s * y, z[1] + s * x + c * y) for x, y in scene.polygon.vertices]
     assert isinstance(body, Polygon)

@@ -36,7 +36,7 @@ def predict(options: argparse.Namespace) -> int:
     prediction = run(problem, squeeze=options.squeeze, progress=show_progress())
     if options.output is not None:
         from ..figures import plots
-        from ..figures.prediction_figure import draw_prediction
+        from ..figures.analysis_figures import draw_prediction
 
         plots.save(draw_prediction(prediction), options.output)
     status = print_result(options, prediction)
@@ -73,7 +73,7 @@ def compare(options: argparse.Namespace) -> int:
     comparison = run(load(options.problem), options.files, show_progress())
     if options.output is not None:
         from ..figures import plots
-        from ..figures.comparison import draw_comparison
+        from ..figures.analysis_figures import draw_comparison
 
         plots.save(draw_comparison(comparison), options.output)
     status = print_result(options, comparison)
@@ -116,7 +116,7 @@ def robustness(options: argparse.Namespace) -> int:
     )
     if options.figure is not None:
         from ..figures import plots
-        from ..figures.robustness_figure import draw_robustness
+        from ..figures.analysis_figures import draw_robustness
 
         plots.save(draw_robustness(study), options.figure)
     status = print_result(options, study, notes)

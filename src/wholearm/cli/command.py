@@ -279,9 +279,9 @@ def plot(options: argparse.Namespace) -> int:
         raise InputError("", "--problem", "is for torques (.csv); trajectories bring their own")
     with name_source(options.trajectory):
         simulation = overlay(options.simulate, trajectory) if options.simulate else None
-        width = plots.WIDTH if options.width is None else options.width
+        width = {} if options.width is None else {"width": options.width}
         figure = plots.force_margins(
-            trajectory, simulation=simulation, width=width, motion=options.motion
+            trajectory, simulation=simulation, motion=options.motion, **width
         )
     plots.save(figure, options.output)
     name_files(options, options.output)

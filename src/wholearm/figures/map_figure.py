@@ -11,9 +11,7 @@ from functools import partial
 from itertools import count
 from typing import Any
 
-import matplotlib
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -29,7 +27,7 @@ from ..mapping.formation_list import trace_problem
 from ..mapping.formation_map import CROSSED, FormationMap
 from ..results.adopt import Moved, adopt_motion
 from ..results.trajectory import Trajectory
-from .style import INK, STYLE, write, write_title
+from .style import INK, add_line, inset, open_figure, write, write_title
 
 SIZE = (11.0, 7.9)  # in
 BOX = (0.75, 1.0, 9.4, 6.2)  # axes: left, bottom, width, height [in]
@@ -78,9 +76,7 @@ def draw_map(chart: FormationMap, plan: Trajectory | Moved | None = None) -> Fig
     problem = chart.problem
     path = None if plan is None else adopt_motion(problem, plan)[1]
     paths = trace_problem(problem) if path is None else trace_plan(path)
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=SIZE)
-        FigureCanvasAgg(figure)
+    with open_figure(*SIZE) as figure:
         drawing = _Drawing(figure, chart, paths)
         drawing.draw_cells()
         drawing.draw_directions(drawing.draw_labels())
@@ -102,8 +98,7 @@ class _Drawing:
     def __init__(self, figure: Figure, chart: FormationMap, paths: Sequence[Array]) -> None:
         self.figure, self.chart, self.paths = figure, chart, [_to_axes(path) for path in paths]
         self.x, self.phi = 1e3 * chart.x, np.degrees(chart.phi)
-        left, bottom, width, height = np.array(BOX) / np.tile(SIZE, 2)
-        self.axes = figure.add_axes((left, bottom, width, height))
+        self.axes = inset(figure, *BOX)
         self.axes.set(xlim=self.x[[0, -1]], xlabel="x of the centroid [mm]")
         self.axes.set(ylim=self.phi[[0, -1]], ylabel="orientation \u03c6 [deg]")
         # Points per mm and per deg.
@@ -133,9 +128,6 @@ class _Drawing:
     def _add(self, polygons: Array, **look: Any) -> None:
         """Draw polygons of n corners, shape (m, n, 2), as one."""
         self.axes.add_artist(PathPatch(Path.make_compound_path_from_polys(polygons), **look))
-
-    def _add_line(self, points: Array, **look: Any) -> None:
-        self.axes.add_artist(Line2D(*points.T, **look))
 
     def _add_lines(self, lines: Sequence[Array], color: str, **look: Any) -> None:
         self.axes.add_artist(LineCollection(lines, colors=color, **look))
@@ -187,7 +179,7 @@ class _Drawing:
             starts = places[free & self.chart.possible[:, k], None]
             self._add(starts + arrow, fc=_FREE, lw=0, zorder=2)
         crosses = places[free & self.chart.ambiguous]
-        self._add_line(crosses, marker="x", ms=3.5, ls="none", color=_AMBIGUOUS, zorder=2)
+        add_line(self.axes, crosses, marker="x", ms=3.5, ls="none", color=_AMBIGUOUS, zorder=2)
 
     def draw_borders(self) -> None:
         """Borders, with lines beside them to where motions are possible, and what can be hit."""
@@ -208,7 +200,7 @@ class _Drawing:
             self._add(heads / self.scale, fc=colour, lw=0, zorder=5)
         self._add_lines(list(cut(every, "ambiguous")), _AMBIGUOUS, zorder=4, **_DOTTED)
         for points in every:
-            self._add_line(points, lw=9, alpha=0.0, zorder=5.5, gid=next(self.gids))
+            add_line(self.axes, points, lw=9, alpha=0.0, zorder=5.5, gid=next(self.gids))
 
     def draw_crossings(self) -> None:
         """Dots; those where only a contact changes its name on a border are small."""
@@ -216,7 +208,7 @@ class _Drawing:
             look: Any = {"marker": "o", "mfc": INK, "mec": "white", "mew": 0.5, "zorder": 6}
             look |= {"ls": "none", "gid": next(self.gids)}
             look["ms"] = 3.6 if len(own.flush) >= 2 else 2.4
-            self._add_line(_to_axes(own.point[None]), **look)
+            add_line(self.axes, _to_axes(own.point[None]), **look)
 
     def draw_paths(self) -> None:
         """The plan, each phase with its number on or beside it."""
@@ -226,9 +218,9 @@ class _Drawing:
         look["bbox"] = {"boxstyle": "circle,pad=0.22", "fc": INK, "ec": "white", "lw": 0.8}
         places = place_discs(lines, _DISC, *corners)
         for number, (line, place) in enumerate(zip(lines, places, strict=True), start=1):
-            self._add_line(line / self.scale, zorder=3.5, **_PLAN)
+            add_line(self.axes, line / self.scale, zorder=3.5, **_PLAN)
             leader = np.array([find_middle(line), place]) / self.scale
-            self._add_line(leader, color=INK, lw=0.8, zorder=8.5)
+            add_line(self.axes, leader, color=INK, lw=0.8, zorder=8.5)
             self._write(leader[1], str(number), **look)
 
     def name_palm_lines(self) -> None:

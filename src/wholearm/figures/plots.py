@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 import matplotlib
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from ..common.errors import InputError, require_number
@@ -32,16 +31,18 @@ from .curves import (
     draw_simulation,
     draw_torques,
 )
-from .snapshots import (
-    choose_numbers,
-    draw_snapshot,
-    draw_strip,
-    lay_out_strip,
-    place_contacts,
-    place_vertices,
-    trace_link,
+from .snapshots import draw_strip, lay_out_strip
+from .style import (
+    STYLE,
+    WIDTH,
+    WIDTHS,
+    choose_styles,
+    inset,
+    list_contacts,
+    open_figure,
+    unit_of,
+    write_title,
 )
-from .style import STYLE, WIDTH, WIDTHS, Sheet, choose_styles, list_contacts, unit_of, write_title
 
 if TYPE_CHECKING:
     from ..simulation.events import Simulation
@@ -91,22 +92,9 @@ def force_margins(
     meta = trajectory.meta
     problem = read_own_problem(meta)
     epsilon = require_number(meta.get("epsilon", problem.epsilon), "meta.epsilon")
-    with matplotlib.rc_context(STYLE):
-        return _draw(trajectory, problem.scene, epsilon, simulation, width, motion)
-
-
-def _draw(
-    trajectory: Trajectory,
-    scene: Scene,
-    epsilon: float,
-    simulation: Simulation | None,
-    width: float,
-    motion: bool,
-) -> Figure:
-    """Lay the figure out from its foot to its title, and draw it."""
-    styles = choose_styles(trajectory.contacts)
-    rolls = bool(trajectory.rolling.any())
-    slim = width < _SLIM
+    scene, styles = problem.scene, choose_styles(trajectory.contacts)
+    # From the foot of the figure to its title.
+    rolls, slim = bool(trajectory.rolling.any()), width < _SLIM
     strip = lay_out_strip(trajectory, scene, width - 0.3, slim)
     columns = max(1, int((width - 0.3) / 1.05))
     keys = len(trajectory.contacts) + 3 + (simulation is not None)
@@ -115,40 +103,36 @@ def _draw(
     sizes = [_MOTION * share] * 3 * motion + [_TORQUES * share] + [_CONES] * rolls
     sizes.append(_MARGINS * share)
     size_of_title = 8.5 if slim else 10.5
-    between = " \u00b7 " if slim else "  \u00b7  "
-    whole = _title(trajectory, scene, epsilon, between)
+    whole = _title(trajectory, scene, epsilon, " \u00b7 " if slim else "  \u00b7  ")
     title = textwrap.wrap(whole, max(24, int(11.5 * width * 10.5 / size_of_title)))
-    above = _TOP + _LINE * (len(title) - 1)
-    panels_high = sum(sizes) + _GAP * (len(sizes) - 1) + 0.3
-    sheet = Sheet(width, foot + panels_high + strip.height + above)
-    figure = Figure(figsize=sheet)
-    FigureCanvasAgg(figure)
-    draw_strip(figure, sheet, sheet.height - above, strip, trajectory, scene, styles)
-    low, places = foot, []
-    for size in sizes:
-        places.append(sheet.inset(_LEFT, low, width - _LEFT - (0.12 if slim else _RIGHT), size))
-        low += size + _GAP
-    margins = figure.add_axes(places[-1])
-    torques = figure.add_axes(places[3 * motion], sharex=margins)
-    covered = None if simulation is None else simulation.c_n - epsilon
-    draw_margins(margins, trajectory, epsilon, styles, covered)
-    draw_torques(torques, trajectory.torque, scene.torque_limit)
-    if simulation is not None:
-        draw_simulation(margins, torques, simulation, epsilon)
-    panels = [margins, torques]
-    if rolls:
-        panels.append(figure.add_axes(places[-2], sharex=margins))
-        draw_cones(panels[-1], trajectory, scene, styles, simulation)
-    if motion:
-        own = [figure.add_axes(place, sharex=margins) for place in places[2::-1]]
-        draw_motion(own, trajectory)
-        panels += own
-    if slim:
-        for axes, name in ((margins, "margin"), (torques, "torque")):
-            axes.set_ylabel(f"{name} {unit_of(axes)}")
-        _draw_legend(figure, [margins, torques], columns)
-    _label(figure, panels, panels[-1] if motion else torques, trajectory, slim)
-    write_title(figure, "\n".join(title), size_of_title)
+    top = foot + sum(sizes) + _GAP * (len(sizes) - 1) + 0.3 + strip.height
+    with open_figure(width, top + _TOP + _LINE * (len(title) - 1)) as figure:
+        draw_strip(figure, top, strip, trajectory, scene, styles)
+        wide, low, places = width - _LEFT - (0.12 if slim else _RIGHT), foot, []
+        for size in sizes:
+            places.append((_LEFT, low, wide, size))
+            low += size + _GAP
+        margins = inset(figure, *places[-1])
+        torques, *others = (
+            inset(figure, *place, sharex=margins)
+            for place in [places[3 * motion], *places[-2:][:rolls], *places[2::-1][: 3 * motion]]
+        )
+        panels = [margins, torques, *others]
+        covered = None if simulation is None else simulation.c_n - epsilon
+        draw_margins(margins, trajectory, epsilon, styles, covered)
+        draw_torques(torques, trajectory.torque, scene.torque_limit)
+        if simulation is not None:
+            draw_simulation(margins, torques, simulation, epsilon)
+        if rolls:
+            draw_cones(others[0], trajectory, scene, styles, simulation)
+        if motion:
+            draw_motion(others[-3:], trajectory)
+        if slim:
+            for axes, name in ((margins, "margin"), (torques, "torque")):
+                axes.set_ylabel(f"{name} {unit_of(axes)}")
+            _draw_legend(figure, [margins, torques], columns)
+        _label(figure, panels, others[-1] if motion else torques, trajectory, slim)
+        write_title(figure, "\n".join(title), size_of_title)
     return figure
 
 
@@ -208,22 +192,3 @@ def _title(trajectory: Trajectory, scene: Scene, epsilon: float, between: str) -
         text = f"{1e3 * gap:.3g} mm" if gap < 0.9995 else f"{gap:.3g} m"
         parts.append(f"finger gap \u2265 {text}".replace("-", "\u2212"))
     return between.join(part.replace(" ", "\u00a0") for part in parts if part)
-
-
-__all__ = [
-    "WIDTH",
-    "choose_numbers",
-    "choose_styles",
-    "draw_cones",
-    "draw_margins",
-    "draw_phases",
-    "draw_simulation",
-    "draw_snapshot",
-    "draw_torques",
-    "force_margins",
-    "place_contacts",
-    "place_vertices",
-    "require_format",
-    "save",
-    "trace_link",
-]

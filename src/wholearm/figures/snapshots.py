@@ -23,7 +23,7 @@ from ..contacts.elemental import build_features, build_geometry, parse_contact
 from ..results.trajectory import Trajectory
 from ..scene.model import Finger, Scene
 from .plot_data import choose_snapshots
-from .style import FINGERS, INK, PALM, STRIP, Sheet, Styles, count_decimals, write
+from .style import BODY, FINGERS, INK, PALM, Styles, add_line, count_decimals, inset, write
 
 NUMBER = 8.0  # size of the numbers at vertices [points]
 _FEW = 5  # most vertices of an object whose numbers may stand outside; case: a ruler, 120 x 15 mm
@@ -31,6 +31,7 @@ _CAPTION = 0.42  # height of the caption of a snapshot [in]
 _ROOM = (1.38, 0.78)
 """Width that a snapshot needs for its caption, on average, in wide and in slim figures [in]."""
 _ROWS = 3  # most rows of a strip; of more snapshots some are left out, evenly
+_STRIP = 1.75  # greatest height of a row of snapshots [in]
 _BAR = 0.2  # height of the bar that gives the scale, above a strip [in]
 
 
@@ -53,26 +54,15 @@ def draw_snapshot(
     vertices = place_vertices(scene, z)
     bases = [np.asarray(finger.base)[0] for finger in scene.fingers]
     ends = np.concatenate([bases, vertices[vertices[:, 1] < scene.touching, 0]])
-    deep = PALM * scene.scales.length
-    palm = Rectangle((ends.min(), -deep), np.ptp(ends), deep, fc=INK, linewidth=0, zorder=1)
-    artists: list[Artist] = [axes.add_patch(palm)]
-    for finger, angle, (line, face) in zip(scene.fingers, z[3:], FINGERS, strict=True):
-        link = Outline(trace_link(finger, angle), fc=face, ec=line, linewidth=0.9, zorder=2)
-        artists.append(axes.add_patch(link))
-        axes.plot(*np.asarray(finger.base), "o", ms=3.2, mfc="white", mec=line, mew=0.9, zorder=3)
-    body = Outline(vertices, fc="#fbf3df", ec=INK, linewidth=1.1, zorder=4)
-    artists.append(axes.add_patch(body))
+    artists = [draw_palm(axes, scene, ends.min(), ends.max()), *draw_bodies(axes, scene, z)]
+    draw_joints(axes, scene)
     for name, point in zip(contacts, place_contacts(scene, z, contacts), strict=True):
         face, _, marker = styles[name]
         look: Any = {"mfc": face, "mec": "white", "mew": 0.9, "zorder": 6, "label": name}
         artists += axes.plot(*point, marker, ms=6.5, **look)
-    if box is None:
-        axes.autoscale_view()
-    else:
-        axes.set(xlim=box[:, 0], ylim=box[:, 1])
-    axes.apply_aspect()
-    ends = axes.transData.transform([[0.0, 0.0], [1.0, 0.0]])
-    scale = 72 / axes.figure.dpi * float(np.ptp(ends[:, 0]))
+    box = measure_box(scene, z[None]) if box is None else box
+    axes.set(xlim=box[:, 0], ylim=box[:, 1])
+    scale = measure_scale(axes)
     corners = [parse_contact(name, scene) for name in contacts]
     first = [corner.index for corner in corners if corner.feature == "v"]
     style: Any = {"va": "center", "fontsize": NUMBER, "color": "#555555", "zorder": 5.5}
@@ -80,6 +70,39 @@ def draw_snapshot(
     for index, shift in choose_numbers(scale * vertices, first, 0.0).items():
         write(axes, str(index), vertices[index], shift, **style)
     return artists
+
+
+def draw_palm(axes: Axes, scene: Scene, left: float, right: float) -> Artist:
+    """Draw the palm between two x [m]."""
+    deep = PALM * scene.scales.length
+    palm = Rectangle((left, -deep), right - left, deep, fc=INK, linewidth=0, zorder=1)
+    return axes.add_patch(palm)
+
+
+def draw_bodies(axes: Axes, scene: Scene, z: Array, **look: Any) -> list[Artist]:
+    """Draw both links and the object."""
+    shapes = [trace_link(f, angle) for f, angle in zip(scene.fingers, z[3:].tolist(), strict=True)]
+    shapes.append(place_vertices(scene, z))
+    artists: list[Artist] = []
+    looks = (*((*own, 0.9, 2) for own in FINGERS), (INK, BODY, 1.1, 4))
+    for points, (line, face, wide, above) in zip(shapes, looks, strict=True):
+        own: dict[str, Any] = {"fc": face, "ec": line, "lw": wide, "zorder": above} | look
+        artists.append(axes.add_artist(Outline(points, **own)))
+    return artists
+
+
+def draw_joints(axes: Axes, scene: Scene) -> list[Artist]:
+    """Draw the joints of both fingers."""
+    look: Any = {"marker": "o", "ms": 3.2, "mfc": "white", "mew": 0.9, "zorder": 3}
+    rows = zip(scene.fingers, FINGERS, strict=True)
+    return [add_line(axes, np.array([f.base]), mec=line, **look) for f, (line, _) in rows]
+
+
+def measure_scale(axes: Axes) -> float:
+    """Printer's points per unit of axes with one scale."""
+    axes.apply_aspect()
+    ends = axes.transData.transform([[0.0, 0.0], [1.0, 0.0]])
+    return 72 / axes.figure.dpi * float(np.ptp(ends[:, 0]))
 
 
 def choose_numbers(
@@ -182,60 +205,47 @@ def lay_out_strip(trajectory: Trajectory, scene: Scene, width: float, slim: bool
     lines = math.ceil(len(chosen) / wide)
     cuts = np.linspace(0, len(chosen), lines + 1).round().astype(int)
     rows = tuple(tuple(chosen[a:b]) for a, b in pairwise(cuts))
-    boxes = {row: _measure(scene, trajectory.z[row]) for row in chosen}
+    pad = PALM * scene.scales.length * np.array([[-1.0], [1.0]])
+    boxes = {row: measure_box(scene, trajectory.z[[row]]) + pad for row in chosen}
     low = min(float(box[0, 1]) for box in boxes.values())
     high = max(float(box[1, 1]) for box in boxes.values())
     widest = [
         (width - 0.12 * max(1, len(row) - 1)) / sum(np.ptp(boxes[k][:, 0]) for k in row)
         for row in rows
     ]
-    return Strip(rows, boxes, low, high, min(*widest, STRIP / (high - low)))
+    return Strip(rows, boxes, low, high, min(*widest, _STRIP / (high - low)))
 
 
 def draw_strip(
     figure: Figure,
-    sheet: Sheet,
     top: float,
     strip: Strip,
     trajectory: Trajectory,
     scene: Scene,
     styles: Styles,
 ) -> None:
-    """Draw the snapshots of a strip whose upper end is at `top` [in]."""
-    room, last = sheet.width - 0.3, strip.rows[-1][-1]
+    """Draw the snapshots of a strip whose upper end is at `top` [in], with times and phases."""
+    room, last = figure.get_figwidth() - 0.3, strip.rows[-1][-1]
     height = strip.scale * (strip.high - strip.low)
+    decimals = count_decimals(trajectory.duration)
     _draw_scale(figure, top, strip)
-    top -= _BAR
-    for line, row in enumerate(strip.rows):
-        bottom = top - (line + 1) * height - line * _CAPTION
+    for line, row in enumerate(strip.rows, start=1):
+        bottom = top - _BAR - line * height - (line - 1) * _CAPTION
         widths = [strip.scale * float(np.ptp(strip.boxes[k][:, 0])) for k in row]
         left, space = 0.15, (room - sum(widths)) / max(1, len(row) - 1)
         for k, width in zip(row, widths, strict=True):
-            axes = figure.add_axes(sheet.inset(left, bottom, width, height))
+            axes = inset(figure, left, bottom, width, height)
             box = np.column_stack([strip.boxes[k][:, 0], [strip.low, strip.high]])
-            _draw_sample(axes, trajectory, k, k == last, scene, styles, box)
+            own = trajectory.motions[trajectory.phase[k]].contacts
+            # What does not press at this instant is left out, unless no force is known.
+            presses = dict(zip(trajectory.contacts, np.isfinite(trajectory.c_n[k]), strict=True))
+            names = [name for name in trajectory.contacts if name in own]
+            names = [name for name in names if presses[name]] or names
+            draw_snapshot(axes, scene, trajectory.z[k], names, styles, box)
+            place = "end" if k == last else f"phase {trajectory.phase[k] + 1}"
+            caption = f"{trajectory.t[k]:.{decimals}f} s\n{place}"
+            write(axes, caption, (0.5, 0), (0, -3), xycoords="axes fraction", va="top")
             left += width + space
-
-
-def _draw_sample(
-    axes: Axes,
-    trajectory: Trajectory,
-    row: int,
-    end: bool,
-    scene: Scene,
-    styles: Styles,
-    box: Array,
-) -> None:
-    """Draw hand and object at a sample, with its time and phase below."""
-    own = trajectory.motions[trajectory.phase[row]].contacts
-    # What does not press at this instant is left out, unless no force is known.
-    known = dict(zip(trajectory.contacts, np.isfinite(trajectory.c_n[row]), strict=True))
-    names = [name for name in trajectory.contacts if name in own]
-    names = [name for name in names if known[name]] or names
-    draw_snapshot(axes, scene, trajectory.z[row], names, styles, box)
-    place = "end" if end else f"phase {trajectory.phase[row] + 1}"
-    caption = f"{trajectory.t[row]:.{count_decimals(trajectory.duration)}f} s\n{place}"
-    write(axes, caption, (0.5, 0), (0, -3), xycoords="axes fraction", va="top")
 
 
 def _draw_scale(figure: Figure, top: float, strip: Strip) -> None:
@@ -250,9 +260,10 @@ def _draw_scale(figure: Figure, top: float, strip: Strip) -> None:
     figure.text(ends[1] + 0.06, top - 0.06, text, **look)
 
 
-def _measure(scene: Scene, z: Array) -> Array:
-    """Corners of the box around hand and object, shape (2, 2) [m]."""
-    links = [trace_link(f, float(a)) for f, a in zip(scene.fingers, z[3:], strict=True)]
-    every = np.concatenate([place_vertices(scene, z), *links])
-    pad = PALM * scene.scales.length
-    return np.array([every.min(axis=0) - pad, every.max(axis=0) + pad])
+def measure_box(scene: Scene, z: Array) -> Array:
+    """Corners of the box around hand and object at configurations, (n, 5); shape (2, 2) [m]."""
+    every = [place_vertices(scene, row) for row in z]
+    for finger, angles in zip(scene.fingers, z[:, 3:].T, strict=True):
+        every += [trace_link(finger, angle) for angle in angles.tolist()]
+    points = np.concatenate(every)
+    return np.array([points.min(axis=0), points.max(axis=0)])

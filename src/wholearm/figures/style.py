@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from itertools import cycle
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from ..common.arrays import Array
 from ..common.fields import Range
 
 if TYPE_CHECKING:
@@ -23,6 +25,7 @@ PALETTE = (
     "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#882255", "#56B4E9", "#D55E00", "#777777",
 )  # fmt: skip
 LINES: Any = (("-", "o"), ((0, (5, 1.5)), "s"), ((0, (1.5, 1)), "D"))  # and markers
+BODY = "#fbf3df"  # face of the object
 FINGERS = (("#444444", "#c4c4c4"), ("#999999", "#ececec"))  # line and face
 BAND, LOW, LOST, INK, GRID = "#eef1f5", "#fff4d9", "#f6d5cc", "#222222", "#c4c9d0"
 STYLE: Any = {
@@ -50,18 +53,34 @@ class ContactStyle(NamedTuple):
 
 
 Styles = Mapping[str, ContactStyle]
-STRIP = 1.75  # greatest height of a row of snapshots [in]
 
 
-class Sheet(NamedTuple):
-    """The paper of a figure."""
+@contextmanager
+def open_figure(width: float, height: float, **options: Any) -> Iterator[Figure]:
+    """A figure of so many inches, to be drawn in the style of all."""
+    import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
 
-    width: float  # width, height [in]:
-    height: float
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(width, height), **options)
+        FigureCanvasAgg(figure)
+        yield figure
 
-    def inset(self, left: float, bottom: float, width: float, height: float) -> Any:
-        """The same [in] as fractions of the figure."""
-        return tuple(np.array([left, bottom, width, height]) / (2 * tuple(self)))
+
+def inset(
+    figure: Figure, left: float, bottom: float, width: float, height: float, **options: Any
+) -> Axes:
+    """Axes at a place of a figure [in]."""
+    place = np.array([left, bottom, width, height]) / np.tile(figure.get_size_inches(), 2)
+    return figure.add_axes(tuple(place.tolist()), **options)
+
+
+def add_line(axes: Axes, points: Array, **look: Any) -> Artist:
+    """Draw a line through points, shape (n, 2), that leaves the limits of the axes as they are."""
+    from matplotlib.lines import Line2D
+
+    return axes.add_artist(Line2D(*points.T, **look))
 
 
 def choose_prefix(size: float) -> tuple[str, float]:

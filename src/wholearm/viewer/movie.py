@@ -10,13 +10,10 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.patches import Polygon, Rectangle
+from matplotlib.patches import Polygon
 from PIL import Image, ImageColor
 
 from ..common.arrays import Array
@@ -25,20 +22,30 @@ from ..common.files import write_whole
 from ..common.sharing import exclusive
 from ..contacts.elemental import parse_contact
 from ..figures.curves import draw_margins, draw_phases, draw_torques
-from ..figures.snapshots import NUMBER, choose_numbers, place_vertices, trace_link, turn
+from ..figures.snapshots import (
+    NUMBER,
+    choose_numbers,
+    draw_bodies,
+    draw_joints,
+    draw_palm,
+    measure_box,
+    measure_scale,
+    turn,
+)
 from ..figures.style import (
     BAND,
+    BODY,
     FINGERS,
     GRID,
     INK,
     LOST,
     LOW,
     PALETTE,
-    PALM,
-    STYLE,
+    add_line,
     choose_styles,
     count_decimals,
     list_contacts,
+    open_figure,
     unit_of,
 )
 from ..problem.definition import Problem
@@ -51,142 +58,73 @@ _SIZE = (8.0, 7.4)
 RESOLUTION = 90  # dots per inch of a movie that is 8 inches wide
 _REACH = 0.3  # length of the largest force's arrow, over the picture's
 _BEYOND = 1.15  # length of friction cones over that of the arrows in them
-BODY, TURNS, GHOST = "#fbf3df", "#D55E00", "#bbbbbb"
-"""Colours of the object, of torques and the cursor, and of what is drawn behind."""
+TURNS, GHOST = "#D55E00", "#bbbbbb"
+"""Colours of torques and the cursor, and of what is drawn behind."""
 _TURN = 1.5 * math.pi  # angle of the arc of a torque at its limit
 
 
 class _Scene:
-    """Hand, object and forces on axes, moved from frame to frame."""
+    """Hand, object and forces on axes, drawn anew for each frame."""
 
     def __init__(
         self, axes: Axes, problem: Problem, trajectory: Trajectory, ghost: Trajectory | None
     ) -> None:
-        self._scene, self._trajectory, self._ghost = problem.scene, trajectory, ghost
-        self._pushes = place_pushes(problem.scene, trajectory)
-        strengths = np.hypot(*self._pushes.forces.T)
-        self._strongest = float(np.nanmax(strengths, initial=0.0)) or 1.0
-        low, high = _measure(self._scene, trajectory.z)
+        scene = self._scene = problem.scene
+        self._axes, self._trajectory, self._ghost = axes, trajectory, ghost
+        points, normals, forces = place_pushes(scene, trajectory)
+        low, high = measure_box(scene, trajectory.z[:: max(1, len(trajectory.t) // 200)])
         self._size = float((high - low).max())
-        fingers = [parse_contact(name, self._scene).finger for name in trajectory.contacts]
-        self._friction = np.array([self._scene.friction.of(finger) for finger in fingers])
-        low, high = self._cover_cones(low, high)
-        pad = 0.05 * self._size
-        axes.set(xlim=(low[0] - pad, high[0] + pad), ylim=(low[1] - pad, high[1] + pad))
+        styles = choose_styles(trajectory.contacts)
+        self._colours = [styles[name].colour for name in trajectory.contacts]
+        fingers = [parse_contact(name, scene).finger for name in trajectory.contacts]
+        friction = np.array([scene.friction.of(finger) for finger in fingers])
+        # Square roots: small forces are to be seen beside large ones.
+        strengths = np.hypot(*forces.T).T[..., None]
+        strongest = float(np.nanmax(strengths, initial=0.0)) or 1.0
+        scales = np.sqrt(np.maximum(strengths, 1e-12 * strongest) * strongest)
+        self._points, self._arrows = points, _REACH * self._size * forces / scales
+        self._presses = np.isfinite(forces).all(axis=2)
+        reach = _BEYOND * np.maximum(np.hypot(*self._arrows.T).T, 0.03 * self._size)[..., None]
+        tangents = np.stack([normals[..., 1], -normals[..., 0]], axis=-1) * friction[:, None]
+        sides = [points + reach * (normals + sign * tangents) for sign in (1, -1)]
+        self._cones = np.stack([points, *sides], axis=2)  # (n, m, 3, 2)
+        every = np.vstack([low, high, self._cones[self._presses].reshape(-1, 2)])
+        low, high = every.min(axis=0) - 0.05 * self._size, every.max(axis=0) + 0.05 * self._size
+        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         axes.set_aspect("equal")
         axes.set_axis_off()
-        width, deep = high[0] - low[0] + 2 * pad, PALM * self._scene.scales.length
-        axes.add_patch(Rectangle((low[0] - pad, -deep), width, deep, fc=INK))
-        self._behind = [] if ghost is None else self._add_bodies(axes, GHOST, "none")
-        self._bodies = self._add_bodies(axes, INK, None)
-        styles = choose_styles(trajectory.contacts)
-        colours = [styles[name].colour for name in trajectory.contacts]
-        self._cones = [
-            Polygon(np.zeros((3, 2)), fc=colour, alpha=0.2, lw=0, zorder=5) for colour in colours
-        ]
-        for cone in self._cones:
-            axes.add_patch(cone)
-        lines: Any = {"lw": 1.8, "solid_joinstyle": "miter", "zorder": 6}
-        self._arrows = [axes.plot([], [], color=colour, **lines)[0] for colour in colours]
-        self._dots = [
-            axes.plot([], [], "o", ms=5.5, mfc=colour, mec="white", zorder=7)[0]
-            for colour in colours
-        ]
-        self._arcs = [
-            axes.plot([], [], color=TURNS, lw=1.6, zorder=8)[0] for _ in self._scene.fingers
-        ]
-        axes.apply_aspect()
-        ends = axes.transData.transform([[0.0, 0.0], [1.0, 0.0]])
-        scale = 72 / axes.figure.dpi * float(np.ptp(ends[:, 0]))
-        vertices, look = self._scene.polygon.vertices, dict[str, Any](ha="center", va="center")
+        draw_palm(axes, scene, low[0], high[0])
+        scale, vertices = measure_scale(axes), scene.polygon.vertices
         shifts = choose_numbers(scale * vertices)
-        self._places = np.array([vertices[k] + own / scale for k, own in shifts.items()])
-        self._numbers = [
-            axes.text(0.0, 0.0, str(k), fontsize=NUMBER, color="#555555", zorder=5, **look)
-            for k in shifts
-        ]
-        for finger, (line, _) in zip(self._scene.fingers, FINGERS, strict=True):
-            axes.plot(*np.asarray(finger.base), "o", ms=4, mfc="white", mec=line, zorder=8)
+        self._numbers = {k: vertices[k] + shift / scale for k, shift in shifts.items()}
 
-    @property
-    def artists(self) -> list[Artist]:
-        """What moves, in the order of drawing."""
-        forces = [*self._cones, *self._arrows, *self._dots, *self._arcs]
-        return [*self._behind, *self._bodies, *self._numbers, *forces]
-
-    def _cover_cones(self, low: Array, high: Array) -> tuple[Array, Array]:
-        """Corners of a box, moved so far that arrows and their cones are inside, too."""
-        points, normals, forces = self._pushes
-        tangents = np.stack([normals[..., 1], -normals[..., 0]], axis=-1) * self._friction[:, None]
-        strength = np.sqrt(np.hypot(forces[..., 0], forces[..., 1]) / self._strongest)
-        reach = _BEYOND * _REACH * self._size * strength[..., None]
-        ends = np.concatenate([points + reach * (normals + sign * tangents) for sign in (1, -1)])
-        every = ends[np.isfinite(ends).all(axis=-1)]
-        if not len(every):
-            return low, high
-        return np.minimum(low, every.min(axis=0)), np.maximum(high, every.max(axis=0))
-
-    def _add_bodies(self, axes: Axes, ink: str, face: str | None) -> list[Polygon]:
-        """Both links and the object."""
-        none, bodies = np.zeros((3, 2)), []
-        for _, own in FINGERS:
-            bodies.append(Polygon(none, fc=face or own, ec=ink, lw=0.9, zorder=2))
-        bodies.append(Polygon(none, fc=face or BODY, ec=ink, lw=1.1, zorder=4))
-        for body in bodies:
-            axes.add_patch(body)
-        return bodies
-
-    def move(self, t: float) -> None:
-        """Put everything where it is at an instant."""
-        own, row = self._trajectory, _find(self._trajectory.t, t)
-        z = _blend(own.t, own.z, t)
-        self._pose(self._bodies, z)
+    def draw(self, t: float) -> list[Artist]:
+        """Everything at an instant, in the order of drawing."""
+        axes, own, artists = self._axes, self._trajectory, list[Artist]()
+        row, z = _find(own.t, t), _blend(own.t, own.z, t)
         if self._ghost is not None:
-            self._pose(self._behind, _blend(self._ghost.t, self._ghost.z, t))
-        for text, place in zip(self._numbers, turn(z, self._places), strict=True):
-            text.set_position(place)
-        self._push(row)
-        for arc, finger, angle in zip(self._arcs, self._scene.fingers, own.tau[row], strict=True):
-            swept = _TURN * float(angle) / finger.torque_limit
-            arc.set_data(*_trace_arc(np.asarray(finger.base), swept, 0.05 * self._size).T)
-
-    def _pose(self, bodies: list[Polygon], z: Array) -> None:
-        for body, finger, angle in zip(bodies, self._scene.fingers, z[3:], strict=False):
-            body.set_xy(trace_link(finger, float(angle)))
-        bodies[-1].set_xy(place_vertices(self._scene, z))
-
-    def _push(self, row: int) -> None:
-        """Arrows and friction cones of the contacts that press at a sample."""
-        points, normals, forces = (values[row] for values in self._pushes)
-        # Square roots: small forces are to be seen beside large ones.
-        scale = np.sqrt(np.maximum(np.hypot(*forces.T), 1e-12 * self._strongest) * self._strongest)
-        arrows = forces * (_REACH * self._size / scale)[:, None]
-        presses = np.isfinite(forces).all(axis=1)
-        tangents = np.column_stack([normals[:, 1], -normals[:, 0]]) * self._friction[:, None]
-        for k, own in enumerate(zip(self._cones, self._arrows, self._dots, strict=True)):
-            for artist in own:
-                artist.set_visible(bool(presses[k]))
-            if not presses[k]:
-                continue
-            cone, arrow, dot = own
-            reach = _BEYOND * max(float(np.hypot(*arrows[k])), 0.03 * self._size)
-            sides = [points[k] + reach * (normals[k] + sign * tangents[k]) for sign in (1, -1)]
-            cone.set_xy(np.array([points[k], *sides]))
-            arrow.set_data(*_trace_arrow(points[k], arrows[k], 0.018 * self._size).T)
-            dot.set_data(*points[k][:, None])
-
-
-def _measure(scene: Any, z: Array) -> tuple[Array, Array]:
-    """Corners of the box around a motion."""
-    rows = z[:: max(1, len(z) // 200)]
-    parts = [place_vertices(scene, row) for row in rows]
-    parts += [
-        trace_link(finger, float(row[3 + k]))
-        for row in rows
-        for k, finger in enumerate(scene.fingers)
-    ]
-    every = np.concatenate(parts)
-    return every.min(axis=0), every.max(axis=0)
+            behind = _blend(self._ghost.t, self._ghost.z, t)
+            artists += draw_bodies(axes, self._scene, behind, ec=GHOST, fc="none")
+        artists += draw_bodies(axes, self._scene, z)
+        places = turn(z, np.array([*self._numbers.values()]).reshape(-1, 2))
+        look: Any = {"ha": "center", "va": "center", "fontsize": NUMBER, "color": "#555555"}
+        for k, (x, y) in zip(self._numbers, places.tolist(), strict=True):
+            artists.append(axes.text(x, y, str(k), **look))
+        pressing = np.flatnonzero(self._presses[row]).tolist()
+        for k in pressing:
+            cone = Polygon(self._cones[row, k], fc=self._colours[k], alpha=0.2, lw=0)
+            artists.append(axes.add_artist(cone))
+        for k in pressing:
+            arrow = _trace_arrow(self._points[row, k], self._arrows[row, k], 0.018 * self._size)
+            artists.append(add_line(axes, arrow, color=self._colours[k], lw=1.8))
+        for k in pressing:
+            dot: Any = {"marker": "o", "ms": 5.5, "mfc": self._colours[k], "mec": "white"}
+            artists.append(add_line(axes, self._points[row, [k]], **dot))
+        for finger, torque in zip(self._scene.fingers, own.tau[row].tolist(), strict=True):
+            swept = _TURN * torque / finger.torque_limit
+            arc = _trace_arc(np.asarray(finger.base), swept, 0.05 * self._size)
+            artists.append(add_line(axes, arc, color=TURNS, lw=1.6))
+        return artists + draw_joints(axes, self._scene)
 
 
 def _find(times: Array, t: float) -> int:
@@ -252,9 +190,8 @@ class Movie:
     def draw(self) -> Iterator[Array]:
         """Pictures one by one, shape (height, width, 4), uint8."""
         problem, own = self._problem, self._trajectory
-        with matplotlib.rc_context(STYLE):
-            figure = Figure(figsize=_SIZE, dpi=self._resolution)
-            canvas: Any = FigureCanvasAgg(figure)
+        with open_figure(*_SIZE, dpi=self._resolution) as figure:
+            canvas: Any = figure.canvas
             scene = _Scene(figure.add_axes((0.02, 0.47, 0.96, 0.49)), problem, own, self._ghost)
             margins = figure.add_axes((0.09, 0.225, 0.74, 0.215))
             torques = figure.add_axes((0.09, 0.06, 0.74, 0.14), sharex=margins)
@@ -268,22 +205,24 @@ class Movie:
             label = rf"$\tau$ {unit_of(torques)}"
             torques.set(xlabel="time $t$ [s]", ylabel=label, xlim=(0.0, own.duration))
             figure.align_ylabels([margins, torques])
-            cursors = [axes.axvline(0.0, color=TURNS, lw=1.3) for axes in (margins, torques)]
-            clock = figure.text(0.02, 0.975, "", va="top", fontsize=10.5, fontweight="bold")
-            moving = [*scene.artists, *cursors, clock]
-            for artist in moving:
-                artist.set_animated(True)
             canvas.draw()
-            still = canvas.copy_from_bbox(figure.bbox)
+            still, decimals = canvas.copy_from_bbox(figure.bbox), count_decimals(own.duration)
+            look: Any = {"va": "top", "fontsize": 10.5, "fontweight": "bold", "parse_math": False}
             for t in self.times:
                 canvas.restore_region(still)
-                scene.move(t)
-                for cursor in cursors:
-                    cursor.set_xdata([t, t])
-                time = f"{t:.{count_decimals(own.duration)}f} s"
-                clock.set_text(f"{problem.name}   t = {time}".replace("$", r"\$"))
+                moving = scene.draw(t)
+                for axes in (margins, torques):
+                    cursor: Any = {
+                        "color": TURNS,
+                        "lw": 1.3,
+                        "transform": axes.get_xaxis_transform(),
+                    }
+                    moving.append(add_line(axes, np.array([[t, 0.0], [t, 1.0]]), **cursor))
+                text = f"{problem.name}   t = {t:.{decimals}f} s"
+                moving.append(figure.text(0.02, 0.975, text, **look))
                 for artist in moving:
                     figure.draw_artist(artist)
+                    artist.remove()
                 yield np.array(canvas.buffer_rgba())
 
 

@@ -1,0 +1,245 @@
+"""Figures of comparisons, predictions and studies of robustness."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon, Rectangle
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+
+from ..common.errors import SimulationError
+from ..common.sharing import exclusive
+from .curves import draw_margins, draw_phases
+from .snapshots import place_vertices, trace_link
+from .style import (
+    FINGERS,
+    GRID,
+    INK,
+    LINES,
+    LOST,
+    LOW,
+    PALETTE,
+    PALM,
+    choose_styles,
+    inset,
+    list_contacts,
+    open_figure,
+    unit_of,
+    write,
+    write_title,
+)
+
+if TYPE_CHECKING:
+    from ..comparison.side_by_side import Comparison, Contender
+    from ..quasistatic.slow_speeds import PhasePrediction, Prediction, Survival
+    from ..results.trajectory import Trajectory
+    from ..robustness.sampling import Robustness
+
+_DOT = "  \u00b7  "  # between the parts of a title
+# Of comparisons [in]: width, height of a panel, room at its left, right, below and above all, and
+# the height of a line above each panel.
+_WIDTH, _HEIGHT, _LEFT, _RIGHT, _BOTTOM, _TOP, _LINE = 10.0, 2.45, 0.80, 1.30, 0.40, 0.35, 0.25
+# Of predictions: most panels side by side; size of one with what is written about it, and room at
+# its left, right, bottom and top [in].
+_COLUMNS, _PANEL, _ROOM = 3, (3.7, 2.85), (0.62, 0.15, 0.50, 0.80)
+_WIDE = 20.0  # largest speed over the least from which on fewer speeds have labels
+_REACH = 2.2  # largest force shown, over that near rest
+_KINDS = (
+    ("contacts kept too", PALETTE[2], "o"),
+    ("goal reached", PALETTE[0], "s"),
+    ("goal missed", PALETTE[6], "x"),
+)
+"""What becomes of a sample, its colour and its mark."""
+_LEAST = 1e-4  # what lesser distances [mm] and angles [deg] are drawn as
+
+
+@exclusive
+def draw_comparison(comparison: Comparison) -> Figure:
+    """Draw c_n - epsilon of every contact over time: a panel for each plan, on one scale of time.
+
+    Replays are drawn; where nothing has moved a panel says so.
+    """
+    shown = [(contender, _find_motion(contender)) for contender in comparison.contenders]
+    motions = [motion for _, motion in shown if motion is not None]
+    styles = choose_styles(tuple(dict.fromkeys(name for own in motions for name in own.contacts)))
+    longest = max((motion.duration for motion in motions), default=1.0)
+    high = 0.15 + _TOP + len(motions) * (_HEIGHT + _LINE + _BOTTOM) + len(shown) * _LINE
+    covered = np.concatenate([[0.0], *(own.c_n.ravel() - comparison.epsilon for own in motions)])
+    with open_figure(_WIDTH, high) as figure:
+        title = f"{comparison.name}{_DOT}force margins{_DOT}\u03b5 = {comparison.epsilon:g} N"
+        write_title(figure, title)
+        look: Any = {"fontsize": 9, "color": INK, "parse_math": False, "va": "bottom"}
+        look["transform"] = figure.dpi_scale_trans
+        high -= _TOP
+        for own, motion in shown:
+            high -= _LINE
+            figure.text(_LEFT, high, _describe(own), **look)
+            if motion is None:
+                continue
+            high -= _HEIGHT + _LINE
+            axes = inset(figure, _LEFT, high, _WIDTH - _LEFT - _RIGHT, _HEIGHT)
+            high -= _BOTTOM
+            draw_margins(axes, motion, comparison.epsilon, styles, covered)
+            axes.set_xlim(0.0, longest)
+            draw_phases(axes, motion.phase_starts, span=longest)
+            list_contacts(axes, 72 * _HEIGHT)
+            axes.set_ylabel(f"$c_n - \\varepsilon$ {unit_of(axes)}")
+            axes.set_xlabel("time $t$ [s]" if motion is motions[-1] else "")
+    return figure
+
+
+def _find_motion(own: Contender) -> Trajectory | None:
+    """The replayed motion; None if there is none."""
+    if own.report is None:
+        return None
+    try:
+        return own.report.trajectory
+    except SimulationError:
+        return None
+
+
+def _describe(own: Contender) -> str:
+    more = [own.verdict, f"{own.duration:.4g} s"] if own.ok else [f"{own.verdict}: {own.reason}"]
+    return _DOT.join([own.name, *more])
+
+
+@exclusive
+def draw_prediction(prediction: Prediction) -> Figure:
+    """Draw the least normal force over speed: a panel for each phase, a line for each motion."""
+    phases = [phase for phase in prediction.phases if phase.curves is not None]
+    columns = min(_COLUMNS, max(len(phases), 2))
+    rows = max(math.ceil(len(phases) / columns), 1)
+    (wide, tall), (left, right, bottom, top) = _PANEL, _ROOM
+    with open_figure(columns * wide, rows * tall + 0.45) as figure:
+        for k, phase in enumerate(phases):
+            row, column = divmod(k, columns)
+            corner = column * wide + left, (rows - 1 - row) * tall + bottom
+            axes = inset(figure, *corner, wide - left - right, tall - bottom - top)
+            _draw_phase(axes, phase, prediction.epsilon)
+            axes.set_ylabel("least $c_n$ [N]" if column == 0 else "")
+            axes.set_xlabel("speed along the phase [m/s]" if k >= len(phases) - columns else "")
+        name = f"{prediction.name}{_DOT}quasistatic motions at speed"
+        write_title(figure, f"{name}{_DOT}\u03b5 = {prediction.epsilon:g} N", left=0.15)
+    return figure
+
+
+def _draw_phase(axes: Axes, phase: PhasePrediction, epsilon: float) -> None:
+    """The lines of one phase, with where they break, and above them what breaks."""
+    curves = phase.curves
+    assert curves is not None
+    rest = max([epsilon, *(float(force[0]) for force in curves.force.values())])
+    low, high = -0.35 * rest, _REACH * rest
+    axes.axhspan(0.0, epsilon, color=LOW, linewidth=0, zorder=1)
+    axes.axhspan(low, 0.0, color=LOST, linewidth=0, zorder=1)
+    axes.axhline(epsilon, color="black", linewidth=1.0, zorder=2)
+    above: Any = {"xycoords": "axes fraction", "ha": "left", "va": "bottom", "fontsize": 7.5}
+    for k, own in enumerate(phase.survivals):
+        look: Any = {"color": PALETTE[k], "linestyle": LINES[k % 3][0], "linewidth": 1.9}
+        force = curves.force[own.motion]
+        axes.plot(curves.speed, np.where(np.isfinite(force), force, np.nan), zorder=3 + k, **look)
+        if own.speed:
+            axes.plot(own.speed, epsilon, "o", color=PALETTE[k], markersize=5, zorder=6)
+        text = f"{own.motion}, {_name_failure(own)}"
+        write(axes, text, (0, 1), (0, 29 - 12 * k), color=PALETTE[k], **above)
+    if not any(np.isfinite(force).any() for force in curves.force.values()):
+        middle: Any = {"transform": axes.transAxes, "ha": "center", "va": "center", "zorder": 7}
+        axes.text(0.5, 0.5, "no slow motion keeps its limits", color=INK, **middle)
+    title = f"phase {phase.number}, until {phase.until}"
+    above |= {"fontsize": 9, "fontweight": "bold"}
+    write(axes, title, (0, 1), (0, 41), color=INK, **above)
+    axes.set(xscale="log", xlim=(curves.speed[0], curves.speed[-1]), ylim=(low, high))
+    wide = curves.speed[-1] > _WIDE * curves.speed[0]
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if wide else (1.0, 2.0, 3.0, 5.0)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.yaxis.set_major_locator(MaxNLocator(5))
+    axes.grid(color=GRID, linewidth=0.4)
+
+
+def _name_failure(own: Survival) -> str:
+    """What gives way first in one motion, and at which speed."""
+    if own.speed is None:
+        return "keeps \u03b5 at any speed"
+    if own.speed > 0:
+        return f"{own.speed:.3g} m/s: {own.first.name}"
+    if own.again is not None:
+        return f"only from {own.again:.3g} m/s on: {own.first.name}"
+    return f"never: {own.first.name}"
+
+
+@exclusive
+def draw_robustness(study: Robustness) -> Figure:
+    """Draw paths and ends of the samples beside the nominal motion.
+
+    Returns
+    -------
+    Figure  axes in the order: hand and paths of the centroid, to scale; distances and angles from
+            the goal
+    """
+    with open_figure(10.0, 4.6, layout="constrained") as figure:
+        motion, ends = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
+        _draw_motion(motion, study)
+        _draw_ends(ends, study)
+    return figure
+
+
+def find_kind(record: dict[str, Any]) -> int:
+    """Index of what has become of a sample: kept, reached, missed."""
+    return 0 if record["reached"] and record["kept"] else 1 if record["reached"] else 2
+
+
+def _draw_motion(axes: Axes, study: Robustness) -> None:
+    scene, nominal = study.trial.problem.scene, np.array(study.nominal["path"])
+    axes.set_aspect("equal", adjustable="box")
+    for finger, angle, (line, face) in zip(scene.fingers, nominal[-1, 3:], FINGERS, strict=True):
+        outline = 1e3 * trace_link(finger, float(angle))
+        axes.add_patch(Polygon(outline, fc=face, ec=line, linewidth=0.9, zorder=1))
+    copies = [record for record in study.records if "path" in record]
+    for record in sorted(copies, key=find_kind):
+        path = np.array(record["path"])
+        colour = _KINDS[find_kind(record)][1]
+        axes.plot(*(1e3 * path[:, :2].T), color=colour, linewidth=0.6, alpha=0.5, zorder=3)
+        body = Polygon(1e3 * place_vertices(scene, path[-1]), fill=False, ec=colour)
+        axes.add_patch(body).set(linewidth=0.5, alpha=0.35, zorder=2)
+    for z, dash in ((nominal[0], (0, (4, 2))), (nominal[-1], "-")):
+        body = Polygon(1e3 * place_vertices(scene, z), fill=False, ec=INK, linestyle=dash)
+        axes.add_patch(body).set(linewidth=1.2, zorder=5)
+    axes.plot(*(1e3 * nominal[:, :2].T), color=INK, linewidth=1.6, zorder=4)
+    axes.autoscale_view()
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    deep = 1e3 * PALM * scene.scales.length
+    axes.add_patch(Rectangle((left, -deep), right - left, deep, fc=INK, linewidth=0, zorder=1))
+    axes.set(xlim=(left, right), ylim=(low, high), xlabel="x [mm]", ylabel="y [mm]")
+    axes.set_title("centroid's paths, poses at the start (dashed) and the end", fontsize=9)
+
+
+def _draw_ends(axes: Axes, study: Robustness) -> None:
+    records = [record for record in study.records if "distance" in record]
+    known = study.trial.uncertainty
+    goal = 1e3 * known.find_distance(study.trial.problem.scene), math.degrees(known.angle)
+    given = [(1e3 * own["distance"], math.degrees(own["angle"])) for own in records]
+    places = np.maximum(np.array(given).reshape(-1, 2), _LEAST)
+    kinds = np.array([find_kind(record) for record in records])
+    for kind, (label, colour, marker) in enumerate(_KINDS):
+        own = places[kinds == kind]
+        text = f"{label}: {len(own)}"
+        axes.plot(*own.T, marker, ms=3.5, color=colour, alpha=0.7, label=text, mew=0.9)
+    axes.set(xscale="log", yscale="log")
+    around = np.vstack([places, goal])
+    # Whole powers of ten, so that both ends of an axis have a number.
+    low = 0.8 * 10 ** np.floor(np.log10(around.min(axis=0)))
+    high = 1.25 * 10 ** np.ceil(np.log10(around.max(axis=0)))
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    least = [f" (at least {_LEAST:g})" if min(own) <= _LEAST else "" for own in around.T.tolist()]
+    axes.set_xlabel(f"distance from the goal [mm]{least[0]}")
+    axes.set_ylabel(f"angle from the goal [deg]{least[1]}")
+    axes.axvline(goal[0], color=INK, linewidth=0.8, linestyle=(0, (1, 2)))
+    axes.axhline(goal[1], color=INK, linewidth=0.8, linestyle=(0, (1, 2)))
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, fontsize=8)
+    beyond = len(study.records) - len(records)
+    title = f"ends of {len(records)} samples" + (f"; {beyond} never started" if beyond else "")
+    axes.set_title(title, fontsize=9)
