@@ -233,6 +233,13 @@ class Iterate:
         return bool(self.data.slack(self.data.nodes, self.solution.profile).min() >= 0)
 
     @property
+    def violation_at_nodes(self) -> float:
+        """Largest violation at nodes, over the scales: within ranges, by signs of no row."""
+        margin = self.solution.margin
+        slack = self.data.slack(self.data.nodes, self.solution.profile, margin)
+        return -float((slack / self.data.spans).min())
+
+    @property
     def is_split(self) -> bool:
         """Whether elements end where the plan switches."""
         return any(len(mesh.breaks) for mesh in self.meshes)
