@@ -17,7 +17,7 @@ from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
-from wholearm.mechanics.dynamics import Directions, inverse
+from wholearm.mechanics.dynamics import LAMBDA, Directions, inverse
 from wholearm.problem.definition import End, Phase, Problem, Until
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Motion, Samples, Trajectory, assemble
@@ -73,7 +73,7 @@ class CosineMotion:
                 self.curve.formation, point.z[mine], point.z_s[mine], point.z_ss[mine], directions
             )
             # The sense of the null vector is that of the curve; here a squeeze always presses.
-            sense = np.where(forces.Cl.sum(axis=1) < 0, -1.0, 1.0)
+            sense = np.where(forces.of_c[..., LAMBDA].sum(axis=1) < 0, -1.0, 1.0)
             squeeze = sense * self.squeeze * (1 - self.fade * t[mine] / self.duration)
             c_n[mine] = forces.c(a[mine], v[mine] ** 2, squeeze)
             tau[mine] = forces.tau(a[mine], v[mine] ** 2, squeeze)

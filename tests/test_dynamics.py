@@ -13,7 +13,14 @@ from wholearm.contacts.closing import close_finger
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
-from wholearm.mechanics.dynamics import Directions, build_forward, energy, inverse, reduced_inertia
+from wholearm.mechanics.dynamics import (
+    LAMBDA,
+    Directions,
+    build_forward,
+    energy,
+    inverse,
+    reduced_inertia,
+)
 from wholearm.problem.read import build_problem
 from wholearm.results.trajectory import Samples
 from wholearm.scene.model import Friction, Scene
@@ -168,7 +175,7 @@ def test_squeeze_moves_no_body(curves: tuple[Curve, ...]) -> None:
         point = curve.evaluate(np.array([s]))
         z, z_s, z_ss = point[:3]
         forces = inverse(curve.formation, z, z_s, z_ss, directions)
-        assert np.linalg.norm(forces.Cl[0]) == pytest.approx(1.0, abs=1e-12)
+        assert np.linalg.norm(forces.of_c[0, :, LAMBDA]) == pytest.approx(1.0, abs=1e-12)
         a, b = np.array([0.5]), np.array([0.04])
         v, z_ddot = z_s[0] * 0.2, z_s[0] * 0.5 + z_ss[0] * 0.04
         for squeeze in (np.zeros(1), np.full(1, 3.0)):
@@ -298,7 +305,7 @@ def test_the_squeeze_keeps_its_sense_along_a_curve() -> None:
     (curve,) = trace_phases(problem)
     (part,) = curve.segments
     place = curve.evaluate(np.linspace(0.0, curve.length, 300))
-    null = inverse(curve.formation, *place[:3], Directions(part.Xi, part.sigma)).Cl
+    null = inverse(curve.formation, *place[:3], Directions(part.Xi, part.sigma)).of_c[..., LAMBDA]
     pressing = null.sum(axis=1)
     assert pressing.min() < 0.0 < pressing.max()
     assert np.abs(np.diff(null, axis=0)).max() < 0.05

@@ -22,14 +22,12 @@ from wholearm.planning.lower_bound.lower_bound import (
     find_least,
     look_along,
 )
-from wholearm.planning.lower_bound.rows import PathLimitRows, evaluate_rows
-from wholearm.planning.lower_bound.speed_sweep import NoMotionError, find_fastest
+from wholearm.planning.lower_bound.path_terms import find_limits
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.impact_sequence import make_sequence
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.path_domain.sequence_plan import plan_sequence
 from wholearm.problem.read import build_problem
-from wholearm.search.travel_times import find_durations
 
 EPSILON = 0.05
 
@@ -76,39 +74,11 @@ def test_two_halves_are_one_whole() -> None:
     assert joined.value == pytest.approx(bound(Toy(half.law, length=2.0)).value, rel=1e-7)
 
 
-@pytest.mark.parametrize("largest", [True, False])
-def test_rows_that_say_the_same_are_told_apart_by_their_order(largest: bool) -> None:
-    """Not by rounding: where a limit has no squeeze, all its pairs are one."""
-    rng, sign = np.random.default_rng(0), 1.0 if largest else -1.0
-    a, b, v, one = (np.tile(rng.uniform(1, 2, (50, 1)), 3) for _ in range(4))
-    noise = 1 + 1e-14 * rng.uniform(-1, 1, one.shape)
-    # The last one is farther away by a millionth.
-    farther = np.array([1.0, 1.0, 1.0 + 1e-6])
-    rows = PathLimitRows(-sign * a, -b, v, one * noise + 5.0, np.full(50, np.inf))
-    found = rows._replace(one=rows.one * farther).extreme(np.ones(50), largest)
-    np.testing.assert_array_equal(found.row, 0)
-    nearer = rows._replace(one=rows.one * (2 - farther)).extreme(np.ones(50), largest)
-    np.testing.assert_array_equal(nearer.row, 2)
-
-
 def test_no_motion_has_no_bound() -> None:
     # The squeeze alone, 0.05 N at a lever of 50 m, takes more torque than there is.
     toy = Toy(constant(1.0, 50.0))
     with toy.in_place():
         assert bound_least_time([toy.curve], toy.epsilon) is None
-
-
-@pytest.mark.parametrize("cap", [3.0, 5.0])
-def test_a_motion_has_to_be_as_fast_as_the_end_asks_for(cap: float) -> None:
-    """At the end s'' is -2, so that rest is reached over 1 m from b = 4, which the cap forbids."""
-    sides, none = np.tile([1.0, -1.0], (2, 1)), np.zeros((2, 2))
-    rows = PathLimitRows(sides, none, none, np.array([[10.0, 10.0], [2.0, -2.0]]), np.full(2, cap))
-    given = rows, np.ones(2), np.full(2, 0.5), np.array([np.inf, cap, np.inf]), None
-    if cap < 4.0:
-        with pytest.raises(NoMotionError):
-            find_fastest(*given)
-    else:
-        assert find_fastest(*given).b == pytest.approx([0.0, 4.0, 0.0], abs=1e-12)
 
 
 @pytest.mark.parametrize("phase", [0, 2])
@@ -129,7 +99,7 @@ def test_any_costate_gives_a_lower_bound(curves: tuple[Curve, ...], phase: int) 
     limits = make_limits(curve.formation, EPSILON)
     kept = (limits.find_slack(y @ limits.rows.T) >= 0).all(axis=1)
     assert kept.sum() > 100
-    rows = evaluate_rows(curve, EPSILON, s, segment)
+    rows = find_limits(curve, EPSILON, point, segment)
     p = rng.normal(0, 0.05, count) * (rng.uniform(0, 1, count) > 0.1)
     slope = rng.normal(0, 2, count)
     value = 1 / np.sqrt(b) - slope * b - 2 * p * a
@@ -219,31 +189,3 @@ def test_a_place_that_motions_hardly_pass_is_found_on_any_first_grid(
         least.append(found.value)
     assert least == pytest.approx([least[-1]] * len(least), rel=1e-5)
     assert look_along(curves, epsilon, 1000) == pytest.approx(least[-1], rel=1e-3)
-
-
-LENGTH, COUNT = 2.0, 64
-
-
-def push() -> tuple[PathLimitRows, tuple[np.ndarray, np.ndarray]]:
-    """|s''| <= 1 along a way."""
-    shape = (1, COUNT, 2)
-    a = np.broadcast_to([1.0, -1.0], shape).copy()
-    rows = PathLimitRows(
-        a, np.zeros(shape), np.zeros(shape), np.ones(shape), np.full((1, COUNT), np.inf)
-    )
-    return rows, (np.full(COUNT, LENGTH / COUNT), np.full(COUNT, 0.5))
-
-
-def test_half_the_way_is_for_speeding_up_and_half_for_braking() -> None:
-    rows, grid = push()
-    # With s'' the same in each interval this motion is on the grid, where intervals are even.
-    assert find_durations(rows, *grid)[0] == pytest.approx(2 * np.sqrt(LENGTH), rel=1e-9)
-
-
-@pytest.mark.filterwarnings("error")
-def test_a_closed_place_lets_no_viscous_motion_pass() -> None:
-    rows, grid = push()
-    closed = slice(0, COUNT // 4)
-    rows.a[0, closed], rows.one[0, closed] = 0.0, -1.0
-    rows.v[:] = -0.1
-    assert find_durations(rows, *grid)[0] == np.inf

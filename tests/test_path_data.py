@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from wholearm.common.arrays import Array, find_minima
 from wholearm.geometry.arcs import CostToGo
-from wholearm.geometry.curve import Curve, Segment
+from wholearm.geometry.curve import Curve, Segment, directions_of
 from wholearm.geometry.tracing import trace_phase, trace_phases
-from wholearm.mechanics.dynamics import PathForces, inverse, metric_weights
+from wholearm.mechanics.dynamics import ONE, PathForces, inverse, metric_weights
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
-from wholearm.planning.lower_bound.rows import directions_of
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain.elements import (
     DEGREE,
@@ -124,9 +123,9 @@ def test_a_planted_miss_is_found(
     here = data.slack(data.checks, data.interpolate(motion.profile, data.sampling.checks))[
         row, contact
     ]
-    C0 = data.checks.forces.C0.copy()
-    C0[row, contact] -= here + 0.25
-    planted = data._replace(checks=data.checks._replace(forces=data.checks.forces._replace(C0=C0)))
+    C = data.checks.forces.of_c.copy()
+    C[row, contact, ONE] -= here + 0.25
+    planted = data._replace(checks=data.checks._replace(forces=data.checks.forces._replace(of_c=C)))
     short, *_ = planted.misses(motion.profile, 0.0)
     interval = row // len(data.sampling.checks)
     # A parabola through the place and its neighbours may dip a little beyond it.

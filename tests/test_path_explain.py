@@ -13,6 +13,7 @@ from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError, SolverError, WholearmError
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
+from wholearm.mechanics.dynamics import LAMBDA, ONE, A, B, V
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.impact_sequence import make_sequence
 from wholearm.planning.path_domain.path_data import prepare
@@ -58,7 +59,7 @@ def relax_by_linear_program(curve: Curve, epsilon: float, name: str) -> float | 
     data = prepare(curve, epsilon, Mesh().make_grid(curve, INTERVALS // 4), 1)
     nodes, n_c = len(data.grid.s), 4
     forces, steps = data.nodes.forces, data.grid.steps
-    assert not forces.Tv.any()
+    assert not forces.of_tau[..., V].any()
     last = 3 * nodes
     rows: list[Array] = []
     right: list[Array] = []
@@ -74,15 +75,15 @@ def relax_by_linear_program(curve: Curve, epsilon: float, name: str) -> float | 
     for i in range(n_c):
         # c_n >= epsilon, or what epsilon is relaxed to.
         give = name == "epsilon"
-        row = write(forces.Ca[:, i], forces.Cb[:, i], forces.Cl[:, i])
+        row = write(forces.of_c[:, i, A], forces.of_c[:, i, B], forces.of_c[:, i, LAMBDA])
         rows.append(give * relaxed - row)
-        right.append(forces.C0[:, i] - (not give) * epsilon)
+        right.append(forces.of_c[:, i, ONE] - (not give) * epsilon)
     for i in range(2):
         give = name == f"torque limit of finger {i + 1}"
-        row = write(forces.Ta[:, i], forces.Tb[:, i], forces.Tl[:, i])
+        row = write(forces.of_tau[:, i, A], forces.of_tau[:, i, B], forces.of_tau[:, i, LAMBDA])
         high = (not give) * tau_limit[i]
         rows += [row - give * relaxed, -row - give * relaxed]
-        right += [high - forces.T0[:, i], high + forces.T0[:, i]]
+        right += [high - forces.of_tau[:, i, ONE], high + forces.of_tau[:, i, ONE]]
     equal = np.zeros((nodes + 1, last + 1))
     for k, step in enumerate(steps):
         equal[k, [k, k + 1]] = -step

@@ -18,11 +18,10 @@ from toys import Toy, constant
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError, JammingError, SolverError
 from wholearm.contacts.formation import Formation
-from wholearm.geometry.curve import Curve
+from wholearm.geometry.curve import Curve, directions_of
 from wholearm.geometry.tracing import trace_phases
-from wholearm.mechanics.dynamics import inverse
+from wholearm.mechanics.dynamics import LAMBDA, ONE, A, B, inverse
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
-from wholearm.planning.lower_bound.rows import directions_of
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain import path_plan, task
 from wholearm.planning.path_domain.path_motion import PathMotion
@@ -165,11 +164,14 @@ def least_shortfall(problem: Problem, phase: int, s: float, row: int) -> float:
         curve.formation, *curve.evaluate(np.array([s]))[:3], directions_of(curve, segment)
     )
     limit = curve.formation.scene.torque_limit
-    c_n = np.column_stack([forces.Ca[0], forces.Cb[0], forces.Cl[0]])
-    tau = np.column_stack([forces.Ta[0], forces.Tb[0], forces.Tl[0]])
+    c_n, tau = forces.of_c[0][:, [A, B, LAMBDA]], forces.of_tau[0][:, [A, B, LAMBDA]]
     rows = np.vstack([c_n, tau, -tau])
     right = np.concatenate(
-        [problem.epsilon - forces.C0[0], -limit - forces.T0[0], -limit + forces.T0[0]]
+        [
+            problem.epsilon - forces.of_c[0, :, ONE],
+            -limit - forces.of_tau[0, :, ONE],
+            -limit + forces.of_tau[0, :, ONE],
+        ]
     )
     soft = np.zeros(8)
     soft[[row] if row < 4 else [row, row + 2]] = 1.0

@@ -32,7 +32,7 @@ from wholearm.policy.make import SAME, find_widest, hold_end, make_policy
 from wholearm.policy.playback import Policy
 from wholearm.policy.range_margins import find_within, retime_within
 from wholearm.policy.regulator import RATE, Linear, regulate
-from wholearm.policy.retiming import eliminate, retime
+from wholearm.policy.retiming import retime
 from wholearm.problem.definition import Problem
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Trajectory
@@ -103,21 +103,10 @@ def test_the_squeeze_makes_up_for_what_is_measured() -> None:
     assert moving > 5
 
 
-def test_what_is_eliminated_is_still_possible() -> None:
-    rng = np.random.default_rng(4)
-    for _ in range(20):
-        rows = rng.normal(size=(6, 3))
-        x = rng.normal()
-        left = (eliminate(rows) @ [1.0, x] >= 0).all()
-        fixed = rows[:, 0] + rows[:, 1] * x
-        found = linprog([0], A_ub=-rows[:, 2:], b_ub=fixed, bounds=[(None, None)])
-        assert left == (found.status == 0)
-
-
 def test_the_fastest_motion_between_limits_of_the_acceleration() -> None:
     # |s''| <= 2 from rest to rest over a length of 1: halfway 2 sqrt(1 / 2) long, peak b = 2.
     s = np.linspace(0.0, 1.0, 21)
-    limits = np.array([[2.0, 0, 0, -1.0, 0], [2.0, 0, 0, 1.0, 0]])
+    limits = np.array([[2.0, -1.0, 0, 0, 0], [2.0, 1.0, 0, 0, 0]])
     slack = np.tile(limits, (21, 1, 1))
     cap = 12 * np.minimum(s, 1 - s)
     b = retime(s, slack, np.zeros((21, 2)), cap).run(0.0)
@@ -352,7 +341,7 @@ def test_limits_are_the_forces_in_the_worst_corner(ranged: Problem) -> None:
     s = curve.length * np.array([0.1, 0.2, 0.3])
     within = find_within(curve, s, np.zeros(3), widths, ranged.epsilon)
     a, b, squeeze = np.array([3.0, 0.0, -4.0]), np.array([0.1, 0.2, 0.1]), np.full(3, 2.0)
-    known = np.column_stack([np.ones(3), b, np.sqrt(b), a, squeeze])
+    known = np.column_stack([np.ones(3), a, b, np.sqrt(b), squeeze])
     tau = np.einsum("nfq,nq->nf", within.torque, known)
     point, part = curve.evaluate(s), curve.segments[0]
     assert part.stop > s[-1]
@@ -403,7 +392,7 @@ def test_ranges_that_are_too_wide_are_kept_in_part(
 def test_geometry_and_gains_count_to_first_order(ranged: Problem) -> None:
     curve = trace_phase(ranged.phases[0], ranged.start, ())
     s, motion = np.array([0.1 * curve.length]), (np.ones(1), np.full(1, 0.1), np.full(1, 2.0))
-    known = np.array([1.0, 0.1, np.sqrt(0.1), 1.0, 2.0])
+    known = np.array([1.0, 1.0, 0.1, np.sqrt(0.1), 2.0])
 
     def measure(widths: dict[str, float]) -> np.ndarray:
         rows, _, _ = find_within(curve, s, np.zeros(1), widths, 0.05).at(motion)

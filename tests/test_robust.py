@@ -11,12 +11,17 @@ import pytest
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.contacts.formation import Formation
-from wholearm.geometry.curve import Curve
+from wholearm.geometry.curve import Curve, directions_of
 from wholearm.geometry.path_guess import load
 from wholearm.geometry.tracing import trace_phases
-from wholearm.mechanics.dynamics import Directions, build_forward, inverse, metric_weights
+from wholearm.mechanics.dynamics import (
+    Directions,
+    build_forward,
+    inverse,
+    metric_weights,
+    stack_motion,
+)
 from wholearm.mechanics.wedging import find_static_torques
-from wholearm.planning.lower_bound.rows import directions_of
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.path_domain.range_factor import find_widest
@@ -112,7 +117,7 @@ def test_slopes_along_curves_are_those_of_the_whole_solve(
     directions = directions_of(way, segment)
     forces = inverse(way.formation, *point[:3], directions, point.kinematics)
     table = find_force_slopes(way.formation, point, directions, forces, [*names, "start_x"])[0]
-    slopes = table @ np.concatenate([[1.0], a, b, squeeze, np.sqrt(b)])
+    slopes = table @ stack_motion(a, b, squeeze)[0]
     tau, here = forces.tau(a, b, squeeze)[0], Directions(directions.Xi[0], directions.sigma[0])
     state = point.z[0], point.z_s[0] * np.sqrt(b), tau, here
     require_slopes(own, way.formation, state, names, slopes)

@@ -18,8 +18,8 @@ from scipy.optimize import brentq
 
 from wholearm.common.arrays import Array
 from wholearm.geometry.curve import Curve, Segment
-from wholearm.mechanics.dynamics import Directions, PathForces
-from wholearm.planning.lower_bound import rows
+from wholearm.mechanics.dynamics import LAMBDA, A, Directions, PathForces, V
+from wholearm.planning.lower_bound import path_terms
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain import path_data, path_plan
 from wholearm.planning.path_domain.path_motion import PathMotion
@@ -107,7 +107,7 @@ class Toy:
     def in_place(self) -> Iterator[None]:
         """Let the planner and the lower bound see this toy's forces."""
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(rows, "inverse", self._inverse)
+            patch.setattr(path_terms, "inverse", self._inverse)
             patch.setattr(path_data, "inverse", self._inverse)
             patch.setattr(path_data, "reduced_inertia", lambda *_: np.ones(1))
             # A toy has no shape that friction could hold at rest.
@@ -117,11 +117,11 @@ class Toy:
     def _inverse(
         self, _: Any, z: Array, z_s: Array, z_ss: Array, directions: Directions, __: Any
     ) -> PathForces:
-        none, one = np.zeros((len(z), 1)), np.ones((len(z), 1))
-        flat = np.zeros((len(z), 2))
+        C, T = np.zeros((len(z), 1, 5)), np.zeros((len(z), 2, 5))
+        C[..., LAMBDA] = 1.0
         # The segment's number stands in for the directions of its joints.
-        Ta, Tl, Tv = self.law(z[:, 0], directions.sigma[:, 0] > 0)
-        return PathForces(none, none, none, one, flat, Ta, flat, Tl, Tv, none)
+        T[..., A], T[..., LAMBDA], T[..., V] = self.law(z[:, 0], directions.sigma[:, 0] > 0)
+        return PathForces(C, T)
 
 
 def _evaluate(s: Array) -> LinePoint:

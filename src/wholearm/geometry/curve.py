@@ -15,10 +15,11 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..contacts.formation import Formation, Kinematics
-from ..mechanics.dynamics import metric_weights
+from ..mechanics.dynamics import Directions, metric_weights
 
 REFINE = 3  # places per node of a panel at which limits and reversals are looked for
 _TIED = 1e-6  # relative error of two rates that are proportional, and relative rate of none
@@ -172,6 +173,12 @@ class Curve:
             signs = np.sign(within[np.abs(within).argmax(axis=0), range(rates.shape[1])])
             segments.append(Segment(start, stop, signs[:-2], signs[-2:]))
         return tuple(segments)
+
+
+def directions_of(curve: Curve, segment: NDArray[np.int64]) -> Directions:
+    """Directions at n places of a curve, given the segment that each belongs to."""
+    signs = ([getattr(part, name) for part in curve.segments] for name in ("Xi", "sigma"))
+    return Directions(*(np.array(sign)[segment] for sign in signs))
 
 
 def solve_tangent(P: Array, P_dot_v: Array, tangent: Array, metric: Array) -> tuple[Array, Array]:

@@ -46,38 +46,31 @@ class Directions(NamedTuple):
         return Directions(np.sign(slip), np.sign(v[:, 3:]))
 
 
-class PathForces(NamedTuple):
-    """Forces along a curve, affine in a = s'', b = s'^2, the internal force lambda and the speed.
+ONE, A, B, V, LAMBDA = range(5)
+"""Columns of coefficients along a path: of 1, a = s'', b = s'^2, s' and the internal force."""
 
-    c = C0 + Ca a + Cb b + Cl lambda + Cv sqrt(b), and the same with T for tau, with
-    c = [c_n; c_t(rolling)] in N, tau in N m, lambda in N; arrays of shape (n, n_c + R) or (n, 2).
-    Contact forces themselves have no part Cv.
+
+class PathForces(NamedTuple):
+    """Forces at n places of a path, as coefficients of (1, a, b, s', lambda).
+
+    The forces are c = [c_n; c_t(rolling)] and the joint torques tau.
     """
 
-    C0: Array
-    Ca: Array
-    Cb: Array
-    Cl: Array
-    T0: Array
-    Ta: Array
-    Tb: Array
-    Tl: Array
-    Tv: Array
-    Cv: Array
+    of_c: Array  # (n, n_c + R, 5) [N]
+    of_tau: Array  # (n, 2, 5) [N m]
 
     def c(self, a: Array, b: Array, internal: Array) -> Array:
         """Contact forces, shape (n, n_c + R) [N], for a, b and lambda of shape (n,)."""
-        a, b, internal, speed = _stack_columns(a, b, internal)
-        return self.C0 + self.Ca * a + self.Cb * b + self.Cl * internal + self.Cv * speed
+        return np.asarray(np.einsum("nij,nj->ni", self.of_c, stack_motion(a, b, internal)))
 
     def tau(self, a: Array, b: Array, internal: Array) -> Array:
         """Joint torques, shape (n, 2) [N m], for a, b and lambda of shape (n,)."""
-        a, b, internal, speed = _stack_columns(a, b, internal)
-        return self.T0 + self.Ta * a + self.Tb * b + self.Tl * internal + self.Tv * speed
+        return np.asarray(np.einsum("nij,nj->ni", self.of_tau, stack_motion(a, b, internal)))
 
 
-def _stack_columns(a: Array, b: Array, internal: Array) -> tuple[Array, ...]:
-    return a[:, None], b[:, None], internal[:, None], np.sqrt(np.maximum(b, 0.0))[:, None]
+def stack_motion(a: Array, b: Array, internal: Array) -> Array:
+    """What coefficients multiply: (1, a, b, s', lambda), shape (n, 5)."""
+    return np.stack([np.ones_like(b), a, b, np.sqrt(np.maximum(b, 0.0)), internal], axis=-1)
 
 
 def build_forward(formation: Formation) -> Expression:
@@ -151,23 +144,19 @@ def inverse(
     mass, count = scene.mass_diagonal, wrench.shape[2]
     null = np.zeros((len(z), count)) if count == 3 else _null_vector(wrench)
     right = np.zeros((len(z), count, 3))
-    right[:, :3, 0] = -scene.applied_force[:3]
-    right[:, :3, 1] = mass[:3] * z_s[:, :3]
-    right[:, :3, 2] = mass[:3] * z_ss[:, :3]
+    right[:, :3, ONE] = -scene.applied_force[:3]
+    right[:, :3, A] = mass[:3] * z_s[:, :3]
+    right[:, :3, B] = mass[:3] * z_ss[:, :3]
     # Bordering by the null vector makes each solution the shortest one.
     matrix = wrench if count == 3 else np.concatenate([wrench, null[:, None, :]], axis=1)
-    solution = np.linalg.solve(matrix, right)
-    C0, Ca, Cb = (solution[..., k] for k in range(3))
-    joint = G[:, :, 3:]
-
-    def reaction(c: Array) -> Array:
-        return np.asarray(np.einsum("nij,ni->nj", joint, c))
-
-    dry = scene.dry[3:] * directions.sigma
-    T0, Tl = dry - reaction(C0), -reaction(null)
-    Ta, Tb = mass[3:] * z_s[:, 3:] - reaction(Ca), mass[3:] * z_ss[:, 3:] - reaction(Cb)
-    Tv, Cv = scene.viscous[3:] * z_s[:, 3:], np.zeros_like(C0)
-    return PathForces(C0, Ca, Cb, null, T0, Ta, Tb, Tl, Tv, Cv)
+    C = np.zeros((len(z), count, 5))
+    C[..., :3], C[..., LAMBDA] = np.linalg.solve(matrix, right), null
+    T = -np.einsum("nij,niq->njq", G[:, :, 3:], C)
+    T[..., ONE] += scene.dry[3:] * directions.sigma
+    T[..., A] += mass[3:] * z_s[:, 3:]
+    T[..., B] += mass[3:] * z_ss[:, 3:]
+    T[..., V] = scene.viscous[3:] * z_s[:, 3:]
+    return PathForces(C, T)
 
 
 def energy(formation: Formation, z: Array, v: Array) -> Array:

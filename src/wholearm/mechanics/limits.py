@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +21,6 @@ from ..common.arrays import Array
 from ..common.shortfalls import Parameter
 from ..contacts.cones import force_limit_rows
 from ..contacts.formation import Formation
-from .dynamics import PathForces
 
 PRESS, CONE, TORQUE, SPEED = "press", "cone", "torque", "speed"
 """Kinds of limits: least normal forces, friction cones, torques and speeds of the joints."""
@@ -96,6 +94,14 @@ class LimitSet:
     def without(self, *kinds: str) -> LimitSet:
         """The limits of other kinds."""
         return LimitSet(tuple(limit for limit in self.limits if limit.kind not in kinds))
+
+    def split_speeds(self) -> tuple[LimitSet, LimitSet]:
+        """The limits that depend on forces or torques, and those of joint speeds alone."""
+        alone = [not limit.rows[:, :-2].any() for limit in self.limits]
+        pairs = list(zip(self.limits, alone, strict=True))
+        parts = (tuple(limit for limit, only in pairs if only is kind) for kind in (False, True))
+        first, second = map(LimitSet, parts)
+        return first, second
 
     def weigh(self, parameter: Parameter) -> Array:
         """By how much the bounds of each row give way per unit of a parameter, shape (m,)."""
@@ -185,43 +191,3 @@ def _make_joint_limits(formation: Formation, _: float) -> list[MotionLimit]:
 
 MAKERS: list[Maker] = [_make_force_limits, _make_joint_limits]
 """Functions that make the limits of a formation."""
-
-
-class SideTerms(NamedTuple):
-    """Slack of one-sided limits at n places: rest + b bend + s' drag + a rate + lambda press.
-
-    With b = s'^2 and a = s''; each of shape (n, n_sides), over what is much for a side.
-    """
-
-    rest: Array
-    bend: Array
-    drag: Array
-    rate: Array
-    press: Array
-
-    @staticmethod
-    def of(limits: LimitSet, forces: PathForces, rates: Array) -> SideTerms:
-        """The sides of some limits, from forces at n places and d theta / ds there, (n, 2)."""
-        of_c, of_tau, of_rates = (part.T for part in limits.columns)
-        rows, signs, bounds = limits.sides
-        scale = signs / limits.scales[rows]
-
-        def measure(values: Array) -> Array:
-            return np.asarray(values[:, rows] * scale)
-
-        return SideTerms(
-            measure(forces.C0 @ of_c + forces.T0 @ of_tau) - bounds * scale,
-            measure(forces.Cb @ of_c + forces.Tb @ of_tau),
-            measure(forces.Cv @ of_c + forces.Tv @ of_tau + rates @ of_rates),
-            measure(forces.Ca @ of_c + forces.Ta @ of_tau),
-            measure(forces.Cl @ of_c + forces.Tl @ of_tau),
-        )
-
-    def pick(self, rows: Any) -> SideTerms:
-        """Some of the places."""
-        return SideTerms(*(part[rows] for part in self))
-
-    def at(self, a: Array, b: Array) -> Array:
-        """Slack without internal force, for accelerations and squared speeds of shape (n,)."""
-        a, b = a[:, None], b[:, None]
-        return np.asarray(self.rest + self.bend * b + self.drag * np.sqrt(b) + self.rate * a)

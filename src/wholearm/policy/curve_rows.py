@@ -1,6 +1,7 @@
-"""Torques and limits at places along a curve, affine in a, b, speed and internal force.
+"""Torques and limits at places along a curve, as coefficients of (1, s'', s'^2, s', lambda).
 
-Coefficients are in the order 1, b = s'^2, s', a = s'', lambda: the last axis of every array here.
+The coefficients multiply a nominal motion. Its torques are applied: with other friction, mass or
+gains they lead to another s'' and internal force, and thus to other contact forces.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ import numpy as np
 from ..common.arrays import Array
 from ..contacts.formation import Formation
 from ..geometry.curve import Curve, CurvePoint
-from ..mechanics.dynamics import Directions, PathForces, inverse
-from ..mechanics.limits import CONE, PRESS, LimitSet, make_limits
+from ..mechanics.dynamics import LAMBDA, ONE, A, Directions, PathForces, inverse, stack_motion
+from ..mechanics.limits import LimitSet, make_limits
+from ..mechanics.path_limits import find_slack_rows
 from ..problem.uncertainty import GROUPS, change_scene
 from ..scene.model import Scene
 from ..sensitivity.slopes import find_force_slopes, find_shifts
@@ -26,8 +28,6 @@ CORNERS = ("mass", "inertia", "friction_palm", "friction_finger1", "friction_fin
 """Numbers whose ranges have corners."""
 OTHERS = (*GROUPS["geometry"], *GROUPS["gain"])
 """Numbers whose ranges count to first order. The start is measured, and a delay is in torques."""
-_ORDER = [0, 2, 4, 1, 3]
-"""Columns of derivatives, by 1, a, b, internal force and s', in the order used here."""
 Motion = tuple[Array, Array, Array]  # a, b and internal force at n places
 DOUBTS = {"mass": 0.05, "inertia": 0.05} | {
     f"friction_{part}": 0.1 for part in ("palm", "finger1", "finger2")
@@ -39,6 +39,9 @@ LEAST = 0.02  # least margin of a normal force, over the scene's unit of force
 SPARE = 0.05  # margin of a torque for feedback, over its limit
 NEAR = 1e-3  # time around a reversal in which friction may have either direction [s]
 NEVER = 1e9  # level of a limit that does not count
+UNLIMITED = np.array([NEVER, 0.0, 0.0, 0.0, 0.0])
+FIXED = np.array([1.0, 0.0, 1.0, 1.0, 0.0])
+"""Columns that torques do not change: all but those of s'' and the internal force."""
 
 
 class CurveLimitRows(NamedTuple):
@@ -51,7 +54,7 @@ class CurveLimitRows(NamedTuple):
     slack: Array
     unit: Array  # (n, m) [N, N m]: margin at level 1
     presses: int  # how many of the m are of forces
-    ends: Array  # (k, n_c, 5) [N]: normal forces at the last place, in each corner of known ranges
+    ends: Array  # (k, n_c, 5) [N]: normal forces at the last place, in each corner of the ranges
     scenes: tuple[Scene, ...]  # the scenes of these corners
 
     @property
@@ -60,33 +63,62 @@ class CurveLimitRows(NamedTuple):
         return np.asarray(self.slack / self.unit[..., None])
 
 
-def make_rows(curve: Curve, s: Array, motion: tuple[Array, Array, Array]) -> CurveLimitRows:
+def split_limits(formation: Formation) -> tuple[LimitSet, LimitSet]:
+    """Limits with an epsilon of zero: those of contact forces, and those of torques alone.
+
+    Speed limits are kept by the plan, and no motion of a policy is faster.
+    """
+    limits, _ = make_limits(formation, 0.0).split_speeds()
+    contact = [limit for limit in limits.limits if limit.rows[:, :-4].any()]
+    joint = [limit for limit in limits.limits if not limit.rows[:, :-4].any()]
+    return LimitSet(tuple(contact)), LimitSet(tuple(joint))
+
+
+def find_torques(curve: Curve, s: Array, directions: Directions) -> Array:
+    """Torques at n places, shape (n, 2, 5)."""
+    point = curve.evaluate(np.clip(s, 0.0, curve.length))
+    return inverse(curve.formation, *point[:3], directions, point.kinematics).of_tau
+
+
+def respond(forces: PathForces, torque: Array) -> tuple[Array, Array]:
+    """Contact forces, (n, n_c + R, 5), a and internal force, (n, 2, 5), from torques (n, 2, 5)."""
+    free = [A, LAMBDA]
+    motion = np.linalg.solve(forces.of_tau[..., free], torque - FIXED * forces.of_tau)
+    return np.asarray(forces.of_c[..., free] @ motion + FIXED * forces.of_c), np.asarray(motion)
+
+
+def measure_slack(limits: LimitSet, c: Array, torque: Array, rates: Array) -> Array:
+    """Slack of limits, (n, m, 5) [N, N m], from coefficients of c and torques; `rates` (n, 2)."""
+    rows = find_slack_rows(limits, PathForces(c, torque), rates)
+    return np.asarray(rows * limits.scales[limits.sides[0], None])
+
+
+def make_rows(curve: Curve, s: Array, motion: Motion) -> CurveLimitRows:
     """Rows at places of a curve, with margins for a motion (a, b, lambda)."""
     formation, point, speed = curve.formation, curve.evaluate(s), np.sqrt(motion[1])
     mean, *sides = blend_directions(curve, s, speed * NEAR)
-    forces = inverse(formation, *point[:3], mean, point.kinematics)
-    torque = np.stack([forces.T0, forces.Tb, forces.Tv, forces.Ta, forces.Tl], axis=2)
-    late = curve.evaluate(np.clip(s - LATE * speed, 0.0, curve.length))
-    delayed = inverse(formation, *late[:3], mean, late.kinematics).tau(*motion)
-    tau = forces.tau(*motion)
-    limits = make_limits(formation, 0.0).only(PRESS, CONE)
+    torque, late = find_torques(curve, s, mean), find_torques(curve, s - LATE * speed, mean)
+    tau, delayed = (PathForces(rows, rows).tau(*motion) for rows in (torque, late))
+    (contact, joint), rates = split_limits(formation), point.z_s[:, 3:]
     slack, unit = [], []
     for side in sides:
-        c = respond(inverse(formation, *point[:3], side, point.kinematics), torque)[0]
-        slack.append(np.einsum("mi,nij->nmj", limits.columns[0], c))
-        error = _estimate_errors(formation, point, side, limits, speed, tau, delayed)
-        unit.append(LEAST * limits.scales + error)
-    same = (sides[0].Xi == sides[1].Xi).all(axis=1) & (sides[0].sigma == sides[1].sigma).all(axis=1)
-    slack[1][same] = np.array([NEVER, 0.0, 0.0, 0.0, 0.0])
-    most = np.tile(formation.scene.torque_limit, 2)
-    left = np.concatenate([-torque, torque], axis=1)
-    left[:, :, 0] += most
-    slack.append(left)
-    unit.append(np.tile(SPARE * most, (len(s), 1)))
-    count = 2 * len(limits.low)
-    ends, scenes = slack[0][-1:, : formation.n_contacts], (formation.scene,)
-    table = np.concatenate(slack, axis=1)
-    return CurveLimitRows(s, torque, table, np.concatenate(unit, axis=1), count, ends, scenes)
+        forces = inverse(formation, *point[:3], side, point.kinematics)
+        slack.append(measure_slack(contact, respond(forces, torque)[0], torque, rates))
+        error = _estimate_errors(formation, point, side, contact, motion[1], tau, delayed)
+        unit.append(LEAST * contact.scales[contact.sides[0]] + error)
+    ends = slack[0][-1:, : formation.n_contacts]
+    slack[1][have_same_signs(*sides)] = UNLIMITED
+    slack.append(measure_slack(joint, np.zeros_like(forces.of_c), torque, rates))
+    unit.append(np.tile(SPARE * joint.scales[joint.sides[0]], (len(s), 1)))
+    table, count = np.concatenate(slack, axis=1), 2 * slack[0].shape[1]
+    units = np.concatenate(unit, axis=1)
+    return CurveLimitRows(s, torque, table, units, count, ends, (formation.scene,))
+
+
+def have_same_signs(before: Directions, after: Directions) -> Array:
+    """Where directions before and after the nearest reversal are equal, shape (n,)."""
+    same = [(one == other).all(axis=1) for one, other in zip(before, after, strict=True)]
+    return np.asarray(same[0] & same[1])
 
 
 def leave_one(levels: Array) -> Array:
@@ -94,48 +126,31 @@ def leave_one(levels: Array) -> Array:
     found = levels.copy()
     for k in range(1, levels.shape[2]):
         twice = (found[:, :, :k] == levels[:, :, k : k + 1]).all(axis=(1, 3)).any(axis=1)
-        found[twice, :, k] = np.array([NEVER, 0.0, 0.0, 0.0, 0.0])
+        found[twice, :, k] = UNLIMITED
     return found
 
 
 def find_internal_force(rows: CurveLimitRows, a: Array, b: Array) -> Array:
     """The internal force with the largest least level for a motion, shape (n,)."""
-    pairs = zip(_measure_base(rows, a, b).tolist(), rows.levels[:, :, 4].tolist(), strict=True)
-    return np.array(
-        [choose_internal_force(base, [0.0] * len(base), by, 0.0)[1] for base, by in pairs]
-    )
+    levels = rows.levels
+    base = np.einsum("nmi,ni->nm", levels, stack_motion(a, b, np.zeros_like(b)))
+    pairs = zip(base.tolist(), levels[..., LAMBDA].tolist(), strict=True)
+    return np.array([choose_internal_force(one, [0.0] * len(one), by, 0.0)[1] for one, by in pairs])
 
 
 def measure_levels(rows: CurveLimitRows, a: Array, b: Array) -> Array:
     """Levels of all limits for a motion with that internal force, shape (n, m)."""
-    return (
-        _measure_base(rows, a, b) + rows.levels[:, :, 4] * find_internal_force(rows, a, b)[:, None]
-    )
-
-
-def _measure_base(rows: CurveLimitRows, a: Array, b: Array) -> Array:
-    values = np.column_stack([np.ones(len(a)), b, np.sqrt(b), a])
-    return np.asarray(np.einsum("nmi,ni->nm", rows.levels[:, :, :4], values))
+    motion = stack_motion(a, b, find_internal_force(rows, a, b))
+    return np.asarray(np.einsum("nmi,ni->nm", rows.levels, motion))
 
 
 def find_forces(curve: Curve, s: Array, speed: Array) -> Array:
     """Normal forces at both ends of the intervals between places, (n - 1, 2, n_c, 5) [N]."""
     formation, point = curve.formation, curve.evaluate(s)
-    forces = inverse(
-        formation, *point[:3], blend_directions(curve, s, speed * NEAR)[0], point.kinematics
-    )
-    of = np.stack([forces.C0, forces.Cb, np.zeros_like(forces.C0), forces.Ca, forces.Cl], axis=2)
-    of = of[:, : formation.n_contacts]
-    return np.stack([of[:-1], of[1:]], axis=1)
-
-
-def find_directions(curve: Curve, s: Array) -> Directions:
-    """Directions at n places."""
-    ends = [part.stop for part in curve.segments[:-1]]
-    segments = [curve.segments[k] for k in np.searchsorted(ends, s)]
-    return Directions(
-        np.array([part.Xi for part in segments]), np.array([part.sigma for part in segments])
-    )
+    mean = blend_directions(curve, s, speed * NEAR)[0]
+    forces = inverse(formation, *point[:3], mean, point.kinematics)
+    c_n = forces.of_c[:, : formation.n_contacts]
+    return np.stack([c_n[:-1], c_n[1:]], axis=1)
 
 
 def blend_directions(curve: Curve, s: Array, width: Array) -> list[Directions]:
@@ -156,31 +171,28 @@ def _estimate_errors(
     point: CurvePoint,
     side: Directions,
     limits: LimitSet,
-    speed: Array,
+    b: Array,
     tau: Array,
     delayed: Array,
 ) -> Array:
     """Errors of forces from uncertain numbers, torques and delays, root sum square, (n, m)."""
-    values = np.column_stack([np.ones(len(speed)), speed**2, speed])
 
-    def find(scene: Scene) -> PathForces:
-        return inverse(replace(formation, scene=scene), *point[:3], side)
+    def measure(scene: Scene, tau: Array) -> Array:
+        changed = replace(formation, scene=scene)
+        forces = inverse(changed, *point[:3], side, point.kinematics)
+        torque = tau[..., None] * np.eye(5)[ONE]
+        rows = measure_slack(limits, respond(forces, torque)[0], torque, point.z_s[:, 3:])
+        return np.asarray(np.einsum("nmi,ni->nm", rows, stack_motion(0 * b, b, 0 * b)))
 
-    def measure(forces: PathForces, tau: Array) -> Array:
-        rows = np.pad(tau[:, :, None], ((0, 0), (0, 0), (0, 4)))
-        c = np.einsum("nij,nj->ni", respond(forces, rows)[0][:, :, :3], values)
-        return np.asarray(c @ limits.columns[0].T)
-
-    scene, nominal = formation.scene, find(formation.scene)
-    cases = [(find(change_scene(scene, {name: width})), tau) for name, width in DOUBTS.items()]
-    cases += [(nominal, tau * (1 + GAIN * np.eye(2)[k])) for k in range(2)]
-    cases.append((nominal, delayed))
-    base = measure(nominal, tau)
+    scene = formation.scene
+    cases = [(change_scene(scene, {name: width}), tau) for name, width in DOUBTS.items()]
+    cases += [(scene, tau * (1 + GAIN * np.eye(2)[k])) for k in range(2)] + [(scene, delayed)]
+    base = measure(scene, tau)
     return np.asarray(np.sqrt(np.sum([(measure(*case) - base) ** 2 for case in cases], axis=0)))
 
 
 class Corners(NamedTuple):
-    """Limits at n places in k corners, of the nominal (1, b, s', a, internal force)."""
+    """Limits at n places in k corners, of the nominal (1, a, b, s', internal force)."""
 
     rows: Array  # (k, n, m, 5)
     moves: Array  # (k, n, 5): actual acceleration s''
@@ -188,8 +200,7 @@ class Corners(NamedTuple):
 
     def pick(self, motion: Motion) -> Array:
         """The limits in the corner that is worst for a motion, shape (n, m, 5)."""
-        a, b, internal = motion
-        values = np.column_stack([np.ones_like(a), b, np.sqrt(b), a, internal])
+        values = stack_motion(*motion)
         worst = np.einsum("knmq,nq->knm", self.rows, values).argmin(axis=0)
         rows = np.take_along_axis(self.rows, worst[None, ..., None], axis=0)[0]
         signs = np.sign(np.einsum("pnmq,nq->pnm", self.swings, values))
@@ -199,11 +210,11 @@ class Corners(NamedTuple):
         """These and other limits, (n, l, 5), with feedback that makes s'' equal to a."""
         count = len(self.rows)
         rows = np.concatenate([self.rows, np.tile(others, (count, 1, 1, 1))], axis=2)
-        rate, rest = self.moves[..., 3:4], self.moves.copy()
-        rest[..., 3] = 0.0
-        asked = rows[..., 3:4] / rate[:, :, None]
-        closed = rows - asked * rest[:, :, None]
-        closed[..., 3] = asked[..., 0]
+        rate, rest = self.moves[:, :, None, [A]], self.moves[:, :, None].copy()
+        rest[..., A] = 0.0
+        asked = rows[..., [A]] / rate
+        closed = rows - asked * rest
+        closed[..., [A]] = asked
         wider = ((0, 0), (0, 0), (0, others.shape[1]), (0, 0))
         return Corners(closed, self.moves, np.pad(self.swings, wider))
 
@@ -220,26 +231,26 @@ def find_corners(
     Torques, (n, 2, 5) each, are the nominal ones, delayed ones, and the derivative by s.
     """
     rows, moves = list[Array](), list[Array]()
+    torque, late, slope = torques
     for scene in list_scenes(formation.scene, widths):
         changed = replace(formation, scene=scene)
-        c, motion = respond(inverse(changed, *point[:3], side, point.kinematics), torques[0])
-        limits = make_limits(changed, 0.0).only(PRESS, CONE)
-        rows.append(np.einsum("mi,nij->nmj", limits.columns[0], c))
+        c, motion = respond(inverse(changed, *point[:3], side, point.kinematics), torque)
+        rows.append(measure_slack(split_limits(changed)[0], c, torque, point.z_s[:, 3:]))
         moves.append(motion[:, 0])
-    plain = inverse(formation, *point[:3], side, point.kinematics)
-    limits = make_limits(formation, 0.0).only(PRESS, CONE)
-    swings = [respond(plain, torques[1])[0] - respond(plain, torques[0])[0]]
+    nominal = inverse(formation, *point[:3], side, point.kinematics)
+    swings = [respond(nominal, late)[0] - respond(nominal, torque)[0]]
     for name in (other for other in OTHERS if widths.get(other, 0.0) > 0):
-        slopes = find_force_slopes(formation, point, side, plain, (name,))[:, :, 0, _ORDER]
+        slopes = find_force_slopes(formation, point, side, nominal, (name,))[:, :, 0]
         if name in GROUPS["geometry"]:
             # Torques depend on the apparent place.
-            shift = find_shifts(formation, point, side, plain, name)
-            moved = torques[0] + shift[:, None, None] * torques[2]
-            slopes = slopes + respond(plain, moved)[0] - respond(plain, torques[0])[0]
+            shift = find_shifts(formation, point, side, nominal, name)
+            moved = torque + shift[:, None, None] * slope
+            slopes = slopes + respond(nominal, moved)[0] - respond(nominal, torque)[0]
         swings.append(widths[name] * slopes)
-    return Corners(
-        np.array(rows), np.array(moves), np.einsum("mi,pnij->pnmj", limits.columns[0], swings)
-    )
+    limits, _ = split_limits(formation)
+    side_rows, signs, _ = limits.sides
+    of_c = signs[:, None] * limits.columns[0][side_rows]
+    return Corners(np.array(rows), np.array(moves), of_c @ np.array(swings))
 
 
 def list_scenes(scene: Scene, widths: Mapping[str, float]) -> tuple[Scene, ...]:
@@ -249,14 +260,3 @@ def list_scenes(scene: Scene, widths: Mapping[str, float]) -> tuple[Scene, ...]:
         change_scene(scene, {n: k * widths[n] for n, k in zip(names, signs, strict=True)})
         for signs in product((-1, 1), repeat=len(names))
     )
-
-
-def respond(forces: PathForces, torque: Array) -> tuple[Array, Array]:
-    """Contact forces, (n, n_c + R, 5), a and internal force, (n, 2, 5), from torques (n, 2, 5)."""
-    rest = torque.copy()
-    rest[:, :, :3] -= np.stack([forces.T0, forces.Tb, forces.Tv], axis=2)
-    motion = np.linalg.solve(np.stack([forces.Ta, forces.Tl], axis=2), rest)
-    found = np.stack([forces.Ca, forces.Cl], axis=2) @ motion
-    found[:, :, 0] += forces.C0
-    found[:, :, 1] += forces.Cb
-    return np.asarray(found), np.asarray(motion)

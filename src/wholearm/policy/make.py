@@ -15,8 +15,19 @@ from ..contacts.formation import Formation
 from ..geometry.curve import Curve
 from ..geometry.tracing import runs_on_curve
 from ..mechanics.arrival import Standstill, find_hold
-from ..mechanics.dynamics import Directions, force_rows, inverse, metric_weights
-from ..mechanics.limits import PRESS, TORQUE, SideTerms, make_limits
+from ..mechanics.dynamics import (
+    LAMBDA,
+    ONE,
+    A,
+    B,
+    Directions,
+    V,
+    force_rows,
+    inverse,
+    metric_weights,
+)
+from ..mechanics.limits import PRESS, TORQUE, make_limits
+from ..mechanics.path_limits import PathLimits
 from ..problem.definition import ROWS, End, Phase, Problem
 from ..problem.uncertainty import PARAMETERS
 from ..results.adopt import Moved, adopt_motion
@@ -49,6 +60,7 @@ CLOSING = 0.02  # time in which final torques are to close a contact [s]
 SHOWN = 1e-3  # least joint motion of a displacement, over the largest
 WEAK = 10.0  # torques over the dry friction of the joints, below which friction decides on rest
 MOST = 0.5  # largest acceleration of the integral, over the scene's
+COLUMNS = [ONE, B, V, A, LAMBDA]  # order of coefficients in the tables of a policy
 
 
 def make_policy(
@@ -222,13 +234,13 @@ def _tabulate_curve(piece: ReferencePiece, phase: Phase, push: Array) -> dict[st
         "s": rows.s,
         "theta": piece.curve.evaluate(rows.s).z[:, 3:],
         "b": piece.b,
-        "levels": leave_one(np.stack([levels[:-1], levels[1:]], axis=1)),
-        "torque": np.stack([rows.torque[:-1], rows.torque[1:]], axis=1),
+        "levels": leave_one(np.stack([levels[:-1], levels[1:]], axis=1))[..., COLUMNS],
+        "torque": np.stack([rows.torque[:-1], rows.torque[1:]], axis=1)[..., COLUMNS],
         "push": push,
         "passes": np.array([piece.passes]),
-        "arrival": arrival,
+        "arrival": arrival[..., COLUMNS],
         "keeps": np.array([float((np.abs(push) < WEAK * dry).all())]),
-        "forces": find_forces(piece.curve, rows.s, np.sqrt(piece.b)),
+        "forces": find_forces(piece.curve, rows.s, np.sqrt(piece.b))[..., COLUMNS],
     }
 
 
@@ -251,7 +263,7 @@ def find_arrival(curve: Curve, gained: Contact, rows: CurveLimitRows) -> Array:
     reserves, found = np.append(reserves, reserves.max()), [np.zeros((0, 5))]
     for balance in _list_balances(curve, both, rows):
         forces = balance[: both.n_contacts, 1:] @ rows.torque[-1]
-        forces[:, 0] += balance[: both.n_contacts, 0]
+        forces[:, ONE] += balance[: both.n_contacts, 0]
         found.append(forces / reserves[:, None])
     return np.vstack(found)
 
@@ -275,8 +287,8 @@ def find_push(
     # Rows of (1, tau, level) >= 0: forces with all contacts; a and forces without the gained one.
     to_motion = _invert(rows.torque[-1])
     forces = rows.ends.reshape(-1, 5)
-    open_forces = forces[:, 3:] @ to_motion
-    open_forces[:, 0] += forces[:, 0]
+    open_forces = forces[:, [A, LAMBDA]] @ to_motion
+    open_forces[:, 0] += forces[:, ONE]
     open_reserves = np.tile(reserves[:-1], len(rows.ends))
     limits = [
         *(np.column_stack([balance[:count], -reserves]) for balance in balances),
@@ -336,8 +348,8 @@ def _balance(curve: Curve, both: Formation, factor: float) -> Array:
 
 def _invert(torque: Array) -> Array:
     """Acceleration and internal force of (1, tau) at rest, (2, 3), from rows of torques, (2, 5)."""
-    back = np.linalg.inv(torque[:, 3:])
-    return np.column_stack([-back @ torque[:, 0], back])
+    back = np.linalg.inv(torque[:, [A, LAMBDA]])
+    return np.column_stack([-back @ torque[:, ONE], back])
 
 
 def find_still(curve: Curve) -> Array:
@@ -346,10 +358,10 @@ def find_still(curve: Curve) -> Array:
     still = Directions(np.zeros((1, formation.n_contacts)), np.zeros((1, 2)))
     forces = inverse(formation, *point[:3], still, point.kinematics)
     limits = make_limits(formation, 0.0).only(PRESS, TORQUE)
-    sides = SideTerms.of(limits, forces, point.z_s[:, 3:])
-    base, press = sides.rest[0].tolist(), sides.press[0].tolist()
+    rows = PathLimits.of(limits, forces, point.z_s[:, 3:]).rows[0]
+    base, press = rows[:, ONE].tolist(), rows[:, LAMBDA].tolist()
     _, internal = choose_internal_force(base, [0.0] * len(base), press, 0.0)
-    return np.asarray((forces.T0 + internal * forces.Tl)[0])
+    return np.asarray(forces.of_tau[0, :, ONE] + internal * forces.of_tau[0, :, LAMBDA])
 
 
 def replan(

@@ -13,22 +13,25 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..geometry.curve import Curve
-from ..mechanics.dynamics import Directions, inverse
-from ..mechanics.limits import CONE, PRESS, make_limits
+from ..mechanics.path_limits import PathLimits
 from ..scene.model import Scene
 from .curve_rows import (
     LATE,
     LEAST,
     NEAR,
-    NEVER,
     SPARE,
+    UNLIMITED,
     Corners,
     CurveLimitRows,
     Motion,
     blend_directions,
     find_corners,
     find_internal_force,
+    find_torques,
+    have_same_signs,
     list_scenes,
+    measure_slack,
+    split_limits,
 )
 from .retiming import Reach, retime
 
@@ -48,23 +51,24 @@ class Within(NamedTuple):
 
     s: Array  # (n,) [m]
     torque: Array  # (n, 2, 5) [N m]
-    left: Array  # (n, 4, 5) [N m]: distances of torques from their limits
+    left: Array  # (n, l, 5) [N m]: distances of torques from their limits
     sides: tuple[Corners, Corners]  # with friction before and after the nearest reversal
     same: Array  # (n,): where these are equal
-    unit: Array  # (m + 4,): margins at level 1, of forces and torques
-    scenes: tuple[Scene, ...]  # in the corners of the ranges
+    unit: Array  # (m + l,): margins at level 1, of forces and torques
+    ends: Array  # (k, n_c, 5) [N]: normal forces at the last place, in each corner of the ranges
+    scenes: tuple[Scene, ...]  # in these corners
 
     def at(self, motion: Motion) -> tuple[CurveLimitRows, Array, Array]:
         """The law's limits near a motion; those of the reference, and their margins."""
         motions = self._spread(motion)
         forces = self._pick(self.sides, motions)
         closed = self._pick([side.close(self.left) for side in self.sides], motions)
-        count, n = len(self.unit) - 4, len(self.s)
+        count, n = len(self.unit) - self.left.shape[1], len(self.s)
         slack = np.concatenate([forces, self.left], axis=1)
         copies = forces.shape[1] // count
         unit = np.concatenate([np.tile(self.unit[:count], copies), self.unit[count:]])
-        table, ends = np.tile(unit, (n, 1)), self.sides[0].rows[:, -1]
-        rows = CurveLimitRows(self.s, self.torque, slack, table, forces.shape[1], ends, self.scenes)
+        table, presses = np.tile(unit, (n, 1)), forces.shape[1]
+        rows = CurveLimitRows(self.s, self.torque, slack, table, presses, self.ends, self.scenes)
         kept = np.concatenate([KEPT * self.unit[:count], AUTHORITY * self.unit[count:]])
         again = np.tile(kept, 2 * len(motions))
         wanted = np.concatenate([np.tile(kept[:count], copies), kept[count:], again])
@@ -76,19 +80,14 @@ class Within(NamedTuple):
         found = [
             np.concatenate([side.pick(motion) for motion in motions], axis=1) for side in sides
         ]
-        found[1][self.same] = np.array([NEVER, 0.0, 0.0, 0.0, 0.0])
+        found[1][self.same] = UNLIMITED
         return np.concatenate(found, axis=1)
 
     def _spread(self, motion: Motion) -> list[Motion]:
         """A motion with its internal force, and with the least and largest one within torques."""
         a, b, internal = motion
-        values = np.column_stack([np.ones_like(a), b, np.sqrt(b), a])
-        base, press = np.einsum("nmq,nq->nm", self.left[..., :4], values), self.left[..., 4]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ends = -base / press
-        low = np.where(press > 0, ends, -np.inf).max(axis=1)
-        high = np.where(press < 0, ends, np.inf).min(axis=1)
-        low, high = (np.where(np.isfinite(end), end, internal) for end in (low, high))
+        ends = PathLimits(self.left, b).find_internal_force_range(a, b)
+        low, high = (np.where(np.isfinite(end), end, internal) for end in ends)
         return [motion, (a, b, np.minimum(low, internal)), (a, b, np.maximum(high, internal))]
 
 
@@ -102,26 +101,21 @@ def find_within(
     width = np.maximum(speed * NEAR, WIDER * np.maximum(gaps[1:], gaps[:-1]))
     mean, *sides = blend_directions(curve, s, width)
     late = s - (LATE + widths.get("delay", 0.0)) * speed
-    nominal, step = _find_torques(curve, s, mean), STEP * curve.length
-    before, after = (_find_torques(curve, s + sign * step, mean) for sign in (-1, 1))
-    change = (after - before) / (2 * step)
-    torques = nominal, _find_torques(curve, late, mean), change
+    nominal, step = find_torques(curve, s, mean), STEP * curve.length
+    before, after = (find_torques(curve, s + sign * step, mean) for sign in (-1, 1))
+    torques = nominal, find_torques(curve, late, mean), (after - before) / (2 * step)
     corners = [find_corners(formation, point, side, torques, widths) for side in sides]
-    most = np.tile(formation.scene.torque_limit, 2)
-    left = np.concatenate([-torques[0], torques[0]], axis=1)
-    left[:, :, 0] += most
-    same = (sides[0].Xi == sides[1].Xi).all(axis=1) & (sides[0].sigma == sides[1].sigma).all(axis=1)
-    scales = make_limits(formation, 0.0).only(PRESS, CONE).scales
+    contact, joint = split_limits(formation)
+    none = np.zeros((len(s), formation.n_constraints, 5))
+    left = measure_slack(joint, none, nominal, point.z_s[:, 3:])
+    scales, most = (each.scales[each.sides[0]] for each in (contact, joint))
     unit = np.concatenate([np.maximum(LEAST * scales, least), SPARE * most])
-    scenes = list_scenes(formation.scene, widths)
-    return Within(s, torques[0], left, (corners[0], corners[1]), same, unit, scenes)
-
-
-def _find_torques(curve: Curve, s: Array, directions: Directions) -> Array:
-    """Torques at n places, shape (n, 2, 5)."""
-    point = curve.evaluate(np.clip(s, 0.0, curve.length))
-    forces = inverse(curve.formation, *point[:3], directions, point.kinematics)
-    return np.stack([forces.T0, forces.Tb, forces.Tv, forces.Ta, forces.Tl], axis=2)
+    ends, scenes = (
+        corners[0].rows[:, -1, : formation.n_contacts],
+        list_scenes(formation.scene, widths),
+    )
+    same = have_same_signs(*sides)
+    return Within(s, nominal, left, (corners[0], corners[1]), same, unit, ends, scenes)
 
 
 def retime_within(

@@ -9,18 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
-from ..geometry.curve import Curve
+from ..geometry.curve import Curve, directions_of
 from ..geometry.tracing import trace_phase
-from ..mechanics.dynamics import inverse, metric_weights
-from ..mechanics.limits import CONE, PRESS, make_limits
+from ..mechanics.dynamics import LAMBDA, inverse, metric_weights
 from ..problem.definition import End, Phase, Problem
 from ..results.trajectory import Trajectory
 from .curve_rows import (
     CurveLimitRows,
-    find_directions,
     find_internal_force,
     make_rows,
     measure_levels,
+    split_limits,
 )
 from .range_margins import retime_within
 from .retiming import ENOUGH, Reach, retime
@@ -59,7 +58,7 @@ class ReferencePiece(NamedTuple):
         """Least level of each contact's normal force along the reference."""
         rows, names = self.rows, self.curve.formation.names
         a = np.diff(self.b) / (2 * np.diff(rows.s))
-        count = len(make_limits(self.curve.formation, 0.0).of(PRESS, CONE))
+        count = len(split_limits(self.curve.formation)[0].low)
         levels = measure_levels(rows, np.append(a, a[-1]), self.b)[:, : rows.presses]
         least = levels.min(axis=0).reshape(-1, count).min(axis=0)
         return dict(zip(names, least[: len(names)].tolist(), strict=True))
@@ -156,12 +155,13 @@ def _follow(
     point = curve.evaluate(s)
     v = (point.z_s * plan.z_dot[rows]) @ metric
     a = (point.z_s * plan.z_ddot[rows]) @ metric
-    forces = inverse(formation, *point[:3], find_directions(curve, s), point.kinematics)
+    segment = np.searchsorted([part.stop for part in curve.segments[:-1]], s)
+    forces = inverse(formation, *point[:3], directions_of(curve, segment), point.kinematics)
     columns = [plan.contacts.index(name) for name in formation.names]
     rolls = [columns[row] for row in formation.rolling_rows]
     c = np.hstack([plan.c_n[rows][:, columns], plan.c_t[rows][:, rolls]])
     # The other parts of the forces are orthogonal to that of the internal force.
-    return s, a, v**2, np.asarray(np.einsum("ni,ni->n", c, forces.Cl))
+    return s, a, v**2, np.asarray(np.einsum("ni,ni->n", c, forces.of_c[..., LAMBDA]))
 
 
 def _place_nodes(curve: Curve) -> Array:

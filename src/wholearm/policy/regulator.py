@@ -17,7 +17,14 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.batch import Batch
 from ..contacts.formation import Formation
-from ..mechanics.dynamics import Directions, PathForces, build_forward, inverse, metric_weights
+from ..mechanics.dynamics import (
+    LAMBDA,
+    Directions,
+    PathForces,
+    build_forward,
+    inverse,
+    metric_weights,
+)
 from ..problem.definition import Phase, Problem
 from ..results.trajectory import Trajectory
 
@@ -116,7 +123,7 @@ def _stretch(formation: Formation, plan: Trajectory, t: Array) -> RegulatedStret
     columns = [plan.contacts.index(name) for name in formation.names]
     rolls = [columns[row] for row in formation.rolling_rows]
     c = np.hstack([samples.c_n[:, columns], samples.c_t[:, rolls]])
-    internal = np.asarray(np.einsum("ni,ni->n", c, forces.Cl))
+    internal = np.asarray(np.einsum("ni,ni->n", c, forces.of_c[..., LAMBDA]))
     return RegulatedStretch(formation, z, v, directions, forces, internal)
 
 

@@ -1,8 +1,7 @@
 """Speed profile along a curve, nowhere faster than a plan, that keeps robustness margins.
 
-With b = s'^2 and a = s'' constant on each interval, limits are linear in a, b and the internal
-force, which is eliminated from pairs of limits. Backward and forward reachability sweep (TOPP-RA,
-Pham and Pham 2018).
+Backward and forward reachability sweep (TOPP-RA, Pham and Pham 2018). In an interval a = s'' is
+constant and the limits are kept at both ends, each with its own internal force.
 """
 
 from __future__ import annotations
@@ -13,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..common.arrays import Array
-from .curve_rows import NEVER
+from ..mechanics.dynamics import ONE, A, B, V
+from ..mechanics.path_limits import PathLimits
 
 # Shares of the margin that are tried, the largest first. Negative ones: limits of a plan hold
 # between its own nodes, so that at others they may be violated a little.
@@ -59,16 +59,17 @@ def retime(
     Parameters
     ----------
     s : (n,) [m]          nodes
-    slack : (n, m, 5)     limits at the nodes, as in `curve_rows.Rows`
+    slack : (n, m, 5)     limits at the nodes, as in `CurveLimitRows`
     reserve : (n, m)      their margins
     cap : (n,) [m^2/s^2]  largest b
     end : [m^2/s^2]       least and largest b at the last node; by default the last of `cap`
     parts                 upper limits of the share, tried where some interval has less
     """
+    bounds, end = _Bounds.of(s, slack, reserve, cap), end or (cap[-1], cap[-1])
     best: Reach | None = None
     for part in (1.0, *parts):
         # A large share in one interval can reduce that of another one.
-        found = _pass(s, slack, reserve, cap, end or (cap[-1], cap[-1]), part)
+        found = bounds.sweep(end, part)
         if best is None or found.share.min() > best.share.min():
             best = found
         if best.share.min() >= min(NEAR * part, ENOUGH):
@@ -77,59 +78,57 @@ def retime(
     return best
 
 
-def _pass(
-    s: Array, slack: Array, reserve: Array, cap: Array, end: tuple[float, float], part: float
-) -> Reach:
-    """Backward pass with the largest share in each interval, at most `part`."""
-    steps, count = np.diff(s), len(s)
-    least, most = SLOWEST * cap, cap.copy()
-    least[-1], most[-1] = end
-    shares = [part, *(smaller for smaller in SHARES if smaller < part)]
-    share = np.empty(count - 1)
-    bounds: list[Array] = []
-    for k in range(count - 2, -1, -1):
-        ends, twice = slice(k, k + 2), 2 * steps[k]
-        after = np.array([[most[k + 1], -1.0, -twice], [-least[k + 1], 1.0, twice]])
-        # Default: only the plan itself is feasible here.
-        rows, low, high, share[k] = after, least[k], cap[k], shares[-1]
-        first, last = 0, len(shares)
-        while first < last:
-            middle = first if first == 0 else (first + last) // 2
-            tried = _bound(slack[ends], shares[middle] * reserve[ends], steps[k], cap[ends])
-            tried = np.vstack([tried, after])
-            slowest, fastest = find_range(tried)
-            slowest, fastest = max(slowest, least[k]), min(fastest, most[k])
-            if slowest <= fastest + SPACE * cap[k]:
-                rows, low, high, share[k], last = tried, slowest, fastest, shares[middle], middle
-            else:
-                first = middle + 1
-        bounds.append(rows)
-        least[k], most[k] = low, high
-    return Reach(s, least, most, bounds, share)
+class _Bounds(NamedTuple):
+    """Limits (1, b, a) >= 0 of the intervals between n nodes, with b at their first one."""
 
+    s: Array  # (n,)
+    cap: Array  # (n,)
+    rows: Array  # (n - 1, m, 3)
+    rates: Array  # (n - 1, m): by how much a row falls with the share of the margin
 
-def eliminate(rows: Array) -> Array:
-    """Fourier-Motzkin elimination of y, the last column, from rows (1, x, y) >= 0."""
-    last = rows[:, -1]
-    up, down = np.flatnonzero(last > 0), np.flatnonzero(last < 0)
-    first, second = np.tile(up, len(down)), np.repeat(down, len(up))
-    share = (-last[second] / (last[first] - last[second]))[:, None]
-    mixed = share * rows[first, :-1] + (1 - share) * rows[second, :-1]
-    return np.vstack([mixed, rows[last == 0, :-1]])
-
-
-def _bound(slack: Array, reserve: Array, step: float, cap: Array) -> Array:
-    """Limits on (1, b, a) of an interval from those at both ends, shape (k, 3)."""
-    found = [np.array([[cap[0], -1.0, 0.0], [0.0, 1.0, 0.0], [0.0, 1.0, 2 * step]])]
-    for end in range(2):
-        limits = slack[end].copy()
+    @staticmethod
+    def of(s: Array, slack: Array, reserve: Array, cap: Array) -> _Bounds:
+        """Those at both ends of the intervals, without the internal force; see `retime`."""
+        limits = PathLimits(slack, cap)
+        plain, tight = (each.eliminate().rows for each in (limits, limits.relax(-reserve)))
         # Viscous terms at the plan's speed: they are small, and no motion is faster.
-        limits[:, 0] += limits[:, 2] * np.sqrt(cap[end]) - reserve[end]
-        limits = np.unique(limits[limits[:, 0] < NEVER / 2], axis=0)
-        rows = eliminate(limits[:, [0, 1, 3, 4]])
-        rows[:, 2] += end * 2 * step * rows[:, 1]
-        found.append(rows)
-    return np.vstack(found)
+        one = plain[..., ONE] + plain[..., V] * np.sqrt(cap)[:, None]
+        rates, twice = plain[..., ONE] - tight[..., ONE], 2 * np.diff(s)[:, None]
+        first = np.stack([one, plain[..., B], plain[..., A]], axis=-1)
+        second = first[1:].copy()
+        second[..., 2] += twice * second[..., 1]
+        box = np.tile([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0], [0.0, 1.0, 0.0]], (len(s) - 1, 1, 1))
+        box[:, 0, 0], box[:, 2, 2] = cap[:-1], twice[:, 0]
+        rows = np.concatenate([box, first[:-1], second], axis=1)
+        return _Bounds(s, cap, rows, np.hstack([np.zeros((len(box), 3)), rates[:-1], rates[1:]]))
+
+    def sweep(self, end: tuple[float, float], part: float) -> Reach:
+        """Backward pass with the largest share in each interval, at most `part`."""
+        steps, cap, least, most = np.diff(self.s), self.cap, SLOWEST * self.cap, self.cap.copy()
+        least[-1], most[-1] = end
+        shares = [part, *(smaller for smaller in SHARES if smaller < part)]
+        share, bounds = np.empty(len(steps)), list[Array]()
+        for k in range(len(steps) - 1, -1, -1):
+            twice = 2 * steps[k]
+            after = np.array([[most[k + 1], -1.0, -twice], [-least[k + 1], 1.0, twice]])
+            # Default: only the plan itself is feasible here.
+            rows, low, high, share[k] = after, least[k], cap[k], shares[-1]
+            table = np.vstack([self.rows[k], after])
+            first, last = 0, len(shares)
+            while first < last:
+                middle = first if first == 0 else (first + last) // 2
+                tried = table.copy()
+                tried[:-2, 0] -= shares[middle] * self.rates[k]
+                slowest, fastest = find_range(tried)
+                slowest, fastest = max(slowest, least[k]), min(fastest, most[k])
+                if slowest <= fastest + SPACE * cap[k]:
+                    rows, low, high, last = tried, slowest, fastest, middle
+                    share[k] = shares[middle]
+                else:
+                    first = middle + 1
+            bounds.append(rows)
+            least[k], most[k] = low, high
+        return Reach(self.s, least, most, bounds, share)
 
 
 def find_range(rows: Array) -> tuple[float, float]:

@@ -24,6 +24,8 @@ from ..geometry.curve import Curve
 from ..geometry.path_guess import RELEASE_AT, count_freedoms, find_end, guess_phase
 from ..geometry.tracing import trace_phase
 from ..mechanics.dynamics import (
+    LAMBDA,
+    ONE,
     Directions,
     PathForces,
     force_rows,
@@ -167,9 +169,11 @@ def find_torques(path: PathSamples, epsilon: float, share: float) -> Quasistatic
         return None
     wanted = epsilon + share * float(best.least.min() - epsilon)
     low, high = path.force_limits.find_span(zero, zero, wanted)
-    forces, size = path.forces, (path.forces.Tl**2).sum(axis=1)
+    forces = path.forces
+    level, press = (forces.of_tau[..., column] for column in (ONE, LAMBDA))
+    size = (press**2).sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        lightest = -(forces.T0 * forces.Tl).sum(axis=1) / size
+        lightest = -(level * press).sum(axis=1) / size
     # At the largest least force the span is one point, but for rounding.
     middle = np.where(low <= high, np.clip(lightest, low, high), best.internal_force)
     internal = np.where(size > 0, middle, 0.0)

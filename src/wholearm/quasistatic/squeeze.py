@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..contacts.formation import Formation
-from ..mechanics.dynamics import PathForces
-from ..mechanics.limits import CONE, PRESS, LimitSet, SideTerms, make_limits
+from ..mechanics.dynamics import LAMBDA, PathForces
+from ..mechanics.limits import CONE, PRESS, LimitSet, make_limits
+from ..mechanics.path_limits import PathLimits, find_slack_rows
 
 _FAR = 1e6  # internal force that stands for an infinite one, over the scene's force
 _LEVEL = 1e-12
@@ -39,13 +40,14 @@ class InternalForceLimits(NamedTuple):
     """Limits at n places of a path as functions of the internal force."""
 
     limits: LimitSet  # for an epsilon of zero
-    terms: SideTerms
+    at: PathLimits  # all sides, also of joint speeds
 
     @staticmethod
     def of(formation: Formation, forces: PathForces, rates: Array) -> InternalForceLimits:
-        """Those of a formation; see `SideTerms.of`."""
+        """Those of a formation at places with d theta / ds = `rates`, (n, 2)."""
         limits = make_limits(formation, 0.0)
-        return InternalForceLimits(limits, SideTerms.of(limits, forces, rates))
+        rows = find_slack_rows(limits, forces, rates)
+        return InternalForceLimits(limits, PathLimits(rows, np.full(len(rows), np.inf)))
 
     @property
     def force(self) -> float:
@@ -66,13 +68,15 @@ class InternalForceLimits(NamedTuple):
         The least is above the largest where there is none.
         """
         _, weights, _ = self._split()
-        offset = self.terms.at(a, b) - np.multiply.outer(np.broadcast_to(epsilon, a.shape), weights)
-        return _intersect(offset, self.terms.press, _FAR * self.force)
+        offset = self.at.find_slack(a, b, 0 * a) - np.multiply.outer(
+            np.broadcast_to(epsilon, a.shape), weights
+        )
+        return _intersect(offset, self.at.rows[..., LAMBDA], _FAR * self.force)
 
     def find_best(self, a: Array, b: Array) -> Grasp:
         """The internal force with the largest least normal force, at a = s'', b = s'^2."""
         soft, weights, owners = self._split()
-        offset, slope = self.terms.at(a, b), self.terms.press
+        offset, slope = self.at.find_slack(a, b, 0 * a), self.at.rows[..., LAMBDA]
         low, high = _intersect(offset[:, ~soft], slope[:, ~soft], _FAR * self.force)
         # In newtons of epsilon.
         rest, rise = offset[:, soft] / weights[soft], slope[:, soft] / weights[soft]

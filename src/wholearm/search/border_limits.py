@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..contacts.formation import Kinematics
-from ..geometry.curve import Curve, CurvePoint, describe_pose
-from ..mechanics.dynamics import Directions, metric_weights, reduced_inertia
+from ..geometry.curve import Curve, CurvePoint, describe_pose, directions_of
+from ..mechanics.dynamics import metric_weights, reduced_inertia
+from ..mechanics.path_limits import PathLimits
 from ..mechanics.uniqueness import find_minors
-from ..planning.lower_bound.path_terms import PathTerms
-from ..planning.lower_bound.rows import PathLimitRows, limit_along
-from ..planning.lower_bound.speed_sweep import NoMotionError, add_up, find_steady
+from ..planning.lower_bound.path_terms import PathTerms, find_limits
+from ..planning.lower_bound.speed_sweep import NoMotionError, find_duration, speed_sweep
 
 INTERVALS = 24  # intervals of the speed sweep along a border
 CHECKED = 12  # further places of each segment that are checked for jamming and uniqueness
@@ -35,15 +35,13 @@ class BorderLimits(NamedTuple):
     begins: str  # why no motion begins at rest at the start
     ends: str  # why no motion ends at rest at the end
     z: Array  # (n, 5): a place in each interval
-    rows: PathLimitRows  # limits there
+    limits: PathLimits  # limits there, without the internal force
     steps: Array  # (n,) [m]: lengths of the intervals
     part: Array  # (n,): share of each interval before its place
 
     def with_speed_ratio(self, ratio: float) -> BorderLimits:
         """The same with the path parameter scaled by `ratio`."""
-        a, b, v, one, cap = self.rows
-        rows = PathLimitRows(a * ratio, b * ratio**2, v * ratio, one, cap / ratio**2)
-        return self._replace(rows=rows, steps=self.steps / ratio)
+        return self._replace(limits=self.limits.scale(ratio), steps=self.steps / ratio)
 
 
 def find_border_limits(curve: Curve, epsilon: float, uniqueness_margin: float) -> BorderLimits:
@@ -64,13 +62,13 @@ def find_border_limits(curve: Curve, epsilon: float, uniqueness_margin: float) -
         closed, clear = _find_ambiguity(curve, s, at, owners, uniqueness_margin)
         first = Kinematics(*(array[:count] for array in at.kinematics))
         nodes_at = CurvePoint(at.z[:count], at.z_s[:count], at.z_ss[:count], first)
-        rows = limit_along(curve, epsilon, nodes_at, owners[:count])
+        limits = find_limits(curve, epsilon, nodes_at, owners[:count])
     except np.linalg.LinAlgError:
-        none = np.zeros((len(steps), 1))
-        rows = PathLimitRows(none, none, none, none - 1, none[:, 0])
-        return BorderLimits(DEPENDENT, 0.0, "", "", none, rows, steps, none[:, 0])
+        z, none = np.zeros((len(steps), 5)), np.zeros(len(steps))
+        limits = PathLimits(np.zeros((len(steps), 1, 4)), none)
+        return BorderLimits(DEPENDENT, 0.0, "", "", z, limits, steps, none)
     begins, ends = (
-        "" if _is_held(sign * rows.a[k], rows.one[k]) else f"no motion {what} at rest at {place}"
+        "" if limits.pick(k).can_rest(sign) else f"no motion {what} at rest at {place}"
         for k, sign, what, place in (
             (0, 1.0, "begins", describe_pose(at.z[0])),
             (1, -1.0, "ends", describe_pose(at.z[1])),
@@ -78,7 +76,7 @@ def find_border_limits(curve: Curve, epsilon: float, uniqueness_margin: float) -
     )
     inner = slice(2, count)
     part = (middles - nodes[:-1]) / steps
-    return BorderLimits(closed, clear, begins, ends, at.z[inner], rows.pick(inner), steps, part)
+    return BorderLimits(closed, clear, begins, ends, at.z[inner], limits.pick(inner), steps, part)
 
 
 def estimate_duration(limits: Sequence[BorderLimits]) -> float | str:
@@ -87,23 +85,15 @@ def estimate_duration(limits: Sequence[BorderLimits]) -> float | str:
     Speed sweep with the limits of one place in each interval. `limits` have such speed ratios that
     the speed is continuous where two borders meet.
     """
-    rows = PathLimitRows(*(np.concatenate(c) for c in zip(*(b.rows for b in limits), strict=True)))
+    rows, cap = (np.concatenate(column) for column in zip(*(b.limits for b in limits), strict=True))
     steps, part, z = (
         np.concatenate([getattr(b, key) for b in limits]) for key in ("steps", "part", "z")
     )
-    caps: Array = np.minimum(np.append(rows.cap, np.inf), np.append(np.inf, rows.cap))
     try:
-        return add_up(find_steady(rows, steps, part, caps).b, steps)
+        motion = speed_sweep(PathLimits(rows, cap), steps, part)
+        return float(find_duration(motion.b, steps))
     except NoMotionError as error:
         return f"no motion keeps its limits at {describe_pose(z[min(error.interval, len(z) - 1)])}"
-
-
-def _is_held(a: Array, one: Array) -> bool:
-    """Whether limits a s'' + one >= 0, shape (m,), allow some s'' >= 0."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        least = np.where(a > 0, -one / a, 0.0).max()
-        most = np.where(a < 0, -one / a, np.inf).min()
-    return bool(max(least, 0.0) <= most and not ((a == 0) & (one < 0)).any())
 
 
 def _find_ambiguity(
@@ -118,14 +108,12 @@ def _find_ambiguity(
     least          uniqueness margin (P-matrix)
     """
     formation = curve.formation
-    Xi, sigma = (
-        np.array([getattr(part, key) for part in curve.segments])[owners] for key in ("Xi", "sigma")
-    )
+    directions = directions_of(curve, owners)
     rows = at.kinematics.P / np.sqrt(metric_weights(formation.scene))
     rows = rows / np.linalg.norm(rows, axis=2, keepdims=True)
     volumes = np.linalg.det(rows @ rows.transpose(0, 2, 1))
-    inertia = reduced_inertia(formation, at.kinematics, Directions(Xi, sigma))
-    minors = find_minors(formation, at.kinematics, Xi)
+    inertia = reduced_inertia(formation, at.kinematics, directions)
+    minors = find_minors(formation, at.kinematics, directions.Xi)
     lost = ~(np.isfinite(inertia) & (volumes > INDEPENDENT))
     bad = lost | (inertia <= 0) | (minors.ratios < least)
     if not bad.any():

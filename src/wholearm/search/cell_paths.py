@@ -14,16 +14,17 @@ from ..common.arrays import Array
 from ..contacts.closing import Flags, Numbers, contact_table, first_contact
 from ..contacts.explicit import move
 from ..contacts.formation import Formation
-from ..mechanics.dynamics import Directions, force_rows, inverse
+from ..mechanics.dynamics import ONE, Directions, force_rows, inverse
 from ..mechanics.limits import LimitSet, make_limits
-from ..planning.lower_bound.rows import PathLimitRows, limit
+from ..mechanics.path_limits import PathLimits
+from ..planning.lower_bound.path_terms import GIVE
+from ..planning.lower_bound.speed_sweep import make_cosine_grid, speed_sweep
 from ..scene.model import Scene
-from .travel_times import find_durations
 
 NODES = 12  # intervals of a path
 
-_ENDS = (1 - np.cos(np.linspace(0, np.pi, NODES + 1))) / 2
-MIDDLES = (_ENDS[1:] + _ENDS[:-1]) / 2  # places where limits are kept, over the path's length
+STEPS, MIDDLES, PART = make_cosine_grid(NODES)
+"""Intervals over the path's length, and the places in them where limits are kept."""
 
 
 def list_middles(starts: Array, ends: Array) -> Array:
@@ -33,13 +34,7 @@ def list_middles(starts: Array, ends: Array) -> Array:
 
 def can_start(scene: Scene, epsilon: float, labels: Numbers, poses: Array, runs: Array) -> Flags:
     """Whether motions along straight paths can start from rest, shape (n,); see `time_paths`."""
-    rows = _evaluate(scene, epsilon, labels, poses, runs)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        bounds = -rows.one / rows.a
-        least = np.where(rows.a > 0, bounds, 0.0).max(axis=1)
-        most = np.where(rows.a < 0, bounds, np.inf).min(axis=1)
-    never = ((rows.a == 0) & (rows.one < 0)).any(axis=1)
-    return np.asarray((np.maximum(least, 0.0) < most) & ~never)
+    return _evaluate(scene, epsilon, labels, poses, runs).can_rest()
 
 
 def time_paths(scene: Scene, epsilon: float, labels: Numbers, starts: Array, ends: Array) -> Array:
@@ -56,14 +51,14 @@ def time_paths(scene: Scene, epsilon: float, labels: Numbers, starts: Array, end
         return np.zeros(0)
     poses = list_middles(starts, ends).reshape(-1, 2)
     labels, runs = np.repeat(labels, NODES, axis=0), np.repeat(ends - starts, NODES, axis=0)
-    rows = _evaluate(scene, epsilon, labels, poses, runs)
-    rows = PathLimitRows(*(part.reshape(-1, NODES, *part.shape[1:]) for part in rows))
-    return find_durations(rows, np.diff(_ENDS), (MIDDLES - _ENDS[:-1]) / np.diff(_ENDS))
+    rows, cap = _evaluate(scene, epsilon, labels, poses, runs)
+    limits = PathLimits(rows.reshape(-1, NODES, *rows.shape[1:]), cap.reshape(-1, NODES))
+    return speed_sweep(limits, STEPS, PART, sweeps=2).find_durations(STEPS)
 
 
 def _evaluate(
     scene: Scene, epsilon: float, labels: Numbers, poses: Array, runs: Array
-) -> PathLimitRows:
+) -> PathLimits:
     """Limits of acceleration and speed at n places of straight paths."""
     at, (formation, limits) = move(scene, labels, poses, runs), _make_limits(scene, epsilon)
     directions, kinematics = Directions.of(at.kinematics, at.z_u), at.kinematics
@@ -74,13 +69,11 @@ def _evaluate(
         unheld = np.equal(np.linalg.det(wrenches), 0.0).reshape(-1, 1, 1)
         kinematics = kinematics._replace(A=np.where(unheld, np.nan, kinematics.A))
         forces = inverse(formation, at.z, at.z_u, at.z_uu, directions, kinematics)
-    rows = limit(limits, forces, at.z_u[:, 3:])
+    rows, cap = PathLimits.of(limits, forces, at.z_u[:, 3:], GIVE).eliminate()
     # No motion where three contacts cannot balance the object.
-    held = np.asarray(np.isfinite(rows.a + rows.b + rows.v + rows.one).all(axis=1))[:, None]
-    a, b, v = (np.where(held, part, 0.0) for part in (rows.a, rows.b, rows.v))
-    return PathLimitRows(
-        a, b, v, np.where(held, rows.one, -1.0), np.where(held[:, 0], rows.cap, 0.0)
-    )
+    held = np.asarray(np.isfinite(rows).all(axis=(1, 2)))
+    rows = np.where(held[:, None, None], rows, -np.eye(rows.shape[-1])[ONE])
+    return PathLimits(rows, np.where(held, cap, 0.0))
 
 
 @lru_cache(maxsize=8)

@@ -16,8 +16,10 @@ from ..geometry.arcs import find_on, join, take
 from ..geometry.curve import Curve
 from ..geometry.tracing import HELD, trace_curve
 from ..mechanics.dynamics import metric_weights
+from ..mechanics.path_limits import PathLimits
 from ..planning.lower_bound.lower_bound import bound_least_time, bound_roughly
-from ..planning.lower_bound.rows import PathLimitRows, evaluate_rows
+from ..planning.lower_bound.path_terms import find_limits
+from ..planning.lower_bound.speed_sweep import make_cosine_grid, speed_sweep
 from ..problem.definition import End, Until
 from .border_limits import (
     INTERVALS,
@@ -27,7 +29,6 @@ from .border_limits import (
     find_border_limits,
 )
 from .places import RoadmapPlace, make_place
-from .travel_times import find_durations
 
 BARRED = 0.01  # violation of a limit a small step ahead, over the step, where a border ends
 ROUGHLY = 0.999  # safety factor of coarse bounds; quadrature errors are up to 2e-5 in seven scenes
@@ -234,16 +235,15 @@ def time_parts(border: BorderEdge, shares: Array) -> Array:
     lengths = lengths[lengths <= border.limits.clear]
     if not len(lengths) or border.limits.begins:
         return times
-    nodes = (1 - np.cos(np.linspace(0, np.pi, PARTED + 1))) / 2
-    places, steps = (nodes[1:] + nodes[:-1]) / 2, np.diff(nodes)
-    s, size = lengths[:, None] * places, lengths[:, None]
-    stops = np.array([part.stop for part in curve.segments[:-1]])
-    rows = evaluate_rows(curve, border.terms.epsilon, s.ravel(), np.searchsorted(stops, s.ravel()))
+    steps, places, part = make_cosine_grid(PARTED)
+    s = lengths[:, None] * places
+    stops = np.array([each.stop for each in curve.segments[:-1]])
+    point, segment = curve.evaluate(s.ravel()), np.searchsorted(stops, s.ravel())
+    rows, cap = find_limits(curve, border.terms.epsilon, point, segment)
+    limits = PathLimits(rows.reshape(*s.shape, *rows.shape[1:]), cap.reshape(s.shape))
     # With the share of each part as path parameter.
-    a, b, v, one, cap = (part.reshape(*s.shape, *part.shape[1:]) for part in rows)
-    scale = size[..., None]
-    scaled = PathLimitRows(scale * a, scale**2 * b, scale * v, one, cap / size**2)
-    times[: len(lengths)] = find_durations(scaled, steps, (places - nodes[:-1]) / steps)
+    motion = speed_sweep(limits.scale(lengths[:, None]), steps, part, sweeps=2)
+    times[: len(lengths)] = motion.find_durations(steps)
     return times
 
 

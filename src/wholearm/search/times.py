@@ -13,10 +13,11 @@ from ..geometry.curve import solve_tangent
 from ..mapping.formation_map import Border
 from ..mechanics.dynamics import Directions, inverse, metric_weights, reduced_inertia
 from ..mechanics.limits import make_limits
+from ..mechanics.path_limits import PathLimits
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN, find_minors
-from ..planning.lower_bound.rows import PathLimitRows, limit
+from ..planning.lower_bound.path_terms import GIVE
+from ..planning.lower_bound.speed_sweep import make_cosine_grid, speed_sweep
 from ..problem.definition import Problem
-from .travel_times import find_durations
 
 NODES = 24  # intervals of a border
 
@@ -39,15 +40,16 @@ def time_borders(problem: Problem, borders: Sequence[Border]) -> Array:
     """
     if not borders:
         return np.zeros((0, 2))
-    nodes = (1 - np.cos(np.linspace(0, np.pi, NODES + 1))) / 2
-    places = (nodes[1:] + nodes[:-1]) / 2
-    rows = _evaluate(problem, borders, places)
-    times = find_durations(rows, np.diff(nodes), (places - nodes[:-1]) / np.diff(nodes))
-    return times.reshape(-1, 2)
+    steps, places, part = make_cosine_grid(NODES)
+    limits = _evaluate(problem, borders, places)
+    return speed_sweep(limits, steps, part, sweeps=2).find_durations(steps)
 
 
-def _evaluate(problem: Problem, borders: Sequence[Border], places: Array) -> PathLimitRows:
-    """Limits at places of borders, in both directions, with the share of length as parameter."""
+def _evaluate(problem: Problem, borders: Sequence[Border], places: Array) -> PathLimits:
+    """Limits at places of borders, in both directions, with the share of length as parameter.
+
+    Rows have the shape (n, 2, count, m, 4). A place that no motion passes has b <= 0.
+    """
     scene, weights = problem.scene, metric_weights(problem.scene)
     count, table = len(places), contact_table(scene)
     z, chord, length = _interpolate(borders, places, weights)
@@ -60,28 +62,26 @@ def _evaluate(problem: Problem, borders: Sequence[Border], places: Array) -> Pat
     at = evaluate_each(scene, labels, z, run)
     z_s, z_ss = solve_tangent(at.P, at.P_dot_v, run, weights)
     tangent, curvature = length * z_s, length**2 * z_ss
-    found = [np.empty(0)] * len(PathLimitRows._fields)
+    shape = len(borders), 2, count
+    rows, cap = np.zeros((*shape, 0, 4)), np.zeros(shape)
     for formation, mine in group_alike(scene, labels):
         part = Kinematics(*(array[mine] for array in at))
-        every = make_limits(formation, problem.epsilon)
+        every, chosen = make_limits(formation, problem.epsilon), mine.reshape(-1, count)[:, 0]
         for back, sign in enumerate((1.0, -1.0)):
-            directions = Directions.of(part, sign * tangent[mine])
             turned = sign * tangent[mine]
+            directions = Directions.of(part, turned)
             forces = inverse(formation, z[mine], turned, curvature[mine], directions, part)
-            rows = limit(every, forces, turned[:, 3:])
+            limits = PathLimits.of(every, forces, turned[:, 3:], GIVE).eliminate()
             inertia = reduced_inertia(formation, part, directions)
             ratios = find_minors(formation, part, directions.Xi).ratios
             closed = ~(inertia > 0) | (ratios < UNIQUENESS_MARGIN)
-            # No motion there.
-            for values in rows:
-                values[closed] = 0.0
-            chosen = mine.reshape(-1, count)[:, 0]
-            for k, values in enumerate(rows):
-                split = values.reshape(-1, count, *values.shape[1:])
-                if not found[k].size:
-                    found[k] = np.empty((len(borders), 2, *split.shape[1:]))
-                found[k][chosen, back] = split[:, ::-1] if back else split
-    return PathLimitRows(*(array.reshape(-1, *array.shape[2:]) for array in found))
+            limits.rows[closed], limits.cap[closed] = 0.0, 0.0
+            if not rows.size:
+                rows = np.zeros((*shape, *limits.rows.shape[1:]))
+            way = slice(None, None, -1 if back else 1)
+            rows[chosen, back] = limits.rows.reshape(-1, count, *rows.shape[3:])[:, way]
+            cap[chosen, back] = limits.cap.reshape(-1, count)[:, way]
+    return PathLimits(rows, cap)
 
 
 def _interpolate(

@@ -23,10 +23,10 @@ import numpy as np
 from ..common.arrays import Array
 from ..contacts.formation import Formation, Kinematics
 from ..geometry.curve import CurvePoint
-from ..mechanics.dynamics import Directions, PathForces, force_rows, metric_weights
+from ..mechanics.dynamics import A, B, Directions, PathForces, V, force_rows, metric_weights
 from ..results.trajectory import Samples
 
-COUNT = 5  # number of coefficients: of 1, a, b, the internal force and s'
+COUNT = 5  # number of coefficients: of 1, a, b, s' and the internal force
 _STEP = 1e-5  # step of the differences of kinematics, over the scene's length
 _LOOSE = 1e-6  # weight of the fingers' angles where they follow the object
 
@@ -47,7 +47,7 @@ def find_force_slopes(
 ) -> Array:
     """Derivatives of contact forces by uncertain numbers, (n, n_c + R, len(names), COUNT).
 
-    They are coefficients of (1, a, b, lambda, s') [N per unit]. Names are of `problem.uncertainty`:
+    They are coefficients of (1, a, b, s', lambda) [N per unit]. Names are of `problem.uncertainty`:
     relative numbers, or lengths in m; `start_x` is the place along the curve.
     """
     return _along(formation, point, directions, forces).find_slopes(names)
@@ -66,15 +66,12 @@ def _along(
     formation: Formation, point: CurvePoint, directions: Directions, forces: PathForces
 ) -> _State:
     """The state of a formation at n places of a curve."""
-    none = np.zeros_like(forces.C0)
-    c = np.stack([forces.C0, forces.Ca, forces.Cb, forces.Cl, none], axis=-1)
-    tau = np.stack([forces.T0, forces.Ta, forces.Tb, forces.Tl, forces.Tv], axis=-1)
     acceleration = np.zeros((*point.z.shape, COUNT))
-    acceleration[..., 1], acceleration[..., 2] = point.z_s, point.z_ss
+    acceleration[..., A], acceleration[..., B] = point.z_s, point.z_ss
     size = np.sqrt(point.z_s[:, :3] ** 2 @ metric_weights(formation.scene)[:3])[:, None]
     along = point.z_s / size, point.z_ss / size
     places = point.z, point.z_s, point.kinematics
-    return _State(formation, *places, directions, c, tau, acceleration, along)
+    return _State(formation, *places, directions, forces.of_c, forces.of_tau, acceleration, along)
 
 
 def find_slopes_at(
@@ -99,7 +96,7 @@ def find_slopes_at(
     state = state._replace(along=(dz, state.turn("", dz)))
     slopes = state.find_slopes(names)
     # The velocity is that of the motion: s' = 1 along a tangent that is z'.
-    return np.asarray(slopes @ np.array([1.0, 0.0, 1.0, 0.0, 1.0]))
+    return np.asarray(slopes @ np.array([1.0, 0.0, 1.0, 1.0, 0.0]))
 
 
 class _State(NamedTuple):
@@ -182,10 +179,10 @@ class _State(NamedTuple):
         # P' z' is a quadratic form of the velocity.
         turns = [self.formation.evaluate(self.z, self.z_s + way * dz_s).P_dot_v for way in (-1, 1)]
         bend = -np.einsum("nij,njq->niq", slopes.P, self.acceleration)
-        bend[..., 2] -= slopes.P_dot_v + (turns[1] - turns[0]) / 2
+        bend[..., B] -= slopes.P_dot_v + (turns[1] - turns[0]) / 2
         dG = force_rows(self.formation, slopes, self.directions)
         load = np.einsum("nij,niq->njq", dG, self.c)
-        load[..., 4] -= self.formation.scene.viscous * dz_s
+        load[..., V] -= self.formation.scene.viscous * dz_s
         return _Change(load, bend)
 
     def _rows_of(self, name: str) -> Array:

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
+from ...geometry.curve import directions_of
 from ...mechanics.dynamics import PathForces, inverse
 from ...mechanics.limits import make_limits
 from ...planning.lower_bound.lower_bound import bound_least_time
-from ...planning.lower_bound.rows import directions_of
 from ...planning.options import Objective, PlanOptions
 from ...planning.path_domain.path_data import prepare
 from ...planning.path_domain.path_mesh import Mesh
@@ -150,16 +150,11 @@ class _PeerRows:
         curve = instance.curve
         self.forces = inverse(curve.formation, *curve.evaluate(s)[:3], directions_of(curve, owner))
         limits = make_limits(curve.formation, instance.problem.epsilon)
-        rows, signs, bounds = limits.sides
-        of_c, of_tau, _ = (part[rows].T * signs for part in limits.columns)
-
-        def collect(c: Array, tau: Array) -> Array:
-            return np.asarray(c @ of_c + tau @ of_tau)
-
-        forces = self.forces
-        self.constant = collect(forces.C0, forces.T0) - signs * bounds
-        self.a, self.b = collect(forces.Ca, forces.Ta), collect(forces.Cb, forces.Tb)
-        self.q = collect(forces.Cl, forces.Tl)
+        sides, signs, bounds = limits.sides
+        of_c, of_tau, _ = (signs[:, None] * part[sides] for part in limits.columns)
+        rows = of_c @ self.forces.of_c + of_tau @ self.forces.of_tau
+        self.constant, self.a, self.b, _, self.q = rows.transpose(2, 0, 1)
+        self.constant = self.constant - signs * bounds
 
     def eliminate(self) -> tuple[Array, Array, Array]:
         """Rows in s'' and s'^2 alone: a, b and constant, shape (n, pairs) each."""

@@ -15,9 +15,17 @@ from numpy.typing import NDArray
 
 from ...common.arrays import Array
 from ...geometry.curve import Curve
+from ...mechanics.dynamics import ONE, A, B, V
+from ...mechanics.path_limits import Extreme, PathLimits
 from .path_terms import PathGrid, PathTerms
-from .rows import Extreme, PathLimitRows
-from .speed_sweep import NoMotionError, Sweep, SweepMode, add_up, find_fastest, find_steady
+from .speed_sweep import (
+    NoMotionError,
+    SpeedProfile,
+    SweepMode,
+    find_duration,
+    join_caps,
+    speed_sweep,
+)
 
 _NEAR = 6  # intervals from a switch within which its row may change sign in a
 _STIFF = 4.0  # growth in an interval from which the exponential rule replaces the trapezoidal one
@@ -46,7 +54,7 @@ class _Round(NamedTuple):
 
     bound: LowerBound
     losses: Array
-    motion: Sweep
+    motion: SpeedProfile
     time: float
 
 
@@ -107,19 +115,13 @@ def look_along(curves: Sequence[Curve], epsilon: float, intervals: int) -> float
     path = PathTerms(curves, epsilon)
     grid = path.make_grid(intervals)
     ends, angles = path.place(grid.angles), (grid.angles[1:] + grid.angles[:-1]) / 2
-    rows = path.evaluate(angles[:, None], grid.owners).pick((slice(None), 0))
-    cap = np.full(len(ends), np.inf)
-    if np.isfinite(rows.cap).any():
+    limits, cap = path.evaluate(angles[:, None], grid.owners).pick((slice(None), 0)), None
+    if np.isfinite(limits.cap).any():
         sides = np.column_stack([grid.angles[:-1], grid.angles[1:]])
-        cap = _join_caps(*path.evaluate(sides, grid.owners).cap.T)
+        cap = join_caps(*path.evaluate(sides, grid.owners).cap.T)
     steps = np.diff(ends)
-    motion = find_steady(rows, steps, (path.place(angles) - ends[:-1]) / steps, cap)
-    return add_up(motion.b, steps)
-
-
-def _join_caps(left: Array, right: Array) -> Array:
-    """Limits of b at nodes from those on both sides of each."""
-    return np.asarray(np.minimum(np.append(left, np.inf), np.append(np.inf, right)))
+    motion = speed_sweep(limits, steps, (path.place(angles) - ends[:-1]) / steps, cap)
+    return float(find_duration(motion.b, steps))
 
 
 def _bound(path: PathTerms, grid: PathGrid, b_guess: Array | None) -> _Round:
@@ -130,17 +132,14 @@ def _bound(path: PathTerms, grid: PathGrid, b_guess: Array | None) -> _Round:
     left, middle, right = (rows.pick((slice(None), k)) for k in range(3))
     s = path.place(grid.angles)
     part = (path.place(angles) - s[:-1, None]) / np.diff(s)[:, None]
-    cap, places = _join_caps(left.cap, right.cap), part[:, 1]
-    if b_guess is None:
-        motion = find_steady(middle, np.diff(s), places, cap)
-    else:
-        motion = find_fastest(middle, np.diff(s), places, cap, b_guess)
+    cap = join_caps(left.cap, right.cap)
+    motion = speed_sweep(middle, np.diff(s), part[:, 1], cap, b_guess)
     b = motion.b[:-1, None] + part * np.diff(motion.b)[:, None]
     costate = find_costate(path, grid, left, right, motion)
     shape = len(h), len(_PLACES) - 3
     p, slope = (part.ravel() for part in costate.interpolate(path, grid, _PLACES[3:]))
     inner = rows.pick((slice(None), slice(3, None)))
-    inner = PathLimitRows(*(part.reshape(-1, *part.shape[2:]) for part in inner))
+    inner = PathLimits(*(array.reshape(-1, *array.shape[2:]) for array in inner))
     least = find_least(inner, p, slope)
     excess = evaluate(inner, p, slope, b[:, 3:].ravel()) - least
     stretch = path.length / 2 * np.sin(angles[:, 3:])
@@ -157,14 +156,16 @@ def _bound(path: PathTerms, grid: PathGrid, b_guess: Array | None) -> _Round:
     jumps = np.minimum(costate.jumps(grid), 0.0)
     taken = np.zeros(len(jumps))
     at = np.flatnonzero(jumps)
-    taken[at] = np.minimum(right.pick(at).highest(), left.pick(at + 1).highest())
+    taken[at] = np.minimum(right.pick(at).find_largest_b(), left.pick(at + 1).find_largest_b())
     lost = np.abs(jumps * (taken - motion.b[1:-1]))
     losses[:-1] += lost
     losses[1:] += lost
     total = float(fine.sum() + jumps @ taken)
     estimate = _SAFETY * float(error.sum())
     value = max(0.0, total - estimate) if np.isfinite(total) else 0.0
-    return _Round(LowerBound(value, estimate), losses, motion, add_up(motion.b, np.diff(s)))
+    return _Round(
+        LowerBound(value, estimate), losses, motion, float(find_duration(motion.b, np.diff(s)))
+    )
 
 
 class Costate(NamedTuple):
@@ -198,7 +199,7 @@ class Costate(NamedTuple):
 
 
 def find_costate(
-    path: PathTerms, grid: PathGrid, left: PathLimitRows, right: PathLimitRows, motion: Sweep
+    path: PathTerms, grid: PathGrid, left: PathLimits, right: PathLimits, motion: SpeedProfile
 ) -> Costate:
     """The costate of a profile, from the limits at the left and right ends of intervals."""
     b, modes = motion.b, motion.modes.copy()
@@ -227,23 +228,21 @@ def find_costate(
     return Costate(y, slopes)
 
 
-def _find_turn(
-    left: PathLimitRows, right: PathLimitRows, row: int, k: int
-) -> tuple[int, int] | None:
+def _find_turn(left: PathLimits, right: PathLimits, row: int, k: int) -> tuple[int, int] | None:
     """The interval near k in which a row turns from an upper to a lower bound of a, and that row.
 
     The profile runs along that row on both sides, and the costate is zero there.
     """
     near = np.arange(max(k - _NEAR, 0), min(k + _NEAR + 1, len(left.cap)))
-    turns = near[(left.a[near, row] < 0) & (right.a[near, row] >= 0)]
+    turns = near[(left.rows[near, row, A] < 0) & (right.rows[near, row, A] >= 0)]
     return (int(turns[np.abs(turns - k).argmin()]), row) if len(turns) else None
 
 
 def _switch(
     path: PathTerms,
     grid: PathGrid,
-    left: PathLimitRows,
-    right: PathLimitRows,
+    left: PathLimits,
+    right: PathLimits,
     b: Array,
     extremes: tuple[float, float],
     k: int,
@@ -258,9 +257,10 @@ def _switch(
         rate = 0.5 * max(before + 2 * pushed * x, before, after) ** -1.5
     else:
         row, most = turn[1], max(before, after)
-        x = h * left.a[k, row] / (left.a[k, row] - right.a[k, row])
-        pull = left.b[k, row] + left.v[k, row] / (2 * np.sqrt(most))
-        rate = 0.5 * most**-1.5 / (1 - 2 * pull * h / (right.a[k, row] - left.a[k, row]))
+        here, rise = left.rows[k, row], right.rows[k, row, A] - left.rows[k, row, A]
+        x = -h * here[A] / rise
+        pull = here[B] + here[V] / (2 * np.sqrt(most))
+        rate = 0.5 * most**-1.5 / (1 - 2 * pull * h / rise)
     return np.asarray(rate * np.array([x, x - h]) * np.sin(grid.angles[k : k + 2]))
 
 
@@ -328,37 +328,38 @@ def _follow(y: float, h: float, force: Array, rate: Array) -> float:
     return float(y * np.exp(growth) + h * force.mean() * np.expm1(growth) / growth)
 
 
-def find_least(rows: PathLimitRows, p: Array, slope: Array) -> Array:
+def find_least(rows: PathLimits, p: Array, slope: Array) -> Array:
     """H at n places, from p and p' there."""
     least = _find_least(rows, p, slope)
     lost = np.flatnonzero(~np.isfinite(least))
     if len(lost):
         bounded = rows.pick(lost)
-        bounded = bounded._replace(cap=bounded.highest())
+        bounded = bounded._replace(cap=bounded.find_largest_b())
         least[lost] = _find_least(bounded, p[lost], slope[lost])
     return least
 
 
-def evaluate(rows: PathLimitRows, p: Array, slope: Array, b: Array) -> Array:
+def evaluate(rows: PathLimits, p: Array, slope: Array, b: Array) -> Array:
     """The integrand at n places for some b and the best a."""
-    share, rest = _weigh(rows, p), rows.rest(b)
+    share, rest = _weigh(rows, p), rows.at(b)
     push = np.where(share < 0, share * rest, -np.inf).max(axis=1)
     return np.asarray(1 / np.sqrt(b) - slope * b + np.where(p == 0, 0.0, push))
 
 
-def _find_least(rows: PathLimitRows, p: Array, slope: Array) -> Array:
-    share, cap = _weigh(rows, p), rows.cap[:, None]
+def _find_least(limits: PathLimits, p: Array, slope: Array) -> Array:
+    share, cap, rows = _weigh(limits, p), limits.cap[:, None], limits.rows
     with np.errstate(over="ignore", invalid="ignore"):
-        least = _minimise(share * rows.b - slope[:, None], share * rows.v, cap) + share * rows.one
+        c, g = share * rows[..., B] - slope[:, None], share * rows[..., V]
+        least = _minimise(c, g, cap) + share * rows[..., ONE]
     least = np.where((share < 0) & ~np.isnan(least), least, -np.inf).max(axis=1)
     alone = _minimise(-slope[:, None], np.zeros((len(p), 1)), cap)[:, 0]
     return np.where(p == 0, alone, least)
 
 
-def _weigh(rows: PathLimitRows, p: Array) -> Array:
+def _weigh(limits: PathLimits, p: Array) -> Array:
     """Weight of a row's rest in the integrand if it alone bounds p a; 0 if it cannot."""
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        share = 2 * p[:, None] / rows.a
+        share = 2 * p[:, None] / limits.rows[..., A]
         return np.where((share < 0) & np.isfinite(share), share, 0.0)
 
 

@@ -15,8 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
-from ...geometry.curve import Curve
-from .rows import PathLimitRows, evaluate_rows
+from ...geometry.curve import Curve, CurvePoint, directions_of
+from ...mechanics.dynamics import inverse
+from ...mechanics.limits import make_limits
+from ...mechanics.path_limits import PathLimits
+
+GIVE = 2.5e-7  # relaxation of limits over their scales: a plan may violate them as much
 
 
 class PathPiece(NamedTuple):
@@ -79,17 +83,26 @@ class PathTerms:
         counts = np.maximum(2, np.rint(np.diff(ends) / np.pi * intervals)).astype(np.int64)
         return PathGrid(ends, np.arange(len(counts))).split(counts)
 
-    def evaluate(self, angles: Array, owners: NDArray[np.int64]) -> PathLimitRows:
-        """Limits at angles of shape (N, n), each row of them as part of a piece."""
-        s, shape = self.place(angles), angles.shape
-        parts = []
-        for index, curve in enumerate(self.curves):
-            mine = np.array([piece.curve == index for piece in self.pieces])[owners]
-            pieces = [self.pieces[k] for k in owners[mine]]
-            low, high = (np.array([[piece[k]] for piece in pieces]) for k in (2, 3))
-            local = np.clip(s[mine], low, high) - self.offsets[index]
-            segment = np.repeat([piece.segment for piece in pieces], shape[1])
-            local = np.clip(local.ravel(), 0.0, curve.length)
-            parts.append(evaluate_rows(curve, self.epsilon, local, segment))
-        stacked = (np.concatenate(column) for column in zip(*parts, strict=True))
-        return PathLimitRows(*(column.reshape(*shape, *column.shape[1:]) for column in stacked))
+    def evaluate(self, angles: Array, owners: NDArray[np.int64]) -> PathLimits:
+        """Limits without lambda at angles of shape (N, n), each row of them as part of a piece."""
+        s, parts = self.place(angles), []
+        pieces = [self.pieces[k] for k in owners]
+        for index, (curve, offset) in enumerate(zip(self.curves, self.offsets, strict=False)):
+            mine = np.flatnonzero([piece.curve == index for piece in pieces])
+            low, high = np.array([pieces[k][2:] for k in mine]).T[..., None]
+            local = np.clip(np.clip(s[mine], low, high) - offset, 0.0, curve.length)
+            segment = np.repeat([pieces[k].segment for k in mine], angles.shape[1])
+            point = curve.evaluate(local.ravel())
+            parts.append(find_limits(curve, self.epsilon, point, segment))
+        rows, cap = (np.concatenate(column) for column in zip(*parts, strict=True))
+        return PathLimits(rows.reshape(*s.shape, *rows.shape[1:]), cap.reshape(s.shape))
+
+
+def find_limits(
+    curve: Curve, epsilon: float, point: CurvePoint, segment: NDArray[np.int64]
+) -> PathLimits:
+    """Limits without lambda at n places of a curve, each as part of a segment; see `GIVE`."""
+    directions = directions_of(curve, segment)
+    forces = inverse(curve.formation, *point[:3], directions, point.kinematics)
+    limits = make_limits(curve.formation, epsilon)
+    return PathLimits.of(limits, forces, point.z_s[:, 3:], GIVE).eliminate()

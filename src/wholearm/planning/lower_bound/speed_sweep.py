@@ -1,8 +1,8 @@
-"""Minimum-time speed profile along a path: backward and forward reachability sweep in (s, b).
+"""Minimum-time speed profiles along paths: backward and forward reachability sweep in (s, b).
 
 The backward pass finds the largest b = s'^2 from which rest at the end can be reached, the forward
 pass the largest reachable one below it (TOPP-RA, Pham and Pham 2018). In an interval a = s'' is
-constant and the limits are kept at one place.
+constant and the limits are kept at one place. Many paths are swept at once.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
-from .rows import PathLimitRows
+from ...mechanics.dynamics import ONE, A, B, V
+from ...mechanics.path_limits import PathLimits
 
 _ROUNDING = 1e-12  # negative b at the end that is rounding, over the largest b
-_SPEEDS = 4  # most sweeps until viscous friction is linearised about the right speed
-_SETTLED = 2e-3  # relative change of b then: the error is about its square
+_SETTLED = 2e-3  # relative change of b at which the linearization is good: the error is its square
+_UNBOUNDED = 1e100  # b [m^2/s^2] where no limit bounds it; case: the map of a rolling octagon
 
 
 class SweepMode(IntEnum):
@@ -30,13 +31,6 @@ class SweepMode(IntEnum):
     HELD = 3  # a limit of b
 
 
-class Sweep(NamedTuple):
-    """Minimum-time profile: b at the nodes, (N + 1,), and `SweepMode` of the intervals, (N,)."""
-
-    b: Array
-    modes: NDArray[np.int64]
-
-
 class NoMotionError(ValueError):
     """No motion keeps the limits in an `interval` of this grid."""
 
@@ -45,86 +39,140 @@ class NoMotionError(ValueError):
         self.interval = interval
 
 
-def find_fastest(
-    rows: PathLimitRows, steps: Array, part: Array, cap: Array, b_guess: Array | None
-) -> Sweep:
-    """Minimum-time speed profile on a grid, from rest to rest.
+class SpeedProfile(NamedTuple):
+    """Minimum-time profiles along paths, (..., N) intervals."""
+
+    b: Array  # (..., N + 1) [m^2/s^2]: at the nodes
+    modes: NDArray[np.int64]  # (..., N): `SweepMode` of the intervals
+    blocked: NDArray[np.int64]  # (...,): an interval without a motion, or -1
+
+    def find_durations(self, steps: Array) -> Array:
+        """Durations for intervals of lengths `steps`, (...,) [s]; infinite without a motion."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(self.blocked < 0, find_duration(self.b, steps), np.inf)
+
+
+def make_cosine_grid(intervals: int) -> tuple[Array, Array, Array]:
+    """Lengths of intervals from 0 to 1, short at both ends, their middles, and `part` of these."""
+    nodes = (1 - np.cos(np.linspace(0, np.pi, intervals + 1))) / 2
+    places, steps = (nodes[1:] + nodes[:-1]) / 2, np.diff(nodes)
+    return steps, places, (places - nodes[:-1]) / steps
+
+
+def join_caps(before: Array, after: Array) -> Array:
+    """Limits of b at nodes, (..., N + 1), from those in each interval or at its two ends."""
+    none = np.full((*before.shape[:-1], 1), np.inf)
+    pair = np.append(before, none, axis=-1), np.append(none, after, axis=-1)
+    return np.asarray(np.minimum(*pair))
+
+
+def find_duration(b: Array, steps: Array) -> Array:
+    """Durations of profiles with constant a in intervals of lengths `steps` [s]."""
+    speeds = np.sqrt(np.maximum(b, 0.0))
+    return np.asarray((2 * steps / (speeds[..., 1:] + speeds[..., :-1])).sum(axis=-1))
+
+
+def speed_sweep(
+    limits: PathLimits,
+    steps: Array,
+    part: Array,
+    cap: Array | None = None,
+    b_guess: Array | None = None,
+    sweeps: int = 4,
+) -> SpeedProfile:
+    """Minimum-time speed profiles from rest to rest.
 
     Parameters
     ----------
-    rows                at a place of each interval
+    limits              without lambda, at a place of each interval: rows (..., N, m, 4)
     steps, part : (N,)  lengths of the intervals, and which part of each is before its place
-    cap : (N + 1,)      largest b at the nodes
-    b_guess : (N,)      b about which the speed is linearised; without it, or at rest, neglected
+    cap : (..., N + 1)  largest b at the nodes, by default that of the places next to them
+    b_guess : (N,)      b at the places about which viscous terms are linearized; neglected at rest
+    sweeps              without a guess: most sweeps, each linearized about the one before
+
+    Raises
+    ------
+    NoMotionError  if there is one path, and no motion along it; with more, it is `blocked`
     """
-    of_b, one = rows.b, rows.one
+    shape = limits.rows.shape[:-3]
+    rows = limits.rows.reshape(-1, *limits.rows.shape[-3:])
+    cap = join_caps(limits.cap, limits.cap) if cap is None else cap
+    cap = cap.reshape(len(rows), -1)
+    profile = _sweep(rows, steps, part, cap, b_guess)
+    for _ in range(sweeps - 1 if b_guess is None and rows[..., V].any() else 0):
+        before = np.where(profile.b < _UNBOUNDED, profile.b, 0.0)
+        near = before[:, :-1] + part * np.diff(before)
+        profile = _sweep(rows, steps, part, cap, near)
+        if np.abs(profile.b - before).max() < _SETTLED * profile.b.max():
+            break
+    if not shape and profile.blocked[0] >= 0:
+        raise NoMotionError(int(profile.blocked[0]))
+    b, modes, blocked = profile
+    return SpeedProfile(
+        b.reshape(*shape, -1), modes.reshape(*shape, -1), np.asarray(blocked.reshape(shape))
+    )
+
+
+def _sweep(
+    rows: Array, steps: Array, part: Array, cap: Array, b_guess: Array | None
+) -> SpeedProfile:
+    """One sweep of w paths, with rows (w, N, m, 4)."""
+    one, of_b = rows[..., ONE], rows[..., B]
     if b_guess is not None:
-        speed = np.sqrt(np.maximum(b_guess, 0.0))[:, None]
-        drag = np.divide(rows.v, 2 * speed, out=np.zeros_like(rows.v), where=speed > 0)
-        of_b, one = of_b + drag, one + rows.v * speed / 2
-    of_a = rows.a / (2 * steps)[:, None]
-    before = (1 - part)[:, None] * of_b - of_a
-    after = part[:, None] * of_b + of_a
+        speed = np.sqrt(np.maximum(b_guess, 0.0))[..., None]
+        drag = np.divide(rows[..., V], 2 * speed, out=np.zeros_like(one), where=speed > 0)
+        of_b, one = of_b + drag, one + rows[..., V] * speed / 2
+    of_a = rows[..., A] / (2 * steps)[:, None]
+    before, after = (1 - part)[:, None] * of_b - of_a, part[:, None] * of_b + of_a
+    before, after, one = (np.ascontiguousarray(x.swapaxes(0, 1)) for x in (before, after, one))
     # From one node's b, bounds of the other's: slopes and values at zero, interval by interval.
     with np.errstate(divide="ignore", invalid="ignore"):
         brakes, pushes = (after >= 0) & (before < 0), after < 0
-        brake_slopes = list(np.where(brakes, after / -before, 0))
-        brake_values = list(np.where(brakes, one / -before, np.inf))
-        push_slopes = list(np.where(pushes, before / -after, 0))
-        push_values = list(np.where(pushes, one / -after, np.inf))
-    count, least, caps = len(steps), np.minimum.reduce, cap.tolist()
-    largest, braked = [0.0] * (count + 1), [False] * count
-    following = 0.0
+        brake_slopes = np.where(brakes, after / -before, 0)
+        brake_values = np.where(brakes, one / -before, np.inf)
+        push_slopes = np.where(pushes, before / -after, 0)
+        push_values = np.where(pushes, one / -after, np.inf)
+    closed = ((before == 0) & (after == 0) & (one < 0)).any(axis=2)
+    count, paths = len(steps), len(rows)
+    largest, b = np.zeros((2, count + 1, paths))
+    braked, slower = np.zeros((count, paths), bool), np.zeros((count + 1, paths), bool)
+    blocked = np.full(paths, -1)
     for k in range(count - 1, -1, -1):
-        b_k = float(least(brake_slopes[k] * following + brake_values[k]))
-        pushed = float(least(push_slopes[k] * b_k + push_values[k])) if b_k < caps[k] else 0.0
-        braked[k] = b_k < caps[k] and pushed >= following
-        if not braked[k]:
-            b_k = min(_find_corner(before[k], after[k], one[k], following), caps[k])
-        if not b_k > 0 and (k or b_k < 0):
-            raise NoMotionError(k)
-        largest[k] = following = b_k
-    b, reaches = [0.0] * (count + 1), [False] * (count + 1)
-    reached = 0.0
+        following = largest[k + 1]
+        b_k = (brake_slopes[k] * following[:, None] + brake_values[k]).min(axis=1)
+        b_k = np.minimum(b_k, _UNBOUNDED)
+        pushed = (push_slopes[k] * b_k[:, None] + push_values[k]).min(axis=1)
+        braked[k] = (b_k < cap[:, k]) & (pushed >= following)
+        b_k = np.minimum(b_k, cap[:, k])
+        others = np.flatnonzero(~braked[k])
+        if len(others):
+            corners = _find_corners(before[k, others], after[k, others], one[k, others])
+            b_k[others] = np.minimum(b_k[others], corners)
+        lost = closed[k] | (~(b_k > 0) if k else b_k < 0)
+        blocked = np.where((blocked < 0) & lost, k, blocked)
+        largest[k] = np.where(lost, 0.0, b_k)
     for k in range(count):
-        pushed = float(least(push_slopes[k] * reached + push_values[k]))
-        reaches[k + 1] = pushed >= largest[k + 1]
-        b[k + 1] = reached = min(pushed, largest[k + 1])
-        if not reached > 0 and k + 1 < count:
-            raise NoMotionError(k)
-    if b[-1] < -_ROUNDING * max(b):
-        raise NoMotionError(count - 1)
-    b[-1] = max(b[-1], 0.0)
-    slower = ~np.array(reaches)
+        pushed = (push_slopes[k] * b[k][:, None] + push_values[k]).min(axis=1)
+        slower[k + 1] = ~(pushed >= largest[k + 1])
+        b[k + 1] = np.minimum(pushed, largest[k + 1])
+        if k + 1 < count:
+            blocked = np.where((blocked < 0) & ~(b[k + 1] > 0), k, blocked)
+    late = b[-1] < -_ROUNDING * b.max(axis=0)
+    blocked = np.where((blocked < 0) & late, count - 1, blocked)
     modes = np.where(braked, SweepMode.BRAKE, SweepMode.HELD)
     modes = np.where(slower[:-1], SweepMode.SWITCH, modes)
-    return Sweep(np.array(b), np.where(slower[1:], SweepMode.PUSH, modes))
+    modes = np.where(slower[1:], SweepMode.PUSH, modes)
+    return SpeedProfile(np.maximum(b, 0.0).T, modes.T, blocked)
 
 
-def find_steady(rows: PathLimitRows, steps: Array, part: Array, cap: Array) -> Sweep:
-    """Sweep until viscous friction is linearised about the resulting speeds; see `find_fastest`."""
-    motion = find_fastest(rows, steps, part, cap, None)
-    if not rows.v.any():
-        return motion
-    for _ in range(_SPEEDS - 1):
-        before = motion.b
-        motion = find_fastest(rows, steps, part, cap, before[:-1] + part * np.diff(before))
-        if np.abs(motion.b - before).max() < _SETTLED * motion.b.max():
-            break
-    return motion
-
-
-def add_up(b: Array, steps: Array) -> float:
-    """Duration of a profile with constant a in intervals [s]."""
-    speeds = np.sqrt(np.maximum(b, 0.0))
-    return float((2 * steps / (speeds[1:] + speeds[:-1])).sum())
-
-
-def _find_corner(before: Array, after: Array, one: Array, following: float) -> float:
-    """Largest b from which rows before b + after b' + one >= 0 leave a b' from 0 to `following`."""
-    before, after = np.append(before, [0, 0]), np.append(after, [1, -1])
-    one = np.append(one, [0, following])
-    up, down = np.maximum(after, 0)[:, None], np.maximum(-after, 0)
-    slope, value = down * before[:, None] + up * before, down * one[:, None] + up * one
-    bounded = (up > 0) & (down > 0) & (slope < 0)
-    return float((value[bounded] / -slope[bounded]).min(initial=np.inf))
+def _find_corners(before: Array, after: Array, one: Array) -> Array:
+    """Largest b from which rows before b + after b' + one >= 0, (w, m), leave some b' >= 0."""
+    none = np.zeros((len(one), 1))
+    pairs = (before, none), (after, none + 1), (one, none)
+    fixed, rise, rest = (np.hstack(pair)[..., None] for pair in pairs)
+    rise, fall = np.maximum(rise, 0), np.maximum(-after, 0)[:, None]
+    slope = fall * fixed + rise * before[:, None]
+    value = fall * rest + rise * one[:, None]
+    bounded = (rise > 0) & (fall > 0) & (slope < 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.where(bounded, value / -slope, np.inf).min(axis=(1, 2)))

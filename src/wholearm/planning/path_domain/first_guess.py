@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...common.arrays import Array
+from ...mechanics.dynamics import A, V
 from .elements import Profile
 from .path_data import PhaseData
 from .path_nlp import Units
@@ -60,7 +61,7 @@ def _fall(data: PhaseData) -> float:
     # The upper median; NumPy's takes 10 ms to import what it needs.
     b_max, middle = data.largest_b(data.nodes), len(data.grid.s) // 2
     median = float(np.partition(b_max, middle)[middle])
-    inertia, drag = 2 * length * usual(forces.Ta), usual(forces.Tv) ** 2
+    inertia, drag = 2 * length * usual(forces.of_tau[..., A]), usual(forces.of_tau[..., V]) ** 2
     return min(fall, _QUICK * min(inertia, drag, median))
 
 
@@ -77,16 +78,7 @@ def _parabola(data: PhaseData, height: float) -> tuple[Array, Array]:
 
 def find_internal_force_range(data: PhaseData, height: float) -> tuple[Array, Array]:
     """Least and largest internal force that limits allow at each node."""
-    a, b = _parabola(data, height)
-    slack = data.slack(data.nodes, Profile(a, b, np.zeros_like(a)))
-    rows, signs, _ = data.limits.sides
-    rate = signs * data.find_terms().lam[:, rows]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        bound = -slack / rate
-    never = np.where((rate == 0) & (slack < 0), np.inf, -np.inf)
-    low = np.where(rate > 0, bound, never).max(axis=1)
-    high = np.where(rate < 0, bound, np.inf).min(axis=1)
-    return low, high
+    return data.find_limits(data.nodes).find_internal_force_range(*_parabola(data, height))
 
 
 def _find_middle(data: PhaseData, low: Array, high: Array) -> Array:

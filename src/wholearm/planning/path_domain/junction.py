@@ -18,6 +18,7 @@ from ...common.arrays import Array
 from ...common.errors import InfeasibleError
 from ...contacts.formation import Formation
 from ...geometry.curve import Curve
+from ...mechanics.dynamics import LAMBDA, ONE
 from ...mechanics.wedging import find_static_torques
 from ...results.plan_record import ModeSpan
 from ...results.torque import TorqueProfile
@@ -98,7 +99,8 @@ def _list_torques(curve: Curve, epsilon: float, phase: int, place: int) -> tuple
     share = np.linspace(_INSIDE, 1 - _INSIDE, _PLACES)
     lams = low + share * (high - low)
     forces = data.nodes.forces
-    return forces.T0[place] + np.outer(lams, forces.Tl[place]), lams
+    T0, by_lambda = forces.of_tau[place, :, ONE], forces.of_tau[place, :, LAMBDA]
+    return T0 + np.outer(lams, by_lambda), lams
 
 
 def require_hold(data: PhaseData, phase: int, place: int) -> tuple[float, float]:

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from ...common.arrays import Array, find_minima
 from ...common.errors import InputError, JammingError
 from ...common.shortfalls import Parameter
-from ...geometry.curve import Curve, describe_pose
+from ...geometry.curve import Curve, describe_pose, directions_of
 from ...mechanics.dynamics import PathForces, inverse, reduced_inertia
-from ...mechanics.limits import CONE, PRESS, SPEED, TORQUE, LimitSet, SideTerms, make_limits
-from ..lower_bound.rows import LimitSides, directions_of
+from ...mechanics.limits import CONE, PRESS, TORQUE, LimitSet, make_limits
+from ...mechanics.path_limits import PathLimits, find_slack_rows, find_speed_cap, find_value_rows
 from ..robust.robust_rows import RobustLimits, spread_limits
 from .elements import Elements, Grid, Profile
 
@@ -45,16 +45,6 @@ class Places(NamedTuple):
         """The same with every table changed."""
         forces = PathForces(*map(change, self.forces))
         return Places(forces, change(self.rates), change(self.variations))
-
-
-class LimitTerms(NamedTuple):
-    """Limited values, constant + a s'' + b s'^2 + lam lambda + speed s', (n, m) each."""
-
-    constant: Array
-    a: Array
-    b: Array
-    lam: Array
-    speed: Array
 
 
 class PhaseData(NamedTuple):
@@ -87,24 +77,21 @@ class PhaseData(NamedTuple):
         """Scale of each side of the limits, shape (n_sides,)."""
         return self.limits.scales[self.limits.sides[0]]
 
-    def find_terms(self) -> LimitTerms:
-        """Coefficients of the limited values at the nodes."""
-        of_c, of_tau, of_rates = (part.T for part in self.limits.columns)
-        forces = self.nodes.forces
-        return LimitTerms(
-            forces.C0 @ of_c + forces.T0 @ of_tau,
-            forces.Ca @ of_c + forces.Ta @ of_tau,
-            forces.Cb @ of_c + forces.Tb @ of_tau,
-            forces.Cl @ of_c + forces.Tl @ of_tau,
-            forces.Cv @ of_c + forces.Tv @ of_tau + self.nodes.rates @ of_rates,
-        )
+    def find_terms(self) -> Array:
+        """Coefficients of the limited values at the nodes, shape (n, m, 5)."""
+        return find_value_rows(self.limits, self.nodes.forces, self.nodes.rates)
+
+    def find_limits(self, places: Places, margin: float = 0.0) -> PathLimits:
+        """The limits for a margin of normal forces over epsilon [N]."""
+        rows = find_slack_rows(self.limits, places.forces, places.rates)
+        normal = np.isin(self.limits.sides[0], self.limits.of(PRESS))
+        return PathLimits(rows, self.largest_b(places)).relax(-margin * normal / self.spans)
 
     def evaluate(self, places: Places, profile: Profile) -> Array:
         """The limited values, shape (n, m) [N, N m]."""
-        of_c, of_tau, of_rates = (part.T for part in self.limits.columns)
-        values = places.forces.c(*profile) @ of_c + places.forces.tau(*profile) @ of_tau
-        if of_rates.any():
-            values += places.rates * np.sqrt(profile.b)[:, None] @ of_rates
+        rates = places.rates * np.sqrt(profile.b)[:, None]
+        forces = places.forces.c(*profile), places.forces.tau(*profile)
+        values = np.hstack([*forces, rates]) @ self.limits.rows.T
         if self.spread is not None:
             least = self.spread.evaluate(places.forces, places.variations, profile)
             rows = self.limits.of(PRESS, CONE)
@@ -117,23 +104,12 @@ class PhaseData(NamedTuple):
         values[:, self.limits.of(PRESS)] -= margin
         return self.limits.find_slack(values)
 
-    def list_sides(self, places: Places, margin: float) -> LimitSides:
-        """The sides of the limits for a margin of normal forces over epsilon [N]."""
-        terms = SideTerms.of(self.limits, places.forces, places.rates)
-        normal = np.isin(self.limits.sides[0], self.limits.of(PRESS))
-        rest = terms.rest - margin * normal / self.spans
-        return LimitSides(rest, *terms[1:], self.largest_b(places))
-
     def largest_b(self, places: Places, spared: Parameter | None = None) -> Array:
         """Largest b by the joints' speed limits but a `spared` one, shape (n,) [m^2/s^2]."""
-        largest = np.full(len(places.rates), np.inf)
-        for limit in self.speeds.limits:
-            if spared is None or limit.parameter.key != spared.key:
-                rates = np.abs(places.rates @ limit.rows[0, -2:])
-                # No division by zero for a joint at rest.
-                rates = np.maximum(rates, np.finfo(float).tiny ** 0.25)
-                largest = np.minimum(largest, (limit.high[0] / rates) ** 2)
-        return largest
+        kept = [
+            each for each in self.speeds.limits if not spared or each.parameter.key != spared.key
+        ]
+        return find_speed_cap(LimitSet(tuple(kept)), places.rates)
 
     def relative_rates(self, places: Places, parameter: Parameter) -> Array:
         """Rate of a joint over its speed limit, shape (n,) [s/m]; zero for another parameter."""
@@ -243,8 +219,7 @@ def prepare(
             )
             for each, at in ((nodes, (grid.s, grid.segment)), (checks, (inside, owners)))
         )
-    kept = limits.without(SPEED), limits.only(SPEED)
-    rates = formation.scene.torque_rate_limit
+    kept, rates = limits.split_speeds(), formation.scene.torque_rate_limit
     return PhaseData(curve, epsilon, *kept, grid, nodes, sampling, knots, checks, rates, spread)
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...common.arrays import Array, sort_unique
 from ...geometry.curve import Curve
-from ..lower_bound.rows import LimitSides, PathLimitRows
+from ...mechanics.path_limits import PathLimits
 from ..options import Objective
 from .elements import DEGREE, Elements, Grid, Profile, lay_out
 from .path_data import PhaseData
@@ -187,8 +187,8 @@ class LimitSamples(NamedTuple):
 
     fractions: Array  # of every interval inside elements
     s: Array  # (n,) [m]: interval by interval
-    sides: LimitSides  # of limits there
-    rows: PathLimitRows  # the same without the internal force
+    sides: PathLimits  # limits there
+    rows: PathLimits  # the same without the internal force
     segment: NDArray[np.int64]  # (n,): of the curves
     length: float  # [m]: of the curves
 
@@ -199,7 +199,7 @@ class LimitSamples(NamedTuple):
         wanted = max(_SAMPLES // len(k), 2)
         picked = np.arange(0, len(fractions) - 1, max(1, (len(fractions) - 1) // wanted))
         places = (len(fractions) * np.arange(len(k))[:, None] + picked).ravel()
-        sides = data.list_sides(data.checks.pick(places), margin)
+        sides = data.find_limits(data.checks.pick(places), margin)
         s = (data.grid.s[k, None] + fractions[picked] * data.grid.steps[k, None]).ravel()
         segment, length = np.repeat(data.grid.segment[k], len(picked)), float(data.grid.s[-1])
         return LimitSamples(fractions[picked], s, sides, sides.eliminate(), segment, length)
@@ -223,8 +223,8 @@ class _Looks(NamedTuple):
 
     s: Array  # [m]
     b: Array  # [m^2/s^2]: of the motion there
-    sides: LimitSides
-    rows: PathLimitRows
+    sides: PathLimits
+    rows: PathLimits
     at_high: NDArray[np.int64]  # at_high, at_low: rows that set the largest and the least s''
     at_low: NDArray[np.int64]
     share: Array  # distance of s'' from its largest, over the range that limits allow

@@ -15,10 +15,9 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
-from ...geometry.curve import Curve
+from ...geometry.curve import Curve, directions_of
 from ...mechanics.dynamics import inverse, split_forces
 from ...results.trajectory import Samples
-from ..lower_bound.rows import directions_of
 from .elements import DEGREE, Elements, Grid, Profile
 
 _POINTS = 12  # Gauss points for the time in an interval between nodes

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ...common.arrays import Array, Expression
 from ...common.shortfalls import Parameter
+from ...mechanics.dynamics import LAMBDA, ONE, A, B, V
 from ...mechanics.limits import LimitSet
 from ...solvers.ipopt import SolverStatistics, book, build_solver
 from ..options import Objective
@@ -143,14 +144,14 @@ def parameters(
     """Parameters of the NLP, in its units."""
     terms, unit, (b_unit, a_unit, force) = data.find_terms(), units.of(data.limits), units.profile
     blocks = {
-        "a": terms.a * a_unit / unit,
-        "b": terms.b * b_unit / unit,
-        "lam": terms.lam * force / unit,
-        "speed": (terms.speed * np.sqrt(b_unit) / unit)[:, nlp.shape.fast],
+        "a": terms[..., A] * a_unit / unit,
+        "b": terms[..., B] * b_unit / unit,
+        "lam": terms[..., LAMBDA] * force / unit,
+        "speed": (terms[..., V] * np.sqrt(b_unit) / unit)[:, nlp.shape.fast],
     }
     torque, motors = unit[list(nlp.shape.torques)], nlp.shape.motors
     if nlp.objective is Objective.EFFORT or motors.slow:
-        blocks["torque"] = data.nodes.forces.T0 / torque
+        blocks["torque"] = data.nodes.forces.of_tau[..., ONE] / torque
     if nlp.objective is Objective.EFFORT:
         blocks["joints"] = torque**2 / units.power
     if motors.slow:
@@ -208,7 +209,7 @@ def make_bounds(
             low[place, node["lam"]] = high[place, node["lam"]] = pin / units.profile[2]
     low[:, node["extra"]] = -np.inf if nlp.objective is Objective.MARGIN else 0.0
     rows, signs, bounds = data.limits.sides
-    sides = bounds + signs * tight - data.find_terms().constant[:, rows]
+    sides = bounds + signs * tight - data.find_terms()[:, rows, ONE]
     sides /= units.of(data.limits)[rows]
     side = np.arange(len(rows)) if nlp.objective in SOFT else rows
     width = nlp.columns.g.sizes["limits"] // n

@@ -16,6 +16,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from ...common.arrays import Array, Expression
+from ...mechanics.dynamics import LAMBDA, ONE
 from ...scene.model import Scene
 from .elements import (
     DEGREE,
@@ -369,8 +370,9 @@ def _hold(
 ) -> tuple[float, Array]:
     """The internal force that holds the object at an end with torques near `tau`, and those."""
     forces = data.nodes.forces
-    level, press = forces.T0[place], forces.Tl[place]
+    level, press = forces.of_tau[place, :, ONE], forces.of_tau[place, :, LAMBDA]
     if pin is None:
         weighted = press * slowness
-        pin = float(weighted @ ((tau - level) * slowness) / max(weighted @ weighted, 1e-300))
+        size = max(float(weighted @ weighted), 1e-300)
+        pin = float(weighted @ ((tau - level) * slowness)) / size
     return pin, np.asarray(level + pin * press)

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
-from ..lower_bound.rows import LimitSides, PathLimitRows
+from ...mechanics.dynamics import LAMBDA, A, B, V
+from ...mechanics.path_limits import PathLimits
 from ..lower_bound.speed_sweep import SweepMode
 from ..options import Objective
 from ..phase_plan import PhasePlan
@@ -412,7 +413,7 @@ def start_at(
 
     The profile is at vertices of the polygon of s'' and internal force that limits allow.
     """
-    sides = data.list_sides(data.nodes, fastest.margin)
+    sides = data.find_limits(data.nodes, fastest.margin)
     vertices = _Vertices.at(data.grid, sides, fastest)
     rows = data.limits.sides[0]
     scale = data.spans / units.of(data.limits)[rows]
@@ -472,7 +473,7 @@ class _Vertices(NamedTuple):
     jumps: NDArray[np.int64]  # elements after which s'' jumps from its largest to its least
 
     @staticmethod
-    def at(grid: Grid, sides: LimitSides, fastest: Fastest) -> _Vertices:
+    def at(grid: Grid, sides: PathLimits, fastest: Fastest) -> _Vertices:
         """The vertices of a minimum-time profile.
 
         Speeds are integrated forwards where s'' is the largest, and backwards where the least.
@@ -506,9 +507,7 @@ class _Vertices(NamedTuple):
         return _Vertices(Profile(a, b, lam), pair, held, jumps)
 
 
-def _find_pairs(
-    sides: LimitSides, rows: PathLimitRows, b: Array, largest: bool
-) -> NDArray[np.int64]:
+def _find_pairs(sides: PathLimits, rows: PathLimits, b: Array, largest: bool) -> NDArray[np.int64]:
     """The sides that meet at the largest or least s'' of each node, shape (n, 2).
 
     Other sides may take over at element ends: there those of the next node inside are taken.
@@ -519,7 +518,7 @@ def _find_pairs(
 
 
 def _find_multipliers(
-    grid: Grid, sides: LimitSides, vertices: _Vertices, scale: Array, units: Units
+    grid: Grid, sides: PathLimits, vertices: _Vertices, scale: Array, units: Units
 ) -> tuple[Array, Array]:
     """Least-squares multipliers of the links, (N,), and of the sides that meet, (n, 2).
 
@@ -548,7 +547,7 @@ def _find_multipliers(
 
 
 def _list_rows(
-    grid: Grid, sides: LimitSides, vertices: _Vertices, scale: Array, units: Units
+    grid: Grid, sides: PathLimits, vertices: _Vertices, scale: Array, units: Units
 ) -> tuple[Array, Array]:
     """Jacobian of each element's rows in its and in the next one's unknowns, (E, 3 p + 3, 3 p + 3).
 
@@ -566,8 +565,9 @@ def _list_rows(
     local[vertices.jumps, DEGREE], across[vertices.jumps, DEGREE] = 0.0, 0.0
     k = np.arange(len(grid.s))[:, None]
     speed = np.sqrt(np.maximum(vertices.profile.b, LEAST_B * units.profile[0]))[:, None]
-    of_b = (sides.bend + sides.drag / (2 * speed))[k, vertices.sides]
-    parts = np.stack([of_b, sides.rate[k, vertices.sides], sides.press[k, vertices.sides]], axis=-1)
+    met = sides.rows[k, vertices.sides]
+    of_b = met[..., B] + met[..., V] / (2 * speed)
+    parts = np.stack([of_b, met[..., A], met[..., LAMBDA]], axis=-1)
     parts *= scale[vertices.sides][..., None] * units.profile
     parts[vertices.held] = 0.0
     parts[vertices.held, 0, 0] = -1.0

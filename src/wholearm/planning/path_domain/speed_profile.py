@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from ...common.arrays import Array
 from ...common.shortfalls import Parameter
-from ..lower_bound.rows import PathLimitRows
-from ..lower_bound.speed_sweep import NoMotionError, SweepMode, add_up
-from ..lower_bound.speed_sweep import find_fastest as sweep
+from ...mechanics.dynamics import ONE, V
+from ...mechanics.path_limits import PathLimits
+from ..lower_bound.speed_sweep import NoMotionError, SweepMode, find_duration, speed_sweep
 from .path_data import PhaseData
 from .path_mesh import LimitSamples, Switch
 
@@ -82,22 +82,25 @@ def is_hopeless(data: PhaseData, spared: Parameter | None = None) -> bool:
     if spared is not None:
         free = data.limits.weigh(spared)[data.limits.sides[0]] > 0
     cap = np.inf if spared is not None and spared.is_speed else 1 + _WIDER
-    rest = np.where(free, _FREE, samples.sides.rest + _WIDER)
-    rows = samples.sides._replace(rest=rest, cap=cap * samples.sides.cap).eliminate()
-    if rows.v.any():
+    wider = samples.sides.relax(_WIDER)
+    wider.rows[:, free, ONE] = _FREE
+    limits = wider._replace(cap=cap * wider.cap).eliminate()
+    viscous = np.abs(limits.rows[..., V])
+    if viscous.any():
         # Viscous friction helps by no more than its value at the largest speed.
-        most = np.sqrt(rows.highest())[:, None]
-        helps = np.multiply(np.abs(rows.v), most, out=np.zeros_like(rows.v), where=rows.v != 0)
-        rows = rows._replace(one=rows.one + np.minimum(helps, _FREE), v=np.zeros_like(rows.v))
+        most = np.sqrt(limits.find_largest_b())[:, None]
+        helps = np.multiply(viscous, most, out=np.zeros_like(viscous), where=viscous > 0)
+        limits = limits.relax(np.minimum(helps, _FREE))
+        limits.rows[..., V] = 0.0
     try:
-        _sweep(samples, rows, 1, None)
+        _sweep(samples, limits, 1)
     except NoMotionError:
         return True
     return False
 
 
 def _find_at(samples: LimitSamples, margin: float) -> Fastest:
-    s, b, modes, b_middle = _sweep(samples, samples.rows, 1, None)
+    s, b, modes, b_middle = _sweep(samples, samples.rows, 1)
     steps, middle = np.diff(s), samples.rows.pick(slice(1, None, 2))
     pushed, braked = (middle.extreme(b_middle, largest).a for largest in (True, False))
     # In an interval with a switch s'' is first the largest, then the least.
@@ -115,36 +118,29 @@ def _find_at(samples: LimitSamples, margin: float) -> Fastest:
 
 
 def _sweep(
-    samples: LimitSamples, rows: PathLimitRows, stride: int, b_guess: Array | None
+    samples: LimitSamples, limits: PathLimits, stride: int, b_guess: Array | None = None
 ) -> tuple[Array, Array, NDArray[np.int64], Array]:
-    """Sweep with the middle of an interval every `2 stride` places, for limits `rows` there.
+    """Sweep with the middle of an interval every `2 stride` places, for limits at the places.
 
-    Nodes s, b, modes, and b at the middles. Viscous friction is linearised about `b_guess` there,
-    by default b of a coarse sweep without it.
+    Nodes s, b, modes, and b at the middles. Viscous terms are linearized about `b_guess` there.
     """
     places = np.append(samples.s, samples.length)
     s, middle = places[:: 2 * stride], slice(stride, len(samples.s), 2 * stride)
-    inner, steps = rows.pick(middle), np.diff(s)
-    part = (samples.s[middle] - s[:-1]) / steps
-    cap = np.append(rows.cap[:: 2 * stride], np.inf)
-    if b_guess is None and inner.v.any():
-        wide = max(len(samples.fractions) // 2, stride)
-        ends, b, *_ = _sweep(samples, rows._replace(v=np.zeros_like(rows.v)), wide, None)
-        b_guess = np.interp(samples.s[middle], ends, b)
-    motion = sweep(inner, steps, part, cap, b_guess)
+    part = (samples.s[middle] - s[:-1]) / np.diff(s)
+    cap = np.append(limits.cap[:: 2 * stride], np.inf)
+    motion = speed_sweep(limits.pick(middle), np.diff(s), part, cap, b_guess, 2)
     return s, motion.b, motion.modes, (1 - part) * motion.b[:-1] + part * motion.b[1:]
 
 
 def _find_margin(data: PhaseData, samples: LimitSamples, duration: float) -> float | Narrow | None:
     """The margin [N] with which the minimum time is a duration [s]: Illinois false position."""
-    force, rows = data.curve.formation.scene.scales.force, samples.rows
-    rate = (LimitSamples.of(data, force).rows.one - rows.one) / force
+    force, limits = data.curve.formation.scene.scales.force, samples.rows
+    rate = (LimitSamples.of(data, force).rows.rows - limits.rows)[..., ONE] / force
 
     def evaluate(margin: float, stride: int, b_guess: Array | None) -> tuple[float, Array]:
         """Relative excess of the squared mean speed, nearly linear in the margin, and b."""
-        tight = rows._replace(one=rows.one + margin * rate)
-        s, b, _, b_guess = _sweep(samples, tight, stride, b_guess)
-        return (duration / add_up(b, np.diff(s))) ** 2 - 1, b_guess
+        s, b, _, b_guess = _sweep(samples, limits.relax(margin * rate), stride, b_guess)
+        return (duration / float(find_duration(b, np.diff(s)))) ** 2 - 1, b_guess
 
     stride = max(len(samples.fractions) // 4, 1)
     at_low, b_guess = evaluate(0.0, stride, None)

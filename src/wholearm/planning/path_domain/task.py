@@ -9,11 +9,10 @@ from functools import cached_property
 import numpy as np
 
 from ...common.errors import AmbiguityError
-from ...geometry.curve import Curve, describe_pose
+from ...geometry.curve import Curve, describe_pose, directions_of
 from ...mechanics.dynamics import reduced_inertia
 from ...mechanics.uniqueness import describe_uniqueness, find_minors
 from ..advice import name_phases
-from ..lower_bound.rows import directions_of
 from ..options import Objective, PlanOptions
 from ..robust.robust_rows import Guide, RobustLimits, spread
 from .elements import DEGREE

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...common.arrays import Array
+from ...mechanics.dynamics import LAMBDA, ONE, A
 from ...mechanics.limits import PRESS
 from ...mechanics.wedging import SURE
 from ..robust.robust_rows import RobustHold, list_holds, measure_holds
@@ -46,24 +47,24 @@ def find_sure_start(
     formation, forces = data.curve.formation, data.nodes.forces
     holds = list_holds(formation, data.curve.start, ranges)
     here = np.array([profile.a[0], profile.lam[0]])
-    T0, T = forces.T0[0], np.column_stack([forces.Ta[0], forces.Tl[0]])
+    T0, T = forces.of_tau[0, :, ONE], forces.of_tau[0][:, [A, LAMBDA]]
     unit = formation.scene.scales.torque
     if measure_holds(holds, T0 + T @ here) > SURE * unit:
         return None
-    rows, signs, bounds = data.limits.sides
-    presses = np.isin(rows, data.limits.of(PRESS)) & (signs > 0)
-    terms = data.find_terms()
-    slopes = signs[:, None] * np.column_stack([terms.a[0], terms.lam[0]])[rows]
+    presses = np.isin(data.limits.sides[0], data.limits.of(PRESS))
+    rows = data.find_limits(data.nodes.pick(slice(0, 1))).rows[0] * data.spans[:, None]
+    slopes = rows[:, [A, LAMBDA]]
     scales = formation.scene.scales
     units = np.array([scales.acceleration, scales.force])
     for share in _SHARES if margin > 0 else _SHARES[:1]:
-        offsets = signs * (terms.constant[0, rows] - bounds) - (1 - share) * margin * presses
+        offsets = rows[:, ONE] - (1 - share) * margin * presses
         best, start = np.inf, None
         for side, bound in _list_sides(holds, BEYOND * SURE * unit):
             normal = side @ T
             if normal[0] <= 0:
                 continue
-            for place in _list_places(normal, bound - side @ T0, slopes, offsets, here, units):
+            level = float(bound - side @ T0)
+            for place in _list_places(normal, level, slopes, offsets, here, units):
                 kept = ((offsets + slopes @ place) / data.spans).min() >= -_KEPT and place[0] > 0
                 kept = kept and measure_holds(holds, T0 + T @ place) > SURE * unit
                 away = float(np.abs(T @ (place - here)).max())

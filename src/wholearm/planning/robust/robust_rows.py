@@ -25,18 +25,17 @@ from numpy.typing import NDArray
 
 from ...common.arrays import Array
 from ...contacts.formation import Formation
-from ...geometry.curve import Curve, CurvePoint
-from ...mechanics.dynamics import Directions, PathForces, inverse
-from ...mechanics.limits import CONE, PRESS, SPEED, LimitSet, SideTerms, make_limits
+from ...geometry.curve import Curve, CurvePoint, directions_of
+from ...mechanics.dynamics import Directions, PathForces, inverse, stack_motion
+from ...mechanics.limits import CONE, PRESS, LimitSet, make_limits
+from ...mechanics.path_limits import PathLimits
 from ...mechanics.wedging import StaticTorques, find_static_torques
 from ...problem.uncertainty import PARAMETERS
 from ...scene.model import Friction
 from ...sensitivity.slopes import find_force_slopes
-from ..lower_bound.rows import LimitSides, directions_of
 
 COPIES = 5  # rows for each force limit: two for each vertex, and one for the reference
 _LOOKS = 97  # places of a segment at which signs are found
-_COLUMNS = ("C0", "Ca", "Cb", "Cl", "Cv")  # of `PathForces`, in the order of the derivatives
 _ROUNDS = 8  # cutting planes
 _LOWER = 0.5  # factor on b where limits leave no polygon
 _SAME = 1e-9  # violation of a row that is rounding, over its scale
@@ -77,11 +76,10 @@ class RobustLimits(NamedTuple):
         """Parametric bounds of each force limit, shape (n, m, p, COUNT)."""
         slopes = find_force_slopes(formation, point, directions, forces, self.names)
         variations = np.einsum("mi,nipq->nmpq", self.rows, slopes)
-        c = _stack(forces)
         for k, name in enumerate(self.names):
             edges = find_edges(formation, self.rows, name)
             if edges is not None:
-                variations[:, :, k] += np.einsum("mi,niq->nmq", edges, c)
+                variations[:, :, k] += edges @ forces.of_c
                 variations[:, :, k, 0] -= epsilon * edges.sum(axis=1)
         return np.asarray(variations * self.radii[:, None])
 
@@ -97,12 +95,9 @@ class RobustLimits(NamedTuple):
     def extend(self, forces: PathForces, variations: Array, signs: NDArray[np.int8]) -> PathForces:
         """Forces with the robust value of each copy of each limit as further columns."""
         spread = np.einsum("nmkp,nmpq->nmkq", signs, variations)
-        nominal = np.einsum("mi,niq->nmq", self.rows, _stack(forces))
-        nominal = np.repeat(nominal, spread.shape[2], axis=1)
-        added = np.moveaxis(nominal - spread.reshape(nominal.shape), -1, 0)
-        pairs = zip(_COLUMNS, added, strict=True)
-        wider = {name: np.hstack([getattr(forces, name), part]) for name, part in pairs}
-        return forces._replace(**wider)
+        nominal = np.repeat(self.rows @ forces.of_c, spread.shape[2], axis=1)
+        wider = np.concatenate([forces.of_c, nominal - spread.reshape(nominal.shape)], axis=1)
+        return forces._replace(of_c=wider)
 
     def evaluate(
         self, forces: PathForces, variations: Array, motion: tuple[Array, Array, Array]
@@ -130,9 +125,7 @@ def find_edges(formation: Formation, rows: Array, name: str) -> Array | None:
 
 def measure(variations: Array, motion: tuple[Array, Array, Array]) -> Array:
     """Parametric bounds of a motion, shape (n, m, p) [N]."""
-    a, b, lam = motion
-    columns = np.stack([np.ones_like(a), a, b, lam, np.sqrt(np.maximum(b, 0.0))], axis=-1)
-    return np.asarray(np.einsum("nmpq,nq->nmp", variations, columns))
+    return np.asarray(np.einsum("nmpq,nq->nmp", variations, stack_motion(*motion)))
 
 
 def spread_limits(limits: LimitSet) -> LimitSet:
@@ -166,7 +159,7 @@ def spread(curve: Curve, guide: Guide, epsilon: float, widths: Mapping[str, floa
     point = curve.evaluate(s)
     directions = directions_of(curve, segment)
     forces = inverse(formation, *point[:3], directions, point.kinematics)
-    limits = make_limits(formation, epsilon).without(SPEED)
+    limits = make_limits(formation, epsilon).split_speeds()[0]
     rows = limits.only(PRESS, CONE).rows[:, :-4]
     none = np.zeros((len(s), len(rows), COPIES, len(names)), dtype=np.int8)
     radii = np.array([widths[name] for name in names])
@@ -190,7 +183,7 @@ def _find_signs(
     forced = limits.only(PRESS, CONE)
     for turn in range(_ROUNDS):
         extended = bare.extend(forces, variations, signs)
-        sides = LimitSides(*SideTerms.of(wider, extended, rates), np.full(len(b), np.inf))
+        sides = PathLimits.of(wider, extended, rates)
         rows = sides.eliminate()
         extremes = (rows.extreme(b, largest).row for largest in (True, False))
         ends = [sides.meet(b, sides.pair(row)) for row in extremes]
@@ -206,11 +199,6 @@ def _find_signs(
             for slot in slots:
                 signs[:, :, slot] = np.where(missed[..., None], better, signs[:, :, slot])
     return signs
-
-
-def _stack(forces: PathForces) -> Array:
-    """Coefficients of the contact forces, shape (n, n_c + R, COUNT)."""
-    return np.stack([getattr(forces, name) for name in _COLUMNS], axis=-1)
 
 
 class RobustHold(NamedTuple):

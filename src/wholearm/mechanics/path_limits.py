@@ -1,0 +1,182 @@
+"""Limits along a path: coefficients of (1, s'', s'^2, s', lambda), from a `LimitSet`.
+
+At a place of a path every limited value is affine in a = s'', b = s'^2, s' and the internal force
+lambda. Two limits with lambda of opposite signs combine to one without it; all such pairs bound
+(a, b) exactly (Fourier-Motzkin elimination).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.arrays import Array
+from .dynamics import LAMBDA, ONE, A, B, PathForces, V, stack_motion
+from .limits import LimitSet
+
+TIED = 1e-9  # relative difference of two bounds that is rounding: pairs of a limit without lambda
+
+
+class Extreme(NamedTuple):
+    """The largest or the least a at n places, its slope da/db, and the row that sets it."""
+
+    a: Array
+    slope: Array
+    row: NDArray[np.int64]
+
+
+class PathLimits(NamedTuple):
+    """One-sided limits, rows @ (1, a, b, s', lambda) >= 0, and b <= `cap`, at places of a path.
+
+    The slack is over the scale of each limit. After `eliminate` the last column is missing.
+    """
+
+    rows: Array  # (..., m, 5), or (..., m, 4) without lambda
+    cap: Array  # (...,) [m^2/s^2]: largest b by joint speeds, infinite without speed limits
+
+    @staticmethod
+    def of(limits: LimitSet, forces: PathForces, rates: Array, give: float = 0.0) -> PathLimits:
+        """Limits of a set at n places with d theta / ds = `rates`, (n, 2).
+
+        They are relaxed by `give`, over their scales.
+        """
+        bounds, speeds = limits.split_speeds()
+        rows = find_slack_rows(bounds, forces, rates)
+        rows[..., ONE] += give
+        return PathLimits(rows, (1 + give) * find_speed_cap(speeds, rates))
+
+    def pick(self, index: Any) -> PathLimits:
+        """Return the places that `index` selects."""
+        return PathLimits(self.rows[index], self.cap[index])
+
+    def scale(self, size: Array | float) -> PathLimits:
+        """The limits with s / `size` in place of s; `size` as the places, or one number."""
+        size = np.asarray(size)[..., None]
+        columns = [size**0, size, size**2, size, size**0][: self.rows.shape[-1]]
+        scaled = self.rows * np.stack(columns, axis=-1)
+        return PathLimits(scaled, self.cap / size[..., 0] ** 2)
+
+    def relax(self, amount: Array | float) -> PathLimits:
+        """The limits with an `amount` of slack more, over their scales."""
+        rows = self.rows.copy()
+        rows[..., ONE] += amount
+        return self._replace(rows=rows)
+
+    def eliminate(self) -> PathLimits:
+        """Limits without lambda: one for each pair of rows, ordered as `triu_indices(m, 1)`.
+
+        Without any influence of lambda, as with three contacts, they are the rows themselves.
+        """
+        by = self.rows[..., LAMBDA]
+        if not by.any():
+            return self._replace(rows=self.rows[..., :LAMBDA])
+        i, j = np.triu_indices(by.shape[-1], 1)
+        opposite = by[..., i] * by[..., j] <= 0
+        first, second = (np.where(opposite, np.abs(by[..., k]), 0) for k in (j, i))
+        # Other pairs are 0 >= -1.
+        used = first + second > 0
+        size = np.where(used, first + second, 1)
+        one, other = (self.rows[..., k, :LAMBDA] for k in (i, j))
+        rows = ((first / size)[..., None] * one) + ((second / size)[..., None] * other)
+        rows[..., ONE] = np.where(used, rows[..., ONE], 1.0)
+        return self._replace(rows=rows)
+
+    def pair(self, row: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The two rows that a row of `eliminate` combines, shape (..., 2)."""
+        return np.asarray(np.stack(np.triu_indices(self.rows.shape[-2], 1), axis=1)[row])
+
+    def meet(
+        self, b: Array, pairs: NDArray[np.int64], slack: float | Array = 0.0
+    ) -> tuple[Array, Array]:
+        """The a and lambda, (n,) each, at which two rows, (n, 2) or (2,), have a slack, (n, 2)."""
+        k = np.arange(len(b))[:, None]
+        (r1, r2), (l1, l2) = (self.rows[k, pairs, column].T for column in (A, LAMBDA))
+        one, other = (self.at(b)[k, pairs] - slack).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            det = r1 * l2 - r2 * l1
+            return (other * l1 - one * l2) / det, (one * r2 - other * r1) / det
+
+    def at(self, b: Array) -> Array:
+        """Slack of the rows at a = 0 and lambda = 0 for b of shape (...,)."""
+        b = b[..., None]
+        return np.asarray(
+            self.rows[..., ONE] + self.rows[..., B] * b + self.rows[..., V] * np.sqrt(b)
+        )
+
+    def find_slack(self, a: Array, b: Array, internal: Array) -> Array:
+        """Slack of the rows for a motion of shape (n,), over their scales, shape (n, m)."""
+        return np.asarray(np.einsum("nmi,ni->nm", self.rows, stack_motion(a, b, internal)))
+
+    def find_internal_force_range(self, a: Array, b: Array) -> tuple[Array, Array]:
+        """Least and largest lambda that the rows allow for a motion, (n,); crossed if none."""
+        slack, by = self.find_slack(a, b, np.zeros_like(b)), self.rows[..., LAMBDA]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            bound = -slack / by
+        never = np.where((by == 0) & (slack < 0), np.inf, -np.inf)
+        low = np.where(by > 0, bound, never).max(axis=1)
+        high = np.where(by < 0, bound, np.inf).min(axis=1)
+        return low, high
+
+    def extreme(self, b: Array, largest: bool) -> Extreme:
+        """The largest or least a at n places for b of shape (n,): of tied rows by the first."""
+        sign, of_a = -1.0 if largest else 1.0, self.rows[..., A]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            bounds = -self.at(b) / of_a
+            slack = TIED * (np.abs(self.rows[..., ONE] / of_a) + np.abs(bounds))
+            lead = np.where(sign * of_a > 0, sign * bounds, -np.inf)
+            reach = np.where(sign * of_a > 0, lead + slack, -np.inf)
+            row = (reach >= lead.max(axis=1, keepdims=True)).argmax(axis=1)
+            k = np.arange(len(b))
+            used = self.rows[k, row]
+            slope = -(used[:, B] + used[:, V] / (2 * np.sqrt(b))) / used[:, A]
+        return Extreme(bounds[k, row], slope, row)
+
+    def can_rest(self, sign: float = 1.0) -> NDArray[np.bool_]:
+        """Whether rows without lambda allow an a of some `sign`, or zero, at rest, shape (...,)."""
+        of_a, one = sign * self.rows[..., A], self.rows[..., ONE]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            least = np.where(of_a > 0, -one / of_a, 0.0).max(axis=-1)
+            most = np.where(of_a < 0, -one / of_a, np.inf).min(axis=-1)
+        never = ((of_a == 0) & (one < 0)).any(axis=-1)
+        return np.asarray((np.maximum(least, 0.0) <= most) & ~never)
+
+    def find_largest_b(self) -> Array:
+        """Upper bound of b at n places by rows without lambda and the speed limits, shape (n,)."""
+        of_a = self.rows[..., A]
+        up, down = np.maximum(of_a, 0)[:, :, None], np.maximum(-of_a, 0)[:, None, :]
+        one, b, v = (
+            down * self.rows[:, :, None, k] + up * self.rows[:, None, :, k] for k in (ONE, B, V)
+        )
+        with np.errstate(divide="ignore", invalid="ignore"):
+            root = (v + np.sqrt(np.maximum(v**2 - 4 * b * one, 0))) / (-2 * b)
+        bounded = (up > 0) & (down > 0) & (b < 0)
+        largest = np.where(bounded, np.maximum(root, 0), np.inf).min(axis=(1, 2))
+        return np.asarray(np.minimum(largest**2, self.cap))
+
+
+def find_value_rows(limits: LimitSet, forces: PathForces, rates: Array) -> Array:
+    """Coefficients of the limited values at n places, shape (n, m, 5); see `PathLimits.of`."""
+    turn = rates[..., None] * np.eye(5)[V]
+    return np.asarray(limits.rows @ np.concatenate([forces.of_c, forces.of_tau, turn], axis=1))
+
+
+def find_slack_rows(limits: LimitSet, forces: PathForces, rates: Array) -> Array:
+    """Coefficients of the slack of each side over its scale, shape (n, n_sides, 5)."""
+    rows, signs, bounds = limits.sides
+    slack = signs[:, None] * find_value_rows(limits, forces, rates)[:, rows]
+    slack[..., ONE] -= signs * bounds
+    return np.asarray(slack / limits.scales[rows, None])
+
+
+def find_speed_cap(limits: LimitSet, rates: Array) -> Array:
+    """Largest b by limits of joint speeds alone, d theta / ds = `rates`, shape (n,)."""
+    cap = np.full(len(rates), np.inf)
+    for limit in limits.limits:
+        for row, low, high in zip(limit.rows[:, -2:], limit.low, limit.high, strict=True):
+            rate = rates @ row
+            with np.errstate(divide="ignore", invalid="ignore"):
+                largest = (np.where(rate > 0, high, low) / rate) ** 2
+            cap = np.fmin(cap, largest)
+    return cap
