@@ -17,8 +17,7 @@ from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.results.trajectory import Samples
-from wholearm.scene.model import Finger, Friction, Scene
-from wholearm.scene.polygon import Polygon
+from wholearm.scene.model import Finger, Friction, Polygon, Scene
 
 SQUARE = [[-0.03, -0.03], [0.03, -0.03], [0.03, 0.03], [-0.03, 0.03]]
 

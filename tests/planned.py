@@ -19,8 +19,9 @@ from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import LAMBDA, Directions, inverse
 from wholearm.problem.definition import End, Phase, Problem, Until
+from wholearm.results.dwell_record import assemble
 from wholearm.results.torque import TorqueProfile
-from wholearm.results.trajectory import Motion, Samples, Trajectory, assemble
+from wholearm.results.trajectory import Motion, Samples, Trajectory
 
 DEPENDENT = [1, 3, 4]
 """Coordinates y, theta_1 and theta_2, which follow from x and phi."""

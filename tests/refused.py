@@ -12,8 +12,7 @@ import pytest
 from once import once
 from shipped import HEPTAGON, problem_of
 from thrown import shove
-from wholearm.common.errors import InfeasibleError
-from wholearm.common.shortfalls import Parameter
+from wholearm.common.errors import InfeasibleError, Parameter
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning import advice
 from wholearm.planning.options import PlanOptions

@@ -19,8 +19,7 @@ from shipped import FOLDER, HEPTAGON, problem_of
 from thrown import shove
 from timed import landing
 from wholearm.common.arrays import Array
-from wholearm.common.errors import InfeasibleError, InputError
-from wholearm.common.shortfalls import LimitPlace, Shortfall
+from wholearm.common.errors import InfeasibleError, InputError, LimitPlace, Shortfall
 from wholearm.geometry.curve import find_tied, tangent_basis
 from wholearm.geometry.explore import close_contacts
 from wholearm.geometry.path_guess import find_end, list_ends

@@ -13,8 +13,7 @@ from wholearm.benchmark.study import Case, Row
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
 from wholearm.problem.read import read_problem
-from wholearm.scene.model import Finger, Friction, Scene
-from wholearm.scene.polygon import Polygon
+from wholearm.scene.model import Finger, Friction, Polygon, Scene
 
 GOOD: dict[str, Any] = {"value": 2.0, "modes": [["+ - -"]], "fault": ""}
 

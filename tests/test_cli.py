@@ -21,8 +21,7 @@ from shipped import HEPTAGON, IMPACTS, solved
 from wholearm.cli.command import build_parser, main
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan_report import describe_plan
-from wholearm.results.trajectory import Trajectory
-from wholearm.results.trajectory_file import load_trajectory
+from wholearm.results.trajectory import Trajectory, load_trajectory
 
 TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
 Edit = Callable[[dict[str, Any]], object]

@@ -21,11 +21,9 @@ from wholearm.figures.analysis_figures import draw_comparison
 from wholearm.problem.definition import Problem
 from wholearm.problem.keys import name_keys
 from wholearm.problem.table import change_table
-from wholearm.results.adopt import save
-from wholearm.results.provenance import describe_origin
+from wholearm.results.adopt import describe_origin, save
 from wholearm.results.torque import TorqueProfile, read_notes, read_torque_csv
-from wholearm.results.trajectory import Trajectory
-from wholearm.results.trajectory_file import load_trajectory
+from wholearm.results.trajectory import Trajectory, load_trajectory
 from wholearm.simulation.events import Simulation
 from wholearm.simulation.simulate import simulate
 from wholearm.verification.verify import verify

@@ -24,7 +24,7 @@ from wholearm.problem.definition import End, Problem, Until
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.problem.table import write_table
 from wholearm.results.adopt import save
-from wholearm.scene.ranges import find_unit_hint
+from wholearm.scene.model import find_unit_hint
 
 TEXT = HEPTAGON.read_text(encoding="utf-8")
 Edit = Callable[[dict[str, Any]], object]

@@ -16,9 +16,8 @@ import pytest
 
 from shipped import HEPTAGON, IMPACTS, problem_of
 from wholearm.common.arrays import Array
-from wholearm.common.document import Document, Result, Table, fixed, show
+from wholearm.common.document import Document, Result, Table, fixed, plain, restore, show
 from wholearm.common.errors import InputError
-from wholearm.common.plain import plain, restore
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
 from wholearm.planning.plan_report import describe_plan

@@ -29,13 +29,13 @@ from wholearm.engines.stretch import (
 )
 from wholearm.planning.plan import solve
 from wholearm.planning.result import Plan
-from wholearm.policy.closed_loop import ClosedLoop
 from wholearm.policy.make import make_policy
+from wholearm.policy.playback import ClosedLoop
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem
 from wholearm.results.adopt import require_same_phases
 from wholearm.results.torque import TorqueProfile
-from wholearm.results.trajectory_file import load_trajectory
+from wholearm.results.trajectory import load_trajectory
 from wholearm.search.find_route import find_route
 from wholearm.verification.verify import verify
 

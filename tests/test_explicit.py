@@ -13,8 +13,10 @@ from wholearm.contacts.closing import (
     evaluate_contacts,
     evaluate_each,
     first_contact,
+    measure_gap,
+    move,
+    place,
 )
-from wholearm.contacts.explicit import measure_gap, move, place
 from wholearm.contacts.formation import Formation
 from wholearm.mapping.borders import label_cells
 from wholearm.scene.model import Scene

@@ -25,10 +25,10 @@ from wholearm.free_simulation.hand import build_system, measure_gaps
 from wholearm.free_simulation.result import FreeSimulation
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import read_problem
+from wholearm.results.dwell_record import assemble
 from wholearm.results.torque import TorqueProfile
-from wholearm.results.trajectory import Trajectory, assemble
-from wholearm.scene.model import Finger, Friction, Scene
-from wholearm.scene.polygon import Polygon
+from wholearm.results.trajectory import Trajectory
+from wholearm.scene.model import Finger, Friction, Polygon, Scene
 from wholearm.simulation.events import EventKind, OutcomeKind
 from wholearm.verification.free import FreeReport, verify_free
 

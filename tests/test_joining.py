@@ -18,14 +18,19 @@ from wholearm.problem.definition import Until
 from wholearm.problem.goal import Goal
 from wholearm.search import route_choice as choosing
 from wholearm.search.astar import RoadmapRoute, RouteSearch, SearchRule
-from wholearm.search.candidates import Lost
-from wholearm.search.edge_plans import BackgroundTask, Cache, PlannedLink, join_route, key_steps
+from wholearm.search.edge_plans import (
+    BackgroundTask,
+    Cache,
+    Lost,
+    PlannedLink,
+    join_route,
+    key_steps,
+)
 from wholearm.search.edges import EdgeStep, Link
 from wholearm.search.feasibility import Measured
 from wholearm.search.places import make_place
-from wholearm.search.refinement import FINEST, STEPS, Found, RefinedPath, ReleaseSearch
 from wholearm.search.roadmap import Roadmap
-from wholearm.search.route_choice import Chooser
+from wholearm.search.route_choice import FINEST, STEPS, Chooser, Found, RefinedPath, ReleaseSearch
 
 # Where plans come from does not depend on how accurate they are.
 OPTIONS = PlanOptions(accuracy=0.1, replay=False)

@@ -10,8 +10,7 @@ import pytest
 from plane import SQUARE, make_formation, make_scene
 from tipping import roll
 from wholearm.common.arrays import Array
-from wholearm.common.errors import InfeasibleError
-from wholearm.common.shortfalls import Parameter
+from wholearm.common.errors import InfeasibleError, Parameter
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases

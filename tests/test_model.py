@@ -12,8 +12,7 @@ from plane import SQUARE, convex_polygon, cross, make_finger, make_scene, rotate
 from wholearm.common.arrays import Array
 from wholearm.common.errors import LONGEST, InputError, name_source, require_number
 from wholearm.common.fields import keys_of
-from wholearm.scene.model import Finger, Friction, Scene
-from wholearm.scene.polygon import Polygon
+from wholearm.scene.model import Finger, Friction, Polygon, Scene
 
 
 @pytest.mark.parametrize("value", [-1.0, math.nan, True, "1"])

@@ -15,8 +15,8 @@ from wholearm import InputError, Plan, Problem, load_plan, simulate, solve, veri
 from wholearm.planning.table_check import make_table
 from wholearm.problem.read import read_own_problem
 from wholearm.problem.table import describe_scene
+from wholearm.results.dwell_record import change_torques, find_change_times
 from wholearm.results.torque import TorqueProfile, read_torque_csv
-from wholearm.results.torque_change import change_torques, find_change_times
 from wholearm.simulation.events import EventKind, OutcomeKind
 from wholearm.simulation.sticking import balances
 from wholearm.simulation.tolerances import find_tolerances

@@ -17,10 +17,14 @@ from plane import (
     rotate,
 )
 from wholearm.common.arrays import Array
-from wholearm.contacts.contact_limits import build_apart
+from wholearm.contacts.contact_limits import (
+    FINGERS_TOUCH,
+    build_apart,
+    build_finger_gap,
+    evaluate_finger_gap,
+)
 from wholearm.contacts.elemental import build_features, parse_contact
 from wholearm.contacts.formation import Formation
-from wholearm.contacts.links import FINGERS_TOUCH, build_finger_gap, evaluate_finger_gap
 from wholearm.scene.model import Scene
 
 ROUNDING = 1e-15

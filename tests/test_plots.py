@@ -25,8 +25,9 @@ from wholearm.figures.plot_data import choose_snapshots, find_steps
 from wholearm.figures.snapshots import choose_numbers, draw_snapshot
 from wholearm.figures.style import WIDTH, choose_styles
 from wholearm.problem.definition import Problem
+from wholearm.results.dwell_record import assemble
 from wholearm.results.torque import TorqueProfile
-from wholearm.results.trajectory import Trajectory, assemble
+from wholearm.results.trajectory import Trajectory
 
 
 @dataclasses.dataclass

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from shipped import HEPTAGON, IMPACTS, LANDING, SQUARE, problem_of, solved
-from wholearm.contacts.closing import contact_table
-from wholearm.contacts.explicit import measure_gap, place
+from wholearm.contacts.closing import contact_table, measure_gap, place
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.arcs import find_on, join, take
 from wholearm.geometry.curve import Curve
@@ -22,10 +21,9 @@ from wholearm.planning.lower_bound.speed_sweep import NoMotionError
 from wholearm.problem.definition import End, Until
 from wholearm.problem.goal import Goal
 from wholearm.search.border_limits import estimate_duration, find_border_limits
-from wholearm.search.cell_paths import can_start, time_paths
 from wholearm.search.edges import Link, cut_curve, time_parts
 from wholearm.search.places import RoadmapPlace, is_at, list_formations_at, make_place, unit_steps
-from wholearm.search.roadmap import BESIDE, Rays, Roadmap, shoot
+from wholearm.search.roadmap import BESIDE, Rays, Roadmap, can_start, shoot, time_paths
 from wholearm.search.times import time_borders
 
 PARTS = 50

@@ -14,8 +14,7 @@ import pytest
 
 from shipped import HEPTAGON, HEXAGON, problem_of
 from wholearm.cli.command import main
-from wholearm.common.errors import InfeasibleError, InputError, SolverError
-from wholearm.common.shortfalls import Change, Parameter
+from wholearm.common.errors import Change, InfeasibleError, InputError, Parameter, SolverError
 from wholearm.common.signals import OutOfTime
 from wholearm.contacts.closing import close_fingers
 from wholearm.contacts.formation import Formation

@@ -25,8 +25,8 @@ from wholearm.planning.plan_report import describe_plan
 from wholearm.planning.result import Plan, load_plan, write_meta
 from wholearm.planning.stops import Plans
 from wholearm.problem.definition import Problem
+from wholearm.results.dwell_record import assemble
 from wholearm.results.torque import TorqueProfile
-from wholearm.results.trajectory import assemble
 from wholearm.simulation.start_modes import RestDirection
 from wholearm.simulation.sticking import balances, close_contacts, find_rest
 from wholearm.verification.verify import verify

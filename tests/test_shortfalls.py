@@ -15,8 +15,15 @@ from refused import ask_shoved
 from shipped import HEPTAGON, problem_of, tipping
 from wholearm.benchmark.stress import refusals
 from wholearm.benchmark.stress.refusals import judge
-from wholearm.common.errors import InfeasibleError, InputError, JammingError
-from wholearm.common.shortfalls import Change, LimitPlace, Parameter, Shortfall
+from wholearm.common.errors import (
+    Change,
+    InfeasibleError,
+    InputError,
+    JammingError,
+    LimitPlace,
+    Parameter,
+    Shortfall,
+)
 from wholearm.figures import plots
 from wholearm.mechanics.limits import EPSILON
 from wholearm.planning.advice import (
@@ -30,7 +37,7 @@ from wholearm.planning.advice import (
 from wholearm.planning.plan import solve
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem, read_problem
-from wholearm.results.trajectory_file import load_trajectory
+from wholearm.results.trajectory import load_trajectory
 
 
 def refuse(problem: Problem, **options: Any) -> InfeasibleError:

@@ -12,8 +12,7 @@ import pytest
 from misbehaving import allow, misbehave
 from wholearm.benchmark import STUDIES
 from wholearm.benchmark.study import Case, Row, Study, digest_source, measure_case
-from wholearm.cli.bench import load_study
-from wholearm.cli.command import main
+from wholearm.cli.command import load_study, main
 from wholearm.common.crowd import Processes, run_all
 from wholearm.common.errors import InputError
 from wholearm.common.journal import Journal

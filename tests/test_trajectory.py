@@ -12,9 +12,9 @@ import pytest
 from tipping import tipped
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
+from wholearm.results.dwell_record import assemble
 from wholearm.results.torque import TorqueProfile
-from wholearm.results.trajectory import Samples, Trajectory, assemble
-from wholearm.results.trajectory_file import load_trajectory
+from wholearm.results.trajectory import Samples, Trajectory, load_trajectory
 
 ARRAYS = ["t", "q", "theta", "q_dot", "theta_dot", "q_ddot", "theta_ddot", "tau", "c_n", "c_t"]
 TEXT = ["contacts", "meta"]

@@ -15,13 +15,11 @@ from tipping import box, tipped
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.problem.definition import Problem
-from wholearm.results.report import Report
+from wholearm.results.report import Loss, Report
 from wholearm.results.torque import TorqueProfile, read_notes
-from wholearm.results.tuning_advice import Loss
 from wholearm.simulation.events import Event, EventKind, Simulation
 from wholearm.simulation.simulate import simulate
-from wholearm.tuning.trial import Bench, TrialOutcome, TuningStep, split_passages
-from wholearm.tuning.tuner import FACTOR
+from wholearm.tuning.tuner import FACTOR, Bench, TrialOutcome, TuningStep, split_passages
 from wholearm.verification.torque_advice import find_approach
 from wholearm.verification.verify import verify
 

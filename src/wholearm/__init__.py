@@ -16,15 +16,16 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .common.errors import (
         AmbiguityError,
+        Change,
         InfeasibleError,
         InputError,
         JammingError,
         ReplayError,
+        Shortfall,
         SimulationError,
         SolverError,
         WholearmError,
     )
-    from .common.shortfalls import Change, Shortfall
     from .comparison.metrics import compare
     from .comparison.side_by_side import Comparison
     from .contacts.elemental import Contact
@@ -50,19 +51,16 @@ if TYPE_CHECKING:
     from .results.adopt import save
     from .results.report import Report
     from .results.torque import TorqueProfile, read_torque_csv
-    from .results.trajectory import Trajectory
-    from .results.trajectory_file import load_trajectory
+    from .results.trajectory import Trajectory, load_trajectory
     from .robustness.error_model import Uncertainty
     from .robustness.sampling import Robustness, assess_robustness
-    from .scene.model import Finger, Friction, Scene
-    from .scene.polygon import Polygon
+    from .scene.model import Finger, Friction, Polygon, Scene
     from .search.find_route import find_route
     from .search.result import Answer
     from .search.solve import solve
     from .simulation.events import Simulation
     from .simulation.simulate import simulate
-    from .tuning.trial import Tuning
-    from .tuning.tuner import tune
+    from .tuning.tuner import Tuning, tune
     from .verification.free import FreeReport, verify_free
     from .verification.policy_check import verify_policy
     from .verification.verify import verify
@@ -72,7 +70,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "AmbiguityError": "common.errors",
     "Answer": "search.result",
-    "Change": "common.shortfalls",
+    "Change": "common.errors",
     "Comparison": "comparison.side_by_side",
     "Contact": "contacts.elemental",
     "End": "problem.definition",
@@ -93,21 +91,21 @@ _HOMES = {
     "PlanOptions": "planning.options",
     "Policy": "policy.playback",
     "PolicyReport": "engines.feedback",
-    "Polygon": "scene.polygon",
+    "Polygon": "scene.model",
     "Prediction": "quasistatic.slow_speeds",
     "Problem": "problem.definition",
     "ReplayError": "common.errors",
     "Report": "results.report",
     "Robustness": "robustness.sampling",
     "Scene": "scene.model",
-    "Shortfall": "common.shortfalls",
+    "Shortfall": "common.errors",
     "Simulation": "simulation.events",
     "SimulationError": "common.errors",
     "SolverError": "common.errors",
     "Status": "planning.result",
     "TorqueProfile": "results.torque",
     "Trajectory": "results.trajectory",
-    "Tuning": "tuning.trial",
+    "Tuning": "tuning.tuner",
     "Uncertainty": "robustness.error_model",
     "Until": "problem.definition",
     "WholearmError": "common.errors",
@@ -120,7 +118,7 @@ _HOMES = {
     "list_formations": "mapping.formation_list",
     "load": "geometry.path_guess",
     "load_plan": "planning.result",
-    "load_trajectory": "results.trajectory_file",
+    "load_trajectory": "results.trajectory",
     "make_policy": "policy.make",
     "place_start": "problem.read",
     "play_policy": "engines.feedback",

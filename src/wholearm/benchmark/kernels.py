@@ -31,8 +31,7 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.fields import Range
 from ..common.files import read_json, write_text
-from ..scene.model import Finger, Friction, Scene
-from ..scene.polygon import Polygon
+from ..scene.model import Finger, Friction, Polygon, Scene
 from .study import Case, Row, Study
 
 LARGEST = 4  # largest change of a number, in units of 2^-52 of it

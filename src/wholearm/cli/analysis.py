@@ -10,8 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from ..common.errors import InputError
-from .output import name_files, print_result, require_output, tell_origin
-from .progress import show_progress
+from .output import name_files, print_result, require_output, show_progress, tell_origin
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -85,7 +84,7 @@ def robustness(options: argparse.Namespace) -> int:
     """Replay samples, and print what becomes of them."""
     from ..policy.playback import Policy
     from ..problem.read import adopt_phases, read_problem
-    from ..results.trajectory_file import load_trajectory
+    from ..results.trajectory import load_trajectory
     from ..robustness.sampling import assess_robustness
 
     output = options.output or _name_output(options)

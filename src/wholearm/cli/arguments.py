@@ -68,14 +68,14 @@ SEARCH = """\
 """
 
 TABLE = f"""\
-[[new]]  new:write  write a problem file to begin with
+[[new]]  help:write  write a problem file to begin with
 name               the problem's name; NAME.toml is written
 --polygon CORNERS  corners of the regular polygon, 3 to 50 = 7 in 3..50
 --size             from its centre to its corners [m] = 0.05 in 1e-6..1e6
 --vertices 'X,Y ...'  corners of the object instead, anticlockwise [m], as in '0,0 0.08,0
     0.08,0.03 0,0.09'
 --mass             of the object [kg] (0.2 at a size of 0.05 m, growing with the area) in 1e-6..1e6
-[[schema]]  new:show_schema  print the JSON Schema of problem files, for editors
+[[schema]]  help:show_schema  print the JSON Schema of problem files, for editors
 -o --output FILE  file to write, instead of printing
 --table           all keys with unit, default and range as tables (Markdown) instead
 [[solve]]  command:solve  plan joint torques for a problem file
@@ -141,7 +141,7 @@ problem           problem file (TOML) with [goal] in place of [[phases]]
 --alternatives N  how many routes of other formations are listed beside the best one = 0 in 0..100
 --objective NAME  of the plans: time, effort or margin; routes are looked for by time = time
 {SEARCH}{JSON}\
-[[map]]  map:draw  draw the contact formations over (x, phi)
+[[map]]  route:draw  draw the contact formations over (x, phi)
 {PROBLEM}\
 -o --output FILE  figure to write (.png, .pdf, .svg; default: map_NAME.png)
 --plan FILE       trajectory file (.npz) to draw over it
@@ -220,7 +220,7 @@ files PROBLEM ...  problem files (TOML)
     = results/gallery.md
 [[help]]  help:show  print a page of the documentation, or list its topics
 [topic TOPIC]  what the page is about (left out: list the topics) among {"|".join(TOPICS)}
-[[completion]]  completion:complete  print what makes a shell complete all this
+[[completion]]  help:complete  print what makes a shell complete all this
 shell  bash, zsh or tcsh; needs the extra completion
 """
 """Commands but `bench`, which has studies of its own: name, module and function that carry it out,

@@ -1,4 +1,4 @@
-"""The command line: ``wholearm solve``, ``verify``, ``plot`` and the others.
+"""The command line: ``wholearm solve``, ``verify``, ``plot``, the studies of ``bench``, the parser.
 
 Exit status 0 means done and all contacts held, 1 infeasible or a contact lost or a goal missed,
 2 bad input, 130 interrupted, 143 terminated. Each command imports what it needs and nothing else.
@@ -12,19 +12,29 @@ import json
 import os
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from functools import partial
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
+from ..benchmark import STUDIES
 from ..common.errors import InputError, WholearmError, name_source
 from ..common.signals import guard
 from .arguments import COMMANDS, Parser, name_simulator
-from .bench import add_bench
-from .map import protect
-from .output import name_files, print_result, require_output, tell_origin
-from .progress import announce, clear_progress, progress_log, show_progress
-from .route import find
+from .output import (
+    announce,
+    clear_progress,
+    name_files,
+    print_result,
+    progress_log,
+    require_output,
+    show_progress,
+    tell_origin,
+)
+from .route import find, protect
 from .viewer import overlay
 
 if TYPE_CHECKING:
+    from ..benchmark.study import Study
     from ..planning.result import Plan
     from ..planning.table_check import TorqueTable
     from ..policy.playback import Policy
@@ -110,7 +120,7 @@ def solve(options: argparse.Namespace) -> int:
     from ..planning.options import PlanOptions
     from ..planning.plan import solve_with
     from ..planning.plan_report import describe_plan
-    from ..scene.ranges import find_unit_hint
+    from ..scene.model import find_unit_hint
 
     output = options.output or f"{os.path.splitext(os.path.basename(options.problem))[0]}.npz"
     given = {key: getattr(options, key) for key in keys_of(PlanOptions)}
@@ -260,7 +270,7 @@ def _check_free(options: argparse.Namespace) -> None:
 def _read_torques(path: str) -> Trajectory | TorqueProfile:
     from ..common.files import require_ending
     from ..results.torque import read_torque_csv
-    from ..results.trajectory_file import load_trajectory
+    from ..results.trajectory import load_trajectory
 
     csv = require_ending(path, ".npz", ".csv") == ".csv"
     return read_torque_csv(path) if csv else load_trajectory(path)
@@ -296,3 +306,66 @@ def _replay(options: argparse.Namespace, torques: TorqueProfile) -> Trajectory:
     from ..simulation.simulate import simulate
 
     return simulate(load(options.problem), torques, progress=show_progress()).trajectory
+
+
+class StudyParser(Parser):
+    """A parser that asks the study for its options when it is used: only then is that imported."""
+
+    study = ""
+
+    def complete(self) -> None:
+        """Add the options of the study."""
+        if self.study:
+            from ..benchmark.study import add_common
+
+            study = load_study(self.study)
+            self.study = ""
+            add_common(self, study)
+            study.add_options(self)
+            self.set_defaults(run=partial(_run_study, study))
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse, with all options."""
+        self.complete()
+        return super().parse_known_args(args, namespace)
+
+    def format_help(self) -> str:
+        """The help, with all options."""
+        self.complete()
+        return super().format_help()
+
+
+def load_study(name: str) -> Study:
+    """The study of a name."""
+    module = STUDIES[name][0]
+    package = "wholearm.benchmark" if module.startswith(".") else None
+    study: Study = import_module(module, package).STUDY
+    return study
+
+
+def add_bench(bench: argparse.ArgumentParser) -> None:
+    """Give the parser of ``bench`` its studies."""
+    studies = bench.add_subparsers(metavar="STUDY", parser_class=StudyParser)
+    for name, (_, text) in STUDIES.items():
+        studies.add_parser(
+            name, help=text, description=f"{text[0].upper()}{text[1:]}."
+        ).study = name
+    bench.set_defaults(run=_list_studies)
+
+
+def _list_studies(options: argparse.Namespace) -> int:
+    """Print the names of all studies, with a line each."""
+    width = max(map(len, STUDIES))
+    print("\n".join(f"{name:{width}}  {text}" for name, (_, text) in STUDIES.items()))
+    return 0
+
+
+def _run_study(study: Study, options: argparse.Namespace) -> int:
+    from ..benchmark.study import run_study
+
+    report = run_study(study, options, show_progress())
+    clear_progress()
+    print(report.text, end="")
+    for path in report.written:
+        print(f"wrote {path}")
+    return 1 if report.findings else 0

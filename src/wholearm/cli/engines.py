@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 from ..common.errors import InputError, name_source
 from ..common.fields import Range
-from .output import name_files, print_result, require_output, tell_origin
-from .progress import show_progress
+from .output import name_files, print_result, require_output, show_progress, tell_origin
 
 if TYPE_CHECKING:
     from ..engines.stretch import Setting
@@ -99,7 +98,7 @@ def _load_plan(path: str, problem: Problem) -> tuple[Problem, Trajectory]:
     from ..common.files import require_ending
     from ..problem.read import adopt_phases
     from ..results.adopt import require_same_phases
-    from ..results.trajectory_file import load_trajectory
+    from ..results.trajectory import load_trajectory
 
     if require_ending(path, ".npz", ".csv") == ".csv":
         text = "torques alone have no motion to compare with; verify -o FILE.npz writes one"

@@ -8,8 +8,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from ..common.errors import name_source
-from .output import print_result, require_output
-from .progress import clear_progress, show_progress
+from .output import clear_progress, print_result, require_output, show_progress
 
 _QUICK = 2e-4
 """Period of the loop that is tried where a policy fails [s]; case: flips onto another edge."""
@@ -25,7 +24,7 @@ def policy(options: argparse.Namespace) -> int:
     from ..planning.plan import solve
     from ..policy.make import find_widest, make_policy
     from ..problem.read import read_own_problem
-    from ..results.trajectory_file import load_trajectory
+    from ..results.trajectory import load_trajectory
     from ..verification.policy_check import verify_policy
 
     stem = os.path.splitext(os.path.basename(options.plan))[0]

@@ -6,8 +6,7 @@ import argparse
 import os
 from typing import TYPE_CHECKING
 
-from .output import name_files, require_output
-from .progress import show_progress
+from .output import name_files, require_output, show_progress
 
 if TYPE_CHECKING:
     from ..results.trajectory import Trajectory
@@ -45,7 +44,7 @@ def animate(options: argparse.Namespace) -> int:
     from ..common.errors import name_source
     from ..common.files import write_text
     from ..problem.read import read_own_problem
-    from ..results.trajectory_file import load_trajectory
+    from ..results.trajectory import load_trajectory
 
     require_output(options.output, ".gif", ".mp4", ".html")
     trajectory = load_trajectory(options.trajectory)

@@ -14,11 +14,10 @@ from ..common.files import require_ending
 from ..problem.check import require_phases
 from ..problem.definition import Problem
 from ..problem.read import adopt_phases
-from ..results.provenance import require_made_for
+from ..results.adopt import require_made_for
 from ..results.report import Report
 from ..results.torque import TorqueProfile, read_notes, read_torque_csv
-from ..results.trajectory import Trajectory
-from ..results.trajectory_file import load_trajectory
+from ..results.trajectory import Trajectory, load_trajectory
 from ..verification.verdict import find_least_force
 from ..verification.verify import verify
 from .side_by_side import Comparison, Contender

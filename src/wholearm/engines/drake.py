@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..policy.closed_loop import ClosedLoop
+from ..policy.playback import ClosedLoop
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from ..scene.model import Scene

@@ -12,8 +12,7 @@ import numpy as np
 
 from ..common.document import Document, Result, Table
 from ..common.errors import InputError
-from ..policy.closed_loop import ROOM, ClosedLoop
-from ..policy.playback import Policy
+from ..policy.playback import ROOM, ClosedLoop, Policy
 from ..problem.definition import Problem
 from ..results.adopt import Moved, adopt_motion
 from ..results.trajectory import Trajectory

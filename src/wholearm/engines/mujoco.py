@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
-from ..policy.closed_loop import ClosedLoop
+from ..policy.playback import ClosedLoop
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from .departure import find_pairs

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..contacts.formation import Formation, find_touching
-from ..policy.closed_loop import ClosedLoop
+from ..policy.playback import ClosedLoop
 from ..problem.definition import Problem
 from ..scene.model import Scene
 from .stretch import EngineStretch

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..common.arrays import Array, sort_unique
 from ..common.errors import WholearmError
-from ..policy.closed_loop import ClosedLoop
+from ..policy.playback import ClosedLoop
 from ..problem.definition import Problem
 from ..problem.read import read_own_problem
 from ..results.torque import TorqueProfile

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from ..common.errors import InputError, require_number
 from ..common.files import write_whole
 from ..common.sharing import exclusive
-from ..contacts.links import evaluate_finger_gap
+from ..contacts.contact_limits import evaluate_finger_gap
 from ..problem.read import read_own_problem
 from ..results.adopt import Torques, narrow
 from ..results.trajectory import Trajectory

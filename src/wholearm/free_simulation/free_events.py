@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
-from ..results.sampled import interpolate_quintic
+from ..results.trajectory import interpolate_quintic
 from ..simulation.events import EventKind
 from ..simulation.root_finding import find_crossing, find_root
 from ..simulation.runge_kutta import ORDER

@@ -27,9 +27,8 @@ import numpy as np
 
 from ..common.arrays import Array, Expression
 from ..common.sharing import exclusive
-from ..contacts.contact_limits import build_apart
+from ..contacts.contact_limits import FINGERS_TOUCH, build_apart, build_finger_gap
 from ..contacts.elemental import build_features, rotate_quarter
-from ..contacts.links import FINGERS_TOUCH, build_finger_gap
 from ..scene.model import Scene
 from .system import ContactPair, Structure, System
 

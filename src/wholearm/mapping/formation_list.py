@@ -20,8 +20,7 @@ from ..geometry.path_guess import guess_phase
 from ..geometry.tracing import trace_phases
 from ..problem.definition import Problem, Until
 from ..problem.read import build_problem
-from ..scene.polygon import Polygon
-from ..scene.ranges import TURN, check_place
+from ..scene.model import TURN, Polygon, check_place
 from .borders import Window
 from .legs import describe_miss, describe_place, find_miss, format_until, tolerance, walk_leg
 

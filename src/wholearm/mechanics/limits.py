@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
-from ..common.shortfalls import Parameter
+from ..common.errors import Parameter
 from ..contacts.cones import force_limit_rows
 from ..contacts.formation import Formation
 

@@ -16,13 +16,22 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from ..common.arrays import Array
-from ..common.errors import InfeasibleError, InputError, JammingError, SolverError
-from ..common.plain import plain
-from ..common.shortfalls import Change, LimitPlace, Parameter, Shortfall
+from ..common.document import plain
+from ..common.errors import (
+    Change,
+    InfeasibleError,
+    InputError,
+    JammingError,
+    LimitPlace,
+    Parameter,
+    Shortfall,
+    SolverError,
+)
 from ..contacts.formation import Formation
 from ..mechanics.limits import LimitSet
+from ..results.dwell_record import assemble
 from ..results.torque import TorqueProfile
-from ..results.trajectory import Motion, Trajectory, assemble
+from ..results.trajectory import Motion, Trajectory
 from ..scene.model import Scene
 
 SHORT = 1e-4  # least violation that counts, over the scale of a limit

@@ -15,8 +15,15 @@ from typing import Any
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import InfeasibleError, InputError, SolverError, WholearmError, name_source
-from ..common.shortfalls import Change, Parameter
+from ..common.errors import (
+    Change,
+    InfeasibleError,
+    InputError,
+    Parameter,
+    SolverError,
+    WholearmError,
+    name_source,
+)
 from ..geometry.arcs import CostToGo
 from ..geometry.curve import Curve
 from ..geometry.tracing import trace_phase

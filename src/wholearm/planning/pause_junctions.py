@@ -15,7 +15,7 @@ from ..contacts.formation import Formation
 from ..geometry.curve import Curve
 from ..geometry.tracing import trace_phase
 from ..problem.definition import Phase
-from ..results.torque_change import find_change_times
+from ..results.dwell_record import find_change_times
 from ..results.trajectory import Motion
 from .block_plan import Planning
 from .options import PlanOptions

@@ -13,8 +13,8 @@ import casadi as ca
 import numpy as np
 
 from .. import __version__
+from ..common.document import plain
 from ..common.errors import AmbiguityError, InfeasibleError, SolverError
-from ..common.plain import plain
 from ..common.sharing import exclusive
 from ..common.signals import OutOfTime, Reporter, limited
 from ..geometry.curve import describe_pose
@@ -22,10 +22,11 @@ from ..geometry.tracing import trace_phases
 from ..mechanics.uniqueness import describe_uniqueness
 from ..problem.check import require_phases
 from ..problem.definition import Problem
+from ..results.dwell_record import assemble
 from ..results.plan_record import Certificate, TimeBound, Transition
 from ..results.report import UniquenessMargin
 from ..results.torque import TorqueProfile
-from ..results.trajectory import Trajectory, assemble
+from ..results.trajectory import Trajectory
 from ..solvers.ipopt import Ledger, open_ledger
 from ..verification.force_uniqueness import find_uniqueness_margin, find_wedged
 from .block_plan import BlockPlan, Planning

@@ -13,9 +13,10 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.errors import InfeasibleError, JammingError, ReplayError, SimulationError, SolverError
 from ..problem.definition import Problem
+from ..results.dwell_record import assemble
 from ..results.plan_record import LeastForce, ReplayedPhase, ReplayFigures
 from ..results.report import Report
-from ..results.trajectory import Samples, Trajectory, assemble
+from ..results.trajectory import Samples, Trajectory
 from ..scene.model import Scales
 from ..verification.newton_euler import balance
 from ..verification.verdict import Allowance, find_least_force, measure_departure

@@ -13,16 +13,14 @@ from typing import Any, NamedTuple, get_type_hints
 
 from numpy.typing import ArrayLike
 
-from ..common.document import Document, Drawn, Result
+from ..common.document import Document, Drawn, Result, plain, restore
 from ..common.errors import InputError
-from ..common.plain import plain, restore
 from ..problem.definition import Problem
 from ..problem.read import read_own_problem
 from ..results.dwell_record import Settling
 from ..results.plan_record import Certificate, ModeSpan, RangeFigures, ReplayFigures, Transition
 from ..results.report import UniquenessMargin
-from ..results.trajectory import Samples, Trajectory
-from ..results.trajectory_file import load_trajectory
+from ..results.trajectory import Samples, Trajectory, load_trajectory
 from ..solvers.ipopt import SolverStatistics
 from .options import Objective, PlanOptions
 

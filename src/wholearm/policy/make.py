@@ -31,8 +31,9 @@ from ..mechanics.path_limits import PathLimits
 from ..problem.definition import ROWS, End, Phase, Problem
 from ..problem.uncertainty import PARAMETERS
 from ..results.adopt import Moved, adopt_motion
+from ..results.dwell_record import assemble
 from ..results.torque import TorqueProfile
-from ..results.trajectory import Motion, Trajectory, assemble
+from ..results.trajectory import Motion, Trajectory
 from .curve_law import LoopSettings, choose_internal_force
 from .curve_rows import CurveLimitRows, find_forces, leave_one
 from .playback import Policy

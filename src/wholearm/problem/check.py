@@ -11,10 +11,9 @@ from ..common.errors import InputError, require_number, require_vector
 from ..common.fields import keys_of
 from ..common.sharing import exclusive
 from ..contacts.closing import name_reach
+from ..contacts.contact_limits import evaluate_finger_gap
 from ..contacts.formation import Formation, describe, find_touching
-from ..contacts.links import evaluate_finger_gap
-from ..scene.model import Scene
-from ..scene.ranges import TURN, check_place, check_ranges
+from ..scene.model import TURN, Scene, check_place, check_ranges
 from .definition import ROWS, End, Phase, Problem
 from .goal import check_goal, name_goal
 from .uncertainty import spread_widths

@@ -13,9 +13,8 @@ from ..common.errors import InputError, name_source, read_share
 from ..common.fields import NONNEGATIVE, POSITIVE, TEXT, FieldKind, choice, declare, key, leave
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
-from ..scene.model import Scene
-from ..scene.ranges import EPSILON, SETTLE
-from ..scene.ranges import SETTLE_GAP as GAP_RANGE
+from ..scene.model import EPSILON, SETTLE, Scene
+from ..scene.model import SETTLE_GAP as GAP_RANGE
 from .goal import Goal
 from .table import change_table, match_table, write_table
 from .uncertainty import read_widths

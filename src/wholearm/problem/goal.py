@@ -9,8 +9,7 @@ from typing import Any
 
 from ..common.errors import InputError, require_number
 from ..common.fields import NUMBER, declare, key, leave
-from ..scene.model import Scene
-from ..scene.ranges import PLACE, TURN, check_place
+from ..scene.model import PLACE, TURN, Scene, check_place
 
 INDEX = leave({"type": "integer", "minimum": 0})  # number of an edge
 _ALLOWED = "allowed is a table with flush or phi_deg, and x"

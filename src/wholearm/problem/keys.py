@@ -22,10 +22,8 @@ from ..common.fields import (
     name_fields,
     refer,
 )
-from ..scene.model import Finger, Friction, Scene
-from ..scene.polygon import Polygon
-from ..scene.ranges import FRICTION as COEFFICIENTS
-from ..scene.ranges import PLACE
+from ..scene.model import FRICTION as COEFFICIENTS
+from ..scene.model import PLACE, Finger, Friction, Polygon, Scene
 from .definition import CONTACT, Phase, Problem
 from .goal import INDEX, Goal
 from .uncertainty import GROUPS, LENGTH, PARAMETERS

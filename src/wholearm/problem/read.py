@@ -20,9 +20,7 @@ from ..common.sharing import exclusive
 from ..contacts.closing import close_finger, name_reach, place_flush
 from ..contacts.elemental import Contact, parse_contact
 from ..contacts.formation import Formation
-from ..scene.model import Finger, Friction, Scene
-from ..scene.polygon import Polygon
-from ..scene.ranges import TURN, check_place, check_ranges
+from ..scene.model import TURN, Finger, Friction, Polygon, Scene, check_place, check_ranges
 from . import keys
 from .definition import End, Phase, Problem, Until
 from .goal import read_goals

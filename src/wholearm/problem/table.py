@@ -1,9 +1,11 @@
-"""The table of a problem file: changed by name, and kept in step with the problem it belongs to."""
+"""The table of a problem file: changed by name, in step with its problem, written as TOML."""
 
 from __future__ import annotations
 
 import copy
+import json
 import math
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
@@ -13,13 +15,14 @@ import numpy as np
 
 from ..common.errors import InputError
 from ..common.fields import Field, keys_of
+from ..common.files import require_ending, write_text
 from ..contacts.closing import close_finger, place_flush
-from ..scene.model import Scene
-from ..scene.polygon import Polygon
+from ..scene.model import Polygon, Scene
 from .goal import match_goals
 
 if TYPE_CHECKING:
     from .definition import Phase, Problem, Until
+
 
 _STEP = re.compile(r"([^.\[\]]+)|\[([1-9][0-9]*)\]")
 
@@ -239,3 +242,44 @@ def name_contacts(phase: Phase) -> list[str]:
     formation = phase.formation
     rolling = formation.rolling
     return [c.name + (" rolling" if c in rolling else "") for c in formation.contacts]
+
+
+def save_problem(problem: Problem, path: str | os.PathLike[str]) -> None:
+    """Write a problem to a ``.toml`` file, which loads as the same.
+
+    Raises
+    ------
+    InputError  if the file cannot be written, or the problem starts where no file can say: with no
+                edge flush on the palm, or a finger that does not touch
+    """
+    require_ending(path, ".toml")
+    if not problem.table:
+        text = "the problem starts with no edge on the palm, or a finger open, which no file says"
+        raise InputError(str(path), "start", text)
+    write_text(path, write_toml(problem.table))
+
+
+def write_toml(table: Mapping[str, Any], where: str = "") -> str:
+    """Nested tables as TOML: values first, then tables, then lists of tables."""
+    plain, inner = [], []
+    for key, value in table.items():
+        name = key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else json.dumps(key)
+        full = f"{where}{name}"
+        if isinstance(value, Mapping):
+            inner.append(f"\n[{full}]\n{write_toml(value, f'{full}.')}")
+        elif key in ("phases", "goal") and isinstance(value, list):
+            for entry in value:
+                lines = (f"{name} = {_write(item)}\n" for name, item in entry.items())
+                inner.append(f"\n[[{full}]]\n{''.join(lines)}")
+        else:
+            plain.append(f"{name} = {_write(value)}\n")
+    return "".join(plain + inner)
+
+
+def _write(value: Any) -> str:
+    """A value, with all digits of a number."""
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{key} = {_write(own)}" for key, own in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_write, value)) + "]"
+    return json.dumps(value) if isinstance(value, str | bool) else repr(value)

@@ -6,9 +6,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from .report import Deviation
-
 ROLLS = "rolls"  # mode of a contact that rolls; one that slides has the sign of its direction
+
+
+class Deviation(NamedTuple):
+    """Largest difference between planned and simulated state."""
+
+    position: float  # [m]: of the coordinates x and y
+    angle: float  # [rad]: of phi and the joint angles
+    time: float  # [s]: when the larger of the two was, positions counting over the scene's length
 
 
 class ModeSpan(NamedTuple):

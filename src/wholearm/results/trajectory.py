@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,10 +11,12 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..common.arrays import Array
-from ..common.document import Drawn
-from ..common.files import require_ending, write_text
-from .torque import TorqueProfile
+from ..common.arrays import Array, sort_unique
+from ..common.document import Drawn, restore
+from ..common.errors import InputError
+from ..common.files import read_arrays, require_ending, write_text, write_whole
+from .plan_record import ModeSpan
+from .torque import MOST, TorqueProfile, format_rows, place_rows
 
 
 class Samples(NamedTuple):
@@ -159,8 +162,6 @@ class Trajectory(Drawn):
         ------
         InputError  if the file cannot be written
         """
-        from .trajectory_file import write_trajectory
-
         write_trajectory(self, path)
 
     def save_torques(self, path: str | os.PathLike[str]) -> None:
@@ -172,48 +173,180 @@ class Trajectory(Drawn):
         ------
         InputError  if the file cannot be written
         """
-        from .torque import format_rows, place_rows
-
         require_ending(path, ".csv")
         write_text(path, format_rows(place_rows(self.torque)))
 
 
-def assemble(
-    motions: Sequence[Motion], torque: TorqueProfile, meta: Mapping[str, Any], samples: int
-) -> Trajectory:
-    """Sample motions that follow one another, `samples` rows to a phase and two to its held end."""
-    from .dwell_record import SettledMotion
+@dataclass(frozen=True, eq=False)
+class SampledMotion:
+    """A phase known by its samples: quintic in time for z, linear for tau and forces."""
 
-    contacts = tuple(dict.fromkeys(name for motion in motions for name in motion.contacts))
-    rows, times, forces, start = [], [], [], 0.0
-    for motion in motions:
-        if isinstance(motion, SettledMotion):
-            local, row = motion.sample(samples)
-        else:
-            local = np.linspace(0.0, motion.duration, samples)
-            row = motion.evaluate(local)
-        wide = np.full((2, len(local), len(contacts)), np.nan)
-        wide[:, :, [contacts.index(name) for name in motion.contacts]] = row.c_n, row.c_t
-        rows.append(row)
-        times.append(start + local)
-        forces.append(wide)
-        start += motion.duration
-    z, z_dot, z_ddot, tau = (np.concatenate([row[k] for row in rows]) for k in range(4))
-    c_n, c_t = np.concatenate(forces, axis=1)
-    return Trajectory(
-        t=np.concatenate(times),
-        q=z[:, :3],
-        theta=z[:, 3:],
-        q_dot=z_dot[:, :3],
-        theta_dot=z_dot[:, 3:],
-        q_ddot=z_ddot[:, :3],
-        theta_ddot=z_ddot[:, 3:],
-        tau=tau,
-        contacts=contacts,
-        c_n=c_n,
-        c_t=c_t,
-        phase=np.repeat(np.arange(len(motions)), [len(row.z) for row in rows]),
-        torque=torque,
-        motions=tuple(motions),
-        meta=dict(meta),
+    t: Array
+    contacts: tuple[str, ...]
+    samples: Samples
+
+    @property
+    def duration(self) -> float:
+        """How long the phase lasts [s]."""
+        return float(self.t[-1] - self.t[0])
+
+    def evaluate(self, t: Array) -> Samples:
+        """Samples at times `t` from the start of the phase, shape (n,) [s]."""
+        grid, known = self.t - self.t[0], self.samples
+        k = np.clip(np.searchsorted(grid, t, side="right") - 1, 0, len(grid) - 2)
+        h, run = grid[k + 1] - grid[k], np.asarray(t) - grid[k]
+        z, z_dot, z_ddot = interpolate_quintic(h, run, known[:3], k)
+        x = (run / h)[:, None]
+        forces = [(1 - x) * f[k] + x * f[k + 1] for f in (known.tau, known.c_n, known.c_t)]
+        return Samples(z, z_dot, z_ddot, *forces)
+
+
+def interpolate_quintic(
+    h: Array, run: Array, knots: Sequence[Array], left: NDArray[np.int64]
+) -> tuple[Array, Array, Array]:
+    """Quintic through z, z' and z'' at two knots, with its first two derivatives.
+
+    Parameters
+    ----------
+    h, run : (n,) [s]  time between the two knots, and since the first of them
+    knots : (m, 5)     z, z' and z'' at all knots
+    left : (n,)        the first of the two knots
+    """
+    h, x = h[:, None], (run / h)[:, None]
+    z, v, a = knots
+    z0, v0, a0 = z[left], h * v[left], h**2 * a[left]
+    rise = z[left + 1] - z0 - v0 - a0 / 2
+    speed = h * v[left + 1] - v0 - a0
+    bend = h**2 * a[left + 1] - a0
+    c3 = 10 * rise - 4 * speed + bend / 2
+    c4 = -15 * rise + 7 * speed - bend
+    c5 = 6 * rise - 3 * speed + bend / 2
+    return (
+        z0 + x * (v0 + x * (a0 / 2 + x * (c3 + x * (c4 + x * c5)))),
+        (v0 + x * (a0 + x * (3 * c3 + x * (4 * c4 + x * 5 * c5)))) / h,
+        (a0 + x * (6 * c3 + x * (12 * c4 + x * 20 * c5))) / h**2,
     )
+
+
+def sample_phases(
+    arrays: Mapping[str, Any], contacts: tuple[str, ...]
+) -> tuple[SampledMotion, ...]:
+    """The motion of each phase, from the arrays of a trajectory by name."""
+    return tuple(_sample(arrays, contacts, index) for index in sort_unique(arrays["phase"]))
+
+
+def _sample(arrays: Mapping[str, Any], contacts: tuple[str, ...], index: float) -> SampledMotion:
+    rows = arrays["phase"] == index
+    held = ~np.isnan(arrays["c_n"][rows]).all(axis=0)
+    parts = {name: array[rows] for name, array in arrays.items()}
+    samples = Samples(
+        np.hstack([parts["q"], parts["theta"]]),
+        np.hstack([parts["q_dot"], parts["theta_dot"]]),
+        np.hstack([parts["q_ddot"], parts["theta_ddot"]]),
+        parts["tau"],
+        parts["c_n"][:, held],
+        parts["c_t"][:, held],
+    )
+    names = tuple(name for name, here in zip(contacts, held, strict=True) if here)
+    return SampledMotion(parts["t"], names, samples)
+
+
+_ARRAYS = {
+    "t": (), "q": (3,), "theta": (2,), "q_dot": (3,), "theta_dot": (2,), "q_ddot": (3,),
+    "theta_ddot": (2,), "tau": (2,), "c_n": (-1,), "c_t": (-1,), "phase": (),
+}  # fmt: skip
+_FARTHEST = 1e6
+"""Largest coordinate [m or rad]: nothing in a problem is farther away or turned more."""
+
+
+def write_trajectory(trajectory: Trajectory, path: str | os.PathLike[str]) -> None:
+    """Write a trajectory; see `Trajectory.save`."""
+    require_ending(path, ".npz")
+    arrays: dict[str, Any] = {name: getattr(trajectory, name) for name in _ARRAYS}
+    arrays["contacts"] = np.array(trajectory.contacts)
+    arrays["torque_breaks"] = trajectory.torque.breaks
+    arrays["torque_coefficients"] = trajectory.torque.coefficients
+    arrays["meta"] = np.array(json.dumps(dict(trajectory.meta)))
+    write_whole(path, lambda stream: np.savez(stream, **arrays))
+
+
+def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
+    """Read a trajectory file.
+
+    Raises
+    ------
+    InputError  if the file cannot be read, or an array is missing or of the wrong shape
+    """
+    source = str(path)
+    extra = {"contacts": (), "torque_breaks": (), "torque_coefficients": (2, -1)}
+    arrays = read_arrays(path, (*_ARRAYS, *extra, "meta"))
+    for name in (*_ARRAYS, *extra, "meta"):
+        if name not in arrays:
+            raise InputError(source, name, "array is missing")
+    for name, shape in (_ARRAYS | extra).items():
+        _check_shape(source, name, arrays, shape)
+    _check_order(source, arrays)
+    try:
+        meta = json.loads(str(arrays["meta"]))
+    except ValueError as error:
+        raise InputError(source, "meta", f"is not JSON: {error}") from None
+    except RecursionError:
+        raise InputError(source, "meta", "is nested too deeply") from None
+    if not isinstance(meta, dict):
+        raise InputError(source, "meta", "is not a JSON object")
+    named = meta.get("rolling", [])
+    if not isinstance(named, list) or not all(isinstance(names, list) for names in named):
+        raise InputError(source, "meta.rolling", "is not a list of names for each phase")
+    try:
+        restore(tuple[tuple[ModeSpan, ...], ...], meta.get("modes", []))
+    except (AttributeError, KeyError, TypeError, ValueError):
+        text = "is not a list of spans with start, stop, contacts and joints for each phase"
+        raise InputError(source, "meta.modes", text) from None
+    contacts = tuple(str(name) for name in arrays["contacts"])
+    known = {name: arrays[name] for name in _ARRAYS}
+    torque = TorqueProfile(arrays["torque_breaks"], arrays["torque_coefficients"])
+    motions = sample_phases(known, contacts)
+    return Trajectory(**known, contacts=contacts, torque=torque, motions=motions, meta=meta)
+
+
+def _check_shape(source: str, name: str, arrays: Mapping[str, Any], tail: tuple[int, ...]) -> None:
+    array = arrays[name]
+    rows = arrays["t"].size if name in _ARRAYS else array.shape[0] if array.ndim else 1
+    widths = (arrays["contacts"].size,) if name in ("c_n", "c_t") else tail
+    fits = array.ndim == 1 + len(widths) and array.shape[0] == rows
+    fits = fits and all(w in (-1, n) for w, n in zip(widths, array.shape[1:], strict=True))
+    if not fits:
+        needed = ", ".join(str(n) if n >= 0 else "any" for n in (rows, *widths))
+        raise InputError(source, name, f"shape {array.shape} given, ({needed}) needed")
+    if name == "contacts":
+        if array.dtype.kind != "U":
+            raise InputError(source, name, "does not hold text")
+    elif array.dtype.kind not in ("iu" if name == "phase" else "iuf"):
+        raise InputError(source, name, f"holds {array.dtype}; numbers are needed")
+    elif np.isinf(array).any() or (name not in ("c_n", "c_t") and np.isnan(array).any()):
+        raise InputError(source, name, "holds numbers that are not finite")
+    most = _FARTHEST if name in ("q", "theta") else MOST
+    if name != "contacts" and (np.abs(array.astype(float)) > most).any():
+        raise InputError(source, name, f"holds numbers beyond {most:g}, the largest allowed")
+
+
+def _check_order(source: str, arrays: Mapping[str, Any]) -> None:
+    """Check that phases follow one another, and that time increases within each."""
+    phase, t = arrays["phase"], arrays["t"]
+    rises = np.diff(phase)
+    in_order = len(phase) and phase[0] == 0 and ((rises == 0) | (rises == 1)).all()
+    if not in_order or np.bincount(phase.astype(int)).min() < 2:
+        raise InputError(source, "phase", "must count up from 0, with two or more rows to a phase")
+    steps, inside = np.diff(t), np.diff(phase) == 0
+    stays = inside & (steps == 0)
+    # Forces step where a time is given twice, which is not at the end of a phase.
+    last = np.append(inside[1:], False)
+    if t[0] != 0 or (steps < 0).any() or (stays & (np.append(stays[1:], False) | ~last)).any():
+        text = "must start at 0 and increase within each phase, a time given twice being a step"
+        raise InputError(source, "t", text)
+    breaks = arrays["torque_breaks"]
+    if len(breaks) < 2 or (np.diff(breaks) <= 0).any():
+        raise InputError(source, "torque_breaks", "must be two or more, and increase")
+    if len(arrays["torque_coefficients"]) != len(breaks) - 1:
+        given, needed = len(arrays["torque_coefficients"]), len(breaks) - 1
+        raise InputError(source, "torque_coefficients", f"{given} pieces given, {needed} needed")

@@ -14,8 +14,7 @@ from ..common.errors import InputError, SimulationError
 from ..contacts.closing import close_fingers, describe_obstacle
 from ..free_simulation.free_simulate import simulate_free
 from ..free_simulation.result import FreeSimulation, list_pauses
-from ..policy.closed_loop import ROOM, ClosedLoop
-from ..policy.playback import Policy
+from ..policy.playback import ROOM, ClosedLoop, Policy
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory

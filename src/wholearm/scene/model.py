@@ -1,4 +1,4 @@
-"""The data model: a polygon, a hand of a palm and two fingers, friction and gravity.
+"""The data model: a polygon, a hand of a palm and two fingers, friction and gravity; their ranges.
 
 The notation that every docstring of the package refers to:
 
@@ -32,43 +32,293 @@ S. L. Yeap and J. C. Trinkle, "Dynamic Whole-Arm Dexterous Manipulation in the P
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.arrays import Array
-from ..common.errors import InputError
+from ..common.errors import InputError, frozen
 from ..common.fields import (
     BOOLEAN,
     COEFFICIENT,
     NONNEGATIVE,
     POINT,
     POSITIVE,
+    FieldKind,
+    Range,
     choice,
     declare,
     key,
+    keys_of,
     read_keys,
 )
-from .polygon import Polygon
-from .ranges import (
-    CONTROL_PERIOD,
-    DRY,
-    FRICTION,
-    GRAVITY,
-    JOINT,
-    LAG,
-    LENGTH,
-    PLACE,
-    RADIUS,
-    SPEED,
-    STRENGTH,
-    TORQUE,
-    TORQUE_RATE,
-    VISCOUS,
+
+# Ranges of the numbers of a problem, most of them relative to one another. Inside them planning and
+# simulation are meant to work, in any units: sizes and masses span decades, and what counts is how
+# heavy, strong and quick a hand is for its object. Outside, a number is taken for a mistake.
+_SIZE, _DRIVE = "times the object's size", "times the torque limit or m g length"
+
+
+def _get_drive(scene: Any, finger: Any) -> float:
+    return float(max(finger.torque_limit, scene.polygon.mass * scene.gravity * finger.length))
+
+
+def _get_strength(scene: Any, finger: Any) -> float | None:
+    """The torque with which finger 1 presses with its tip like finger 2; None for finger 2."""
+    right, left = scene.fingers
+    return left.torque_limit / left.length * right.length if finger is right else None
+
+
+def _get_press(scene: Any, _: object) -> float:
+    press = (finger.torque_limit / finger.length for finger in scene.fingers)
+    return float(max(scene.polygon.mass * scene.gravity, *press))
+
+
+MASS = Range(1e-6, 1e6)
+INERTIA = Range(1e-2, 1e2, lambda _, body: body.uniform_inertia, "times uniform density")
+GRAVITY = Range(1e-3, 1e5)
+FRICTION = Range(0.0, 10.0)
+PLACE = Range(-300.0, 300.0, lambda scene, _: scene.polygon.size, _SIZE)
+"""Coordinates of joints and of the object."""
+TURN = Range(-3600.0, 3600.0)  # angle of the object at which a phase ends [degrees]
+LENGTH = Range(0.03, 100.0, PLACE.scale, _SIZE)
+RADIUS = Range(1e-4, 1.0, lambda _, finger: finger.length, "times the length, or 0")
+JOINT = Range(
+    1e-8, 1e3, lambda scene, finger: scene.polygon.mass * finger.length**2, "times m length^2"
 )
+TORQUE = Range(
+    1e-6,
+    1e3,
+    lambda scene, finger: scene.polygon.mass * scene.gravity * finger.length or None,
+    "times m g length",
+)
+STRENGTH = Range(1e-6, 1e6, _get_strength, "times finger 2's strength")
+VISCOUS = Range(
+    *(0.0, 200.0),
+    lambda scene, finger: _get_drive(scene, finger) * scene.scales.time,
+    f"{_DRIVE}, x {{time}}",
+)
+DRY = Range(0.0, 1e3, _get_drive, _DRIVE)
+SPEED = Range(1e-3, 1e6, lambda scene, _: scene.scales.rate, "radians in {time}")
+TORQUE_RATE = Range(
+    1e-4,
+    1e9,
+    lambda scene, finger: finger.torque_limit / scene.scales.time,
+    "torque limits in {time}",
+)
+LAG = Range(0.0, 1e2, lambda scene, _: scene.scales.time, "x {time}")
+CONTROL_PERIOD = Range(1e-3, 1e2, LAG.scale, "times the scene's time")
+SETTLE = Range(1e-4, 1e3, LAG.scale, "times the scene's time, or 0")
+SETTLE_GAP = Range(1e-6, 0.1, lambda scene, _: scene.scales.length, "times the scene's length")
+EPSILON = Range(0.0, 1e3, _get_press, "times what presses at most")
+
+
+LARGE, THIN = 2.0, 1e-2
+"""Size [m] from which on so little mass over its square [kg/m^2] looks like corners in mm: a sheet
+of paper has 0.08."""
+SLOW = 1.0
+"""Control period over the scene's time that looks like one in ms: shipped scenes have 0.06 s."""
+
+
+def check_ranges(scene: Scene) -> None:
+    """Check the numbers of a scene.
+
+    Raises
+    ------
+    InputError  for the first that is out of its range; names the key, what is given and what is
+                allowed
+    """
+    parts: list[list[tuple[str, Any]]] = [
+        [("object.", scene.polygon)],
+        [("", scene)],
+        [("friction.", scene.friction)],
+        [(f"{finger.name}.", finger) for finger in scene.fingers],
+    ]
+    for owners in parts:
+        for attribute, own in keys_of(owners[0][1]).items():
+            for one, (prefix, owner) in product(own.ranges, owners):
+                key = f"{prefix}{own.name}"
+                one.check(key, getattr(owner, attribute), own.unit, scene, owner)
+
+
+def find_unit_hint(scene: Scene) -> str:
+    """What looks as if it were in mm or ms, with the key first; empty where nothing does."""
+    size, time = scene.polygon.size, scene.scales.time
+    if size > LARGE and scene.polygon.mass < THIN * size**2:
+        return f"object.vertices: {size:g} m across at {scene.polygon.mass:g} kg; are they in mm?"
+    if scene.control_period > SLOW * time:
+        many = scene.control_period / time
+        text = f"{scene.control_period:g} s is {many:.3g} times a fall over the radius of gyration"
+        return f"control_period: {text}; is it in ms?"
+    return ""
+
+
+def check_place(scene: Scene, key: str, value: float) -> None:
+    """Check a coordinate x of the object [m]; raises like `check_ranges`."""
+    PLACE.check(key, value, "m", scene)
+
+
+SIZES = (1e-4, 1e3)
+"""Least and largest distance between the two corners of a polygon that are farthest apart [m]."""
+FAR = 1e3  # largest distance of given corners from the origin, over that distance
+SLENDER = 1e-3  # least width of a polygon, over that distance
+SHORTEST_EDGE = 1e-4  # least length of an edge, over that distance
+MOST_VERTICES = 500  # most corners of a polygon
+
+
+def _read_corners(given: object, key: str) -> Array:
+    if not isinstance(given, list | tuple | np.ndarray) or len(given) < 3:
+        raise InputError("", key, f"{given!r} is not a list of 3 or more points")
+    if len(given) > MOST_VERTICES:
+        allowed = f"allowed are 3 to {MOST_VERTICES}"
+        raise InputError("", key, f"{len(given)} corners given; {allowed}")
+    return frozen([POINT.read(point, f"{key}[{k}]") for k, point in enumerate(given)])
+
+
+CORNERS = FieldKind(
+    _read_corners,
+    {"type": "array", "minItems": 3, "maxItems": MOST_VERTICES, "items": POINT.schema},
+)
+
+
+@declare(
+    key(
+        "vertices",
+        "Corners of a convex polygon, anticlockwise, from any origin [m].",
+        *(CORNERS, "length"),
+        attribute="points",
+    ),
+    key("mass", "[kg]", POSITIVE, "mass", MASS),
+    key(
+        "inertia",
+        "About the centroid [kg m^2]; by default that of uniform density.",
+        *(POSITIVE, "inertia", INERTIA),
+    ),
+)
+@dataclass(frozen=True, eq=False)
+class Polygon:
+    """The object: a rigid convex polygon.
+
+    Raises
+    ------
+    InputError  if the corners are not those of a convex anticlockwise polygon, or a number is not
+                positive; if the polygon is too small, too large or too slender, or has too short an
+                edge
+    """
+
+    points: ArrayLike
+    mass: float
+    inertia: float | None = None
+    # (n_v, 2) [m]: corners relative to the centroid, in the orientation phi = 0
+    vertices: Array = field(init=False, repr=False)
+    # (2,) [m]: the centroid in the frame of `points`
+    centroid: Array = field(init=False, repr=False)
+    # [kg m^2]: what the inertia about the centroid would be for uniform density
+    uniform_inertia: float = field(init=False, repr=False)
+    size: float = field(init=False, repr=False)  # [m]: largest distance between two corners
+
+    def __post_init__(self) -> None:
+        read_keys(self, "object.")
+        corners = np.asarray(self.points)
+        size = _check_size(corners)
+        edges = np.roll(corners, -1, axis=0) - corners
+        # About a corner: far from the origin, areas would lose their digits.
+        local = corners - corners[0]
+        cross = cross_product(local, np.roll(local, -1, axis=0))
+        area = cross.sum() / 2
+        if area <= 0:
+            text = f"the polygon is clockwise or flat (signed area {area:.3g} m^2); "
+            raise InputError("", "object.vertices", f"{text}list its corners anticlockwise")
+        turns = cross_product(np.roll(edges, 1, axis=0), edges)
+        headings = np.arctan2(turns, np.sum(np.roll(edges, 1, axis=0) * edges, axis=1))
+        reflex = np.flatnonzero(turns <= 1e-9 * area)
+        if reflex.size:
+            text = f"the polygon is not strictly convex at {corners[reflex[0]].tolist()}; "
+            key = f"object.vertices[{reflex[0]}]"
+            raise InputError("", key, f"{text}every corner must turn left")
+        _check_shape(corners, edges, size)
+        if headings.sum() > 2 * np.pi + 1e-6:
+            raise InputError("", "object.vertices", "the polygon crosses itself; it must be convex")
+        neighbours = local + np.roll(local, -1, axis=0)
+        middle = (neighbours * cross[:, None]).sum(axis=0) / (6 * area)
+        vertices = local - middle
+        after = np.roll(vertices, -1, axis=0)
+        squares = (vertices**2 + vertices * after + after**2).sum(axis=1)
+        uniform = self.mass * float(cross_product(vertices, after) @ squares) / (12 * float(area))
+        object.__setattr__(self, "vertices", frozen(vertices))
+        object.__setattr__(self, "centroid", frozen(corners[0] + middle))
+        object.__setattr__(self, "inertia", uniform if self.inertia is None else self.inertia)
+        object.__setattr__(self, "uniform_inertia", uniform)
+        object.__setattr__(self, "size", size)
+
+    @property
+    def n_vertices(self) -> int:
+        """Number of corners, which is also the number of edges."""
+        return len(self.vertices)
+
+    @property
+    def gyration_radius(self) -> float:
+        """Radius of gyration about the centroid [m], which weighs angles against lengths."""
+        assert self.inertia is not None
+        return math.sqrt(self.inertia / self.mass)
+
+    def flush_angle(self, edge: int) -> float:
+        """Angle phi in (-pi, pi] at which `edge` lies on the palm below the object [rad]."""
+        run = self.vertices[(edge + 1) % self.n_vertices] - self.vertices[edge]
+        return -math.atan2(run[1], run[0])
+
+
+def _check_size(corners: Array) -> float:
+    """Largest distance between two corners [m], if that is neither too small nor too large."""
+    key, (least, largest) = "object.vertices", SIZES
+    if np.abs(corners).max() > FAR * largest:
+        far = corners[int(np.abs(corners).max(axis=1).argmax())].tolist()
+        raise InputError("", key, f"{far} given; allowed are coordinates up to {FAR * largest:g} m")
+    size = float(np.hypot(*(corners[:, None] - corners).transpose(2, 0, 1)).max())
+    if not least <= size <= largest:
+        raise InputError(
+            "", key, f"{size:.3g} m from corner to corner; allowed are {least:g} to {largest:g} m"
+        )
+    if np.abs(corners).max() > FAR * size:
+        raise InputError(
+            "",
+            key,
+            f"{np.abs(corners).max():.3g} m from the origin; allowed are {FAR * size:.3g} m, "
+            f"{FAR:g} times the polygon's size",
+        )
+    return size
+
+
+def _check_shape(corners: Array, edges: Array, size: float) -> None:
+    """Check that a convex polygon is not too slender, and that it has no too short edge."""
+    lengths = np.hypot(*edges.T)
+    shortest = int(lengths.argmin())
+    if lengths[shortest] < SHORTEST_EDGE * size:
+        raise InputError(
+            "",
+            f"object.vertices[{shortest}]",
+            f"the edge from there has {lengths[shortest]:.3g} m; allowed are "
+            f"{SHORTEST_EDGE * size:.3g} m and more, {SHORTEST_EDGE:g} of the polygon's size",
+        )
+    away = cross_product(edges[:, None], corners - corners[:, None]) / lengths[:, None]
+    width = float(away.max(axis=1).min())
+    if width < SLENDER * size:
+        raise InputError(
+            "",
+            "object.vertices",
+            f"the polygon is {width:.3g} m wide; allowed are {SLENDER * size:.3g} m and more, "
+            f"{SLENDER:g} of its size",
+        )
+
+
+def cross_product(a: Array, b: Array) -> Array:
+    """Plane cross product a_x b_y - a_y b_x along the last axis."""
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+
 
 LIGHT = 1e-4  # weight, over what the weaker finger can press with, that is next to nothing
 HOLDS = ("constant", "linear")  # how torques may be held over control periods

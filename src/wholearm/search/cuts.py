@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from ..common.shortfalls import Change, Parameter
+from ..common.errors import Change, Parameter
 from ..mechanics.limits import EPSILON, make_limits
 from ..planning.advice import bracket
 from ..planning.path_domain.path_explain import change_curve, list_frictions

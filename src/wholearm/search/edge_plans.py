@@ -27,17 +27,57 @@ from ..planning.advice import unadvised
 from ..planning.block_plan import BEGUN, BlockPlan, Planning
 from ..planning.blocks import plan_next
 from ..planning.options import PlanOptions
-from ..planning.plan import assemble_plan, finish_plan
+from ..planning.plan import assemble_plan, finish_plan, solve_with
 from ..planning.replay_check import Checked
 from ..planning.result import Plan
 from ..planning.stops import end_of, split_blocks
 from ..problem.definition import ROWS, End, Phase, Problem
 from ..scene.model import Scene
 from ..solvers.ipopt import SolverStatistics, open_ledger
-from .candidates import Lost
+from .astar import RoadmapRoute
 from .edges import EdgeStep, Link, describe_steps, find_headings, point_out
 from .feasibility import SINGULAR, Measured, make_phases
 from .places import measure_apart
+
+
+@dataclass(frozen=True, eq=False)
+class FailedCandidate:
+    """A route that has no plan."""
+
+    route: RoadmapRoute
+    reason: str
+
+
+class Lost(str):
+    """Why a route has no plan, with the links for which that is so on every route."""
+
+    # the one whose planning or replay fails, after the one that lands at its start, if any
+    links: tuple[Link, ...] = ()
+
+    @classmethod
+    def at(cls, links: tuple[Link, ...], reason: str) -> Lost:
+        """A reason together with the links that cause it."""
+        lost = cls(reason)
+        lost.links = links
+        return lost
+
+
+def plan_phases(
+    problem: Problem, options: PlanOptions, cache: dict[object, Plan | str]
+) -> Plan | str:
+    """The plan of a route's phases, or why there is none; `cache` has those made before."""
+    phases = tuple((phase.formation.names, phase.until, phase.end) for phase in problem.phases)
+    key = (tuple(np.round(problem.start, 12).tolist()), phases, repr(options))
+    if key not in cache:
+        try:
+            with unadvised():
+                cache[key] = solve_with(problem, options)
+        except WholearmError as error:
+            cache[key] = str(error)
+        except np.linalg.LinAlgError:
+            cache[key] = SINGULAR
+    return cache[key]
+
 
 # Distances are in radii of gyration and radians.
 OFF = 1e-4  # distance of a traced end from a border's end that makes it another one

@@ -25,10 +25,16 @@ import numpy as np
 
 from .. import __version__
 from ..common.arrays import Array
-from ..common.errors import InfeasibleError, InputError, SolverError, WholearmError
+from ..common.errors import (
+    Change,
+    InfeasibleError,
+    InputError,
+    Parameter,
+    SolverError,
+    WholearmError,
+)
 from ..common.files import write_whole
 from ..common.sharing import exclusive
-from ..common.shortfalls import Change, Parameter
 from ..common.signals import OutOfTime, Reporter, limited, yielding
 from ..contacts.closing import close_fingers, describe_obstacle, name_reach
 from ..contacts.formation import Formation

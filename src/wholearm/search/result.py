@@ -17,8 +17,8 @@ from ..planning.options import Objective
 from ..planning.result import Plan
 from ..problem.definition import End, Problem
 from .astar import EAGER, RoadmapRoute, RouteSearch
-from .candidates import FailedCandidate
 from .cuts import list_cut
+from .edge_plans import FailedCandidate
 from .edges import ROUGHLY, Blocked, Link, describe_steps
 from .places import Key, RoadmapPlace, is_at
 from .roadmap import LONGEST

@@ -15,9 +15,8 @@ from ..common.document import Drawn
 from ..common.errors import SimulationError
 from ..mechanics.dynamics import energy
 from ..problem.definition import Phase, Problem
-from ..results.sampled import sample_phases
 from ..results.torque import TorqueProfile
-from ..results.trajectory import Trajectory
+from ..results.trajectory import Trajectory, sample_phases
 from .layout import Outputs
 from .runge_kutta import INNER_STAGES, NODES
 

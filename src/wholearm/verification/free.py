@@ -22,7 +22,7 @@ from ..free_simulation.result import FreeSimulation, list_pauses
 from ..geometry.curve import describe_pose
 from ..problem.definition import Phase, Problem
 from ..results.adopt import Torques, adopt_torques, require_same_contacts
-from ..results.report import Deviation
+from ..results.plan_record import Deviation
 from ..results.trajectory import Trajectory
 from ..simulation.events import EventKind, OutcomeKind
 from .verdict import DEPARTURE

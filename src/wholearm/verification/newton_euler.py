@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
-from ..scene.model import Scene
-from ..scene.polygon import cross_product
+from ..scene.model import Scene, cross_product
 
 if TYPE_CHECKING:
     from ..contacts.elemental import Contact

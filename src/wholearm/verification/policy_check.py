@@ -8,8 +8,7 @@ from ..common.errors import InputError, require_number
 from ..common.sharing import exclusive
 from ..free_simulation.free_simulate import simulate_free
 from ..free_simulation.result import FreeSimulation
-from ..policy.closed_loop import ROOM, ClosedLoop
-from ..policy.playback import Policy
+from ..policy.playback import ROOM, ClosedLoop, Policy
 from ..problem.definition import Phase, Problem
 from ..results.adopt import Moved, adopt_motion
 from ..results.trajectory import Trajectory

@@ -18,8 +18,7 @@ from ..common.arrays import Array
 from ..contacts.formation import Formation
 from ..mechanics.limits import CONE, PRESS, LimitSet, make_limits
 from ..problem.definition import Phase, Problem
-from ..results.report import PhaseReport
-from ..results.tuning_advice import Approach, ForceAt, Loss, TorqueAdvice, TuningHelp
+from ..results.report import Approach, ForceAt, Loss, PhaseReport, TorqueAdvice, TuningHelp
 from ..simulation.events import EventKind, Simulation
 from ..simulation.modes import find_grips, list_units, respond, share_mode
 from ..simulation.sliding_signs import evaluate_rows, measure_rates

@@ -10,12 +10,13 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.fields import POSITIVE, declare, key, read_keys
-from ..contacts.links import FINGERS_TOUCH
+from ..contacts.contact_limits import FINGERS_TOUCH
 from ..geometry.curve import describe_pose
 from ..mechanics.margin_key import UNIQUENESS
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN, describe_uniqueness
 from ..problem.definition import End, Problem
-from ..results.report import ContactMargin, Deviation, Failure, FingerGap, PhaseReport
+from ..results.plan_record import Deviation
+from ..results.report import ContactMargin, Failure, FingerGap, PhaseReport
 from ..scene.model import Scene
 from ..simulation.events import EventKind, OutcomeKind, Simulation
 

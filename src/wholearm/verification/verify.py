@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from ..common.arrays import Array
 from ..common.sharing import exclusive
 from ..contacts.cones import slip_margins
-from ..contacts.links import evaluate_finger_gap
+from ..contacts.contact_limits import evaluate_finger_gap
 from ..mechanics.limits import CONE, PRESS, TORQUE, make_limits
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN
 from ..problem.definition import End, Phase, Problem
 from ..results.adopt import Torques, adopt_torques, require_same_contacts
+from ..results.plan_record import Deviation
 from ..results.report import (
     ContactMargin,
-    Deviation,
     EnergyBalance,
     Failure,
     FingerGap,

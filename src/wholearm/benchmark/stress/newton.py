@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...common.arrays import Array
-from ...scene.model import Scene
-from ...scene.polygon import cross_product
+from ...scene.model import Scene, cross_product
 
 
 class Touch(NamedTuple):

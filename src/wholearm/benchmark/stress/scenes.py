@@ -26,8 +26,7 @@ from ...mapping.formation_list import Stretch, format_route, list_formations
 from ...mapping.legs import tolerance
 from ...problem.definition import Phase, Problem
 from ...problem.read import build_problem
-from ...scene.model import Finger, Friction, Scene
-from ...scene.polygon import Polygon
+from ...scene.model import Finger, Friction, Polygon, Scene
 from .newton import locate
 from .slow_motion import slow_margin
 

@@ -20,9 +20,9 @@ from ...contacts.formation import Formation
 from ...geometry.curve import Curve
 from ...mechanics.dynamics import LAMBDA, ONE
 from ...mechanics.wedging import find_static_torques
+from ...results.dwell_record import TorqueChange, change_torques, find_change_times
 from ...results.plan_record import ModeSpan
 from ...results.torque import TorqueProfile
-from ...results.torque_change import TorqueChange, change_torques, find_change_times
 from ...results.trajectory import Motion, Samples
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array, find_minima
-from ...common.errors import InputError, JammingError
-from ...common.shortfalls import Parameter
+from ...common.errors import InputError, JammingError, Parameter
 from ...geometry.curve import Curve, describe_pose, directions_of
 from ...mechanics.dynamics import PathForces, inverse, reduced_inertia
 from ...mechanics.limits import CONE, PRESS, TORQUE, LimitSet, make_limits

@@ -14,8 +14,15 @@ from typing import Any
 import numpy as np
 
 from ...common.arrays import Array
-from ...common.errors import InfeasibleError, JammingError, SolverError, WholearmError
-from ...common.shortfalls import LimitPlace, Parameter, Shortfall
+from ...common.errors import (
+    InfeasibleError,
+    JammingError,
+    LimitPlace,
+    Parameter,
+    Shortfall,
+    SolverError,
+    WholearmError,
+)
 from ...contacts.formation import Formation
 from ...geometry.curve import Curve, describe_pose
 from ...mechanics.limits import EPSILON

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array, Expression
-from ...common.shortfalls import Parameter
+from ...common.errors import Parameter
 from ...mechanics.dynamics import LAMBDA, ONE, A, B, V
 from ...mechanics.limits import LimitSet
 from ...solvers.ipopt import SolverStatistics, book, build_solver

@@ -13,8 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...common.errors import InfeasibleError, JammingError, SolverError, WholearmError
-from ...common.shortfalls import Parameter
+from ...common.errors import InfeasibleError, JammingError, Parameter, SolverError, WholearmError
 from ...geometry.curve import Curve
 from ..advice import describe_changes, find_changes, name_phases
 from ..options import DEFAULT_ACCURACY, Objective, PlanOptions

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
-from ...common.shortfalls import Parameter
+from ...common.errors import Parameter
 from ...mechanics.dynamics import ONE, V
 from ...mechanics.path_limits import PathLimits
 from ..lower_bound.speed_sweep import NoMotionError, SweepMode, find_duration, speed_sweep

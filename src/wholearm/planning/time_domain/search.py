@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...common.arrays import Array
-from ...common.shortfalls import Parameter
+from ...common.errors import Parameter
 from ...geometry.arcs import CostToGo
 from ...problem.definition import Problem
 from ..options import Objective, PlanOptions

@@ -14,8 +14,7 @@ from ...contacts.formation import Formation
 from ...mechanics.dynamics import Directions
 from ...problem.definition import Phase, Problem, Until
 from ...problem.uncertainty import PARAMETERS
-from ...scene.model import Scales, Scene
-from ...scene.polygon import Polygon
+from ...scene.model import Polygon, Scales, Scene
 from ..options import CLEARANCE, OPENING, Objective, PlanOptions
 
 

@@ -8,8 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...common.errors import InfeasibleError, SolverError
-from ...common.shortfalls import LimitPlace, Parameter, Shortfall
+from ...common.errors import InfeasibleError, LimitPlace, Parameter, Shortfall, SolverError
 from ...geometry.curve import describe_pose
 from ...geometry.path_guess import count_freedoms
 from ...mechanics.limits import EPSILON, PRESS, make_limits

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
-from ...common.shortfalls import Parameter
+from ...common.errors import Parameter
 from ...mechanics.limits import PRESS, SPEED, LimitSet, make_limits
 from ..options import Objective
 from .collocation import Scheme, blend
