@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
-from ...problem.definition import Phase, Until
+from ...problem.definition import Phase
 from ...scene.model import Scene
-from .event_tracing import weights
+from .event_tracing import constrain, project, weights
 from .newton import clearances, locate
 from .slow_motion import fast_margin, rest_margin
 
@@ -60,7 +60,7 @@ def list_ends(scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]) -
     for way in (1.0, -1.0):
         here, ahead = first, None
         for step in STEP * scene.scales.length * GROWTH ** np.arange(ENDS):
-            rows = _end_rows(scene, phase, here)[1] / scale
+            rows = _end_equations(scene, phase, here)[1] / scale
             tangent = np.linalg.svd(rows)[2][-1] / scale
             if ahead is None:
                 tangent = way * tangent
@@ -98,7 +98,8 @@ def find_best(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: Array)
     def look(controls: Array, most: int) -> bool:
         nonlocal count, best
         curves = bend(scene, phase, z, controls)
-        kept = np.flatnonzero(keep(scene, phase, curves))[:most]
+        stays = inside(scene, phase, curves.reshape(-1, 5)).reshape(len(curves), -1)
+        kept = np.flatnonzero(stays.all(axis=1))[:most]
         for k in kept:
             margins = _find_margins(scene, phase, epsilon, curves[k])
             best.append((*margins, controls[k], curves[k]))
@@ -154,20 +155,13 @@ def place(scene: Scene, phase: Phase, z: Array, before: Array) -> Array:
     z = z.copy()
     z[:, [1, 3, 4]] = before[:, [1, 3, 4]]
     for _ in range(6):
-        touches = [locate(scene, name, z) for name in phase.formation.names]
-        rows = np.stack([touch.normal[:, [1, 3, 4]] for touch in touches], axis=1)
-        gaps = np.stack([touch.gap for touch in touches], axis=1)
+        gaps, rows = constrain(scene, phase, z)
+        rows = rows[:, :, [1, 3, 4]]
         flat = np.abs(np.linalg.det(rows)) < 1e-12 * scene.scales.length**2
         rows[flat] = np.eye(3)
         step = -np.linalg.solve(rows, gaps[..., None])[..., 0]
         z[:, [1, 3, 4]] += np.clip(step, -0.5, 0.5)
     return z
-
-
-def keep(scene: Scene, phase: Phase, curves: Array) -> Flags:
-    """Whether curves, shape (n, PLACES, 5), keep their contacts and stay in the cell."""
-    flat = curves.reshape(-1, 5)
-    return np.asarray(inside(scene, phase, flat).reshape(len(curves), -1).all(axis=1))
 
 
 def inside(scene: Scene, phase: Phase, z: Array) -> Flags:
@@ -194,27 +188,18 @@ def _find_margins(scene: Scene, phase: Phase, epsilon: float, z: Array) -> tuple
     return np.nan_to_num(plain, nan=-np.inf), np.nan_to_num(loose, nan=-np.inf)
 
 
-def _end_rows(scene: Scene, phase: Phase, z: Array) -> tuple[Array, Array]:
-    """What is missing to contacts and end at one configuration, and its rows."""
-    touches = [locate(scene, name, z[None]) for name in phase.formation.names]
-    gaps = [touch.gap[0] for touch in touches]
-    rows = [touch.normal[0] for touch in touches]
-    until: Until = phase.until
-    if until.contact is not None:
-        touch = locate(scene, until.contact.name, z[None])
-        return np.array([*gaps, touch.gap[0]]), np.array([*rows, touch.normal[0]])
-    row = 2 if until.coordinate == "phi" else 0
-    value = z[row] if until.value is None else until.value
-    return np.array([*gaps, z[row] - value]), np.array([*rows, np.eye(5)[row]])
-
-
 def _project_end(scene: Scene, phase: Phase, z: Array) -> Array | None:
     """The nearest configuration at which a phase ends, or None."""
-    scale, size = np.sqrt(weights(scene)), scene.scales.length
-    for _ in range(20):
-        gaps, rows = _end_rows(scene, phase, z)
-        step = -np.linalg.pinv(rows / scale, rcond=1e-10) @ gaps / scale
-        z = z + step
-        if np.abs(step * scale).max() < 1e-13 * size:
-            break
-    return z if np.abs(_end_rows(scene, phase, z)[0]).max() < 1e-9 * size else None
+    return project(scene, z, lambda z: _end_equations(scene, phase, z))
+
+
+def _end_equations(scene: Scene, phase: Phase, z: Array) -> tuple[Array, Array]:
+    """What is missing to contacts and end at one configuration, and its rows."""
+    (gaps,), (rows,) = constrain(scene, phase, z[None])
+    until = phase.until
+    if until.contact is not None:
+        touch = locate(scene, until.contact.name, z[None])
+        return np.append(gaps, touch.gap[0]), np.vstack([rows, touch.normal[0]])
+    k = 2 if until.coordinate == "phi" else 0
+    value = z[k] if until.value is None else until.value
+    return np.append(gaps, z[k] - value), np.vstack([rows, np.eye(5)[k]])

@@ -24,6 +24,9 @@ OVERLAP = 1e-6
 MET = 1e-5  # distance over the radius of gyration (or angle) that counts as having reached `until`
 
 
+DEPENDENT = "the contacts become dependent"
+
+
 class Trace(NamedTuple):
     """A curve of configurations that keep a phase's contacts closed."""
 
@@ -40,22 +43,44 @@ def follow(scene: Scene, phase: Phase, z: Array) -> tuple[Trace, Trace]:
 
 def weights(scene: Scene) -> Array:
     """Diagonal of the metric, shape (5,): an angle counts as it moves the object's rim [1, m^2]."""
-    return np.array([1.0, 1.0, *[scene.polygon.gyration_radius**2] * 3])
+    return np.array([1.0, 1.0, *[scene.scales.length**2] * 3])
 
 
-def rates(scene: Scene, phase: Phase, z: Array) -> tuple[Array, Array]:
+def project(
+    scene: Scene,
+    z: Array,
+    equations: Callable[[Array], tuple[Array, Array]],
+    farthest: float = math.inf,
+) -> Array | None:
+    """Nearest zero of equations to `z`, by Newton's method; None if none, or on a longer step.
+
+    Parameters
+    ----------
+    equations  their values, shape (m,), and rows of their Jacobian, (m, 5)
+    """
+    scale, size = np.sqrt(weights(scene)), scene.scales.length
+    for _ in range(20):
+        miss, rows = equations(z)
+        step = -np.linalg.pinv(rows / scale, rcond=1e-10) @ miss / scale
+        z, change = z + step, np.abs(step * scale).max()
+        if change < 1e-13 * size:
+            break
+        if change > farthest:
+            return None
+    return z if np.abs(equations(z)[0]).max() < 1e-9 * size else None
+
+
+def constrain(scene: Scene, phase: Phase, z: Array) -> tuple[Array, Array]:
     """Gaps, shape (n, n_c), and rows of the constraints, (n, n_c + R, 5), at configurations."""
     touches = [locate(scene, name, z) for name in phase.formation.names]
-    rolling = [touches[row] for row in phase.formation.rolling_rows]
-    rows = [touch.normal for touch in touches] + [touch.tangent for touch in rolling]
+    rows = [t.normal for t in touches] + [touches[k].tangent for k in phase.formation.rolling_rows]
     return np.stack([touch.gap for touch in touches], axis=1), np.stack(rows, axis=1)
 
 
 def _tangents(scene: Scene, phase: Phase, z: Array) -> Array:
     """Unit tangents at n configurations, shape (n, 5)."""
     scale = np.sqrt(weights(scene))
-    rows = rates(scene, phase, z)[1] / scale
-    return np.asarray(np.linalg.svd(rows)[2][:, -1] / scale)
+    return np.asarray(np.linalg.svd(constrain(scene, phase, z)[1] / scale)[2][:, -1] / scale)
 
 
 def close(scene: Scene, phase: Phase, z: Array, before: Array) -> Array | None:
@@ -63,78 +88,71 @@ def close(scene: Scene, phase: Phase, z: Array, before: Array) -> Array | None:
 
     What rolls keeps its place: the slip between the two is taken out, to the second order.
     """
-    scale, size = np.sqrt(weights(scene)), scene.polygon.gyration_radius
-    count = phase.formation.n_contacts
-    for _ in range(20):
-        gaps, rows = rates(scene, phase, np.array([z, (z + before) / 2]))
-        slip = rows[1, count:] @ (z - before)
-        miss = np.concatenate([gaps[0], slip])
-        step = -np.linalg.pinv(rows[0] / scale, rcond=1e-10) @ miss / scale
-        z = z + step
-        change = np.abs(step * scale).max()
-        if change < 1e-13 * size:
-            break
-        if change > size:
-            return None
-    return z if np.abs(rates(scene, phase, z[None])[0]).max() < 1e-9 * size else None
+
+    def equations(z: Array) -> tuple[Array, Array]:
+        gaps, rows = constrain(scene, phase, np.array([z, (z + before) / 2]))
+        slip = rows[1, phase.formation.n_contacts :] @ (z - before)
+        return np.concatenate([gaps[0], slip]), rows[0]
+
+    return project(scene, z, equations, scene.scales.length)
 
 
 def _march(scene: Scene, phase: Phase, z: Array, tangent: Array) -> Trace:
-    size, scale = scene.polygon.gyration_radius, weights(scene)
-    points, step = [z], STEP * size
-    overlap_at_start = _overlaps(scene, phase, z)
-    while step * len(points) < LONGEST * size:
-        following = close(scene, phase, z + step * tangent, z)
-        if following is None:
-            return Trace(np.array(points), "the contacts become dependent", False)
-        names = _overlaps(scene, phase, following) - (overlap_at_start if len(points) < 2 else {""})
-        passed = _passes(scene, phase.until, z, following)
-        if names or passed:
-            return _end(scene, phase, points, following)
-        way = following - z
-        z = following
+    points, scale, until = [z], weights(scene), phase.until
+    passing = _overlaps(scene, phase, z)
+    while STEP * len(points) < LONGEST:
+        after = close(scene, phase, z + STEP * scene.scales.length * tangent, z)
+        if after is None:
+            return Trace(np.array(points), DEPENDENT, False)
+        if _passes(scene, until, z, after) or _overlaps(scene, phase, after) - passing:
+            return _end(scene, phase, points, after)
+        way, z, passing = after - z, after, set()
         points.append(z)
-        new = _tangents(scene, phase, z[None])[0]
-        tangent = new * math.copysign(1.0, float((new * scale) @ way))
+        tangent = _tangents(scene, phase, z[None])[0]
+        tangent = tangent * math.copysign(1.0, float((tangent * scale) @ way))
     return Trace(np.array(points), "nothing happens", False)
 
 
 def _end(scene: Scene, phase: Phase, points: list[Array], beyond: Array) -> Trace:
     """Bisect for the first event between the last point and one beyond it."""
-    last = points[-1]
+    last, until = points[-1], phase.until
 
     def place(share: float) -> Array | None:
         return close(scene, phase, last + share * (beyond - last), last)
 
     def stops(share: float) -> bool:
         z = place(share)
-        return z is None or bool(_overlaps(scene, phase, z)) or _passes(scene, phase.until, last, z)
+        return z is None or bool(_overlaps(scene, phase, z)) or _passes(scene, until, last, z)
 
     low, high = _bisect(stops, 40)
     here = _or(place(low), last) if low else last
-    met = _meets(scene, phase.until, here)
+    near = MET * (1.0 if until.coordinate == "phi" else scene.scales.length)
+    met = abs(_distance(scene, until, here)) <= near
+    if met and until.contact is not None:
+        touch = locate(scene, until.contact.name, here[None])
+        met = bool(min(touch.low[0], touch.high[0]) > -near)
     after = place(high)
     names = set() if after is None else _overlaps(scene, phase, after)
-    text = str(phase.until) if met else ", ".join(sorted(names)) or "the contacts become dependent"
+    text = str(until) if met else ", ".join(sorted(names)) or DEPENDENT
     return Trace(np.array([*points, here]), text, met)
 
 
 def _overlaps(scene: Scene, phase: Phase, z: Array) -> set[str]:
     """Names of the bodies that are inside each other at `z`, and of contacts that left."""
-    least = OVERLAP * scene.polygon.gyration_radius
+    least = OVERLAP * scene.scales.length
     names = {name for name, gap in clearances(scene, z[None]).items() if gap[0] < -least}
-    for name in phase.formation.names:
-        touch = locate(scene, name, z[None])
-        if min(touch.low[0], touch.high[0]) < -least:
-            names.add(f"{name} leaves")
-    return names
+    touches = {name: locate(scene, name, z[None]) for name in phase.formation.names}
+    return names | {
+        f"{name} leaves" for name, t in touches.items() if min(t.low[0], t.high[0]) < -least
+    }
 
 
 def _distance(scene: Scene, until: Until, z: Array) -> float:
+    """How far the end of a phase is, [m] or [rad]; infinite if it has none."""
     if until.contact is not None:
         return float(locate(scene, until.contact.name, z[None]).gap[0])
     if until.value is None:
-        return 1.0
+        return math.inf
     return float(z[0 if until.coordinate == "x" else 2] - until.value)
 
 
@@ -143,17 +161,6 @@ def _passes(scene: Scene, until: Until, before: Array, after: Array) -> bool:
     if until.value is None:
         return False
     return _distance(scene, until, before) * _distance(scene, until, after) < 0
-
-
-def _meets(scene: Scene, until: Until, z: Array) -> bool:
-    size = scene.polygon.gyration_radius
-    near = MET * (1.0 if until.coordinate == "phi" else size)
-    if abs(_distance(scene, until, z)) > near:
-        return False
-    if until.contact is None:
-        return until.value is not None
-    touch = locate(scene, until.contact.name, z[None])
-    return bool(min(touch.low[0], touch.high[0]) > -near)
 
 
 def resample(scene: Scene, phase: Phase, trace: Trace, count: int) -> tuple[Array, Array, Array]:
@@ -166,7 +173,7 @@ def resample(scene: Scene, phase: Phase, trace: Trace, count: int) -> tuple[Arra
     """
     scale = weights(scene)
     runs = np.sqrt(np.diff(trace.z, axis=0) ** 2 @ scale)
-    keep = np.append(True, runs > 1e-9 * scene.polygon.gyration_radius)
+    keep = np.append(True, runs > 1e-9 * scene.scales.length)
     points, runs = trace.z[keep], runs[keep[1:]]
     s = np.append(0.0, np.cumsum(runs))
     where = np.linspace(0.0, s[-1], count)

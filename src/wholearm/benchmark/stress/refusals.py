@@ -111,9 +111,9 @@ def _reach(scene: Scene, phase: Phase, z: Array) -> Trace:
 def _judge_curve(problem: Problem, phase: Phase, trace: Trace) -> Verdict:
     scene, epsilon = problem.scene, problem.epsilon
     s, z, z_s = resample(scene, phase, trace, PLACES)
-    slow, place = slow_margin(scene, phase, epsilon, z, z_s)
+    slow = slow_margin(scene, phase, epsilon, z, z_s)
     free = float(inertia_ratio(scene, phase, z, z_s).min())
-    at = f"phase {phase.number}, place {place} of {len(z)}"
+    at = f"phase {phase.number}"
     if free < FREE:
         return Verdict("confirmed" if free < 0.0 else "close", f"{at}: inertia ratio {free:.3g}")
     if slow > CLEAR:

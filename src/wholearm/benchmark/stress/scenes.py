@@ -266,7 +266,7 @@ def can_move(problem: Problem, stretches: Sequence[Stretch]) -> bool:
         for place, following in zip(z[::2], z[1::2], strict=True):
             way = np.array([following - place] * 2)
             pair = np.array([place, following])
-            if slow_margin(scene, phase, problem.epsilon, pair, way)[0] < 0:
+            if slow_margin(scene, phase, problem.epsilon, pair, way) < 0:
                 return False
     return True
 

@@ -5,7 +5,7 @@ linearly, and so do the contact forces: whether any motion keeps all limits is a
 discretised in s. Two questions are asked of it, each for the largest share `margin` by which all
 limits can be kept at once (negative where they cannot):
 
-* `slow_margin`: at b = a = 0, place by place. Positive everywhere, a slow enough motion exists.
+* `slow_margin`: at b = a = 0. Positive, a slow enough motion exists.
 * `fast_margin`: with b >= 0 free along the curve, at rest at its ends. Negative, none exists.
   Viscous friction is not linear in b; what stands in for sqrt(b) may be anything between its chord
   and its tangents, which can only allow more.
@@ -22,16 +22,17 @@ Forces are from bodies and points alone (`benchmark.stress.newton`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import null_space
 from scipy.optimize import linprog
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import block_array, block_diag, diags_array, eye_array, kron
 
 from ...common.arrays import Array
-from ...contacts.closing import Numbers
 from ...problem.definition import Phase
 from ...scene.model import Scene
 from .event_tracing import slides
@@ -44,38 +45,11 @@ TANGENTS = np.geomspace(1e-6, 1.0, 13)
 """Places of the tangents that bound sqrt(b), over the largest b."""
 
 
-class Forces(NamedTuple):
-    """Limits of a phase at n places, as rows over x = (a, b, v, c) >= least.
-
-    With forces over the scene's weight, torques over their limits and lengths over the radius of
-    gyration. v stands for sqrt(b).
-    """
-
-    equal: Array  # equal, equal_to (n, 3, k) and (n, 3): Newton's and Euler's laws of the object
-    equal_to: Array
-    rows: Array  # rows, least (n, m, k) and (n, m): limits
-    least: Array
-    share: Array  # (m,): what a margin of 1 takes from each limit
-
-
-def slow_margin(
-    scene: Scene, phase: Phase, epsilon: float, z: Array, z_s: Array
-) -> tuple[float, int]:
-    """Least margin of all places, each at its best, for vanishing speed, and which place it is."""
-    signs = _signs(scene, phase, z, z_s)
-    worst, place = np.inf, 0
-    for k in range(len(z)):
-        for sign in signs[max(k - 1, 0) : k + 1]:
-            at = slice(k, k + 1)
-            forces = _limits(scene, phase, epsilon, z[at], z_s[at], np.zeros((1, 5)), sign[None])
-            rows, equal = forces.rows[0, :, 3:], forces.equal[0, :, 3:]
-            upper = np.column_stack([-rows, forces.share]), -forces.least[0]
-            object_laws = np.column_stack([equal, np.zeros(3)]), forces.equal_to[0]
-            bounds: Bounds = [(None, None)] * rows.shape[1] + [(None, 1.0)]
-            margin = np.nan_to_num(_maximise(*upper, *object_laws, bounds), nan=-np.inf)
-            if margin < worst:
-                worst, place = margin, k
-    return worst, place
+def slow_margin(scene: Scene, phase: Phase, epsilon: float, z: Array, z_s: Array) -> float:
+    """Least margin of all places, each at its best, for vanishing speed."""
+    curve = np.arange(1.0 * len(z)), z, z_s, np.zeros_like(z)
+    margin = _solve_along(scene, phase, epsilon, curve, np.zeros(len(z)), 0.0)
+    return float(np.nan_to_num(margin, nan=-np.inf))
 
 
 def fast_margin(
@@ -96,105 +70,111 @@ def fast_margin(
            slide the other way, on a curve nearby: its friction may then be any in its cone
     """
     s, z, z_s = curve
-    size, speed = scene.scales.length, scene.scales.speed
-    signs = _signs(scene, phase, z, z_s)
+    with np.errstate(divide="ignore"):
+        joints = ((scene.speed_limit / np.abs(z_s[:, 3:])) ** 2).min(axis=1)
+    top = np.minimum(FASTEST**2, joints / scene.scales.speed**2)
+    top[[0, -1]] *= ~np.array(rests)
     z_ss = np.gradient(z_s, s, axis=0, edge_order=1)
-    contacts = phase.formation.n_contacts
-    slow = np.abs(slides(scene, phase, z, z_s)[:, :contacts]) < loose
-    free = slow[1:] | slow[:-1] if loose else None
-    count, forces = len(s), []
-    for left in (True, False):
-        at = slice(0, count - 1) if left else slice(1, count)
-        forces.append(_limits(scene, phase, epsilon, z[at], z_s[at], z_ss[at], signs, free))
-    width, slots = forces[0].rows.shape[2] - 3, np.arange(count - 1)
-    run = np.diff(s) / size
-    # Unknowns: b at the nodes, then v at the nodes, then c at both ends of every interval, margin.
-    first_c = 2 * count
-    total = first_c + 2 * (count - 1) * width + 1
-    upper, equal = _Rows(total), _Rows(total)
-    for side, part in enumerate(forces):
-        columns = first_c + (2 * slots + side)[:, None] * width + np.arange(width)
-        _add_limits(equal, part.equal, part.equal_to, slots, slots + side, run, columns)
-        first = upper.count
-        _add_limits(upper, -part.rows, -part.least, slots, slots + side, run, columns)
-        row = np.arange(first, upper.count)
-        upper.add(row, np.full(len(row), total - 1), np.repeat(part.share, len(slots)))
-    top = _top(scene, z_s) / speed**2
-    _add_tangents(upper, top)
-    bounds: Bounds = [(0.0, float(limit)) for limit in top]
-    bounds += [(0.0, None)] * count
-    bounds += [(None, None)] * (total - first_c - 1) + [(None, 1.0)]
-    for end, rest in zip((0, count - 1), rests, strict=True):
-        if rest:
-            bounds[end] = bounds[count + end] = (0.0, 0.0)
-    return _maximise(*upper.build(), *equal.build(), bounds)
+    return _solve_along(scene, phase, epsilon, (s, z, z_s, z_ss), top, loose)
 
 
-def _add_limits(
-    rows: _Rows,
-    matrix: Array,
-    right: Array,
-    slots: Numbers,
-    node: Numbers,
-    run: Array,
-    columns: Numbers,
-) -> None:
-    """Rows over (a, b, v, c) at one end of every interval, a being the slope of b along it."""
-    count = len(slots) + 1
-    for m in range(matrix.shape[1]):
-        row = rows.begin(len(slots), right[:, m])
-        slope = matrix[:, m, 0] / (2 * run)
-        rows.add(row, slots + 1, slope)
-        rows.add(row, slots, -slope)
-        rows.add(row, node, matrix[:, m, 1])
-        rows.add(row, count + node, matrix[:, m, 2])
-        for j in range(columns.shape[1]):
-            rows.add(row, columns[:, j], matrix[:, m, 3 + j])
+def _solve_along(
+    scene: Scene,
+    phase: Phase,
+    epsilon: float,
+    curve: tuple[Array, Array, Array, Array],
+    top: Array,
+    loose: float,
+) -> float:
+    """Largest margin along a curve (s, z, z_s, z_ss), b being at most `top` at its n places.
 
-
-def _add_tangents(upper: _Rows, top: Array) -> None:
-    """Rows that keep v below the tangents of sqrt(b), and above its chord up to `top`."""
-    count, nodes = len(top), np.arange(len(top))
-    for share in TANGENTS:
-        at = share * top
-        row = upper.begin(count, np.sqrt(at) / 2)
-        upper.add(row, count + nodes, np.ones(count))
-        upper.add(row, nodes, -0.5 / np.sqrt(at))
-    row = upper.begin(count, np.zeros(count))
-    upper.add(row, nodes, 1 / np.sqrt(top))
-    upper.add(row, count + nodes, -np.ones(count))
+    Unknowns: b and v, which stands for sqrt(b), at the places, contact forces at both ends of every
+    interval, and the margin.
+    """
+    s, z, z_s, z_ss = curve
+    n, n_c = len(s), phase.formation.n_contacts
+    slow = np.abs(slides(scene, phase, z, z_s)[:, :n_c]) < loose
+    signs, free = _signs(scene, phase, z, z_s), slow[1:] | slow[:-1] if loose else None
+    slope = diags_array(scene.scales.length / (2 * np.diff(s))) @ (
+        eye_array(n - 1, n, k=1) - eye_array(n - 1, n)
+    )
+    upper, most, equal, equal_to = list[Any](), list[Array](), list[Any](), list[Array]()
+    for side in (0, 1):
+        at, place = slice(side, n - 1 + side), eye_array(n - 1, n, k=side)
+        forces = _limits(scene, phase, epsilon, z[at], z_s[at], z_ss[at], signs, free)
+        for blocks, matrix in ((equal, forces.equal), (upper, -forces.rows)):
+            every = kron(eye_array(n - 1), np.ones((matrix.shape[1], 1)))
+            a, b, v = (diags_array(matrix[:, :, k].ravel()) @ every for k in range(3))
+            c: list[Any] = [None, None]
+            c[side] = block_diag(list(matrix[:, :, 3:]))
+            blocks.append([a @ slope + b @ place, v @ place, *c])
+        upper[-1].append(np.tile(forces.share, n - 1)[:, None])
+        most.append(-forces.least.ravel())
+        equal_to.append(forces.equal_to.ravel())
+    moving = np.flatnonzero(top)
+    bounds: Bounds = [*zip(np.zeros(n), top, strict=True)]
+    bounds += [(0.0, None if limit else 0.0) for limit in top]
+    if len(moving):
+        # v is below the tangents of sqrt(b), and above its chord.
+        some, root = eye_array(n, format="csr")[moving], np.sqrt(top[moving])
+        for share in np.sqrt(TANGENTS):
+            upper.append([-diags_array(0.5 / (share * root)) @ some, some, None, None, None])
+            most.append(share * root / 2)
+        upper.append([diags_array(1 / root) @ some, -some, None, None, None])
+        most.append(np.zeros(len(moving)))
+    A_ub, A_eq = block_array(upper, format="csr"), block_array(equal, format="csr")
+    bounds += [(None, None)] * (A_ub.shape[1] - 2 * n - 1) + [(None, 1.0)]
+    A_eq.resize(A_eq.shape[0], A_ub.shape[1])
+    return _maximise(A_ub, np.concatenate(most), A_eq, np.concatenate(equal_to), bounds)
 
 
 def inertia_ratio(scene: Scene, phase: Phase, z: Array, z_s: Array) -> Array:
     """Reduced inertia over that without friction, least of both sides, shape (n,): jams below 0."""
     names, rolling = phase.formation.names, phase.formation.rolling_rows
     touches = [locate(scene, name, z) for name in names]
-    rows = np.stack([touch.normal for touch in touches], axis=1)
-    slid = np.stack([touch.tangent for touch in touches], axis=1)
-    mu = np.array([0.0 if k in rolling else t.friction for k, t in enumerate(touches)])
-    own = np.stack([touches[k].tangent for k in rolling], axis=1) if rolling else rows[:, :0]
-    signs = _signs(scene, phase, z, z_s)[:, : len(names)]
-    constraints = np.concatenate([rows, own], axis=1)
-    light = constraints / scene.mass_diagonal
-    without = np.linalg.det(light @ constraints.transpose(0, 2, 1))
+    signs = _signs(scene, phase, z, z_s)
+    rows = np.concatenate(
+        [
+            np.stack([touch.normal for touch in touches], axis=1),
+            *(touches[k].tangent[:, None] for k in rolling),
+        ],
+        axis=1,
+    )
+    light = rows / scene.mass_diagonal
+    without = np.linalg.det(light @ rows.transpose(0, 2, 1))
     ratios = []
     for sign in (np.vstack([signs[:1], signs]), np.vstack([signs, signs[-1:]])):
-        push = np.concatenate([rows - (mu * sign)[:, :, None] * slid, own], axis=1)
-        ratios.append(np.linalg.det(light @ push.transpose(0, 2, 1)) / without)
+        ratios.append(np.linalg.det(light @ _push(touches, rolling, sign)) / without)
     return np.asarray(np.minimum(*ratios))
-
-
-def _top(scene: Scene, z_s: Array) -> Array:
-    """Largest s'^2 that the joints' speed limits and `FASTEST` allow, shape (n,)."""
-    with np.errstate(divide="ignore"):
-        joints = (scene.speed_limit / np.abs(z_s[:, 3:])) ** 2
-    return np.asarray(np.minimum((FASTEST * scene.scales.speed) ** 2, joints.min(axis=1)))
 
 
 def _signs(scene: Scene, phase: Phase, z: Array, z_s: Array) -> Array:
     """Signs of sliding of contacts and joints on each interval, shape (n - 1, n_c + 2)."""
     rates = slides(scene, phase, z, z_s)
     return np.asarray(np.sign(rates[1:] + rates[:-1]))
+
+
+def _push(touches: list[Touch], rolling: tuple[int, ...], signs: Array) -> Array:
+    """What the forces c_n and c_t(rolling) push with, shape (n, 5, n_c + R)."""
+    pushes = [
+        touch.normal - (0.0 if k in rolling else touch.friction) * signs[:, [k]] * touch.tangent
+        for k, touch in enumerate(touches)
+    ]
+    return np.stack([*pushes, *(touches[k].tangent for k in rolling)], axis=2)
+
+
+class Forces(NamedTuple):
+    """Limits of a phase at n places, as rows over x = (a, b, v, c) >= least.
+
+    With forces over the scene's weight, torques over their limits and lengths over the radius of
+    gyration. v stands for sqrt(b), c for c_n, c_t(rolling), and all c_t where friction is free.
+    """
+
+    equal: Array  # equal, equal_to (n, 3, k) and (n, 3): Newton's and Euler's laws of the object
+    equal_to: Array
+    rows: Array  # rows, least (n, m, k) and (n, m): limits
+    least: Array
+    share: Array  # (m,): what a margin of 1 takes from each limit
 
 
 def _limits(
@@ -205,93 +185,39 @@ def _limits(
     z_s: Array,
     z_ss: Array,
     signs: Array,
-    free: NDArray[np.bool_] | None = None,
+    free: NDArray[np.bool_] | None,
 ) -> Forces:
     """Limits at n places; where `free`, shape (n, n_c), friction of a contact is in its cone."""
-    length, force = scene.scales.length, scene.scales.force
-    limit, square = scene.torque_limit, scene.scales.speed**2
-    names, rolling = phase.formation.names, phase.formation.rolling_rows
-    holds, least, share = [], [], []
-    touches = [locate(scene, name, z) for name in names]
-    push = force * _push(touches, rolling, signs, free is not None)
-    width = 3 + push.shape[2]
-    mass = scene.mass_diagonal
-    drive = np.stack(
-        [mass * z_s * square / length, mass * z_ss * square, scene.viscous * z_s * np.sqrt(square)],
-        axis=2,
-    )
-    scale = force * np.array([1.0, 1.0, length])
-    equal = np.concatenate([drive[:, :3], -push[:, :3]], axis=2) / scale[:, None]
-    equal_to = np.broadcast_to(scene.applied_force[:3] / scale, (len(z), 3))
-    n = len(z)
-
-    def limit_row(row: Array, bound: Array, own: float) -> None:
-        holds.append(row)
-        least.append(bound)
-        share.append(own)
-
-    for k in range(len(names)):
-        row = np.zeros((n, width))
-        row[:, 3 + k] = 1.0
-        limit_row(row, np.full(n, epsilon / force), 1.0)
-    for k, own in enumerate(rolling):
-        for sign in (-1.0, 1.0):
-            row = np.zeros((n, width))
-            row[:, 3 + own] = touches[own].friction
-            row[:, 3 + len(names) + k] = sign
-            limit_row(row, np.full(n, touches[own].friction * epsilon / force), 1.0)
+    length, force, speed = scene.scales.length, scene.scales.force, scene.scales.speed
+    n, n_c, rolling = len(z), phase.formation.n_contacts, phase.formation.rolling_rows
+    touches = [locate(scene, name, z) for name in phase.formation.names]
+    mu, held = np.array([touch.friction for touch in touches]), list(rolling)
+    push = [_push(touches, rolling, signs)]
     if free is not None:
-        for k in range(len(names)):
-            # What is left of friction against the sliding, between nothing and twice its amount.
-            for sign, most in ((1.0, 0.0), (-1.0, 2.0)):
-                row = np.zeros((n, width))
-                row[:, 3 + k] = most * touches[k].friction * free[:, k]
-                row[:, width - len(names) + k] = sign * signs[:, k]
-                limit_row(row, np.zeros(n), 0.0)
-    for joint in range(2):
-        row = np.concatenate([drive[:, 3 + joint], -push[:, 3 + joint]], axis=1) / limit[joint]
-        dry = scene.dry[3 + joint] * signs[:, len(names) + joint] / limit[joint]
-        limit_row(-row, dry - 1.0, 1.0)
-        limit_row(row, -dry - 1.0, 1.0)
-    return Forces(
-        equal, equal_to, np.stack(holds, axis=1), np.stack(least, axis=1), np.array(share)
-    )
-
-
-def _push(touches: Sequence[Touch], rolling: Sequence[int], signs: Array, loose: bool) -> Array:
-    """What the contact forces push with, shape (n, 5, k): c_n, c_t(rolling), all c_t if `loose`."""
-    pushes = []
-    for k, touch in enumerate(touches):
-        slip = 0.0 if k in rolling else touch.friction
-        pushes.append(touch.normal - slip * signs[:, [k]] * touch.tangent)
-    pushes += [touches[k].tangent for k in rolling]
-    pushes += [touch.tangent for touch in touches] if loose else []
-    return np.stack(pushes, axis=2)
-
-
-class _Rows:
-    """Rows of a sparse matrix with their right sides, collected piece by piece."""
-
-    def __init__(self, width: int) -> None:
-        self.width, self.count = width, 0
-        self._entries: list[tuple[Numbers, Numbers, Array]] = []
-        self._right: list[Array] = []
-
-    def begin(self, count: int, right: Array) -> Numbers:
-        """Numbers of `count` new rows with the given right sides."""
-        self._right.append(np.broadcast_to(right, (count,)))
-        self.count += count
-        return np.arange(self.count - count, self.count)
-
-    def add(self, row: Numbers, column: Numbers, value: Array) -> None:
-        """Add one entry to each of some rows."""
-        self._entries.append((row, column, np.broadcast_to(value, row.shape)))
-
-    def build(self) -> tuple[csr_array, Array]:
-        """The matrix and the right sides."""
-        row, column, value = (np.concatenate(part) for part in zip(*self._entries, strict=True))
-        shape = self.count, self.width
-        return coo_array((value, (row, column)), shape).tocsr(), np.concatenate(self._right)
+        push.append(np.stack([touch.tangent for touch in touches], axis=2))
+    mass = scene.mass_diagonal * speed**2
+    inertia = [mass * z_s / length, mass * z_ss, scene.viscous * z_s * speed]
+    drive = np.concatenate([np.stack(inertia, axis=2), *(-force * part for part in push)], axis=2)
+    scale, limit = force * np.array([1.0, 1.0, length]), scene.torque_limit
+    unit = np.eye(drive.shape[2])
+    press, grip = unit[3 : 3 + n_c], unit[3 + n_c : 3 + n_c + len(held)]
+    cone = mu[held, None] * press[held]
+    fixed = np.concatenate([press, cone + grip, cone - grip])
+    torque = drive[:, 3:] / limit[:, None]
+    dry = scene.dry[3:] * signs[:, n_c:] / limit
+    rows = [np.broadcast_to(fixed, (n, *fixed.shape)), -torque, torque]
+    least = [np.tile(epsilon / force * np.concatenate([np.ones(n_c), *[mu[held]] * 2]), (n, 1))]
+    least += [dry - 1.0, -dry - 1.0]
+    share = [np.ones(len(fixed) + 4)]
+    if free is not None:
+        # What is left of friction against the sliding, between nothing and twice its amount.
+        left = signs[:, :n_c, None] * unit[-n_c:]
+        rows += [left, 2 * (mu * free)[:, :, None] * press - left]
+        least.append(np.zeros((n, 2 * n_c)))
+        share.append(np.zeros(2 * n_c))
+    equal_to = np.broadcast_to(scene.applied_force[:3] / scale, (n, 3))
+    matrices = np.concatenate(rows, axis=1), np.concatenate(least, axis=1)
+    return Forces(drive[:, :3] / scale[:, None], equal_to, *matrices, np.concatenate(share))
 
 
 def _maximise(A_ub: Any, b_ub: Any, A_eq: Any, b_eq: Any, bounds: Bounds) -> float:
@@ -323,47 +249,29 @@ def rest_margin(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: bool
     rolling = phase.formation.rolling_rows
     closed = np.array([t.normal[0] for t in touches] + [touches[k].tangent[0] for k in rolling])
     size = np.array([1.0, 1.0, *[1 / scene.scales.length] * 3])
-    N = size[:, None] * _null_space(closed * size)
+    N = size[:, None] * null_space(closed * size, rcond=STILL)
     if N.shape[1] not in (1, 2):
         return np.nan
     slip = np.array([t.tangent[0] for t in touches] + list(np.eye(5)[3:])) @ N
     slip[list(rolling)] = 0.0
-    apart = np.array([t.normal[0] @ N for t in list_others(scene, phase, z)]).reshape(
-        -1, N.shape[1]
-    )
+    apart = np.array([t.normal[0] for t in list_others(scene, phase, z)]).reshape(-1, 5) @ N
     largest = np.abs(slip).max()
     margins = [-np.inf]
     for way in _ways(np.vstack([slip, apart])):
         rate = slip @ way
         signs = np.where(np.abs(rate) > STILL * largest, np.sign(rate), 0.0)
         if (apart @ way >= -STILL * largest).all():
-            margins.append(_solve(scene, epsilon, touches, N, (slip, signs, apart), ends))
+            margins.append(_solve_at_rest(scene, epsilon, touches, N, (slip, signs, apart), ends))
     return max(margins)
 
 
 def list_others(scene: Scene, phase: Phase, z: Array) -> list[Touch]:
     """Contacts that touch at `z` but are none of the phase's: they may only open."""
-    names = set(phase.formation.names)
-    others = []
-    for name in sorted(_every_name(scene) - names):
-        touch = locate(scene, name, z[None])
-        near = TOUCHES * scene.scales.length
-        if abs(touch.gap[0]) < near and min(touch.low[0], touch.high[0]) > near:
-            others.append(touch)
-    return others
-
-
-def _every_name(scene: Scene) -> set[str]:
-    count = len(scene.polygon.vertices)
-    parts = ("palm", "finger1", "finger2")
-    names = {f"v{k}-{part}" for k in range(count) for part in parts}
-    return names | {f"e{k}-tip{finger}" for k in range(count) for finger in (1, 2)}
-
-
-def _null_space(rows: Array) -> Array:
-    """Columns that span what the rows leave free."""
-    _, size, V = np.linalg.svd(rows)
-    return np.asarray(V[int((size > 1e-9 * size[0]).sum()) :].T)
+    near, count = TOUCHES * scene.scales.length, len(scene.polygon.vertices)
+    names = [f"v{k}-{part}" for k, part in product(range(count), ("palm", "finger1", "finger2"))]
+    names += [f"e{k}-tip{finger}" for k, finger in product(range(count), (1, 2))]
+    touches = [locate(scene, n, z[None]) for n in sorted({*names} - {*phase.formation.names})]
+    return [t for t in touches if abs(t.gap[0]) < near and min(t.low[0], t.high[0]) > near]
 
 
 def _ways(slip: Array) -> Iterator[Array]:
@@ -379,20 +287,7 @@ def _ways(slip: Array) -> Iterator[Array]:
         yield np.array([np.cos(angle), np.sin(angle)])
 
 
-def _drive(scene: Scene, touches: list[Touch], N: Array) -> Array:
-    """The equations of motion, shape (5, f + 2 n_c + 3), over the unknowns of `_solve`."""
-    force, scales = scene.scales.force, scene.scales
-    f, n_c = N.shape[1], len(touches)
-    drive = np.zeros((5, f + 2 * n_c + 3))
-    drive[:, :f] = scene.mass_diagonal[:, None] * N * scales.acceleration * scales.length
-    for k, touch in enumerate(touches):
-        drive[:, f + k] = -touch.normal[0] * force
-        drive[:, f + n_c + k] = -touch.tangent[0] * force
-    drive[3:, f + 2 * n_c : -1] = np.diag(scene.dry[3:])
-    return drive
-
-
-def _solve(
+def _solve_at_rest(
     scene: Scene,
     epsilon: float,
     touches: list[Touch],
@@ -402,6 +297,9 @@ def _solve(
 ) -> float:
     """Margin in one way.
 
+    Unknowns: the acceleration over the scene's, c_n and c_t over the weight, dry friction of the
+    joints over its bound, and the margin.
+
     Parameters
     ----------
     N : (5, f)  accelerations that keep the contacts
@@ -409,42 +307,36 @@ def _solve(
                 gaps
     """
     slip, signs, apart = rates
-    force, f, n_c = scene.scales.force, N.shape[1], len(touches)
-    # Unknowns: the acceleration over the scene's, c_n and c_t over the weight, dry friction of the
-    # joints over its bound, and the margin.
-    total = f + 2 * n_c + 3
-    drive, load = _drive(scene, touches, N), scene.applied_force
-    scale = force * np.array([1.0, 1.0, scene.scales.length])
-    equal, equal_to = [*(drive[:3] / scale[:, None])], [*(load[:3] / scale)]
-    rows, most = list[Array](), list[float]()
-
-    def at_least(row: Array, least: float, share: float) -> None:
-        rows.append(-row + share * np.eye(total)[-1])
-        most.append(-least)
-
-    bounds: Bounds = [(None, None)] * (f + 2 * n_c)
-    for k, sign in enumerate(signs):
-        if sign:
-            at_least(np.append(sign * slip[k], np.zeros(total - f)), 0.0, 0.0)
-        elif np.abs(slip[k]).max() > 0:
-            equal.append(np.append(slip[k], np.zeros(total - f)))
-            equal_to.append(0.0)
-    way = -signs if ends else signs
+    scales, f, n_c = scene.scales, N.shape[1], len(touches)
+    unit = np.eye(f + 2 * n_c + 3)
+    move, press, grip = unit[:f], unit[f : f + n_c], unit[f + n_c : f + 2 * n_c]
+    drive = scene.mass_diagonal[:, None] * N @ move * scales.acceleration * scales.length
     for k, touch in enumerate(touches):
-        press, grip = np.eye(total)[f + k], np.eye(total)[f + n_c + k]
-        at_least(press, epsilon / force, 1.0)
-        if way[k]:
-            equal.append(grip + way[k] * touch.friction * press)
-            equal_to.append(0.0)
-        else:
-            for side in (-grip, grip):
-                at_least(touch.friction * press + side, 0.0, 0.0)
-    for joint in range(2):
-        for side in (-1.0, 1.0):
-            at_least(side * drive[3 + joint] / scene.torque_limit[joint], -1.0, 1.0)
-        sign = way[n_c + joint]
-        bounds.append((sign, sign) if sign else (-1.0, 1.0))
-    for row in apart:
-        at_least(np.append(row, np.zeros(total - f)), 0.0, 0.0)
-    bounds.append((None, 1.0))
-    return _maximise(np.array(rows), most, np.array(equal), equal_to, bounds)
+        drive -= scales.force * (
+            np.outer(touch.normal, press[k]) + np.outer(touch.tangent, grip[k])
+        )
+    drive[3:] += scene.dry[3:, None] * unit[f + 2 * n_c : -1]
+    scale = scales.force * np.array([1.0, 1.0, scales.length])
+    torque = drive[3:] / scene.torque_limit[:, None]
+    way = -signs if ends else signs
+    gone, still = way[:n_c] != 0, (signs == 0) & (np.abs(slip).max(axis=1) > 0)
+    mu = np.array([touch.friction for touch in touches])[:, None]
+    cone = mu * press
+    equal = [drive[:3] / scale[:, None], slip[still] @ move]
+    equal.append((grip + way[:n_c, None] * cone)[gone])
+    equal_to = np.append(scene.applied_force[:3] / scale, np.zeros(still.sum() + gone.sum()))
+    # Limits: rows, what they are at least, and what a margin of 1 takes from them.
+    limits = [
+        ((signs[:, None] * slip) @ move, 0.0, 0.0),
+        (press, epsilon / scales.force, 1.0),
+        ((cone - grip)[~gone], 0.0, 0.0),
+        ((cone + grip)[~gone], 0.0, 0.0),
+        (torque, -1.0, 1.0),
+        (-torque, -1.0, 1.0),
+        (apart @ move, 0.0, 0.0),
+    ]
+    upper = np.concatenate([share * unit[-1] - rows for rows, _, share in limits])
+    most = np.concatenate([np.full(len(rows), -least) for rows, least, _ in limits])
+    bounds: Bounds = [(None, None)] * (f + 2 * n_c)
+    bounds += [(sign, sign) if sign else (-1.0, 1.0) for sign in way[n_c:]]
+    return _maximise(upper, most, np.concatenate(equal), equal_to, [*bounds, (None, 1.0)])
