@@ -27,8 +27,8 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import metric_weights
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
+from wholearm.planning.time_domain import attempts, time_plan
 from wholearm.planning.time_domain import time_explain as explain
-from wholearm.planning.time_domain import time_plan
 from wholearm.planning.time_domain.attempts import (
     GRADUAL,
     MOST,
@@ -45,7 +45,13 @@ from wholearm.planning.time_domain.stage_kernels import goal_kernel
 from wholearm.planning.time_domain.stage_modes import mode_of
 from wholearm.planning.time_domain.stages import guess_stages
 from wholearm.planning.time_domain.time_mesh import bisect_intervals
-from wholearm.planning.time_domain.time_plan import NEARER, ContinuedEnd, plan_phases, refuse_pinned
+from wholearm.planning.time_domain.time_plan import (
+    NEARER,
+    ContinuedEnd,
+    plan_phases,
+    refuse_pinned,
+    try_phases,
+)
 from wholearm.problem.definition import End, Phase, Problem
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.simulation.simulate import simulate
@@ -93,6 +99,19 @@ def tried(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> li
     monkeypatch.setattr(time_plan, "find_short", lambda *_: (None, []))
     monkeypatch.setattr(time_plan, "list_plans", lambda *given: [given[-1]])
     return names
+
+
+@pytest.mark.parametrize("tried", [NEAREST], indirect=True)
+def test_a_single_guess_straight_to_a_place_is_no_other(
+    tried: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where limits exclude the straight path there is none; goal 15 of the corpus."""
+    problem = landing()
+    start, phase = trace_phases(problem)[-1].end, replace(problem.phases[4], end=End.REST)
+    goal = find_end(phase, start, problem.phases[5:])
+    monkeypatch.setattr(attempts, "pace_straight", lambda *_: None)
+    assert try_phases(problem, [phase], start, OPTIONS, goal, single_guess=True) is None
+    assert tried == []
 
 
 @pytest.mark.parametrize(

@@ -16,10 +16,10 @@ from wholearm.common.errors import InfeasibleError, SolverError
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.limits import EPSILON
-from wholearm.planning.options import PlanOptions
+from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
-from wholearm.planning.time_domain import time_explain
+from wholearm.planning.time_domain import time_explain, time_plan
 from wholearm.planning.time_domain.attempts import Attempts
 from wholearm.planning.time_domain.collocation import make_scheme
 from wholearm.planning.time_domain.search import TimeSearch
@@ -115,6 +115,22 @@ def outline(problem: Problem, index: int = 0) -> Stage:
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Advice takes the time that it needs, however slow the machine is."""
     monkeypatch.setattr(time_explain, "ADVICE", np.inf)
+
+
+def test_changes_are_planned_with_the_options_as_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of the solver are in the scene's units, and would be scaled twice."""
+    seen, plan = list[PlanOptions](), time_plan.plan_phases
+
+    def watch(problem: Problem, phases: Any, z: Any, options: PlanOptions, **rest: Any) -> Any:
+        seen.append(options)
+        raise SolverError("only asked")
+
+    problem = change_limit(shove()[0], EPSILON, 1.0)
+    options = replace(COARSE, objective=Objective.EFFORT, time_weight=0.3)
+    monkeypatch.setattr(time_plan, "plan_phases", watch)
+    with pytest.raises(InfeasibleError), advising(lambda own: own.key == EPSILON):
+        plan(problem, problem.phases, problem.start, options)
+    assert seen and all(own == replace(options, accuracy=time_plan.ROUGH) for own in seen)
 
 
 def test_a_force_that_weight_limits_has_its_closed_form() -> None:

@@ -24,7 +24,7 @@ from ...geometry.path_guess import find_end
 from ...problem.definition import Phase, Problem
 from .collocation import Scheme, make_scheme
 from .initial_path import PacedWay, list_ways, pace_straight
-from .mode_search import drop_gone, improve
+from .mode_search import WORTH, drop_gone, improve
 from .search import Price, TimeSearch, TimeSolution
 from .stage import Stage
 from .stage_modes import LEAST_INTERVALS, StageMode, drop, in_mode, link, merge, mode_of
@@ -210,7 +210,8 @@ def solve_attempt(search: TimeSearch, attempt: Attempt) -> TimeSolution:
     if fewer is not solution:
         # Phase 3 of query 57 does not hold in its replay otherwise.
         fewer = enforce_between(search, fewer)
-        solution = fewer if fewer.success else solution
+        if fewer.success and fewer.cost - solution.cost < WORTH * abs(solution.cost):
+            solution = fewer
     if solution.success and search.problem.scene.control_period:
         return hold_torques(search, solution)
     return solution

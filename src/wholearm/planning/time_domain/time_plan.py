@@ -113,7 +113,7 @@ def plan_phases(
         return list_plans(problem, search, phases, solution, name)
 
     def replan(other: Problem) -> object:
-        rough = replace(search.options, accuracy=max(search.options.accuracy, ROUGH))
+        rough = replace(options, accuracy=max(options.accuracy, ROUGH))
         same = [other.phases[phase.index] for phase in phases]
         return plan_phases(other, same, z, rough, explained=False, patient=False)
 
@@ -147,7 +147,8 @@ def try_phases(
     attempts = Attempts(problem, phases, z, search, None, further > 0)
     guesses = attempts.begin(goal)[: None if further else 1]
     if single_guess:
-        guesses = [attempt._replace(most=FEW) for attempt in guesses]
+        # The nearest end is another guess than a straight path that limits exclude.
+        guesses = [own._replace(most=FEW) for own in guesses if goal is None or own.name != NEAREST]
     for attempt in chain(guesses, attempts.list_further(further)):
         solution, name = solve_attempt(search, attempt), attempt.name
         if solution.success:
