@@ -20,16 +20,15 @@ from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, SimulationError
 from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation
-from wholearm.free_simulation.free_simulate import simulate_free
-from wholearm.free_simulation.hand import build_system, measure_gaps
-from wholearm.free_simulation.result import FreeSimulation
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import read_problem
 from wholearm.results.dwell_record import assemble
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Trajectory
 from wholearm.scene.model import Finger, Friction, Polygon, Scene
-from wholearm.simulation.events import EventKind, OutcomeKind
+from wholearm.simulation.events import EventKind, FreeSimulation, OutcomeKind
+from wholearm.simulation.free_simulate import simulate_free
+from wholearm.simulation.hand import build_system, measure_gaps
 from wholearm.verification.free import FreeReport, verify_free
 
 DURATION = 0.4

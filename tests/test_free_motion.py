@@ -11,12 +11,12 @@ import pytest
 from scipy.integrate import quad
 
 from wholearm.common.arrays import Array
-from wholearm.free_simulation.free_events import play
-from wholearm.free_simulation.state import FreeRun
-from wholearm.free_simulation.system import ContactPair, Structure, System
 from wholearm.results.torque import TorqueProfile
 from wholearm.scene.model import Scales
 from wholearm.simulation.events import EventKind
+from wholearm.simulation.free_events import play
+from wholearm.simulation.free_run import FreeRun
+from wholearm.simulation.system import ContactPair, Structure, System
 
 G = 9.81
 

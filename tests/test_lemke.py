@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wholearm.free_simulation.contact_problem import (
+from wholearm.simulation.contact_problem import (
     APART,
     BACK,
     FORTH,

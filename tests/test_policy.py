@@ -16,7 +16,6 @@ import wholearm
 from shipped import HEPTAGON, IMPACTS, LANDING, plan_of, problem_of
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
-from wholearm.free_simulation.free_simulate import simulate_free
 from wholearm.geometry.tracing import trace_phase
 from wholearm.mechanics.dynamics import build_forward
 from wholearm.planning.result import Plan
@@ -38,6 +37,7 @@ from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Trajectory
 from wholearm.robustness.error_model import Uncertainty
 from wholearm.robustness.sample_run import make_trial
+from wholearm.simulation.free_simulate import simulate_free
 from wholearm.verification.policy_check import verify_policy
 
 

@@ -16,7 +16,6 @@ from shipped import HEPTAGON, problem_of, solved
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.contacts.formation import Formation
-from wholearm.free_simulation.free_simulate import simulate_free
 from wholearm.mechanics.arrival import DRIVE, maximise_margin
 from wholearm.planning import dwell as shares
 from wholearm.planning.dwell import DwellEnd, list_touching, settle_plans
@@ -27,6 +26,7 @@ from wholearm.planning.stops import Plans
 from wholearm.problem.definition import Problem
 from wholearm.results.dwell_record import assemble
 from wholearm.results.torque import TorqueProfile
+from wholearm.simulation.free_simulate import simulate_free
 from wholearm.simulation.start_modes import RestDirection
 from wholearm.simulation.sticking import balances, close_contacts, find_rest
 from wholearm.verification.verify import verify

@@ -27,11 +27,11 @@ from wholearm.results.torque import TorqueProfile
 from wholearm.scene.model import Finger, Friction, Scene
 from wholearm.simulation import runge_kutta
 from wholearm.simulation.events import EventKind, OutcomeKind
-from wholearm.simulation.layout import STATE
+from wholearm.simulation.hand import build_system
 from wholearm.simulation.modes import Grips, Mode, ModeRows, respond
 from wholearm.simulation.simulate import simulate
-from wholearm.simulation.stepper import build_stepper, share_mechanics
-from wholearm.simulation.sticking import Collapse, balances, find_rest
+from wholearm.simulation.stepper import Modes, ModeStepper, build_stepper
+from wholearm.simulation.sticking import Collapse, balances, close_contacts, find_rest
 
 
 def pick(index: int) -> tuple[Problem, CosineMotion]:
@@ -435,22 +435,31 @@ def test_error_estimate_bounds_the_error() -> None:
         assert abs(state - np.exp(-length)) < float(estimate) * 2 * tolerance
 
 
+def load_stepper(formation: Formation, grips: Grips, degree: int) -> ModeStepper:
+    """Steps of a formation in which friction holds some contacts and joints."""
+    system = build_system(formation.scene)
+    pairs = [system.names.index(name) for name in formation.names]
+    stuck = tuple(tuple(pairs[row] for row in rows) for rows in grips.contacts)
+    modes = Modes(tuple(pairs), stuck, tuple(3 + joint for joint in grips.joints))
+    s = build_stepper(system.structure, modes, degree)
+    s.load(system, 1e-9)
+    return s
+
+
 def test_order_on_the_real_dynamics() -> None:
     _, trajectory = plan()
     motion = trajectory.motions[1]
-    phase = plan()[0].phases[1]
     # One smooth piece for the whole phase, so that only the steps limit the error.
     torque = motion.fit(1, 24)  # type: ignore[attr-defined]
-    s = build_stepper(phase.formation, phase.until, 1.0, 24)
+    s = load_stepper(plan()[0].phases[1].formation, Grips(), 24)
     segment = motion.curve.segments[0]  # type: ignore[attr-defined]
 
     def integrate(count: int) -> np.ndarray:
         inputs, at = s.inputs, s.at
         start = motion.evaluate(np.array([0.05]))
-        inputs[at.y] = [*start.z[0], *start.z_dot[0], *np.zeros(STATE - 10)]
-        inputs[at.Xi], inputs[at.sigma] = segment.Xi, segment.sigma
+        inputs[at.y] = [*start.z[0], *start.z_dot[0], *np.zeros(4)]
+        inputs[at.Xi], inputs[at.sigma] = segment.Xi, [0, 0, 0, *segment.sigma]
         inputs[at.piece], inputs[at.torque] = torque.breaks, torque.coefficients.ravel()
-        inputs[at.tolerance], inputs[at.heading] = 1e-9, start.z_dot[0]
         inputs[at.h] = 0.3 / count
         for k in range(count):
             inputs[at.t] = 0.05 + 0.3 * k / count
@@ -474,33 +483,31 @@ def test_rates_are_those_of_the_formations_own_rows(grips: Grips) -> None:
     free = problem.phases[2].formation
     formations = [free] if len(grips) else [phase.formation for phase in problem.phases[:2]]
     rng = np.random.default_rng(3)
-    shared = [share_mechanics(Mode(formation, grips), 1) for formation in formations]
-    assert all(one is shared[0] for one in shared)
     for formation in formations:
-        mode, at = Mode(formation, grips), shared[0].at
-        state = np.zeros(STATE)
-        state[:5] = problem.start + 0.01 * rng.standard_normal(5)
-        state[5:10] = rng.standard_normal(5)
+        # On the constraints, where gaps and slip of pairs are those of contacts.
+        z = close_contacts(formation, problem.start + 1e-3 * rng.standard_normal(5))
+        mode, s = Mode(formation, grips), load_stepper(formation, grips, 1)
+        v = rng.standard_normal(5)
         signs = rng.choice([-1.0, 1.0], formation.n_contacts + 2)
         signs[[row for rows in grips.contacts for row in rows]] = 0.0
         signs[[formation.n_contacts + joint for joint in grips.joints]] = 0.0
         tau = rng.standard_normal(2)
-        packed = np.zeros(at.size)
-        packed[at.Xi], packed[at.sigma] = signs[:-2], signs[-2:]
-        packed[at.piece], packed[at.torque] = (0.0, 2.0), [tau[0], 0.0, tau[1], 0.0]
-        _, P, bend, A_t = mode.build_constraints(state[:5], state[5:10])
-        rates, least, c_n = shared[0].stage(state[:10], 0.7, packed, P, bend, A_t)
-        v = state[5:10]
-        known = formation.evaluate(state[None, :5], v[None])
+        inputs, at, to = s.inputs, s.at, s.to
+        inputs[at.y], inputs[at.t] = [*z, *v, *np.zeros(4)], 0.7
+        inputs[at.Xi], inputs[at.sigma] = signs[:-2], [0, 0, 0, *signs[-2:]]
+        inputs[at.piece], inputs[at.torque] = (0.0, 2.0), [tau[0], 0.0, tau[1], 0.0]
+        s.look()
+        kinematics = formation.evaluate(z[None], v[None])
         turn = 1e-7 * v
-        ahead, back = (formation.evaluate((state[:5] + k * turn)[None], v[None]) for k in (1, -1))
+        ahead, back = (formation.evaluate((z + k * turn)[None], v[None]) for k in (1, -1))
         bends = (ahead.A_t[0] - back.A_t[0]) @ v / 2e-7
-        rows = ModeRows(known.A[0], known.A_t[0], known.A_dot_v[0], bends)
+        rows = ModeRows(kinematics.A[0], kinematics.A_t[0], kinematics.A_dot_v[0], bends)
         response = respond(mode, signs, rows, v)
         assert response is not None
         load = np.array([1.0, *tau])
-        expected = response.acceleration @ load
-        assert np.asarray(rates)[5:10, 0] == pytest.approx(expected, rel=1e-6)
+        accelerations = response.acceleration @ load
+        assert s.outputs[to.acceleration] == pytest.approx(accelerations, rel=1e-6, abs=1e-9)
         held = response.force_limits @ load
-        assert float(least) == pytest.approx((held / mode.force_limit_units).min(), rel=1e-6)
-        assert np.asarray(c_n)[:, 0] == pytest.approx(held[: formation.n_contacts], rel=1e-6)
+        margins = s.outputs[to.values][: s.rows.cone.stop]
+        assert margins == pytest.approx(held / mode.force_limit_units, rel=1e-6)
+        assert s.outputs[to.c_n] == pytest.approx(held[: formation.n_contacts], rel=1e-6)

@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from .engines.mjcf import write_mjcf
     from .figures import plots
     from .figures.map_figure import draw_map
-    from .free_simulation.free_simulate import simulate_free
-    from .free_simulation.result import FreeSimulation
     from .geometry.path_guess import load
     from .mapping.formation_list import format_route, list_formations
     from .mapping.formation_map import FormationMap, build_map
@@ -58,7 +56,8 @@ if TYPE_CHECKING:
     from .search.find_route import find_route
     from .search.result import Answer
     from .search.solve import solve
-    from .simulation.events import Simulation
+    from .simulation.events import FreeSimulation, Simulation
+    from .simulation.free_simulate import simulate_free
     from .simulation.simulate import simulate
     from .tuning.tuner import Tuning, tune
     from .verification.free import FreeReport, verify_free
@@ -79,7 +78,7 @@ _HOMES = {
     "Formation": "contacts.formation",
     "FormationMap": "mapping.formation_map",
     "FreeReport": "verification.free",
-    "FreeSimulation": "free_simulation.result",
+    "FreeSimulation": "simulation.events",
     "Friction": "scene.model",
     "Goal": "problem.goal",
     "InfeasibleError": "common.errors",
@@ -129,7 +128,7 @@ _HOMES = {
     "replay_in": "engines.engine_replay",
     "save": "results.adopt",
     "simulate": "simulation.simulate",
-    "simulate_free": "free_simulation.free_simulate",
+    "simulate_free": "simulation.free_simulate",
     "solve": "search.solve",
     "tune": "tuning.tuner",
     "verify": "verification.verify",

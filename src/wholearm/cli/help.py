@@ -38,7 +38,7 @@ TOPICS = {
     "tuning": "tuning",
     "comparison": "comparison",
     "simulation": "simulation",
-    "free-simulation": "free_simulation",
+    "free-simulation": "simulation",
     "output-files": "results",
     "figures": "figures",
     "movies": "viewer",

@@ -19,7 +19,7 @@ def overlay(simulator: str, trajectory: Trajectory) -> Simulation:
 
     problem, say = read_own_problem(trajectory.meta), show_progress()
     if simulator == "free":
-        from ..free_simulation.free_simulate import simulate_free
+        from ..simulation.free_simulate import simulate_free
 
         if say is not None:
             say("simulating the whole")

@@ -17,11 +17,11 @@ from ..common.arrays import Array
 from ..common.errors import SimulationError, WholearmError
 from ..contacts.closing import close_finger
 from ..contacts.formation import Formation
-from ..free_simulation.free_simulate import simulate_free
 from ..mechanics.arrival import Hold, Standstill, find_hold, find_opening
 from ..problem.definition import Phase, Problem
 from ..results.dwell_record import SettledMotion, Settling, change_torques
 from ..results.torque import TorqueProfile
+from ..simulation.free_simulate import simulate_free
 from ..simulation.sticking import close_contacts
 from ..simulation.tolerances import SLOW, is_slower
 from .path_domain.junction import begin_from

@@ -302,7 +302,7 @@ EXTRA = 0.05  # Time in which the contact of the first phase may close, in addit
 
 
 class ClosedLoop:
-    """Feedback of a simulation; a `free_simulation.feedback.Law`.
+    """Feedback of a simulation; a `simulation.run.Law`.
 
     Parameters
     ----------
@@ -343,7 +343,7 @@ class ClosedLoop:
     def held(
         self, t: float, theta: Array, theta_dot: Array, forces: Mapping[str, float]
     ) -> tuple[float, float]:
-        """Torques for a state; as `free_simulation.feedback.Law`."""
+        """Torques for a state; as `simulation.run.Law`."""
         felt: dict[str, float] | None = None
         if self.policy.sensor and t > 0.0:
             felt = {name: forces.get(name, 0.0) for name in self.policy.contacts}

@@ -12,13 +12,12 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.errors import InputError, SimulationError
 from ..contacts.closing import close_fingers, describe_obstacle
-from ..free_simulation.free_simulate import simulate_free
-from ..free_simulation.result import FreeSimulation, list_pauses
 from ..policy.playback import ROOM, ClosedLoop, Policy
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
-from ..simulation.events import EventKind, OutcomeKind
+from ..simulation.events import EventKind, FreeSimulation, OutcomeKind, list_pauses
+from ..simulation.free_simulate import simulate_free
 from .error_model import Uncertainty, change_problem, change_torques
 
 PAUSE = 1e-3

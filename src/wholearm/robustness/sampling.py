@@ -21,10 +21,10 @@ from ..common.document import Document, Result, Table
 from ..common.errors import InputError, SimulationError
 from ..common.fields import Range
 from ..common.journal import Journal
-from ..free_simulation.result import FreeSimulation
 from ..policy.playback import Policy
 from ..problem.definition import Problem
 from ..results.adopt import Torques, adopt_motion, require_same_phases
+from ..simulation.events import FreeSimulation
 from .error_model import Uncertainty, change_torques
 from .sample_run import TimeWindow, Trial, make_trial
 

@@ -1,9 +1,10 @@
 """Forward simulation with contacts and joints that stick, slip and are gained.
 
+Contacts are those of a problem's phases, or found by a complementarity problem at every event.
+
 It shares the data model with the planner (`scene`, `contacts`, `problem`, `results`), and of what
-is computed from it these alone, each with an independent check among the tests: `Directions`,
-`build_force_rows` (the rows G of contact forces) and `energy` of `mechanics.dynamics`;
-`compute_impact`, `solve_impulses` and `ViolationKind` of `mechanics.impact` (plastic impacts); and
-`find_weakest` of `contacts.cones`. Equations of motion, their integration, events and the choice of
-contact modes are its own.
+is computed from it these alone, each with an independent check among the tests: `Directions` of
+`mechanics.dynamics`; `compute_impact`, `solve_impulses` and `ViolationKind` of `mechanics.impact`
+(plastic impacts); and `find_weakest` of `contacts.cones`. Equations of motion, their integration,
+events and the choice of contact modes are its own.
 """

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,12 +14,11 @@ from numpy.typing import NDArray
 from ..common.arrays import Array
 from ..common.document import Drawn
 from ..common.errors import SimulationError
-from ..mechanics.dynamics import energy
-from ..problem.definition import Phase, Problem
+from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory, sample_phases
-from .layout import Outputs
-from .runge_kutta import INNER_STAGES, NODES
+from .stepper import ModeStepper
+from .system import System
 
 REPLAYED = "replayed"  # status in the `meta` of such a trajectory
 
@@ -166,95 +166,115 @@ class Simulation(Drawn):
         return np.concatenate([self.z[index], self.z_dot[index]])
 
 
-class Step(NamedTuple):
-    """A step that has been made."""
+class FreeStretch(NamedTuple):
+    """Some time in which a contact presses."""
 
-    t: float  # t, h [s]: its start and length
-    h: float
-    inputs: Array  # its packed inputs
-    row: Array  # its packed outputs
+    contact: str
+    start: float  # start, stop [s]:
+    stop: float
+    # [N]: its least c_n then; NaN where everything rests, as forces are indeterminate there
+    least: float
+    time: float  # [s]: when
+
+
+def list_pauses(
+    stretches: Sequence[FreeStretch], contact: str, start: float, stop: float
+) -> list[tuple[float, float]]:
+    """When a contact does not press between two times [s], in their order."""
+    pauses, at = [], start
+    for first, last in sorted((one.start, one.stop) for one in stretches if one.contact == contact):
+        if first > at:
+            pauses.append((at, min(first, stop)))
+        at = max(at, last)
+        if at >= stop:
+            return pauses
+    return [*pauses, (at, stop)]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FreeSimulation(Simulation):
+    """A simulated motion without prescribed contacts, at every step.
+
+    As of `Simulation`, but phases are those of a plan's clock, `contacts` has others that pressed,
+    forces are NaN where a contact does not press, events are there twice, and `missed_by` is NaN.
+    """
+
+    # when each pair of features pressed, by the order of their start
+    stretches: tuple[FreeStretch, ...]
+    residual: float  # largest residual of a contact problem, relative to its largest rate
+
+    def show(self, contacts: Sequence[str]) -> FreeSimulation:
+        """The same with other columns of forces, NaN where a contact never pressed."""
+        forces = np.full((2, len(self.t), len(contacts)), np.nan)
+        for column, name in enumerate(contacts):
+            if name in self.contacts:
+                at = self.contacts.index(name)
+                forces[:, :, column] = self.c_n[:, at], self.c_t[:, at]
+        return replace(self, contacts=tuple(contacts), c_n=forces[0], c_t=forces[1])
+
+
+class Record(NamedTuple):
+    """One instant of a running simulation."""
+
+    t: float
+    phase: int
+    section: int  # counts changes of modes
+    kept: tuple[int, ...]  # pairs that press
+    y: Array  # z, z' and integrals
+    acceleration: Array
+    tau: Array
+    c_n: Array  # c_n, c_t: of the kept pairs
+    c_t: Array
     impact: float  # [J]: energy lost to impacts so far
-    arrives: bool  # whether it ends where the phase ends, which it has passed by rounding
+
+    @staticmethod
+    def of(s: ModeStepper, t: float, phase: int, section: int, impact: float) -> Record:
+        """What the outputs of some steps say."""
+        out, to, kept = s.outputs.copy(), s.to, s.modes.kept
+        state = out[to.y], out[to.acceleration], out[to.tau]
+        return Record(t, phase, section, kept, *state, out[to.c_n], out[to.c_t], impact)
 
 
-class Section(NamedTuple):
-    """What is recorded while one phase is simulated, row by row."""
-
-    phase: Phase
-    to: Outputs  # layout of the rows
-    # times, rows, impacts: instants [s], packed outputs, and the energy lost to impacts so far [J]
-    times: list[float]
-    rows: list[Array]
-    impacts: list[float]
-    steps: list[Step]  # those that may be looked into
-
-
-def collect(
-    problem: Problem,
-    sections: Sequence[Section],
-    events: Sequence[Event],
-    torque: TorqueProfile,
-    outcome: Outcome,
-    missed_by: float,
-    counts: tuple[int, int],
-) -> Simulation:
-    """Put the sections of a simulation together; `counts` are steps and rejected steps."""
-    contacts = problem.contacts
-    columns: list[tuple[Array, ...]] = []
-    for section in sections:
-        to, formation = section.to, section.phase.formation
-        # What has been seen within steps comes last there.
-        order = np.argsort(section.times, kind="stable")
-        rows = np.array(section.rows).reshape(-1, to.size)[order]
-        forces = np.full((2, len(rows), len(contacts)), np.nan)
-        where = [contacts.index(contact) for contact in formation.contacts]
-        forces[:, :, where] = rows[:, to.c_n], rows[:, to.c_t]
-        y = rows[:, to.y]
-        stored = energy(formation, y[:, :5], y[:, 5:10])
-        index = np.full(len(rows), section.phase.index)
-        parts = np.array(section.times)[order], y, rows[:, to.acceleration], rows[:, to.tau]
-        columns.append((*parts, index, *forces, stored, np.array(section.impacts)[order]))
-    t, y, z_ddot, tau, phase, c_n, c_t, stored, impact = (
-        np.concatenate(column) for column in zip(*columns, strict=True)
+def collect(system: System, records: Sequence[Record], contacts: Sequence[str]) -> dict[str, Any]:
+    """Fields of a simulation that its records have, with the forces of some contacts."""
+    # What has been seen within steps comes last in its section.
+    rows = sorted(records, key=lambda row: (row.section, row.t))
+    n, columns = system.n, {name: column for column, name in enumerate(contacts)}
+    forces = np.full((2, len(rows), len(columns)), np.nan)
+    first = 0
+    for kept, group in groupby(rows, lambda row: row.kept):
+        values = np.array([(row.c_n, row.c_t) for row in group])
+        last = first + len(values)
+        for k, pair in enumerate(kept):
+            if (column := columns.get(system.names[pair])) is not None:
+                forces[:, first:last, column] = values[:, :, k].T
+        first = last
+    names = ("t", "phase", "y", "acceleration", "tau", "impact")
+    t, phase, y, z_ddot, tau, impact = (
+        np.array([getattr(r, name) for r in rows]) for name in names
     )
-    return Simulation(
-        t=t,
-        z=y[:, :5],
-        z_dot=y[:, 5:10],
-        z_ddot=z_ddot,
-        tau=tau,
-        phase=phase,
-        contacts=tuple(contact.name for contact in contacts),
-        c_n=c_n,
-        c_t=c_t,
-        problem=problem,
-        torque=torque,
-        events=tuple(sorted(events, key=lambda event: event.time)),
-        energies=Energies(stored, y[:, 10], y[:, 11], y[:, 12], y[:, 13], impact),
-        outcome=outcome,
-        missed_by=missed_by,
-        steps=counts[0],
-        rejected=counts[1],
-    )
+    z, z_dot = y[:, :n], y[:, n : 2 * n]
+    work, viscous, dry, contact = y[:, 2 * n :].T
+    energies = Energies(system.stored(z, z_dot), work, viscous, dry, contact, impact)
+    return {
+        **dict(t=t, z=z, z_dot=z_dot, z_ddot=z_ddot, tau=tau, phase=phase),
+        **dict(contacts=tuple(contacts), c_n=forces[0], c_t=forces[1], energies=energies),
+    }
 
 
-def list_glimpses(problem: Problem, sections: Sequence[Section]) -> Glimpses:
-    """Normal forces at the stages of all steps."""
-    contacts = problem.contacts
-    nodes = np.array(NODES)[list(INNER_STAGES)]
-    columns = [(np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros((0, len(contacts))))]
-    for section in sections:
-        if not section.steps:
-            continue
-        own = section.phase.formation.contacts
-        places = np.array([(step.t, step.h) for step in section.steps])
-        t = (places[:, :1] + nodes * places[:, 1:]).ravel()
-        c_n = np.full((len(t), len(contacts)), np.nan)
-        seen = np.array([step.row[section.to.stage_forces] for step in section.steps])
-        where = [contacts.index(contact) for contact in own]
-        c_n[:, where] = seen.reshape(len(t), len(own))
-        columns.append((t, np.full(len(t), section.phase.index), c_n))
-    return Glimpses(*(np.concatenate(column) for column in zip(*columns, strict=True)))
+def list_stretches(records: Sequence[Record], names: Sequence[str]) -> tuple[FreeStretch, ...]:
+    """When each pair pressed, without a pause."""
+    stretches: list[FreeStretch] = []
+    groups = [list(group) for _, group in groupby(records, lambda row: row.kept)]
+    for pair in dict.fromkeys(pair for group in groups for pair in group[0].kept):
+        for presses, run in groupby(groups, lambda group: pair in group[0].kept):  # noqa: B023
+            if presses:
+                rows = [row for group in run for row in group]
+                c_n = np.array([row.c_n[row.kept.index(pair)] for row in rows])
+                at = 0 if np.isnan(c_n).all() else int(np.nanargmin(c_n))
+                ends = rows[0].t, rows[-1].t
+                stretches.append(FreeStretch(names[pair], *ends, float(c_n[at]), rows[at].t))
+    return tuple(sorted(stretches, key=lambda stretch: (stretch.start, stretch.contact)))
 
 
 def make_trajectory(simulation: Simulation) -> Trajectory:

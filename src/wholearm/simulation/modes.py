@@ -16,13 +16,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import NamedTuple
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.arrays import Array, Expression
+from ..common.arrays import Array
 from ..contacts.formation import Formation
-from ..mechanics.dynamics import build_force_rows
 
 INDEPENDENT = 1e-9  # least singular value of normalized constraints that are independent
 
@@ -132,41 +130,6 @@ class Mode:
         scales, count = self.formation.scene.scales, self.formation.n_contacts
         held = [scales.force if rows[0] < count else scales.torque for rows in self.holders]
         return np.array([scales.force] * count + held + held)
-
-    def build_constraints(self, z: Expression, v: Expression) -> tuple[Expression, ...]:
-        """Expressions as of `Formation.build_constraints`, with the angles of held joints."""
-        held, P, P_dot_v, A_t = self.rolled.build_constraints(z, v)
-        if self.grips.joints:
-            joints = [3 + joint for joint in self.grips.joints]
-            held = ca.vertcat(held, z[joints])
-            P = ca.vertcat(P, ca.DM(np.eye(5)[joints]))
-            P_dot_v = ca.vertcat(P_dot_v, ca.DM(len(joints), 1))
-        return held, P, P_dot_v, A_t
-
-    def build_force_rows(self, P: Expression, A_t: Expression, Xi: Expression) -> Expression:
-        """G from P, A_t and Xi, which is zero for what sticks."""
-        count = self.rolled.n_constraints
-        G = build_force_rows(self.rolled, P[:count, :], A_t, Xi)
-        return ca.vertcat(G, P[count:, :]) if self.grips.joints else G
-
-    def build_tangential(self, c: Expression, Xi: Expression) -> Expression:
-        """c_t of every contact from the forces c, shape (n_c,)."""
-        count = self.formation.n_contacts
-        c_n = c[:count]
-        c_t = -ca.DM(self.rolled.sliding_friction) * Xi * c_n
-        for k, rows in enumerate(self.holders):
-            if rows[0] >= count:
-                continue
-            total = ca.fmax(ca.sum1(c_n[list(rows)]), 1e-300)
-            for row in rows:
-                share = 1 if len(rows) == 1 else c_n[row] / total
-                c_t[row] = c[count + k] * share
-        return c_t
-
-    def read_kept(self, z: Array) -> Array:
-        """Slip coordinates and angles that rolling, stuck and held ones keep, (K,) [m, rad]."""
-        slip = self.rolled.evaluate_slip(z[None])[0]
-        return np.concatenate([slip, z[[3 + joint for joint in self.grips.joints]]])
 
 
 @lru_cache(maxsize=64)

@@ -15,8 +15,9 @@ that roll there. After an impact every contact of the next formation has to pres
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,53 +31,28 @@ from ..mechanics.impact import ViolationKind, compute_impact, solve_impulses
 from ..problem.check import require_phases
 from ..problem.definition import End, Phase, Problem
 from ..results.adopt import Torques, adopt_torques
-from .events import (
-    EventKind,
-    Glimpses,
-    Outcome,
-    OutcomeKind,
-    Simulation,
-    Step,
-    collect,
-    list_glimpses,
-)
-from .jumps import (
-    Arrival,
-    Ending,
-    Released,
-    Rested,
-    Switched,
-    coast_to_step,
-    come_to_rest,
-    find_slipping,
-    is_there,
-    let_go,
-    let_slip,
-    restart,
-    steps_within,
-    turn,
-)
+from .events import EventKind, Glimpses, Outcome, OutcomeKind, Record, Simulation, collect
 from .modes import find_fixed, find_grips, list_units, share_mode
-from .root_finding import find_first
-from .runge_kutta import ORDER
-from .sliding_signs import measure_rates
+from .replay import Replay, Step, find_first, open_limits
+from .run import StuckError
+from .runge_kutta import INNER_STAGES, NODES
+from .sliding_signs import choose_mode, measure_rates, note_change
 from .start_modes import StartDeparture
-from .stepper import ModeStepper, Replay, open_limits
 from .sticking import Collapse, Rest, balances, close_contacts, find_rest
 from .tolerances import (
     CREEPING,
     PASSED,
     REACHED,
+    ROUNDING_FORCE,
     ROUNDING_LIMIT,
     SETTLING,
-    SHORTEST_STEP,
     SLOW,
     STANDING,
     is_slower,
     measure_units,
-    measure_until,
 )
 
+_FAR = 100.0  # speed over its change at which nothing reverses: lever arms are below that
 _OUTCOMES = {
     ViolationKind.PULL: OutcomeKind.CONTACT_LOST,
     ViolationKind.SLIP: OutcomeKind.SLIPS,
@@ -88,6 +64,37 @@ _HELD_AT = 5  # places of a piece of the torques at which they have to hold the 
 ROUNDS = 8  # most simulations, each with steps that end at events missed before
 Closer = Callable[[Simulation, Glimpses, int], ArrayLike]
 """Simulation, forces within its steps and number of calls so far -> further instants to check."""
+
+
+class Arrival(NamedTuple):
+    """The end of a phase is reached."""
+
+    rate: float  # [m/s or rad/s]: how fast the distance to the phase's end closes
+    # [s]: if the next break of the torques is no further off, the arrival belongs to it
+    window: float
+    strikes: bool = False  # whether it takes an impact to go on
+    # [s]: time in which a motion whose deceleration fades would have come to rest
+    remaining: float = 0.0
+
+
+class Released(NamedTuple):
+    """The contacts that the next phase does not have are let go."""
+
+    c_n: float  # [N]: the least that the old formation would need of them
+
+
+class Switched(NamedTuple):
+    """A contact comes to rest, or slips, as the next phase has it."""
+
+    contact: str
+    sign: float = 0.0  # direction in which it slips; 0 if it comes to rest
+
+
+class Rested:
+    """The motion has come to rest."""
+
+
+Ending = Arrival | Released | Switched | Rested | Outcome
 
 
 @exclusive
@@ -133,7 +140,7 @@ def simulate(
         run = Replay(problem, profile, tolerance, wanted)
         outcome, missed_by = _simulate(run, progress)
         simulation, missed, calls = _collect(run, outcome, missed_by), list[float](), 0
-        glimpses = list_glimpses(problem, run.sections if closer else ())
+        glimpses = list_glimpses(run.problem, run.taken if closer else ())
         while closer and not missed:
             times = _sort_times(closer(simulation, glimpses, calls))
             if not len(times):
@@ -166,7 +173,7 @@ def _simulate(run: Replay, progress: Callable[[str], None] | None) -> tuple[Outc
             raise
         if outcome is not None:
             release = phase.until.is_release
-            return outcome, math.nan if release else run.value(run.stepper.rows.until)
+            return outcome, math.nan if release else run.distance
     goal = problem.phases[-1].until
     text = f"{goal} is reached at t = {run.t:.5g} s, the end of phase {len(problem.phases)}"
     return Outcome(OutcomeKind.GOAL_REACHED, text), math.nan if goal.is_release else 0.0
@@ -217,16 +224,15 @@ def _arrive(run: Replay, arrival: Arrival, following: Phase | None) -> Outcome |
     run.moving = run.phase.end is End.SMOOTH
     if run.moving:
         return None
-    before, run.previous = run.stored, run.phase.formation
-    run.y[5:10] = 0.0
-    run.impact += before - run.stored
+    run.previous = run.formation
+    run.set_velocity(0.0)
     # The torques of the phase that has ended go on until they step, or end.
     coming = min(run.coming_step, run.breaks[-1])
     run.held_until = coming if coming - run.t <= arrival.window else run.t
     if run.problem.scene.has_slow_motors:
         # Rate-limited torques do not step. A motion whose deceleration fades comes early by about
         # the cube root of its error: the old torques act until it was to end.
-        early = run.breaks[run.piece] < run.t < run.breaks[run.piece + 1]
+        early = run.breaks[run.piece] < run.t < run.stop
         remaining = arrival.remaining if early else 0.0
         run.held_until = max(run.held_until, min(run.t + remaining, run.breaks[-1]))
         run.settled_by = run.held_until + run.tolerances.rest_window
@@ -235,21 +241,19 @@ def _arrive(run: Replay, arrival: Arrival, following: Phase | None) -> Outcome |
 
 def _rest(run: Replay) -> StartDeparture | Arrival | Released | Switched | Outcome:
     """Wait at rest until the formation can start, the goal is near or balance is lost."""
-    y = run.y
-    before = run.stored
-    y[5:10] = 0.0
-    run.impact += before - run.stored
+    run.set_velocity(0.0)
+    run.look()
     run.record(still=True)
     if is_there(run):
         return Arrival(0.0, run.tolerances.rest_window)
-    rest = find_rest(run.phase.formation, y[:5])
+    rest = find_rest(run.formation, run.z)
     sticks = False
     while True:
         if run.t >= run.breaks[-1]:
             return run.run_out()
         if run.t >= run.held_until:
-            x = run.fraction(run.t)
-            change = rest.wait(run.coefficients[run.piece], x)
+            x = min(1.0, max(-1.0, run.fraction(run.t)))
+            change = rest.wait(run.torque.coefficients[run.piece], x)
             if isinstance(change, StartDeparture) and change.x <= x:
                 return change
             if not sticks:
@@ -264,11 +268,10 @@ def _rest(run: Replay) -> StartDeparture | Arrival | Released | Switched | Outco
                 soon = run.coming_step - t <= run.tolerances.rest_window
                 if not (t < run.settled_by or soon or _touches(run)):
                     return _collapse(run, rest, change)
-        stop = run.breaks[run.piece + 1]
-        if run.t < run.settled_by < stop:
+        if run.t < run.settled_by < run.stop:
             _advance(run, run.settled_by)
         else:
-            _advance(run, stop)
+            _advance(run, run.stop)
             run.next_piece()
 
 
@@ -276,11 +279,9 @@ def _touches(run: Replay) -> bool:
     """Whether the contacts of both phases balance rate-limited torques on the present piece."""
     if run.previous is None or not run.problem.scene.has_slow_motors:
         return False
-    contacts = dict.fromkeys((*run.phase.formation.contacts, *run.previous.contacts))
-    coefficients = run.coefficients[run.piece]
-    x = np.linspace(run.fraction(run.t), 1.0, _HELD_AT)[:, None]
-    torques = x ** np.arange(coefficients.shape[1]) @ coefficients.T
-    return all(balances(run.problem.scene, tuple(contacts), run.y[:5], tau) for tau in torques)
+    contacts = tuple(dict.fromkeys((*run.formation.contacts, *run.previous.contacts)))
+    times = np.linspace(run.t, run.stop, _HELD_AT).tolist()
+    return all(balances(run.problem.scene, contacts, run.z, run.tau(t)) for t in times)
 
 
 def _advance(run: Replay, stop: float) -> None:
@@ -302,7 +303,7 @@ def _collapse(run: Replay, rest: Rest, change: Collapse) -> Released | Switched 
             "the reduced inertia vanish or turn negative"
         )
     if change.c_t is not None:
-        row = run.phase.formation.names.index(change.contact)
+        row = run.formation.names.index(change.contact)
         if row in run.slipping:
             return Switched(change.contact, -math.copysign(1.0, change.c_t))
         return run.slip(row, change.c_n, change.c_t)
@@ -312,66 +313,55 @@ def _collapse(run: Replay, rest: Rest, change: Collapse) -> Released | Switched 
 
 
 def _collect(run: Replay, outcome: Outcome, missed_by: float) -> Simulation:
-    counts = (run.steps, run.rejected)
-    return collect(run.problem, run.sections, run.events, run.torques, outcome, missed_by, counts)
+    contacts = [contact.name for contact in run.problem.contacts]
+    return Simulation(
+        **collect(run.system, run.records, contacts),
+        problem=run.problem,
+        torque=run.torque,
+        events=tuple(sorted(run.events, key=lambda event: event.time)),
+        outcome=outcome,
+        missed_by=missed_by,
+        steps=run.steps,
+        rejected=run.rejected,
+    )
+
+
+def list_glimpses(problem: Problem, steps: Sequence[Step]) -> Glimpses:
+    """Normal forces at the stages of all steps."""
+    nodes, names = np.array(NODES)[list(INNER_STAGES)], [c.name for c in problem.contacts]
+    columns = [(np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros((0, len(names))))]
+    for step in steps:
+        formation = step.leg.mode.formation
+        c_n = np.full((len(nodes), len(names)), np.nan)
+        at = [names.index(name) for name in formation.names]
+        c_n[:, at] = step.stage_forces.reshape(len(nodes), -1)
+        columns.append((step.t + nodes * step.h, np.full(len(nodes), step.leg.phase), c_n))
+    return Glimpses(*(np.concatenate(column) for column in zip(*columns, strict=True)))
 
 
 def move(run: Replay) -> Ending:
     """Integrate until the motion rests, arrives, releases its contacts or fails."""
-    start = run.stepper.outputs.copy()
+    start = run.values
     run.h = min(run.h, run.tolerances.first_step)
     while True:
-        outputs, to = run.stepper.outputs, run.stepper.to
         while run.wanted[run.next_wanted] <= run.t:
             run.next_wanted += 1
-        target = min(run.breaks[run.piece + 1], run.wanted[run.next_wanted])
-        h, whole = _try_step(run, target)
-        arrives = bool(outputs[to.worst] < 0)
+        target = min(run.stop, run.wanted[run.next_wanted])
+        try:
+            h, whole = run.try_step(target, run.happens)
+        except StuckError:
+            run.fail_to_step(float(run.s.outputs[run.s.to.ratio]))
+        arrives = run.happens()
+        ending = None
         if arrives and not (whole and _is_at_end(run, target)):
             ending = _stop_at_event(run, start, h)
-            if ending is not None:
-                return ending
-            start = run.stepper.outputs.copy()
-            continue
-        start = _accept(run, target if whole else run.t + h, arrives)
-        if whole and target == run.breaks[run.piece + 1]:
-            ending = _pass_break(run)
-            if ending is not None:
-                return ending
-            start = run.stepper.outputs.copy()
-
-
-def _accept(run: Replay, t: float, arrives: bool = False) -> Array:
-    """Accept and keep the step to time `t`; `arrives`: it passes the phase's end by rounding."""
-    begin, inputs = run.t, run.stepper.inputs.copy()
-    row = run.accept(t)
-    run.sections[-1].steps.append(Step(begin, t - begin, inputs, row, run.impact, arrives))
-    return row
-
-
-def _try_step(run: Replay, target: float) -> tuple[float, bool]:
-    """Find a step within the tolerance; returns its length and whether it ends at `target`."""
-    s = run.stepper
-    inputs, outputs, at, to = s.inputs, s.outputs, s.at, s.to
-    remaining = target - run.t
-    while True:
-        whole = run.h >= 0.999 * remaining
-        h = remaining if whole else min(run.h, remaining / 2)
-        inputs[at.t], inputs[at.h] = run.t, h
-        s.step()
-        error = outputs[to.error]
-        brief = h <= run.tolerances.settling / 10
-        sudden = outputs[to.dip] < -1e-6 and outputs[to.worst] >= 0 and not brief
-        if error <= 1 and not sudden:
-            grown = h * min(_GROWTH, 0.9 * max(error, 1e-300) ** (-1 / ORDER))
-            run.h = grown if h == run.h else max(run.h, grown)
-            run.steps += 1
-            return h, whole
-        run.rejected += 1
-        factor = 0.9 * error ** (-1 / ORDER) if error > 1 else 0.2
-        run.h = h * (0.5 if error <= 1 else max(0.2, factor))
-        if run.h < max(run.tolerances.shortest_step, SHORTEST_STEP * abs(run.t)):
-            run.fail_to_step(float(outputs[to.ratio]))
+        else:
+            run.keep(target if whole else run.t + h, arrives)
+            if whole and target == run.stop:
+                ending = _pass_break(run)
+        if ending is not None:
+            return ending
+        start = run.values
 
 
 def _is_at_end(run: Replay, t: float) -> bool:
@@ -380,12 +370,11 @@ def _is_at_end(run: Replay, t: float) -> bool:
     It has to be at rest there or to reach a contact softly. A coordinate, or the end of a contact's
     range, is passed at any speed; an impact comes at any, with its torque step or at their end.
     """
-    s = run.stepper
-    if t != run.breaks[run.piece + 1] or not is_there(run) or _comes_later(run):
+    if t != run.stop or not is_there(run) or _comes_later(run):
         return False
     speed = abs(_measure_rate(run))
     if run.passes:
-        distance = run.value(s.rows.until) / run.until_unit
+        distance = run.distance / run.until_unit
         # Of several breaks as near as that, the nearest is the one at which the phase ends.
         later = run.breaks[run.piece + 2 : run.piece + 3]
         apart = (later[0] - t) / run.problem.scene.scales.time if len(later) else math.inf
@@ -394,11 +383,11 @@ def _is_at_end(run: Replay, t: float) -> bool:
     elif run.phase.end is End.IMPACT and _strikes(run):
         coming = run.piece + 1
         speed = 0.0 if coming >= len(run.steps_at) or run.steps_at[coming] else speed
-    elif run.phase.end is not End.SMOOTH and s.formation.n_constraints < 4:
+    elif run.phase.end is not End.SMOOTH and run.formation.n_constraints < 4:
         units = measure_units(run.problem.scene)[5:]
-        speed = float(np.abs(s.outputs[s.to.y][5:10] / units).max())
-    pressing = s.outputs[s.to.events][s.rows.force]
-    return speed < SLOW and bool(pressing.min() >= -run.tolerances.force) and not find_slipping(s)
+        speed = float(np.abs(run.s.outputs[5:10] / units).max())
+    presses = bool(run.values[run.leg.rows.force].min() >= -ROUNDING_FORCE)
+    return speed < SLOW and presses and not find_slipping(run)
 
 
 def _comes_later(run: Replay) -> bool:
@@ -414,9 +403,8 @@ def _comes_later(run: Replay) -> bool:
 
 def _pass_break(run: Replay) -> Ending | None:
     """Go on to the next piece of the torques."""
-    s = run.stepper
     if _is_at_end(run, run.t):
-        rate, strikes = -float(s.outputs[s.to.until_rate]), _strikes(run)
+        rate, strikes = -run.rate, _strikes(run)
         # Before a step that is still to come, the torques are those of the phase that ends.
         stepped = run.next_piece()
         window = run.tolerances.settling if stepped else run.tolerances.rest_window
@@ -431,10 +419,9 @@ def _pass_break(run: Replay) -> Ending | None:
 
 def _stop_at_event(run: Replay, start: Array, h: float) -> Ending | None:
     """End the step at the first event within it; None if the motion goes on."""
-    s = run.stepper
-    rows = s.rows
+    rows = run.leg.rows
     kinds = find_first(run, start, h)
-    _accept(run, run.t + float(s.inputs[s.at.h]))
+    run.keep(run.t + float(run.s.inputs[run.s.at.h]))
     if rows.until in kinds:
         return _pass_on(run) if run.phase.end is End.SMOOTH or _strikes(run) else _reach(run)
     if rows.speed in kinds:
@@ -446,7 +433,8 @@ def _stop_at_event(run: Replay, start: Array, h: float) -> Ending | None:
         return let_slip(run, kinds)
     for k in kinds:
         if rows.limit.start <= k < rows.limit.stop:
-            text = f"{run.limits[k - rows.limit.start]} {run.when()}"
+            limit = open_limits(run.formation, run.phase.until)[k - rows.limit.start]
+            text = f"{limit.text} {run.when()}"
             run.note(EventKind.LIMIT, text)
             return Outcome(OutcomeKind.LIMIT_REACHED, text)
     return turn(run, kinds)
@@ -454,29 +442,24 @@ def _stop_at_event(run: Replay, start: Array, h: float) -> Ending | None:
 
 def _reach(run: Replay) -> Arrival:
     """The end of the phase is reached while moving."""
-    s = run.stepper
-    rate = -float(s.outputs[s.to.until_rate])
     # A planned motion that comes this early by its error would have stopped v / a later.
     stopping = 2 * _time_to_stop(run)
     remaining = min(stopping, run.tolerances.longest_window) if stopping < math.inf else 0.0
     slow = abs(_measure_rate(run)) < SLOW
     window = max(remaining, run.tolerances.settling) if slow else remaining
-    return Arrival(rate, window, remaining=remaining)
+    return Arrival(-run.rate, window, remaining=remaining)
 
 
 def _measure_rate(run: Replay) -> float:
     """Time derivative of the distance to the end of the phase, in units of the scene."""
-    s = run.stepper
-    return float(s.outputs[s.to.until_rate]) / run.until_unit * run.problem.scene.scales.time
+    return run.rate / run.until_unit * run.problem.scene.scales.time
 
 
 def _time_to_stop(run: Replay) -> float:
     """Time in which the motion would stop at its present deceleration [s]."""
-    s = run.stepper
-    heading = run.problem.scene.mass_diagonal * s.outputs[s.to.heading]
-    slowing = -float(heading @ s.outputs[s.to.acceleration])
-    speed = float(heading @ s.outputs[s.to.y][5:10])
-    return speed / slowing if slowing > 0 else math.inf
+    v, acceleration = run.s.outputs[5:10], run.s.outputs[run.s.to.acceleration]
+    slowing = -float((run.system.mass * v) @ acceleration)
+    return float(run.system.mass @ v**2) / slowing if slowing > 0 else math.inf
 
 
 def _strikes(run: Replay) -> bool:
@@ -488,17 +471,15 @@ def _strikes(run: Replay) -> bool:
 
 def _pass_on(run: Replay) -> Arrival:
     """The end of a phase is passed; the torques of the next one may still have to come."""
-    s = run.stepper
-    s.inputs[s.at.t] = run.t
     window = settling = run.tolerances.settling
-    rate, strikes = -float(s.outputs[s.to.until_rate]), run.phase.end is End.IMPACT
+    rate, strikes = -run.rate, run.phase.end is End.IMPACT
     if run.passes and rate > 0:
         # A motion that is off by rounding comes the earlier the slower it is.
         early = PASSED * run.until_unit / rate
         window = min(max(early, settling), run.tolerances.longest_window)
     elif run.phase.until.contact is not None and not strikes:
         run.step_to(settling)
-        slowing = (float(s.outputs[s.to.until_rate]) + rate) / settling
+        slowing = (run.rate + rate) / settling
         if slowing > 0:
             window = min(max(2 * rate / slowing, settling), run.tolerances.longest_window)
     if steps_within(run, window):
@@ -512,27 +493,19 @@ def enter(run: Replay, phase: Phase, following: Phase | None) -> None:
     A phase without an `until` ends where a contact of `releasable` parts, or else where contacts
     of `resting` come to rest, as they roll in the next phase, or one of `slipping` slips.
     """
-    run.phase = phase
-    before = run.stored
-    run.y[:5] = _close(run, phase.formation)
-    if run.moving:
-        run.y[5:10] = project_velocity(phase.formation, run.y[:5], run.y[5:10])
-        run.moving = not is_slower(run.problem.scene, run.y[5:10], STANDING)
-    if not run.moving:
-        run.y[5:10] = 0.0
-    run.impact += before - run.stored
-    until, run.side = phase.until, 1.0
-    if until.value is not None:
-        run.side = math.copysign(1.0, run.y[0 if until.coordinate == "x" else 2] - until.value)
-    run.stuck = set()
-    run.until_unit = measure_until(run.problem.scene, until)
+    formation, until, moves = phase.formation, phase.until, run.moving
+    run.phase, old = phase, run.system.stored(run.z, run.v)
+    run.y[:5] = _close(run, formation)
+    v = project_velocity(formation, run.z, run.v) if moves else np.zeros(5)
+    run.moving = moves and not is_slower(run.problem.scene, v, STANDING)
+    run.y[5:10] = v if run.moving else 0.0
+    run.impact += float(old - run.system.stored(run.z, run.v))
     # At any speed a contact can be gained only where it goes on for another one.
-    gained, formation = until.contact, phase.formation
+    gained = until.contact
     run.passes = phase.end is End.SMOOTH and (
         gained is None or takes_over(gained, formation.scene, formation.contacts)
     )
-    run.take()
-    run.limits = [limit.text for limit in open_limits(formation, until)]
+    run.enter(phase)
     run.releasable, run.resting, run.slipping = (), frozenset(), frozenset()
     run.has_slid = False
     if phase.end is End.REST or following is None or not until.is_release:
@@ -550,7 +523,7 @@ def enter(run: Replay, phase: Phase, following: Phase | None) -> None:
 def _close(run: Replay, formation: Formation) -> Array:
     """The present configuration with every contact of a formation closed."""
     try:
-        return close_contacts(formation, run.y[:5], 10 * REACHED * run.problem.scene.scales.length)
+        return close_contacts(formation, run.z, 10 * REACHED * run.problem.scene.scales.length)
     except SimulationError as error:
         raise SimulationError(f"{error} {run.where()}") from None
 
@@ -558,7 +531,7 @@ def _close(run: Replay, formation: Formation) -> Array:
 def collide(run: Replay, following: Phase) -> Outcome | None:
     """Plastic impact onto the next formation; the outcome if it is not possible."""
     z = _close(run, following.formation)
-    impact = compute_impact(run.phase.formation, following.formation, z, run.y[5:10])
+    impact = compute_impact(run.formation, following.formation, z, run.v)
     name, least = impact.least
     names = following.formation.names
     normal = impact.p[: len(names)]
@@ -570,9 +543,7 @@ def collide(run: Replay, following: Phase) -> Outcome | None:
         if worst.kind is ViolationKind.JAM:
             raise JammingError(text)
         return Outcome(_OUTCOMES[worst.kind], text)
-    before = run.stored
-    run.y[5:10] = impact.v
-    run.impact += before - run.stored
+    run.set_velocity(impact.v)
     return None
 
 
@@ -584,93 +555,283 @@ def project_velocity(formation: Formation, z: Array, v: Array) -> Array:
 
 def set_off(run: Replay, departure: StartDeparture) -> None:
     """Set the friction signs of a motion that starts from rest."""
-    formation = run.phase.formation
+    formation = run.formation
     grips = find_grips(formation, np.concatenate(departure.directions))
     if formation.n_constraints < 4:
-        rows = formation.evaluate(run.y[None, :5], run.y[None, 5:10])
+        rows = formation.evaluate(run.z[None], run.v[None])
         fixed = find_fixed(share_mode(formation, grips), rows.A[0], rows.A_t[0])
         run.stuck = {row for u in list_units(formation) for row in u.rows if u.grips and fixed[row]}
-    if grips != run.stepper.mode.grips:
+    if grips != run.leg.mode.grips:
         run.take(grips)
-    s = run.stepper
-    s.inputs[s.at.Xi], s.inputs[s.at.sigma] = departure.directions
-    s.inputs[s.at.heading] = departure.heading
-    run.record()
+    run.signs, run.heading = np.concatenate(departure.directions), departure.heading
+    run.observe()
 
 
 def go_on(run: Replay) -> Ending | None:
     """Set the friction signs of the present velocity; what ends the motion at once, if anything."""
-    s = run.stepper
-    y, formation = run.y, run.phase.formation
-    s.inputs[s.at.y], s.inputs[s.at.t] = y, run.t
-    v = y[5:10]
-    mass = formation.scene.mass_diagonal
-    s.inputs[s.at.heading] = v / np.sqrt(mass @ v**2)
-    rates = np.concatenate([formation.evaluate(y[None, :5], v[None]).A_t[0] @ v, v[3:]])
+    formation, v = run.formation, run.v
+    run.heading = v / np.sqrt(run.system.mass @ v**2)
+    rates = np.concatenate([formation.evaluate(run.z[None], v[None]).A_t[0] @ v, v[3:]])
     signs = np.where(rates < 0, -1.0, 1.0)
     for row, name in enumerate(formation.names):
         signs[row] = run.slip_signs.get(name, signs[row])
     run.slip_signs = {}
     movable = {row for unit in list_units(formation) for row in unit.rows}
     signs[[row for row in range(len(signs)) if row not in movable]] = 0.0
-    _set_signs(run, signs)
-    if s.is_free:
+    run.signs = signs
+    if formation.n_constraints < 4:
         return restart(run, enters=True)
     slow = STANDING * measure_rates(run.problem.scene, formation.n_contacts)
     still = np.flatnonzero((np.abs(rates) < slow) & (signs != 0)).tolist()
     for choice in product((1.0, -1.0), repeat=len(still)):
         tried = signs.copy()
         tried[still] *= choice
-        _set_signs(run, tried)
-        if s.outputs[s.to.ratio] > 0:
+        run.signs = tried
+        run.look()
+        if run.s.outputs[run.s.to.ratio] > 0:
             break
     else:
-        _set_signs(run, signs)
+        run.signs = signs
     return restart(run)
-
-
-def _set_signs(run: Replay, signs: Array) -> None:
-    """Evaluate the state with friction signs of contacts and joints, shape (n_c + 2,)."""
-    s = run.stepper
-    s.inputs[s.at.Xi], s.inputs[s.at.sigma] = signs[:-2], signs[-2:]
-    s.look()
 
 
 def look_within(run: Replay, times: Array) -> list[float]:
     """Record states at increasing instants, (n,) [s], within steps; those of missed events."""
     missed: list[float] = []
-    scene, scales = run.problem.scene, run.problem.scene.scales
-    for section, stepper in zip(run.sections, run.steppers, strict=True):
-        if not section.steps:
+    begins = np.array([step.t for step in run.taken])
+    owners = np.searchsorted(begins, times, side="left") - 1
+    for time, owner in zip(times.tolist(), owners.tolist(), strict=True):
+        step = run.taken[max(owner, 0)] if run.taken else None
+        if step is None or owner < 0 or time - step.t >= step.h:
             continue
+        leg, s = step.leg, step.leg.stepper
+        s.inputs[:] = step.inputs
+        s.inputs[s.at.h] = time - step.t
+        s.step()
+        run.records.append(Record.of(s, time, leg.phase, leg.section, step.impact))
         # Within a step more counts as rounding than at its end.
-        at, rows, slack = stepper.at, stepper.rows, stepper.slack.copy()
-        slack[rows.slide] = slack[rows.speed] = STANDING * scales.speed
-        slack[rows.speed] *= scales.mass**0.5
-        slack[rows.joint] = STANDING / scales.time
-        slack[rows.until] = ROUNDING_LIMIT * measure_until(scene, section.phase.until)
-        begins = np.array([step.t for step in section.steps])
-        owners = np.searchsorted(begins, times, side="left") - 1
-        for time, owner in zip(times.tolist(), owners.tolist(), strict=True):
-            step = section.steps[max(owner, 0)]
-            h = time - step.t
-            if owner < 0 or h >= step.h:
-                continue
-            stepper.inputs[:] = step.inputs
-            stepper.inputs[at.h] = h
-            stepper.step()
-            section.times.append(time)
-            section.rows.append(stepper.outputs.copy())
-            section.impacts.append(step.impact)
-            if shows(step, stepper, slack):
-                missed.append(time)
+        rows, slack = leg.rows, leg.slack.copy()
+        slack[rows.turning] = slack[rows.speed] = STANDING
+        slack[rows.until] = ROUNDING_LIMIT
+        leg.heading[:] = step.heading
+        leg.measure()
+        short = leg.event_values[: len(slack)] + slack < 0
+        if step.arrives:
+            # The end of the phase may be passed.
+            short[rows.until] = short[rows.speed] = short[rows.turning] = False
+        if short.any():
+            missed.append(time)
     return missed
 
 
-def shows(step: Step, stepper: ModeStepper, slack: Array) -> bool:
-    """Whether an event lies in a step before the instant just evaluated; its end may be passed."""
-    short = stepper.outputs[stepper.to.events] + slack < 0
-    if step.arrives:
-        rows = stepper.rows
-        short[rows.until] = short[rows.speed] = short[rows.slide] = short[rows.joint] = False
-    return bool(short.any())
+def restart(
+    run: Replay, turned: Sequence[int] = (), *, time: float | None = None, enters: bool = False
+) -> Ending | None:
+    """Choose contact modes after forces jump and record them; what ends the motion, if that does.
+
+    `turned`: contacts, then joints, that came to rest at `time` [s]; `enters`: a new formation.
+    """
+    stuck = run.stuck
+    if _decide(run, turned, time=time, enters=enters):
+        return come_to_rest(run)
+    run.observe()
+    if _bridge(run):
+        return come_to_rest(run)
+    s, holders = run.s, run.leg.mode.holders
+    if not s.outputs[s.to.ratio] > 0:
+        run.fail_to_step(float(s.outputs[s.to.ratio]))
+    if not enters and run.resting and run.resting <= run.stuck:
+        # A planned motion may all but come to rest a little before the torques step; until they do
+        # it may slip and stick again.
+        window = min(run.tolerances.longest_window, run.t - run.last_step)
+        rested = run.resting <= stuck
+        if run.has_slid if rested else not steps_within(run, window):
+            return _hold(run)
+        run.has_slid |= not rested
+    slipping = {holders[k][0] for k in find_slipping(run)}
+    pulling = np.flatnonzero(s.outputs[s.to.c_n] < -run.tolerances.force)
+    # Whether anything pulls where a contact slips by plan, its next formation says.
+    if len(pulling) and not slipping & run.slipping:
+        return let_go(run, pulling.tolist())
+    return slip(run) if slipping else None
+
+
+def _decide(
+    run: Replay, turned: Sequence[int], *, time: float | None = None, enters: bool = False
+) -> bool:
+    """Choose the modes of contacts and joints at rest; whether all motion has ended.
+
+    With one freedom whatever slides or turns does so for as long as there is motion.
+    """
+    if run.formation.n_constraints < 4:
+        return choose_mode(run, turned, time=time, enters=enters)
+    signs = run.signs
+    for row in turned:
+        signs[row] *= -1
+        note_change(run, row, -signs[row], signs[row], run.t if time is None else time)
+    run.signs = signs
+    return False
+
+
+def come_to_rest(run: Replay) -> Rested | Switched:
+    """End all motion, and the phase if a contact was to come to rest."""
+    if not is_there(run):
+        run.note(EventKind.REST, f"the object comes to rest {run.when()}")
+    return _hold(run) if run.resting else Rested()
+
+
+def _hold(run: Replay) -> Switched:
+    return Switched(", ".join(run.formation.names[row] for row in sorted(run.resting)))
+
+
+def _drop_repeated(run: Replay) -> None:
+    """Take back forces after a jump that are those of a formation that is given up."""
+    if run.repeats():
+        run.records.pop()
+
+
+def let_go(run: Replay, contacts: Sequence[int]) -> Released | Outcome:
+    """End as contacts would have to pull: a release if that is planned of one of them."""
+    names = run.formation.names
+    forces = dict(zip(names, run.s.outputs[run.s.to.c_n].tolist(), strict=True))
+    pulling = [names[k] for k in contacts]
+    if any(name in run.releasable for name in pulling):
+        _drop_repeated(run)
+        return Released(min(forces[name] for name in run.releasable))
+    name = min(pulling, key=forces.__getitem__)
+    return run.lose(name, min(0.0, forces[name]))
+
+
+def slip(run: Replay) -> Released | Switched | Outcome:
+    """End because a rolling contact slips, or starts to part where its release is planned."""
+    s, mode = run.s, run.leg.mode
+    cones = _measure_reserves(run)
+    declared = [k for k in range(len(cones)) if mode.declares(k)]
+    planned = [k for k in find_slipping(run) if mode.holders[k][0] in run.slipping]
+    row = mode.holders[min(planned or declared, key=cones.__getitem__)][0]
+    name = run.formation.names[row]
+    if name in run.releasable:
+        return let_go(run, [row])
+    c_n, c_t = (float(s.outputs[part][row]) for part in (s.to.c_n, s.to.c_t))
+    if row in run.slipping:
+        _drop_repeated(run)
+        return Switched(name, -math.copysign(1.0, c_t))
+    return run.slip(row, c_n, c_t)
+
+
+def let_slip(run: Replay, events: Sequence[int]) -> Ending | None:
+    """Go on after friction has reached its bound; a prescribed rolling contact must not slip."""
+    mode, cone = run.leg.mode, run.leg.rows.cone
+    bounds = [(k - cone.start) % len(mode.holders) for k in events if cone.start <= k < cone.stop]
+    if any(map(mode.declares, bounds)):
+        return slip(run)
+    return restart(run, _find_turning(run, events))
+
+
+def _find_turning(run: Replay, events: Sequence[int]) -> list[int]:
+    """Contacts, then joints, whose sliding or turning is among events."""
+    turning = run.leg.rows.turning
+    return [k - turning.start for k in events if turning.start <= k < turning.stop]
+
+
+def _measure_reserves(run: Replay) -> list[float]:
+    """Friction margin of each contact and joint that sticks, over the scene's force or torque."""
+    reserves: list[float] = run.values[run.leg.rows.cone].reshape(2, -1).min(axis=0).tolist()
+    return reserves
+
+
+def find_slipping(run: Replay) -> list[int]:
+    """Which contacts that the phase lets roll are out of their cones."""
+    reserves, mode = _measure_reserves(run), run.leg.mode
+    return [k for k, x in enumerate(reserves) if x < -ROUNDING_FORCE and mode.declares(k)]
+
+
+def turn(run: Replay, events: Sequence[int]) -> Ending | None:
+    """Go on where contacts or joints have come to rest; None if the motion goes on."""
+    now, window = run.t, run.tolerances.rest_window
+    # With two freedoms the last speeds fall to zero one after the other by rounding.
+    if (
+        run.formation.n_constraints < 4
+        and run.phase.end is End.REST
+        and is_there(run)
+        and is_slower(run.problem.scene, run.v, SLOW)
+        and run.stop - now <= window
+    ):
+        return Arrival(-run.rate, window)
+    if steps_within(run, run.tolerances.settling):
+        _finish_piece(run)
+    return restart(run, _find_turning(run, events), time=now)
+
+
+def _finish_piece(run: Replay) -> None:
+    """Step to the torque step, without a record of the forces on the way."""
+    coast_to_step(run, hide=True)
+    run.records.pop()
+    run.note(EventKind.TORQUE_STEP, f"the torques step {run.when()}")
+
+
+def steps_within(run: Replay, window: float) -> bool:
+    """Whether the torques step soon."""
+    return run.coming_step - run.t <= window
+
+
+def coast(run: Replay, stop: float, hide: bool) -> None:
+    """Step to `stop`, whatever happens on the way; `hide` leaves out the forces on the way."""
+    while run.wanted[run.next_wanted] < stop:
+        place = run.wanted[run.next_wanted]
+        run.step_to(place - run.t)
+        run.accept(place)
+        if hide:
+            row = run.records[-1]
+            none = np.full(len(row.kept), np.nan)
+            run.records[-1] = row._replace(c_n=none, c_t=none)
+        run.next_wanted += 1
+    run.step_to(stop - run.t)
+    run.accept(stop)
+
+
+def coast_to_step(run: Replay, hide: bool) -> None:
+    """Step to where the torques step next, as `coast` does, and go on to the piece from there."""
+    while True:
+        coast(run, run.stop, hide)
+        if run.next_piece():
+            return
+        run.records.pop()
+
+
+def is_there(run: Replay) -> bool:
+    """Whether the distance to the end of the phase counts as none, at rest."""
+    return abs(run.distance) < REACHED * run.until_unit
+
+
+def _bridge(run: Replay) -> bool:
+    """Integrate from a reversal to its torque step, unrecorded; whether all motion has ended."""
+    rows: list[int] = []
+    if steps_within(run, run.tolerances.settling):
+        run.records.pop()
+        _finish_piece(run)
+    elif _goes_on(run):
+        return False
+    else:
+        start = run.values
+        stretch = min(run.tolerances.settling, run.stop - run.t)
+        run.step_to(stretch)
+        rows = _find_turning(run, find_first(run, start, stretch, run.leg.rows.turning))
+        if not rows:
+            run.look()
+            return False
+        run.records.pop()
+        coast(run, run.t + float(run.s.inputs[run.s.at.h]), hide=True)
+        run.records.pop()
+    ended = _decide(run, rows)
+    run.observe()
+    return ended
+
+
+def _goes_on(run: Replay) -> bool:
+    """Whether all that slides or turns is far too fast to come to rest in the shortest time."""
+    out, units = run.s.outputs, run.system.units[5:]
+    fastest = np.abs(out[5:10] / units).max()
+    strongest = np.abs(out[run.s.to.acceleration] / units).max() * run.system.scales.time
+    least = _FAR * SETTLING * (strongest + fastest**2)
+    return bool((run.values[run.leg.rows.turning][run.signs != 0] > least).all())

@@ -28,10 +28,9 @@ from ..common.errors import JammingError, SimulationError
 from ..contacts.formation import Formation
 from ..scene.model import Scene
 from .events import EventKind
-from .layout import evaluate_piece
 from .modes import Mode, ModeRows, Response, Unit, find_fixed, find_grips, list_units, respond
-from .stepper import Replay
-from .tolerances import STANDING, is_slower
+from .replay import Replay
+from .tolerances import ROUNDING_FORCE, STANDING, is_slower
 
 CLEAR = 1e-8  # least margin of a clear decision, over the scene's units
 TRIES = 50  # most decisions in a row without any time passing
@@ -53,23 +52,17 @@ def choose_mode(
 
     Parameters as of `jumps.restart`.
     """
-    s = run.stepper
-    formation, scene = run.phase.formation, run.problem.scene
-    signs = np.concatenate([s.inputs[s.at.Xi], s.inputs[s.at.sigma]])
-    s.inputs[s.at.y], s.inputs[s.at.t] = run.y, run.t
-    s.look()
-    speeds = np.abs(s.outputs[s.to.events][s.rows.slide.start : s.rows.joint.stop])
-    units = list_units(formation)
-    slow = STANDING * measure_rates(scene, formation.n_contacts)
+    formation, signs = run.formation, run.signs
+    run.look()
+    slow = np.abs(run.values[run.leg.rows.turning]) < STANDING
     still = [
         unit
-        for unit in units
-        if set(unit.rows) & set(turned)
-        or (unit.grips and (speeds[list(unit.rows)] < slow[list(unit.rows)]).any())
+        for unit in list_units(formation)
+        if set(unit.rows) & set(turned) or (unit.grips and slow[list(unit.rows)].any())
     ]
     if not still:
         return False
-    if is_slower(scene, run.y[5:10], STANDING):
+    if is_slower(run.problem.scene, run.v, STANDING):
         return True
     count = run.decided[1] + 1 if run.t <= run.decided[0] else 1
     run.decided = (run.t, count)
@@ -98,7 +91,7 @@ def measure_rates(scene: Scene, count: int) -> Array:
 
 def note_change(run: Replay, row: int, before: float, after: float, time: float) -> None:
     """Record that a contact or joint sticks, slips or turns back."""
-    formation = run.phase.formation
+    formation = run.formation
     contact = row < formation.n_contacts
     name = formation.names[row] if contact else f"joint {row - formation.n_contacts + 1}"
     when = f"at t = {time:.5g} s, phase {run.phase.number}"
@@ -119,12 +112,11 @@ def _list_options(
     if present != 0:
         first = -present if set(unit.rows) & set(turned) else present
         return (first, 0.0, -first) if unit.grips else (first, -first)
-    s = run.stepper
-    holder = s.mode.holders.index(unit.rows)
-    low, high = s.outputs[s.to.events][s.rows.cone].reshape(2, -1)[:, holder]
+    holder = run.leg.mode.holders.index(unit.rows)
+    low, high = run.values[run.leg.rows.cone].reshape(2, -1)[:, holder]
     sign = 1.0 if high < low else -1.0
     # Friction is at the edge of its cone and opposes the slip to come.
-    edge = min(low, high) < s.slack[s.rows.cone.start + holder]
+    edge = min(low, high) < ROUNDING_FORCE
     return (sign, -sign, 0.0) if edge else (0.0, sign, -sign)
 
 
@@ -154,7 +146,7 @@ def _choose(
         return max(pulling, key=lambda choice: choice.margin)
     if evaluation.worst <= 0:
         run.fail_to_step(evaluation.worst)
-    names = " ".join(run.phase.formation.names)
+    names = " ".join(run.formation.names)
     raise JammingError(
         f"{names} jams {run.where()}: no combination of sliding and sticking is consistent"
     )
@@ -164,14 +156,11 @@ class _Evaluation:
     """Margins of combinations of friction signs at the present state."""
 
     def __init__(self, run: Replay, still: Sequence[Unit]) -> None:
-        self.formation, self.still = run.phase.formation, still
+        self.formation, self.still = run.formation, still
         self.scene = run.problem.scene
         self.h = run.tolerances.settling
-        self.z, self.v = run.y[:5].copy(), run.y[5:10].copy()
-        piece = run.torques, run.piece
-        self.load, self.later = (
-            np.array([1.0, *evaluate_piece(*piece, t)]) for t in (run.t, run.t + self.h)
-        )
+        self.z, self.v = run.z.copy(), run.v.copy()
+        self.load, self.later = (np.array([1.0, *run.tau(t)]) for t in (run.t, run.t + self.h))
         self.rows = evaluate_rows(self.formation, self.z, self.v)
         self.worst = 1.0
 
@@ -228,9 +217,8 @@ def _roll_all(formation: Formation) -> Formation:
 
 def _take(run: Replay, signs: Array, still: Sequence[Unit]) -> None:
     """Go on with the directions chosen; rounding of speeds against them is taken away."""
-    formation = run.phase.formation
-    count, v = formation.n_contacts, run.y[5:10]
-    kinematics = formation.evaluate(run.y[None, :5], v[None])
+    formation, v = run.formation, run.v
+    kinematics = formation.evaluate(run.z[None], v[None])
     gradients = np.vstack([kinematics.A_t[0], np.eye(5)[3:]])
     wrong = [
         unit.rows[0]
@@ -238,16 +226,11 @@ def _take(run: Replay, signs: Array, still: Sequence[Unit]) -> None:
         if signs[unit.rows[0]] == 0 or signs[unit.rows[0]] * (gradients[unit.rows[0]] @ v) < 0
     ]
     root = np.sqrt(formation.scene.mass_diagonal)
-    before = run.stored
     rows = np.vstack([kinematics.P[0], gradients[wrong]]) / root
     rows /= np.linalg.norm(rows, axis=1)[:, None]
-    run.y[5:10] -= np.linalg.lstsq(rows, rows @ (root * v))[0] / root
-    run.impact += before - run.stored
+    run.set_velocity(v - np.linalg.lstsq(rows, rows @ (root * v))[0] / root)
     grips = find_grips(formation, signs)
-    if grips != run.stepper.mode.grips:
+    if grips != run.leg.mode.grips:
         run.take(grips)
-    s = run.stepper
-    s.inputs[s.at.Xi], s.inputs[s.at.sigma] = signs[:count], signs[count:]
-    v = run.y[5:10]
-    s.inputs[s.at.y], s.inputs[s.at.t] = run.y, run.t
-    s.inputs[s.at.heading] = v / np.sqrt(root**2 @ v**2)
+    run.signs = signs
+    run.heading = run.v / np.linalg.norm(root * run.v)

@@ -1,10 +1,19 @@
-"""Compiled steps of a contact mode: Runge-Kutta, projection and events in one CasADi function."""
+"""Runge-Kutta steps of a motion with given contact modes, compiled once for all bodies of a kind.
+
+With the rows P of what a mode keeps at rest (gaps of contacts that press, slip coordinates of those
+that stick, coordinates that dry friction holds) and G, whose rows of sliding contacts bring their
+friction with them,
+
+    M z'' = f + S tau - B z' - D sigma + G^T c,    P z'' + P' z' = 0,    c = [c_n; f].
+
+Contacts that stick as one, as the vertices of a flush edge do, have one force of friction. Only
+this sum is determined; it is shared in proportion to c_n, which does not affect the motion. A step
+ends with a projection of z and z' onto the constraints, in the metric M.
+"""
 
 from __future__ import annotations
 
-import math
-from bisect import bisect_left
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -12,537 +21,272 @@ import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
-from ..common.errors import JammingError, SimulationError
-from ..contacts.elemental import GapLimit, build_features, build_gap
-from ..contacts.formation import Formation
-from ..problem.definition import Phase, Problem, Until
-from ..results.torque import TorqueProfile
-from ..scene.model import Scene
-from .events import Event, EventKind, Outcome, OutcomeKind, Section
-from .layout import (
-    MOVING,
-    STATE,
-    EventRows,
-    Inputs,
-    Outputs,
-    bind,
-    build_torque,
-    find_torque_steps,
-    lay_out,
-)
-from .modes import FREE, Grips, Mode
 from .runge_kutta import INNER_STAGES, build_error, build_step
-from .tolerances import ROUNDING_FORCE, find_tolerances, measure_units
+from .system import Structure, System
+
+LOSSES = 4  # integrals along the motion: work, losses to viscous, dry and sliding friction
 
 
-class ModeStepper(NamedTuple):
-    """Compiled steps of one contact mode.
+class Modes(NamedTuple):
+    """What keeps which contacts while a motion is smooth."""
 
-    Calling `step` or `look` reads `inputs` and overwrites `outputs`. Each simulation has its own.
+    kept: tuple[int, ...] = ()  # pairs that press
+    stuck: tuple[
+        tuple[int, ...], ...
+    ] = ()  # those of them that stick, each with what sticks as one
+    held: tuple[int, ...] = ()  # coordinates that dry friction holds
+    Xi: tuple[float, ...] = ()  # sliding directions of the kept pairs, zero where they stick
+    # directions of coordinates with dry friction, zero for those that are held
+    sigma: tuple[float, ...] = ()
+
+
+class Inputs(NamedTuple):
+    """Where each input of a step is in its packed vector.
+
+    Those from `geometry` on are numbers of the system and its units.
     """
 
-    mode: Mode
+    y: slice  # z, z' and the integrals, (2 n + LOSSES,)
+    t: int  # t, h [s]:
+    h: int
+    tolerance: int  # largest error of z and z' over the step, in units of the scene
+    Xi: slice  # Xi, sigma: directions of sliding (k,) and of coordinates (n,), zero where held
+    sigma: slice
+    stay: slice  # slip coordinates of what sticks [m], then held coordinates
+    piece: slice  # start and end of the torque's piece [s]
+    torque: slice  # its coefficients, joint by joint, as in `TorqueProfile`
+    geometry: slice
+    lift: slice  # diagonal of M^-1
+    applied: slice
+    viscous: slice
+    dry: slice
+    mu: slice  # of the kept pairs
+    units: slice  # of z and z'
+    scales: slice  # units of force and speed
+    friction_units: slice  # of the friction of coordinates
+    size: int
+
+
+class Outputs(NamedTuple):
+    """Where each output of a step is in its packed vector; all but `error` hold at its end."""
+
+    y: slice
+    acceleration: slice
+    c_n: slice  # c_n, c_t [N]: forces of the kept pairs
+    c_t: slice
+    tau: slice  # [N m]
+    ratio: int  # reduced inertia over that without friction
+    # positive until something happens, in units of the scene: see `EventRows`
+    values: slice
+    error: int  # estimated error over the tolerance; accept at 1 and below
+    dip: int  # least force or friction margin at stages within the step, at most 1
+    stage_forces: slice  # c_n at the stages of `INNER_STAGES`, one after the other [N]
+    size: int
+
+
+class EventRows(NamedTuple):
+    """Where each kind of event value is among `Outputs.values`."""
+
+    force: slice  # c_n
+    # what friction still has to give where it holds: bound - f of each force f, then bound + f
+    cone: slice
+    slide: slice  # slide, turn: sliding velocities times Xi, rates of coordinates times sigma
+    turn: slice
+    size: int
+
+
+@dataclass(frozen=True, eq=False)
+class ModeStepper:
+    """Compiled steps of one set of modes; calling `step` or `look` reads `inputs`."""
+
+    modes: Modes  # without signs
     inputs: Array  # inputs, outputs: packed vectors
     outputs: Array
-    at: Inputs  # at, to: their layouts
+    at: Inputs  # at, to, rows: their layouts
     to: Outputs
     rows: EventRows
-    slack: Array  # (n_events,): how far below zero each event value counts as rounding
     step: Any  # step, look: a step of length h; the same outputs at the state given, without a step
     look: Any
     buffers: Any  # what has to live as long as these
 
-    @property
-    def formation(self) -> Formation:
-        """The phase's formation."""
-        return self.mode.formation
+    def load(self, system: System, tolerance: float) -> None:
+        """Set the inputs that do not change along a motion."""
+        inputs, at = self.inputs, self.at
+        inputs[at.tolerance] = tolerance
+        inputs[at.geometry], inputs[at.lift] = system.geometry, 1 / system.mass
+        inputs[at.applied], inputs[at.viscous] = system.applied, system.viscous
+        inputs[at.dry], inputs[at.mu] = system.dry, system.friction[list(self.modes.kept)]
+        inputs[at.units] = system.units
+        inputs[at.scales] = system.scales.force, system.scales.speed
+        inputs[at.friction_units] = system.friction_units
 
-    @property
-    def is_free(self) -> bool:
-        """Whether more than one freedom is left."""
-        return self.mode.n_constraints < 4
+    def stay(self, system: System, z: Array) -> None:
+        """Keep from `z` on what sticks and is held."""
+        stuck, held = self.modes.stuck, self.modes.held
+        if stuck or held:
+            slip = system.evaluate_slip(z, [pairs[0] for pairs in stuck])
+            self.inputs[self.at.stay] = np.concatenate([slip, z[list(held)]])
 
 
-def build_stepper(
-    formation: Formation, until: Until, side: float, degree: int, grips: Grips = FREE
-) -> ModeStepper:
-    """Steps of a formation for torques of a polynomial degree, compiled when first used.
-
-    `side` is the sign of (coordinate - value) before the end of the phase, `until`.
-    """
-    mode, at, to, rows, slack, functions = _compile(formation, until, side, degree, grips)
-    inputs, outputs, *calls = bind(at.size, to.size, functions)
-    return ModeStepper(mode, inputs, outputs, at, to, rows, slack, *calls)
+@lru_cache(maxsize=256)
+def build_stepper(structure: Structure, modes: Modes, degree: int) -> ModeStepper:
+    """Steps of a set of modes without its signs, for torques of a polynomial degree."""
+    return _Equations(structure, modes, degree).compile()
 
 
 class _Equations:
-    """Equations of a formation, as calls on one packed vector: stages are not expanded."""
+    """Equations of motion, as expressions of one packed vector."""
 
-    def __init__(
-        self, formation: Formation, until: Until, side: float, degree: int, grips: Grips
-    ) -> None:
-        self.mode = mode = Mode(formation, grips)
-        self.mechanics = share_mechanics(mode, degree)
-        self.short = find_tolerances(formation.scene).short
-        self._measure = _build_measure(formation, until, side, self.short)
-        inputs = [
-            ca.SX.sym(n, k) for n, k in (("y", MOVING), ("t", 1), ("p", self.mechanics.at.size))
-        ]
-        _, *rows = mode.build_constraints(inputs[0][:5], inputs[0][5:10])
-        self._stage = ca.Function("stage", inputs, self.mechanics.stage(*inputs, *rows))
-        self.packed = ca.MX.sym("packed", self.mechanics.at.size)
-        self.least: list[Expression] = []
-        self.c_n: list[Expression] = []
+    def __init__(self, structure: Structure, modes: Modes, degree: int) -> None:
+        self.structure, self.modes, self.n = structure, modes, structure.n
+        self.groups = [[modes.kept.index(pair) for pair in pairs] for pairs in modes.stuck]
+        n, k, s = self.n, len(modes.kept), len(modes.stuck) + len(modes.held)
+        size, g = 2 * n + LOSSES, structure.geometry.shape[0]
+        numbers = (g, n, n, n, n, k, 2 * n, 2, n)
+        self.at = Inputs(*_lay_out(size, None, None, None, k, n, s, 2, 2 * degree + 2, *numbers))
+        self.rows = EventRows(*_lay_out(k, 2 * s, k, n))
+        brief = len(INNER_STAGES) * k
+        outputs = (size, n, k, k, 2, None, self.rows.size, None, None, brief)
+        self.to = Outputs(*_lay_out(*outputs))
 
-    def rate(self, state: Expression, time: Expression) -> Expression:
-        """Rates of the state at the next stage, whose forces are kept."""
-        rates, least, c_n = self._stage(state, time, self.packed)
-        self.least.append(least)
-        self.c_n.append(c_n)
-        return rates
+    def compile(self) -> ModeStepper:
+        """Steps, and looks at a state, as functions of the packed inputs."""
+        at, n, k = self.at, self.n, len(self.modes.kept)
+        stage, report = self._build_motion()
+        packed = ca.MX.sym("packed", at.size)
+        y, t, h, geometry = packed[at.y], packed[at.t], packed[at.h], packed[at.geometry]
+        stages: list[tuple[Expression, ...]] = []
 
-    def report(self, state: Expression, time: Expression, *errors: Expression) -> Expression:
-        """Outputs at a state, with error, dip and stage forces of the step that led there."""
-        mechanics, packed = self.mechanics, self.packed
-        _, *constraints = self.mode.build_constraints(state[:5], state[5:10])
-        outputs, events, speed, least = mechanics.report(state, time, packed, *constraints)
-        values, distance, approach, closest = self._measure(state[:5], state[5:10])
-        error, dip, stage_forces = errors
-        worst = ca.fmin(least, closest)
-        return ca.vertcat(
-            outputs, error, worst, dip, stage_forces, approach, events, values, distance, speed
+        def rate(state: Expression, time: Expression) -> Expression:
+            rates, *forces = stage(state, time, packed, geometry)
+            stages.append(tuple(forces))
+            return rates
+
+        end, fifth, third = build_step(rate, y, t, h, 2 * n)
+        error = build_error(fifth, third, y[: 2 * n], packed[at.units], packed[at.tolerance])
+        inner = [stages[row] for row in INNER_STAGES]
+        dip = ca.mmin(ca.vertcat(*(least for _, least in inner)))
+        seen = (error, dip, *(c_n for c_n, _ in inner))
+        end = ca.vertcat(self._build_projection()(end[: 2 * n], packed), end[2 * n :])
+        functions = []
+        for state, time, extra in (
+            (end, t + h, seen),
+            (y, t, (0, 1, ca.DM.zeros(len(INNER_STAGES) * k))),
+        ):
+            parts = report(state[: 2 * n], time, packed, geometry)
+            outputs = ca.densify(ca.vertcat(state, parts, *extra))
+            functions.append(ca.Function("step", [packed], [outputs]))
+        inputs, outputs = np.zeros(at.size), np.zeros(self.to.size)
+        buffers = [function.buffer() for function in functions]
+        for buffer, _ in buffers:
+            buffer.set_arg(0, inputs.data)
+            buffer.set_res(0, outputs.data)
+        step, look = (call for _, call in buffers)
+        return ModeStepper(self.modes, inputs, outputs, at, self.to, self.rows, step, look, buffers)
+
+    def _stack(self, normal: Expression, tangential: Expression) -> Expression:
+        """Constraint rows: normal ones, tangential ones that stick, held coordinates."""
+        hold = ca.DM(np.eye(self.n)[list(self.modes.held)].reshape(-1, self.n))
+        return ca.vertcat(normal, *(tangential[rows[0], :] for rows in self.groups), hold)
+
+    def _build_motion(self) -> tuple[Expression, Expression]:
+        """CasADi functions of state, time, packed inputs and geometry.
+
+        The first one returns rates of the state, c_n and the least margin; the second one the
+        outputs from the acceleration to the event values.
+        """
+        structure, n, at, groups = self.structure, self.n, self.at, self.groups
+        k, held = len(self.modes.kept), list(self.modes.held)
+        z, v, time = structure.z, ca.SX.sym("v", n), ca.SX.sym("time")
+        packed = ca.SX.sym("packed", at.size)
+        mu, sigma, lift = packed[at.mu], packed[at.sigma], packed[at.lift]
+        slides = np.ones(k)
+        slides[[row for rows in groups for row in rows]] = 0.0
+        rub = mu * packed[at.Xi] * ca.DM(slides)
+        _, _, A, A_t, bend, bend_t = structure.build_rows(self.modes.kept, v)
+        P, G = (self._stack(part, A_t) for part in (A, A - ca.repmat(rub, 1, n) * A_t))
+        curve = ca.vertcat(bend, *(bend_t[rows[0]] for rows in groups), ca.DM(len(held), 1))
+        tau = _build_torque(time, packed[at.piece], packed[at.torque])
+        viscous, dry = packed[at.viscous] * v, packed[at.dry] * sigma
+        drive = ca.SX(n, 1)
+        for row, coordinate in enumerate(structure.driven):
+            drive[coordinate] = tau[row]
+        force, c, ratio = packed[at.applied] + drive - viscous - dry, ca.SX(0, 1), ca.SX(1)
+        if P.shape[0]:
+            lifted = P * ca.repmat(lift.T, P.shape[0], 1)
+            K = lifted @ G.T
+            c = ca.solve(K, -curve - lifted @ force)
+            force = force + G.T @ c
+            ratio = ca.det(K) / ca.det(lifted @ P.T)
+        acceleration, v_t, (c_n, f) = lift * force, A_t @ v, ca.vertsplit(c, [0, k, c.shape[0]])
+        losses = [ca.dot(part, v) for part in (drive, viscous, dry)]
+        losses.append(ca.dot(rub * c_n, v_t))
+        bounds = [ca.dot(mu[rows], c_n[rows]) for rows in groups]
+        bounds += [packed[at.dry][i] for i in held]
+        units = [packed[at.scales][0]] * len(groups) + [packed[at.friction_units][i] for i in held]
+        bound, unit = (ca.vertcat(ca.SX(0, 1), *part) for part in (bounds, units))
+        margins = ca.vertcat(c_n / packed[at.scales][0], (bound - f) / unit, (bound + f) / unit)
+        speeds = packed[at.Xi] * v_t / packed[at.scales][1], sigma * v / packed[at.units][n:]
+        c_t = -rub * c_n
+        for rows, friction in zip(groups, ca.vertsplit(f)[: len(groups)], strict=True):
+            share = c_n[rows] / ca.fmax(ca.sum1(c_n[rows]), 1e-300) if len(rows) > 1 else 1
+            c_t[rows] = friction * share
+        inputs = [ca.vertcat(z, v), time, packed, structure.geometry]
+        stage = [ca.vertcat(v, acceleration, *losses), c_n, ca.mmin(ca.vertcat(1.0, margins))]
+        report = [ca.vertcat(acceleration, c_n, c_t, tau, ratio, margins, *speeds)]
+        return (
+            ca.Function("stage", inputs, [ca.densify(part) for part in stage]),
+            ca.Function("report", inputs, [ca.densify(part) for part in report]),
         )
 
-    def project(self, y: Expression) -> Expression:
-        """Move z onto the constraints and z' to P z' = 0, the shortest way in metric M5.
+    def _build_projection(self) -> Expression:
+        """CasADi function (state, packed) -> its projection on the constraints in the metric M.
 
         A step leaves gaps of the size of its error, so one Newton iteration closes them.
         """
-        z, v, mode, mechanics = y[:5], y[5:10], self.mode, self.mechanics
-        values, P, _, _ = mode.build_constraints(z, v)
-        kept = ca.vertcat(ca.DM(mode.formation.n_contacts, 1), self.packed[mechanics.at.kept])
-        z = z - mechanics.correct(P, values - kept)
-        _, P, _, _ = mode.build_constraints(z, v)
-        v = v - mechanics.correct(P, P @ v)
-        return ca.vertcat(z, v, y[10:])
-
-
-@lru_cache(maxsize=64)
-def _compile(
-    formation: Formation, until: Until, side: float, degree: int, grips: Grips
-) -> tuple[Mode, Inputs, Outputs, EventRows, Array, tuple[Expression, Expression]]:
-    """What all steppers of a formation share: mode, layouts, slack, functions step and look."""
-    equations = _Equations(formation, until, side, degree, grips)
-    mechanics, mode, packed = equations.mechanics, equations.mode, equations.packed
-    at, n_c, held = mechanics.at, formation.n_contacts, len(mode.holders)
-    limits = len(open_limits(formation, until))
-    rows = EventRows(*lay_out(n_c, 2 * held, n_c, 2, limits, None, None))
-    brief = len(INNER_STAGES) * n_c
-    to = Outputs(*lay_out(STATE, 5, n_c, n_c, 2, 5, None, None, None, None, brief, None, rows.size))
-    short = np.full(limits, equations.short)
-    slack = np.concatenate([mechanics.slack, short, [0.0, mechanics.stall]])
-    y, t, h = packed[at.y], packed[at.t], packed[at.h]
-    end, fifth, third = build_step(equations.rate, y, t, h, MOVING)
-    error = mechanics.error(fifth, third, packed)
-    stage_forces = ca.vertcat(*(equations.c_n[stage] for stage in INNER_STAGES))
-    dip = ca.mmin(ca.vertcat(*equations.least))
-    outputs = equations.report(equations.project(end), t + h, error, dip, stage_forces)
-    step = ca.Function("step", [packed], [outputs])
-    look = ca.Function("look", [packed], [equations.report(y, t, 0, 0, ca.DM.zeros(brief))])
-    return mode, at, to, rows, slack, (step, look)
-
-
-def _build_measure(formation: Formation, until: Until, side: float, short: float) -> Expression:
-    """CasADi function (z, v) -> limits, distance to the end, its rate, least slack of these."""
-    z, v = build_features(formation.scene).z, ca.SX.sym("v", 5)
-    gained = [limit for limit in formation.limits if limit.gains(until.contact)]
-    if until.is_release:
-        distance = ca.SX(1)
-    elif until.contact is None:
-        distance = side * (z[0 if until.coordinate == "x" else 2] - until.value)
-    elif gained:
-        # A pointed tip comes to a vertex along the edge, or turns onto it with its link.
-        distance = ca.mmin(ca.vertcat(*(limit.value for limit in gained)))
-    else:
-        distance = build_gap(until.contact, formation.scene)
-    values = ca.vertcat(*(limit.value for limit in open_limits(formation, until)))
-    closest = ca.mmin(ca.vertcat(values + short, distance))
-    parts = [values, distance, ca.jtimes(distance, z, v), closest]
-    return ca.Function("measure", [z, v], [ca.densify(part) for part in parts])
-
-
-@lru_cache(maxsize=64)
-def open_limits(formation: Formation, until: Until) -> tuple[GapLimit, ...]:
-    """Limits that end a phase early: all but that of the contact to be gained."""
-    return tuple(limit for limit in formation.limits if not limit.gains(until.contact))
-
-
-@dataclass(frozen=True)
-class Kind:
-    """What the equations of motion depend on besides the constraint rows."""
-
-    scene: Scene
-    friction: tuple[float, ...]  # of each contact
-    rolling: tuple[int, ...]  # contacts that the phase lets roll
-    grips: Grips
-    degree: int  # of the torque's polynomials
-    mode: Mode = field(compare=False)  # one of this kind
-
-
-class Mechanics(NamedTuple):
-    """CasADi functions of the constraint rows: P, P' v and A_t."""
-
-    at: Inputs  # layout of the packed inputs
-    # (z and z', time, packed, rows) -> rates of the state, the least that holds it in units of the
-    # scene, and c_n
-    stage: Expression
-    # (state, time, packed, rows) -> outputs up to the ratio, events before and after the limits,
-    # and the least of these events with their slacks
-    report: Expression
-    # (P, r) -> M5^-1 P^T (P M5^-1 P^T)^-1 r, the shortest change of z that makes P change by r
-    correct: Expression
-    error: Expression  # (fifth, third, packed) -> error of a step over the tolerance
-    # (n_events before the limits,): how far below zero each of these counts as rounding
-    slack: Array
-    stall: float  # likewise for the speed
-
-
-def share_mechanics(mode: Mode, degree: int) -> Mechanics:
-    """Return the equations of motion of a mode, for torques of a polynomial degree."""
-    formation = mode.formation
-    friction = tuple(formation.friction.tolist())
-    kind = Kind(formation.scene, friction, formation.rolling_rows, mode.grips, degree, mode)
-    return _build_mechanics(kind)
-
-
-@lru_cache(maxsize=32)
-def _build_mechanics(kind: Kind) -> Mechanics:
-    return _Model(kind).build()
-
-
-class _Model:
-    """Right-hand side and events of a kind of modes, as expressions of the packed inputs."""
-
-    def __init__(self, kind: Kind) -> None:
-        self.mode = mode = kind.mode
-        count, held = len(kind.friction), len(mode.holders)
-        self.at = Inputs(
-            *lay_out(STATE, None, None, None, count, 2, held, 5, 2, 2 * kind.degree + 2)
+        structure, n = self.structure, self.n
+        z, v = structure.z, ca.SX.sym("v", n)
+        packed = ca.SX.sym("packed", self.at.size)
+        gap, slip, A, A_t, _, _ = structure.build_rows(self.modes.kept, v)
+        P, state = self._stack(A, A_t), ca.vertcat(z, v)
+        if not P.shape[0]:
+            return ca.Function("correct", [state, packed], [state])
+        places = ca.vertcat(
+            gap, *(slip[rows[0]] for rows in self.groups), *(z[i] for i in self.modes.held)
         )
-        self.packed = packed = ca.SX.sym("packed", self.at.size)
-        self.Xi, self.sigma = packed[self.at.Xi], packed[self.at.sigma]
-        self.y, self.t = ca.SX.sym("state", STATE), ca.SX.sym("time")
-        n = mode.n_constraints
-        self.rows = [ca.SX.sym("P", n, 5), ca.SX.sym("bend", n), ca.SX.sym("A_t", count, 5)]
-
-    def build(self) -> Mechanics:
-        """All of its functions."""
-        scene = self.mode.formation.scene
-        tolerances = find_tolerances(scene)
-        stall = tolerances.speed * scene.scales.mass**0.5
-        slack = np.concatenate(
-            [
-                ROUNDING_FORCE * self.mode.force_limit_units,
-                np.full(self.mode.formation.n_contacts, tolerances.speed),
-                np.full(2, tolerances.turning),
-            ]
+        wanted = ca.vertcat(ca.DM(len(self.modes.kept), 1), packed[self.at.stay])
+        rows = ca.Function(
+            "rows", [z, packed, structure.geometry], [ca.densify(P), ca.densify(places - wanted)]
         )
-        inputs = [self.t, self.packed, *self.rows]
-        rates, c, v_t, tau, K, P = self._move()
-        H, h = self.mode.force_limit_rows
-        margins, c_n = ca.sparsify(ca.DM(H)) @ c + ca.DM(h), c[: self.mode.formation.n_contacts]
-        least = ca.mmin(margins / self.mode.force_limit_units)
-        report = self._report(rates, c, v_t, tau, K, P, margins, slack, stall)
-        row, r = self.rows[0], ca.SX.sym("r", self.mode.n_constraints)
-        lift = ca.DM(1 / scene.mass_diagonal) * row.T
-        correction = ca.densify(lift @ ca.solve(row @ lift, r))
-        fifth, third = ca.SX.sym("fifth", MOVING), ca.SX.sym("third", MOVING)
-        start, tolerance = self.packed[self.at.y][:MOVING], self.packed[self.at.tolerance]
-        error = build_error(fifth, third, start, ca.DM(measure_units(scene)), tolerance)
-        return Mechanics(
-            self.at,
-            ca.Function("stage", [self.y[:MOVING], *inputs], [rates, least, c_n]),
-            ca.Function("report", [self.y, *inputs], report),
-            ca.Function("correct", [row, r], [correction]),
-            ca.Function("error", [fifth, third, self.packed], [error]),
-            slack,
-            stall,
-        )
-
-    def _move(self) -> list[Expression]:
-        """Rates of the state, c, v_t, tau, K and P at (z, z') = y[:10]."""
-        mode, scene = self.mode, self.mode.formation.scene
-        v = self.y[5:10]
-        P, bend, A_t = self.rows
-        tau = build_torque(self.t, self.packed[self.at.piece], self.packed[self.at.torque])
-        inverse_mass = ca.DM(1 / scene.mass_diagonal)
-        G = mode.build_force_rows(P, A_t, self.Xi)
-        viscous = ca.DM(scene.viscous[3:]) * v[3:]
-        dry = ca.DM(scene.dry[3:]) * self.sigma
-        applied = ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, tau - viscous - dry)
-        K = P @ (inverse_mass * G.T)
-        c = ca.solve(K, -bend - P @ (inverse_mass * applied))
-        acceleration = inverse_mass * (applied + G.T @ c)
-        v_t = A_t @ v
-        drag = ca.DM(mode.rolled.sliding_friction) * self.Xi * c[: mode.formation.n_contacts]
-        powers = [ca.dot(force, v[3:]) for force in (tau, viscous, dry)]
-        powers.append(ca.dot(drag, v_t))
-        return [ca.vertcat(v, acceleration, *powers), c, v_t, tau, K, P]
-
-    def _report(
-        self,
-        rates: Expression,
-        c: Expression,
-        v_t: Expression,
-        tau: Expression,
-        K: Expression,
-        P: Expression,
-        margins: Expression,
-        slack: Array,
-        stall: float,
-    ) -> list[Expression]:
-        mode, mass = self.mode, self.mode.formation.scene.mass_diagonal
-        y, v, before = self.y, self.y[5:10], self.packed[self.at.heading]
-        frictionless = P @ (ca.DM(1 / mass) * P.T)
-        size = ca.sqrt(ca.dot(v, ca.DM(mass) * v))
-        heading = ca.if_else(size > 0, v / ca.fmax(size, 1e-300), before)
-        speed = ca.dot(before, ca.DM(mass) * v) if mode.n_constraints >= 4 else ca.SX(1)
-        c_n, c_t = c[: mode.formation.n_contacts], mode.build_tangential(c, self.Xi)
-        ratio = ca.det(K) / ca.det(frictionless)
-        outputs = ca.vertcat(y, rates[5:10], c_n, c_t, tau, heading, ratio)
-        events = ca.vertcat(margins, self.Xi * v_t, self.sigma * v[3:])
-        least = ca.fmin(ca.mmin(events + ca.DM(slack)), speed + stall)
-        return [ca.densify(part) for part in (outputs, events, speed, least)]
+        P, r, lift = ca.SX.sym("P", *P.shape), ca.SX.sym("r", P.shape[0]), ca.SX.sym("lift", n)
+        lifted = ca.repmat(lift, 1, P.shape[0]) * P.T
+        shift = ca.densify(lifted @ ca.solve(P @ lifted, r))
+        correct = ca.Function("correct", [P, r, lift], [shift])
+        y, inputs = ca.MX.sym("y", 2 * n), ca.MX.sym("packed", self.at.size)
+        geometry, lift = inputs[self.at.geometry], inputs[self.at.lift]
+        P, off = rows(y[:n], inputs, geometry)
+        place = y[:n] - correct(P, off, lift)
+        P, _ = rows(place, inputs, geometry)
+        speed = y[n:] - correct(P, P @ y[n:], lift)
+        return ca.Function("project", [y, inputs], [ca.vertcat(place, speed)])
 
 
-class Replay:
-    """State, piece of the torques and records of a running simulation.
+def _build_torque(time: Expression, piece: Expression, coefficients: Expression) -> Expression:
+    """Torques on a polynomial piece with ends `piece` [s], shape (2,) [N m], by Horner's rule."""
+    start, stop = piece[0], piece[1]
+    x = (2 * time - start - stop) / (stop - start)
+    coefficients = ca.reshape(coefficients, -1, 2)
+    value = coefficients[-1, :]
+    for power in range(coefficients.shape[0] - 2, -1, -1):
+        value = value * x + coefficients[power, :]
+    return value.T
 
-    Attributes
-    ----------
-    t, h : [s]               present time, and the step to try next
-    y : (STATE,)             z, z', then work, viscous, dry and contact losses
-    has_slid                 whether contacts that come to rest have slid in the phase
-    slip_signs               signs of contacts, by name, that have just begun to slip
-    side                     sign of (coordinate - value) before the end of the phase
-    until_unit : [m or rad]  unit of the distance to the end of the phase
-    passes                   whether the end may be passed at any speed, without an impact
-    moving                   whether the motion goes on into the next phase
-    previous                 formation of the last phase that has ended at rest
-    wanted                   instants at which steps have to end; infinity is last
-    stuck                    contacts, then joints, that stick while the rest moves
-    """
 
-    stepper: ModeStepper  # of the phase's formation
-    phase: Phase
-    limits: list[str]  # what has happened when each of the stepper's limits is zero
-    releasable: tuple[str, ...]  # the contacts whose release ends the phase
-    # resting, slipping: the contacts that come to rest, all of them, or slip, one of them, where
-    # the phase ends
-    resting: frozenset[int]
-    slipping: frozenset[int]
-
-    def __init__(
-        self, problem: Problem, torque: TorqueProfile, tolerance: float, wanted: Array
-    ) -> None:
-        self.problem, self.torques, self.tolerance = problem, torque, tolerance
-        self.tolerances = find_tolerances(problem.scene)
-        self.until_unit = 1.0
-        self.breaks = [float(b) for b in torque.breaks]
-        self.coefficients = torque.coefficients
-        parts, least = torque.coefficients, self.tolerances.torque_step
-        self.steps_at: list[bool] = [
-            True,
-            *find_torque_steps(parts[:-1], parts[1:], least).tolist(),
-        ]
-        ends = torque.breaks[:-1], torque.breaks[1:]
-        flat = self.coefficients.reshape(len(self.coefficients), -1)
-        self.pieces = np.column_stack([*ends, flat])
-        self.step_times = [b for b, s in zip(self.breaks, self.steps_at, strict=False) if s]
-        within = wanted[(wanted >= self.breaks[0]) & (wanted <= self.breaks[-1])]
-        self.wanted = [*within.tolist(), math.inf]
-        self.next_wanted = 0
-        self.t, self.piece = self.breaks[0], 0
-        self.y = np.zeros(STATE)
-        self.y[:5] = problem.start
-        self.h = self.tolerances.first_step
-        self.held_until = self.settled_by = -math.inf
-        self.impact = 0.0
-        self.passes = self.moving = False
-        self.previous: Formation | None = None
-        self.side = 1.0
-        self.stuck: set[int] = set()
-        self.has_slid = False
-        self.slip_signs: dict[str, float] = {}
-        self.decided = (-math.inf, 0)
-        self.sections: list[Section] = []
-        self.steppers: list[ModeStepper] = []
-        self.events: list[Event] = []
-        self.steps = self.rejected = 0
-
-    def take(self, grips: Grips = FREE) -> None:
-        """Go on with the steps of the phase's formation in which friction holds `grips`."""
-        degree = self.coefficients.shape[2] - 1
-        formation, until = self.phase.formation, self.phase.until
-        self.stepper = s = build_stepper(formation, until, self.side, degree, grips)
-        self.sections.append(Section(self.phase, s.to, [], [], [], []))
-        self.steppers.append(s)
-        s.inputs[s.at.tolerance] = self.tolerance
-        s.inputs[s.at.kept] = s.mode.read_kept(self.y[:5])
-        self.load_piece()
-
-    def accept(self, t: float) -> Array:
-        """Take the step just made, to time `t`, and record its end."""
-        s = self.stepper
-        self.t = t
-        self.y[:] = s.outputs[s.to.y]
-        s.inputs[s.at.heading] = s.outputs[s.to.heading]
-        if not s.outputs[s.to.ratio] > 0:
-            self.fail_to_step(float(s.outputs[s.to.ratio]))
-        return self.keep(s.outputs.copy())
-
-    def fail_to_step(self, ratio: float) -> None:
-        """Raise the error for a step size that underflows."""
-        names = " ".join(self.phase.formation.names)
-        if not ratio > 1e-3:
-            raise JammingError(
-                f"{names} jams {self.where()}: friction makes the reduced inertia {ratio:.3g} of "
-                "its frictionless value"
-            )
-        raise SimulationError(f"the step size of {names} underflows {self.where()}")
-
-    def step_to(self, h: float) -> None:
-        """Repeat the step with another length."""
-        s = self.stepper
-        s.inputs[s.at.h] = h
-        s.step()
-
-    def record(self, still: bool = False) -> Array:
-        """Record the present state; at rest without forces and acceleration."""
-        s = self.stepper
-        s.inputs[s.at.y], s.inputs[s.at.t] = self.y, self.t
-        s.look()
-        row = s.outputs.copy()
-        if still:
-            row[s.to.acceleration] = 0.0
-            row[s.to.c_n] = row[s.to.c_t] = math.nan
-        return self.keep(row)
-
-    def keep(self, row: Array) -> Array:
-        """Append a row of outputs to the records; it becomes the start of the next step."""
-        s, section = self.stepper, self.sections[-1]
-        s.inputs[s.at.y] = self.y
-        section.times.append(self.t)
-        section.rows.append(row)
-        section.impacts.append(self.impact)
-        return row
-
-    def drop(self) -> None:
-        """Take back the last record."""
-        section = next(section for section in reversed(self.sections) if section.times)
-        for column in (section.times, section.rows, section.impacts):
-            column.pop()
-
-    def repeats(self) -> bool:
-        """Whether the last two records are of the same instant of one phase, but for rounding."""
-        sections = [section for section in self.sections if section.phase is self.phase]
-        times = [time for section in sections[-2:] for time in section.times[-2:]]
-        return len(times) > 1 and self.t - times[-2] <= self.tolerances.settling
-
-    def note(
-        self,
-        kind: EventKind,
-        text: str,
-        contact: str = "",
-        value: float = math.nan,
-        time: float | None = None,
-    ) -> None:
-        """Append an event, at present if no time is given."""
-        time = self.t if time is None else time
-        self.events.append(Event(time, self.phase.index, kind, text, contact, value))
-
-    def lose(self, contact: str, c_n: float) -> Outcome:
-        """End because `contact` would have to pull."""
-        how = "to zero" if c_n > -1e3 * self.tolerances.force else f"to {c_n:.3g} N"
-        text = f"c_n of {contact} falls {how} {self.when()}"
-        self.note(EventKind.CONTACT_LOST, text, contact, c_n)
-        return Outcome(OutcomeKind.CONTACT_LOST, text)
-
-    def slip(self, row: int, c_n: float, c_t: float) -> Outcome:
-        """End because a rolling contact slips: the `row`-th of the formation, with forces in N."""
-        formation = self.phase.formation
-        name, bound = formation.names[row], formation.friction[row] * c_n
-        how = "exceeds" if abs(c_t) - bound > 1e3 * self.tolerances.force else "reaches"
-        text = f"{name} slips: |c_t| = {abs(c_t):.5g} N {how} mu c_n = {bound:.5g} N {self.when()}"
-        self.note(EventKind.SLIP, text, name, bound - abs(c_t))
-        return Outcome(OutcomeKind.SLIPS, text)
-
-    def run_out(self) -> Outcome:
-        """End because the torques end."""
-        until, distance = self.phase.until, math.nan
-        if until.is_release:
-            names = self.phase.formation.names
-            ends = [(self.resting, "comes to rest"), (self.slipping, "slips")]
-            texts = [f"{', '.join(names[k] for k in sorted(rows))} {t}" for rows, t in ends if rows]
-            if self.releasable:
-                texts = [f"{', '.join(self.releasable)} is released"]
-            text = f"the torques end {self.when()}, before {' or '.join(texts)}"
-        else:
-            distance = self.value(self.stepper.rows.until)
-            unit = "rad" if until.coordinate == "phi" else "m"
-            text = f"the torques end {self.when()}, {distance:.3g} {unit} short of {until}"
-        self.note(EventKind.END, text, "", distance)
-        return Outcome(OutcomeKind.GOAL_MISSED, text)
-
-    def value(self, row: int) -> float:
-        """One of the event values at the present state."""
-        return float(self.stepper.outputs[self.stepper.to.events.start + row])
-
-    def load_piece(self) -> None:
-        """Set the stepper's inputs for the present piece of the torques."""
-        s = self.stepper
-        s.inputs[s.at.piece.start : s.at.torque.stop] = self.pieces[self.piece]
-
-    def next_piece(self) -> bool:
-        """Go on to the next piece, if there is one; whether the torques step there."""
-        if self.piece + 2 >= len(self.breaks):
-            return False
-        self.piece += 1
-        self.load_piece()
-        return self.steps_at[self.piece]
-
-    @property
-    def coming_step(self) -> float:
-        """When the torques step next, after the present piece, or infinity [s]."""
-        k = bisect_left(self.step_times, self.breaks[self.piece + 1])
-        return self.step_times[k] if k < len(self.step_times) else math.inf
-
-    @property
-    def last_step(self) -> float:
-        """When the torques last stepped, at their start or later [s]."""
-        return self.step_times[bisect_left(self.step_times, self.breaks[self.piece + 1]) - 1]
-
-    def fraction(self, t: float) -> float:
-        """Coordinate of time `t` on the present piece, from -1 to 1."""
-        start, stop = self.breaks[self.piece], self.breaks[self.piece + 1]
-        return min(1.0, max(-1.0, (2 * t - start - stop) / (stop - start)))
-
-    def time(self, x: float) -> float:
-        """Time at `x` of the present piece [s]."""
-        start, stop = self.breaks[self.piece], self.breaks[self.piece + 1]
-        return (start + stop + x * (stop - start)) / 2
-
-    def when(self) -> str:
-        """Present time and phase, to end a sentence."""
-        return f"at t = {self.t:.5g} s, phase {self.phase.number}"
-
-    def where(self) -> str:
-        """Present phase and time, for errors."""
-        return f"in phase {self.phase.number} at t = {self.t:.5g} s"
-
-    @property
-    def stored(self) -> float:
-        """Kinetic and potential energy [J]."""
-        scene, v = self.problem.scene, self.y[5:10]
-        height = scene.polygon.mass * scene.gravity * self.y[1]
-        return float(0.5 * v**2 @ scene.mass_diagonal + height)
+def _lay_out(*sizes: int | None) -> tuple[Any, ...]:
+    """Consecutive slices of the given sizes, an index where None is given, and the total."""
+    places: list[Any] = []
+    stop = 0
+    for size in sizes:
+        places.append(stop if size is None else slice(stop, stop + size))
+        stop += 1 if size is None else size
+    return (*places, stop)

@@ -20,15 +20,14 @@ from ..common.errors import InputError, name_source
 from ..common.fields import SHARE
 from ..common.sharing import exclusive
 from ..contacts.elemental import Contact
-from ..free_simulation.free_simulate import simulate_free
-from ..free_simulation.hand import build_system
-from ..free_simulation.result import FreeSimulation, list_pauses
-from ..free_simulation.state import FreeRun
 from ..problem.check import require_phases
 from ..problem.definition import End, Phase, Problem, Until
 from ..quasistatic.slow_speeds import SQUEEZE, find_torques, sample_path
 from ..results.torque import TorqueProfile, format_rows, read_rows
-from ..simulation.events import Event, EventKind
+from ..simulation.events import Event, EventKind, FreeSimulation, list_pauses
+from ..simulation.free_run import FreeRun
+from ..simulation.free_simulate import simulate_free
+from ..simulation.hand import build_system
 from ..simulation.tolerances import REST_WINDOW
 from ..verification.free import FreeReport, find_losses, verify_free
 from ..verification.verdict import DEPARTURE

@@ -16,15 +16,14 @@ import numpy as np
 from ..common.document import Document, Result, Table, fixed
 from ..common.errors import require_number
 from ..common.sharing import exclusive
-from ..free_simulation.free_simulate import simulate_free, simulate_phases
-from ..free_simulation.hand import build_system
-from ..free_simulation.result import FreeSimulation, list_pauses
 from ..geometry.curve import describe_pose
 from ..problem.definition import Phase, Problem
 from ..results.adopt import Torques, adopt_torques, require_same_contacts
 from ..results.plan_record import Deviation
 from ..results.trajectory import Trajectory
-from ..simulation.events import EventKind, OutcomeKind
+from ..simulation.events import EventKind, FreeSimulation, OutcomeKind, list_pauses
+from ..simulation.free_simulate import simulate_free, simulate_phases
+from ..simulation.hand import build_system
 from .verdict import DEPARTURE
 
 MOST = 60  # most events that the text lists; `to_dict` has all

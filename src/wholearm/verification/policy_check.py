@@ -6,13 +6,12 @@ import math
 
 from ..common.errors import InputError, require_number
 from ..common.sharing import exclusive
-from ..free_simulation.free_simulate import simulate_free
-from ..free_simulation.result import FreeSimulation
 from ..policy.playback import ROOM, ClosedLoop, Policy
 from ..problem.definition import Phase, Problem
 from ..results.adopt import Moved, adopt_motion
 from ..results.trajectory import Trajectory
-from ..simulation.events import OutcomeKind
+from ..simulation.events import FreeSimulation, OutcomeKind
+from ..simulation.free_simulate import simulate_free
 from .free import FreePhase, FreeReport, describe_losses, find_losses, measure_end, warn
 from .verdict import DEPARTURE
 

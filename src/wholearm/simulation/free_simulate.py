@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -11,16 +12,25 @@ from numpy.typing import ArrayLike
 from ..common.arrays import Array
 from ..common.errors import InputError, SimulationError, require_number
 from ..common.sharing import exclusive
+from ..contacts.elemental import parse_contact
 from ..problem.definition import Problem
 from ..results.adopt import Torques, adopt_torques
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
-from ..simulation.tolerances import SLOW, is_slower
+from .events import (
+    EventKind,
+    FreeSimulation,
+    Outcome,
+    OutcomeKind,
+    collect,
+    list_stretches,
+)
 from .free_events import play
-from .free_stepper import Modes
+from .free_run import FreeRun
 from .hand import build_system, is_apart, measure_gaps
-from .result import FreeSimulation, collect
-from .state import Feedback, FreeRun, Law
+from .run import Feedback, Law
+from .stepper import Modes
+from .tolerances import SLOW, is_slower
 
 
 class PhaseRun(NamedTuple):
@@ -142,7 +152,49 @@ def _simulate(
             raise SimulationError(f"{pairs[worst]} overlap by {depths[worst]:.3g} m at the start")
     run = FreeRun(system, profile, z, v, restitution, tolerance, hint)
     play(run, problem.scene.touching, halt)
-    return collect(run, problem, starts)
+    return _conclude(run, problem, np.asarray(starts))
+
+
+def _conclude(run: FreeRun, problem: Problem, clock: Array) -> FreeSimulation:
+    """The result of a run; `clock` are the starts of the phases [s]."""
+    names, records = run.system.names, run.records
+    planned = [contact.name for contact in problem.contacts]
+    used = dict.fromkeys(names[pair] for row in records for pair in row.kept)
+    others = [name for name in used if name not in planned and _is_named(name, problem)]
+    given_up = next((e for e in run.events if e.kind is EventKind.GIVEN_UP), None)
+    outcome = Outcome(OutcomeKind.ENDED, f"the simulation ends at t = {run.t:.5g} s")
+    if given_up is not None:
+        outcome = Outcome(OutcomeKind.GIVEN_UP, given_up.text)
+    fields = collect(run.system, records, [*planned, *others])
+    t = fields["t"]
+    owners = np.searchsorted(clock, [event.time for event in run.events], side="right") - 1
+    # Of two rows at a boundary the first one ends the phase before.
+    twice = np.append(np.diff(t) == 0, False) & np.isin(t, clock[1:])
+    fields["phase"] = np.maximum(np.searchsorted(clock, t, side="right") - 1 - twice, 0)
+    return FreeSimulation(
+        **fields,
+        problem=problem,
+        torque=run.torque,
+        events=tuple(
+            event._replace(phase=max(int(owner), 0))
+            for event, owner in zip(run.events, owners, strict=True)
+        ),
+        stretches=list_stretches(records, names),
+        outcome=outcome,
+        missed_by=math.nan,
+        residual=run.residual,
+        steps=run.steps,
+        rejected=run.rejected,
+    )
+
+
+def _is_named(name: str, problem: Problem) -> bool:
+    """Whether a pair is a contact that problem files know."""
+    try:
+        parse_contact(name, problem.scene)
+    except InputError:
+        return False
+    return True
 
 
 def _recall(problem: Problem, plan: Trajectory, row: int) -> Modes:
@@ -158,7 +210,7 @@ def _recall(problem: Problem, plan: Trajectory, row: int) -> Modes:
     rolls = [system.names[pair] in {c.name for c in phase.formation.rolling} for pair in kept]
     Xi = np.where(rolls, 0.0, slides)
     turns = np.sign(v + ahead * a) * (system.dry > 0)
-    stuck = tuple(pair for pair, one in zip(kept, rolls, strict=True) if one)
+    stuck = tuple((pair,) for pair, one in zip(kept, rolls, strict=True) if one)
     return Modes(tuple(kept), stuck, (), tuple(Xi.tolist()), tuple(turns.tolist()))
 
 

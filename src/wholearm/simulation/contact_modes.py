@@ -12,8 +12,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ..common.arrays import Array
-from ..simulation.events import EventKind
-from ..simulation.tolerances import STANDING, STILL
 from .contact_problem import (
     APART,
     BACK,
@@ -28,9 +26,11 @@ from .contact_problem import (
     solve,
     try_modes,
 )
-from .free_stepper import Modes
-from .state import AHEAD, CLOSED, SUNK, FreeRun
+from .events import EventKind
+from .free_run import AHEAD, CLOSED, SUNK, FreeRun
+from .stepper import Modes
 from .system import ContactRows, System
+from .tolerances import STANDING, STILL
 
 CLEAR = 1e-3  # forces and rates, over the largest, that do not vanish within `AHEAD`
 DEPENDENT = 1e-7  # share of a row that others leave, below which it is no constraint of its own
@@ -265,7 +265,7 @@ def _make_modes(run: FreeRun, pattern: Pattern, answer: ContactAnswer, rows: Con
     kept_pairs = sorted(kept)
     return Modes(
         tuple(closed[k] for k in kept_pairs),
-        tuple(sorted(closed[k] for k in stuck)),
+        tuple((pair,) for pair in sorted(closed[k] for k in stuck)),
         tuple(sorted(held)),
         tuple(float(Xi[k]) for k in kept_pairs),
         tuple(sigma.tolist()),
@@ -282,7 +282,7 @@ def _project_velocity(run: FreeRun, rows: Array) -> None:
     if np.abs(along).max(initial=0.0) <= ROUNDED * np.abs(speed).max():
         return
     change = np.linalg.lstsq(scaled, along, rcond=1e-9)[0]
-    run.take_impulse(run.v - change / root)
+    run.set_velocity(run.v - change / root)
 
 
 def _name(system: System, joint: int) -> str:
@@ -306,12 +306,12 @@ def _note_changes(run: FreeRun, closed: Sequence[int], modes: Modes, rests: bool
         heirs = [p for p in new if names[p][-1:] == names[pair][-1:]]
         if heirs and abs(gaps[pair]) < near and ranges[pair] < near:
             text = f"{names[pair]} goes on as {names[heirs[0]]}"
-            run.note(EventKind.PASS, text, names[heirs[0]])
+            run.note_at(EventKind.PASS, text, names[heirs[0]])
             new.remove(heirs[0])
         elif pair not in closed or run.records:
-            run.note(EventKind.CONTACT_LOST, f"{names[pair]} is lost", names[pair])
+            run.note_at(EventKind.CONTACT_LOST, f"{names[pair]} is lost", names[pair])
     for pair in new if run.records else ():
-        run.note(EventKind.GAINED, f"{names[pair]} presses", names[pair])
+        run.note_at(EventKind.GAINED, f"{names[pair]} presses", names[pair])
     for pair in modes.kept:
         if pair not in before.kept or not run.records:
             continue
@@ -322,9 +322,9 @@ def _note_changes(run: FreeRun, closed: Sequence[int], modes: Modes, rests: bool
         old, now = before.sigma[joint], modes.sigma[joint]
         _note_change(run, _name(system, int(joint)), old, now, "turns", True)
     if rests:
-        run.note(EventKind.REST, "everything rests")
+        run.note_at(EventKind.REST, "everything rests")
     elif run.resting:
-        run.note(EventKind.START, "the motion begins")
+        run.note_at(EventKind.START, "the motion begins")
 
 
 def _note_change(run: FreeRun, name: str, old: float, now: float, verb: str, rubs: bool) -> None:
@@ -333,12 +333,12 @@ def _note_change(run: FreeRun, name: str, old: float, now: float, verb: str, rub
     contact = verb == "slides"
     if now == 0:
         text = f"{name} sticks" if contact else f"friction holds {name}"
-        run.note(EventKind.STICK, text, name)
+        run.note_at(EventKind.STICK, text, name)
     elif old == 0:
         text = f"{name} slips" if contact else f"{name} starts to turn"
-        run.note(EventKind.SLIP, text, name)
+        run.note_at(EventKind.SLIP, text, name)
     else:
-        run.note(EventKind.REVERSAL, f"{name} {verb} the other way", name)
+        run.note_at(EventKind.REVERSAL, f"{name} {verb} the other way", name)
 
 
 def _note_ambiguity(run: FreeRun, pattern: Pattern, answers: Sequence[Sequence[int]]) -> None:
@@ -363,4 +363,4 @@ def _note_ambiguity(run: FreeRun, pattern: Pattern, answers: Sequence[Sequence[i
     text += "; or ".join(texts) + ")"
     last = [event for event in run.events if event.kind is EventKind.AMBIGUOUS]
     if not last or last[-1].text.split(" at t =")[0] != text:
-        run.note(EventKind.AMBIGUOUS, text, " ".join(names))
+        run.note_at(EventKind.AMBIGUOUS, text, " ".join(names))

@@ -5,19 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import product
 from operator import mul
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..results.trajectory import interpolate_quintic
-from ..simulation.events import EventKind
-from ..simulation.root_finding import find_crossing, find_root
-from ..simulation.runge_kutta import ORDER
-from ..simulation.tolerances import ROUNDING_FORCE, SHORTEST_STEP, STANDING, STILL
 from .contact_modes import ClosedContacts, Pattern, decide, find_closed, stands
 from .contact_problem import (
     APART,
@@ -29,13 +23,16 @@ from .contact_problem import (
     solve,
     try_modes,
 )
-from .free_stepper import FreeOutputs, Modes
-from .state import AHEAD, ARMED, CLOSED, NO_PROGRESS, SUNK, FreeRun
-from .system import System
+from .events import EventKind
+from .free_run import AHEAD, CLOSED, SUNK, FreeRun
+from .root_finding import find_root
+from .run import StuckError
+from .tolerances import ROUNDING_FORCE, SHORTEST_STEP, STANDING, STILL
 
 SPEED_ROUNDING = 1e-12  # sliding or turning speed that counts as rounding, over the scene's
 TURNING = 1e-4  # speed, over the scene's, below which a reversal may be near
-GROWTH = 10.0  # largest growth of a step
+ARMED = 1e-13  # gap from which on a pair has been apart, relative to the scene's length
+NO_PROGRESS = 60  # most decisions in a row without any time passing
 LOOKS = 8  # instants of the longest step at which gaps are looked at, its end among them
 REACH = 0.3  # longest step, in units of the scene: gaps are sampled every `REACH` / `LOOKS`
 EXACT = 1e-14  # gap of a closed contact, over the scene's length: some ten roundings
@@ -47,7 +44,7 @@ ROUNDS = 30  # most impacts at one instant; what is left after them is plastic
 def play(run: FreeRun, touching: float, halt: Callable[[FreeRun], bool] | None = None) -> None:
     """Simulate until the torques end or `halt`, called at events; `touching` [m]: gaps to close."""
     _close(run, touching)
-    while run.t < run.end and not (halt is not None and halt(run)):
+    while run.t < run.breaks[-1] and not (halt is not None and halt(run)):
         if run.t >= run.stop:
             run.next_piece()
         found = collide(run)
@@ -58,18 +55,18 @@ def play(run: FreeRun, touching: float, halt: Callable[[FreeRun], bool] | None =
         run.decisions = run.decisions + 1 if run.t == run.decided_at else 0
         run.decided_at = run.t
         if run.decisions > NO_PROGRESS:
-            run.note(EventKind.GIVEN_UP, "decisions do not end")
+            run.note_at(EventKind.GIVEN_UP, "decisions do not end")
             return
         if rests is None:
             if not jolt(run):
-                run.note(EventKind.GIVEN_UP, "no motion obeys the laws of contact")
+                run.note_at(EventKind.GIVEN_UP, "no motion obeys the laws of contact")
                 if not run.records:
-                    run.record(None)
+                    run.record(still=True)
                 return
             continue
         run.resting = rests
         if rests:
-            run.take_impulse(np.zeros(run.system.n))
+            run.set_velocity(0.0)
             hold(run)
             continue
         try:
@@ -77,7 +74,7 @@ def play(run: FreeRun, touching: float, halt: Callable[[FreeRun], bool] | None =
         except StuckError:
             # Forces grow without bound where the motion jams.
             if not jolt(run):
-                run.note(EventKind.GIVEN_UP, "steps become too short")
+                run.note_at(EventKind.GIVEN_UP, "steps become too short")
                 return
 
 
@@ -99,13 +96,11 @@ def _close(run: FreeRun, touching: float) -> None:
 
 def hold(run: FreeRun) -> None:
     """Let time pass at rest until forces leave their bounds, or the torques end."""
-    run.record(None)
+    run.record(still=True)
     while True:
-        start, stop = run.torque.breaks[run.piece : run.piece + 2]
-        x = float(2 * run.t - start - stop) / float(stop - start)
-        breach = _find_breach(_list_margins(run), x)
-        run.t = float(start + stop + breach * (stop - start)) / 2 if breach < 1 else float(stop)
-        run.record(None)
+        breach = _find_breach(_list_margins(run), run.fraction(run.t))
+        run.t = run.time(breach) if breach < 1 else run.stop
+        run.record(still=True)
         if breach < 1 or not run.next_piece():
             return
 
@@ -115,7 +110,7 @@ def _list_margins(run: FreeRun) -> Array:
     system, modes = run.system, run.modes
     scales, n = system.scales, system.n
     rows = system.evaluate(run.z, run.v, modes.kept)
-    mu, stuck = system.friction[list(modes.kept)], [modes.kept.index(k) for k in modes.stuck]
+    mu, stuck = system.friction[list(modes.kept)], [modes.kept.index(k) for (k,) in modes.stuck]
     held = np.eye(n)[list(modes.held)].reshape(-1, n)
     P = np.vstack([rows.A, rows.A_t[stuck], held])
     G = np.vstack([rows.A - (mu * np.array(modes.Xi))[:, None] * rows.A_t, rows.A_t[stuck], held])
@@ -191,11 +186,11 @@ def _collide(run: FreeRun, closed: ClosedContacts, rates: Array, bouncing: bool)
         noted = [e.time for e in run.events if (e.kind, e.contact) == (EventKind.CHATTER, name)]
         if bouncing:
             note = f"{text or name} at {-rates[k]:.4g} m/s"
-            run.note(EventKind.IMPACT, note, name, float(-rates[k]))
+            run.note_at(EventKind.IMPACT, note, name, float(-rates[k]))
         elif not noted or run.t - noted[-1] >= pause:
             note = f"the impacts of {name} come ever closer and are over"
-            run.note(EventKind.CHATTER, note, name, float(-rates[k]))
-    run.take_impulse(v)
+            run.note_at(EventKind.CHATTER, note, name, float(-rates[k]))
+    run.set_velocity(v)
 
 
 def _slide_on(p: ContactProblem) -> ContactAnswer | None:
@@ -270,24 +265,20 @@ def jolt(run: FreeRun) -> bool:
     if exact is None or (np.abs(exact.change) < STANDING * units).all():
         return False
     names = " ".join(system.names[pair] for pair in pattern.closed)
-    run.note(
+    run.note_at(
         EventKind.INCONSISTENT,
         f"no finite forces keep {names} closed: an impact without a collision",
         names,
     )
-    run.take_impulse(run.v + exact.change)
+    run.set_velocity(run.v + exact.change)
     return True
 
 
-class StuckError(ArithmeticError):
-    """Steps become too short to get anywhere."""
-
-
 class View(NamedTuple):
-    """Event values of a step."""
+    """Event values at the end of a step, and gaps within it."""
 
     out: Array  # outputs at its end
-    values: Array  # values of `Watch` there
+    values: Array  # values of `_Motion.measure` there
     times: Array  # (m,) [s]: instants since its start
     gaps: Array  # gaps, ranges (m, N) [m]: of all pairs then
     ranges: Array
@@ -306,23 +297,28 @@ class _Motion:
     """Integration with given contact modes."""
 
     def __init__(self, run: FreeRun) -> None:
-        self.run, self.s = run, run.load()
-        system = run.system
+        run.load(run.modes)
+        self.run, self.s = run, run.s
+        system, modes, rows = run.system, run.modes, run.s.rows
         self.unit, self.per_unit = system.scales.length, (1 / system.units[: system.n]).tolist()
-        if run.modes not in run.watches:
-            run.watches[run.modes] = build_watch(system, run.modes, self.s.to)
-        self.watch = run.watches[run.modes]
-        self.slack, self.watched = self.watch.slack, self.watch.pairs
         self.time = system.scales.time
         self.near = 1e-3 * SHORTEST_STEP * max(self.time, abs(run.t))
+        self.kept = list(modes.kept)
+        self.watched = np.ones(len(system.names), dtype=bool)
+        self.watched[self.kept] = False
+        counts = [rows.cone.stop, rows.size - rows.cone.stop, len(self.kept)]
+        self.slack = np.repeat([ROUNDING_FORCE, SPEED_ROUNDING, CLOSED], counts)
+        self.clear = np.repeat([10 * ROUNDING_FORCE, TURNING, 10 * CLOSED], counts)
+        # What has no direction has no speed that could reverse.
+        self.clear[rows.slide.start : rows.turn.stop][np.array([*modes.Xi, *modes.sigma]) == 0] = -1
 
     def move(self) -> None:
         """Integrate until an event or until the torques step or end."""
         run, s = self.run, self.s
-        run.stay(s)
+        s.stay(run.system, run.z)
         s.look()
         start = self.view(None, 0.0)
-        run.record(s, start.out)
+        run.record()
         # What touches already may sink by rounding; what is behind something else never closes.
         shallow = start.gaps[-1] > -SUNK * self.unit
         sunk = np.minimum(start.gaps[-1], 0.0) - 0.5 * CLOSED * self.unit
@@ -331,12 +327,11 @@ class _Motion:
         floor = np.maximum(self.slack, self.slack - start.values)
         run.h = min(run.h, self._time_to_return(start))
         while True:
-            h, whole, end = self._try_step(start)
-            found, end = self._stop_at_event(start, floor, h, end)
+            h, whole = run.try_step(run.stop, self._happens, self._find_reach(start.out))
+            found, end = self._stop_at_event(start, floor, h, self.view(start.out, h))
             run.t = run.t + float(s.inputs[s.at.h]) if found or not whole else run.stop
             run.y = end.out[s.to.y].copy()
-            run.steps += 1
-            run.record(s, end.out)
+            run.record()
             run.armed = end.gaps[-1] > ARMED * self.unit
             if found:
                 return
@@ -344,83 +339,74 @@ class _Motion:
             if run.t >= run.stop:
                 if not run.next_piece():
                     return
-                run.feed(s)
+                run.feed()
                 if run.torque_steps():
                     s.look()
                     end = self.view(None, 0.0)
                     if not self._holds(end):
                         return
-                    run.record(s, end.out)
+                    run.record()
             else:
-                run.feed(s)
+                run.feed()
             start = end
 
     def _holds(self, end: View) -> bool:
         """Whether the modes are the only solution after a torque step, by more than rounding."""
-        clear = np.count_nonzero(end.values > self.watch.clear) == len(end.values)
-        if not (self.run.unique and self.watch.plain and clear):
+        if not self.run.unique or self.s.modes.stuck or self.s.modes.held:
             return False
         near = CLOSED * self.unit
         touches = (np.abs(end.gaps[-1]) < near) & (end.ranges[-1] > -near)
-        return not np.count_nonzero(touches & self.watched)
+        return bool((end.values > self.clear).all()) and not (touches & self.watched).any()
 
-    def _try_step(self, start: View) -> tuple[float, bool, View]:
-        """Make a step within the tolerance; its length, and whether it ends the torques' piece."""
-        run, s = self.run, self.s
-        inputs, outputs, at, to = s.inputs, s.outputs, s.at, s.to
-        n, remaining = run.system.n, run.stop - run.t
-        speed = self._find_most(start.out[n : 2 * n])
-        push = self._find_most(start.out[to.acceleration])
-        reach = 2 * REACH / (speed + math.sqrt(speed**2 + 2 * push * REACH) + 1e-300)
-        least = SHORTEST_STEP * max(self.time, abs(run.t))
-        while True:
-            h = min(run.h, reach)
-            whole = h >= 0.999 * remaining
-            h = remaining if whole else min(h, remaining / 2)
-            inputs[at.h] = h
-            s.step()
-            error = float(outputs[to.error])
-            if error <= 1:
-                view = self.view(start.out, h)
-                sudden = outputs[to.dip] < -1e-6 and h > AHEAD * self.time
-                if not sudden or (view.values < -self.slack).any():
-                    grown = h * min(GROWTH, 0.9 * max(error, 1e-300) ** (-1 / ORDER))
-                    run.h = grown if h >= run.h else max(run.h, grown)
-                    return h, whole, view
-            run.rejected += 1
-            if not error < np.inf or h < least:
-                raise StuckError
-            run.h = h * (max(0.1, 0.9 * error ** (-1 / ORDER)) if error > 1 else 0.5)
+    def _find_reach(self, out: Array) -> float:
+        """Longest step after the outputs at its start: one of `REACH`, in units of the scene."""
+        n = self.run.system.n
+        speed, push = self._find_most(out[n : 2 * n]), self._find_most(out[self.s.to.acceleration])
+        return 2 * REACH / (speed + math.sqrt(speed**2 + 2 * push * REACH) + 1e-300)
 
     def _find_most(self, motion: Array) -> float:
         """Largest of coordinates or their rates, in units of the scene."""
         return float(max(map(abs, map(mul, motion.tolist(), self.per_unit))))
 
+    def measure(self, ranges: Array | None = None) -> Array:
+        """Values that are positive until an event: those of the steps, then ranges of kept pairs.
+
+        Of all pairs, `ranges` (N,) [m] are computed if left out.
+        """
+        out, to = self.s.outputs, self.s.to
+        if ranges is None:
+            ranges = self.run.system.look(out[: self.run.system.n])[1]
+        return np.concatenate([out[to.values], ranges[self.kept] / self.unit])
+
+    def _happens(self) -> bool:
+        return bool((self.measure() < -self.slack).any())
+
     def view(self, before: Array | None, h: float) -> View:
         """Look at the step just made, of length h from the outputs `before`, if any."""
-        n, to = self.run.system.n, self.s.to
-        out = self.s.outputs.copy()
-        values = self.watch.measure(out)
-        times, gaps, ranges = np.array([h]), out[None, to.gaps], out[None, to.ranges]
-        if before is None:
-            return View(out, values, times, gaps, ranges)
-        gone = np.abs(out[: 2 * n] - before[: 2 * n])
-        most = self._find_most(gone[:n] + h * gone[n:])
-        count = 1 + int(LOOKS * min(1.0, most / REACH))
-        if count > 1:
-            times = h * np.arange(1, count + 1) / count
+        n, out = self.run.system.n, self.s.outputs.copy()
+        count = 1
+        if before is not None:
+            gone = np.abs(out[: 2 * n] - before[: 2 * n])
+            most = self._find_most(gone[:n] + h * gone[n:])
+            count += int(LOOKS * min(1.0, most / REACH))
+        times = h * np.arange(1, count + 1) / count
+        if count == 1 or before is None:
+            gaps, ranges = (part[None] for part in self.run.system.look(out[:n]))
+        else:
             ends = np.array([before, out])
-            knots = ends[:, :n], ends[:, n : 2 * n], ends[:, to.acceleration]
+            knots = ends[:, :n], ends[:, n : 2 * n], ends[:, self.s.to.acceleration]
             first = np.zeros(count - 1, dtype=np.int64)
             z = interpolate_quintic(np.full(count - 1, h), times[:-1], knots, first)[0]
-            both = zip(self.run.system.measure(z), (gaps, ranges), strict=True)
-            gaps, ranges = (np.vstack([within, last]) for within, last in both)
-        return View(out, values, times, gaps, ranges)
+            gaps, ranges = self.run.system.measure(np.vstack([z, out[:n]]))
+        return View(out, self.measure(ranges[-1]), times, gaps, ranges)
+
+    def _gap(self, pair: int) -> float:
+        """Gap of a pair at the end of the step just made [m]."""
+        return float(self.run.system.look(self.s.outputs[: self.run.system.n])[0][pair])
 
     def _step_to(self, h: float) -> None:
         if self.s.inputs[self.s.at.h] != h:
-            self.s.inputs[self.s.at.h] = h
-            self.s.step()
+            self.run.step_to(h)
 
     def _stop_at_event(self, start: View, floor: Array, h: float, end: View) -> tuple[bool, View]:
         """Shorten the step just made to the first event within it; whether there is one."""
@@ -445,7 +431,7 @@ class _Motion:
 
                 def value(step: float, row: int = row, least: float = least) -> float:
                     self._step_to(step)
-                    return float(self.watch.measure(self.s.outputs)[row]) + least
+                    return float(self.measure()[row]) + least
 
                 ends = float(first[row]), float(values[row])
                 h = find_root(value, h, *ends, self.near, 1e-3 * least)
@@ -457,29 +443,27 @@ class _Motion:
     def _find_contact(self, start: View, h: float, closing: Closing) -> float | None:
         """When a pair closes within a step; None if it does not, or where the two do not face."""
         pair, level, left, right = closing
-        s, place, n = self.s, self.s.to.gaps.start + pair, self.run.system.n
+        s, n = self.s, self.run.system.n
 
-        def look(step: float) -> tuple[float, float]:
+        def value(step: float) -> float:
             self._step_to(step)
-            return float(s.outputs[place]) - level, self._approach(s.outputs, pair)
+            return self._gap(pair) - level
 
-        first = float(start.gaps[-1, pair]) - level, self._approach(start.out, pair)
-        first = look(left) if left > 0 else first
-        last = look(right)
-        if last[0] >= 0 and right < h:
+        first = value(left) if left > 0 else float(start.gaps[-1, pair]) - level
+        last = value(right)
+        if last >= 0 and right < h:
             # The bracket is that of an interpolation, which grazing may mislead.
-            right, last = h, look(h)
-        if last[0] >= 0:
+            right, last = h, value(h)
+        if last >= 0:
             return None
-        near, exact = self.near, EXACT * self.unit
-        root = find_crossing(look, (left, *first), (right, *last), near, exact)
+        root = find_root(value, right, first, last, self.near, EXACT * self.unit, left)
         self._step_to(root)
         return root if self.run.face(s.outputs[:n], s.outputs[n : 2 * n])[1][pair] else None
 
-    def _approach(self, out: Array, pair: int) -> float:
-        """Rate of a pair's gap at a state [m/s]."""
-        z, v, _ = np.split(out, [self.run.system.n, 2 * self.run.system.n])
-        return float(self.run.system.evaluate(z, v, (pair,)).A[0] @ v)
+    def _list_bounds(self, start: View, end: View) -> tuple[Array, Array, Array]:
+        """Gaps and ranges at the beginning of each part of a step, (m, N) each, and its time."""
+        gaps = np.vstack([start.gaps[-1:], end.gaps[:-1]])
+        return gaps, np.vstack([start.ranges[-1:], end.ranges[:-1]]), np.append(0.0, end.times[:-1])
 
     def _find_closing(self, start: View, end: View, passed: set[int]) -> Closing | None:
         """The first pair that closes within the step, and a bracket of when."""
@@ -492,61 +476,51 @@ class _Motion:
         below = (end.gaps < level) & self.watched
         if not np.count_nonzero(below):
             return None
-        earlier = [start.gaps[-1:], start.ranges[-1:]]
-        if len(end.times) > 1:
-            both = zip(earlier, (end.gaps, end.ranges), strict=True)
-            earlier = [np.vstack([first, later[:-1]]) for first, later in both]
-        crosses = below & (earlier[0] >= level)
-        if not np.count_nonzero(crosses):
-            return None
-        crosses &= np.maximum(end.ranges, earlier[1]) > -1e-3 * self.unit
+        gaps, ranges, times = self._list_bounds(start, end)
+        crosses = below & (gaps >= level) & (np.maximum(end.ranges, ranges) > -1e-3 * self.unit)
         crosses[:, list(passed)] = False
         rows, pairs = np.nonzero(crosses)
         if not len(rows):
             return None
         row, pair = int(rows[0]), int(pairs[0])
-        left = 0.0 if row == 0 else float(end.times[row - 1])
-        return Closing(pair, float(level[row, pair]), left, float(end.times[row]))
+        return Closing(pair, float(level[row, pair]), float(times[row]), float(end.times[row]))
 
     def _find_entering(self, start: View, end: View, passed: set[int]) -> Closing | None:
         """The first pair that comes into range apart or touching, and overlaps after that.
 
         Out of range a gap has no meaning and may be negative throughout.
         """
-        earlier = start.ranges[-1:]
-        if len(end.times) > 1:
-            earlier = np.vstack([earlier, end.ranges[:-1]])
-        turns = (end.ranges > 0) & (earlier <= 0)
-        if not np.count_nonzero(turns):
+        overlaps = (end.ranges > 0) & (end.gaps < -CLOSED * self.unit) & self.watched
+        if not np.count_nonzero(overlaps):
             return None
-        turns &= self.watched & (end.gaps < -CLOSED * self.unit) & (end.gaps > -REACH * self.unit)
-        h, found = float(self.s.inputs[self.s.at.h]), None
-        for row, pair in zip(*(part.tolist() for part in turns.nonzero()), strict=True):
-            if pair in passed or found is not None:
-                continue
-            left, right = float(end.times[row - 1]) if row else 0.0, float(end.times[row])
-            entry, gap = self._find_entry(pair, left, right, -float(earlier[row, pair]))
-            if gap > -SUNK * self.unit:
-                found = Closing(pair, min(gap, 0.0) - 0.5 * CLOSED * self.unit, entry, right)
-        self._step_to(h)
-        return found
+        _, ranges, times = self._list_bounds(start, end)
+        turns = overlaps & (ranges <= 0) & (end.gaps > -REACH * self.unit)
+        turns[:, list(passed)] = False
+        h = float(self.s.inputs[self.s.at.h])
+        try:
+            for row, pair in zip(*(part.tolist() for part in turns.nonzero()), strict=True):
+                left, right = float(times[row]), float(end.times[row])
+                entry = self._find_entry(pair, left, right, -float(ranges[row, pair]))
+                gap = self._gap(pair)
+                if gap > -SUNK * self.unit:
+                    return Closing(pair, min(gap, 0.0) - 0.5 * CLOSED * self.unit, entry, right)
+            return None
+        finally:
+            self._step_to(h)
 
-    def _find_entry(
-        self, pair: int, left: float, right: float, outside: float
-    ) -> tuple[float, float]:
-        """When a pair comes into range between two instants of a step, and its gap then."""
-        s = self.s
+    def _find_entry(self, pair: int, left: float, right: float, outside: float) -> float:
+        """When a pair comes into range between two instants of a step, to which the step is set."""
 
         def value(step: float) -> float:
             self._step_to(step)
-            return -float(s.outputs[s.to.ranges.start + pair])
+            return -float(self.run.system.look(self.s.outputs[: self.run.system.n])[1][pair])
 
-        within, flat = value(right), CLOSED * self.unit
-        entered = right
+        within = value(right)
         if within < 0 <= outside:
-            entered = find_root(value, right, outside, within, self.near, flat, left)
-        self._step_to(entered)
-        return entered, float(s.outputs[s.to.gaps.start + pair])
+            flat = CLOSED * self.unit
+            right = find_root(value, right, outside, within, self.near, flat, left)
+        self._step_to(right)
+        return right
 
     def _time_to_return(self, start: View) -> float:
         """Half the time in which the nearest pair that has just parted would close again [s]."""
@@ -560,61 +534,3 @@ class _Motion:
         # What parts more slowly was closed when the modes were chosen.
         back = (rate >= run.chatter) & (bend < 0)
         return float((-rate[back] / bend[back]).min(initial=np.inf))
-
-
-class Watch(NamedTuple):
-    """Event values, positive until an event, in units of the scene.
-
-    In this order: c_n; friction margins of both signs; sliding and turning speeds; ranges.
-    """
-
-    columns: NDArray[np.int64]  # (c,): outputs of a step that they depend on
-    rows: Array  # rows, constant (m, c) and (m,): they are rows @ outputs[columns] + constant
-    constant: Array
-    slack: Array  # slack, clear (m,): what counts as rounding, and what is more than that for sure
-    clear: Array
-    pairs: NDArray[np.bool_]  # (N,): those that are not kept, and may close
-    plain: bool  # whether friction holds nothing
-
-    def measure(self, out: Array) -> Array:
-        """Values of the outputs of a step, shape (m,)."""
-        return np.asarray(self.rows @ out[self.columns] + self.constant)
-
-
-def build_watch(system: System, modes: Modes, to: FreeOutputs) -> Watch:
-    """What is looked at with some modes."""
-    scales, n, k = system.scales, system.n, len(modes.kept)
-    stuck, held = [modes.kept.index(pair) for pair in modes.stuck], list(modes.held)
-    slides, turning = np.flatnonzero(modes.Xi), np.flatnonzero(modes.sigma)
-    holds = len(stuck) + len(held)
-    counts = [k + 2 * holds, len(slides) + len(turning), k]
-    rows, constant = np.zeros((sum(counts), to.size)), np.zeros(sum(counts))
-    i = np.arange(sum(counts))
-    rows[i[:k], to.c_n.start + i[:k]] = 1 / scales.force
-    for j, (one, sign) in enumerate(product(range(holds), (-1.0, 1.0)), start=k):
-        unit, row = scales.force, rows[j]
-        if one < len(stuck):
-            row[to.c_n.start + stuck[one]] = system.friction[modes.stuck[one]] / unit
-        else:
-            unit = float(system.friction_units[held[one - len(stuck)]])
-            constant[j] = system.dry[held[one - len(stuck)]] / unit
-        row[to.f.start + one] = sign / unit
-    at = i[counts[0] :]
-    rows[at[: len(slides)], to.v_t.start + slides] = np.array(modes.Xi)[slides] / scales.speed
-    at = at[len(slides) :]
-    signs = np.array(modes.sigma)[turning] / system.units[n + turning]
-    rows[at[: len(turning)], n + turning] = signs
-    ranges = to.ranges.start + np.array(modes.kept, dtype=int)
-    rows[at[len(turning) :], ranges] = 1 / scales.length
-    columns = np.flatnonzero(rows.any(axis=0))
-    pairs = np.ones(len(system.names), dtype=bool)
-    pairs[list(modes.kept)] = False
-    return Watch(
-        columns,
-        np.ascontiguousarray(rows[:, columns]),
-        constant,
-        np.repeat([ROUNDING_FORCE, SPEED_ROUNDING, CLOSED], counts),
-        np.repeat([10 * ROUNDING_FORCE, TURNING, 10 * CLOSED], counts),
-        pairs,
-        not holds,
-    )

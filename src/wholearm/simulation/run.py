@@ -1,0 +1,235 @@
+"""State, torques and records of a running simulation, and its steps; torques of a feedback law."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..common.arrays import Array
+from ..common.errors import SimulationError, require_number
+from ..results.torque import TorqueProfile
+from .events import Event, EventKind, Record
+from .runge_kutta import ORDER
+from .stepper import LOSSES, Modes, ModeStepper, build_stepper
+from .system import System
+from .tolerances import FIRST_STEP, SETTLING, SHORTEST_STEP, STEP_OF_TORQUE
+
+SAME = 1e-9  # distance of two instants that counts as none, relative to the period
+_GROWTH = 40.0  # largest growth of a step: at order 8 an error of 1e-13 of the tolerance allows it
+
+
+class StuckError(ArithmeticError):
+    """Steps become too short to get anywhere."""
+
+
+class Run:
+    """A running simulation.
+
+    Attributes
+    ----------
+    t, h : [s]           present time, and the step to try next
+    y : (2 n + LOSSES,)  z, z', then work, viscous, dry and contact losses
+    s                    steps of the present modes
+    piece                of the torques, which the present time belongs to
+    impact : [J]         energy lost to impacts so far
+    section              counts changes of modes: records are in order within each section
+    """
+
+    s: ModeStepper
+    t: float
+    modes: Modes
+
+    def __init__(
+        self, system: System, torque: TorqueProfile, z: Array, v: Array, tolerance: float
+    ) -> None:
+        self.system, self.torque, self.tolerance = system, torque, tolerance
+        self.breaks: list[float] = torque.breaks.tolist()
+        self.t, self.piece = self.breaks[0], 0
+        self.y = np.concatenate([z, v, np.zeros(LOSSES)])
+        self.h = FIRST_STEP * system.scales.time
+        self.impact = 0.0
+        self.phase_index = self.section = self.steps = self.rejected = 0
+        self.records: list[Record] = []
+        self.events: list[Event] = []
+
+    @property
+    def z(self) -> Array:
+        """Coordinates, shape (n,)."""
+        return self.y[: self.system.n]
+
+    @property
+    def v(self) -> Array:
+        """Velocities, shape (n,)."""
+        return self.y[self.system.n : 2 * self.system.n]
+
+    @property
+    def stop(self) -> float:
+        """When the present piece of the torques ends [s]."""
+        return self.breaks[self.piece + 1]
+
+    def tau(self, t: float) -> Array:
+        """Torques of the present piece at `t`, also beyond its end, shape (2,) [N m]."""
+        coefficients = self.torque.coefficients[self.piece]
+        return np.asarray(coefficients @ self.fraction(t) ** np.arange(coefficients.shape[1]))
+
+    def fraction(self, t: float) -> float:
+        """Coordinate of time `t` on the present piece of the torques, from -1 to 1 within it."""
+        start, stop = self.breaks[self.piece : self.piece + 2]
+        return (2 * t - start - stop) / (stop - start)
+
+    def time(self, x: float) -> float:
+        """Time at `x` of the present piece [s]."""
+        start, stop = self.breaks[self.piece : self.piece + 2]
+        return (start + stop + x * (stop - start)) / 2
+
+    def set_velocity(self, v: Array | float) -> None:
+        """Change the velocity, shape (n,); its kinetic energy is lost to impacts."""
+        before = self.system.stored(self.z, self.v)
+        self.y[self.system.n : 2 * self.system.n] = v
+        self.impact += float(before - self.system.stored(self.z, self.v))
+
+    def load(self, modes: Modes) -> None:
+        """Take the steps of some modes from here on, with their signs where they have any."""
+        self.modes, degree = modes, self.torque.coefficients.shape[2] - 1
+        key = modes._replace(Xi=(), sigma=())
+        self.s = build_stepper(self.system.structure, key, degree)
+        inputs, at = self.s.inputs, self.s.at
+        self.s.load(self.system, self.tolerance)
+        if modes.sigma:
+            inputs[at.Xi], inputs[at.sigma] = modes.Xi, modes.sigma
+        self.feed()
+
+    def feed(self) -> None:
+        """Hand the present state and torques to the steps."""
+        inputs, at = self.s.inputs, self.s.at
+        inputs[at.y], inputs[at.t] = self.y, self.t
+        inputs[at.piece] = self.torque.breaks[self.piece : self.piece + 2]
+        inputs[at.torque] = self.torque.coefficients[self.piece].ravel()
+
+    def step_to(self, h: float) -> None:
+        """Repeat the step with another length."""
+        self.s.inputs[self.s.at.h] = h
+        self.s.step()
+
+    def try_step(
+        self, target: float, happens: Callable[[], bool], longest: float = math.inf
+    ) -> tuple[float, bool]:
+        """Make a step within the tolerance, to `target` [s] at most.
+
+        Steps are halved where a force dips below zero within one and nothing `happens` by its end.
+
+        Returns
+        -------
+        h, whole  its length [s] and whether it ends at `target`
+        """
+        inputs, outputs, at, to = self.s.inputs, self.s.outputs, self.s.at, self.s.to
+        remaining, time = target - self.t, self.system.scales.time
+        least = SHORTEST_STEP * max(time, abs(self.t))
+        while True:
+            h = min(self.h, longest)
+            whole = h >= 0.999 * remaining
+            h = remaining if whole else min(h, remaining / 2)
+            inputs[at.h] = h
+            self.s.step()
+            error = float(outputs[to.error])
+            sudden = outputs[to.dip] < -1e-6 and h > SETTLING / 10 * time
+            if error <= 1 and not (sudden and not happens()):
+                grown = h * min(_GROWTH, 0.9 * max(error, 1e-300) ** (-1 / ORDER))
+                self.h = grown if h >= self.h else max(self.h, grown)
+                self.steps += 1
+                return h, whole
+            self.rejected += 1
+            if h < least:
+                raise StuckError
+            self.h = h * (0.5 if error <= 1 else max(0.2, 0.9 * error ** (-1 / ORDER)))
+            if not error < math.inf:
+                self.h = 0.2 * h
+
+    def note(
+        self,
+        kind: EventKind,
+        text: str,
+        contact: str = "",
+        value: float = math.nan,
+        time: float | None = None,
+    ) -> None:
+        """Append an event, at present if no time is given."""
+        time = self.t if time is None else time
+        self.events.append(Event(time, self.phase_index, kind, text, contact, value))
+
+    def record(self, still: bool = False) -> None:
+        """Record the present instant from the outputs of the steps.
+
+        At rest accelerations are zero, and forces are NaN, as they are indeterminate.
+        """
+        here = self.t, self.phase_index, self.section
+        if still:
+            kept, n = self.modes.kept, self.system.n
+            none, tau = np.full(len(kept), math.nan), self.tau(self.t)
+            record = Record(*here, kept, self.y.copy(), np.zeros(n), tau, none, none, self.impact)
+        else:
+            record = Record.of(self.s, *here, self.impact)
+        self.records.append(record)
+
+
+def find_torque_steps(before: Array, after: Array, system: System) -> NDArray[np.bool_]:
+    """Whether torques step from pieces to pieces, (n, 2, d + 1) each, (n,)."""
+    jump = after @ (-1.0) ** np.arange(after.shape[2]) - before.sum(axis=2)
+    return np.asarray(np.abs(jump).max(axis=1) > STEP_OF_TORQUE * system.scales.torque)
+
+
+@runtime_checkable
+class Law(Protocol):
+    """Torques as a function of what a controller measures."""
+
+    @property
+    def period(self) -> float:
+        """Time between two samples [s]."""
+
+    @property
+    def delay(self) -> float:
+        """Time after which a sample takes effect; the first one does at once [s]."""
+
+    def held(
+        self, t: float, theta: Array, theta_dot: Array, forces: Mapping[str, float]
+    ) -> ArrayLike:
+        """Torques, shape (2,) [N m], held from time `t` [s] on, from angles and rates, (2,) each.
+
+        `forces` [N] are the c_n of contacts that press, by name; NaN at rest, empty at the start.
+        """
+
+
+class Feedback:
+    """Sampled torques of a law up to time `until` [s]: `torque` is zero from the present on."""
+
+    def __init__(self, law: Law, until: float) -> None:
+        self.law = law
+        period = require_number(law.period, "period", positive=True)
+        delay = require_number(law.delay, "delay", nonnegative=True)
+        ticks = period * np.arange(int(np.ceil(until / period - SAME)))
+        times = np.sort(np.concatenate([ticks, ticks[1:] + delay]))
+        times = times[times < until - SAME * period]
+        times = times[np.diff(times, prepend=-np.inf) > SAME * period]
+        self._samples = np.zeros((len(ticks), 2))
+        # Rounding must not put an instant before its own sample.
+        self._latest = np.floor(times / period + SAME).astype(int)
+        self._source = np.floor((times - delay) / period + SAME).astype(int).clip(0)
+        self.torque = TorqueProfile(np.append(times, until), np.zeros((len(times), 2, 1)))
+
+    def begin(
+        self, piece: int, theta: Array, theta_dot: Array, forces: Mapping[str, float]
+    ) -> None:
+        """Sample where one is due at the start of a piece, and set the torques of the piece."""
+        latest = self._latest[piece]
+        if piece == 0 or latest > self._latest[piece - 1]:
+            t = float(self.torque.breaks[piece])
+            tau = np.asarray(self.law.held(t, theta, theta_dot, forces), dtype=float)
+            if tau.shape != (2,) or not np.isfinite(tau).all():
+                text = f"{tau.tolist()} at t = {t:.6g} s; two finite numbers are needed"
+                raise SimulationError(f"the law of the torques gives {text}")
+            self._samples[latest] = tau
+        self.torque.coefficients[piece, :, 0] = self._samples[self._source[piece]]
