@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
-from ...mechanics.dynamics import LAMBDA, A, B, V
 from ...mechanics.path_limits import PathLimits
 from ..lower_bound.speed_sweep import SweepMode
 from ..options import Objective
@@ -417,7 +417,7 @@ def start_at(
     vertices = _Vertices.at(data.grid, sides, fastest)
     rows = data.limits.sides[0]
     scale = data.spans / units.of(data.limits)[rows]
-    on_links, kept = _find_multipliers(data.grid, sides, vertices, scale, units)
+    on_links, kept = _find_multipliers(nlp, data, units, vertices)
     rate = 1.0
     if nlp.objective is Objective.MARGIN:
         presses = np.isin(rows[vertices.sides], nlp.shape.presses) & ~vertices.held[:, None]
@@ -518,71 +518,43 @@ def _find_pairs(sides: PathLimits, rows: PathLimits, b: Array, largest: bool) ->
 
 
 def _find_multipliers(
-    grid: Grid, sides: PathLimits, vertices: _Vertices, scale: Array, units: Units
+    nlp: PathNLP, data: PhaseData, units: Units, vertices: _Vertices
 ) -> tuple[Array, Array]:
     """Least-squares multipliers of the links, (N,), and of the sides that meet, (n, 2).
 
-    Where a speed limit is active, its multiplier is in the first column. The normal equations of
-    stationarity of the duration are block tridiagonal in elements: block Gaussian elimination.
+    From stationarity of the duration, with the Jacobian of the NLP. Where a speed limit is active,
+    its multiplier is in the first column.
     """
-    local, across = _list_rows(grid, sides, vertices, scale, units)
-    slope = _find_slopes(grid, vertices.profile, units)
-    following = np.concatenate([local[1:], np.zeros_like(local[:1])])
-    squares = local @ local.transpose(0, 2, 1) + across @ across.transpose(0, 2, 1)
-    squares += _DAMPING * np.trace(squares, axis1=1, axis2=2).mean() * np.eye(local.shape[1])
-    coupling = across @ following.transpose(0, 2, 1)
-    pull = -(local @ slope[..., None])
-    pull[:-1] -= across[:-1] @ slope[1:, :, None]
-    for e in range(len(local) - 1):
-        solved = np.linalg.solve(squares[e], np.hstack([coupling[e], pull[e]]))
-        squares[e + 1] -= coupling[e].T @ solved[:, :-1]
-        pull[e + 1] -= coupling[e].T @ solved[:, -1:]
-        coupling[e], pull[e] = solved[:, :-1], solved[:, -1:]
-    pull[-1] = np.linalg.solve(squares[-1], pull[-1])
-    for e in reversed(range(len(local) - 1)):
-        pull[e] -= coupling[e] @ pull[e + 1]
-    values = pull[..., 0]
-    on_sides = -values[:, _NODES:].reshape(-1, 2, _NODES).transpose(0, 2, 1)
-    return values[:, :_NODES].ravel()[:-1], on_sides.reshape(-1, 2)
-
-
-def _list_rows(
-    grid: Grid, sides: PathLimits, vertices: _Vertices, scale: Array, units: Units
-) -> tuple[Array, Array]:
-    """Jacobian of each element's rows in its and in the next one's unknowns, (E, 3 p + 3, 3 p + 3).
-
-    Unknowns are b, a and the internal force at its nodes. Rows are the links to each next node
-    and the sides that meet at its nodes.
-    """
-    count, inner = len(grid.kinds), np.arange(DEGREE)
-    lengths = np.diff(grid.edges) / units.length
-    local = np.zeros((count, 3 * _NODES, 3 * _NODES))
-    across = np.zeros_like(local)
-    local[:, inner, inner], local[:, inner, inner + 1] = -1.0, 1.0
-    local[:, :DEGREE, _NODES : 2 * _NODES] = -lengths[..., None] * find_basis().links[grid.kinds]
-    local[:-1, DEGREE, DEGREE], across[:-1, DEGREE, 0] = -1.0, 1.0
+    (a, b, lam), grid, g = vertices.profile, data.grid, nlp.columns.g
+    # The duration has no slope at rest, nor without acceleration there.
+    a, b = a.copy(), np.maximum(b, LEAST_B * units.profile[0])
+    a[[0, -1]] = np.maximum(np.abs(a[[0, -1]]), LEAST_B * units.profile[1]) * [1.0, -1.0]
+    x, p = pack(nlp, Profile(a, b, lam), units, 0.0, grid.sizes), parameters(nlp, data, units, 0.0)
+    table = np.full(nlp.free.shape, -1)
+    table[nlp.free] = np.arange(len(x))
+    unknowns = table[:, :3][table[:, :3] >= 0].tolist()
+    rows, signs, _ = data.limits.sides
     # Where s'' jumps the duration does not depend on the speed.
-    local[vertices.jumps, DEGREE], across[vertices.jumps, DEGREE] = 0.0, 0.0
-    k = np.arange(len(grid.s))[:, None]
-    speed = np.sqrt(np.maximum(vertices.profile.b, LEAST_B * units.profile[0]))[:, None]
-    met = sides.rows[k, vertices.sides]
-    of_b = met[..., B] + met[..., V] / (2 * speed)
-    parts = np.stack([of_b, met[..., A], met[..., LAMBDA]], axis=-1)
-    parts *= scale[vertices.sides][..., None] * units.profile
-    parts[vertices.held] = 0.0
-    parts[vertices.held, 0, 0] = -1.0
-    parts = parts.reshape(count, _NODES, 2, 3)
-    node = np.arange(_NODES)
-    for side in range(2):
-        for unknown in range(3):
-            rows, columns = node + (1 + side) * _NODES, node + unknown * _NODES
-            local[:, rows, columns] = parts[:, :, side, unknown]
-    local[0, :, 0] = local[-1, :, DEGREE] = 0.0
-    return local, across
+    links = np.delete(np.arange(len(grid.steps)), vertices.jumps * _NODES + DEGREE)
+    free = np.flatnonzero(~vertices.held)
+    limits = g["limits"].start + free[:, None] * nlp.shape.rows + rows[vertices.sides[free]]
+    jacobian = nlp.solver.function.get_function("nlp_jac_g")(x, p)[1]
+    bounds = ca.DM.eye(len(x))[table[vertices.held, 0].tolist(), :]
+    active = ca.vertcat(jacobian[[*links.tolist(), *limits.ravel().tolist()], :], bounds)
+    slope = _find_slopes(grid, vertices.profile, units)[table[:, :3] >= 0]
+    active = active[:, unknowns]
+    squares = active @ active.T
+    damping = _DAMPING * float(ca.trace(squares)) / squares.shape[0]
+    solved = ca.solve(squares + damping * ca.DM.eye(squares.shape[0]), active @ slope, "ldl")
+    on_links, on_limits, on_b = np.split(-solved.full()[:, 0], np.cumsum([len(links), limits.size]))
+    every_link, kept = np.zeros(len(grid.steps)), np.zeros((len(b), 2))
+    every_link[links], kept[vertices.held, 0] = on_links, on_b
+    kept[free] = -signs[vertices.sides[free]] * on_limits.reshape(-1, 2)
+    return every_link, kept
 
 
 def _find_slopes(grid: Grid, profile: Profile, units: Units) -> Array:
-    """Gradient of the NLP's duration at the nodes of each element, (E, 3 p + 3)."""
+    """Gradient of the NLP's duration at each node over b, s'' and internal force, (n, 3)."""
     basis, count = find_basis(), len(grid.kinds)
     b, a = profile.b / units.profile[0], profile.a / units.profile[1]
     weights = basis.weights * np.diff(grid.edges) / units.length
@@ -595,4 +567,4 @@ def _find_slopes(grid: Grid, profile: Profile, units: Units) -> Array:
             per_weight = (2 * (grid.edges[e, 1] - grid.edges[e, 0]) / units.length) ** -0.5
             slope[e, 0, node] = 0.0
             slope[e, 1, node] = -np.sign(end) * weights[e, node] * per_weight * abs(end) ** -1.5
-    return slope.reshape(count, -1)
+    return slope.transpose(0, 2, 1).reshape(-1, 3)
