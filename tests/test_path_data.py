@@ -27,15 +27,14 @@ from wholearm.planning.path_domain.elements import (
     lay_out,
 )
 from wholearm.planning.path_domain.first_guess import guess
-from wholearm.planning.path_domain.interpolation import fit_torque
 from wholearm.planning.path_domain.path_data import PhaseData, choose_sampling, prepare
 from wholearm.planning.path_domain.path_mesh import Mesh
-from wholearm.planning.path_domain.path_motion import PathMotion
+from wholearm.planning.path_domain.path_motion import PathMotion, fit_torque
 from wholearm.planning.path_domain.path_nlp import build_path_nlp, pack, parameters
 from wholearm.planning.path_domain.path_plan import plan_path
-from wholearm.planning.path_domain.refine import start_at
 from wholearm.planning.path_domain.speed_profile import Fastest, Narrow, find_fastest
 from wholearm.planning.path_domain.terms import LimitShape
+from wholearm.planning.path_domain.warm_start import start_at
 from wholearm.problem.definition import Problem
 
 PHASES = range(5)

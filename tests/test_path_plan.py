@@ -15,7 +15,7 @@ from plane import measure_slip, place_corners, unbalance, with_speed_limit
 from shipped import HEPTAGON, plan_of, problem_of
 from tipping import box, tip
 from toys import Toy, constant
-from wholearm.common.arrays import Array
+from wholearm.common.arrays import Array, Expression
 from wholearm.common.errors import InfeasibleError, JammingError, SolverError
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve, directions_of
@@ -23,7 +23,7 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import LAMBDA, ONE, A, B, inverse
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
 from wholearm.planning.options import Objective, PlanOptions
-from wholearm.planning.path_domain import path_plan, task
+from wholearm.planning.path_domain import path_plan
 from wholearm.planning.path_domain.path_motion import PathMotion
 from wholearm.planning.path_domain.path_nlp import PathNLP, build_path_nlp
 from wholearm.planning.path_domain.path_plan import plan_curves, plan_path
@@ -221,6 +221,9 @@ def test_jamming_friction_is_named() -> None:
 class Stopped:
     """A solver that gives up where it starts."""
 
+    def __init__(self, function: Expression) -> None:
+        self.function = function  # has the derivatives
+
     def __call__(self, x0: Array, **_: Array) -> dict[str, Array]:
         return {"x": x0}
 
@@ -231,9 +234,9 @@ class Stopped:
 def test_a_stuck_solver_does_not_blame_the_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     def build(shape: LimitShape, intervals: int, goal: Objective) -> PathNLP:
         nlp = build_path_nlp(shape, intervals, goal)
-        return replace(nlp, solver=Stopped()) if goal is Objective.TIME else nlp
+        return replace(nlp, solver=Stopped(nlp.solver.function)) if goal is Objective.TIME else nlp
 
-    monkeypatch.setattr(task, "build_path_nlp", build)
+    monkeypatch.setattr(path_plan, "build_path_nlp", build)
     with pytest.raises(SolverError, match=r"Ipopt stopped with Max.* although limits can be kept"):
         Toy(constant(1.0, 0.0, 3.0)).plan(intervals=20)
 

@@ -40,10 +40,9 @@ from ..advice import (
 )
 from ..options import Objective
 from .elements import Profile
-from .interpolation import fit_torque
 from .junction import require_hold
 from .path_data import PhaseData, cut, join
-from .path_motion import PathMotion
+from .path_motion import PathMotion, fit_torque
 from .path_nlp import (
     Relaxation,
     Tightening,
@@ -54,8 +53,8 @@ from .path_nlp import (
     parameters,
     unpack,
 )
+from .path_plan import Task
 from .speed_profile import is_hopeless
-from .task import Task
 from .terms import LimitShape
 
 _TRIED = (2.0, 10.0, 100.0)  # factors on torque rate limits with which plans are tried

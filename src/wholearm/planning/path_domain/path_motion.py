@@ -2,7 +2,8 @@
 
 Inside an element a = s'' and the internal force are polynomials, and so is b = s'^2; s(t) follows
 by Gauss quadrature of 1 / s'. z, tau and the contact forces follow from s, s' and s'' by inverse
-dynamics: the equations of motion hold at every instant.
+dynamics: the equations of motion hold at every instant. Torques as a function of time are
+piecewise polynomials through those (`fit_torque`).
 """
 
 from __future__ import annotations
@@ -15,15 +16,20 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
+from ...common.errors import SolverError
 from ...geometry.curve import Curve, directions_of
 from ...mechanics.dynamics import inverse, split_forces
+from ...results.torque import TorqueProfile
 from ...results.trajectory import Samples
 from .elements import DEGREE, Elements, Grid, Profile
+from .path_data import PhaseData, Places
 
 _POINTS = 12  # Gauss points for the time in an interval between nodes
 _STALLED = 100.0  # speed interpolated from an interval's ends over the one inside when it stalls
 _TINY = 1e-100  # least speed [m/s] that is divided by
 _NEWTON = 5  # iterations from a time to a place
+TORQUE_ERROR = 5e-7  # largest error of the polynomials between knots, over the torque limit
+PLACES = 13  # interpolation points where that is exceeded
 
 
 # Gauss points, and the matrix from values there to Legendre coefficients of the integral.
@@ -166,3 +172,39 @@ def _share(v0: Array, v1: Array, w: Array) -> tuple[Array, Array]:
     total = np.maximum(v0 + v1, _TINY)
     done = w * (v0 * (2 - w) + v1 * w) / total
     return done, (1 - w) * (v1 * (1 + w) + v0 * (1 - w)) / total
+
+
+class StalledError(SolverError):
+    """The motion nearly stops, or takes no time, between two nodes: the grid is too coarse."""
+
+
+def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, float]:
+    """Torque of a motion, one polynomial in time per interval, and its effort [(N m)^2 s].
+
+    Through the knots, or through `PLACES` points if that misses the torque between them.
+    """
+    knots, checks = data.sampling
+    torque = _fit(data, motion, data.knots, knots)
+    times = motion.times[data.nonempty, None] + motion.durations(checks)
+    wanted = data.checks.forces.tau(*data.interpolate(motion.profile, checks))
+    inner = np.tile((checks > 0) & (checks < 1), len(data.nonempty))
+    misfit = torque.at(times.ravel()[inner]) - wanted[inner]
+    if np.abs(misfit / data.torque_limit).max() > TORQUE_ERROR:
+        every = (len(checks) - 1) // (PLACES - 1)
+        rows = np.tile(np.arange(len(checks)) % every == 0, len(data.nonempty))
+        torque = _fit(data, motion, data.checks.pick(rows), checks[::every])
+    return torque, torque.integrate_squares()
+
+
+def _fit(data: PhaseData, motion: PathMotion, places: Places, fractions: Array) -> TorqueProfile:
+    """Polynomials through the torques at `fractions` of every solid interval."""
+    k = data.nonempty
+    values = places.forces.tau(*data.interpolate(motion.profile, fractions))
+    spans = motion.durations(fractions)
+    if motion.stalls or not (np.diff(spans, axis=1) > 0).all():
+        raise StalledError("the motion all but stops between two nodes; plan with more intervals")
+    x = 2 * spans / spans[:, -1:] - 1
+    vandermonde = x[..., None] ** np.arange(len(fractions))
+    coefficients = np.linalg.solve(vandermonde, values.reshape(len(k), len(fractions), 2))
+    breaks = np.append(motion.times[k], motion.times[-1])
+    return TorqueProfile(breaks, np.asarray(coefficients.transpose(0, 2, 1), dtype=float))

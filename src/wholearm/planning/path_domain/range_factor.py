@@ -14,10 +14,8 @@ from ...common.errors import InfeasibleError, SolverError
 from ...geometry.curve import Curve
 from ..options import PlanOptions
 from ..robust.robust_rows import Guide
-from .path_plan import ROUGH, plan_curves
-from .refine import Iterate
+from .path_plan import ROUGH, Iterate, Task, plan_curves
 from .speed_profile import Fastest
-from .task import Task
 
 _CLOSE = 0.01  # error of the factor, relatively
 _LESS = 0.98  # factor from one tried plan to the next

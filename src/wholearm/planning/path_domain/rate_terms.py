@@ -32,10 +32,9 @@ from .elements import (
     find_basis,
     follow,
 )
-from .interpolation import PLACES
 from .path_data import PhaseData
 from .path_mesh import Switch
-from .path_motion import PathMotion
+from .path_motion import PLACES, PathMotion
 
 if TYPE_CHECKING:
     from ..columns import Symbols

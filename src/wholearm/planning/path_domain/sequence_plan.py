@@ -18,8 +18,7 @@ from ..stops import PlanPart, Plans, end_of
 from .impact_sequence import ImpactSequence
 from .junction import Joint, add_pause, choose_joint
 from .path_motion import PathMotion
-from .path_plan import plan_curves
-from .task import Pins
+from .path_plan import Pins, plan_curves
 
 
 def plan_sequence(
