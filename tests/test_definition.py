@@ -19,10 +19,9 @@ import wholearm
 from shipped import BOX, FOLDER, HEPTAGON, problem_of
 from wholearm.common.errors import InputError
 from wholearm.geometry.path_guess import load
-from wholearm.mapping.legs import format_until
 from wholearm.problem.definition import End, Problem, Until
 from wholearm.problem.read import build_problem, read_problem
-from wholearm.problem.table import write_table
+from wholearm.problem.table import format_until, write_table
 from wholearm.results.adopt import save
 from wholearm.scene.model import find_unit_hint
 

@@ -13,9 +13,16 @@ import pytest
 
 from shipped import HEPTAGON
 from wholearm.cli.command import build_parser
-from wholearm.common.command_options import read_options
 from wholearm.common.errors import InputError
-from wholearm.common.fields import NONNEGATIVE, Range, declare, key, keys_of, read_keys
+from wholearm.common.fields import (
+    NONNEGATIVE,
+    Range,
+    declare,
+    key,
+    keys_of,
+    read_keys,
+    read_options,
+)
 from wholearm.planning.options import CHOICES, Objective, PlanOptions
 from wholearm.problem import keys, read
 from wholearm.problem.definition import Problem

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import NoReturn
 
-from ..common.command_options import read_options
 from ..common.errors import InputError
+from ..common.fields import read_options
 from ..mechanics.margin_key import MARGIN
 from ..planning.options import PLANNER
 from .help import TOPICS
@@ -240,3 +240,18 @@ def name_simulator(given: Sequence[str]) -> list[str]:
                 continue
         named.append(text)
     return [f"{text}={SIMULATORS[0]}" if text == "--simulate" else text for text in named]
+
+
+def protect(given: Sequence[str]) -> list[str]:
+    """Keep argparse from taking pairs of numbers that start with a minus for options.
+
+    Of several pairs it would take one alone after an equals sign.
+    """
+    texts = list[str]()
+    for text in given:
+        texts += ["--list", text[7:]] if text.startswith("--list=") else [text]
+    return [f" {text}" if _is_pair(text) else text for text in texts]
+
+
+def _is_pair(text: str) -> bool:
+    return text[:1] == "-" and text[1:2] in tuple(".0123456789") and "," in text

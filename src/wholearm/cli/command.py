@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from ..benchmark import STUDIES
 from ..common.errors import InputError, WholearmError, name_source
 from ..common.signals import guard
-from .arguments import COMMANDS, Parser, name_simulator
+from .arguments import COMMANDS, Parser, name_simulator, protect
 from .output import (
     announce,
     clear_progress,
@@ -30,8 +30,6 @@ from .output import (
     show_progress,
     tell_origin,
 )
-from .route import find, protect
-from .viewer import overlay
 
 if TYPE_CHECKING:
     from ..benchmark.study import Study
@@ -136,6 +134,8 @@ def solve(options: argparse.Namespace) -> int:
             raise InputError("", f"--{key}", "is for problems with [goal]")
     try:
         if problem.goals:
+            from .route import find
+
             asked = {key: getattr(options, key) for key in ("cache", "jobs", "time_limit")}
             answer = find(problem, plan_options, **asked)
             plan, found = answer.plan, answer.to_text()
@@ -280,6 +280,7 @@ def plot(options: argparse.Namespace) -> int:
     """Draw a plan, or the replay of torques."""
     from ..figures import plots
     from ..results.trajectory import Trajectory
+    from .viewer import overlay
 
     require_output(options.output)
     trajectory = _read_torques(options.trajectory)

@@ -7,7 +7,6 @@ import json
 import os
 import sys
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -157,18 +156,3 @@ def _read_pair(text: str, key: str, allowed: str) -> tuple[float, float]:
     except ValueError:
         raise InputError("", key, f"{text.strip()!r} given; allowed is {allowed}") from None
     return first, second
-
-
-def protect(given: Sequence[str]) -> list[str]:
-    """Keep argparse from taking pairs of numbers that start with a minus for options.
-
-    Of several pairs it would take one alone after an equals sign.
-    """
-    texts = list[str]()
-    for text in given:
-        texts += ["--list", text[7:]] if text.startswith("--list=") else [text]
-    return [f" {text}" if _is_pair(text) else text for text in texts]
-
-
-def _is_pair(text: str) -> bool:
-    return text[:1] == "-" and text[1:2] in tuple(".0123456789") and "," in text

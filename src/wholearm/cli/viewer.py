@@ -21,8 +21,7 @@ def overlay(simulator: str, trajectory: Trajectory) -> Simulation:
     if simulator == "free":
         from ..simulation.free_simulate import simulate_free
 
-        if say is not None:
-            say("simulating the whole")
+        say("simulating the whole")
         return simulate_free(problem, trajectory).show(trajectory.contacts)
     from ..simulation.simulate import simulate
 

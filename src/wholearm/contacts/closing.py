@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..common.errors import InputError
-from ..scene.model import Finger, Scene
+from ..scene.model import Finger, Scene, cross_product
 from .contact_limits import FINGERS_TOUCH, evaluate_finger_gap
 from .elemental import Contact, candidate_contacts
 from .formation import Formation, Kinematics
@@ -30,6 +30,8 @@ TOO_SHORT, JOINT_COVERED, FINGERS_CROSS = 1, 2, 3
 """Reasons why a finger cannot close: it reaches no part of the object; its joint is in the object
 or right above it, so that the link overlaps the object before it closes; the other finger is closed
 in its way."""
+SIDE, EDGE, ARC = 0, 1, 2
+"""What of a link and an object touch: its side a vertex, its tip an edge, its tip a vertex."""
 AROUND = 3  # neighbouring vertices that are looked at where a finger closes
 LEVEL = 1e-12  # how far below a joint the object is still level with it, over the link's length
 CHUNK = 4096  # poses that are closed at a time, so that they stay in the cache
@@ -244,24 +246,19 @@ def _touch(link: Finger, finger: int, corners: Array) -> tuple[Array, Numbers]:
     outside = -np.pi / 2 if finger == 0 else np.pi + np.pi / 2
     length, radius = link.length, link.radius
     distance = np.hypot(corners[..., 0], corners[..., 1])
-    bearing = np.arctan2(corners[..., 1], corners[..., 0])
     along = following - corners
     size = np.hypot(along[..., 0], along[..., 1])
     along /= size[..., None]
     outward = np.stack([along[..., 1], -along[..., 0]], axis=-1)
-    offset = (radius + (outward * corners).sum(axis=-1)) / length
-    heading = np.arctan2(outward[..., 1], outward[..., 0])
     # At the very end of a pointed link rounding must not let the vertex slip between candidates.
     slack = 1e-11 * length if radius == 0 else 0.0
     with np.errstate(invalid="ignore", divide="ignore"):
         run = np.sqrt(distance**2 - radius**2)
-        side = np.where(
-            run <= length + slack, bearing - sign * np.arcsin(radius / distance), np.nan
-        )
-        reach = (distance**2 + length**2 - radius**2) / (2 * distance * length)
-        beyond = (run > length) & (reach <= 1) & (radius > 0)
-        arc = np.where(beyond, bearing - sign * np.arccos(reach), np.nan)
-        both = heading[..., None] + np.arccos(offset)[..., None] * np.array([-1.0, 1.0])
+        side = np.where(run <= length + slack, _find_angle(link, sign, SIDE, corners), np.nan)
+        beyond = (run > length) & (radius > 0)
+        arc = np.where(beyond, _find_angle(link, sign, ARC, corners), np.nan)
+        edges = (_find_angle(link, own, EDGE, corners, outward) for own in (-1.0, 1.0))
+        both = np.stack(list(edges), axis=-1)
     tip = length * np.stack([np.cos(both), np.sin(both)], axis=-1)
     place = ((tip - corners[:, :, None]) * along[:, :, None]).sum(axis=-1)
     both = np.where((place >= 0) & (place <= size[..., None]), both, np.nan)
@@ -276,6 +273,25 @@ def _touch(link: Finger, finger: int, corners: Array) -> tuple[Array, Numbers]:
     reached = np.isfinite(least)
     angle = outside + sign * np.where(reached, least, 0.0)
     return angle, np.where(reached, feature, -1)
+
+
+def _find_angle(
+    link: Finger, sign: float, kind: int, corners: Array, outward: Array | None = None
+) -> Array:
+    """Joint angles at which a link touches vertices or, with its tip, edges [rad].
+
+    Of a link that turns anticlockwise, `sign` 1, or clockwise; NaN where it cannot. `corners`,
+    (..., 2), are relative to the joint; those of edges are where they begin, with their `outward`
+    normals.
+    """
+    if kind == EDGE and outward is not None:
+        offset = link.radius + (outward * corners).sum(axis=-1)
+        heading = np.arctan2(outward[..., 1], outward[..., 0])
+        return np.asarray(heading + sign * np.arccos(offset / link.length))
+    away = np.hypot(corners[..., 0], corners[..., 1])
+    reach = (away**2 + link.length**2 - link.radius**2) / (2 * away * link.length)
+    inner = np.arcsin(link.radius / away) if kind == SIDE else np.arccos(reach)
+    return np.asarray(np.arctan2(corners[..., 1], corners[..., 0]) - sign * inner)
 
 
 def _hangs_into(link: Finger, corners: Array) -> Flags:
@@ -293,7 +309,7 @@ def _hangs_into(link: Finger, corners: Array) -> Flags:
 def _distance(corners: Array) -> Array:
     """Distance of convex anticlockwise polygons from the origin, zero inside, shape (n,) [m]."""
     runs = np.roll(corners, -1, axis=1) - corners
-    cross = corners[..., 0] * runs[..., 1] - corners[..., 1] * runs[..., 0]
+    cross = cross_product(corners, runs)
     part = np.clip(-(corners * runs).sum(axis=-1) / (runs**2).sum(axis=-1), 0.0, 1.0)
     nearest = corners + part[..., None] * runs
     distance = np.hypot(nearest[..., 0], nearest[..., 1]).min(axis=1)
@@ -359,10 +375,6 @@ def _round(low: float, high: float) -> tuple[float, float]:
     return round(inner[0], digits), round(inner[1], digits)
 
 
-SIDE, EDGE, ARC = 0, 1, 2
-"""What of a link and an object touch: its side a vertex, its tip an edge, its tip a vertex."""
-
-
 class ExplicitMotion(NamedTuple):
     """Straight paths at n places."""
 
@@ -394,14 +406,7 @@ def place(scene: Scene, labels: Numbers, poses: Array) -> Array:
         sign = 1.0 if finger == 0 else -1.0
         for own in _list_touches(scene, finger, labels[:, 1 + finger], z):
             with np.errstate(invalid="ignore", divide="ignore"):
-                if own.kind == EDGE:
-                    offset = link.radius + (own.outward * own.corner).sum(axis=1)
-                    angle = _heading(own.outward) + sign * np.arccos(offset / link.length)
-                else:
-                    away = np.hypot(*own.corner.T)
-                    reach = (away**2 + link.length**2 - link.radius**2) / (2 * away * link.length)
-                    inner = np.arcsin(link.radius / away) if own.kind == SIDE else np.arccos(reach)
-                    angle = _heading(own.corner) - sign * inner
+                angle = _find_angle(link, sign, own.kind, own.corner, own.outward)
             # Counted from where the finger hangs outside, from which it closes.
             outside = -np.pi / 2 if finger == 0 else 3 * np.pi / 2
             swept = np.mod(sign * (angle - outside), 2 * np.pi)
@@ -436,8 +441,8 @@ def move(scene: Scene, labels: Numbers, poses: Array, rates: Array) -> ExplicitM
             lever = own.arm + point - own.corner
             for rows, along in ((A, normal), (A_t, -_quarter(normal))):
                 rows[at, 1 + finger, :2] = along
-                rows[at, 1 + finger, 2] = _cross(lever, along)
-                rows[at, 1 + finger, joint] = -_cross(point, along)
+                rows[at, 1 + finger, 2] = cross_product(lever, along)
+                rows[at, 1 + finger, joint] = -cross_product(point, along)
             held = A[at, 1 + finger]
             with np.errstate(invalid="ignore", divide="ignore"):
                 rate = -(held[:, :3] * z_u[at, :3]).sum(axis=1) / held[:, joint]
@@ -463,7 +468,7 @@ def measure_gap(scene: Scene, contacts: Numbers, z: Array) -> Array:
             axis = np.column_stack([np.cos(angle), np.sin(angle)])
             apart = own.corner - link.length * axis
             if own.kind == SIDE:
-                gap = sign * _cross(axis, own.corner)
+                gap = sign * cross_product(axis, own.corner)
             elif own.kind == EDGE:
                 gap = -(own.outward * apart).sum(axis=1)
             else:
@@ -502,15 +507,8 @@ def _list_touches(scene: Scene, finger: int, contacts: Numbers, z: Array) -> Ite
         if len(rows):
             index, at = indices[rows], z[rows]
             arm = _turn(body[index], at[:, 2])
-            outward = _turn(_list_normals(scene)[index], at[:, 2]) if kind == EDGE else arm
+            outward = _turn(_list_edges(scene)[2][index], at[:, 2]) if kind == EDGE else arm
             yield _Touch(rows, kind, arm, arm + at[:, :2] - base, outward)
-
-
-@lru_cache(maxsize=8)
-def _list_normals(scene: Scene) -> Array:
-    """Outward normals of the edges of the object, in its own frame, shape (n_v, 2)."""
-    run = np.roll(scene.polygon.vertices, -1, axis=0) - scene.polygon.vertices
-    return -_quarter(run / np.hypot(*run.T)[:, None])
 
 
 def _turn(vectors: Array, phi: Array) -> Array:
@@ -521,16 +519,8 @@ def _turn(vectors: Array, phi: Array) -> Array:
     return turned
 
 
-def _heading(vectors: Array) -> Array:
-    return np.asarray(np.arctan2(vectors[:, 1], vectors[:, 0]))
-
-
 def _quarter(vectors: Array) -> Array:
     """Vectors turned by +90 degrees."""
     turned = np.empty_like(vectors)
     turned[:, 0], turned[:, 1] = -vectors[:, 1], vectors[:, 0]
     return turned
-
-
-def _cross(one: Array, two: Array) -> Array:
-    return np.asarray(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0])

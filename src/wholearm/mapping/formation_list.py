@@ -20,9 +20,10 @@ from ..geometry.path_guess import guess_phase
 from ..geometry.tracing import trace_phases
 from ..problem.definition import Problem, Until
 from ..problem.read import build_problem
+from ..problem.table import format_until
 from ..scene.model import TURN, Polygon, check_place
 from .borders import Window
-from .legs import describe_miss, describe_place, find_miss, format_until, tolerance, walk_leg
+from .legs import describe_miss, describe_place, find_miss, tolerance, walk_leg
 
 _MOST = 50  # Corners of a polygon that a file still shows well
 _SIZE, _MASS = 0.05, 0.2  # radius [m] and mass [kg] of the reference object

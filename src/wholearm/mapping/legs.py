@@ -51,7 +51,6 @@ AT_START = 1e-4  # length of a first part, over `NEAR`, that counts as rounding
 INSIDE = 0.2  # distance of a leg's end from an obstacle, over `NEAR`
 PROBES = 9  # samples of an excursion into a neighbouring cell
 DIGITS = 1e-5  # rounding of the coordinates that end phases, in radii of gyration and rad
-SAME = 9  # decimals of an angle in degrees that are no rounding
 REPLANS = 12  # most times that the rest of a leg is split anew
 BEFORE = 0.98  # share of a part at which intermediate phases end: short of the change of contacts
 Span = tuple[Numbers, float, float]  # a label, and the parameters between which a leg has it
@@ -195,17 +194,6 @@ def end_at(scene: Scene, row: int, pose: Array) -> Until:
         return Until(coordinate="x", value=round(float(pose[0]), digits))
     degrees = round(math.degrees(pose[1]), math.ceil(-math.log10(math.degrees(DIGITS))))
     return Until(coordinate="phi", value=math.radians(degrees))
-
-
-def format_until(until: Until) -> str:
-    """The value of `until` in a problem file."""
-    if until.contact is not None and not until.pins:
-        return f'"{until.contact}"'
-    parts = [] if until.contact is None else [f'contact = "{until.contact}"']
-    for row, value in until.poses:
-        number = round(math.degrees(value), SAME) if row else value
-        parts.append(f"{'phi_deg' if row else 'x'} = {number + 0.0!r}")
-    return f"{{ {', '.join(parts)} }}"
 
 
 @lru_cache(maxsize=64)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ..common.command_options import read_options
 from ..common.errors import InputError, require_number
-from ..common.fields import FieldKind
+from ..common.fields import FieldKind, read_options
 
 MARGIN = """\
 --uniqueness-margin  least uniqueness margin of contact forces: principal minors of the contact

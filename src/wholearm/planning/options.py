@@ -7,9 +7,8 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
-from ..common.command_options import read_options
 from ..common.errors import InputError
-from ..common.fields import declare, read_keys
+from ..common.fields import declare, read_keys, read_options
 from ..mechanics.margin_key import UNIQUENESS
 
 

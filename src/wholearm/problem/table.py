@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from .definition import Phase, Problem, Until
 
 
+SAME = 9  # decimals of an angle in degrees that are no rounding
 _STEP = re.compile(r"([^.\[\]]+)|\[([1-9][0-9]*)\]")
 
 
@@ -92,9 +93,7 @@ def _to_plain(value: Any) -> Any:
         return value.tolist()
     if isinstance(value, Mapping):
         return {str(key): _to_plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_to_plain(item) for item in value]
-    return value
+    return [_to_plain(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def match_table(problem: Problem) -> Mapping[str, Any]:
@@ -200,30 +199,40 @@ def _match_start(start: Mapping[str, Any], problem: Problem) -> Mapping[str, Any
 
 def _match_phase(entries: Sequence[Mapping[str, Any]], phase: Phase) -> Mapping[str, Any]:
     """The entry that says what a phase is, or a new one."""
-    until = phase.until
-    own: dict[str, Any] = {"contacts": name_contacts(phase)}
-    if not until.is_release:
-        own["until"] = write_until(until)
-    if phase.settle is not None:
-        own["settle"] = phase.settle
+    own = describe_phase(phase)
     for entry in (*entries[phase.index : phase.index + 1], *entries):
-        given = entry.get("until")
-        same = _is_same(given, own.get("until"))
+        same = _is_same(entry.get("until"), own.get("until"))
         same = same and all(entry.get(key) == own.get(key) for key in ("contacts", "settle"))
         if same and entry.get("end", "rest") == phase.end.value:
             return entry
-    return own | ({} if phase.end.value == "rest" else {"end": phase.end.value})
+    return own
 
 
-def write_until(until: Until) -> Any:
-    """What ends a phase, as its file has it: a name, or a table."""
+def describe_phase(phase: Phase, digits: int | None = None) -> dict[str, Any]:
+    """A phase as an entry of a file, with angles rounded to so many decimals."""
+    own: dict[str, Any] = {"contacts": name_contacts(phase)}
+    if not phase.until.is_release:
+        own["until"] = write_until(phase.until, digits)
+    if phase.settle is not None:
+        own["settle"] = phase.settle
+    return own if phase.end.value == "rest" else own | {"end": phase.end.value}
+
+
+def write_until(until: Until, digits: int | None = None) -> Any:
+    """What ends a phase, as its file has it: a name, or a table, with rounded angles if asked."""
     if until.contact is not None and not until.pins:
         return until.contact.name
     own: dict[str, Any] = {} if until.contact is None else {"contact": until.contact.name}
-    names = {0: "x", 2: "phi_deg"}
     for row, value in until.poses:
-        own[names[row]] = math.degrees(value) if row else value
+        angle = math.degrees(value)
+        angle = angle if digits is None else round(angle, digits)
+        own["phi_deg" if row else "x"] = angle + 0.0 if row else value + 0.0
     return own
+
+
+def format_until(until: Until) -> str:
+    """The value of `until` in a problem file, to read."""
+    return _write(write_until(until, SAME))
 
 
 def _is_same(given: Any, own: Any) -> bool:
@@ -239,9 +248,8 @@ def _is_same(given: Any, own: Any) -> bool:
 
 def name_contacts(phase: Phase) -> list[str]:
     """Contacts of a phase as its file names them."""
-    formation = phase.formation
-    rolling = formation.rolling
-    return [c.name + (" rolling" if c in rolling else "") for c in formation.contacts]
+    rolling = phase.formation.rolling
+    return [c.name + (" rolling" if c in rolling else "") for c in phase.formation.contacts]
 
 
 def save_problem(problem: Problem, path: str | os.PathLike[str]) -> None:

@@ -358,6 +358,8 @@ def _sample(coefficients: Array) -> Array:
 
 def _fit_lines(torque: TorqueProfile, knots: Array) -> Array:
     """Values at knots, shape (n, 2), of the continuous straight lines nearest to the torques."""
+    from scipy.linalg import solveh_banded
+
     h = np.diff(knots)
     t = knots[:-1, None] + h[:, None] * (_POINTS + 1) / 2
     tau = torque.at(t.ravel()).reshape(*t.shape, 2) * (_WEIGHTS * h[:, None] / 2)[..., None]
@@ -366,21 +368,5 @@ def _fit_lines(torque: TorqueProfile, knots: Array) -> Array:
     right[:-1] += np.einsum("knj,n->kj", tau, 1 - later)
     right[1:] += np.einsum("knj,n->kj", tau, later)
     diagonal = (np.append(h, 0.0) + np.append(0.0, h)) / 3
-    return _solve_tridiagonal(diagonal, h / 6, right)
-
-
-def _solve_tridiagonal(diagonal: Array, beside: Array, right: Array) -> Array:
-    """Solve a symmetric, diagonally dominant system: shapes (n,), (n - 1,) and (n, 2)."""
-    pivot, rows = diagonal.tolist(), right.tolist()
-    off = beside.tolist()
-    for k in range(1, len(pivot)):
-        share = off[k - 1] / pivot[k - 1]
-        pivot[k] -= share * off[k - 1]
-        rows[k] = [own - share * before for own, before in zip(rows[k], rows[k - 1], strict=True)]
-    rows[-1] = [own / pivot[-1] for own in rows[-1]]
-    for k in range(len(pivot) - 2, -1, -1):
-        rows[k] = [
-            (own - off[k] * after) / pivot[k]
-            for own, after in zip(rows[k], rows[k + 1], strict=True)
-        ]
-    return np.array(rows)
+    # The upper diagonal begins with a place that is not used.
+    return np.asarray(solveh_banded([np.append(0.0, h / 6), diagonal], right))

@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 from ..common.document import Document, Result, Table
 from ..common.signals import beat
 from ..contacts.formation import describe
-from ..mapping.legs import format_until
 from ..planning.options import Objective
 from ..planning.result import Plan
-from ..problem.definition import End, Problem
+from ..problem.definition import Problem
+from ..problem.table import SAME, describe_phase, write_toml
 from .astar import EAGER, RoadmapRoute, RouteSearch
 from .cuts import list_cut
 from .edge_plans import FailedCandidate
@@ -150,14 +150,7 @@ class Answer(Alternative):
 
 def format_phases(problem: Problem) -> str:
     """The phases of a problem as `[[phases]]` of a problem file."""
-    lines = []
-    for phase in problem.phases:
-        names = ", ".join(f'"{name}"' for name in phase.formation.names)
-        lines += ["[[phases]]", f"contacts = [{names}]"]
-        lines += [] if phase.until.is_release else [f"until = {format_until(phase.until)}"]
-        lines += [] if phase.end is End.REST else [f'end = "{phase.end.value}"']
-        lines.append("")
-    return "\n".join(lines)
+    return write_toml({"phases": [describe_phase(phase, SAME) for phase in problem.phases]})[1:]
 
 
 def describe_block(
