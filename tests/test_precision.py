@@ -20,7 +20,6 @@ from wholearm.benchmark.precision.planners import (
     NO_DRAG,
     PLANNERS,
     find_least_time,
-    is_installed,
     run_planner,
 )
 from wholearm.benchmark.precision.precision_study import Medians, PeerComparison, find_times
@@ -42,9 +41,9 @@ def phase(number: int, drag: bool = True) -> Instance:
 
 @pytest.mark.parametrize("method", TRIED)
 def test_every_planner_comes_near_the_least_time(method: str) -> None:
-    if not is_installed(method):
+    if not PLANNERS[method].is_installed:
         pytest.skip(f"{method}: pip install 'wholearm[bench]'")
-    (study, *_) = PLANNERS[method].studies
+    (study, *_) = PLANNERS[method].choices
     found = run_planner(study, phase(4).name, method, TRIED[method], FILES)
     error, end, violation = found.errors
     assert found.outcome == SOLVED and abs(error) < 2e-2
@@ -99,7 +98,7 @@ def test_every_simulator_converges_to_the_reference(method: str) -> None:
         measure_error(
             course().problem, SIMULATORS[method].build(course(), tolerance)(), course().end
         )
-        for tolerance in (1e-5, 1e-9)
+        for tolerance in ("1e-5", "1e-9")
     ]
     assert errors[1] < 2e-7 and errors[1] < max(0.3 * errors[0], 1e-10)
 

@@ -12,7 +12,7 @@ import pytest
 
 from shipped import HEPTAGON, tipping
 from wholearm.benchmark.stress.cell_curves import find_best, list_ends
-from wholearm.benchmark.stress.damage import look, run_file, to_toml
+from wholearm.benchmark.stress.damage import look, run_file
 from wholearm.benchmark.stress.event_tracing import follow, resample, slides
 from wholearm.benchmark.stress.newton import balance, clearances, locate, separate
 from wholearm.benchmark.stress.scenes import draw_case, random_scene
@@ -29,6 +29,7 @@ from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.problem.definition import Phase, Problem
 from wholearm.problem.read import build_problem, read_problem
+from wholearm.problem.table import write_toml
 from wholearm.results.trajectory import Trajectory
 from wholearm.scene.model import Friction, Scene
 
@@ -37,7 +38,7 @@ def test_a_scene_is_drawn_alike_again_and_is_the_same_as_a_file() -> None:
     case, again = draw_case(0, 2), draw_case(0, 2)
     assert case == again
     assert case.table["phases"]
-    assert tomllib.loads(to_toml(case.table)) == case.table
+    assert tomllib.loads(write_toml(case.table)) == case.table
 
 
 @pytest.mark.parametrize("number", range(12))

@@ -16,7 +16,7 @@ from typing import Any
 
 from ..common.files import read_json, write_text
 from .corpus_cases import answer, list_cases
-from .study import Case, Row, Study, name_case
+from .study import Case, Row, Study, format_table, name_case
 
 TOLERANCES = {"value": 1e-6, "amount": 1e-2, "advice": 5e-2, "numbers": 1e-3, "least": 1e-3}
 """Relative to the largest number of an entry: what Ipopt and the refinement of limits leave open.
@@ -81,16 +81,13 @@ class Corpus(Study):
             for row in rows
         }
         kinds = ("same", "better", "other words", "differs")
-        lines = [f"| family | cases | {' | '.join(kinds)} | processor time [s] |"]
-        lines.append("|---|" + "---:|" * (len(kinds) + 2))
+        table = []
         for family in [*dict.fromkeys(row["case"][0] for row in rows), "all"]:
             mine = [row for row in rows if family in ("all", row["case"][0])]
             count = Counter(verdicts[name_case(row)][0] for row in mine)
-            cells = [family, len(mine), *(count[kind] for kind in kinds)]
-            lines.append(
-                f"| {' | '.join(map(str, cells))} | {sum(r['seconds'] for r in mine):.0f} |"
-            )
-        lines.append("")
+            seconds = sum(row["seconds"] for row in mine)
+            table.append((family, len(mine), *(count[kind] for kind in kinds), f"{seconds:.0f}"))
+        lines = [*format_table(["family", "cases", *kinds, "processor time [s]"], table), ""]
         for name, (kind, texts) in verdicts.items():
             if kind in kinds[1:3]:
                 lines.append(f"* {kind}: {name}: {texts[0]}")

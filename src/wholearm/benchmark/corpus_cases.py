@@ -23,11 +23,12 @@ import numpy as np
 import wholearm
 from wholearm import Plan, Problem
 
+from ..problem.table import write_toml
 from ..search.find_route import forget_roadmaps
 from ..verification.verdict import find_least_force
 from .kernels import list_modes
 from .queries import draw_leg, draw_query
-from .stress.damage import BASE, to_toml
+from .stress.damage import BASE
 from .stress.scenes import draw_case
 from .study import Case, Row
 
@@ -247,7 +248,7 @@ def _read_table(table: Any) -> Problem:
     """A problem by way of its file, whose messages do not name the folder."""
     with tempfile.TemporaryDirectory() as place:
         path = Path(place, "problem.toml")
-        path.write_text(to_toml(table), encoding="utf-8")
+        path.write_text(write_toml(table), encoding="utf-8")
         try:
             return wholearm.load(str(path))
         except wholearm.InputError as error:

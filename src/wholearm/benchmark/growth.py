@@ -21,7 +21,7 @@ from ..mapping.formation_map import build_map
 from ..planning.plan import solve
 from ..problem.read import build_problem, read_problem
 from .stress.scenes import name_first
-from .study import Case, Row, Study, finish_axes
+from .study import Case, Row, Study, finish_axes, format_table
 
 SIZES = {
     "intervals": (50, 100, 200, 400, 800, 1600, 3200),
@@ -79,14 +79,13 @@ class Growth(Study):
         lines = ["Processor time and rise of the peak memory, each in a process of its own.", ""]
         for grows, sizes in SIZES.items():
             lines += [f"## {grows.capitalize()}", ""]
-            lines += [f"| work | {' | '.join(map(str, sizes))} | exponent |"]
-            lines += ["|---|" + "---:|" * (len(sizes) + 1)]
+            table = []
             for work, (unit, field) in product(WORK[grows], UNITS.items()):
                 known, values = select(rows, grows, work, field)
                 shown = [f"{value:.3g}" for value in values] + [""] * (len(sizes) - len(values))
                 exponent = fit_exponent(known, values)
-                lines.append(f"| {work} [{unit}] | {' | '.join(shown)} | {exponent:.2f} |")
-            lines.append("")
+                table.append((f"{work} [{unit}]", *shown, f"{exponent:.2f}"))
+            lines += [*format_table(["work", *map(str, sizes), "exponent"], table), ""]
         return "\n".join(lines), []
 
     def draw(self, rows: Sequence[Row]) -> Figure:

@@ -32,7 +32,7 @@ from ..common.arrays import Array
 from ..common.fields import Range
 from ..common.files import read_json, write_text
 from ..scene.model import Finger, Friction, Polygon, Scene
-from .study import Case, Row, Study
+from .study import Case, Row, Study, format_table
 
 LARGEST = 4  # largest change of a number, in units of 2^-52 of it
 
@@ -219,9 +219,7 @@ class Kernels(Study):
             first = next(iter(found.values()))
             write_text(options.answers, json.dumps(first, indent=1, sort_keys=True) + "\n")
         known = read_json(options.answers, "--update writes it anew")
-        lines = ["| environment | answers | as stored | largest difference of a value |"]
-        lines.append("|---|---|---|---|")
-        findings = []
+        table, findings = [], []
         for environment, answers in found.items():
             label = environment.describe()
             texts = {name: compare(own, known.get(name)) for name, own in answers.items()}
@@ -232,7 +230,9 @@ class Kernels(Study):
                 if own["value"] and known.get(name, {}).get("value")
             ]
             same = sum(not own for own in texts.values())
-            lines.append(f"| {label} | {len(answers)} | {same} | {max(offs, default=0.0):.1e} |")
+            table.append((label, len(answers), same, f"{max(offs, default=0.0):.1e}"))
+        heads = ["environment", "answers", "as stored", "largest difference of a value"]
+        lines = format_table(heads, table, 4)
         if options.output:
             write_text(options.output, "\n".join([f"# {self.title}", "", *lines]) + "\n")
         return "\n".join(lines), findings

@@ -28,7 +28,7 @@ from ..problem.read import build_problem, place_start, read_problem
 from ..search.find_route import find_route, forget_roadmaps
 from ..verification.verify import verify
 from .stress.scenes import Table
-from .study import Case, Row, Study
+from .study import Case, Row, Study, format_table
 
 SHIPPED = ("heptagon", "hexagon", "square", "triangle")
 POLYGONS = 5  # random polygons, in the hexagon's hand
@@ -89,17 +89,18 @@ class Queries(Study):
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
         """What came of them, and the times."""
         kinds = Counter(row["kind"] for row in rows)
-        lines = [f"| queries | {' | '.join(kinds)} |", "|---|" + "---|" * len(kinds)]
-        lines += [f"| {len(rows)} | {' | '.join(map(str, kinds.values()))} |", ""]
-        lines += ["| processor time | median [s] | 95 % [s] | most [s] |", "|---|---|---|---|"]
+        lines = format_table(["queries", *kinds], [(len(rows), *kinds.values())], 1 + len(kinds))
+        table = []
         for name, times in (
             ("all", [row["first"] for row in rows]),
             *((kind, [row["first"] for row in rows if row["kind"] == kind]) for kind in kinds),
             ("second query", [row["second"] for row in rows if "second" in row]),
         ):
             if times:
-                middle, most, last = np.percentile(times, [50, 95, 100])
-                lines.append(f"| {name} | {middle:.2f} | {most:.2f} | {last:.2f} |")
+                shown = (f"{own:.2f}" for own in np.percentile(times, [50, 95, 100]))
+                table.append((name, *shown))
+        heads = ["processor time", "median [s]", "95 % [s]", "most [s]"]
+        lines += ["", *format_table(heads, table, 4)]
         ratios = [row["second"] / row["first"] for row in rows if "second" in row]
         gaps = [row["gap"] for row in rows if row.get("gap") is not None]
         if ratios:

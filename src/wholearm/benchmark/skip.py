@@ -22,7 +22,7 @@ from ..planning.plan import solve
 from ..problem.definition import End, Problem, Until
 from ..problem.read import build_problem
 from ..solvers.ipopt import record_runs
-from .study import Case, Row, Study
+from .study import Case, Row, Study, format_table
 
 REPEATS = 3  # runs of which the medians are taken
 PUSHED = 0.03  # place that the object is pushed to by one finger or by both [m]
@@ -60,16 +60,17 @@ class Skip(Study):
             "NLP, times those of the processor, as medians of fresh processes; building is all but",
             "the solver.",
             "",
-            "| part | unknowns without | with | rows without | with | building without [ms] | with "
-            "| solving without [ms] | with |",
-            "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
         ]
+        table = []
         for part in dict.fromkeys(row["case"][1] for row in rows):
             cells = [part]
             for column, having in product(COLUMNS, (False, True)):
                 own = [row for row in rows if row["case"][1:3] == [part, having]]
                 cells.append(f"{median(row[column] for row in own):.0f}")
-            lines.append(f"| {' | '.join(cells)} |")
+            table.append(cells)
+        firsts = ("unknowns", "rows", "building without [ms]", "solving without [ms]")
+        heads = [f"{name} without" if name in COLUMNS else name for name in firsts]
+        lines += format_table(["part", *(h for head in heads for h in (head, "with"))], table)
         return "\n".join(lines), []
 
 

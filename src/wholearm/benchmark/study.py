@@ -200,6 +200,16 @@ def describe_machine(packages: Sequence[str] = ()) -> str:
     return ", ".join([*parts, _name_processor(), f"{os.cpu_count()} cores"])
 
 
+def format_table(
+    heads: Sequence[str], rows: Iterable[Sequence[object]], left: int = 1
+) -> list[str]:
+    """Lines of a table in Markdown, whose first columns are aligned to the left."""
+    marks = ["---" if k < left else "---:" for k in range(len(heads))]
+    cells = [heads, *rows]
+    lines = [f"| {' | '.join(map(str, row))} |" for row in cells]
+    return [lines[0], f"|{'|'.join(marks)}|", *lines[1:]]
+
+
 def finish_axes(axes: Axes, **legend: Any) -> None:
     """Give axes a grid, no frame and a legend."""
     axes.grid(True, which="major", color="#c4c9d0", linewidth=0.6)

@@ -271,23 +271,26 @@ def write_toml(table: Mapping[str, Any], where: str = "") -> str:
     """Nested tables as TOML: values first, then tables, then lists of tables."""
     plain, inner = [], []
     for key, value in table.items():
-        name = key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else json.dumps(key)
-        full = f"{where}{name}"
+        full = f"{where}{_quote(key)}"
         if isinstance(value, Mapping):
             inner.append(f"\n[{full}]\n{write_toml(value, f'{full}.')}")
-        elif key in ("phases", "goal") and isinstance(value, list):
+        elif isinstance(value, list) and value and all(isinstance(v, Mapping) for v in value):
             for entry in value:
-                lines = (f"{name} = {_write(item)}\n" for name, item in entry.items())
+                lines = (f"{_quote(name)} = {_write(item)}\n" for name, item in entry.items())
                 inner.append(f"\n[[{full}]]\n{''.join(lines)}")
         else:
-            plain.append(f"{name} = {_write(value)}\n")
+            plain.append(f"{_quote(key)} = {_write(value)}\n")
     return "".join(plain + inner)
+
+
+def _quote(key: str) -> str:
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else json.dumps(key)
 
 
 def _write(value: Any) -> str:
     """A value, with all digits of a number."""
     if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{key} = {_write(own)}" for key, own in value.items()) + " }"
+        return "{ " + ", ".join(f"{_quote(k)} = {_write(v)}" for k, v in value.items()) + " }"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_write, value)) + "]"
     return json.dumps(value) if isinstance(value, str | bool) else repr(value)

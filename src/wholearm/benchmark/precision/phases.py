@@ -12,8 +12,9 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -162,6 +163,21 @@ def sample_slow_motion(instance: Instance, counts: list[int]) -> list[tuple[Arra
         inside = np.clip(t, start + 1e-9 * (stop - start), stop - 1e-9 * (stop - start))
         stretches.append((t - start, motion.evaluate(inside)))
     return stretches
+
+
+class Method(NamedTuple):
+    """A planner or a simulator."""
+
+    settings: str  # what it is told besides the setting
+    # takes a phase or a course, and a setting; gives what solves it
+    build: Callable[[Any, str], Callable[[], Any]]
+    choices: dict[str, tuple[str, ...]]  # settings that are measured, by study
+    module: str = ""  # what has to be installed, if anything
+
+    @property
+    def is_installed(self) -> bool:
+        """Whether there is what it needs."""
+        return not self.module or find_spec(self.module) is not None
 
 
 class Median(NamedTuple):

@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import lru_cache, partial
-from importlib.util import find_spec
-from typing import Any, NamedTuple
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 
 from ...common.arrays import Array
 from ...geometry.curve import directions_of
@@ -35,7 +35,9 @@ from .phases import (
     OPTIMUM,
     Instance,
     Median,
+    Method,
     PeerPlan,
+    PhaseStretch,
     build_plant,
     list_stretches,
     measure,
@@ -51,17 +53,6 @@ FINE = 1e-7
 NEAR = 1e-7  # distance over the duration in which a step of the torques is that of a reversal
 APART = 1e-7  # distance of grid points from a reversal between them, over the curve's length
 TORQUE_NODES = 5  # instants in an interval that its torque's polynomial goes through
-
-
-class Planner(NamedTuple):
-    """A planner."""
-
-    settings: str  # what it is told besides the number of intervals
-    # takes an instance and a setting; gives what solves it
-    build: Callable[[Instance, str], Callable[[], PeerPlan]]
-    choices: tuple[str, ...]  # settings that are measured
-    module: str = ""  # what has to be installed, if anything
-    studies: tuple[str, ...] = (LEAST_TIME,)
 
 
 def run_planner(study: str, name: str, method: str, setting: str, files: tuple[str, ...]) -> Median:
@@ -97,12 +88,6 @@ def find_least_time(instance: Instance) -> float:
     return plan_path(curve, epsilon, PlanOptions(accuracy=FINE), 1).motion.duration
 
 
-def is_installed(method: str) -> bool:
-    """Whether a planner has what it needs."""
-    module = PLANNERS[method].module
-    return not module or find_spec(module) is not None
-
-
 def _build_on_curve(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
     """Ours along the curve; its NLP is built anew."""
     curve, epsilon = instance.curve, instance.problem.epsilon
@@ -128,18 +113,16 @@ def _build_over_time(instance: Instance, setting: str) -> Callable[[], PeerPlan]
 
 def _convert(instance: Instance, plan: PhasePlan[Any]) -> PeerPlan:
     """Our plan as those of peers are given: reversals are where the way passes their places."""
-    motion, marks = plan.motion, []
+    motion, breaks, marks = plan.motion, plan.torque.breaks, []
     for stretch in list_stretches(instance.curve)[:-1]:
-        low, high = 0.0, motion.duration
-        for _ in range(60):
-            middle = (low + high) / 2
-            place = motion.evaluate(np.array([middle])).z[0, stretch.progress]
-            first = instance.curve.start[stretch.progress]
-            before = (place - stretch.target) * (first - stretch.target) > 0
-            low, high = (middle, high) if before else (low, middle)
-        breaks = plan.torque.breaks
-        nearest = float(breaks[np.abs(breaks - high).argmin()])
-        marks.append(nearest if abs(nearest - high) < NEAR * motion.duration else high)
+
+        def pass_by(t: float, stretch: PhaseStretch = stretch) -> float:
+            z = motion.evaluate(np.array([t])).z[0]
+            return float(z[stretch.progress] - stretch.target)
+
+        time = brentq(pass_by, 0.0, motion.duration, xtol=1e-15)
+        nearest = float(breaks[np.abs(breaks - time).argmin()])
+        marks.append(nearest if abs(nearest - time) < NEAR * motion.duration else time)
     return PeerPlan(OPTIMUM, motion.duration, plan.torque, tuple(marks))
 
 
@@ -373,30 +356,29 @@ def _read(solution: Any) -> PeerPlan:
 
 
 _CURVE = ("1e-2", "1e-3", "1e-4", "1e-5", "1e-6")
-_TIME = ("8 x 3", "16 x 3", "32 x 3", "16 x 2", "16 x 4")
 PLANNERS = {
-    "wholearm, curve": Planner(
+    "wholearm, curve": Method(
         "accuracy; limits tightened between nodes included",
         _build_on_curve,
-        _CURVE,
-        studies=(LEAST_TIME, NO_DRAG),
+        {LEAST_TIME: _CURVE, NO_DRAG: _CURVE},
     ),
-    "wholearm, time": Planner(
-        "Radau, intervals x degree; linear torques, refinement included", _build_over_time, _TIME
+    "wholearm, time": Method(
+        "Radau, intervals x degree; linear torques, refinement included",
+        _build_over_time,
+        {LEAST_TIME: ("8 x 3", "16 x 3", "32 x 3", "16 x 2", "16 x 4")},
     ),
-    "yapss": Planner(
+    "yapss": Method(
         "two Legendre-Gauss points a segment, automatic second derivatives; adaptive barrier, the "
         "slow motion",
         build_yapss,
-        ("20", "40", "80", "160"),
+        {LEAST_TIME: ("20", "40", "80", "160")},
         "yapss",
     ),
-    "toppra": Planner(
+    "toppra": Method(
         "Seidel, limits at both ends of intervals, squeeze eliminated after Fourier and Motzkin",
         build_toppra,
-        ("50", "100", "200", "400", "800", "1600", "3200"),
+        {NO_DRAG: ("50", "100", "200", "400", "800", "1600", "3200")},
         "toppra",
-        (NO_DRAG,),
     ),
 }
 """Planners by name."""

@@ -17,11 +17,15 @@ from matplotlib.figure import Figure
 from ...common.errors import InputError
 from ...common.fields import Range
 from ...figures.style import PALETTE
-from ..study import Case, Row, Study, finish_axes
+from ..study import Case, Row, Study, finish_axes, format_table
 from .phases import BUDGET, REPEATS, SHIFT, SHORT, SOLVED, Median, find_mean, list_instances
-from .planners import LEAST_TIME, NO_DRAG, PLANNERS, is_installed, run_planner
-from .simulators import FEW, MANY, SIMULATORS, TOLERANCES, run_simulator
+from .planners import LEAST_TIME, NO_DRAG, PLANNERS, run_planner
+from .simulators import FEW, MANY, SIMULATORS, run_simulator
 
+METHODS = SIMULATORS | PLANNERS
+"""All methods by name, in the order of the tables."""
+SIMULATION, PLANNING = (FEW, MANY), (LEAST_TIME, NO_DRAG)
+"""Studies of each part."""
 Key = tuple[str, str, str, str]
 """Study, instance, method and setting: what one median is of."""
 Medians = dict[Key, Median]
@@ -41,13 +45,10 @@ class PeerComparison(NamedTuple):
 
 
 COMPARISONS = (
-    *(
-        PeerComparison(own, own, "wholearm", (1e-6, 1e-9, 1e-11), False, None)
-        for own in (FEW, MANY)
-    ),
+    *(PeerComparison(own, own, "wholearm", (1e-6, 1e-9, 1e-11), False, None) for own in SIMULATION),
     *(
         PeerComparison(own, f"{own}, {which}", "wholearm, curve", (1e-2, 1e-3, 1e-4), True, count)
-        for own in (LEAST_TIME, NO_DRAG)
+        for own in PLANNING
         for count, which in ((1, "by the error of the phase time"), (None, "by all three errors"))
     ),
 )
@@ -86,10 +87,10 @@ def format_report(medians: Medians, limit: float) -> str:
     ]
     for comparison in COMPARISONS:
         lines += _format_targets(medians, comparison, limit)
-    for study in (LEAST_TIME, NO_DRAG):
+    for study in PLANNING:
         lines += _format_settings(medians, study)
-    lines += ["## Settings", "", "| method | settings |", "|---|---|"]
-    lines += [f"| {name} | {own.settings} |" for name, own in (SIMULATORS | PLANNERS).items()]
+    table = [(name, own.settings) for name, own in METHODS.items()]
+    lines += ["## Settings", "", *format_table(["method", "settings"], table, 2)]
     return "\n".join([*lines, ""])
 
 
@@ -112,17 +113,14 @@ def find_times(
 def list_methods(medians: Medians, study: str) -> list[str]:
     """Methods that a study has runs of, in their order."""
     given = {key[2] for key in medians if key[0] == study}
-    return [name for name in SIMULATORS | PLANNERS if name in given]
+    return [name for name in METHODS if name in given]
 
 
 def _format_targets(medians: Medians, own: PeerComparison, limit: float) -> list[str]:
     """Times to reach errors, and how many times as long as ours that is."""
-    methods = list_methods(medians, own.study)
+    methods, table = list_methods(medians, own.study), []
     if own.ours not in methods:
         return []
-    lines = [f"## {own.title[0].upper()}{own.title[1:]}", ""]
-    heads = [f"{target:g} [s] | reached | times ours" for target in own.targets]
-    lines += [f"| method | {' | '.join(heads)} |", "|---|" + "---:|---:|---:|" * len(heads)]
     for method in methods:
         cells = [method]
         for target in own.targets:
@@ -135,8 +133,13 @@ def _format_targets(medians: Medians, own: PeerComparison, limit: float) -> list
             )
             shown = (f"{mean:.4f}", f"{mean / least:.2g}") if reached else ("-", "-")
             cells += [shown[0], f"{reached} of {len(names)}", shown[1]]
-        lines.append(f"| {' | '.join(cells)} |")
-    return [*lines, ""]
+        table.append(cells)
+    heads = [head for t in own.targets for head in (f"{t:g} [s]", "reached", "times ours")]
+    return [f"## {_begin(own.title)}", "", *format_table(["method", *heads], table), ""]
+
+
+def _begin(text: str) -> str:
+    return text[0].upper() + text[1:]
 
 
 def group_settings(medians: Medians, study: str, method: str) -> dict[str, list[Median]]:
@@ -150,34 +153,33 @@ def group_settings(medians: Medians, study: str, method: str) -> dict[str, list[
 
 def _format_settings(medians: Medians, study: str) -> list[str]:
     """What each setting of each planner gives: medians of errors, means of times."""
-    methods = list_methods(medians, study)
-    if not methods:
-        return []
-    lines = [f"## {study[0].upper()}{study[1:]}: medians over phases of each setting", ""]
-    lines += ["| method | setting | solved | phase time | end state | violation | building [s] |"]
-    lines[-1] += " solving [s] | what failed |"
-    lines += ["|---|---:|---:|---:|---:|---:|---:|---:|---|"]
-    for method in methods:
+    table = []
+    for method in list_methods(medians, study):
         for setting, group in group_settings(medians, study, method).items():
             errors = [np.abs(own.errors) for own in group if len(own.errors) == 3]
             middle = np.median(errors, axis=0) if errors else np.full(3, np.nan)
-            shown = " | ".join(f"{value:.1e}" for value in middle)
             failed = dict.fromkeys(own.outcome for own in group if own.outcome != SOLVED)
             solved = sum(own.outcome == SOLVED for own in group)
-            built, took = (
+            times = (
                 find_mean([t for t in part if math.isfinite(t)] or [math.nan])
                 for part in ([own.build for own in group], [own.solve for own in group])
             )
-            cells = f"{solved} of {len(group)} | {shown} | {built:.4f} | {took:.4f}"
-            lines.append(f"| {method} | {setting} | {cells} | {'; '.join(failed)} |")
-    return [*lines, ""]
+            cells = [f"{value:.1e}" for value in middle] + [f"{value:.4f}" for value in times]
+            solutions = f"{solved} of {len(group)}"
+            table.append((method, setting, solutions, *cells, "; ".join(failed)))
+    if not table:
+        return []
+    heads = ["method", "setting", "solved", "phase time", "end state", "violation"]
+    heads += ["building [s]", "solving [s]", "what failed"]
+    title = f"## {_begin(study)}: medians over phases of each setting"
+    return [title, "", *format_table(heads, table), ""]
 
 
 def draw_medians(medians: Medians) -> Figure:
     """Mean run time over the error that half of the phases keep, one line for each method."""
     figure = Figure(figsize=(11.0, 9.0), layout="constrained")
     FigureCanvasAgg(figure)
-    studies = (LEAST_TIME, NO_DRAG, FEW, MANY)
+    studies = PLANNING + SIMULATION
     for axes, study in zip(figure.subplots(2, 2).flat, studies, strict=True):
         _draw_study(axes, medians, study)
     return figure
@@ -185,7 +187,7 @@ def draw_medians(medians: Medians) -> Figure:
 
 def _draw_study(axes: Axes, medians: Medians, study: str) -> None:
     """One panel; hollow markers are settings with which some phases are not solved."""
-    planning = study in (LEAST_TIME, NO_DRAG)
+    planning = study in PLANNING
     for index, method in enumerate(list_methods(medians, study)):
         points, full = [], []
         for group in group_settings(medians, study, method).values():
@@ -207,7 +209,7 @@ def _draw_study(axes: Axes, medians: Medians, study: str) -> None:
             axes.plot(*zip(*hollow, strict=True), **look)
     axes.set_xscale("log")
     axes.set_yscale("log")
-    axes.set_title(study[0].upper() + study[1:])
+    axes.set_title(_begin(study))
     what = "relative error of the phase time" if planning else "error of z and z' in scene units"
     axes.set_xlabel(f"{what}, median over phases [-]")
     axes.set_ylabel(f"{'build and solve' if planning else 'run'} time, mean over phases [s]")
@@ -215,7 +217,6 @@ def _draw_study(axes: Axes, medians: Medians, study: str) -> None:
         finish_axes(axes, fontsize=8, ncols=2)
 
 
-METHODS = [*SIMULATORS, *PLANNERS]  # names of all methods, in the order of the tables
 REFERENCE = 120.0  # processor time that the reference of a phase may take on top [s]
 
 
@@ -234,7 +235,7 @@ class Precision(Study):
         text = "measure this part only: simulation or planning"
         parser.add_argument("--part", choices=("simulation", "planning"), help=text)
         text = "measure these methods only, by the names that the table has"
-        parser.add_argument("--peers", nargs="+", default=METHODS, metavar="NAME", help=text)
+        parser.add_argument("--peers", nargs="+", default=[*METHODS], metavar="NAME", help=text)
         text = "processor time that one setting of a method may take on one phase [s] (60)"
         parser.add_argument("--limit", type=Range(1e-3, 1e6).parse, default=60.0, help=text)
 
@@ -249,20 +250,12 @@ class Precision(Study):
             if method not in METHODS:
                 text = f"{method!r} given; allowed are {'; '.join(METHODS)}"
                 raise InputError("", "--peers", text)
-        every = {
-            drag: [instance.name for instance in list_instances(files, drag)]
-            for drag in (True, False)
-        }
-        if options.part != "planning":
-            for study, phase, method in product((FEW, MANY), every[True], SIMULATORS):
-                if method in options.peers:
-                    settings = [f"{tolerance:g}" for tolerance in TOLERANCES[study]]
-                    yield from product([study], [phase], [method], settings, [files])
-        if options.part != "simulation":
-            for study, (method, own) in product((LEAST_TIME, NO_DRAG), PLANNERS.items()):
-                if method in options.peers and study in own.studies and is_installed(method):
-                    phases = every[study != NO_DRAG]
-                    yield from product([study], phases, [method], own.choices, [files])
+        parts = {"simulation": SIMULATION, "planning": PLANNING}
+        studies = parts.get(options.part, SIMULATION + PLANNING)
+        for study, (method, own) in product(studies, METHODS.items()):
+            if method in options.peers and study in own.choices and own.is_installed:
+                phases = [instance.name for instance in list_instances(files, study != NO_DRAG)]
+                yield from product([study], phases, [method], own.choices[study], [files])
 
     def limit(self, case: Case) -> float:
         """The time allowed, and that of the reference."""
@@ -270,7 +263,7 @@ class Precision(Study):
 
     def run(self, case: Case) -> Row:
         """Measure one setting."""
-        run = run_simulator if case[0] in (FEW, MANY) else run_planner
+        run = run_simulator if case[0] in SIMULATION else run_planner
         median = run(*case)
         row = dict(zip(self.columns[:4], case, strict=False))
         return row if median is None else row | median._asdict()

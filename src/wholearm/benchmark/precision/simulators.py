@@ -26,12 +26,15 @@ from ...planning.path_domain.path_motion import PathMotion
 from ...planning.path_domain.path_plan import plan_path
 from ...results.torque import TorqueProfile
 from ...simulation.simulate import simulate
-from .phases import OPTIMUM, SOLVED, Instance, Median, PeerPlan, measure, pick
+from .phases import OPTIMUM, SOLVED, Instance, Median, Method, PeerPlan, measure, pick
 from .reference import Course, Span, evaluate_piece, find_course, measure_error, solve_motion
 
 FEW, MANY = "simulation, few pieces", "simulation, many pieces"
 """Studies: torques in a few long pieces, and planned torques in eighty."""
-TOLERANCES = {FEW: tuple(10.0**-k for k in (4, *range(6, 14))), MANY: (1e-6, 1e-9, 1e-12)}
+TOLERANCES = {
+    FEW: ("0.0001", *(f"1e-{k:02}" for k in range(6, 14))),
+    MANY: ("1e-06", "1e-09", "1e-12"),
+}
 """Tolerances of each study."""
 DEGREES = {FEW: 14, MANY: 6}  # degrees of the torques' polynomials
 SLOW = 0.3
@@ -50,15 +53,9 @@ Runner = Callable[[], Array]
 """Gives the state (z, z') at the end of a course, shape (10,)."""
 
 
-class Simulator(NamedTuple):
-    """A simulator."""
-
-    settings: str  # what it is told besides the tolerance
-    build: Callable[[Course, float], Runner]  # takes a course and a tolerance; gives what runs it
-
-
-def build_own(course: Course, tolerance: float) -> Runner:
+def build_own(course: Course, setting: str) -> Runner:
     """Our simulator; what it keeps of a formation is built by a first run."""
+    tolerance = float(setting)
 
     def run() -> Array:
         simulation = simulate(course.problem, course.torque, tolerance=tolerance)
@@ -68,11 +65,11 @@ def build_own(course: Course, tolerance: float) -> Runner:
     return run
 
 
-def build_scipy(course: Course, tolerance: float, callback: Callable[..., Any]) -> Runner:
+def build_scipy(course: Course, setting: str, callback: Callable[..., Any]) -> Runner:
     """SciPy's DOP853 on some kind of callbacks, with the same relative and absolute tolerance."""
     from scipy.integrate import solve_ivp
 
-    choose = callback(course)
+    choose, tolerance = callback(course), float(setting)
 
     def run() -> Array:
         state = np.append(course.problem.start, np.zeros(5))
@@ -164,9 +161,9 @@ def pack_course(course: Course) -> tuple[Expression, Expression]:
     return ca.DM(np.append(course.problem.start, np.zeros(5))), ca.DM(np.array(columns).T)
 
 
-def build_cvodes(course: Course, tolerance: float) -> Runner:
+def build_cvodes(course: Course, setting: str) -> Runner:
     """CasADi's interface to cvodes; all stretches are one call, by `mapaccum`."""
-    t, y, p, ode, _ = write_rates(course)
+    tolerance, (t, y, p, ode, _) = float(setting), write_rates(course)
     ends, x = ca.SX.sym("ends", 2), ca.SX.sym("x")
     half, now = (ends[1] - ends[0]) / 2, (ends[0] + ends[1] + x * (ends[1] - ends[0])) / 2
     system = {"x": y, "t": x, "p": ca.vertcat(p, ends), "ode": half * ca.substitute(ode, t, now)}
@@ -185,15 +182,17 @@ def build_cvodes(course: Course, tolerance: float) -> Runner:
 
 _SAME = "rtol = atol = tolerance"
 SIMULATORS = {
-    "wholearm": Simulator("events, contact forces and energies included", build_own),
-    "DOP853, NumPy": Simulator(_SAME, partial(build_scipy, callback=call_numpy)),
-    "DOP853, CasADi": Simulator(
+    "wholearm": Method("events, contact forces and energies included", build_own, TOLERANCES),
+    "DOP853, NumPy": Method(_SAME, partial(build_scipy, callback=call_numpy), TOLERANCES),
+    "DOP853, CasADi": Method(
         f"{_SAME}; CasADi function with buffers that stay",
         partial(build_scipy, callback=call_casadi),
+        TOLERANCES,
     ),
-    "cvodes": Simulator(
+    "cvodes": Method(
         "abstol = reltol = tolerance; Adams, functional iteration; all stretches in one call",
         build_cvodes,
+        TOLERANCES,
     ),
 }
 """Simulators by name."""
@@ -213,10 +212,10 @@ def run_simulator(
         error = measure_error(course.problem, state, course.end)
         return (error,), SOLVED if np.isfinite(error) else "no finite state"
 
-    return measure(partial(SIMULATORS[method].build, course, float(setting)), judge)
+    return measure(partial(SIMULATORS[method].build, course, setting), judge)
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=64)
 def _get_course(name: str, study: str, files: tuple[str, ...]) -> Course | None:
     return make_course(pick(name, files), study)
 

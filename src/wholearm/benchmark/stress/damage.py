@@ -25,6 +25,7 @@ import numpy as np
 
 from ...planning.plan import solve
 from ...problem.read import build_problem
+from ...problem.table import write_toml
 
 Random = np.random.Generator
 BASE: dict[str, Any] = {
@@ -101,7 +102,7 @@ def base_files() -> tuple[bytes, bytes, bytes]:
     none = [0.0] * len(meta["solves"])
     told = {"timings": {}, "build_times": none, "solve_times": none}
     arrays["meta"] = np.array(json.dumps(meta | told))
-    return to_toml(BASE).encode(), torques, _pack(arrays)
+    return write_toml(BASE).encode(), torques, _pack(arrays)
 
 
 def draw_mutant(seed: int, number: int) -> Mutant:
@@ -182,7 +183,7 @@ def _damage_problem(rng: Random, base: bytes) -> tuple[str, bytes]:
     if rng.uniform() < 0.7:
         table = copy.deepcopy(BASE)
         done = [change_tree(rng, table) for _ in range(int(rng.integers(1, 3)))]
-        return "; ".join(done), to_toml(table).encode("utf-8", "surrogatepass")
+        return "; ".join(done), write_toml(table).encode("utf-8", "surrogatepass")
     lines = base.decode().split("\n")
     at, deep = int(rng.integers(len(lines))), int(10.0 ** rng.uniform(1, 5))
     texts = [
@@ -297,39 +298,6 @@ def _pack(arrays: Mapping[str, Any], extra: str = "", raw: bytes = b"") -> bytes
     return stream.getvalue()
 
 
-def to_toml(table: Mapping[str, Any], prefix: str = "") -> str:
-    """The text of a TOML file, whatever is in the table: values, then tables and lists of them."""
-    lines, below = [], []
-    for key, value in table.items():
-        name = f"{prefix}{_key(key)}"
-        if isinstance(value, Mapping) and key != "until":
-            below += ["", f"[{name}]", to_toml(value, f"{name}.")]
-        elif isinstance(value, list) and value and all(isinstance(v, Mapping) for v in value):
-            below += [text for v in value for text in ("", f"[[{name}]]", to_toml(v, f"{name}."))]
-        else:
-            lines.append(f"{_key(key)} = {_value(value)}")
-    return "\n".join([*lines, *below, ""])
-
-
-def _key(key: str) -> str:
-    plain = key.isascii() and key.replace("_", "").replace("-", "").isalnum()
-    return key if plain else json.dumps(key)
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, float):
-        return repr(float(value))
-    if isinstance(value, str):
-        return json.dumps(value)
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_value, value)) + "]"
-    if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items()) + " }"
-    return str(value)
-
-
 STATUSES = (0, 1, 2)
 LONGEST = 2000  # longest line on stderr that still counts as clear
 PROGRESS = re.compile(r"wholearm: \d+ s: ")  # lines that tell how long work goes on already
@@ -340,41 +308,48 @@ def run_file(seed: int, number: int) -> dict[str, Any]:
     mutant = draw_mutant(seed, number)
     rng = np.random.default_rng([seed, number, 2])
     with tempfile.TemporaryDirectory() as folder:
-        command = write_case(mutant, folder, rng)
+        command = write_case(mutant, Path(folder), rng)
         status, findings = run_command(command, folder)
     text = " ".join([command[0], *map(os.path.basename, command[1:])])
     answer = {"command": text, "status": status, "findings": findings}
     return {"kind": mutant.kind, "what": mutant.what, **answer}
 
 
-def write_case(mutant: Mutant, folder: str, rng: Random) -> list[str]:
+def write_case(mutant: Mutant, folder: Path, rng: Random) -> list[str]:
     """Write a mutant and what its command needs into a folder; return the command's arguments."""
-    path, own = os.path.join(folder, f"mutant{mutant.ending}"), os.path.join(folder, "problem.toml")
+    file, own, table = (
+        folder / f"mutant{mutant.ending}",
+        folder / "problem.toml",
+        folder / "torques.csv",
+    )
     if mutant.content is None:
-        os.mkdir(path)
+        file.mkdir()
     else:
-        Path(path).write_bytes(mutant.content)
+        file.write_bytes(mutant.content)
     problem, torques, _ = base_files()
-    Path(own).write_bytes(problem)
-    share, out = float(rng.uniform()), os.path.join(folder, "out")
+    own.write_bytes(problem)
+    share, path, out = float(rng.uniform()), str(file), str(folder / "out")
+    narrow = ["-o", f"{out}.png", "--phi=-10,10"]
     if mutant.kind == "problem":
-        if share < 0.6:
-            extra = ["--torques", f"{out}.csv"] if share < 0.2 else []
-            return ["solve", path, "-o", f"{out}.npz", "--intervals", "20", *extra]
-        if share < 0.8:
-            table = os.path.join(folder, "torques.csv")
-            Path(table).write_bytes(torques)
-            return ["verify", path, table]
-        if share < 0.97:
-            return ["map", path, "--list", "0.02,0", "-0.01,0"]
-        return ["map", path, "-o", f"{out}.png", "--phi=-10,10"]
-    if mutant.kind == "torque" or share < 0.75:
-        return ["verify", own, path, *(["--json"] if share < 0.1 else [])]
-    if share < 0.9:
-        return ["plot", path, "-o", f"{out}.png", "--simulate"]
-    if share < 0.97:
-        return ["plot", path, "-o", f"{out}.svg"]
-    return ["map", own, "--plan", path, "-o", f"{out}.png", "--phi=-10,10"]
+        table.write_bytes(torques)
+        solving = ["solve", path, "-o", f"{out}.npz", "--intervals", "20"]
+        commands = [
+            (0.2, [*solving, "--torques", f"{out}.csv"]),
+            (0.6, solving),
+            (0.8, ["verify", path, str(table)]),
+            (0.97, ["map", path, "--list", "0.02,0", "-0.01,0"]),
+            (1.0, ["map", path, *narrow]),
+        ]
+    else:
+        checking = ["verify", str(own), path]
+        commands = [
+            (0.1, [*checking, "--json"]),
+            (1.0 if mutant.kind == "torque" else 0.75, checking),
+            (0.9, ["plot", path, "-o", f"{out}.png", "--simulate"]),
+            (0.97, ["plot", path, "-o", f"{out}.svg"]),
+            (1.0, ["map", str(own), "--plan", path, *narrow]),
+        ]
+    return next(command for most, command in commands if share < most)
 
 
 def run_command(command: list[str], folder: str) -> tuple[int | None, list[tuple[str, str]]]:
@@ -385,20 +360,20 @@ def run_command(command: list[str], folder: str) -> tuple[int | None, list[tuple
     out, err = io.StringIO(), io.StringIO()
     status: int | None = None
     try:
-        with (
-            warnings.catch_warnings(),
-            contextlib.redirect_stdout(out),
-            contextlib.redirect_stderr(err),
-        ):
-            warnings.simplefilter("error")
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             status = start(command)
     except SystemExit as error:
         status = error.code if isinstance(error.code, int) else None
     except Exception as error:
-        kind = "warning" if isinstance(error, Warning) else "traceback"
-        return None, [(kind, "".join(traceback.format_exception(error)[-4:]).strip())]
+        return None, [describe_error(error)]
     written = set(os.listdir(folder)) - before
     return status, look(command, status, out.getvalue(), err.getvalue(), written)
+
+
+def describe_error(error: BaseException) -> tuple[str, str]:
+    """The finding of an exception that nobody meant to raise."""
+    kind = "warning" if isinstance(error, Warning) else "traceback"
+    return kind, "".join(traceback.format_exception(error)[-4:]).strip()
 
 
 def look(

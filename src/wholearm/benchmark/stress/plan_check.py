@@ -52,16 +52,14 @@ def _choose_times(plan: Trajectory, start: float, duration: float) -> Array:
 def _check_phase(problem: Problem, phase: Phase, rows: Samples) -> list[str]:
     scene, names = problem.scene, phase.formation.names
     size, speed = scene.scales.length, scene.scales.speed
-    touches = [locate(scene, name, rows.z) for name in names]
-    texts = []
+    fastest = max(speed, float(np.abs(rows.z_dot[:, :2]).max()))
+    touches, texts = [locate(scene, name, rows.z) for name in names], []
     for name, touch in zip(names, touches, strict=True):
-        inside = np.minimum(touch.low, touch.high)
+        separation = np.abs((touch.normal * rows.z_dot).sum(axis=1)).max()
         worst = {
             "gap": np.abs(touch.gap).max() / size / OVERLAP,
-            "beyond its feature": -inside.min() / size / OVERLAP,
-            "rate of separation": np.abs((touch.normal * rows.z_dot).sum(axis=1)).max()
-            / max(speed, float(np.abs(rows.z_dot[:, :2]).max()))
-            / ROUNDING,
+            "beyond its feature": -np.minimum(touch.low, touch.high).min() / size / OVERLAP,
+            "rate of separation": separation / fastest / ROUNDING,
         }
         texts += [f"{what} of {name} is {v:.2g} of its bound" for what, v in worst.items() if v > 1]
     for pair, gap in clearances(scene, rows.z).items():
@@ -69,21 +67,18 @@ def _check_phase(problem: Problem, phase: Phase, rows: Samples) -> list[str]:
             texts.append(f"{pair} overlap by {-gap.min():.3g} m")
     texts += _check_forces(problem, phase, rows, touches)
     motion, forces = (rows.z_dot, rows.z_ddot), np.stack([rows.c_n, rows.c_t])
-    rest = balance(scene, touches, motion, rows.tau, forces)
+    rest = np.abs(balance(scene, touches, motion, rows.tau, forces))
     # A joint that all but stands still is held by any dry friction up to its own.
     still = np.abs(rows.z_dot) < STILL * speed / np.append(np.ones(2), np.full(3, size))
-    slack = np.where(still, 2 * scene.dry, 0.0)
+    rest -= np.where(still, 2 * scene.dry, 0.0)
     arms = scene.scales.force * np.array([1.0, 1.0, size, size, size])
     biggest = np.maximum(np.abs(scene.mass_diagonal * rows.z_ddot).max(axis=0), arms)
     biggest[3:] = np.maximum(biggest[3:], np.abs(rows.tau).max(axis=0))
-    excess = (np.abs(rest) - slack).max(axis=0) / biggest / ROUNDING
+    excess = rest.max(axis=0) / biggest / ROUNDING
     for k in np.flatnonzero(excess > 1):
-        row = ("x", "y", "phi", "theta_1", "theta_2")[k]
-        at = int((np.abs(rest) - slack)[:, k].argmax())
-        texts.append(
-            f"the equation of {row} misses {rest[at, k]:.3g} ({excess[k]:.2g} of its bound) "
-            f"at instant {at}"
-        )
+        row, at = ("x", "y", "phi", "theta_1", "theta_2")[k], int(rest[:, k].argmax())
+        text = f"the equation of {row} misses {rest[at, k]:.3g} ({excess[k]:.2g} of its bound)"
+        texts.append(f"{text} at instant {at}")
     return texts
 
 
@@ -109,21 +104,12 @@ def _check_forces(problem: Problem, phase: Phase, rows: Samples, touches: list[T
         wrong = np.where(moving, np.abs(c_t + touch.friction * np.sign(slip) * c_n), 0.0).max()
         if wrong > scale:
             texts.append(f"friction at {name} is {wrong:.3g} N off Coulomb's for its sliding")
-    over = np.abs(rows.tau).max(axis=0) / scene.torque_limit - 1
-    fast = np.abs(rows.z_dot[:, 3:]).max(axis=0) / scene.speed_limit - 1
-    excesses = (("tau_{} exceeds its limit", over), ("joint {} exceeds its speed", fast))
-    texts += [
-        f"{text.format(j + 1)} by {share[j]:.2g} of it"
-        for text, share in excesses
-        for j in (0, 1)
-        if share[j] > 1e-5
-    ]
-    quick = np.abs(rows.z_dot[:, 3:]).max(axis=0) / scene.speed_limit - 1
-    texts += [
-        f"joint {j + 1} exceeds its speed by {quick[j]:.2g} of it"
-        for j in (0, 1)
-        if quick[j] > 1e-5
-    ]
+    for text, values, limits in (
+        ("tau_{} exceeds its limit by {:.2g} of it", rows.tau, scene.torque_limit),
+        ("joint {} exceeds its speed by {:.2g} of it", rows.z_dot[:, 3:], scene.speed_limit),
+    ):
+        share = np.abs(values).max(axis=0) / limits - 1
+        texts += [text.format(j + 1, share[j]) for j in (0, 1) if share[j] > 1e-5]
     return texts
 
 
@@ -163,12 +149,9 @@ def _spread(values: Array, middles: Array) -> Array:
 
 def _check_profile(scene: Scene, plan: Trajectory, t: Array, rows: Samples) -> list[str]:
     """Whether the torques as functions of time are those of the motion, between their steps."""
-    breaks = plan.torque.breaks
-    near = np.abs(breaks[np.clip(np.searchsorted(breaks, t), 0, len(breaks) - 1)] - t)
-    before = np.abs(t - breaks[np.clip(np.searchsorted(breaks, t) - 1, 0, len(breaks) - 1)])
-    inside = np.minimum(near, before) > 1e-9 * max(plan.duration, 1e-300)
-    miss = np.abs(plan.torque.at(t) - rows.tau)[inside]
-    share = (miss / scene.torque_limit).max() if miss.size else 0.0
+    near = np.abs(t[:, None] - plan.torque.breaks).min(axis=1)
+    miss = np.abs(plan.torque.at(t) - rows.tau)[near > 1e-9 * plan.duration]
+    share = (miss / scene.torque_limit).max(initial=0.0)
     return [f"the torque profile is {share:.2g} of the limit off"] if share > 1e-4 else []
 
 
@@ -186,20 +169,17 @@ def _check_joint(problem: Problem, phase: Phase, before: Array, rows: Samples) -
 
 
 def _check_end(problem: Problem, phase: Phase, rows: Samples) -> list[str]:
-    scene, until = problem.scene, phase.until
-    size, texts = scene.scales.length, []
+    scene, until, texts = problem.scene, phase.until, []
+    size, z, offs = scene.scales.length, rows.z[-1], [0.0]
+    pins = [*until.pins]
     if until.contact is not None:
-        off = float(np.abs(locate(scene, until.contact.name, rows.z[-1:]).gap[0])) / size
+        offs.append(float(np.abs(locate(scene, until.contact.name, rows.z[-1:]).gap[0])) / size)
     elif until.value is not None:
-        angle = until.coordinate == "phi"
-        off = abs(rows.z[-1, 2 if angle else 0] - until.value) / (1.0 if angle else size)
-    else:
-        off = 0.0
+        pins.append((until.coordinate, until.value))
     units = {"x": (0, size), "phi": (2, 1.0)}
-    pinned = [(*units[name], value) for name, value in until.pins]
-    off = max([off, *(abs(rows.z[-1, row] - value) / unit for row, unit, value in pinned)])
-    if off > 1e-5:
-        texts.append(f"ends {off:.3g} from {until}")
+    offs += [abs(z[units[name][0]] - value) / units[name][1] for name, value in pins]
+    if max(offs) > 1e-5:
+        texts.append(f"ends {max(offs):.3g} from {until}")
     if phase.end is End.REST:
         speed = np.abs(rows.z_dot[-1]) * np.array([1.0, 1.0, size, size, size])
         if speed.max() > 1e-5 * max(scene.scales.speed, float(np.abs(rows.z_dot).max()) * size):

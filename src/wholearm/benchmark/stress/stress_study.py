@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import copy
 import os
-import traceback
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import product
@@ -17,17 +16,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...common.errors import InputError, SolverError, WholearmError
+from ...common.errors import SolverError, WholearmError
 from ...common.fields import Range
 from ...common.files import make_folder, write_text
 from ...geometry.path_guess import check_phases, load
 from ...planning.plan import solve
 from ...problem.definition import Problem
 from ...problem.read import build_problem, read_problem
+from ...problem.table import write_toml
 from ...results.trajectory import Trajectory
 from ...verification.verify import verify
-from ..study import Case, Row, Study
-from .damage import run_file, to_toml
+from ..study import Case, Row, Study, format_table, name_case
+from .damage import describe_error, run_file
 from .plan_check import check_plan
 from .refusals import judge
 from .scenes import Case as Scene
@@ -82,7 +82,7 @@ class Stress(Study):
         if only is not None:
             make_folder(options.output)
             path = os.path.join(options.output, f"stress_{seed}_{only}.toml")
-            write_text(path, to_toml(draw_case(seed, only).table))
+            write_text(path, write_toml(draw_case(seed, only).table))
         numbers = range(options.scenes) if only is None else [only]
         yield from product(["scene"], [seed], numbers, OBJECTIVES)
         if only is None:
@@ -104,9 +104,9 @@ class Stress(Study):
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
         """Tables of each part, and every finding."""
-        found = [(" ".join(map(str, row["case"])), *own) for row in rows for own in row["findings"]]
+        found = [(name_case(row), *own) for row in rows for own in row["findings"]]
         found += [
-            (" ".join(map(str, row["case"])), "warning", f"printed: {row['printed']}")
+            (name_case(row), "warning", f"printed: {row['printed']}")
             for row in rows
             if "printed" in row
         ]
@@ -121,8 +121,8 @@ class Stress(Study):
             if mine:
                 lines += [f"## {title}", "", *describe(mine), ""]
         counted = Counter(kind for _, kind, _ in found)
-        lines += ["| finding | number |", "|---|---:|"]
-        lines += [f"| {kind} | {counted[kind]} |" for kind in dict.fromkeys([*KINDS, *counted])]
+        kinds = dict.fromkeys([*KINDS, *counted])
+        lines += format_table(["finding", "number"], [(kind, counted[kind]) for kind in kinds])
         return "\n".join(lines), [f"{where}: {kind}: {text}" for where, kind, text in found]
 
 
@@ -142,58 +142,48 @@ class StressAnswer(NamedTuple):
 def run_scene(seed: int, number: int, objective: str) -> Row:
     """Plan a generated scene, with and without noise, and look again at what is said of it."""
     scene = draw_case(seed, number)
-    problem, refusal = _load(scene.table)
-    if problem is None or refusal is not None:
-        return {"kind": scene.kind, **_refuse_list(scene, problem, refusal)._asdict()}
-    answer = _plan(problem, objective, scene)
-    noisy, _ = _load(add_noise(scene.table, np.random.default_rng(number)))
-    again = StressAnswer("failed", None, "", []) if noisy is None else _plan(noisy, objective)
-    findings = [*answer.findings, *_compare(answer, again)]
-    return {"kind": scene.kind, **answer._replace(findings=findings)._asdict()}
+    answer = _plan(scene.table, objective, scene)
+    if answer.outcome != "failed":
+        noisy = add_noise(scene.table, np.random.default_rng(number))
+        answer.findings.extend(_compare(answer, _plan(noisy, objective)))
+    return {"kind": scene.kind, **answer._asdict()}
 
 
-def _load(table: dict[str, Any]) -> tuple[Problem | None, Exception | None]:
-    problem = None
+def _plan(table: dict[str, Any], objective: str, scene: Scene | None = None) -> StressAnswer:
+    """Load and plan; with a scene, replay and check the plan, or judge the refusal."""
+    problem, loaded = None, False
     try:
         problem = build_problem(table)
         check_phases(problem)
-    except Exception as error:
-        return problem, error
-    return problem, None
-
-
-def _refuse_list(scene: Scene, problem: Problem | None, error: Exception | None) -> StressAnswer:
-    """Why a problem did not load, and whether that is right."""
-    if not isinstance(error, InputError):
-        return _fail(error)
-    verdict, reason = ("open", "") if problem is None else _judge(problem, error, scene)
-    findings = _list_findings(verdict, f"{error} ({reason})")
-    if scene.kind.endswith("from the map"):
-        findings = [("list that does not load", f"{error} ({verdict}: {reason})")]
-    return StressAnswer("refused", None, str(error), findings, verdict)
-
-
-def _plan(problem: Problem, objective: str, scene: Scene | None = None) -> StressAnswer:
-    """Plan; with a scene, replay and check the plan, or judge the refusal."""
-    try:
+        loaded = True
         plan = solve(problem, objective)
     except SolverError as error:
         return StressAnswer("failed", None, str(error), [("no answer", str(error))])
     except WholearmError as error:
-        verdict, reason = ("", "") if scene is None else _judge(problem, error, scene)
-        findings = _list_findings(verdict, f"{error} ({reason})")
+        findings, verdict = list[Finding](), ""
+        if scene is not None:
+            verdict, findings = _judge(problem, error, scene, loaded)
         return StressAnswer("refused", None, str(error), findings, verdict)
     except Exception as error:
-        return _fail(error)
+        return StressAnswer("failed", None, repr(error), [describe_error(error)])
     findings = [] if scene is None else _check(problem, plan.trajectory)
     return StressAnswer("planned", plan.value, "", findings)
 
 
-def _fail(error: Exception | None) -> StressAnswer:
-    """An exception that nobody meant to raise."""
-    kind = "warning" if isinstance(error, Warning) else "traceback"
-    text = "".join(traceback.format_exception(error)[-4:]).strip()
-    return StressAnswer("failed", None, repr(error), [(kind, text)])
+def _judge(
+    problem: Problem | None, error: WholearmError, scene: Scene, loaded: bool
+) -> tuple[str, list[Finding]]:
+    """What a second look at a refusal finds; lists from the map have to load."""
+    kind, reason = "open", ""
+    try:
+        if problem is not None:
+            kind, reason = judge(problem, error, scene.stops)
+    except Exception as failure:
+        kind, reason = "failed", describe_error(failure)[1]
+    if not loaded and scene.kind.endswith("from the map"):
+        return kind, [("list that does not load", f"{error} ({kind}: {reason})")]
+    kinds = {"refuted": "refusal where a motion exists", "failed": "check that failed"}
+    return kind, [(kinds[kind], f"{error} ({reason})")] if kind in kinds else []
 
 
 def _check(problem: Problem, plan: Trajectory) -> list[Finding]:
@@ -205,39 +195,26 @@ def _check(problem: Problem, plan: Trajectory) -> list[Finding]:
     except WholearmError as error:
         findings.append(("plan refuted by replay", str(error)))
     except Exception as error:
-        findings += _fail(error).findings
+        findings.append(describe_error(error))
     try:
         found = check_plan(problem, plan)
         findings += [("plan refuted by residual", "; ".join(found[:3]))] if found else []
     except Exception as error:
-        findings.append(("check that failed", _fail(error).findings[0][1]))
+        findings.append(("check that failed", describe_error(error)[1]))
     return findings
-
-
-def _judge(problem: Problem, error: WholearmError, scene: Scene) -> tuple[str, str]:
-    try:
-        return judge(problem, error, scene.stops)
-    except Exception as failure:
-        return "failed", _fail(failure).findings[0][1]
-
-
-def _list_findings(verdict: str, text: str) -> list[Finding]:
-    """What a second look at a refusal finds."""
-    kinds = {"refuted": "refusal where a motion exists", "failed": "check that failed"}
-    return [(kinds[verdict], text)] if verdict in kinds else []
 
 
 def _compare(one: StressAnswer, other: StressAnswer) -> list[Finding]:
     """What noise changed in an answer."""
-    kind = "optimum that differs under noise"
+    if other.outcome == "failed":
+        return []
+    text = ""
     if one.outcome != other.outcome:
         text = f"{one.outcome}, with noise {other.outcome} {other.text or one.text}"
-        return [(kind, text)] if "failed" not in (one.outcome, other.outcome) else []
-    if one.value is None or other.value is None:
-        return []
-    if abs(one.value - other.value) <= SAME * abs(one.value):
-        return []
-    return [(kind, f"{one.value:.9g} and {other.value:.9g}")]
+    elif one.value is not None and other.value is not None:
+        if abs(one.value - other.value) > SAME * abs(one.value):
+            text = f"{one.value:.9g} and {other.value:.9g}"
+    return [("optimum that differs under noise", text)] if text else []
 
 
 def add_noise(table: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]:
@@ -250,20 +227,16 @@ def add_noise(table: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]
     return changed
 
 
-def change_numbers(
-    table: Mapping[str, Any], largest: float, rng: np.random.Generator
-) -> dict[str, Any]:
-    """Masses, friction, drag and torque limits changed by up to `largest`, by dotted keys."""
-    friction = table["friction"]
-    places: list[tuple[str, Mapping[str, Any], Iterable[str]]] = [
-        ("object", table["object"], ("mass",)),
-        *((f"fingers.{k}", own, _FINGER) for k, own in table["fingers"].items()),
-        ("friction", friction, friction),
-    ]
+def change_numbers(table: Mapping[str, Any], rng: np.random.Generator) -> dict[str, float]:
+    """Masses, friction, drag and torque limits changed by up to `SPREAD`, by dotted keys."""
+    places = {"object": table["object"]}
+    places |= {f"fingers.{k}": own for k, own in table["fingers"].items()}
+    places["friction"] = table["friction"]
+    kept = {"object": ("mass",), "friction": table["friction"]}
     return {
-        f"{where}.{key}": own[key] * (1 + largest * float(rng.uniform(-1, 1)))
-        for where, own, keys in places
-        for key in keys
+        f"{where}.{key}": own[key] * (1 + SPREAD * float(rng.uniform(-1, 1)))
+        for where, own in places.items()
+        for key in kept.get(where, _FINGER)
         if key in own
     }
 
@@ -276,14 +249,14 @@ def run_trial(path: str, objective: str, what: str, number: int) -> Row:
         if what == "noise":
             problem = build_problem(add_noise(dict(given.table), rng), path)
         else:
-            problem = given.with_(change_numbers(given.table, SPREAD, rng))
+            problem = given.with_(change_numbers(given.table, rng))
         check_phases(problem)
         plan = solve(problem, objective)
         value, findings = plan.value, _check(problem, plan.trajectory)
     except WholearmError as error:
         findings = [("no plan for a shipped problem", str(error))]
     except Exception as error:
-        findings = _fail(error).findings
+        findings = [describe_error(error)]
     return {"value": value, "findings": findings}
 
 
@@ -296,7 +269,7 @@ def compare_values(rows: Iterable[Row]) -> list[tuple[str, str, str]]:
             groups.setdefault(f"{path}, {objective}", []).append(row["value"])
     found = []
     for name, values in groups.items():
-        apart = (max(values) - min(values)) / max(map(abs, values))
+        apart = np.ptp(values) / np.abs(values).max()
         if apart > SAME:
             text = f"{min(values):.9g} to {max(values):.9g}, {apart:.2g} apart"
             found.append((name, "optimum that differs under noise", text))
@@ -308,42 +281,41 @@ def _describe_scenes(rows: Sequence[Row]) -> list[str]:
     seconds = np.array([row["seconds"] for row in rows])
     middle, most = np.percentile(seconds, [50, 95])
     text = f"median {middle:.2f} s, 95 % within {most:.2f} s, longest {seconds.max():.2f} s"
-    lines = [
-        "| | |",
-        "|---|---|",
-        f"| scenes | {len({row['case'][2] for row in rows})} |",
-        f"| answers, one for each objective | {_count(row['outcome'] for row in rows)} |",
-        f"| refusals, looked at a second time | {_count(verdicts)} |",
-        f"| processor time of an answer, planned twice and checked | {text} |",
-        "",
-        "| kind of scene | planned | refused | failed |",
-        "|---|---:|---:|---:|",
+    about = [
+        ("scenes", len({row["case"][2] for row in rows})),
+        ("answers, one for each objective", _count(row["outcome"] for row in rows)),
+        ("refusals, looked at a second time", _count(verdicts)),
+        ("processor time of an answer, planned twice and checked", text),
     ]
-    for kind in sorted({row["kind"] for row in rows}):
-        own = Counter(row["outcome"] for row in rows if row["kind"] == kind)
-        lines.append(f"| {kind} | {own['planned']} | {own['refused']} | {own['failed']} |")
-    return lines
+    outcomes = ("planned", "refused", "failed")
+    kinds = Counter((row["kind"], row["outcome"]) for row in rows)
+    names = sorted({row["kind"] for row in rows})
+    counts = [(kind, *(kinds[kind, outcome] for outcome in outcomes)) for kind in names]
+    return [
+        *format_table(["", ""], about, 2),
+        "",
+        *format_table(["kind of scene", *outcomes], counts),
+    ]
 
 
 def _describe_files(rows: Sequence[Row]) -> list[str]:
-    lines = ["| files | number | exit status |", "|---|---:|---|"]
-    for kind in sorted({row["kind"] for row in rows}):
-        mine = [str(row["status"]) for row in rows if row["kind"] == kind]
-        lines.append(f"| {kind} | {len(mine)} | {_count(mine)} |")
-    return lines
+    statuses = dict[str, list[str]]()
+    for row in sorted(rows, key=lambda row: str(row["kind"])):
+        statuses.setdefault(row["kind"], []).append(str(row["status"]))
+    table = [(kind, len(mine), _count(mine)) for kind, mine in statuses.items()]
+    return format_table(["files", "number", "exit status"], table)
 
 
 def _describe_trials(rows: Sequence[Row]) -> list[str]:
-    lines = ["| problem | objective | trials | without a finding | values apart under noise |"]
-    lines.append("|---|---|---:|---:|---:|")
+    table = []
     for path, objective in dict.fromkeys(tuple(row["case"][1:3]) for row in rows):
         mine = [row for row in rows if row["case"][1:3] == [path, objective]]
         good = sum(not row["findings"] for row in mine)
         values = [row["value"] for row in mine if row["case"][3] == "noise" and row["value"]]
-        apart = f"{(max(values) - min(values)) / max(map(abs, values)):.1e}" if values else ""
-        name = os.path.basename(path)
-        lines.append(f"| {name} | {objective} | {len(mine)} | {good} | {apart} |")
-    return lines
+        apart = f"{np.ptp(values) / np.abs(values).max():.1e}" if values else ""
+        table.append((os.path.basename(path), objective, len(mine), good, apart))
+    heads = ["problem", "objective", "trials", "without a finding", "values apart under noise"]
+    return format_table(heads, table, 2)
 
 
 def _count(names: Iterable[str]) -> str:
