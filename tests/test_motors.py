@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from held import balances
 from shipped import HEPTAGON, problem_of
 from toys import LIMIT, Toy, constant
 from wholearm import InputError, Plan, Problem, load_plan, simulate, solve, verify
@@ -18,7 +19,6 @@ from wholearm.problem.table import describe_scene
 from wholearm.results.dwell_record import change_torques, find_change_times
 from wholearm.results.torque import TorqueProfile, read_torque_csv
 from wholearm.simulation.events import EventKind, OutcomeKind
-from wholearm.simulation.sticking import balances
 from wholearm.simulation.tolerances import find_tolerances
 from wholearm.verification.verify import describe_motors, find_commands
 
@@ -74,8 +74,7 @@ def test_torques_of_a_plan_never_step_and_hold_the_object_between_phases(
     start = plan.trajectory.phase_starts[1]
     for t in (0.0, start):
         tau, z = torque.at(np.array([t]))[0], plan.at(t).z[0]
-        contacts = problem.phases[int(t > 0)].formation.contacts
-        assert balances(scene, contacts, z, tau)
+        assert balances(problem.phases[int(t > 0)].formation, z, tau)
     assert verify(problem, plan).ok
     path = tmp_path / "torques.csv"
     make_table(problem, plan.trajectory, replay=False).save(path)
@@ -133,10 +132,10 @@ def test_phases_over_time_take_as_long_as_along_their_curves(heptagon: Problem) 
     over = solve(problem, replay=False, accuracy=1e-2, transcription="time", mode_search=False)
     assert over.duration == pytest.approx(along.duration, rel=1e-2)
     assert describe_motors(problem, over.trajectory.torque) == []
-    torque, contacts = over.trajectory.torque, problem.phases[0].formation.contacts
+    torque = over.trajectory.torque
     for t in (0.0, over.duration):
         tau, z = torque.at(np.array([t]))[0], over.at(t).z[0]
-        assert balances(problem.scene, contacts, z, tau)
+        assert balances(problem.phases[0].formation, z, tau)
         assert (
             np.abs(over.at(t).z_ddot[0]).max()
             < 1e-5 * np.abs(over.at(over.duration / 3).z_ddot[0]).max()

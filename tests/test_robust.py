@@ -21,7 +21,7 @@ from wholearm.mechanics.dynamics import (
     metric_weights,
     stack_motion,
 )
-from wholearm.mechanics.wedging import find_static_torques
+from wholearm.mechanics.statics import find_static_torques
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.path_domain.range_factor import find_widest
@@ -201,7 +201,7 @@ def test_options_that_make_no_sense_are_refused(given: dict[str, float], text: s
 def test_what_friction_may_hold_grows_with_the_ranges(problem: Problem) -> None:
     formation, tau = problem.phases[0].formation, np.array([0.05, -0.02])
     ranges = {"friction_palm": 0.3, "friction_finger1": 0.3, "mass": 0.1, "gain2": 0.05}
-    exact = find_static_torques([formation], problem.start).measure(tau[None])[0]
+    exact = find_static_torques(formation, problem.start).measure(tau[None])[0]
     assert measure_holds(list_holds(formation, problem.start, {}), tau) == pytest.approx(exact)
     rng, within = np.random.default_rng(3), list_holds(formation, problem.start, ranges)
     for tau in rng.uniform(-1.0, 1.0, (20, 2)):
@@ -209,7 +209,7 @@ def test_what_friction_may_hold_grows_with_the_ranges(problem: Problem) -> None:
         for _ in range(5):
             own = {name: width * rng.uniform(-1, 1) for name, width in ranges.items()}
             scene = change_problem(problem, own).scene
-            static = find_static_torques([replace(formation, scene=scene)], problem.start)
+            static = find_static_torques(replace(formation, scene=scene), problem.start)
             assert static.measure((tau * [1.0, 1 + own["gain2"]])[None])[0] >= least - 1e-9
 
 

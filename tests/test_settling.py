@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
+from held import balances
 from once import once
 from shipped import HEPTAGON, problem_of, solved
-from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.contacts.formation import Formation
-from wholearm.mechanics.arrival import DRIVE, maximise_margin
 from wholearm.planning import dwell as shares
 from wholearm.planning.dwell import DwellEnd, list_touching, settle_plans
 from wholearm.planning.phase_plan import PhasePlan
@@ -27,8 +26,8 @@ from wholearm.problem.definition import Problem
 from wholearm.results.dwell_record import assemble
 from wholearm.results.torque import TorqueProfile
 from wholearm.simulation.free_simulate import simulate_free
-from wholearm.simulation.start_modes import RestDirection
-from wholearm.simulation.sticking import balances, close_contacts, find_rest
+from wholearm.simulation.holding_torques import DRIVE, maximise_margin
+from wholearm.simulation.rest import close_contacts, find_rest
 from wholearm.verification.verify import verify
 
 HELD = (0.019, 0.01, 0.01, 0.01, 0.0)
@@ -54,24 +53,6 @@ def settled() -> Plan:
     return replace(plan, trajectory=replace(motion, meta=write_meta(plan)))
 
 
-def balance(touching: Formation, z: Array, tau: Array, least: float) -> bool:
-    """Whether forces with c_n >= least and |c_t| <= mu (c_n - least) balance everything."""
-    scene, count = touching.scene, touching.n_contacts
-    at = touching.evaluate(z[None], np.zeros((1, 5)))
-    joints = np.eye(5)[:, 3:]
-    dry = zip(-scene.dry[3:], scene.dry[3:], strict=True)
-    cone, one, none = np.diag(touching.friction), np.eye(count), np.zeros((count, 2))
-    answer = linprog(
-        np.zeros(2 * count + 2),
-        A_ub=np.vstack([np.hstack([-cone, way * one, none]) for way in (1.0, -1.0)]),
-        b_ub=np.tile(-touching.friction * least, 2),
-        A_eq=np.hstack([at.A[0].T, at.A_t[0].T, -joints]),
-        b_eq=-(scene.applied_force + joints @ tau),
-        bounds=[*[(least, None)] * count, *[(None, None)] * count, *dry],
-    )
-    return bool(answer.status == 0)
-
-
 def test_held_ends_balance_with_all_that_touches() -> None:
     plan = settled()
     problem, motion = plan.problem, plan.trajectory
@@ -81,7 +62,7 @@ def test_held_ends_balance_with_all_that_touches() -> None:
             continue
         z = motion.z[np.flatnonzero(motion.phase == phase.index)[-1]]
         touching, tau = list_touching(problem, phase), np.array(own.settling.tau)
-        assert balance(touching, z, tau, problem.epsilon)
+        assert balances(touching, z, tau, problem.epsilon)
         assert (np.abs(tau) <= problem.scene.torque_limit * (1 + 1e-9)).all()
 
 
@@ -97,18 +78,18 @@ def test_they_drive_on_towards_what_is_still_open() -> None:
         gained = Formation(problem.scene, (phase.until.contact,))
         normal = gained.evaluate(z[None], np.zeros((1, 5))).A[0][0]
         first = find_rest(phase.formation, z).sliding[0]
-        assert isinstance(first, RestDirection)
+        assert first.heading is not None
         back = settling.gap / (normal @ first.heading) * first.heading
         z = close_contacts(phase.formation, z + back)
         gap = float(gained.evaluate(z[None], np.zeros((1, 5))).C[0, 0])
         assert gap == pytest.approx(settling.gap, rel=0.02)
         tau, (one, two) = np.array(settling.tau), find_rest(phase.formation, z).sliding
-        assert isinstance(one, RestDirection) and isinstance(two, RestDirection)
+        assert one.heading is not None and two.heading is not None
         way = one if normal @ one.heading < 0 else two
         closing = -float(normal @ way.heading) * way.drive(tau)
         assert closing >= 0.99 * DRIVE * problem.scene.scales.acceleration
         assert settling.speed == pytest.approx(np.sqrt(2 * gap * closing), rel=0.02)
-        assert not balances(problem.scene, phase.formation.contacts, z, tau)
+        assert not balances(phase.formation, z, tau)
 
 
 def test_the_whole_ends_where_it_was_planned_to() -> None:
@@ -193,7 +174,7 @@ def test_margins_are_those_of_the_linear_programme() -> None:
             b_ub=sides[:, 0],
             bounds=[*((-most / unit, most / unit) for most in scene.torque_limit), (None, 1e3)],
         )
-        found = maximise_margin(scene, rows, bounds)
+        found = maximise_margin(scene.torque_limit, rows, bounds)
         assert (found is None) == (answer.status != 0)
         if found is not None:
             assert found[1] == pytest.approx(answer.x[2], abs=1e-6)

@@ -10,6 +10,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
+from held import balances
 from plane import convex_polygon, make_formation, make_scene, measure_slip, place_corners
 from planned import plan_landing
 from pushing import Push, Roll, evaluate, linear, pushed, rocking
@@ -23,7 +24,6 @@ from wholearm.results.torque import TorqueProfile
 from wholearm.scene.model import Friction, Scene
 from wholearm.simulation.events import EventKind, OutcomeKind, Simulation
 from wholearm.simulation.simulate import simulate
-from wholearm.simulation.sticking import balances
 from wholearm.verification.verify import verify
 
 
@@ -259,10 +259,10 @@ def test_a_swinging_joint_is_held_while_its_dry_friction_allows() -> None:
 
 def find_slipping_torque(problem: Problem) -> float:
     """Torque of finger 1 from which on nothing holds the box at rest, by linear programmes."""
-    contacts = problem.phases[0].formation.contacts
+    formation = problem.phases[0].formation
 
     def holds(tau: float) -> bool:
-        return balances(problem.scene, contacts, problem.start, np.array([tau, 0.0]))
+        return balances(formation, problem.start, np.array([tau, 0.0]))
 
     low, high = 0.0, 0.2
     assert holds(low) and not holds(high)

@@ -24,9 +24,8 @@ from wholearm.problem.definition import End, Phase, Problem, Until
 from wholearm.problem.read import build_problem
 from wholearm.results.torque import TorqueProfile
 from wholearm.simulation.events import EventKind, OutcomeKind
+from wholearm.simulation.rest import StartDeparture, Touching, find_rest
 from wholearm.simulation.simulate import project_velocity, simulate
-from wholearm.simulation.start_modes import StartDeparture, Touching
-from wholearm.simulation.sticking import find_rest
 from wholearm.verification.verify import verify
 
 RELEASE = 0.5

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from held import balances
 from plane import make_formation, make_scene, rotate
 from shipped import BOX, FOLDER, HEPTAGON, IMPACTS, plan_of, problem_of
 from timed import landing, plan_landing
@@ -18,8 +19,8 @@ from wholearm.common.arrays import Array
 from wholearm.common.errors import AmbiguityError, InfeasibleError
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phases
+from wholearm.mechanics.statics import find_static_torques
 from wholearm.mechanics.uniqueness import find_minors
-from wholearm.mechanics.wedging import find_static_torques
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.path_plan import plan_curves
 from wholearm.planning.time_domain.resting import find_block, list_ways, pushes_one_way
@@ -28,7 +29,6 @@ from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.results.torque import TorqueProfile
 from wholearm.scene.model import Friction, Scene
-from wholearm.simulation.sticking import balances
 from wholearm.verification.force_uniqueness import find_wedged
 
 
@@ -122,12 +122,11 @@ def test_torques_that_friction_can_hold_are_those_of_the_linear_programme(path: 
     problem = problem_of(path)
     rng, scene = np.random.default_rng(5), problem.scene
     for curve in trace_phases(problem)[::2]:
-        contacts = curve.formation.contacts
-        static = find_static_torques([curve.formation], curve.start)
+        static = find_static_torques(curve.formation, curve.start)
         tau = rng.uniform(-1.0, 1.0, (12, 2)) * scene.torque_limit
         for own, beyond in zip(tau, static.measure(tau), strict=True):
             if abs(beyond) > 1e-4 * scene.scales.torque:
-                assert balances(scene, contacts, curve.start, own) == (beyond < 0)
+                assert balances(curve.formation, curve.start, own) == (beyond < 0)
                 if beyond < 0:
                     assert not static.is_empty(np.abs(own))
         if abs(beyond := static.measure(np.zeros((1, 2)))[0]) > 1e-4 * scene.scales.torque:
@@ -141,8 +140,8 @@ def test_a_wedged_start_lasts_until_nothing_balances_the_torques() -> None:
     rows = np.flatnonzero(plan.phase == phase.index)
     first = last = plan.tau[rows[0]]
     duration = plan.t[rows[-1]] - plan.t[rows[0]]
-    z, contacts = plan.z[rows[0]], phase.formation.contacts
-    while not balances(problem.scene, contacts, z, first):
+    z = plan.z[rows[0]]
+    while not balances(phase.formation, z, first):
         first, last = first / 2, first
     first = first / 2
     halves = (first + last) / 2, (last - first) / 2
@@ -151,7 +150,7 @@ def test_a_wedged_start_lasts_until_nothing_balances_the_torques() -> None:
     assert wedged is not None and 0 < wedged < duration
     for share, held in ((0.0, True), (0.97, True), (1.03, False)):
         tau = first + share * wedged / duration * (last - first)
-        assert balances(problem.scene, contacts, z, tau) == held
+        assert balances(phase.formation, z, tau) == held
 
 
 def test_plans_leave_rest_surely() -> None:
@@ -160,8 +159,7 @@ def test_plans_leave_rest_surely() -> None:
     assert plan.meta["wedged"] == [0.0] * 5
     for phase in problem.phases:
         row = int(np.flatnonzero(plan.phase == phase.index)[0])
-        contacts = phase.formation.contacts
-        assert not balances(problem.scene, contacts, plan.z[row], plan.tau[row])
+        assert not balances(phase.formation, plan.z[row], plan.tau[row])
 
 
 COARSE = PlanOptions(time_intervals=4)

@@ -142,7 +142,8 @@ def inverse(
     G = force_rows(formation, kinematics, directions)
     wrench = G[:, :, :3].transpose(0, 2, 1)
     mass, count = scene.mass_diagonal, wrench.shape[2]
-    null = np.zeros((len(z), count)) if count == 3 else _null_vector(wrench)
+    # Of rank two, as where a tip is on a flush edge's vertex, it has no single null vector.
+    null = np.zeros((len(z), count)) if count == 3 else null_vector(wrench)
     right = np.zeros((len(z), count, 3))
     right[:, :3, ONE] = -scene.applied_force[:3]
     right[:, :3, A] = mass[:3] * z_s[:, :3]
@@ -166,13 +167,16 @@ def energy(formation: Formation, z: Array, v: Array) -> Array:
     return np.asarray(kinetic + scene.polygon.mass * scene.gravity * z[:, 1])
 
 
-def _null_vector(wrench: Array) -> Array:
-    """Unit null vector of each (3, 4) matrix, by its minors (continuous); NaN if not unique."""
-    minors = [np.linalg.det(np.delete(wrench, k, axis=2)) for k in range(4)]
-    null = np.stack([minors[0], -minors[1], minors[2], -minors[3]], axis=1)
+def null_vector(matrix: Array, least: float = 0.0) -> Array:
+    """Unit null vector of each (k, k + 1) matrix, by its minors (continuous), shape (n, k + 1).
+
+    NaN where the minors have at most the size `least`: it is not unique.
+    """
+    count = matrix.shape[2]
+    minors = [np.linalg.det(np.delete(matrix, k, axis=2)) for k in range(count)]
+    null = np.stack(minors, axis=1) * (-1.0) ** np.arange(count)
     size = np.linalg.norm(null, axis=1)[:, None]
-    # Of rank two, as where a tip is on a flush edge's vertex, it has no single null vector.
-    return np.asarray(np.divide(null, size, out=np.full_like(null, np.nan), where=size > 0))
+    return np.asarray(np.divide(null, size, out=np.full_like(null, np.nan), where=size > least))
 
 
 def force_rows(formation: Formation, kinematics: Kinematics, directions: Directions) -> Array:

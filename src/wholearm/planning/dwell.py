@@ -1,8 +1,8 @@
 """Dwells: constant torques that hold the ends of phases until contacts are closed.
 
 A phase that stops short of the contact to be gained leaves the next one in another formation.
-Torques that press all contacts together (`mechanics.arrival`) close it first; how soon depends on
-impacts, which are simulated without assumptions on contacts.
+Torques that press all contacts together (`simulation.holding_torques`) close it first; how soon
+depends on impacts, which are simulated without assumptions on contacts.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from ..common.arrays import Array
 from ..common.errors import SimulationError, WholearmError
 from ..contacts.closing import close_finger
 from ..contacts.formation import Formation
-from ..mechanics.arrival import Hold, Standstill, find_hold, find_opening
 from ..problem.definition import Phase, Problem
 from ..results.dwell_record import SettledMotion, Settling, change_torques
 from ..results.torque import TorqueProfile
 from ..simulation.free_simulate import simulate_free
-from ..simulation.sticking import close_contacts
+from ..simulation.holding_torques import Hold, Standstill, find_hold, find_opening
+from ..simulation.rest import close_contacts
 from ..simulation.tolerances import SLOW, is_slower
 from .path_domain.junction import begin_from
 from .phase_plan import Settled

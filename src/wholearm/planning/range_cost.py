@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..mechanics.dynamics import measure_speed
-from ..mechanics.wedging import SURE
+from ..mechanics.statics import SURE
 from ..problem.uncertainty import PARAMETERS
 from ..results.plan_record import RangeFigures
 from .block_plan import Planning

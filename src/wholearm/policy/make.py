@@ -14,7 +14,6 @@ from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..geometry.curve import Curve
 from ..geometry.tracing import runs_on_curve
-from ..mechanics.arrival import Standstill, find_hold
 from ..mechanics.dynamics import (
     LAMBDA,
     ONE,
@@ -34,6 +33,7 @@ from ..results.adopt import Moved, adopt_motion
 from ..results.dwell_record import assemble
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion, Trajectory
+from ..simulation.holding_torques import Standstill, find_hold
 from .curve_law import LoopSettings, choose_internal_force
 from .curve_rows import CurveLimitRows, find_forces, leave_one
 from .playback import Policy

@@ -3,7 +3,7 @@
 Event-driven integration (DOP853) from rest in the first formation. Friction has the sliding signs
 of the current mode; steps end where a polynomial piece of the torques ends, and events are located
 by repeating the step with another length. At rest the formation waits until it can start
-(`sticking`).
+(`rest`).
 
 A phase that ends at rest stops the motion. After a smooth end the velocity is projected onto the
 next formation, and contacts that it does not have are released. A phase without an `until` ends at
@@ -28,17 +28,17 @@ from ..common.sharing import exclusive
 from ..contacts.contact_limits import takes_over
 from ..contacts.formation import Formation
 from ..mechanics.impact import ViolationKind, compute_impact, solve_impulses
+from ..mechanics.statics import find_static_torques
 from ..problem.check import require_phases
 from ..problem.definition import End, Phase, Problem
 from ..results.adopt import Torques, adopt_torques
 from .events import EventKind, Glimpses, Outcome, OutcomeKind, Record, Simulation, collect
 from .modes import find_fixed, find_grips, list_units, share_mode
 from .replay import Replay, Step, find_first, open_limits
+from .rest import BALANCED, Collapse, Rest, StartDeparture, close_contacts, find_rest
 from .run import StuckError
 from .runge_kutta import INNER_STAGES, NODES
 from .sliding_signs import choose_mode, measure_rates, note_change
-from .start_modes import StartDeparture
-from .sticking import Collapse, Rest, balances, close_contacts, find_rest
 from .tolerances import (
     CREEPING,
     PASSED,
@@ -279,9 +279,10 @@ def _touches(run: Replay) -> bool:
     """Whether the contacts of both phases balance rate-limited torques on the present piece."""
     if run.previous is None or not run.problem.scene.has_slow_motors:
         return False
-    contacts = tuple(dict.fromkeys((*run.formation.contacts, *run.previous.contacts)))
-    times = np.linspace(run.t, run.stop, _HELD_AT).tolist()
-    return all(balances(run.problem.scene, contacts, run.z, run.tau(t)) for t in times)
+    contacts = dict.fromkeys((*run.formation.contacts, *run.previous.contacts))
+    static = find_static_torques(Formation(run.problem.scene, tuple(contacts)), run.z)
+    torques = np.array([run.tau(t) for t in np.linspace(run.t, run.stop, _HELD_AT).tolist()])
+    return bool(static.measure(torques).max() <= BALANCED * run.problem.scene.scales.torque)
 
 
 def _advance(run: Replay, stop: float) -> None:

@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contacts.formation import Kinematics
+from ..contacts.formation import Formation, Kinematics
+from ..mechanics.statics import SURE, find_static_torques
 from ..mechanics.uniqueness import find_minors
-from ..mechanics.wedging import SURE, find_static_torques
 from ..problem.definition import Phase, Problem
 from ..results.report import UniquenessMargin
 from ..results.torque import TorqueProfile
@@ -71,7 +71,7 @@ def find_wedged(
     """Time for which friction may hold a phase that begins at rest (static indeterminacy) [s].
 
     Until no contact forces within their cones, of all contacts that touch, balance torques and
-    gravity: see `mechanics.wedging`. None if the phase does not begin at rest.
+    gravity: see `mechanics.statics`. None if the phase does not begin at rest.
 
     Parameters
     ----------
@@ -80,11 +80,12 @@ def find_wedged(
     start : [s]  since when the phase is to move, if its rows begin with the time for which it is
                  held
     """
-    scene, touching = problem.scene, [phase.formation]
+    scene, contacts = problem.scene, phase.formation.contacts
     if phase.index:
         if measure_speed(scene, motion.z_dot[rows[0]]) > slow * scene.scales.speed:
             return None
-        touching.append(problem.phases[phase.index - 1].formation)
+        contacts += problem.phases[phase.index - 1].formation.contacts
+    touching = Formation(scene, tuple(dict.fromkeys(contacts)))
     static = find_static_torques(touching, motion.z[rows[0]])
     start, stop = max(start, float(motion.t[rows[0]])), float(motion.t[rows[-1]])
     t = np.linspace(start, stop, 4 * PLACES)

@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from ..common.arrays import Array
 from ..contacts.formation import Formation
 from ..mechanics.limits import CONE, PRESS, LimitSet, make_limits
+from ..mechanics.statics import find_holding_change
 from ..problem.definition import Phase, Problem
 from ..results.report import Approach, ForceAt, Loss, PhaseReport, TorqueAdvice, TuningHelp
 from ..simulation.events import EventKind, Simulation
 from ..simulation.modes import find_grips, list_units, respond, share_mode
+from ..simulation.rest import StartMode, find_rest
 from ..simulation.sliding_signs import evaluate_rows, measure_rates
-from ..simulation.start_modes import StartMode
-from ..simulation.sticking import find_rest
 from .verdict import Allowance
 from .verify import find_lowest
 
@@ -210,7 +210,7 @@ def find_resting_changes(
         known = [change for own in moved if (change := own[k]) is not None]
         if len(free) == 2 and resting_changes:
             break
-        held = None if known else _hold(formation, epsilon, z, tau, free)
+        held = None if known else find_holding_change(formation, z, tau, epsilon, free)
         if known:
             resting_changes.append(make_advice(min(known, key=np.linalg.norm), tau))
         elif held is not None:
@@ -237,8 +237,7 @@ def _move(
     if instant is None:
         return [None] * len(_TORQUES)
     limits = make_limits(formation, epsilon)
-    rows = [row + np.array([offset, 0.0, 0.0]) for row, offset in path.margins]
-    rows += [] if gradient is None else [-gradient @ instant.acceleration]
+    rows = [*path.margins, *([] if gradient is None else [-gradient @ instant.acceleration])]
     sizes = np.abs(rows) @ [1.0, unit, unit]
     scale = np.concatenate([limits.scales[limits.sides[0]], np.where(sizes > 0, sizes, 1.0)])
     sides = np.vstack([instant.find_sides(limits), *rows])
@@ -251,48 +250,6 @@ def _move(
         return unit * change if path.moves(tau + unit * change) else None
 
     return [keep(change) for change in tried]
-
-
-def _hold(
-    formation: Formation, epsilon: float, z: Array, tau: Array, free: tuple[int, ...]
-) -> Array | None:
-    """The change of the torques `free` with the least sum of sizes that holds it at rest.
-
-    A linear programme in c_n >= epsilon, c_t within U c_n, dry joint friction within D and the
-    torques, with g + S (tau - friction) + A^T c_n + A_t^T c_t = 0.
-    """
-    from scipy.optimize import linprog
-
-    scene, n_c = formation.scene, formation.n_contacts
-    scales = scene.scales
-    units = np.array([1.0, 1.0, *[scales.length] * 3])
-    at = formation.evaluate(z[None], np.zeros((1, 5)))
-    joints = np.eye(5)[:, 3:]
-    # Unknowns are c_n, c_t, dry friction, and what each torque rises and falls by.
-    balance = [(at.A[0] / units).T, (at.A_t[0] / units).T, -joints, joints, -joints]
-    load = (scene.applied_force + joints @ tau) / (scales.force * units)
-    cone, unit, none = -np.diag(formation.friction), np.eye(n_c), np.zeros((n_c, 6))
-    within = [np.hstack([cone, sign * unit, none]) for sign in (1.0, -1.0)]
-    room = [np.maximum(scene.torque_limit + side * tau, 0.0) for side in (-1.0, 1.0)]
-    spare = np.where([k in free for k in (0, 1)], np.array(room) / scales.torque, 0.0)
-    answered = linprog(
-        np.repeat([0.0, 1.0], [2 * n_c + 2, 4]),
-        A_ub=np.vstack(within),
-        b_ub=np.zeros(2 * n_c),
-        A_eq=np.hstack(balance),
-        b_eq=-load,
-        bounds=[
-            *[(epsilon / scales.force, None)] * n_c,
-            *[(None, None)] * n_c,
-            *((-most, most) for most in scene.dry[3:] / scales.torque),
-            *((0.0, most) for most in spare.ravel()),
-        ],
-        method="highs",
-    )
-    if answered.status != 0:
-        return None
-    rise, fall = answered.x[-4:-2], answered.x[-2:]
-    return np.asarray(scales.torque * (rise - fall))
 
 
 class Instant(NamedTuple):

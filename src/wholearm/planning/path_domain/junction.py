@@ -19,7 +19,7 @@ from ...common.errors import InfeasibleError
 from ...contacts.formation import Formation
 from ...geometry.curve import Curve
 from ...mechanics.dynamics import LAMBDA, ONE
-from ...mechanics.wedging import find_static_torques
+from ...mechanics.statics import find_static_torques
 from ...results.dwell_record import TorqueChange, change_torques, find_change_times
 from ...results.plan_record import ModeSpan
 from ...results.torque import TorqueProfile
@@ -75,7 +75,7 @@ def choose_joint(
     else:
         before, ends = ending[None], np.full(1, np.nan)
     formation = beginning.formation if isinstance(beginning, Curve) else beginning
-    scene, static = formation.scene, find_static_torques([formation], z)
+    scene, static = formation.scene, find_static_torques(formation, z)
     beyond = static.measure(before)
     held = beyond <= _VERGE * scene.scales.torque
     if not held.any():

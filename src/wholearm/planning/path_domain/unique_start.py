@@ -1,7 +1,7 @@
 """Bounds of a plan's first node with which static friction cannot hold the start.
 
 At rest the torques are affine in s'' and internal force, tau = T0 + Ta s'' + Tl lambda. Those that
-friction can hold are a polygon (`mechanics.wedging`). A plan that starts inside it is planned again
+friction can hold are a polygon (`mechanics.statics`). A plan that starts inside it is planned again
 with its first node beyond one of the sides: at the nearest place that keeps every limit, or beyond.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 from ...common.arrays import Array
 from ...mechanics.dynamics import LAMBDA, ONE, A
 from ...mechanics.limits import PRESS
-from ...mechanics.wedging import SURE
+from ...mechanics.statics import SURE
 from ..robust.robust_rows import RobustHold, list_holds, measure_holds
 from .elements import Profile
 from .path_data import PhaseData

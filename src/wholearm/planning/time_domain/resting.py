@@ -8,12 +8,15 @@ and closed gaps of other contacts can only open. Friction follows from the accel
 slides with c_t = -mu Xi c_n and Xi A_t a > 0, or sticks with |c_t| <= mu (c_n - epsilon) and
 A_t a = 0. With two degrees of freedom the modes are the sectors and rays between a few lines. If
 none admits a nonzero acceleration, no plan exists. For a motion that comes to rest the acceleration
-is against the direction of motion.
+is against the direction of motion. Forces may be indeterminate here, as where only a finger starts;
+the start modes of `simulation.rest` are those with forces that torques determine.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,6 +40,14 @@ class BlockedStart(NamedTuple):
     short: float  # least shortfall of c_n below epsilon
 
 
+class _Margin(NamedTuple):
+    """Largest margin of a mode, with its acceleration (5,) and normal forces (n_c,)."""
+
+    value: float
+    acceleration: Array
+    c_n: Array
+
+
 def find_block(
     formation: Formation, z: Array, epsilon: float, ends: bool = False
 ) -> BlockedStart | None:
@@ -44,11 +55,16 @@ def find_block(
 
     Formations with more than two degrees of freedom always may.
     """
-    modes = _list_modes(formation, z, epsilon, ends)
-    if not modes or any(mode.moves() for mode in modes):
-        return None
-    shorts = [short for mode in modes if (short := mode.find_short()) is not None]
-    return min(shorts, key=lambda short: short.short, default=BlockedStart("", 0.0))
+    best, modes = None, list(_list_modes(formation, z, ends))
+    for mode in modes:
+        margin = _maximise(formation, mode, epsilon, MOVES)
+        if margin is not None and margin.value >= 0:
+            return None
+        if margin is not None and (best is None or margin.value > best.value):
+            best = margin
+    if best is None:
+        return BlockedStart("", 0.0) if modes else None
+    return BlockedStart(formation.names[int(best.c_n.argmin())], -best.value)
 
 
 def find_change(
@@ -58,8 +74,23 @@ def find_change(
 
     The least torque limit of a finger, or for None the largest epsilon.
     """
-    values = [mode.find_limit(finger) for mode in _list_modes(formation, z, epsilon, ends)]
-    return (max if finger is None else min)((v for v in values if v is not None), default=None)
+    modes = _list_modes(formation, z, ends)
+    if finger is None:
+        margins = [_maximise(formation, mode, 0.0, MOVES, cones=True) for mode in modes]
+        return max((m.value for m in margins if m is not None and m.value >= 0), default=None)
+    margins = [_maximise(formation, mode, epsilon, MOVES, finger=finger) for mode in modes]
+    return min((-m.value for m in margins if m is not None), default=None)
+
+
+def list_headings(formation: Formation, z: Array, epsilon: float) -> list[Array]:
+    """Initial directions of motions from rest at `z`, (5,), by decreasing normal forces."""
+    headings: list[_Margin] = []
+    for mode in _list_modes(formation, z, ends=False):
+        one = _maximise(formation, mode, epsilon, BEGINS)
+        if one is not None and one.value >= 0:
+            if all(abs(one.value - other.value) > _SAME for other in headings):
+                headings.append(one)
+    return [one.acceleration for one in sorted(headings, key=lambda one: -one.value)]
 
 
 def pushes_one_way(formation: Formation, z: Array) -> bool:
@@ -81,16 +112,6 @@ def pushes_one_way(formation: Formation, z: Array) -> bool:
     return bool(answer.status == 0 and answer.x[-1] > PUSHES)
 
 
-def list_headings(formation: Formation, z: Array, epsilon: float) -> list[Array]:
-    """Initial directions of motions from rest at `z`, (5,), by decreasing normal forces."""
-    headings: list[tuple[float, Array]] = []
-    for mode in _list_modes(formation, z, epsilon, ends=False):
-        answer = mode.find_heading()
-        if answer is not None and all(abs(answer[0] - margin) > _SAME for margin, _ in headings):
-            headings.append(answer)
-    return [heading for _, heading in sorted(headings, key=lambda pair: -pair[0])]
-
-
 def list_ways(rates: Array) -> list[Array]:
     """One acceleration, shape (f,), for each combination of signs of rates, shape (n, f)."""
     if rates.shape[1] == 1:
@@ -102,25 +123,31 @@ def list_ways(rates: Array) -> list[Array]:
     return [np.array([np.cos(t), np.sin(t)]) for t in np.concatenate([middles, angles])]
 
 
-def _list_modes(formation: Formation, z: Array, epsilon: float, ends: bool) -> list[_Programme]:
-    """One programme for each mode; none with other than one or two degrees of freedom."""
+class _Mode(NamedTuple):
+    """A contact mode: accelerations are N y, with rates and opens @ y."""
+
+    z: Array  # (5,)
+    N: Array  # (5, f)
+    rates: Array  # (n_c + 2, f): of sliding and turning
+    opens: Array  # (k, f): of closed gaps, that can only open
+    signs: Array  # (n_c + 2,): of the motion that begins or ends, zero for what sticks or is held
+
+
+def _list_modes(formation: Formation, z: Array, ends: bool) -> Iterator[_Mode]:
+    """Every mode of a motion with one or two degrees of freedom; none with more."""
     N = tangent_basis(formation, z)
-    metric = np.array([1.0, 1.0, *(3 * [formation.scene.polygon.gyration_radius**2])])
-    N = N / metric[:, None]
+    N = N / np.array([1.0, 1.0, *(3 * [formation.scene.polygon.gyration_radius**2])])[:, None]
     if not 1 <= N.shape[1] <= 2:
-        return []
-    kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
-    A, A_t = kinematics.A[0], kinematics.A_t[0]
-    rates = np.vstack([A_t, np.eye(5)[3:]]) @ N
-    least = _STILL * np.abs(rates).max()
+        return
+    rates = np.vstack([formation.evaluate(z[None], np.zeros((1, 5))).A_t[0], np.eye(5)[3:]]) @ N
     opens = _list_opening(formation, z) @ N
-    modes = []
+    opens = opens[np.abs(opens).max(axis=1, initial=0.0) > _LEVEL]
+    side, least = -1.0 if ends else 1.0, _STILL * np.abs(rates).max()
     for way in list_ways(rates):
-        side, speed = -1.0 if ends else 1.0, rates @ way
+        speed = rates @ way
         signs = np.sign(np.where(np.abs(speed) > least, speed, 0))
         signs[list(formation.rolling_rows)] = 0.0
-        modes.append(_Programme(formation, epsilon, side * N, A, A_t, rates, signs, side * opens))
-    return modes
+        yield _Mode(z, side * N, rates, side * opens, signs)
 
 
 def _list_opening(formation: Formation, z: Array) -> Array:
@@ -132,121 +159,54 @@ def _list_opening(formation: Formation, z: Array) -> Array:
     return np.asarray((ahead - behind).T / (2 * steps.diagonal()))
 
 
-class _Programme:
-    """Linear programme of one mode: x = (y, c_n, sticking c_t, friction of joints at rest, tau)."""
+def _maximise(
+    formation: Formation,
+    mode: _Mode,
+    epsilon: float,
+    speed: float,
+    cones: bool = False,
+    finger: int | None = None,
+) -> _Margin | None:
+    """The largest r with c_n >= epsilon + r in a motion of at least a speed; None without any.
 
-    def __init__(
-        self,
-        formation: Formation,
-        epsilon: float,
-        N: Array,
-        A: Array,
-        A_t: Array,
-        rates: Array,
-        signs: Array,
-        opens: Array,
-    ) -> None:
-        scene, n_c, f = formation.scene, formation.n_contacts, N.shape[1]
-        self.names, self.epsilon, self.N = formation.names, epsilon, N
-        self.f, self.n_c, mu = f, n_c, formation.friction
-        self.normal = slice(f, f + n_c)
-        sticks, held = np.flatnonzero(signs[:n_c] == 0), np.flatnonzero(signs[n_c:] == 0)
-        forces = [
-            -(scene.mass_diagonal[:, None] * N),
-            (A - (mu * signs[:n_c])[:, None] * A_t).T,
-            A_t[sticks].T,
-            np.eye(5)[:, 3 + held],
-            np.eye(5)[:, 3:],
-        ]
-        balance, moving = np.hstack(forces), signs != 0
-        self.size = balance.shape[1]
-        still = self._pad(rates[~moving])
-        self.equal = np.vstack([balance, still])
-        dry = scene.dry * np.array([0.0, 0.0, 0.0, *signs[n_c:]])
-        self.equal_to = np.append(dry - scene.applied_force, np.zeros(len(still)))
-        unit, motion = np.eye(self.size), signs[moving, None] * rates[moving]
-        cones = [
-            side * unit[f + n_c + k] - mu[contact] * unit[f + contact]
-            for k, contact in enumerate(sticks)
-            for side in (1.0, -1.0)
-        ]
-        growing = opens[np.abs(opens).max(axis=1, initial=0.0) > _LEVEL]
-        others = self._pad(-np.vstack([motion, growing]))
-        self.rows = np.vstack([*cones, others])
-        # What epsilon adds to each row.
-        self.relaxations = np.append(np.repeat(mu[sticks], 2), np.zeros(len(others)))
-        self.most = -epsilon * self.relaxations
-        self.speed = self._pad(motion).sum(axis=0)
-        free: tuple[float | None, float | None] = (None, None)
-        self.limits = [free] * f + [(epsilon, None)] * n_c + [free] * len(sticks)
-        for limit in (*scene.dry[3 + held], *scene.torque_limit):
-            self.limits.append((-float(limit), float(limit)))
+    `cones` take epsilon + r for epsilon, too. With a `finger` its torque is at most -r, and
+    c_n >= epsilon.
+    """
+    from scipy.optimize import linprog
 
-    def _pad(self, rows: Array) -> Array:
-        """Rows of the acceleration as rows of x."""
-        return np.pad(rows, ((0, 0), (0, self.size - rows.shape[1])))
-
-    def moves(self) -> bool:
-        """Whether a nonzero acceleration is possible, which counts so if undecided or unbounded."""
-        from scipy.optimize import linprog
-
-        answer = linprog(-self.speed, self.rows, self.most, self.equal, self.equal_to, self.limits)
-        return bool(answer.status not in (0, 2) or (answer.status == 0 and -answer.fun > MOVES))
-
-    def find_short(self) -> BlockedStart | None:
-        """The least largest shortfall of the normal forces in a motion, and its contact."""
-        answer = self._minimise(1.0, MOVES, self._press(-1.0, self.epsilon), self.normal)
-        if answer is None:
-            return None
-        worst = int(np.argmin(answer[self.normal]))
-        return BlockedStart(self.names[worst], float(answer[-1]))
-
-    def find_heading(self) -> tuple[float, Array] | None:
-        """The largest least c_n over epsilon with a speed of `BEGINS`, and the acceleration."""
-        answer = self._minimise(-1.0, BEGINS, self._press(1.0, self.epsilon), self.normal)
-        return None if answer is None else (float(answer[-1]), self.N @ answer[: self.f])
-
-    def find_limit(self, finger: int | None) -> float | None:
-        """The least torque limit of a finger, or the largest epsilon, with a motion."""
-        if finger is None:
-            answer = self._minimise(-1.0, MOVES, self._press(1.0, 0.0), self.normal, relaxed=True)
-        else:
-            at = self.size - 2 + finger
-            torque = np.zeros((2, self.size + 1))
-            torque[:, at], torque[:, -1] = [1.0, -1.0], -1.0
-            answer = self._minimise(1.0, MOVES, (torque, np.zeros(2)), slice(at, at + 1))
-        return None if answer is None else float(answer[-1])
-
-    def _press(self, share: float, least: float) -> tuple[Array, Array]:
-        """Rows c_n >= least + share r."""
-        rows = np.zeros((self.n_c, self.size + 1))
-        rows[:, self.f : self.f + self.n_c], rows[:, -1] = -np.eye(self.n_c), share
-        return rows, np.full(self.n_c, -least)
-
-    def _minimise(
-        self,
-        cost: float,
-        speed: float,
-        more: tuple[Array, Array],
-        own: slice,
-        relaxed: bool = False,
-    ) -> Array | None:
-        """Minimise `cost` times one more unknown r >= 0 in a motion of given speed.
-
-        Rows `more` replace the bounds of the unknowns `own`; if `relaxed`, r is epsilon.
-        """
-        from scipy.optimize import linprog
-
-        by_r = self.relaxations * relaxed
-        moving = np.append(-self.speed * (MOVES / speed), 0.0)[None]
-        limits = [*self.limits, (0.0, None)]
-        limits[own] = [(None, None)] * (own.stop - own.start)
-        answer = linprog(
-            np.append(np.zeros(self.size), cost),
-            np.vstack([np.column_stack([self.rows, by_r]), more[0], moving]),
-            np.concatenate([self.most + by_r * self.epsilon, more[1], [-MOVES]]),
-            np.hstack([self.equal, np.zeros((len(self.equal), 1))]),
-            self.equal_to,
-            limits,
-        )
-        return answer.x if answer.status == 0 else None
+    scene, n_c, mu = formation.scene, formation.n_contacts, formation.friction
+    N, signs, f = mode.N, mode.signs, mode.N.shape[1]
+    at = formation.evaluate(mode.z[None], np.zeros((1, 5)))
+    A, A_t, joints = at.A[0], at.A_t[0], np.eye(5)[:, 3:]
+    sticks, held, moving = np.flatnonzero(signs[:n_c] == 0), signs[n_c:] == 0, signs != 0
+    # Unknowns are y, c_n, c_t of what sticks, friction of joints that are held, tau and r.
+    slip = (A - (mu * signs[:n_c])[:, None] * A_t).T
+    forces = [-scene.mass_diagonal[:, None] * N, slip, A_t[sticks].T, joints[:, held], joints]
+    balance = np.hstack([*forces, np.zeros((5, 1))])
+    one = np.eye(balance.shape[1])
+    y, c_n, others = np.split(one, [f, f + n_c])
+    c_t, tau, r = others[: len(sticks)], others[-3:-1], others[-1]
+    motion = signs[moving, None] * mode.rates[moving] @ y
+    dry = scene.dry * np.array([0.0, 0.0, 0.0, *signs[n_c:]])
+    edges, least = mu[sticks, None] * (c_n[sticks] - cones * r), epsilon * mu[sticks]
+    rows = [c_n - (finger is None) * r, edges - c_t, edges + c_t, motion, mode.opens @ y]
+    lows = [np.full(n_c, epsilon), least, least, np.zeros(len(motion) + len(mode.opens))]
+    rows, lows = [*rows, motion.sum(axis=0)[None] * (MOVES / speed)], [*lows, np.array([MOVES])]
+    limits = scene.torque_limit.copy()
+    if finger is not None:
+        limits[finger] = math.inf
+        rows, lows = [*rows, np.stack([-r - tau[finger], -r + tau[finger]])], [*lows, np.zeros(2)]
+    bounds = np.tile([-np.inf, np.inf], (len(one), 1))
+    most = np.concatenate([scene.dry[3:][held], limits])
+    bounds[-1 - len(most) : -1] = np.stack([-most, most], axis=1)
+    answer: Any = linprog(
+        -r,
+        A_ub=-np.vstack(rows),
+        b_ub=-np.concatenate(lows),
+        A_eq=np.vstack([balance, mode.rates[~moving] @ y]),
+        b_eq=np.append(dry - scene.applied_force, np.zeros((~moving).sum())),
+        bounds=bounds,
+    )
+    if answer.status != 0:
+        return None
+    return _Margin(float(answer.x[-1]), N @ answer.x[:f], c_n @ answer.x)

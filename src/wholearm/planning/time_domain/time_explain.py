@@ -108,10 +108,10 @@ def _refuse_pushed(problem: Problem, phase: Phase, stages: Sequence[Stage]) -> N
 
 def _refuse_unheld(problem: Problem, phase: Phase, stage: Stage, node: int) -> None:
     """Raise an error if rate-limited torques cannot hold the object at rest at an end."""
-    from ...mechanics.wedging import find_static_torques
+    from ...mechanics.statics import find_static_torques
 
     z, limit = to_si(stage, problem).guess.nodes[node, 0], problem.scene.torque_limit
-    held = find_static_torques([phase.formation], z)
+    held = find_static_torques(phase.formation, z)
     if not held.is_empty(limit):
         return
     most = "however large" if held.is_empty(np.full(2, np.inf)) else "within their limits"

@@ -1,0 +1,397 @@
+"""Formations at rest: start modes, and the instant at which balance is lost or a motion begins.
+
+Each choice of signs of sliding and turning, and of what sticks, makes accelerations and contact
+forces affine in the torques. Such a start mode is consistent if contacts and joints accelerate with
+its signs, friction can hold the others, every contact presses and nothing that touches closes
+further. With one freedom these are both directions along it. If none is consistent the formation
+sticks; contact forces are then indeterminate, and the torque polygon (`mechanics.statics`) says
+whether any inside the friction cones balance. On a polynomial piece of the torques both change at
+roots of polynomials.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.arrays import Array
+from ..common.errors import SimulationError
+from ..contacts.cones import find_weakest
+from ..contacts.formation import Formation
+from ..mechanics.dynamics import Directions
+from ..mechanics.statics import StaticTorques, find_pulls, find_static_torques
+from .modes import ModeRows, find_grips, list_units, respond, share_mode
+from .tolerances import ROUNDING_FORCE, find_tolerances, measure_units
+
+BALANCED = 1e-6  # distance beyond torques that can be held that counts as none, over the scene's
+_CLOSED = 3e-15  # gap that counts as rounding, relative to the scene's length
+_AHEAD = 1e-5  # step along the free direction for the signs of what is stationary, in scene units
+_STEP = 3e-5  # step of the difference quotient, in units of the scene
+_KINK = 1e-2  # rise of a limit both ways, over the step, from which it has a kink and no gradient
+_GRAZE = 1e-3  # largest closing acceleration of a gap that grazes, over sliding and turning
+_CLEAR = 1e3  # least starting acceleration halfway to the next change, over rounding
+
+
+class StartDeparture(NamedTuple):
+    """The formation starts to move, or goes on, at `x` in [-1, 1] of a piece of the torques."""
+
+    x: float
+    heading: Array  # (5,): where to, of length one in the metric M5
+    directions: Directions
+
+
+class Collapse(NamedTuple):
+    """Loss of balance at `x` of a piece without a consistent start mode."""
+
+    x: float
+    contact: str  # the contact that would have to pull most, or that slips
+    c_n: float  # [N]
+    jammed: bool  # whether friction jams one of the directions
+    c_t: float | None = None  # [N]: of a rolling contact that slips, although it presses with `c_n`
+
+
+class StartMode(NamedTuple):
+    """Start mode; quantities at rest are rows @ (1, tau_1, tau_2)."""
+
+    directions: Directions  # zero for what friction holds
+    mass: Array  # (5,): diagonal of M5
+    acceleration: Array  # (5, 3): z''
+    # (n_c + 2 R, 3) [N]: what has to be positive for the contacts to hold, H c (`contacts.cones`)
+    force_limits: Array
+    # (k, 3): accelerations of sliding and turning along the signs, or along the only freedom
+    slips: Array
+    grips: Array  # (2 k, 3) [N, N m]: what has to be positive for friction to hold what has no sign
+    openings: Array  # (k, 3) [m/s^2]: of closed gaps of other contacts, plus what counts as grazing
+    slack: Array  # rounding of force limits, slips, grips and openings
+    ratio: float  # reduced inertia over that without friction; jammed at zero and below
+    heading: Array | None  # (5,): with one freedom, the direction
+    touching: Touching
+
+    @property
+    def margins(self) -> Array:
+        """Rows that are not negative where the mode is consistent, those of force limits first."""
+        rows = np.vstack([self.force_limits, self.slips, self.grips, self.openings])
+        rows[:, 0] += self.slack
+        return rows
+
+    def drive(self, tau: Array) -> float:
+        """Acceleration in the metric M5."""
+        return float(np.sqrt(self.mass @ (self.acceleration @ [1.0, *tau]) ** 2))
+
+    def slides(self, tau: Array) -> bool:
+        """Whether the formation accelerates in this mode if every contact can press or pull."""
+        load, least = np.array([1.0, *tau]), find_tolerances(self.touching.formation.scene).drive
+        return (
+            self.ratio > 0
+            and self.drive(tau) > least
+            and bool((self.margins[len(self.force_limits) :] @ load >= 0).all())
+            and self.touching.opens(self.acceleration @ load)
+        )
+
+    def moves(self, tau: Array) -> bool:
+        """Whether the formation starts in this mode under torques `tau`, shape (2,)."""
+        return bool((self.margins @ [1.0, *tau] >= 0).all()) and self.slides(tau)
+
+    def depart(self, x: float, tau: Array) -> StartDeparture:
+        """Start at `x` of a piece, where the torques are `tau`."""
+        heading = self.acceleration @ [1.0, *tau] / self.drive(tau)
+        return StartDeparture(x, heading, self.directions)
+
+
+class Touching:
+    """Limits `near` zero at `z` of what touches outside the formation, with gradient (k, 5).
+
+    A pointed tip at a vertex has a kink instead.
+    """
+
+    def __init__(self, formation: Formation, z: Array, near: NDArray[np.bool_]) -> None:
+        self.formation, self.z = formation, z
+        self.units = measure_units(formation.scene)[:5]
+        self.gradient, self.kinked = np.zeros((0, 5)), np.zeros(0, dtype=np.int64)
+        if not near.any():
+            return
+        ahead = _STEP * self.units
+        values = formation.evaluate_limits(z + np.vstack([np.diag(ahead), -np.diag(ahead)]))
+        values = (values - formation.evaluate_limits(z[None]))[:, near]
+        rises = (values[:5] + values[5:]).max(axis=0)
+        kinked = rises > _KINK * _STEP * formation.scene.scales.length
+        self.kinked = np.flatnonzero(near)[kinked]
+        self.gradient = (values[:5] - values[5:])[:, ~kinked].T / (2 * ahead)
+
+    def opens(self, acceleration: Array) -> bool:
+        """Whether what has a kink does not close along an acceleration, shape (5,)."""
+        if not len(self.kinked):
+            return True
+        step = _STEP / np.abs(acceleration / self.units).max()
+        places = self.z + np.array([[0.0], [step]]) * acceleration
+        here, ahead = self.formation.evaluate_limits(places)[:, self.kinked]
+        closing = _GRAZE * _STEP * self.formation.scene.scales.length
+        return bool((ahead - here >= -closing).all())
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """A formation at rest at a configuration."""
+
+    formation: Formation
+    z: Array  # (5,)
+    near: NDArray[np.bool_]  # (n_limits,): which limits of the formation are zero here
+    heading: Array | None  # (5,): with one freedom the direction, of length one in the metric M5
+
+    @cached_property
+    def sliding(self) -> tuple[StartMode, ...]:
+        """Start modes without sticking: two with one freedom, all sign patterns with more."""
+        if self.heading is not None:
+            modes = (self._build(self._find_signs(h), h) for h in (self.heading, -self.heading))
+            return tuple(mode for mode in modes if mode is not None)
+        return tuple(self._list_patterns(held=False))
+
+    @cached_property
+    def sticking(self) -> tuple[StartMode, ...]:
+        """Start modes in which friction holds some contact or joint, the least first."""
+        return () if self.heading is not None else tuple(self._list_patterns(held=True))
+
+    @property
+    def modes(self) -> tuple[StartMode, ...]:
+        """All start modes."""
+        return self.sliding + self.sticking
+
+    def _list_modes(self) -> Iterator[StartMode]:
+        # Those with sticking are built when first needed: most never are.
+        yield from self.sliding
+        yield from self.sticking
+
+    @cached_property
+    def touching(self) -> Formation:
+        """Every contact that touches, in the formation or not."""
+        gained = [self.formation.limits[k].gained for k in np.flatnonzero(self.near)]
+        others = (contact for contact in gained if contact is not None)
+        return Formation(self.formation.scene, (*self.formation.contacts, *others))
+
+    @cached_property
+    def held(self) -> StaticTorques:
+        """Torques that friction can hold, but for `BALANCED`."""
+        static = find_static_torques(self.touching, self.z)
+        rounding = BALANCED * self.formation.scene.scales.torque
+        return static._replace(bounds=static.bounds + rounding)
+
+    @cached_property
+    def _others(self) -> Touching:
+        return Touching(self.formation, self.z, self.near)
+
+    @cached_property
+    def _rows(self) -> ModeRows:
+        kinematics = self.formation.evaluate(self.z[None], np.zeros((1, 5)))
+        none = np.zeros(self.formation.n_contacts)
+        return ModeRows(kinematics.A[0], kinematics.A_t[0], none, none)
+
+    def _list_patterns(self, held: bool) -> Iterator[StartMode]:
+        """Start modes with more freedoms: only those with sticking, or only the others."""
+        units, count = list_units(self.formation), self.formation.n_contacts
+        choices = [(1.0, -1.0, 0.0) if held and unit.grips else (1.0, -1.0) for unit in units]
+        for options in sorted(product(*choices), key=lambda options: options.count(0.0)):
+            grips = options.count(0.0)
+            if (grips > 0) != held or self.formation.n_constraints + grips > 4:
+                continue
+            signs = np.zeros(count + 2)
+            for unit, sign in zip(units, options, strict=True):
+                signs[list(unit.rows)] = sign
+            mode = self._build(signs)
+            if mode is not None:
+                yield mode
+
+    def _find_signs(self, heading: Array) -> Array:
+        """Directions of contacts and joints along the only freedom, (n_c + 2,); zero for none."""
+        formation, scales = self.formation, self.formation.scene.scales
+        step = _AHEAD / np.abs(heading / measure_units(formation.scene)[:5]).max()
+        rates = np.concatenate([self._rows.A_t @ heading, heading[3:]])
+        rates[list(formation.rolling_rows)] = 0.0
+        # How fast each slides or turns over how fast anything moves.
+        scale = _AHEAD / step * np.repeat([scales.length, 1.0], [formation.n_contacts, 2])
+        still = np.abs(rates) < 1e-9 * scale
+        still[list(formation.rolling_rows)] = False
+        if still.any():
+            # What is stationary here has the direction that it has just after.
+            ahead = _find_rates(formation, self.z, step, heading)
+            rates = np.where(still, np.where(np.abs(ahead) > 1e-12 * scale, ahead, 0.0), rates)
+        return np.asarray(np.sign(rates))
+
+    def _build(self, signs: Array, heading: Array | None = None) -> StartMode | None:
+        """The start mode of some signs, (n_c + 2,); None if its forces are not determined."""
+        formation, scene, count = self.formation, self.formation.scene, self.formation.n_contacts
+        mode = share_mode(formation, find_grips(formation, signs))
+        response = respond(mode, signs, self._rows, np.zeros(5))
+        if response is None:
+            return None
+        declared = np.array([mode.declares(k) for k in range(len(mode.holders))] * 2, dtype=bool)
+        kept = np.concatenate([np.ones(count, dtype=bool), declared])
+        tolerances, length = find_tolerances(scene), scene.scales.length
+        slips = signs[:, None] * response.rates
+        graze = _GRAZE * np.repeat([1.0, length], [count, 2]) @ slips
+        openings = self._others.gradient @ response.acceleration + graze
+        still = np.repeat([tolerances.still, tolerances.still_joint], [count, 2])
+        closing = np.full(len(openings), tolerances.closing)
+        if heading is not None:
+            # All accelerations are multiples of this one.
+            slips = (heading * scene.mass_diagonal @ response.acceleration)[None]
+            still, closing = np.array([-tolerances.drive]), np.zeros(len(openings))
+        rounding = ROUNDING_FORCE * mode.force_limit_units
+        return StartMode(
+            directions=Directions(signs[:count], signs[count:]),
+            mass=scene.mass_diagonal,
+            acceleration=response.acceleration,
+            force_limits=response.force_limits[kept],
+            slips=slips,
+            grips=response.force_limits[~kept],
+            openings=openings,
+            slack=np.concatenate([rounding[kept], still, rounding[~kept], closing]),
+            ratio=response.ratio,
+            heading=heading,
+            touching=self._others,
+        )
+
+    def wait(self, coefficients: Array, x: float) -> StartDeparture | Collapse | None:
+        """End of the rest on a piece of torques, (2, d + 1) [N m] in powers of x, or None."""
+        tau = _evaluate(coefficients, x)
+        for mode in self._list_modes():
+            if mode.moves(tau):
+                return mode.depart(x, tau)
+        loss = self._find_loss(coefficients, x)
+        least = _CLEAR * find_tolerances(self.formation.scene).drive
+        margins = [mode.margins for mode in self.modes]
+        rows = np.vstack(margins)
+        first = np.cumsum([0, *(len(part) for part in margins[:-1])])
+        # Where a margin changes sign; in between, no mode changes.
+        polynomials = rows[:, 1:] @ coefficients + _constant(rows[:, 0], coefficients)
+        starts, middles = _split(polynomials, x)
+        torques = _evaluate(coefficients, middles)
+        values = rows[:, :1] + rows[:, 1:] @ torques
+        consistent = np.logical_and.reduceat(values >= 0, first, axis=0).T
+        for start, tau, chosen in zip(starts.tolist(), torques.T, consistent, strict=True):
+            if start > loss:
+                break
+            modes = [self.modes[k] for k in np.flatnonzero(chosen)]
+            for mode in sorted(modes, key=lambda mode: -mode.drive(tau)):
+                if mode.drive(tau) > least and mode.moves(tau):
+                    return mode.depart(start, tau)
+        return self._collapse(coefficients, loss) if loss <= 1 else None
+
+    def _find_loss(self, coefficients: Array, x: float) -> float:
+        """Where torques cannot be held any more, from `x` on; infinite if they can all along."""
+        normals, bounds = self.held
+        if not np.isfinite(bounds).all():
+            return x
+        starts, middles = _split(normals @ coefficients - _constant(bounds, coefficients), x)
+        beyond = self.held.measure(_evaluate(coefficients, middles).T) > 0
+        return float(starts[beyond.argmax()]) if beyond.any() else np.inf
+
+    def _collapse(self, coefficients: Array, x: float) -> Collapse:
+        """The contact that gives way at `x`."""
+        tau = _evaluate(coefficients, x)
+        jammed = [mode.ratio <= 0 for mode in self.sliding]
+        jams = any(jammed) if self.heading is not None else all(jammed)
+        free = [mode for mode in self.modes if mode.slides(tau)]
+        pulls = find_pulls(self.touching, self.z, tau)
+        if free or np.isinf(pulls).all():
+            load = np.array([1.0, *tau])
+            weakest = min((mode.force_limits @ load for mode in free or self.sliding), key=np.min)
+            row, least, c_t = find_weakest(self.formation, weakest)
+            return Collapse(x, self.formation.names[row], least, jams, c_t)
+        return Collapse(x, self.touching.names[int(pulls.argmax())], -float(pulls.max()), jams)
+
+
+def find_rest(formation: Formation, z: Array) -> Rest:
+    """Formation at rest at `z`, (5,); `SimulationError` for dependent contacts or no freedom."""
+    root = np.sqrt(formation.scene.mass_diagonal)
+    P = formation.evaluate(z[None], np.zeros((1, 5))).P[0]
+    _, values, right = np.linalg.svd(P / root)
+    rank = int((values > 1e-9 * values[0]).sum())
+    if rank < len(P) or rank == 5:
+        raise SimulationError(
+            f"{' '.join(formation.names)} leaves {5 - rank} freedoms, and no forces that are "
+            "determined; it cannot start from rest"
+        )
+    near = np.abs(formation.evaluate_limits(z[None])[0]) < formation.scene.touching
+    return Rest(formation, z, near, right[4] / root if rank == 4 else None)
+
+
+def _find_rates(formation: Formation, z: Array, step: float, heading: Array) -> Array:
+    """Sliding and joint rates a `step` from `z` along the free direction, shape (n_c + 2,)."""
+    slip = formation.evaluate_slip(z[None])[0]
+    ahead = close_contacts(formation, z + step * heading, slip=slip)
+    kinematics = formation.evaluate(ahead[None], heading[None])
+    P, inverse_mass = kinematics.P[0], 1 / formation.scene.mass_diagonal
+    lift = inverse_mass[:, None] * P.T
+    tangent = heading - lift @ np.linalg.solve(P @ lift, P @ heading)
+    return np.concatenate([kinematics.A_t[0] @ tangent, tangent[3:]])
+
+
+def _evaluate(coefficients: Array, x: float | Array) -> Array:
+    """Torques at one place of a piece, shape (2,), or at n places, shape (2, n)."""
+    powers = np.power.outer(np.asarray(x), np.arange(coefficients.shape[1]))
+    return np.asarray(coefficients @ powers.T)
+
+
+def _constant(values: Array, coefficients: Array) -> Array:
+    """Values, shape (m,), as polynomials of as many coefficients as those of a piece."""
+    return np.pad(values[:, None], ((0, 0), (0, coefficients.shape[1] - 1)))
+
+
+def _split(polynomials: Array, x: float) -> tuple[Array, Array]:
+    """Starts and middles of the parts of [x, 1] in which none of the rows changes its sign."""
+    if polynomials.shape[1] == 2:
+        level, slope = polynomials[polynomials[:, 1] != 0].T
+        roots = -level / slope
+    else:
+        roots = np.array([r for row in np.unique(polynomials, axis=0) for r in _roots(row)])
+    starts = np.array([x, *np.unique(roots[(x < roots) & (roots < 1)])])
+    return starts, (starts + np.append(starts[1:], 1.0)) / 2
+
+
+def _roots(polynomial: Array) -> list[float]:
+    """Real roots of a polynomial given by ascending coefficients."""
+    significant = np.flatnonzero(np.abs(polynomial) > 1e-14 * np.abs(polynomial).max())
+    if not len(significant) or significant[-1] == 0:
+        return []
+    roots = np.roots(polynomial[significant[-1] :: -1])
+    return [float(root.real) for root in roots if abs(root.imag) < 1e-9]
+
+
+def close_contacts(
+    formation: Formation, z: Array, within: float = np.inf, slip: Array | None = None
+) -> Array:
+    """Nearest configuration, in the metric M5, with every contact of the formation closed.
+
+    Gaps up to `within` [m] are closed; rolling contacts take coordinates `slip`, (R,) [m], if any.
+    A `SimulationError` says which contact cannot be closed.
+    """
+    inverse_mass = 1 / formation.scene.mass_diagonal
+    closed = _CLOSED * formation.scene.scales.length
+    for _ in range(8):
+        kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
+        gaps, rows = kinematics.C[0], kinematics.A[0]
+        worst = int(np.abs(gaps).argmax())
+        if np.abs(gaps[worst]) > within:
+            raise SimulationError(
+                f"{formation.names[worst]}, with a gap of {gaps[worst]:.3g} m, does not touch"
+            )
+        slid = np.zeros(0) if slip is None else formation.evaluate_slip(z[None])[0] - slip
+        if np.abs(gaps[worst]) < closed and (np.abs(slid) < closed).all():
+            break
+        rows = rows if slip is None else kinematics.P[0]
+        lift = inverse_mass[:, None] * rows.T
+        try:
+            z = z - lift @ np.linalg.solve(rows @ lift, np.concatenate([gaps, slid]))
+        except np.linalg.LinAlgError:
+            raise SimulationError(f"{' '.join(formation.names)} depend on one another") from None
+    if not np.abs(gaps[worst]) < formation.scene.touching * 1e-3:
+        raise SimulationError(
+            f"{formation.names[worst]}, with a gap of {gaps[worst]:.3g} m, cannot be closed"
+        )
+    return z
