@@ -17,15 +17,17 @@ from wholearm.engines.departure import Departure, compare
 from wholearm.engines.engine_replay import EngineReport, Level, replay_in
 from wholearm.engines.feedback import play_policy
 from wholearm.engines.mjcf import write_mjcf
-from wholearm.engines.pressing import LOOSE, EngineDrive, press_in
 from wholearm.engines.shapes import list_pairs
 from wholearm.engines.stretch import (
+    LOOSE,
+    EngineDrive,
     EngineRun,
     Setting,
     apply_friction,
     find_between,
     list_steps,
     list_stretches,
+    press_in,
 )
 from wholearm.planning.plan import solve
 from wholearm.planning.result import Plan

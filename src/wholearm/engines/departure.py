@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.arrays import Array
+from ..common.arrays import Array, find_runs
 from ..problem.definition import Phase, Problem
 from ..results.trajectory import Samples, Trajectory
 from .stretch import EngineRun, EngineStretch
@@ -110,38 +110,21 @@ def _divide(
     return parts
 
 
-def find_pairs(contact: str, corners: int) -> tuple[str, ...]:
-    """Pairs of shapes of a contact; of a vertex on a tip's arc also both edges."""
-    corner, part = contact.split("-")
-    if corner[0] == "e" or not part.startswith("tip"):
-        return (contact,)
-    index, finger = int(corner[1:]), part[3:]
-    edges = [f"e{k % corners}-tip{finger}" for k in (index - 1, index)]
-    return (f"{corner}-finger{finger}", *edges)
-
-
-def _find_columns(contact: str, part: _Part, run: EngineRun) -> list[int]:
-    pairs = find_pairs(contact, part.phase.formation.scene.polygon.n_vertices)
-    return [run.pairs.index(name) for name in pairs]
-
-
 def _average(plan: Trajectory, part: _Part, run: EngineRun) -> list[Force]:
     """Planned and found normal forces of a phase, averaged until the gained contact closes.
 
     Its gap closes at a vanishing speed: a small error of the pose closes it early.
     """
-    motion, until = plan.motions[part.phase.index], part.phase.until.contact
-    # Forces before a row are stored in the row before it.
-    ends = part.rows[part.rows > 0]
-    if until is not None:
-        gained = run.press[ends - 1][:, _find_columns(until.name, part, run)].any(axis=1)
-        ends = ends[: max(1, int(np.argmax(np.append(gained, True))))]
+    motion, scene = plan.motions[part.phase.index], part.phase.formation.scene
+    every = part.rows[part.rows > 0]
+    ends = run.cut(every, part.phase.until.contact, scene)
+    ends = ends if len(ends) else every[:1]
     time = run.t[ends[-1]] - plan.phase_starts[part.phase.index]
     middles = (np.arange(_INSTANTS) + 0.5) * min(time, motion.duration) / _INSTANTS
     planned = np.nanmean(motion.evaluate(middles).c_n, axis=0).tolist()
     share = np.diff(run.t)[ends - 1]
     press = share @ run.press[ends - 1] / share.sum()
-    found = [float(press[_find_columns(name, part, run)].sum()) for name in part.contacts]
+    found = [float(press[run.find_columns(name, scene)].sum()) for name in part.contacts]
     rows = zip(part.contacts, planned, found, strict=True)
     return [Force(part.phase.number, *row) for row in rows]
 
@@ -157,7 +140,7 @@ def _list_changes(
     meant = np.einsum("nij,nj->ni", planned.A_t, part.want.z_dot)
     pressing = run.press[rows[rows > 0] - 1].copy()
     for k, name in enumerate(formation.names):
-        pressing[:, _find_columns(name, part, run)] = 0.0
+        pressing[:, run.find_columns(name, problem.scene)] = 0.0
         yield from _find_runs(run.t[rows], actual.C[:, k] > OPEN * reach, f"{name} opens")
         moves = MOVES * scales.speed
         if k in formation.rolling_rows:
@@ -173,6 +156,5 @@ def _list_changes(
 
 def _find_runs(t: Array, happens: NDArray[np.bool_], what: str) -> Iterator[_PressChange]:
     """Intervals in which a flag is set."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], happens, [False]]).astype(int)))
-    for first, last in zip(edges[::2], edges[1::2] - 1, strict=True):
-        yield _PressChange(float(t[first]), float(t[last]), what)
+    for run in find_runs(happens):
+        yield _PressChange(float(t[run.start]), float(t[run.stop - 1]), what)

@@ -9,14 +9,22 @@ from typing import Any
 
 import numpy as np
 
+from ..common.arrays import Array
 from ..policy.playback import ClosedLoop
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from ..scene.model import Scene
-from .departure import find_pairs
-from .pressing import EngineDrive, press_in
-from .shapes import LINKS, OBJECT, PALM, Shape, find_rounding, list_pairs, list_shapes
-from .stretch import EngineRun, EngineStretch, Setting, Steps, list_steps
+from .shapes import LINKS, OBJECT, PALM, Shape, find_pairs, find_rounding, list_pairs, list_shapes
+from .stretch import (
+    EngineDrive,
+    EngineRun,
+    EngineStretch,
+    Setting,
+    Steps,
+    list_steps,
+    press_in,
+    record,
+)
 
 SINKING = 6e-3
 """penetration by the scene's force, over the scene's length and the relative step."""
@@ -49,11 +57,11 @@ def play(
     plant.SetVelocities(context, steps.v)
     simulator.Initialize()
     results = plant.get_contact_results_output_port()
-    names = tuple(pair.name for pair in list_pairs(problem.scene))
-    states, press, start, done = [(stretch.z, stretch.z_dot)], [], 0, 0
-    for end in steps.ends:
-        total = np.zeros(len(names))
-        looks = range(end, start, -_EVERY)[::-1]
+    done = 0
+
+    def advance(start: int, end: int) -> Array:
+        nonlocal done
+        total, looks = np.zeros(len(pairs)), range(end, start, -_EVERY)[::-1]
         for step in looks:
             if drive is not None:
                 z, v = plant.GetPositions(context), plant.GetVelocities(context)
@@ -68,14 +76,12 @@ def play(
                 both = info.point_pair()
                 number = pairs[frozenset((both.id_A, both.id_B))]
                 total[number] += abs(info.contact_force() @ both.nhat_BA_W)
-        press.append(total / len(looks))
-        states.append((plant.GetPositions(context), plant.GetVelocities(context)))
-        start = end
-        if drive is not None and drive.over:
-            break
-    places, speeds = (np.array(part) for part in zip(*states, strict=True))
-    t = stretch.start + steps.h * np.array([0, *steps.ends[: len(press)]])
-    return EngineRun(t, places, speeds, names, np.array(press))
+        return total / len(looks)
+
+    def read() -> tuple[Array, Array]:
+        return plant.GetPositions(context), plant.GetVelocities(context)
+
+    return record(stretch, steps, list_pairs(problem.scene), drive, advance, read)
 
 
 @contextmanager

@@ -16,7 +16,6 @@ from ..policy.playback import ROOM, ClosedLoop, Policy
 from ..problem.definition import Problem
 from ..results.adopt import Moved, adopt_motion
 from ..results.trajectory import Trajectory
-from .departure import find_pairs
 from .engine_replay import ENGINES, require_engine
 from .stretch import EngineRun, EngineStretch, Setting, find_between, list_stretches
 
@@ -150,12 +149,8 @@ def _judge(
     for index, start, stop in zip(stretch.phases, begins, [*begins[1:], np.inf], strict=True):
         phase = problem.phases[index]
         rows = np.flatnonzero((t >= start) & (t < stop))
+        rows = run.cut(rows, phase.until.contact, problem.scene)
         gaps = phase.formation.evaluate(run.z[rows], run.z_dot[rows]).C
-        if phase.until.contact is not None:
-            pairs = find_pairs(phase.until.contact.name, problem.scene.polygon.n_vertices)
-            columns = [run.pairs.index(name) for name in pairs]
-            made = (run.press[np.maximum(rows - 1, 0)][:, columns] > 0).any(axis=1)
-            gaps = gaps[: int(np.argmax(np.append(made, True)))]
         if gaps.size and gaps.max() > gap:
             gap = float(gaps.max())
             contact = phase.formation.names[int(gaps.max(axis=0).argmax())]

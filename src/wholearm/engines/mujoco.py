@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..policy.playback import ClosedLoop
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
-from .departure import find_pairs
 from .mjcf import Softness, write_mjcf
-from .pressing import EngineDrive, press_in
-from .shapes import list_pairs
-from .stretch import EngineRun, EngineStretch, Setting, list_steps
+from .shapes import find_pairs, list_pairs
+from .stretch import (
+    EngineDrive,
+    EngineRun,
+    EngineStretch,
+    Setting,
+    list_steps,
+    press_in,
+    record,
+)
 
 _LITTLE = 1e-6  # depth at which stiffnesses are read, over the scene's length
 
@@ -34,14 +40,21 @@ def play(
     text = write_mjcf(problem, step=steps.h, softness=Softness().scale(setting.softness))
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
-    names = tuple(pair.name for pair in list_pairs(problem.scene))
-    numbers = _number_pairs(model, problem)
-    data.qpos[:], data.qvel[:] = _press(problem, stretch, model, data, numbers), steps.v
-    states, press, start = [(stretch.z, stretch.z_dot)], [], 0
-    # Warnings of states that are not finite would go to stderr and to a file; the deviation shows.
-    mujoco.set_mju_user_warning(lambda _: None)
-    for end in steps.ends:
-        total = np.zeros(len(names))
+    pairs = list_pairs(problem.scene)
+    # Numbers of the pairs by the numbers of their shapes, in either order.
+    numbers = np.full((model.ngeom, model.ngeom), -1)
+    for number, pair in enumerate(pairs):
+        first, second = (model.geom(name).id for name in (pair.first, pair.second))
+        numbers[first, second] = numbers[second, first] = number
+
+    def add(total: Array, find: Callable[[Any], Array]) -> None:
+        """Add to totals of pairs what `find` has for the rows of their constraints."""
+        contact, held = data.contact, data.contact.efc_address >= 0
+        pair = numbers[contact.geom1[held], contact.geom2[held]]
+        np.add.at(total, pair, find(contact.efc_address[held]))
+
+    def advance(start: int, end: int) -> Array:
+        total = np.zeros(len(pairs))
         for step in range(start, end):
             tau = steps.tau[step]
             if drive is not None:
@@ -49,52 +62,28 @@ def play(
             data.ctrl[:] = tau
             mujoco.mj_step(model, data)
             if data.ncon:
-                contact = data.contact
-                address = contact.efc_address
-                held = address >= 0
-                pair = numbers[contact.geom1[held], contact.geom2[held]]
-                np.add.at(total, pair, data.efc_force[address[held]])
-        press.append(total / (end - start))
-        states.append((data.qpos.copy(), data.qvel.copy()))
-        start = end
-        if drive is not None and drive.over:
-            break
-    mujoco.set_mju_user_warning(None)
-    z, z_dot = (np.array(part) for part in zip(*states, strict=True))
-    t = stretch.start + steps.h * np.array([0, *steps.ends[: len(press)]])
-    return EngineRun(t, z, z_dot, names, np.array(press))
+                add(total, lambda rows: data.efc_force[rows])
+        return total / (end - start)
 
-
-def _number_pairs(model: Any, problem: Problem) -> NDArray[np.int64]:
-    """Numbers of the pairs by the numbers of their shapes, in either order."""
-    table = np.full((model.ngeom, model.ngeom), -1)
-    for number, pair in enumerate(list_pairs(problem.scene)):
-        first, second = (model.geom(name).id for name in (pair.first, pair.second))
-        table[first, second] = table[second, first] = number
-    return table
-
-
-def _press(
-    problem: Problem, stretch: EngineStretch, model: Any, data: Any, numbers: NDArray[np.int64]
-) -> Array:
-    """The planned start with penetrations that give the planned forces.
-
-    MuJoCo computes stiffnesses from time constants and inertias; they are read at a small depth.
-    """
-    import mujoco
-
+    # MuJoCo computes stiffnesses from time constants and inertias; they are read at a small depth.
     nowhere = dict.fromkeys(stretch.c_n, np.inf)
     little = _LITTLE * problem.scene.scales.length
     touching = {name: max(force, 0.0) / little for name, force in stretch.c_n.items()}
     data.qpos[:] = press_in(problem, stretch, {**nowhere, **touching})
     mujoco.mj_forward(model, data)
-    contact, found = data.contact, np.zeros(len(list_pairs(problem.scene)))
-    held = contact.efc_address >= 0
-    rows = contact.efc_address[held]
-    stiffness_row = data.efc_KBIP[rows, 0] * data.efc_KBIP[rows, 2] / data.efc_R[rows]
-    np.add.at(found, numbers[contact.geom1[held], contact.geom2[held]], stiffness_row)
-    names, corners = [pair.name for pair in list_pairs(problem.scene)], problem.scene.polygon
-    pairs = {name: find_pairs(name, corners.n_vertices) for name in stretch.c_n}
-    stiffness = {k: sum(found[names.index(p)] for p in v) for k, v in pairs.items()}
+    found = np.zeros(len(pairs))
+    add(found, lambda k: data.efc_KBIP[k, 0] * data.efc_KBIP[k, 2] / data.efc_R[k])
+    names, corners = [pair.name for pair in pairs], problem.scene.polygon.n_vertices
+    shares = {
+        name: sum(found[names.index(own)] for own in find_pairs(name, corners)) or np.inf
+        for name in stretch.c_n
+    }
     mujoco.mj_resetData(model, data)
-    return press_in(problem, stretch, {k: v if v > 0 else np.inf for k, v in stiffness.items()})
+    data.qpos[:], data.qvel[:] = press_in(problem, stretch, shares), steps.v
+    # Warnings of states that are not finite would go to stderr and to a file; the deviation shows.
+    mujoco.set_mju_user_warning(lambda _: None)
+    run = record(
+        stretch, steps, pairs, drive, advance, lambda: (data.qpos.copy(), data.qvel.copy())
+    )
+    mujoco.set_mju_user_warning(None)
+    return run

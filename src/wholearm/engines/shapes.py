@@ -99,3 +99,13 @@ def list_pairs(scene: Scene) -> list[Pair]:
     if scene.fingers_collide:
         pairs.append(Pair("finger1", "finger2", 0.0))
     return pairs
+
+
+def find_pairs(contact: str, corners: int) -> tuple[str, ...]:
+    """Pairs of shapes of a contact; of a vertex on a tip's arc also both edges."""
+    corner, part = contact.split("-")
+    if corner[0] == "e" or not part.startswith("tip"):
+        return (contact,)
+    index, finger = int(corner[1:]), part[3:]
+    edges = [f"e{k % corners}-tip{finger}" for k in (index - 1, index)]
+    return (f"{corner}-finger{finger}", *edges)

@@ -1,14 +1,18 @@
-"""Interface of physics engines: parts of a plan, settings, time steps and results."""
+"""Interface of physics engines: parts of a plan, starts, time steps, torques and results."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..common.arrays import Array, sort_unique
 from ..common.errors import WholearmError
+from ..contacts.elemental import Contact
+from ..contacts.formation import Formation, find_touching
 from ..policy.playback import ClosedLoop
 from ..problem.definition import Problem
 from ..problem.read import read_own_problem
@@ -16,6 +20,7 @@ from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
 from ..simulation.simulate import simulate
+from .shapes import Pair, find_pairs
 
 SAME = 1e-4  # difference of replay and plan that counts as none, over the scene's length and in rad
 LATE = 1e-3  # difference of phase ends, over the scene's time: rest is approached slowly
@@ -25,6 +30,11 @@ ROWS = 200  # approximate rows of a result per phase
 FEWEST = 5000  # least steps of a stretch: contacts oscillate after a jump of torques
 _LOOKS = 8  # samples of each step over which torques are averaged
 _LEAST = 1e-3  # first of these samples after the start, in steps
+CREEP = 10.0
+"""regularization speed of dry friction, over its change of speed in a step."""
+LOOSE = 3e-7  # gap of contacts without a force, over the scene's length
+_APART = 0.1
+"""Share of a contact's row that no other contact has, from which on it is another place."""
 
 
 class EngineStretch(NamedTuple):
@@ -83,6 +93,18 @@ class EngineRun(NamedTuple):
     pairs: tuple[str, ...]  # pairs of shapes, see `shapes.list_pairs`
     press: Array  # (rows, n_pairs) [N]: normal forces, averaged between rows
 
+    def find_columns(self, contact: str, scene: Scene) -> list[int]:
+        """Numbers of the pairs that are one contact."""
+        return [self.pairs.index(name) for name in find_pairs(contact, scene.polygon.n_vertices)]
+
+    def cut(self, rows: NDArray[np.int64], gained: Contact | None, scene: Scene) -> NDArray[Any]:
+        """Rows of a phase up to the first force of the contact that it gains."""
+        if gained is None:
+            return rows
+        # Forces before a row are stored in the row before it.
+        forces = self.press[np.maximum(rows - 1, 0)][:, self.find_columns(gained.name, scene)]
+        return rows[: int(np.argmax(np.append(forces.any(axis=1), True)))]
+
 
 Engine = Callable[[Problem, EngineStretch, TorqueProfile | ClosedLoop, Setting], EngineRun]
 """Replays a stretch under the torques that are applied, or by feedback until the motion is over."""
@@ -124,6 +146,33 @@ def list_steps(
     return Steps(h, v, tau, ends)
 
 
+def record(
+    stretch: EngineStretch,
+    steps: Steps,
+    pairs: Sequence[Pair],
+    drive: EngineDrive | None,
+    advance: Callable[[int, int], Array],
+    read: Callable[[], tuple[Array, Array]],
+) -> EngineRun:
+    """Run an engine to the end of its steps, or until its policy is over.
+
+    Parameters
+    ----------
+    advance  takes the steps from one number to another; returns the mean forces of the pairs [N]
+    read     z and z_dot, (5,) each
+    """
+    states, press, start = [(stretch.z, stretch.z_dot)], [], 0
+    for end in steps.ends:
+        press.append(advance(start, end))
+        states.append(read())
+        start = end
+        if drive is not None and drive.over:
+            break
+    z, z_dot = (np.array(part) for part in zip(*states, strict=True))
+    t = stretch.start + steps.h * np.array([0, *steps.ends[: len(press)]])
+    return EngineRun(t, z, z_dot, tuple(pair.name for pair in pairs), np.array(press))
+
+
 def apply_friction(scene: Scene, plan: Trajectory) -> TorqueProfile:
     """The torques of a plan less D sgn(theta') of its own joint velocities, with its steps."""
     torque, reversals = plan.torque, list[Array]()
@@ -161,3 +210,67 @@ def find_between(plan: Trajectory) -> Trajectory:
     error = np.abs(replay.at(inside).z - plan.z) / [*2 * [problem.scene.scales.length], 1, 1, 1]
     same = late < LATE * problem.scene.scales.time and error.max() < SAME
     return replay if same else plan
+
+
+def press_in(problem: Problem, stretch: EngineStretch, stiffness: Mapping[str, float]) -> Array:
+    """The planned start with penetrations of planned force over stiffness [N/m], shape (5,).
+
+    It is the nearest such configuration in the metric of the kinetic energy. Contacts without a
+    force, such as released ones, get a small gap: oscillations at the start would hit them.
+    """
+    scene, formation = problem.scene, problem.phases[stretch.phases[0]].formation
+    touching = find_touching(scene, stretch.z)
+    contacts = formation.contacts + tuple(c for c in touching if c not in formation.contacts)
+    A = Formation(scene, contacts).evaluate(stretch.z[None], stretch.z_dot[None]).A[0]
+    weight = 1 / np.sqrt(scene.mass_diagonal)
+    rows = _list_independent(A * weight, formation.n_contacts)
+    depth = np.full(len(contacts), -LOOSE * scene.scales.length)
+    for k, name in enumerate(formation.names):
+        depth[k] = stretch.c_n[name] / stiffness[name]
+    return np.asarray(stretch.z - weight * (np.linalg.pinv((A * weight)[rows]) @ depth[rows]))
+
+
+def _list_independent(rows: Array, kept: int) -> list[int]:
+    """The first `kept` rows, and those of the others that are independent of the rows before."""
+    unit, chosen = rows / np.linalg.norm(rows, axis=1)[:, None], list(range(kept))
+    for row in range(kept, len(rows)):
+        basis = unit[chosen]
+        rest = unit[row] - np.linalg.pinv(basis) @ (basis @ unit[row])
+        if np.linalg.norm(rest) > _APART:
+            chosen.append(row)
+    return chosen
+
+
+class EngineDrive:
+    """Torques of a policy in an engine, sampled, delayed, and less regularized dry friction.
+
+    Parameters
+    ----------
+    h : [s]  time between two calls
+
+    Attributes
+    ----------
+    over  whether the motion is over
+    """
+
+    def __init__(self, scene: Scene, loop: ClosedLoop, h: float) -> None:
+        self.loop, self.h = loop, h
+        self.dry = scene.dry[3:]
+        inertia = np.array([finger.inertia for finger in scene.fingers])
+        self.creep = np.maximum(CREEP * self.dry * h / inertia, np.finfo(float).tiny)
+        self.samples, self.tau = 0, np.zeros(2)
+        self.coming: deque[tuple[float, Array]] = deque()
+        self.over = False
+
+    def step(self, t: float, theta: Array, theta_dot: Array) -> Array:
+        """Applied torques at a time, shape (2,) [N m]; times increase from zero."""
+        t += 0.5 * self.h
+        if t >= self.samples * self.loop.period:
+            at = self.samples * self.loop.period
+            tau = np.array(self.loop.held(at, theta, theta_dot, {}))
+            self.coming.append((at + self.loop.delay if self.samples else 0.0, tau))
+            self.samples += 1
+            self.over = self.loop.over
+        while self.coming and t >= self.coming[0][0]:
+            self.tau = self.coming.popleft()[1]
+        return np.asarray(self.tau - self.dry * np.clip(theta_dot / self.creep, -1.0, 1.0))
