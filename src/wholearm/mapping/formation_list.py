@@ -7,7 +7,6 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
-from typing import overload
 
 import numpy as np
 
@@ -23,7 +22,7 @@ from ..problem.read import build_problem
 from ..problem.table import format_until
 from ..scene.model import TURN, Polygon, check_place
 from .borders import Window
-from .legs import describe_miss, describe_place, find_miss, tolerance, walk_leg
+from .legs import describe_miss, describe_place, tolerance, walk_leg
 
 _MOST = 50  # Corners of a polygon that a file still shows well
 _SIZE, _MASS = 0.05, 0.2  # radius [m] and mass [kg] of the reference object
@@ -53,26 +52,12 @@ class Stretch:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Route(Sequence[Stretch]):
+class Route(tuple[Stretch, ...]):
     """The stretches of a route, which are the phases of a problem file."""
 
-    stretches: tuple[Stretch, ...]
     # flush edge and x [m] of the route's ``[start]``; None: the problem's own
     start: tuple[int, float] | None = None
     notes: tuple[str, ...] = ()  # such as borders that were missed by little
-
-    def __len__(self) -> int:
-        return len(self.stretches)
-
-    @overload
-    def __getitem__(self, index: int) -> Stretch: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> tuple[Stretch, ...]: ...
-
-    def __getitem__(self, index: int | slice) -> Stretch | tuple[Stretch, ...]:
-        return self.stretches[index]
 
 
 @exclusive
@@ -107,8 +92,7 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
     here, stretches, legs = z[[0, 2]], list[Stretch](), list[int]()
     origin = here
     for leg, there in enumerate(corners):
-        miss = find_miss(problem.scene, here, there)
-        note = "" if miss is None else describe_miss(problem.scene, miss)
+        note = describe_miss(problem.scene, here, there)
         try:
             walked = walk_leg(problem, len(stretches), z, here, there)
         except InputError as error:
@@ -132,7 +116,9 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
         here = z[[0, 2]]
     # The end of a leg may be moved to a change of contacts, but not the start.
     stretches[0] = replace(stretches[0], start=origin)
-    return Route(tuple(stretches), start, tuple(notes))
+    route = Route(stretches)
+    route.start, route.notes = start, tuple(notes)
+    return route
 
 
 def _begin(

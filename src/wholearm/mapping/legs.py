@@ -327,14 +327,6 @@ class Leg:
         return np.array(self.track.pose(np.array([place]))).ravel()
 
 
-class Miss(NamedTuple):
-    """A border that a straight leg misses closely."""
-
-    track: Track
-    off: float  # larger distance of the leg's ends from the border, over `NEAR`
-    text: str
-
-
 def tolerance(scene: Scene) -> Array:
     """`NEAR` in the scene's units, shape (2,) [m, rad]."""
     return np.array([NEAR[0] * scene.scales.length, NEAR[1]])
@@ -342,23 +334,21 @@ def tolerance(scene: Scene) -> Array:
 
 def choose_leg(scene: Scene, start: Array, stop: Array) -> Leg:
     """The border that both ends are near, or a straight line."""
-    near = tolerance(scene)
-    if abs(stop[0] - start[0]) > near[0] and abs(stop[1] - start[1]) <= 2 * near[1]:
-        for track, off in _list_palm(scene, start, stop):
-            if off < 1:
-                return Leg(track, float(start[0]), float(stop[0]), near[0])
     found = []
-    for track, reach in _list_fingers(scene, start, stop):
-        (a, off_a), (b, off_b) = (_locate(track, pose, near) for pose in (start, stop))
-        if max(off_a, off_b) < 1 and abs(a - b) > near[1]:
-            ends = np.clip([min(a, b) - near[1], max(a, b) + near[1]], *reach)
-            part = replace(track, places=np.linspace(ends[0], ends[1], PLACES))
-            ranges = [piece.places[[0, -1]] + [-near[1], near[1]] for piece in cut(scene, [part])]
-            if all(any(low < place < high for low, high in ranges) for place in (a, b)):
-                found.append((max(off_a, off_b), part, a, b))
+    for leg, off in _list_near(scene, start, stop):
+        flush = leg.track.flush
+        if off < 1 and (flush is None or flush[0] is None):
+            return leg
+        if off < 1:
+            # Both ends have to be near the same piece of the curve, or near one each.
+            reach = np.array([-leg.near, leg.near])
+            ranges = [piece.places[[0, -1]] + reach for piece in cut(scene, [leg.track])]
+            ends = leg.start, leg.stop
+            if all(any(low < place < high for low, high in ranges) for place in ends):
+                found.append((off, leg))
     if found:
-        _, track, a, b = min(found, key=lambda entry: entry[0])
-        return Leg(track, a, b, near[1])
+        return min(found, key=lambda entry: entry[0])[1]
+    near = tolerance(scene)
 
     def pose(s: Array) -> tuple[Array, Array]:
         points = start + s[:, None] * (stop - start)
@@ -373,36 +363,32 @@ def choose_leg(scene: Scene, start: Array, stop: Array) -> Leg:
     return Leg(track, 0.0, 1.0, share)
 
 
-def _list_palm(scene: Scene, start: Array, stop: Array) -> Iterator[tuple[Track, float]]:
-    """Flush lines on the palm within `MISSED` of both ends, and these distances, over `NEAR`."""
+def _list_near(scene: Scene, start: Array, stop: Array) -> Iterator[tuple[Leg, float]]:
+    """Legs along borders that pass both ends within `MISSED`, on the palm first.
+
+    Each with the larger distance of the ends from the border, over `NEAR`.
+    """
     near = tolerance(scene)
-    x, phi = np.sort([start[0], stop[0]]), np.array([start[1], stop[1]])
-    places = np.linspace(x[0] - near[0], x[1] + near[0], PLACES)
-    reach = MISSED * near[1]
-    window = Window(
-        (float(x[0]), float(x[1])), (float(phi.min() - reach), float(phi.max() + reach))
-    )
-    for angle, edge in window.flush_angles(scene):
-        off = float(np.abs(phi - angle).max() / near[1])
-        yield palm_track(scene, edge, angle, places), off
-
-
-def _list_fingers(
-    scene: Scene, start: Array, stop: Array
-) -> Iterator[tuple[Track, tuple[float, float]]]:
-    """Curves of edges flush on a finger near a leg, and their ranges of phi."""
-    near = tolerance(scene)[1]
-    low, high = sorted((float(start[1]), float(stop[1])))
-    x = (float(min(start[0], stop[0])), float(max(start[0], stop[0])))
-    around = Window(x, (low - np.pi, high + np.pi))
-    for first, last, vertex in around.bands(scene):
-        if not (first - near < low and high < last + near):
+    (left, low), (right, high) = np.sort([start, stop], axis=0).tolist()
+    if right - left > near[0]:
+        reach, places = MISSED * near[1], np.linspace(left - near[0], right + near[0], PLACES)
+        around = Window((left, right), (low - reach, high + reach))
+        for angle, edge in around.flush_angles(scene):
+            off = max(abs(low - angle), abs(high - angle)) / near[1]
+            if off < MISSED:
+                track = palm_track(scene, edge, angle, places)
+                yield Leg(track, float(start[0]), float(stop[0]), near[0]), off
+    for first, last, vertex in Window((left, right), (low - np.pi, high + np.pi)).bands(scene):
+        if not (first - near[1] < low and high < last + near[1]):
             continue
-        ends = np.clip([low - near, high + near], first, last)
-        places = np.linspace(ends[0], ends[1], PLACES)
-        for finger in (0, 1):
-            for edge in range(scene.polygon.n_vertices):
-                yield flush_track(scene, finger, edge, vertex, places), (first, last)
+        ends = np.clip([low - near[1], high + near[1]], first, last)
+        for finger, edge in product((0, 1), range(scene.polygon.n_vertices)):
+            track = flush_track(scene, finger, edge, vertex, ends)
+            (a, off_a), (b, off_b) = (_locate(track, pose, near) for pose in (start, stop))
+            if max(off_a, off_b) < MISSED and abs(a - b) > near[1]:
+                ends_on = np.clip([min(a, b) - near[1], max(a, b) + near[1]], first, last)
+                track = replace(track, places=np.linspace(ends_on[0], ends_on[1], PLACES))
+                yield Leg(track, a, b, near[1]), max(off_a, off_b)
 
 
 def _locate(track: Track, pose: Array, near: Array) -> tuple[float, float]:
@@ -427,39 +413,21 @@ def _locate(track: Track, pose: Array, near: Array) -> tuple[float, float]:
     return float(places[k]), float(away[k])
 
 
-def find_miss(scene: Scene, start: Array, stop: Array) -> Miss | None:
-    """The nearest border beside both ends of a straight leg, if there is one."""
-    near = tolerance(scene)
-    misses = []
-    if abs(stop[0] - start[0]) > near[0]:
-        for track, off in _list_palm(scene, start, stop):
-            if off < MISSED and cut(scene, [track]):
-                angle = float(track.pose(np.zeros(1))[1][0])
-                turn = max((angle - pose[1] for pose in (start, stop)), key=abs)
-                text = f"{np.degrees(turn):+.3g} deg in phi"
-                misses.append(Miss(track, off, text))
-    for track, _ in _list_fingers(scene, start, stop):
-        located = [_locate(track, pose, near) for pose in (start, stop)]
-        off = max(distance for _, distance in located)
-        if off < MISSED and abs(located[0][0] - located[1][0]) > near[1] and cut(scene, [track]):
-            gaps = [
-                np.array(track.pose(np.array([place]))).ravel() - pose
-                for (place, _), pose in zip(located, (start, stop), strict=True)
-            ]
-            dx, dphi = (max(pair, key=abs) for pair in np.transpose(gaps).tolist())
-            text = f"{1e3 * dx:+.3g} mm in x and {np.degrees(dphi):+.3g} deg in phi"
-            misses.append(Miss(track, off, text))
-    nearest = min(misses, key=lambda miss: miss.off, default=None)
-    return nearest if nearest is not None and nearest.off >= 1 else None
-
-
-def describe_miss(scene: Scene, miss: Miss) -> str:
-    """A near miss in words: which border, how far it is, and what would be near enough."""
-    assert miss.track.flush is not None
-    finger, edge = miss.track.flush
-    part = "the palm" if finger is None else f"finger {finger + 1}"
+def describe_miss(scene: Scene, start: Array, stop: Array) -> str:
+    """The nearest border beside both ends of a straight leg, how far it is, and what is near."""
+    legs = [pair for pair in _list_near(scene, start, stop) if cut(scene, [pair[0].track])]
+    leg, off = min(legs, key=lambda pair: pair[1], default=(None, 0.0))
+    if leg is None or off < 1:
+        return ""
+    assert leg.track.flush is not None
+    finger, edge = leg.track.flush
+    gaps = leg.at(leg.start) - start, leg.at(leg.stop) - stop
+    dx, dphi = (max(pair, key=abs) for pair in np.transpose(gaps).tolist())
+    part, away = "the palm", f"{np.degrees(dphi):+.3g} deg in phi"
+    if finger is not None:
+        part, away = f"finger {finger + 1}", f"{1e3 * dx:+.3g} mm in x and {away}"
     x, phi = tolerance(scene)
     return (
-        f"the nearest border, e{edge} flush on {part}, is up to {miss.text} away; "
+        f"the nearest border, e{edge} flush on {part}, is up to {away} away; "
         f"a leg follows it with both ends within {1e3 * x:.3g} mm and {np.degrees(phi):.3g} deg"
     )
