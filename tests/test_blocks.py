@@ -12,7 +12,7 @@ import pytest
 
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError, SolverError
-from wholearm.planning.block_plan import Planning
+from wholearm.planning.blocks import Planning
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.rate_limits import explain_motors

@@ -11,7 +11,7 @@ import pytest
 
 from shipped import HEPTAGON, problem_of
 from wholearm.common.arrays import Array
-from wholearm.planning.block_plan import BlockPlan
+from wholearm.planning.blocks import BlockPlan
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.result import Plan
 from wholearm.problem.definition import Until

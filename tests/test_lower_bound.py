@@ -24,9 +24,8 @@ from wholearm.planning.lower_bound.lower_bound import (
 )
 from wholearm.planning.lower_bound.path_terms import find_limits
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.path_domain.impact_sequence import make_sequence
+from wholearm.planning.path_domain.impact_sequence import make_sequence, plan_sequence
 from wholearm.planning.path_domain.path_plan import plan_path
-from wholearm.planning.path_domain.sequence_plan import plan_sequence
 from wholearm.problem.read import build_problem
 
 EPSILON = 0.05

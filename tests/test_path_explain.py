@@ -15,11 +15,10 @@ from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import LAMBDA, ONE, A, B, V
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.path_domain.impact_sequence import make_sequence
+from wholearm.planning.path_domain.impact_sequence import make_sequence, plan_sequence
 from wholearm.planning.path_domain.path_data import prepare
 from wholearm.planning.path_domain.path_mesh import Mesh
 from wholearm.planning.path_domain.path_plan import plan_path
-from wholearm.planning.path_domain.sequence_plan import plan_sequence
 
 LIMITS = ("torque limit of finger 1", "torque limit of finger 2", "epsilon")
 

@@ -10,8 +10,7 @@ from planned import brake_less, change, plan, plan_landing
 from wholearm.common.errors import JammingError, ReplayError
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning import replay_check as self_check
-from wholearm.planning.block_plan import Planning
-from wholearm.planning.blocks import plan_blocks
+from wholearm.planning.blocks import Planning, plan_blocks
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.replay_check import (
     RESIDUAL,

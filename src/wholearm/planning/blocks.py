@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import zip_longest
 from typing import Any
 
@@ -32,16 +33,18 @@ from ..problem.definition import Phase, Problem
 from ..results.trajectory import Motion
 from ..scene.model import Scene
 from ..solvers.ipopt import charge
-from .block_plan import BEGUN, FINEST, PLAIN, BlockPlan, Planning
 from .lower_bound.lower_bound import look_along
 from .lower_bound.speed_sweep import NoMotionError
 from .options import Objective, PlanOptions
-from .path_domain.impact_sequence import ImpactSequence, make_sequence
-from .path_domain.sequence_plan import plan_sequence, plan_slowly
-from .phase_plan import PhasePlan, add_up
+from .path_domain.impact_sequence import ImpactSequence, make_sequence, plan_sequence, plan_slowly
+from .path_domain.junction import find_beside, plan_with_pauses
+from .phase_plan import PhasePlan, Settled, add_up
 from .rate_limits import explain_motors, free_torques, require_steps
-from .stops import Plans, leads_on, runs_along_curves, split_blocks
+from .stops import Plans, end_of, leads_on, runs_along_curves, split_blocks
 
+PLAIN = -1  # refinement level: first number of intervals, no search for modes
+BEGUN = -2  # refinement level: coarse plans, which may miss limits between points
+FINEST = 64  # most intervals of a phase in the time domain after refinement
 SKETCH = 24  # intervals of the speed sweep for a least time-to-go
 CLEAR = 0.05  # relative violation above which no better plan of earlier phases helps
 COARSE = 80  # intervals along a curve that are doubled where none are given
@@ -49,6 +52,86 @@ AMPLE = 1.1  # saturation of the margin, over the least normal force of other ph
 MOVED = 1e-9  # distance of two starts, in radii of gyration or radians
 APART = 1e-6  # the same, above which time-optimal plans are others
 SHORT = 5e-7  # largest shortfall of a margin below epsilon by rounding, over the scene's force
+
+
+@dataclass(frozen=True, eq=False)
+class BlockPlan:
+    """A planned block."""
+
+    phases: tuple[Phase, ...]
+    start: Array  # (5,)
+    finer: int  # refinement level: doublings of its intervals, or `PLAIN` or `BEGUN`
+    duration: float | None  # [s]: longest, for the objective `margin`
+    fastest: Plans  # time-optimal plans from this start, if they were made for it
+    plans: Plans  # one for each of its phases
+    chain: ImpactSequence | None  # its curves; None in the time domain
+
+    @property
+    def end(self) -> Array:
+        """Where the block ends, shape (5,)."""
+        if self.chain is not None:
+            return self.chain.curves[-1].end
+        return end_of(self.plans[-1])[0]
+
+    @property
+    def intervals(self) -> int:
+        """Most intervals of a phase in the time domain."""
+        return max(len(plan.torque.coefficients) for plan in self.plans)
+
+    @property
+    def has_searched(self) -> bool:
+        """Whether more than one sequence of contact modes was tried."""
+        return any(plan.sequences > 1 for plan in self.plans)
+
+    @property
+    def is_finest(self) -> bool:
+        """Whether it is planned in the time domain on the finest intervals."""
+        return self.chain is None and self.intervals >= FINEST
+
+
+@dataclass(frozen=True, eq=False)
+class Planning:
+    """The plans of all phases of a problem."""
+
+    problem: Problem
+    curves: tuple[Curve, ...]  # of the first phases, as far as ends follow from geometry alone
+    options: PlanOptions
+    blocks: tuple[BlockPlan, ...]
+    # shares, allowed [s]: longest duration of each phase, for the objective `margin`: in proportion
+    # to time-optimal plans, and as used after blocks turned out to start elsewhere
+    shares: list[float | None]
+    allowed: list[float | None]
+    least: Plans = field(default_factory=list)  # these time-optimal plans
+    pinned: bool = False  # whether blocks end where those plans do
+    ahead: bool = True  # whether blocks end by the cost-to-go, which `margin` and `least` do not
+    sketches: bool = False  # whether least times-to-go are those of a speed sweep
+    # [N]: by how much c_n of blocks, by their indices, have to exceed epsilon, if at all
+    more: dict[int, float] = field(default_factory=dict)
+
+    @property
+    def plans(self) -> Plans:
+        """One for each phase."""
+        return [plan for block in self.blocks for plan in block.plans]
+
+    @cached_property
+    def settled(self) -> Settled:
+        """The plans with dwells at their ends, where the problem asks for these."""
+        plans, phases = self.plans, self.problem.phases
+        if not self.problem.is_settled:
+            return Settled(plans, (None,) * len(phases))
+        from .dwell import settle_plans
+
+        return settle_plans(self.problem, plans)
+
+    def find_block(self, number: int) -> int:
+        """Index of the block with the phase of a number, counted from 1."""
+        ends = [block.phases[-1].number for block in self.blocks]
+        return next(k for k, end in enumerate(ends) if number <= end)
+
+    def find_before(self, phases: Sequence[Phase]) -> BlockPlan | None:
+        """The planned block that ends where some phases begin."""
+        index = phases[0].index
+        return next((own for own in self.blocks if own.phases[-1].index + 1 == index), None)
 
 
 def plan_blocks(
@@ -79,9 +162,7 @@ def plan_alone(planning: Planning, report: Callable[[str], None]) -> Planning | 
     """Plan without cost-to-go; None if there was none."""
     problem, options = planning.problem, planning.options
     blocks = split_blocks(problem)
-    if not planning.ahead or all(
-        look_ahead(planning, own, options, plan_block) is None for own in blocks
-    ):
+    if not planning.ahead or all(look_ahead(planning, own, options) is None for own in blocks):
         return None
     alone = replace(planning, blocks=(), ahead=False)
     return _require_margin(plan_each(alone, [0] * len(blocks), report))
@@ -175,7 +256,7 @@ def plan_next(
                 z,
                 own,
                 allowed,
-                to_go=look_ahead(planning, phases, own, plan_block) if planning.ahead else None,
+                to_go=look_ahead(planning, phases, own) if planning.ahead else None,
                 ample=find_ample(planning.blocks),
                 fastest=fastest or [least[phase.index] for phase in phases if least],
                 begun=known.plans if known and known.finer == BEGUN else (),
@@ -234,8 +315,6 @@ def plan_block(
         with charge(block[0].number):
             try:
                 if problem.scene.has_slow_motors:
-                    from .pause_junctions import plan_with_pauses
-
                     return plan_with_pauses(planning, block, plan, add_up(block, allowed)), None
                 return plan(add_up(block, allowed)), None
             except (InfeasibleError, SolverError) as error:
@@ -248,8 +327,6 @@ def plan_block(
     chain = make_sequence(block, curves)
     parts = chain.split()
     if problem.scene.has_slow_motors:
-        from .pause_junctions import find_beside
-
         beside = find_beside(planning, block, chain.curves[-1].end, options)
         longest = [add_up(part.phases, allowed) for part in parts]
         return plan_slowly(parts, beside, problem.epsilon, options, longest), chain
@@ -292,7 +369,6 @@ def look_ahead(
     planning: Planning,
     block: Sequence[Phase],
     options: PlanOptions,
-    plan_block: Callable[..., tuple[Plans, ImpactSequence | None]],
 ) -> CostToGo | None:
     """Cost-to-go of a block in the time domain with a free end on a curve.
 

@@ -29,12 +29,11 @@ from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..solvers.ipopt import Ledger, open_ledger
 from ..verification.force_uniqueness import find_uniqueness_margin, find_wedged
-from .block_plan import BlockPlan, Planning
-from .blocks import plan_blocks
+from .blocks import BlockPlan, Planning, plan_blocks
 from .impacts import assess_impacts
 from .lower_bound.lower_bound import bound_least_time
 from .options import PlanOptions
-from .path_domain import sequence_plan
+from .path_domain import impact_sequence
 from .phase_plan import combine
 from .result import Plan, PlannedPhase, Status, Timings, write_meta
 
@@ -248,8 +247,8 @@ def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transitio
             impacts = list_impacts(block.phases, block.plans)
             plan_part = plan_parts_of(planning.problem, block.phases)
         else:
-            impacts = sequence_plan.list_impacts(block.chain, block.plans)
-            plan_part = sequence_plan.plan_parts_of(block.chain, planning.problem.epsilon)
+            impacts = impact_sequence.list_impacts(block.chain, block.plans)
+            plan_part = impact_sequence.plan_parts_of(block.chain, planning.problem.epsilon)
         found += assess_impacts(
             block.phases,
             impacts,

@@ -11,8 +11,7 @@ from ..mechanics.dynamics import measure_speed
 from ..mechanics.statics import SURE
 from ..problem.uncertainty import PARAMETERS
 from ..results.plan_record import RangeFigures
-from .block_plan import Planning
-from .blocks import plan_blocks
+from .blocks import Planning, plan_blocks
 from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence
 from .path_domain.path_motion import PathMotion

@@ -5,14 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from ..common.errors import InfeasibleError, InputError, SolverError, WholearmError
 from ..problem.definition import Phase, Problem
 from ..scene.model import Scene
 from .advice import name_phases
-from .block_plan import Planning
 from .options import PlanOptions
 from .stops import Plans, runs_along_curves, split_blocks
+
+if TYPE_CHECKING:
+    from .blocks import Planning
 
 FREE = {"torque_rate_limit": None, "actuator_lag": None, "control_period": None}  # free torques
 _ROUGH = 1e-2  # least accuracy where only the existence of a plan matters

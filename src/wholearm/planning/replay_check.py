@@ -21,8 +21,7 @@ from ..scene.model import Scales
 from ..verification.newton_euler import balance
 from ..verification.verdict import Allowance, find_least_force, measure_departure
 from ..verification.verify import judge, observe
-from .block_plan import PLAIN, BlockPlan, Planning
-from .blocks import plan_alone, press_more, refine_block
+from .blocks import PLAIN, BlockPlan, Planning, plan_alone, press_more, refine_block
 
 REFINEMENTS = 3  # most doublings of the intervals of a block
 ROUGH = 2  # the same in the time domain, before the mode search is left out: some modes never hold

@@ -24,8 +24,7 @@ from ..geometry.curve import Curve
 from ..geometry.path_guess import count_freedoms
 from ..geometry.tracing import trace_phase
 from ..planning.advice import unadvised
-from ..planning.block_plan import BEGUN, BlockPlan, Planning
-from ..planning.blocks import plan_next
+from ..planning.blocks import BEGUN, BlockPlan, Planning, plan_next
 from ..planning.options import PlanOptions
 from ..planning.plan import assemble_plan, finish_plan, solve_with
 from ..planning.replay_check import Checked

@@ -4,13 +4,15 @@ A motion starts and ends with torques at the limit of static equilibrium: withou
 the friction of its directions. There the internal force is free, so these torques are a line for
 each of the two phases. The pair that is the nearest in time is taken, and torques change linearly
 between them while everything rests. The former also have to hold the object in the next formation;
-then so do all in between, as balanced forces within their cones are a convex set.
+then so do all in between, as balanced forces within their cones are a convex set. A plan in the
+time domain begins and ends with the torques of its motion; a pause changes the torques before it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -18,17 +20,23 @@ from ...common.arrays import Array
 from ...common.errors import InfeasibleError
 from ...contacts.formation import Formation
 from ...geometry.curve import Curve
+from ...geometry.tracing import trace_phase
 from ...mechanics.dynamics import LAMBDA, ONE
 from ...mechanics.statics import find_static_torques
+from ...problem.definition import Phase
 from ...results.dwell_record import TorqueChange, change_torques, find_change_times
 from ...results.plan_record import ModeSpan
 from ...results.torque import TorqueProfile
 from ...results.trajectory import Motion, Samples
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
+from ..stops import Plans, runs_along_curves, split_blocks
 from .first_guess import find_internal_force_range
 from .path_data import PhaseData, prepare
 from .path_mesh import Mesh
+
+if TYPE_CHECKING:
+    from ..blocks import Planning
 
 _PLACES = 129  # internal forces tried on each side of a junction
 _WIDEST = 40.0  # largest range of them, over the scene's force
@@ -231,3 +239,69 @@ def find_static_forces(formation: Formation, z: Array, tau: Array) -> Array:
     if answer.status:
         return np.full((2, n_c), np.nan)
     return np.asarray(scene.scales.force * answer.x[: 2 * n_c].reshape(2, n_c))
+
+
+def find_beside(
+    planning: Planning, block: Sequence[Phase], end: Array, options: PlanOptions
+) -> tuple[Curve | Array | None, Curve | Formation | None]:
+    """Neighbours of a block along curves that ends at `end`, for `plan_slowly`."""
+    index, later = block[-1].index + 1, planning.problem.phases[block[-1].index + 1 :]
+    before: Curve | Array | None = _find_torque_before(planning, block)
+    own = planning.find_before(block)
+    if own is not None and own.chain is not None:
+        before = own.chain.curves[-1]
+    if not later:
+        return before, None
+    following = next(own for own in split_blocks(planning.problem) if own[0] is later[0])
+    if not runs_along_curves(following, options):
+        return before, later[0].formation
+    known = planning.curves[index] if index < len(planning.curves) else None
+    return before, known or trace_phase(later[0], end, later[1:])
+
+
+def plan_with_pauses(
+    planning: Planning,
+    block: Sequence[Phase],
+    plan: Callable[[float | None], Plans],
+    duration: float | None,
+) -> Plans:
+    """Plans of a block in the time domain by `plan` for a longest duration [s], with pauses."""
+    plans = plan(duration)
+    junctions = _list_junctions(planning, block, plans)
+    pause = sum(junction.pause for junction in junctions if junction)
+    if duration is not None and pause:
+        plans = plan(duration - pause)
+        junctions = _list_junctions(planning, block, plans)
+    paused: Plans = []
+    for own, junction, phase in zip(plans, junctions, block, strict=True):
+        if junction is not None:
+            z = own.motion.evaluate(np.zeros(1)).z[0]
+            own = add_pause(own, junction, phase.formation, z, planning.options)
+        paused.append(own)
+    return paused
+
+
+def _list_junctions(planning: Planning, block: Sequence[Phase], plans: Plans) -> list[Joint | None]:
+    """Starts of the phases at which torques change."""
+    ends = [_find_torque_before(planning, block), *map(_find_last, plans[:-1])]
+    junctions = list[Joint | None]()
+    for end, own, phase in zip(ends, plans, block, strict=True):
+        first, scene = own.torque.at(np.zeros(1))[0], planning.problem.scene
+        pause = 0.0 if end is None else float(find_change_times(scene, end, first))
+        if end is None or not pause:
+            junctions.append(None)
+            continue
+        z = own.motion.evaluate(np.zeros(1)).z[0]
+        junction = choose_joint(end, phase.formation, z, planning.problem.epsilon, phase.number)
+        junctions.append(junction._replace(after=first, pause=pause))
+    return junctions
+
+
+def _find_torque_before(planning: Planning, block: Sequence[Phase]) -> Array | None:
+    """The last torques of the block before, shape (2,) [N m], if that is planned."""
+    before = planning.find_before(block)
+    return None if before is None else _find_last(before.plans[-1])
+
+
+def _find_last(plan: PhasePlan[Motion]) -> Array:
+    return np.asarray(plan.torque.at(plan.torque.breaks[-1:])[0])
