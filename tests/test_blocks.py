@@ -12,10 +12,9 @@ import pytest
 
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError, SolverError
-from wholearm.planning.blocks import Planning
+from wholearm.planning.blocks import Planning, explain_motors
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.phase_plan import PhasePlan
-from wholearm.planning.rate_limits import explain_motors
 from wholearm.planning.stops import Plans, plan_stops
 from wholearm.problem.definition import Phase, Problem
 from wholearm.results.torque import TorqueProfile

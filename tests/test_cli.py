@@ -20,7 +20,7 @@ import wholearm
 from shipped import HEPTAGON, IMPACTS, solved
 from wholearm.cli.command import build_parser, main
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.plan_report import describe_plan
+from wholearm.planning.result import describe_plan
 from wholearm.results.trajectory import Trajectory, load_trajectory
 
 TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))

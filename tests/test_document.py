@@ -20,8 +20,7 @@ from wholearm.common.document import Document, Result, Table, fixed, plain, rest
 from wholearm.common.errors import InputError
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
-from wholearm.planning.plan_report import describe_plan
-from wholearm.planning.result import Plan, Status, load_plan, write_meta
+from wholearm.planning.result import Plan, Status, describe_plan, load_plan, write_meta
 from wholearm.problem.definition import Problem
 from wholearm.solvers.ipopt import Solver, SolverStatistics, book, charge, open_ledger
 from wholearm.verification.verify import verify

@@ -19,8 +19,7 @@ from wholearm.contacts.formation import Formation
 from wholearm.planning import dwell as shares
 from wholearm.planning.dwell import DwellEnd, list_touching, settle_plans
 from wholearm.planning.phase_plan import PhasePlan
-from wholearm.planning.plan_report import describe_plan
-from wholearm.planning.result import Plan, load_plan, write_meta
+from wholearm.planning.result import Plan, describe_plan, load_plan, write_meta
 from wholearm.planning.stops import Plans
 from wholearm.problem.definition import Problem
 from wholearm.results.dwell_record import assemble

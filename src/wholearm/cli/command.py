@@ -117,7 +117,7 @@ def solve(options: argparse.Namespace) -> int:
     from ..geometry.path_guess import load
     from ..planning.options import PlanOptions
     from ..planning.plan import solve_with
-    from ..planning.plan_report import describe_plan
+    from ..planning.result import describe_plan
     from ..scene.model import find_unit_hint
 
     output = options.output or f"{os.path.splitext(os.path.basename(options.problem))[0]}.npz"

@@ -33,13 +33,13 @@ from ..problem.definition import Phase, Problem
 from ..results.trajectory import Motion
 from ..scene.model import Scene
 from ..solvers.ipopt import charge
+from .advice import describe_changes, name_phases, round_outwards
 from .lower_bound.lower_bound import look_along
 from .lower_bound.speed_sweep import NoMotionError
 from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence, make_sequence, plan_sequence, plan_slowly
 from .path_domain.junction import find_beside, plan_with_pauses
 from .phase_plan import PhasePlan, Settled, add_up
-from .rate_limits import explain_motors, free_torques, require_steps
 from .stops import Plans, end_of, leads_on, runs_along_curves, split_blocks
 
 PLAIN = -1  # refinement level: first number of intervals, no search for modes
@@ -51,6 +51,8 @@ COARSE = 80  # intervals along a curve that are doubled where none are given
 AMPLE = 1.1  # saturation of the margin, over the least normal force of other phases
 MOVED = 1e-9  # distance of two starts, in radii of gyration or radians
 APART = 1e-6  # the same, above which time-optimal plans are others
+FREE = {"torque_rate_limit": None, "actuator_lag": None, "control_period": None}  # free torques
+ROUGH = 1e-2  # least accuracy where only the existence of a plan matters
 SHORT = 5e-7  # largest shortfall of a margin below epsilon by rounding, over the scene's force
 
 
@@ -433,8 +435,6 @@ def share_duration(
     times = [plan.motion.duration for plan in least]
     total = 2 * sum(times) if duration is None else duration
     if total <= sum(times):
-        from .advice import describe_changes, round_outwards
-
         # The least-time plan shows it; a little more leaves something to choose.
         own = Parameter("duration", total, "s", 1, "duration")
         enough = Change(own, round_outwards(1.005 * sum(times), 1))
@@ -444,3 +444,80 @@ def share_duration(
             changes=[enough],
         )
     return [total / sum(times) * own for own in times]
+
+
+def require_steps(problem: Problem, options: PlanOptions) -> None:
+    """Raise an InputError for combinations with rate-limited or held torques without a planner."""
+    given = [
+        (f"{finger.name}.{key}", getattr(finger, key))
+        for finger in problem.scene.fingers
+        for key, free in (("torque_rate_limit", math.inf), ("actuator_lag", 0.0))
+        if getattr(finger, key) != free
+    ]
+    scene, why = problem.scene, ""
+    if scene.control_period:
+        if options.ranges:
+            why = "ranges (--robust) are not kept with it yet"
+        elif given and scene.control_hold == "constant":
+            why = f"torques held constant step, and {given[0][0]} is given; hold them linear"
+        if why:
+            raise InputError("", "control_period", f"{scene.control_period:g} given; {why}")
+    along = all(runs_along_curves(block, options) for block in split_blocks(problem))
+    if given and options.ranges and not along:
+        why = "ranges (--robust) are not kept with it in phases over time yet"
+        raise InputError("", given[0][0], f"{given[0][1]:g} given; {why}")
+
+
+def free_torques(problem: Problem, options: PlanOptions) -> tuple[Problem, PlanOptions]:
+    """The same with free torques."""
+    scene = problem.scene
+    if scene.control_period:
+        options = replace(options, transcription="auto")
+    if scene.has_slow_motors or scene.control_period:
+        problem = problem.with_(FREE)
+    return problem, options
+
+
+def name_motors(scene: Scene) -> str:
+    """The keys that limit rates or hold torques, with their values."""
+    given = list[str]()
+    if scene.control_period:
+        given.append(f"control_period = {scene.control_period:g} s ({scene.control_hold})")
+    kinds = (("torque_rate_limit", "N m/s", math.inf), ("actuator_lag", "s", 0.0))
+    for key, unit, free in kinds:
+        values = list(dict.fromkeys(getattr(finger, key) for finger in scene.fingers))
+        if values != [free]:
+            texts = dict.fromkeys(f"{value:g}" for value in values)
+            given.append(f"{key} = {' and '.join(texts)} {unit}")
+    return " and ".join(given)
+
+
+def explain_motors(
+    planning: Planning,
+    block: Sequence[Phase],
+    options: PlanOptions,
+    error: InfeasibleError | SolverError,
+    plan_block: Callable[[Planning, Sequence[Phase], PlanOptions], Plans],
+) -> InfeasibleError | SolverError:
+    """The error with whether the phases have a plan with free torques, found by `plan_block`."""
+    keys = name_motors(planning.problem.scene)
+    if not keys:
+        return error
+    where = name_phases([phase.number for phase in block])
+    if isinstance(error, InfeasibleError):
+        where += f" ({'; '.join(' '.join(phase.formation.names) for phase in block)})"
+    free, own = free_torques(planning.problem, options)
+    own = replace(own, accuracy=max(own.accuracy, ROUGH))
+    try:
+        phases = [free.phases[phase.index] for phase in block]
+        found = plan_block(replace(planning, problem=free, curves=()), phases, own)
+    except WholearmError as other:
+        text = f"{error}; without {keys} none was found either: {other}"
+    else:
+        lasts = sum(plan.motion.duration for plan in found)
+        text = f"without {keys} there is a plan of {lasts:.4g} s for {where}; with that, {error}"
+    if not isinstance(error, InfeasibleError):
+        return SolverError(text)
+    extended = InfeasibleError(text, error.shortfalls, error.changes)
+    extended.motion = error.motion
+    return extended

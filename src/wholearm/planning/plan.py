@@ -21,21 +21,22 @@ from ..geometry.curve import describe_pose
 from ..geometry.tracing import trace_phases
 from ..mechanics.uniqueness import describe_uniqueness
 from ..problem.check import require_phases
-from ..problem.definition import Problem
+from ..problem.definition import Phase, Problem
 from ..results.dwell_record import assemble
 from ..results.plan_record import Certificate, TimeBound, Transition
 from ..results.report import UniquenessMargin
 from ..results.torque import TorqueProfile
-from ..results.trajectory import Trajectory
-from ..solvers.ipopt import Ledger, open_ledger
+from ..results.trajectory import Motion, Trajectory
+from ..solvers.ipopt import Ledger, charge, open_ledger
 from ..verification.force_uniqueness import find_uniqueness_margin, find_wedged
 from .blocks import BlockPlan, Planning, plan_blocks
-from .impacts import assess_impacts
 from .lower_bound.lower_bound import bound_least_time
-from .options import PlanOptions
+from .options import Objective, PlanOptions
 from .path_domain import impact_sequence
-from .phase_plan import combine
+from .path_domain.impact_sequence import BlockImpact
+from .phase_plan import PhasePlan, add_up, combine
 from .result import Plan, PlannedPhase, Status, Timings, write_meta
+from .stops import PlanPart, plan_stops
 
 if TYPE_CHECKING:
     from .replay_check import Checked
@@ -259,6 +260,54 @@ def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transitio
             report,
         )
     return found
+
+
+def assess_impacts(
+    block: Sequence[Phase],
+    impacts: Sequence[BlockImpact],
+    plans: Sequence[PhasePlan[Motion]],
+    plan_part: PlanPart,
+    options: PlanOptions,
+    allowed: Sequence[float | None],
+    report: Callable[[str], None],
+) -> list[Transition]:
+    """Transitions of all impacts of a block, with what each saves over a planned stop.
+
+    `allowed` are the longest durations of the problem's phases [s], for the objective `margin`.
+    """
+    stops = [0, *(impact.before + 1 for impact in impacts if not impact.passed), len(block)]
+    transitions = []
+    for own in impacts:
+        phase, at, saves = block[own.before], own.before + 1, math.nan
+        if own.passed:
+            report(f"phase {phase.number}: what its impact saves")
+            start, stop = max(k for k in stops if k < at), min(k for k in stops if k > at)
+            duration = add_up(block[start:stop], allowed)
+            with charge(phase.number):
+                saves = _find_saving(plans, (start, at, stop), plan_part, options, duration)
+        contact, impulse = own.impact.least
+        what = phase.number, str(phase.until), own.passed, own.reason, own.ratio
+        transitions.append(Transition(*what, impulse, contact, own.speed, saves))
+    return transitions
+
+
+def _find_saving(
+    plans: Sequence[PhasePlan[Motion]],
+    bounds: tuple[int, int, int],
+    plan_part: PlanPart,
+    options: PlanOptions,
+    duration: float | None,
+) -> float:
+    """Cost of a stop at the middle one of `bounds` in phases in motion; NaN without a plan."""
+    moving = plans[bounds[0] : bounds[-1]]
+    z = moving[0].motion.evaluate(np.zeros(1)).z[0]
+    try:
+        stopped = plan_stops(plan_part, bounds, z, options, duration)
+    except (InfeasibleError, SolverError):
+        return math.nan
+    values = [combine(options.goal, [plan.value for plan in own]) for own in (stopped, moving)]
+    gain = values[0] - values[1]
+    return -gain if options.goal is Objective.MARGIN else gain
 
 
 Uniqueness = tuple[UniquenessMargin | None, float | None]

@@ -6,6 +6,7 @@ The residual of the equations of motion is independent of the planner (`verifica
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -131,9 +132,7 @@ def replay_plan(
             known = planning, trajectory, accepted
         number = found.culprit
         assert number is not None
-        better = _improve(planning, number, accepted.failure is not None, report)
-        if better is None and accepted.failure is not None:
-            better = _press_more(planning, number, accepted, report)
+        better = _improve(planning, number, accepted, report)
         if better is None and known is not None:
             planning, trajectory, check = known
             break
@@ -145,42 +144,49 @@ def replay_plan(
 
 
 def _improve(
-    planning: Planning, number: int, fails: bool, report: Callable[[str], None]
-) -> Planning | None:
-    """Another plan of the block with phase `number`, if any; `fails` by the usual tolerances."""
-    alone = plan_alone(planning, report) if fails else None
-    if alone is not None:
-        # Short phases after a landing magnify its residual speed.
-        return alone
-    index = planning.find_block(number)
-    block, refined = planning.blocks[index], None
-    most = (REFINEMENTS if block.chain else ROUGH) if fails else 1
-    if PLAIN != block.finer < most and not block.is_finest:
-        refined = _refine(planning, index, report)
-    if refined is None and fails and block.has_searched and block.finer != PLAIN:
-        refined = _refine(planning, index, report, plain=True)
-    return refined
-
-
-def _press_more(
     planning: Planning, number: int, check: ReplayCheck, report: Callable[[str], None]
 ) -> Planning | None:
-    """A plan of the block with phase `number` with more c_n, by the shortfall in its replay.
+    """The first other plan of the block with phase `number` that there is, None without one.
 
-    At a reversal a replay may stick for an instant, with another force.
+    A plan that holds by the tolerances of `verify` is only refined, once. For one that fails:
+    without cost-to-go, as short phases after a landing magnify its residual speed; on finer
+    intervals; without mode search; with a larger epsilon, as at a reversal a replay may stick for
+    an instant, with another force.
     """
-    index, problem = planning.find_block(number), planning.problem
-    if not isinstance(check.report, Report) or index in planning.more:
-        return None
-    block, force = planning.blocks[index], problem.scene.scales.force
-    phases = [p for p in check.report.phases if problem.phases[p.number - 1] in block.phases]
-    short = -min((c.margin for phase in phases for c in phase.contacts), default=0.0)
-    if not 0.0 < short < DIP * force:
-        return None
-    try:
-        return press_more(planning, index, SPARE * short, report)
-    except (InfeasibleError, SolverError):
-        return None
+    index, fails = planning.find_block(number), check.failure is not None
+    block, others = planning.blocks[index], list[Callable[[], Planning | None]]()
+    if fails:
+        others.append(partial(plan_alone, planning, report))
+    most = (REFINEMENTS if block.chain else ROUGH) if fails else 1
+    if PLAIN != block.finer < most and not block.is_finest:
+        others.append(partial(refine_block, planning, index, report))
+    if fails and block.has_searched and block.finer != PLAIN:
+        others.append(partial(refine_block, planning, index, report, True))
+    short = _find_dip(planning, block, check) if index not in planning.more else 0.0
+    if fails and short:
+        others.append(partial(press_more, planning, index, SPARE * short, report))
+    for plan in others:
+        try:
+            better = plan()
+        except (InfeasibleError, SolverError):
+            continue
+        if better is not None:
+            return better
+    return None
+
+
+def _find_dip(planning: Planning, block: BlockPlan, check: ReplayCheck) -> float:
+    """By how much c_n of a block falls short of epsilon in its replay, if only a little [N]."""
+    problem = planning.problem
+    phases = check.report.phases if isinstance(check.report, Report) else ()
+    margins = [
+        contact.margin
+        for phase in phases
+        if problem.phases[phase.number - 1] in block.phases
+        for contact in phase.contacts
+    ]
+    short = -min(margins, default=0.0)
+    return short if 0.0 < short < DIP * problem.scene.scales.force else 0.0
 
 
 def check_plan(
@@ -221,16 +227,6 @@ def find_residual(problem: Problem, trajectory: Trajectory) -> Residual:
             when = f"at t = {trajectory.t[rows][row]:.5g} s, phase {phase.number}"
             worst = Residual(size, phase.number, f"{text} {when}")
     return worst
-
-
-def _refine(
-    planning: Planning, index: int, report: Callable[[str], None], plain: bool = False
-) -> Planning | None:
-    """The planning with another plan of a block; None if there is none."""
-    try:
-        return refine_block(planning, index, report, plain)
-    except (InfeasibleError, SolverError):
-        return None
 
 
 def _describe(block: BlockPlan, number: int, check: ReplayCheck) -> str:

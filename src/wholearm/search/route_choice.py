@@ -12,8 +12,8 @@ from functools import partial
 from typing import NamedTuple, TypeVar
 
 from ..common.workers import Task, share
+from ..planning.blocks import free_torques
 from ..planning.options import Objective, PlanOptions
-from ..planning.rate_limits import free_torques
 from ..planning.result import Plan
 from ..problem.definition import Problem
 from .astar import CAREFUL, EAGER, RoadmapRoute, RouteSearch, SearchRule

@@ -24,13 +24,13 @@ from ...mechanics.impact import Impact, compute_impact
 from ...problem.definition import End, Phase
 from ...results.trajectory import Motion
 from ...solvers.ipopt import charge
-from ..impacts import PER_SPEED, BlockImpact
 from ..options import PlanOptions
 from ..phase_plan import PhasePlan
 from ..stops import PlanPart, Plans, end_of
 from .junction import Joint, add_pause, choose_joint
 from .path_plan import plan_curves
 
+PER_SPEED = " per m/s"  # unit after impulses and rates, which are for unit speed before an impact
 BEND = 1e-6  # largest 1 - cosine between tangents that count as the same
 
 
@@ -53,6 +53,22 @@ class CurveImpact:
         if self.impact.violations:
             return self.impact.violations[0].describe(PER_SPEED)
         return "" if self.possible else f"phase {self.phase.number + 1} would be run backwards"
+
+
+@dataclass(frozen=True, eq=False)
+class BlockImpact:
+    """An impact between two phases of a block, for unit speed before it."""
+
+    before: int  # index in the block of the phase that it ends
+    impact: Impact  # velocities per m/s, hence without unit and in rad/m; impulses in N s per m/s
+    ratio: float  # speed after over speed before
+    reason: str  # why the motion stops there instead; empty if it passes at speed
+    speed: float  # [m/s]: before the impact; zero at a stop
+
+    @property
+    def passed(self) -> bool:
+        """Whether the motion goes on at speed."""
+        return not self.reason
 
 
 def compute_curve_impact(phase: Phase, before: Curve, after: Curve) -> CurveImpact:

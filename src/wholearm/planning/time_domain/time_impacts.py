@@ -19,8 +19,8 @@ from ...mechanics.dynamics import measure_speed
 from ...mechanics.impact import Impact, compute_impact
 from ...problem.definition import End, Phase, Problem
 from ...results.trajectory import Motion
-from ..impacts import PER_SPEED, BlockImpact
 from ..options import Objective, PlanOptions
+from ..path_domain.impact_sequence import PER_SPEED, BlockImpact
 from ..phase_plan import PhasePlan
 from ..stops import PlanPart, Plans, end_of, plan_stops
 from .time_plan import plan_phases
