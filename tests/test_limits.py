@@ -11,23 +11,35 @@ from plane import SQUARE, make_formation, make_scene
 from tipping import roll
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError, Parameter
+from wholearm.contacts.closing import contact_table
 from wholearm.contacts.formation import Formation
-from wholearm.geometry.curve import Curve
+from wholearm.geometry.curve import Curve, directions_of
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics import limits as limits_module
+from wholearm.mechanics.dynamics import inverse, stack_motion
 from wholearm.mechanics.limits import CONE, PRESS, SPEED, TORQUE, MotionLimit, make_limits
+from wholearm.planning.lower_bound.lower_bound import bound_least_time, look_along
+from wholearm.planning.lower_bound.speed_sweep import find_duration
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.path_data import prepare
+from wholearm.planning.path_domain.path_mesh import Mesh
 from wholearm.planning.path_domain.path_motion import PathMotion
 from wholearm.planning.path_domain.path_plan import plan_path
+from wholearm.planning.path_domain.speed_profile import Fastest, find_fastest
 from wholearm.planning.time_domain.intersample import MISS, check_between, find_misses
 from wholearm.planning.time_domain.search import TimeSearch
 from wholearm.planning.time_domain.stage import Stage
 from wholearm.planning.time_domain.time_explain import change_limit, list_shortfalls
 from wholearm.planning.time_domain.time_motion import TimeMotion
 from wholearm.planning.time_domain.time_plan import plan_phases
+from wholearm.policy.curve_rows import make_rows
 from wholearm.problem.definition import Problem
+from wholearm.quasistatic.squeeze import InternalForceLimits
 from wholearm.scene.model import Friction
+from wholearm.search.border_limits import estimate_duration
+from wholearm.search.cell_paths import time_paths
+from wholearm.search.edges import BorderEdge, Terms, time_parts
+from wholearm.search.places import make_place
 
 EPSILON = 0.05
 DROOP = 4.0
@@ -215,3 +227,58 @@ def test_speed_limits_hold_between_collocation_points(
     rates = np.abs(over.motion.evaluate(t).z_dot[:, 4])
     assert 0.999 * fastest < rates.max() < fastest * (1 + 1e-6)
     assert over.value == pytest.approx(along.value, rel=0.02) and along.value > 1.02 * plain.value
+
+
+def test_another_limit_is_kept_by_sweeps_search_and_policies(
+    curves: tuple[Curve, ...], request: pytest.FixtureRequest
+) -> None:
+    curve = curves[PHASE]
+    formation, place = curve.formation, make_place(curve.formation.scene, curve.start)
+    pose = curve.evaluate(np.array([0.5 * curve.length])).z[:, [0, 2]]
+    table = contact_table(place.scene)
+    labels = np.array([[table.index(formation.contacts[k]) for k in (0, 2, 3)]])
+    path = labels, pose + np.array([-0.008, 0.1]), pose + np.array([0.015, 0.23])
+
+    def measure(epsilon: float) -> Array:
+        border = BorderEdge(place, curve, None, Terms(EPSILON, 0.0))
+        least = bound_least_time([curve], EPSILON)
+        fastest = find_fastest(prepare(curve, EPSILON, Mesh().make_grid(curve, 10), 2), None)
+        assert least is not None and isinstance(fastest, Fastest)
+        return np.array(
+            [
+                least.value,
+                look_along([curve], EPSILON, 50),
+                estimate_duration([border.limits]),
+                time_parts(border, np.array([1.0]))[0],
+                float(find_duration(fastest.b, np.diff(fastest.s))),
+                time_paths(formation.scene, epsilon, *path)[0],
+            ]
+        )
+
+    plain = measure(EPSILON)
+    s = np.linspace(0.2, 0.8, 7) * curve.length
+    motion = np.full(7, 2.0), np.full(7, 0.5), np.full(7, 3.0)
+    before = make_rows(curve, s, motion)
+    request.getfixturevalue("motors")
+    # Limits of cells are kept by scene and epsilon.
+    driven = measure(EPSILON + 1e-9)
+    assert np.isfinite(plain).all() and (driven > 1.001 * plain).all(), (plain, driven)
+    # Policies: the limit is one of torques and speeds, at both ends.
+    after, point = make_rows(curve, s, motion), curve.evaluate(s)
+    rows = after.slack @ stack_motion(*motion)[..., None]
+    droop = DROOP * formation.scene.scales.torque * formation.scene.scales.time
+    tau = (after.torque @ stack_motion(*motion)[..., None])[..., 0]
+    drive = tau + droop * point.z_s[:, 3:] * np.sqrt(0.5)
+    assert after.slack.shape[1] == before.slack.shape[1] + 4
+    for sign in (-1, 1):
+        for column in (formation.scene.torque_limit + sign * drive).T:
+            assert np.abs(rows[..., 0] - column[:, None]).max(axis=0).min() < 1e-12
+    # Predictions: the internal force that presses most is less free.
+    forces = inverse(formation, *point[:3], directions_of(curve, np.zeros(7, int)))
+    fast = np.zeros(7), np.full(7, 4.0)
+    assert fast[1].all()
+    grasp = InternalForceLimits.of(formation, forces, point.z_s[:, 3:]).find_best(*fast)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(limits_module, "MAKERS", limits_module.MAKERS[:-1])
+        free = InternalForceLimits.of(formation, forces, point.z_s[:, 3:]).find_best(*fast)
+    assert (grasp.least < free.least - 1e-6).any() and (grasp.least <= free.least + 1e-12).all()
