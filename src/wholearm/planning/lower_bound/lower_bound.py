@@ -27,8 +27,6 @@ from .speed_sweep import (
     speed_sweep,
 )
 
-_NEAR = 6  # intervals from a switch within which its row may change sign in a
-_STIFF = 4.0  # growth in an interval from which the exponential rule replaces the trapezoidal one
 _TOLERANCE = 3e-8  # loss of the bound, and its error, relative to the time
 GRID_INTERVALS = 100  # of the first grid
 _ROUNDS = 16  # most grids: losses fall by 64 from one to the next where speeds are very low
@@ -182,12 +180,6 @@ class Costate(NamedTuple):
         bow = first + last - 2 * rise
         y = start + t * (first + t * (rise - first - bow + t * bow))
         y_t = first + t * (2 * (rise - first - bow) + 3 * t * bow)
-        # Only the signs at the ends, which say whether the largest or least a is optimal.
-        wrong = ((y > 0) & (self.y.max(axis=1) <= 0)[:, None]) | (
-            (y < 0) & (self.y.min(axis=1) >= 0)[:, None]
-        )
-        plain = wrong.any(axis=1)
-        y[plain], y_t[plain] = (start + t * rise)[plain], rise[plain]
         angles = grid.angles[:-1, None] + t * h
         sine = np.sin(angles)
         p_angle = (y_t / h - y / np.tan(angles)) / sine
@@ -202,21 +194,13 @@ def find_costate(
     path: PathTerms, grid: PathGrid, left: PathLimits, right: PathLimits, motion: SpeedProfile
 ) -> Costate:
     """The costate of a profile, from the limits at the left and right ends of intervals."""
-    b, modes = motion.b, motion.modes.copy()
+    b, modes = motion.b, motion.modes
     pushes, brakes = (
         (left.extreme(b[:-1], largest), right.extreme(b[1:], largest)) for largest in (True, False)
     )
     y = np.zeros((len(modes), 2))
-    for k in np.flatnonzero(modes == SweepMode.SWITCH).tolist():
-        pushed, braked = float(pushes[0].a[k]), float(brakes[1].a[k])
-        turn = _find_turn(left, right, int(brakes[1].row[k]), k)
-        if turn is not None:
-            low, high = min(k, turn[0]), max(k, turn[0])
-            modes[low : high + 1] = SweepMode.PUSH
-            modes[turn[0] + 1 : high + 1] = SweepMode.BRAKE
-            modes[turn[0]] = SweepMode.SWITCH
-        index = k if turn is None else turn[0]
-        y[index] = _switch(path, grid, left, right, b, (pushed, braked), index, turn)
+    k = np.flatnonzero(modes == SweepMode.SWITCH)
+    y[k] = _switch(path, grid, b, pushes[0].a[k], brakes[1].a[k], k)
     rates, forces = _linearise(path, grid, b, modes, pushes, brakes)
     ends = float(pushes[0].a[0]), float(brakes[1].a[-1])
     _integrate(path, grid, modes, rates, forces, ends, y)
@@ -228,40 +212,18 @@ def find_costate(
     return Costate(y, slopes)
 
 
-def _find_turn(left: PathLimits, right: PathLimits, row: int, k: int) -> tuple[int, int] | None:
-    """The interval near k in which a row turns from an upper to a lower bound of a, and that row.
-
-    The profile runs along that row on both sides, and the costate is zero there.
-    """
-    near = np.arange(max(k - _NEAR, 0), min(k + _NEAR + 1, len(left.cap)))
-    turns = near[(left.rows[near, row, A] < 0) & (right.rows[near, row, A] >= 0)]
-    return (int(turns[np.abs(turns - k).argmin()]), row) if len(turns) else None
-
-
 def _switch(
-    path: PathTerms,
-    grid: PathGrid,
-    left: PathLimits,
-    right: PathLimits,
-    b: Array,
-    extremes: tuple[float, float],
-    k: int,
-    turn: tuple[int, int] | None,
+    path: PathTerms, grid: PathGrid, b: Array, pushed: Array, braked: Array, k: NDArray[np.int64]
 ) -> Array:
-    """The costate, y, at both ends of the interval k with a switch, shape (2,)."""
-    start, stop = path.place(grid.angles[k : k + 2])
-    (before, after), h = b[k : k + 2], stop - start
-    if turn is None:
-        pushed, braked = extremes
-        x = np.clip((after - before - 2 * braked * h) / (2 * (pushed - braked)), 0.0, h)
-        rate = 0.5 * max(before + 2 * pushed * x, before, after) ** -1.5
-    else:
-        row, most = turn[1], max(before, after)
-        here, rise = left.rows[k, row], right.rows[k, row, A] - left.rows[k, row, A]
-        x = -h * here[A] / rise
-        pull = here[B] + here[V] / (2 * np.sqrt(most))
-        rate = 0.5 * most**-1.5 / (1 - 2 * pull * h / rise)
-    return np.asarray(rate * np.array([x, x - h]) * np.sin(grid.angles[k : k + 2]))
+    """The costate, y, at both ends of the intervals `k` with a switch, shape (n, 2).
+
+    It is zero where a changes from `pushed`, at the first end, to `braked`, at the second.
+    """
+    angles = grid.angles[k[:, None] + [0, 1]]
+    h = np.diff(path.place(angles))[:, 0]
+    x = np.clip((b[k + 1] - b[k] - 2 * braked * h) / (2 * (pushed - braked)), 0.0, h)
+    rate = 0.5 * np.maximum(b[k] + 2 * pushed * x, np.maximum(b[k], b[k + 1])) ** -1.5
+    return np.asarray(rate[:, None] * np.column_stack([x, x - h]) * np.sin(angles))
 
 
 def _linearise(
@@ -315,35 +277,21 @@ def _integrate(
             if k == (last if far else 0):
                 y[k, far] = at_rest[far]
             else:
-                y[k, far] = _follow(
-                    float(y[k, near]), step * h[k], forces[k, [near, far]], rates[k, [near, far]]
-                )
+                # Trapezoidal rule.
+                half, rate = step * h[k] / 2, rates[k]
+                start = y[k, near] * (1 + half * rate[near]) + half * forces[k].sum()
+                y[k, far] = start / (1 - half * rate[far])
 
 
-def _follow(y: float, h: float, force: Array, rate: Array) -> float:
-    """One step of y' = force + rate y: trapezoidal rule, or exponential where stiff."""
-    if np.abs(rate * h).max() < _STIFF:
-        return float((y + h / 2 * (force.sum() + rate[0] * y)) / (1 - h / 2 * rate[1]))
-    growth = float(np.clip(h * rate.mean(), -60, 60))
-    return float(y * np.exp(growth) + h * force.mean() * np.expm1(growth) / growth)
-
-
-def find_least(rows: PathLimits, p: Array, slope: Array) -> Array:
+def find_least(limits: PathLimits, p: Array, slope: Array) -> Array:
     """H at n places, from p and p' there."""
-    least = _find_least(rows, p, slope)
+    least = _find_least(limits, p, slope)
     lost = np.flatnonzero(~np.isfinite(least))
     if len(lost):
-        bounded = rows.pick(lost)
+        bounded = limits.pick(lost)
         bounded = bounded._replace(cap=bounded.find_largest_b())
         least[lost] = _find_least(bounded, p[lost], slope[lost])
     return least
-
-
-def evaluate(rows: PathLimits, p: Array, slope: Array, b: Array) -> Array:
-    """The integrand at n places for some b and the best a."""
-    share, rest = _weigh(rows, p), rows.at(b)
-    push = np.where(share < 0, share * rest, -np.inf).max(axis=1)
-    return np.asarray(1 / np.sqrt(b) - slope * b + np.where(p == 0, 0.0, push))
 
 
 def _find_least(limits: PathLimits, p: Array, slope: Array) -> Array:
@@ -354,6 +302,13 @@ def _find_least(limits: PathLimits, p: Array, slope: Array) -> Array:
     least = np.where((share < 0) & ~np.isnan(least), least, -np.inf).max(axis=1)
     alone = _minimise(-slope[:, None], np.zeros((len(p), 1)), cap)[:, 0]
     return np.where(p == 0, alone, least)
+
+
+def evaluate(rows: PathLimits, p: Array, slope: Array, b: Array) -> Array:
+    """The integrand at n places for some b and the best a."""
+    share, rest = _weigh(rows, p), rows.at(b)
+    push = np.where(share < 0, share * rest, -np.inf).max(axis=1)
+    return np.asarray(1 / np.sqrt(b) - slope * b + np.where(p == 0, 0.0, push))
 
 
 def _weigh(limits: PathLimits, p: Array) -> Array:
