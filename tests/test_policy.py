@@ -26,10 +26,10 @@ from wholearm.policy.curve_law import (
     Sensing,
     choose_internal_force,
 )
-from wholearm.policy.curve_rows import list_scenes
+from wholearm.policy.curve_rows import find_within, list_scenes
 from wholearm.policy.make import SAME, find_widest, hold_end, make_policy
 from wholearm.policy.playback import Policy
-from wholearm.policy.range_margins import find_within, retime_within
+from wholearm.policy.reference_motion import retime_within
 from wholearm.policy.regulator import RATE, Linear, regulate
 from wholearm.policy.retiming import retime
 from wholearm.problem.definition import Problem

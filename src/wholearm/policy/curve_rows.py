@@ -1,7 +1,9 @@
 """Torques and limits at places along a curve, as coefficients of (1, s'', s'^2, s', lambda).
 
 The coefficients multiply a nominal motion. Its torques are applied: with other friction, mass or
-gains they lead to another s'' and internal force, and thus to other contact forces.
+gains they lead to another s'' and internal force, and thus to other contact forces. Within ranges,
+limits hold in the worst corner (`Corners`), both under nominal torques and with feedback that
+tracks the reference.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from ..contacts.formation import Formation
 from ..geometry.curve import Curve, CurvePoint
 from ..mechanics.dynamics import LAMBDA, ONE, A, Directions, PathForces, inverse, stack_motion
 from ..mechanics.limits import LimitSet, make_limits
-from ..mechanics.path_limits import find_slack_rows
+from ..mechanics.path_limits import PathLimits, find_slack_rows
 from ..problem.uncertainty import GROUPS, change_scene
 from ..scene.model import Scene
 from ..sensitivity.slopes import find_force_slopes, find_shifts
@@ -38,6 +40,10 @@ LATE = 5e-4  # uncertainty of the delay [s]
 LEAST = 0.02  # least margin of a normal force, over the scene's unit of force
 SPARE = 0.05  # margin of a torque for feedback, over its limit
 NEAR = 1e-3  # time around a reversal in which friction may have either direction [s]
+KEPT = 1.3  # margin of the reference's forces, in units: feedback may use what is above one
+AUTHORITY = 2.0  # margin of torques for feedback, in units
+WIDER = 1.01  # least width of a reversal, over the distance to the next node
+STEP = 1e-4  # step of differences along a curve, over its length
 NEVER = 1e9  # level of a limit that does not count
 UNLIMITED = np.array([NEVER, 0.0, 0.0, 0.0, 0.0])
 FIXED = np.array([1.0, 0.0, 1.0, 1.0, 0.0])
@@ -260,3 +266,75 @@ def list_scenes(scene: Scene, widths: Mapping[str, float]) -> tuple[Scene, ...]:
         change_scene(scene, {n: k * widths[n] for n, k in zip(names, signs, strict=True)})
         for signs in product((-1, 1), repeat=len(names))
     )
+
+
+class Within(NamedTuple):
+    """Limits along a curve within ranges, at n places."""
+
+    s: Array  # (n,) [m]
+    torque: Array  # (n, 2, 5) [N m]
+    left: Array  # (n, l, 5) [N m]: distances of torques from their limits
+    sides: tuple[Corners, Corners]  # with friction before and after the nearest reversal
+    same: Array  # (n,): where these are equal
+    unit: Array  # (m + l,): margins at level 1, of forces and torques
+    ends: Array  # (k, n_c, 5) [N]: normal forces at the last place, in each corner of the ranges
+    scenes: tuple[Scene, ...]  # in these corners
+
+    def at(self, motion: Motion) -> tuple[CurveLimitRows, Array, Array]:
+        """The law's limits near a motion; those of the reference, and their margins."""
+        motions = self._spread(motion)
+        forces = self._pick(self.sides, motions)
+        closed = self._pick([side.close(self.left) for side in self.sides], motions)
+        count, n = len(self.unit) - self.left.shape[1], len(self.s)
+        slack = np.concatenate([forces, self.left], axis=1)
+        copies = forces.shape[1] // count
+        unit = np.concatenate([np.tile(self.unit[:count], copies), self.unit[count:]])
+        table, presses = np.tile(unit, (n, 1)), forces.shape[1]
+        rows = CurveLimitRows(self.s, self.torque, slack, table, presses, self.ends, self.scenes)
+        kept = np.concatenate([KEPT * self.unit[:count], AUTHORITY * self.unit[count:]])
+        again = np.tile(kept, 2 * len(motions))
+        wanted = np.concatenate([np.tile(kept[:count], copies), kept[count:], again])
+        whole = np.concatenate([slack, closed], axis=1)
+        return rows, whole, np.tile(wanted, (n, 1))
+
+    def _pick(self, sides: tuple[Corners, ...] | list[Corners], motions: list[Motion]) -> Array:
+        """Limits on both sides of reversals in the worst corners of motions, (n, rows, 5)."""
+        found = [
+            np.concatenate([side.pick(motion) for motion in motions], axis=1) for side in sides
+        ]
+        found[1][self.same] = UNLIMITED
+        return np.concatenate(found, axis=1)
+
+    def _spread(self, motion: Motion) -> list[Motion]:
+        """A motion with its internal force, and with the least and largest one within torques."""
+        a, b, internal = motion
+        ends = PathLimits(self.left, b).find_internal_force_range(a, b)
+        low, high = (np.where(np.isfinite(end), end, internal) for end in ends)
+        return [motion, (a, b, np.minimum(low, internal)), (a, b, np.maximum(high, internal))]
+
+
+def find_within(
+    curve: Curve, s: Array, speed: Array, widths: Mapping[str, float], least: float
+) -> Within:
+    """Limits along a curve within ranges, with forces of at least so much [N]."""
+    formation, point = curve.formation, curve.evaluate(s)
+    # Limits are interpolated: nodes next to a reversal need both directions.
+    gaps = np.pad(np.diff(s), 1)
+    width = np.maximum(speed * NEAR, WIDER * np.maximum(gaps[1:], gaps[:-1]))
+    mean, *sides = blend_directions(curve, s, width)
+    late = s - (LATE + widths.get("delay", 0.0)) * speed
+    nominal, step = find_torques(curve, s, mean), STEP * curve.length
+    before, after = (find_torques(curve, s + sign * step, mean) for sign in (-1, 1))
+    torques = nominal, find_torques(curve, late, mean), (after - before) / (2 * step)
+    corners = [find_corners(formation, point, side, torques, widths) for side in sides]
+    contact, joint = split_limits(formation)
+    none = np.zeros((len(s), formation.n_constraints, 5))
+    left = measure_slack(joint, none, nominal, point.z_s[:, 3:])
+    scales, most = (each.scales[each.sides[0]] for each in (contact, joint))
+    unit = np.concatenate([np.maximum(LEAST * scales, least), SPARE * most])
+    ends, scenes = (
+        corners[0].rows[:, -1, : formation.n_contacts],
+        list_scenes(formation.scene, widths),
+    )
+    same = have_same_signs(*sides)
+    return Within(s, nominal, left, (corners[0], corners[1]), same, unit, ends, scenes)

@@ -37,8 +37,7 @@ from ..simulation.holding_torques import Standstill, find_hold
 from .curve_law import LoopSettings, choose_internal_force
 from .curve_rows import CurveLimitRows, find_forces, leave_one
 from .playback import Policy
-from .range_margins import WIDEST
-from .reference_motion import TOUCH, ReferencePiece, Reserve, trace_pieces
+from .reference_motion import TOUCH, WIDEST, ReferencePiece, Reserve, trace_pieces
 from .regulator import RATE, ROOM, end_within, follow
 
 WIDEST_FACTOR = 64.0  # largest factor on ranges
@@ -463,8 +462,8 @@ def _pin(phase: Phase, z: Array) -> Phase:
 def find_widest(problem: Problem, plan: Trajectory, delay: float) -> dict[int, float]:
     """The largest factor on the ranges of each phase along a curve, by its number.
 
-    It is at most `WIDEST_FACTOR`, and no relative range exceeds `range_margins.WIDEST`. The delay
-    [s] is that of the torques, as far as known. InputError if neither plan nor problem have ranges.
+    It is at most `WIDEST_FACTOR`, and no relative range exceeds `WIDEST`. The delay [s] is that of
+    the torques, as far as known. InputError if neither plan nor problem have ranges.
     """
     ranges = find_ranges(problem, plan)
     if ranges is None:

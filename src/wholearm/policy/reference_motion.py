@@ -15,25 +15,31 @@ from ..mechanics.dynamics import LAMBDA, inverse, metric_weights
 from ..problem.definition import End, Phase, Problem
 from ..results.trajectory import Trajectory
 from .curve_rows import (
+    AUTHORITY,
     CurveLimitRows,
+    Motion,
     find_internal_force,
+    find_within,
     make_rows,
     measure_levels,
     split_limits,
 )
-from .range_margins import retime_within
 from .retiming import ENOUGH, Reach, retime
 
 INTERVALS = 120  # intervals of a curve's table, dense at its ends
 PLACES = 400  # places of a curve at which the nearest one is searched first
 NEWTON = 4  # iterations of that search
-AUTHORITY = 2.0  # margin of torques for feedback, in those of `curve_rows`
 TOUCH = 3e-3  # speed along curves at which contacts are made, over the scene's
 ARRIVAL = 3e-3  # time constant of the approach to the end [s]
 # Squared speeds over the plan's that are tried until there is a margin, or less of it: relative
 # errors of torques matter less where torques are small.
 SLOWER = (1.0, 0.5, 0.25, 0.12, 0.06)
 REFINE = 2  # iterations between a slower motion's internal force and its margins
+ROUNDS = 3  # iterations between worst corners and motion
+LEAST_SHARE = 0.5  # least share of the margins within ranges; with less the ranges are too wide
+LESS = 0.8  # factor by which ranges shrink while they are too wide
+CLOSE, NONE = 0.03, 0.02  # relative accuracy of the widest ranges, and the least share of them
+WIDEST = 0.9  # largest relative range
 
 
 class ReferencePiece(NamedTuple):
@@ -139,6 +145,58 @@ def _trace(
     # Margins without ranges keep no share of ranges.
     share = share if reserve.ranges is None else 0.0
     return ReferencePiece(curve, rows, found, share, begins, passes, b)
+
+
+def retime_within(
+    curve: Curve,
+    s: Array,
+    plan: Motion,
+    widths: Mapping[str, float],
+    least: float,
+    end: tuple[float, float] | None = None,
+) -> tuple[tuple[CurveLimitRows, Reach] | None, float]:
+    """The fastest motion that keeps its limits within the largest feasible share of ranges.
+
+    Fixed-point iteration between the worst corners of the ranges and the motion.
+
+    Parameters
+    ----------
+    s : (n,) [m]  nodes
+    plan : (n,)   a, b and internal force of a plan there; no motion is faster
+    widths        half widths of the ranges; that of the delay is its unknown part
+    least : [N]   least normal force within them
+    end           as of `retime`
+
+    Returns
+    -------
+    tuple  the law's limits and the motions, None if there are none; and the share of the ranges
+    """
+
+    def find(share: float) -> tuple[CurveLimitRows, Reach] | None:
+        scaled = {name: min(share * width, WIDEST) for name, width in widths.items()}
+        within, motion = find_within(curve, s, np.sqrt(plan[1]), scaled, least), plan
+        for _ in range(ROUNDS):
+            rows, whole, wanted = within.at(motion)
+            found = retime(s, whole, wanted, plan[1], end, ())
+            b = found.run(float(found.most[0]))
+            if found.share.min() < LEAST_SHARE:
+                return None
+            a = np.gradient(b, s) / 2
+            motion = a, b, find_internal_force(rows, a, b)
+        return within.at(motion)[0], found
+
+    low, high, best = 0.0, 1.0, find(1.0)
+    if best is not None:
+        return best, 1.0
+    # Downwards first: most ranges are only a little too wide.
+    while high - low > CLOSE * high and high > NONE:
+        share = LESS * high if best is None else (low + high) / 2
+        found = find(share)
+        if found is None:
+            high = share
+        else:
+            low, best = share, found
+    return best, low
 
 
 def _follow(

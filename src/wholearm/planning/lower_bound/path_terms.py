@@ -23,17 +23,8 @@ from ...mechanics.path_limits import PathLimits
 GIVE = 2.5e-7  # relaxation of limits over their scales: a plan may violate them as much
 
 
-class PathPiece(NamedTuple):
-    """A segment of one of the curves, from `start` to `stop` along all of them [m]."""
-
-    curve: int
-    segment: int
-    start: float
-    stop: float
-
-
 class PathGrid(NamedTuple):
-    """Angles of N + 1 nodes, and the piece that each of the N intervals belongs to."""
+    """Angles of N + 1 nodes, and the segment that each of the N intervals belongs to."""
 
     angles: Array
     owners: NDArray[np.int64]
@@ -64,10 +55,10 @@ class PathTerms:
         return float(self.offsets[-1])
 
     @cached_property
-    def pieces(self) -> tuple[PathPiece, ...]:
-        """The segments of all curves."""
+    def pieces(self) -> tuple[tuple[int, int, float, float], ...]:
+        """Each segment: its curve, its number there, and its start and stop on the path [m]."""
         return tuple(
-            PathPiece(index, number, offset + part.start, offset + part.stop)
+            (index, number, offset + part.start, offset + part.stop)
             for index, (curve, offset) in enumerate(zip(self.curves, self.offsets, strict=False))
             for number, part in enumerate(curve.segments)
         )
@@ -77,22 +68,21 @@ class PathTerms:
         return np.asarray(self.length * np.sin(angles / 2) ** 2)
 
     def make_grid(self, intervals: int) -> PathGrid:
-        """A grid of about so many intervals, with nodes wherever pieces meet."""
-        stops = np.array([0.0, *(piece.stop for piece in self.pieces)])
+        """A grid of about so many intervals, with nodes wherever segments meet."""
+        stops = np.array([0.0, *(stop for *_, stop in self.pieces)])
         ends = np.arccos(np.clip(1 - 2 * stops / self.length, -1, 1))
         counts = np.maximum(2, np.rint(np.diff(ends) / np.pi * intervals)).astype(np.int64)
         return PathGrid(ends, np.arange(len(counts))).split(counts)
 
     def evaluate(self, angles: Array, owners: NDArray[np.int64]) -> PathLimits:
-        """Limits without lambda at angles of shape (N, n), each row of them as part of a piece."""
+        """Limits without lambda at angles (N, n), each row of them as part of a segment."""
         s, parts = self.place(angles), []
-        pieces = [self.pieces[k] for k in owners]
+        owner, number, start, stop = np.array(self.pieces)[owners].T[..., None]
         for index, (curve, offset) in enumerate(zip(self.curves, self.offsets, strict=False)):
-            mine = np.flatnonzero([piece.curve == index for piece in pieces])
-            low, high = np.array([pieces[k][2:] for k in mine]).T[..., None]
-            local = np.clip(np.clip(s[mine], low, high) - offset, 0.0, curve.length)
-            segment = np.repeat([pieces[k].segment for k in mine], angles.shape[1])
-            point = curve.evaluate(local.ravel())
+            mine = owner[:, 0] == index
+            local = np.clip(s[mine], start[mine], stop[mine]) - offset
+            point = curve.evaluate(np.clip(local.ravel(), 0.0, curve.length))
+            segment = np.repeat(number[mine].astype(np.int64), angles.shape[1])
             parts.append(find_limits(curve, self.epsilon, point, segment))
         rows, cap = (np.concatenate(column) for column in zip(*parts, strict=True))
         return PathLimits(rows.reshape(*s.shape, *rows.shape[1:]), cap.reshape(s.shape))
