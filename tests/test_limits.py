@@ -37,9 +37,9 @@ from wholearm.problem.definition import Problem
 from wholearm.quasistatic.squeeze import InternalForceLimits
 from wholearm.scene.model import Friction
 from wholearm.search.border_limits import estimate_duration
-from wholearm.search.cell_paths import time_paths
 from wholearm.search.edges import BorderEdge, Terms, time_parts
 from wholearm.search.places import make_place
+from wholearm.search.roadmap import time_paths
 
 EPSILON = 0.05
 DROOP = 4.0
