@@ -11,9 +11,8 @@ import numpy as np
 
 from ..common.errors import InputError, JammingError, SimulationError, name_source
 from ..common.files import require_ending
-from ..problem.check import require_phases
 from ..problem.definition import Problem
-from ..problem.read import adopt_phases
+from ..problem.read import adopt_phases, require_phases
 from ..results.adopt import require_made_for
 from ..results.report import Report
 from ..results.torque import TorqueProfile, read_notes, read_torque_csv

@@ -20,8 +20,8 @@ from ..common.signals import OutOfTime, Reporter, limited
 from ..geometry.curve import describe_pose
 from ..geometry.tracing import trace_phases
 from ..mechanics.uniqueness import describe_uniqueness
-from ..problem.check import require_phases
 from ..problem.definition import Phase, Problem
+from ..problem.read import require_phases
 from ..results.dwell_record import assemble
 from ..results.plan_record import Certificate, TimeBound, Transition
 from ..results.report import UniquenessMargin

@@ -190,7 +190,7 @@ class Problem:
         if self.checked:
             object.__setattr__(self, "table", match_table(self))
             return
-        from .check import check_problem
+        from .read import check_problem
 
         with name_source(self.source):
             check_problem(self)

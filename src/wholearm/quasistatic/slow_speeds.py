@@ -35,8 +35,8 @@ from ..mechanics.dynamics import (
     split_forces,
 )
 from ..mechanics.limits import CONE, PRESS, SPEED
-from ..problem.check import require_phases
 from ..problem.definition import End, Phase, Problem
+from ..problem.read import require_phases
 from ..results.torque import TorqueProfile
 from .squeeze import InternalForceLimits
 

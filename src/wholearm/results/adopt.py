@@ -9,9 +9,8 @@ from typing import Any, Protocol
 from ..common.errors import InputError
 from ..common.files import require_ending, write_text
 from ..common.journal import Difference, describe_differences, find_differences
-from ..problem.check import require_phases
 from ..problem.definition import Problem
-from ..problem.read import adopt_phases
+from ..problem.read import adopt_phases, require_phases
 from ..problem.table import save_problem
 from .torque import TorqueProfile, format_rows, place_rows
 from .trajectory import Trajectory

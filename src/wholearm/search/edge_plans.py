@@ -126,16 +126,16 @@ def join_route(
     background  a task for one of these processes
     """
     options = options.scale_ranges(problem.ranges)
-    start = time.perf_counter()
+    start, planner = time.perf_counter(), _LinkPlanner(problem, options, cache, report)
     guesses, culprit = [[*measured, None] for _, measured in links], None
     try:
         with unadvised():
             first = [(link, plans[0]) for (link, _), plans in zip(links, guesses, strict=True)]
             if jobs > 1:
-                _plan_parallel(problem, first, options, cache, report, jobs, background)
+                planner.plan_parallel(first, jobs, background)
             while True:
                 chosen = [(link, plans[0]) for (link, _), plans in zip(links, guesses, strict=True)]
-                planned, reason = _plan_links(problem, chosen, options, cache, report)
+                planned, reason = planner.plan(chosen)
                 if reason:
                     culprit = len(planned)
                     blamed = range(culprit, culprit - len(_blame(links, culprit)), -1)
@@ -178,99 +178,113 @@ def _blame(links: Links, culprit: int) -> tuple[Link, ...]:
     return tuple(link for link, _ in links[first : culprit + 1])
 
 
-def _plan_parallel(
-    problem: Problem,
-    links: Sequence[Chosen],
-    options: PlanOptions,
-    cache: Cache,
-    report: Callable[[str], None],
-    jobs: int,
-    background: BackgroundTask[Any] | None,
-) -> None:
-    """Plan links in parallel: each part begins with a link whose start is known."""
-    starts = [0, *(k + 1 for k, (link, _) in enumerate(links[:-1]) if not link.in_cell)]
-    parts = [range(*ends) for ends in zip(starts, [*starts[1:], len(links)], strict=True)]
-    # The longest tasks first.
-    cells = [part for part in parts if any(links[k][0].in_cell for k in part)]
-    parts = [*cells, *(part for part in parts if part not in cells)]
-    report(f"planning {len(links)} parts of the route")
-    tasks: list[Task[Any]]
-    tasks = [partial(_plan_part, problem, links, part, options, cache) for part in parts]
-    if background:
-        tasks.insert(len(cells), background.task)
-    found = share(tasks, jobs, (problem, problem.scene))
-    if background:
-        background.result = found.pop(len(cells))
-    for plans in found:
-        cache.update(plans)
+@dataclass(frozen=True, eq=False)
+class _LinkPlanner:
+    """Plans the links of a route, and keeps their plans in a cache."""
 
+    problem: Problem
+    options: PlanOptions
+    cache: Cache
+    report: Callable[[str], None]
 
-def _plan_part(
-    problem: Problem,
-    links: Sequence[Chosen],
-    part: Sequence[int],
-    options: PlanOptions,
-    cache: Cache,
-) -> dict[Key, PlannedLink | str]:
-    """New entries of the cache after planning some links one after the other."""
-    # Each plan is stored at once, so that an interrupt loses none.
-    before, z = set(cache), links[part[0]][0].start.z if part[0] else problem.start
-    for k in part:
-        planned = _plan_cached(problem, links, k, z, options, cache, lambda _: None)
-        if isinstance(planned, str):
-            break
-        z = planned.end
-    return {key: cache[key] for key in set(cache) - before}
+    def plan_parallel(
+        self, links: Sequence[Chosen], jobs: int, background: BackgroundTask[Any] | None
+    ) -> None:
+        """Plan links in parallel: each part begins with a link whose start is known."""
+        starts = [0, *(k + 1 for k, (link, _) in enumerate(links[:-1]) if not link.in_cell)]
+        parts = [range(*ends) for ends in zip(starts, [*starts[1:], len(links)], strict=True)]
+        # The longest tasks first.
+        cells = [part for part in parts if any(links[k][0].in_cell for k in part)]
+        parts = [*cells, *(part for part in parts if part not in cells)]
+        self.report(f"planning {len(links)} parts of the route")
+        quiet = replace(self, report=lambda _: None)
+        tasks: list[Task[Any]] = [partial(quiet._plan_part, links, part) for part in parts]
+        if background:
+            tasks.insert(len(cells), background.task)
+        found = share(tasks, jobs, (self.problem, self.problem.scene))
+        if background:
+            background.result = found.pop(len(cells))
+        for plans in found:
+            self.cache.update(plans)
 
+    def _plan_part(
+        self, links: Sequence[Chosen], part: Sequence[int]
+    ) -> dict[Key, PlannedLink | str]:
+        """New entries of the cache after planning some links one after the other."""
+        # Each plan is stored at once, so that an interrupt loses none.
+        before = set(self.cache)
+        z = links[part[0]][0].start.z if part[0] else self.problem.start
+        for k in part:
+            planned = self._plan_cached(links, k, z)
+            if isinstance(planned, str):
+                break
+            z = planned.end
+        return {key: self.cache[key] for key in set(self.cache) - before}
 
-def _plan_links(
-    problem: Problem,
-    links: Sequence[Chosen],
-    options: PlanOptions,
-    cache: Cache,
-    report: Callable[[str], None],
-) -> tuple[list[PlannedLink], str]:
-    """Plans of links one after the other, and why the next one has none, if so."""
-    z, found = problem.start, list[PlannedLink]()
-    for k, (link, _) in enumerate(links):
-        apart = measure_apart(problem.scene, z, link.start.z)
-        if k and not links[k - 1][0].in_cell and apart < MET:
-            z = link.start.z  # A border ends at the same place from wherever it starts.
-        planned = _plan_cached(problem, links, k, z, options, cache, report)
-        if isinstance(planned, str):
-            return found, f"{describe_steps(link.steps)}: {planned}"
-        found.append(planned)
-        z = planned.end
-    return found, ""
+    def plan(self, links: Sequence[Chosen]) -> tuple[list[PlannedLink], str]:
+        """Plans of links one after the other, and why the next one has none, if so."""
+        z, found = self.problem.start, list[PlannedLink]()
+        for k, (link, _) in enumerate(links):
+            apart = measure_apart(self.problem.scene, z, link.start.z)
+            if k and not links[k - 1][0].in_cell and apart < MET:
+                z = link.start.z  # A border ends at the same place from wherever it starts.
+            planned = self._plan_cached(links, k, z)
+            if isinstance(planned, str):
+                return found, f"{describe_steps(link.steps)}: {planned}"
+            found.append(planned)
+            z = planned.end
+        return found, ""
 
+    def _plan_cached(self, links: Sequence[Chosen], k: int, z: Array) -> PlannedLink | str:
+        """The plan of link number k from `z`, from the cache if it is there."""
+        link, guess = links[k]
+        following = links[k + 1][0] if k + 1 < len(links) else None
+        link = link if guess is None else replace(link, steps=guess.steps)
+        # A landing is planned with the border that follows, as if that ended at rest.
+        lands = link.in_cell and following is not None and not following.in_cell
+        follows = (following.steps[0]._replace(end=End.REST),) if following and lands else ()
+        place = key_configuration(self.problem.scene, z)
+        settings = repr(replace(self.options, samples=2))
+        key = (place, key_steps(link.steps), key_steps(follows), guess is None, settings)
+        if key not in self.cache:
+            self.report(f"planning {describe_steps(link.steps)}")
+            try:
+                self.cache[key] = self._plan_link(link, follows, guess, z)
+            except WholearmError as error:
+                self.cache[key] = str(error)
+            except np.linalg.LinAlgError:
+                self.cache[key] = SINGULAR
+        return self.cache[key]
 
-def _plan_cached(
-    problem: Problem,
-    links: Sequence[Chosen],
-    k: int,
-    z: Array,
-    options: PlanOptions,
-    cache: Cache,
-    report: Callable[[str], None],
-) -> PlannedLink | str:
-    """The plan of link number k from `z`, from the cache if it is there."""
-    link, guess = links[k]
-    following = links[k + 1][0] if k + 1 < len(links) else None
-    link = link if guess is None else replace(link, steps=guess.steps)
-    # A landing is planned with the border that follows, as if that ended at rest.
-    lands = link.in_cell and following is not None and not following.in_cell
-    follows = (following.steps[0]._replace(end=End.REST),) if following and lands else ()
-    place, settings = key_configuration(problem.scene, z), repr(replace(options, samples=2))
-    key = (place, key_steps(link.steps), key_steps(follows), guess is None, settings)
-    if key not in cache:
-        report(f"planning {describe_steps(link.steps)}")
-        try:
-            cache[key] = _plan_link(problem, link, follows, guess, z, options, report)
-        except WholearmError as error:
-            cache[key] = str(error)
-        except np.linalg.LinAlgError:
-            cache[key] = SINGULAR
-    return cache[key]
+    def _plan_link(
+        self, link: Link, follows: Sequence[EdgeStep], measured: Measured | None, z: Array
+    ) -> PlannedLink:
+        """Plan a link and the phases that follow, of which only the link is kept."""
+        steps = (*link.steps, *follows)
+        phases, curves = make_phases(self.problem, steps), list[Curve]()
+        if not link.in_cell and len(phases) == 1:
+            phases[0], curve = _aim(phases[0], z, link)
+            curves.append(curve)
+        single = replace(self.problem, start=z, phases=tuple(phases), goals=())
+        count = len(phases) - len(follows)
+        none = list[float | None]([None] * len(phases))
+        planning = Planning(single, tuple(curves), self.options, (), none, none, sketches=True)
+        with open_ledger(apart=True) as ledger, name_source(self.problem.source):
+            for part in split_blocks(single):
+                first, guess = part[0], None
+                if first.index >= count:
+                    break
+                ends = first.end is not End.REST or first.index == count - 1
+                if measured and measured.begun and ends:
+                    start = planning.blocks[-1].end if planning.blocks else z
+                    guess = BlockPlan(part, start, BEGUN, None, [], list(measured.begun), None)
+                planning = plan_next(planning, 0, guess, self.report)
+        costs = tuple(ledger.of(phase.number) for phase in phases[:count])
+        pinned = [
+            pin_landing(phase, end_of(plan)[0])
+            for phase, plan in zip(phases[:count], planning.plans, strict=True)
+        ]
+        return PlannedLink(tuple(pinned), planning.blocks, costs)
 
 
 def _assemble(problem: Problem, links: Sequence[PlannedLink], options: PlanOptions) -> Planning:
@@ -318,43 +332,6 @@ def key_configuration(scene: Scene, z: Array) -> tuple[float, ...]:
 def key_steps(steps: Sequence[EdgeStep]) -> Key:
     """Contacts and ends of phases."""
     return tuple((tuple(c.name for c in s.contacts), s.until, s.end.value) for s in steps)
-
-
-def _plan_link(
-    problem: Problem,
-    link: Link,
-    follows: Sequence[EdgeStep],
-    measured: Measured | None,
-    z: Array,
-    options: PlanOptions,
-    report: Callable[[str], None],
-) -> PlannedLink:
-    """Plan a link and the phases that follow, of which only the link is kept."""
-    steps = (*link.steps, *follows)
-    phases, curves = make_phases(problem, steps), list[Curve]()
-    if not link.in_cell and len(phases) == 1:
-        phases[0], curve = _aim(phases[0], z, link)
-        curves.append(curve)
-    single = replace(problem, start=z, phases=tuple(phases), goals=())
-    count = len(phases) - len(follows)
-    none = list[float | None]([None] * len(phases))
-    planning = Planning(single, tuple(curves), options, (), none, none, sketches=True)
-    with open_ledger(apart=True) as ledger, name_source(problem.source):
-        for part in split_blocks(single):
-            first, guess = part[0], None
-            if first.index >= count:
-                break
-            ends = first.end is not End.REST or first.index == count - 1
-            if measured and measured.begun and ends:
-                start = planning.blocks[-1].end if planning.blocks else z
-                guess = BlockPlan(part, start, BEGUN, None, [], list(measured.begun), None)
-            planning = plan_next(planning, 0, guess, report)
-    costs = tuple(ledger.of(phase.number) for phase in phases[:count])
-    pinned = [
-        pin_landing(phase, end_of(plan)[0])
-        for phase, plan in zip(phases[:count], planning.plans, strict=True)
-    ]
-    return PlannedLink(tuple(pinned), planning.blocks, costs)
 
 
 def pin_landing(phase: Phase, z: Array) -> Phase:

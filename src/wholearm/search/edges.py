@@ -267,11 +267,3 @@ def link_along(
     if isinstance(found, str):
         return Blocked(start, steps, Unstopped(found), stop)
     return Link(start, stop, steps, found, borders=borders, ratios=ratios)
-
-
-def link_border(border: BorderEdge) -> Link | Blocked | None:
-    """The link along the whole of a border; None where it ends at an obstacle."""
-    if border.gained is None:
-        return None
-    steps = (EdgeStep(border.formation.contacts, Until(contact=border.gained)),)
-    return link_along((border,), (1.0,), steps, border.stop)

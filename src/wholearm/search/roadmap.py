@@ -17,7 +17,15 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..common.arrays import Array
-from ..contacts.closing import Flags, Numbers, contact_table, first_contact, measure_gap, move
+from ..contacts.closing import (
+    Flags,
+    Numbers,
+    contact_table,
+    find_reach,
+    first_contact,
+    measure_gap,
+    move,
+)
 from ..contacts.closing import place as place_at
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
@@ -44,7 +52,6 @@ from .edges import (
     cut_curve,
     follow_borders,
     link_along,
-    link_border,
     point_out,
     time_parts,
 )
@@ -199,7 +206,7 @@ class Roadmap:
         """Borders from a place, with the link along the whole of each."""
         key = place.key
         if key not in self._links:
-            self._links[key] = [(border, link_border(border)) for border in self.trace(place)]
+            self._links[key] = [(b, Chain.of(b).link_whole()) for b in self.trace(place)]
         return self._links[key]
 
     def extend(self, chain: Chain) -> list[tuple[Chain, Link | Blocked | None]]:
@@ -591,10 +598,7 @@ class LabelMap(NamedTuple):
 def map_labels(scene: Scene) -> LabelMap:
     """Labels of all poses at which both fingers reach the object."""
     steps: Array = 2 * np.pi / AROUND * unit_steps(scene)
-    size = float(np.hypot(*scene.polygon.vertices.T).max())
-    bases = np.array([np.asarray(link.base)[0] for link in scene.fingers])
-    reach = np.array([link.length + link.radius + size for link in scene.fingers])
-    least, most = (bases - reach).max() - steps[0], (bases + reach).min() + steps[0]
+    least, most = find_reach(scene) + steps[0] * np.array([-1.0, 1.0])
     x = least + steps[0] * np.arange(max(2, np.ceil((most - least) / steps[0]) + 1))
     phi = steps[1] * np.arange(AROUND)
     labels = label_cells(scene, np.repeat(x, len(phi)), np.tile(phi, len(x)))[:, [0, 2, 4]]

@@ -21,7 +21,6 @@ from .edge_plans import BackgroundTask, FailedCandidate, Lost, can_join, join_ro
 from .edges import Link, describe_steps, leave_at
 from .feasibility import Measured, leave_in_motion, measure_link
 from .result import BorderBound, bound_borders
-from .roadmap import Roadmap
 
 FURTHER = 2  # further guesses of a path through a cell, if the first ones lead to no plan
 FINEST = 0.03  # finest step of the place where a border is left, over the border's length
@@ -32,72 +31,6 @@ INSIDE = 0.02  # least distance of the place from both ends of the border, over 
 
 Found = Measured | str
 T = TypeVar("T")
-
-
-class EdgeRefiner:
-    """Plans of links through cells, kept in a roadmap, with at most `jobs` processes."""
-
-    def __init__(
-        self, problem: Problem, roadmap: Roadmap, options: PlanOptions, jobs: int = 1
-    ) -> None:
-        self.problem, self.roadmap, self.options, self.jobs = problem, roadmap, options, jobs
-        self._prefetched: dict[Link, Found] = {}
-
-    def prefetch(self, links: Sequence[Link]) -> None:
-        """Plan links in parallel, for later calls of `measure`."""
-        waiting = [link for link in links if link not in self._prefetched]
-        if self.jobs > 1 and len(waiting) > 1:
-            found = self._share([partial(self._measure, link) for link in waiting])
-            self._prefetched.update(zip(waiting, found, strict=True))
-
-    def measure(self, link: Link) -> Found:
-        """Plan a link through a cell, from other places of its border if that fails."""
-        return self._prefetched.pop(link) if link in self._prefetched else self._measure(link)
-
-    def refine(self, route: RoadmapRoute, report: Callable[[str], None]) -> None:
-        """Optimize the places where a route leaves borders for cells."""
-        roadmap = self.roadmap
-        links = [link for link in route.links if link.left and link not in roadmap.refined]
-        roadmap.refined.update(links)
-        for link in links:
-            report(f"planning {describe_steps(link.steps)} in other ways")
-        plans = {link: roadmap.measured[link] for link in links}
-        searches = [
-            ReleaseSearch(partial(self._release, link), plan)
-            for link, plan in plans.items()
-            if isinstance(plan, Measured)
-        ]
-        if self.jobs > 1 and len(searches) == 1:
-            searches[0].prefetch(self._share)
-        found = self._share([search.run for search in searches])
-        for link, (best, *others) in zip(links, found, strict=True):
-            roadmap.measured[link] = best
-            roadmap.others.setdefault(link, []).extend(others)
-
-    def _share(self, tasks: Sequence[Task[T]]) -> list[T]:
-        return share(tasks, self.jobs, (self.problem, self.problem.scene))
-
-    def _measure(self, link: Link) -> Found:
-        found = measure_link(self.problem, link, link.steps, self.options, further=FURTHER)
-        for move in ELSEWHERE if link.left else ():
-            place = link.share + move
-            if not isinstance(found, str):
-                break
-            if INSIDE < place < 1 - INSIDE:
-                found = measure_link(self.problem, link, leave_at(link, place), self.options)
-        return found
-
-    def _release(self, link: Link, path: RefinedPath) -> Found:
-        """Plan a link that leaves its border at another place, or in motion."""
-        steps = leave_in_motion(link.steps)
-        if path.move is not None:
-            place = link.share + FINEST * path.move
-            if not INSIDE < place < 1 - INSIDE:
-                return "it is too near to the end of the border"
-            steps = leave_at(link, place)
-        return measure_link(
-            self.problem, link, steps, self.options, straight=path.straight, first_only=True
-        )
 
 
 class RefinedPath(NamedTuple):
@@ -195,7 +128,7 @@ class Chooser:
         self.found: list[RoadmapRoute] = []
         self.made: list[tuple[Plan, RoadmapRoute]] = []
         self.failures: list[FailedCandidate] = []
-        self._refiner = EdgeRefiner(problem, search.roadmap, options, jobs)
+        self._prefetched: dict[Link, Found] = {}
         self._measurements = 0
         self._bound: tuple[float, BackgroundTask[BorderBound]] | None = None
         self._lost: list[tuple[Link, ...]] = []
@@ -228,7 +161,7 @@ class Chooser:
                 self.found.remove(route)
                 continue
             if not self.first_only:
-                self._refiner.refine(route, report)
+                self._refine(route, report)
             report(f"planning a route of {sum(len(link.steps) for link in route.links)} phases")
             plan = self._plan(route, report)
             # An interrupted one is still there, to be planned then.
@@ -306,17 +239,67 @@ class Chooser:
         known = self.roadmap.measured
         if self._is_lost(route):
             return False
-        self._refiner.prefetch([link for link in route.links if link.in_cell and link not in known])
+        kept = self._prefetched
+        new = [own for own in route.links if own.in_cell and own not in known and own not in kept]
+        if self.jobs > 1 and len(new) > 1:
+            found = self._share([partial(self._measure_link, link) for link in new])
+            kept.update(zip(new, found, strict=True))
         for link in route.links:
             if not link.in_cell:
                 continue
             if link not in known:
                 self._measurements += 1
                 report(f"planning {describe_steps(link.steps)}")
-                known[link] = self._refiner.measure(link)
+                known[link] = kept.pop(link) if link in kept else self._measure_link(link)
             if isinstance(known[link], str):
                 return False
         return True
+
+    def _refine(self, route: RoadmapRoute, report: Callable[[str], None]) -> None:
+        """Optimize the places where a route leaves borders for cells."""
+        roadmap = self.roadmap
+        links = [link for link in route.links if link.left and link not in roadmap.refined]
+        roadmap.refined.update(links)
+        for link in links:
+            report(f"planning {describe_steps(link.steps)} in other ways")
+        plans = {link: roadmap.measured[link] for link in links}
+        searches = [
+            ReleaseSearch(partial(self._release, link), plan)
+            for link, plan in plans.items()
+            if isinstance(plan, Measured)
+        ]
+        if self.jobs > 1 and len(searches) == 1:
+            searches[0].prefetch(self._share)
+        found = self._share([search.run for search in searches])
+        for link, (best, *others) in zip(links, found, strict=True):
+            roadmap.measured[link] = best
+            roadmap.others.setdefault(link, []).extend(others)
+
+    def _share(self, tasks: Sequence[Task[T]]) -> list[T]:
+        return share(tasks, self.jobs, (self.problem, self.problem.scene))
+
+    def _measure_link(self, link: Link) -> Found:
+        """Plan a link through a cell, from other places of its border if that fails."""
+        found = measure_link(self.problem, link, link.steps, self.options, further=FURTHER)
+        for move in ELSEWHERE if link.left else ():
+            place = link.share + move
+            if not isinstance(found, str):
+                break
+            if INSIDE < place < 1 - INSIDE:
+                found = measure_link(self.problem, link, leave_at(link, place), self.options)
+        return found
+
+    def _release(self, link: Link, path: RefinedPath) -> Found:
+        """Plan a link that leaves its border at another place, or in motion."""
+        steps = leave_in_motion(link.steps)
+        if path.move is not None:
+            place = link.share + FINEST * path.move
+            if not INSIDE < place < 1 - INSIDE:
+                return "it is too near to the end of the border"
+            steps = leave_at(link, place)
+        return measure_link(
+            self.problem, link, steps, self.options, straight=path.straight, first_only=True
+        )
 
     def _is_lost(self, route: RoadmapRoute) -> bool:
         """Whether a route contains links that had no plan on another one."""

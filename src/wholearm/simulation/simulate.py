@@ -29,8 +29,8 @@ from ..contacts.contact_limits import takes_over
 from ..contacts.formation import Formation
 from ..mechanics.impact import ViolationKind, compute_impact, solve_impulses
 from ..mechanics.statics import find_static_torques
-from ..problem.check import require_phases
 from ..problem.definition import End, Phase, Problem
+from ..problem.read import require_phases
 from ..results.adopt import Torques, adopt_torques
 from .events import EventKind, Glimpses, Outcome, OutcomeKind, Record, Simulation, collect
 from .modes import find_fixed, find_grips, list_units, share_mode

@@ -20,8 +20,8 @@ from ..common.errors import InputError, name_source
 from ..common.fields import SHARE
 from ..common.sharing import exclusive
 from ..contacts.elemental import Contact
-from ..problem.check import require_phases
 from ..problem.definition import End, Phase, Problem, Until
+from ..problem.read import require_phases
 from ..quasistatic.slow_speeds import SQUEEZE, find_torques, sample_path
 from ..results.torque import TorqueProfile, format_rows, read_rows
 from ..simulation.events import Event, EventKind, FreeSimulation, list_pauses
