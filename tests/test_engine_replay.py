@@ -13,9 +13,14 @@ from shipped import HEPTAGON, LANDING, plan_of, problem_of
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
 from wholearm.contacts.formation import Formation, find_touching
-from wholearm.engines.departure import Departure, compare
-from wholearm.engines.engine_replay import EngineReport, Level, replay_in
-from wholearm.engines.feedback import play_policy
+from wholearm.engines.engine_replay import (
+    Departure,
+    EngineReport,
+    Level,
+    compare,
+    play_policy,
+    replay_in,
+)
 from wholearm.engines.mjcf import write_mjcf
 from wholearm.engines.shapes import list_pairs
 from wholearm.engines.stretch import (

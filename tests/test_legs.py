@@ -20,8 +20,14 @@ from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.path_guess import guess_phase
 from wholearm.mapping.borders import NOWHERE, flush_track, label_cells
-from wholearm.mapping.formation_list import Route, format_route, list_formations
-from wholearm.mapping.legs import describe_miss, split_leg, tolerance
+from wholearm.mapping.formation_list import (
+    Route,
+    describe_miss,
+    format_route,
+    list_formations,
+    split_leg,
+    tolerance,
+)
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem
 from wholearm.search.roadmap import map_labels

@@ -19,10 +19,9 @@ from wholearm.contacts.closing import contact_table, evaluate_contacts
 from wholearm.figures.style import choose_styles
 from wholearm.mapping.formation_list import write_template
 from wholearm.viewer import page
-from wholearm.viewer.chart import describe_map
 from wholearm.viewer.motion_data import describe_motion, place_pushes
 from wholearm.viewer.movie import FRAMES, Movie, write_movie
-from wholearm.viewer.report_page import build_report, list_joints, list_phases
+from wholearm.viewer.report_page import build_report, describe_map, list_joints, list_phases
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 

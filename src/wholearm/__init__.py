@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     from .comparison.side_by_side import Comparison
     from .contacts.elemental import Contact
     from .contacts.formation import Formation
-    from .engines.engine_replay import EngineReport, replay_in
-    from .engines.feedback import PolicyReport, play_policy
+    from .engines.engine_replay import EngineReport, PolicyReport, play_policy, replay_in
     from .engines.mjcf import write_mjcf
     from .figures import plots
     from .figures.map_figure import draw_map
@@ -73,8 +72,7 @@ _NAMES = {
     "comparison.side_by_side": "Comparison",
     "contacts.elemental": "Contact",
     "contacts.formation": "Formation",
-    "engines.engine_replay": "EngineReport replay_in",
-    "engines.feedback": "PolicyReport play_policy",
+    "engines.engine_replay": "EngineReport PolicyReport play_policy replay_in",
     "engines.mjcf": "write_mjcf",
     "figures.map_figure": "draw_map",
     "geometry.path_guess": "load",

@@ -72,7 +72,7 @@ def replay(options: argparse.Namespace) -> int:
 def _play_policy(
     options: argparse.Namespace, problem: Problem, plan: Trajectory, setting: Setting
 ) -> int:
-    from ..engines.feedback import ALLOWED, play_policy
+    from ..engines.engine_replay import ALLOWED, play_policy
     from ..policy.playback import Policy
 
     if options.refine:

@@ -1,26 +1,47 @@
-"""Verification of plans by open-loop replay in physics engines."""
+"""Replays of plans, and simulations of policies, in physics engines, compared with the plan.
+
+The cause of a departure is the first deviation in contacts that lasts until the error of the pose
+exceeds its limit: a contact opens, sticks, slips, or one that is not planned has force.
+"""
 
 from __future__ import annotations
 
 import importlib
 import importlib.util
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..common.arrays import Array, find_runs
 from ..common.document import Document, Result, Table
 from ..common.errors import InputError
-from ..problem.definition import Problem
+from ..policy.playback import ROOM, ClosedLoop, Policy
+from ..problem.definition import Phase, Problem
 from ..results.adopt import Moved, adopt_motion, require_same_phases
-from ..results.trajectory import Trajectory
-from .departure import PRESS, Departure, compare
-from .stretch import Engine, EngineStretch, Setting, apply_friction, find_between, list_stretches
+from ..results.trajectory import Samples, Trajectory
+from .stretch import (
+    Engine,
+    EngineRun,
+    EngineStretch,
+    Setting,
+    apply_friction,
+    find_between,
+    list_stretches,
+)
 
 PARTS = 5  # equal parts of a stretch at whose ends the error is listed
+OPEN = 0.1  # gap of an open contact, over the allowed error
+SLOW = 0.1  # share of the planned sliding speed below which a contact sticks
+MOVES = 2e-3  # sliding speed of a contact that slides, over the scene's speed
+PRESS = 0.25  # least normal force that counts, over the scene's force: 0.5 N in `problems/`
+_INSTANTS = 2000  # samples of a phase over which planned forces are averaged
+# Allowed error of the final pose, over the scene's length and in rad; soft contacts cause 2e-3.
+ALLOWED = 1e-2
 
 
 class EngineInfo(NamedTuple):
@@ -37,6 +58,31 @@ ENGINES = {
     "drake": EngineInfo("Drake", "pydrake", 1.5e-3, Setting(1.6e-4)),
 }
 """In the scenes of `problems/` 3e-3 are 0.1 mm and 0.17 degrees, and steps take 1e-5 s."""
+
+
+class Force(NamedTuple):
+    """The normal force of a contact, averaged over a phase [N]."""
+
+    phase: int
+    contact: str
+    planned: float
+    found: float
+
+    @property
+    def off(self) -> float:
+        """Error relative to the planned one."""
+        return (self.found - self.planned) / self.planned
+
+
+class Departure(NamedTuple):
+    """A stretch, compared with the plan."""
+
+    t: Array  # (n,) [s]: from the start of the plan
+    position: Array  # (n,) [m]: error of the object's position
+    angle: Array  # (n,) [rad]: error of its angle
+    forces: tuple[Force, ...]
+    time: float | None  # [s]: when the error exceeds its limit
+    reason: str  # the cause; empty without one
 
 
 class Level(NamedTuple):
@@ -222,3 +268,248 @@ def list_settings(setting: Setting, halvings: int) -> list[Setting]:
     return finer + [
         level._replace(softness=setting.softness * 2**k) for k, level in enumerate(finer[1:], 1)
     ]
+
+
+class _PressChange(NamedTuple):
+    """A deviation of a contact and its interval [s]."""
+
+    start: float
+    stop: float
+    what: str
+
+
+class _Part(NamedTuple):
+    """A phase of a stretch: its rows of the run, and the plan there."""
+
+    phase: Phase
+    contacts: tuple[str, ...]
+    rows: NDArray[np.int64]
+    want: Samples
+
+
+def compare(
+    problem: Problem, plan: Trajectory, stretch: EngineStretch, run: EngineRun, allowed: float
+) -> Departure:
+    """Compare a replay with the plan.
+
+    Parameters
+    ----------
+    allowed  largest error of the position over the scene's length, and of the angle in rad
+    """
+    length = problem.scene.scales.length
+    parts = _divide(problem, plan, stretch, run)
+    error = run.z - np.concatenate([part.want.z for part in parts])
+    position, angle = np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])
+    forces = tuple(force for part in parts for force in _average(plan, part, run))
+    beyond = np.flatnonzero(~(np.maximum(position / length, angle) <= allowed))
+    if not len(beyond):
+        return Departure(run.t, position, angle, forces, None, "")
+    time = float(run.t[beyond[0]])
+    changes = [c for part in parts for c in _list_changes(problem, part, run, allowed * length)]
+    before = [change for change in changes if change.start <= time]
+    # The first one that lasts until then, or else the last one before.
+    lasting = [change for change in before if change.stop >= time]
+    reason = "every contact is as planned"
+    if before:
+        cause = min(lasting) if lasting else max(before, key=lambda change: change.stop)
+        reason = f"{cause.what} at t = {cause.start:.5g} s"
+    return Departure(run.t, position, angle, forces, time, reason)
+
+
+def _divide(
+    problem: Problem, plan: Trajectory, stretch: EngineStretch, run: EngineRun
+) -> list[_Part]:
+    """The phases of a stretch; each includes the row at its end."""
+    starts, parts = plan.phase_starts, []
+    owner = np.searchsorted(starts[1:-1], run.t, side="left")
+    owner = np.clip(owner, stretch.phases[0], stretch.phases[-1])
+    owner[0] = stretch.phases[0]
+    for index in stretch.phases:
+        rows, motion = np.flatnonzero(owner == index), plan.motions[index]
+        want = motion.evaluate(np.clip(run.t[rows] - starts[index], 0.0, motion.duration))
+        parts.append(_Part(problem.phases[index], motion.contacts, rows, want))
+    return parts
+
+
+def _average(plan: Trajectory, part: _Part, run: EngineRun) -> list[Force]:
+    """Planned and found normal forces of a phase, averaged until the gained contact closes.
+
+    Its gap closes at a vanishing speed: a small error of the pose closes it early.
+    """
+    motion, scene = plan.motions[part.phase.index], part.phase.formation.scene
+    every = part.rows[part.rows > 0]
+    ends = run.cut(every, part.phase.until.contact, scene)
+    ends = ends if len(ends) else every[:1]
+    time = run.t[ends[-1]] - plan.phase_starts[part.phase.index]
+    middles = (np.arange(_INSTANTS) + 0.5) * min(time, motion.duration) / _INSTANTS
+    planned = np.nanmean(motion.evaluate(middles).c_n, axis=0).tolist()
+    share = np.diff(run.t)[ends - 1]
+    press = share @ run.press[ends - 1] / share.sum()
+    found = [float(press[run.find_columns(name, scene)].sum()) for name in part.contacts]
+    rows = zip(part.contacts, planned, found, strict=True)
+    return [Force(part.phase.number, *row) for row in rows]
+
+
+def _list_changes(
+    problem: Problem, part: _Part, run: EngineRun, reach: float
+) -> Iterator[_PressChange]:
+    """Deviations of contacts from the plan in a phase."""
+    scales, formation, rows = problem.scene.scales, part.phase.formation, part.rows
+    actual = formation.evaluate(run.z[rows], run.z_dot[rows])
+    planned = formation.evaluate(part.want.z, part.want.z_dot)
+    slides = np.einsum("nij,nj->ni", actual.A_t, run.z_dot[rows])
+    meant = np.einsum("nij,nj->ni", planned.A_t, part.want.z_dot)
+    pressing = run.press[rows[rows > 0] - 1].copy()
+    for k, name in enumerate(formation.names):
+        pressing[:, run.find_columns(name, problem.scene)] = 0.0
+        yield from _find_runs(run.t[rows], actual.C[:, k] > OPEN * reach, f"{name} opens")
+        moves = MOVES * scales.speed
+        if k in formation.rolling_rows:
+            yield from _find_runs(run.t[rows], np.abs(slides[:, k]) > moves, f"{name} slips")
+            continue
+        held = (np.abs(meant[:, k]) > moves) & (np.abs(slides[:, k]) < SLOW * np.abs(meant[:, k]))
+        yield from _find_runs(run.t[rows], held, f"{name} sticks")
+    for column in np.flatnonzero((pressing > PRESS * scales.force).any(axis=0)):
+        hits = pressing[:, column] > PRESS * scales.force
+        times = run.t[rows[rows > 0]]
+        yield from _find_runs(times, hits, f"{run.pairs[column]} presses, which is not planned,")
+
+
+def _find_runs(t: Array, happens: NDArray[np.bool_], what: str) -> Iterator[_PressChange]:
+    """Intervals in which a flag is set."""
+    for run in find_runs(happens):
+        yield _PressChange(float(t[run.start]), float(t[run.stop - 1]), what)
+
+
+class StretchEnd(NamedTuple):
+    """A stretch that a policy carries out in an engine."""
+
+    stretch: EngineStretch
+    duration: float  # [s]: until the joints are at rest at the end
+    over: bool  # whether they are
+    position: float  # [m]: final error of the object's position
+    angle: float  # [rad]: of its angle
+    contact: str  # the planned contact that opens most during its phase
+    gap: float  # [m]: its gap
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PolicyReport(Result):
+    """Final errors of a policy in an engine; `allowed` is over the scene's length and in rad."""
+
+    problem: Problem
+    title: str
+    allowed: float
+    arrivals: tuple[StretchEnd, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether every stretch ends, at the planned pose."""
+        return all(self.find_failure(end) is None for end in self.arrivals)
+
+    def find_failure(self, end: StretchEnd) -> str | None:
+        """Description of a failure, if there is one."""
+        far = max(end.position / self.problem.scene.scales.length, end.angle)
+        if not far <= self.allowed:
+            text = f"{end.position * 1e3:.3g} mm and {math.degrees(end.angle):.3g} degrees"
+            return f"phase {end.stretch.name} ends {text} away from the plan"
+        if not end.over:
+            return f"phase {end.stretch.name} does not end within {end.duration:.4g} s"
+        return None
+
+    @property
+    def document(self) -> Document:
+        """Durations and final errors."""
+        columns = {
+            "stretch.name": "phase:d", "stretch.duration": "plan [s]:.6f",
+            "duration": "policy [s]:.6f", "position": "end off [mm]:.4f", "angle": "[deg]:.4f",
+            "gap": "largest gap [mm]:.4f", "contact": "",
+        }  # fmt: skip
+        failures = [self.find_failure(end) or "" for end in self.arrivals]
+        title = f"{self.problem.name} in {self.title}, by the policy"
+        verdict, table = "ok" if self.ok else "FAILS", Table.of(self.arrivals, columns)
+        return Document(title, verdict, parts=[*failures, table])
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The report for machines, in m, rad and s."""
+        stretches = [{"phases": end.stretch.numbers, **end._asdict()} for end in self.arrivals]
+        for stretch in stretches:
+            del stretch["stretch"]
+        values = {"problem": self.problem.name, "engine": self.title, "ok": self.ok}
+        return {**values, "allowed": self.allowed, "stretches": stretches}
+
+
+def play_policy(
+    engine: str,
+    problem: Problem,
+    plan: Trajectory | Moved,
+    policy: Policy,
+    *,
+    whole: bool = False,
+    setting: Setting | None = None,
+    allowed: float = ALLOWED,
+    progress: Callable[[str], None] | None = None,
+) -> PolicyReport:
+    """Simulate a policy in an engine that does not know the contact sequence.
+
+    Parameters
+    ----------
+    engine : {"mujoco", "drake"}
+    plan                        start and end of each phase
+    whole                       from start to end; otherwise from each phase that begins at rest
+    setting, allowed, progress  as of `replay_in`
+
+    Raises
+    ------
+    InputError  if the engine is unknown or not installed, or the policy is of other phases
+    """
+    problem, plan = adopt_motion(problem, plan)
+    play = require_engine(engine)
+    if policy.count != len(problem.phases):
+        given = f"{policy.count} given; the problem has {len(problem.phases)}"
+        raise InputError("", "phases of the policy", given)
+    info = ENGINES[engine]
+    setting = info.setting if setting is None else setting
+    arrivals = []
+    for stretch in _join(list_stretches(find_between(plan), False), policy, whole):
+        if progress is not None:
+            progress(f"phase {stretch.name} in {info.title}")
+        last = stretch.phases[-1] + 1
+        loop = ClosedLoop(policy.cut(last), stretch.phases[0] + 1)
+        until = stretch.start + (1 + ROOM) * loop.find_duration(last)
+        run = play(problem, stretch._replace(stop=until), loop, setting)
+        arrivals.append(_judge(problem, plan, stretch, loop, run))
+    title = f"{info.title} {version(engine)}"
+    return PolicyReport(problem, title, allowed, tuple(arrivals))
+
+
+def _join(parts: list[EngineStretch], policy: Policy, whole: bool) -> list[EngineStretch]:
+    """Stretches that begin at rest, or one of all phases."""
+    begins = [1] if whole else policy.resting
+    found = []
+    for first, after in zip(begins, [*begins[1:], len(parts) + 1], strict=True):
+        phases, stop, rest = tuple(range(first - 1, after - 1)), parts[after - 2].stop, np.zeros(5)
+        start = parts[first - 1]
+        found.append(start._replace(phases=phases, stop=stop, z_dot=rest, z_ddot=rest))
+    return found
+
+
+def _judge(
+    problem: Problem, plan: Trajectory, stretch: EngineStretch, loop: ClosedLoop, run: EngineRun
+) -> StretchEnd:
+    """Final error of a run, and the planned contact that opens most."""
+    goal = plan.z[np.flatnonzero(plan.phase == stretch.phases[-1])[-1]]
+    away, t = np.abs(run.z[-1] - goal), run.t - stretch.start
+    position, angle = float(np.hypot(*away[:2])), float(away[2])
+    begins = [loop.began.get(index + 1, np.inf) for index in stretch.phases]
+    contact, gap = "", 0.0
+    for index, start, stop in zip(stretch.phases, begins, [*begins[1:], np.inf], strict=True):
+        phase = problem.phases[index]
+        rows = np.flatnonzero((t >= start) & (t < stop))
+        rows = run.cut(rows, phase.until.contact, problem.scene)
+        gaps = phase.formation.evaluate(run.z[rows], run.z_dot[rows]).C
+        if gaps.size and gaps.max() > gap:
+            gap = float(gaps.max())
+            contact = phase.formation.names[int(gaps.max(axis=0).argmax())]
+    return StretchEnd(stretch, float(t[-1]), loop.over, position, angle, contact, gap)

@@ -4,25 +4,49 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise, product
+from functools import lru_cache
+from itertools import pairwise, permutations, product
+from typing import NamedTuple
 
 import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import InputError, require_number
 from ..common.sharing import exclusive
-from ..contacts.closing import close_finger, place_flush
+from ..contacts.closing import (
+    ClosedFinger,
+    Numbers,
+    close_finger,
+    close_fingers,
+    contact_table,
+    describe_obstacle,
+    lower,
+    place_flush,
+)
 from ..contacts.elemental import Contact
-from ..geometry.path_guess import guess_phase
+from ..contacts.formation import Formation, find_touching
+from ..geometry.curve import describe_pose
+from ..geometry.explore import STILL, is_inside
+from ..geometry.path_guess import find_end, guess_phase
 from ..geometry.tracing import trace_phases
-from ..problem.definition import Problem, Until
+from ..mechanics.dynamics import metric_weights
+from ..problem.definition import Phase, Problem, Until
 from ..problem.read import build_problem
 from ..problem.table import format_until
-from ..scene.model import TURN, Polygon, check_place
-from .borders import Window
-from .legs import describe_miss, describe_place, tolerance, walk_leg
+from ..scene.model import TURN, Polygon, Scene, check_place
+from .borders import (
+    Piece,
+    Track,
+    Window,
+    cut,
+    flush_track,
+    label_cells,
+    label_closed,
+    name_contacts,
+    palm_track,
+)
 
 _MOST = 50  # Corners of a polygon that a file still shows well
 _SIZE, _MASS = 0.05, 0.2  # radius [m] and mass [kg] of the reference object
@@ -32,6 +56,20 @@ _LEFT, _START, _SLIDE = (-1.6, -0.2), (0.3, 1.2), 0.4
 # Other hands and starts for given vertices.
 _OTHERS = tuple(product((True, False), (1.2, 0.8, 0.3, 0.0)))
 _COMMENTS = 31  # Column of the comments
+NEAR = (0.015, float(np.radians(0.5)))  # tolerance of poses: x in radii of gyration, phi in rad
+MISSED = 4.0  # largest distance of a leg from a border that is reported, over `NEAR`
+PLACES = 401  # samples of a leg
+SAME_PLACE = 1e-3  # length of a part, over `NEAR`, below which its ends are one crossing
+BESIDE = 1e-6  # gap between parts, over `NEAR`, that counts as unreachable
+SHORTEST = 0.3  # largest tolerance along a leg, over its length
+AT_START = 1e-4  # length of a first part, over `NEAR`, that counts as rounding
+INSIDE = 0.2  # distance of a leg's end from an obstacle, over `NEAR`
+PROBES = 9  # samples of an excursion into a neighbouring cell
+DIGITS = 1e-5  # rounding of the coordinates that end phases, in radii of gyration and rad
+REPLANS = 12  # most times that the rest of a leg is split anew
+BEFORE = 0.98  # share of a part at which intermediate phases end: short of the change of contacts
+Span = tuple[Numbers, float, float]  # a label, and the parameters between which a leg has it
+Step = tuple[tuple[Contact, ...], Until]  # contacts of a phase, and its end
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +102,7 @@ class Route(tuple[Stretch, ...]):
 def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
     """List the contact formations along a route of straight legs.
 
-    A leg with both ends near one border (`legs.NEAR`) follows the border; ends that near a change
+    A leg with both ends near one border (`NEAR`) follows the border; ends that near a change
     of contacts are moved to it. Phases are carried out as in a plan: on a border along its curve,
     in a cell to the nearest end, or to the pose at the end of the leg.
 
@@ -100,7 +138,7 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
             raise InputError("", "route", text) from None
         if note:
             notes.append(f"leg {leg + 1} goes through cells: {note}")
-        for _, (contacts, until), end in walked:
+        for (contacts, until), end in walked:
             stretch = Stretch(contacts, until, z[[0, 2]], end[[0, 2]])
             before = stretches[-1] if stretches and legs[-1] != leg else None
             # On a border a leg may continue the one before; a reversal is a new phase.
@@ -174,6 +212,382 @@ def trace_problem(problem: Problem) -> list[Array]:
     except InputError:
         pass  # The map is drawn of infeasible phases, too.
     return paths
+
+
+class Part(NamedTuple):
+    """A part of a leg with one contact formation."""
+
+    contacts: tuple[Contact, ...]
+    start: Array  # start, stop (2,) [m, rad]: x and phi at its ends
+    stop: Array
+    gained: tuple[Contact, ...]  # at its end; empty where it ends inside a cell
+    coordinate: int  # {0, 1}: x or phi, whichever changes more
+    inside: Array  # (2,) [m, rad]: end without a gained contact: `stop`, or before an obstacle
+
+
+Walked = tuple[Step, Array]  # a phase, and the configuration at its end
+
+
+def walk_leg(problem: Problem, index: int, z: Array, start: Array, stop: Array) -> list[Walked]:
+    """Phases along a leg, with their final configurations.
+
+    A phase with two degrees of freedom ends at the nearest place, not on the leg, except for the
+    last one. If the phases that follow cannot start there, the rest of the leg is split anew.
+
+    Parameters
+    ----------
+    index                        number of the first phase, from 0
+    z : (5,)                     configuration at the start
+    start, stop : (2,) [m, rad]  x and phi at the ends of the leg
+
+    Raises
+    ------
+    InputError  if the leg cannot be followed
+    """
+    walked: list[Walked] = []
+    parts, replans = split_leg(problem.scene, start, stop), 0
+    while parts:
+        near = tolerance(problem.scene)
+        while len(parts) > 1 and (np.abs(parts[0].stop - parts[0].start) < near).all():
+            # A first part within `NEAR` is left out if the next one can start here.
+            if not _can_start(problem.scene, z, parts[1].contacts):
+                break
+            parts = parts[1:]
+        try:
+            walked += _walk_part(problem, index + len(walked), z, parts[:2])
+        except InputError as error:
+            moved = (np.abs(z[[0, 2]] - parts[0].start) > 1e-3 * near).any()
+            if not moved or replans == REPLANS:
+                raise InputError("", "route", error.problem) from None
+            parts, replans = split_leg(problem.scene, z[[0, 2]], stop), replans + 1
+            continue
+        z, parts = walked[-1][1], parts[1:]
+    return walked
+
+
+def _list_missing(scene: Scene, z: Array, contacts: tuple[Contact, ...]) -> list[Contact]:
+    """Contacts that do not touch at `z`."""
+    gaps = _form(scene, contacts).evaluate(z[None], z[None]).C[0]
+    return [c for c, gap in zip(contacts, gaps, strict=True) if abs(gap) > scene.touching]
+
+
+def _walk_part(problem: Problem, index: int, z: Array, parts: list[Part]) -> list[Walked]:
+    """The first feasible phases through a part; preferably such that the next part can start."""
+    first: InputError | None = None
+    spare: list[Walked] = []
+    scene, part = problem.scene, parts[0]
+    for steps in _list_steps(scene, z, part, len(parts) == 1):
+        end, walked = z, list[Walked]()
+        try:
+            for contacts, until in steps:
+                start = end
+                phase = Phase(index + len(walked), _form(scene, contacts), until)
+                end = find_end(phase, start)
+                moved = metric_weights(scene) @ (end - start) ** 2
+                if moved < (STILL * scene.scales.length) ** 2:
+                    text = f"{until} holds already at {describe_pose(start)}"
+                    raise InputError("", "", text)
+                walked.append(((contacts, until), end))
+        except InputError as error:
+            first = first or error
+            continue
+        if len(part.contacts) == 4:
+            # A contact may be gained in both directions along a border.
+            pose = end[[0, 2]]
+            away = np.minimum(np.abs(pose - part.stop), np.abs(pose - part.inside))
+            if not (away < tolerance(scene)).all():
+                text = f"{steps[-1][1]} is first reached at {describe_pose(end)}"
+                first = first or InputError("", "", text)
+                continue
+        if len(parts) == 1 or _can_start(scene, end, parts[1].contacts):
+            return walked
+        spare = spare or walked
+    if spare:
+        return spare
+    assert first is not None
+    raise first
+
+
+def _can_start(scene: Scene, z: Array, contacts: tuple[Contact, ...]) -> bool:
+    """Whether a formation holds at `z`."""
+    return not _list_missing(scene, z, contacts) and is_inside(_form(scene, contacts), z)
+
+
+def _list_steps(scene: Scene, z: Array, part: Part, last: bool) -> Iterator[list[Step]]:
+    """Candidate phases for a part from `z`, the simplest first."""
+    simple: list[list[Step]] = [[(part.contacts, Until(contact=c))] for c in part.gained]
+    ends: list[list[Step]] = list(simple) or [[]]
+    if not part.gained or (part.inside != part.stop).any():
+        simple.append([(part.contacts, end_at(scene, part.coordinate, part.inside))])
+    if last and len(part.contacts) == 3:
+        # One phase with terminal constraints on the pose.
+        pose = [end_at(scene, row, part.stop) for row in (0, 1)]
+        pins = [((end.coordinate, end.value or 0.0),) for end in pose]
+        for contact, pin in product(part.gained, pins):
+            yield [(part.contacts, Until(contact=contact, pins=pin))]
+        if not part.gained:
+            row = part.coordinate
+            yield [(part.contacts, replace(pose[row], pins=pins[1 - row]))]
+    missing = _list_missing(scene, z, part.contacts)
+    if len(missing) == 1 and len(part.contacts) == 4:
+        # A border that `z` is beside, not on, has to be reached first.
+        held = tuple(c for c in part.contacts if c not in missing)
+        yield from ([(held, Until(contact=missing[0])), *steps] for steps in simple)
+        return
+    yield from simple
+    # Intermediate phases by x and phi lead to near the end: another end may be nearer.
+    rows = (part.coordinate,) if len(part.contacts) == 4 else (0, 1)
+    aim = part.start + (BEFORE if part.gained else 1.0) * (part.stop - part.start)
+    between = [(part.contacts, end_at(scene, row, aim)) for row in rows]
+    for count in range(1, len(rows) + 1):
+        for chosen in permutations(between, count):
+            yield from ([*chosen, *end] for end in ends)
+
+
+def end_at(scene: Scene, row: int, pose: Array) -> Until:
+    """The end of a phase at x or phi of a pose, rounded as in problem files."""
+    if row == 0:
+        digits = math.ceil(-math.log10(DIGITS * scene.scales.length))
+        return Until(coordinate="x", value=round(float(pose[0]), digits))
+    degrees = round(math.degrees(pose[1]), math.ceil(-math.log10(math.degrees(DIGITS))))
+    return Until(coordinate="phi", value=math.radians(degrees))
+
+
+@lru_cache(maxsize=64)
+def _form(scene: Scene, contacts: tuple[Contact, ...]) -> Formation:
+    return Formation(scene, contacts)
+
+
+def describe_place(pose: Array) -> str:
+    """A pose (x, phi) in words."""
+    return describe_pose(np.array([pose[0], 0.0, pose[1]]))
+
+
+def split_leg(scene: Scene, start: Array, stop: Array) -> list[Part]:
+    """Split a leg into parts with one formation each.
+
+    A leg with both ends within `NEAR` of one border follows the border; any other is straight.
+    An end that near a change of contacts is moved to it, and a straight leg that leaves a cell by
+    no more than that, and comes back, stays in it.
+
+    Parameters
+    ----------
+    start, stop : (2,) [m, rad]  x and phi
+
+    Raises
+    ------
+    InputError  if part of the leg cannot be reached, or it runs through a crossing of borders
+    """
+    leg = choose_leg(scene, start, stop)
+    low, high = min(leg.start, leg.stop), max(leg.start, leg.stop)
+    near = min(leg.near, SHORTEST * (high - low))
+    sign = 1 if leg.stop >= leg.start else -1
+    # The start is that of the leg before, up to rounding.
+    margins = (AT_START * near, near)[::sign]
+    kept = [
+        piece
+        for piece in cut(scene, [leg.track])
+        if piece.places[-1] > low + margins[0] and piece.places[0] < high - margins[1]
+    ]
+    _require_reached(scene, leg, kept, [low + near, high - near])
+    spans = [(p.label, float(p.places[0]), float(p.places[-1])) for p in kept]
+    spans = [span for span in spans if span[2] - span[1] > SAME_PLACE * leg.near] or spans
+    if sign < 0:
+        spans = [(label, last, first) for label, first, last in spans[::-1]]
+    # The track goes on a little beyond the leg; a change of contacts that near ends the leg.
+    label, first, last = spans[0]
+    if abs(first - leg.start) > 0.99 * near:
+        spans[0] = (label, leg.start, last)
+    label, first, last = spans[-1]
+    at_change = sign * (last - leg.stop) < 0.99 * near
+    if not at_change:
+        spans[-1] = (label, first, leg.stop)
+    if leg.track.flush is None:
+        spans = _drop_excursions(scene, leg, spans)
+    return _build_parts(scene, leg, spans, at_change)
+
+
+def _build_parts(scene: Scene, leg: Leg, spans: list[Span], at_change: bool) -> list[Part]:
+    table, near = contact_table(scene), tolerance(scene)
+    parts = []
+    for index, (label, first, last) in enumerate(spans):
+        mine = name_contacts(table, label)
+        begin, end = leg.at(first), leg.at(last)
+        gained: tuple[Contact, ...] = ()
+        inside = end
+        if index + 1 < len(spans):
+            following = name_contacts(table, spans[index + 1][0])
+            gained = tuple(c for c in following if c not in mine)
+            if len(gained) != 1:
+                names = ", ".join(c.name for c in dict.fromkeys((*mine, *following)))
+                text = f"runs through a crossing of borders at {describe_place(end)}, of {names}"
+                raise InputError("", "route", f"{text}; go around it, or stop there")
+        elif at_change:
+            z = close_fingers(scene, end[:1], end[1:]).z[0]
+            touching = find_touching(scene, z) if np.isfinite(z).all() else ()
+            gained = tuple(c for c in touching if c not in mine)
+            inside = leg.at(last + np.clip(first - last, -INSIDE * leg.near, INSIDE * leg.near))
+        coordinate = int((np.abs(end - begin) / near).argmax())
+        if leg.track.flush is not None:
+            coordinate = 0 if leg.track.flush[0] is None else 1
+        parts.append(Part(mine, begin, end, gained, coordinate, inside))
+    return parts
+
+
+def _drop_excursions(scene: Scene, leg: Leg, spans: list[Span]) -> list[Span]:
+    """Remove excursions within `NEAR`, in which a straight leg loses a contact and regains it."""
+    labels = np.array([label for label, _, _ in spans])
+    box = np.array(list(product((-1, 0, 1), repeat=2))) * tolerance(scene)
+    for column in (0, 2, 4):
+        contacts = labels[:, column]
+        for k in range(1, len(spans)):
+            again = np.flatnonzero(contacts[k:] == contacts[k - 1])
+            if not len(again) or again[0] == 0:
+                continue
+            first, last = spans[k][1], spans[k + int(again[0]) - 1][2]
+            # Each place has to be within `NEAR` of where the contact touches.
+            x, phi = leg.track.pose(np.linspace(first, last, PROBES))
+            poses = (np.column_stack([x, phi])[:, None] + box).reshape(-1, 2)
+            near = label_cells(scene, *poses.T).reshape(PROBES, len(box), -1)[..., column]
+            if (near == contacts[k - 1]).any(axis=1).all():
+                contacts[k : k + int(again[0])] = contacts[k - 1]
+    kept: list[Span] = []
+    for label, (_, first, last) in zip(labels, spans, strict=True):
+        if kept and (kept[-1][0] == label).all():
+            _, first, _ = kept.pop()
+        kept.append((label, first, last))
+    return kept
+
+
+def _require_reached(scene: Scene, leg: Leg, kept: list[Piece], ends: list[float]) -> None:
+    inner = [float(s) for piece in kept for s in piece.places[[0, -1]]]
+    ends = [ends[0], *inner, ends[1]]
+    for before, after in zip(ends[::2], ends[1::2], strict=True):
+        if after - before > BESIDE * leg.near:
+            pose = leg.at((before + after) / 2)
+            text = describe_obstacle(close_fingers(scene, pose[:1], pose[1:]))
+            text = text or "there the border has ended"
+            raise InputError("", "route", f"cannot be followed at {describe_place(pose)}: {text}")
+
+
+@dataclass(frozen=True, eq=False)
+class Leg:
+    """A curve in the (x, phi) plane."""
+
+    track: Track
+    start: float  # start, stop: parameters of the curve
+    stop: float
+    near: float  # `NEAR` as a difference of the parameter
+
+    def at(self, place: float) -> Array:
+        """The pose (x, phi) at a parameter, shape (2,) [m, rad]."""
+        return np.array(self.track.pose(np.array([place]))).ravel()
+
+
+def tolerance(scene: Scene) -> Array:
+    """`NEAR` in the scene's units, shape (2,) [m, rad]."""
+    return np.array([NEAR[0] * scene.scales.length, NEAR[1]])
+
+
+def choose_leg(scene: Scene, start: Array, stop: Array) -> Leg:
+    """The border that both ends are near, or a straight line."""
+    found = []
+    for leg, off in _list_near(scene, start, stop):
+        flush = leg.track.flush
+        if off < 1 and (flush is None or flush[0] is None):
+            return leg
+        if off < 1:
+            # Both ends have to be near the same piece of the curve, or near one each.
+            reach = np.array([-leg.near, leg.near])
+            ranges = [piece.places[[0, -1]] + reach for piece in cut(scene, [leg.track])]
+            ends = leg.start, leg.stop
+            if all(any(low < place < high for low, high in ranges) for place in ends):
+                found.append((off, leg))
+    if found:
+        return min(found, key=lambda entry: entry[0])[1]
+    near = tolerance(scene)
+
+    def pose(s: Array) -> tuple[Array, Array]:
+        points = start + s[:, None] * (stop - start)
+        return points[:, 0], points[:, 1]
+
+    def label(_: Array, phi: Array, closed: ClosedFinger) -> Numbers:
+        return label_closed(closed, lower(scene, phi)[1])
+
+    share = float(1 / (np.abs(stop - start) / near).max())
+    places = np.linspace(-share, 1.0 + share, PLACES)
+    track = Track(pose, label, places, np.inf)
+    return Leg(track, 0.0, 1.0, share)
+
+
+def _list_near(scene: Scene, start: Array, stop: Array) -> Iterator[tuple[Leg, float]]:
+    """Legs along borders that pass both ends within `MISSED`, on the palm first.
+
+    Each with the larger distance of the ends from the border, over `NEAR`.
+    """
+    near = tolerance(scene)
+    (left, low), (right, high) = np.sort([start, stop], axis=0).tolist()
+    if right - left > near[0]:
+        reach, places = MISSED * near[1], np.linspace(left - near[0], right + near[0], PLACES)
+        around = Window((left, right), (low - reach, high + reach))
+        for angle, edge in around.flush_angles(scene):
+            off = max(abs(low - angle), abs(high - angle)) / near[1]
+            if off < MISSED:
+                track = palm_track(scene, edge, angle, places)
+                yield Leg(track, float(start[0]), float(stop[0]), near[0]), off
+    for first, last, vertex in Window((left, right), (low - np.pi, high + np.pi)).bands(scene):
+        if not (first - near[1] < low and high < last + near[1]):
+            continue
+        ends = np.clip([low - near[1], high + near[1]], first, last)
+        for finger, edge in product((0, 1), range(scene.polygon.n_vertices)):
+            track = flush_track(scene, finger, edge, vertex, ends)
+            (a, off_a), (b, off_b) = (_locate(track, pose, near) for pose in (start, stop))
+            if max(off_a, off_b) < MISSED and abs(a - b) > near[1]:
+                ends_on = np.clip([min(a, b) - near[1], max(a, b) + near[1]], first, last)
+                track = replace(track, places=np.linspace(ends_on[0], ends_on[1], PLACES))
+                yield Leg(track, a, b, near[1]), max(off_a, off_b)
+
+
+def _locate(track: Track, pose: Array, near: Array) -> tuple[float, float]:
+    """Parameter of the nearest place on a track, and its distance over `NEAR`."""
+
+    def off(places: Array) -> Array:
+        points = np.column_stack(track.pose(places))
+        return np.asarray(np.nan_to_num((np.abs(points - pose) / near).max(axis=1), nan=np.inf))
+
+    low, high = float(track.places[0]), float(track.places[-1])
+    phi = float(np.clip(pose[1], low, high))
+    straight = float(off(np.array([phi]))[0])
+    if straight < 1:
+        return phi, straight
+    for count in (101, 41, 41):
+        places = np.linspace(low, high, count)
+        away = off(places)
+        k = int(away.argmin())
+        if away[k] > 2 * MISSED:
+            break
+        low, high = float(places[max(k - 1, 0)]), float(places[min(k + 1, count - 1)])
+    return float(places[k]), float(away[k])
+
+
+def describe_miss(scene: Scene, start: Array, stop: Array) -> str:
+    """The nearest border beside both ends of a straight leg, how far it is, and what is near."""
+    legs = [pair for pair in _list_near(scene, start, stop) if cut(scene, [pair[0].track])]
+    leg, off = min(legs, key=lambda pair: pair[1], default=(None, 0.0))
+    if leg is None or off < 1:
+        return ""
+    assert leg.track.flush is not None
+    finger, edge = leg.track.flush
+    gaps = leg.at(leg.start) - start, leg.at(leg.stop) - stop
+    dx, dphi = (max(pair, key=abs) for pair in np.transpose(gaps).tolist())
+    part, away = "the palm", f"{np.degrees(dphi):+.3g} deg in phi"
+    if finger is not None:
+        part, away = f"finger {finger + 1}", f"{1e3 * dx:+.3g} mm in x and {away}"
+    x, phi = tolerance(scene)
+    return (
+        f"the nearest border, e{edge} flush on {part}, is up to {away} away; "
+        f"a leg follows it with both ends within {1e3 * x:.3g} mm and {np.degrees(phi):.3g} deg"
+    )
 
 
 def write_template(

@@ -22,8 +22,7 @@ from ...common.errors import InputError
 from ...contacts.closing import close_finger, close_fingers, place_flush
 from ...contacts.formation import Formation, find_touching
 from ...mapping.borders import NOWHERE, Piece, Window, cut, flush_track, label_cells, palm_track
-from ...mapping.formation_list import Stretch, format_route, list_formations
-from ...mapping.legs import tolerance
+from ...mapping.formation_list import Stretch, format_route, list_formations, tolerance
 from ...problem.definition import Phase, Problem
 from ...problem.read import build_problem
 from ...scene.model import Finger, Friction, Polygon, Scene
