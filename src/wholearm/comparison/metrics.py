@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from ..common.files import require_ending
 from ..problem.definition import Problem
 from ..problem.read import adopt_phases, require_phases
 from ..results.adopt import require_made_for
-from ..results.report import Report
 from ..results.torque import TorqueProfile, read_notes, read_torque_csv
 from ..results.trajectory import Trajectory, load_trajectory
 from ..verification.verdict import find_least_force
@@ -44,10 +43,7 @@ def compare(
     for name, path in zip(names, paths, strict=True):
         if progress is not None:
             progress(f"replaying {name}")
-        own, what, simulations = _read(problem, str(path))
-        planned = what if isinstance(what, Trajectory) else None
-        judged = _judge(name, own, what, simulations)
-        contenders.append(replace(judged, problem=own, planned=planned))
+        contenders.append(_judge(name, *_read(problem, str(path))))
     return Comparison(problem.name, problem.epsilon, tuple(contenders))
 
 
@@ -75,47 +71,42 @@ def _judge(
     name: str, problem: Problem, what: Trajectory | TorqueProfile, simulations: int | None
 ) -> Contender:
     """The replay of one of them, in numbers."""
+    planned = what if isinstance(what, Trajectory) else None
     torque = what if isinstance(what, TorqueProfile) else what.torque
-    limits = np.abs(torque.at_places(np.linspace(-1, 1, 17))).max(axis=(0, 2))
-    peaks = (float(limits[0]), float(limits[1]))
-    effort = torque.integrate_squares()
+    peaks = np.abs(torque.at_places(np.linspace(-1, 1, 17))).max(axis=(0, 2))
+    common: dict[str, Any] = {
+        "name": name,
+        "effort": torque.integrate_squares(),
+        "peaks": (float(peaks[0]), float(peaks[1])),
+        "simulations": simulations,
+        "problem": problem,
+        "planned": planned,
+    }
     try:
         report = verify(problem, what)
     except (JammingError, SimulationError) as error:
-        return Contender(name, False, str(error), torque.duration, effort, peaks, simulations)
-    return _collect(name, report, torque, effort, peaks, simulations)
-
-
-def _collect(
-    name: str,
-    report: Report,
-    torque: TorqueProfile,
-    effort: float,
-    peaks: tuple[float, float],
-    simulations: int | None,
-) -> Contender:
-    forces = [(find_least_force(phase), phase) for phase in report.phases]
-    known = [(least, phase.number) for least, phase in forces if least is not None]
-    least = min(known, key=lambda pair: pair[0].least, default=None)
-    energy = report.energy
-    lasts = [
-        math.nan if phase.arrival is None else phase.arrival - phase.start
-        for phase in report.phases
-    ]
-    end = report.phases[-1].arrival if report.reached else None
+        return Contender(ok=False, reason=str(error), duration=torque.duration, **common)
+    forces = [(find_least_force(phase), phase.number) for phase in report.phases]
+    least, number = min(
+        ((force, number) for force, number in forces if force is not None),
+        key=lambda pair: pair[0].least,
+        default=(None, 0),
+    )
+    energy, ends = report.energy, [phase.arrival for phase in report.phases]
+    starts = [phase.start for phase in report.phases]
     return Contender(
-        name,
-        report.ok,
-        report.reason,
-        torque.duration if end is None else end,
-        effort,
-        peaks,
-        simulations,
-        None if least is None else least[0].margin,
-        "" if least is None else least[0].contact,
-        0 if least is None else least[1],
-        energy.viscous + energy.dry + energy.contact + energy.impact,
-        tuple(lasts),
-        tuple(math.nan if least_force is None else least_force.margin for least_force, _ in forces),
-        report,
+        ok=report.ok,
+        reason=report.reason,
+        duration=ends[-1] if report.reached and ends[-1] is not None else torque.duration,
+        margin=None if least is None else least.margin,
+        contact="" if least is None else least.contact,
+        phase=number,
+        lost=energy.viscous + energy.dry + energy.contact + energy.impact,
+        lasts=tuple(
+            math.nan if end is None else end - start
+            for end, start in zip(ends, starts, strict=True)
+        ),
+        margins=tuple(math.nan if force is None else force.margin for force, _ in forces),
+        report=report,
+        **common,
     )

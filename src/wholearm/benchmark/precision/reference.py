@@ -1,23 +1,23 @@
-"""An independent reference for simulators: extrapolation in extended precision.
+"""An independent reference for simulators: Newton-Euler equations at the tightest tolerance.
 
 The Newton-Euler equations of object and fingers are written out contact by contact, and solved
 together with the contact conditions as one linear system. Nothing is shared with the package's own
 contacts and dynamics; friction keeps the directions that it is given. They are integrated by
-Gragg's modified midpoint rule with 2, 4, ... steps, extrapolated in the square of the step, in
-NumPy's `longdouble` (64 bits of mantissa on x86). Directions reverse where the sliding velocity
-vanishes, which a secant finds.
+SciPy's DOP853 from step to step of the torques, in double precision. Directions reverse where the
+sliding velocity vanishes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.integrate import solve_ivp
 
 from ...common.arrays import Array
 from ...contacts.elemental import Contact
-from ...geometry.curve import Curve
+from ...contacts.formation import Formation
+from ...geometry.curve import Curve, Segment
 from ...problem.definition import Problem
 from ...results.torque import TorqueProfile
 from ...scene.model import Scene
@@ -48,11 +48,10 @@ def solve_motion(
     """Accelerations z'', shape (5,), and c_n, shape (n_c,) [N], from one linear system.
 
     The unknowns are those of Eqs. (1) and (2) with the friction of Eq. (3) put in, together with
-    the contact conditions differentiated twice. Extended precision is kept.
+    the contact conditions differentiated twice.
     """
     count = len(contacts)
-    matrix = np.zeros((5 + count, 5 + count), dtype=z.dtype)
-    right = np.zeros(5 + count, dtype=z.dtype)
+    matrix, right = np.zeros((5 + count, 5 + count)), np.zeros(5 + count)
     matrix[range(5), range(5)] = scene.mass_diagonal
     right[1] = -scene.polygon.mass * scene.gravity
     for i, finger in enumerate(scene.fingers):
@@ -67,35 +66,20 @@ def solve_motion(
         matrix[:5, 5 + k] = -force
         matrix[5 + k, :5] = row
         right[5 + k] = -bend
-    solution = solve_linear(matrix, right)
+    solution = np.linalg.solve(matrix, right)
     return np.asarray(solution[:5]), np.asarray(solution[5:])
 
 
-def solve_linear(matrix: Array, right: Array) -> Array:
-    """Solve a linear system: by LAPACK, or by elimination what that has no precision for."""
-    if matrix.dtype == np.float64:
-        return np.asarray(np.linalg.solve(matrix, right))
-    table = np.column_stack([matrix, right])
-    for k in range(len(table)):
-        pivot = k + int(np.abs(table[k:, k]).argmax())
-        table[[k, pivot]] = table[[pivot, k]]
-        table[k] /= table[k, k]
-        factors = table[:, k].copy()
-        factors[k] = 0.0
-        table -= factors[:, None] * table[k]
-    return np.asarray(table[:, -1])
-
-
-def find_sliding(scene: Scene, contact: Contact, z: Array, z_dot: Array) -> Any:
+def find_sliding(scene: Scene, contact: Contact, z: Array, z_dot: Array) -> float:
     """Sliding velocity of a contact [m/s]."""
     point, normal, _ = _touch(scene, contact, z, z_dot)
     tangent = np.array([normal[1], -normal[0]])
-    return _lever(scene, contact, z, point, tangent) @ z_dot
+    return float(_lever(scene, contact, z, point, tangent) @ z_dot)
 
 
 def _lever(scene: Scene, contact: Contact, z: Array, point: Array, force: Array) -> Array:
     """Generalised force of a unit force on the object at `point` and its reaction on the finger."""
-    row = np.zeros(5, dtype=z.dtype)
+    row = np.zeros(5)
     arm = point - z[:2]
     row[:3] = force[0], force[1], arm[0] * force[1] - arm[1] * force[0]
     if contact.finger is not None:
@@ -142,14 +126,8 @@ def _touch(scene: Scene, contact: Contact, z: Array, z_dot: Array) -> tuple[Arra
     return tip - finger.radius * outward, -outward, bend
 
 
-COLUMNS = 9  # columns of the extrapolation
-TOLERANCE = 1e-17
-"""Largest difference of the last two columns, over each entry or 1 where that is more."""
-LOOSER = 1e4  # factor on the tolerance of the run that the own error is found with
-_SMALLEST = 1e-9
-
-Extended = Any
-"""An array of `longdouble`."""
+TOLERANCE = 2.3e-14  # of the integration, relative: the smallest that SciPy takes
+LOOSER = 100.0  # factor on the tolerance of the run that the reference's error is found with
 
 
 class Span(NamedTuple):
@@ -172,13 +150,10 @@ class Course(NamedTuple):
     own_error: float  # of that state, relative to the scene
 
 
-def find_course(problem: Problem, torque: TorqueProfile, curve: Curve, reversals: Array) -> Course:
-    """Integrate torques along a phase whose directions reverse at about the given instants."""
-    # The first steps that are tried are far too long.
-    with np.errstate(all="ignore"):
-        exact, spans = _integrate(problem, torque, curve, reversals, TOLERANCE)
-        looser, _ = _integrate(problem, torque, curve, reversals, LOOSER * TOLERANCE)
-    end, rough = (np.asarray(state, dtype=float) for state in (exact, looser))
+def find_course(problem: Problem, torque: TorqueProfile, curve: Curve, reversals: int) -> Course:
+    """Integrate torques along a phase whose directions reverse so often."""
+    end, spans = _integrate(problem, torque, curve, reversals, TOLERANCE)
+    rough, _ = _integrate(problem, torque, curve, reversals, LOOSER * TOLERANCE)
     return Course(problem, torque, spans, end, measure_error(problem, rough, end))
 
 
@@ -190,86 +165,45 @@ def measure_error(problem: Problem, state: Array, exact: Array) -> float:
 
 
 def _integrate(
-    problem: Problem, torque: TorqueProfile, curve: Curve, reversals: Array, tolerance: float
-) -> tuple[Extended, tuple[Span, ...]]:
+    problem: Problem, torque: TorqueProfile, curve: Curve, reversals: int, tolerance: float
+) -> tuple[Array, tuple[Span, ...]]:
     """The state at the end, and the stretches on the way there."""
-    (phase,), stop = problem.phases, float(torque.breaks[-1])
-    contacts = phase.formation.contacts
-    y = np.append(problem.start, np.zeros(5)).astype(np.longdouble)
-    spans = []
-    marks = [*(float(t) for t in reversals if t < stop), stop]
-    start = np.longdouble(0.0)
-    for index, (part, mark) in enumerate(zip(curve.segments, marks, strict=False)):
-        inner = torque.breaks[(torque.breaks > start) & (torque.breaks < mark)]
-        for end in [*inner, mark]:
-            piece = find_piece(torque, (float(start) + end) / 2)
+    contacts, formation = problem.phases[0].formation.contacts, curve.formation
+    t, y, spans = 0.0, np.append(problem.start, np.zeros(5)), list[Span]()
+    parts = [*curve.segments[: reversals + 1]]
+    while t < torque.breaks[-1]:
+        part, piece = parts[0], find_piece(torque, t)
 
-            def rates(t: Extended, y: Extended, piece: int = piece, part: Any = part) -> Extended:
-                tau = evaluate_piece(torque, piece, t)
-                found = solve_motion(
-                    problem.scene, contacts, y[:5], y[5:], tau, part.Xi, part.sigma
-                )
-                return np.concatenate([y[5:], found[0]])
+        def rates(t: float, y: Array, part: Segment = part, piece: int = piece) -> Array:
+            tau = evaluate_piece(torque, piece, t)
+            found = solve_motion(problem.scene, contacts, y[:5], y[5:], tau, part.Xi, part.sigma)
+            return np.concatenate([y[5:], found[0]])
 
-            end = np.longdouble(end)
-            y = _advance(rates, start, y, end - start, tolerance)
-            spans.append(Span(float(start), float(end), piece, part.Xi, part.sigma))
-            start = end
-        if index + 1 < len(marks):
-            start, y = _find_reversal(rates, curve, index, start, y)
-            spans[-1] = spans[-1]._replace(stop=float(start))
+        events = [_find_reversal(formation, *parts[:2])] if len(parts) > 1 else []
+        run = solve_ivp(
+            rates,
+            (t, torque.breaks[piece + 1]),
+            y,
+            "DOP853",
+            rtol=tolerance,
+            atol=tolerance,
+            events=events,
+        )
+        start, t, y = t, float(run.t[-1]), run.y[:, -1]
+        spans.append(Span(start, t, piece, part.Xi, part.sigma))
+        parts = parts[1:] if run.status == 1 else parts
     return y, tuple(spans)
 
 
-def _find_reversal(
-    rates: Callable[..., Extended], curve: Curve, index: int, t: Extended, y: Extended
-) -> tuple[Extended, Extended]:
-    """Go on from near a reversal to where the rate that vanishes there is zero."""
-    before, after = curve.segments[index : index + 2]
-    turned = np.append(before.Xi * after.Xi, before.sigma * after.sigma) < 0
-    row = int(np.flatnonzero(turned)[0])
+def _find_reversal(formation: Formation, before: Segment, after: Segment) -> Any:
+    """Event at which the rate vanishes whose direction differs in two segments."""
+    directions = np.append(before.Xi, before.sigma)
+    row = int(np.flatnonzero(directions * np.append(after.Xi, after.sigma) < 0)[0])
 
-    def rate(y: Extended) -> Extended:
+    def rate(_: float, y: Array) -> float:
         if row >= len(before.Xi):
-            return y[8 + row - len(before.Xi)]
-        contact = curve.formation.contacts[row]
-        return find_sliding(curve.formation.scene, contact, y[:5], y[5:])
+            return float(y[8 + row - len(before.Xi)])
+        return find_sliding(formation.scene, formation.contacts[row], y[:5], y[5:])
 
-    step = np.longdouble(1e-7)
-    for _ in range(4):
-        near = _step(rates, t, y, step)[0]
-        slope = (rate(near) - rate(y)) / step
-        ahead = -rate(y) / slope
-        t, y = t + ahead, _step(rates, t, y, ahead)[0]
-    return t, y
-
-
-def _advance(
-    rates: Callable[..., Extended], t: Extended, y: Extended, length: Extended, tolerance: float
-) -> Extended:
-    """Integrate over a length of time, in halves where that is not exact enough."""
-    end, difference = _step(rates, t, y, length)
-    if difference <= tolerance or length < _SMALLEST:
-        return end
-    half = _advance(rates, t, y, length / 2, tolerance)
-    return _advance(rates, t + length / 2, half, length / 2, tolerance)
-
-
-def _step(
-    rates: Callable[..., Extended], t: Extended, y: Extended, length: Extended
-) -> tuple[Extended, float]:
-    """One step of the extrapolated midpoint rule, and the difference of its last two columns."""
-    first, row = rates(t, y), []
-    for column in range(1, COLUMNS + 1):
-        count = 2 * column
-        h = length / count
-        before, here = y, y + h * first
-        for k in range(1, count):
-            before, here = here, before + 2 * h * rates(t + k * h, here)
-        smooth = (before + here + h * rates(t + length, here)) / 2
-        row, old = [smooth], row
-        for k, known in enumerate(old, start=1):
-            ratio = np.longdouble(count) / (count - 2 * k)
-            row.append(row[-1] + (row[-1] - known) / (ratio**2 - 1))
-    difference = np.abs(row[-1] - row[-2]) / np.maximum(np.abs(y), 1.0)
-    return row[-1], float(difference.max())
+    rate.terminal, rate.direction = True, -directions[row]  # type: ignore[attr-defined]
+    return rate

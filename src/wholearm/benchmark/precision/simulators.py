@@ -239,7 +239,7 @@ def make_course(instance: Instance, study: str) -> Course | None:
     breaks = motion.times[np.append(motion.grid.steps > 0, True)]
     breaks = np.append(breaks[breaks < stop], stop)
     torque = TorqueProfile.fit(breaks, lambda t: motion.evaluate(t).tau, DEGREES[study])
-    return find_course(problem, torque, curve, marks[1:-1])
+    return find_course(problem, torque, curve, len(marks) - 2)
 
 
 def make_slow_motion(curve: Curve, epsilon: float) -> PathMotion:
