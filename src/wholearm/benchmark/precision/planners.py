@@ -18,8 +18,9 @@ from scipy.optimize import brentq
 
 from ...common.arrays import Array
 from ...geometry.curve import directions_of
-from ...mechanics.dynamics import PathForces, inverse
+from ...mechanics.dynamics import ONE, A, B, PathForces, inverse
 from ...mechanics.limits import make_limits
+from ...mechanics.path_limits import PathLimits
 from ...planning.lower_bound.lower_bound import bound_least_time
 from ...planning.options import Objective, PlanOptions
 from ...planning.path_domain.path_data import prepare
@@ -126,43 +127,12 @@ def _convert(instance: Instance, plan: PhasePlan[Any]) -> PeerPlan:
     return PeerPlan(OPTIMUM, motion.duration, plan.torque, tuple(marks))
 
 
-class _PeerRows:
-    """Limits at places of a curve, as constant + a s'' + b s'^2 + q lambda >= 0."""
-
-    def __init__(self, instance: Instance, s: Array, owner: NDArray[np.int64]) -> None:
-        curve = instance.curve
-        self.forces = inverse(curve.formation, *curve.evaluate(s)[:3], directions_of(curve, owner))
-        limits = make_limits(curve.formation, instance.problem.epsilon)
-        sides, signs, bounds = limits.sides
-        of_c, of_tau, _ = (signs[:, None] * part[sides] for part in limits.columns)
-        rows = of_c @ self.forces.of_c + of_tau @ self.forces.of_tau
-        self.constant, self.a, self.b, _, self.q = rows.transpose(2, 0, 1)
-        self.constant = self.constant - signs * bounds
-
-    def eliminate(self) -> tuple[Array, Array, Array]:
-        """Rows in s'' and s'^2 alone: a, b and constant, shape (n, pairs) each."""
-        one, other = np.triu_indices(self.q.shape[1], 1)
-        first, second = self.q[:, one], self.q[:, other]
-        opposite = first * second < 0
-        weigh = np.where(opposite, np.abs(second), 0.0), np.where(opposite, np.abs(first), 0.0)
-        size = np.maximum(weigh[0] + weigh[1], 1e-300)
-
-        def combine(rows: Array) -> Array:
-            return np.asarray((weigh[0] * rows[:, one] + weigh[1] * rows[:, other]) / size)
-
-        kept = opposite.any(axis=0)
-        # A row that is none at some places holds there whatever the motion.
-        constant = np.where(opposite, combine(self.constant), 1.0)
-        return combine(self.a)[:, kept], combine(self.b)[:, kept], constant[:, kept]
-
-    def middle(self, a: Array, b: Array) -> Array:
-        """Internal force amid the range that limits leave, shape (n,) [N]."""
-        rest = self.constant + self.a * a[:, None] + self.b * b[:, None]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            bound = -rest / self.q
-        low = np.where(self.q > 0, bound, -np.inf).max(axis=1)
-        high = np.where(self.q < 0, bound, np.inf).min(axis=1)
-        return np.asarray((low + high) / 2)
+def _limit(instance: Instance, s: Array, owner: NDArray[np.int64]) -> tuple[PathForces, PathLimits]:
+    """Forces and limits at places of a curve, whose segments are `owner`."""
+    curve, point = instance.curve, instance.curve.evaluate(s)
+    forces = inverse(curve.formation, *point[:3], directions_of(curve, owner))
+    limits = make_limits(curve.formation, instance.problem.epsilon)
+    return forces, PathLimits.of(limits, forces, point.z_s[:, 3:])
 
 
 def build_toppra(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
@@ -179,7 +149,9 @@ def build_toppra(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
         grid = np.append(grid[near], part.stop + APART * length * np.array([-1.0, 1.0]))
         grid.sort()
     stops = [part.stop for part in instance.curve.segments[:-1]]
-    a, b, constant = _PeerRows(instance, grid, np.searchsorted(stops, grid)).eliminate()
+    _, limits = _limit(instance, grid, np.searchsorted(stops, grid))
+    rows = limits.eliminate().rows
+    constant, a, b = (rows[:, rows[..., A].any(axis=0), column] for column in (ONE, A, B))
     below, zero = -np.eye(a.shape[1]), np.zeros(a.shape[1])
 
     class Limits(LinearConstraint):  # type: ignore[misc]
@@ -191,8 +163,9 @@ def build_toppra(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
             self.set_discretization_type(DiscretizationType.Interpolation)
 
         def compute_constraint_params(self, *_: Any) -> Any:
-            rows = a, b, constant, below, zero
-            return canlinear_colloc_to_interpolate(*rows, None, None, grid, identical=True)
+            return canlinear_colloc_to_interpolate(
+                a, b, constant, below, zero, None, None, grid, identical=True
+            )
 
     path = toppra.SplineInterpolator(grid, grid[:, None])
     planner = toppra.algorithm.TOPPRA(
@@ -230,7 +203,8 @@ def _make_plan(instance: Instance, grid: Array, speeds: Array) -> PeerPlan:
     times = np.append(0.0, np.cumsum(2 * steps / (speeds[1:] + speeds[:-1])))
     owner = np.searchsorted(stops, (grid[1:] + grid[:-1]) / 2)
     ends = [
-        _PeerRows(instance, grid[p], owner).middle(a, b[p]) for p in (slice(-1), slice(1, None))
+        np.mean(_limit(instance, grid[p], owner)[1].find_internal_force_range(a, b[p]), axis=0)
+        for p in (slice(-1), slice(1, None))
     ]
 
     def torque(t: Array) -> Array:
@@ -239,7 +213,7 @@ def _make_plan(instance: Instance, grid: Array, speeds: Array) -> PeerPlan:
         run = np.clip(local * (speeds[k] + a[k] * local / 2), 0.0, steps[k])
         part = run / steps[k]
         internal = ends[0][k] * (1 - part) + ends[1][k] * part
-        forces: PathForces = _PeerRows(instance, grid[k] + run, owner[k]).forces
+        forces, _ = _limit(instance, grid[k] + run, owner[k])
         return forces.tau(a[k], (speeds[k] + a[k] * local) ** 2, internal)
 
     profile = TorqueProfile.fit(times, torque, TORQUE_NODES - 1)
