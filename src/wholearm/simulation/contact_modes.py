@@ -26,7 +26,7 @@ from .contact_problem import (
     solve,
     try_modes,
 )
-from .events import EventKind
+from .events import EventKind, describe_change
 from .free_run import AHEAD, CLOSED, SUNK, FreeRun
 from .stepper import Modes
 from .system import ContactRows, System
@@ -34,7 +34,6 @@ from .tolerances import STANDING, STILL
 
 CLEAR = 1e-3  # forces and rates, over the largest, that do not vanish within `AHEAD`
 DEPENDENT = 1e-7  # share of a row that others leave, below which it is no constraint of its own
-ROUNDED = 1e-15  # speed that rounding leaves, relative to the largest one
 _NONE = np.zeros(0)
 _NOTHING = (_NONE, np.zeros(0, dtype=np.int64), _NONE, _NONE)
 
@@ -142,7 +141,7 @@ def decide(run: FreeRun, closed: ClosedContacts | None = None) -> bool | None:
         pairs, rows = closed
         sticks = np.abs(rows.A_t @ run.v) < run.chatter
         sticks &= system.friction[list(pairs)] > 0
-        _project_velocity(run, np.vstack([rows.A, rows.A_t[sticks]]))
+        run.project_velocity(np.vstack([rows.A, rows.A_t[sticks]]))
         closed = ClosedContacts(pairs, system.evaluate(run.z, run.v, pairs))
     pattern = Pattern(run, closed)
     later = AHEAD * system.scales.time
@@ -170,7 +169,7 @@ def decide(run: FreeRun, closed: ClosedContacts | None = None) -> bool | None:
     kept = [k for k, pair in enumerate(pattern.closed) if pair in modes.kept]
     joints = np.eye(system.n)[pattern.joints]
     at_rest = [pattern.rows.A[kept], pattern.rows.A_t[pattern.standing], joints]
-    _project_velocity(run, np.vstack(at_rest))
+    run.project_velocity(np.vstack(at_rest))
     return rests
 
 
@@ -272,19 +271,6 @@ def _make_modes(run: FreeRun, pattern: Pattern, answer: ContactAnswer, rows: Con
     )
 
 
-def _project_velocity(run: FreeRun, rows: Array) -> None:
-    """Project the velocity onto rows v = 0, in the metric of masses."""
-    root = np.sqrt(run.system.mass)
-    scaled = rows / root
-    scaled /= np.sqrt((scaled**2).sum(axis=1))[:, None]
-    speed = root * run.v
-    along = scaled @ speed
-    if np.abs(along).max(initial=0.0) <= ROUNDED * np.abs(speed).max():
-        return
-    change = np.linalg.lstsq(scaled, along, rcond=1e-9)[0]
-    run.set_velocity(run.v - change / root)
-
-
 def _name(system: System, joint: int) -> str:
     known = joint in system.driven
     return f"joint {system.driven.index(joint) + 1}" if known else f"coordinate {joint + 1}"
@@ -312,33 +298,22 @@ def _note_changes(run: FreeRun, closed: Sequence[int], modes: Modes, rests: bool
             run.note_at(EventKind.CONTACT_LOST, f"{names[pair]} is lost", names[pair])
     for pair in new if run.records else ():
         run.note_at(EventKind.GAINED, f"{names[pair]} presses", names[pair])
-    for pair in modes.kept:
-        if pair not in before.kept or not run.records:
-            continue
-        old = before.Xi[before.kept.index(pair)]
-        now = modes.Xi[modes.kept.index(pair)]
-        _note_change(run, names[pair], old, now, "slides", system.friction[pair] > 0)
-    for joint in np.flatnonzero(system.dry > 0) if run.records else ():
-        old, now = before.sigma[joint], modes.sigma[joint]
-        _note_change(run, _name(system, int(joint)), old, now, "turns", True)
+    if not run.records:
+        before = modes
+    changes = [
+        (names[pair], before.Xi[before.kept.index(pair)], Xi, "slides")
+        for pair, Xi in zip(modes.kept, modes.Xi, strict=True)
+        if pair in before.kept and system.friction[pair] > 0
+    ]
+    joints = zip(before.sigma, modes.sigma, strict=True)
+    changes += [(_name(system, k), old, new, "turns") for k, (old, new) in enumerate(joints)]
+    for name, old, now, verb in changes:
+        if old != now:
+            run.note_at(*describe_change(name, old, now, verb), name)
     if rests:
         run.note_at(EventKind.REST, "everything rests")
     elif run.resting:
         run.note_at(EventKind.START, "the motion begins")
-
-
-def _note_change(run: FreeRun, name: str, old: float, now: float, verb: str, rubs: bool) -> None:
-    if old == now or not rubs:
-        return
-    contact = verb == "slides"
-    if now == 0:
-        text = f"{name} sticks" if contact else f"friction holds {name}"
-        run.note_at(EventKind.STICK, text, name)
-    elif old == 0:
-        text = f"{name} slips" if contact else f"{name} starts to turn"
-        run.note_at(EventKind.SLIP, text, name)
-    else:
-        run.note_at(EventKind.REVERSAL, f"{name} {verb} the other way", name)
 
 
 def _note_ambiguity(run: FreeRun, pattern: Pattern, answers: Sequence[Sequence[int]]) -> None:

@@ -62,6 +62,16 @@ class Event(NamedTuple):
     value: float = float("nan")
 
 
+def describe_change(name: str, before: float, after: float, verb: str) -> tuple[EventKind, str]:
+    """Kind and text of a change of direction, 0 for none, of what `verb`: slides or turns."""
+    slides = verb == "slides"
+    if after == 0:
+        return EventKind.STICK, f"{name} sticks" if slides else f"friction holds {name}"
+    if before == 0:
+        return EventKind.SLIP, f"{name} slips" if slides else f"{name} starts to turn"
+    return EventKind.REVERSAL, f"{name} {verb} the other way"
+
+
 class OutcomeKind(Enum):
     """How a simulation ends."""
 

@@ -19,7 +19,6 @@ from .contact_problem import (
     STICKS,
     ContactAnswer,
     ContactProblem,
-    read,
     solve,
     try_modes,
 )
@@ -37,7 +36,6 @@ LOOKS = 8  # instants of the longest step at which gaps are looked at, its end a
 REACH = 0.3  # longest step, in units of the scene: gaps are sampled every `REACH` / `LOOKS`
 EXACT = 1e-14  # gap of a closed contact, over the scene's length: some ten roundings
 CHATTER_PAUSE = 1e-3  # time between two notes of chatter of a pair, over the scene's
-SLIDES = 1e-3  # least sliding after an impact, over that before and the impact speed
 ROUNDS = 30  # most impacts at one instant; what is left after them is plastic
 
 
@@ -171,7 +169,7 @@ def collide(run: FreeRun) -> ClosedContacts:
 
 def _collide(run: FreeRun, closed: ClosedContacts, rates: Array, bouncing: bool) -> None:
     problem = _pose(run, closed, run.v)
-    answer = _slide_on(problem) or solve(problem)
+    answer = solve(problem)
     if answer is None:
         raise ArithmeticError("the plastic impact has no solution")
     run.residual = max(run.residual, answer.residual)
@@ -191,25 +189,6 @@ def _collide(run: FreeRun, closed: ClosedContacts, rates: Array, bouncing: bool)
             note = f"the impacts of {name} come ever closer and are over"
             run.note_at(EventKind.CHATTER, note, name, float(-rates[k]))
     run.set_velocity(v)
-
-
-def _slide_on(p: ContactProblem) -> ContactAnswer | None:
-    """Impact after which every sliding sign is that before, if there is one.
-
-    Of several solutions it is the nearest, and without sticking the problem is small.
-    """
-    k, none = len(p.b_n), np.zeros(0)
-    signs, pushes = np.sign(p.b_t), p.A.copy()
-    pushes[p.owner] -= (p.mu * signs)[:, None] * p.T
-    slides = ContactProblem(p.lift, p.A, pushes, p.b_n, p.T[:0], none, p.owner[:0], none, none)
-    answer = solve(slides) if k and slides.is_unique and signs.all() else None
-    if answer is None:
-        return None
-    rates = p.b_t + p.T @ answer.change
-    least = SLIDES * np.maximum(np.abs(p.b_t), np.abs(p.b_n).max())
-    if ((rates * signs <= least) & (answer.c_n[p.owner] > 0)).any():
-        return None
-    return read(p, answer.c_n, -p.mu * signs * answer.c_n[p.owner], answer.residual)
 
 
 def _pose(run: FreeRun, closed: ClosedContacts, v: Array) -> ContactProblem:

@@ -19,6 +19,7 @@ from .system import System
 from .tolerances import FIRST_STEP, SETTLING, SHORTEST_STEP, STEP_OF_TORQUE
 
 SAME = 1e-9  # distance of two instants that counts as none, relative to the period
+_ROUNDED = 1e-15  # speed that rounding leaves, relative to the largest one
 _GROWTH = 40.0  # largest growth of a step: at order 8 an error of 1e-13 of the tolerance allows it
 
 
@@ -91,6 +92,16 @@ class Run:
         before = self.system.stored(self.z, self.v)
         self.y[self.system.n : 2 * self.system.n] = v
         self.impact += float(before - self.system.stored(self.z, self.v))
+
+    def project_velocity(self, rows: Array) -> None:
+        """Project the velocity onto rows v = 0, (m, n), in the metric of masses."""
+        root = np.sqrt(self.system.mass)
+        scaled = rows / root
+        scaled /= np.sqrt((scaled**2).sum(axis=1))[:, None]
+        speed = root * self.v
+        along = scaled @ speed
+        if np.abs(along).max(initial=0.0) > _ROUNDED * np.abs(speed).max():
+            self.set_velocity(self.v - np.linalg.lstsq(scaled, along, rcond=1e-9)[0] / root)
 
     def load(self, modes: Modes) -> None:
         """Take the steps of some modes from here on, with their signs where they have any."""

@@ -27,8 +27,8 @@ from ..common.arrays import Array
 from ..common.errors import JammingError, SimulationError
 from ..contacts.formation import Formation
 from ..scene.model import Scene
-from .events import EventKind
-from .modes import Mode, ModeRows, Response, Unit, find_fixed, find_grips, list_units, respond
+from .events import describe_change
+from .modes import Mode, ModeRows, Unit, find_fixed, find_grips, list_units, respond
 from .replay import Replay
 from .tolerances import ROUNDING_FORCE, STANDING, is_slower
 
@@ -50,7 +50,7 @@ def choose_mode(
 ) -> bool:
     """Choose the friction signs of all that stands still; whether the motion has ended.
 
-    Parameters as of `jumps.restart`.
+    Parameters as of `simulate.restart`.
     """
     formation, signs = run.formation, run.signs
     run.look()
@@ -91,18 +91,11 @@ def measure_rates(scene: Scene, count: int) -> Array:
 
 def note_change(run: Replay, row: int, before: float, after: float, time: float) -> None:
     """Record that a contact or joint sticks, slips or turns back."""
-    formation = run.formation
-    contact = row < formation.n_contacts
-    name = formation.names[row] if contact else f"joint {row - formation.n_contacts + 1}"
-    when = f"at t = {time:.5g} s, phase {run.phase.number}"
-    if after == 0:
-        kind, text = EventKind.STICK, f"{name} sticks" if contact else f"friction holds {name}"
-    elif before == 0:
-        kind, text = EventKind.SLIP, f"{name} slips" if contact else f"{name} starts to turn"
-    else:
-        verb = "slides" if contact else "turns"
-        kind, text = EventKind.REVERSAL, f"{name} {verb} the other way"
-    run.note(kind, f"{text} {when}", name, time=time)
+    names = run.formation.names
+    contact = row < len(names)
+    name = names[row] if contact else f"joint {row - len(names) + 1}"
+    kind, text = describe_change(name, before, after, "slides" if contact else "turns")
+    run.note(kind, f"{text} at t = {time:.5g} s, phase {run.phase.number}", name, time=time)
 
 
 def _list_options(
@@ -124,13 +117,44 @@ def _choose(
     run: Replay, signs: Array, still: Sequence[Unit], orders: Sequence[tuple[float, ...]]
 ) -> Choice:
     """Signs of the first clear combination or of the best; `JammingError` if none is consistent."""
-    evaluation = _Evaluation(run, still)
+    formation, scales, ahead = run.formation, run.system.scales, run.tolerances.settling
+    loads = [np.array([1.0, *run.tau(t)]) for t in (run.t, run.t + ahead)]
+    present, count, ratios = evaluate_rows(formation, run.z, run.v), formation.n_contacts, [1.0]
+
+    def measure(signs: Array) -> Choice | None:
+        """Margins of one combination; None if it jams or leaves its forces undetermined."""
+        mode = Mode(formation, find_grips(formation, signs))
+        if mode.n_constraints > 4:
+            return None
+        acceleration, rates = np.zeros(5), np.zeros(count + 2)
+        for delay, load in zip((0.0, ahead), loads, strict=True):
+            v = run.v + delay * acceleration
+            z = run.z + delay * (run.v + v) / 2
+            rows = evaluate_rows(formation, z, v) if delay else present
+            response = respond(mode, signs, rows, v)
+            if response is None or not response.ratio > 0:
+                ratios.extend([] if response is None else [response.ratio])
+                return None
+            acceleration, rates = response.acceleration @ load, rates + response.rates @ load / 2
+            held = response.force_limits @ load / mode.force_limit_units
+        gained = signs * rates / (measure_rates(run.problem.scene, count) / scales.time)
+        cones = held[count:].reshape(2, -1).min(axis=0)
+        margins = [np.inf]
+        for unit in still:
+            row = unit.rows[0]
+            if signs[row] == 0:
+                margins.append(cones[mode.holders.index(unit.rows)])
+            elif abs(gained[row]) > CLEAR:
+                margins.append(gained[row])
+        fixed = find_fixed(mode, present.A, present.A_t)
+        return Choice(signs, fixed, float(min(margins)), float(held[:count].min()))
+
     choices: list[Choice] = []
     for options in product(*orders):
         tried = signs.copy()
         for unit, sign in zip(still, options, strict=True):
             tried[list(unit.rows)] = sign
-        choice = evaluation.measure(tried)
+        choice = measure(tried)
         if choice is None:
             continue
         if choice.margin > CLEAR and choice.pressing > -CLEAR:
@@ -144,63 +168,12 @@ def _choose(
     pulling = [choice for choice in choices if choice.pressing <= -CLEAR]
     if pulling:
         return max(pulling, key=lambda choice: choice.margin)
-    if evaluation.worst <= 0:
-        run.fail_to_step(evaluation.worst)
-    names = " ".join(run.formation.names)
+    if min(ratios) <= 0:
+        run.fail_to_step(min(ratios))
+    names = " ".join(formation.names)
     raise JammingError(
         f"{names} jams {run.where()}: no combination of sliding and sticking is consistent"
     )
-
-
-class _Evaluation:
-    """Margins of combinations of friction signs at the present state."""
-
-    def __init__(self, run: Replay, still: Sequence[Unit]) -> None:
-        self.formation, self.still = run.formation, still
-        self.scene = run.problem.scene
-        self.h = run.tolerances.settling
-        self.z, self.v = run.z.copy(), run.v.copy()
-        self.load, self.later = (np.array([1.0, *run.tau(t)]) for t in (run.t, run.t + self.h))
-        self.rows = evaluate_rows(self.formation, self.z, self.v)
-        self.worst = 1.0
-
-    def measure(self, signs: Array) -> Choice | None:
-        """Margins of one combination; None if it jams or leaves its forces undetermined."""
-        mode = Mode(self.formation, find_grips(self.formation, signs))
-        if mode.n_constraints > 4:
-            return None
-        now = self._respond(mode, signs, self.rows, self.v)
-        if now is None:
-            return None
-        acceleration = now.acceleration @ self.load
-        v = self.v + self.h * acceleration
-        z = self.z + self.h * (self.v + v) / 2
-        then = self._respond(mode, signs, evaluate_rows(self.formation, z, v), v)
-        if then is None:
-            return None
-        scales, count = self.scene.scales, self.formation.n_contacts
-        gained = (now.rates @ self.load + then.rates @ self.later) / 2
-        gained = signs * gained / (measure_rates(self.scene, count) / scales.time)
-        fixed = find_fixed(mode, self.rows.A, self.rows.A_t)
-        force_limits = then.force_limits @ self.later
-        cones = force_limits[count:].reshape(2, -1).min(axis=0)
-        margins = [np.inf]
-        for unit in self.still:
-            row = unit.rows[0]
-            if signs[row] == 0:
-                force = scales.force if row < count else scales.torque
-                margins.append(cones[mode.holders.index(unit.rows)] / force)
-            elif abs(gained[row]) > CLEAR:
-                margins.append(gained[row])
-        pressing = float(force_limits[:count].min() / scales.force)
-        return Choice(signs, fixed, float(min(margins)), pressing)
-
-    def _respond(self, mode: Mode, signs: Array, rows: ModeRows, v: Array) -> Response | None:
-        response = respond(mode, signs, rows, v)
-        if response is not None and not response.ratio > 0:
-            self.worst = min(self.worst, response.ratio)
-            return None
-        return response
 
 
 def evaluate_rows(formation: Formation, z: Array, v: Array) -> ModeRows:
@@ -225,12 +198,9 @@ def _take(run: Replay, signs: Array, still: Sequence[Unit]) -> None:
         for unit in still
         if signs[unit.rows[0]] == 0 or signs[unit.rows[0]] * (gradients[unit.rows[0]] @ v) < 0
     ]
-    root = np.sqrt(formation.scene.mass_diagonal)
-    rows = np.vstack([kinematics.P[0], gradients[wrong]]) / root
-    rows /= np.linalg.norm(rows, axis=1)[:, None]
-    run.set_velocity(v - np.linalg.lstsq(rows, rows @ (root * v))[0] / root)
+    run.project_velocity(np.vstack([kinematics.P[0], gradients[wrong]]))
     grips = find_grips(formation, signs)
     if grips != run.leg.mode.grips:
         run.take(grips)
     run.signs = signs
-    run.heading = run.v / np.linalg.norm(root * run.v)
+    run.heading = run.v / np.sqrt(run.system.mass @ run.v**2)

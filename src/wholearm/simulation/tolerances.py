@@ -31,20 +31,15 @@ CLOSING = 1e-7  # acceleration of a gap that is rounding: a difference quotient
 
 
 class Tolerances(NamedTuple):
-    """Tolerances of a scene in SI units; see the constants of the same names."""
+    """Some tolerances of a scene in SI units; see the constants of the same names."""
 
-    force: float  # force, torque [N], [N m]: rounding
-    torque: float
-    speed: float  # speed, turning [m/s], [rad/s]: rounding
-    turning: float
-    limit: float  # limit, short [m]:
-    short: float
+    force: float  # [N]: rounding
+    limit: float  # [m]: rounding
     settling: float  # settling, rest_window, longest_window, first_step, shortest_step [s]:
     rest_window: float
     longest_window: float
     first_step: float
     shortest_step: float
-    torque_step: float  # [N m]
     drive: float  # [kg^(1/2) m/s^2]: `STILL`, in the metric M5
     still: float  # still, still_joint, closing [m/s^2], [rad/s^2], [m/s^2]:
     still_joint: float
@@ -57,17 +52,12 @@ def find_tolerances(scene: Scene) -> Tolerances:
     scales = scene.scales
     return Tolerances(
         force=ROUNDING_FORCE * scales.force,
-        torque=ROUNDING_FORCE * scales.torque,
-        speed=ROUNDING_SPEED * scales.speed,
-        turning=ROUNDING_SPEED / scales.time,
         limit=ROUNDING_LIMIT * scales.length,
-        short=SHORT * scales.length,
         settling=SETTLING * scales.time,
         rest_window=REST_WINDOW * scales.time,
         longest_window=LONGEST_WINDOW * scales.time,
         first_step=FIRST_STEP * scales.time,
         shortest_step=SHORTEST_STEP * scales.time,
-        torque_step=STEP_OF_TORQUE * scales.torque,
         drive=STILL * scales.mass**0.5 * scales.acceleration,
         still=STILL * scales.acceleration,
         still_joint=STILL / scales.time**2,
