@@ -16,6 +16,7 @@ from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from .. import __version__
 from ..benchmark import STUDIES
 from ..common.errors import InputError, WholearmError, name_source
 from ..common.signals import guard
@@ -88,7 +89,8 @@ def _silence_output() -> None:
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of all commands."""
     parser = Parser(prog="wholearm", description="Plan and verify whole-arm manipulation.")
-    parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
+    version = f"wholearm {__version__}"
+    parser.add_argument("--version", action="version", version=version, help="print the version")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     for name, own in COMMANDS.items():
         own.add(commands.add_parser(name, help=own.text, description=_to_sentence(own.text)))
@@ -100,14 +102,6 @@ def build_parser() -> argparse.ArgumentParser:
 def _to_sentence(text: str) -> str:
     """With a capital first, and a full stop."""
     return f"{text[0].upper()}{text[1:]}."
-
-
-class _Version(argparse.Action):
-    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        from .. import __version__
-
-        print(f"wholearm {__version__}")
-        parser.exit()
 
 
 def solve(options: argparse.Namespace) -> int:
@@ -348,9 +342,7 @@ def add_bench(bench: argparse.ArgumentParser) -> None:
     """Give the parser of ``bench`` its studies."""
     studies = bench.add_subparsers(metavar="STUDY", parser_class=StudyParser)
     for name, (_, text) in STUDIES.items():
-        studies.add_parser(
-            name, help=text, description=f"{text[0].upper()}{text[1:]}."
-        ).study = name
+        studies.add_parser(name, help=text, description=_to_sentence(text)).study = name
     bench.set_defaults(run=_list_studies)
 
 

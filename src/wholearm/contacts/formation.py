@@ -12,7 +12,7 @@ keeps its value from where the rolling begins.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -74,6 +74,10 @@ class Formation(Keeper):
     def n_constraints(self) -> int:
         """Number of constraint rows, n_c + R, and of independent contact forces."""
         return len(self.contacts) + len(self.rolling)
+
+    def add(self, contact: Contact | None) -> Formation:
+        """The formation with one more contact, which slides, if there is one."""
+        return self if contact is None else replace(self, contacts=(*self.contacts, contact))
 
     @cached_property
     def rolling_rows(self) -> tuple[int, ...]:

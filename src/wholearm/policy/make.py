@@ -214,9 +214,7 @@ def _tabulate_motion(
 
 def _list_free_joints(problem: Problem, phase: Phase, z: Array) -> Array:
     """Orthonormal basis of joint displacements that the contacts at the end leave free, (f, 2)."""
-    formation, contact = phase.formation, phase.until.contact
-    contacts = formation.contacts if contact is None else (*formation.contacts, contact)
-    both = Formation(problem.scene, contacts, formation.rolling)
+    both = phase.formation.add(phase.until.contact)
     units = np.sqrt(metric_weights(problem.scene))
     P = both.evaluate(z, np.zeros_like(z)).P[0] / units
     left = np.linalg.svd(P)[2][len(P) :] / units
@@ -257,10 +255,8 @@ def find_arrival(curve: Curve, gained: Contact, rows: CurveLimitRows) -> Array:
 
     Empty where forces at rest are not unique.
     """
-    formation = curve.formation
-    both = Formation(formation.scene, (*formation.contacts, gained), formation.rolling)
-    reserves = rows.unit[-1, : formation.n_contacts]
-    reserves, found = np.append(reserves, reserves.max()), [np.zeros((0, 5))]
+    both, found = curve.formation.add(gained), [np.zeros((0, 5))]
+    reserves = _list_reserves(curve, rows)
     for balance in _list_balances(curve, both, rows):
         forces = balance[: both.n_contacts, 1:] @ rows.torque[-1]
         forces[:, ONE] += balance[: both.n_contacts, 0]
@@ -276,14 +272,12 @@ def find_push(
     Linear programme: the least normal force over its margin is largest. In the balance friction is
     that of the motion. `rows` are along the curve, `after` along the next one.
     """
-    formation, scene = curve.formation, curve.formation.scene
-    both = Formation(scene, (*formation.contacts, gained), formation.rolling)
+    scene, both = curve.formation.scene, curve.formation.add(gained)
     balances = _list_balances(curve, both, rows)
     if not balances:
         return None
     count, unit = both.n_contacts, scene.scales.acceleration
-    reserves = rows.unit[-1, : formation.n_contacts]
-    reserves = np.append(reserves, reserves.max())
+    reserves = _list_reserves(curve, rows)
     # Rows of (1, tau, level) >= 0: forces with all contacts; a and forces without the gained one.
     to_motion = _invert(rows.torque[-1])
     forces = rows.ends.reshape(-1, 5)
@@ -301,6 +295,12 @@ def find_push(
         tables.insert(0, [*limits, np.append(-_invert(after.torque[0])[0], -BRAKE * unit)[None]])
     found = (_find_best(np.vstack(table), scene.torque_limit) for table in tables)
     return next((tau for tau in found if tau is not None), None)
+
+
+def _list_reserves(curve: Curve, rows: CurveLimitRows) -> Array:
+    """Margins of the normal forces at the end of a curve and, the largest of them, of one more."""
+    reserves = rows.unit[-1, : curve.formation.n_contacts]
+    return np.append(reserves, reserves.max())
 
 
 def _find_best(rows: Array, limit: Array) -> Array | None:

@@ -19,7 +19,6 @@ from ..common.arrays import Array
 from ..common.errors import InputError, ReplayError, WholearmError, name_source
 from ..common.sharing import exclusive
 from ..common.workers import Task, share
-from ..contacts.formation import Formation
 from ..geometry.curve import Curve
 from ..geometry.path_guess import count_freedoms
 from ..geometry.tracing import trace_phase
@@ -343,8 +342,7 @@ def pin_landing(phase: Phase, z: Array) -> Phase:
     if until.contact is None or until.pins or count_freedoms(formation, z) < 2:
         return phase
     length = formation.scene.scales.length
-    border = Formation(formation.scene, (*formation.contacts, until.contact), formation.rolling)
-    x, _, phi, *_ = np.abs(find_headings(border, z) or np.eye(5))[0]
+    x, _, phi, *_ = np.abs(find_headings(formation.add(until.contact), z) or np.eye(5))[0]
     name, digits = ("x", length) if x > length * phi else ("phi", 1.0)
     value = round(float(z[ROWS[name]]), math.ceil(-math.log10(PINNED * digits)))
     return replace(phase, until=replace(until, pins=((name, value),)))

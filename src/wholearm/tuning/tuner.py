@@ -19,7 +19,7 @@ from ..common.document import Document, Result, Table
 from ..common.errors import InputError, name_source
 from ..common.fields import SHARE
 from ..common.sharing import exclusive
-from ..contacts.elemental import Contact
+from ..contacts.contact_limits import takes_over
 from ..problem.definition import End, Phase, Problem, Until
 from ..problem.read import require_phases
 from ..quasistatic.slow_speeds import SQUEEZE, find_torques, sample_path
@@ -356,25 +356,12 @@ def _list_leaving(phase: Phase, after: Phase | None) -> set[str]:
 
 
 def _find_predecessor(phase: Phase, after: Phase | None) -> str:
-    gained = phase.until.contact
-    if gained is None or gained.finger is None:
-        return ""
-    count = phase.formation.scene.polygon.n_vertices
+    """The contact of a phase that goes on as the one which ends it, empty if none does."""
+    gained, scene = phase.until.contact, phase.formation.scene
     kept = () if after is None else after.formation.contacts
-    for contact in phase.formation.contacts:
-        near = contact.finger == gained.finger and contact not in kept
-        if near and (_adjoins(contact, gained, count) or _adjoins(gained, contact, count)):
-            return contact.name
-    return ""
-
-
-def _adjoins(first: Contact, second: Contact, count: int) -> bool:
-    """Whether a vertex on the arc of a tip is next to a contact with its side, or with an edge."""
-    if (first.feature, first.surface) != ("v", "tip"):
-        return False
-    if second.surface == "finger":
-        return first.index == second.index
-    return second.feature == "e" and first.index in (second.index, (second.index + 1) % count)
+    ending = [contact for contact in phase.formation.contacts if contact not in kept]
+    found = (own.name for own in ending if gained and takes_over(gained, scene, [own]))
+    return next(found, "")
 
 
 @dataclass(frozen=True, eq=False)
@@ -640,14 +627,11 @@ class _Setting(NamedTuple):
         phases = self.passage.phases
         own = PhaseTuning(phases[0].number, phases[-1].number, str(self.passage.until))
         if any(phase.until.value is not None for phase in phases[:-1]):
-            return (own, None, "a coordinate is passed in motion; the rule tunes phases to rest")
+            return own, None, "a coordinate is passed in motion; the rule tunes phases to rest"
         found = self._balance(phases, z)
         if found is None:
-            return (
-                own,
-                None,
-                "no quasistatic motion keeps every contact, where tuning would start",
-            )
+            text = "no quasistatic motion keeps every contact, where tuning would start"
+            return own, None, text
         bench = Bench(self.problem, self.passage, z)
         first = self._tune_by(found.acting, own, bench, found)
         if first[1] is not None or first[0].raised is not None:
