@@ -20,21 +20,20 @@ from ..common.signals import OutOfTime, Reporter, limited
 from ..geometry.curve import describe_pose
 from ..geometry.tracing import trace_phases
 from ..mechanics.uniqueness import describe_uniqueness
-from ..problem.definition import Phase, Problem
+from ..problem.definition import Problem
 from ..problem.read import require_phases
 from ..results.dwell_record import assemble
 from ..results.plan_record import Certificate, TimeBound, Transition
 from ..results.report import UniquenessMargin
 from ..results.torque import TorqueProfile
-from ..results.trajectory import Motion, Trajectory
+from ..results.trajectory import Trajectory
 from ..solvers.ipopt import Ledger, charge, open_ledger
 from ..verification.force_uniqueness import find_uniqueness_margin, find_wedged
 from .blocks import BlockPlan, Planning, plan_blocks
 from .lower_bound.lower_bound import bound_least_time
 from .options import Objective, PlanOptions
 from .path_domain import impact_sequence
-from .path_domain.impact_sequence import BlockImpact
-from .phase_plan import PhasePlan, add_up, combine
+from .phase_plan import add_up, combine
 from .result import Plan, PlannedPhase, Status, Timings, write_meta
 from .stops import PlanPart, plan_stops
 
@@ -237,7 +236,7 @@ def _list_phases(
 
 
 def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transition]:
-    """Assess the impacts of every block, as its domain knows them."""
+    """Transitions of all impacts, as the block's domain knows them, and what each saves."""
     found: list[Transition] = []
     for block in planning.blocks:
         if len(block.phases) == 1:
@@ -250,56 +249,28 @@ def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transitio
         else:
             impacts = impact_sequence.list_impacts(block.chain, block.plans)
             plan_part = impact_sequence.plan_parts_of(block.chain, planning.problem.epsilon)
-        found += assess_impacts(
-            block.phases,
-            impacts,
-            block.plans,
-            plan_part,
-            planning.options,
-            planning.allowed,
-            report,
-        )
+        ends = [own.before + 1 for own in impacts if not own.passed]
+        stops = [0, *ends, len(block.phases)]
+        for own in impacts:
+            phase, at, saves = block.phases[own.before], own.before + 1, math.nan
+            if own.passed:
+                report(f"phase {phase.number}: what its impact saves")
+                bounds = max(k for k in stops if k < at), at, min(k for k in stops if k > at)
+                with charge(phase.number):
+                    saves = _find_saving(planning, block, bounds, plan_part)
+            contact, impulse = own.impact.least
+            what = phase.number, str(phase.until), own.passed, own.reason, own.ratio
+            found.append(Transition(*what, impulse, contact, own.speed, saves))
     return found
 
 
-def assess_impacts(
-    block: Sequence[Phase],
-    impacts: Sequence[BlockImpact],
-    plans: Sequence[PhasePlan[Motion]],
-    plan_part: PlanPart,
-    options: PlanOptions,
-    allowed: Sequence[float | None],
-    report: Callable[[str], None],
-) -> list[Transition]:
-    """Transitions of all impacts of a block, with what each saves over a planned stop.
-
-    `allowed` are the longest durations of the problem's phases [s], for the objective `margin`.
-    """
-    stops = [0, *(impact.before + 1 for impact in impacts if not impact.passed), len(block)]
-    transitions = []
-    for own in impacts:
-        phase, at, saves = block[own.before], own.before + 1, math.nan
-        if own.passed:
-            report(f"phase {phase.number}: what its impact saves")
-            start, stop = max(k for k in stops if k < at), min(k for k in stops if k > at)
-            duration = add_up(block[start:stop], allowed)
-            with charge(phase.number):
-                saves = _find_saving(plans, (start, at, stop), plan_part, options, duration)
-        contact, impulse = own.impact.least
-        what = phase.number, str(phase.until), own.passed, own.reason, own.ratio
-        transitions.append(Transition(*what, impulse, contact, own.speed, saves))
-    return transitions
-
-
 def _find_saving(
-    plans: Sequence[PhasePlan[Motion]],
-    bounds: tuple[int, int, int],
-    plan_part: PlanPart,
-    options: PlanOptions,
-    duration: float | None,
+    planning: Planning, block: BlockPlan, bounds: tuple[int, int, int], plan_part: PlanPart
 ) -> float:
     """Cost of a stop at the middle one of `bounds` in phases in motion; NaN without a plan."""
-    moving = plans[bounds[0] : bounds[-1]]
+    inside, options = slice(bounds[0], bounds[-1]), planning.options
+    moving = block.plans[inside]
+    duration = add_up(block.phases[inside], planning.allowed)
     z = moving[0].motion.evaluate(np.zeros(1)).z[0]
     try:
         stopped = plan_stops(plan_part, bounds, z, options, duration)

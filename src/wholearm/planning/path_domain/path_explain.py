@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -53,7 +52,7 @@ from .path_nlp import (
     parameters,
     unpack,
 )
-from .path_plan import Task
+from .path_plan import Task, plan_curves
 from .speed_profile import is_hopeless
 from .terms import LimitShape
 
@@ -237,25 +236,23 @@ def _list_shortfalls(
     return list_shortfalls(data.limits, data.evaluate(data.nodes, profile), locate)
 
 
-def explain_rate_limits(
-    task: Task, parts: Sequence[PhaseData], reason: str, plan: Callable[..., Any]
-) -> WholearmError:
+def explain_rate_limits(task: Task, parts: Sequence[PhaseData], reason: str) -> WholearmError:
     """The error for phases without a plan under rate limits and lags.
 
     It is that of unlimited rates if there is no plan with these either. Otherwise larger limits
-    are tried with `plan`, which is `plan_curves`.
+    are tried.
     """
     rest = task.epsilon, task.options, task.phases, task.duration
     try:
         require_hold(parts[0], task.phases[0], 0)
         require_hold(parts[-1], task.phases[-1], -1)
-        plan([_raise_rate_limits(curve, np.inf) for curve in task.curves], *rest)
+        plan_curves([_raise_rate_limits(curve, np.inf) for curve in task.curves], *rest)
     except WholearmError as error:
         return error
     for factor in _TRIED:
         try:
             curves = [_raise_rate_limits(curve, factor) for curve in task.curves]
-            plan(curves, *rest, False, task.pins)
+            plan_curves(curves, *rest, False, task.pins)
         except WholearmError:
             continue
         change = f"feasible with motors {factor:g} times as quick"

@@ -191,7 +191,7 @@ def explain_stuck(
     from .path_explain import explain, explain_rate_limits
 
     if task.is_held:
-        return explain_rate_limits(task, stuck.parts, stuck.reason, plan_curves)
+        return explain_rate_limits(task, stuck.parts, stuck.reason)
     late, slow = _explain_duration(task), guess_slowly(join(stuck.parts))
     return late or explain(stuck.parts, *slow, task.phases, stuck.reason, replan)
 
