@@ -37,17 +37,14 @@ class Corpus(Study):
     """Answers of today against stored ones."""
 
     name, title = "corpus", "Answers against stored ones"
-    of_code, folder = True, "build"
+    of_code, folder, shipped = True, "build", True
+    stored = ("--answers", "results/corpus.json")
     problems = Path("problems")
 
     def add_options(self, parser: argparse.ArgumentParser) -> None:
-        """Which cases, and where the answers are."""
+        """Which cases."""
         text = "cases whose names match, such as 'plan heptagon *' (all)"
         parser.add_argument("--only", nargs="+", default=["*"], metavar="PATTERN", help=text)
-        parser.add_argument("--problems", default="problems", metavar="DIR", help="shipped ones")
-        text = "file of stored answers (results/corpus.json)"
-        parser.add_argument("--answers", default="results/corpus.json", metavar="FILE", help=text)
-        parser.add_argument("--update", action="store_true", help="store the answers of now")
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
         """Those that are asked for."""

@@ -12,6 +12,7 @@ import re
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -279,14 +280,8 @@ def _simulate_free(folder: Path, name: str) -> Row:
 def _follow(folder: Path, name: str, share: float) -> Row:
     """Torques of a file, times a share: up to their first loss of a contact, and simulated free."""
     problem = _load(folder, name)
-    with open(folder / "torques" / TUNED[name][0], encoding="utf-8") as stream:
-        rows = [line for line in stream if line.strip() and line[0] != "#"]
-    with tempfile.TemporaryDirectory() as place:
-        path = Path(place, "torques.csv")
-        scaled = [[float(v) for v in line.split(",")] for line in rows[1:]]
-        text = "".join(f"{t!r},{share * a!r},{share * b!r}\n" for t, a, b in scaled)
-        path.write_text(rows[0] + text, encoding="utf-8")
-        torque = wholearm.read_torque_csv(str(path))
+    torque = wholearm.read_torque_csv(str(folder / "torques" / TUNED[name][0]))
+    torque = replace(torque, coefficients=share * torque.coefficients)
     report = wholearm.verify_free(problem, torque)
     lost = [(phase.number, loss) for phase in report.phases for loss in phase.losses]
     # Once contacts bounce, and beyond the first loss, what rounding does grows from event to event.

@@ -34,13 +34,11 @@ class Guard(Study):
     """Counts of today against stored ones."""
 
     name, title, keeps = "guard", "Counts against stored ones", False
+    stored = ("--counts", "results/bench_guard.json")
 
     def add_options(self, parser: argparse.ArgumentParser) -> None:
-        """Which problems, and where the counts are."""
+        """Which problems."""
         parser.add_argument("problems", nargs="+", metavar="FILE", help="problem files (TOML)")
-        text = "file of stored counts (results/bench_guard.json)"
-        parser.add_argument("--counts", default="results/bench_guard.json", help=text)
-        parser.add_argument("--update", action="store_true", help="store the counts anew")
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
         """The problems."""

@@ -28,7 +28,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..common.arrays import Array
 from ..common.fields import Range
 from ..common.files import read_json, write_text
 from ..scene.model import Finger, Friction, Polygon, Scene
@@ -69,17 +68,11 @@ def _perturb(kind: Any, seed: int) -> None:
 
 def _change(value: Any, label: str) -> Any:
     if isinstance(value, np.ndarray):
-        return _change_array(value, label)
+        changed = [_change_number(float(v), f"{label}{i}") for i, v in np.ndenumerate(value)]
+        return np.array(changed).reshape(value.shape)
     if isinstance(value, Real) and not isinstance(value, bool):
         return _change_number(float(value), label)
     return value
-
-
-def _change_array(values: Array, label: str) -> Array:
-    places = np.ndenumerate(values)
-    return np.array([_change_number(float(v), f"{label}{i}") for i, v in places]).reshape(
-        values.shape
-    )
 
 
 @cache
@@ -174,9 +167,10 @@ class Kernels(Study):
     """Answers in several environments against stored ones."""
 
     name, title, keeps = "kernels", "Answers by environment", False
+    stored = ("--answers", "results/bench_kernels.json")
 
     def add_options(self, parser: argparse.ArgumentParser) -> None:
-        """Which problems and environments, and where the answers are."""
+        """Which problems and environments; the answers of the first one are stored."""
         parser.add_argument("problems", nargs="+", metavar="FILE", help="problem files (TOML)")
         text = "kernels of OpenBLAS, as for OPENBLAS_CORETYPE (default: the processor's own)"
         parser.add_argument("--kernels", nargs="+", default=[""], metavar="NAME", help=text)
@@ -185,10 +179,6 @@ class Kernels(Study):
         parser.add_argument("--seeds", nargs="+", type=read, default=[0], metavar="K", help=text)
         text = "interpreters that have the package (default: this one)"
         parser.add_argument("--pythons", nargs="+", default=[sys.executable], help=text)
-        text = "file of stored answers (results/bench_kernels.json)"
-        parser.add_argument("--answers", default="results/bench_kernels.json", help=text)
-        text = "store the answers of the first environment"
-        parser.add_argument("--update", action="store_true", help=text)
         parser.add_argument("-o", "--output", metavar="FILE", help="write the table (Markdown)")
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:

@@ -45,14 +45,12 @@ class Queries(Study):
     """Queries, and second ones on the same map."""
 
     name, title = "queries", "From pose to pose"
+    shipped = seeded = True
 
     def add_options(self, parser: argparse.ArgumentParser) -> None:
-        """How many queries, and of which scenes."""
+        """How many queries."""
         read = Range(0, 2**63).parse
         parser.add_argument("--queries", type=read, default=250, help="how many (250)")
-        parser.add_argument("--seed", type=read, default=0, help="of everything drawn (0)")
-        text = "folder of the shipped problems (problems)"
-        parser.add_argument("--problems", default="problems", metavar="DIR", help=text)
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
         """Seed, number, and folder of the problems."""

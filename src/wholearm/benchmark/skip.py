@@ -35,12 +35,7 @@ class Skip(Study):
     """Plans without a part of the model and with it."""
 
     name, title, timed = "skip", "What each part costs", True
-    alone = True
-
-    def add_options(self, parser: argparse.ArgumentParser) -> None:
-        """Where the problems are."""
-        text = "folder of problem files (problems)"
-        parser.add_argument("--problems", default="problems", metavar="DIR", help=text)
+    alone = shipped = True
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
         """Each part, without and with it, several times."""

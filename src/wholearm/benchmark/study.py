@@ -65,6 +65,9 @@ class Study:
                   made with
     timed, alone  whether cases are run one at a time, and each in a process of its own
     strict        whether warnings are errors
+    shipped       whether it reads a folder of problem files
+    seeded        whether cases are drawn from a seed
+    stored        option and default of a file of stored answers, if answers are compared with them
     """
 
     name = ""
@@ -75,6 +78,8 @@ class Study:
     timed = False
     alone = False
     strict = False
+    shipped = seeded = False
+    stored: tuple[str, str] | None = None
     columns: tuple[str, ...] = ()  # entries of rows that are written as CSV; none for no such file
     packages: tuple[str, ...] = ()  # further ones whose versions are stated
 
@@ -121,6 +126,17 @@ def add_common(parser: argparse.ArgumentParser, study: Study) -> None:
         cores = os.cpu_count() or 1
         text = f"processes ({cores}, as many as cores)"
         parser.add_argument("--jobs", type=Range(1, 256).parse, default=cores, help=text)
+    if study.shipped:
+        text = "folder of problem files (problems)"
+        parser.add_argument("--problems", default="problems", metavar="DIR", help=text)
+    if study.seeded:
+        read = Range(0, 2**63).parse
+        parser.add_argument("--seed", type=read, default=0, help="of everything drawn (0)")
+    if study.stored is not None:
+        option, path = study.stored
+        text = f"file of what is stored ({path})"
+        parser.add_argument(option, metavar="FILE", default=path, help=text)
+        parser.add_argument("--update", action="store_true", help="store what is found now")
     if study.keeps:
         text = "run all cases anew instead of going on with the records in the folder"
         parser.add_argument("--fresh", action="store_true", help=text)

@@ -150,19 +150,30 @@ def sample_slow_motion(instance: Instance, counts: list[int]) -> list[tuple[Arra
 
     It keeps all limits, with its internal force amid its range.
     """
-    curve = instance.curve
-    grid = Mesh().make_grid(curve, 5 + len(curve.segments))
-    data = prepare(curve, instance.problem.epsilon, grid, 0)
-    motion = PathMotion(curve, data.grid, guess(data)[0])
-    last = np.flatnonzero(np.diff(motion.grid.segment, append=-1))
-    marks = np.append(0.0, motion.times[last])
-    stretches = []
+    motion = make_slow_motion(instance, 5)
+    marks, stretches = find_reversals(motion), []
     for start, stop, count in zip(marks, marks[1:], counts, strict=False):
         # The ends of a stretch are evaluated within it.
         t = np.linspace(start, stop, count)
         inside = np.clip(t, start + 1e-9 * (stop - start), stop - 1e-9 * (stop - start))
         stretches.append((t - start, motion.evaluate(inside)))
     return stretches
+
+
+def make_slow_motion(instance: Instance, intervals: int, share: float = 1.0) -> PathMotion:
+    """The motion that the planner guesses first, with a share of its squared speed."""
+    curve = instance.curve
+    grid = Mesh().make_grid(curve, intervals + len(curve.segments))
+    data = prepare(curve, instance.problem.epsilon, grid, 0)
+    profile, _ = guess(data)
+    slow = profile._replace(a=share * profile.a, b=share * profile.b)
+    return PathMotion(curve, data.grid, slow)
+
+
+def find_reversals(motion: PathMotion) -> Array:
+    """Times at which the stretches of a motion begin and the last one ends [s]."""
+    last = np.flatnonzero(np.diff(motion.grid.segment, append=-1))
+    return np.append(0.0, motion.times[last])
 
 
 class Method(NamedTuple):

@@ -225,13 +225,11 @@ class Precision(Study):
 
     name, title, timed = "precision", "Run time against error, with peers", True
     columns = ("study", "phase", "method", "setting", "build", "solve", "errors", "outcome")
-    packages = ("toppra", "yapss")
+    packages, shipped = ("toppra", "yapss"), True
     allowed = 60.0
 
     def add_options(self, parser: argparse.ArgumentParser) -> None:
         """Which methods, and for how long."""
-        text = "folder of problem files (problems)"
-        parser.add_argument("--problems", default="problems", metavar="DIR", help=text)
         text = "measure this part only: simulation or planning"
         parser.add_argument("--part", choices=("simulation", "planning"), help=text)
         text = "measure these methods only, by the names that the table has"

@@ -16,17 +16,23 @@ import casadi as ca
 import numpy as np
 
 from ...common.arrays import Array, Expression
-from ...geometry.curve import Curve
 from ...mechanics.dynamics import build_forward
 from ...planning.options import PlanOptions
-from ...planning.path_domain.first_guess import guess
-from ...planning.path_domain.path_data import prepare
-from ...planning.path_domain.path_mesh import Mesh
-from ...planning.path_domain.path_motion import PathMotion
 from ...planning.path_domain.path_plan import plan_path
 from ...results.torque import TorqueProfile
 from ...simulation.simulate import simulate
-from .phases import OPTIMUM, SOLVED, Instance, Median, Method, PeerPlan, measure, pick
+from .phases import (
+    OPTIMUM,
+    SOLVED,
+    Instance,
+    Median,
+    Method,
+    PeerPlan,
+    find_reversals,
+    make_slow_motion,
+    measure,
+    pick,
+)
 from .reference import Course, Span, evaluate_piece, find_course, measure_error, solve_motion
 
 FEW, MANY = "simulation, few pieces", "simulation, many pieces"
@@ -227,27 +233,18 @@ def make_course(instance: Instance, study: str) -> Course | None:
     """
     problem, curve = instance.problem, instance.curve
     if study == FEW:
-        motion = make_slow_motion(curve, problem.epsilon)
+        motion = make_slow_motion(instance, 2, SLOW)
     else:
         motion = plan_path(curve, problem.epsilon, PlanOptions(), 1).motion
     looks = np.linspace(0.0, motion.duration, LOOKS)
     if motion.evaluate(looks).c_n.min() <= 0:
         return None
-    last = np.flatnonzero(np.diff(motion.grid.segment, append=-1))
-    marks = np.append(0.0, motion.times[last])
+    marks = find_reversals(motion)
     stop = marks[-2] + STOP * (marks[-1] - marks[-2])
     breaks = motion.times[np.append(motion.grid.steps > 0, True)]
     breaks = np.append(breaks[breaks < stop], stop)
     torque = TorqueProfile.fit(breaks, lambda t: motion.evaluate(t).tau, DEGREES[study])
     return find_course(problem, torque, curve, len(marks) - 2)
-
-
-def make_slow_motion(curve: Curve, epsilon: float) -> PathMotion:
-    """A slow smooth motion with its internal force amid the range that limits allow."""
-    data = prepare(curve, epsilon, Mesh().make_grid(curve, 2 + len(curve.segments)), 0)
-    profile, _ = guess(data)
-    calm = profile._replace(a=SLOW * profile.a, b=SLOW * profile.b)
-    return PathMotion(curve, data.grid, calm)
 
 
 class ReferenceCheck(NamedTuple):

@@ -57,16 +57,16 @@ KINDS = (
 class Stress(Study):
     """Generated scenes, damaged files, and shipped problems with other numbers."""
 
-    name, title, strict = "stress", "Stress study", True
+    name, title = "stress", "Stress study"
+    strict = seeded = True
 
     def add_options(self, parser: argparse.ArgumentParser) -> None:
         """How much of each."""
-        read, many = Range(0, 10**7).parse, Range(0, 2**63).parse
+        read = Range(0, 10**7).parse
         parser.add_argument("--scenes", type=read, default=1000, help="generated scenes (1000)")
         parser.add_argument("--files", type=read, default=0, help="damaged files (0)")
         text = "problem files to plan with noise, and with other masses and forces"
         parser.add_argument("--problems", nargs="+", default=[], metavar="FILE", help=text)
-        parser.add_argument("--seed", type=many, default=0, help="of everything drawn (0)")
         text = "run scene K alone, and write its problem file"
         parser.add_argument("--only", type=read, metavar="K", help=text)
 
