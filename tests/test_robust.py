@@ -24,8 +24,8 @@ from wholearm.mechanics.dynamics import (
 from wholearm.mechanics.statics import find_static_torques
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.path_plan import plan_path
-from wholearm.planning.path_domain.range_factor import find_widest
 from wholearm.planning.phase_plan import PhasePlan
+from wholearm.planning.range_cost import find_widest
 from wholearm.planning.robust.robust_rows import Guide, list_holds, measure_holds
 from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.definition import Problem

@@ -7,21 +7,26 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..common.errors import InfeasibleError, SolverError
+from ..geometry.curve import Curve
 from ..mechanics.dynamics import measure_speed
 from ..mechanics.statics import SURE
 from ..problem.uncertainty import PARAMETERS
 from ..results.plan_record import RangeFigures
 from .blocks import Planning, plan_blocks
 from .options import Objective, PlanOptions
-from .path_domain.impact_sequence import ImpactSequence
 from .path_domain.path_motion import PathMotion
-from .path_domain.range_factor import find_widest
+from .path_domain.path_plan import ROUGH, Iterate, Task, plan_curves
+from .path_domain.speed_profile import Fastest
 from .phase_plan import combine
 from .robust.robust_rows import Guide, list_holds, measure_holds
 
 WIDEST = 0.95  # largest relative range that is tried
 _STILL = 1e-9  # relative speed of rest but for rounding
 _MOST = 1e3  # largest factor that is tried
+_CLOSE = 0.01  # error of the factor, relatively
+_LESS = 0.98  # factor from one tried plan to the next
+_TRIES = 8  # most plans that are tried
 
 
 def assess_ranges(planning: Planning, report: Callable[[str], None]) -> RangeFigures:
@@ -42,10 +47,13 @@ def assess_ranges(planning: Planning, report: Callable[[str], None]) -> RangeFig
         return replace(wider, objective=Objective.TIME, duration=None)
 
     found: dict[int, float] = {}
-    for numbers, part, motions in _list_parts(planning):
+    chains = [block.chain for block in planning.blocks if block.chain is not None]
+    for part in (part for chain in chains for part in chain.split()):
+        numbers = [phase.number for phase in part.phases]
+        motions = (planning.plans[number - 1].motion for number in numbers)
+        guides = [Guide(m.grid.s, *m.profile) for m in motions if isinstance(m, PathMotion)]
         report(f"looking for the widest ranges of phase {numbers[0]}")
         curves = part.continuous_curves
-        guides = [Guide(own.grid.s, *own.profile) for own in motions]
         widest = find_widest(curves, problem.epsilon, scale, numbers, guides, most)
         found |= dict.fromkeys(numbers, widest)
     if not found:
@@ -66,12 +74,52 @@ def _list_held(planning: Planning) -> Iterator[int]:
             yield phase.number
 
 
-def _list_parts(
-    planning: Planning,
-) -> Iterator[tuple[Sequence[int], ImpactSequence, list[PathMotion]]]:
-    """Parts of blocks along curves from rest to rest: phases, curves and motions."""
-    for block in planning.blocks:
-        for part in block.chain.split() if block.chain is not None else ():
-            numbers = [phase.number for phase in part.phases]
-            motions = [planning.plans[number - 1].motion for number in numbers]
-            yield numbers, part, [own for own in motions if isinstance(own, PathMotion)]
+def find_widest(
+    curves: Sequence[Curve],
+    epsilon: float,
+    scale: Callable[[float], PlanOptions],
+    phases: Sequence[int],
+    guides: Sequence[Guide],
+    most: float,
+) -> float:
+    """The largest factor on ranges with which phases have a plan; zero if there is none.
+
+    The minimum-time sweep decides each step of a bisection; then plans are tried with ever smaller
+    factors.
+
+    Parameters
+    ----------
+    curves         as for `plan_curves`
+    epsilon : [N]
+    scale          options for the least time with ranges so many times as wide
+    guides         a motion along each curve
+    most           the largest factor that is tried
+    """
+    low, high, middle = 0.0, np.inf, min(1.0, most)
+    while low < most and (np.isinf(high) or high - low > _CLOSE * high):
+        task = Task(curves, epsilon, scale(middle), phases, None, guides=tuple(guides))
+        fastest = Iterate.begin(task, 1).fastest
+        if fastest is None:
+            high = middle
+        else:
+            low, guides = middle, _cut(fastest, curves)
+        middle = min(2 * low, most) if np.isinf(high) else (low + high) / 2
+    for _ in range(_TRIES):
+        options = replace(scale(low), accuracy=ROUGH)
+        try:
+            plan_curves(curves, epsilon, options, phases, explained=False)
+            return low
+        except (InfeasibleError, SolverError):
+            low *= _LESS
+    return 0.0
+
+
+def _cut(fastest: Fastest, curves: Sequence[Curve]) -> list[Guide]:
+    """A minimum-time profile along each curve."""
+    guides, start = [], 0.0
+    for curve in curves:
+        s = np.linspace(0.0, curve.length, len(fastest.s))
+        b, none = np.interp(s + start, fastest.s, fastest.b), np.zeros_like(s)
+        guides.append(Guide(s, none, b, none))
+        start += curve.length
+    return guides
