@@ -115,8 +115,8 @@ class PathLimits(NamedTuple):
         with np.errstate(divide="ignore", invalid="ignore"):
             bound = -slack / by
         never = np.where((by == 0) & (slack < 0), np.inf, -np.inf)
-        low = np.where(by > 0, bound, never).max(axis=1)
-        high = np.where(by < 0, bound, np.inf).min(axis=1)
+        low = np.where(by > 0, bound, never).max(axis=1, initial=-np.inf)
+        high = np.where(by < 0, bound, np.inf).min(axis=1, initial=np.inf)
         return low, high
 
     def extreme(self, b: Array, largest: bool) -> Extreme:

@@ -127,7 +127,7 @@ def _predict_phase(
     motion_name = ("moving", "to rest", "from rest", "rest to rest")[2 * rests[0] + rests[1]]
     profile = UnitProfile.between(path, rests)
     motions = {
-        "steady": (evaluate_best(path, UnitProfile.steady(path)), path.length),
+        "steady": (evaluate_best(path, UnitProfile.between(path, (False, False))), path.length),
         motion_name: (evaluate_best(path, profile), profile.way),
     }
     torques = find_torques(path, problem.epsilon, share)
@@ -279,11 +279,6 @@ class UnitProfile(NamedTuple):
     way: float  # [m]: duration times the largest speed
 
     @staticmethod
-    def steady(path: PathSamples) -> UnitProfile:
-        """At one speed throughout."""
-        return UnitProfile(np.zeros_like(path.s), np.ones_like(path.s), path.length)
-
-    @staticmethod
     def between(path: PathSamples, rests: tuple[bool, bool]) -> UnitProfile:
         """From rest or not, to rest or not: a cosine of time from rest to rest.
 
@@ -293,7 +288,7 @@ class UnitProfile(NamedTuple):
         if rests == (True, True):
             return UnitProfile(2 * (1 - 2 * x) / length, 4 * x * (1 - x), np.pi / 2 * length)
         if not any(rests):
-            return UnitProfile.steady(path)
+            return UnitProfile(np.zeros_like(x), np.ones_like(x), length)
         sign, b = (1.0, x) if rests[0] else (-1.0, 1 - x)
         return UnitProfile(np.full_like(x, sign / (2 * length)), b, 2 * length)
 
@@ -458,30 +453,24 @@ def _straighten(
     u = (1 - np.cos(np.linspace(0.0, np.pi, PLACES))) / 2
     way = goal - start
     z, slip = start + u[:, None] * way, formation.evaluate_slip(start[None])[0]
-    pose = np.zeros((PLACES, 2, 5))
-    pose[:, [0, 1], [0, 2]] = 1.0
-    wanted, metric = z[:, [0, 2]].copy(), metric_weights(formation.scene)
-    none, rows = np.zeros_like(z), formation.n_constraints
+    metric, none, count = metric_weights(formation.scene), np.zeros_like(z), formation.n_constraints
+    pose = np.broadcast_to(np.eye(5)[[0, 2]], (PLACES, 2, 5))
     for _ in range(_NEWTON):
         at = formation.evaluate(z, none)
-        off = np.hstack([at.C, formation.evaluate_slip(z) - slip, z[:, [0, 2]] - wanted])
-        change = np.linalg.solve(np.concatenate([at.P, pose], axis=1), off[..., None])[..., 0]
-        z = z - change
+        inverse_rows = np.linalg.inv(np.concatenate([at.P, pose], axis=1))
+        off = np.hstack([at.C, formation.evaluate_slip(z) - slip])
+        change = np.einsum("nij,nj->ni", inverse_rows[..., :count], off)
         if np.abs(change * np.sqrt(metric)).max() < _CLOSED * formation.scene.scales.length:
             break
-    matrix = np.concatenate([formation.evaluate(z, none).P, pose], axis=1)
-    right = np.zeros((PLACES, 5, 1))
-    right[:, rows:, 0] = way[[0, 2]]
-    z_u = np.linalg.solve(matrix, right)[..., 0]
-    at = formation.evaluate(z, z_u)
-    right = np.zeros((PLACES, 5, 1))
-    right[:, :rows, 0] = -at.P_dot_v
-    z_uu = np.linalg.solve(matrix, right)[..., 0]
+        z = z - change
+    z_u = inverse_rows[..., count:] @ way[[0, 2]]
+    bend = formation.evaluate(z, z_u).P_dot_v
+    z_uu = -np.einsum("nij,nj->ni", inverse_rows[..., :count], bend)
     speed = np.sqrt(z_u**2 @ metric)[:, None]
-    bend = ((z_u * z_uu) @ metric)[:, None] / speed**2
+    z_uu -= ((z_u * z_uu) @ metric)[:, None] / speed**2 * z_u
     steps = np.diff(u) * (speed[1:, 0] + speed[:-1, 0]) / 2
     s = np.concatenate([[0.0], np.cumsum(steps)])
-    return s, z, z_u / speed, (z_uu - bend * z_u) / speed**2, formation.evaluate(z, z_u / speed)
+    return s, z, z_u / speed, z_uu / speed**2, formation.evaluate(z, z_u / speed)
 
 
 class Place(NamedTuple):

@@ -47,6 +47,7 @@ class InternalForceLimits(NamedTuple):
         """Those of a formation at places with d theta / ds = `rates`, (n, 2)."""
         limits = make_limits(formation, 0.0)
         rows = find_slack_rows(limits, forces, rates)
+        rows[..., LAMBDA] *= np.abs(rows[..., LAMBDA]) > _LEVEL
         return InternalForceLimits(limits, PathLimits(rows, np.full(len(rows), np.inf)))
 
     @property
@@ -67,17 +68,21 @@ class InternalForceLimits(NamedTuple):
 
         The least is above the largest where there is none.
         """
-        _, weights, _ = self._split()
-        offset = self.at.find_slack(a, b, 0 * a) - np.multiply.outer(
-            np.broadcast_to(epsilon, a.shape), weights
-        )
-        return _intersect(offset, self.at.rows[..., LAMBDA], _FAR * self.force)
+        loss = np.multiply.outer(np.broadcast_to(epsilon, a.shape), self._split()[1])
+        return self._find_range(self.at.relax(-loss), a, b)
+
+    def _find_range(self, limits: PathLimits, a: Array, b: Array) -> tuple[Array, Array]:
+        low, high = limits.find_internal_force_range(a, b)
+        return np.maximum(low, -_FAR * self.force), np.minimum(high, _FAR * self.force)
 
     def find_best(self, a: Array, b: Array) -> Grasp:
         """The internal force with the largest least normal force, at a = s'', b = s'^2."""
         soft, weights, owners = self._split()
         offset, slope = self.at.find_slack(a, b, 0 * a), self.at.rows[..., LAMBDA]
-        low, high = _intersect(offset[:, ~soft], slope[:, ~soft], _FAR * self.force)
+        others = self.at._replace(rows=self.at.rows[:, ~soft])
+        low, high = self._find_range(others, a, b)
+        feasible, far = low <= high, _FAR * self.force
+        low, high = np.clip([low, high], -far, far)
         # In newtons of epsilon.
         rest, rise = offset[:, soft] / weights[soft], slope[:, soft] / weights[soft]
         i, j = np.triu_indices(soft.sum(), 1)
@@ -87,7 +92,7 @@ class InternalForceLimits(NamedTuple):
         tried = np.clip(np.column_stack([low, high, corners]), low[:, None], high[:, None])
         least = (rest[:, None] + rise[:, None] * tried[..., None]).min(axis=2)
         k, best = np.arange(len(a)), least.argmax(axis=1)
-        internal, value = tried[k, best], np.where(low <= high, least[k, best], -np.inf)
+        internal, value = tried[k, best], np.where(feasible, least[k, best], -np.inf)
         slack = offset + slope * internal[:, None]
         found = np.isfinite(value)
         slack[:, soft] -= np.where(found, value, 0.0)[:, None] * weights[soft]
@@ -100,13 +105,3 @@ class InternalForceLimits(NamedTuple):
         pair[:, 1] = np.where(free & ~bent.any(axis=1), pair[:, 0], pair[:, 1])
         rank = np.sort(owners[pair] + len(self.limits.limits) * ~soft[pair], axis=1)
         return Grasp(value, internal, rank % len(self.limits.limits))
-
-
-def _intersect(offset: Array, slope: Array, far: float) -> tuple[Array, Array]:
-    """Ends of where offset + slope x >= 0 for all columns, shape (n,); crossed if nowhere."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        edge = -offset / slope
-    low = np.where(slope > _LEVEL, edge, -far).max(axis=1, initial=-far)
-    high = np.where(slope < -_LEVEL, edge, far).min(axis=1, initial=far)
-    stuck = ((np.abs(slope) <= _LEVEL) & (offset < -_TIED)).any(axis=1)
-    return np.where(stuck, far, low), np.where(stuck, -far, high)

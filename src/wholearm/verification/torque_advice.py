@@ -204,52 +204,34 @@ def find_resting_changes(
     tau : (2,) [N m]
     gradient : (5,)   of the distance to the end of the phase, if that is known
     """
-    moved = [_move(formation, path, epsilon, z, tau, gradient) for path in paths]
-    resting_changes: list[TorqueAdvice] = []
-    for k, free in enumerate(_TORQUES):
-        known = [change for own in moved if (change := own[k]) is not None]
-        if len(free) == 2 and resting_changes:
+    limits, unit = make_limits(formation, epsilon), formation.scene.scales.torque
+    starts = list[tuple[StartMode, tuple[Array, Array]]]()
+    for path in paths:
+        instant = _answer(formation, z, path)
+        if instant is not None:
+            towards = [] if gradient is None else [-gradient @ path.acceleration]
+            rows = np.vstack([path.margins, *towards])
+            sizes = np.abs(rows) @ [1.0, unit, unit]
+            scale = [limits.scales[limits.sides[0]], np.where(sizes > 0, sizes, 1.0)]
+            sides = np.vstack([instant.find_sides(limits), rows])
+            starts.append((path, normalise(sides, np.concatenate(scale), tau, unit)))
+    changes: list[TorqueAdvice] = []
+    for free in _TORQUES:
+        if len(free) == 2 and changes:
             break
-        held = None if known else find_holding_change(formation, z, tau, epsilon, free)
-        if known:
-            resting_changes.append(make_advice(min(known, key=np.linalg.norm), tau))
+        found = ((path, find_least_change(*sides, free)) for path, sides in starts)
+        least = [(path, unit * one) for path, one in found if one is not None]
+        moved = [change for path, change in least if path.moves(tau + change)]
+        held = None if moved else find_holding_change(formation, z, tau, epsilon, free)
+        if moved:
+            changes.append(make_advice(min(moved, key=np.linalg.norm), tau))
         elif held is not None:
-            resting_changes.append(make_advice(held, tau, holds=True))
-    return tuple(
-        sorted(resting_changes, key=lambda change: (change.holds, np.hypot(*change.change)))
-    )
+            changes.append(make_advice(held, tau, holds=True))
+    return tuple(sorted(changes, key=lambda change: (change.holds, np.hypot(*change.change))))
 
 
 def _answer(formation: Formation, z: Array, path: StartMode) -> Instant | None:
     return answer(formation, z, np.zeros(5), np.concatenate(path.directions))
-
-
-def _move(
-    formation: Formation,
-    path: StartMode,
-    epsilon: float,
-    z: Array,
-    tau: Array,
-    gradient: Array | None,
-) -> list[Array | None]:
-    """Least changes of one torque, the other and both with which it begins to move one way."""
-    instant, unit = _answer(formation, z, path), formation.scene.scales.torque
-    if instant is None:
-        return [None] * len(_TORQUES)
-    limits = make_limits(formation, epsilon)
-    rows = [*path.margins, *([] if gradient is None else [-gradient @ instant.acceleration])]
-    sizes = np.abs(rows) @ [1.0, unit, unit]
-    scale = np.concatenate([limits.scales[limits.sides[0]], np.where(sizes > 0, sizes, 1.0)])
-    sides = np.vstack([instant.find_sides(limits), *rows])
-    slack, slope = normalise(sides, scale, tau, unit)
-    tried = (change_one(slack, slope, 0), change_one(slack, slope, 1), change_both(slack, slope))
-
-    def keep(change: Array | None) -> Array | None:
-        if change is None or (slack + slope @ change < -KEPT).any():
-            return None
-        return unit * change if path.moves(tau + unit * change) else None
-
-    return [keep(change) for change in tried]
 
 
 class Instant(NamedTuple):
@@ -349,9 +331,13 @@ def find_changes(
             but = f"{limit.text} is {short[worst] * scale[worst]:.3g} {limit.unit} short"
         return make_advice(unit * change, tau, but)
 
-    singles = [change_one(slack, slope, joint) for joint in range(2)]
+    short = slack < 0
+    # A change of one torque may miss others, and is then told with them.
+    singles = [find_least_change(slack[short], slope[short], one) for one in _TORQUES[:2]]
     changes = [describe(one) for one in singles if one is not None]
-    both = change_both(slack, slope) if all(change.but for change in changes) else None
+    both = None
+    if all(change.but for change in changes):
+        both = find_least_change(slack, slope, _TORQUES[2])
     changes += [] if both is None else [describe(both)]
     return tuple(sorted(changes, key=lambda change: (bool(change.but), np.hypot(*change.change))))
 
@@ -368,30 +354,19 @@ def make_advice(change: Array, tau: Array, but: str = "", holds: bool = False) -
     return TorqueAdvice((first, second), (one, other), but, holds)
 
 
-def change_one(slack: Array, slope: Array, joint: int) -> Array | None:
-    """The least change of one torque with which slack + slope @ change >= 0 where slack < 0.
+def find_least_change(slack: Array, slope: Array, free: tuple[int, ...]) -> Array | None:
+    """The shortest change of the torques `free`, (2,), with slack + slope @ change >= 0, or None.
 
-    None if there is none; others than these may then be missed.
+    It is zero, on a side, or in a corner of two sides.
     """
-    short = slack < 0
-    slack, along = slack[short], slope[short, joint]
-    if (np.abs(along) < FLAT).any() or ((along > 0).any() and (along < 0).any()):
-        return None
-    change = np.zeros(2)
-    steps = -slack / along
-    change[joint] = steps[np.abs(steps).argmax()] if len(steps) else 0.0
-    return change
-
-
-def change_both(slack: Array, slope: Array) -> Array | None:
-    """The shortest change with slack + slope @ change >= 0: on a side, or in a corner of two."""
-    sizes = np.linalg.norm(slope, axis=1)
-    steep = sizes > FLAT
-    normal, reach = slope[steep] / sizes[steep, None], slack[steep] / sizes[steep]
-    found = [-own * normal[k] for k, own in enumerate(reach)]
+    steep = slope * np.isin([0, 1], free)
+    sizes = np.linalg.norm(steep, axis=1)
+    used = sizes > FLAT
+    normal, reach = steep[used] / sizes[used, None], slack[used] / sizes[used]
+    found = [np.zeros(2), *(-reach[:, None] * normal)]
     for i, j in combinations(range(len(reach)), 2):
         pair = normal[[i, j]]
         if abs(np.linalg.det(pair)) > FLAT:
             found.append(np.linalg.solve(pair, -reach[[i, j]]))
-    kept = [change for change in found if (slack + slope @ change >= -KEPT).all()]
+    kept = [change for change in found if (slack + steep @ change >= -KEPT).all()]
     return min(kept, key=np.linalg.norm, default=None)
