@@ -39,12 +39,11 @@ from wholearm.planning.time_domain.attempts import (
     find_modes,
     split_by_senses,
 )
+from wholearm.planning.time_domain.initial_path import guess_stages
+from wholearm.planning.time_domain.mode_search import mode_of
 from wholearm.planning.time_domain.search import TimeSearch, TimeSolution
-from wholearm.planning.time_domain.stage import Stage
+from wholearm.planning.time_domain.stage import Stage, bisect_intervals
 from wholearm.planning.time_domain.stage_kernels import goal_kernel
-from wholearm.planning.time_domain.stage_modes import mode_of
-from wholearm.planning.time_domain.stages import guess_stages
-from wholearm.planning.time_domain.time_mesh import bisect_intervals
 from wholearm.planning.time_domain.time_plan import (
     NEARER,
     ContinuedEnd,

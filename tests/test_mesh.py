@@ -16,20 +16,22 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.time_domain.attempts import GAIN, choose_end
 from wholearm.planning.time_domain.collocation import Scheme, make_scheme
+from wholearm.planning.time_domain.initial_path import guess_stages
+from wholearm.planning.time_domain.mode_search import LEAST_INTERVALS
 from wholearm.planning.time_domain.nlp_layout import pack
 from wholearm.planning.time_domain.search import TimeSearch, TimeSolution, carry_multipliers
-from wholearm.planning.time_domain.stage import Stage, StagePoints, in_own_units
-from wholearm.planning.time_domain.stage_modes import LEAST_INTERVALS
-from wholearm.planning.time_domain.stages import guess_stages
-from wholearm.planning.time_domain.tightening import find_least
-from wholearm.planning.time_domain.time_mesh import (
+from wholearm.planning.time_domain.stage import (
     AT_ONCE,
     DEFECT,
+    Stage,
+    StagePoints,
     bisect,
     bisect_intervals,
     count_halvings,
+    in_own_units,
     resample,
 )
+from wholearm.planning.time_domain.tightening import find_least
 from wholearm.planning.time_domain.time_motion import StageMotion
 from wholearm.planning.time_domain.time_plan import try_phases
 from wholearm.problem.definition import Problem

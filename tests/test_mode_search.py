@@ -17,11 +17,17 @@ from tipping import roll, tilting
 from wholearm.mechanics.dynamics import Directions
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
-from wholearm.planning.time_domain.mode_search import WORTH, improve
+from wholearm.planning.time_domain.initial_path import guess_stages
+from wholearm.planning.time_domain.mode_search import (
+    WORTH,
+    StageMode,
+    improve,
+    in_mode,
+    link,
+    mode_of,
+)
 from wholearm.planning.time_domain.search import TimeSearch, TimeSolution
 from wholearm.planning.time_domain.stage import Stage
-from wholearm.planning.time_domain.stage_modes import StageMode, in_mode, link, mode_of
-from wholearm.planning.time_domain.stages import guess_stages
 from wholearm.planning.time_domain.tightening import MOST
 from wholearm.planning.time_domain.time_motion import TimeMotion
 from wholearm.planning.time_domain.time_plan import plan_phases

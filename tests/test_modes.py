@@ -13,7 +13,15 @@ from wholearm.common.arrays import Array
 from wholearm.contacts.formation import Formation
 from wholearm.mechanics.dynamics import Directions, split_forces
 from wholearm.planning.time_domain.collocation import make_scheme
-from wholearm.planning.time_domain.mode_search import list_moves
+from wholearm.planning.time_domain.mode_search import (
+    StageMode,
+    in_mode,
+    link,
+    list_moves,
+    merge,
+    mode_of,
+    split,
+)
 from wholearm.planning.time_domain.nlp_layout import (
     MARGIN,
     STATE,
@@ -24,16 +32,7 @@ from wholearm.planning.time_domain.nlp_layout import (
     pack,
     unpack,
 )
-from wholearm.planning.time_domain.stage import Stage, StagePoints
-from wholearm.planning.time_domain.stage_modes import (
-    StageMode,
-    in_mode,
-    link,
-    merge,
-    mode_of,
-    split,
-)
-from wholearm.planning.time_domain.time_mesh import resample
+from wholearm.planning.time_domain.stage import Stage, StagePoints, resample
 
 SCHEMES = [("radau", 2), ("radau", 3), ("legendre", 2), ("legendre", 4)]
 

@@ -16,7 +16,7 @@ from wholearm.common.errors import InfeasibleError
 from wholearm.planning.options import Objective
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
-from wholearm.planning.time_domain import time_impacts, time_plan
+from wholearm.planning.time_domain import time_plan
 from wholearm.planning.time_domain.time_motion import TimeMotion
 from wholearm.problem.definition import Problem
 from wholearm.results.trajectory import Samples, Trajectory
@@ -220,7 +220,7 @@ def test_a_phase_without_margin_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
             plans[low - 1] = plans[low - 1]._replace(value=0.031)
         return plans
 
-    monkeypatch.setattr(time_impacts, "plan_phases", plan_tightly)
+    monkeypatch.setattr(time_plan, "plan_phases", plan_tightly)
     least = shoved_in()[low - 1]
     with pytest.raises(InfeasibleError) as caught:
         solve(problem, "margin", time_intervals=4)

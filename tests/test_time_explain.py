@@ -22,9 +22,9 @@ from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.time_domain import time_explain, time_plan
 from wholearm.planning.time_domain.attempts import Attempts
 from wholearm.planning.time_domain.collocation import make_scheme
+from wholearm.planning.time_domain.initial_path import guess_stages
 from wholearm.planning.time_domain.search import TimeSearch
 from wholearm.planning.time_domain.stage import Stage
-from wholearm.planning.time_domain.stages import guess_stages
 from wholearm.planning.time_domain.time_explain import (
     change_limit,
     explain,

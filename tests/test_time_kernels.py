@@ -15,6 +15,7 @@ from wholearm.mechanics.dynamics import split_forces
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.time_domain import stage_kernels as kernels
 from wholearm.planning.time_domain.collocation import blend, make_scheme
+from wholearm.planning.time_domain.initial_path import guess_stages
 from wholearm.planning.time_domain.nlp_layout import Kernel
 from wholearm.planning.time_domain.search import TimeSearch
 from wholearm.planning.time_domain.stage_kernels import (
@@ -29,7 +30,6 @@ from wholearm.planning.time_domain.stage_kernels import (
     opening_kernel,
     point_kernel,
 )
-from wholearm.planning.time_domain.stages import guess_stages
 from wholearm.problem.definition import Problem, Until
 from wholearm.results.trajectory import Samples
 from wholearm.scene.model import Scene

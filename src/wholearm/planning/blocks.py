@@ -303,7 +303,7 @@ def plan_block(
     problem, known = planning.problem, planning.curves
     allowed = [None] * len(problem.phases) if allowed is None else allowed
     if not runs_along_curves(block, options):
-        from .time_domain.time_impacts import plan_with_impacts
+        from .time_domain.time_plan import plan_with_impacts
 
         def plan(duration: float | None) -> Plans:
             pinned = planning.pinned or leads_on(problem, block, options)

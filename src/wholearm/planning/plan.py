@@ -242,7 +242,7 @@ def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transitio
         if len(block.phases) == 1:
             continue
         if block.chain is None:
-            from .time_domain.time_impacts import list_impacts, plan_parts_of
+            from .time_domain.time_plan import list_impacts, plan_parts_of
 
             impacts = list_impacts(block.phases, block.plans)
             plan_part = plan_parts_of(planning.problem, block.phases)

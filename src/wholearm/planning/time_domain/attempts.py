@@ -23,14 +23,22 @@ from ...geometry.curve import find_tied
 from ...geometry.path_guess import find_end
 from ...problem.definition import Phase, Problem
 from .collocation import Scheme, make_scheme
-from .initial_path import PacedWay, list_ways, pace_straight
-from .mode_search import WORTH, drop_gone, improve
+from .initial_path import PacedWay, guess_stages, list_ways, pace_straight
+from .mode_search import (
+    LEAST_INTERVALS,
+    WORTH,
+    StageMode,
+    drop,
+    drop_gone,
+    improve,
+    in_mode,
+    link,
+    merge,
+    mode_of,
+)
 from .search import Price, TimeSearch, TimeSolution
-from .stage import Stage
-from .stage_modes import LEAST_INTERVALS, StageMode, drop, in_mode, link, merge, mode_of
-from .stages import guess_stages
+from .stage import Stage, halve, resample, with_controls
 from .tightening import DEARER, PATIENCE, enforce_between, is_hopeless
-from .time_mesh import halve, resample, with_controls
 
 _TRIES = ((1.01, 2), (1.03, 2), (1.07, 3), (1.15, 4), (1.3, 6), (1.6, 8))
 """Durations with held torques to try, over those with free ones, and least numbers of periods."""

@@ -12,13 +12,9 @@ from numpy.typing import NDArray
 from ...common.arrays import Array, find_minima
 from ...mechanics.limits import PRESS, LimitSet, make_limits
 from ...results.trajectory import Samples
-from .equations import SLIDING, least_senses
-from .nlp_layout import StageLayout
+from .equations import SLIDING, find_relieved, least_senses
 from .stage import Stage
-from .time_limits import LimitRows, bound_by_limits
 from .time_motion import StageMotion
-from .time_nlp import TimeNLP
-from .time_rate_limits import find_relieved
 
 MISS = 2.5e-7  # largest miss of a force limit between points, over the weight of the object
 GRAZE = 3e-7  # deepest overlap between points, over the radius of gyration
@@ -152,58 +148,3 @@ def monitor_missed(stages: Sequence[Stage], checks: Sequence[CheckPlaces]) -> li
         changed.append(replace(stage, monitored=tuple(sorted({*stage.monitored, *broken}))))
     news = [one.monitored != other.monitored for one, other in zip(changed, stages, strict=True)]
     return changed if any(news) else None
-
-
-def raise_bounds(
-    nlp: TimeNLP,
-    stages: Sequence[Stage],
-    limits: Sequence[IntersampleLimits],
-    bounds: tuple[Array, Array],
-) -> tuple[Array, Array]:
-    """Bounds of the NLP's rows; raises `bounds`, those of its unknowns, in place."""
-    low, high = nlp.rows.bounds
-    low_x, high_x = bounds
-    for k, (stage, raised) in enumerate(zip(stages, limits, strict=True)):
-        own, layout = nlp.rows_of[k], nlp.layouts[k]
-        kept = own.limits.limits
-        rows, signs, values = kept.sides
-        more = raised.held * kept.scales[rows]
-        # Forces that vanish or set in are only nonnegative.
-        more = np.where(find_relieved(stage, kept), -signs * values, more)
-        pressed = own.limits.pressed
-        floor = values[pressed] + more[:, pressed]
-        # Where rows hold c_n at the points too, its own bounds must not.
-        if own.limits.alone:
-            low_x[layout.forces[..., : stage.formation.n_contacts]] = floor[:, None]
-        low[own.limits.presses] = floor[:, None]
-        others = own.limits.sides
-        low[own.limits.others] = ((signs * values)[others] + more[:, others])[:, None]
-        for held in (layout.begin, layout.finish):
-            low_x[held[: stage.formation.n_contacts]] = values[pressed][: len(held)]
-        _free_equal(stage, own.limits, layout, (low_x, low))
-        bound_by_limits(own.limits, layout, bounds, more)
-        low[own.monitor_rows] += raised.gap[:, None]
-        low[own.senses] += raised.sense[:, None, list(stage.formation.rubbing_rows)]
-        for joint, sigma in enumerate(stage.directions.sigma):
-            rates, faster = layout.v[..., 3 + joint], raised.sense[:, -2 + joint, None]
-            low_x[rates] += faster * (sigma > 0)
-            high_x[rates] -= faster * (sigma < 0)
-    return low, high
-
-
-def _free_equal(
-    stage: Stage, rows: LimitRows, layout: StageLayout, lows: tuple[Array, Array]
-) -> None:
-    """Remove bounds, in place, of forces that are given by equations."""
-    if not stage.formation.scene.has_slow_motors:
-        return
-    low_x, low = lows
-    for contact, slips in stage.fading:
-        if slips:
-            names = [rows.limits.limits[k].part for k in rows.limits.owners]
-            own = [names[k] == stage.formation.names[contact] for k in rows.limits.sides[0]]
-            low[rows.others[-1, -1, np.array(own)[rows.sides]]] = -np.inf
-        else:
-            low_x[layout.forces[-1, -1, contact]] = -np.inf
-            low[rows.presses[-1, 1:2, contact]] = -np.inf
-    low[rows.presses[0, 0, list(stage.growing)]] = -np.inf

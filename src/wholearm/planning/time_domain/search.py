@@ -16,13 +16,20 @@ from ...problem.definition import Problem
 from ..options import Objective, PlanOptions
 from ..phase_plan import Tried
 from .collocation import Scheme, make_scheme
-from .equations import StageRows
-from .intersample import IntersampleLimits, raise_bounds
+from .equations import StageRows, Target
+from .intersample import IntersampleLimits
 from .nlp_layout import MARGIN, Indices, pack, unpack
-from .stage import Stage, in_own_units, scale_options, unit_lengths, unit_of
-from .time_limits import Target
-from .time_mesh import adopt, monitor_violated, with_controls
-from .time_nlp import TimeNLP, bound_unknowns, build_time_nlp
+from .stage import (
+    Stage,
+    adopt,
+    in_own_units,
+    monitor_violated,
+    scale_options,
+    unit_lengths,
+    unit_of,
+    with_controls,
+)
+from .time_nlp import TimeNLP, bound_unknowns, build_time_nlp, raise_bounds
 
 FIRST_SIZE = 1e-2  # multipliers of a first guess
 Multipliers = dict[str, Array]  # of the unknowns' bounds, `lam_x0`, and of the rows, `lam_g0`

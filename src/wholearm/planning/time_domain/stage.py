@@ -1,12 +1,17 @@
-"""Stages: parts of a motion in the time domain with one formation and fixed contact modes."""
+"""Stages: parts of a motion in the time domain with one formation and fixed contact modes.
+
+Also their units, and interpolation on other intervals.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...common.arrays import Array
 from ...common.fields import keys_of
@@ -16,6 +21,10 @@ from ...problem.definition import Phase, Problem, Until
 from ...problem.uncertainty import PARAMETERS
 from ...scene.model import Polygon, Scales, Scene
 from ..options import CLEARANCE, OPENING, Objective, PlanOptions
+from .collocation import Scheme, blend, fit_controls
+
+_BROKEN = 1e-6  # violation of a formation limit that counts, over the radius of gyration
+_HAIR = 1e-12  # rounding of a place, as share of the duration
 
 
 class StagePoints(NamedTuple):
@@ -198,3 +207,99 @@ def to_si(stage: Stage, problem: Problem) -> Stage:
 def _with_rolling(formation: Formation, rolling: tuple[object, ...]) -> Formation:
     contacts = tuple(contact for contact in formation.contacts if contact in rolling)
     return Formation(formation.scene, formation.contacts, contacts)
+
+
+def resample(
+    part: StagePoints, scheme: Scheme, breaks: Array, begin: float = 0.0, stop: float = 1.0
+) -> StagePoints:
+    """Part of a stage from `begin` to `stop`, on intervals with `breaks`, (K + 1,), in [0, 1]."""
+    span = stop - begin
+    fractions = np.diff(breaks)
+    inner = breaks[:-1, None] + fractions[:, None] * scheme.points
+    shape = (len(fractions), scheme.degree, -1)
+    points = _interpolate(part, scheme, (begin + span * inner).ravel())
+    nodes = np.stack(_interpolate(part, scheme, begin + span * breaks)[:2], axis=1)
+    z, v, a, forces = (table.reshape(shape) for table in points)
+    tau = _torques(part, begin + span * breaks)
+    impulses = part.impulses if stop == 1.0 else part.impulses[:0]
+    return StagePoints(part.duration * span, fractions, nodes, z, v, a, forces, tau, impulses)
+
+
+def bisect(part: StagePoints, scheme: Scheme, times: NDArray[np.int64]) -> StagePoints:
+    """Halve each interval and its parts so many times, shape (K,)."""
+    pairs = zip(part.breaks[:-1], part.breaks[1:], 2**times, strict=True)
+    pieces = [np.linspace(start, stop, count, endpoint=False) for start, stop, count in pairs]
+    return resample(part, scheme, np.append(np.concatenate(pieces), part.breaks[-1]))
+
+
+def _interpolate(part: StagePoints, scheme: Scheme, places: Array) -> tuple[Array, ...]:
+    """z, z', z'' and forces at shares of the duration, by the polynomials of the intervals."""
+    count, degree = len(part.fractions), scheme.degree
+    # z'' and forces may step after the last point of an interval.
+    k = np.clip(np.searchsorted(part.breaks, places - _HAIR) - 1, 0, count - 1)
+    x = (places - part.breaks[k]) / part.fractions[k]
+    powers = np.arange(degree + 1)
+    wide = x[:, None] ** powers @ np.linalg.inv(np.append(0.0, scheme.points)[:, None] ** powers)
+    z, v = (
+        np.einsum("nj,njd->nd", wide, np.concatenate([first[k, None], table[k]], axis=1))
+        for first, table in ((part.nodes[:-1, 0], part.z), (part.nodes[:-1, 1], part.v))
+    )
+    narrow = scheme.interpolate(x)
+    a, forces = (np.einsum("nj,njd->nd", narrow, table[k]) for table in (part.a, part.forces))
+    return z, v, a, forces
+
+
+def with_controls(part: StagePoints, count: int) -> StagePoints:
+    """A stage's points with another number of control points of torques."""
+    old = part.tau.shape[1]
+    at = np.linspace(0.0, 1.0, max(count, old))
+    return part._replace(tau=fit_controls(at, blend(at, old) @ part.tau, count))
+
+
+def _torques(part: StagePoints, breaks: Array) -> Array:
+    """Control points of torques in new intervals, each inside one old interval at its middle."""
+    middles = (breaks[1:] + breaks[:-1]) / 2
+    count, controls = part.tau.shape[:2]
+    k = np.clip(np.searchsorted(part.breaks, middles, side="right") - 1, 0, count - 1)
+    at = np.linspace(0.0, 1.0, controls)
+    places = breaks[:-1, None] + np.diff(breaks)[:, None] * at
+    x = np.clip((places - part.breaks[k, None]) / part.fractions[k, None], 0.0, 1.0)
+    return fit_controls(at, blend(x, controls) @ part.tau[k], controls)
+
+
+def adopt(stages: Sequence[Stage], points: Sequence[StagePoints]) -> list[Stage]:
+    """The same stages with a solution as their guess."""
+    return [replace(stage, guess=part) for stage, part in zip(stages, points, strict=True)]
+
+
+def bisect_intervals(
+    stages: Sequence[Stage], scheme: Scheme, times: Sequence[NDArray[np.int64]]
+) -> list[Stage]:
+    """Stages with intervals halved so many times, each of shape (K,)."""
+    return [
+        replace(
+            stage,
+            guess=bisect(stage.guess, scheme, mine),
+            periods=tuple(np.repeat(stage.periods, 2**mine).tolist()) if stage.periods else (),
+        )
+        if mine.any()
+        else stage
+        for stage, mine in zip(stages, times, strict=True)
+    ]
+
+
+def halve(stages: Sequence[Stage], scheme: Scheme) -> list[Stage]:
+    """Stages with all intervals halved."""
+    return bisect_intervals(stages, scheme, [np.ones(own.intervals, dtype=int) for own in stages])
+
+
+def monitor_violated(stages: Sequence[Stage]) -> list[Stage] | None:
+    """Stages with limits added that their guesses violate, or None if there are none."""
+    changed = []
+    for stage in stages:
+        values = stage.formation.evaluate_limits(stage.guess.z.reshape(-1, 5))
+        rho = stage.formation.scene.polygon.gyration_radius
+        broken = np.flatnonzero(values.min(axis=0) < -_BROKEN * rho).tolist()
+        changed.append(replace(stage, monitored=tuple(sorted({*stage.monitored, *broken}))))
+    monitored = [stage.monitored for stage in stages]
+    return changed if [stage.monitored for stage in changed] != monitored else None

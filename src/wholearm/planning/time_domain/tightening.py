@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from ...common.arrays import Array
 from ...mechanics.limits import PRESS, LimitSet, make_limits
 from ..options import Objective
-from .equations import least_senses
+from .collocation import Scheme
+from .equations import least_senses, price_sides
 from .intersample import (
     CheckPlaces,
     IntersampleLimits,
@@ -28,11 +29,14 @@ from .intersample import (
     monitor_missed,
 )
 from .search import TimeSearch, TimeSolution
-from .stage import Stage
-from .time_limits import price_sides
-from .time_mesh import bisect_intervals, cap_halvings, count_halvings, spread_halvings
+from .stage import Stage, bisect_intervals
 from .time_motion import MotionResponse, StageMotion, make_motions
 
+DEFECT = 2e-8  # largest collocation error of z and z' in an interval, in the scene's own units
+DEAR = 1e-5  # largest relative cost of raised limits in an interval
+AT_ONCE = 2  # most times that an interval is halved at once
+_LESS = 4.0  # reduction by a halving of the gain of better torques
+_CHEAPER = 3  # power of two of the reduction of the cost of missed limits
 _PLACES = 7  # Gauss points of an interval at which torques are compared
 _HELD = 3.0  # rate over the least one below which that bound is active
 _CLOSE = 1e-6  # gap over the radius of gyration below which its limit is active
@@ -345,3 +349,33 @@ def find_least(slope: Array, square: float, rows: Array, slack: Array) -> Array:
         value = np.einsum("nj,nuj->nu", slope, u) + square * (u**2).sum(axis=2)
     allowed = (over >= -_ROUNDING).all(axis=2) & np.isfinite(value)
     return np.asarray(np.where(allowed, value, 0.0).min(axis=1, initial=0.0))
+
+
+def count_halvings(prices: Array, defects: Array, scheme: Scheme) -> NDArray[np.int64]:
+    """How often to halve each interval, by its relative cost of misses and collocation error, (K,).
+
+    Errors of collocation decrease with the scheme's order, costs to less than a tenth.
+    """
+    price = np.maximum(prices / DEAR, 1.0)
+    error = np.maximum(np.abs(defects).max(axis=(1, 2)) / DEFECT, 1.0)
+    times = np.maximum(np.log2(price) / _CHEAPER, np.log2(error) / scheme.order)
+    return np.asarray(np.clip(np.ceil(times), 0, AT_ONCE), dtype=np.int64)
+
+
+def spread_halvings(shares: Sequence[Array], most: float) -> list[NDArray[np.int64]]:
+    """How often to halve intervals, (K,) each, the largest first, until errors sum up to `most`."""
+    left, times = np.concatenate(shares), np.zeros(sum(map(len, shares)), dtype=np.int64)
+    even = most / len(left)
+    while left.sum() > most:
+        worst = int(np.where(times < AT_ONCE, left, 0.0).argmax())
+        if times[worst] == AT_ONCE or left[worst] <= even:
+            break
+        left[worst] /= _LESS
+        times[worst] += 1
+    return np.split(times, np.cumsum([len(own) for own in shares])[:-1])
+
+
+def cap_halvings(times: list[NDArray[np.int64]], most: int) -> list[NDArray[np.int64]]:
+    """How often to halve intervals: once at most, if there would be more than `most` of them."""
+    wanted = sum(int((2**mine).sum()) for mine in times)
+    return times if wanted <= most else [np.minimum(mine, 1) for mine in times]

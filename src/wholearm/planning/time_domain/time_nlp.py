@@ -35,7 +35,19 @@ from ...solvers.ipopt import SolverStatistics, book, build_solver
 from ..columns import Columns
 from ..options import Objective
 from .collocation import Scheme
-from .equations import StageRows, add_stage, find_still, join_stages, least_senses
+from .equations import (
+    LimitRows,
+    StageRows,
+    Target,
+    add_stage,
+    bound_by_limits,
+    find_relieved,
+    find_still,
+    hold_ends,
+    join_stages,
+    least_senses,
+)
+from .intersample import IntersampleLimits
 from .nlp_layout import (
     MARGIN,
     STATE,
@@ -50,8 +62,6 @@ from .nlp_layout import (
 )
 from .stage import Stage
 from .stage_kernels import NamedKernel, bend_kernel, effort_kernel, name_kernel
-from .time_limits import Target, bound_by_limits
-from .time_rate_limits import hold_ends
 
 SHORTEST = 1e-6  # least duration of an interval, in the scene's unit
 _BEND = 1e-2  # weight of second differences of torques over their limits, which else may ring
@@ -242,3 +252,58 @@ def slope_kernel() -> NamedKernel:
     x = Columns(before=4, after=4, h=1, coming=1).make_symbols()
     slopes = (x.before[2:] - x.before[:2]) * x.coming - (x.after[2:] - x.after[:2]) * x.h
     return name_kernel(x, Columns().make_symbols(), slopes=slopes)
+
+
+def raise_bounds(
+    nlp: TimeNLP,
+    stages: Sequence[Stage],
+    limits: Sequence[IntersampleLimits],
+    bounds: tuple[Array, Array],
+) -> tuple[Array, Array]:
+    """Bounds of the NLP's rows; raises `bounds`, those of its unknowns, in place."""
+    low, high = nlp.rows.bounds
+    low_x, high_x = bounds
+    for k, (stage, raised) in enumerate(zip(stages, limits, strict=True)):
+        own, layout = nlp.rows_of[k], nlp.layouts[k]
+        kept = own.limits.limits
+        rows, signs, values = kept.sides
+        more = raised.held * kept.scales[rows]
+        # Forces that vanish or set in are only nonnegative.
+        more = np.where(find_relieved(stage, kept), -signs * values, more)
+        pressed = own.limits.pressed
+        floor = values[pressed] + more[:, pressed]
+        # Where rows hold c_n at the points too, its own bounds must not.
+        if own.limits.alone:
+            low_x[layout.forces[..., : stage.formation.n_contacts]] = floor[:, None]
+        low[own.limits.presses] = floor[:, None]
+        others = own.limits.sides
+        low[own.limits.others] = ((signs * values)[others] + more[:, others])[:, None]
+        for held in (layout.begin, layout.finish):
+            low_x[held[: stage.formation.n_contacts]] = values[pressed][: len(held)]
+        _free_equal(stage, own.limits, layout, (low_x, low))
+        bound_by_limits(own.limits, layout, bounds, more)
+        low[own.monitor_rows] += raised.gap[:, None]
+        low[own.senses] += raised.sense[:, None, list(stage.formation.rubbing_rows)]
+        for joint, sigma in enumerate(stage.directions.sigma):
+            rates, faster = layout.v[..., 3 + joint], raised.sense[:, -2 + joint, None]
+            low_x[rates] += faster * (sigma > 0)
+            high_x[rates] -= faster * (sigma < 0)
+    return low, high
+
+
+def _free_equal(
+    stage: Stage, rows: LimitRows, layout: StageLayout, lows: tuple[Array, Array]
+) -> None:
+    """Remove bounds, in place, of forces that are given by equations."""
+    if not stage.formation.scene.has_slow_motors:
+        return
+    low_x, low = lows
+    for contact, slips in stage.fading:
+        if slips:
+            names = [rows.limits.limits[k].part for k in rows.limits.owners]
+            own = [names[k] == stage.formation.names[contact] for k in rows.limits.sides[0]]
+            low[rows.others[-1, -1, np.array(own)[rows.sides]]] = -np.inf
+        else:
+            low_x[layout.forces[-1, -1, contact]] = -np.inf
+            low[rows.presses[-1, 1:2, contact]] = -np.inf
+    low[rows.presses[0, 0, list(stage.growing)]] = -np.inf
