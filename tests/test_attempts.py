@@ -108,7 +108,7 @@ def test_a_single_guess_straight_to_a_place_is_no_other(
     problem = landing()
     start, phase = trace_phases(problem)[-1].end, replace(problem.phases[4], end=End.REST)
     goal = find_end(phase, start, problem.phases[5:])
-    monkeypatch.setattr(attempts, "pace_straight", lambda *_: None)
+    monkeypatch.setattr(attempts, "pace_way", lambda *_: None)
     assert try_phases(problem, [phase], start, OPTIONS, goal, single_guess=True) is None
     assert tried == []
 

@@ -21,17 +21,19 @@ from wholearm.planning.time_domain.mode_search import LEAST_INTERVALS
 from wholearm.planning.time_domain.nlp_layout import pack
 from wholearm.planning.time_domain.search import TimeSearch, TimeSolution, carry_multipliers
 from wholearm.planning.time_domain.stage import (
-    AT_ONCE,
-    DEFECT,
     Stage,
     StagePoints,
     bisect,
     bisect_intervals,
-    count_halvings,
     in_own_units,
     resample,
 )
-from wholearm.planning.time_domain.tightening import find_least
+from wholearm.planning.time_domain.tightening import (
+    AT_ONCE,
+    DEFECT,
+    count_halvings,
+    find_least,
+)
 from wholearm.planning.time_domain.time_motion import StageMotion
 from wholearm.planning.time_domain.time_plan import try_phases
 from wholearm.problem.definition import Problem

@@ -20,10 +20,15 @@ from wholearm.mechanics.dynamics import Directions, metric_weights
 from wholearm.planning.options import Objective
 from wholearm.planning.time_domain.collocation import Scheme, make_scheme
 from wholearm.planning.time_domain.equations import Target
-from wholearm.planning.time_domain.intersample import IntersampleLimits, raise_bounds
+from wholearm.planning.time_domain.intersample import IntersampleLimits
 from wholearm.planning.time_domain.nlp_layout import pack
 from wholearm.planning.time_domain.stage import Stage, StagePoints
-from wholearm.planning.time_domain.time_nlp import TimeNLP, bound_unknowns, build_time_nlp
+from wholearm.planning.time_domain.time_nlp import (
+    TimeNLP,
+    bound_unknowns,
+    build_time_nlp,
+    raise_bounds,
+)
 
 PHASE = 3
 """Of the heptagon, without a reversal."""

@@ -23,7 +23,7 @@ from ...geometry.curve import find_tied
 from ...geometry.path_guess import find_end
 from ...problem.definition import Phase, Problem
 from .collocation import Scheme, make_scheme
-from .initial_path import PacedWay, guess_stages, list_ways, pace_straight
+from .initial_path import PacedWay, guess_stages, list_ways, pace_way
 from .mode_search import (
     LEAST_INTERVALS,
     WORTH,
@@ -108,7 +108,7 @@ class Attempts:
         if len(self.phases) > 1 or (goal is None and not phase.until.pins):
             return [self.first]
         goal = find_end(phase, self.z) if goal is None else goal
-        way = pace_straight(self.problem, phase, self.z, goal)
+        way = pace_way(self.problem, phase, self.z, goal)
         if way is None or way.margin <= NEAR:
             return [self.first]
         return [self._follow(way)._replace(most=SPLIT), self.first]

@@ -20,7 +20,6 @@ from ...contacts.formation import Formation
 from ...geometry.curve import find_tied, tangent_basis
 from ...geometry.explore import close_contacts, is_inside
 from ...geometry.path_guess import (
-    RELEASE_AT,
     PathGuess,
     connect,
     guess_onwards,
@@ -28,7 +27,7 @@ from ...geometry.path_guess import (
     list_ends,
 )
 from ...mechanics.dynamics import Directions, force_rows, metric_weights
-from ...mechanics.limits import CONE, PRESS, TORQUE
+from ...mechanics.limits import SPEED, make_limits
 from ...problem.definition import End, Phase, Problem
 from .collocation import Scheme
 from .mode_search import LEAST_INTERVALS, link
@@ -58,28 +57,19 @@ _TOUCHES = 1e-5  # gap over the radius of gyration below which a released contac
 
 
 class PacedWay(NamedTuple):
-    """A path, its largest margin, and a fast speed profile with nearly that."""
+    """A path, straight or bent, and the largest margin of limits along it."""
 
-    stretches: Way
-    margin: float
-    profile: PathSpeed | None
-    forces: WayForces  # the linear programme
-
-    @staticmethod
-    def of(way: Way, forces: WayForces, margin: float) -> PacedWay:
-        """The path with its speed profile."""
-        return PacedWay(way, margin, forces.find_profile(margin), forces)
-
-
-class _Bent(NamedTuple):
-    """A bent path to a goal, and its margin."""
-
-    goal: Array
+    goal: Array  # (5,): its end
     bends: tuple[float, float]
-    heading: Array | None
-    way: Way
-    forces: WayForces
+    heading: Array | None  # initial direction of z, shape (5,); None: to the goal
+    stretches: Way
+    forces: WayForces  # the linear programme
     margin: float
+
+    @property
+    def profile(self) -> PathSpeed | None:
+        """A fast speed profile with nearly the largest margin."""
+        return self.forces.find_profile(self.margin)
 
     @property
     def rank(self) -> tuple[float, float]:
@@ -93,64 +83,70 @@ def list_ways(problem: Problem, phase: Phase, z: Array, most: int) -> list[Paced
 
     None of a phase that ends by a release or has other than two degrees of freedom.
     """
-    formation = phase.formation
-    if phase.until.is_release or tangent_basis(formation, z).shape[1] != 2:
+    if not _is_planar(phase, z):
         return []
     (nearest,) = guess_phase(phase, z)
-    found: list[_Bent] = []
+    goals, ways = list_goals(phase, z, nearest.z[-1]), list[PacedWay]()
 
-    def add(goal: Array, bends: tuple[float, float], heading: Array | None = None) -> None:
-        way = split_way(connect(formation, z, goal, bends, heading))
-        forces = WayForces(way, problem.epsilon) if _is_free(way) else None
-        if forces is not None and np.isfinite(margin := forces.find_margin()):
-            found.append(_Bent(goal, bends, heading, way, forces, margin))
+    def add(goal: Array, bends: tuple[float, float], heading: Array | None) -> None:
+        way = pace_way(problem, phase, z, goal, bends, heading)
+        ways.extend([way] if way else [])
 
     def spread(heading: Array | None) -> None:
         for goal in goals:
             add(goal, (0.0, 0.0), heading)
         for turn, scale in enumerate(SCALES):
-            ranked = sorted((b for b in found if b.heading is heading), key=lambda b: b.rank)
+            ranked = sorted((w for w in ways if w.heading is heading), key=lambda way: way.rank)
             if not ranked or not (-np.inf if turn < 2 else CLOSE) < ranked[0].margin <= SURE:
                 break
-            for bent in ranked[: BENT if turn < 2 else 1]:
+            for way in ranked[: BENT if turn < 2 else 1]:
                 for one, two in BENDS:
-                    bends = bent.bends[0] + scale * one, bent.bends[1] + scale * two
-                    add(bent.goal, bends, heading)
+                    bends = way.bends[0] + scale * one, way.bends[1] + scale * two
+                    add(way.goal, bends, heading)
 
-    goals = list_goals(phase, z, nearest.z[-1])
     spread(None)
-    if all(bent.margin <= CLOSE for bent in found):
+    if all(way.margin <= CLOSE for way in ways):
         # Contacts may exclude motions that begin straight.
-        own, scales = in_own_units(problem), problem.scene.scales
-        start = own.phases[phase.index].formation, scale_state(z, scales), own.epsilon
+        scaled, scales = in_own_units(problem), problem.scene.scales
+        start = scaled.phases[phase.index].formation, scale_state(z, scales), scaled.epsilon
         for heading in list_headings(*start)[:HEADINGS]:
             spread(unit_lengths(scales) * heading)
-    found.sort(key=lambda bent: bent.rank)
-    best: dict[tuple[float, ...], _Bent] = {}
-    for bent in found:
-        signs = [np.concatenate(part.directions) for part in bent.way]
-        best.setdefault(tuple(np.concatenate(signs).tolist()), bent)
-    return [PacedWay.of(b.way, b.forces, b.margin) for b in list(best.values())[:most]]
+    best: dict[tuple[float, ...], PacedWay] = {}
+    for way in sorted(ways, key=lambda way: way.rank):
+        signs = [np.concatenate(part.directions) for part in way.stretches]
+        best.setdefault(tuple(np.concatenate(signs).tolist()), way)
+    return list(best.values())[:most]
 
 
-def pace_straight(problem: Problem, phase: Phase, z: Array, goal: Array) -> PacedWay | None:
-    """The straight path of a phase with two degrees of freedom to an end; None if obstructed."""
-    if phase.until.is_release or tangent_basis(phase.formation, z).shape[1] != 2:
+def _is_planar(phase: Phase, z: Array) -> bool:
+    """Whether a phase has two degrees of freedom, and does not end by a release."""
+    return not phase.until.is_release and tangent_basis(phase.formation, z).shape[1] == 2
+
+
+def pace_way(
+    problem: Problem,
+    phase: Phase,
+    z: Array,
+    goal: Array,
+    bends: tuple[float, float] = (0.0, 0.0),
+    heading: Array | None = None,
+) -> PacedWay | None:
+    """The path of a phase with two degrees of freedom to an end; None if obstructed.
+
+    Also None if motion has to stop on it, or if it has many pieces.
+    """
+    if not _is_planar(phase, z):
         return None
-    way = split_way(connect(phase.formation, z, goal))
-    if not _is_free(way):
+    way = split_way(connect(phase.formation, z, goal, bends, heading))
+    touching = phase.formation.scene.touching
+    moves = all(np.diff(part.z, axis=0).any(axis=1).all() for part in way)
+    if len(way) > _STRETCHES or not moves:
+        return None
+    if any(part.formation.evaluate_limits(part.z).min() <= -touching for part in way):
         return None
     forces = WayForces(way, problem.epsilon)
     margin = forces.find_margin()
-    return PacedWay.of(way, forces, margin) if margin > -np.inf else None
-
-
-def _is_free(way: Way) -> bool:
-    """Whether a path is free of collisions and stops, in few pieces."""
-    if len(way) > _STRETCHES or not all(np.diff(part.z, axis=0).any(axis=1).all() for part in way):
-        return False
-    touching = way[0].formation.scene.touching
-    return all(part.formation.evaluate_limits(part.z).min() > -touching for part in way)
+    return PacedWay(goal, bends, heading, way, forces, margin) if margin > -np.inf else None
 
 
 def list_goals(phase: Phase, z: Array, nearest: Array) -> list[Array]:
@@ -228,9 +224,8 @@ def split_way(outline: PathGuess) -> Way:
 
 
 def _make_stretch(formation: Formation, z: Array, signs: Array, rows: Sequence[int]) -> PathGuess:
-    n_c = formation.n_contacts
-    directions = Directions(signs[:n_c].copy(), signs[n_c:].copy())
-    return PathGuess(formation, z, directions, tuple(rows))
+    Xi, sigma = np.split(signs.copy(), [formation.n_contacts])
+    return PathGuess(formation, z, Directions(Xi, sigma), tuple(rows))
 
 
 def _order_turns(
@@ -267,7 +262,7 @@ class WayForces:
         z = np.concatenate([way[0].z[:1], *(part.z[1:] for part in way)])
         dz = np.diff(z, axis=0)
         self.runs = np.sqrt(dz**2 @ metric_weights(scene))
-        self.n_c, m = formation.n_contacts, len(dz)
+        m = len(dz)
         z_s = dz / self.runs[:, None]
         middles = np.cumsum(self.runs) - self.runs / 2
         z_ss = np.gradient(z_s, middles, axis=0) if m > 1 else 0 * z_s
@@ -281,34 +276,28 @@ class WayForces:
         )
         sigma = np.repeat([part.directions.sigma for part in way], np.diff(parts), axis=0)
         force, square, width = scene.scales.force, scene.scales.speed**2, G.shape[1]
-        units = force * np.array([1.0, 1.0, scene.scales.length])
         self.square, self.size = square, m + 1 + m * width + 1
-        drive = np.zeros((m, 5, self.size))
-        k = np.arange(m)
-        mass = scene.mass_diagonal * square
-        slope = z_s / (2 * self.runs[:, None])
+        drive, k = np.zeros((m, 5, self.size)), np.arange(m)
+        mass, slope = scene.mass_diagonal * square, z_s / (2 * self.runs[:, None])
         drive[k, :, k], drive[k, :, k + 1] = mass * (z_ss / 2 - slope), mass * (z_ss / 2 + slope)
         own = m + 1 + k[:, None] * width + np.arange(width)
         drive[k[:, None], :, own] = -force * G
-        drive[:, 3:] /= scene.torque_limit[:, None]
-        drive[:, :3] /= units[:, None]
-        self.equal = drive[:, :3].reshape(-1, self.size)
+        units = force * np.array([1.0, 1.0, scene.scales.length])
+        self.equal = (drive[:, :3] / units[:, None]).reshape(-1, self.size)
         self.equal_to = np.tile(scene.applied_force[:3] / units, m)
-        torque = drive[:, 3:].reshape(-1, self.size)
-        dry = (scene.dry[3:] * sigma / scene.torque_limit).ravel()
-        press = -np.eye(self.size)[own[:, : self.n_c].ravel()]
-        rows = [torque, -torque, press]
-        most = [1 - dry, 1 + dry, np.full(len(press), -epsilon / force)]
-        self.kinds = [(TORQUE, "finger 1"), (TORQUE, "finger 2")] * (2 * m)
-        self.kinds += [(PRESS, name) for name in formation.names] * m
-        for i, row in enumerate(formation.rolling_rows):
-            grip, slip = np.eye(self.size)[own[:, row]], np.eye(self.size)[own[:, self.n_c + i]]
-            mu = formation.friction[row]
-            rows += [slip - mu * grip, -slip - mu * grip]
-            most += 2 * [np.full(m, -mu * epsilon / force)]
-            self.kinds += [(CONE, formation.names[row])] * (2 * m)
-        self.rows, self.most = np.concatenate(rows), np.concatenate(most)
-        self.rows[:, -1] = 1.0
+        # (c, tau) of each interval are affine in x; limits of joint speeds bound b.
+        y, offset = np.zeros((m, width + 2, self.size)), np.zeros((m, width + 2))
+        y[k[:, None], np.arange(width), own] = force
+        y[:, width:], offset[:, width:] = drive[:, 3:], scene.dry[3:] * sigma
+        limits = make_limits(formation, epsilon).without(SPEED)
+        sides, signs, bounds = limits.sides
+        scales = signs / limits.scales[sides]
+        slopes = limits.rows[sides, :-2] * scales[:, None]
+        self.rows, self.most = -(slopes @ y), offset @ slopes.T - scales * bounds
+        self.rows[..., -1] = 1.0
+        self.kinds = [(limits.limits[j].kind, limits.limits[j].part) for j in limits.owners[sides]]
+        self.kinds *= m
+        self.rows, self.most = self.rows.reshape(-1, self.size), self.most.ravel()
         with np.errstate(divide="ignore"):
             quick = ((scene.speed_limit / np.abs(z_s[:, 3:])) ** 2).min(axis=1) / square
         top = np.minimum(FASTEST, np.minimum(np.append(quick, np.inf), np.append(np.inf, quick)))
@@ -363,21 +352,20 @@ def guess_stages(
     intervals: int,
     falls: float,
     onwards: bool = False,
-    release_at: float = RELEASE_AT,
     way: PacedWay | None = None,
 ) -> list[Stage]:
     """Stages of phases in one NLP, with an initial guess, in the scene's own units.
 
     The guessed duration is `falls` times that of a fall over the length of the initial paths. With
     `onwards`, phases joined in motion may end farther away where that takes fewer reversals. A
-    release is guessed at the share `release_at` of a curve. A single phase may follow a given path
-    with its speed profile instead.
+    single phase may follow a given path with its speed profile instead.
     """
-    parts = _list_parts(problem, phases, z, onwards, release_at, way)
+    parts = _list_parts(problem, phases, z, onwards, way)
     lengths = np.array([outline.length for _, outline, _ in parts])
     ends = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()
     # The path parameter of the guess is (1 - cos) / 2 over all stages.
-    total, profile = falls * float(np.sqrt(lengths.sum())), None if way is None else way.profile
+    total = falls * float(np.sqrt(lengths.sum()))
+    profile = None if way is None else way.profile
     clock = np.arccos(1 - 2 * np.clip(ends, 0.0, 1.0)) / np.pi
     if profile is not None:
         total = float(profile.t[-1]) / problem.scene.scales.time
@@ -385,12 +373,20 @@ def guess_stages(
     stages: list[Stage] = []
     released: tuple[int, ...] = ()
     for k, (phase, outline, last) in enumerate(parts):
+        ahead = None
+        if phase.until.value is not None:
+            row, value = 0 if phase.until.coordinate == "x" else 2, phase.until.value
+            begin = next(other.z[0, row] for own, other, _ in parts if own is phase)
+            ahead = row, value, 1.0 if value > begin else -1.0
         whole = lengths[[own is phase for own, _, _ in parts]].sum()
         count = max(LEAST_INTERVALS, round(lengths[k] / whole * intervals))
         guess = _guess(outline, scheme, count, clock[k : k + 2], ends[k : k + 2], total, profile)
         ends_in_impact = last and phase.end is End.IMPACT and k + 1 < len(parts)
         if ends_in_impact:
             guess = guess._replace(impulses=np.zeros(parts[k + 1][0].formation.n_constraints))
+        # Limits near zero along the path, and that of the phase's end.
+        near = phase.formation.evaluate_limits(outline.z).min(axis=0) < _NEAR
+        near |= [limit.gains(phase.until.contact) for limit in phase.formation.limits]
         opens = k > 0 and parts[k - 1][0] is not phase
         if opens:
             touching = np.abs(phase.formation.evaluate_limits(outline.z[:1])[0]) < _TOUCHES
@@ -403,24 +399,13 @@ def guess_stages(
                 guess,
                 until=phase.until if last and not phase.until.is_release else None,
                 ends_in_impact=ends_in_impact,
-                monitored=tuple(sorted({*_choose_monitored(phase, outline), *released})),
+                monitored=tuple(sorted({*np.flatnonzero(near).tolist(), *released})),
                 released=released,
                 opens=opens,
-                ahead=_find_value_ahead(phase, parts),
+                ahead=ahead,
             )
         )
     return link(stages)
-
-
-def _find_value_ahead(
-    phase: Phase, parts: Sequence[tuple[Phase, PathGuess, bool]]
-) -> tuple[int, float, float] | None:
-    """`Stage.ahead` of a phase that ends at the value of a coordinate."""
-    if phase.until.value is None:
-        return None
-    row, value = 0 if phase.until.coordinate == "x" else 2, phase.until.value
-    start = next(outline.z[0, row] for own, outline, _ in parts if own is phase)
-    return row, value, 1.0 if value > start else -1.0
 
 
 def _list_parts(
@@ -428,19 +413,18 @@ def _list_parts(
     phases: Sequence[Phase],
     z: Array,
     onwards: bool,
-    release_at: float,
     way: PacedWay | None,
 ) -> list[tuple[Phase, PathGuess, bool]]:
     """Phases with their initial paths, in own units, and whether each is the last of its phase."""
     parts: list[tuple[Phase, PathGuess, bool]] = []
     for k, phase in enumerate(phases):
-        outlines = list(
-            way.stretches if way else guess_phase(phase, z, phases[k + 1 :], release_at)
-        )
+        outlines = list(way.stretches if way else guess_phase(phase, z, phases[k + 1 :]))
         if parts and parts[-1][0].end is End.SMOOTH:
             outlines = [*_turn_first(outlines[0], parts[-1][1]), *outlines[1:]]
             if onwards:
-                outlines = _go_straight(phase, outlines, parts[-1][1])
+                further = guess_onwards(phase, parts[-1][1])
+                ways = [outlines, *(_turn_first(own, parts[-1][1]) for own in further)]
+                outlines = min(ways, key=lambda way: (len(way), sum(p.length for p in way)))
         parts += [(phase, outline, outline is outlines[-1]) for outline in outlines]
         z = outlines[-1].z[-1]
     scaled = []
@@ -483,13 +467,18 @@ def _guess(
 
     at = breaks[:-1, None] + scheme.points / count
     z, v, a = follow(at)
+    G, needed = _lack(outline, z, v, a)
     if profile is None:
-        forces = _press(outline, z, v, a)
+        forces = _press(outline.formation, G, needed).reshape(*z.shape[:2], -1)
     else:
         passed = clock[0] + at * (clock[1] - clock[0])
         own = np.searchsorted(profile.t / profile.t[-1], passed) - 1
         forces = profile.forces[np.clip(own, 0, len(profile.forces) - 1)]
-    tau = _balance(outline, scheme, z, v, a, forces)
+    # Torques of the motion, within limits, at about as many points as they have control points.
+    limit = outline.formation.scene.torque_limit
+    tau = needed[:, 3:] - np.einsum("nij,ni->nj", G[:, :, 3:], forces.reshape(len(G), -1))
+    tau = np.clip(tau, -0.9 * limit, 0.9 * limit).reshape(*z.shape[:2], 2)
+    tau = tau[:, np.linspace(0, scheme.degree - 1, scheme.controls).round().astype(int)]
     return StagePoints(
         total * (clock[1] - clock[0]),
         np.full(count, 1 / count),
@@ -524,36 +513,18 @@ def _lack(outline: PathGuess, z: Array, v: Array, a: Array) -> tuple[Array, Arra
     return G, scene.mass_diagonal * flat[2] + scene.viscous * flat[1] - applied
 
 
-def _press(outline: PathGuess, z: Array, v: Array, a: Array) -> Array:
-    """Contact forces of a motion nearest to equal normal forces, shape (K, d, n_c + R)."""
-    formation, (G, needed) = outline.formation, _lack(outline, z, v, a)
+def _press(formation: Formation, G: Array, needed: Array) -> Array:
+    """Contact forces of a motion nearest to equal normal forces, shape (n, n_c + R)."""
     light = np.zeros(formation.n_constraints)
     light[: formation.n_contacts] = _LIGHT
-    forces = []
-    for rows, wanted in zip(G[:, :, :3], needed[:, :3], strict=True):
-        missing = wanted - light @ rows
-        forces.append(light + np.linalg.lstsq(rows.T, missing, rcond=1e-6)[0])
+    missing = needed[:, :3] - light @ G[:, :, :3]
+    forces = [
+        light + np.linalg.lstsq(rows.T, short, rcond=1e-6)[0]
+        for rows, short in zip(G[:, :, :3], missing, strict=True)
+    ]
     c = np.array(forces)
     c[:, : formation.n_contacts] = np.clip(c[:, : formation.n_contacts], 0.1 * _LIGHT, 20.0)
-    return c.reshape(*z.shape[:2], -1)
-
-
-def _balance(
-    outline: PathGuess, scheme: Scheme, z: Array, v: Array, a: Array, forces: Array
-) -> Array:
-    """Control points of the torques of a motion with contact forces, (K, m, 2), within limits."""
-    limit, (G, needed) = outline.formation.scene.torque_limit, _lack(outline, z, v, a)
-    c = forces.reshape(len(G), -1)
-    tau = needed[:, 3:] - np.einsum("nij,ni->nj", G[:, :, 3:], c)
-    tau = np.clip(tau, -0.9 * limit, 0.9 * limit).reshape(*z.shape[:2], 2)
-    chosen = np.linspace(0, scheme.degree - 1, scheme.controls).round().astype(int)
-    return np.asarray(tau[:, chosen])
-
-
-def _go_straight(phase: Phase, nearest: list[PathGuess], before: PathGuess) -> list[PathGuess]:
-    """Of paths to the nearest end and to farther ones, those with the fewest reversals."""
-    ahead = [_turn_first(other, before) for other in guess_onwards(phase, before)]
-    return min([nearest, *ahead], key=lambda way: (len(way), sum(part.length for part in way)))
+    return c
 
 
 def _turn_first(outline: PathGuess, before: PathGuess) -> list[PathGuess]:
@@ -578,16 +549,7 @@ def _turn_first(outline: PathGuess, before: PathGuess) -> list[PathGuess]:
     cuts = np.linspace(0, len(outline.z) - 1, len(turns) + 2).astype(int)
     for k, (begin, stop) in enumerate(pairwise(cuts)):
         turn = turns[k] if k < len(turns) else outline.turns
-        directions = Directions(signs[:n_c].copy(), signs[n_c:].copy())
-        z = outline.z[begin : stop + 1]
-        pieces.append(replace(outline, z=z, directions=directions, turns=turn))
+        pieces.append(_make_stretch(formation, outline.z[begin : stop + 1], signs, turn))
         if k < len(turns):
             signs[list(turns[k])] = own[list(turns[k])]
     return pieces
-
-
-def _choose_monitored(phase: Phase, outline: PathGuess) -> tuple[int, ...]:
-    """Limits that are near zero along the path, and that of the phase's end."""
-    near = outline.formation.evaluate_limits(outline.z).min(axis=0) < _NEAR
-    ends = np.array([limit.gains(phase.until.contact) for limit in outline.formation.limits])
-    return tuple(np.flatnonzero(near | ends).tolist())

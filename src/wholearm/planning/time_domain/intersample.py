@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -136,15 +134,3 @@ def _find_slack(stage: Stage, limits: LimitSet, samples: Samples, margin: float)
     bent = np.flatnonzero(of_c.any(axis=1) | of_rates.any(axis=1))
     slack[:, ~np.isin(limits.sides[0], bent)] = 0.0
     return slack
-
-
-def monitor_missed(stages: Sequence[Stage], checks: Sequence[CheckPlaces]) -> list[Stage] | None:
-    """Stages with limits added that are violated between points; None if none is."""
-    changed = []
-    for stage, check in zip(stages, checks, strict=True):
-        values = check.limits.reshape(stage.intervals, CHECKS, -1)
-        deepest = -GRAZE * stage.formation.scene.scales.length
-        broken = np.flatnonzero(find_minima(values).min(axis=0) < deepest).tolist()
-        changed.append(replace(stage, monitored=tuple(sorted({*stage.monitored, *broken}))))
-    news = [one.monitored != other.monitored for one, other in zip(changed, stages, strict=True)]
-    return changed if any(news) else None

@@ -21,9 +21,8 @@ from .intersample import IntersampleLimits
 from .nlp_layout import MARGIN, Indices, pack, unpack
 from .stage import (
     Stage,
-    adopt,
     in_own_units,
-    monitor_violated,
+    monitor,
     scale_options,
     unit_lengths,
     unit_of,
@@ -35,6 +34,7 @@ FIRST_SIZE = 1e-2  # multipliers of a first guess
 Multipliers = dict[str, Array]  # of the unknowns' bounds, `lam_x0`, and of the rows, `lam_g0`
 _ITERATIONS = {Objective.ELASTIC: 90, Objective.RELAX: 50}  # most of one solve, else 150
 _SLOWER = 2  # factor on the most iterations of one solve with rate-limited torques
+_BROKEN = 1e-6  # violation of a formation limit that counts, over the radius of gyration
 _CAP = 1.1  # upper bound of the margin, over the one at which it saturates
 
 
@@ -181,7 +181,13 @@ class TimeSearch:
             raised = [IntersampleLimits.none(stage) for stage in stages]
             margin = before.margin if before else 0.0
             solution = self.run(nlp, stages, raised, multipliers, margin)
-            extended = monitor_violated(solution.stages) if solution.success else None
+            if not solution.success:
+                return solution
+            tables = [
+                s.formation.evaluate_limits(s.guess.z.reshape(-1, 5)) for s in solution.stages
+            ]
+            depth = _BROKEN * self.problem.scene.polygon.gyration_radius
+            extended = monitor(solution.stages, [table.min(axis=0) for table in tables], depth)
             if extended is None:
                 return solution
             stages = extended
@@ -227,7 +233,10 @@ class TimeSearch:
         x, cost = result["x"].full()[:, 0], float(result["f"])
         cost -= float(self.price.gradient @ self.price.origin) if self.price else 0.0
         return TimeSolution(
-            adopt(stages, unpack(x, nlp.layouts)),
+            [
+                replace(stage, guess=part)
+                for stage, part in zip(stages, unpack(x, nlp.layouts), strict=True)
+            ],
             cost,
             -cost if self.goal is Objective.MARGIN else 0.0,
             f"Ipopt stopped with {stats['return_status']}",

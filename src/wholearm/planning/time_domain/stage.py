@@ -23,7 +23,6 @@ from ...scene.model import Polygon, Scales, Scene
 from ..options import CLEARANCE, OPENING, Objective, PlanOptions
 from .collocation import Scheme, blend, fit_controls
 
-_BROKEN = 1e-6  # violation of a formation limit that counts, over the radius of gyration
 _HAIR = 1e-12  # rounding of a place, as share of the duration
 
 
@@ -267,11 +266,6 @@ def _torques(part: StagePoints, breaks: Array) -> Array:
     return fit_controls(at, blend(x, controls) @ part.tau[k], controls)
 
 
-def adopt(stages: Sequence[Stage], points: Sequence[StagePoints]) -> list[Stage]:
-    """The same stages with a solution as their guess."""
-    return [replace(stage, guess=part) for stage, part in zip(stages, points, strict=True)]
-
-
 def bisect_intervals(
     stages: Sequence[Stage], scheme: Scheme, times: Sequence[NDArray[np.int64]]
 ) -> list[Stage]:
@@ -293,13 +287,11 @@ def halve(stages: Sequence[Stage], scheme: Scheme) -> list[Stage]:
     return bisect_intervals(stages, scheme, [np.ones(own.intervals, dtype=int) for own in stages])
 
 
-def monitor_violated(stages: Sequence[Stage]) -> list[Stage] | None:
-    """Stages with limits added that their guesses violate, or None if there are none."""
+def monitor(stages: Sequence[Stage], least: Sequence[Array], depth: float) -> list[Stage] | None:
+    """Stages with the limits added whose least values, (n_limits,), are below -depth; or None."""
     changed = []
-    for stage in stages:
-        values = stage.formation.evaluate_limits(stage.guess.z.reshape(-1, 5))
-        rho = stage.formation.scene.polygon.gyration_radius
-        broken = np.flatnonzero(values.min(axis=0) < -_BROKEN * rho).tolist()
+    for stage, values in zip(stages, least, strict=True):
+        broken = np.flatnonzero(values < -depth).tolist()
         changed.append(replace(stage, monitored=tuple(sorted({*stage.monitored, *broken}))))
-    monitored = [stage.monitored for stage in stages]
-    return changed if [stage.monitored for stage in changed] != monitored else None
+    news = [one.monitored != other.monitored for one, other in zip(changed, stages, strict=True)]
+    return changed if any(news) else None

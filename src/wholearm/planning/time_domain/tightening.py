@@ -15,21 +15,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...common.arrays import Array
+from ...common.arrays import Array, find_minima
 from ...mechanics.limits import PRESS, LimitSet, make_limits
 from ..options import Objective
 from .collocation import Scheme
 from .equations import least_senses, price_sides
 from .intersample import (
+    CHECKS,
+    GRAZE,
     CheckPlaces,
     IntersampleLimits,
     Raised,
     check_between,
     find_misses,
-    monitor_missed,
 )
 from .search import TimeSearch, TimeSolution
-from .stage import Stage, bisect_intervals
+from .stage import Stage, bisect_intervals, monitor
 from .time_motion import MotionResponse, StageMotion, make_motions
 
 DEFECT = 2e-8  # largest collocation error of z and z' in an interval, in the scene's own units
@@ -69,7 +70,10 @@ def enforce_between(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
     raised = [Raised.none(stage) for stage in solution.stages]
     for _ in range(ROUNDS):
         motions, checks = _check(search, solution)
-        extended = monitor_missed(solution.stages, checks)
+        tables = [check.limits.reshape(-1, CHECKS, check.limits.shape[1]) for check in checks]
+        lowest = [find_minima(table).min(axis=0) for table in tables]
+        depth = GRAZE * search.problem.scene.scales.length
+        extended = monitor(solution.stages, lowest, depth)
         if extended is not None:
             solution = search.solve(extended, solution, most=search.wait(PATIENCE))
             if not solution.success:
@@ -96,7 +100,9 @@ def enforce_between(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
                 solution, coarse = finer, solution.cost
                 raised = [Raised.none(stage) for stage in solution.stages]
                 continue
-            if measure_error(solution, misses, gains) > _VAGUE * search.options.accuracy:
+            # Gain of better torques plus cost of misses.
+            error = _sum((*gains, *price_misses(solution, misses)))
+            if error > _VAGUE * search.options.accuracy:
                 return finer
             refined = REFINEMENTS
         if worst <= 1:
@@ -203,13 +209,6 @@ def price_misses(solution: TimeSolution, misses: Sequence[IntersampleLimits]) ->
     return prices
 
 
-def measure_error(
-    solution: TimeSolution, misses: Sequence[IntersampleLimits], gains: Sequence[Array]
-) -> float:
-    """Relative gain of better torques plus cost of misses."""
-    return _sum((*gains, *price_misses(solution, misses)))
-
-
 def _choose_halvings(
     search: TimeSearch,
     solution: TimeSolution,
@@ -231,7 +230,8 @@ def _choose_halvings(
     if options.time_intervals is None and _sum(shares) > options.accuracy:
         more = spread_halvings(shares, max(_SPARE * options.accuracy, slow * _sum(shares)))
         times = [np.maximum(*pair) for pair in zip(times, more, strict=True)]
-    return cap_halvings(times, most)
+    wanted = sum(int((2**mine).sum()) for mine in times)
+    return times if wanted <= most else [np.minimum(mine, 1) for mine in times]
 
 
 def _count_most(search: TimeSearch, solution: TimeSolution) -> int:
@@ -373,9 +373,3 @@ def spread_halvings(shares: Sequence[Array], most: float) -> list[NDArray[np.int
         left[worst] /= _LESS
         times[worst] += 1
     return np.split(times, np.cumsum([len(own) for own in shares])[:-1])
-
-
-def cap_halvings(times: list[NDArray[np.int64]], most: int) -> list[NDArray[np.int64]]:
-    """How often to halve intervals: once at most, if there would be more than `most` of them."""
-    wanted = sum(int((2**mine).sum()) for mine in times)
-    return times if wanted <= most else [np.minimum(mine, 1) for mine in times]
