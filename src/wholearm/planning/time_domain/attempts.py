@@ -28,6 +28,7 @@ from .mode_search import (
     LEAST_INTERVALS,
     WORTH,
     StageMode,
+    divide,
     drop,
     drop_gone,
     improve,
@@ -37,7 +38,7 @@ from .mode_search import (
     mode_of,
 )
 from .search import Price, TimeSearch, TimeSolution
-from .stage import Stage, halve, resample, with_controls
+from .stage import Stage, StagePoints, halve, resample, with_controls
 from .tightening import DEARER, PATIENCE, enforce_between, is_hopeless
 
 _TRIES = ((1.01, 2), (1.03, 2), (1.07, 3), (1.15, 4), (1.3, 6), (1.6, 8))
@@ -65,6 +66,7 @@ SPLIT = 80  # the same in modes of the homotopy and straight to a place; query 3
 MUCH_DEARER = 3.0  # cost of a plan, over that of the friction homotopy, above which it is rejected
 ROUNDING = 5e-7  # largest shortfall of a margin below epsilon by rounding, over the object's weight
 FALLS = (2.0, 4.0, 1.0)  # guessed durations, over that of a fall over the path's length
+_Turn = tuple[float, tuple[int, ...]]  # place of a reversal, and rows of (contacts, joints)
 
 
 class Attempt(NamedTuple):
@@ -277,13 +279,6 @@ def find_modes(search: TimeSearch, stages: Sequence[Stage]) -> TimeSolution:
     return solution._replace(stages=split)
 
 
-class _Turn(NamedTuple):
-    """Rows of (contacts, joints) that reverse, and at which share of the stage's duration."""
-
-    place: float
-    rows: tuple[int, ...]
-
-
 def split_by_senses(stage: Stage, scheme: Scheme) -> list[Stage]:
     """Pieces of a stage without reversals, which have to be linked."""
     part, given = stage.guess, np.array(mode_of(stage).signs)
@@ -292,24 +287,23 @@ def split_by_senses(stage: Stage, scheme: Scheme) -> list[Stage]:
     signs, turns = _find_turns(stage, scheme, rates)
     signs[given == 0] = 0.0
     # Reversals that coincide are moved apart.
-    widths = np.diff([0.0, *(turn.place for turn in turns), 1.0])
+    widths = np.diff([0.0, *(place for place, _ in turns), 1.0])
     widths = np.maximum(widths, min(BRIEF, 0.5 / len(widths)))
     edges = [0.0, *np.cumsum(widths / widths.sum())[:-1].tolist(), 1.0]
-    pieces = list[Stage]()
-    for k, (begin, stop) in enumerate(pairwise(edges)):
+    parts = list[tuple[StagePoints, StageMode]]()
+    for (begin, stop), (_, rows) in zip(pairwise(edges), [*turns, (1.0, ())], strict=True):
         count = max(LEAST_INTERVALS, round((stop - begin) * stage.intervals))
         guess = resample(part, scheme, np.linspace(0.0, 1.0, count + 1), begin, stop)
-        opens = stage.opens and not pieces
-        piece = replace(stage, guess=guess, until=None, ends_in_impact=False, opens=opens)
-        pieces.append(in_mode(piece, StageMode(tuple(signs.tolist()))))
-        if k < len(turns):
-            signs[list(turns[k].rows)] *= -1
-    pieces[-1] = replace(pieces[-1], until=stage.until, ends_in_impact=stage.ends_in_impact)
-    return pieces
+        parts.append((guess, StageMode(tuple(signs.tolist()))))
+        signs[list(rows)] *= -1
+    return divide(stage, parts)
 
 
 def _find_turns(stage: Stage, scheme: Scheme, rates: Array) -> tuple[Array, list[_Turn]]:
-    """Initial signs of rates, shape (n, n_c + 2), and reversals in order of time."""
+    """Initial signs of rates, shape (n, n_c + 2), and reversals in order of time.
+
+    A reversal has its place, as share of the stage's duration, and the rows that reverse.
+    """
     places, z = stage.guess.places(scheme.points).ravel(), stage.guess.z.reshape(-1, 5)
     sizes = np.abs(rates).max(axis=1)
     clear = (np.abs(rates) > SLOW * sizes[:, None]) & (sizes > STILL * sizes.max())[:, None]
@@ -325,20 +319,20 @@ def _find_turns(stage: Stage, scheme: Scheme, rates: Array) -> tuple[Array, list
                 zeros.append((float(places[i] + share * (places[j] - places[i])), row))
     turns, near = list[_Turn](), 2 * float(np.diff(places).max())
     for place, row in sorted(zeros):
-        last = turns[-1] if turns else None
+        before, rows = turns[-1] if turns else (-1.0, ())
         at = int(np.abs(places - place).argmin())
         together = find_tied(stage.formation, z[at], row)
-        if last and place - last.place < near and set(last.rows) & set(together) - {row}:
-            turns[-1] = last._replace(rows=(*last.rows, row))
+        if place - before < near and set(rows) & set(together) - {row}:
+            turns[-1] = before, (*rows, row)
         else:
-            turns.append(_Turn(place, (row,)))
+            turns.append((place, (row,)))
     # Where all rows reverse near each other motion stops: that is one reversal.
     joined, count = list[_Turn](), rates.shape[1] - stage.formation.n_rolling
     while turns:
-        close = [turn for turn in turns if turn.place < turns[0].place + near]
-        rows = tuple(row for turn in close for row in turn.rows)
+        close = [turn for turn in turns if turn[0] < turns[0][0] + near]
+        rows = tuple(row for _, own in close for row in own)
         if len(rows) == len(set(rows)) == count:
-            joined.append(_Turn(close[len(close) // 2].place, rows))
+            joined.append((close[len(close) // 2][0], rows))
             turns = turns[len(close) :]
         else:
             joined.append(turns.pop(0))

@@ -303,7 +303,7 @@ class LimitRows:
     presses: Indices
     others: Indices  # (K, d, n): at the points, sides of limits of several unknowns: friction cones
     sides: NDArray[np.int64]  # (n,): which sides of the limits these are
-    bounded: tuple[int, ...]  # sides that are bounds of an unknown
+    bounded: dict[int, Indices]  # unknowns of the sides that are bounds of these
     alone: bool  # whether c_n are bounded at the points themselves
 
     @property
@@ -324,13 +324,6 @@ class _Gives(NamedTuple):
     weight: float
 
 
-def find_single(limits: LimitSet, n_forces: int) -> NDArray[np.int64]:
-    """Column of y for each row that is of one torque or joint speed alone, shape (m,); else -1."""
-    alone = (limits.rows != 0).sum(axis=1) == 1
-    column = np.abs(limits.rows).argmax(axis=1)
-    return np.where(alone & (column >= n_forces), column, -1)
-
-
 def add_limits(
     rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme, target: Target
 ) -> LimitRows:
@@ -339,7 +332,10 @@ def add_limits(
     gives = _list_gives(limits, layout, target)
     presses = limits.of(PRESS)
     own, signs, bounds = limits.sides
-    single = find_single(limits, stage.formation.n_constraints)[own]
+    # Column of y of each side that is of one torque or joint speed alone; else -1.
+    column, n_forces = np.abs(limits.rows).argmax(axis=1), stage.formation.n_constraints
+    alone = ((limits.rows != 0).sum(axis=1) == 1) & (column >= n_forces)
+    single = np.where(alone, column - n_forces, -1)[own]
     others = np.flatnonzero(~np.isin(own, presses) & (single < 0))
     soft, slow = [gives[row] for row in presses], stage.formation.scene.has_slow_motors
     pressed = _add_presses(rows, limits, layout, scheme, soft, slow)
@@ -348,28 +344,27 @@ def add_limits(
         row = own[side]
         _add_point_row(rows, added[..., k], signs[side] * limits.rows[row], layout, scheme)
         _add_gives(rows, added[..., k], gives[row])
-    bounded = []
+    bounded = dict[int, Indices]()
     for side in np.flatnonzero(single >= 0):
+        j = int(single[side])
+        # Control points of a torque, or speeds at the points.
+        unknowns = layout.tau[:, j::2] if j < 2 else layout.v[..., 1 + j]
         if gives[own[side]] is None:
-            bounded.append(int(side))
+            bounded[int(side)] = unknowns
             continue
-        unknowns = _find_unknowns(layout, stage.formation.n_constraints, single[side])
         added_row = rows.linear(*unknowns.shape, low=signs[side] * bounds[side], high=np.inf)
         rows.add_entries(added_row, unknowns, signs[side])
         _add_gives(rows, added_row, gives[own[side]])
-    return LimitRows(limits, pressed, added, others, tuple(bounded), alone=not any(soft))
+    return LimitRows(limits, pressed, added, others, bounded, alone=not any(soft))
 
 
 def bound_by_limits(
-    rows: LimitRows, layout: StageLayout, bounds: tuple[Array, Array], raised: Array | None = None
+    rows: LimitRows, bounds: tuple[Array, Array], raised: Array | None = None
 ) -> None:
     """Bound torques and joint speeds, in place, by limits raised by shape (K, n_sides)."""
     low, high = bounds
-    own, signs, values = rows.limits.sides
-    n_forces = layout.forces.shape[2]
-    single = find_single(rows.limits, n_forces)[own]
-    for side in rows.bounded:
-        unknowns = _find_unknowns(layout, n_forces, single[side])
+    _, signs, values = rows.limits.sides
+    for side, unknowns in rows.bounded.items():
         more = 0.0 if raised is None else raised[:, side, None]
         if signs[side] > 0:
             low[unknowns] = np.maximum(low[unknowns], values[side] + more)
@@ -382,14 +377,12 @@ def price_sides(rows: LimitRows, layout: StageLayout, on_x: Array, on_g: Array) 
 
     `on_x` and `on_g` are absolute multipliers of the unknowns' bounds and of the rows.
     """
-    own, n_forces = rows.limits.sides[0], layout.forces.shape[2]
-    single = find_single(rows.limits, n_forces)[own]
-    price = np.zeros((len(layout.h), len(own)))
+    price = np.zeros((len(layout.h), len(rows.limits.sides[0])))
     c_n = layout.forces[..., : rows.presses.shape[2]]
     price[:, rows.pressed] = on_x[c_n].sum(axis=1) + on_g[rows.presses].sum(axis=1)
     price[:, rows.sides] = on_g[rows.others].sum(axis=1)
-    for side in rows.bounded:
-        price[:, side] = on_x[_find_unknowns(layout, n_forces, single[side])].sum(axis=1)
+    for side, unknowns in rows.bounded.items():
+        price[:, side] = on_x[unknowns].sum(axis=1)
     return price
 
 
@@ -450,13 +443,6 @@ def _add_point_row(
     for k in np.flatnonzero(of_tau):
         for i, shares in enumerate(blend(scheme.points, scheme.controls).T):
             rows.add_entries(own, layout.tau[:, None, 2 * i + k], of_tau[k] * shares)
-
-
-def _find_unknowns(layout: StageLayout, n_forces: int, column: int) -> Indices:
-    """The unknowns of one torque or joint speed: its control points, or those at the points."""
-    if column < n_forces + 2:
-        return layout.tau[:, column - n_forces :: 2]
-    return layout.v[..., 3 + column - n_forces - 2]
 
 
 @dataclass(frozen=True, eq=False)

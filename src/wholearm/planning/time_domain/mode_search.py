@@ -125,18 +125,22 @@ def find_fresh(stage: Stage, coming: Stage) -> tuple[int, ...]:
     return tuple(k for k, c in enumerate(coming.formation.contacts) if c not in known)
 
 
-def split(stage: Stage, scheme: Scheme, begin: int, stop: int, mode: StageMode) -> list[Stage]:
-    """Pieces of a stage with intervals `begin` to `stop` in another mode, to be linked."""
-    own = mode_of(stage)
-    pieces: list[Stage] = []
-    for first, last, signs in ((0, begin, own), (begin, stop, mode), (stop, stage.intervals, own)):
-        if last > first:
-            guess = _cut(stage.guess, scheme, first, last)
-            opens = stage.opens and not pieces
-            piece = replace(stage, guess=guess, until=None, ends_in_impact=False, opens=opens)
-            pieces.append(in_mode(piece, signs))
+def divide(stage: Stage, parts: Sequence[tuple[StagePoints, StageMode]]) -> list[Stage]:
+    """Pieces of a stage with a guess and a mode each, to be linked."""
+    pieces = list[Stage]()
+    for guess, mode in parts:
+        opens = stage.opens and not pieces
+        piece = replace(stage, guess=guess, until=None, ends_in_impact=False, opens=opens)
+        pieces.append(in_mode(piece, mode))
     pieces[-1] = replace(pieces[-1], until=stage.until, ends_in_impact=stage.ends_in_impact)
     return pieces
+
+
+def split(stage: Stage, scheme: Scheme, begin: int, stop: int, mode: StageMode) -> list[Stage]:
+    """Pieces of a stage with intervals `begin` to `stop` in another mode, to be linked."""
+    edges, modes = [0, begin, stop, stage.intervals], [mode_of(stage), mode, mode_of(stage)]
+    parts = [part for part in zip(edges, edges[1:], modes, strict=False) if part[1] > part[0]]
+    return divide(stage, [(_cut(stage.guess, scheme, k, n), signs) for k, n, signs in parts])
 
 
 def merge(stages: Sequence[Stage]) -> list[Stage]:

@@ -36,30 +36,20 @@ class NamedKernel(Kernel):
     y: Columns
 
 
-class _Alike:
-    """A formation that equals all with the same equations."""
-
-    def __init__(self, formation: Formation) -> None:
-        self.formation = formation
-
-    def __hash__(self) -> int:
-        return hash(self.formation.equations)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Alike) and self.formation.equations == other.formation.equations
-
-
 def share(size: int) -> Callable[[Callable[..., _K]], Callable[..., _K]]:
     """Keep the last `size` kernels, each for all formations with the same equations."""
 
     def decorate(build: Callable[..., _K]) -> Callable[..., _K]:
-        @lru_cache(maxsize=size)
-        def build_once(*args: Any) -> _K:
-            return build(*(arg.formation if isinstance(arg, _Alike) else arg for arg in args))
+        kept = dict[tuple[Any, ...], _K]()
 
         @wraps(build)
         def find(*args: Any) -> _K:
-            return build_once(*(_Alike(a) if isinstance(a, Formation) else a for a in args))
+            key = tuple(arg.equations if isinstance(arg, Formation) else arg for arg in args)
+            # The latest are last.
+            kept[key] = kept.pop(key) if key in kept else build(*args)
+            if len(kept) > size:
+                del kept[next(iter(kept))]
+            return kept[key]
 
         return find
 

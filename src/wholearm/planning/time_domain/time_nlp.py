@@ -175,7 +175,7 @@ def bound_unknowns(nlp: TimeNLP, stages: Sequence[Stage], scheme: Scheme) -> tup
                 low[own] = one_way
             else:
                 high[own] = -one_way
-        bound_by_limits(nlp.rows_of[k].limits, layout, (low, high))
+        bound_by_limits(nlp.rows_of[k].limits, (low, high))
         _stay_short(stage, layout, scheme, (low, high))
         if coming is not None and stage.ends_in_impact:
             low[layout.impulses[: coming.formation.n_contacts]] = 0.0
@@ -281,7 +281,7 @@ def raise_bounds(
         for held in (layout.begin, layout.finish):
             low_x[held[: stage.formation.n_contacts]] = values[pressed][: len(held)]
         _free_equal(stage, own.limits, layout, (low_x, low))
-        bound_by_limits(own.limits, layout, bounds, more)
+        bound_by_limits(own.limits, bounds, more)
         low[own.monitor_rows] += raised.gap[:, None]
         low[own.senses] += raised.sense[:, None, list(stage.formation.rubbing_rows)]
         for joint, sigma in enumerate(stage.directions.sigma):

@@ -121,10 +121,11 @@ def plan_phases(
         return plan_phases(other, same, z, rough, explained=False, patient=False)
 
     refuse(search, problem, phases, attempts.first.stages, replan if explained else None)
-    *_, last = outcomes = _try_all(search, problem, attempts, first)
-    if last.solution.success:
-        return list_plans(problem, search, phases, last.solution, last.name)
-    if not any(outcome.short for outcome in outcomes):
+    outcomes = _try_all(search, problem, attempts, first)
+    name, solution, _ = outcomes[-1]
+    if solution.success:
+        return list_plans(problem, search, phases, solution, name)
+    if not any(short for *_, short in outcomes):
         refuse_pinned(search, problem, phases, moved)
     raise explain_lost(search, problem, attempts, outcomes, replan if explained else None)
 
@@ -197,12 +198,8 @@ def _resume(
     return solution if solution.success else None
 
 
-class _Outcome(NamedTuple):
-    """Result of an attempt."""
-
-    name: str
-    solution: TimeSolution
-    short: list[Stage]  # the elastic solution, if it violates limits; empty otherwise
+_Outcome = tuple[str, TimeSolution, list[Stage]]
+"""Result of an attempt: its name, the solution, and the elastic one if that violates limits."""
 
 
 def _try_all(
@@ -219,25 +216,25 @@ def _try_all(
         # Far from any plan, or after a violation, the elastic problem is solved at once.
         elastic = far or count or attempt is attempts.first
         solved = first if elastic and not attempt.homotopy else None
-        outcomes.append(_try(search, problem, attempt, solved))
-        count += bool(outcomes[-1].short)
+        solution, short = _try(search, problem, attempt, solved)
+        outcomes.append((attempt.name, solution, short))
+        count += bool(short)
         late = search.tried.iterations > stop
-        if outcomes[-1].solution.success or late or count == (1 if far else CONVINCING):
+        if solution.success or late or count == (1 if far else CONVINCING):
             break
-    looked = not first.is_lost and any(outcome.name == NEAREST for outcome in outcomes)
-    if not (looked or outcomes[-1].solution.success or any(each.short for each in outcomes)):
-        short = find_short(search, problem, attempts.first.stages)[1]
-        outcomes.append(_Outcome(NEAREST, first, short))
+    looked = not first.is_lost and any(name == NEAREST for name, *_ in outcomes)
+    if not (looked or count or outcomes[-1][1].success):
+        outcomes.append((NEAREST, first, find_short(search, problem, attempts.first.stages)[1]))
     return outcomes
 
 
 def _try(
     search: TimeSearch, problem: Problem, attempt: Attempt, solved: TimeSolution | None
-) -> _Outcome:
+) -> tuple[TimeSolution, list[Stage]]:
     """Solve, unless `solved`; without success solve the elastic problem, and again from there."""
     solution = solve_attempt(search, attempt) if solved is None else solved
     if solution.success or attempt.homotopy:
-        return _Outcome(attempt.name, solution, [])
+        return solution, []
     # Finer intervals may show violations that coarse ones do not.
     lost = solution.is_lost
     stages = halve(solution.stages, search.scheme) if lost else attempt.stages
@@ -246,7 +243,7 @@ def _try(
         solution = solve_attempt(search, attempt._replace(stages=elastic))
         if not solution.success:
             short = find_short(search, problem, halve(elastic, search.scheme))[1]
-    return _Outcome(attempt.name, solution, short)
+    return solution, short
 
 
 def find_short(
@@ -271,12 +268,12 @@ def explain_lost(
     """Error that says why no attempt has led to a plan; `replan` as for `explain`."""
     from .time_explain import explain, refuse_ways
 
-    count = len({NEAREST, *(outcome.name for outcome in outcomes)})
+    count = len({NEAREST, *(name for name, *_ in outcomes)})
     reason = (
         "the solver found neither a plan nor a motion that misses limits least, from "
         f"{count} guess{'es' * (count > 1)} of the motion"
     )
-    short = [outcome.short for outcome in outcomes if outcome.short]
+    short = [stages for *_, stages in outcomes if stages]
     if not short:
         refuse_ways(problem, attempts.phases[0], attempts.ways)
     return explain(search, problem, attempts.phases, short, reason, replan)
