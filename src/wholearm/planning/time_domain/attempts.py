@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import groupby, islice, pairwise, product
+from itertools import groupby, islice, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -29,7 +29,6 @@ from .mode_search import (
     WORTH,
     StageMode,
     divide,
-    drop,
     drop_gone,
     improve,
     in_mode,
@@ -44,7 +43,6 @@ from .tightening import DEARER, PATIENCE, enforce_between, is_hopeless
 _TRIES = ((1.01, 2), (1.03, 2), (1.07, 3), (1.15, 4), (1.3, 6), (1.6, 8))
 """Durations with held torques to try, over those with free ones, and least numbers of periods."""
 _PATIENCE = 80  # most solver iterations with held torques
-_SLIVER = 0.5  # duration of a stage, over a period, below which it is first left out
 _BRIEF = 1e-3  # duration, over a period, that counts as zero
 _SHORTER = 4  # most times that a period is left out
 ONSETS = (0.1, 0.03)  # rates of the friction homotopy, in the scene's unit
@@ -344,10 +342,8 @@ def hold_torques(search: TimeSearch, free: TimeSolution) -> TimeSolution:
     scene, options = search.problem.scene, search.options
     controls = 2 if scene.control_hold == "linear" else 1
     held = replace(search, scheme=make_scheme(options.scheme, options.degree, controls))
-    whole = drop_brief(free.stages)
-    others = [free.stages] if len(whole) < len(free.stages) else []
-    for stages, (stretch, least) in product((whole, *others), _TRIES):
-        periods = cut_periods(stages, held.scheme, stretch, least)
+    for stretch, least in _TRIES:
+        periods = cut_periods(free.stages, held.scheme, stretch, least)
         solution = held.solve(periods, most=search.wait(_PATIENCE))
         if solution.success:
             solution = enforce_between(held, _leave_out(held, solution))
@@ -387,16 +383,6 @@ def _drop_last(stage: Stage) -> Stage:
         nodes=np.delete(part.nodes, -2, axis=0),
     )
     return replace(stage, guess=guess, periods=stage.periods[:-1])
-
-
-def drop_brief(stages: Sequence[Stage]) -> list[Stage]:
-    """Stages without those much shorter than a period, as far as phases have others."""
-    left = list(stages)
-    for stage in stages:
-        if stage.guess.duration < _SLIVER * stage.formation.scene.control_period:
-            fewer = drop(left, left.index(stage))
-            left = left if fewer is None else fewer
-    return link(merge(left)) if len(left) < len(stages) else left
 
 
 def cut_periods(

@@ -29,8 +29,8 @@ from ...problem.definition import ROWS, End, Phase, Problem
 from ...results.trajectory import Motion
 from ...sensitivity.slopes import find_slopes_at
 from ..advice import describe_shortfalls, name_phases, rank_shortfalls
-from ..path_domain.impact_sequence import PER_SPEED, BlockImpact
 from ..options import Objective, PlanOptions
+from ..path_domain.impact_sequence import PER_SPEED, BlockImpact
 from ..phase_plan import PhasePlan
 from ..robust.robust_rows import find_edges
 from ..stops import PlanPart, Plans, end_of, plan_stops
