@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import gc
+import math
 import os
 import signal
 
@@ -46,6 +47,12 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> None:
     shared = own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
     STORE.folder = shared / "once"
     STORE.folder.mkdir(exist_ok=True)
+
+
+@pytest.fixture(autouse=True)
+def quiet(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No line of progress on stderr, however long a command takes on this machine."""
+    monkeypatch.setattr("wholearm.cli.output.EVERY", math.inf)
 
 
 @pytest.fixture(scope="session")
