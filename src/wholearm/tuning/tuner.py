@@ -213,12 +213,20 @@ class Bench:
         ]
         time, contact = min(losses, default=(stop, ""))
         at = int(np.searchsorted(simulation.t, time))
-        least, weakest, row = self._find_least(simulation, ends, at)
-        short = float(gaps[: at + 1][simulation.t[: at + 1] >= start].min(initial=math.inf))
+        # The step in which a coordinate arrives goes on beyond that.
+        t, c_n = simulation.t[: at + 1].copy(), simulation.c_n[: at + 1].copy()
+        gaps = gaps[: at + 1].copy()
+        if t[at] > time > 0:
+            sample, t[at] = simulation.trajectory.at([time]), time
+            gaps[at] = self.measure(sample.z)[0]
+            pairs = [simulation.trajectory.contacts.index(name) for name in simulation.contacts]
+            c_n[at] = sample.c_n[0, pairs]
+        least, weakest, row = self._find_least(simulation.contacts, t, c_n, ends)
+        short = float(gaps[t >= start].min(initial=math.inf))
         if losses:
             outcome = TrialOutcome.LOSES
         elif least < self.problem.epsilon:
-            outcome, contact, time = TrialOutcome.LOSES, weakest, float(simulation.t[row])
+            outcome, contact, time = TrialOutcome.LOSES, weakest, float(t[row])
         elif arrival == stop:
             outcome = TrialOutcome.ARRIVES
         else:
@@ -247,17 +255,17 @@ class Bench:
         ]
 
     def _find_least(
-        self, simulation: FreeSimulation, ends: Sequence[float], at: int
+        self, contacts: Sequence[str], t: Array, forces: Array, ends: Sequence[float]
     ) -> tuple[float, str, int]:
-        """The least normal force up to a row, of which contact, and in which row."""
+        """The least of normal forces over time, of which contact, and in which row."""
         phases = self.passage.phases
-        of = np.minimum(np.searchsorted(ends, simulation.t[: at + 1], side="left"), len(phases) - 1)
+        of = np.minimum(np.searchsorted(ends, t, side="left"), len(phases) - 1)
         best = (math.inf, phases[0].formation.names[0], 0)
         for index in range(len(phases)):
             rows = np.flatnonzero(of == index)
             names = self.passage.list_pressed(index)
-            own = [simulation.contacts.index(name) for name in names]
-            c_n = np.nan_to_num(simulation.c_n[rows][:, own], nan=math.inf)
+            columns = [contacts.index(name) for name in names]
+            c_n = np.nan_to_num(forces[rows][:, columns], nan=math.inf)
             if c_n.min(initial=math.inf) < best[0]:
                 row, column = np.unravel_index(int(c_n.argmin()), c_n.shape)
                 best = (float(c_n[row, column]), names[int(column)], int(rows[row]))
