@@ -64,7 +64,9 @@ def find_block(
             best = margin
     if best is None:
         return BlockedStart("", 0.0) if modes else None
-    return BlockedStart(formation.names[int(best.c_n.argmin())], -best.value)
+    # Contacts that lack equally much: the first, not the one that rounding chooses.
+    equal = best.c_n <= best.c_n.min() + _SAME * formation.scene.scales.force
+    return BlockedStart(formation.names[int(equal.argmax())], -best.value)
 
 
 def find_change(
