@@ -45,7 +45,7 @@ class LegRows(NamedTuple):
         return slice(self.slide.start, self.joint.stop)
 
 
-class Leg(NamedTuple):
+class ModeSegment(NamedTuple):
     """A part of a phase with one set of contact modes."""
 
     mode: Mode
@@ -65,7 +65,7 @@ class Leg(NamedTuple):
 class Step(NamedTuple):
     """A step that has been made, into which may be looked."""
 
-    leg: Leg
+    leg: ModeSegment
     t: float  # t, h [s]: its start and length
     h: float
     inputs: Array  # its packed inputs
@@ -82,8 +82,10 @@ def open_limits(formation: Formation, until: Until) -> tuple[GapLimit, ...]:
 
 
 @lru_cache(maxsize=64)
-def _build_leg(formation: Formation, until: Until, side: float, s: ModeStepper, mode: Mode) -> Leg:
-    """A leg with the steps of its modes, before it gets a phase and a number."""
+def _build_leg(
+    formation: Formation, until: Until, side: float, s: ModeStepper, mode: Mode
+) -> ModeSegment:
+    """A segment with the steps of its mode, before it gets a phase and a number."""
     scene, own = formation.scene, s.rows
     limits, last = open_limits(formation, until), own.slide.stop + 2
     parts = own.force, own.cone, own.slide, slice(own.slide.stop, last)
@@ -120,7 +122,7 @@ def _build_leg(formation: Formation, until: Until, side: float, s: ModeStepper, 
     buffer.set_arg(0, s.outputs.data)
     buffer.set_arg(1, start.data)
     buffer.set_res(0, event_values.data)
-    return Leg(mode, s, rows, slack, measure, start, event_values, buffer)
+    return ModeSegment(mode, s, rows, slack, measure, start, event_values, buffer)
 
 
 class Replay(Run):
@@ -140,7 +142,7 @@ class Replay(Run):
     taken                    steps so far, but for those that coast
     """
 
-    leg: Leg
+    leg: ModeSegment
     phase: Phase
     releasable: tuple[str, ...]  # the contacts whose release ends the phase
     # resting, slipping: the contacts that come to rest, all of them, or slip, one of them, where
