@@ -100,7 +100,7 @@ def test_small_steps_end_where_the_curve_does(
     start = curves[index].evaluate(np.zeros(1)).z[0]
     ways = follow(heptagon.scene, phase, start)
     (reached,) = (way for way in ways if way.reached)
-    assert np.abs(reached.z[-1] - curves[index].end).max() < 1e-5
+    assert np.abs(reached.end - curves[index].end).max() < 1e-5
     assert {way.ending for way in ways if not way.reached} <= {
         "object and palm",
         "object and finger 1",
@@ -113,7 +113,7 @@ def test_rolling_keeps_its_place() -> None:
     first, second = trace_phases(problem)[:2]
     ways = follow(problem.scene, problem.phases[1], first.end)
     (reached,) = (way for way in ways if way.reached)
-    assert np.abs(reached.z[-1] - second.end).max() < 1e-4
+    assert np.abs(reached.end - second.end).max() < 1e-4
 
 
 def test_places_where_a_contact_turns_are_on_the_grid(

@@ -43,54 +43,37 @@ def link_axis(scene: Scene, z: Array, finger: int) -> Array:
 
 
 def locate(scene: Scene, name: str, z: Array) -> Touch:
-    """The contact called `name` at n configurations `z`, shape (n, 5)."""
+    """The contact called `name` at n configurations `z`, shape (n, 5), which may be complex."""
     feature, part = name.split("-")
     index, corners = int(feature[1:]), place_object(scene, z)
-    corner = corners[:, index]
-    endless = np.full(len(z), np.inf)
-    if part == "palm":
-        normal = np.tile([0.0, 1.0], (len(z), 1))
-        return _touch(scene, z, None, corner, normal, corner[:, 1], endless, endless)
-    finger = int(part[-1]) - 1
-    link = scene.fingers[finger]
-    base, axis = np.asarray(link.base), link_axis(scene, z, finger)
-    tip = base + link.length * axis
-    if part.startswith("finger"):
-        side = np.stack([-axis[:, 1], axis[:, 0]], axis=1) * (1 if finger == 0 else -1)
-        gap = _dot(side, corner - base) - link.radius
-        run = _dot(axis, corner - base)
-        return _touch(scene, z, finger, corner, side, gap, run, link.length - run)
-    if feature[0] == "v":
-        apart = corner - tip
-        distance = np.hypot(apart[:, 0], apart[:, 1])
-        normal = apart / np.maximum(distance, np.finfo(float).tiny)[:, None]
-        run = _dot(axis, apart)
-        return _touch(scene, z, finger, corner, normal, distance - link.radius, run, endless)
-    along = corners[:, (index + 1) % corners.shape[1]] - corner
-    length = np.hypot(along[:, 0], along[:, 1])
-    along /= length[:, None]
-    outward = np.stack([along[:, 1], -along[:, 0]], axis=1)
-    gap, run = _dot(outward, tip - corner) - link.radius, _dot(along, tip - corner)
-    point = tip - link.radius * outward
-    return _touch(scene, z, finger, point, -outward, gap, run, length - run)
-
-
-def _touch(
-    scene: Scene, z: Array, finger: int | None, point: Array, normal: Array, *sides: Array
-) -> Touch:
-    """A contact with its `sides`: gap, low and high."""
-    gap, low, high = sides
+    point = corner = corners[:, index]
+    normal, low, high = np.tile([0.0, 1.0], (len(z), 1)), *2 * [np.full(len(z), np.inf)]
+    gap, finger = corner[:, 1], None if part == "palm" else int(part[-1]) - 1
+    if finger is not None:
+        link, axis = scene.fingers[finger], link_axis(scene, z, finger)
+        base = np.asarray(link.base)
+        tip = base + link.length * axis
+        if part.startswith("finger"):
+            normal = (1 - 2 * finger) * np.stack([-axis[:, 1], axis[:, 0]], axis=1)
+            gap, low = _dot(normal, corner - base) - link.radius, _dot(axis, corner - base)
+            high = link.length - low
+        elif feature[0] == "v":
+            distance = _norm(corner - tip)
+            normal = (corner - tip) / np.where(distance == 0, 1.0, distance)[:, None]
+            gap, low = distance - link.radius, _dot(axis, corner - tip)
+        else:
+            along = corners[:, (index + 1) % corners.shape[1]] - corner
+            length = _norm(along)
+            along = along / length[:, None]
+            normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
+            gap, low = -_dot(normal, tip - corner) - link.radius, _dot(along, tip - corner)
+            high, point = length - low, tip + link.radius * normal
     tangent = np.stack([normal[:, 1], -normal[:, 0]], axis=1)
-    rows = []
-    for direction in (normal, tangent):
-        row = np.zeros((len(z), 5))
-        row[:, :2] = direction
-        row[:, 2] = cross_product(point - z[:, :2], direction)
+    rows = np.zeros((2, len(z), 5), dtype=z.dtype)
+    for row, direction in zip(rows, (normal, tangent), strict=True):
+        row[:, :2], row[:, 2] = direction, cross_product(point - z[:, :2], direction)
         if finger is not None:
-            row[:, 3 + finger] = -cross_product(
-                point - np.asarray(scene.fingers[finger].base), direction
-            )
-        rows.append(row)
+            row[:, 3 + finger] = -cross_product(point - base, direction)
     return Touch(gap, low, high, rows[0], rows[1], scene.friction.of(finger))
 
 
@@ -114,33 +97,23 @@ def balance(
     return np.asarray(rest)
 
 
-def _dot(a: Array, b: Array) -> Array:
-    return np.asarray((a * b).sum(axis=-1))
-
-
 def clearances(scene: Scene, z: Array) -> dict[str, Array]:
     """Signed distances [m] of every solid pair at n configurations, each of shape (n,).
 
     Exact where a pair overlaps by a little or faces flat to vertex; elsewhere a lower bound of the
     distance, with the right sign. The palm does not stop a link.
     """
-    corners = place_object(scene, z)
-    bones = [link_bone(scene, z, finger) for finger in (0, 1)]
+    corners, bones = place_object(scene, z), list[Array]()
     apart = {"object and palm": corners[..., 1].min(axis=1)}
     for finger, link in enumerate(scene.fingers):
+        base = np.broadcast_to(np.asarray(link.base), (len(z), 2))
+        bones.append(np.stack([base, base + link.length * link_axis(scene, z, finger)], axis=1))
         gap = separate(corners, bones[finger]) - link.radius
         apart[f"object and finger {finger + 1}"] = gap
-    if getattr(scene, "fingers_collide", True):
+    if scene.fingers_collide:
         thick = sum(link.radius for link in scene.fingers)
-        apart["finger 1 and finger 2"] = separate(bones[0], bones[1]) - thick
+        apart["finger 1 and finger 2"] = separate(*bones) - thick
     return apart
-
-
-def link_bone(scene: Scene, z: Array, finger: int) -> Array:
-    """The segment from joint to tip centre, shape (n, 2, 2) [m]."""
-    link = scene.fingers[finger]
-    base = np.broadcast_to(np.asarray(link.base), (len(z), 2))
-    return np.stack([base, base + link.length * link_axis(scene, z, finger)], axis=1)
 
 
 def separate(first: Array, second: Array) -> Array:
@@ -156,18 +129,24 @@ def separate(first: Array, second: Array) -> Array:
 def _reach(first: Array, second: Array) -> Array:
     """Largest gap along the normals of the first body's edges, both ways for a segment."""
     along = np.roll(first, -1, axis=1) - first
-    along = along / np.maximum(np.hypot(along[..., 0], along[..., 1]), 1e-300)[..., None]
+    along = along / np.maximum(_norm(along), 1e-300)[..., None]
     outward = np.stack([along[..., 1], -along[..., 0]], axis=-1)
-    own = (outward * first).sum(axis=-1)
     other = np.einsum("nkd,nmd->nkm", outward, second).min(axis=2)
-    return np.asarray((other - own).max(axis=1))
+    return np.asarray((other - _dot(outward, first)).max(axis=1))
 
 
 def _nearest(points: Array, body: Array) -> Array:
     """Least distance of the points of one body to the edges of another, shape (n,)."""
-    start, along = body, np.roll(body, -1, axis=1) - body
-    square = np.maximum((along**2).sum(axis=-1), 1e-300)
-    apart = points[:, :, None] - start[:, None]
-    share = np.clip((apart * along[:, None]).sum(axis=-1) / square[:, None], 0.0, 1.0)
-    away = apart - share[..., None] * along[:, None]
-    return np.asarray(np.hypot(away[..., 0], away[..., 1]).min(axis=(1, 2)))
+    along = np.roll(body, -1, axis=1) - body
+    apart = points[:, :, None] - body[:, None]
+    square = np.maximum(_dot(along, along), 1e-300)
+    share = np.clip(_dot(apart, along[:, None]) / square[:, None], 0.0, 1.0)
+    return np.asarray(_norm(apart - share[..., None] * along[:, None]).min(axis=(1, 2)))
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return np.asarray((a * b).sum(axis=-1))
+
+
+def _norm(a: Array) -> Array:
+    return np.sqrt(_dot(a, a))

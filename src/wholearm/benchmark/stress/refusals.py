@@ -59,8 +59,7 @@ def judge(
             continue
         if phase.formation.n_constraints == 4 and not phase.until.is_release:
             trace = _reach(problem.scene, phase, z)
-            length = np.sqrt(np.diff(trace.z, axis=0) ** 2 @ weights(problem.scene)).sum()
-            if len(trace.z) < 3 and length < HELD * problem.scene.scales.length:
+            if trace.length < HELD * problem.scene.scales.length:
                 return Verdict("close", f"phase {phase.number} has nothing to do")
             if not trace.reached:
                 return Verdict("confirmed", f"phase {phase.number}: {trace.ending}")
@@ -69,7 +68,7 @@ def judge(
                 if verdict.kind != "refuted" or number is not None:
                     return verdict
                 open_end = verdict
-            z = trace.z[-1]
+            z = trace.end
             continue
         if concerned and phase.index < len(stops):
             return _judge_cell(problem, phase, z, stops[phase.index])
@@ -100,12 +99,9 @@ def _find_start(problem: Problem, number: int, objective: str) -> Array | None:
 
 
 def _reach(scene: Scene, phase: Phase, z: Array) -> Trace:
-    """The curve that reaches the phase's end, or the longer one if none does."""
+    """The shortest curve that reaches the phase's end, or the longer one if none does."""
     traces = follow(scene, phase, z)
-    reached = [trace for trace in traces if trace.reached]
-    return min(
-        reached or traces, key=lambda trace: len(trace.z) if trace.reached else -len(trace.z)
-    )
+    return max(traces, key=lambda own: (own.reached, -own.length if own.reached else own.length))
 
 
 def _judge_curve(problem: Problem, phase: Phase, trace: Trace) -> Verdict:
