@@ -87,8 +87,6 @@ def format_report(medians: Medians, limit: float) -> str:
     ]
     for comparison in COMPARISONS:
         lines += _format_targets(medians, comparison, limit)
-    for study in PLANNING:
-        lines += _format_settings(medians, study)
     table = [(name, own.settings) for name, own in METHODS.items()]
     lines += ["## Settings", "", *format_table(["method", "settings"], table, 2)]
     return "\n".join([*lines, ""])
@@ -149,30 +147,6 @@ def group_settings(medians: Medians, study: str, method: str) -> dict[str, list[
         if (key[0], key[2]) == (study, method):
             found.setdefault(key[3], []).append(median)
     return found
-
-
-def _format_settings(medians: Medians, study: str) -> list[str]:
-    """What each setting of each planner gives: medians of errors, means of times."""
-    table = []
-    for method in list_methods(medians, study):
-        for setting, group in group_settings(medians, study, method).items():
-            errors = [np.abs(own.errors) for own in group if len(own.errors) == 3]
-            middle = np.median(errors, axis=0) if errors else np.full(3, np.nan)
-            failed = dict.fromkeys(own.outcome for own in group if own.outcome != SOLVED)
-            solved = sum(own.outcome == SOLVED for own in group)
-            times = (
-                find_mean([t for t in part if math.isfinite(t)] or [math.nan])
-                for part in ([own.build for own in group], [own.solve for own in group])
-            )
-            cells = [f"{value:.1e}" for value in middle] + [f"{value:.4f}" for value in times]
-            solutions = f"{solved} of {len(group)}"
-            table.append((method, setting, solutions, *cells, "; ".join(failed)))
-    if not table:
-        return []
-    heads = ["method", "setting", "solved", "phase time", "end state", "violation"]
-    heads += ["building [s]", "solving [s]", "what failed"]
-    title = f"## {_begin(study)}: medians over phases of each setting"
-    return [title, "", *format_table(heads, table), ""]
 
 
 def draw_medians(medians: Medians) -> Figure:

@@ -33,7 +33,7 @@ from .phases import (
     measure,
     pick,
 )
-from .reference import Course, Span, evaluate_piece, find_course, measure_error, solve_motion
+from .reference import Course, Span, find_course, measure_error
 
 FEW, MANY = "simulation, few pieces", "simulation, many pieces"
 """Studies: torques in a few long pieces, and planned torques in eighty."""
@@ -54,7 +54,6 @@ CLOSE = 1e-2
 """Error of the end state, and of torques over their limits, up to which a plan counts as one."""
 PLACES = 9  # instants of every piece of the torques at which their limits are looked at
 
-Rates = Callable[[float, Array], Array]
 Runner = Callable[[], Array]
 """Gives the state (z, z') at the end of a course, shape (10,)."""
 
@@ -71,51 +70,25 @@ def build_own(course: Course, setting: str) -> Runner:
     return run
 
 
-def build_scipy(course: Course, setting: str, callback: Callable[..., Any]) -> Runner:
-    """SciPy's DOP853 on some kind of callbacks, with the same relative and absolute tolerance."""
+def build_scipy(course: Course, setting: str) -> Runner:
+    """SciPy's DOP853 on a CasADi function, with the same relative and absolute tolerance."""
     from scipy.integrate import solve_ivp
 
-    choose, tolerance = callback(course), float(setting)
+    t, y, p, ode, _ = write_rates(course)
+    rates = _Buffered(ca.Function("rates", [t, y, p], [ode]))
+    options: Any = {"method": "DOP853", "rtol": float(setting), "atol": float(setting)}
 
     def run() -> Array:
         state = np.append(course.problem.start, np.zeros(5))
         for span in course.spans:
-            options = {"method": "DOP853", "rtol": tolerance, "atol": tolerance}
-            solution = solve_ivp(choose(span), (span.start, span.stop), state, **options)
+            rates.p[:] = pack_span(course, span)
+            solution = solve_ivp(rates, (span.start, span.stop), state, **options)
             if solution.status:
                 raise RuntimeError(solution.message)
             state = solution.y[:, -1]
         return np.asarray(state)
 
     return run
-
-
-def call_numpy(course: Course) -> Callable[[Span], Rates]:
-    """Plain NumPy: one linear system in every call."""
-    scene, torque = course.problem.scene, course.torque
-    contacts = course.problem.phases[0].formation.contacts
-
-    def choose(span: Span) -> Rates:
-        def rates(t: float, y: Array) -> Array:
-            tau = evaluate_piece(torque, span.piece, t)
-            found = solve_motion(scene, contacts, y[:5], y[5:], tau, span.Xi, span.sigma)
-            return np.concatenate([y[5:], found[0]])
-
-        return rates
-
-    return choose
-
-
-def call_casadi(course: Course) -> Callable[[Span], Rates]:
-    """A CasADi function of the same equations, with buffers that stay."""
-    t, y, p, ode, _ = write_rates(course)
-    function = _Buffered(ca.Function("rates", [t, y, p], [ode]))
-
-    def choose(span: Span) -> Rates:
-        function.p[:] = pack_span(course, span)
-        return function
-
-    return choose
 
 
 class _Buffered:
@@ -186,14 +159,10 @@ def build_cvodes(course: Course, setting: str) -> Runner:
     return run
 
 
-_SAME = "rtol = atol = tolerance"
 SIMULATORS = {
     "wholearm": Method("events, contact forces and energies included", build_own, TOLERANCES),
-    "DOP853, NumPy": Method(_SAME, partial(build_scipy, callback=call_numpy), TOLERANCES),
     "DOP853, CasADi": Method(
-        f"{_SAME}; CasADi function with buffers that stay",
-        partial(build_scipy, callback=call_casadi),
-        TOLERANCES,
+        "rtol = atol = tolerance; CasADi function with buffers that stay", build_scipy, TOLERANCES
     ),
     "cvodes": Method(
         "abstol = reltol = tolerance; Adams, functional iteration; all stretches in one call",

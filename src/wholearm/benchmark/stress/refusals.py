@@ -14,7 +14,7 @@ from ...planning.plan import solve
 from ...problem.definition import End, Phase, Problem
 from ...scene.model import Scene
 from .cell_curves import best_end, find_best, list_ends
-from .event_tracing import Trace, follow, resample, weights
+from .event_tracing import Trace, follow, resample
 from .slow_motion import fast_margin, inertia_ratio, rest_margin, slow_margin
 
 PLACES = 60  # places along a curve at which limits are looked at
