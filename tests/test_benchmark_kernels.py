@@ -40,7 +40,7 @@ def test_answers_come_from_the_environment() -> None:
     assert absent["value"] is None and "absent.toml: cannot be read" in absent["fault"]
 
 
-def test_the_command_stores_answers_and_fails_where_they_differ(
+def test_the_command_fails_where_answers_differ(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def answer_all(_: object, cases: list[Case], *__: object) -> list[tuple[Case, Row]]:
@@ -51,15 +51,15 @@ def test_the_command_stores_answers_and_fails_where_they_differ(
     command = ["bench", "kernels", "a.toml", "--answers", str(stored), "--jobs", "1"]
     assert main(command) == 2
     assert f"{stored}: cannot be read: " in capsys.readouterr().err
-    assert main([*command, "--update"]) == 0
+    known = {f"plan a {goal}": GOOD for goal in ("time", "effort", "margin")}
+    stored.write_text(json.dumps(known), encoding="utf-8")
     assert main([*command, "--seeds", "0", "1", "-o", str(table)]) == 0
     text = table.read_text(encoding="utf-8")
     assert text.count("| 3 | 3 | 0.0e+00 |") == 2 and ", seed 1 |" in text
-    known = json.loads(stored.read_text(encoding="utf-8"))
-    stored.write_text(json.dumps(known | {"a time": GOOD | {"value": 1.0}}), encoding="utf-8")
+    stored.write_text(json.dumps(known | {"plan a time": GOOD | {"value": 1.0}}), encoding="utf-8")
     capsys.readouterr()
     assert main(command) == 1
-    assert "a time: value 2 is off 1 by +1.0e+00" in capsys.readouterr().out
+    assert "plan a time: value 2 is off 1 by +1.0e+00" in capsys.readouterr().out
 
 
 def test_numbers_change_in_the_last_bits_and_stay_so(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from itertools import product
+from itertools import groupby, product
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -27,7 +27,6 @@ from wholearm import Plan, Problem
 from ..problem.table import write_toml
 from ..search.find_route import forget_roadmaps
 from ..verification.verdict import find_least_force
-from .kernels import list_modes
 from .queries import draw_leg, draw_query
 from .stress.damage import BASE
 from .stress.scenes import draw_case
@@ -90,6 +89,7 @@ SEED = 0
 ROUTE = ((0.045, -2.0), (-0.0637, -2.0), (-0.0505, -23.4), (0.0078, -50.0))
 """Of `list_formations`: x [m] and phi [degrees]."""
 MOMENT = 1e-3  # time before the end of a phase in which contacts may bounce [s]
+BRIEF = 1e-3  # part of a phase below which a stretch with other contact modes does not count
 NUMBER = re.compile(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
 
 
@@ -152,6 +152,16 @@ def _refuse(error: Exception) -> Row:
     changes = getattr(error, "changes", ())
     row["advice"] = {change.parameter.key: change.value for change in changes}
     return row
+
+
+def list_modes(plan: Plan) -> list[list[str]]:
+    """Contact modes and directions of the joints that follow each other in every phase."""
+    modes = []
+    for phase in plan.phases:
+        spans = [s for s in phase.modes if s.stop - s.start > BRIEF * phase.duration]
+        texts = (f"{' '.join(s.contacts.values())} {' '.join(s.joints)}" for s in spans)
+        modes.append([text for text, _ in groupby(texts)])
+    return modes
 
 
 def _describe_plan(plan: Plan) -> Row:

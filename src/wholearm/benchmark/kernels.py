@@ -4,9 +4,9 @@ OpenBLAS has kernels for each processor, which differ in the last bits; ``OPENBL
 one machine stand in for another. Further Pythons bring other versions of the libraries. Seeds
 change the numbers of the scenes themselves in the last bits.
 
-Each problem is planned and verified for every objective, in a process for each environment. Its
-answer is the value of the objective and the sequence of contact modes of each phase. Answers are
-held against those that are stored.
+Each problem is planned and verified for every objective, in a process for each environment. The
+value of the objective and the sequence of contact modes of each phase are compared with those that
+the corpus has stored.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
 from functools import cache
-from itertools import groupby, product
+from itertools import product
 from numbers import Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -84,15 +84,10 @@ def _change_number(value: float, label: str) -> float:
     return rounded * (1 + k * 2.0**-52)
 
 
-if TYPE_CHECKING:
-    from ..planning.result import Plan
-
 OBJECTIVES = ("time", "effort", "margin")
 TOLERANCE = 1e-6
 """Largest relative difference of values: what Ipopt and the refinement of limits leave open."""
-BRIEF = 1e-3
-"""Duration below which a stretch with other contact modes does not count, over the phase's."""
-ANSWER = ("value", "modes", "fault")
+STORED, UPDATE = "results/corpus.json", "`bench corpus --update` writes it anew"
 SUPPORTED = re.compile(r"^Core: (\w+)", re.M)
 
 
@@ -131,46 +126,13 @@ def find_kernel(kernel: str = "", python: str = sys.executable) -> str:
     return match[1] if match else ""
 
 
-def answer(path: str, objective: str) -> dict[str, Any]:
-    """Plan a problem and replay the plan.
-
-    Returns
-    -------
-    dict  ``value`` of the objective, None without a plan; ``modes``, a list for each phase;
-          ``fault`` says why there is no plan that holds, and is empty where there is one
-    """
-    from ..common.errors import WholearmError
-    from ..geometry.path_guess import load
-    from ..planning.plan import solve
-    from ..verification.verify import verify
-
-    try:
-        problem = load(path)
-        plan = solve(problem, objective)
-        fault = "; ".join(verify(problem, plan).failures)
-    except WholearmError as error:
-        return {"value": None, "modes": [], "fault": str(error)}
-    return {"value": plan.value, "modes": list_modes(plan), "fault": fault}
-
-
-def list_modes(plan: Plan) -> list[list[str]]:
-    """Contact modes and directions of the joints that follow each other in every phase."""
-    modes = []
-    for phase in plan.phases:
-        spans = [s for s in phase.modes if s.stop - s.start > BRIEF * phase.duration]
-        texts = (f"{' '.join(s.contacts.values())} {' '.join(s.joints)}" for s in spans)
-        modes.append([text for text, _ in groupby(texts)])
-    return modes
-
-
 class Kernels(Study):
-    """Answers in several environments against stored ones."""
+    """Plans of the corpus in several environments against its answers."""
 
     name, title, keeps = "kernels", "Answers by environment", False
-    stored = ("--answers", "results/bench_kernels.json")
 
     def add_options(self, parser: argparse.ArgumentParser) -> None:
-        """Which problems and environments; the answers of the first one are stored."""
+        """Which problems and environments, and what their answers are compared with."""
         parser.add_argument("problems", nargs="+", metavar="FILE", help="problem files (TOML)")
         text = "kernels of OpenBLAS, as for OPENBLAS_CORETYPE (default: the processor's own)"
         parser.add_argument("--kernels", nargs="+", default=[""], metavar="NAME", help=text)
@@ -179,48 +141,39 @@ class Kernels(Study):
         parser.add_argument("--seeds", nargs="+", type=read, default=[0], metavar="K", help=text)
         text = "interpreters that have the package (default: this one)"
         parser.add_argument("--pythons", nargs="+", default=[sys.executable], help=text)
+        text = f"answers of the corpus ({STORED})"
+        parser.add_argument("--answers", metavar="FILE", default=STORED, help=text)
         parser.add_argument("-o", "--output", metavar="FILE", help="write the table (Markdown)")
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
         """Every problem and objective in each environment."""
-        if not options.update:
-            read_json(options.answers, "--update writes it anew")
+        read_json(options.answers, UPDATE)
         given = options.pythons, options.kernels, options.seeds, options.problems, OBJECTIVES
         return product(*given)
 
     def run(self, case: Case) -> Row:
-        """What `answer` returns in a process of an environment."""
+        """Value, contact modes and failures of a plan made by a process of an environment."""
         *given, path, objective = case
-        environment = Environment(*given)
-        asked = ["--answer", path, objective, str(environment.seed)]
-        run = environment.run(["-m", "wholearm.benchmark.kernels", *asked])
+        asked = [path, objective, str(given[-1])]
+        run = Environment(*given).run(["-m", "wholearm.benchmark.kernels", *asked])
         if run.returncode:
             return {"value": None, "modes": [], "fault": run.stderr.strip()[-300:]}
         return dict(json.loads(run.stdout))
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
         """A row for each environment, and what differs."""
-        found: dict[Environment, dict[str, Row]] = {}
-        for row in rows:
-            *given, path, objective = row["case"]
-            answers = found.setdefault(Environment(*given), {})
-            answers[f"{Path(path).stem} {objective}"] = {k: row[k] for k in ANSWER}
-        if options.update:
-            first = next(iter(found.values()))
-            write_text(options.answers, json.dumps(first, indent=1, sort_keys=True) + "\n")
-        known = read_json(options.answers, "--update writes it anew")
-        table, findings = [], []
-        for environment, answers in found.items():
-            label = environment.describe()
-            texts = {name: compare(own, known.get(name)) for name, own in answers.items()}
-            findings += [f"{label}: {name}: {'; '.join(own)}" for name, own in texts.items() if own]
-            offs = [
-                abs(own["value"] / known[name]["value"] - 1)
-                for name, own in answers.items()
-                if own["value"] and known.get(name, {}).get("value")
-            ]
-            same = sum(not own for own in texts.values())
-            table.append((label, len(answers), same, f"{max(offs, default=0.0):.1e}"))
+        known, table, findings = read_json(options.answers, UPDATE), [], list[str]()
+        for environment in dict.fromkeys(tuple(row["case"][:3]) for row in rows):
+            mine = [row for row in rows if tuple(row["case"][:3]) == environment]
+            label, same, offs = Environment(*environment).describe(), 0, [0.0]
+            for row in mine:
+                name = f"plan {Path(row['case'][3]).stem} {row['case'][4]}"
+                texts = compare(row, known.get(name))
+                findings += [f"{label}: {name}: {'; '.join(texts)}"] if texts else []
+                same += not texts
+                if row["value"] and known.get(name):
+                    offs.append(abs(row["value"] / known[name]["value"] - 1))
+            table.append((label, len(mine), same, f"{max(offs):.1e}"))
         heads = ["environment", "answers", "as stored", "largest difference of a value"]
         lines = format_table(heads, table, 4)
         if options.output:
@@ -236,7 +189,7 @@ def compare(found: Mapping[str, Any], stored: Mapping[str, Any] | None) -> list[
     if found["fault"]:
         return [found["fault"]]
     if stored is None:
-        return ["no answer is stored; --update stores it"]
+        return [f"no answer is stored; {UPDATE}"]
     texts, off = [], found["value"] / stored["value"] - 1
     if abs(off) > TOLERANCE:
         texts.append(f"value {found['value']:.9g} is off {stored['value']:.9g} by {off:+.1e}")
@@ -245,15 +198,16 @@ def compare(found: Mapping[str, Any], stored: Mapping[str, Any] | None) -> list[
     return texts
 
 
-def _answer() -> None:
+def _answer(path: str, objective: str, seed: str) -> None:
     """Print the answer that the parent process asks for."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--answer", nargs=3, required=True)
-    path, objective, seed = parser.parse_args().answer
+    from .corpus_cases import answer
+
     if int(seed):
         perturb_scenes(int(seed))
-    print(json.dumps(answer(path, objective)))
+    row = answer(("plan", Path(path).stem, objective), Path(path).parent)
+    fault = row["text"] if "text" in row else "; ".join(row["replay"]["failures"])
+    print(json.dumps({"value": None, "modes": [], **row, "fault": fault}))
 
 
 if __name__ == "__main__":
-    _answer()
+    _answer(*sys.argv[1:])

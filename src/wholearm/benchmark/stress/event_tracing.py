@@ -89,7 +89,8 @@ def _march(scene: Scene, phase: Phase, z: Array, way: float) -> Trace:
         rows = constrain(scene, phase, z)[1] / scale
         minors = [way * (-1) ** k * np.linalg.det(np.delete(rows, k, axis=2)) for k in range(5)]
         found = np.stack(minors, axis=1)
-        return found / np.maximum(np.linalg.norm(found, axis=1), 1e-300)[:, None] / scale
+        size = np.maximum(np.linalg.norm(found, axis=1), 1e-300)[:, None]
+        return np.asarray(found / size / scale)
 
     def find_room(z: Array) -> dict[str, float]:
         touches = {f"{n} leaves": locate(scene, n, z[None]) for n in phase.formation.names}

@@ -7,12 +7,11 @@ looked at by arguments that share nothing with the planner.
 from __future__ import annotations
 
 import argparse
-import copy
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +23,6 @@ from ...planning.plan import solve
 from ...problem.definition import Problem
 from ...problem.read import build_problem, read_problem
 from ...problem.table import write_toml
-from ...results.trajectory import Trajectory
 from ...verification.verify import verify
 from ..study import Case, Row, Study, format_table, name_case
 from .damage import describe_error, run_file
@@ -36,12 +34,12 @@ from .scenes import draw_case
 OBJECTIVES = ("time", "effort", "margin")
 LIMITS = {"scene": 30.0, "file": 20.0, "problem": 60.0}
 """Processor time that a scene and an objective (two plans), a file and a problem may take [s]."""
-NOISE = 1e-10  # relative change of the masses that must not change an answer
 SAME = 1e-6  # relative difference of two values that rounding may make
 TRIALS = {"noise": 8, "change": 20}
 """Times that noise is added to the masses, and that masses, friction, drag and limits change."""
-SPREAD = 0.1  # largest relative change
-_FINGER = ("inertia", "viscous", "dry", "torque_limit")
+_PARTS = ("palm", "finger1", "finger2", "viscous", "dry", "torque_limit")
+CHANGES = {"noise": (("mass", "inertia"), 1e-10), "change": (("mass", "inertia", *_PARTS), 0.1)}
+"""Numbers that each of them changes, and by how much at most, relative."""
 
 Finding = tuple[str, str]
 """The kind of something that must not happen, and a text."""
@@ -129,45 +127,54 @@ class Stress(Study):
 STUDY = Stress()
 
 
-class StressAnswer(NamedTuple):
-    """What the planner said about a problem and an objective."""
-
-    outcome: str  # {"planned", "refused", "failed"}
-    value: float | None
-    text: str  # of the refusal or failure
-    findings: list[Finding]
-    verdict: str = ""  # kind of the second look at a refusal
-
-
 def run_scene(seed: int, number: int, objective: str) -> Row:
     """Plan a generated scene, with and without noise, and look again at what is said of it."""
     scene = draw_case(seed, number)
-    answer = _plan(scene.table, objective, scene)
-    if answer.outcome != "failed":
-        noisy = add_noise(scene.table, np.random.default_rng(number))
-        answer.findings.extend(_compare(answer, _plan(noisy, objective)))
-    return {"kind": scene.kind, **answer._asdict()}
+    row = _plan(scene.table, objective, scene)
+    if row["outcome"] != "failed":
+        noisy = change(scene.table, "noise", np.random.default_rng(number))
+        row["findings"] += _compare(row, _plan(noisy, objective))
+    return {"kind": scene.kind, **row}
 
 
-def _plan(table: dict[str, Any], objective: str, scene: Scene | None = None) -> StressAnswer:
-    """Load and plan; with a scene, replay and check the plan, or judge the refusal."""
+def run_trial(path: str, objective: str, what: str, number: int) -> Row:
+    """Plan, replay and check a shipped problem with other numbers."""
+    table = change(read_problem(path).table, what, np.random.default_rng(number))
+    row = _plan(table, objective)
+    refused = (
+        [("no plan for a shipped problem", row["text"])] if row["outcome"] == "refused" else []
+    )
+    return row | {"findings": row["findings"] + refused}
+
+
+def _plan(table: Mapping[str, Any], objective: str, scene: Scene | None = None) -> Row:
+    """Load, plan, replay and check; of a scene, judge the refusal."""
     problem, loaded = None, False
+    row: Row = {"outcome": "failed", "value": None, "text": "", "findings": [], "verdict": ""}
+    findings: list[Finding] = row["findings"]
     try:
         problem = build_problem(table)
         check_phases(problem)
         loaded = True
         plan = solve(problem, objective)
-    except SolverError as error:
-        return StressAnswer("failed", None, str(error), [("no answer", str(error))])
+        row |= {"outcome": "planned", "value": plan.value}
+        findings += [("plan refuted by replay", t) for t in verify(problem, plan).failures[:1]]
+        if found := check_plan(problem, plan.trajectory):
+            findings.append(("plan refuted by residual", "; ".join(found[:3])))
     except WholearmError as error:
-        findings, verdict = list[Finding](), ""
-        if scene is not None:
-            verdict, findings = _judge(problem, error, scene, loaded)
-        return StressAnswer("refused", None, str(error), findings, verdict)
+        row["text"] = str(error)
+        if row["outcome"] == "planned":
+            findings.append(("plan refuted by replay", str(error)))
+        elif isinstance(error, SolverError):
+            findings.append(("no answer", str(error)))
+        else:
+            row["outcome"] = "refused"
+            if scene is not None:
+                row["verdict"], more = _judge(problem, error, scene, loaded)
+                findings += more
     except Exception as error:
-        return StressAnswer("failed", None, repr(error), [describe_error(error)])
-    findings = [] if scene is None else _check(problem, plan.trajectory)
-    return StressAnswer("planned", plan.value, "", findings)
+        findings.append(describe_error(error))
+    return row
 
 
 def _judge(
@@ -186,78 +193,29 @@ def _judge(
     return kind, [(kinds[kind], f"{error} ({reason})")] if kind in kinds else []
 
 
-def _check(problem: Problem, plan: Trajectory) -> list[Finding]:
-    """What a replay, and equations of motion written out anew, have against a plan."""
-    findings: list[Finding] = []
-    try:
-        failures = verify(problem, plan).failures
-        findings += [("plan refuted by replay", text) for text in failures[:1]]
-    except WholearmError as error:
-        findings.append(("plan refuted by replay", str(error)))
-    except Exception as error:
-        findings.append(describe_error(error))
-    try:
-        found = check_plan(problem, plan)
-        findings += [("plan refuted by residual", "; ".join(found[:3]))] if found else []
-    except Exception as error:
-        findings.append(("check that failed", describe_error(error)[1]))
-    return findings
-
-
-def _compare(one: StressAnswer, other: StressAnswer) -> list[Finding]:
+def _compare(one: Row, other: Row) -> list[Finding]:
     """What noise changed in an answer."""
-    if other.outcome == "failed":
+    if other["outcome"] == "failed":
         return []
     text = ""
-    if one.outcome != other.outcome:
-        text = f"{one.outcome}, with noise {other.outcome} {other.text or one.text}"
-    elif one.value is not None and other.value is not None:
-        if abs(one.value - other.value) > SAME * abs(one.value):
-            text = f"{one.value:.9g} and {other.value:.9g}"
+    if one["outcome"] != other["outcome"]:
+        why = other["text"] or one["text"]
+        text = f"{one['outcome']}, with noise {other['outcome']} {why}"
+    elif one["value"] and abs(one["value"] - other["value"]) > SAME * abs(one["value"]):
+        text = f"{one['value']:.9g} and {other['value']:.9g}"
     return [("optimum that differs under noise", text)] if text else []
 
 
-def add_noise(table: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]:
-    """A problem file's table with noise in the object's mass and the joints' inertias."""
-    changed = copy.deepcopy(dict(table))
-    for part in (changed["object"], *changed["fingers"].values()):
-        for key in ("mass", "inertia"):
-            if key in part:
-                part[key] *= 1 + NOISE * float(rng.uniform(-1, 1))
-    return changed
+def change(table: Mapping[str, Any], what: str, rng: np.random.Generator) -> dict[str, Any]:
+    """A problem file's table with noise, or with other masses, friction, drag and torque limits."""
+    keys, share = CHANGES[what]
 
+    def vary(key: str, value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {name: vary(name, own) for name, own in value.items()}
+        return value * (1 + share * float(rng.uniform(-1, 1))) if key in keys else value
 
-def change_numbers(table: Mapping[str, Any], rng: np.random.Generator) -> dict[str, float]:
-    """Masses, friction, drag and torque limits changed by up to `SPREAD`, by dotted keys."""
-    places = {"object": table["object"]}
-    places |= {f"fingers.{k}": own for k, own in table["fingers"].items()}
-    places["friction"] = table["friction"]
-    kept = {"object": ("mass",), "friction": table["friction"]}
-    return {
-        f"{where}.{key}": own[key] * (1 + SPREAD * float(rng.uniform(-1, 1)))
-        for where, own in places.items()
-        for key in kept.get(where, _FINGER)
-        if key in own
-    }
-
-
-def run_trial(path: str, objective: str, what: str, number: int) -> Row:
-    """Plan, replay and check a shipped problem with other numbers."""
-    value, findings = None, list[Finding]()
-    given, rng = read_problem(path), np.random.default_rng(number)
-    try:
-        if what == "noise":
-            problem = build_problem(add_noise(dict(given.table), rng), path)
-        else:
-            problem = given.with_(change_numbers(given.table, rng))
-        check_phases(problem)
-        plan = solve(problem, objective)
-        value, findings = plan.value, _check(problem, plan.trajectory)
-    except WholearmError as error:
-        findings = [("no plan for a shipped problem", str(error))]
-    except Exception as error:
-        findings = [describe_error(error)]
-    return {"value": value, "findings": findings}
+    return dict(vary("", table))
 
 
 def compare_values(rows: Iterable[Row]) -> list[tuple[str, str, str]]:
