@@ -19,6 +19,7 @@ import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -110,10 +111,9 @@ def draw_mutant(seed: int, number: int) -> Mutant:
     rng = np.random.default_rng([seed, number, 1])
     k = (0, 0, 1, 2, 2)[number % 5]
     kind, ending = ("problem", "torque", "trajectory")[k], (".toml", ".csv", ".npz")[k]
-    base = base_files()[k]
     own: Callable[[Random, bytes], tuple[str, bytes | None]]
     own = (_damage_problem, _damage_torques, _damage_archive)[k]
-    what, content = (_damage_bytes if rng.uniform() < 0.25 else own)(rng, base)
+    what, content = (_damage_bytes if rng.uniform() < 0.25 else own)(rng, base_files()[k])
     if rng.uniform() < 0.01:
         ending = pick(rng, [".TOML", ".txt", "", ".npy", ".CSV", ".npz.csv"])
     return Mutant(kind, what, ending, content)
@@ -149,13 +149,13 @@ def _damage_bytes(rng: Random, base: bytes) -> tuple[str, bytes | None]:
     return what, changed[what]
 
 
-def change_tree(rng: Random, table: Any) -> str:
+def change_tree(rng: Random, tree: Any, strange: Sequence[Any]) -> str:
     """Change one value or key of nested tables and lists in place; says what."""
-    path = pick(rng, _list_places(table))
-    parent, key = table, path[-1]
-    for step in path[:-1]:
-        parent = parent[step]
-    value, name = parent[key], ".".join(map(str, path))
+    parent, key, name = tree, pick(rng, _list_keys(tree)), ""
+    while _list_keys(parent[key]) and rng.uniform() < 0.8:
+        parent, name = parent[key], f"{name}{key}."
+        key = pick(rng, _list_keys(parent))
+    value, name = parent[key], f"{name}{key}"
     what = pick(rng, ["delete", "rename", "replace", "replace", "replace", "scale", "double"])
     if what == "delete":
         del parent[key]
@@ -163,26 +163,28 @@ def change_tree(rng: Random, table: Any) -> str:
         new = pick(rng, [f"{key}s", str(key).upper(), "", "x y", "\u00e9", "mass"])
         parent[new] = parent.pop(key)
     elif what == "scale" and isinstance(value, int | float) and not isinstance(value, bool):
-        parent[key] = value * pick(rng, [-1.0, 0.5, 1e3, 1e-3, 1e6, 1e-6, 1e12, 1e-12])
+        factors = [-1.0, 0.5, 1e3, 1e-3, 1e6, 1e-6, 1e12, 1e-12, 1e-320, 1e300]
+        parent[key] = value * pick(rng, factors)
     elif what == "double" and isinstance(parent, list):
-        parent.insert(int(rng.integers(len(parent) + 1)), copy.deepcopy(value))
+        at = int(rng.integers(len(parent) + 1))
+        parent[at:at] = [copy.deepcopy(value)] * pick(rng, [1, 2, 100])
     else:
-        parent[key] = new = copy.deepcopy(pick(rng, STRANGE))
+        parent[key] = new = copy.deepcopy(pick(rng, strange))
         return f"{name} becomes {str(new)[:40]}"
     return f"{what} {name}"
 
 
-def _list_places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Every path into nested tables and lists."""
-    items: Any = value.items() if isinstance(value, dict) else ()
-    items = enumerate(value) if isinstance(value, list) else items
-    return [at for key, part in items for at in ((*path, key), *_list_places(part, (*path, key)))]
+def _list_keys(value: Any) -> list[Any]:
+    """Keys of a table, or indices of a list."""
+    if isinstance(value, dict):
+        return list(value)
+    return list(range(len(value))) if isinstance(value, list) else []
 
 
 def _damage_problem(rng: Random, base: bytes) -> tuple[str, bytes]:
     if rng.uniform() < 0.7:
         table = copy.deepcopy(BASE)
-        done = [change_tree(rng, table) for _ in range(int(rng.integers(1, 3)))]
+        done = [change_tree(rng, table, STRANGE) for _ in range(int(rng.integers(1, 3)))]
         return "; ".join(done), write_toml(table).encode("utf-8", "surrogatepass")
     lines = base.decode().split("\n")
     at, deep = int(rng.integers(len(lines))), int(10.0 ** rng.uniform(1, 5))
@@ -199,102 +201,73 @@ def _damage_problem(rng: Random, base: bytes) -> tuple[str, bytes]:
 
 
 def _damage_torques(rng: Random, base: bytes) -> tuple[str, bytes]:
-    rows = [line.split(",") for line in base.decode().strip().split("\n")]
-    rows = rows[:1] + rows[1 :: max(1, len(rows) // 40)]
-    at, other = (int(row) for row in rng.integers(len(rows), size=2))
-    column, many = int(rng.integers(3)), int(10.0 ** rng.uniform(0, 3))
-    factor = pick(rng, [1e-320, 1e-100, 1e-6, 0.1, 10.0, 1e3, 1e6, 1e100, 1e300, -1.0])
-    heads = [["t", "tau1"], ["T", "tau1", "tau2"], ["t", "t", "t"], ["tau2", "tau1", "t"], []]
-    row, cell = rows[at], pick(rng, CELLS)
-    changed = {
-        "cell": [*rows[:at], [*row[:column], cell, *row[column + 1 :]], *rows[at + 1 :]],
-        "header": [pick(rng, heads), *rows[1:]],
-        "delete": rows[:at] + rows[at + 1 :],
-        "repeat": [*rows[:at], row, *rows[at:]],
-        "thrice": [*rows[:at], row, row, *rows[at:]],
-        "move": [*rows[:at], rows[other], *rows[at:]],
-        "short": [*rows[:at], row[:column], *rows[at + 1 :]],
-        "long": [*rows[:at], row * many, *rows[at + 1 :]],
-        "column": [own[:column] + own[column + 1 :] for own in rows],
-        "scale": [
-            [*row[:column], repr(float(row[column]) * factor), *row[column + 1 :]] if k else row
-            for k, row in enumerate(rows)
-        ],
-        "few": rows[: int(rng.integers(1, 4))],
-        "blank": [*rows[:at], *[[""]] * many, *rows[at:]],
-    }
-    what = pick(rng, ["cell"] * 4 + list(changed))
+    head, *lines = base.decode().strip().split("\n")
+    rows: list[Any] = [[float(cell) for cell in line.split(",")] for line in lines]
+    rows = [head.split(","), *rows[:: max(1, len(rows) // 40)]]
+    what = change_tree(rng, rows, CELLS)
     separator = ";" if rng.uniform() < 0.05 else ","
-    text = "\n".join(separator.join(own) for own in changed[what]) + "\n"
-    return f"{what} in row {at}, column {column}", text.encode("utf-8", "surrogatepass")
+    cells = [map(str, row) if isinstance(row, list) else [str(row)] for row in rows]
+    text = "\n".join(map(separator.join, cells)) + "\n"
+    return what, text.encode("utf-8", "surrogatepass")
 
 
 def _damage_archive(rng: Random, base: bytes) -> tuple[str, bytes]:
-    """A trajectory file with one array, its `meta` or the archive itself changed."""
+    """A trajectory file with one array or its `meta` changed, or with another member."""
     with np.load(io.BytesIO(base)) as data:
         arrays: dict[str, Any] = {name: data[name] for name in data.files}
     name = pick(rng, list(arrays))
-    how = pick(rng, ["array", "array", "array", "meta", "meta", "header", "member", "rename"])
+    how = pick(rng, ["array", "array", "array", "meta", "meta", "header", "rename"])
     if how == "meta":
         meta = json.loads(str(arrays["meta"]))
-        what, text = change_tree(rng, meta), pick(rng, METAS)
+        what, text = change_tree(rng, meta, STRANGE), pick(rng, METAS)
         if rng.uniform() < 0.8:
             text = json.dumps(meta)
         arrays["meta"] = np.array(text)
         return f"meta: {what} or {text[:20]!r}", _pack(arrays)
     if how == "array":
-        what, arrays[name] = _change_array(rng, arrays[name])
-        return f"{what} {name}", _pack(arrays)
+        arrays[name] = made = _change_array(rng, arrays[name])
+        return f"{made.dtype.str} of shape {made.shape} for {name}", _pack(arrays)
     if how == "rename":
-        new = pick(rng, ["x", "T", "tau", ""])
+        new = pick(rng, ["x", "T", "tau", "", "a/b/t", "../t"])
         arrays[new] = arrays.pop(name)
         return f"{name} is called {new!r}", _pack(arrays)
-    if how == "header":
-        shape = pick(rng, [(10**12,), (10**6, 10**6), (2**62, 4), (-1,), (10**9, 3), (3, 2**40)])
-        kind = pick(rng, ["<f8", "<i8", "<U1000000", "|O", "<f4", ">f8", "|V1000000000", "<M8[s]"])
-        header = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}".encode()
-        raw = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + b"\0" * 64
-        del arrays[name]
-        return f"{name} claims {shape} of {kind}", _pack(arrays, name, raw)
-    member = pick(rng, ["a/b/t", "t", "t/", "../t", "x"])
-    return f"archive with {member}", _pack(arrays, member, b"abc")
+    shape = pick(rng, [(10**12,), (10**6, 10**6), (2**62, 4), (-1,), (10**9, 3), (3, 2**40)])
+    kind = pick(rng, ["<f8", "<i8", "<U1000000", "|O", "<f4", ">f8", "|V1000000000", "<M8[s]"])
+    header = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}".encode()
+    del arrays[name]
+    raw = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + b"\0" * 64
+    return f"{name} claims {shape} of {kind}", _pack(arrays, {name: raw})
 
 
-def _change_array(rng: Random, array: Any) -> tuple[str, Any]:
+def _change_array(rng: Random, array: Any) -> Any:
     if array.dtype.kind in "iuf" and array.size and rng.uniform() < 0.5:
         new = pick(rng, [np.nan, np.inf, -np.inf, 1e308, -1e308, 0.0, -1.0, 1e30, 1e-30, 7.0])
         changed = array.astype(float)
         count = pick(rng, [1, 1, max(1, array.size // 10), array.size])
         changed.flat[rng.integers(array.size, size=count)] = new
-        return f"{new} in", changed
+        return changed
     makers: list[Callable[[], Any]] = [
-        lambda: array.astype(str), lambda: array.astype(object), lambda: array.astype("S8"),
-        lambda: np.zeros(array.shape, complex), lambda: np.zeros(array.shape, bool),
-        lambda: np.zeros(array.shape, "M8[s]"), lambda: np.zeros(array.shape, "f2"),
-        lambda: np.zeros(array.shape, [("a", "f8")]), lambda: np.zeros(array.shape, ">f8"),
+        lambda: array.astype(pick(rng, [str, object, "S8"])),
+        lambda: np.zeros(array.shape, pick(rng, [complex, bool, "M8[s]", "f2", ">f8", "f8,f8"])),
         lambda: np.array({"a": 1}, dtype=object), lambda: np.array("text"),
         lambda: np.array([array, array]), lambda: array[None], lambda: array[..., None],
         lambda: array.T, lambda: array.ravel()[::-1], lambda: array.ravel()[:1],
         lambda: array.ravel()[:0], lambda: array.ravel()[:-1], lambda: np.zeros((0, 0)),
     ]  # fmt: skip
-    made = pick(rng, makers)()
-    return f"{made.dtype.str} of shape {made.shape} for", made
+    return pick(rng, makers)()
 
 
-def _pack(arrays: Mapping[str, Any], extra: str = "", raw: bytes = b"") -> bytes:
-    """The arrays as an archive, and one more member with bytes of its own."""
-    stream = io.BytesIO()
+def _pack(arrays: Mapping[str, Any], others: Mapping[str, bytes] = MappingProxyType({})) -> bytes:
+    """The arrays as an archive, with further members as they are."""
+    stream, members = io.BytesIO(), dict(others)
+    for name, array in arrays.items():
+        member = io.BytesIO()
+        np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=True)
+        members[name] = member.getvalue()
     with warnings.catch_warnings(), zipfile.ZipFile(stream, "w") as archive:
         warnings.simplefilter("ignore")
-        for name, array in arrays.items():
-            member = io.BytesIO()
-            np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=True)
-            archive.writestr(
-                zipfile.ZipInfo(f"{name}.npy"), member.getvalue(), zipfile.ZIP_DEFLATED
-            )
-        if extra:
-            full = extra if extra.endswith("/") else f"{extra}.npy"
-            archive.writestr(zipfile.ZipInfo(full), b"" if full == extra else raw)
+        for name, raw in members.items():
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), raw, zipfile.ZIP_DEFLATED)
     return stream.getvalue()
 
 
@@ -304,70 +277,52 @@ PROGRESS = re.compile(r"wholearm: \d+ s: ")  # lines that tell how long work goe
 
 
 def run_file(seed: int, number: int) -> dict[str, Any]:
-    """Run one damaged file, and return what came of it as plain data."""
-    mutant = draw_mutant(seed, number)
-    rng = np.random.default_rng([seed, number, 2])
-    with tempfile.TemporaryDirectory() as folder:
-        command = write_case(mutant, Path(folder), rng)
-        status, findings = run_command(command, folder)
+    """Run the command line on one damaged file in this process, and look at what it leaves."""
+    from ...__main__ import start
+
+    mutant, rng = draw_mutant(seed, number), np.random.default_rng([seed, number, 2])
+    problem, torques, _ = base_files()
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        file, own, table = (folder / n for n in (f"mutant{mutant.ending}", "own.toml", "own.csv"))
+        own.write_bytes(problem)
+        table.write_bytes(torques)
+        if mutant.content is None:
+            file.mkdir()
+        else:
+            file.write_bytes(mutant.content)
+        command = pick(rng, _list_commands(mutant.kind, str(file), str(own), str(folder / "out")))
+        before, out, err = set(folder.iterdir()), io.StringIO(), io.StringIO()
+        status: int | None = None
+        try:
+            with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+                status = start(command)
+            written = {path.name for path in {*folder.iterdir()} - before}
+            findings = look(command, status, out.getvalue(), err.getvalue(), written)
+        except Exception as error:
+            findings = [describe_error(error)]
     text = " ".join([command[0], *map(os.path.basename, command[1:])])
     answer = {"command": text, "status": status, "findings": findings}
     return {"kind": mutant.kind, "what": mutant.what, **answer}
 
 
-def write_case(mutant: Mutant, folder: Path, rng: Random) -> list[str]:
-    """Write a mutant and what its command needs into a folder; return the command's arguments."""
-    file, own, table = (
-        folder / f"mutant{mutant.ending}",
-        folder / "problem.toml",
-        folder / "torques.csv",
-    )
-    if mutant.content is None:
-        file.mkdir()
-    else:
-        file.write_bytes(mutant.content)
-    problem, torques, _ = base_files()
-    own.write_bytes(problem)
-    share, path, out = float(rng.uniform()), str(file), str(folder / "out")
+def _list_commands(kind: str, path: str, own: str, out: str) -> list[list[str]]:
+    """Commands that read a file, as often as they are drawn."""
     narrow = ["-o", f"{out}.png", "--phi=-10,10"]
-    if mutant.kind == "problem":
-        table.write_bytes(torques)
+    if kind == "problem":
         solving = ["solve", path, "-o", f"{out}.npz", "--intervals", "20"]
-        commands = [
-            (0.2, [*solving, "--torques", f"{out}.csv"]),
-            (0.6, solving),
-            (0.8, ["verify", path, str(table)]),
-            (0.97, ["map", path, "--list", "0.02,0", "-0.01,0"]),
-            (1.0, ["map", path, *narrow]),
-        ]
-    else:
-        checking = ["verify", str(own), path]
-        commands = [
-            (0.1, [*checking, "--json"]),
-            (1.0 if mutant.kind == "torque" else 0.75, checking),
-            (0.9, ["plot", path, "-o", f"{out}.png", "--simulate"]),
-            (0.97, ["plot", path, "-o", f"{out}.svg"]),
-            (1.0, ["map", str(own), "--plan", path, *narrow]),
-        ]
-    return next(command for most, command in commands if share < most)
-
-
-def run_command(command: list[str], folder: str) -> tuple[int | None, list[tuple[str, str]]]:
-    """Run the command line in this process, warnings being errors, and look at what it leaves."""
-    from ...__main__ import start
-
-    before = set(os.listdir(folder))
-    out, err = io.StringIO(), io.StringIO()
-    status: int | None = None
-    try:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-            status = start(command)
-    except SystemExit as error:
-        status = error.code if isinstance(error.code, int) else None
-    except Exception as error:
-        return None, [describe_error(error)]
-    written = set(os.listdir(folder)) - before
-    return status, look(command, status, out.getvalue(), err.getvalue(), written)
+        asking = [["verify", path, f"{own[:-5]}.csv"], ["map", path, "--list", "0.02,0", "-0.01,0"]]
+        return (
+            4 * [solving]
+            + 2 * [[*solving, "--torques", f"{out}.csv"], *asking]
+            + [["map", path, *narrow]]
+        )
+    checking = 14 * [["verify", own, path]] + 2 * [["verify", own, path, "--json"]]
+    if kind == "torque":
+        return checking
+    drawing = 3 * [["plot", path, "-o", f"{out}.png", "--simulate"]]
+    drawing += [["plot", path, "-o", f"{out}.svg"], ["map", own, "--plan", path, *narrow]]
+    return checking + drawing
 
 
 def describe_error(error: BaseException) -> tuple[str, str]:
