@@ -38,7 +38,8 @@ def test_a_scene_is_drawn_alike_again_and_is_the_same_as_a_file() -> None:
     case, again = draw_case(0, 2), draw_case(0, 2)
     assert case == again
     assert case.table["phases"]
-    assert tomllib.loads(write_toml(case.table)) == case.table
+    named = case.table | {"name": "\u4e2d\U0001f600"}
+    assert tomllib.loads(write_toml(named)) == named
 
 
 @pytest.mark.parametrize("number", range(12))

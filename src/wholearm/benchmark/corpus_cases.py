@@ -28,7 +28,7 @@ from ..problem.table import write_toml
 from ..search.find_route import forget_roadmaps
 from ..verification.verdict import find_least_force
 from .queries import draw_leg, draw_query
-from .stress.damage import BASE
+from .stress.damage import BASE, STRANGE, change_tree, damage_torques
 from .stress.scenes import draw_case
 from .study import Case, Row
 
@@ -82,7 +82,7 @@ TUNED = {
     "hexagon": ("hexagon_tuned.csv", 1),
 }
 """Problems with torques that `tune` found, and how often it may stop on the way."""
-GOALS, SCENES, LEGS, LISTS = 60, 60, 60, 20
+GOALS, SCENES, LEGS, LISTS, INPUTS, TABLES = 60, 60, 60, 20, 120, 10
 PINNED = 40
 """Goals of the queries study as they are, with x; others are an edge, or now and then an angle."""
 SEED = 0
@@ -110,9 +110,9 @@ def list_cases() -> Iterator[Case]:
     yield from (("predict", name) for name in PROBLEMS)
     yield from (("map", name) for name in PROBLEMS)
     yield from (("list", k) for k in range(LISTS))
-    yield from (("input", *own) for own in _list_inputs())
+    yield from (("input", k) for k in range(INPUTS))
     yield from (("option", name) for name in OPTIONS)
-    yield from (("torque file", name) for name in TORQUES)
+    yield from (("torque file", k) for k in range(TABLES))
 
 
 def answer(case: Case, folder: Path) -> Row:
@@ -454,47 +454,6 @@ def _list(folder: Path, number: int) -> Row:
     }
 
 
-BAD: tuple[Any, ...] = ("text", -1.0, 1e12, [1.0], True, float("nan"))
-"""What takes the place of entries of a problem file."""
-EDITS: tuple[tuple[str, Any], ...] = (
-    ("gravty", 9.81),
-    ("fingers.3", {}),
-    ("fingers.1.mass", 1.0),
-    ("object.vertices", [[0, 0], [0.05, 0.0]]),
-    ("object.vertices", [[0, 0], [0.05, 0.0], [0.1, 0.0]]),
-    ("object.vertices", [[0, 0], [0.0, 0.05], [0.05, 0.0]]),
-    ("object.vertices", [[0, 0], [0.05, 0.0], [0.02, 0.01], [0.0, 0.05]]),
-    ("fingers.1.base", [0.08]),
-    ("fingers.1.base", [0.0, 0.02]),
-    ("start.flush", 4),
-    ("start.x", 0.5),
-    ("start", {"flush": 0}),
-    ("phases", []),
-    ("phases.0.contacts", ["v0-palm"]),
-    ("phases.0.contacts", ["v0-palm", "v1-palm", "v2-finger1"]),
-    ("phases.0.contacts", ["v0-palm", "v0-palm", "v2-finger1", "v3-finger2"]),
-    ("phases.0.contacts", ["v0-palm", "v1-palm", "v3-finger1", "v2-finger2"]),
-    ("phases.0.contacts", ["v0-palm", "v1-palm", "v9-finger1", "v3-finger2"]),
-    ("phases.0.contacts", ["v0-palm", "v1-palm", "e2-finger1", "v3-finger2"]),
-    ("phases.0.contacts", ["v0-palm", "v1-palm", "v2-finger1", "v3-finger2 rolling"]),
-    ("phases.0.until", "v0-palm"),
-    ("phases.0.until", "v2-palm"),
-    ("phases.0.until", "nothing"),
-    ("phases.0.until", {"y": 0.0}),
-    ("phases.0.until", {"x": 0.02}),
-    ("phases.0.until", {"x": 0.005, "phi_deg": 10.0}),
-    ("phases.0.until", {}),
-    ("phases.0.end", "slowly"),
-    ("phases.0.end", "impact"),
-    ("phases.1.end", "smooth"),
-    ("phases.0.settle", "200 %"),
-    ("uncertainty", {"weight": 0.1}),
-    ("uncertainty", {"mass": 2.0}),
-    ("control_period", 0.005),
-    ("control_hold", "cubic"),
-    ("goal", {"flush": 0}),
-)
-"""Further entries, each in a problem that is right otherwise."""
 OPTIONS: dict[str, dict[str, Any]] = {
     "objective": {"objective": "speed"},
     "intervals": {"intervals": 0},
@@ -512,51 +471,17 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "time limit": {"time_limit": -1.0},
     "unknown": {"speed": 1.0},
 }
-TORQUES = {
-    "empty": "",
-    "header": "time,a,b\n0,0,0\n1,0,0\n",
-    "one row": "t,tau1,tau2\n0,0,0\n",
-    "text": "t,tau1,tau2\n0,0,0\n1,x,0\n",
-    "short": "t,tau1,tau2\n0,0,0\n1,0\n",
-    "back": "t,tau1,tau2\n0,0,0\n1,0,0\n0.5,0,0\n",
-    "thrice": "t,tau1,tau2\n0,0,0\n1,0,0\n1,0,0\n1,0,0\n2,0,0\n",
-    "nan": "t,tau1,tau2\n0,0,0\n1,nan,0\n",
-    "large": "t,tau1,tau2\n0,0,0\n1,1e9,0\n",
-}
 
 
-def _list_inputs() -> Iterator[tuple[str, str]]:
-    """Entries of a problem file, and what takes their place (JSON)."""
-    leaves = list(_list_leaves(BASE, ""))
-    # Every entry with some of the bad values, all of which come as often.
-    for k, (path, value) in enumerate(product(leaves, BAD)):
-        if k % 11 == 0 or (k % 2 == 0 and k % 3 == (k // len(BAD)) % 3):
-            yield path, json.dumps(value)
-    yield from ((path, json.dumps(value)) for path, value in EDITS)
-
-
-def _list_leaves(table: Any, prefix: str) -> Iterator[str]:
-    for key, value in table.items():
-        if isinstance(value, dict):
-            yield from _list_leaves(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}"
-
-
-def _read(folder: Path, path: str, value: str) -> Row:
+def _read(folder: Path, number: int) -> Row:
     """A problem file with another entry; the message does not name the folder."""
-    table: Any = copy.deepcopy(BASE)
-    keys = path.split(".")
-    *way, last = [int(key) if key.isdigit() and keys[0] == "phases" else key for key in keys]
-    own = table
-    for part in way:
-        own = own[part]
-    own[last] = json.loads(value)
+    table = copy.deepcopy(BASE)
+    change = change_tree(np.random.default_rng([SEED, number]), table, STRANGE)
     try:
         _read_table(table)
     except wholearm.WholearmError as error:
-        return {"refused": type(error).__name__, "message": str(error)}
-    return {"refused": ""}
+        return {"change": change, "refused": type(error).__name__, "message": str(error)}
+    return {"change": change, "refused": ""}
 
 
 def _ask(folder: Path, name: str) -> Row:
@@ -568,16 +493,20 @@ def _ask(folder: Path, name: str) -> Row:
     return {"refused": ""}
 
 
-def _read_torques(folder: Path, name: str) -> Row:
+def _read_torques(folder: Path, number: int) -> Row:
+    """A table of torques with another entry."""
+    rng = np.random.default_rng([SEED, number])
+    change, content = damage_torques(rng, b"t,tau1,tau2\n0,0,0\n0.5,1,0\n1,0,0\n")
     with tempfile.TemporaryDirectory() as place:
         path = Path(place, "bad.csv")
-        path.write_text(TORQUES[name], encoding="utf-8")
+        path.write_bytes(content)
         try:
             torque = wholearm.read_torque_csv(str(path))
             wholearm.verify(_load(folder, "square"), torque)
         except wholearm.WholearmError as error:
-            return {"refused": type(error).__name__, "message": str(error).replace(str(path), "F")}
-    return {"refused": ""}
+            text = str(error).replace(str(path), "F")
+            return {"change": change, "refused": type(error).__name__, "message": text}
+    return {"change": change, "refused": ""}
 
 
 FAMILIES: dict[str, Callable[..., Row]] = {

@@ -17,7 +17,8 @@ import traceback
 import warnings
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, reduce
+from operator import getitem
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -112,7 +113,7 @@ def draw_mutant(seed: int, number: int) -> Mutant:
     k = (0, 0, 1, 2, 2)[number % 5]
     kind, ending = ("problem", "torque", "trajectory")[k], (".toml", ".csv", ".npz")[k]
     own: Callable[[Random, bytes], tuple[str, bytes | None]]
-    own = (_damage_problem, _damage_torques, _damage_archive)[k]
+    own = (_damage_problem, damage_torques, _damage_archive)[k]
     what, content = (_damage_bytes if rng.uniform() < 0.25 else own)(rng, base_files()[k])
     if rng.uniform() < 0.01:
         ending = pick(rng, [".TOML", ".txt", "", ".npy", ".CSV", ".npz.csv"])
@@ -151,11 +152,9 @@ def _damage_bytes(rng: Random, base: bytes) -> tuple[str, bytes | None]:
 
 def change_tree(rng: Random, tree: Any, strange: Sequence[Any]) -> str:
     """Change one value or key of nested tables and lists in place; says what."""
-    parent, key, name = tree, pick(rng, _list_keys(tree)), ""
-    while _list_keys(parent[key]) and rng.uniform() < 0.8:
-        parent, name = parent[key], f"{name}{key}."
-        key = pick(rng, _list_keys(parent))
-    value, name = parent[key], f"{name}{key}"
+    *way, key = path = pick(rng, _list_places(tree))
+    parent = reduce(getitem, way, tree)
+    value, name = parent[key], ".".join(map(str, path))
     what = pick(rng, ["delete", "rename", "replace", "replace", "replace", "scale", "double"])
     if what == "delete":
         del parent[key]
@@ -174,11 +173,11 @@ def change_tree(rng: Random, tree: Any, strange: Sequence[Any]) -> str:
     return f"{what} {name}"
 
 
-def _list_keys(value: Any) -> list[Any]:
-    """Keys of a table, or indices of a list."""
-    if isinstance(value, dict):
-        return list(value)
-    return list(range(len(value))) if isinstance(value, list) else []
+def _list_places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Every path into nested tables and lists."""
+    items: Any = value.items() if isinstance(value, dict) else ()
+    items = enumerate(value) if isinstance(value, list) else items
+    return [at for key, part in items for at in ((*path, key), *_list_places(part, (*path, key)))]
 
 
 def _damage_problem(rng: Random, base: bytes) -> tuple[str, bytes]:
@@ -200,7 +199,8 @@ def _damage_problem(rng: Random, base: bytes) -> tuple[str, bytes]:
     return f"line {at} is {text[:30]!r} of {len(text)}", "\n".join(lines).encode()
 
 
-def _damage_torques(rng: Random, base: bytes) -> tuple[str, bytes]:
+def damage_torques(rng: Random, base: bytes) -> tuple[str, bytes]:
+    """What was done to a table of torques, and its text afterwards."""
     head, *lines = base.decode().strip().split("\n")
     rows: list[Any] = [[float(cell) for cell in line.split(",")] for line in lines]
     rows = [head.split(","), *rows[:: max(1, len(rows) // 40)]]
