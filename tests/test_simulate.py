@@ -31,6 +31,7 @@ from wholearm.simulation.events import EventKind, OutcomeKind
 from wholearm.simulation.hand import build_system
 from wholearm.simulation.modes import Grips, Mode, ModeRows, respond
 from wholearm.simulation.rest import Collapse, close_contacts, find_rest
+from wholearm.simulation.root_finding import find_root
 from wholearm.simulation.simulate import simulate
 from wholearm.simulation.stepper import Modes, ModeStepper, build_stepper
 
@@ -512,3 +513,15 @@ def test_rates_are_those_of_the_formations_own_rows(grips: Grips) -> None:
         margins = s.outputs[to.values][: s.rows.cone.stop]
         assert margins == pytest.approx(held / mode.force_limit_units, rel=1e-6)
         assert s.outputs[to.c_n] == pytest.approx(held[: formation.n_contacts], rel=1e-6)
+
+
+@pytest.mark.parametrize("power", [1, 3, 5])
+@pytest.mark.parametrize("root", [1e-7, 3e-4, 0.7])
+def test_events_are_located_at_multiple_roots(power: int, root: float) -> None:
+    # A joint that starts without acceleration turns back like t^3.
+    def fall(x: float) -> float:
+        return 1e-6 * math.copysign(abs(root - x) ** power, root - x)
+
+    found = find_root(fall, 1.0, fall(0.0), fall(1.0), near=1e-12, flat=0.0)
+    # The bracket is at most 1e-12 wide at the end.
+    assert found == pytest.approx(root, abs=1e-12)

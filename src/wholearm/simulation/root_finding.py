@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 
@@ -16,13 +17,25 @@ def find_root(
 ) -> float:
     """Root in [low, high] of a function that falls from f_low >= 0 to f_high < 0.
 
-    Regula falsi of Anderson and Bjorck, until it moves by `near` or the function is within `flat`.
+    Regula falsi of Anderson and Bjorck until the bracket is as narrow as `near` or the function is
+    within `flat`. After two steps that have not halved the bracket, as near a triple root, the
+    next is a bisection.
     """
     if f_low <= 0:
         return low
-    for _ in range(60):
+    slow, width = 0, abs(high - low)
+    while abs(high - low) > near:
         middle = high - f_high * (high - low) / (f_high - f_low)
-        if not low < middle < high and not high < middle < low:
+        slow = slow + 1 if 2 * abs(high - low) > width else 0
+        if not slow:
+            width = abs(high - low)
+        if slow > 2:
+            middle, slow, width = (low + high) / 2, 0, abs(high - low)
+        elif abs(middle - high) < near:
+            middle = high + math.copysign(near, low - high)
+        elif abs(middle - low) < near:
+            middle = low + math.copysign(near, high - low)
+        if middle in (low, high):
             break
         f_middle = function(middle)
         if abs(f_middle) <= flat:
@@ -31,8 +44,5 @@ def find_root(
             low, f_low = high, f_high
         else:
             f_low *= 1 - f_middle / f_high if abs(f_middle) < abs(f_high) else 0.5
-        close = abs(middle - high) <= near
         high, f_high = middle, f_middle
-        if close:
-            break
     return high
