@@ -18,7 +18,7 @@ def find_root(
     """Root in [low, high] of a function that falls from f_low >= 0 to f_high < 0.
 
     Regula falsi of Anderson and Bjorck until the bracket is as narrow as `near` or the function is
-    within `flat`. After two steps that have not halved the bracket, as near a triple root, the
+    within `flat`. After three steps that have not halved the bracket, as near a triple root, the
     next is a bisection.
     """
     if f_low <= 0:
@@ -29,7 +29,7 @@ def find_root(
         slow = slow + 1 if 2 * abs(high - low) > width else 0
         if not slow:
             width = abs(high - low)
-        if slow > 2:
+        if slow > 3:
             middle, slow, width = (low + high) / 2, 0, abs(high - low)
         elif abs(middle - high) < near:
             middle = high + math.copysign(near, low - high)
