@@ -1,14 +1,16 @@
-"""Problem files are read and written; problems made of objects are checked like those."""
+"""Problem files and their keys: read, written, checked, in the schema, and to begin with."""
 
 from __future__ import annotations
 
+import argparse
 import copy
 import dataclasses
+import json
 import math
 import re
 import tomllib
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +18,33 @@ import numpy as np
 import pytest
 
 import wholearm
-from shipped import BOX, FOLDER, HEPTAGON, problem_of
+from shipped import BOX, FOLDER, HEPTAGON, plan_of, problem_of
+from wholearm.cli.command import build_parser, main
 from wholearm.common.errors import InputError
+from wholearm.common.fields import (
+    NONNEGATIVE,
+    Range,
+    declare,
+    keys_of,
+    read_keys,
+    read_options,
+)
+from wholearm.common.fields import (
+    key as declare_key,
+)
+from wholearm.comparison.metrics import compare
 from wholearm.geometry.path_guess import load
+from wholearm.mapping.formation_list import write_template
+from wholearm.planning.options import CHOICES, Objective, PlanOptions
+from wholearm.planning.plan import solve
+from wholearm.problem import keys, read
 from wholearm.problem.definition import End, Problem, Until
-from wholearm.problem.read import build_problem, read_problem
-from wholearm.problem.table import format_until, write_table
+from wholearm.problem.goal import Goal
+from wholearm.problem.keys import TOP, build_schema, write_page
+from wholearm.problem.read import adopt_phases, build_problem, read_problem
+from wholearm.problem.table import describe_scene, format_until, write_table
 from wholearm.results.adopt import save
-from wholearm.scene.model import find_unit_hint
+from wholearm.scene.model import Finger, Friction, find_unit_hint
 
 TEXT = HEPTAGON.read_text(encoding="utf-8")
 Edit = Callable[[dict[str, Any]], object]
@@ -466,3 +487,524 @@ def test_a_start_that_no_file_can_say_leaves_the_table_empty() -> None:
     start = trace_phases(given)[3].end
     made = rebuild(given, start=start, phases=(replace(given.phases[4], index=0),))
     assert made.table == {} and copy.deepcopy(made).table == {}
+
+
+STIFF = Range(1e-3, 2.0, lambda _, own: own.torque_limit, "times the torque limit")
+STIFFNESS = declare_key("stiffness", "Spring of the joint [N m/rad].", NONNEGATIVE, "torque", STIFF)
+
+
+@declare(*keys_of(Finger).values(), STIFFNESS)
+@dataclass(frozen=True, eq=False)
+class SprungFinger(Finger):
+    """A finger with a spring."""
+
+    stiffness: float = 0.0
+
+
+@pytest.fixture
+def table(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    monkeypatch.setattr(read, "Finger", SprungFinger)
+    monkeypatch.setitem(keys.FINGER, "stiffness", keys_of(SprungFinger)["stiffness"])
+    return copy.deepcopy(dict(read_problem(str(HEPTAGON)).table))
+
+
+def get_stiffness(problem: Problem) -> list[Any]:
+    return [getattr(finger, "stiffness") for finger in problem.scene.fingers]  # noqa: B009
+
+
+def test_a_new_key_is_read_and_left_out(table: dict[str, Any]) -> None:
+    assert get_stiffness(build_problem(table)) == [0.0, 0.0]
+    table["fingers"]["2"]["stiffness"] = 1
+    assert get_stiffness(build_problem(table)) == [0.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "text"),
+    [
+        ("stiffness", -1.0, "fingers.1.stiffness: -1.0 is not a number >= 0"),
+        ("stiffness", "soft", "fingers.1.stiffness: 'soft' is not a number"),
+        (
+            "stiffness",
+            5.0,
+            r"5 given; allowed are 0.002 to 4 N m/rad \(0.001 to 2 times the torque limit\)",
+        ),
+        ("stifness", 1.0, "fingers.1.stifness: unknown key; did you mean 'stiffness'?"),
+    ],
+)
+def test_messages_know_it(table: dict[str, Any], name: str, value: object, text: str) -> None:
+    table["fingers"]["1"][name] = value
+    with pytest.raises(InputError, match=text):
+        build_problem(table)
+
+
+def test_schema_page_and_docstring_know_it(table: dict[str, Any]) -> None:
+    assert keys.build_schema()["definitions"]["finger"]["properties"]["stiffness"] == {
+        "type": "number",
+        "minimum": 0,
+        "default": 0.0,
+        "description": "Spring of the joint [N m/rad].",
+    }
+    row = "| `stiffness` | N m/rad | 0 | 0.001 to 2 times the torque limit | Spring of the joint. |"
+    assert row in keys.write_page()
+    assert "Spring of the joint" in (SprungFinger.__doc__ or "")
+
+
+def test_changes_by_name_and_files_know_it(table: dict[str, Any], tmp_path: Path) -> None:
+    problem = build_problem(table)
+    assert get_stiffness(problem.with_(stiffness=0.5)) == [0.5, 0.5]
+    changed = problem.with_(stiffness2=0.7)
+    assert get_stiffness(changed) == [0.0, 0.7]
+    save(changed, str(tmp_path / "sprung.toml"))
+    assert get_stiffness(read_problem(str(tmp_path / "sprung.toml"))) == [0.0, 0.7]
+
+
+FIELDS = """\
+problem             problem file
+[files PLAN ...]    more files
+-o --output FILE    what to write (required)
+--most-rounds N     how often it is tried = 3 in 1..9
+--share             of the way, which is
+    a number = 0.5 in 0.0..1
+--scheme NAME       of points = radau among radau|legendre
+--robust [FACTOR]   within ranges = 0 in 0.0..1000
+--fresh             begin anew
+--no-replay         return it without a replay
+"""
+OPTIONS = {option.field.name: option for option in read_options(FIELDS)}
+
+
+@declare(*(OPTIONS[name].field for name in ("most_rounds", "share", "scheme", "replay")))
+@dataclass(frozen=True)
+class Given:
+    """Options of a class."""
+
+    most_rounds: int = OPTIONS["most_rounds"].field.default
+    share: float = OPTIONS["share"].field.default
+    scheme: str = OPTIONS["scheme"].field.default
+    replay: bool = OPTIONS["replay"].field.default
+
+    def __post_init__(self) -> None:
+        read_keys(self)
+
+
+def parse(*given: str) -> dict[str, Any]:
+    parser = argparse.ArgumentParser(exit_on_error=False)
+    for option in OPTIONS.values():
+        option.add(parser)
+    return vars(parser.parse_args(["a.toml", *given, "-o", "b"]))
+
+
+def test_options_have_the_defaults_of_their_table() -> None:
+    left_out = {"problem": "a.toml", "files": [], "output": "b", "scheme": "radau", "share": 0.5}
+    left_out |= {"most_rounds": 3, "robust": 0.0, "fresh": False, "replay": True}
+    assert parse() == left_out
+    assert Given() == Given(3, 0.5, "radau", True)
+    named = {"files": ["c", "d"], "most_rounds": 9, "share": 1.0, "fresh": True, "replay": False}
+    given = ("c", "d", "--most-rounds", "9", "--share", "1", "--fresh", "--no-replay")
+    assert parse(*given) == left_out | named
+    assert parse("--robust")["robust"] == 1.0 and parse("--robust", "2")["robust"] == 2.0
+
+
+def test_options_and_arguments_have_the_same_ranges() -> None:
+    text = "10 given; allowed are whole numbers from 1 to 9"
+    with pytest.raises(argparse.ArgumentError, match=text):
+        parse("--most-rounds", "10")
+    with pytest.raises(InputError, match=f"most_rounds: {text}"):
+        Given(most_rounds=10)
+    with pytest.raises(InputError, match="scheme: 'gauss' given; allowed are 'radau' and"):
+        Given(scheme="gauss")
+    with pytest.raises(InputError, match="replay: 0 given; allowed are true and false"):
+        Given(replay=0)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("choice", ["time", "effort", "margin"])
+def test_objectives_are_given_by_name_or_as_members(choice: str) -> None:
+    assert PlanOptions(objective=choice).goal is Objective(choice)
+    assert PlanOptions(objective=Objective(choice)) == PlanOptions(objective=choice)
+    assert choice in CHOICES
+
+
+BAD: dict[str, list[Any]] = {
+    "objective": ["speed", "elastic", Objective.ELASTIC, None, 3],
+    "intervals": [9, -80, 80.0, True, "80"],
+    "samples": [1, 2.5],
+    "time_weight": [0.0, -1.0, math.nan, math.inf, "1"],
+    "duration": [0.0, -0.1, math.nan],
+    "time_intervals": [3, 10.0, True, "10"],
+    "degree": [1, 7, 3.0, False],
+    "transcription": ["path", "", None],
+    "certify": [1],
+}
+
+
+@pytest.mark.parametrize("key, given", [(key, own) for key, every in BAD.items() for own in every])
+def test_bad_options_are_named(key: str, given: Any) -> None:
+    options = {"objective": "margin"} | {key: given}
+    with pytest.raises(InputError) as caught:
+        PlanOptions(**options)
+    assert caught.value.key == key and caught.value.exit_status == 2
+    assert repr(given) in str(caught.value)
+
+
+@pytest.mark.parametrize("objective", ["time", "effort"])
+def test_only_the_margin_has_a_duration(objective: str) -> None:
+    with pytest.raises(InputError, match="duration: is for the objective margin only"):
+        PlanOptions(objective=objective, duration=1.0)
+
+
+@pytest.mark.parametrize("objective", ["effort", "margin"])
+def test_only_the_least_time_has_a_bound(objective: str) -> None:
+    with pytest.raises(InputError, match="certify: is for the objective time only"):
+        PlanOptions(objective=objective, certify=True)
+
+
+def list_numbers(parser: argparse.ArgumentParser) -> list[tuple[str, argparse.Action]]:
+    """Every option of every command that takes a number."""
+    found = []
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for own in action.choices.values():
+                found += list_numbers(own)
+        elif action.type is not None:
+            found.append((parser.prog, action))
+    return found
+
+
+def test_every_number_among_the_options_has_a_range() -> None:
+    numbers = list_numbers(build_parser())
+    assert len(numbers) > 40
+    for _, action in numbers:
+        assert callable(action.type) and action.type not in (int, float)
+        for wrong in ("1e300", "1" + 40 * "0", "-1e300", "nan", "inf", "much"):
+            with pytest.raises(argparse.ArgumentTypeError, match="given; allowed are"):
+                action.type(wrong)
+        if isinstance(action.default, int | float):
+            assert action.type(str(action.default)) == action.default
+
+
+@pytest.mark.parametrize(
+    "key", [key for key, own in keys_of(PlanOptions).items() if isinstance(own.kind, Range)]
+)
+def test_what_would_take_all_memory_is_refused(key: str) -> None:
+    given: dict[str, Any] = {key: 10**400}
+    with pytest.raises(InputError, match=f"^{key}: .* given; allowed are"):
+        PlanOptions(**given)
+
+
+jsonschema = pytest.importorskip("jsonschema")
+SCHEMA = build_schema()
+WHOLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8")) | {"uncertainty": {"mass": 0.1}}
+PARTS = SCHEMA["properties"]
+TABLES: dict[str, tuple[dict[str, Any], Callable[[Any], Any]]] = {
+    "": (SCHEMA, lambda table: table),
+    "object": (PARTS["object"], lambda table: table["object"]),
+    "fingers": (PARTS["fingers"], lambda table: table["fingers"]),
+    "fingers.1": (SCHEMA["definitions"]["finger"], lambda table: table["fingers"]["1"]),
+    "friction": (PARTS["friction"], lambda table: table["friction"]),
+    "uncertainty": (PARTS["uncertainty"], lambda table: table["uncertainty"]),
+    "start": (PARTS["start"], lambda table: table["start"]),
+    "phases[1]": (PARTS["phases"]["items"], lambda table: table["phases"][0]),
+}
+
+
+@pytest.mark.parametrize("where", TABLES)
+def test_keys_are_those_that_the_reader_allows(where: str) -> None:
+    part, find = TABLES[where]
+    table = copy.deepcopy(WHOLE)
+    find(table)["surely_unknown"] = 1
+    with pytest.raises(InputError, match="unknown key") as caught:
+        build_problem(table)
+    (allowed,) = re.findall(r"allowed are (.*)", str(caught.value))
+    assert sorted(part["properties"]) == allowed.split(", ")
+    # Each key that is left out is missed if the schema requires it, and only then.
+    for key in part["properties"]:
+        table = copy.deepcopy(WHOLE)
+        find(table).pop(key, None)
+        # Only a phase with a smooth end may lack `until`; this one ends at rest.
+        if key in part["required"] or key == "until":
+            with pytest.raises(jsonschema.ValidationError):
+                jsonschema.validate(table, SCHEMA)
+            with pytest.raises(InputError, match="is missing"):
+                build_problem(table)
+        else:
+            build_problem(table)
+
+
+@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.toml")), ids=lambda path: path.stem)
+def test_shipped_problems_are_valid(path: Path) -> None:
+    jsonschema.validate(tomllib.loads(path.read_text(encoding="utf-8")), SCHEMA)
+
+
+@pytest.mark.parametrize(
+    ("where", "key", "value"),
+    [
+        ("", "epsilon", -1.0),
+        ("", "surely_unknown", 1),
+        ("object", "vertices", [[0.0, 0.0], [1.0, 0.0]]),
+        ("fingers.1", "length", "long"),
+        ("friction", "palm", 11.0),
+        ("uncertainty", "gain", 1.0),
+        ("start", "flush", 0.5),
+        ("phases[1]", "end", "soft"),
+        ("phases[1]", "until", {"y": 1.0}),
+        ("phases[1]", "contacts", ["v0-wall"]),
+    ],
+)
+def test_what_the_schema_refuses_the_reader_refuses(where: str, key: str, value: object) -> None:
+    table = copy.deepcopy(WHOLE)
+    TABLES[where][1](table)[key] = value
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(table, SCHEMA)
+    with pytest.raises(InputError):
+        build_problem(table)
+
+
+def test_the_command_prints_it(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["schema"]) == 0
+    assert json.loads(capsys.readouterr().out) == SCHEMA
+    assert main(["schema", "-o", str(tmp_path / "schema.json")]) == 0
+    assert json.loads((tmp_path / "schema.json").read_text(encoding="utf-8")) == SCHEMA
+    capsys.readouterr()
+    assert main(["schema", "--table"]) == 0
+    assert capsys.readouterr().out == write_page()
+    assert all(f"| `{key}` |" in write_page() for key, own in TOP.items() if own.text)
+
+
+PROBLEMS = sorted(HEPTAGON.parent.glob("*.toml"))
+
+
+@pytest.fixture
+def heptagon() -> Problem:
+    """Read anew, so that nothing is kept for its scene."""
+    return load(str(HEPTAGON))
+
+
+def check_scene(problem: Problem) -> None:
+    assert all(phase.formation.scene is problem.scene for phase in problem.phases)
+
+
+def check_table(problem: Problem) -> None:
+    """The table alone makes the same problem."""
+    again = build_problem(json.loads(json.dumps(dict(problem.table))), problem.source)
+    assert describe_scene(again.scene) == describe_scene(problem.scene)
+    assert (again.name, again.epsilon) == (problem.name, problem.epsilon)
+    np.testing.assert_allclose(again.start, problem.start, rtol=1e-12, atol=1e-14)
+    assert len(again.phases) == len(problem.phases)
+    for own, other in zip(problem.phases, again.phases, strict=True):
+        assert own.formation.contacts == other.formation.contacts
+        assert own.formation.rolling == other.formation.rolling
+        assert own.end == other.end and own.until.contact == other.until.contact
+        assert (own.until.value or 0.0) == pytest.approx(other.until.value or 0.0, rel=1e-14)
+
+
+@pytest.mark.parametrize("path", PROBLEMS, ids=lambda path: path.stem)
+def test_a_problem_as_read_keeps_its_table(path: Path) -> None:
+    problem = read_problem(str(path))
+    assert replace(problem).table is problem.table
+    check_table(problem)
+    check_table(problem.with_())
+
+
+def test_another_scene_is_the_scene_of_every_phase(heptagon: Problem) -> None:
+    rough = replace(heptagon.scene, friction=Friction(0.2, 0.15, 0.12))
+    other = replace(heptagon, scene=rough, epsilon=0.06)
+    check_scene(other)
+    check_table(other)
+    assert other.phases[0].formation.friction == pytest.approx([0.2, 0.2, 0.15, 0.12])
+    assert heptagon.phases[0].formation.friction == pytest.approx([0.1] * 4)
+    assert other.table["friction"] == pytest.approx({"palm": 0.2, "finger1": 0.15, "finger2": 0.12})
+    assert heptagon.table["friction"]["palm"] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "key", "expected"),
+    [
+        ({"name": "other"}, "name", "other"),
+        ({"epsilon": 0.01}, "epsilon", 0.01),
+        ({"gravity": 1.62}, "gravity", 1.62),
+        ({"fingers_collide": False}, "fingers_collide", False),
+        ({"mass": np.float64(0.3)}, "object.mass", 0.3),
+        ({"inertia": 2e-4}, "object.inertia", 2e-4),
+        ({"friction_finger1": 0.3}, "friction.finger1", 0.3),
+        ({"torque_limit1": 3}, "fingers.1.torque_limit", 3.0),
+        ({"finger_inertia2": 0.01}, "fingers.2.inertia", 0.01),
+        ({"base1": (0.081, -0.01)}, "fingers.1.base", [0.081, -0.01]),
+        ({"speed_limit": 5.0}, "fingers.2.speed_limit", 5.0),
+        ({"viscous": 0.02}, "fingers.1.viscous", 0.02),
+        ({"fingers.2.dry": 0.03}, "fingers.2.dry", 0.03),
+    ],
+)
+def test_names_change_what_they_say(
+    heptagon: Problem, changes: dict[str, Any], key: str, expected: object
+) -> None:
+    other = heptagon.with_(changes)
+    values = {"name": other.name, "epsilon": other.epsilon} | describe_scene(other.scene)
+    number = not isinstance(expected, str | bool)
+    assert values[key] == (pytest.approx(expected) if number else expected)
+    check_scene(other)
+    check_table(other)
+    assert other.source == heptagon.source
+
+
+def test_another_shape_closes_the_fingers_anew(heptagon: Problem) -> None:
+    small = 0.99 * np.asarray(heptagon.scene.polygon.vertices)
+    other = heptagon.with_(vertices=small)
+    assert not np.allclose(other.start[3:], heptagon.start[3:], atol=1e-4)
+    gaps = other.phases[0].formation.evaluate(other.start[None], np.zeros((1, 5))).C
+    np.testing.assert_allclose(gaps, 0.0, atol=1e-12)
+    check_table(other)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"fricton": 0.2},
+            "fricton: unknown name; did you mean 'friction'? allowed are actuator_lag, ",
+        ),
+        ({"friction": -1}, "friction.palm: -1 is not a number >= 0"),
+        ({"mass": "a"}, "object.mass: 'a' is not a positive number"),
+        ({"torque_limit": None}, "fingers.1.torque_limit: is missing"),
+        ({"friction": {"palm": 0.1}}, "friction.finger1: is missing"),
+        ({"object.masss": 1}, "object.masss: unknown key; did you mean 'mass'?"),
+        ({"fingers.3.base": [0, 0]}, "fingers.3.base: there is no '3'; what is there: 1, 2"),
+        ({"phases[9].end": "rest"}, "phases[9].end: there is no number 9; the list has 5"),
+        ({"phases[9]": {}}, "phases[9]: there is no number 9; the list has 5"),
+        ({"epsilon.much": 1}, "epsilon.much: 0.05 is not a table"),
+        ({"phases[1].until": "v9-palm"}, "phases[1].until: 'v9-palm' does not exist"),
+        ({"x": 9.0}, "start: finger 1 is too short to reach the object"),
+        ({"": 1}, "unknown name; allowed are "),
+    ],
+)
+def test_what_a_file_may_not_say_no_change_may(
+    heptagon: Problem, changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(InputError) as caught:
+        heptagon.with_(changes)
+    assert str(caught.value).startswith(f"{HEPTAGON}: {message}")
+
+
+def test_a_problem_without_a_table_cannot_be_changed_by_name(heptagon: Problem) -> None:
+    bare = replace(heptagon, table={})
+    assert replace(bare, epsilon=0.1).table == {}
+    with pytest.raises(InputError, match="has no table"):
+        bare.with_(epsilon=0.1)
+
+
+def test_other_phases_and_another_start_are_in_the_table(heptagon: Problem) -> None:
+    check_table(replace(heptagon, phases=heptagon.phases[:2]))
+    box = read_problem(str(BOX))
+    last = replace(box.phases[-1], end=End.REST)
+    short = replace(box, phases=(*box.phases[:-1], last))
+    check_table(short)
+    smooth = [replace(phase, end=End.SMOOTH) for phase in heptagon.phases[:-1]]
+    passing = replace(heptagon, phases=(*smooth, heptagon.phases[-1]))
+    assert [entry.get("end") for entry in passing.table["phases"]] == ["smooth"] * 4 + [None]
+    moved = heptagon.with_(x=0.04)
+    check_table(replace(heptagon, start=moved.start))
+    tilted = heptagon.start + 0.1 * np.eye(5)[2]
+    assert replace(heptagon, start=tilted).table == {}
+
+
+def least_time(folder: Path, corners: int, size: float, mass: float | None = None) -> float:
+    path = folder / "own.toml"
+    path.write_text(write_template("own", corners, size, mass), encoding="utf-8")
+    return solve(load(str(path))).value
+
+
+@pytest.mark.parametrize("corners", [3, 4, 5, 6, 7, 12])
+def test_a_template_plans_as_it_is(corners: int, tmp_path: Path) -> None:
+    assert least_time(tmp_path, corners, 0.05) > 0
+
+
+def test_templates_are_alike_in_every_size(tmp_path: Path) -> None:
+    # Under gravity times go with the root of lengths, whatever the mass; numbers have four digits.
+    small, large = least_time(tmp_path, 7, 0.05), least_time(tmp_path, 7, 5.0, mass=3.0)
+    assert large / small == pytest.approx(math.sqrt(100.0), rel=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("given", "key"),
+    [((2, 0.05, None), "--polygon"), ((7, -1.0, None), "--size"), ((7, 0.05, 0.0), "--mass")],
+)
+def test_what_makes_no_scene_is_refused(given: tuple[int, float, float | None], key: str) -> None:
+    with pytest.raises(InputError, match=key):
+        write_template("own", *given)
+
+
+def test_new_writes_a_file_and_keeps_one_that_is_there(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "mine.toml"
+    assert main(["new", str(tmp_path / "mine"), "--polygon", "5"]) == 0
+    text = path.read_text(encoding="utf-8")
+    assert load(str(path)).name == "mine"
+    assert load(str(path)).scene.polygon.n_vertices == 5
+    assert main(["new", str(path)]) == 2
+    assert "is there already" in capsys.readouterr().err
+    assert path.read_text(encoding="utf-8") == text
+
+
+LARGE = {k: v for k, v in tomllib.loads(HEPTAGON.read_text()).items() if k != "phases"}
+
+
+def read_file(goal: object) -> Problem:
+    return build_problem({**LARGE, "goal": goal})
+
+
+@pytest.mark.parametrize(
+    ("given", "goals"),
+    [
+        ({"flush": 6}, (Goal(flush=6),)),
+        ({"phi_deg": -50.0, "x": 0.02}, (Goal(phi=math.radians(-50.0), x=0.02),)),
+        ([{"flush": 6, "x": 0.0}, {"flush": 0}], (Goal(flush=6, x=0.0), Goal(flush=0))),
+    ],
+)
+def test_goals_are_read_and_written(given: object, goals: tuple[Goal, ...]) -> None:
+    problem = read_file(given)
+    assert problem.goals == goals and not problem.phases
+    assert replace(problem, epsilon=0.1).table["goal"] == given
+    other = replace(problem, goals=(Goal(flush=1, x=0.01),))
+    assert other.table["goal"] == {"flush": 1, "x": 0.01}
+    assert build_problem(other.table).goals == other.goals
+    # What a search finds takes the place of goals.
+    found = replace(problem, goals=(), phases=problem_of(HEPTAGON).phases)
+    assert "goal" not in found.table and len(found.table["phases"]) == 5
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ({"x": 0.0}, "goal: neither flush nor phi_deg given"),
+        ({"flush": 1, "phi_deg": 3.0}, "goal: flush and phi_deg are both given"),
+        ({"flush": 7}, "goal.flush: 7 is not an edge; allowed are 0 to 6"),
+        ({"flush": 1.5}, "goal.flush: 1.5 is not an edge"),
+        ([{"flush": 1}, {"flush": 2, "x": 1e6}], r"goal\[2\].x: 1e+"),
+        ({"flush": 1, "y": 0.0}, "goal.y: unknown key"),
+        ("edge 6", "goal: 'edge 6' given"),
+    ],
+)
+def test_other_goals_are_refused(given: Any, text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        read_file(given)
+
+
+def test_phases_and_goals_exclude_each_other() -> None:
+    table = tomllib.loads(HEPTAGON.read_text())
+    with pytest.raises(InputError, match=r"goal: given with \[\[phases\]\]"):
+        build_problem({**table, "goal": {"flush": 6}})
+
+
+def test_a_plan_brings_the_phases_that_lead_to_its_goal(tmp_path: Path) -> None:
+    plan, planned = plan_of(HEPTAGON), problem_of(HEPTAGON)
+    phi = math.degrees(plan.q[-1, 2])
+    problem = read_file({"phi_deg": phi})
+    found = adopt_phases(problem, plan.meta, plan.q[-1])
+    assert found.table["phases"] == planned.table["phases"] and not found.goals
+    assert adopt_phases(planned, plan.meta, plan.q[-1]) is planned
+    plan.save(tmp_path / "plan.npz")
+    (own,) = compare(problem, [str(tmp_path / "plan.npz")]).contenders
+    assert own.ok and len(own.lasts) == 5
+    for goal in ({"phi_deg": phi + 1.0}, {"phi_deg": phi, "x": plan.q[-1, 0] + 1e-3}, {"flush": 6}):
+        with pytest.raises(InputError, match=r"goal: the plan ends at .*, and not with"):
+            adopt_phases(read_file(goal), plan.meta, plan.q[-1])

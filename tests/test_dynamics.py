@@ -2,16 +2,39 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import permutations, product
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from plane import SQUARE, make_formation, make_scene, measure_slip, unbalance
+from held import balances
+from moreau import collide
+from plane import (
+    SQUARE,
+    cross,
+    make_formation,
+    make_scene,
+    measure_gaps,
+    measure_slip,
+    rotate,
+    touch,
+    unbalance,
+)
 from pushed import forward
+from shipped import BOX, FOLDER, HEPTAGON, IMPACTS, plan_of, problem_of
+from timed import landing, plan_landing
+from tipping import box, roll, tipped
+from wholearm import InputError, verify
+from wholearm import solve as plan
+from wholearm.benchmark.stress.slow_motion import list_others, rest_margin
 from wholearm.common.arrays import Array
+from wholearm.common.errors import AmbiguityError, InfeasibleError
 from wholearm.contacts.closing import close_finger
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
+from wholearm.geometry.path_guess import load
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import (
     LAMBDA,
@@ -21,9 +44,32 @@ from wholearm.mechanics.dynamics import (
     inverse,
     reduced_inertia,
 )
-from wholearm.problem.read import build_problem
+from wholearm.mechanics.impact import Impact, ViolationKind, compute_impact, solve_impulses
+from wholearm.mechanics.statics import find_static_torques
+from wholearm.mechanics.uniqueness import find_minors
+from wholearm.planning.options import PlanOptions
+from wholearm.planning.path_domain.impact_sequence import ImpactSequence, make_sequence
+from wholearm.planning.path_domain.path_plan import plan_curves
+from wholearm.planning.time_domain.resting import find_block, list_ways, pushes_one_way
+from wholearm.planning.time_domain.stage import in_own_units, scale_state
+from wholearm.planning.time_domain.time_plan import plan_phases
+from wholearm.problem.read import build_problem, read_problem
+from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Samples
 from wholearm.scene.model import Friction, Scene
+from wholearm.simulation.contact_problem import (
+    APART,
+    BACK,
+    FORTH,
+    STICKS,
+    ContactAnswer,
+    ContactProblem,
+    list_answers,
+    solve,
+    solve_lcp,
+    try_modes,
+)
+from wholearm.verification.force_uniqueness import find_wedged
 from wholearm.verification.minimal_coordinates import reduce_to_first_joint
 
 FRICTIONLESS = Friction(0.0, 0.0, 0.0)
@@ -309,3 +355,626 @@ def test_the_squeeze_keeps_its_sense_along_a_curve() -> None:
     pressing = null.sum(axis=1)
     assert pressing.min() < 0.0 < pressing.max()
     assert np.abs(np.diff(null, axis=0)).max() < 0.05
+
+
+MASS = 0.2
+
+
+def chain_of(path: Path) -> ImpactSequence:
+    problem = load(str(path))
+    return make_sequence(problem.phases, trace_phases(problem))
+
+
+@pytest.fixture(scope="module")
+def rough() -> ImpactSequence:
+    """With a rough right finger: two impacts that are possible, and two that are not."""
+    return chain_of(IMPACTS)
+
+
+@pytest.fixture(scope="module")
+def tipping() -> ImpactSequence:
+    """With four that are not."""
+    return chain_of(HEPTAGON)
+
+
+def arrivals(chain: ImpactSequence) -> list[tuple[Formation, Formation, Array, Array]]:
+    """Formations before and after every impact, configuration, and velocity before."""
+    found = []
+    for before, after in zip(chain.curves[:-1], chain.curves[1:], strict=True):
+        point = before.evaluate(np.array([before.length]))
+        found.append((before.formation, after.formation, after.start, point.z_s[0]))
+    return found
+
+
+def frictionless(formation: Formation) -> Formation:
+    scene = formation.scene
+    smooth = Scene(scene.polygon, scene.fingers, Friction(0.0, 0.0, 0.0), scene.gravity)
+    return Formation(smooth, formation.contacts)
+
+
+def check_momenta(impact: Impact, z: Array, before: Array) -> None:
+    """Momentum of each body changes by the impulses at its contact points."""
+    formation = impact.formation
+    scene, change = formation.scene, impact.v - before
+    body = scene.polygon
+    assert body.inertia is not None
+    push, turn = np.zeros(2), 0.0
+    joints = np.zeros(2)
+    for k, (contact, point, n) in enumerate(
+        zip(formation.contacts, *touch(formation, z), strict=True)
+    ):
+        along = np.array([n[1], -n[0]])
+        slip = float(measure_slip(formation, z, impact.v)[k])
+        impulse = impact.p[k] * (n - formation.friction[k] * np.sign(slip) * along)
+        push += impulse
+        turn += float(cross(point - z[:2], impulse))
+        if contact.finger is not None:
+            base = np.asarray(scene.fingers[contact.finger].base)
+            joints[contact.finger] -= float(cross(point - base, impulse))
+    np.testing.assert_allclose(body.mass * change[:2], push, rtol=0, atol=1e-12)
+    assert body.inertia * change[2] == pytest.approx(turn, abs=1e-12)
+    inertias = np.array([finger.inertia for finger in scene.fingers])
+    np.testing.assert_allclose(inertias * change[3:], joints, rtol=0, atol=1e-12)
+
+
+def energy_of(scene: Scene, v: Array) -> float:
+    return float(0.5 * v**2 @ scene.mass_diagonal)
+
+
+def test_each_body_takes_its_impulses(rough: ImpactSequence, tipping: ImpactSequence) -> None:
+    for chain in (rough, tipping):
+        for join, (before, after, z, v) in zip(chain.impacts, arrivals(chain), strict=True):
+            impact = compute_impact(before, after, z, v)
+            np.testing.assert_array_equal(impact.v, join.impact.v)
+            check_momenta(impact, z, v)
+
+
+def test_every_contact_is_kept_afterwards(rough: ImpactSequence) -> None:
+    for before, after, z, v in arrivals(rough):
+        v_after, h = compute_impact(before, after, z, v).v, 1e-6
+        rates = (measure_gaps(after, z + h * v_after) - measure_gaps(after, z - h * v_after)) / h
+        assert np.abs(rates).max() < 1e-8
+        arriving = measure_gaps(after, z + h * v) - measure_gaps(after, z - h * v)
+        assert arriving.min() < -0.1 * h
+
+
+@pytest.mark.parametrize("index", range(4))
+def test_complementarity_gives_the_same(
+    rough: ImpactSequence, tipping: ImpactSequence, index: int
+) -> None:
+    """Moreau's law, which assumes neither what presses nor what slides which way."""
+    for chain in (rough, tipping):
+        before, after, z, v = arrivals(chain)[index]
+        released = [c for c in before.contacts if c not in after.contacts]
+        every = Formation(after.scene, (*after.contacts, *released))
+        collision, impact = collide(every, z, v), compute_impact(before, after, z, v)
+        assert impact.possible == (chain is rough and index < 2)
+        kept, parting = np.split(collision.rates, [after.n_contacts])
+        if impact.possible:
+            np.testing.assert_allclose(collision.v, impact.v, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(collision.normal[:-1], impact.p, rtol=0, atol=1e-12)
+            assert (parting > 0.1).all()
+        else:
+            # What would have to pull is let go.
+            assert kept[after.names.index(impact.least[0])] > 0.01
+            assert not np.allclose(collision.v, impact.v, atol=0.1)
+
+
+def test_what_would_have_to_pull_is_named(tipping: ImpactSequence) -> None:
+    impact = tipping.impacts[0].impact
+    assert impact.least == ("v1-palm", float(impact.p[1]))
+    first = impact.violations[0]
+    assert (first.kind, first.name, first.value) == (ViolationKind.PULL, *impact.least)
+    assert tipping.impacts[0].reason == "impulse on v1-palm would be -0.0414 N s per m/s"
+    assert first.describe() == "impulse on v1-palm would be -0.0414 N s"
+
+
+def test_energy_goes_into_the_jump_and_into_sliding(
+    rough: ImpactSequence, tipping: ImpactSequence
+) -> None:
+    for chain in (rough, tipping):
+        for before, after, z, v in arrivals(chain):
+            impact = compute_impact(before, after, z, v)
+            jump = energy_of(after.scene, impact.v - v)
+            slid = after.friction * impact.p @ np.abs(measure_slip(after, z, impact.v))
+            lost = energy_of(after.scene, v) - energy_of(after.scene, impact.v)
+            assert lost == pytest.approx(jump + slid, rel=1e-9)
+            assert lost > 0 or not impact.possible
+
+
+def test_random_impacts_never_gain_energy() -> None:
+    rng = np.random.default_rng(5)
+    scene = make_scene(SQUARE, friction=0.3)
+    names = ["v0-palm", "v1-palm", "v2-finger1", "v3-finger2"]
+    formations = [make_formation(scene, " ".join(three)) for three in permutations(names, 3)]
+    possible = 0
+    for number in range(200):
+        formation = formations[number % len(formations)]
+        z = np.array([0.0, 0.03, 0.0, 1.2, 1.9]) + rng.normal(scale=0.02, size=5)
+        v = rng.normal(size=5) * [0.3, 0.3, 3.0, 3.0, 3.0]
+        impact = compute_impact(formation, formation, z, v)
+        sound = not {h.kind for h in impact.violations} & {ViolationKind.JAM, ViolationKind.HELD}
+        if sound:
+            check_momenta(impact, z, v)
+            slips = measure_slip(formation, z, impact.v)
+            assert (impact.Xi * slips >= -1e-9).all()
+        if sound and impact.p.min() >= 0:
+            possible += 1
+            assert energy_of(scene, impact.v) <= energy_of(scene, v)
+    assert possible > 5
+
+
+def test_without_friction_it_is_the_nearest_velocity(rough: ImpactSequence) -> None:
+    rng = np.random.default_rng(8)
+    for before, after, z, v in arrivals(rough):
+        impact = compute_impact(before, frictionless(after), z, v)
+        A = after.evaluate(z[None], v[None]).A[0]
+        tangents = np.linalg.svd(A)[2][len(A) :].T
+        root = np.sqrt(after.scene.mass_diagonal)
+        nearest = tangents @ np.linalg.lstsq(root[:, None] * tangents, root * v, rcond=None)[0]
+        np.testing.assert_allclose(impact.v, nearest, rtol=0, atol=1e-12)
+        least = energy_of(after.scene, impact.v - v)
+        for _ in range(20):
+            other = impact.v + tangents @ rng.normal(size=tangents.shape[1])
+            assert energy_of(after.scene, other - v) > least
+
+
+# A square that comes down on its right lower corner, r away from its centroid: one impulse.
+
+
+def drop(v: Array, friction: float, lean: float = 0.3) -> tuple[Impact, Array, Scene]:
+    """Impact of corner 1 on the palm, and r; the square is turned by `lean`."""
+    scene = make_scene(SQUARE, friction=friction)
+    c, s = np.cos(lean), np.sin(lean)
+    r = np.array([0.03 * c + 0.03 * s, 0.03 * s - 0.03 * c])
+    formation = make_formation(scene, "v1-palm")
+    z = np.array([0.0, -r[1], lean, 0.5, 2.6])
+    assert abs(measure_gaps(formation, z)[0]) < 1e-13
+    return compute_impact(formation, formation, z, v), r, scene
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.2, 0.5])
+@pytest.mark.parametrize("slide", [-2.0, 2.0])
+def test_a_corner_dropped_on_the_palm(friction: float, slide: float) -> None:
+    v = np.array([slide, -0.4, 1.5, 0.0, 0.0])
+    impact, r, scene = drop(v, friction)
+    inertia = scene.polygon.inertia
+    assert inertia is not None and scene.polygon.mass == pytest.approx(MASS)
+    way = np.sign(slide)
+    # The impulse (-mu way p, p) at r stops the corner's fall v_y + r_x omega.
+    fall = v[1] + r[0] * v[2]
+    p = -fall / (1 / MASS + r[0] * (r[0] + friction * way * r[1]) / inertia)
+    assert p > 0 and impact.possible
+    assert impact.least[0] == "v1-palm" and impact.least[1] == pytest.approx(p)
+    spin = v[2] + (r[0] * p + r[1] * friction * way * p) / inertia
+    expected = [v[0] - friction * way * p / MASS, v[1] + p / MASS, spin, 0.0, 0.0]
+    np.testing.assert_allclose(impact.v, expected, rtol=0, atol=1e-12)
+
+
+def test_friction_that_would_hold_is_no_sliding() -> None:
+    impact, _, _ = drop(np.array([0.01, -0.4, 0.0, 0.0, 0.0]), 0.8, lean=0.7)
+    assert not impact.possible
+    assert impact.violations[0].describe() == "friction would hold v1-palm"
+    formation, z = impact.formation, np.array([0.0, 0.0, 0.7, 0.5, 2.6])
+    collision = collide(formation, z, np.array([0.01, -0.4, 0.0, 0.0, 0.0]))
+    assert abs(collision.slips[0]) < 1e-12 and collision.normal[0] > 0
+
+
+@pytest.mark.parametrize("friction", [0.3, 3.0])
+def test_a_corner_that_rolls(friction: float) -> None:
+    """It is caught like a hinge if friction can hold it: angular momentum about it is kept."""
+    v, lean = np.array([0.2, -0.4, 0.0, 0.0, 0.0]), 0.7
+    _, r, scene = drop(v, friction, lean)
+    sliding = make_formation(scene, "v1-palm")
+    rolling = Formation(scene, sliding.contacts, sliding.contacts)
+    z = np.array([0.0, -r[1], lean, 0.5, 2.6])
+    impact = compute_impact(sliding, rolling, z, v)
+    inertia = scene.polygon.inertia
+    assert inertia is not None
+    spin = -MASS * float(cross(r, v[:2])) / (inertia + MASS * r @ r)
+    expected = np.array([spin * r[1], -spin * r[0], spin, 0.0, 0.0])
+    np.testing.assert_allclose(impact.v, expected, rtol=0, atol=1e-12)
+    tangential, normal = MASS * (expected[:2] - v[:2])
+    np.testing.assert_allclose(impact.p, [normal, tangential], rtol=0, atol=1e-12)
+    beyond = abs(tangential) - friction * normal
+    assert impact.possible == (beyond <= 0) == (friction == 3.0)
+    collision = collide(sliding, z, v)
+    if impact.possible:
+        np.testing.assert_allclose(collision.v, impact.v, rtol=0, atol=1e-12)
+    else:
+        assert abs(collision.slips[0]) > 1e-3
+        text = f"v1-palm would slip, {beyond:.3g} N s beyond its friction cone"
+        assert impact.violations[0].describe() == text
+
+
+def test_jamming_is_named() -> None:
+    """As Painleve's rod: r_x (r_x + mu r_y) / inertia below -1 / mass."""
+    impact, r, scene = drop(np.array([2.0, -0.4, 0.0, 0.0, 0.0]), 10.0, lean=0.3)
+    assert scene.polygon.inertia is not None
+    ratio = 1 + r[0] * 10.0 * r[1] / scene.polygon.inertia / (
+        1 / MASS + r[0] ** 2 / scene.polygon.inertia
+    )
+    assert ratio < 0 and impact.violations[0].kind is ViolationKind.JAM
+    assert impact.violations[0].value == pytest.approx(ratio)
+    assert impact.violations[0].describe().startswith("v1-palm would jam, with -")
+    assert np.isnan(impact.v).all() and np.isnan(impact.p).all()
+
+
+def test_what_touches_must_not_be_driven_into() -> None:
+    """A square flush on the palm cannot turn about its right corner into the palm."""
+    scene = make_scene(SQUARE)
+    flush, corner = make_formation(scene, "v0-palm v1-palm"), make_formation(scene, "v1-palm")
+    z = np.array([0.0, 0.03, 0.0, 0.5, 2.6])
+    for spin in (-2.0, 2.0):
+        impact = compute_impact(flush, corner, z, np.array([0.5, -0.03 * spin, spin, 0.0, 0.0]))
+        rate = float(measure_gaps(flush, z + 1e-6 * impact.v)[0]) / 1e-6
+        closing = [h for h in impact.violations if h.kind is ViolationKind.CLOSING]
+        assert impact.possible == (spin < 0) == (rate > 0)
+        if spin > 0:
+            # Given up by name, or found among the formation's limits.
+            assert [h.value for h in closing] == pytest.approx([rate], rel=1e-4)
+            assert closing[0].describe().startswith("v0-palm would not part, at ")
+            again = compute_impact(corner, corner, z, np.array([0.5, -0.03 * spin, spin, 0.0, 0.0]))
+            assert again.violations[0].describe() == "v0 touches the palm, at 0.12 m/s"
+
+
+def test_the_sliding_directions_are_found_among_all(rough: ImpactSequence) -> None:
+    """Every choice by brute force: the one taken is consistent, and no other one only presses."""
+    for before, after, z, v in arrivals(rough):
+        A, A_t = (part[0] for part in after.evaluate(z[None], v[None])[1:3])
+        found = []
+        for signs in product((1.0, -1.0), repeat=4):
+            G = A - (after.friction * np.array(signs))[:, None] * A_t
+            v_after, p = solve_impulses(after.scene.mass_diagonal, A, G, v)
+            if (np.array(signs) * (A_t @ v_after) >= 0).all():
+                found.append((signs, p))
+        impact = compute_impact(before, after, z, v)
+        assert tuple(impact.Xi) in [signs for signs, _ in found]
+        assert len([p for _, p in found if p.min() >= 0]) == impact.possible
+
+
+# Curves that impacts join.
+
+
+def test_paces_make_the_speed_continuous(rough: ImpactSequence) -> None:
+    """A velocity of z_s on one curve becomes z_s on the next."""
+    part = rough.split()[0]
+    continuous_curves = part.continuous_curves
+    assert continuous_curves[0].speed_ratio == 1.0
+    for join, before, after in zip(
+        part.impacts, continuous_curves[:-1], continuous_curves[1:], strict=True
+    ):
+        v = before.evaluate(np.array([before.length])).z_s[0]
+        v_after = after.evaluate(np.zeros(1)).z_s[0]
+        check_momenta(
+            replace(join.impact, v=v_after, p=before.speed_ratio * join.impact.p), before.end, v
+        )
+
+
+def test_a_curve_at_another_pace(rough: ImpactSequence) -> None:
+    curve = rough.curves[2]
+    fast = curve.with_speed_ratio(2.5)
+    assert fast.length == pytest.approx(curve.length / 2.5, rel=1e-13)
+    np.testing.assert_allclose(fast.end, curve.end, rtol=0, atol=1e-14)
+    assert [g.stop for g in fast.segments] == pytest.approx([g.stop / 2.5 for g in curve.segments])
+    s, h = np.linspace(0.1, 0.9, 9) * fast.length, 1e-5 * fast.length
+    before, here, after = (fast.evaluate(s + k * h) for k in (-1, 0, 1))
+    scale = 2.5 / curve.formation.scene.polygon.gyration_radius
+    np.testing.assert_allclose((after.z - before.z) / (2 * h), here.z_s, atol=1e-6 * scale)
+    np.testing.assert_allclose((after.z_s - before.z_s) / (2 * h), here.z_ss, atol=1e-5 * scale**2)
+    assert fast.with_speed_ratio(1.0).length == pytest.approx(curve.length, rel=1e-13)
+
+
+def test_one_unknown() -> None:
+    assert solve_lcp(np.array([[2.0]]), np.array([-3.0])).z == pytest.approx([1.5])
+    assert solve_lcp(np.array([[2.0]]), np.array([3.0])).w == pytest.approx([3.0])
+    assert solve_lcp(np.zeros((0, 0)), np.zeros(0)).residual == 0.0
+
+
+def test_a_ray_is_no_solution() -> None:
+    assert np.isinf(solve_lcp(np.array([[-1.0]]), np.array([-1.0])).residual)
+
+
+@pytest.mark.parametrize("skew", [0.0, 1.0])
+def test_positive_semidefinite_problems_are_solved(skew: float) -> None:
+    # With degenerate solutions, singular matrices and ties, as contacts of flush edges make them.
+    rng = np.random.default_rng(3)
+    for _ in range(150):
+        n = int(rng.integers(1, 13))
+        root = rng.normal(size=(n, int(rng.integers(1, n + 1))))
+        turn = skew * rng.normal(size=(n, n))
+        M = root @ root.T + turn - turn.T
+        z = np.maximum(rng.normal(size=n), 0)
+        w = np.where(z > 0, 0.0, np.maximum(rng.normal(size=n), 0))
+        found = solve_lcp(M, w - M @ z)
+        assert found.residual < 1e-9 * np.abs(M).sum()
+        assert found.z.min() >= 0 and found.w.min() >= 0
+        assert found.w == pytest.approx(M @ found.z + w - M @ z, abs=1e-9 * np.abs(M).sum())
+
+
+def test_ties_do_not_cycle() -> None:
+    # Every row falls as much as every other.
+    n = 8
+    found = solve_lcp(np.ones((n, n)) + np.triu(np.ones((n, n)), 1), -np.ones(n))
+    assert found.residual < 1e-12
+
+
+def draw(rng: np.random.Generator, mu: float) -> ContactProblem:
+    """Three contacts, the first two of which may stick, and a joint, on five coordinates."""
+    A, A_t = rng.normal(size=(2, 3, 5))
+    Xi = np.array([0.0, 0.0, rng.choice([-1.0, 1.0])])
+    T = np.vstack([A_t[:2], np.eye(5)[3]])
+    return ContactProblem(
+        rng.uniform(0.5, 2.0, 5),
+        A,
+        A - mu * Xi[:, None] * A_t,
+        rng.normal(size=3),
+        T,
+        rng.normal(size=3),
+        np.array([0, 1, -1]),
+        np.array([mu, mu, 0.0]),
+        np.array([0.0, 0.0, 0.3]),
+    )
+
+
+def check(p: ContactProblem, answer: ContactAnswer) -> None:
+    """Coulomb's law and complementarity, from the forces alone."""
+    change = p.lift * (p.G.T @ answer.c_n + p.T.T @ answer.f)
+    r_n, r_t = p.b_n + p.A @ change, p.b_t + p.T @ change
+    assert answer.c_n.min() >= 0 and r_n.min() > -1e-9
+    assert answer.c_n * r_n == pytest.approx(np.zeros(3), abs=1e-8)
+    most = p.bound + p.mu * np.append(answer.c_n[:2], 0.0)
+    assert (np.abs(answer.f) <= most + 1e-9).all()
+    for force, rate, bound in zip(answer.f, r_t, most, strict=True):
+        assert abs(rate) < 1e-8 or force == pytest.approx(-bound * np.sign(rate), abs=1e-8)
+
+
+def test_lemke_finds_one_of_all_answers() -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(40):
+        problem = draw(rng, 0.15)
+        found, every = solve(problem), list_answers(problem)
+        assert found is not None and every
+        check(problem, found)
+        for answer in every:
+            check(problem, answer)
+        assert min(np.abs(found.change - a.change).max() for a in every) < 1e-8
+
+
+def make_mass(b_n: float, b_t: float, mu: float = 0.5) -> ContactProblem:
+    """A unit mass over a floor."""
+    normal, tangent = np.array([[0.0, 1.0]]), np.array([[1.0, 0.0]])
+    one, none = np.array([mu]), np.zeros(1)
+    b = np.array([b_n]), np.array([b_t])
+    return ContactProblem(np.ones(2), normal, normal, b[0], tangent, b[1], np.array([0]), one, none)
+
+
+@pytest.mark.parametrize(
+    ("b_n", "b_t", "mode", "c_n", "f"),
+    [
+        (-2.0, 0.5, STICKS, 2.0, -0.5),
+        (-2.0, 1.5, FORTH, 2.0, -1.0),
+        (-2.0, -1.5, BACK, 2.0, 1.0),
+        (2.0, 1.5, APART, 0.0, 0.0),
+    ],
+)
+def test_a_mass_on_a_floor(b_n: float, b_t: float, mode: int, c_n: float, f: float) -> None:
+    problem = make_mass(b_n, b_t)
+    for answer in (solve(problem), try_modes(problem, [mode])):
+        assert answer is not None
+        assert (*answer.c_n, *answer.f) == pytest.approx((c_n, f))
+    for other in {APART, STICKS, FORTH, BACK} - {mode}:
+        assert try_modes(problem, [other]) is None
+    assert len(list_answers(problem) or []) == 1
+
+
+def count_answers(K: Array, loads: Array) -> Array:
+    """How many sets of contacts press, and leave the others apart: a = q + K c, for n loads q."""
+    found = np.zeros(len(loads), dtype=int)
+    for pressed in product((False, True), repeat=len(K)):
+        own = np.array(pressed)
+        c = np.zeros_like(loads)
+        c[:, own] = -np.linalg.solve(K[np.ix_(own, own)], loads[:, own].T).T
+        apart = loads + c @ K.T
+        found += (c[:, own] > 0).all(axis=1) & (apart[:, ~own] > 0).all(axis=1)
+    return found
+
+
+def list_loads(K: Array, count: int) -> Array:
+    """Loads that each set of contacts answers with forces and accelerations of many sizes."""
+    rng, loads = np.random.default_rng(3), []
+    for pressed in product((0.0, 1.0), repeat=len(K)):
+        c, apart = 10.0 ** rng.uniform(-1, 1, (2, count, len(K)))
+        loads.append(apart * np.diag(K) * (1 - np.array(pressed)) - (c * pressed) @ K.T)
+    return np.concatenate(loads)
+
+
+def box_at(mu: float, index: int, share: float) -> tuple[Formation, Any, Array]:
+    """The box on a palm of friction mu in the middle of a phase, with its sliding directions."""
+    problem = problem_of(BOX).with_(friction_palm=mu)
+    curve = trace_phases(problem)[index]
+    point = curve.evaluate(np.array([share * curve.length]))
+    return curve.formation, point.kinematics, curve.segments[-1].Xi
+
+
+@pytest.mark.parametrize("index", [0, 2])
+def test_forces_are_unique_where_all_minors_are_positive(index: int) -> None:
+    for mu in (0.1, 0.3, 0.5):
+        formation, kinematics, Xi = box_at(mu, index, 0.9 if index == 0 else 0.4)
+        A, A_t = kinematics.A[0], kinematics.A_t[0]
+        weighted = A / formation.scene.mass_diagonal
+        K, smooth = weighted @ (A - (formation.friction * Xi)[:, None] * A_t).T, weighted @ A.T
+        ratio, names, _ = find_minors(formation, kinematics, Xi).find_least()
+        answers = count_answers(K, list_loads(K, 100))
+        assert (answers == 1).all() if ratio > 0 else (answers > 1).any()
+        assert (ratio > 0) == (mu < 0.4)
+        # The minor that is named is that of its contacts alone.
+        own = [formation.names.index(name) for name in names.split(" with ")]
+        expected = np.linalg.det(K[np.ix_(own, own)]) / np.linalg.det(smooth[np.ix_(own, own)])
+        assert ratio == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_rod_on_the_palm_is_that_of_painleve() -> None:
+    """Friction mu takes mu a h / (k^2 + a^2) from 1, a and h being the arms of both forces."""
+    scene = make_scene([[-0.05, -1e-4], [0.05, -1e-4], [0.05, 1e-4], [-0.05, 1e-4]], base=0.6)
+    for slope, mu in product((0.4, 1.0, 1.3), (0.5, 2.0)):
+        other = Scene(scene.polygon, scene.fingers, Friction(mu, 0.1, 0.1))
+        formation = make_formation(other, "v1-palm")
+        arm, height = rotate(-slope, [0.05, -1e-4])
+        z = np.array([[0.0, -height, -slope, 1.57, 1.57]])
+        kinematics = formation.evaluate(z, np.zeros((1, 5)))
+        loss = mu * arm * abs(height) / (scene.polygon.gyration_radius**2 + arm**2)
+        found = [find_minors(formation, kinematics, np.array([Xi])).ratios[0] for Xi in (-1.0, 1.0)]
+        # Sliding the other way friction helps, and the least is that of no contact, 1.
+        assert sorted(found) == pytest.approx([1 - loss, 1.0], rel=1e-9)
+        rolling = find_minors(roll(formation, "v1-palm"), kinematics, np.zeros(1))
+        ratio, names, _ = rolling.find_least()
+        assert ratio == pytest.approx(1 - loss, rel=1e-9) and names.startswith("v1-palm slipping")
+
+
+def test_an_ambiguous_scene_is_refused_by_name() -> None:
+    rough = problem_of(BOX).with_(friction_palm=0.5)
+    with pytest.raises(AmbiguityError, match=r"phase 1: ambiguous: v0-palm with v0-finger2, uniq"):
+        plan_curves(trace_phases(rough)[:1], rough.epsilon, PlanOptions(), (1,), explained=False)
+    with pytest.raises(
+        InputError, match=r"uniqueness_margin: 1 given; allowed are numbers below 1"
+    ):
+        plan(rough, uniqueness_margin=1.0)
+
+
+def test_replays_tell_the_uniqueness_margin_of_each_phase() -> None:
+    report = verify(box(), tipped())
+    minors = [phase.uniqueness_margin for phase in report.phases]
+    assert report.ok and all(minor is not None and 0.1 < minor.value < 1 for minor in minors)
+    planned = [own["value"] for own in tipped().meta["uniqueness_margins"]]
+    found = [minor.value for minor in minors if minor is not None]
+    np.testing.assert_allclose(found, planned, atol=5e-3)
+    strict = verify(box(), tipped(), uniqueness_margin=0.9)
+    assert not strict.ok and strict.failures[0].startswith("ambiguous: ")
+
+
+@pytest.mark.parametrize("path", [BOX, IMPACTS], ids=lambda path: path.stem)
+def test_torques_that_friction_can_hold_are_those_of_the_linear_programme(path: Path) -> None:
+    problem = problem_of(path)
+    rng, scene = np.random.default_rng(5), problem.scene
+    for curve in trace_phases(problem)[::2]:
+        static = find_static_torques(curve.formation, curve.start)
+        tau = rng.uniform(-1.0, 1.0, (12, 2)) * scene.torque_limit
+        for own, beyond in zip(tau, static.measure(tau), strict=True):
+            if abs(beyond) > 1e-4 * scene.scales.torque:
+                assert balances(curve.formation, curve.start, own) == (beyond < 0)
+                if beyond < 0:
+                    assert not static.is_empty(np.abs(own))
+        if abs(beyond := static.measure(np.zeros((1, 2)))[0]) > 1e-4 * scene.scales.torque:
+            assert static.is_empty(np.zeros(2)) == (beyond > 0)
+
+
+def test_a_wedged_start_lasts_until_nothing_balances_the_torques() -> None:
+    """From torques that the linear programme balances straight to four times as much."""
+    problem, plan = problem_of(BOX), plan_of(BOX)
+    phase = problem.phases[-1]
+    rows = np.flatnonzero(plan.phase == phase.index)
+    first = last = plan.tau[rows[0]]
+    duration = plan.t[rows[-1]] - plan.t[rows[0]]
+    z = plan.z[rows[0]]
+    while not balances(phase.formation, z, first):
+        first, last = first / 2, first
+    first = first / 2
+    halves = (first + last) / 2, (last - first) / 2
+    torque = TorqueProfile(plan.t[rows[[0, -1]]], np.stack(halves, axis=-1)[None])
+    wedged = find_wedged(problem, phase, replace(plan, torque=torque), rows, 1e-9)
+    assert wedged is not None and 0 < wedged < duration
+    for share, held in ((0.0, True), (0.97, True), (1.03, False)):
+        tau = first + share * wedged / duration * (last - first)
+        assert balances(phase.formation, z, tau) == held
+
+
+def test_plans_leave_rest_surely() -> None:
+    """Where the largest margin of a phase is that of its start, too, friction could hold it."""
+    problem, plan = problem_of(HEPTAGON), plan_of(HEPTAGON, "margin")
+    assert plan.meta["wedged"] == [0.0] * 5
+    for phase in problem.phases:
+        row = int(np.flatnonzero(plan.phase == phase.index)[0])
+        assert not balances(phase.formation, plan.z[row], plan.tau[row])
+
+
+COARSE = PlanOptions(time_intervals=4)
+
+
+@pytest.mark.parametrize("freedoms, count", [(1, 2), (2, 20)])
+def test_every_way_to_set_things_in_motion_is_listed_once(freedoms: int, count: int) -> None:
+    rng = np.random.default_rng(2)
+    rates = rng.normal(size=(5, freedoms))
+    ways = np.array(list_ways(rates))
+    signs = np.sign(np.round(ways @ rates.T, 9))
+    assert len(ways) == count == len(np.unique(signs, axis=0))
+    # Any acceleration is of one of these ways.
+    for way in rng.normal(size=(50, freedoms)):
+        assert (np.sign(rates @ way) == signs).all(axis=1).sum() == 1
+
+
+def test_what_limits_forbid_at_rest_is_refused_at_once() -> None:
+    problem = landing()
+    z = scale_state(problem.start, problem.scene.scales)
+    formation = in_own_units(problem).phases[0].formation
+    # Torques of 2 N m press a heptagon of 2 N with less than 100 N.
+    blocked = find_block(formation, z, 50.0)
+    assert blocked is not None and blocked.contact in formation.names and blocked.short > 1.0
+
+
+def test_a_finger_that_would_have_to_pull_is_named() -> None:
+    """All contacts of the flip would have to press with twenty times the weight."""
+    problem = landing()
+    start = trace_phases(problem)[-1].end
+    feeble = problem.with_(epsilon=40.0)
+    with pytest.raises(InfeasibleError, match="no motion begins in any contact mode: c_n of v"):
+        plan_phases(feeble, feeble.phases[4:], start, COARSE, explained=False)
+    assert plan_landing(time_intervals=6)
+
+
+def test_one_contact_pushes_one_way_unless_the_centroid_passes_above_it() -> None:
+    """About the vertex that touches it is weight alone that turns, whatever friction does."""
+    table = dict(read_problem(str(FOLDER / "square.toml")).table)
+    phase = {"contacts": ["v0-palm"], "until": {"phi_deg": 5.0}}
+    problem = build_problem({**table, "phases": [phase]})
+    vertex = problem.scene.polygon.vertices[0]
+    upright = -np.pi / 2 - np.arctan2(vertex[1], vertex[0])
+    for turns, one_way in (([0.1, 0.11], True), ([0.1, 0.0], False), ([0.1, -0.1], False)):
+        z = np.repeat(problem.start[None], len(turns), axis=0)
+        z[:, 2] = upright + np.array(turns)
+        for friction in (0.1, 1.0):
+            formation = problem.with_(friction=friction).phases[0].formation
+            assert pushes_one_way(formation, z) == one_way
+    with pytest.raises(InfeasibleError, match="v0-palm can only push the object one way"):
+        plan_phases(problem, problem.phases, problem.start, COARSE, explained=False)
+    assert not pushes_one_way(landing().phases[0].formation, landing().start[None])
+
+
+@pytest.mark.parametrize("ends", [False, True])
+@pytest.mark.parametrize("phase", [0, 3])
+def test_planner_and_linear_programme_agree_on_what_rests(phase: int, ends: bool) -> None:
+    """As epsilon grows, both find that nothing moves from the same value on."""
+    problem = landing()
+    curve = trace_phases(problem)[phase]
+    z = curve.end if ends else curve.evaluate(np.zeros(1)).z[0]
+    cell, scene = problem.phases[phase], problem.scene
+    low, high = 0.0, 200.0
+    own, scaled = in_own_units(problem), scale_state(z, problem.scene.scales)
+    while high - low > 1e-3:
+        middle = (low + high) / 2
+        held = find_block(own.phases[phase].formation, scaled, middle, ends)
+        low, high = (middle, high) if held is None else (low, middle)
+    force = scene.scales.force
+    assert rest_margin(scene, cell, force * (high + 0.01), z, ends) < 0.0
+    assert rest_margin(scene, cell, force * (low - 0.01), z, ends) > -1e-9
+
+
+def test_what_touches_and_is_none_of_the_contacts_may_only_open() -> None:
+    problem = landing()
+    phase, z = problem.phases[0], problem.start
+    assert list_others(problem.scene, phase, z) == []
+    fewer = Formation(problem.scene, phase.formation.contacts[1:])
+    lifted = replace(phase, formation=fewer)
+    (other,) = list_others(problem.scene, lifted, z)
+    assert abs(other.gap[0]) < 1e-9
+    assert rest_margin(problem.scene, lifted, 1e3, z) < 0.0

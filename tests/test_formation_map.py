@@ -1,31 +1,73 @@
+"""Maps of formations, straight paths through cells, borders that are passed, and traced curves."""
+
 from __future__ import annotations
 
 import copy
 import math
 import tomllib
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from crossing import hexagon, measure_fingers
+from crossing import hexagon, measure_centres, measure_fingers, place_links
 from once import once
-from plane import finger_gap, make_scene, place_corners, point_to_segment
-from shipped import HEPTAGON
+from plane import (
+    SQUARE,
+    convex_polygon,
+    finger_gap,
+    make_finger,
+    make_formation,
+    make_scene,
+    place_corners,
+    point_to_segment,
+    rotate,
+)
+from shipped import HEPTAGON, IMPACTS, LANDING, problem_of, solved
+from shipped import SQUARE as BOX_FILE
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
-from wholearm.contacts.closing import close_finger, close_fingers, contact_table, first_contact
+from wholearm.contacts.closing import (
+    close_finger,
+    close_fingers,
+    contact_table,
+    first_contact,
+    measure_gap,
+)
+from wholearm.contacts.closing import (
+    place as place_labels,
+)
+from wholearm.contacts.contact_limits import (
+    FINGERS_TOUCH,
+    build_apart,
+    build_finger_gap,
+    evaluate_finger_gap,
+)
+from wholearm.contacts.elemental import build_features, parse_contact
 from wholearm.contacts.formation import Formation
+from wholearm.geometry.arcs import find_on, join, take
 from wholearm.geometry.curve import Curve
+from wholearm.geometry.tracing import trace_curve, trace_phases
 from wholearm.mapping.borders import NOWHERE, Window, label_cells
 from wholearm.mapping.formation_list import list_formations
 from wholearm.mapping.formation_map import CROSSED, Border, FormationMap, build_map, choose_window
-from wholearm.problem.definition import Problem
+from wholearm.planning.lower_bound.lower_bound import look_along
+from wholearm.planning.lower_bound.speed_sweep import NoMotionError
+from wholearm.problem.definition import End, Problem, Until
+from wholearm.problem.goal import Goal
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.scene.model import Scene
+from wholearm.search.border_limits import estimate_duration, find_border_limits
+from wholearm.search.edges import Link, cut_curve, time_parts
+from wholearm.search.places import RoadmapPlace, is_at, list_formations_at, make_place, unit_steps
+from wholearm.search.roadmap import BESIDE, Rays, Roadmap, can_start, shoot, time_paths
+from wholearm.search.times import time_borders
 
 TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
 WINDOW = Window((-0.16, 0.16), (np.radians(-75.0), np.radians(30.0)))
@@ -459,3 +501,485 @@ def test_command_names_bad_arguments(
     captured = capsys.readouterr()
     assert words in captured.err and captured.err.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+ROUNDING = 1e-15
+
+
+def random_scene(rng: np.random.Generator, radius: float, count: int = 5) -> Scene:
+    """One link whose length is between a part and twice of the object's size."""
+    length = rng.uniform(0.03, 0.2)
+    scene = make_scene(convex_polygon(rng, count), length=length, radius=radius, base=0.05)
+    return replace(scene, fingers_collide=False)
+
+
+def link_gaps(scene: Scene, finger: int, z: Array) -> Array:
+    return finger_gap(scene, z[:, :3], finger, z[:, 3 + finger])
+
+
+def approach(rng: np.random.Generator, scene: Scene, finger: int) -> Array:
+    """A place where a corner or an edge is within 2 mm of some point of a link's outline."""
+    link, phi = scene.fingers[finger], rng.uniform(-np.pi, np.pi)
+    corners = rotate(phi, scene.polygon.vertices)
+    one, other = corners[[k := int(rng.integers(len(corners))), k - 1]]
+    on_edge = one + np.clip(rng.uniform(-0.5, 1.0), 0, 1) * (other - one)
+    away = np.arctan2(*-on_edge[::-1]) + rng.uniform(-0.5, 0.5)
+    share = np.clip(rng.uniform(-0.5, 1.5), 0, 1)
+    lean = np.pi / 2 if 0 < share < 1 else rng.uniform(np.pi / 2, np.pi)
+    angle = away + rng.choice([-1, 1]) * lean + (np.pi if share == 1 else 0.0)
+    on_axis = np.asarray(link.base) + share * link.length * np.array([np.cos(angle), np.sin(angle)])
+    heading = np.array([np.cos(away), np.sin(away)])
+    at = on_axis + (link.radius + rng.uniform(-2e-3, 4e-3)) * heading - on_edge
+    return np.array([*at, phi, angle, angle])
+
+
+def limits_of(formation: Formation, finger: int, values: Array) -> dict[str, float]:
+    """Values of the limits that are about one finger and the object."""
+    words = f"finger {finger + 1}"
+    return {
+        limit.text: value
+        for limit, value in zip(formation.limits, values.tolist(), strict=True)
+        if words in limit.text
+    }
+
+
+@pytest.mark.parametrize("finger", [0, 1])
+@pytest.mark.parametrize("radius", [0.0, 0.004, 0.02])
+def test_a_free_link_and_the_object_overlap_where_a_limit_says_so(
+    radius: float, finger: int
+) -> None:
+    """At random all around each other: limits are positive if, and only if, the bodies are apart.
+
+    The object is pushed to within a few millimetres of the link, the distances of which are
+    measured by plain geometry.
+    """
+    rng = np.random.default_rng([finger, int(1e3 * radius)])
+    broken: set[str] = set()
+    seen = {True: 0, False: 0}
+    for _ in range(3):
+        scene = random_scene(rng, radius, int(rng.integers(3, 9)))
+        formation = make_formation(scene, "v0-palm")
+        z = np.array([approach(rng, scene, finger) for _ in range(250)])
+        values = formation.evaluate_limits(z)
+        for gap, row in zip(link_gaps(scene, finger, z), values, strict=True):
+            limits = limits_of(formation, finger, row)
+            text = min(limits, key=limits.__getitem__)
+            least = limits[text]
+            assert least > 0 if gap > ROUNDING else least < 0, (text, gap, least)
+            seen[gap > ROUNDING] += 1
+            broken |= {text.split(maxsplit=1)[1] for text, value in limits.items() if value < 0}
+    assert min(seen.values()) > 100
+    name = f"finger {finger + 1}"
+    expected = {f"touches {part}{name}" for part in ("", "the far side of ", "the tip of ")}
+    assert broken == expected | {f"touches the joint of {name}"}
+
+
+def hold(rng: np.random.Generator, scene: Scene, name: str) -> Array:
+    """A place where a contact of a link touches, the object turned by any angle."""
+    contact = parse_contact(name, scene)
+    assert contact.finger is not None
+    link, (angle, phi) = scene.fingers[contact.finger], rng.uniform(-np.pi, np.pi, 2)
+    axis = np.array([np.cos(angle), np.sin(angle)])
+    corners = rotate(phi, scene.polygon.vertices)
+    one, other = corners[[contact.index, (contact.index + 1) % len(corners)]]
+    share, normal, on_body = 1.0, rotate(rng.uniform(-np.pi / 2, np.pi / 2), axis), one
+    if contact.surface == "finger":
+        share = rng.uniform(0.02, 0.98)
+        normal = rotate(np.pi / 2 if contact.finger == 0 else -np.pi / 2, axis)
+    elif contact.feature == "e":
+        normal = rotate(np.pi / 2, other - one) / np.hypot(*(other - one))
+        on_body = one + rng.uniform(0.02, 0.98) * (other - one)
+    at = np.asarray(link.base) + share * link.length * axis + link.radius * normal - on_body
+    return np.array([*at, phi, angle, angle])
+
+
+@pytest.mark.parametrize("name", ["v1-finger1", "v1-finger2", "e1-tip1", "e1-tip2", "v1-tip2"])
+@pytest.mark.parametrize("radius", [0.0, 0.004, 0.02])
+def test_a_link_that_touches_overlaps_elsewhere_where_a_limit_says_so(
+    radius: float, name: str
+) -> None:
+    if radius == 0 and name.startswith("v1-tip"):
+        return  # A pointed tip has no arc.
+    finger = int(name[-1]) - 1
+    rng = np.random.default_rng([finger, int(1e3 * radius), len(name)])
+    seen = {True: 0, False: 0}
+    for _ in range(3):
+        scene = random_scene(rng, radius, int(rng.integers(3, 9)))
+        formation = make_formation(scene, name)
+        z = np.array([hold(rng, scene, name) for _ in range(56)])
+        assert np.abs(formation.evaluate(z, z).C).max() < 1e-14
+        # A little smaller, the object touches nothing where it only touched.
+        body = replace(scene.polygon, points=(1 - 1e-6) * scene.polygon.vertices)
+        smaller = replace(scene, polygon=body)
+        every = zip(z, formation.evaluate_limits(z), link_gaps(smaller, finger, z), strict=True)
+        for place, values, gap in every:
+            least = min(limits_of(formation, finger, values).values())
+            clear = bool(gap > (-1e-7 if radius else 0.0))
+            assert clear or least < 1e-7, (place, least, gap)
+            # An object behind a pointed link, which has no thickness, overlaps nothing.
+            thick = radius > 0 or name.startswith("e")
+            assert not (clear and thick and least < -2e-3), (place, least)
+            seen[clear] += 1
+    assert min(seen.values()) > 10
+
+
+@pytest.mark.parametrize("radius", [0.0, 0.01])
+def test_the_gap_of_link_and_object_is_the_distance_measured(radius: float) -> None:
+    rng = np.random.default_rng(int(1e3 * radius))
+    for finger in (0, 1):
+        scene = random_scene(rng, radius, 6)
+        function = ca.Function("apart", [build_features(scene).z], [build_apart(scene, finger)])
+        z = np.array([approach(rng, scene, finger) for _ in range(100)])
+        z[:, :2] += rng.uniform(-0.01, 0.01, (100, 2))
+        measured = link_gaps(scene, finger, z)
+        # As far inside as the link's middle, the distance measured ends.
+        outside = measured > -radius + 1e-9
+        found = function(z.T).full()[0]
+        np.testing.assert_allclose(found[outside], measured[outside], atol=1e-14)
+        assert (found[~outside] <= 0).all() and outside.sum() > 30 and (~outside).sum() > 5
+
+
+COUNT = 400
+
+
+def random_hands(seed: int, count: int = 12) -> list[Scene]:
+    """Hands whose links differ in base, length and radius."""
+    rng = np.random.default_rng(seed)
+    hands = []
+    for _ in range(count):
+        right = make_finger([rng.uniform(0.01, 0.1), rng.uniform(-0.05, 0.02)])
+        left = make_finger([rng.uniform(-0.1, -0.01), rng.uniform(-0.05, 0.02)])
+        fingers = [
+            replace(f, length=rng.uniform(0.05, 0.25), radius=rng.choice([0.0, 0.004, 0.02]))
+            for f in (right, left)
+        ]
+        hands.append(replace(make_scene(SQUARE), fingers=(fingers[0], fingers[1])))
+    return hands
+
+
+def random_angles(seed: int, count: int = COUNT) -> Array:
+    z = np.zeros((count, 5))
+    z[:, 3:] = np.random.default_rng(seed).uniform(-np.pi, np.pi, (count, 2))
+    return z
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_apart_the_gap_is_the_distance_less_both_radii(seed: int) -> None:
+    seen = np.zeros(2, dtype=int)
+    for scene in random_hands(seed):
+        z = random_angles(seed)
+        distance, crossed = measure_centres(scene, z)
+        gap = evaluate_finger_gap(scene, z) + sum(link.radius for link in scene.fingers)
+        np.testing.assert_allclose(gap[~crossed], distance[~crossed], atol=1e-14)
+        assert (gap[crossed] <= ROUNDING).all()
+        seen += [crossed.sum(), (~crossed).sum()]
+    assert seen.min() > 100
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_apart_the_gap_is_the_least_distance_of_sampled_points(seed: int) -> None:
+    share = np.linspace(0.0, 1.0, 201)[:, None]
+    for scene in random_hands(seed, 4):
+        z = random_angles(seed, 25)
+        for gap, one, other in zip(
+            evaluate_finger_gap(scene, z), *place_links(scene, z), strict=True
+        ):
+            points = [ends[0] + share * (ends[1] - ends[0]) for ends in (one, other)]
+            least = np.linalg.norm(points[0][:, None] - points[1], axis=2).min()
+            least -= sum(link.radius for link in scene.fingers)
+            # Samples are a hundredth of a link apart at most: no nearer than the links themselves.
+            spacing = max(link.length for link in scene.fingers) / 200
+            assert max(gap, -sum(f.radius for f in scene.fingers)) <= least + 1e-14
+            assert least <= max(gap, -sum(f.radius for f in scene.fingers)) + spacing
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_crossed_the_gap_is_minus_the_least_push_that_parts(seed: int) -> None:
+    """The separation along 3600 directions, the largest of which is the gap."""
+    angles = np.linspace(0.0, 2 * np.pi, 3600, endpoint=False)
+    directions = np.column_stack([np.cos(angles), np.sin(angles)])
+    deep = 0
+    for scene in random_hands(seed, 6):
+        z = random_angles(seed + 10, 60)
+        one, other = place_links(scene, z)
+        apart = (other @ directions.T).min(axis=1) - (one @ directions.T).max(axis=1)
+        gap = evaluate_finger_gap(scene, z)
+        expected = apart.max(axis=1) - sum(link.radius for link in scene.fingers)
+        assert (gap >= expected - 1e-14).all()
+        reach = sum(link.length for link in scene.fingers) + 0.3
+        np.testing.assert_allclose(gap, expected, atol=reach * np.pi / 3600)
+        deep += int((apart.max(axis=1) < -0.01).sum())
+    assert deep > 10
+
+
+def test_apart_the_gradient_is_that_of_differences_and_continuous() -> None:
+    scene, step = make_scene(SQUARE, lengths=(0.18, 0.13)), 1e-6
+    z = random_angles(3)
+    z = z[evaluate_finger_gap(scene, z) > 1e-3]
+    features = build_features(scene)
+    gradient = ca.Function("g", [features.z], [ca.jacobian(build_finger_gap(scene), features.z)])
+    values = gradient(z.T).full().reshape(1, -1, 5)[0]
+    for k, unit in enumerate(step * np.eye(5)):
+        rise = evaluate_finger_gap(scene, z + unit) - evaluate_finger_gap(scene, z - unit)
+        # Where the nearest points pass an end of a link the second derivative steps.
+        np.testing.assert_allclose(values[:, k], rise / (2 * step), atol=1e-4 * 0.18)
+    assert np.abs(values[:, :3]).max() == 0
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_gap_is_the_same_mirrored(seed: int) -> None:
+    """Mirroring swaps the fingers."""
+    for scene in random_hands(seed):
+        right, left = (
+            replace(link, base=np.asarray(link.base) * [-1.0, 1.0]) for link in scene.fingers[::-1]
+        )
+        z = random_angles(seed, 50)
+        swapped = np.hstack([z[:, :3], np.pi - z[:, [4, 3]]])
+        gaps = evaluate_finger_gap(replace(scene, fingers=(right, left)), swapped)
+        np.testing.assert_allclose(gaps, evaluate_finger_gap(scene, z), atol=1e-13)
+
+
+def test_ends_that_coincide_touch() -> None:
+    """Two pointed links that meet at their tips."""
+    scene = make_scene(SQUARE, base=0.06, depth=0.0, length=0.1, radius=0.0)
+    z = np.zeros((1, 5))
+    z[0, 3:] = np.arccos(-0.6), np.arccos(0.6)
+    assert evaluate_finger_gap(scene, z) == pytest.approx(0.0, abs=1e-14)
+    features = build_features(scene)
+    hessian, gradient = ca.hessian(build_finger_gap(scene), features.z)
+    values = ca.Function("h", [features.z], [hessian, gradient])(z[0])
+    assert all(np.isfinite(value.full()).all() for value in values)
+
+
+def test_the_gap_is_a_limit_of_every_formation() -> None:
+    scene = make_scene(SQUARE)
+    for names in ("v0-palm v1-palm", "v0-palm v2-finger1 e3-tip2"):
+        formation = make_formation(scene, names)
+        (index,) = [k for k, e in enumerate(formation.limits) if e.text == FINGERS_TOUCH]
+        assert formation.limits[index].gained is None
+        z = random_angles(5, 20)
+        values = formation.evaluate_limits(z)[:, index]
+        np.testing.assert_allclose(values, evaluate_finger_gap(scene, z), atol=ROUNDING)
+
+
+def test_fingers_in_different_planes_pass_each_other() -> None:
+    scene = replace(make_scene(SQUARE), fingers_collide=False)
+    formation = make_formation(scene, "v0-palm v1-palm")
+    assert FINGERS_TOUCH not in [limit.text for limit in formation.limits]
+
+
+PARTS = 50
+
+
+@cache
+def around_the_start() -> tuple[RoadmapPlace, Rays]:
+    problem = problem_of(BOX_FILE)
+    own = make_place(problem.scene, problem.start)
+    return own, shoot([own], problem.epsilon)
+
+
+def test_rays_stay_in_a_cell_of_the_place_until_a_contact_is_gained() -> None:
+    own, rays = around_the_start()
+    scene, table = own.scene, contact_table(own.scene)
+    cells = [cell.contacts for cell in list_formations_at(own, 3)]
+    assert len(np.unique(rays.gained)) > 1
+    for label, gained in zip(rays.labels, rays.gained, strict=True):
+        assert tuple(table[k] for k in label) in cells
+        assert table[gained] not in own.contacts
+    parts = np.arange(1, PARTS + 1) / PARTS
+    poses = rays.starts[:, None] + parts[:, None] * rays.runs[:, None]
+    labels = label_cells(scene, *poses.reshape(-1, 2).T)[:, [0, 2, 4]]
+    assert (labels.reshape(len(poses), -1, 3) == rays.labels[:, None]).all()
+
+
+def test_rays_end_right_before_what_they_gain_touches() -> None:
+    own, rays = around_the_start()
+    scene = own.scene
+    before = measure_gap(scene, rays.gained, place_labels(scene, rays.labels, rays.ends))
+    assert (before > 0).all()
+    lengths = np.linalg.norm(rays.runs / unit_steps(scene), axis=1)[:, None]
+    ends = rays.ends + BESIDE * rays.runs / lengths
+    assert (measure_gap(scene, rays.gained, place_labels(scene, rays.labels, ends)) < 0).all()
+
+
+def test_no_way_is_faster_with_more_to_press() -> None:
+    own, rays = around_the_start()
+    epsilon = problem_of(BOX_FILE).epsilon
+    times, harder = (
+        time_paths(own.scene, least, rays.labels, rays.starts, rays.ends)
+        for least in (epsilon, 4 * epsilon)
+    )
+    assert np.isfinite(times).any() and (harder >= times * (1 - 1e-12)).all()
+    one = time_paths(own.scene, epsilon, rays.labels[:1], rays.starts[:1], rays.ends[:1])
+    assert one[0] == pytest.approx(times[0], rel=1e-9)
+
+
+def test_only_ways_that_can_be_set_out_on_have_times() -> None:
+    own, rays = around_the_start()
+    epsilon = problem_of(BOX_FILE).epsilon
+    times = time_paths(own.scene, epsilon, rays.labels, rays.starts, rays.ends)
+    assert can_start(own.scene, epsilon, rays.labels, rays.starts, rays.runs).all()
+    assert np.isfinite(times).any()
+    assert not can_start(own.scene, 1e3, rays.labels, rays.starts, rays.runs).any()
+    assert np.isinf(time_paths(own.scene, 1e3, rays.labels, rays.starts, rays.ends)).all()
+
+
+def look(curve: Curve, epsilon: float) -> float:
+    try:
+        return look_along((curve,), epsilon, 100)
+    except NoMotionError:
+        return math.inf
+
+
+def make_border(curve: Curve) -> Border:
+    z = curve.evaluate(np.linspace(0, curve.length, 12)).z
+    still = np.zeros(len(z), dtype=bool)
+    return Border(curve.formation.contacts, (None, 0), "x", z[:, [0, 2]], z, still, still, still)
+
+
+def test_times_of_borders_are_those_of_sweeps_along_traced_curves() -> None:
+    problem = problem_of(HEPTAGON)
+    curves = trace_phases(problem)
+    expected = []
+    for forth in curves:
+        way = -forth.evaluate(np.array([forth.length])).z_s[0]
+        back = cut_curve(trace_curve(forth.formation, forth.end, way, Until()), forth.length)
+        expected.append([look(own, problem.epsilon) for own in (forth, back)])
+    found = time_borders(problem, [make_border(curve) for curve in curves])
+    # Twelve points and twenty-four intervals leave an error of a few in a hundred.
+    assert found == pytest.approx(np.array(expected), rel=0.04)
+    assert np.isfinite(found[:, 0]).all()
+
+
+def test_a_chain_of_impacts_is_bounded_as_its_plan_takes() -> None:
+    problem = problem_of(IMPACTS)
+    chart, phases = Roadmap(problem, 0.1), problem.phases[:3]
+    until = [str(phase.until) for phase in phases]
+    (own,) = (
+        link
+        for chain, link in chart.pass_on(make_place(problem.scene, problem.start))
+        if isinstance(link, Link) and [str(step.until) for step in link.steps] == until
+    )
+    assert [step.end for step in own.steps] == [End.IMPACT, End.IMPACT, End.REST]
+    took = sum(motion.duration for motion in solved(IMPACTS).trajectory.motions[:3])
+    assert own.bound <= took * (1 + 1e-6)
+    assert own.duration == pytest.approx(took, rel=1e-2)
+    # A stop at each crossing takes longer, by what the plan says that the impacts save.
+    alone, place = 0.0, make_place(problem.scene, problem.start)
+    for phase in phases:
+        (link,) = (
+            link
+            for border, link in chart.follow(place)
+            if isinstance(link, Link)
+            and set(border.formation.contacts) == set(phase.formation.contacts)
+            and link.steps[0].until == phase.until
+        )
+        alone, place = alone + link.duration, link.stop
+    assert alone > 1.2 * own.duration
+
+
+def test_no_chain_leads_through_an_impact_that_is_not_possible() -> None:
+    problem = problem_of(HEPTAGON)
+    chart = Roadmap(problem, 0.1)
+    place = make_place(problem.scene, problem.start)
+    # With little friction there the impact onto v3-finger1 would tip edge 0 off the palm.
+    assert [
+        chain for chain, _ in chart.pass_on(place) if str(chain.steps[0].until) == "v3-finger1"
+    ] == []
+
+
+def test_chains_are_followed_a_border_at_a_time_to_where_all_of_them_lead() -> None:
+    problem, goal = problem_of(IMPACTS), Goal(flush=1)
+    chart = Roadmap(problem, 0.1)
+    place = make_place(problem.scene, problem.start)
+    waiting, steps = list(chart.set_out(place, goal)), set()
+    while waiting:
+        own = waiting.pop()
+        if isinstance(own.link, Link):
+            steps.add(own.link.steps)
+            waiting += chart.go_on(own.chain, goal) if own.whole else []
+    every = [link for _, link in chart.list_along(place, goal) if isinstance(link, Link)]
+    assert steps == {link.steps for link in every} and len(steps) > 3
+
+
+def test_parts_of_a_border_take_as_long_together_as_one_by_one() -> None:
+    problem = problem_of(IMPACTS)
+    chart, shares = Roadmap(problem, 0.1), np.array([0.2, 0.5, 0.8])
+    for border in chart.trace(make_place(problem.scene, problem.start)):
+        times = time_parts(border, shares)
+        for share, took in zip(shares, times, strict=True):
+            part = cut_curve(border.curve, share * border.curve.length)
+            limits = find_border_limits(part, *chart.terms)
+            alone = limits.closed or limits.begins or limits.ends or estimate_duration([limits])
+            assert np.isfinite(took) == (not isinstance(alone, str))
+            assert isinstance(alone, str) or took == pytest.approx(alone, rel=0.02)
+
+
+def test_a_landing_is_led_to_where_the_goal_is() -> None:
+    problem, goal = problem_of(LANDING), Goal(flush=1, x=0.022)
+    chart, curves = Roadmap(problem, 0.1), trace_phases(problem)
+    place = make_place(problem.scene, curves[3].end)
+    contacts = set(problem.phases[4].formation.contacts)
+    ((index, border),) = (
+        (k, own)
+        for k, (own, _) in enumerate(chart.follow(place))
+        if set(own.formation.contacts) == contacts
+    )
+    landings = chart.land_at(chart.release(border, index), goal)
+    assert landings
+    for link in landings:
+        assert is_at(link.stop, goal) and str(link.steps[-1].until) == "v2-palm at x = 0.022 m"
+        assert [step.end for step in link.steps] == [End.SMOOTH, End.REST]
+        gaps = Formation(problem.scene, link.stop.contacts).evaluate(*[link.stop.z[None]] * 2).C
+        assert np.abs(gaps).max() < 1e-8 * problem.scene.scales.length
+    assert chart.land_at(chart.release(border, index), Goal(flush=1)) == []
+
+
+CURVES = trace_phases(problem_of(HEPTAGON))
+
+
+def whole_of(curve: Curve) -> Curve:
+    """The curve through a place inside another one, as it is traced both ways from there."""
+    at = curve.evaluate(np.array([0.4 * curve.length]))
+    back, forth = (
+        trace_curve(curve.formation, at.z[0], sign * at.z_s[0], Until()) for sign in (-1, 1)
+    )
+    return join(back, forth)
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_parts_of_a_joined_curve_are_what_is_traced_from_there(index: int) -> None:
+    whole = whole_of(CURVES[index])
+    length = whole.formation.scene.scales.length
+    for share in (0.0, 0.3, 0.7, 1.0):
+        s = share * whole.length
+        at = whole.evaluate(np.array([s]))
+        for stop, sign in ((whole.length, 1), (0.0, -1)):
+            if abs(stop - s) < 0.1 * whole.length:
+                continue
+            part = take(whole, s, stop)
+            traced = trace_curve(whole.formation, at.z[0], sign * at.z_s[0], Until())
+            # Panels are resolved to 1e-13, and ends are as sharp as limits are met, to 3e-10.
+            assert part.length == pytest.approx(traced.length, abs=1e-9 * length)
+            places = np.linspace(0, 1, 50) * min(part.length, traced.length)
+            own, other = part.evaluate(places), traced.evaluate(places)
+            np.testing.assert_allclose(own.z, other.z, atol=1e-11)
+            np.testing.assert_allclose(own.z_s, other.z_s, atol=1e-10)
+            np.testing.assert_allclose(part.start, at.z[0], atol=1e-12)
+            assert len(part.segments) == len(traced.segments)
+            for mine, theirs in zip(part.segments, traced.segments, strict=True):
+                assert mine.stop == pytest.approx(theirs.stop, abs=1e-8 * length)
+                np.testing.assert_array_equal(mine.Xi, theirs.Xi)
+                np.testing.assert_array_equal(mine.sigma, theirs.sigma)
+
+
+def test_places_on_a_curve_are_found_and_others_are_not() -> None:
+    curve = CURVES[0]
+    length = curve.formation.scene.scales.length
+    for s in np.array([0.0, 0.123, 0.77, 1.0]) * curve.length:
+        z = curve.evaluate(np.array([s])).z[0]
+        found = find_on(curve, z)
+        assert found is not None and found == pytest.approx(s, abs=1e-10 * length)
+        assert find_on(curve, z + 1e-6 * length * np.array([0, 1, 0, 0, 0])) is None
+    beyond = curve.end + 1e-3 * length * curve.evaluate(np.array([curve.length])).z_s[0]
+    assert find_on(curve, beyond) is None

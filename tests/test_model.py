@@ -1,18 +1,38 @@
+"""Scenes at the ends of their ranges are planned, or refused with a reason; nothing warns."""
+
 from __future__ import annotations
 
+import copy
 import math
+import re
 from dataclasses import fields, replace
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from plane import SQUARE, convex_polygon, cross, make_finger, make_scene, rotate
+from retelling import RETELLINGS, Answer, Retelling, answer, compare
+from shipped import HEPTAGON
 from wholearm.common.arrays import Array
-from wholearm.common.errors import LONGEST, InputError, name_source, require_number
+from wholearm.common.errors import (
+    LONGEST,
+    InfeasibleError,
+    InputError,
+    JammingError,
+    name_source,
+    require_number,
+)
 from wholearm.common.fields import keys_of
+from wholearm.geometry.path_guess import load
+from wholearm.geometry.tracing import trace_phases
+from wholearm.planning.plan import solve
+from wholearm.problem.definition import Problem
+from wholearm.problem.read import build_problem
 from wholearm.scene.model import Finger, Friction, Polygon, Scene
+from wholearm.verification.verify import verify
 
 
 @pytest.mark.parametrize("value", [-1.0, math.nan, True, "1"])
@@ -277,3 +297,130 @@ def test_polygons_beyond_all_reason(points: Any, text: str) -> None:
     with pytest.raises(InputError, match=text) as caught:
         Polygon(points, 1.0)
     assert caught.value.key.startswith("object.vertices")
+
+
+TABLE = dict(load(str(HEPTAGON)).table)
+
+
+def edited(friction: dict[str, float] | None = None, **joints: float) -> Problem:
+    """The first phase of the heptagon with other numbers, those of joints or at the top."""
+    table: dict[str, Any] = copy.deepcopy(TABLE)
+    table["phases"] = table["phases"][:1]
+    table["friction"] |= friction or {}
+    for key, value in joints.items():
+        for part in (table,) if key in table else table["fingers"].values():
+            part[key] = value
+    return build_problem(table)
+
+
+@pytest.mark.parametrize(
+    "joints",
+    [
+        {"viscous": 16.0},
+        {"speed_limit": 0.1},
+        {"inertia": 1e-9, "viscous": 0.0},
+        {"torque_limit": 350.0},
+        {"gravity": 100.0, "torque_limit": 20.0},
+    ],
+    ids=str,
+)
+def test_extreme_scenes_are_planned(joints: dict[str, Any]) -> None:
+    problem = edited(**joints)
+    # Links a thousand times as heavy let other contact forces be possible than the planned ones.
+    plan = solve(problem, intervals=20, replay=False, uniqueness_margin=-5.0)
+    report = verify(problem, plan, uniqueness_margin=-5.0)
+    assert report.ok, report.failures
+
+
+def test_strong_drag_bounds_the_speed() -> None:
+    """Ten times the drag takes ten times as long: inertia does not matter any more."""
+    slow, slower = (solve(edited(viscous=drag), replay=False).value for drag in (2.3, 23.0))
+    assert slower / slow == pytest.approx(10.0, rel=1e-2)
+
+
+@pytest.mark.usefixtures("unadvised")
+def test_dry_friction_above_the_torque_limit_is_named() -> None:
+    with pytest.raises(InfeasibleError, match=r"torque limit of finger \d = 2 N m is .* short"):
+        solve(edited(dry=3.0), intervals=10)
+
+
+def test_friction_is_advised_where_it_is_the_cause(request: pytest.FixtureRequest) -> None:
+    """Each advised value does, and one halfway back to what is given does not."""
+    rough = {"palm": 0.35, "finger1": 0.35, "finger2": 0.35}
+    with pytest.raises(InfeasibleError, match="feasible with friction of palm = ") as caught:
+        solve(edited(rough), intervals=10)
+    advised = re.findall(r"friction of (\w+)( \d)? = ([\d.]+) instead of 0.35", str(caught.value))
+    assert advised
+    request.getfixturevalue("unadvised")
+    for part, number, value in advised:
+        key = part + number.strip()
+        solve(edited(rough | {key: float(value)}), intervals=10, replay=False)
+        with pytest.raises(InfeasibleError):
+            solve(edited(rough | {key: (float(value) + 0.35) / 2}), intervals=10)
+
+
+def test_jamming_says_which_friction_to_lower() -> None:
+    rough = {"palm": 3.0, "finger1": 0.3, "finger2": 0.3}
+    with pytest.raises(JammingError, match=r"jams at .*; feasible with friction of palm = ") as jam:
+        solve(edited(rough), intervals=10)
+    found = re.search(r"friction of palm = ([\d.]+) instead of 3", str(jam.value))
+    assert found is not None
+    (change,) = jam.value.changes
+    assert change.parameter.key == "friction.palm" and str(change) in str(jam.value)
+    solve(edited(rough | {"palm": float(found[1])}), intervals=10, replay=False)
+
+
+PROBLEMS = Path(__file__).parents[1] / "problems"
+CASES = [("heptagon_impact", 2, 20), ("box_rolling", 1, 20)]
+"""Problems, how many of their phases are planned, the last of them to rest, and intervals."""
+TELLINGS = [("time", telling) for telling in (RETELLINGS[1], *RETELLINGS[3:])]
+TELLINGS += [("effort", RETELLINGS[4]), ("margin", RETELLINGS[1])]
+"""Of other costs, the effort mirrored, which swaps the torques, and the margin in small units."""
+
+
+@pytest.fixture(scope="module", params=CASES, ids=[case[0] for case in CASES])
+def case(request: pytest.FixtureRequest) -> tuple[str, int, int]:
+    found: tuple[str, int, int] = request.param
+    return found
+
+
+@pytest.fixture(scope="module")
+def problem(case: tuple[str, int, int]) -> Problem:
+    name, phases, _ = case
+    table = copy.deepcopy(dict(load(str(PROBLEMS / f"{name}.toml")).table))
+    table["phases"] = table["phases"][:phases]
+    table["phases"][-1]["end"] = "rest"
+    return build_problem(table)
+
+
+@pytest.fixture(scope="module")
+def answers(case: tuple[str, int, int], problem: Problem) -> dict[str, Answer]:
+    goals = ("time", "effort", "margin")
+    return {goal: answer(problem, goal, intervals=case[2], replay=False) for goal in goals}
+
+
+@pytest.mark.parametrize("objective, telling", TELLINGS, ids=lambda p: getattr(p, "name", p))
+def test_answers_do_not_depend_on_how_a_problem_is_told(
+    case: tuple[str, int, int],
+    problem: Problem,
+    answers: dict[str, Answer],
+    telling: Retelling,
+    objective: str,
+) -> None:
+    other = answer(telling.apply(problem), objective, telling, intervals=case[2], replay=False)
+    difference = compare(answers[objective], other)
+    assert difference.value < 1e-8 and difference.torques < 1e-7
+
+
+@pytest.mark.parametrize("telling", RETELLINGS, ids=lambda telling: telling.name)
+def test_a_retelling_changes_what_it_says(problem: Problem, telling: Retelling) -> None:
+    """Configurations at the ends of phases are those of the first telling, in other words."""
+    other = telling.apply(problem)
+    scale = np.array([telling.units.length] * 2 + [1.0] * 3)
+    for one, same in zip(trace_phases(problem), trace_phases(other), strict=True):
+        z = scale * one.end
+        if telling.mirrored:
+            z = np.array([-z[0], z[1], -z[2], np.pi - z[4], np.pi - z[3]])
+        turns = (same.end - z) / (2 * np.pi) * [0, 0, 0, 1, 1]
+        np.testing.assert_allclose(same.end - 2 * np.pi * np.round(turns), z, atol=1e-11 * scale[0])
+        assert same.length == pytest.approx(telling.units.length * one.length, rel=1e-11)

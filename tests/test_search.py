@@ -1,33 +1,62 @@
-"""Searches of routes, and changes of one number that open a way that is blocked."""
+"""Searches of routes, changes that open a way, and routes that are joined, chosen and refined."""
 
 from __future__ import annotations
 
+import copy
+import json
 import math
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from shipped import HEPTAGON, HEXAGON, problem_of
+import wholearm
+from plane import convex_polygon, make_scene
+from shipped import FOLDER, HEPTAGON, HEXAGON, problem_of
 from wholearm.cli.command import main
+from wholearm.common.arrays import Array
 from wholearm.common.errors import Change, InfeasibleError, InputError, Parameter, SolverError
 from wholearm.common.signals import OutOfTime
-from wholearm.contacts.closing import close_fingers
+from wholearm.contacts.closing import close_fingers, contact_table
 from wholearm.contacts.formation import Formation
+from wholearm.geometry.curve import Curve
+from wholearm.geometry.path_guess import guess_phase
 from wholearm.geometry.tracing import trace_phase
+from wholearm.mapping.borders import NOWHERE, flush_track, label_cells
+from wholearm.mapping.formation_list import (
+    Route,
+    describe_miss,
+    format_route,
+    list_formations,
+    split_leg,
+    tolerance,
+)
+from wholearm.planning.blocks import BlockPlan
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.result import load_plan
-from wholearm.problem.definition import Phase, Problem
+from wholearm.planning.result import Plan, load_plan
+from wholearm.problem.definition import Phase, Problem, Until
 from wholearm.problem.goal import Goal
 from wholearm.problem.read import build_problem
-from wholearm.search.astar import RoadmapRoute, RouteSearch
+from wholearm.search import route_choice as choosing
+from wholearm.search.astar import RoadmapRoute, RouteSearch, SearchRule
 from wholearm.search.cuts import Opening, link_changed, list_cut, list_cut_borders, list_openings
-from wholearm.search.edges import Link
+from wholearm.search.edge_plans import (
+    BackgroundTask,
+    Cache,
+    Lost,
+    PlannedLink,
+    join_route,
+    key_steps,
+)
+from wholearm.search.edges import EdgeStep, Link
+from wholearm.search.feasibility import Measured
 from wholearm.search.find_route import (
     choose_opening,
     explain,
@@ -41,7 +70,8 @@ from wholearm.search.find_route import (
 )
 from wholearm.search.places import list_formations_at, make_place
 from wholearm.search.result import bound_borders, describe_block
-from wholearm.search.roadmap import Roadmap, cross, go_to
+from wholearm.search.roadmap import Roadmap, cross, go_to, map_labels
+from wholearm.search.route_choice import FINEST, STEPS, Chooser, Found, RefinedPath, ReleaseSearch
 from wholearm.verification.verify import verify
 
 TABLE = {k: v for k, v in tomllib.loads(HEPTAGON.read_text()).items() if k != "phases"}
@@ -300,3 +330,483 @@ def test_fingers_that_cross_on_the_way_are_mounted_elsewhere(
 
     text, changes = find_hand(own, crossing, PlanOptions(), 0.0, end)
     assert changes == () and "not reached with 0 other" in text
+
+
+# Where plans come from does not depend on how accurate they are.
+OPTIONS = PlanOptions(accuracy=0.1, replay=False)
+
+
+def join(
+    links: tuple[Link, ...], kept: Cache, jobs: int, aside: BackgroundTask[int] | None = None
+) -> Plan:
+    own = [(link, list[Measured]()) for link in links]
+    plan = join_route(problem_of(HEPTAGON), own, OPTIONS, kept, lambda _: None, jobs, aside)
+    assert isinstance(plan, Plan), plan
+    return plan
+
+
+def test_links_planned_at_the_same_time_make_the_same_plan() -> None:
+    problem = problem_of(HEPTAGON)
+    search = RouteSearch(
+        Roadmap(problem, 0.1), make_place(problem.scene, problem.start), Goal(flush=6)
+    )
+    route = next(search.run())
+    assert len(route.links) > 1
+    kept: Cache = {}
+    asides = [BackgroundTask(lambda: 7) for _ in range(2)]
+    one, other = join(route.links, {}, 1, asides[0]), join(route.links, kept, 2, asides[1])
+    assert [own.result for own in asides] == [None, 7]
+    # Solves in another process may differ in the last bits, and by the solver's tolerance then.
+    assert one.duration == pytest.approx(other.duration, rel=1e-6)
+    assert one.trajectory.z[-1] == pytest.approx(other.trajectory.z[-1], abs=1e-6)
+    # What solving has cost is said of each phase, wherever it was done, and of plans kept as well.
+    again = join(route.links, kept, 1)
+    for mine, theirs, kept_one in zip(one.phases, other.phases, again.phases, strict=True):
+        assert mine.statistics.solves > 0 and mine.statistics.iterations > 0
+        assert theirs.statistics.iterations == kept_one.statistics.iterations
+
+
+PROBLEM = problem_of(HEPTAGON)
+PLACE, PHASE = make_place(PROBLEM.scene, PROBLEM.start), PROBLEM.phases[0]
+
+
+def make_steps(x: float) -> tuple[EdgeStep, ...]:
+    return (EdgeStep(PLACE.contacts, Until(coordinate="x", value=x)),)
+
+
+class Still(BlockPlan):
+    """A plan that ends where it starts."""
+
+    @property
+    def end(self) -> Array:
+        return self.start
+
+
+class Plans(dict[Any, Any]):
+    """Plans of every link, but of those with some steps, and what has been asked for."""
+
+    def __init__(self, without: tuple[EdgeStep, ...] = ()) -> None:
+        super().__init__()
+        self.without, self.asked = key_steps(without), list[Any]()
+
+    def __contains__(self, key: object) -> bool:
+        return True
+
+    def __getitem__(self, key: Any) -> Any:
+        self.asked.append(key[1])
+        if key[1] == self.without:
+            return "too short of force"
+        return PlannedLink((PHASE,), (Still((PHASE,), PROBLEM.start, 0, None, [], [], None),), ())
+
+
+def test_where_nothing_leads_on_another_landing_is_tried() -> None:
+    first = Link(PLACE, PLACE, make_steps(0.01), 1.0)
+    landing = Link(PLACE, PLACE, make_steps(0.02), 1.0, in_cell=True)
+    onward = Link(PLACE, PLACE, make_steps(0.03), 1.0)
+    ways = [Measured(1.0, make_steps(x), []) for x in (0.021, 0.022)]
+    plans = Plans(onward.steps)
+    links = [(first, []), (landing, ways), (onward, [])]
+    lost = join_route(PROBLEM, links, PlanOptions(), plans, lambda _: None)
+    assert isinstance(lost, Lost) and "too short of force" in lost
+    # The landing decides whether the border after it can be set out on, the border before does not.
+    assert lost.links == (landing, onward)
+    tried = [key for key in plans.asked if key not in (key_steps(first.steps), plans.without)]
+    assert tried == [key_steps(own) for own in (*(way.steps for way in ways), landing.steps)]
+
+
+def make_link(duration: float) -> Link:
+    steps = (EdgeStep(PLACE.contacts, Until(coordinate="x", value=duration)),)
+    return Link(PLACE, PLACE, steps, duration)
+
+
+class FoundRoutes:
+    """A search that finds some routes, each once, as long as they are within its limit."""
+
+    def __init__(self, routes: Sequence[RoadmapRoute]) -> None:
+        self.roadmap = SimpleNamespace(measured={}, others={}, joined={}, plans={}, refined=set())
+        self.limit, self.waiting = math.inf, list(routes)
+
+    def run(self, rule: SearchRule) -> Iterator[RoadmapRoute]:
+        for route in list(self.waiting):
+            if route.duration <= self.limit:
+                self.waiting.remove(route)
+                yield route
+
+
+def test_what_has_no_plan_neither_bounds_nor_is_tried_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    one, lost, good = (make_link(duration) for duration in (0.1, 0.2, 0.9))
+    routes = [RoadmapRoute((one, lost)), RoadmapRoute((lost, one, one)), RoadmapRoute((good, one))]
+    planned = list[Any]()
+
+    def join(problem: Any, links: Any, *rest: Any) -> Any:
+        planned.append(tuple(link for link, _ in links))
+        if lost in planned[-1]:
+            return Lost.at((lost,), "no plan")
+        return SimpleNamespace(value=1.0)
+
+    monkeypatch.setattr(choosing, "join_route", join)
+    chooser = Chooser(PROBLEM, [], FoundRoutes(routes), PlanOptions())  # type: ignore[arg-type]
+    chooser.run(1, lambda _: None)
+    # The second route has a link of the first one; the third is far longer than what had no plan.
+    assert planned == [routes[0].links, routes[2].links]
+    assert [route for _, route in chooser.made] == [routes[2]] and len(chooser.failures) == 1
+
+
+def plan_of(duration: float) -> Measured:
+    return Measured(duration, (), [])
+
+
+class Cell:
+    """Ways that take longer away from a best place, and none beyond an end."""
+
+    def __init__(self, best: int, end: int, moving: float | None = None, saved: float = 0) -> None:
+        self.best, self.end, self.moving, self.saved = best, end, moving, saved
+        self.tried: list[RefinedPath] = []
+
+    def __call__(self, way: RefinedPath) -> Found:
+        assert way not in self.tried
+        self.tried.append(way)
+        if way.move is None:
+            return "no guess leads to a plan" if self.moving is None else plan_of(self.moving)
+        if way.move < self.end:
+            return "no guess leads to a plan"
+        saved = 0.0 if way.straight else self.saved
+        return plan_of(1 + FINEST * abs(way.move - self.best) - saved)
+
+    def leave(self) -> list[Measured]:
+        return ReleaseSearch(self, plan_of(1 + FINEST * abs(self.best))).run()
+
+
+@pytest.mark.parametrize(("best", "end"), [(0, -1), (-7, -8), (5, -20), (-3, -3)])
+def test_a_border_is_left_where_that_is_best(best: int, end: int) -> None:
+    cell = Cell(best, end)
+    found, *others = cell.leave()
+    assert found.duration == pytest.approx(1, abs=1e-9)
+    assert all(own.duration >= found.duration for own in others)
+    assert RefinedPath(0) not in cell.tried
+
+
+def test_a_border_that_no_other_place_is_better_for_may_be_left_in_motion() -> None:
+    cell = Cell(-1, -20, moving=0.9)
+    found, *others = cell.leave()
+    assert cell.tried == [RefinedPath(-STEPS[0]), RefinedPath(STEPS[0]), RefinedPath(None)]
+    assert found.duration == 0.9 and len(others) == 3
+    # Where another place is better, that is gone on with.
+    other = Cell(-7, -20, moving=0.9)
+    assert other.leave()[0].duration == pytest.approx(1) and RefinedPath(None) not in other.tried
+
+
+PHI = np.radians(-35.0)
+
+
+def on_border(problem: Problem, phi: float) -> Array:
+    """Where edge 6 lies flush on finger 2 with vertex 1 on the palm, as in the flip's plan."""
+    track = flush_track(problem.scene, 1, 6, 1, np.array([phi]))
+    return np.array(track.pose(track.places)).ravel()
+
+
+@pytest.mark.parametrize("back", [False, True])
+def test_leg_through_cells_changes_one_contact_at_a_time(heptagon: Problem, back: bool) -> None:
+    scene = heptagon.scene
+    ends = [np.array([0.02, 0.3]), np.array([-0.08, -0.8])]
+    start, stop = ends[::-1] if back else ends
+    parts = split_leg(scene, start, stop)
+    assert len(parts) == 7
+    np.testing.assert_array_equal(parts[0].start, start)
+    np.testing.assert_allclose(parts[-1].stop, stop, atol=1e-12)
+    assert parts[-1].gained == () and parts[-1].coordinate == 0
+    for one, two in pairwise(parts):
+        np.testing.assert_allclose(one.stop, two.start, atol=1e-12)
+        assert set(two.contacts) - set(one.contacts) == set(one.gained)
+        z = close_fingers(scene, *one.stop[:, None]).z
+        both = Formation(scene, tuple({*one.contacts, *two.contacts}))
+        assert np.abs(both.evaluate(z, z).C).max() < 1e-9
+    for part in parts:
+        middle = (part.start + part.stop) / 2
+        label = label_cells(scene, *middle[:, None])[0]
+        table = contact_table(scene)
+        assert part.contacts == tuple(table[i] for i in label if i != NOWHERE)
+
+
+def test_leg_follows_a_border_that_both_ends_are_near(heptagon: Problem) -> None:
+    near = tolerance(heptagon.scene)
+    for share in (0.0, 0.9, -0.9):
+        ends = [on_border(heptagon, phi) + share * near for phi in (PHI, PHI + 0.15)]
+        (part,) = split_leg(heptagon.scene, *ends)
+        assert len(part.contacts) == 4 and part.coordinate == 1
+        for place, end in ((part.start, ends[0]), (part.stop, ends[1])):
+            np.testing.assert_allclose(place, on_border(heptagon, place[1]), atol=1e-12)
+            assert (np.abs(place - end) < near).all()
+
+
+def beside_border(problem: Problem, bulge: float) -> tuple[Array, Array]:
+    """A leg whose ends are three times the tolerance off a border that bulges by so many times."""
+    near = tolerance(problem.scene)[0]
+    for span in np.linspace(0.1, 0.6, 400):
+        start, stop = on_border(problem, PHI), on_border(problem, PHI + span)
+        away = ((start + stop) / 2 - on_border(problem, PHI + span / 2))[0]
+        if abs(away) > bulge * near:
+            break
+    aside = np.array([-np.sign(away) * 3.0 * near, 0.0])
+    return start + aside, stop + aside
+
+
+@pytest.mark.parametrize("bulge, crosses", [(4.0, False), (9.0, True)])
+def test_straight_leg_beside_a_curved_border(
+    heptagon: Problem, bulge: float, crosses: bool
+) -> None:
+    """Where it is less than the tolerance beyond the border, it stays in its cell."""
+    scene, leg = heptagon.scene, beside_border(heptagon, bulge)
+    on_finger_2 = label_cells(scene, *np.linspace(*leg, 300).T)[:, 4]
+    assert (np.diff(on_finger_2) != 0).sum() == 2
+    parts = split_leg(scene, *leg)
+    touched = [next(c for c in part.contacts if c.finger == 1) for part in parts]
+    changes = sum(one != two for one, two in pairwise(touched))
+    assert changes == (2 if crosses else 0)
+    assert touched[0] == touched[-1] == contact_table(scene)[on_finger_2[0]]
+
+
+def test_a_crossing_is_named_by_its_contacts(heptagon: Problem) -> None:
+    phi, x = heptagon.scene.polygon.flush_angle(0), -0.06368782401
+    words = r"crossing of borders at x = -63.69 mm.*, of v1-palm, v3-finger1, v0-finger2, v0-palm"
+    with pytest.raises(InputError, match=words):
+        split_leg(heptagon.scene, np.array([x - 0.01, phi - 0.1]), np.array([x + 0.01, phi + 0.1]))
+
+
+def test_near_miss_names_the_border_and_its_distance(heptagon: Problem) -> None:
+    scene, near = heptagon.scene, tolerance(heptagon.scene)
+    aside = np.array([near[0], 0.0])
+    start, stop = (on_border(heptagon, phi) + 2.0 * aside for phi in (PHI, PHI + 0.2))
+    text = describe_miss(scene, start, stop)
+    words = "e6 flush on finger 2", " up to -", "mm in x", "0.5 deg"
+    assert all(word in text for word in words)
+    assert describe_miss(scene, start + 10 * aside, stop + 10 * aside) == ""
+    phi = scene.polygon.flush_angle(0) + 3 * near[1]
+    palm = describe_miss(scene, np.array([0.045, phi]), np.array([0.0, phi]))
+    assert "e0 flush on the palm, is up to -1.5 deg" in palm
+
+
+def test_places_of_the_grid_have_their_labels_however_often_the_object_has_turned() -> None:
+    rng = np.random.default_rng(1)
+    scene = make_scene(convex_polygon(rng, 5))
+    grid = map_labels(scene)
+    poses = np.column_stack([rng.uniform(-0.3, 0.3, 200), rng.uniform(-9, 9, 200)])
+    count = np.rint((poses - [grid.least, 0.0]) / grid.steps)
+    nearest = [grid.least, 0.0] + count * grid.steps
+    labels = label_cells(scene, *nearest.T)[:, [0, 2, 4]]
+    seen = grid.labels[grid.look_up(poses)]
+    assert (seen == labels).all()
+    assert (labels != NOWHERE).any() and (labels == NOWHERE).any()
+
+
+HEPTAGON_TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
+FLAT = -1.984
+
+
+def write_table(table: dict[str, Any], path: str = "") -> str:
+    """A problem file's tables as TOML, without its phases."""
+    plain = {k: v for k, v in table.items() if not isinstance(v, dict) and k != "phases"}
+    lines = [f"{key} = {json.dumps(value)}" for key, value in plain.items()]
+    for key, value in table.items():
+        if isinstance(value, dict):
+            lines += [f"[{path}{key}]", write_table(value, f"{path}{key}.")]
+    return "\n".join(lines) + "\n"
+
+
+def load_pasted(table: dict[str, Any], route: Route, folder: Path) -> Problem:
+    """What loading gives when the list replaces what it names in a problem file."""
+    text = format_route(route)
+    kept = {key: value for key, value in table.items() if key not in tomllib.loads(text)}
+    path = folder / "pasted.toml"
+    path.write_text(write_table(kept) + text, encoding="utf-8")
+    return wholearm.load(str(path))
+
+
+def list_degrees(problem: Problem, *poses: tuple[float, float]) -> Route:
+    return list_formations(problem, *((x, np.radians(phi)) for x, phi in poses))
+
+
+def test_slide_is_listed_as_in_the_problem_file(heptagon: Problem) -> None:
+    text = format_route(list_degrees(heptagon, (0.045, FLAT), (-0.0637, FLAT)))
+    assert tomllib.loads(text)["phases"] == HEPTAGON_TABLE["phases"][:3]
+    assert "[start]" not in text
+    assert [line.split("#")[1][:5] for line in text.splitlines() if "[[" in line] == [
+        " 1: t",
+        " 2: t",
+        " 3: t",
+    ]
+
+
+def test_route_along_curved_borders_is_the_whole_plan(
+    heptagon: Problem, curves: tuple[Curve, ...], tmp_path: Path
+) -> None:
+    # Poses as read off the map: to a tenth of a millimetre and of a degree.
+    poses = [(0.045, -2.0), (-0.0637, -2.0), (-0.0505, -23.4), (0.0078, -50.0)]
+    route = list_degrees(heptagon, *poses)
+    assert tomllib.loads(format_route(route))["phases"] == HEPTAGON_TABLE["phases"]
+    for stretch, curve in zip(route, curves, strict=True):
+        # Ends are those of the traced curves, but for the last, which the user gives.
+        np.testing.assert_allclose(stretch.start, curve.start[[0, 2]], atol=1e-9)
+    assert len(load_pasted(HEPTAGON_TABLE, route, tmp_path).phases) == 5
+
+
+def test_turn_back_on_a_border_is_a_phase(heptagon: Problem, tmp_path: Path) -> None:
+    route = list_degrees(heptagon, (0.045, FLAT), (0.03, FLAT), (0.04, FLAT))
+    assert [str(stretch.until) for stretch in route] == ["x = 0.03 m", "x = 0.04 m"]
+    assert set(route[0].contacts) == set(route[1].contacts)
+    assert len(load_pasted(HEPTAGON_TABLE, route, tmp_path).phases) == 2
+    onwards = list_degrees(heptagon, (0.045, FLAT), (0.04, FLAT), (0.03, FLAT))
+    assert [str(stretch.until) for stretch in onwards] == ["x = 0.03 m"]
+
+
+def test_route_that_starts_elsewhere_brings_its_start(heptagon: Problem, tmp_path: Path) -> None:
+    route = list_degrees(heptagon, (-0.05, FLAT + 0.2), (0.03, FLAT))
+    assert [str(stretch.until) for stretch in route] == ["v5-finger2", "v2-finger1", "x = 0.03 m"]
+    text = format_route(route)
+    assert tomllib.loads(text)["start"] == {"flush": 0, "x": -0.05}
+    assert "takes the place of the problem's own" in text
+    assert load_pasted(HEPTAGON_TABLE, route, tmp_path).start[0] == -0.05
+
+
+def test_route_that_starts_in_a_cell_is_led_there(heptagon: Problem, tmp_path: Path) -> None:
+    route = list_degrees(heptagon, (0.03, -8.0), (0.01, -12.0))
+    assert route.start is None and "from the problem's start" in format_route(route)
+    np.testing.assert_allclose(route[0].start, heptagon.start[[0, 2]], rtol=1e-12)
+    assert len(load_pasted(HEPTAGON_TABLE, route, tmp_path).phases) == len(route)
+
+
+def test_routes_that_cannot_be_followed_are_named(heptagon: Problem) -> None:
+    start = (float(heptagon.start[0]), float(heptagon.start[2]))
+    with pytest.raises(InputError, match=r"leg 1 cannot be followed .* finger 2 is too short"):
+        list_formations(heptagon, start, (0.2, 0.2))
+    with pytest.raises(InputError, match="two or more"):
+        list_formations(heptagon, start)
+    with pytest.raises(InputError, match="same place"):
+        list_formations(heptagon, start, start)
+    with pytest.raises(InputError, match=r"cannot start at .*: finger 1 is too short"):
+        list_formations(heptagon, (0.4, start[1]), start)
+    with pytest.raises(InputError, match=r"route: -63\.7 given; allowed are .* m "):
+        list_formations(heptagon, start, (-63.7, start[1]))
+
+
+def test_lists_do_not_depend_on_units(heptagon: Problem) -> None:
+    size = 700.0
+    table = copy.deepcopy(HEPTAGON_TABLE)
+    table["object"]["vertices"] = (size * np.array(table["object"]["vertices"])).tolist()
+    for finger in table["fingers"].values():
+        finger |= {key: size * finger[key] for key in ("length", "radius")}
+        finger["base"] = [size * value for value in finger["base"]]
+    table["start"]["x"] *= size
+    table["phases"][-1]["until"] = {"x": 0.0}
+    large = build_problem(table)
+    poses = [(0.045, -2.0), (-0.0637, -2.0), (-0.0505, -23.4), (0.03, 3.0)]
+    one = list_degrees(heptagon, *poses)
+    two = list_degrees(large, *((size * x, phi) for x, phi in poses))
+    assert [s.contacts for s in one] == [s.contacts for s in two]
+    for a, b in zip(one, two, strict=True):
+        np.testing.assert_allclose(a.stop * [size, 1.0], b.stop, rtol=1e-4, atol=1e-4)
+
+
+HARD = {
+    "a pointed tip runs off an edge that lies flush": (
+        "-0.0861 -0.0032; -0.0337 -0.0679; 0.0661 -0.0493; 0.0721 0.0395; -0.0278 0.0712",
+        [([0.0687, 0.0075], 0.2347, 0.0), ([-0.195, 0.0028], 0.2047, 0.0)],
+        (0, -0.0009),
+        [(-0.0009, 51.034), (0.0133, 51.034), (-0.109, 91.915)],
+        "v3-finger2",
+    ),
+    "a pointed tip passes from edge to edge": (
+        "0.0666 0.0695; 0.0511 0.0713; -0.0296 0.0332; -0.0733 -0.0178; -0.0678 -0.0691; "
+        "-0.0189 -0.0631; 0.0071 -0.0494; 0.0694 0.011",
+        [([0.2446, -0.0229], 0.3186, 0.0), ([-0.2226, 0.026], 0.2919, 0.0)],
+        (6, 0.0873),
+        [(0.0873, -44.138), (0.1379, -28.38), (0.1384, -27.663), (0.0715, -27.663)],
+        "v2-finger2",
+    ),
+    "a vertex passes from the side of a link to its rounded tip": (
+        "-0.0492 -0.092; -0.0364 -0.0739; 0.0087 0.0079; 0.0328 0.055; 0.0492 0.0923; "
+        "0.0333 0.0687; -0.001 0.0068; -0.0404 -0.0706",
+        [([0.1886, -0.0131], 0.1886, 0.0012), ([-0.1469, -0.0287], 0.1492, 0.0053)],
+        (1, -0.0139),
+        [(-0.0139, -61.107), (0.0364, -62.899), (-0.1043, -62.936)],
+        "v5-tip1",
+    ),
+    "the end of a cell is far away": (
+        "0.0771 0.0821; 0.0302 0.0392; -0.0333 -0.0287; -0.0767 -0.0826; -0.0332 -0.0422; "
+        "0.0334 0.0288",
+        [([0.117, -0.0326], 0.3934, 0.0128), ([-0.0972, -0.0252], 0.3999, 0.0093)],
+        (4, -0.1417),
+        [(-0.1417, -46.856), (-0.1387, -47.581), (0.3798, -42.853)],
+        "v5-finger1",
+    ),
+    "a contact may be gained both ways along a border": (
+        "0.1283 0.0553; -0.0557 0.0251; -0.0548 -0.0629",
+        [([0.1915, -0.0479], 0.1946, 0.0), ([-0.1548, -0.0395], 0.1405, 0.0)],
+        (2, 0.0151),
+        [(0.0151, -32.848), (-0.1111, -32.848), (0.0093, -32.848)],
+        "v0-finger1",
+    ),
+    "a vertex at a pointed tip is nearer than the edge that lies flush": (
+        "-0.0647 -0.0725; -0.0373 -0.0694; -0.0031 -0.0481; 0.0298 -0.017; 0.0471 0.0042; "
+        "0.0707 0.0505; 0.0622 0.0735; 0.0525 0.0739; 0.0158 0.0574; -0.0296 0.0173; "
+        "-0.0521 -0.0113; -0.0708 -0.0508",
+        [([0.2366, -0.0346], 0.2665, 0.0), ([-0.0996, -0.008], 0.3867, 0.0)],
+        (11, 0.0098),
+        [(0.0098, 74.176), (0.0183, 129.255)],
+        "v9-palm",
+    ),
+}
+"""Vertices [m], fingers (base, length, radius) [m], start (edge, x), poses [m, deg], an end."""
+
+
+def build_table(
+    vertices: str, hands: list[tuple[list[float], float, float]], start: tuple[int, float]
+) -> dict[str, Any]:
+    """A problem file's tables whose phase names what touches at the start."""
+    table = copy.deepcopy(HEPTAGON_TABLE) | {"start": {"flush": start[0], "x": start[1]}}
+    corners = [[float(x) for x in corner.split()] for corner in vertices.split(";")]
+    table["object"]["vertices"] = corners
+    for finger, (base, length, radius) in zip(table["fingers"].values(), hands, strict=True):
+        finger |= {"base": base, "length": length, "radius": radius}
+    lowest = [f"v{start[0]}-palm", f"v{(start[0] + 1) % len(corners)}-palm"]
+    table["phases"] = [{"contacts": lowest, "until": {"x": start[1]}}]
+    return table
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_hard_lists_load(name: str, tmp_path: Path) -> None:
+    vertices, hands, start, poses, end = HARD[name]
+    table = build_table(vertices, hands, start)
+    route = list_degrees(build_problem(table), *poses)
+    assert end in [str(stretch.until) for stretch in route]
+    problem = load_pasted(table, route, tmp_path)
+    assert len(problem.phases) == len(route)
+
+
+def test_list_goes_on_where_loading_ends_a_phase(heptagon: Problem, tmp_path: Path) -> None:
+    """Each phase of a list, loaded, ends where the next one's contacts touch."""
+    route = list_degrees(heptagon, (0.045, FLAT), (0.03, -20.0), (-0.02, -30.0), (-0.0505, -23.4))
+    problem = load_pasted(HEPTAGON_TABLE, route, tmp_path)
+    z = problem.start
+    for phase in problem.phases:
+        gaps = phase.formation.evaluate(z[None], z[None]).C[0]
+        assert np.abs(gaps).max() < 1e-9
+        assert phase.formation.evaluate_limits(z[None]).min() > -1e-9
+        z = guess_phase(phase, z)[-1].z[-1]
+
+
+def test_a_contact_that_a_leg_begins_with_has_been_gained(tmp_path: Path) -> None:
+    """Also after a leg that ends in a cell, next to where another contact is gained."""
+    square = problem_of(FOLDER / "square.toml")
+    turns = [(0.0352104, -0.1879037), (0.0561329, -0.4940113), (0.0813296, -0.6529818)]
+    route = list_formations(square, (0.06, 0.0), (0.007424, 0.0), *turns)
+    for before, after in pairwise(route):
+        assert {*after.contacts} <= {*before.contacts, before.until.contact}
+    # Legs that end in a cell do so where they are said to, to what is printed.
+    unit = (square.scene.scales.length, 1.0)
+    for turn in turns:
+        assert min(np.abs((own.stop - turn) / unit).max() for own in route) < 1e-5
+    assert sum(len(own.until.poses) == 2 for own in route) == len(turns)
+    load_pasted(dict(square.table), route, tmp_path)

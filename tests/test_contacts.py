@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import gc
 from dataclasses import replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -10,19 +11,211 @@ import pytest
 from plane import (
     SQUARE,
     convex_polygon,
+    cross,
     finger_gap,
     make_formation,
     make_scene,
+    nearest_on_segment,
     place_corners,
     place_tips,
+    point_to_segment,
     rotate,
 )
+from shipped import HEPTAGON, chart, problem_of
+from tipping import roll
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
-from wholearm.contacts.closing import close_finger, place_flush
-from wholearm.contacts.elemental import build_features, parse_contact
-from wholearm.contacts.formation import Formation, find_touching
-from wholearm.scene.model import Scene
+from wholearm.contacts.closing import (
+    Numbers,
+    close_finger,
+    close_fingers,
+    contact_table,
+    evaluate_contacts,
+    evaluate_each,
+    first_contact,
+    measure_gap,
+    move,
+    place,
+    place_flush,
+)
+from wholearm.contacts.cones import find_weakest, force_limit_rows, slip_margins
+from wholearm.contacts.elemental import Contact, build_features, candidate_contacts, parse_contact
+from wholearm.contacts.formation import Formation, build_slip, find_touching
+from wholearm.mapping.borders import label_cells
+from wholearm.scene.model import Friction, Scene
+
+KITE = [[-0.04, -0.03], [0.02, -0.035], [0.045, 0.01], [0.0, 0.05], [-0.045, 0.02]]
+NAMES = ["v3-palm", "v2-finger1", "v4-finger2", "e1-tip1", "e3-tip2", "v2-tip1", "v4-tip2"]
+STEP = 1e-6
+# Central differences: rounding 1e-16 / STEP, truncation STEP^2.
+DIFFERENCE = 1e-9
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return make_scene(KITE)
+
+
+def configurations(seed: int, count: int = 20) -> Array:
+    """Random z, on no contact's manifold."""
+    rng = np.random.default_rng(seed)
+    low, high = [-0.1, 0.02, -3.0, 0.3, 0.3], [0.1, 0.15, 3.0, 2.8, 2.8]
+    return np.asarray(rng.uniform(low, high, (count, 5)))
+
+
+def measure_apart(scene: Scene, contact: Contact, z: Array) -> tuple[float, Array, Array]:
+    """Signed gap, closest point of the object, and normal into it, by plain geometry."""
+    corners = place_corners(scene, z)
+    corner = corners[contact.index]
+    if contact.finger is None:
+        return float(corner[1]), corner, np.array([0.0, 1.0])
+    link = scene.fingers[contact.finger]
+    base, tip = np.asarray(link.base), place_tips(scene, contact.finger, z[3 + contact.finger])
+    if contact.surface == "finger":
+        axis = (tip - base) / link.length
+        normal = np.array([-axis[1], axis[0]]) * (1 if contact.finger == 0 else -1)
+        # Far ends, so that the foot of the perpendicular is on the segment.
+        distance = float(point_to_segment(corner, base - 9 * axis, tip + 9 * axis))
+        side = np.sign(normal @ (corner - base))
+        return float(side * distance - link.radius), corner, normal
+    if contact.feature == "e":
+        after = corners[(contact.index + 1) % len(corners)]
+        run = after - corner
+        normal = np.array([-run[1], run[0]]) / np.hypot(*run)
+        point = nearest_on_segment(tip, corner - 9 * run, after + 9 * run)
+        side = np.sign(cross(run, corner - tip))
+        return float(side * np.hypot(*(tip - point)) - link.radius), point, normal
+    away = corner - tip
+    return float(np.hypot(*away) - link.radius), corner, away / np.hypot(*away)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_gap_is_the_distance_measured(scene: Scene, name: str) -> None:
+    formation = make_formation(scene, name)
+    z = configurations(1)
+    gaps = formation.evaluate(z, z).C[:, 0]
+    measured = [measure_apart(scene, formation.contacts[0], point)[0] for point in z]
+    np.testing.assert_allclose(gaps, measured, atol=1e-14)
+    assert {-1.0, 1.0} >= set(np.sign(gaps)) and np.ptp(gaps) > 0.01
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_rows_are_the_derivatives_of_the_gap(scene: Scene, name: str) -> None:
+    formation = make_formation(scene, name)
+    z = configurations(2)
+    A = formation.evaluate(z, z).A[:, 0]
+    for k, unit in enumerate(STEP * np.eye(5)):
+        rise = formation.evaluate(z + unit, z).C - formation.evaluate(z - unit, z).C
+        np.testing.assert_allclose(A[:, k], rise[:, 0] / (2 * STEP), atol=DIFFERENCE)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_velocities_at_the_contact_point(scene: Scene, name: str) -> None:
+    """A v and A_t v are the relative velocity of two material points, differenced in time."""
+    formation = make_formation(scene, name)
+    contact = formation.contacts[0]
+    rng = np.random.default_rng(3)
+    for z in configurations(3, 8):
+        gap, _, normal = measure_apart(scene, contact, z)
+        z[:2] -= gap * normal
+        gap, point, normal = measure_apart(scene, contact, z)
+        assert abs(gap) < 1e-15
+        v = rng.uniform(-1, 1, 5)
+        on_object = rotate(-z[2], point - z[:2])
+
+        def separate(
+            moved: Array, point: Array = point, start: Array = z, body: Array = on_object
+        ) -> Array:
+            world = moved[:2] + rotate(moved[2], body)
+            if contact.finger is None:
+                return np.asarray(world - point)
+            base = np.asarray(scene.fingers[contact.finger].base)
+            k = 3 + contact.finger
+            return np.asarray(world - base - rotate(moved[k] - start[k], point - base))
+
+        velocity = (separate(z + STEP * v) - separate(z - STEP * v)) / (2 * STEP)
+        kinematics = formation.evaluate(z[None], v[None])
+        tangent = np.array([normal[1], -normal[0]])
+        assert kinematics.A[0, 0] @ v == pytest.approx(normal @ velocity, abs=DIFFERENCE)
+        assert kinematics.A_t[0, 0] @ v == pytest.approx(tangent @ velocity, abs=DIFFERENCE)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_second_derivative_term(scene: Scene, name: str) -> None:
+    formation = make_formation(scene, name)
+    z = configurations(5)
+    v = np.random.default_rng(5).uniform(-1, 1, z.shape)
+    rise = formation.evaluate(z + STEP * v, v).A - formation.evaluate(z - STEP * v, v).A
+    expected = np.einsum("nij,nj->ni", rise / (2 * STEP), v)
+    np.testing.assert_allclose(formation.evaluate(z, v).A_dot_v, expected, atol=DIFFERENCE)
+
+
+def test_names_round_trip(scene: Scene) -> None:
+    contacts = [c for part in (None, 0, 1) for c in candidate_contacts(scene, part)]
+    assert len(set(contacts)) == 5 + 2 * 15
+    assert [parse_contact(contact.name, scene) for contact in contacts] == contacts
+    assert [str(contact) for contact in contacts] == [contact.name for contact in contacts]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("v5-palm", "e5-tip1", "e0-palm", "e1-finger1", "v1-finger3", "v1-tip0", "v1", "x1-palm"),
+        *("v1-palm1", "v-1-palm", "V1-palm", " v1-palm", "v1-palm\n", "v\u0661-palm", "v01-palm"),
+        *("v1-finger", "", None, 7, ["v1-palm"], True),
+    ],
+)
+def test_bad_name_lists_what_is_allowed(scene: Scene, name: Any) -> None:
+    with pytest.raises(InputError, match="allowed are vN-palm") as caught:
+        parse_contact(name, scene)
+    assert repr(name) in caught.value.problem and "0 to 4" in caught.value.problem
+
+
+def test_pointed_tip_has_no_arc() -> None:
+    pointed = make_scene(KITE, radius=0.0)
+    assert len(candidate_contacts(pointed, 0)) == 10
+    with pytest.raises(InputError, match=r"fingers\.1\.radius is 0"):
+        parse_contact("v1-tip1", pointed)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_slip_coordinate_integrates_the_sliding_velocity(scene: Scene, name: str) -> None:
+    """Where a contact touches, the gradient of its slip is A_t, by derivative and difference."""
+    formation = make_formation(scene, name)
+    slip, z_symbol = build_slip(formation.contacts[0], scene), build_features(scene).z
+    function = ca.Function("slip", [z_symbol], [slip, ca.jacobian(slip, z_symbol)])
+    rng = np.random.default_rng(6)
+    for z in configurations(6, 8):
+        gap, _, normal = measure_apart(scene, formation.contacts[0], z)
+        z[:2] -= gap * normal
+        v = rng.uniform(-1, 1, 5)
+        A_t = formation.evaluate(z[None], v[None]).A_t[0]
+        np.testing.assert_allclose(function(z)[1].full(), A_t, atol=1e-14)
+        rise = float(function(z + STEP * v)[0] - function(z - STEP * v)[0])
+        # On a tip's arc truncation is (STEP / radius)^2.
+        assert rise / (2 * STEP) == pytest.approx(A_t[0] @ v, abs=(STEP / 0.005) ** 2)
+
+
+@pytest.fixture
+def formation() -> Formation:
+    scene = replace(make_scene(SQUARE), friction=Friction(0.5, 0.2, 0.3))
+    return roll(make_formation(scene, "v0-finger2 v1-palm v2-finger1"), "v1-palm", "v2-finger1")
+
+
+def test_margin_to_slipping(formation: Formation) -> None:
+    c_n, c_t = np.array([[1.0, 2.0, 3.0]]), np.array([[9.0, -0.7, 0.8]])
+    np.testing.assert_allclose(slip_margins(formation, c_n, c_t), [[0.3, -0.2]])
+
+
+def test_what_gives_way_first(formation: Formation) -> None:
+    H = force_limit_rows(formation)
+    row, c_n, c_t = find_weakest(formation, H @ [1.0, 2.0, 3.0, 0.7, -0.9])
+    assert (row, c_n) == (2, 3.0) and c_t == pytest.approx(-0.9)
+    row, c_n, c_t = find_weakest(formation, H @ [1.0, 2.0, 3.0, 1.2, 0.1])
+    assert (row, c_n) == (1, 2.0) and c_t == pytest.approx(1.2)
+    # A contact that pulls has no cone to be in.
+    assert find_weakest(formation, H @ [1.0, 2.0, -0.1, 0.0, 0.0]) == (2, -0.1, None)
+
 
 # Distances of metres-sized coordinates in double precision.
 ROUNDING = 1e-14
@@ -311,3 +504,89 @@ def test_limits_outlive_the_scene_that_built_them() -> None:
     values = ca.vertcat(*(limit.value for limit in second.limits))
     function = ca.Function("limits", [build_features(second.scene).z], [values])
     assert np.isfinite(np.array(function(np.ones(5)))).all()
+
+
+COUNT = 400
+
+
+def close(radius: float) -> tuple[Scene, Numbers, Array, Array]:
+    """A hand with links that are just long enough: labels, poses, and the hand closed there."""
+    scene = make_scene(lengths=(0.11, 0.09), radius=radius)
+    rng = np.random.default_rng(3)
+    x, phi = rng.uniform(-0.06, 0.06, COUNT), rng.uniform(-4, 4, COUNT)
+    labels = label_cells(scene, x, phi)[:, [0, 2, 4]]
+    usable = (labels >= 0).all(axis=1)
+    assert usable.sum() > COUNT / 4
+    return (
+        scene,
+        labels[usable],
+        np.column_stack([x, phi])[usable],
+        close_fingers(scene, x[usable], phi[usable]).z,
+    )
+
+
+@pytest.mark.parametrize(("radius", "kinds"), [(0.01, {0, 1, 2}), (0.0, {0, 1})])
+def test_known_contacts_are_where_closing_fingers_come_to_touch(
+    radius: float, kinds: set[int]
+) -> None:
+    scene, labels, poses, z = close(radius)
+    for finger in (0, 1):
+        found = (labels[:, 1 + finger] - first_contact(scene, finger)) // 4
+        assert set(found.tolist()) == kinds
+    # Joint angles lose digits where a link is stretched towards what it touches.
+    np.testing.assert_allclose(place(scene, labels, poses), z, atol=1e-10)
+
+
+def test_rates_are_those_of_contacts_that_stay_closed() -> None:
+    scene, labels, poses, _ = close(0.01)
+    ways = np.random.default_rng(4).normal(size=poses.shape) * [0.03, 1.0]
+    at, step = move(scene, labels, poses, ways), 1e-5
+    left, right = (place(scene, labels, poses + side * step * ways) for side in (-1, 1))
+    # Away from where a link is stretched, where derivatives grow.
+    mild = np.abs(at.z_uu).max(axis=1) < 30
+    assert mild.mean() > 0.8
+    np.testing.assert_allclose(at.z_u[mild], (right - left)[mild] / (2 * step), atol=1e-6)
+    bent = (right - 2 * at.z + left)[mild] / step**2
+    np.testing.assert_allclose(at.z_uu[mild], bent, atol=1e-3)
+
+
+def test_rows_are_those_of_formations() -> None:
+    scene, labels, poses, _ = close(0.01)
+    ways = np.random.default_rng(5).normal(size=poses.shape) * [0.03, 1.0]
+    at = move(scene, labels, poses, ways)
+    for label in np.unique(labels, axis=0)[::8]:
+        mine = (labels == label).all(axis=1)
+        every = evaluate_contacts(scene, label.tolist(), at.z[mine], at.z_u[mine])
+        own = at.kinematics
+        for part, other in (
+            (own.A, every.A),
+            (own.A_t, every.A_t),
+            (own.P_dot_v, every.P_dot_v),
+            (own.C, every.C),
+        ):
+            np.testing.assert_allclose(part[mine], other, rtol=1e-9, atol=1e-10)
+
+
+def test_gaps_are_those_of_formations() -> None:
+    scene, _, _, z = close(0.01)
+    contacts = np.random.default_rng(6).integers(0, len(contact_table(scene)), len(z))
+    gaps = measure_gap(scene, contacts, z)
+    for index in np.unique(contacts):
+        mine = contacts == index
+        own = evaluate_contacts(scene, [int(index)], z[mine]).C[:, 0]
+        np.testing.assert_allclose(gaps[mine], own, atol=1e-14)
+
+
+def test_rows_are_those_of_each_formation() -> None:
+    scene = problem_of(HEPTAGON).scene
+    table = contact_table(scene)
+    borders = [own for own in chart().borders if own.flush is not None][::30]
+    labels = np.array([[table.index(contact) for contact in own.contacts] for own in borders])
+    z = np.array([own.z[len(own.z) // 2] for own in borders])
+    v = np.random.default_rng(5).normal(size=z.shape)
+    found = evaluate_each(scene, labels, z, v)
+    for k, border in enumerate(borders):
+        expected = Formation(scene, border.contacts).evaluate(z[k : k + 1], v[k : k + 1])
+        for one, other in zip(found, expected, strict=True):
+            # Formations' own expressions share parts, which costs the last bits.
+            np.testing.assert_allclose(one[k], other[0], rtol=1e-12, atol=1e-12)

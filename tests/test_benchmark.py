@@ -1,0 +1,688 @@
+"""What every study has (processes, records, a table, a command), and each study."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import re
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from misbehaving import allow, misbehave
+from shipped import FOLDER, HEPTAGON, SQUARE, problem_of, solved
+from wholearm.benchmark import STUDIES
+from wholearm.benchmark.corpus import compare
+from wholearm.benchmark.corpus_cases import FAMILIES, answer, list_cases
+from wholearm.benchmark.growth import SIZES, WORK, fit_exponent, run_work
+from wholearm.benchmark.growth import STUDY as GROWTH
+from wholearm.benchmark.guard import BANDS, count, read_stored
+from wholearm.benchmark.guard import compare as compare_counts
+from wholearm.benchmark.kernels import LARGEST, Environment, perturb_scenes
+from wholearm.benchmark.kernels import STUDY as KERNELS
+from wholearm.benchmark.kernels import compare as compare_plans
+from wholearm.benchmark.precision.phases import (
+    SHORT,
+    SOLVED,
+    Instance,
+    Median,
+    list_instances,
+    measure,
+)
+from wholearm.benchmark.precision.planners import (
+    LEAST_TIME,
+    NO_DRAG,
+    PLANNERS,
+    find_least_time,
+    run_planner,
+)
+from wholearm.benchmark.precision.precision_study import Medians, PeerComparison, find_times
+from wholearm.benchmark.precision.reference import Course, measure_error
+from wholearm.benchmark.precision.simulators import FEW, SIMULATORS, check_plan, make_course
+from wholearm.benchmark.skip import STUDY as SKIP
+from wholearm.benchmark.skip import SkipPair, list_pairs, spend
+from wholearm.benchmark.study import Case, Row, Study, digest_source, measure_case
+from wholearm.cli.command import load_study, main
+from wholearm.common.crowd import Processes, run_all
+from wholearm.common.errors import InputError
+from wholearm.common.journal import Journal
+from wholearm.problem.read import build_problem, read_problem
+from wholearm.results.torque import TorqueProfile
+from wholearm.scene.model import Finger, Friction, Polygon, Scene
+from wholearm.solvers.ipopt import record_runs
+
+
+@pytest.fixture
+def steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tiny study is one of those that there are."""
+    monkeypatch.setitem(STUDIES, "steps", ("tiny_study", "count steps to one"))
+
+
+@pytest.mark.usefixtures("steps")
+def test_a_study_is_a_command_with_records_and_a_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "out"
+    command = ["bench", "steps", "-o", str(folder), "--jobs", "2"]
+    assert main([*command, "--most", "4"]) == 1
+    text = capsys.readouterr().out
+    assert text.startswith("# Steps to one\n\nwholearm ") and "| 3 | 7 |" in text
+    assert "* no natural one" in text and f"wrote {folder / 'bench_steps.md'}" in text
+    records = (folder / "bench_steps.jsonl").read_text(encoding="utf-8")
+    assert len(records.splitlines()) == 1 + 4
+    # It goes on with what there is; a case that raises is a finding with its reason.
+    assert main([*command, "--most", "6"]) == 1
+    after = (folder / "bench_steps.jsonl").read_text(encoding="utf-8")
+    assert after.startswith(records) and len(after.splitlines()) == 1 + 6
+    text = (folder / "bench_steps.md").read_text(encoding="utf-8")
+    assert "| 4 | 2 |" in text and "* 5: traceback after " in text and "ValueError: five" in text
+    table = (folder / "bench_steps.csv").read_text(encoding="utf-8").splitlines()
+    assert table[:3] == ["number,steps", "0,0", "1,0"]
+    # What had findings is run again, and everything where that is asked for.
+    assert main([*command, "--most", "5", "--again"]) == 1
+    lines = (folder / "bench_steps.jsonl").read_text(encoding="utf-8").splitlines()
+    assert [json.loads(line)["case"] for line in lines[1:]][-1] == [0]
+    main([*command, "--most", "1", "--fresh"])
+    assert len((folder / "bench_steps.jsonl").read_text(encoding="utf-8").splitlines()) == 2
+
+
+@pytest.mark.usefixtures("steps")
+def test_records_of_other_code_do_not_count_where_that_matters(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = load_study("steps")
+    monkeypatch.setattr(study, "of_code", True, raising=False)
+    command = ["bench", "steps", "-o", str(tmp_path), "--jobs", "1", "--most", "2"]
+    path = tmp_path / "bench_steps.jsonl"
+    main(command)
+    head, *rows = path.read_text(encoding="utf-8").splitlines()
+    assert json.loads(head)["source"] == digest_source()
+    path.write_text("\n".join([head, *rows[:1], ""]), encoding="utf-8")
+    main(command)
+    assert path.read_text(encoding="utf-8").splitlines()[:2] == [head, rows[0]]
+    path.write_text(
+        head.replace(digest_source(), "other") + "\n" + rows[0] + "\n", encoding="utf-8"
+    )
+    main(command)
+    assert path.read_text(encoding="utf-8").splitlines()[0] == head
+
+
+def test_every_study_is_listed_and_has_its_options(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench"]) == 0
+    text = capsys.readouterr().out
+    for name, (_, about) in STUDIES.items():
+        assert re.search(rf"^{name} +{re.escape(about)}$", text, re.M)
+        study = load_study(name)
+        assert isinstance(study, Study) and study.name == name and study.title
+        with pytest.raises(SystemExit):
+            main(["bench", name, "--help"])
+        assert ("--output DIR" in capsys.readouterr().out) is study.keeps
+
+
+@pytest.mark.parametrize("option", ["--scenes", "--files", "--seed", "--jobs", "--only"])
+def test_numbers_out_of_range_are_refused(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "stress", option, "-1"]) == 2
+    assert capsys.readouterr().err.startswith(f"wholearm: {option}: -1 given")
+
+
+@pytest.mark.usefixtures("steps")
+def test_a_folder_that_cannot_be_made_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    assert main(["bench", "steps", "-o", str(tmp_path / "file" / "folder")]) == 2
+    assert "cannot be made" in capsys.readouterr().err
+
+
+def ask(tasks: list[str], **options: Any) -> dict[str, Any]:
+    return dict(run_all(misbehave, tasks, Processes(1, allow, **options), ahead=1))
+
+
+def test_a_process_that_hangs_or_dies_is_replaced() -> None:
+    answers = ask(["fine", "hang", "die", "raise", "well"])
+    assert (answers["fine"], answers["well"]) == ("fine", "well")
+    assert answers["hang"].late and str(answers["hang"]).startswith("time limit after ")
+    assert not answers["die"].late and str(answers["die"]).endswith(" s: exit status 3")
+    assert isinstance(answers["raise"], KeyError)
+    assert "raise KeyError(how)" in answers["raise"].__notes__[0]
+
+
+class Misbehaving(Study):
+    strict = True
+
+    def run(self, case: Case) -> Row:
+        return {"how": misbehave(*case)}
+
+
+def numbered(how: str) -> Row:
+    """Here a case is measured in a process of its own."""
+    return measure_case(Misbehaving(), (how,))
+
+
+def test_what_a_case_prints_and_takes_is_recorded() -> None:
+    rows = dict(run_all(numbered, ["fine", "print", "warn", "large"], Processes(1, alone=True)))
+    assert "printed" not in rows["fine"] and rows["print"]["printed"] == "CasADi - WARNING"
+    assert rows["warn"]["failed"].startswith("traceback after 0 s: ")
+    assert "RuntimeWarning: careful" in rows["warn"]["failed"]
+    assert 40 < rows["large"]["memory"] < 100 and rows["fine"]["memory"] < 10
+    assert 0 < rows["large"]["seconds"] < 10
+
+
+def test_a_journal_goes_on_after_half_a_line(tmp_path: Path) -> None:
+    path, stamp = str(tmp_path / "records.jsonl"), {"study": "any", "seed": 1}
+    with Journal(path, stamp) as journal:
+        journal.add({"scene": [0, "time"]})
+    with open(path, "a", encoding="utf-8") as stream:
+        stream.write('{"scene": [1, "ti')
+    with Journal(path, stamp) as again:
+        again.add({"scene": [2, "time"]})
+    with Journal(path, stamp) as journal:
+        assert [r["scene"][0] for r in journal.records] == [0, 2]
+        journal.add({"scene": [3, "time"], "findings": [["hang", ""]]})
+        journal.add({"scene": [4, "time"], "findings": []})
+    for drop in (True, False):
+        with Journal(path, stamp, again=drop) as journal:
+            assert [record["scene"][0] for record in journal.records] == [0, 2, 4]
+
+
+@pytest.mark.parametrize(
+    "given, text",
+    [
+        ('{"study": "any", "seed": 2}\n{"a": 1}\n', "holds another study: seed (2 in the file, 1"),
+        ('{"my": "data"}\n', "holds no any study"),
+        ("t,tau1,tau2\n", "holds no any study"),
+        ("\0\xff", "holds no any study"),
+    ],
+)
+def test_no_journal_overwrites_anything_else(given: str, text: str, tmp_path: Path) -> None:
+    path, stamp = tmp_path / "records.jsonl", {"study": "any", "seed": 1}
+    path.write_text(given, encoding="latin-1")
+    with pytest.raises(InputError, match=re.escape(text)) as caught:
+        Journal(str(path), stamp)
+    assert caught.value.source == str(path) and "--fresh" in str(caught.value)
+    assert path.read_text(encoding="latin-1") == given
+    with Journal(str(path), stamp, fresh=True) as journal:
+        assert journal.records == []
+    assert path.read_text(encoding="utf-8") == json.dumps(stamp) + "\n"
+
+
+def test_two_runs_do_not_write_to_one_file(tmp_path: Path) -> None:
+    path, stamp = str(tmp_path / "records.jsonl"), {"study": "any"}
+    with Journal(path, stamp) as journal:
+        journal.add({"scene": 0})
+        with pytest.raises(InputError, match="another run is writing to it"):
+            Journal(path, stamp, fresh=True)
+    with Journal(path, stamp) as journal:
+        assert journal.records == [{"scene": 0}]
+
+
+KEYS = ("grows", "work", "size")
+
+
+def make_rows() -> list[Row]:
+    """Times that grow with the square of sizes, and memory in proportion to them."""
+    return [
+        {"grows": grows, "work": work, "size": k, "seconds": 1e-3 * k**2, "memory": 0.1 * k}
+        for grows, sizes in SIZES.items()
+        for work in WORK[grows]
+        for k in sizes
+    ]
+
+
+def test_exponents_are_those_of_powers_where_small_sizes_cost_the_same() -> None:
+    sizes = [10, 20, 40, 80, 160, 320]
+    for power in (0.5, 1.0, 2.0):
+        costs = np.maximum(np.power(sizes, power), np.power(80.0, power)).tolist()
+        assert fit_exponent(sizes, costs) == pytest.approx(power)
+
+
+def test_the_table_has_every_measurement_and_exponent() -> None:
+    text = GROWTH.report(make_rows(), argparse.Namespace())[0]
+    rows = iter(line for line in text.splitlines() if " [s] | " in line)
+    for grows, sizes in SIZES.items():
+        assert f"## {grows.capitalize()}" in text
+        for work in WORK[grows]:
+            row = next(rows)
+            assert row.startswith(f"| {work} [s] | ") and row.endswith(" 2.00 |")
+            assert row.count("|") == len(sizes) + 3
+    assert text.count("[MB]") == text.count(" 1.00 |") == sum(map(len, WORK.values()))
+
+
+def test_work_is_as_large_as_is_asked() -> None:
+    table = dict(read_problem(str(HEPTAGON)).table)
+    # Five nodes for each element of four intervals, of which there are more than switches.
+    for size, nodes in ((40, 50), (80, 100)):
+        with record_runs() as runs:
+            run_work(table, "intervals", "least time", size)
+        assert runs[0].unknowns == 3 * nodes - 2
+    with record_runs() as runs:
+        run_work(table, "intervals", "margin", 40)
+    assert max(run.unknowns for run in runs) > 3 * 50 - 2
+    for size in (5, 6):
+        run_work(table, "vertices", "reading", size)
+
+
+def test_what_is_drawn_and_listed_is_what_is_run() -> None:
+    options = argparse.Namespace(problem=str(HEPTAGON))
+    cases = list(GROWTH.list_cases(options))
+    assert [case[1:] for case in cases] == [tuple(map(row.get, KEYS)) for row in make_rows()]
+    assert GROWTH.alone and GROWTH.columns == (*KEYS, "seconds", "memory")
+
+
+INTERVALS, TIME_INTERVALS, POINTS, TOUCHING = 12, 4, 3, 4
+ABSENT = ("friction of joints", "speed limits that never bind")
+"""Parts that are coefficients and bounds, where they are."""
+
+
+@pytest.fixture(scope="module")
+def pairs() -> dict[str, SkipPair]:
+    every = list_pairs(
+        str(FOLDER), intervals=INTERVALS, time_intervals=TIME_INTERVALS, mode_search=False
+    )
+    return {pair.part: pair for pair in every}
+
+
+def assert_bare(cost: Row, contacts: int, rolling: int) -> None:
+    """Along a curve from rest to rest nothing but what each node needs.
+
+    Unknowns are speed, acceleration and squeeze, but for the speed at both ends, where it is 0.
+    Rows are how the speed goes on, and at each node contact forces, both sides of the cones of
+    rolling contacts, and torques.
+    """
+    nodes, rest = divmod(cost["unknowns"] + 2, 3)
+    # Five nodes for each element of four intervals, of which switches may ask for more.
+    assert rest == nodes % 5 == 0 and nodes >= 5 * INTERVALS // 4
+    assert cost["rows"] == nodes - 1 + (contacts + 2 * rolling + 2) * nodes
+
+
+@pytest.mark.parametrize("part", ["friction of contacts", *ABSENT])
+def test_friction_and_limits_are_free_along_curves(pairs: dict[str, SkipPair], part: str) -> None:
+    pair = pairs[f"{part}, along curves"]
+    for case in (pair.without, pair.having):
+        assert_bare(spend(case), TOUCHING, 0)
+
+
+def test_over_time_friction_adds_a_sense_for_each_contact_and_point(
+    pairs: dict[str, SkipPair],
+) -> None:
+    own = [pairs[f"{part}, over time"] for part in ("friction of contacts", *ABSENT)]
+    full, smooth, free, limited = (
+        spend(case) for case in (own[0].having, own[0].without, own[1].without, own[2].having)
+    )
+    # What else there is, are coefficients and bounds.
+    assert {own["unknowns"] for own in (full, free, limited)} == {smooth["unknowns"]}
+    assert {own["rows"] for own in (full, free, limited)} == {full["rows"]}
+    intervals, rest = divmod(full["rows"] - smooth["rows"], TOUCHING * POINTS)
+    # Where a direction turns, a stage ends and an interval is divided.
+    assert TIME_INTERVALS <= intervals < 2 * TIME_INTERVALS and rest == 0
+
+
+def test_a_rolling_contact_has_two_rows_more_than_a_sliding_one_along_a_curve(
+    pairs: dict[str, SkipPair],
+) -> None:
+    tip = pairs["a second freedom"].without
+    (phase,) = tip.problem.phases
+    assert (phase.formation.n_contacts, phase.formation.n_rolling) == (3, 1)
+    assert_bare(spend(tip), 3, 1)
+
+
+def test_the_table_has_a_row_for_each_part(pairs: dict[str, SkipPair]) -> None:
+    pair = pairs["a figure"]
+    rows = [
+        {"case": ["anywhere", pair.part, having, 0], **spend(plan)}
+        for having, plan in ((False, pair.without), (True, pair.having))
+    ]
+    *_, row = SKIP.report(rows, argparse.Namespace())[0].splitlines()
+    name, *cells = [cell.strip() for cell in row.strip("|").split("|")]
+    assert name == "a figure" and len(cells) == 8
+    assert cells[0] == cells[1] and cells[2] == cells[3]
+    # Drawing costs, and nothing of it is run where no figure is wanted.
+    assert int(cells[5]) > int(cells[4])
+
+
+COUNTS = FOLDER.with_name("results") / "bench_guard.json"
+NODES, CONTACTS = 50, 4
+"""Five nodes for each of ten elements; sliding contacts."""
+
+
+def write_first_phase(folder: Path) -> str:
+    lines = HEPTAGON.read_text(encoding="utf-8").split("[[phases]]")
+    path = folder / "slide.toml"
+    path.write_text("[[phases]]".join(lines[:2]), encoding="utf-8")
+    return str(path)
+
+
+def test_counts_of_one_phase_are_those_of_theory() -> None:
+    table = dict(read_problem(str(HEPTAGON)).table)
+    found = count(build_problem({**table, "phases": table["phases"][:1]}))
+    # Speed, acceleration and squeeze at each node, but for the speed at both ends, where it is 0.
+    assert found["phase 1 of 1: unknowns"] == 3 * NODES - 2
+    # How the speed goes on, and the forces and torques at each node.
+    assert found["phase 1 of 1: rows"] == NODES - 1 + (CONTACTS + 2) * NODES
+    assert found["panels of curves"] >= 1 and set(BANDS) < set(found)
+    assert found["iterations"] > 1 and found["evaluations of the replay"] > 12
+
+
+@pytest.mark.parametrize(
+    ("stored", "texts"),
+    [
+        ({"a: rows": 10, "iterations": 100}, []),
+        ({"a: rows": 11, "iterations": 300}, []),
+        ({"a: rows": 9, "iterations": 100}, ["p: a: rows has grown from 9 to 10"]),
+        ({"a: rows": 10, "iterations": 81}, []),
+        (
+            {"a: rows": 10, "iterations": 79},
+            ["p: iterations has grown from 79 to 100 (allowed: 99)"],
+        ),
+        ({"iterations": 100}, ["p: a: rows = 10 is new; --update stores it"]),
+        ({"a: rows": 10, "iterations": 100, "b: rows": 3}, ["p: b: rows is not counted any more"]),
+    ],
+)
+def test_what_has_grown_is_named(stored: dict[str, int], texts: list[str]) -> None:
+    assert compare_counts("p", {"a: rows": 10, "iterations": 100}, stored) == texts
+
+
+def test_the_command_stores_counts_and_fails_where_they_grow(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, counts = write_first_phase(tmp_path), tmp_path / "counts.json"
+    command = ["bench", "guard", path, "--counts", str(counts)]
+    assert main(command) == 2
+    assert f"{counts}: cannot be read: " in capsys.readouterr().err
+    counts.write_text('{"other": {"rows": 3}}')
+    assert main([*command, "--update"]) == 0
+    assert main(command) == 0
+    assert "1 problems: no count has grown" in capsys.readouterr().out
+    stored = read_stored(str(counts))
+    assert set(stored) == {"other", "slide"}
+    stored["slide"]["phase 1 of 1: rows"] -= 1
+    counts.write_text(json.dumps(stored))
+    assert main(command) == 1
+    now = stored["slide"]["phase 1 of 1: rows"]
+    line = f"* slide: phase 1 of 1: rows has grown from {now} to {now + 1}\n"
+    assert capsys.readouterr().out.endswith(line)
+    del stored["slide"]
+    counts.write_text(json.dumps(stored))
+    assert main(command) == 1
+    assert "* slide: no counts are stored" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "text", ["[", "[]", '{"a": 3}', '{"a": {"rows": 1.5}}', '{"a": {"b": true}}']
+)
+def test_bad_counts_are_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "counts.json").write_text(text)
+    with pytest.raises(InputError, match=r"counts\.json"):
+        read_stored(str(tmp_path / "counts.json"))
+
+
+def test_every_problem_has_stored_counts() -> None:
+    assert set(read_stored(str(COUNTS))) == {path.stem for path in FOLDER.glob("*.toml")}
+
+
+STORED = json.loads((FOLDER.with_name("results") / "corpus.json").read_text(encoding="utf-8"))
+QUICK: tuple[Case, ...] = (
+    *(("plan", "heptagon_four_contacts", goal) for goal in ("time", "effort")),
+    ("plan over time", "heptagon_four_contacts", "effort"),
+    *(("variant", name) for name in ("speed", "weak", "rough", "certified", "rough, over time")),
+    *(("goal", number) for number in (13, 20, 34)),
+    *(("scene", number, "margin") for number in (2, 17, 44)),
+    *(("leg", number, "time") for number in (24, 36)),
+    ("torques", "heptagon", 0.9),
+    ("tune", "heptagon_four_contacts"),
+    ("free", "heptagon_four_contacts"),
+    ("policy", "heptagon_four_contacts"),
+    ("robustness", "heptagon_four_contacts"),
+    ("compare", "heptagon_four_contacts"),
+    ("report", "heptagon_four_contacts"),
+    ("map", "square"),
+    *(("list", number) for number in range(4)),
+    *(("predict", name) for name in ("square", "triangle")),
+)
+REFUSED = ("input", "option", "torque file")
+"""Families whose cases cost next to nothing."""
+
+
+def name(case: Case) -> str:
+    return " ".join(map(str, case))
+
+
+@pytest.mark.parametrize("case", QUICK, ids=name)
+def test_answers_are_as_stored(case: Case) -> None:
+    kind, texts = compare(case[0], json.loads(json.dumps(answer(case, FOLDER))), STORED[name(case)])
+    assert kind != "differs", texts
+
+
+def list_words(found: Any) -> list[str]:
+    """Words of an answer in any order, as two ways may be equal; numbers to six digits."""
+    text = re.sub(r"\d+\.\d+(e-?\d+)?", lambda m: f"{float(m[0]):.6g}", json.dumps(found))
+    return sorted(re.findall(r"[^\s,\"{}]+", text))
+
+
+def test_bad_input_is_refused_as_ever() -> None:
+    for case in list_cases():
+        if case[0] in REFUSED:
+            assert list_words(answer(case, FOLDER)) == list_words(STORED[name(case)]), case
+
+
+def test_every_case_has_a_stored_answer() -> None:
+    cases = list(list_cases())
+    assert {name(case) for case in cases} == set(STORED)
+    assert {case[0] for case in cases} == set(FAMILIES)
+
+
+PLANNED: dict[str, Any] = {
+    "objective": "time", "value": 1.0, "durations": [0.4, 0.6], "modes": [["+"], ["-"]],
+    "replay": {"ok": True, "events": [0.1, 0.5]},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("change", "kind"),
+    [
+        ({}, "same"),
+        ({"value": 1 + 5e-7, "durations": [0.40002, 0.59998]}, "same"),
+        ({"value": 1.0 + 5e-6}, "differs"),
+        ({"value": 0.999, "modes": [["-"], ["-"]]}, "better"),
+        ({"value": 0.999, "replay": {"ok": False, "events": []}}, "differs"),
+        ({"objective": "margin", "value": 0.999}, "differs"),
+        ({"modes": [["+"], ["-", "+"]]}, "differs"),
+        ({"replay": {"ok": True, "events": [0.1, 0.50001]}}, "same"),
+        ({"replay": {"ok": True, "events": [0.1, 0.501]}}, "differs"),
+        ({"replay": {"ok": True, "events": [0.1]}}, "differs"),
+        ({"text": "by another name"}, "other words"),
+    ],
+)
+def test_what_counts_as_a_difference(change: dict[str, Any], kind: str) -> None:
+    assert compare("plan", PLANNED | change, PLANNED)[0] == kind
+
+
+def test_local_optima_agree_within_the_accuracy_of_plans() -> None:
+    near = PLANNED | {"value": 1.0 + 5e-5}
+    assert compare("goal", near, PLANNED)[0] == "same"
+    assert compare("plan", near, PLANNED)[0] == "differs"
+
+
+def test_refusals_agree_in_kind_and_in_what_is_short() -> None:
+    refused = {"refused": "InfeasibleError", "amount": 0.1, "advice": {"a": 1.0}, "text": "why"}
+    assert compare("leg", refused | {"text": "because", "advice": {}}, refused)[0] == "other words"
+    assert compare("leg", refused | {"amount": 0.2}, refused)[0] == "differs"
+    assert compare("leg", {"refused": "InputError"}, refused)[0] == "differs"
+    assert compare("leg", PLANNED, refused)[0] == "differs"
+    assert compare("leg", refused, None)[0] == "differs"
+
+
+GOOD: dict[str, Any] = {"value": 2.0, "modes": [["+ - -"]], "fault": ""}
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({}, None),
+        ({"value": 2.0 * (1 + 5e-7)}, None),
+        ({"value": 2.0 * (1 + 2e-6)}, "value 2.000004 is off 2 by +2.0e-06"),
+        ({"modes": [["+ + -"]]}, "contact modes [['+ + -']] are not [['+ - -']]"),
+        ({"value": None, "fault": "phase 1 is infeasible"}, "phase 1 is infeasible"),
+    ],
+)
+def test_what_differs_is_named(changes: dict[str, Any], text: str | None) -> None:
+    assert compare_plans(GOOD | changes, GOOD) == ([text] if text else [])
+
+
+def test_answers_come_from_the_environment() -> None:
+    found = KERNELS.run((*Environment(seed=3), str(SQUARE), "time"))
+    assert found["fault"] == ""
+    assert found["value"] == pytest.approx(solved(SQUARE).value, rel=1e-6)
+    absent = KERNELS.run((*Environment(), "absent.toml", "time"))
+    assert absent["value"] is None and "absent.toml: cannot be read" in absent["fault"]
+
+
+def test_the_command_fails_where_answers_differ(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def answer_all(_: object, cases: list[Case], *__: object) -> list[tuple[Case, Row]]:
+        return [(case, dict(GOOD)) for case in cases]
+
+    monkeypatch.setattr("wholearm.benchmark.study.run_all", answer_all)
+    stored, table = tmp_path / "answers.json", tmp_path / "table.md"
+    command = ["bench", "kernels", "a.toml", "--answers", str(stored), "--jobs", "1"]
+    assert main(command) == 2
+    assert f"{stored}: cannot be read: " in capsys.readouterr().err
+    known = {f"plan a {goal}": GOOD for goal in ("time", "effort", "margin")}
+    stored.write_text(json.dumps(known), encoding="utf-8")
+    assert main([*command, "--seeds", "0", "1", "-o", str(table)]) == 0
+    text = table.read_text(encoding="utf-8")
+    assert text.count("| 3 | 3 | 0.0e+00 |") == 2 and ", seed 1 |" in text
+    stored.write_text(json.dumps(known | {"plan a time": GOOD | {"value": 1.0}}), encoding="utf-8")
+    capsys.readouterr()
+    assert main(command) == 1
+    assert "plan a time: value 2 is off 1 by +1.0e+00" in capsys.readouterr().out
+
+
+def test_numbers_change_in_the_last_bits_and_stay_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    exact = problem_of(SQUARE)
+    for kind in (Polygon, Finger, Friction, Scene):
+        monkeypatch.setattr(kind, "__post_init__", kind.__post_init__)
+    perturb_scenes(2**20)
+    once = read_problem(str(SQUARE))
+    again = once.with_(name="again")
+    pairs = [
+        (np.asarray(own.scene.polygon.points), own.scene.torque_limit, own.scene.gravity)
+        for own in (exact, once, again)
+    ]
+    for one, other, third in zip(*pairs, strict=True):
+        change = np.abs(np.subtract(other, one))
+        assert (change <= (2 * LARGEST + 1) * 2.0**-52 * np.abs(one)).all()
+        np.testing.assert_array_equal(other, third)
+    assert (pairs[0][0] != pairs[1][0]).any()
+    with pytest.raises(InputError, match=r"object\.mass"):
+        once.with_(mass=-1.0)
+
+
+FILES = (str(Path(__file__).parents[1] / "problems" / "heptagon_four_contacts.toml"),)
+LEAST = {LEAST_TIME: 0.0666298, NO_DRAG: 0.0663431}
+"""Least times of the fourth phase, within 1e-5."""
+TRIED = {"wholearm, curve": "1e-3", "wholearm, time": "8 x 3", "yapss": "20", "toppra": "100"}
+
+
+@lru_cache
+def phase(number: int, drag: bool = True) -> Instance:
+    return list_instances(FILES, drag)[number - 1]
+
+
+@pytest.mark.parametrize("method", TRIED)
+def test_every_planner_comes_near_the_least_time(method: str) -> None:
+    if not PLANNERS[method].is_installed:
+        pytest.skip(f"{method}: pip install 'wholearm[bench]'")
+    (study, *_) = PLANNERS[method].choices
+    found = run_planner(study, phase(4).name, method, TRIED[method], FILES)
+    error, end, violation = found.errors
+    assert found.outcome == SOLVED and abs(error) < 2e-2
+    assert end < 1e-2 and violation < 2.6e-2
+    least = find_least_time(phase(4, study != NO_DRAG))
+    assert least == pytest.approx(LEAST[study], rel=1e-5)
+
+
+def test_what_a_replay_does_not_keep_is_no_solution() -> None:
+    plan = PLANNERS["wholearm, curve"].build(phase(4), "1e-3")()
+    good = check_plan(phase(4), plan)
+    assert good.outcome == SOLVED and good.end < 1e-8
+    weak = TorqueProfile(plan.torque.breaks, 0.98 * plan.torque.coefficients)
+    late = check_plan(phase(4), plan._replace(torque=weak))
+    assert late.end > 1e-3
+    none = np.zeros_like(plan.torque.coefficients)
+    lost = check_plan(phase(4), plan._replace(torque=TorqueProfile(plan.torque.breaks, none)))
+    assert "contact is lost" in lost.outcome and lost.violation > 0.02
+    assert check_plan(phase(4), plan._replace(status="stopped")).outcome == "stopped"
+
+
+def test_methods_that_nobody_knows_are_named(capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["bench", "precision", "--problems", str(Path(FILES[0]).parent), "-o", "out"]
+    assert main([*command, "--peers", "fastest"]) == 2
+    assert "--peers: 'fastest' given; allowed are wholearm;" in capsys.readouterr().err
+
+
+PROBLEMS = Path(__file__).parents[1] / "problems"
+FLIPS = str(PROBLEMS / "heptagon_four_contacts.toml")
+
+
+@lru_cache
+def course() -> Course:
+    """The heptagon's first phase, with a reversal on its way."""
+    (first, *_) = list_instances((FLIPS,))
+    found = make_course(first, FEW)
+    assert found is not None
+    return found
+
+
+def test_reference_is_exact_and_meets_the_reversal() -> None:
+    assert course().own_error < 1e-12
+    directions = {tuple(np.append(span.Xi, span.sigma)) for span in course().spans}
+    assert len(directions) == 2
+    ends = [span.stop for span in course().spans]
+    assert [span.start for span in course().spans] == [0.0, *ends[:-1]]
+
+
+@pytest.mark.parametrize("method", SIMULATORS)
+def test_every_simulator_converges_to_the_reference(method: str) -> None:
+    errors = [
+        measure_error(
+            course().problem, SIMULATORS[method].build(course(), tolerance)(), course().end
+        )
+        for tolerance in ("1e-5", "1e-9")
+    ]
+    assert errors[1] < 2e-7 and errors[1] < max(0.3 * errors[0], 1e-10)
+
+
+FINE = Median(0.5, 0.3, (-3e-7,))
+MEDIANS: Medians = {
+    ("study", "phase 1", "a, b", "1e-6"): FINE,
+    ("study", "phase 1", "a, b", "1e-3"): FINE._replace(solve=0.1, errors=(1e-4,)),
+    ("study", "phase 2", "a, b", "1e-6"): Median(0.5, 60.0, (math.nan,), "time limit"),
+}
+
+
+def test_some_errors_count_or_all() -> None:
+    median = Median(0.5, 0.2, (1e-4, 1e-2, 0.0))
+    assert median.reaches(1e-3, 1) and not median.reaches(1e-3) and median.reaches(1e-2)
+    assert FINE.reaches(3e-7) and not FINE.reaches(2e-7)
+    assert not median._replace(outcome="a contact is lost").reaches(1.0)
+
+
+def test_medians_keep_the_worst_error_and_the_first_failure() -> None:
+    errors, outcomes = iter([1e-7, -3e-7, 2e-7]), iter([SOLVED, "lost", "late"])
+    found = measure(lambda: lambda: 7, lambda _: ((next(errors),), next(outcomes)))
+    assert found.errors == (-3e-7,) and found.outcome == "lost"
+    assert 0 <= found.solve < SHORT and 0 <= found.build < SHORT
+
+
+def test_the_soonest_setting_counts_and_failures_never_do() -> None:
+    own = PeerComparison("study", "title", "a, b", (1e-3, 1e-6), False, None)
+    assert find_times(MEDIANS, "a, b", own, 1e-3) == {"phase 1": 0.1, "phase 2": math.inf}
+    assert find_times(MEDIANS, "a, b", own, 1e-6) == {"phase 1": 0.3, "phase 2": math.inf}
+    built = own._replace(building=True)
+    assert find_times(MEDIANS, "a, b", built, 1e-6) == {"phase 1": 0.8, "phase 2": math.inf}

@@ -1,0 +1,1062 @@
+"""Figures, pages and movies, and results as data, text, HTML and Markdown."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import math
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, PathPatch, Polygon
+from matplotlib.text import Text
+from PIL import Image, ImageColor
+from scipy import ndimage
+
+import tipping
+from crossing import hexagon
+from shipped import HEPTAGON, IMPACTS, LANDING, chart, plan_of, problem_of
+from wholearm import plots
+from wholearm.cli.command import main
+from wholearm.common.arrays import Array
+from wholearm.common.document import Document, Result, Table, fixed, plain, restore, show
+from wholearm.common.errors import InputError
+from wholearm.contacts.closing import contact_table, evaluate_contacts
+from wholearm.figures.curves import draw_torques
+from wholearm.figures.map_figure import draw_map, find_room, split
+from wholearm.figures.plot_data import choose_snapshots, find_steps
+from wholearm.figures.snapshots import choose_numbers, draw_snapshot
+from wholearm.figures.style import WIDTH, choose_styles
+from wholearm.mapping.borders import Window
+from wholearm.mapping.formation_list import write_template
+from wholearm.mapping.formation_map import FormationMap, build_map
+from wholearm.planning.options import PlanOptions
+from wholearm.planning.plan import solve
+from wholearm.planning.result import Plan, Status, describe_plan, load_plan, write_meta
+from wholearm.problem.definition import Problem
+from wholearm.results.dwell_record import assemble
+from wholearm.results.torque import TorqueProfile
+from wholearm.results.trajectory import Trajectory
+from wholearm.solvers.ipopt import Solver, SolverStatistics, book, charge, open_ledger
+from wholearm.verification.verify import verify
+from wholearm.viewer import page
+from wholearm.viewer.motion_data import describe_motion, place_pushes
+from wholearm.viewer.movie import FRAMES, Movie, write_movie
+from wholearm.viewer.report_page import build_report, describe_map, list_joints, list_phases
+
+
+@dataclasses.dataclass
+class Replayed:
+    t: Array
+    phase: Any
+    tau: Array
+    c_n: Array
+
+
+@pytest.fixture(scope="module")
+def problem(heptagon: Problem) -> Problem:
+    return heptagon
+
+
+@pytest.fixture(scope="module")
+def planned(trajectory: Trajectory) -> Trajectory:
+    return trajectory
+
+
+@pytest.fixture(scope="module")
+def figure(planned: Trajectory) -> Figure:
+    return plots.force_margins(planned)
+
+
+@pytest.fixture
+def axes() -> Axes:
+    figure = Figure()
+    FigureCanvasAgg(figure)
+    return figure.add_subplot()
+
+
+def line_of(axes: Axes, label: str) -> Line2D:
+    (line,) = (line for line in axes.lines if line.get_label() == label)
+    return line
+
+
+def data_of(line: Line2D) -> tuple[Array, Array]:
+    x, y = line.get_data()
+    return np.asarray(x, dtype=float), np.asarray(y, dtype=float)
+
+
+def levels(axes: Axes) -> list[float]:
+    """Heights of the lines that cross the whole axes."""
+    every = [data_of(line) for line in axes.lines]
+    return [float(y[0]) for x, y in every if x.tolist() == [0, 1] and y[0] == y[1]]
+
+
+def repeat(trajectory: Trajectory, phases: list[int]) -> Trajectory:
+    """The trajectory's phases in another order and number, with torques joined from samples."""
+    motions = [trajectory.motions[k] for k in phases]
+    parts = [trajectory.phase == k for k in phases]
+    starts = np.cumsum([0.0, *(motion.duration for motion in motions)])
+    t = [
+        trajectory.t[p] - trajectory.t[p][0] + start
+        for p, start in zip(parts, starts[:-1], strict=True)
+    ]
+    tau = np.concatenate([trajectory.tau[part] for part in parts])
+    joined = np.maximum.accumulate(np.concatenate(t))
+    return assemble(motions, TorqueProfile.join_rows(joined, tau), trajectory.meta, 101)
+
+
+def visible(figure: Figure) -> list[tuple[str, Any]]:
+    """Every text that is drawn and its box in pixels; tick labels beyond the limits are not."""
+    canvas: Any = figure.canvas
+    canvas.draw()
+    renderer = canvas.get_renderer()
+    drawn = {id(text) for text in figure.findobj(Text)}
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            low, high = sorted(axis.get_view_interval())
+            for tick in axis.get_major_ticks():
+                inside = low <= tick.get_loc() <= high
+                if not inside or not tick.label1.get_visible() or not axes.axison:
+                    drawn.discard(id(tick.label1))
+                drawn.discard(id(tick.label2))
+    chosen = [text for text in figure.findobj(Text) if id(text) in drawn]
+    shown = [t for t in chosen if isinstance(t, Text) and t.get_visible() and t.get_text().strip()]
+    return [(text.get_text(), text.get_window_extent(renderer)) for text in shown]
+
+
+def check_layout(figure: Figure) -> None:
+    """No text outside the figure, none upon another, none smaller than 8 points."""
+    found = visible(figure)
+    assert len(found) > 20
+    for name, box in found:
+        assert box.x0 >= 0 and box.y0 >= 0, name
+        assert box.x1 <= figure.bbox.width and box.y1 <= figure.bbox.height, name
+    for (one, a), (other, b) in itertools.combinations(found, 2):
+        apart = a.x1 <= b.x0 or b.x1 <= a.x0 or a.y1 <= b.y0 or b.y1 <= a.y0
+        assert apart, (one, other)
+    for text in figure.findobj(Text):
+        assert isinstance(text, Text)
+        assert float(text.get_fontsize()) >= 8
+
+
+def test_figure_has_a_strip_and_two_panels_with_units(figure: Figure) -> None:
+    *strip, margins, torques = figure.axes
+    assert len(strip) == 6
+    assert "[N]" in margins.get_ylabel()
+    assert "[N m]" in torques.get_ylabel()
+    assert "[s]" in torques.get_xlabel()
+    assert margins.get_xlim() == torques.get_xlim()
+
+
+def test_strip_has_one_scale_and_its_bar(figure: Figure) -> None:
+    figure.canvas.draw()
+    scales = []
+    for axes in figure.axes[:6]:
+        box, (left, right), (low, high) = axes.bbox, axes.get_xlim(), axes.get_ylim()
+        scales += [box.width / (right - left), box.height / (high - low)]
+    np.testing.assert_allclose(scales, scales[0], rtol=1e-6)
+    assert "50 mm" in [text.get_text() for text in figure.texts]
+    (bar,) = (own for own in figure.artists if isinstance(own, Line2D))
+    assert np.ptp(data_of(bar)[0]) * figure.dpi / scales[0] == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("count", [3, 4, 7, 12, 30, 50])
+@pytest.mark.parametrize("thin", [1.0, 0.12])
+def test_numbers_at_vertices_stand_apart(count: int, thin: float) -> None:
+    angles = 2 * np.pi * (np.arange(count) + 0.5) / count
+    vertices = 40 * np.column_stack([np.cos(angles), thin * np.sin(angles)])
+    found = choose_numbers(vertices, [1])
+    places = {str(k): vertices[k] + own for k, own in found.items()}
+    for (one, a), (other, b) in itertools.combinations(places.items(), 2):
+        wide = 0.32 * 8 * (len(one) + len(other))
+        assert abs(a[0] - b[0]) > wide or abs(a[1] - b[1]) > 8
+    assert 1 in found
+    assert len(found) >= 3 or (thin < 1.0 and count > 4)
+    if count <= 7 and thin == 1.0:
+        assert len(found) == count
+
+
+@pytest.mark.parametrize(
+    ("size", "prefix"), [(5e-4, "m"), (2e-6, "\u00b5"), (2.0, ""), (400.0, ""), (1e5, "k")]
+)
+def test_units_suit_the_size(axes: Axes, size: float, prefix: str) -> None:
+    torque = TorqueProfile(np.array([0.0, 1.0]), np.full((1, 2, 1), 0.5 * size))
+    draw_torques(axes, torque, np.array([size, size]))
+    axes.figure.canvas.draw()
+    assert f"[{prefix}N m]" in axes.get_ylabel()
+    labels = [tick.get_text() for tick in axes.get_yticklabels()]
+    assert max(map(len, labels)) <= 5
+
+
+def test_margins_are_the_trajectory_with_breaks_at_phases(
+    figure: Figure, planned: Trajectory
+) -> None:
+    margins, steps = figure.axes[-2], find_steps(planned)
+    assert set(np.flatnonzero(np.diff(planned.phase)) + 1) <= set(steps)
+    added = np.insert(np.zeros(len(planned.t), dtype=bool), np.repeat(steps, 2), True)
+    for index, name in enumerate(planned.contacts):
+        t, values = data_of(line_of(margins, name))
+        np.testing.assert_array_equal(t[~added], planned.t)
+        np.testing.assert_array_equal(values[~added], planned.c_n[:, index] - 0.05)
+        # At a step the line breaks upright: it lasts until then, and goes on from there.
+        np.testing.assert_array_equal(t[added], np.repeat(planned.t[steps], 2))
+        before = planned.c_n[steps - 1, index] - 0.05
+        np.testing.assert_array_equal(values[added][::2], before)
+        assert np.isnan(values[added][1::2]).all()
+
+
+def test_zero_line_and_limits_are_there(
+    figure: Figure, planned: Trajectory, problem: Problem
+) -> None:
+    margins, torques = figure.axes[-2:]
+    assert 0.0 in levels(margins)
+    low, high = margins.get_ylim()
+    assert low < -problem.epsilon and high > np.nanmax(planned.c_n) - problem.epsilon
+    limits = problem.scene.torque_limit
+    assert sorted(y for y in levels(torques) if y) == sorted([*limits, *-limits])
+    for line in torques.lines:
+        if line.get_label() == "limits":
+            assert line.is_dashed()
+
+
+def test_torque_lines_have_both_ends_of_every_step(axes: Axes) -> None:
+    profile = TorqueProfile(
+        np.array([0.0, 0.5, 2.0]),
+        np.array([[[0.25, 0.25, 0.0], [1.0, 0.0, 0.0]], [[-1.0, 0.0, 0.5], [1.0, 0.0, 0.0]]]),
+    )
+    line, other = draw_torques(axes, profile, np.array([2.0, 2.0]))
+    t, tau = data_of(line)
+    np.testing.assert_allclose(tau[t == 0.5], [0.5, -0.5])
+    inside = t != 0.5
+    np.testing.assert_allclose(tau[inside], profile.at(t[inside])[:, 0], atol=1e-12)
+    np.testing.assert_allclose(data_of(other)[1], 1.0)
+
+
+def test_planned_torques_are_drawn_exactly(figure: Figure, planned: Trajectory) -> None:
+    for index in range(2):
+        t, tau = data_of(line_of(figure.axes[-1], f"finger {index + 1}"))
+        inside = np.abs(t[:, None] - planned.torque.breaks).min(axis=1) > 1e-9
+        expected = planned.torque.at(t[inside])[:, index]
+        np.testing.assert_allclose(tau[inside], expected, atol=1e-10)
+
+
+@pytest.mark.parametrize("row", [0, 320, -1])
+def test_snapshot_is_to_scale(axes: Axes, planned: Trajectory, problem: Problem, row: int) -> None:
+    z, names = planned.z[row], planned.motions[planned.phase[row]].contacts
+    scene, styles = problem.scene, choose_styles(planned.contacts)
+    _, *links, body = draw_snapshot(axes, scene, z, names, styles)[:4]
+    c, s = np.cos(z[2]), np.sin(z[2])
+    corners = [(z[0] + c * x - s * y, z[1] + s * x + c * y) for x, y in scene.polygon.vertices]
+    assert isinstance(body, Polygon)
+    np.testing.assert_allclose(body.get_xy()[:-1], corners, atol=1e-13)
+    for link, finger, angle in zip(links, scene.fingers, z[3:], strict=True):
+        assert isinstance(link, Polygon)
+        offset = link.get_xy() - np.asarray(finger.base)
+        axis = np.array([np.cos(angle), np.sin(angle)])
+        along = np.clip(offset @ axis, 0.0, finger.length)
+        distance = np.hypot(*(offset - along[:, None] * axis).T)
+        np.testing.assert_allclose(distance, finger.radius, atol=1e-13)
+        assert np.max(offset @ axis) == pytest.approx(finger.length + finger.radius)
+    marks = {str(line.get_label()): line for line in axes.lines}
+    for name in names:
+        found = np.ravel(data_of(marks[name]))
+        vertex = corners[int(name[1])]
+        np.testing.assert_allclose(found, vertex, atol=1e-12)
+    numbers = [text.get_text() for text in axes.texts]
+    assert numbers == [str(i) for i in range(7)]
+
+
+def test_snapshots_are_at_least_six_and_one_of_every_phase(planned: Trajectory) -> None:
+    for phases in ([0], [0, 1], [0, 1, 2], [0, 1, 2, 3], list(range(5)), [0, 1] * 5):
+        trajectory = repeat(planned, phases)
+        rows = choose_snapshots(trajectory)
+        assert len(rows) == max(6, len(phases) + 1)
+        assert rows[0] == 0 and rows[-1] == len(trajectory.t) - 1
+        assert (np.diff(rows) > 0).all()
+        boundaries = np.flatnonzero(np.diff(trajectory.phase)) + 1
+        assert set(boundaries) <= set(rows)
+
+
+@pytest.mark.parametrize("width", [3.5, 7.0])
+def test_text_is_inside_and_apart_in_other_widths(width: float, planned: Trajectory) -> None:
+    figure = plots.force_margins(planned, width=width, motion=True)
+    assert figure.get_figwidth() == width
+    check_layout(figure)
+    pose, angles, speeds = figure.axes[-3:]
+    assert data_of(line_of(pose, "x [mm]"))[1][-1] == pytest.approx(1e3 * planned.q[-1, 0])
+    assert data_of(line_of(angles, "finger 2"))[1][0] == pytest.approx(
+        np.degrees(planned.theta[0, 1])
+    )
+    assert np.nanmax(data_of(line_of(speeds, "finger 1"))[1]) == planned.theta_dot[:, 0].max()
+
+
+@pytest.mark.parametrize("width", [2.0, 50.0, float("nan")])
+def test_widths_that_are_no_paper_are_refused(width: float, planned: Trajectory) -> None:
+    with pytest.raises(InputError, match="width"):
+        plots.force_margins(planned, width=width)
+
+
+def test_simulation_is_drawn_over_the_plan(planned: Trajectory) -> None:
+    c_n = planned.c_n.copy()
+    c_n[100, 0] = -3.0
+    simulation: Any = Replayed(planned.t, planned.phase, planned.tau, c_n)
+    figure = plots.force_margins(planned, simulation=simulation)
+    margins, torques = figure.axes[-2:]
+    line = line_of(margins, "simulated")
+    t, values = data_of(line)
+    rows = ~np.isnan(t)
+    assert (~rows).sum() == 4
+    np.testing.assert_array_equal(values[rows], c_n[:, 0] - 0.05)
+    assert margins.get_ylim()[0] < -3.05
+    both = [line_of(torques, f"simulated {number}") for number in (1, 2)]
+    assert line.is_dashed() and both[0].is_dashed()
+    # The torque of one finger is told from that of the other.
+    assert both[0].get_linewidth() != both[1].get_linewidth()
+    check_layout(figure)
+
+
+def test_save_writes_the_format_of_the_ending_and_the_same_bytes(
+    planned: Trajectory, tmp_path: Path
+) -> None:
+    short = repeat(planned, [0])
+    # Letters take a PDF long.
+    figure, wordless = plots.force_margins(short), Figure()
+    wordless.add_subplot().set_axis_off()
+    wordless.axes[0].plot(short.t, short.tau)
+    for ending, magic in ((".png", b"\x89PNG\r\n"), (".PDF", b"%PDF-")):
+        drawn = figure if ending == ".png" else wordless
+        first, second = (tmp_path / f"{name}{ending}" for name in "ab")
+        # Whether a figure is new or has been drawn before.
+        plots.save(drawn, first)
+        plots.save(drawn, str(second))
+        written = first.read_bytes()
+        assert written.startswith(magic) and written == second.read_bytes()
+        assert b"Date" not in written and b"dc:date" not in written and len(written) < 1_000_000
+        if ending == ".png":
+            # At least 150 dots per inch.
+            assert int.from_bytes(written[16:20], "big") >= 150 * WIDTH
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "a", "png", "a.png.txt"])
+def test_save_refuses_other_endings(figure: Figure, tmp_path: Path, name: str) -> None:
+    with pytest.raises(InputError, match=r"allowed: \.png, \.pdf, \.svg") as caught:
+        plots.save(figure, tmp_path / name)
+    assert name in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_trajectory_without_its_problem_is_refused(planned: Trajectory) -> None:
+    bare = dataclasses.replace(planned, meta={"epsilon": 0.05})
+    with pytest.raises(InputError, match=r"meta\.problem"):
+        plots.force_margins(bare)
+
+
+def test_odd_names_are_drawn_as_they_are(planned: Trajectory) -> None:
+    short = repeat(planned, [0])
+    for name in ("cost $5 and \\frac{" + 20 * " a long name", ""):
+        meta = {**planned.meta, "name": name}
+        check_layout(plots.force_margins(dataclasses.replace(short, meta=meta)))
+
+
+def test_settings_of_matplotlib_are_left_alone_and_pyplot_is_not_imported(
+    planned: Trajectory, tmp_path: Path
+) -> None:
+    planned.save(tmp_path / "plan.npz")
+    code = (
+        "import sys, matplotlib, wholearm\n"
+        "before = matplotlib.rcParams.copy()\n"
+        f"plan = wholearm.load_trajectory({str(tmp_path / 'plan.npz')!r})\n"
+        "figure = wholearm.plots.force_margins(plan)\n"
+        f"wholearm.plots.save(figure, {str(tmp_path / 'a.svg')!r})\n"
+        "assert matplotlib.rcParams.copy() == before\n"
+        "assert 'matplotlib.pyplot' not in sys.modules\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_friction_cones_have_a_panel_of_their_own(figure: Figure) -> None:
+    plan = tipping.tipped()
+    drawn = plots.force_margins(plan)
+    check_layout(drawn)
+    assert len(drawn.axes) == len(figure.axes) + 1
+    margins, torques, cones = drawn.axes[-3:]
+    assert margins.get_position().y0 > cones.get_position().y1
+    assert cones.get_position().y0 > torques.get_position().y1
+    t, shares = data_of(line_of(cones, "v1-palm"))
+    known = ~np.isnan(t)
+    column = plan.contacts.index("v1-palm")
+    expected = np.where(
+        plan.phase == 1, plan.c_t[:, column] / (tipping.PALM * plan.c_n[:, column]), np.nan
+    )
+    np.testing.assert_allclose(shares[known], expected, rtol=1e-12)
+    assert np.nanmax(np.abs(shares)) < 1 and levels(cones) == [-1.0, 1.0, 0.0]
+    margin_line = line_of(margins, "v1-palm")
+    assert line_of(cones, "v1-palm").get_color() == margin_line.get_color()
+
+
+@pytest.fixture(scope="module")
+def picture(chart: FormationMap) -> Figure:
+    return draw_map(chart)
+
+
+def texts(picture: Figure) -> list[str]:
+    return [text.get_text() for text in picture.findobj(Text)]
+
+
+def test_axes_have_names_and_units_and_cover_the_window(
+    picture: Figure, chart: FormationMap
+) -> None:
+    (axes,) = picture.axes
+    assert axes.get_xlabel() == "x of the centroid [mm]"
+    assert axes.get_ylabel() == "orientation \u03c6 [deg]"
+    assert axes.get_xlim() == pytest.approx(tuple(1e3 * chart.x[[0, -1]]))
+    assert axes.get_ylim() == pytest.approx(tuple(np.degrees(chart.phi[[0, -1]])))
+
+
+def test_cells_edges_and_phases_are_named(picture: Figure, chart: FormationMap) -> None:
+    shown = texts(picture)
+    assert {"v1 | v3 | v6", "v1 | v4 | v6", "v0 | v3 | v5", "v0 | e2 | v0"} <= set(shown)
+    assert [text for text in shown if text.isdigit()] == ["1", "2", "3", "4", "5"]
+    assert {f"edge {edge} on\nthe palm" for edge in (6, 0, 1)} <= set(shown)
+
+
+def test_labels_are_inside_their_cells(picture: Figure, chart: FormationMap) -> None:
+    names = [
+        " | ".join(f"{c.corner}{'*' if (c.surface, c.feature) == ('tip', 'v') else ''}" for c in f)
+        for f in chart.formations
+    ]
+    labels = [text for text in picture.axes[0].texts if text.get_text() in names]
+    assert len(labels) > 20
+    for label in labels:
+        x, phi = label.get_position()
+        column = np.abs(1e3 * chart.x - x).argmin()
+        row = np.abs(np.degrees(chart.phi) - phi).argmin()
+        assert names[chart.cell[row, column]] == label.get_text()
+
+
+def test_directed_lines_are_where_motion_is_possible(picture: Figure, chart: FormationMap) -> None:
+    (axes,) = picture.axes
+    strips = [c for c in axes.collections if isinstance(c, LineCollection)]
+    by_colour = {to_hex(np.asarray(c.get_color())[0]).upper(): c for c in strips}
+    # A line is moved aside by a few points: a few per cent of the axes' half.
+    slack = 0.02 * np.array([np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())])
+    for colour, name in (("#0072B2", "forth"), ("#D55E00", "back")):
+        places = np.concatenate(
+            [b.points[getattr(b, name)] for b in chart.borders if getattr(b, name).any()]
+        )
+        places = np.column_stack([1e3 * places[:, 0], np.degrees(places[:, 1])])
+        for segment in by_colour[colour].get_segments():
+            for point in np.asarray(segment)[:: len(segment) // 3 + 1]:
+                assert (np.abs(places - point) < slack).all(axis=1).any()
+
+
+def test_nothing_is_clipped_and_labels_do_not_overlap(picture: Figure) -> None:
+    canvas: Any = FigureCanvasAgg(picture)
+    canvas.draw()
+    width, height = picture.bbox.width, picture.bbox.height
+    (axes,), (legend,) = picture.axes, picture.legends
+    labels = [axes.xaxis.label, axes.yaxis.label, *axes.texts, *picture.texts, *legend.texts]
+    for text in labels:
+        box = text.get_window_extent()
+        assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= width and box.y1 <= height
+    inside = [text.get_window_extent() for text in axes.texts]
+    for k, box in enumerate(inside):
+        assert not any(box.overlaps(other) for other in inside[:k])
+
+
+def test_plan_is_drawn_over_the_map(chart: FormationMap, trajectory: Trajectory) -> None:
+    lines = draw_map(chart, trajectory).axes[0].lines
+    paths = [np.column_stack(line.get_data()) for line in lines]
+    ends = [path[[0, -1]] for path in paths if len(path) > 50]
+    assert len(ends) >= 5
+    q = trajectory.q[[0, -1]]
+    start, stop = (np.array([1e3 * row[0], np.degrees(row[2])]) for row in q)
+    assert any(np.allclose(end[0], start) for end in ends)
+    assert any(np.allclose(end[-1], stop) for end in ends)
+
+
+def test_command_writes_the_figure(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    chart: FormationMap,
+    trajectory: Trajectory,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    trajectory.save("plan.npz")
+    with monkeypatch.context() as patch:
+        patch.setattr("wholearm.mapping.formation_map.build_map", lambda *_, **__: chart)
+        assert main(["map", str(HEPTAGON), "--plan", "plan.npz"]) == 0
+        assert capsys.readouterr().out == "wrote map_heptagon_four_contacts.png\n"
+        data = (tmp_path / "map_heptagon_four_contacts.png").read_bytes()
+        assert data[:4] == b"\x89PNG"
+        listing = ["--list", "0.045,-1.98", "0.03,-1.98"]
+        assert main(["map", str(HEPTAGON), "-o", "m.svg", *listing]) == 0
+    captured = capsys.readouterr()
+    assert "contacts = [" in captured.out and captured.err == "wrote m.svg\n"
+    assert (tmp_path / "m.svg").read_bytes()[:5] == b"<?xml"
+
+
+def test_overlap_of_the_fingers_has_its_own_hatching(picture: Figure) -> None:
+    window = Window((-0.06, 0.05), (np.radians(-15.0), np.radians(15.0)))
+    drawn = draw_map(build_map(hexagon((0.19, 0.19), -0.085), 60, window))
+    label = "the fingers would overlap"
+    assert label in texts(drawn) and label not in texts(picture)
+    legend = drawn.legends[0]
+    looks = {
+        text.get_text(): patch
+        for text, patch in zip(legend.get_texts(), legend.legend_handles, strict=True)
+    }
+    patches = [own for own in drawn.axes[0].patches if isinstance(own, PathPatch)]
+    (crossed,) = [own for own in patches if own.get_hatch() is not None]
+    own, other = looks[label], looks["cannot be reached"]
+    assert isinstance(own, Patch) and isinstance(other, Patch)
+    assert crossed.get_hatch() == own.get_hatch() != other.get_hatch()
+    assert crossed.get_facecolor() == own.get_facecolor()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_parts_and_their_rooms_are_those_of_scipy(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    field = ndimage.gaussian_filter(rng.normal(size=(40, 50)), rng.uniform(0.5, 4.0))
+    cell = np.digitize(field, np.quantile(field, [0.2, 0.5, 0.8])) - 1
+    step, parts = rng.uniform(0.2, 3.0, 2), list(split(cell))
+    expected = []
+    for k in range(3):
+        number, count = ndimage.label(cell == k)
+        expected += [(k, number == n + 1) for n in range(count)]
+    assert [k for k, _ in parts] == [k for k, _ in expected]
+    for (_, region), (_, other) in zip(parts, expected, strict=True):
+        np.testing.assert_array_equal(region, other)
+        room = ndimage.distance_transform_edt(np.pad(other, 1), sampling=step)[1:-1, 1:-1]
+        row, column, found = find_room(region, step)
+        assert found == pytest.approx(room.max()) == pytest.approx(room[row, column])
+
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+
+
+def test_pushes_and_weight_are_what_accelerates_the_object() -> None:
+    problem, plan = problem_of(LANDING), plan_of(LANDING)
+    pushes = place_pushes(problem.scene, plan)
+    body = problem.scene.polygon
+    assert body.inertia is not None
+    arms = pushes.points - plan.q[:, None, :2]
+    moments = arms[..., 0] * pushes.forces[..., 1] - arms[..., 1] * pushes.forces[..., 0]
+    force, moment = np.nansum(pushes.forces, axis=1), np.nansum(moments, axis=1)
+    force[:, 1] -= body.mass * problem.scene.gravity
+    # Newton and Euler; plans satisfy them between nodes to 1e-6 of the largest forces.
+    scale = np.nanmax(np.abs(pushes.forces))
+    np.testing.assert_allclose(body.mass * plan.q_ddot[:, :2], force, atol=1e-5 * scale)
+    np.testing.assert_allclose(body.inertia * plan.q_ddot[:, 2], moment, atol=1e-6 * scale)
+    np.testing.assert_allclose(np.hypot(*pushes.normals.T), 1.0, rtol=1e-12)
+
+
+def test_a_motion_survives_its_page() -> None:
+    problem, plan = problem_of(HEPTAGON), plan_of(HEPTAGON)
+    text = page.build_page("a <title>", [page.write_player(describe_motion(plan, problem))])
+    assert "a &lt;title&gt;" in text
+    # Nothing is fetched: the only address is the name of SVG's namespace.
+    assert set(re.findall(r"https?://[^\"]+", text)) == {"http://www.w3.org/2000/svg"}
+    assert not re.search(r"\bsrc=\"(?!data:)|\bhref=", text)
+    (found,) = re.findall(r'<script type="application/json">(.*?)</script>', text, re.S)
+    read = json.loads(found)
+    assert len(read["t"]) == len(read["z"]) == len(plan.t)
+    np.testing.assert_allclose(read["z"], plan.z, atol=1e-5)
+    for index, contact in enumerate(read["contacts"]):
+        c = np.full((len(plan.t), 2), np.nan)
+        for span in contact["spans"]:
+            c[span["first"] : span["first"] + len(span["c"])] = span["c"]
+        np.testing.assert_allclose(c[:, 0], plan.c_n[:, index], rtol=1e-5, atol=1e-12)
+        np.testing.assert_allclose(c[:, 1], plan.c_t[:, index], rtol=1e-5, atol=1e-12)
+
+
+def test_names_cannot_end_a_script() -> None:
+    name = "</script><script>alert(1)"
+    motion = describe_motion(plan_of(HEPTAGON), problem_of(HEPTAGON)) | {"name": name}
+    assert "</script><script>alert" not in page.write_player(motion)
+
+
+def test_tables_say_what_the_joints_of_phases_are() -> None:
+    problem, plan = problem_of(LANDING), plan_of(LANDING)
+    phases, joints = list_phases(problem, plan), list_joints(plan)
+    assert [row[0] for row in phases.cells] == list("123456")
+    for table in (phases, joints):
+        assert {len(row) for row in table.rows} == {len(table.columns)}
+    assert [row[0] for row in joints.cells] == list("12345")
+    duration = sum(float(row[phases.heads.index("duration [s]")]) for row in phases.cells)
+    assert duration == pytest.approx(plan.duration, abs=1e-5)
+    # The fourth ends at rest, the fifth smoothly: at a speed, the same on both sides.
+    speeds = [row[joints.heads.index("speed before [m/s]") :][:2] for row in joints.cells]
+    assert speeds[3] == ["0.0000", "0.0000"]
+    assert speeds[4][0] == speeds[4][1] != "0.0000"
+    assert "v3-finger1: 0.050 \u2192 -" in joints.cells[4][1]
+
+
+def test_a_movie_shows_the_whole_motion(tmp_path: Path) -> None:
+    problem, plan = problem_of(HEPTAGON), plan_of(HEPTAGON)
+    movie = Movie(problem, plan, plan, speed=2.0)
+    assert movie.times[[0, -1]] == pytest.approx([0.0, plan.duration])
+    # Not slower than a frame of the whole, and at twice the speed.
+    assert len(movie.times) == pytest.approx(plan.duration / 2.0 * FRAMES + 1, abs=1.0)
+    write_movie(movie, tmp_path / "plan.gif")
+    with Image.open(tmp_path / "plan.gif") as image:
+        frames = getattr(image, "n_frames", 1)
+        assert frames == len(movie.times)
+        assert image.info["duration"] * FRAMES == 1000
+        first = np.array(image.convert("RGB"), dtype=int)
+        # Each contact has its own colour.
+        for colour in {own.colour for own in choose_styles(plan.contacts).values()}:
+            assert (first == ImageColor.getrgb(colour)).all(axis=2).any()
+        image.seek(frames - 1)
+        assert (np.abs(np.array(image.convert("RGB")) - first).max(axis=2) > 60).mean() > 0.01
+
+
+@pytest.mark.parametrize(
+    ("output", "words"), [("plan.avi", "'.avi' given"), ("none/plan.gif", "none")]
+)
+def test_animate_refuses_what_it_cannot_write(
+    output: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan_of(HEPTAGON).save(str(tmp_path / "plan.npz"))
+    assert main(["animate", str(tmp_path / "plan.npz"), "-o", str(tmp_path / output)]) == 2
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.skipif(shutil.which("ffmpeg") is not None, reason="ffmpeg is there")
+def test_an_mp4_needs_ffmpeg(tmp_path: Path) -> None:
+    movie = Movie(problem_of(HEPTAGON), plan_of(HEPTAGON), speed=100.0)
+    with pytest.raises(InputError, match="needs ffmpeg"):
+        write_movie(movie, tmp_path / "plan.mp4")
+
+
+def open_in_browser(text: str, folder: Path, fragment: str = "") -> str:
+    """What a page has become in a browser, as HTML."""
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        pytest.skip("no Chromium here")
+    (folder / "page.html").write_text(text, encoding="utf-8")
+    options = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking"]
+    options += ["--no-first-run", "--disable-sync", "--disable-component-update", "--disable-quic"]
+    command = [browser, *options, f"--user-data-dir={folder / 'profile'}", "--dump-dom"]
+    address = f"file://{folder / 'page.html'}{fragment}"
+    done = subprocess.run([*command, address], capture_output=True, text=True, timeout=60)
+    return done.stdout
+
+
+def test_slider_plots_and_map_respond_in_a_browser(tmp_path: Path) -> None:
+    problem, plan = problem_of(HEPTAGON), plan_of(HEPTAGON)
+    drawing, told = describe_map(chart(), plan)
+    places = told["places"]
+    kinds = ("a cell", "a border", "a crossing")
+    texts = [place["text"] for place in places]
+    firsts = [next(k for k, text in enumerate(texts) if text.startswith(kind)) for kind in kinds]
+    motion = describe_motion(plan, problem, plan) | {"speed": 0.25}
+    parts = [page.write_player(motion), page.write_chart(drawing, told)]
+    acts = """<script>
+      const said = {}, output = document.querySelector("output");
+      const read = () => [output.textContent, document.querySelector(".cursor").getAttribute("x1")];
+      said.first = read(); said.speed = document.querySelector("select").value;
+      const slider = document.querySelector("input[type=range]");
+      slider.value = 500; slider.dispatchEvent(new Event("input")); said.slid = read();
+      const plot = document.querySelector(".plot"), box = plot.getBoundingClientRect();
+      plot.setPointerCapture = () => {};
+      plot.dispatchEvent(new PointerEvent("pointerdown",
+        { clientX: box.left + box.width * (58 + 932 * 0.25) / 1000, clientY: box.top + 50 }));
+      said.clicked = read();
+      said.places = FIRSTS.map((k) => {
+        document.querySelector(`.map #place-${k}`).dispatchEvent(new MouseEvent("click"));
+        return [document.querySelector(".choice p").textContent,
+                document.querySelectorAll(".pose polygon").length,
+                document.querySelectorAll(".pose circle[visibility=visible]").length];
+      });
+      document.body.append(JSON.stringify(said));
+    </script></body>""".replace("FIRSTS", str(firsts))
+    text = page.build_page("heptagon", parts).replace("</body>", acts)
+    found = re.findall(r'\{"first".*\}', open_in_browser(text, tmp_path, "#t=0.1"))
+    said = json.loads(found[-1])
+    cursor = [58 + 932 * share for share in (0.1 / plan.duration, 0.5, 0.25)]
+    for key, x in zip(("first", "slid", "clicked"), cursor, strict=True):
+        t = (x - 58) / 932 * plan.duration
+        own = int(plan.phase[np.searchsorted(plan.t, t, side="right") - 1])
+        assert said[key][0] == f"{float(said[key][0].split()[0]):.4f} s, phase {own + 1}"
+        assert float(said[key][0].split()[0]) == pytest.approx(t, abs=1e-3 * plan.duration)
+        assert float(said[key][1]) == pytest.approx(x, abs=1.0)
+    assert said["speed"] == "0.25"
+    # A cell, a border and a crossing, each with its contacts: the object and a dot for each.
+    for (text, objects, dots), n_contacts in zip(said["places"], (3, 4, 5), strict=True):
+        own = next(own for own in places if own["text"] in text)
+        assert text.startswith(" ".join(own["contacts"]) + ": ")
+        assert objects == 1 + dots and dots == len(own["contacts"]) >= n_contacts
+
+
+def test_what_touches_at_a_place_of_the_map_is_told() -> None:
+    drawing, told = describe_map(chart(), plan_of(HEPTAGON))
+    places = told["places"]
+    # Each has its number in the drawing.
+    ids = re.findall(r'id="place-(\d+)"', drawing)
+    assert sorted(map(int, ids)) == list(range(len(places)))
+    scene, freedoms = problem_of(HEPTAGON).scene, {"a cell": 3, "a border": 4, "a crossing": 5}
+    table = {contact.name: k for k, contact in enumerate(contact_table(scene))}
+    seen = set()
+    for own in places:
+        kind = next(kind for kind in freedoms if own["text"].startswith(kind))
+        assert len(own["contacts"]) >= freedoms[kind]
+        label = [table[name] for name in own["contacts"]]
+        # Poses are rounded to 1e-5 m and rad, and links are 0.2 m long.
+        assert np.abs(evaluate_contacts(scene, label, np.array(own["z"])).C).max() < 1e-5
+        seen.add(kind)
+    assert seen == set(freedoms)
+
+
+def test_a_gallery_shows_every_problem(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    problem = tmp_path / "slide.toml"
+    problem.write_text(write_template("slide", 4, 0.05), encoding="utf-8")
+    page = tmp_path / "gallery.md"
+    assert main(["gallery", str(problem), "-o", str(page)]) == 0
+    text = page.read_text(encoding="utf-8")
+    (row,) = re.findall(r"^\| slide \|.*$", text, re.M)
+    assert row.endswith("| ok |")
+    for name in re.findall(r"\]\((.*?)\)", text):
+        assert (tmp_path / name).stat().st_size < 1_000_000
+    assert len(list((tmp_path / "gallery").iterdir())) == 2
+
+
+def test_a_report_holds_what_was_given(tmp_path: Path) -> None:
+    problem, path = problem_of(HEPTAGON), tmp_path / "plan.npz"
+    plan_of(HEPTAGON).save(str(path))
+    text = build_report(problem, [str(path)], HEPTAGON.read_text(encoding="utf-8"), chart=chart())
+    for words in ("plan.npz", "ok: ", "v3-finger1", "[fingers.1]", "what verify says"):
+        assert words in text
+    assert len(text) < 5e6
+
+
+def test_a_report_says_which_contact_torques_lose_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "torques.csv"
+    path.write_text("t,tau1,tau2\n0,3,2.1\n0.5,3,2.1\n", encoding="utf-8")
+    text = build_report(problem_of(HEPTAGON), [str(path)], chart=chart())
+    assert "FAILED: c_n of v5-finger2 falls to " in text and "what verify says" in text
+
+
+class Grade(Enum):
+    GOOD = "good"
+
+
+class Place(NamedTuple):
+    x: float
+    name: str = ""
+
+
+class Visit(NamedTuple):
+    number: int
+    place: Place | None
+    pair: tuple[float, float]
+    time: float
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Tour(Result):
+    """A result of its own: all that it has is a document."""
+
+    name: str
+    visits: tuple[Visit, ...]
+    samples: Array = field(repr=False)
+    grade: Grade = Grade.GOOD
+
+    derived = ("ok",)
+
+    @property
+    def ok(self) -> bool:
+        return all(own.place is not None for own in self.visits)
+
+    @property
+    def document(self) -> Document:
+        columns = {"number": "phase:d", "place.name": "place", "place.x": "x [mm]:.1f"}
+        columns |= {"pair": "tau [N m]:.2f", "time": "t [s]:.3f"}
+        table = Table.of(self.visits, columns, "visits")
+        return self.judge(self.name, "a <reason>", ["a line", "", table, "the end"])
+
+
+TOUR = Tour(
+    "tour",
+    (
+        Visit(1, Place(0.0125, "edge & tip"), (1.0, -2.0), 0.5),
+        Visit(20, None, (0.25, 0.125), math.nan),
+    ),
+    np.zeros(3),
+)
+
+
+def test_text_is_lines_and_aligned_tables() -> None:
+    assert TOUR.to_text().splitlines() == [
+        "tour: FAILED: a <reason>",
+        "a line",
+        "",
+        "visits",
+        "phase  place       x [mm]   tau [N m]  t [s]",
+        "    1  edge & tip    12.5  1.00 -2.00  0.500",
+        "   20  -                -   0.25 0.12      -",
+        "",
+        "the end",
+    ]
+    assert repr(TOUR) == "Tour(tour: FAILED: a <reason>)" and TOUR.exit_status == 1
+
+
+def test_plain_values_are_json() -> None:
+    values = TOUR.to_dict()
+    assert json.loads(json.dumps(values, allow_nan=False)) == values
+    assert values["ok"] is False and values["grade"] == "good" and "samples" not in values
+    assert values["visits"][0]["place"] == {"x": 0.0125, "name": "edge & tip"}
+    assert values["visits"][1] == {"number": 20, "place": None, "pair": [0.25, 0.125], "time": None}
+
+
+def test_what_is_made_plain_is_read_back() -> None:
+    again = restore(tuple[Visit, ...], json.loads(json.dumps(plain(TOUR.visits))))
+    assert again[0] == TOUR.visits[0] and again[1][:3] == TOUR.visits[1][:3]
+    assert math.isnan(again[1].time)
+    # What is missing is as by default; what is of another kind is an error.
+    assert restore(Place | None, {"x": 1}) == Place(1.0)
+    for kind, value in ((Place, {"x": "far"}), (Place, 3), (Place, {}), (tuple[Place, ...], 1)):
+        with pytest.raises((TypeError, ValueError, AttributeError)):
+            restore(kind, value)
+
+
+def test_html_has_the_same_cells_and_names_escaped() -> None:
+    cells, tags = list[str](), list[str]()
+
+    class Reader(HTMLParser):
+        def handle_starttag(self, tag: str, attrs: object) -> None:
+            tags.append(tag)
+
+        def handle_data(self, data: str) -> None:
+            cells.extend([data] if data.strip() else [])
+
+    Reader().feed(TOUR._repr_html_())
+    table = TOUR.document.parts[2]
+    assert isinstance(table, Table)
+    rows = [cell for row in (table.heads, *table.cells) for cell in row]
+    assert cells == ["tour: FAILED: a <reason>", "a line", "visits", *rows, "the end"]
+    assert tags.count("tr") == 3 and "reason" not in tags
+
+
+def test_long_tables_are_cut_as_text_and_have_a_rule_as_markdown() -> None:
+    table = Table(["n:d", "a:b:.1f", "word"], [(k, k / 2, "w") for k in range(5)], most=2)
+    text = table.to_text().splitlines()
+    assert text[0].split() == ["n", "a:b", "word"] and len(text) == 4
+    assert text[-1] == "... and 3 more, see --json"
+    lines = table.to_markdown().splitlines()
+    assert lines[:3] == ["| n | a:b | word |", "| ---: | ---: | --- |", "| 0 | 0.0 | w |"]
+    assert len(lines) == 2 + 5
+
+
+def test_numbers_are_written_with_significant_digits() -> None:
+    assert show(0.0123456, fixed(0.05)) == "0.0123" and show(-1e-9, fixed(0.05)) == "0.0000"
+    assert show(None, ".1f") == show(math.nan, ".1f") == "-"
+    assert show(0.25, ".0f", 100.0) == "25"
+
+
+NOT_IN_0_1_0 = (
+    "rolling", "modes", "sequences", "complete", "attempts", "transcription", "duration",
+    "time_intervals", "degree", "scheme", "opening", "clearance", "samples", "mode_search",
+    "build_times",
+    "solve_times", "transitions", "replay", "certify", "certificate",
+)  # fmt: skip
+
+
+def two_phases(path: Path = HEPTAGON) -> Problem:
+    """The first two phases of a problem, the last one ending at rest."""
+    whole = problem_of(path)
+    first, second = whole.phases[:2]
+    return replace(whole, phases=(first, replace(second, end=whole.phases[-1].end)))
+
+
+@pytest.fixture(scope="module")
+def made() -> Plan:
+    return solve(two_phases(), "effort", intervals=20, samples=21, time_weight=2.0)
+
+
+@pytest.fixture(scope="module")
+def within() -> Plan:
+    """A plan in the time domain."""
+    whole = two_phases()
+    first = replace(whole, phases=whole.phases[:1])
+    return solve(first, transcription="time", time_intervals=4, certify=True)
+
+
+@pytest.fixture(scope="module")
+def certified() -> Plan:
+    return solve(two_phases(), intervals=20, samples=5, replay=False, certify=True)
+
+
+def change_meta(plan: Plan, path: Path, changed: dict[str, Any], gone: tuple[str, ...] = ()) -> str:
+    meta = {key: value for key, value in plan.meta.items() if key not in gone} | changed
+    replace(plan.trajectory, meta=meta).save(path)
+    return str(path)
+
+
+@pytest.mark.parametrize("which", ["made", "within", "certified"])
+def test_a_plan_comes_back_from_its_file(
+    which: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    plan: Plan = request.getfixturevalue(which)
+    plan.save(tmp_path / "a.npz")
+    loaded = load_plan(tmp_path / "a.npz")
+    for name in (
+        "options",
+        "status",
+        "value",
+        "phases",
+        "transitions",
+        "timings",
+        "versions",
+        "certificate",
+    ):
+        assert getattr(loaded, name) == getattr(plan, name), name
+    assert loaded.replay == plan.replay
+    assert loaded.meta == plan.meta == write_meta(loaded)
+    assert loaded.problem.table == plan.problem.table
+    np.testing.assert_array_equal(loaded.trajectory.tau, plan.trajectory.tau)
+
+
+def test_a_plan_says_what_it_is(made: Plan) -> None:
+    assert repr(made).startswith("Plan('heptagon") and "\n" not in repr(made)
+    assert made.options == PlanOptions("effort", intervals=20, samples=21, time_weight=2.0)
+    assert made.unit == "(N m)^2 s" and made.status is Status.SOLVED
+    assert made.value == pytest.approx(sum(phase.value for phase in made.phases))
+    assert made.duration == pytest.approx(sum(phase.duration for phase in made.phases))
+    assert made.at(0.0).z[0] == pytest.approx(made.problem.start, abs=1e-9)
+    report = verify(made.problem, made)
+    assert report.ok and made.replay is not None
+    arrivals = [phase.arrival for phase in made.replay.phases]
+    assert arrivals == pytest.approx([phase.arrival for phase in report.phases])
+
+
+def test_a_file_of_0_1_0_loads(made: Plan, tmp_path: Path) -> None:
+    path = change_meta(made, tmp_path / "a.npz", {}, NOT_IN_0_1_0)
+    loaded = load_plan(path)
+    assert loaded.value == made.value and loaded.phases[0].duration == made.phases[0].duration
+    assert loaded.options == replace(
+        PlanOptions("effort"), intervals=20, time_weight=2.0, replay=False
+    )
+    assert loaded.replay is None and loaded.transitions == ()
+    assert loaded.statistics.solves == made.statistics.solves
+
+
+def test_a_certificate_has_every_phase_and_all_together(certified: Plan) -> None:
+    certificate = certified.certificate
+    assert certificate is not None and certificate.total is not None
+    assert [part.phases for part in certificate.parts] == [(1,), (2,)]
+    for part, phase in zip(certificate.parts, certified.phases, strict=True):
+        assert part.bound is not None and part.error is not None and part.gap is not None
+        assert part.duration == phase.duration and part.error < 1e-7 * part.bound
+        # Twenty intervals are coarse. The bound is good to its error.
+        assert -1e-7 < part.gap < 1e-2
+    total = certificate.total
+    assert total.phases == (1, 2) and total.duration == pytest.approx(certified.duration)
+    assert total.bound == pytest.approx(sum(part.bound or 0 for part in certificate.parts))
+    assert certified.meta["certificate"]["total"]["gap"] == total.gap
+    text = describe_plan(certified, "a.npz").to_text()
+    (table,) = (part for part in text.split("\n\n") if "lower bounds" in part)
+    rows = [line.split() for line in table.splitlines()[1:]]
+    assert [row[0] for row in rows] == ["1", "2", "all"]
+    assert float(rows[2][2]) == pytest.approx(total.bound, abs=1e-8)
+
+
+@pytest.mark.parametrize("error, said", [(1.4e-4, False), (1.6e-4, True), (2e-6, False)])
+def test_an_accuracy_that_is_not_reached_is_said(certified: Plan, error: float, said: bool) -> None:
+    """Where the error as it is printed, to one digit, is larger."""
+    phases = tuple(own._replace(error=error) for own in certified.phases)
+    options = dataclasses.replace(certified.options, accuracy=1e-4)
+    plan = dataclasses.replace(certified, phases=phases, options=options)
+    last = describe_plan(plan, "a.npz").to_text().splitlines()[-1]
+    assert f"(to {error:.0e}" in last
+    assert ("; accuracy 0.0001 not reached)" in last) == said
+
+
+def test_what_is_planned_over_time_is_not_certified(within: Plan) -> None:
+    certificate = within.certificate
+    assert certificate is not None and certificate.total is None
+    (part,) = certificate.parts
+    assert part.bound is None and part.gap is None and part.phases == (1,)
+    assert "  not certified: planned over time" in describe_plan(within, "a.npz").to_text()
+
+
+@pytest.mark.parametrize(
+    ("changed", "gone", "text"),
+    [
+        ({"status": "replayed"}, (), "'replayed' is not a valid Status"),
+        ({"objective": "fast"}, (), "meta.objective: 'fast' given"),
+        ({"phase_values": [1.0]}, (), "meta.phase_values: 1 values given, 2 needed"),
+        ({"iterations": ["a", "b"]}, (), "does not describe a plan"),
+        ({"transitions": [3]}, (), "does not describe a plan"),
+        ({"replay": {}}, (), "does not describe a plan"),
+        ({"certificate": {"parts": [3]}}, (), "does not describe a plan"),
+        ({"timings": {"plan": "long"}}, (), "does not describe a plan"),
+        ({}, ("value",), "does not describe a plan"),
+        ({}, ("problem",), "does not hold its problem's tables"),
+    ],
+)
+def test_what_is_no_plan_is_an_error(
+    made: Plan, tmp_path: Path, changed: dict[str, Any], gone: tuple[str, ...], text: str
+) -> None:
+    path = change_meta(made, tmp_path / "a.npz", changed, gone)
+    with pytest.raises(InputError, match=text) as caught:
+        load_plan(path)
+    assert str(caught.value).startswith(path)
+
+
+@pytest.mark.parametrize(
+    ("case", "options"), [("slides", {"objective": "margin"}), ("impacts", {"objective": "time"})]
+)
+def test_every_solve_is_counted_once(
+    monkeypatch: pytest.MonkeyPatch, case: str, options: dict[str, Any]
+) -> None:
+    """Those of plans with stops, of least time, refined ones and what impacts save as well."""
+    calls = []
+    run = Solver.__call__
+
+    def count(self: Solver, **arguments: Any) -> Any:
+        result = run(self, **arguments)
+        calls.append(self.stats()["iter_count"])
+        return result
+
+    monkeypatch.setattr(Solver, "__call__", count)
+    problem = two_phases(IMPACTS if case == "impacts" else HEPTAGON)
+    plan = solve(problem, intervals=20, samples=5, **options)
+    assert plan.statistics.solves == len(calls) > len(problem.phases)
+    assert plan.statistics.iterations == sum(calls)
+    assert plan.timings.solve == pytest.approx(plan.statistics.solve_time)
+    assert json.loads(json.dumps(plan.meta["solves"])) == [
+        phase.statistics.solves for phase in plan.phases
+    ]
+
+
+def test_costs_are_booked_to_the_innermost_phase_and_every_ledger() -> None:
+    cost = SolverStatistics(3, 1, 0.5, 0.25)
+    book(cost)
+    with open_ledger() as outer:
+        book(cost)
+        with charge(2), open_ledger() as inner:
+            book(cost)
+            with charge(5):
+                book(cost)
+    assert (outer.of(0), outer.of(2), outer.of(5)) == (cost, cost, cost)
+    assert inner.of(0) == SolverStatistics() and inner.of(5) == cost
+    assert cost + cost == SolverStatistics(6, 2, 1.0, 0.5)

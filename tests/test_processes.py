@@ -1,0 +1,689 @@
+"""Processes that are lost, signals that end a command, threads, and copies of plans."""
+
+from __future__ import annotations
+
+import copy
+import gc
+import multiprocessing
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+import numpy as np
+import pytest
+
+import wholearm
+from shipped import FOLDER, HEPTAGON, LANDING, plan_of, problem_of
+from wholearm.cli.route import hasten
+from wholearm.common import signals as interrupts
+from wholearm.common.crowd import Processes, run_all
+from wholearm.common.files import together, write_whole
+from wholearm.common.sharing import Keeper, Store, exclusive, kept_property, retire_with
+from wholearm.common.signals import check, guard, held
+from wholearm.common.workers import can_fork, count_cores, share
+from wholearm.simulation.simulate import simulate
+from wholearm.solvers.ipopt import STOPPED, Solver
+
+PARENT = os.getpid()
+needs_fork = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux")
+
+
+class Meeting:
+    """Tasks of two processes that wait for each other, so that each does one of them."""
+
+    def __init__(self, act: Callable[[], object] = object) -> None:
+        self.barrier = multiprocessing.get_context("fork").Barrier(2)
+        self.act, self.met = act, False
+
+    def __call__(self) -> int:
+        if not self.met:
+            self.met = True
+            self.barrier.wait(30)
+        self.act()
+        return os.getpid()
+
+
+def in_child(act: Callable[[], object]) -> Callable[[], object]:
+    return lambda: act() if os.getpid() != PARENT else None
+
+
+def stop() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def fail() -> None:
+    raise ValueError("only here")
+
+
+@needs_fork
+def test_tasks_are_done_by_two_processes_at_the_same_time() -> None:
+    assert can_fork() and count_cores() >= 1
+    one, other = share([Meeting()] * 2, 2)
+    assert PARENT in (one, other) and one != other
+    assert not multiprocessing.active_children()
+
+
+@needs_fork
+def test_results_are_in_order_and_have_what_is_known() -> None:
+    known, meet = object(), Meeting()
+
+    def task(k: int) -> Callable[[], object]:
+        return lambda: (meet() and k, known)
+
+    assert share([task(k) for k in range(1, 5)], 2, [known]) == [(k, known) for k in range(1, 5)]
+
+
+@needs_fork
+@pytest.mark.parametrize("act", [stop, fail])
+def test_what_a_child_does_not_finish_is_done_here(act: Callable[[], object]) -> None:
+    assert share([Meeting(in_child(act))] * 2, 2) == [PARENT, PARENT]
+
+
+@needs_fork
+def test_the_first_error_is_raised_whoever_meets_it() -> None:
+    meet = Meeting()
+
+    def task(text: str) -> Callable[[], object]:
+        def act() -> object:
+            meet()
+            raise ValueError(text)
+
+        return act
+
+    with pytest.raises(ValueError, match="one"):
+        share([task("one"), task("two")], 2)
+
+
+@needs_fork
+def test_an_interrupt_ends_children() -> None:
+    def interrupt() -> None:
+        if os.getpid() == PARENT:
+            raise KeyboardInterrupt
+        signal.pause()
+
+    with pytest.raises(KeyboardInterrupt):
+        share([Meeting(interrupt)] * 2, 2)
+    assert not multiprocessing.active_children()
+
+
+@needs_fork
+def test_other_threads_keep_it_in_one_process() -> None:
+    over = threading.Event()
+    thread = threading.Thread(target=over.wait)
+    thread.start()
+    try:
+        found = share([os.getpid] * 2, 2)
+    finally:
+        over.set()
+        thread.join()
+    assert found == [PARENT, PARENT]
+
+
+def square(number: int) -> int:
+    if number == 13:
+        raise ValueError("thirteen")
+    return number**2
+
+
+def test_every_task_is_answered_once() -> None:
+    answers = list(run_all(square, range(200), ThreadPoolExecutor(3)))
+    assert sorted(task for task, _ in answers) == list(range(200))
+    for task, answer in answers:
+        if task == 13:
+            assert isinstance(answer, ValueError)
+        else:
+            assert answer == task**2
+
+
+def test_tasks_are_given_a_few_at_a_time() -> None:
+    given: list[int] = []
+
+    def draw(count: int) -> Any:
+        for number in range(count):
+            given.append(number)
+            yield number
+
+    answers = run_all(square, draw(1000), ThreadPoolExecutor(1), ahead=4)
+    for _ in range(5):
+        next(answers)
+    assert len(given) <= 5 + 4
+
+
+def die_once(path: str) -> str:
+    """Die of the first task at a path."""
+    if not os.path.exists(path):
+        open(path, "x").close()
+        stop()
+    return path
+
+
+def test_a_process_that_is_killed_loses_and_doubles_no_task(tmp_path: Path) -> None:
+    paths = [str(tmp_path / f"{k}") for k in range(4)]
+    assert sorted(run_all(die_once, paths, Processes(2))) == [(path, path) for path in paths]
+    assert not multiprocessing.active_children()
+
+
+BOTH = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda n: n.name)
+
+
+def write(path: Path, text: str = "whole") -> None:
+    write_whole(path, lambda stream: stream.write(text.encode()))
+
+
+@BOTH
+def test_a_signal_ends_a_command(
+    number: signal.Signals, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reached: list[str] = []
+
+    def run() -> int:
+        try:
+            signal.raise_signal(number)
+            reached.append("after the signal")
+        finally:
+            reached.append("cleaned up")
+        return 0
+
+    before = signal.getsignal(number)
+    assert guard(run, lambda: reached.append("tidied")) == 128 + number
+    assert reached == ["cleaned up", "tidied"]
+    word = "interrupted" if number == signal.SIGINT else "terminated"
+    assert capsys.readouterr().err == f"wholearm: {word}\n"
+    assert signal.getsignal(number) is before
+    assert guard(lambda: 3) == 3
+
+
+def swallow() -> int:
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt:
+        print("whatever is said about it", file=sys.stderr)
+    return 0
+
+
+def turn_into_another() -> int:
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt:
+        raise ImportError from None
+    return 0
+
+
+@pytest.mark.parametrize("run", [swallow, turn_into_another])
+def test_a_swallowed_interrupt_counts(
+    run: Callable[[], int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert guard(run) == 130
+    assert capsys.readouterr().err == "wholearm: interrupted\n"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_search_says_that_it_plans_unless_it_is_terminated(
+    number: signal.Signals, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def search() -> int:
+        try:
+            with interrupts.yielding():
+                signal.raise_signal(number)
+        except KeyboardInterrupt:
+            hasten()
+        return 0
+
+    assert guard(search) == (0 if number is signal.SIGINT else 128 + number)
+    assert ("again to stop" in capfd.readouterr().err) == (number is signal.SIGINT)
+
+
+def test_no_file_appears_after_a_swallowed_interrupt(tmp_path: Path) -> None:
+    def run() -> int:
+        swallow()
+        with pytest.raises(KeyboardInterrupt):
+            check()
+        write(tmp_path / "late")
+        return 0
+
+    assert guard(run) == 130
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_signal_waits_for_files_that_belong_together(tmp_path: Path) -> None:
+    def run() -> int:
+        with held():
+            signal.raise_signal(signal.SIGINT)
+            (tmp_path / "one").touch()
+            (tmp_path / "two").touch()
+        (tmp_path / "three").touch()
+        return 0
+
+    assert guard(run) == 130
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["one", "two"]
+
+
+def test_files_appear_together_or_not_at_all(tmp_path: Path) -> None:
+    one, two = tmp_path / "one", tmp_path / "two"
+    one.write_text("before")
+
+    def run() -> int:
+        with together():
+            write(one)
+            assert one.read_text() == "before"
+            signal.raise_signal(signal.SIGINT)
+            write(two)
+        return 0
+
+    assert guard(run) == 130
+    assert [path.name for path in tmp_path.iterdir()] == ["one"]
+    assert one.read_text() == "before"
+    with together():
+        write(one)
+        write(two)
+        assert not two.exists()
+    assert (one.read_text(), two.read_text()) == ("whole", "whole")
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_an_ignored_signal_stays_ignored() -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        assert guard(swallow) == 0
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+SWALLOWS = """
+import sys, tempfile, time
+from wholearm.common.files import write_whole
+from wholearm.common.signals import guard
+
+def write(stream):
+    stream.write(b"half")
+    stream.flush()
+    print("ready", flush=True)
+    while True:
+        try:
+            time.sleep(60)
+        except KeyboardInterrupt:
+            print("swallowed", file=sys.stderr)
+
+sys.exit(guard(lambda: write_whole(sys.argv[1], write) or 0))
+"""
+
+
+@BOTH
+def test_a_command_that_goes_on_is_ended(number: signal.Signals, tmp_path: Path) -> None:
+    command = [sys.executable, "-c", SWALLOWS, str(tmp_path / "out")]
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, text=True, **streams) as process:  # type: ignore[call-overload]
+        assert process.stdout.readline() == "ready\n"
+        assert len(os.listdir(tmp_path)) == 1
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 128 + number
+    word = "interrupted" if number == signal.SIGINT else "terminated"
+    assert errors == f"wholearm: {word}\n"
+    assert os.listdir(tmp_path) == []
+
+
+STARTED = "import wholearm.__main__ as m; print('ready', flush=True); m.run()"
+
+
+@pytest.mark.parametrize("delay", [0.05, 0.15, 0.5])
+def test_planning_is_interrupted(delay: float, tmp_path: Path) -> None:
+    given = ["solve", str(HEPTAGON), "--intervals", "800", "--objective", "margin"]
+    command = [sys.executable, "-c", STARTED, *given, "-o", "plan.npz", "--torques", "plan.csv"]
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "cwd": tmp_path}
+    with subprocess.Popen(command, text=True, **streams) as process:  # type: ignore[call-overload]
+        # Before the interpreter is up nobody can catch a signal.
+        assert process.stdout.readline() == "ready\n"
+        time.sleep(delay)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (130, "wholearm: interrupted\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+WORKS = """
+import time
+import wholearm.__main__ as m
+from wholearm.common.crowd import Processes, run_all
+
+def work():
+    for _ in run_all(time.sleep, [0, 60, 60, 60, 60], Processes(2)):
+        print("ready", flush=True)
+        {then}
+    return 0
+
+m.start = work
+m.run()
+"""
+
+
+@pytest.mark.parametrize("then", ["pass", "raise OSError('full')", "return 2"])
+def test_workers_end_with_their_command(then: str, tmp_path: Path) -> None:
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    command = [sys.executable, "-c", WORKS.format(then=then)]
+    with subprocess.Popen(command, text=True, **streams) as process:  # type: ignore[call-overload]
+        assert process.stdout.readline() == "ready\n"
+        # A terminal and `timeout` may send it twice.
+        for _ in range(2 * (then == "pass")):
+            process.send_signal(signal.SIGINT)
+        # Far below what the tasks take; pipes close when the last worker has ended.
+        _, errors = process.communicate(timeout=30)
+    if then == "pass":
+        assert (process.returncode, errors) == (130, "wholearm: interrupted\n")
+    else:
+        assert process.returncode == (2 if "return" in then else 1)
+
+
+class Stopped:
+    """A solver as CasADi leaves it when an interrupt comes."""
+
+    def __call__(self, **_: object) -> dict[str, object]:
+        return {"x": 1.0}
+
+    def stats(self) -> dict[str, object]:
+        return {"success": False, "return_status": STOPPED}
+
+
+def test_a_solver_that_an_interrupt_stops_raises_it() -> None:
+    with pytest.raises(KeyboardInterrupt):
+        Solver(Stopped())(x0=0.0)
+
+
+SQUARE = str(FOLDER / "square.toml")
+
+IN_THREADS = """
+import gc, sys, threading, time
+import tomllib
+import wholearm
+from wholearm.problem.read import build_problem
+
+path = sys.argv[1]
+failures, values, running = [], {}, True
+
+def read():
+    with open(path, "rb") as stream:
+        table = tomllib.load(stream)
+    return build_problem(table | {"phases": table["phases"][:1]})
+
+common = read()
+
+def work(number):
+    goal, shared = ("time", "effort")[number % 2], number < 2
+    try:
+        problem = common if shared else read()
+        plan = wholearm.solve(problem, goal, intervals=10, replay=False)
+        values.setdefault(goal, []).append(plan.meta["value"])
+        plan.at(0.3 * plan.duration)
+        assert wholearm.simulate(problem, plan).outcome.reached
+        try:
+            wholearm.solve(problem, goal, intervals=10, degree=99)
+        except wholearm.InputError as error:
+            failure = error  # refers to this call, which it keeps for the collector
+    except BaseException as error:
+        failures.append(repr(error))
+
+def collect():
+    while running:
+        gc.collect()
+        time.sleep(0.02)
+
+threads = [threading.Thread(target=work, args=(k,)) for k in range(4)]
+collector = threading.Thread(target=collect)
+for thread in (*threads, collector):
+    thread.start()
+for thread in threads:
+    thread.join()
+running = False
+collector.join()
+assert not failures, failures
+for own in values.values():
+    assert len(own) == 2 and max(own) - min(own) < 1e-6 * max(own), values
+"""
+
+
+def test_four_threads_plan_and_replay_at_once() -> None:
+    """Two of them share a problem, the others have their own."""
+    command = [sys.executable, "-X", "faulthandler", "-W", "error", "-c", IN_THREADS]
+    run = subprocess.run([*command, SQUARE], capture_output=True, text=True)
+    assert (run.returncode, run.stderr) == (0, "")
+
+
+class Tracked:
+    """Counts how many of its kind are alive."""
+
+    alive = 0
+
+    def __init__(self) -> None:
+        Tracked.alive += 1
+
+    def __del__(self) -> None:
+        type(self).alive -= 1
+
+
+@exclusive
+def nothing() -> None:
+    pass
+
+
+@pytest.fixture
+def tracked() -> type[Tracked]:
+    nothing()
+    Tracked.alive = 0
+    return Tracked
+
+
+class Owner(Keeper):
+    def __init__(self, number: int = 1) -> None:
+        self.number = number
+
+    @kept_property
+    def value(self) -> Tracked:
+        return Tracked()
+
+
+def in_another_thread(run: Callable[[], object]) -> None:
+    thread = Thread(target=run)
+    thread.start()
+    thread.join()
+
+
+def test_values_of_dropped_owners_are_deleted_under_the_lock(tracked: type[Tracked]) -> None:
+    owners = [Owner(), Owner()]
+    assert owners[0].value is owners[0].value
+    retire_with(owners[1], Tracked())
+    assert tracked.alive == 2
+    in_another_thread(owners.clear)
+    assert tracked.alive == 2
+    nothing()
+    assert tracked.alive == 0
+
+
+def test_a_kept_value_is_computed_once_by_many_threads(tracked: type[Tracked]) -> None:
+    owner, seen = Owner(), list[Tracked]()
+    threads = [Thread(target=lambda: seen.append(owner.value)) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len({id(value) for value in seen}) == 1
+    assert tracked.alive == 1
+
+
+def test_an_error_takes_no_local_variables_along(tracked: type[Tracked]) -> None:
+    def fail() -> None:
+        value = Tracked()
+        raise ValueError(f"{tracked.alive} {value.alive}")
+
+    @exclusive
+    def change() -> None:
+        own = Tracked()
+        try:
+            fail()
+        except ValueError as error:
+            raise KeyError(own.alive) from error
+
+    with pytest.raises(KeyError) as caught:
+        change()
+    assert isinstance(caught.value.__cause__, ValueError)
+    assert tracked.alive == 0
+
+
+@pytest.mark.usefixtures("unadvised")
+def test_nothing_of_casadi_is_left_to_the_garbage_collector() -> None:
+    def run(transcription: str = "auto", **changes: Any) -> None:
+        problem = wholearm.load(SQUARE)
+        problem = replace(problem, phases=problem.phases[:1], **changes)
+        options: dict[str, Any] = {"transcription": transcription, "replay": False, "accuracy": 0.1}
+        try:
+            plan = wholearm.solve(problem, intervals=10, time_intervals=4, **options)
+            wholearm.verify(problem, plan)
+        except wholearm.InfeasibleError:
+            assert changes
+
+    gc.collect()
+    gc.disable()
+    gc.set_debug(gc.DEBUG_SAVEALL)
+    try:
+        run()
+        run("time")
+        run(epsilon=3.0)
+        gc.collect()
+        kinds = {type(item).__module__.partition(".")[0] for item in gc.garbage}
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+        gc.enable()
+    assert "casadi" not in kinds
+
+
+def _roundtrip(item: Any) -> Any:
+    return pickle.loads(pickle.dumps(item))
+
+
+COPIES = pytest.mark.parametrize("duplicate", [_roundtrip, copy.copy, copy.deepcopy])
+
+
+@pytest.fixture(scope="module")
+def planned(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, ...]:
+    problem, trajectory = problem_of(LANDING), plan_of(LANDING)
+    path = tmp_path_factory.mktemp("copies") / "plan.npz"
+    trajectory.save(path)
+    loaded = wholearm.load_trajectory(path)
+    simulation = simulate(problem, trajectory.torque, times=[0.1])
+    return problem, trajectory, loaded, simulation, wholearm.verify(problem, trajectory)
+
+
+def check_same(one: wholearm.Trajectory, other: wholearm.Trajectory) -> None:
+    for t in np.linspace(0.0, one.duration, 7):
+        for own, copied in zip(one.at(float(t)), other.at(float(t)), strict=True):
+            np.testing.assert_allclose(
+                copied, own, rtol=1e-9, atol=1e-9 * max(1, np.abs(own).max())
+            )
+
+
+@COPIES
+def test_problems_copy(planned: tuple[Any, ...], duplicate: Callable[[Any], Any]) -> None:
+    problem = planned[0]
+    other = duplicate(problem)
+    assert other is not problem
+    assert all(phase.formation.scene is other.scene for phase in other.phases)
+    z = problem.start[None]
+    for own, copied in zip(problem.phases, other.phases, strict=True):
+        expected = own.formation.evaluate_limits(z)
+        np.testing.assert_allclose(copied.formation.evaluate_limits(z), expected, atol=1e-14)
+    assert (other.table, other.source) == (problem.table, problem.source)
+    assert duplicate(problem.scene).scales == problem.scene.scales
+    formation = duplicate(problem.phases[0].formation)
+    assert formation.evaluate(z, z).A.shape == (1, 4, 5)
+
+
+@COPIES
+def test_results_copy(planned: tuple[Any, ...], duplicate: Callable[[Any], Any]) -> None:
+    problem, trajectory, loaded, simulation, report = planned
+    check_same(trajectory, duplicate(trajectory))
+    check_same(loaded, duplicate(loaded))
+    assert duplicate(trajectory).meta == trajectory.meta
+    assert duplicate(report).to_text() == report.to_text()
+    assert np.array_equal(duplicate(simulation).z, simulation.z)
+    assert np.array_equal(
+        duplicate(trajectory.torque).at(np.ones(1)), trajectory.torque.at(np.ones(1))
+    )
+    assert wholearm.verify(duplicate(problem), duplicate(trajectory)).ok == report.ok
+
+
+def _plan(problem: wholearm.Problem) -> wholearm.Trajectory:
+    return wholearm.solve(problem, intervals=10).trajectory
+
+
+def _refuse(key: str) -> None:
+    raise wholearm.InputError("file", key, "is missing")
+
+
+def test_a_plan_comes_back_from_another_process() -> None:
+    problem = wholearm.load(SQUARE)
+    problem = replace(problem, phases=problem.phases[:1])
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        theirs = pool.apply(_plan, (problem,))
+        with pytest.raises(wholearm.InputError, match=r"^file: gravity: is missing$"):
+            pool.apply(_refuse, ("gravity",))
+    assert theirs.meta["value"] == pytest.approx(_plan(problem).meta["value"], rel=1e-6)
+    with pytest.raises(ValueError, match="outside"):
+        theirs.at(-1.0)
+    rows = np.flatnonzero(np.diff(theirs.t) > 0)[::50]
+    for row in rows:
+        np.testing.assert_allclose(theirs.at(theirs.t[row]).z[0], theirs.z[row], atol=1e-9)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+def test_a_forked_process_can_plan() -> None:
+    code = (
+        "import dataclasses, os, sys, threading, wholearm\n"
+        "problem, solve = wholearm.load(sys.argv[1]), wholearm.solve\n"
+        "problem = dataclasses.replace(problem, phases=problem.phases[:1])\n"
+        "thread = threading.Thread(target=lambda: solve(problem, intervals=10))\n"
+        "thread.start()\n"
+        "child = os.fork()\n"
+        "if child == 0:\n"
+        "    solve(problem, intervals=10)\n"
+        "    os._exit(7)\n"
+        "thread.join()\n"
+        "assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7\n"
+    )
+    # Python 3.12 and later warn of forks beside threads, which is what is tried here.
+    command = [sys.executable, "-W", "ignore:This process:DeprecationWarning", "-c", code, SQUARE]
+    run = subprocess.run(command, capture_output=True, timeout=100)
+    assert (run.returncode, run.stderr) == (0, b"")
+
+
+class Sharer:
+    """What shares a value with others."""
+
+
+def test_a_value_lives_as_long_as_one_of_its_owners() -> None:
+    built: list[object] = []
+
+    def build(_: object) -> list[int]:
+        built.append(value := [len(built)])
+        return value
+
+    store = Store(build, lambda _: "same")
+    first, second = Sharer(), Sharer()
+    assert store(first) is store(second)
+    kept = store(second)
+    del first
+    gc.collect()
+    third = Sharer()
+    assert store(third) is kept and len(built) == 1
+    del second, third
+    gc.collect()
+    assert store(Sharer()) == [1]
