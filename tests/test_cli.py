@@ -21,28 +21,18 @@ from shipped import HEPTAGON, IMPACTS, solved
 from wholearm.cli.command import build_parser, main
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.result import describe_plan
+from wholearm.problem.table import write_toml
 from wholearm.results.trajectory import Trajectory, load_trajectory
 
 TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
 Edit = Callable[[dict[str, Any]], object]
 
 
-def to_toml(value: Any) -> str:
-    """A TOML value on one line; only what problem files hold."""
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{key} = {to_toml(v)}" for key, v in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(to_toml, value)) + "]"
-    if isinstance(value, float) and value != value:
-        return "nan"
-    return json.dumps(value)
-
-
 def write_problem(folder: Path, edit: Edit) -> str:
     table = copy.deepcopy(TABLE)
     edit(table)
     path = folder / "problem.toml"
-    path.write_text("\n".join(f"{key} = {to_toml(v)}" for key, v in table.items()))
+    path.write_text(write_toml(table), encoding="utf-8")
     return str(path)
 
 
