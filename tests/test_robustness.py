@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 import wholearm
-from retelling import Units, in_units
+from retelling import Retelling, Units
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.common.crowd import connect, run_all
@@ -675,4 +675,4 @@ def test_ranges_follow_the_units(path: Path) -> None:
     """Millimetres and grams, and sizes and masses far from those of the shipped problems."""
     problem = load(str(path))
     for units in (Units(1e3, 1e3), Units.of(0.01, 1e-3), Units.of(100.0, 1e4)):
-        in_units(units).apply(problem)
+        build_problem(Retelling("", units).apply(problem).table)
