@@ -27,9 +27,10 @@ from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Trajectory
 from wholearm.scene.model import Finger, Friction, Polygon, Scene
 from wholearm.simulation.events import EventKind, FreeSimulation, OutcomeKind
-from wholearm.simulation.free_simulate import simulate_free
 from wholearm.simulation.hand import build_system, measure_gaps
+from wholearm.simulation.simulate import simulate, simulate_free
 from wholearm.verification.free import FreeReport, verify_free
+from wholearm.verification.verify import verify
 
 DURATION = 0.4
 """Of a random run [s]."""
@@ -318,7 +319,7 @@ def test_torques_alone_are_followed_by_what_happens() -> None:
 def test_numbers_out_of_range(options: dict[str, object], message: str) -> None:
     problem, torque, _ = pinch(0.3)
     with pytest.raises(InputError, match=message):
-        simulate_free(problem, torque, **options)  # type: ignore[arg-type]
+        simulate_free(problem, torque, **options)
 
 
 def test_an_overlap_at_the_start_is_told() -> None:
@@ -343,3 +344,15 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert Path(figure).stat().st_size > 10_000
     for options in (["--reduced", "--free"], ["--restitution", "0.5"]):
         assert main(["verify", path, given, *options]) == 2
+
+
+def test_one_function_simulates_under_both_rules() -> None:
+    problem, torque, _ = pinch(0.3)
+    free = simulate(problem, torque, contacts="free", times=[0.0123])
+    assert 0.0123 in free.t
+    assert free.z[-1] == pytest.approx(simulate_free(problem, torque).z[-1], abs=1e-9)
+    for options in ({"contacts": "none"}, {"until": 1.0}, {"restitution": 0.5}):
+        with pytest.raises(InputError, match="contacts: "):
+            simulate(problem, torque, **options)
+    with pytest.raises(InputError, match="contacts: "):
+        verify(problem, torque, contacts="none")  # type: ignore[call-overload]

@@ -13,9 +13,8 @@ from scipy.integrate import quad
 from wholearm.common.arrays import Array
 from wholearm.results.torque import TorqueProfile
 from wholearm.scene.model import Scales
+from wholearm.simulation.complementarity import FreeRun
 from wholearm.simulation.events import EventKind
-from wholearm.simulation.free_events import play
-from wholearm.simulation.free_run import FreeRun
 from wholearm.simulation.system import ContactPair, Structure, System
 
 G = 9.81
@@ -62,7 +61,7 @@ def simulate(
     """Let a system go without torques."""
     torque = TorqueProfile(np.array([0.0, until]), np.zeros((1, 2, 1)))
     run = FreeRun(system, torque, np.array(z, float), np.array(v, float), restitution)
-    play(run, 1e-9 * system.scales.length)
+    run.play(1e-9 * system.scales.length)
     return run
 
 

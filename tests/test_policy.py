@@ -37,7 +37,7 @@ from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Trajectory
 from wholearm.robustness.error_model import Uncertainty
 from wholearm.robustness.sample_run import make_trial
-from wholearm.simulation.free_simulate import simulate_free
+from wholearm.simulation.simulate import simulate_free
 from wholearm.verification.policy_check import verify_policy
 
 

@@ -24,9 +24,9 @@ from wholearm.planning.stops import Plans
 from wholearm.problem.definition import Problem
 from wholearm.results.dwell_record import assemble
 from wholearm.results.torque import TorqueProfile
-from wholearm.simulation.free_simulate import simulate_free
 from wholearm.simulation.holding_torques import DRIVE, maximise_margin
 from wholearm.simulation.rest import close_contacts, find_rest
+from wholearm.simulation.simulate import simulate_free
 from wholearm.verification.verify import verify
 
 HELD = (0.019, 0.01, 0.01, 0.01, 0.0)

@@ -24,8 +24,9 @@ from wholearm.problem.definition import End, Phase, Problem, Until
 from wholearm.problem.read import build_problem
 from wholearm.results.torque import TorqueProfile
 from wholearm.simulation.events import EventKind, OutcomeKind
+from wholearm.simulation.prescribed import project_velocity
 from wholearm.simulation.rest import StartDeparture, Touching, find_rest
-from wholearm.simulation.simulate import project_velocity, simulate
+from wholearm.simulation.simulate import simulate
 from wholearm.verification.verify import verify
 
 RELEASE = 0.5

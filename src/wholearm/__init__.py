@@ -56,8 +56,7 @@ if TYPE_CHECKING:
     from .search.result import Answer
     from .search.solve import solve
     from .simulation.events import FreeSimulation, Simulation
-    from .simulation.free_simulate import simulate_free
-    from .simulation.simulate import simulate
+    from .simulation.simulate import simulate, simulate_free
     from .tuning.tuner import Tuning, tune
     from .verification.free import FreeReport, verify_free
     from .verification.policy_check import verify_policy
@@ -97,8 +96,7 @@ _NAMES = {
     "search.result": "Answer",
     "search.solve": "solve",
     "simulation.events": "FreeSimulation Simulation",
-    "simulation.free_simulate": "simulate_free",
-    "simulation.simulate": "simulate",
+    "simulation.simulate": "simulate simulate_free",
     "tuning.tuner": "Tuning tune",
     "verification.free": "FreeReport verify_free",
     "verification.policy_check": "verify_policy",

@@ -19,7 +19,7 @@ def overlay(simulator: str, trajectory: Trajectory) -> Simulation:
 
     problem, say = read_own_problem(trajectory.meta), show_progress()
     if simulator == "free":
-        from ..simulation.free_simulate import simulate_free
+        from ..simulation.simulate import simulate_free
 
         say("simulating the whole")
         return simulate_free(problem, trajectory).show(trajectory.contacts)

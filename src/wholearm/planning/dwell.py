@@ -20,9 +20,9 @@ from ..contacts.formation import Formation
 from ..problem.definition import Phase, Problem
 from ..results.dwell_record import SettledMotion, Settling, change_torques
 from ..results.torque import TorqueProfile
-from ..simulation.free_simulate import simulate_free
 from ..simulation.holding_torques import Hold, Standstill, find_hold, find_opening
 from ..simulation.rest import close_contacts
+from ..simulation.simulate import simulate_free
 from ..simulation.tolerances import SLOW, is_slower
 from .path_domain.junction import begin_from
 from .phase_plan import Settled

@@ -17,7 +17,7 @@ from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..simulation.events import EventKind, FreeSimulation, OutcomeKind, list_pauses
-from ..simulation.free_simulate import simulate_free
+from ..simulation.simulate import simulate_free
 from .error_model import Uncertainty, change_problem, change_torques
 
 PAUSE = 1e-3

@@ -91,38 +91,8 @@ class ContactAnswer(NamedTuple):
     residual: float  # relative; see `RESIDUAL`
 
 
-def solve(problem: ContactProblem, presses: Sequence[bool] = ()) -> ContactAnswer | None:
-    """Solve by principal pivoting from the contacts that press, or by Lemke's method, or fail."""
-    answer = _exchange(problem, presses) if problem.is_unique else None
-    return answer or _solve_by_lemke(problem)
-
-
-def _exchange(p: ContactProblem, presses: Sequence[bool]) -> ContactAnswer | None:
-    """Bard-type principal pivoting: blocks of contacts first, then the first infeasible one.
-
-    The latter ends for every P-matrix (Murty, "Note on a Bard-type scheme ...", 1974).
-    """
-    s_n, _, K, q = p.scaled
-    k = len(q)
-    size = float(np.abs(q).max(initial=0.0)) or 1.0
-    active = np.array(presses, dtype=bool) if len(presses) else q < 0
-    for turn in range(k + 2**k):
-        c = np.zeros(k)
-        at = active.nonzero()[0]
-        if len(at):
-            c[at] = np.linalg.solve(K[at[:, None], at], -q[at])
-        rates = K @ c + q
-        values = np.where(active, c, rates)
-        wrong = (values < -EDGE * size).nonzero()[0]
-        if not len(wrong):
-            worst = max(float(np.abs(rates[at]).max(initial=0.0)), float(-values.min(initial=0.0)))
-            return read(p, s_n * np.maximum(c, 0.0), np.zeros(0), worst / size)
-        wrong = wrong if turn < k else wrong[:1]
-        active[wrong] = ~active[wrong]
-    return None
-
-
-def _solve_by_lemke(p: ContactProblem) -> ContactAnswer | None:
+def solve(p: ContactProblem) -> ContactAnswer | None:
+    """One solution by Lemke's method, or none."""
     s_n, s_t, K, q = p.scaled
     k, s = len(s_n), len(s_t)
     held = (p.owner >= 0).nonzero()[0]
@@ -149,14 +119,13 @@ def read(problem: ContactProblem, c_n: Array, f: Array, residual: float = 0.0) -
     if not len(f):
         change = p.lift * (c_n @ p.G)
         return ContactAnswer(c_n, f, p.b_n + p.A @ change, f, f, f, change, residual)
-    change = p.lift * (c_n @ p.G + f @ p.T)
-    contacts, most = p.owner >= 0, p.bound.copy()
-    most[contacts] += p.mu[contacts] * c_n[p.owner[contacts]]
+    change, size = p.lift * (c_n @ p.G + f @ p.T), np.abs(f)
+    most = p.bound + p.mu * np.append(c_n, 0.0)[p.owner]
     # Friction whose bound is zero by c_n has no margin in either direction.
-    edge = most - np.abs(f) <= EDGE * np.maximum(most, 1e-3 * np.abs(f).max(initial=0.0))
+    edge = most - size <= EDGE * np.maximum(most, 1e-3 * size.max())
     r_t = p.b_t + p.T @ change
     sign = np.where(edge, np.where(f != 0, -np.sign(f), np.sign(r_t)), 0.0)
-    shares = np.abs(f) / np.maximum(most, np.finfo(float).tiny)
+    shares = size / np.maximum(most, 1e-300)
     return ContactAnswer(c_n, f, p.b_n + p.A @ change, r_t, shares, sign, change, residual)
 
 
@@ -170,30 +139,26 @@ def is_clear(problem: ContactProblem, answer: ContactAnswer, least: float) -> bo
 def list_answers(problem: ContactProblem) -> list[ContactAnswer] | None:
     """All solutions with distinct rates, by enumeration of modes; None if these are too many."""
     combinations = _combine(len(problem.b_n), len(problem.lift), tuple(problem.owner.tolist()))
-    return None if combinations is None else _try(problem, combinations)
+    return None if combinations is None else _try(problem, *combinations)
 
 
 def try_modes(problem: ContactProblem, choice: Sequence[int]) -> ContactAnswer | None:
     """Solution with the modes `choice` of contacts, then joints, if they are consistent."""
     sizes = len(problem.b_n), len(problem.lift), tuple(problem.owner.tolist())
     combinations = _combine(*sizes, tuple(choice))
-    answers = [] if combinations is None else _try(problem, combinations)
+    answers = [] if combinations is None else _try(problem, *combinations)
     return answers[0] if answers else None
-
-
-class _Combinations(NamedTuple):
-    """Modes to try."""
-
-    ways: Array  # (m, s): which way what may stick gives way, 0 where it does not
-    # rows with as many conditions, and the forces that these are for, shape (r,) and (r, count)
-    groups: tuple[tuple[NDArray[np.int64], NDArray[np.int64]], ...]
 
 
 @lru_cache(maxsize=256)
 def _combine(
     k: int, n: int, owner: tuple[int, ...], choice: tuple[int, ...] | None = None
-) -> _Combinations | None:
-    """One choice of modes of k contacts and n coordinates, or all, with up to n conditions."""
+) -> tuple[Array, NDArray[np.bool_]] | None:
+    """One choice of modes of k contacts and n coordinates, or all, with up to n conditions.
+
+    Returns which way what may stick gives way, 0 where it does not, (m, s), and which forces are
+    for a condition, (m, k + s).
+    """
     own = np.array(owner, dtype=int)
     options: list[tuple[int, ...]]
     options = [(APART, STICKS, FORTH, BACK) if i in owner else (APART, STICKS) for i in range(k)]
@@ -205,63 +170,55 @@ def _combine(
     modes = np.empty((len(choices), len(own)), dtype=int)
     modes[:, own >= 0], modes[:, own < 0] = choices[:, own[own >= 0]], choices[:, k:]
     active = np.hstack([choices[:, :k] != APART, modes == STICKS])
-    counts = active.sum(axis=1)
-    sound = counts <= n
-    modes, active, counts = modes[sound], active[sound], counts[sound]
-    groups = []
-    for count in range(1, int(counts.max(initial=0)) + 1):
-        rows = np.flatnonzero(counts == count)
-        if len(rows):
-            groups.append((rows, np.nonzero(active[rows])[1].reshape(len(rows), count)))
+    sound = active.sum(axis=1) <= n
     ways = np.where(modes == FORTH, 1.0, np.where(modes == BACK, -1.0, 0.0))
-    return _Combinations(ways, tuple(groups))
+    return ways[sound], active[sound]
 
 
-def _try(p: ContactProblem, combinations: _Combinations) -> list[ContactAnswer]:
+def _try(p: ContactProblem, ways: Array, active: NDArray[np.bool_]) -> list[ContactAnswer]:
     """Solve for each combination of modes; the consistent solutions with distinct rates."""
     s_n, s_t, K, q = p.scaled
-    ways, groups = combinations
-    k, held = len(s_n), (p.owner >= 0).nonzero()[0]
-    owner = p.owner[held]
-    share, bound = p.mu[held] * s_n[owner] / s_t[held], p.bound / s_t
-    # A contact that slides brings its friction with it, what turns has a given one.
-    rubs, partner = np.zeros((len(ways), len(q))), np.arange(len(q))
-    rubs[:, owner], partner[owner] = share * ways[:, held], k + held
-    right = (ways * bound) @ K[:, k:].T - q
-    forces, sound = np.zeros((len(ways), len(q))), np.ones(len(ways), dtype=bool)
-    for rows, at in groups:
-        places, across, row = at[:, :, None], at[:, None, :], rows[:, None]
-        own = K[places, across] - rubs[row, at][:, None, :] * K[places, partner[across]]
-        fine = np.abs(np.linalg.det(own)) > SINGULAR
-        if not fine.all():
-            sound[rows[~fine]] = False
-            own, row, at = own[fine], row[fine], at[fine]
-        forces[row, at] = np.linalg.solve(own, right[row, at][:, :, None])[:, :, 0]
+    k, own = len(s_n), K
+    if len(s_t):
+        # A contact that slides brings its friction with it, what turns has a given one.
+        held = (p.owner >= 0).nonzero()[0]
+        owner, bound = p.owner[held], ways * (p.bound / s_t)
+        rubs, partner = np.zeros((len(ways), len(q))), np.arange(len(q))
+        rubs[:, owner], partner[owner] = (
+            p.mu[held] * s_n[owner] / s_t[held] * ways[:, held],
+            k + held,
+        )
+        own = K - rubs[:, None, :] * K[:, partner]
+        right = bound @ K[:, k:].T - q
+    else:
+        right = np.broadcast_to(-q, active.shape)
+    # Forces without a condition are zero, by rows of the unit matrix.
+    own = np.where(active[:, :, None] & active[:, None, :], own, np.eye(len(q)))
+    sound = np.abs(np.linalg.det(own)) > SINGULAR
+    forces = np.linalg.solve(own[sound], np.where(active, right, 0.0)[sound][:, :, None])[:, :, 0]
+    if len(s_t):
+        forces[:, k:] -= bound[sound]
+        forces[:, k + held] -= rubs[sound][:, owner] * forces[:, owner]
+    rates = q + forces @ K.T
     size = float(np.abs(q).max(initial=0.0)) or 1.0
     slack = EDGE * size
-    sound &= (forces[:, :k] >= -slack).all(axis=1)
-    if not sound.any():
-        return []
-    forces, ways = forces[sound], ways[sound]
-    forces[:, k:] -= ways * bound
-    forces[:, k + held] -= ways[:, held] * share * forces[:, owner]
-    rates = q + forces @ K.T
-    c_n, f = forces[:, :k] * s_n, forces[:, k:] * s_t
-    own = np.where(p.owner >= 0, c_n[:, np.maximum(p.owner, 0)] if k else 0.0, 0.0)
-    spare = (p.mu * own + p.bound - np.abs(f)) / s_t
-    turning = np.where(spare <= slack, -np.sign(f) * rates[:, k:], -np.abs(rates[:, k:]))
-    turning[np.abs(rates[:, k:]) <= slack] = 0.0
-    # What slides without a force has nothing that could be wrong.
-    turning[(np.abs(f / s_t) <= slack) & (spare <= slack)] = 0.0
-    worst = np.hstack([forces[:, :k], rates[:, :k], spare, turning]).min(axis=1, initial=0.0)
-    both = np.abs(forces[:, :k] * rates[:, :k]).max(axis=1, initial=0.0)
-    distinct: list[Array] = []
-    answers = []
-    for k in np.flatnonzero((worst >= -slack) & (both <= slack * size)).tolist():
-        if all(np.abs(rates[k] - other).max() > SAME * size for other in distinct):
-            distinct.append(rates[k])
-            answers.append(read(p, np.maximum(c_n[k], 0.0), f[k]))
-    return answers
+    pair = forces[:, :k], rates[:, :k]
+    obeys = (np.minimum(*pair) >= -slack) & (np.abs(pair[0] * pair[1]) <= slack * size)
+    fine = np.logical_and.reduce(obeys, axis=1)
+    if len(s_t) and fine.any():
+        forces, rates = forces[fine], rates[fine]
+        most = np.maximum(forces[:, :k] * s_n, 0.0)
+        most = np.hstack([most, np.zeros((len(most), 1))])[:, p.owner] * p.mu + p.bound
+        f, r = forces[:, k:], rates[:, k:]
+        spare = most / s_t - np.abs(f)
+        # Friction holds, or it is at its bound and opposes; none that slides without a force errs.
+        opposes = (spare <= slack) & ((f * r <= 0) | (np.abs(f) <= slack))
+        fine = np.logical_and.reduce((spare >= -slack) & (opposes | (np.abs(r) <= slack)), axis=1)
+    distinct: list[int] = []
+    for row in fine.nonzero()[0].tolist():
+        if all(np.abs(rates[row] - rates[other]).max() > SAME * size for other in distinct):
+            distinct.append(row)
+    return [read(p, np.maximum(s_n * forces[i, :k], 0.0), s_t * forces[i, k:]) for i in distinct]
 
 
 class ContactSolution(NamedTuple):

@@ -123,9 +123,24 @@ class Glimpses(NamedTuple):
     c_n: Array  # (k, m) [N]: naN where a contact is not in the formation
 
 
+class FreeStretch(NamedTuple):
+    """Some time in which a contact presses."""
+
+    contact: str
+    start: float  # start, stop [s]:
+    stop: float
+    # [N]: its least c_n then; NaN where everything rests, as forces are indeterminate there
+    least: float
+    time: float  # [s]: when
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Simulation(Drawn):
-    """A simulated motion at every accepted step and requested instant, twice where forces jump."""
+    """A simulated motion at every accepted step and requested instant, twice where forces jump.
+
+    With free contacts phases are those of a plan's clock, `contacts` has others that pressed,
+    forces are NaN where a contact does not press, and events are there twice.
+    """
 
     t: Array  # (n,) [s]
     z: Array  # z, z_dot, z_ddot (n, 5):
@@ -144,10 +159,13 @@ class Simulation(Drawn):
     energies: Energies
     outcome: Outcome
     # [m or rad]: distance to the end of the last phase entered; zero when the goal is reached, and
-    # NaN if that phase ends by a release
+    # NaN if that phase ends by a release or contacts are free
     missed_by: float
     steps: int  # steps, rejected: accepted and rejected Runge-Kutta steps
     rejected: int
+    # when each pair of features pressed, by the order of their start
+    stretches: tuple[FreeStretch, ...] = field(repr=False)
+    residual: float  # largest residual of a contact problem, relative to its largest rate
 
     @property
     def headline(self) -> str:
@@ -163,6 +181,15 @@ class Simulation(Drawn):
         """Events of one kind, in the order of time."""
         return tuple(event for event in self.events if event.kind is kind)
 
+    def show(self, contacts: Sequence[str]) -> Simulation:
+        """The same with other columns of forces, NaN where a contact never pressed."""
+        forces = np.full((2, len(self.t), len(contacts)), np.nan)
+        for column, name in enumerate(contacts):
+            if name in self.contacts:
+                at = self.contacts.index(name)
+                forces[:, :, column] = self.c_n[:, at], self.c_t[:, at]
+        return replace(self, contacts=tuple(contacts), c_n=forces[0], c_t=forces[1])
+
     def at(self, t: float) -> Array:
         """State (z, z') at a recorded instant, shape (10,), the later one where there are two.
 
@@ -174,17 +201,6 @@ class Simulation(Drawn):
         if index < 0 or self.t[index] != t:
             raise ValueError(f"t = {t} s was not recorded; ask for it with `times`")
         return np.concatenate([self.z[index], self.z_dot[index]])
-
-
-class FreeStretch(NamedTuple):
-    """Some time in which a contact presses."""
-
-    contact: str
-    start: float  # start, stop [s]:
-    stop: float
-    # [N]: its least c_n then; NaN where everything rests, as forces are indeterminate there
-    least: float
-    time: float  # [s]: when
 
 
 def list_pauses(
@@ -201,26 +217,7 @@ def list_pauses(
     return [*pauses, (at, stop)]
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class FreeSimulation(Simulation):
-    """A simulated motion without prescribed contacts, at every step.
-
-    As of `Simulation`, but phases are those of a plan's clock, `contacts` has others that pressed,
-    forces are NaN where a contact does not press, events are there twice, and `missed_by` is NaN.
-    """
-
-    # when each pair of features pressed, by the order of their start
-    stretches: tuple[FreeStretch, ...]
-    residual: float  # largest residual of a contact problem, relative to its largest rate
-
-    def show(self, contacts: Sequence[str]) -> FreeSimulation:
-        """The same with other columns of forces, NaN where a contact never pressed."""
-        forces = np.full((2, len(self.t), len(contacts)), np.nan)
-        for column, name in enumerate(contacts):
-            if name in self.contacts:
-                at = self.contacts.index(name)
-                forces[:, :, column] = self.c_n[:, at], self.c_t[:, at]
-        return replace(self, contacts=tuple(contacts), c_n=forces[0], c_t=forces[1])
+FreeSimulation = Simulation  # the name of earlier versions for one with free contacts
 
 
 class Record(NamedTuple):
@@ -245,10 +242,8 @@ class Record(NamedTuple):
         return Record(t, phase, section, kept, *state, out[to.c_n], out[to.c_t], impact)
 
 
-def collect(system: System, records: Sequence[Record], contacts: Sequence[str]) -> dict[str, Any]:
-    """Fields of a simulation that its records have, with the forces of some contacts."""
-    # What has been seen within steps comes last in its section.
-    rows = sorted(records, key=lambda row: (row.section, row.t))
+def collect(system: System, rows: Sequence[Record], contacts: Sequence[str]) -> dict[str, Any]:
+    """Fields of a simulation that its records, in order, have, with the forces of some contacts."""
     n, columns = system.n, {name: column for column, name in enumerate(contacts)}
     forces = np.full((2, len(rows), len(columns)), np.nan)
     first = 0

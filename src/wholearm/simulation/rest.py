@@ -349,12 +349,12 @@ def _split(polynomials: Array, x: float) -> tuple[Array, Array]:
         level, slope = polynomials[polynomials[:, 1] != 0].T
         roots = -level / slope
     else:
-        roots = np.array([r for row in np.unique(polynomials, axis=0) for r in _roots(row)])
+        roots = np.array([r for row in np.unique(polynomials, axis=0) for r in find_roots(row)])
     starts = np.array([x, *np.unique(roots[(x < roots) & (roots < 1)])])
     return starts, (starts + np.append(starts[1:], 1.0)) / 2
 
 
-def _roots(polynomial: Array) -> list[float]:
+def find_roots(polynomial: Array) -> list[float]:
     """Real roots of a polynomial given by ascending coefficients."""
     significant = np.flatnonzero(np.abs(polynomial) > 1e-14 * np.abs(polynomial).max())
     if not len(significant) or significant[-1] == 0:

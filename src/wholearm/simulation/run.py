@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from typing import Protocol, runtime_checkable
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,8 +28,8 @@ class StuckError(ArithmeticError):
     """Steps become too short to get anywhere."""
 
 
-class Run:
-    """A running simulation.
+class Run(ABC):
+    """A running simulation; the rule that decides on contacts is that of the class.
 
     Attributes
     ----------
@@ -37,6 +38,7 @@ class Run:
     s                    steps of the present modes
     piece                of the torques, which the present time belongs to
     impact : [J]         energy lost to impacts so far
+    wanted : [s]         instants at which steps have to end; infinity is last
     section              counts changes of modes: records are in order within each section
     """
 
@@ -45,7 +47,13 @@ class Run:
     modes: Modes
 
     def __init__(
-        self, system: System, torque: TorqueProfile, z: Array, v: Array, tolerance: float
+        self,
+        system: System,
+        torque: TorqueProfile,
+        z: Array,
+        v: Array,
+        tolerance: float,
+        wanted: Array | None = None,
     ) -> None:
         self.system, self.torque, self.tolerance = system, torque, tolerance
         self.breaks: list[float] = torque.breaks.tolist()
@@ -56,6 +64,10 @@ class Run:
         self.phase_index = self.section = self.steps = self.rejected = 0
         self.records: list[Record] = []
         self.events: list[Event] = []
+        wanted = np.zeros(0) if wanted is None else wanted
+        within = wanted[(wanted >= self.breaks[0]) & (wanted <= self.breaks[-1])]
+        self.wanted, self.next_wanted = [*within.tolist(), math.inf], 0
+        self.residual = 0.0
 
     @property
     def z(self) -> Array:
@@ -71,6 +83,31 @@ class Run:
     def stop(self) -> float:
         """When the present piece of the torques ends [s]."""
         return self.breaks[self.piece + 1]
+
+    @property
+    def longest(self) -> float:
+        """Longest step from the present state [s]."""
+        return math.inf
+
+    @abstractmethod
+    def happens(self) -> bool:
+        """Whether an event shows at the end of the step just made."""
+
+    @abstractmethod
+    def locate(self, h: float, t: float) -> Any:
+        """Shorten the step just made, of length `h` to `t` [s], to its first events; if any."""
+
+    @abstractmethod
+    def keep(self, t: float) -> None:
+        """Take the step just made, to time `t` [s], and record its end."""
+
+    @abstractmethod
+    def handle(self, found: Any) -> Any:
+        """How events end the motion; None if it goes on."""
+
+    @abstractmethod
+    def pass_break(self) -> Any:
+        """Go on to the next piece of the torques; how that ends the motion, if it does."""
 
     def tau(self, t: float) -> Array:
         """Torques of the present piece at `t`, also beyond its end, shape (2,) [N m]."""
@@ -126,12 +163,27 @@ class Run:
         self.s.inputs[self.s.at.h] = h
         self.s.step()
 
-    def try_step(
-        self, target: float, happens: Callable[[], bool], longest: float = math.inf
-    ) -> tuple[float, bool]:
+    def move(self) -> Any:
+        """Integrate with the present modes until the contact rule ends the motion; how it does."""
+        while True:
+            while self.wanted[self.next_wanted] <= self.t:
+                self.next_wanted += 1
+            target = min(self.stop, self.wanted[self.next_wanted])
+            h, whole = self.try_step(target)
+            t = target if whole else self.t + h
+            if found := self.locate(h, t):
+                self.keep(self.t + float(self.s.inputs[self.s.at.h]))
+                ending = self.handle(found)
+            else:
+                self.keep(t)
+                ending = self.pass_break() if t == self.stop else None
+            if ending is not None:
+                return ending
+
+    def try_step(self, target: float) -> tuple[float, bool]:
         """Make a step within the tolerance, to `target` [s] at most.
 
-        Steps are halved where a force dips below zero within one and nothing `happens` by its end.
+        Steps are halved where a force dips below zero within one and nothing happens by its end.
 
         Returns
         -------
@@ -140,6 +192,7 @@ class Run:
         inputs, outputs, at, to = self.s.inputs, self.s.outputs, self.s.at, self.s.to
         remaining, time = target - self.t, self.system.scales.time
         least = SHORTEST_STEP * max(time, abs(self.t))
+        longest = self.longest
         while True:
             h = min(self.h, longest)
             whole = h >= 0.999 * remaining
@@ -148,7 +201,7 @@ class Run:
             self.s.step()
             error = float(outputs[to.error])
             sudden = outputs[to.dip] < -1e-6 and h > SETTLING / 10 * time
-            if error <= 1 and not (sudden and not happens()):
+            if error <= 1 and not (sudden and not self.happens()):
                 grown = h * min(_GROWTH, 0.9 * max(error, 1e-300) ** (-1 / ORDER))
                 self.h = grown if h >= self.h else max(self.h, grown)
                 self.steps += 1
@@ -159,6 +212,15 @@ class Run:
             self.h = h * (0.5 if error <= 1 else max(0.2, 0.9 * error ** (-1 / ORDER)))
             if not error < math.inf:
                 self.h = 0.2 * h
+
+    def wait(self, stop: float) -> None:
+        """Let time pass at rest."""
+        while self.wanted[self.next_wanted] <= stop:
+            self.t = max(self.t, self.wanted[self.next_wanted])
+            self.record(still=True)
+            self.next_wanted += 1
+        self.t = stop
+        self.record(still=True)
 
     def note(
         self,

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import product
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +29,10 @@ from ..contacts.formation import Formation
 from ..scene.model import Scene
 from .events import describe_change
 from .modes import Mode, ModeRows, Unit, find_fixed, find_grips, list_units, respond
-from .replay import Replay
 from .tolerances import ROUNDING_FORCE, STANDING, is_slower
+
+if TYPE_CHECKING:
+    from .prescribed import Replay
 
 CLEAR = 1e-8  # least margin of a clear decision, over the scene's units
 TRIES = 50  # most decisions in a row without any time passing

@@ -24,10 +24,10 @@ from ..problem.definition import End, Phase, Problem, Until
 from ..problem.read import require_phases
 from ..quasistatic.slow_speeds import SQUEEZE, find_torques, sample_path
 from ..results.torque import TorqueProfile, format_rows, read_rows
+from ..simulation.complementarity import FreeRun
 from ..simulation.events import Event, EventKind, FreeSimulation, list_pauses
-from ..simulation.free_run import FreeRun
-from ..simulation.free_simulate import simulate_free
 from ..simulation.hand import build_system
+from ..simulation.simulate import simulate_free
 from ..simulation.tolerances import REST_WINDOW
 from ..verification.free import FreeReport, find_losses, verify_free
 from ..verification.verdict import DEPARTURE

@@ -22,8 +22,8 @@ from ..results.adopt import Torques, adopt_torques, require_same_contacts
 from ..results.plan_record import Deviation
 from ..results.trajectory import Trajectory
 from ..simulation.events import EventKind, FreeSimulation, OutcomeKind, list_pauses
-from ..simulation.free_simulate import simulate_free, simulate_phases
 from ..simulation.hand import build_system
+from ..simulation.simulate import simulate_free, simulate_phases
 from .verdict import DEPARTURE
 
 MOST = 60  # most events that the text lists; `to_dict` has all

@@ -11,7 +11,7 @@ from ..problem.definition import Phase, Problem
 from ..results.adopt import Moved, adopt_motion
 from ..results.trajectory import Trajectory
 from ..simulation.events import FreeSimulation, OutcomeKind
-from ..simulation.free_simulate import simulate_free
+from ..simulation.simulate import simulate_free
 from .free import FreePhase, FreeReport, describe_losses, find_losses, measure_end, warn
 from .verdict import DEPARTURE
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
+from ..common.errors import InputError
 from ..common.sharing import exclusive
 from ..contacts.cones import slip_margins
 from ..contacts.contact_limits import evaluate_finger_gap
@@ -38,6 +39,7 @@ from ..simulation.events import Event, EventKind, Glimpses, Simulation
 from ..simulation.simulate import Closer, simulate
 from ..simulation.tolerances import SETTLING
 from .force_uniqueness import find_departure, find_uniqueness_margin, find_wedged
+from .free import FreeReport, verify_free
 from .verdict import (
     DEPARTURE,
     REST_SPEED,
@@ -84,25 +86,44 @@ class Observation(NamedTuple):
     gap: FingerGap | None
 
 
-@exclusive
+@overload
 def verify(
     problem: Problem,
     what: Torques,
     *,
+    contacts: Literal["prescribed"] = "prescribed",
     tolerance: float = 1e-9,
     departure: float = DEPARTURE,
     rest_speed: float = REST_SPEED,
     uniqueness_margin: float = UNIQUENESS_MARGIN,
     reduced: bool = False,
-) -> Report:
-    """Replay the torques of a plan, or given ones, open loop and report what happens.
+) -> Report: ...
+@overload
+def verify(
+    problem: Problem,
+    what: Torques,
+    *,
+    contacts: Literal["free"],
+    tolerance: float = 1e-9,
+    departure: float = DEPARTURE,
+    restitution: float = 0.0,
+    progress: Callable[[str], None] | None = None,
+) -> FreeReport: ...
+@exclusive
+def verify(
+    problem: Problem, what: Torques, *, contacts: str = "prescribed", **options: Any
+) -> Report | FreeReport:
+    """Simulate the torques of a plan, or given ones, open loop and report what happens.
 
     Every contact has to hold, every phase with an end at rest has to be at rest there, and the goal
     has to be reached. A plan has to keep every normal force above epsilon, too, and its
     replay has to stay near it; of torques alone a force below epsilon is a warning.
 
+    With free contacts, none is assumed: see `verify_free`.
+
     Parameters
     ----------
+    contacts           prescribed: those of the problem's phases; free: any
     tolerance          of the simulation
     departure          how far the replay may be from the trajectory: positions relative to the
                        scene's length (the object's radius of gyration), angles in rad
@@ -119,6 +140,21 @@ def verify(
                                    number is out of its range
     JammingError, SimulationError  if the simulation cannot go on
     """
+    if contacts not in ("prescribed", "free"):
+        raise InputError("", "contacts", f"{contacts!r} given; known: prescribed, free")
+    return (verify_free if contacts == "free" else _verify)(problem, what, **options)
+
+
+def _verify(
+    problem: Problem,
+    what: Torques,
+    *,
+    tolerance: float = 1e-9,
+    departure: float = DEPARTURE,
+    rest_speed: float = REST_SPEED,
+    uniqueness_margin: float = UNIQUENESS_MARGIN,
+    reduced: bool = False,
+) -> Report:
     problem, torque, plan = adopt_torques(problem, what)
     allowance = Allowance(departure, rest_speed, uniqueness_margin=uniqueness_margin)
     require_same_contacts(problem, plan)

@@ -1,0 +1,890 @@
+"""Motion with contacts from complementarity problems: events, contact modes, impacts.
+
+At every event the contact modes are the solution of a contact problem (`contact_problem`) that
+changes the fewest modes. They are evaluated a short time later, at the state that present
+accelerations lead to: a force's trend counts. The last modes are tried first, then Lemke's method.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.arrays import Array
+from ..results.torque import TorqueProfile
+from ..results.trajectory import interpolate_quintic
+from .contact_problem import (
+    APART,
+    BACK,
+    FORTH,
+    MODES,
+    SAME,
+    STICKS,
+    ContactAnswer,
+    ContactProblem,
+    is_clear,
+    list_answers,
+    solve,
+    try_modes,
+)
+from .events import EventKind, describe_change
+from .rest import find_roots
+from .root_finding import find_root
+from .run import Feedback, Run, StuckError, find_torque_steps
+from .stepper import Modes
+from .system import ContactRows, System
+from .tolerances import ROUNDING_FORCE, SHORTEST_STEP, STANDING, STILL
+
+CLOSED = 1e-10  # gap that counts as closed at an event, relative to the scene's length
+SUNK = 1e-6  # overlap up to which features touch, over the scene's length; else they are behind
+CHATTER = 1e-6  # speed of the last impact, over the scene's: separation stays below rounding
+COARSE = 1e3  # the same over the tolerance, where that is coarser than impacts need
+BURST = 3e-4
+"""Time, relative to the scene's, in which `MANY` impacts raise `CHATTER` tenfold, and twice as many
+a hundredfold: fingers may knock an object to and fro for ever."""
+MANY = 20
+AHEAD = 2e-5  # delay at which modes are evaluated, over the scene's time: a force's trend counts
+CLEAR = 1e-3  # forces and rates, over the largest, that do not vanish within `AHEAD`
+DEPENDENT = 1e-7  # share of a row that others leave, below which it is no constraint of its own
+SPEED_ROUNDING = 1e-12  # sliding or turning speed that counts as rounding, over the scene's
+TURNING = 1e-4  # speed, over the scene's, below which a reversal may be near
+ARMED = 1e-13  # gap from which on a pair has been apart, relative to the scene's length
+NO_PROGRESS = 60  # most decisions in a row without any time passing
+LOOKS = 8  # instants of the longest step at which gaps are looked at, its end among them
+REACH = 0.3  # longest step, in units of the scene: gaps are sampled every `REACH` / `LOOKS`
+EXACT = 1e-14  # gap of a closed contact, over the scene's length: some ten roundings
+CHATTER_PAUSE = 1e-3  # time between two notes of chatter of a pair, over the scene's
+ROUNDS = 30  # most impacts at one instant; what is left after them is plastic
+_NONE = np.zeros(0)
+_NOTHING = (_NONE, np.zeros(0, dtype=np.int64), _NONE, _NONE)
+
+
+class ClosedContacts(NamedTuple):
+    """Pairs that touch and do not part, each constraint once, and their rows at present."""
+
+    pairs: tuple[int, ...]
+    rows: ContactRows
+
+
+class Closing(NamedTuple):
+    """A pair whose gap falls below a level [m] between two instants since a step's start [s]."""
+
+    pair: int
+    level: float
+    left: float
+    right: float
+
+
+class View(NamedTuple):
+    """Event values at the end of a step, and gaps within it."""
+
+    out: Array  # outputs at its end
+    values: Array  # those of the steps, then ranges of kept pairs: positive until an event
+    times: Array  # (m,) [s]: instants since its start
+    gaps: Array  # gaps, ranges (m, N) [m]: of all pairs then
+    ranges: Array
+
+
+class FreeRun(Run):
+    """A running simulation without prescribed contacts.
+
+    Attributes
+    ----------
+    armed : (N,)  pairs that have been apart, so that their closing is an event
+    resting       whether everything rests
+    unique        whether the present modes were certainly the only solution
+    residual      largest residual of a contact problem so far
+    """
+
+    def __init__(
+        self,
+        system: System,
+        torque: TorqueProfile | Feedback,
+        z: Array,
+        v: Array,
+        restitution: float = 0.0,
+        tolerance: float = 1e-9,
+        hint: Modes | None = None,
+        wanted: Array | None = None,
+    ) -> None:
+        self.feedback = torque if isinstance(torque, Feedback) else None
+        torque = torque.torque if isinstance(torque, Feedback) else torque
+        super().__init__(system, torque, z, v, tolerance, wanted)
+        self.restitution = restitution
+        self.modes = hint or Modes(sigma=(0.0,) * system.n)
+        self.armed = np.zeros(len(system.names), dtype=bool)
+        self.decisions, self.decided_at = 0, -math.inf
+        self.resting = self.unique = False
+        self._begin_piece()
+
+    def play(self, touching: float, halt: Callable[[FreeRun], bool] | None = None) -> None:
+        """Simulate until the torques end or `halt`, called at events.
+
+        `touching` are gaps to close at the start [m].
+        """
+        self._close(touching)
+        while self.t < self.breaks[-1] and not (halt is not None and halt(self)):
+            if self.t >= self.stop:
+                self.next_piece()
+            found = self._collide()
+            moved = not self.stands()
+            rests = self._decide(found)
+            if moved and self.stands():
+                rests = self._decide(self._find_closed())
+            self.decisions = self.decisions + 1 if self.t == self.decided_at else 0
+            self.decided_at = self.t
+            if self.decisions > NO_PROGRESS:
+                self.note_at(EventKind.GIVEN_UP, "decisions do not end")
+                return
+            if rests is None:
+                if not self._jolt():
+                    self.note_at(EventKind.GIVEN_UP, "no motion obeys the laws of contact")
+                    if not self.records:
+                        self.record(still=True)
+                    return
+                continue
+            self.resting = rests
+            if rests:
+                self.set_velocity(0.0)
+                self._hold()
+                continue
+            try:
+                self.move()
+            except StuckError:
+                # Forces grow without bound where the motion jams.
+                if not self._jolt():
+                    self.note_at(EventKind.GIVEN_UP, "steps become too short")
+                    return
+
+    # Instants: impacts and modes.
+
+    @property
+    def chatter(self) -> float:
+        """Speed of impacts that count as the last one [m/s]."""
+        since, recent = self.t - BURST * self.system.scales.time, 0
+        for event in reversed(self.events):
+            if event.time < since:
+                break
+            recent += event.kind is EventKind.IMPACT
+        least = max(CHATTER, COARSE * self.tolerance)
+        return least * self.system.scales.speed * 10.0 ** min(recent // MANY, 2)
+
+    def next_piece(self) -> bool:
+        """Go on to the next piece of the torques, if there is one."""
+        if self.piece + 2 >= len(self.breaks):
+            return False
+        self.piece += 1
+        self._begin_piece()
+        return True
+
+    def _begin_piece(self) -> None:
+        """Sample the feedback law, if there is one."""
+        if self.feedback is None:
+            return
+        theta, theta_dot = (part[list(self.system.driven)] for part in (self.z, self.v))
+        forces = {}
+        if self.records:
+            last = self.records[-1]
+            names = (self.system.names[pair] for pair in last.kept)
+            forces = dict(zip(names, last.c_n.tolist(), strict=True))
+        self.feedback.begin(self.piece, theta, theta_dot, forces)
+
+    def note_at(
+        self, kind: EventKind, text: str, contact: str = "", value: float = math.nan
+    ) -> None:
+        """Append an event at present, whose text says when."""
+        self.note(kind, f"{text} at t = {self.t:.6g} s", contact, value)
+
+    def stands(self) -> bool:
+        """Whether nothing moves."""
+        return bool((np.abs(self.v) < STANDING * self.system.units[self.system.n :]).all())
+
+    def _is_still(self, acceleration: Array) -> bool:
+        system = self.system
+        still = STILL * system.units[system.n :] / system.scales.time
+        return bool((np.abs(acceleration) < still).all())
+
+    def _close(self, touching: float) -> None:
+        """Project the start onto what touches, in the metric of masses."""
+        system = self.system
+        root = np.sqrt(system.mass)
+        for _ in range(5):
+            gaps, ranges = system.look(self.z)
+            near = np.flatnonzero((np.abs(gaps) < touching) & (ranges > -touching)).tolist()
+            if not near:
+                break
+            rows = system.evaluate(self.z, self.v, near).A / root
+            self.y[: system.n] -= np.linalg.lstsq(rows, gaps[near], rcond=1e-9)[0] / root
+        self.armed = system.look(self.z)[0] > ARMED * system.scales.length
+
+    def _face(self, z: Array, v: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Gaps of all pairs at a state, and which of them face each other, shape (N,) each."""
+        scales = self.system.scales
+        gaps, ranges = self.system.look(z)
+        near = CLOSED * scales.length
+        faces = ranges > near
+        at_end = (ranges > -near) & ~faces
+        if np.count_nonzero(at_end):
+            faces |= at_end & (self.system.look(z + AHEAD * scales.time * v)[1] >= ranges)
+        return gaps, faces
+
+    def _find_closed(self) -> ClosedContacts:
+        """Look for what is closed."""
+        system, unit = self.system, self.system.scales.length
+        gaps, faces = self._face(self.z, self.v)
+        near = (gaps < CLOSED * unit) & (gaps > -SUNK * unit) & faces
+        touching: list[int] = near.nonzero()[0].tolist()
+        rows = system.evaluate(self.z, self.v, touching)
+        if not touching:
+            return ClosedContacts((), rows)
+        slow = (rows.A @ self.v < self.chatter).tolist()
+        lines = rows.A / np.sqrt(system.mass)
+        lines /= np.sqrt((lines**2).sum(axis=1))[:, None]
+        own = (np.abs(lines[:, None] - lines).max(axis=2) > DEPENDENT).tolist()
+        chosen: list[int] = []
+        for k in sorted(range(len(touching)), key=lambda k: touching[k] not in self.modes.kept):
+            if slow[k] and all(own[k][j] for j in chosen):
+                chosen.append(k)
+        chosen.sort()
+        pairs = tuple(touching[k] for k in chosen)
+        return ClosedContacts(pairs, ContactRows(*(part[chosen] for part in rows)))
+
+    def _collide(self) -> ClosedContacts:
+        """Resolve impacts until no closed gap closes further; what is closed then."""
+        limit = STANDING * self.system.scales.speed
+        for count in range(ROUNDS + 1):
+            closed = self._find_closed()
+            rates = closed.rows.A @ self.v
+            if not (rates < -limit).any():
+                return closed
+            self._strike(closed, rates, -rates.min() > self.chatter and count < ROUNDS)
+        return self._find_closed()
+
+    def _strike(self, closed: ClosedContacts, rates: Array, bouncing: bool) -> None:
+        answer = solve(self._pose(closed, self.v))
+        if answer is None:
+            raise ArithmeticError("the plastic impact has no solution")
+        self.residual = max(self.residual, answer.residual)
+        v = self.v + answer.change
+        if bouncing and self.restitution:
+            v = self._expand(closed, answer, v)
+        pause = CHATTER_PAUSE * self.system.scales.time
+        for k, pair in enumerate(closed.pairs):
+            if rates[k] >= -STANDING * self.system.scales.speed or answer.c_n[k] <= 0:
+                continue
+            name, text = self.system.names[pair], self.system.structure.pairs[pair].text
+            if bouncing:
+                note = f"{text or name} at {-rates[k]:.4g} m/s"
+                self.note_at(EventKind.IMPACT, note, name, float(-rates[k]))
+                continue
+            noted = [
+                e.time for e in self.events if (e.kind, e.contact) == (EventKind.CHATTER, name)
+            ]
+            if not noted or self.t - noted[-1] >= pause:
+                note = f"the impacts of {name} come ever closer and are over"
+                self.note_at(EventKind.CHATTER, note, name, float(-rates[k]))
+        self.set_velocity(v)
+
+    def _pose(self, closed: ClosedContacts, v: Array) -> ContactProblem:
+        """Contact problem of velocities: whatever has friction may stick."""
+        system, rows = self.system, closed.rows
+        mu = system.friction[list(closed.pairs)]
+        rubs = np.flatnonzero(mu > 0)
+        T, none = rows.A_t[rubs], np.zeros(len(rubs))
+        return ContactProblem(
+            1 / system.mass, rows.A, rows.A, rows.A @ v, T, T @ v, rubs, mu[rubs], none
+        )
+
+    def _expand(self, closed: ClosedContacts, plastic: ContactAnswer, v: Array) -> Array:
+        """Velocity after expansion with Poisson's restitution, which may not gain energy."""
+        mass, restitution = self.system.mass, self.restitution
+        before = float(self.v**2 @ mass)
+        while restitution > 1e-3:
+            impulse = restitution * plastic.c_n
+            pushed = v + closed.rows.A.T @ impulse / mass
+            problem = self._pose(closed, pushed)
+            problem = replace(problem, bound=problem.mu * impulse[problem.owner])
+            answer = solve(problem)
+            if answer is not None:
+                after = pushed + answer.change
+                if float(after**2 @ mass) <= before * (1 + 1e-12):
+                    return np.asarray(after)
+            restitution /= 2
+        return v
+
+    def _jolt(self) -> bool:
+        """Impact without collision (Painleve), the limit of time stepping; whether there is one."""
+        system = self.system
+        closed = self._find_closed()
+        pattern = Pattern(self, closed)
+        free = system.push(self.v, self.tau(self.t), pattern.sigma) / system.mass
+        answer = solve(self._pose(closed, self.v + AHEAD * system.scales.time * free))
+        if answer is None:
+            return False
+        # With the modes that it ends in, the impact at the instant itself is linear.
+        problem = self._pose(closed, self.v)
+        choice = [STICKS if c > 0 else APART for c in answer.c_n]
+        for contact, sign in zip(problem.owner, answer.sign, strict=True):
+            choice[contact] = MODES[float(sign)] if choice[contact] != APART else APART
+        exact = try_modes(problem, choice)
+        if exact is None or (np.abs(exact.change) < STANDING * system.units[system.n :]).all():
+            return False
+        names = " ".join(system.names[pair] for pair in pattern.closed)
+        self.note_at(
+            EventKind.INCONSISTENT,
+            f"no finite forces keep {names} closed: an impact without a collision",
+            names,
+        )
+        self.set_velocity(self.v + exact.change)
+        return True
+
+    def _decide(self, closed: ClosedContacts) -> bool | None:
+        """Set the contact modes; whether everything rests, None where no modes are consistent."""
+        system, lift = self.system, 1 / self.system.mass
+        if (np.abs(closed.rows.A @ self.v) > STANDING * system.scales.speed).any():
+            # What is closed and parts more slowly than chatter is closed at rest, all at once.
+            pairs, rows = closed
+            sticks = np.abs(rows.A_t @ self.v) < self.chatter
+            sticks &= system.friction[list(pairs)] > 0
+            self.project_velocity(np.vstack([rows.A, rows.A_t[sticks]]))
+            closed = ClosedContacts(pairs, system.evaluate(self.z, self.v, pairs))
+        pattern = Pattern(self, closed)
+        later = AHEAD * system.scales.time
+        coming = free = lift * system.push(self.v, self.tau(self.t), pattern.sigma)
+        problem, rows = pattern.pose(free, pattern.rows), pattern.rows
+        answer = first = self._answer(problem, pattern.recall(self.modes))
+        if first is None:
+            return None
+        acceleration = free + first.change
+        self.unique = problem.is_unique
+        if not self.unique or not is_clear(problem, first, CLEAR):
+            v = self.v + later * acceleration
+            rows = system.evaluate(self.z + later * (self.v + v) / 2, v, pattern.closed)
+            coming = lift * system.push(v, self.tau(self.t + later), pattern.sigma)
+            answer = self._choose(pattern, pattern.pose(coming, rows), coming, first)
+        if answer is None:
+            return None
+        # What rests leaves its last modes by rounding, before it takes others in which it rests.
+        still = self.resting or self._is_still(acceleration)
+        rests = self.stands() and still and self._is_still(coming + answer.change)
+        modes = pattern.make_modes(answer, rows, self.unique)
+        self._note_changes(pattern.closed, modes, rests)
+        self.modes = modes
+        # Rounding of speeds that are zero.
+        kept = [k for k, pair in enumerate(pattern.closed) if pair in modes.kept]
+        joints = np.eye(system.n)[pattern.joints]
+        at_rest = [pattern.rows.A[kept], pattern.rows.A_t[pattern.standing], joints]
+        self.project_velocity(np.vstack(at_rest))
+        return rests
+
+    def _answer(self, problem: ContactProblem, *likely: Sequence[int]) -> ContactAnswer | None:
+        """The solution with some likely modes, or another."""
+        if problem.is_unique and (answers := list_answers(problem)):
+            return answers[0]
+        for modes in likely:
+            if (answer := try_modes(problem, modes)) is not None:
+                return answer
+        answer = solve(problem)
+        if answer is None:
+            return next(iter(list_answers(problem) or ()), None)
+        self.residual = max(self.residual, answer.residual)
+        return answer
+
+    def _choose(
+        self, pattern: Pattern, problem: ContactProblem, free: Array, before: ContactAnswer
+    ) -> ContactAnswer | None:
+        """The answer nearest to the last one; what rests stays at rest if possible.
+
+        `free` has the accelerations without contacts, shape (n,); `before` is an answer a little
+        earlier.
+        """
+        last = pattern.recall(self.modes)
+        self.unique = problem.is_unique
+        answers = [] if self.unique else list_answers(problem) or []
+        if len(answers) > 1:
+            modes = [pattern.describe(answer) for answer in answers]
+            if self.modes.kept or len(problem.b_n):
+                self._note_ambiguity(pattern, modes)
+            starts = [self.resting and not self._is_still(free + a.change) for a in answers]
+            away = [sum(a != b for a, b in zip(one, last, strict=True)) for one in modes]
+            return answers[min(range(len(answers)), key=lambda k: (starts[k], away[k]))]
+        return self._answer(problem, last, pattern.describe(before))
+
+    def _note_changes(self, closed: Sequence[int], modes: Modes, rests: bool) -> None:
+        """Record what changes."""
+        if rests and self.resting:
+            # Other forces that hold the same rest are no event.
+            return
+        system, before = self.system, self.modes
+        names = system.names
+        gone = [pair for pair in before.kept if pair not in modes.kept]
+        new = [pair for pair in modes.kept if pair not in before.kept]
+        gaps, ranges = system.look(self.z) if gone else (_NONE, _NONE)
+        near = CLOSED * system.scales.length
+        for pair in gone:
+            # What still touches, at the end of its range, is a neighbour's from there on.
+            heirs = [p for p in new if names[p][-1:] == names[pair][-1:]]
+            if heirs and abs(gaps[pair]) < near and ranges[pair] < near:
+                text = f"{names[pair]} goes on as {names[heirs[0]]}"
+                self.note_at(EventKind.PASS, text, names[heirs[0]])
+                new.remove(heirs[0])
+            elif pair not in closed or self.records:
+                self.note_at(EventKind.CONTACT_LOST, f"{names[pair]} is lost", names[pair])
+        for pair in new if self.records else ():
+            self.note_at(EventKind.GAINED, f"{names[pair]} presses", names[pair])
+        if not self.records:
+            before = modes
+        changes = [
+            (names[pair], before.Xi[before.kept.index(pair)], Xi, "slides")
+            for pair, Xi in zip(modes.kept, modes.Xi, strict=True)
+            if pair in before.kept and system.friction[pair] > 0
+        ]
+        joints = zip(before.sigma, modes.sigma, strict=True)
+        changes += [(_name(system, k), old, new, "turns") for k, (old, new) in enumerate(joints)]
+        for name, old, now, verb in changes:
+            if old != now:
+                self.note_at(*describe_change(name, old, now, verb), name)
+        if rests:
+            self.note_at(EventKind.REST, "everything rests")
+        elif self.resting:
+            self.note_at(EventKind.START, "the motion begins")
+
+    def _note_ambiguity(self, pattern: Pattern, answers: Sequence[Sequence[int]]) -> None:
+        """Record that there are several answers, once for each set of contacts."""
+        names = [self.system.names[pair] for pair in pattern.closed]
+        words = {APART: "parts", STICKS: "presses", FORTH: "slides +", BACK: "slides -"}
+        turns = {STICKS: "is held", FORTH: "turns +", BACK: "turns -"}
+        standing = set(pattern.standing.tolist())
+        texts = []
+        for answer in answers:
+            parts = [
+                f"{name} {'sticks' if mode == STICKS and k in standing else words[mode]}"
+                for k, (name, mode) in enumerate(zip(names, answer, strict=False))
+                if any(other[k] != mode for other in answers)
+            ]
+            parts += [
+                f"{_name(self.system, int(joint))} {turns[mode]}"
+                for joint, mode in zip(pattern.joints, answer[len(names) :], strict=True)
+            ]
+            texts.append(", ".join(parts) or "the rest accelerates otherwise")
+        text = f"{len(answers)} motions are possible with {', '.join(names) or 'no contact'} closed"
+        text += f" ({'; or '.join(texts)})"
+        last = [event for event in self.events if event.kind is EventKind.AMBIGUOUS]
+        if not last or last[-1].text.split(" at t =")[0] != text:
+            self.note_at(EventKind.AMBIGUOUS, text, " ".join(names))
+
+    # Rest.
+
+    def _hold(self) -> None:
+        """Let time pass at rest until forces leave their bounds, or the torques end."""
+        self.record(still=True)
+        while True:
+            breach = _find_breach(self._list_margins(), self.fraction(self.t))
+            self.wait(self.time(breach) if breach < 1 else self.stop)
+            if breach < 1 or not self.next_piece():
+                return
+
+    def _list_margins(self) -> Array:
+        """Margins at rest, polynomials of x in [-1, 1] on the present piece, (m, d + 1), scaled.
+
+        All are affine in the torques: they follow from the steps' forces under three torques.
+        """
+        self.load(self.modes)
+        s, at, to = self.s, self.s.inputs, self.s.to
+        s.stay(self.system, self.z)
+        seen = []
+        for tau in np.vstack([np.zeros(2), self.system.scales.torque * np.eye(2)]):
+            at[s.at.torque] = 0.0
+            at[s.at.torque.start : s.at.torque.stop : self.torque.coefficients.shape[2]] = tau
+            s.look()
+            rates = s.outputs[to.acceleration] * self.system.scales.time
+            margins = s.outputs[to.values][: s.rows.cone.stop]
+            seen.append(np.concatenate([margins, rates / self.system.units[self.system.n :]]))
+        slopes = np.array([part - seen[0] for part in seen[1:]]).T / self.system.scales.torque
+        values = slopes @ self.torque.coefficients[self.piece]
+        values[:, 0] += seen[0]
+        count = s.rows.cone.stop
+        margins, rates = values[:count], values[count:]
+        margins[:, 0] += ROUNDING_FORCE
+        creeps = np.vstack([-rates, rates])
+        creeps[:, 0] += 10 * STILL
+        return np.vstack([margins, creeps])
+
+    # Motion.
+
+    def move(self) -> None:
+        """Integrate with the present modes until an event, or until the torques step or end."""
+        self.load(self.modes)
+        s, system, modes, rows = self.s, self.system, self.modes, self.s.rows
+        s.stay(system, self.z)
+        s.look()
+        self.near = 1e-3 * SHORTEST_STEP * max(system.scales.time, abs(self.t))
+        self.unit, self.kept = system.scales.length, list(modes.kept)
+        self.watched = np.ones(len(system.names), dtype=bool)
+        self.watched[self.kept] = False
+        counts = [rows.cone.stop, rows.size - rows.cone.stop, len(self.kept)]
+        self.slack = np.repeat([ROUNDING_FORCE, SPEED_ROUNDING, CLOSED], counts)
+        self.start = self._view(0.0)
+        gaps = self.start.gaps[-1]
+        # What touches already may sink by rounding; what is behind something else never closes.
+        shallow = gaps > -SUNK * self.unit
+        sunk = np.minimum(gaps, 0.0) - 0.5 * CLOSED * self.unit
+        self.level = np.where(shallow, sunk, -np.inf)
+        # Values that start below zero may stay there: modes are judged a moment later.
+        self.floor = np.maximum(self.slack, self.slack - self.start.values)
+        self.h = min(self.h, self._time_to_return())
+        self.record()
+        super().move()
+
+    @property
+    def longest(self) -> float:
+        """Longest step from the present state: one of `REACH`, in units of the scene."""
+        out, n = self.start.out, self.system.n
+        speed, push = self._measure(out[n : 2 * n]), self._measure(out[self.s.to.acceleration])
+        return 2 * REACH / (speed + math.sqrt(speed**2 + 2 * push * REACH) + 1e-300)
+
+    def _measure(self, motion: Array) -> float:
+        """Largest of coordinates or their rates, in units of the scene."""
+        return float(np.abs(motion / self.system.units[: self.system.n]).max())
+
+    def _view(self, h: float) -> View:
+        """Look at the step just made, of length h."""
+        s, n, out = self.s, self.system.n, self.s.outputs.copy()
+        gaps, ranges = self.system.look(out[:n])
+        values = self._list_values(ranges)
+        count = 1
+        if h > 0:
+            gone = np.abs(out[: 2 * n] - self.start.out[: 2 * n])
+            count += int(LOOKS * min(1.0, self._measure(gone[:n] + h * gone[n:]) / REACH))
+        times, gaps, ranges = h * np.arange(1, count + 1) / count, gaps[None], ranges[None]
+        if count > 1:
+            ends = np.array([self.start.out, out])
+            knots = ends[:, :n], ends[:, n : 2 * n], ends[:, s.to.acceleration]
+            first = np.zeros(count - 1, dtype=np.int64)
+            z = interpolate_quintic(np.full(count - 1, h), times[:-1], knots, first)[0]
+            more = self.system.measure(z)
+            gaps, ranges = np.vstack([more[0], gaps]), np.vstack([more[1], ranges])
+        return View(out, values, times, gaps, ranges)
+
+    def happens(self) -> bool:
+        """Whether an event value of the steps, or a range, is negative after the step just made."""
+        ranges = self.system.look(self.s.outputs[: self.system.n])[1]
+        return bool((self._list_values(ranges) < -self.slack).any())
+
+    def _list_values(self, ranges: Array) -> Array:
+        """Event values after the step just made, where `ranges` of all pairs are, (N,) [m]."""
+        values = self.s.outputs[self.s.to.values]
+        return np.concatenate([values, ranges[self.kept] / self.unit])
+
+    def _find_value(self, h: float, row: int) -> float:
+        """One event value at another end of the step."""
+        self._step_to(h)
+        return float(self._list_values(self.system.look(self.s.outputs[: self.system.n])[1])[row])
+
+    def _find_gap(self, h: float, pair: int) -> float:
+        """A pair's gap at another end of the step [m]."""
+        self._step_to(h)
+        return float(self.system.look(self.s.outputs[: self.system.n])[0][pair])
+
+    def _step_to(self, h: float) -> None:
+        if self.s.inputs[self.s.at.h] != h:
+            self.step_to(h)
+
+    def locate(self, h: float, t: float) -> bool:
+        """Shorten the step just made, of length `h`, to its first event; whether there is one."""
+        passed: set[int] = set()
+        floor, found = self.floor, False
+        first = np.maximum(self.start.values + floor, 0)
+        while True:
+            self._step_to(h)
+            self.end = end = self._view(h)
+            values = end.values + floor
+            closing = self._find_closing(passed) or self._find_entering(passed)
+            low = (values < 0).nonzero()[0]
+            if not len(low) and closing is None:
+                return found
+            shares = first[low] / (first[low] - values[low])
+            if closing is not None and (not len(low) or closing.left <= h * shares.min()):
+                root = self._find_contact(h, closing)
+                passed.add(closing.pair)
+                h, found = (h, found) if root is None else (root, True)
+            else:
+                row = int(low[np.argmin(shares)])
+                least = float(floor[row])
+
+                def value(step: float, row: int = row, least: float = least) -> float:
+                    return self._find_value(step, row) + least
+
+                ends = float(first[row]), float(values[row])
+                h = find_root(value, h, *ends, self.near, 1e-3 * least)
+                floor = np.where(np.arange(len(floor)) == row, np.inf, floor)
+                found = True
+
+    def keep(self, t: float) -> None:
+        """Take the step just made, to time `t`, and record its end."""
+        end, self.t = self.end, t
+        self.y = end.out[self.s.to.y].copy()
+        self.record()
+        self.armed = end.gaps[-1] > ARMED * self.unit
+        self.floor = np.where(end.values > 0, self.slack, self.floor)
+        self.s.inputs[self.s.at.y], self.s.inputs[self.s.at.t] = self.y, t
+        self.start = end
+
+    def handle(self, found: bool) -> bool:
+        """End the motion at an event."""
+        return found
+
+    def pass_break(self) -> bool | None:
+        """Go on to the next piece of the torques; the motion ends if they end or modes change."""
+        if not self.next_piece():
+            return True
+        self.feed()
+        before, after = self.torque.coefficients[self.piece - 1 : self.piece + 1]
+        if find_torque_steps(before[None], after[None], self.system)[0]:
+            self.s.look()
+            self.start = self._view(0.0)
+            if not self._holds(self.start):
+                return True
+            self.record()
+        return None
+
+    def _holds(self, end: View) -> bool:
+        """Whether the modes are the only solution after a torque step, by more than rounding."""
+        modes, rows = self.s.modes, self.s.rows
+        if not self.unique or modes.stuck or modes.held:
+            return False
+        counts = [rows.cone.stop, rows.size - rows.cone.stop, len(self.kept)]
+        clear = np.repeat([10 * ROUNDING_FORCE, TURNING, 10 * CLOSED], counts)
+        # What has no direction has no speed that could reverse.
+        signs = np.array([*self.modes.Xi, *self.modes.sigma])
+        clear[rows.slide.start : rows.turn.stop][signs == 0] = -1
+        near = CLOSED * self.unit
+        touches = (np.abs(end.gaps[-1]) < near) & (end.ranges[-1] > -near)
+        return bool((end.values > clear).all()) and not (touches & self.watched).any()
+
+    def _find_contact(self, h: float, closing: Closing) -> float | None:
+        """When a pair closes within a step; None if it does not, or where the two do not face."""
+        pair, level, left, right = closing
+        n = self.system.n
+
+        def value(step: float) -> float:
+            return self._find_gap(step, pair) - level
+
+        first = value(left) if left > 0 else float(self.start.gaps[-1, pair]) - level
+        last = value(right)
+        if last >= 0 and right < h:
+            # The bracket is that of an interpolation, which grazing may mislead.
+            right, last = h, value(h)
+        if last >= 0:
+            return None
+        root = find_root(value, right, first, last, self.near, EXACT * self.unit, left)
+        self._step_to(root)
+        out = self.s.outputs
+        return root if self._face(out[:n], out[n : 2 * n])[1][pair] else None
+
+    def _list_bounds(self) -> tuple[Array, Array, Array]:
+        """Gaps and ranges at the beginning of each part of a step, (m, N) each, and its time."""
+        start, end = self.start, self.end
+        gaps = np.vstack([start.gaps[-1:], end.gaps[:-1]])
+        return gaps, np.vstack([start.ranges[-1:], end.ranges[:-1]]), np.append(0.0, end.times[:-1])
+
+    def _find_closing(self, passed: set[int]) -> Closing | None:
+        """The first pair that closes within the step, and a bracket of when."""
+        end, armed = self.end, self.armed[None]
+        if len(end.times) > 1:
+            # What comes apart within the step may close again within it.
+            apart = end.gaps[:-1] > ARMED * self.unit
+            armed = np.logical_or.accumulate(np.vstack([armed, apart]), axis=0)
+        level = np.where(armed, 0.0, self.level)
+        below = (end.gaps < level) & self.watched
+        if not np.count_nonzero(below):
+            return None
+        gaps, ranges, times = self._list_bounds()
+        crosses = below & (gaps >= level) & (np.maximum(end.ranges, ranges) > -1e-3 * self.unit)
+        crosses[:, list(passed)] = False
+        rows, pairs = np.nonzero(crosses)
+        if not len(rows):
+            return None
+        row, pair = int(rows[0]), int(pairs[0])
+        return Closing(pair, float(level[row, pair]), float(times[row]), float(end.times[row]))
+
+    def _find_entering(self, passed: set[int]) -> Closing | None:
+        """The first pair that comes into range apart or touching, and overlaps after that.
+
+        Out of range a gap has no meaning and may be negative throughout.
+        """
+        end = self.end
+        overlaps = (end.ranges > 0) & (end.gaps < -CLOSED * self.unit) & self.watched
+        if not np.count_nonzero(overlaps):
+            return None
+        _, ranges, times = self._list_bounds()
+        turns = overlaps & (ranges <= 0) & (end.gaps > -REACH * self.unit)
+        turns[:, list(passed)] = False
+        h = float(self.s.inputs[self.s.at.h])
+        try:
+            for row, pair in zip(*(part.tolist() for part in turns.nonzero()), strict=True):
+                left, right = float(times[row]), float(end.times[row])
+                entry = self._find_entry(pair, left, right, -float(ranges[row, pair]))
+                gap = self._find_gap(entry, pair)
+                if gap > -SUNK * self.unit:
+                    return Closing(pair, min(gap, 0.0) - 0.5 * CLOSED * self.unit, entry, right)
+            return None
+        finally:
+            self._step_to(h)
+
+    def _find_entry(self, pair: int, left: float, right: float, outside: float) -> float:
+        """When a pair comes into range between two instants of a step."""
+
+        def value(step: float) -> float:
+            self._step_to(step)
+            return -float(self.system.look(self.s.outputs[: self.system.n])[1][pair])
+
+        within = value(right)
+        if within < 0 <= outside:
+            flat = CLOSED * self.unit
+            return find_root(value, right, outside, within, self.near, flat, left)
+        return right
+
+    def _time_to_return(self) -> float:
+        """Half the time in which the nearest pair that has just parted would close again [s]."""
+        near = self.watched & ~self.armed & (np.abs(self.start.gaps[-1]) < CLOSED * self.unit)
+        if not np.count_nonzero(near):
+            return math.inf
+        rows = self.system.evaluate(self.z, self.v, near.nonzero()[0].tolist())
+        rate = rows.A @ self.v
+        bend = rows.A @ self.s.outputs[self.s.to.acceleration] + rows.bend
+        # What parts more slowly was closed when the modes were chosen.
+        back = (rate >= self.chatter) & (bend < 0)
+        return float((-rate[back] / bend[back]).min(initial=np.inf))
+
+
+def _find_breach(margins: Array, x: float) -> float:
+    """First `x` at which a polynomial turns negative; at least 1 if none does before."""
+    first = 2.0
+    for row in margins:
+        if np.polyval(row[::-1], x) < 0:
+            return x
+        slope = np.polyder(row[::-1])
+        roots = [r for r in find_roots(row) if x < r < min(first, 1.0) and np.polyval(slope, r) < 0]
+        first = min([first, *roots])
+    return first
+
+
+class Pattern:
+    """Closed pairs and coordinates at rest, and sliding signs of the others."""
+
+    def __init__(self, run: FreeRun, found: ClosedContacts) -> None:
+        system = run.system
+        self.system, self.closed, self.rows = system, *found
+        v_t = self.rows.A_t @ run.v
+        self.mu = system.friction[list(self.closed)]
+        rubs = self.mu > 0
+        slow = np.abs(v_t) < STANDING * system.scales.speed
+        self.Xi = np.where(rubs & ~slow, np.sign(v_t), 0.0)
+        self.rub = (self.mu * self.Xi)[:, None]
+        self.standing = (rubs & slow).nonzero()[0]
+        slow = np.abs(run.v) < STANDING * system.units[system.n :]
+        self.sigma = np.where((system.dry > 0) & ~slow, np.sign(run.v), 0.0)
+        self.joints = ((system.dry > 0) & slow).nonzero()[0]
+
+    def pose(self, free: Array, rows: ContactRows) -> ContactProblem:
+        """Contact problem of rows, from accelerations without contacts, `free` (n,)."""
+        system, lift, standing = self.system, 1 / self.system.mass, self.standing
+        G, b_n = rows.A - self.rub * rows.A_t, rows.A @ free + rows.bend
+        if not len(standing) and not len(self.joints):
+            return ContactProblem(lift, rows.A, G, b_n, np.zeros((0, system.n)), *_NOTHING)
+        none = np.zeros(len(self.joints))
+        return ContactProblem(
+            lift,
+            rows.A,
+            G,
+            b_n,
+            np.vstack([rows.A_t[standing], np.eye(system.n)[self.joints]]),
+            np.append(rows.A_t[standing] @ free + rows.bend_t[standing], free[self.joints]),
+            np.append(standing, none - 1).astype(int),
+            np.append(self.mu[standing], none),
+            np.append(np.zeros(len(standing)), system.dry[self.joints]),
+        )
+
+    def recall(self, modes: Modes) -> list[int]:
+        """Modes as `try_modes` has them."""
+        known = dict(zip(modes.kept, modes.Xi, strict=True))
+        standing = set(self.standing.tolist())
+        choice = [
+            MODES[known[pair] if k in standing else 0.0] if pair in known else APART
+            for k, pair in enumerate(self.closed)
+        ]
+        return choice + [MODES[modes.sigma[joint]] for joint in self.joints]
+
+    def describe(self, answer: ContactAnswer) -> list[int]:
+        """Modes of an answer as `try_modes` has them."""
+        choice = [STICKS if c > 0 else APART for c in answer.c_n]
+        signs = [MODES[sign] for sign in answer.sign.tolist()]
+        for k, mode in zip(self.standing, signs, strict=False):
+            if choice[k] != APART:
+                choice[k] = mode
+        return choice + signs[len(self.standing) :]
+
+    def make_modes(self, answer: ContactAnswer, rows: ContactRows, unique: bool) -> Modes:
+        """Independent constraints that give the answer's motion; `unique`: it is the only one."""
+        system, closed = self.system, self.closed
+        size = max(float(np.abs(answer.r_n).max(initial=0.0)), system.scales.acceleration)
+        still, presses = 1e-3 * SAME * size, answer.c_n > 0
+        if unique and (presses | (answer.r_n > still)).all():
+            # What presses is independent then, and nothing stands.
+            own = np.flatnonzero(presses).tolist()
+            slides, turns = tuple(self.Xi[own].tolist()), tuple(self.sigma.tolist())
+            return Modes(tuple(closed[k] for k in own), (), (), slides, turns)
+        order = sorted(range(len(closed)), key=lambda k: -answer.c_n[k])
+        root = np.sqrt(system.mass)
+        basis: list[Array] = []
+
+        def adds(row: Array) -> bool:
+            """Whether a row is a constraint of its own; it counts from then on."""
+            row = row / root
+            size, rest = float(np.linalg.norm(row)), row.copy()
+            for _ in range(2):
+                for other in basis:
+                    rest = rest - (other @ rest) * other
+            left = float(np.linalg.norm(rest))
+            if left <= DEPENDENT * size:
+                return False
+            basis.append(rest / left)
+            return True
+
+        kept = {k for k in order if presses[k] and adds(rows.A[k])}
+        count = len(self.standing)
+        stuck, Xi = [], self.Xi.copy()
+        held, sigma = [], self.sigma.copy()
+        sigma[self.joints] = answer.sign[count:]
+        # Of what sticks as one, as the contacts of a flush edge do, what has to hold comes first.
+        for j in np.argsort(-answer.shares, kind="stable").tolist():
+            sign = answer.sign[j]
+            if j >= count:
+                joint = int(self.joints[j - count])
+                if sign == 0 and adds(np.eye(system.n)[joint]):
+                    held.append(joint)
+            elif (k := int(self.standing[j])) in kept:
+                Xi[k] = sign
+                if sign == 0 and adds(rows.A_t[k]):
+                    stuck.append(k)
+        # What touches without a force stays, for as long as it needs none.
+        kept |= {k for k in order if not presses[k] and answer.r_n[k] <= still and adds(rows.A[k])}
+        kept_pairs = sorted(kept)
+        return Modes(
+            tuple(closed[k] for k in kept_pairs),
+            tuple((pair,) for pair in sorted(closed[k] for k in stuck)),
+            tuple(sorted(held)),
+            tuple(float(Xi[k]) for k in kept_pairs),
+            tuple(sigma.tolist()),
+        )
+
+
+def _name(system: System, joint: int) -> str:
+    known = joint in system.driven
+    return f"joint {system.driven.index(joint) + 1}" if known else f"coordinate {joint + 1}"

@@ -1,0 +1,1061 @@
+"""Motion with prescribed contact formations: phase after phase, from rest in the first one.
+
+Friction has the sliding signs of the current mode, steps end where a polynomial piece of the
+torques ends. At rest the formation waits until it can start (`rest`).
+
+A phase that ends at rest stops the motion. After a smooth end the velocity is projected onto the
+next formation, and contacts that it does not have are released. A phase without an `until` ends at
+that release, where a contact slips that slides in the next phase, or where contacts come to rest
+that roll there. After an impact every contact of the next formation has to press
+(`mechanics.impact`).
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from itertools import product
+from typing import Any, NamedTuple, NoReturn
+
+import casadi as ca
+import numpy as np
+
+from ..common.arrays import Array
+from ..common.errors import JammingError, SimulationError
+from ..contacts.contact_limits import takes_over
+from ..contacts.elemental import GapLimit, build_features, build_gap
+from ..contacts.formation import Formation
+from ..mechanics.impact import ViolationKind, compute_impact, solve_impulses
+from ..mechanics.statics import find_static_torques
+from ..problem.definition import End, Phase, Problem, Until
+from ..results.torque import TorqueProfile
+from .events import EventKind, Outcome, OutcomeKind, Record
+from .hand import build_system
+from .modes import FREE, Grips, Mode, find_fixed, find_grips, list_units, share_mode
+from .rest import BALANCED, Collapse, Rest, StartDeparture, close_contacts, find_rest
+from .root_finding import find_root
+from .run import Run, StuckError, find_torque_steps
+from .sliding_signs import choose_mode, measure_rates, note_change
+from .stepper import Modes, ModeStepper
+from .tolerances import (
+    CREEPING,
+    PASSED,
+    REACHED,
+    ROUNDING_FORCE,
+    ROUNDING_LIMIT,
+    ROUNDING_SPEED,
+    SETTLING,
+    SHORT,
+    SLOW,
+    STANDING,
+    find_tolerances,
+    is_slower,
+    measure_units,
+    measure_until,
+)
+
+_FAR = 100.0  # speed over its change at which nothing reverses: lever arms are below that
+_OUTCOMES = {
+    ViolationKind.PULL: OutcomeKind.CONTACT_LOST,
+    ViolationKind.SLIP: OutcomeKind.SLIPS,
+    ViolationKind.CLOSING: OutcomeKind.LIMIT_REACHED,
+    ViolationKind.HELD: OutcomeKind.HELD,
+}
+_HELD_AT = 5  # places of a piece of the torques at which they have to hold the object
+
+
+class LegRows(NamedTuple):
+    """Where each kind of event value of a leg is; all are in units of the scene."""
+
+    force: slice  # c_n
+    # what friction still has to give where it holds (`Mode.holders`): bound - f, then bound + f
+    cone: slice
+    slide: slice  # slide, joint: sliding velocities times Xi, joint speeds times sigma
+    joint: slice
+    limit: slice  # the formation's limits; that of the contact to be gained counts as `until`
+    until: int  # distance to the end of the phase; one if that is a release
+    # speed along the heading, in the metric M5; one with more than one freedom, where contacts and
+    # joints come to rest one by one
+    speed: int
+
+    @property
+    def turning(self) -> slice:
+        """All that changes sign at a reversal: contacts, then joints."""
+        return slice(self.slide.start, self.joint.stop)
+
+
+class ModeSegment(NamedTuple):
+    """A part of a phase with one set of contact modes."""
+
+    mode: Mode
+    stepper: ModeStepper
+    rows: LegRows
+    slack: Array  # (m,): how far below zero each event value counts as rounding
+    # sets `event_values` from outputs of the steps and the `heading` at their start, (5,)
+    measure: Any
+    heading: Array
+    # m values, distance to the end [m or rad], its rate, least value plus slack, heading
+    event_values: Array
+    buffers: Any  # what has to live as long as these
+    phase: int = 0  # index of its phase
+    section: int = 0  # number of its records
+
+
+class Step(NamedTuple):
+    """A step that has been made, into which may be looked."""
+
+    leg: ModeSegment
+    t: float  # t, h [s]: its start and length
+    h: float
+    inputs: Array  # its packed inputs
+    heading: Array  # direction of the velocity at its start
+    stage_forces: Array
+    impact: float  # [J]: energy lost to impacts so far
+    arrives: bool  # whether it ends where the phase ends, which it has passed by rounding
+
+
+@lru_cache(maxsize=64)
+def open_limits(formation: Formation, until: Until) -> tuple[GapLimit, ...]:
+    """Limits that end a phase early: all but that of the contact to be gained."""
+    return tuple(limit for limit in formation.limits if not limit.gains(until.contact))
+
+
+@lru_cache(maxsize=64)
+def _build_leg(
+    formation: Formation, until: Until, side: float, s: ModeStepper, mode: Mode
+) -> ModeSegment:
+    """A segment with the steps of its mode, before it gets a phase and a number."""
+    scene, own = formation.scene, s.rows
+    limits, last = open_limits(formation, until), own.slide.stop + 2
+    parts = own.force, own.cone, own.slide, slice(own.slide.stop, last)
+    until_row = last + len(limits)
+    rows = LegRows(*parts, slice(last, until_row), until_row, until_row + 1)
+    sizes = [own.cone.stop, last - own.cone.stop, len(limits), 1, 1]
+    slack = np.repeat([ROUNDING_FORCE, ROUNDING_SPEED, SHORT, 0.0, ROUNDING_SPEED], sizes)
+    z, v, before = build_features(scene).z, ca.SX.sym("v", 5), ca.SX.sym("before", 5)
+    values = ca.SX.sym("values", own.size)
+    gained = [limit for limit in formation.limits if limit.gains(until.contact)]
+    if until.is_release:
+        distance = ca.SX(1)
+    elif until.contact is None:
+        distance = side * (z[0 if until.coordinate == "x" else 2] - until.value)
+    elif gained:
+        # A pointed tip comes to a vertex along the edge, or turns onto it with its link.
+        distance = ca.mmin(ca.vertcat(*(limit.value for limit in gained)))
+    else:
+        distance = build_gap(until.contact, scene)
+    mass, unit = ca.DM(scene.mass_diagonal), scene.scales.speed * scene.scales.mass**0.5
+    speed = ca.dot(before, mass * v) / unit if mode.n_constraints >= 4 else ca.SX(1)
+    gaps = [limit.value / scene.scales.length for limit in limits]
+    reached = distance / measure_until(scene, until)
+    every = ca.vertcat(values[: own.slide.stop], values[-2:], *gaps, reached, speed)
+    size = ca.sqrt(ca.dot(v, mass * v))
+    heading = ca.if_else(size > 0, v / ca.fmax(size, 1e-300), before)
+    least = ca.mmin(every + ca.DM(slack))
+    outputs = ca.vertcat(every, distance, ca.jtimes(distance, z, v), least, heading)
+    inner = ca.Function("measure", [z, v, values, before], [ca.densify(outputs)])
+    packed, start = ca.MX.sym("packed", s.to.size), ca.MX.sym("start", 5)
+    measured = inner(packed[:5], packed[5:10], packed[s.to.values], start)
+    buffer, measure = ca.Function("measure", [packed, start], [measured]).buffer()
+    start, event_values = np.zeros(5), np.zeros(len(slack) + 8)
+    buffer.set_arg(0, s.outputs.data)
+    buffer.set_arg(1, start.data)
+    buffer.set_res(0, event_values.data)
+    return ModeSegment(mode, s, rows, slack, measure, start, event_values, buffer)
+
+
+class Arrival(NamedTuple):
+    """The end of a phase is reached."""
+
+    rate: float  # [m/s or rad/s]: how fast the distance to the phase's end closes
+    # [s]: if the next break of the torques is no further off, the arrival belongs to it
+    window: float
+    strikes: bool = False  # whether it takes an impact to go on
+    # [s]: time in which a motion whose deceleration fades would have come to rest
+    remaining: float = 0.0
+
+
+class Released(NamedTuple):
+    """The contacts that the next phase does not have are let go."""
+
+    c_n: float  # [N]: the least that the old formation would need of them
+
+
+class Switched(NamedTuple):
+    """A contact comes to rest, or slips, as the next phase has it."""
+
+    contact: str
+    sign: float = 0.0  # direction in which it slips; 0 if it comes to rest
+
+
+class Rested:
+    """The motion has come to rest."""
+
+
+Ending = Arrival | Released | Switched | Rested | Outcome
+
+
+class Replay(Run):
+    """A running simulation with prescribed contacts.
+
+    Attributes
+    ----------
+    has_slid                 whether contacts that come to rest have slid in the phase
+    slip_signs               signs of contacts, by name, that have just begun to slip
+    side                     sign of (coordinate - value) before the end of the phase
+    until_unit : [m or rad]  unit of the distance to the end of the phase
+    passes                   whether the end may be passed at any speed, without an impact
+    moving                   whether the motion goes on into the next phase
+    previous                 formation of the last phase that has ended at rest
+    stuck                    contacts, then joints, that stick while the rest moves
+    taken                    steps so far, but for those that coast
+    """
+
+    leg: ModeSegment
+    phase: Phase
+    releasable: tuple[str, ...]  # the contacts whose release ends the phase
+    # resting, slipping: the contacts that come to rest, all of them, or slip, one of them, where
+    # the phase ends
+    resting: frozenset[int]
+    slipping: frozenset[int]
+
+    def __init__(
+        self, problem: Problem, torque: TorqueProfile, tolerance: float, wanted: Array
+    ) -> None:
+        system = build_system(problem.scene)
+        super().__init__(system, torque, np.asarray(problem.start), np.zeros(5), tolerance, wanted)
+        self.problem, self.tolerances = problem, find_tolerances(problem.scene)
+        parts = torque.coefficients
+        steps = find_torque_steps(parts[:-1], parts[1:], system)
+        self.steps_at: list[bool] = [True, *steps.tolist()]
+        self.step_times = [b for b, s in zip(self.breaks, self.steps_at, strict=False) if s]
+        self.held_until = self.settled_by = -math.inf
+        self.until_unit = self.side = 1.0
+        self.passes = self.moving = self.has_slid = False
+        self.previous: Formation | None = None
+        self.stuck: set[int] = set()
+        self.slip_signs: dict[str, float] = {}
+        self.decided = (-math.inf, 0)
+        self.taken: list[Step] = []
+
+    @property
+    def formation(self) -> Formation:
+        """That of the present phase."""
+        return self.phase.formation
+
+    @property
+    def signs(self) -> Array:
+        """Directions of contacts, then of joints, (n_c + 2,), zero for what is held or rolls."""
+        inputs, at = self.s.inputs, self.s.at
+        return np.concatenate([inputs[at.Xi], inputs[at.sigma][3:]])
+
+    @signs.setter
+    def signs(self, signs: Array) -> None:
+        inputs, at = self.s.inputs, self.s.at
+        inputs[at.Xi], inputs[at.sigma][3:] = signs[:-2], signs[-2:]
+
+    def take(self, grips: Grips = FREE) -> None:
+        """Go on with the steps of the phase's formation in which friction holds `grips`."""
+        formation, mode = self.formation, share_mode(self.formation, grips)
+        count = formation.n_contacts
+        pairs = [self.system.names.index(name) for name in formation.names]
+        stuck = (tuple(pairs[k] for k in rows) for rows in mode.holders if rows[0] < count)
+        joints = tuple(3 + joint for joint in grips.joints)
+        self.load(Modes(tuple(pairs), tuple(stuck), joints, (0.0,) * count, (0.0,) * 5))
+        self.s.stay(self.system, self.z)
+        self.section += 1
+        leg = _build_leg(formation, self.phase.until, self.side, self.s, mode)
+        self.leg = leg._replace(phase=self.phase.index, section=self.section)
+        self.heading = np.zeros(5)
+
+    @property
+    def values(self) -> Array:
+        """Event values at the end of the last step, or at the state looked at."""
+        return self.leg.event_values[:-8].copy()
+
+    @property
+    def distance(self) -> float:
+        """Distance to the end of the phase there [m or rad]."""
+        return float(self.leg.event_values[-8])
+
+    @property
+    def rate(self) -> float:
+        """Time derivative of the distance."""
+        return float(self.leg.event_values[-7])
+
+    def happens(self) -> bool:
+        """Whether the step just made ends behind an event."""
+        self.leg.measure()
+        return bool(self.leg.event_values[-6] < 0)
+
+    @property
+    def heading(self) -> Array:
+        """Velocity at the start of a step, scaled to one in the metric M5, or the impending one."""
+        return self.leg.heading
+
+    @heading.setter
+    def heading(self, heading: Array) -> None:
+        self.leg.heading[:] = heading
+
+    def step_to(self, h: float) -> None:
+        """Repeat the step with another length."""
+        super().step_to(h)
+        self.leg.measure()
+
+    def look(self) -> None:
+        """Evaluate the present state."""
+        self.s.inputs[self.s.at.y], self.s.inputs[self.s.at.t] = self.y, self.t
+        self.s.look()
+        self.leg.measure()
+
+    def observe(self) -> None:
+        """Evaluate the present state, and record it."""
+        self.look()
+        self.record()
+
+    def accept(self, t: float) -> None:
+        """Take the step just made, to time `t`, and record its end."""
+        s, self.t = self.s, t
+        self.y[:] = s.outputs[s.to.y]
+        self.leg.heading[:] = self.leg.event_values[-5:]
+        if not s.outputs[s.to.ratio] > 0:
+            self.fail_to_step(float(s.outputs[s.to.ratio]))
+        s.inputs[s.at.y], s.inputs[s.at.t] = self.y, t
+        self.record()
+
+    def keep(self, t: float) -> None:
+        """Accept the step to time `t` as one to look into."""
+        s, begin, heading = self.s, self.t, self.heading.copy()
+        inputs, forces = s.inputs.copy(), s.outputs[s.to.stage_forces].copy()
+        self.accept(t)
+        more = self.impact, self.arrives
+        self.taken.append(Step(self.leg, begin, t - begin, inputs, heading, forces, *more))
+
+    def fail_to_step(self, ratio: float) -> NoReturn:
+        """Raise the error for a step size that underflows."""
+        names = " ".join(self.formation.names)
+        if not ratio > 1e-3:
+            raise JammingError(
+                f"{names} jams {self.where()}: friction makes the reduced inertia {ratio:.3g} of "
+                "its frictionless value"
+            )
+        raise SimulationError(f"the step size of {names} underflows {self.where()}")
+
+    def repeats(self) -> bool:
+        """Whether the last two records are of the same instant of one phase, but for rounding."""
+        last = self.records[-2:]
+        same = len(last) > 1 and last[0].phase == last[1].phase == self.phase.index
+        return same and self.t - last[0].t <= self.tolerances.settling
+
+    def lose(self, contact: str, c_n: float) -> Outcome:
+        """End because `contact` would have to pull."""
+        how = "to zero" if c_n > -1e3 * self.tolerances.force else f"to {c_n:.3g} N"
+        text = f"c_n of {contact} falls {how} {self.when()}"
+        self.note(EventKind.CONTACT_LOST, text, contact, c_n)
+        return Outcome(OutcomeKind.CONTACT_LOST, text)
+
+    def fail_by_slip(self, row: int, c_n: float, c_t: float) -> Outcome:
+        """End because a rolling contact slips: the `row`-th of the formation, with forces in N."""
+        name, bound = self.formation.names[row], self.formation.friction[row] * c_n
+        how = "exceeds" if abs(c_t) - bound > 1e3 * self.tolerances.force else "reaches"
+        text = f"{name} slips: |c_t| = {abs(c_t):.5g} N {how} mu c_n = {bound:.5g} N {self.when()}"
+        self.note(EventKind.SLIP, text, name, bound - abs(c_t))
+        return Outcome(OutcomeKind.SLIPS, text)
+
+    def run_out(self) -> Outcome:
+        """End because the torques end."""
+        until, distance = self.phase.until, math.nan
+        if until.is_release:
+            names = self.formation.names
+            ends = [(self.resting, "comes to rest"), (self.slipping, "slips")]
+            texts = [f"{', '.join(names[k] for k in sorted(rows))} {t}" for rows, t in ends if rows]
+            if self.releasable:
+                texts = [f"{', '.join(self.releasable)} is released"]
+            text = f"the torques end {self.when()}, before {' or '.join(texts)}"
+        else:
+            distance = self.distance
+            unit = "rad" if until.coordinate == "phi" else "m"
+            text = f"the torques end {self.when()}, {distance:.3g} {unit} short of {until}"
+        self.note(EventKind.END, text, "", distance)
+        return Outcome(OutcomeKind.GOAL_MISSED, text)
+
+    def next_piece(self) -> bool:
+        """Go on to the next piece, if there is one; whether the torques step there."""
+        if self.piece + 2 >= len(self.breaks):
+            return False
+        self.piece += 1
+        self.feed()
+        return self.steps_at[self.piece]
+
+    @property
+    def coming_step(self) -> float:
+        """When the torques step next, after the present piece, or infinity [s]."""
+        k = bisect_left(self.step_times, self.stop)
+        return self.step_times[k] if k < len(self.step_times) else math.inf
+
+    @property
+    def last_step(self) -> float:
+        """When the torques last stepped, at their start or later [s]."""
+        return self.step_times[bisect_left(self.step_times, self.stop) - 1]
+
+    def when(self) -> str:
+        """Present time and phase, to end a sentence."""
+        return f"at t = {self.t:.5g} s, phase {self.phase.number}"
+
+    def where(self) -> str:
+        """Present phase and time, for errors."""
+        return f"in phase {self.phase.number} at t = {self.t:.5g} s"
+
+    def play(self, progress: Callable[[str], None] | None) -> tuple[Outcome, float]:
+        """Simulate phase after phase; how that ends, and how far from the end of the last one."""
+        phases = self.problem.phases
+        for phase, following in zip(phases, [*phases[1:], None], strict=True):
+            if progress is not None:
+                progress(f"simulating phase {phase.number} of {len(phases)}")
+            try:
+                outcome = self._play(phase, following)
+            except (JammingError, SimulationError) as error:
+                error.phase = phase.number
+                raise
+            if outcome is not None:
+                return outcome, math.nan if phase.until.is_release else self.distance
+        goal = phases[-1].until
+        text = f"{goal} is reached at t = {self.t:.5g} s, the end of phase {len(phases)}"
+        return Outcome(OutcomeKind.GOAL_REACHED, text), math.nan if goal.is_release else 0.0
+
+    def _play(self, phase: Phase, following: Phase | None) -> Outcome | None:
+        """Simulate one phase; None if its end is reached."""
+        self.enter(phase, following)
+        ending: StartDeparture | Ending = Rested()
+        if self.moving:
+            ending = self.go_on() or self.move()
+        brief = 0
+        while isinstance(ending, Rested | StartDeparture):
+            if isinstance(ending, Rested):
+                ending = self._rest()
+            if isinstance(ending, StartDeparture):
+                started = self.t
+                self.note(EventKind.START, f"the object starts to move {self.when()}")
+                self.set_off(ending)
+                ending = self.move()
+                brief = brief + 1 if self.t - started < 100 * self.tolerances.shortest_step else 0
+                if brief > 20:
+                    raise SimulationError(f"starting and stopping do not end {self.where()}")
+        if isinstance(ending, Outcome):
+            return ending
+        if isinstance(ending, Arrival):
+            return self._arrive(ending, following)
+        if isinstance(ending, Released):
+            names = ", ".join(self.releasable)
+            self.note(EventKind.RELEASE, f"{names} released {self.when()}", names, ending.c_n)
+        else:
+            contact, sign = ending
+            text = f"{contact} {'slips' if sign else 'comes to rest'} {self.when()}"
+            self.note(EventKind.ARRIVAL, text, contact)
+            self.slip_signs = {contact: sign} if sign else {}
+        self.moving = True
+        return None
+
+    def _arrive(self, arrival: Arrival, following: Phase | None) -> Outcome | None:
+        """End the phase; if it ends at rest the motion stops, with a plastic impact if need be."""
+        until, rate = self.phase.until, arrival.rate
+        text = f"{until} reached {self.when()}"
+        self.note(EventKind.ARRIVAL, text, str(until), rate)
+        if arrival.strikes and following is not None:
+            self.moving = True
+            return self.collide(following)
+        self.moving = self.phase.end is End.SMOOTH
+        if self.moving:
+            return None
+        self.previous = self.formation
+        self.set_velocity(0.0)
+        # The torques of the phase that has ended go on until they step, or end.
+        coming = min(self.coming_step, self.breaks[-1])
+        self.held_until = coming if coming - self.t <= arrival.window else self.t
+        if self.problem.scene.has_slow_motors:
+            # Rate-limited torques do not step. A motion whose deceleration fades comes early by
+            # about the cube root of its error: the old torques act until it was to end.
+            early = self.breaks[self.piece] < self.t < self.stop
+            remaining = arrival.remaining if early else 0.0
+            self.held_until = max(self.held_until, min(self.t + remaining, self.breaks[-1]))
+            self.settled_by = self.held_until + self.tolerances.rest_window
+        return None
+
+    def _rest(self) -> StartDeparture | Arrival | Released | Switched | Outcome:
+        """Wait at rest until the formation can start, the goal is near or balance is lost."""
+        self.set_velocity(0.0)
+        self.look()
+        self.record(still=True)
+        if self.is_there():
+            return Arrival(0.0, self.tolerances.rest_window)
+        rest = find_rest(self.formation, self.z)
+        sticks = False
+        while True:
+            if self.t >= self.breaks[-1]:
+                return self.run_out()
+            if self.t >= self.held_until:
+                x = min(1.0, max(-1.0, self.fraction(self.t)))
+                change = rest.wait(self.torque.coefficients[self.piece], x)
+                if isinstance(change, StartDeparture) and change.x <= x:
+                    return change
+                if not sticks:
+                    self.note(EventKind.STICK, f"the object sticks {self.when()}")
+                sticks = True
+                if isinstance(change, StartDeparture):
+                    self.wait(self.time(change.x))
+                    return change
+                if isinstance(change, Collapse):
+                    # Balance may be lost where the torques are about to step or to be the next
+                    # phase's.
+                    t = self.time(change.x)
+                    soon = self.coming_step - t <= self.tolerances.rest_window
+                    if not (t < self.settled_by or soon or self._touches()):
+                        return self._collapse(rest, change)
+            if self.t < self.settled_by < self.stop:
+                self.wait(self.settled_by)
+            else:
+                self.wait(self.stop)
+                self.next_piece()
+
+    def _touches(self) -> bool:
+        """Whether both phases' contacts balance rate-limited torques on the present piece."""
+        if self.previous is None or not self.problem.scene.has_slow_motors:
+            return False
+        contacts = dict.fromkeys((*self.formation.contacts, *self.previous.contacts))
+        static = find_static_torques(Formation(self.problem.scene, tuple(contacts)), self.z)
+        torques = np.array([self.tau(t) for t in np.linspace(self.t, self.stop, _HELD_AT).tolist()])
+        return bool(static.measure(torques).max() <= BALANCED * self.problem.scene.scales.torque)
+
+    def _collapse(self, rest: Rest, change: Collapse) -> Released | Switched | Outcome:
+        """End because nothing balances at rest."""
+        self.wait(max(self.t, self.time(change.x)))
+        if change.jammed:
+            raise JammingError(
+                f"{' '.join(rest.formation.names)} jams at rest {self.where()}: friction makes "
+                "the reduced inertia vanish or turn negative"
+            )
+        if change.c_t is not None:
+            row = self.formation.names.index(change.contact)
+            if row in self.slipping:
+                return Switched(change.contact, -math.copysign(1.0, change.c_t))
+            return self.fail_by_slip(row, change.c_n, change.c_t)
+        if change.contact in self.releasable:
+            return Released(change.c_n)
+        return self.lose(change.contact, change.c_n)
+
+    def try_step(self, target: float) -> tuple[float, bool]:
+        """As of `Run`; says where it jams or gets nowhere."""
+        self.start = self.values
+        try:
+            return super().try_step(target)
+        except StuckError:
+            self.fail_to_step(float(self.s.outputs[self.s.to.ratio]))
+
+    def move(self) -> Ending:
+        """Integrate until the motion rests, arrives, releases its contacts or fails."""
+        self.h = min(self.h, self.tolerances.first_step)
+        ending: Ending = super().move()
+        return ending
+
+    def locate(self, h: float, t: float) -> list[int]:
+        """Shorten the step just made to its first event; rows of its event values."""
+        self.arrives = self.happens()
+        if not self.arrives or self._is_at_end(t):
+            return []
+        self.arrives = False
+        return self.find_first(self.start, h)
+
+    def _is_at_end(self, t: float) -> bool:
+        """Whether the step just tried ends the phase, at a torque break and but for rounding.
+
+        It has to be at rest there or to reach a contact softly. A coordinate, or the end of a
+        contact's range, is passed at any speed; an impact comes at any, with its torque step or at
+        their end.
+        """
+        if t != self.stop or not self.is_there() or self._comes_later():
+            return False
+        speed = abs(self._measure_rate())
+        if self.passes:
+            distance = self.distance / self.until_unit
+            # Of several breaks as near as that, the nearest is the one at which the phase ends.
+            later = self.breaks[self.piece + 2 : self.piece + 3]
+            apart = (later[0] - t) / self.problem.scene.scales.time if len(later) else math.inf
+            early = min(SETTLING, apart / 2)
+            speed = 0.0 if -SETTLING * speed <= distance <= early * speed else math.inf
+        elif self.phase.end is End.IMPACT and self._strikes():
+            coming = self.piece + 1
+            speed = 0.0 if coming >= len(self.steps_at) or self.steps_at[coming] else speed
+        elif self.phase.end is not End.SMOOTH and self.formation.n_constraints < 4:
+            units = measure_units(self.problem.scene)[5:]
+            speed = float(np.abs(self.s.outputs[5:10] / units).max())
+        presses = bool(self.values[self.leg.rows.force].min() >= -ROUNDING_FORCE)
+        return speed < SLOW and presses and not self.find_slipping()
+
+    def _comes_later(self) -> bool:
+        """Whether a motion with fading deceleration still approaches, at a break before its end."""
+        coming = self.piece + 1
+        if not self.problem.scene.has_slow_motors or self.phase.end is not End.REST:
+            return False
+        if coming + 1 >= len(self.breaks) or self.steps_at[coming]:
+            return False
+        late = 2 * self._time_to_stop() > self.tolerances.rest_window
+        return late and self._measure_rate() < -CREEPING
+
+    def pass_break(self) -> Ending | None:
+        """Go on to the next piece of the torques."""
+        if self._is_at_end(self.t):
+            rate, strikes = -self.rate, self._strikes()
+            # Before a step that is still to come, the torques are those of the phase that ends.
+            stepped = self.next_piece()
+            window = self.tolerances.settling if stepped else self.tolerances.rest_window
+            return Arrival(rate, window, strikes)
+        if self.t >= self.breaks[-1]:
+            return self.run_out()
+        if not self.next_piece():
+            return None
+        self.note(EventKind.TORQUE_STEP, f"the torques step {self.when()}")
+        return self.restart()
+
+    def handle(self, kinds: Sequence[int]) -> Ending | None:
+        """End the motion at events, or go on."""
+        rows = self.leg.rows
+        if rows.until in kinds:
+            return (
+                self._pass_on()
+                if self.phase.end is End.SMOOTH or self._strikes()
+                else self._reach()
+            )
+        if rows.speed in kinds:
+            return self.come_to_rest()
+        pulling = [k for k in kinds if k < rows.force.stop]
+        if pulling:
+            return self.let_go(pulling)
+        if any(rows.cone.start <= k < rows.cone.stop for k in kinds):
+            return self.let_slip(kinds)
+        for k in kinds:
+            if rows.limit.start <= k < rows.limit.stop:
+                limit = open_limits(self.formation, self.phase.until)[k - rows.limit.start]
+                text = f"{limit.text} {self.when()}"
+                self.note(EventKind.LIMIT, text)
+                return Outcome(OutcomeKind.LIMIT_REACHED, text)
+        return self.turn(kinds)
+
+    def _reach(self) -> Arrival:
+        """The end of the phase is reached while moving."""
+        # A planned motion that comes this early by its error would have stopped v / a later.
+        stopping = 2 * self._time_to_stop()
+        remaining = min(stopping, self.tolerances.longest_window) if stopping < math.inf else 0.0
+        slow = abs(self._measure_rate()) < SLOW
+        window = max(remaining, self.tolerances.settling) if slow else remaining
+        return Arrival(-self.rate, window, remaining=remaining)
+
+    def _measure_rate(self) -> float:
+        """Time derivative of the distance to the end of the phase, in units of the scene."""
+        return self.rate / self.until_unit * self.problem.scene.scales.time
+
+    def _time_to_stop(self) -> float:
+        """Time in which the motion would stop at its present deceleration [s]."""
+        v, acceleration = self.s.outputs[5:10], self.s.outputs[self.s.to.acceleration]
+        slowing = -float((self.system.mass * v) @ acceleration)
+        return float(self.system.mass @ v**2) / slowing if slowing > 0 else math.inf
+
+    def _strikes(self) -> bool:
+        """Whether the phase ends here with an impact, and not at rest but for an error."""
+        rate, time = -self._measure_rate(), self._time_to_stop() / self.problem.scene.scales.time
+        stops = rate < SLOW or rate * time / 2 < REACHED
+        return self.phase.end is End.IMPACT and not stops
+
+    def _pass_on(self) -> Arrival:
+        """The end of a phase is passed; the torques of the next one may still have to come."""
+        window = settling = self.tolerances.settling
+        rate, strikes = -self.rate, self.phase.end is End.IMPACT
+        if self.passes and rate > 0:
+            # A motion that is off by rounding comes the earlier the slower it is.
+            early = PASSED * self.until_unit / rate
+            window = min(max(early, settling), self.tolerances.longest_window)
+        elif self.phase.until.contact is not None and not strikes:
+            self.step_to(settling)
+            slowing = (self.rate + rate) / settling
+            if slowing > 0:
+                window = min(max(2 * rate / slowing, settling), self.tolerances.longest_window)
+        if self.steps_within(window):
+            self.coast_to_step(hide=False)
+        return Arrival(rate, window, strikes)
+
+    def enter(self, phase: Phase, following: Phase | None) -> None:
+        """Enter the formation of `phase`; the energy that its projection takes is lost to impact.
+
+        A phase without an `until` ends where a contact of `releasable` parts, or else where
+        contacts of `resting` come to rest, as they roll in the next phase, or one of `slipping`
+        slips.
+        """
+        formation, until, moves = phase.formation, phase.until, self.moving
+        self.phase, self.phase_index, old = phase, phase.index, self.system.stored(self.z, self.v)
+        self.y[:5] = self._close(formation)
+        v = project_velocity(formation, self.z, self.v) if moves else np.zeros(5)
+        self.moving = moves and not is_slower(self.problem.scene, v, STANDING)
+        self.y[5:10] = v if self.moving else 0.0
+        self.impact += float(old - self.system.stored(self.z, self.v))
+        # At any speed a contact can be gained only where it goes on for another one.
+        gained = until.contact
+        self.passes = phase.end is End.SMOOTH and (
+            gained is None or takes_over(gained, formation.scene, formation.contacts)
+        )
+        self.side = 1.0
+        if until.value is not None:
+            place = self.y[0 if until.coordinate == "x" else 2]
+            self.side = math.copysign(1.0, place - until.value)
+        self.until_unit = measure_until(self.problem.scene, until)
+        self.stuck = set()
+        self.take()
+        self.releasable, self.resting, self.slipping = (), frozenset(), frozenset()
+        self.has_slid = False
+        if phase.end is End.REST or following is None or not until.is_release:
+            return
+        names, kept = formation.names, following.formation.names
+        rolled, rolls = ({c.name for c in p.formation.rolling} for p in (phase, following))
+        self.releasable = tuple(name for name in names if name not in kept)
+        if not self.releasable:
+            self.resting = frozenset(k for k, name in enumerate(names) if name in rolls - rolled)
+        self.slipping = frozenset(
+            k for k, name in enumerate(names) if name in rolled - rolls and name in kept
+        )
+
+    def _close(self, formation: Formation) -> Array:
+        """The present configuration with every contact of a formation closed."""
+        try:
+            return close_contacts(
+                formation, self.z, 10 * REACHED * self.problem.scene.scales.length
+            )
+        except SimulationError as error:
+            raise SimulationError(f"{error} {self.where()}") from None
+
+    def collide(self, following: Phase) -> Outcome | None:
+        """Plastic impact onto the next formation; the outcome if it is not possible."""
+        z = self._close(following.formation)
+        impact = compute_impact(self.formation, following.formation, z, self.v)
+        name, least = impact.least
+        names = following.formation.names
+        normal = impact.p[: len(names)]
+        impulses = ", ".join(f"{p:.4g} on {n}" for n, p in zip(names, normal, strict=True))
+        self.note(EventKind.IMPACT, f"impact {self.when()}, in N s {impulses}", name, least)
+        if impact.violations:
+            worst = impact.violations[0]
+            text = f"{worst.describe()} in the impact {self.when()}"
+            if worst.kind is ViolationKind.JAM:
+                raise JammingError(text)
+            return Outcome(_OUTCOMES[worst.kind], text)
+        self.set_velocity(impact.v)
+        return None
+
+    def set_off(self, departure: StartDeparture) -> None:
+        """Set the friction signs of a motion that starts from rest."""
+        formation = self.formation
+        grips = find_grips(formation, np.concatenate(departure.directions))
+        if formation.n_constraints < 4:
+            rows = formation.evaluate(self.z[None], self.v[None])
+            fixed = find_fixed(share_mode(formation, grips), rows.A[0], rows.A_t[0])
+            self.stuck = {
+                row for u in list_units(formation) for row in u.rows if u.grips and fixed[row]
+            }
+        if grips != self.leg.mode.grips:
+            self.take(grips)
+        self.signs, self.heading = np.concatenate(departure.directions), departure.heading
+        self.observe()
+
+    def go_on(self) -> Ending | None:
+        """Set the friction signs of the present velocity; what ends the motion at once, if any."""
+        formation, v = self.formation, self.v
+        self.heading = v / np.sqrt(self.system.mass @ v**2)
+        rates = np.concatenate([formation.evaluate(self.z[None], v[None]).A_t[0] @ v, v[3:]])
+        signs = np.where(rates < 0, -1.0, 1.0)
+        for row, name in enumerate(formation.names):
+            signs[row] = self.slip_signs.get(name, signs[row])
+        self.slip_signs = {}
+        movable = {row for unit in list_units(formation) for row in unit.rows}
+        signs[[row for row in range(len(signs)) if row not in movable]] = 0.0
+        self.signs = signs
+        if formation.n_constraints < 4:
+            return self.restart(enters=True)
+        slow = STANDING * measure_rates(self.problem.scene, formation.n_contacts)
+        still = np.flatnonzero((np.abs(rates) < slow) & (signs != 0)).tolist()
+        for choice in product((1.0, -1.0), repeat=len(still)):
+            tried = signs.copy()
+            tried[still] *= choice
+            self.signs = tried
+            self.look()
+            if self.s.outputs[self.s.to.ratio] > 0:
+                break
+        else:
+            self.signs = signs
+        return self.restart()
+
+    def look_within(self, times: Array) -> list[float]:
+        """Record states at increasing instants, (n,) [s], within steps; those of missed events."""
+        missed: list[float] = []
+        begins = np.array([step.t for step in self.taken])
+        owners = np.searchsorted(begins, times, side="left") - 1
+        for time, owner in zip(times.tolist(), owners.tolist(), strict=True):
+            step = self.taken[max(owner, 0)] if self.taken else None
+            if step is None or owner < 0 or time - step.t >= step.h:
+                continue
+            leg, s = step.leg, step.leg.stepper
+            s.inputs[:] = step.inputs
+            s.inputs[s.at.h] = time - step.t
+            s.step()
+            self.records.append(Record.of(s, time, leg.phase, leg.section, step.impact))
+            # Within a step more counts as rounding than at its end.
+            rows, slack = leg.rows, leg.slack.copy()
+            slack[rows.turning] = slack[rows.speed] = STANDING
+            slack[rows.until] = ROUNDING_LIMIT
+            leg.heading[:] = step.heading
+            leg.measure()
+            short = leg.event_values[: len(slack)] + slack < 0
+            if step.arrives:
+                # The end of the phase may be passed.
+                short[rows.until] = short[rows.speed] = short[rows.turning] = False
+            if short.any():
+                missed.append(time)
+        return missed
+
+    def restart(
+        self, turned: Sequence[int] = (), *, time: float | None = None, enters: bool = False
+    ) -> Ending | None:
+        """Choose contact modes after forces jump and record them; what ends the motion, if any.
+
+        `turned`: contacts, then joints, that came to rest at `time` [s]; `enters`: a new formation.
+        """
+        stuck = self.stuck
+        if self._decide(turned, time=time, enters=enters):
+            return self.come_to_rest()
+        self.observe()
+        if self._bridge():
+            return self.come_to_rest()
+        s, holders = self.s, self.leg.mode.holders
+        if not s.outputs[s.to.ratio] > 0:
+            self.fail_to_step(float(s.outputs[s.to.ratio]))
+        if not enters and self.resting and self.resting <= self.stuck:
+            # A planned motion may all but come to rest a little before the torques step; until they
+            # do it may slip and stick again.
+            window = min(self.tolerances.longest_window, self.t - self.last_step)
+            rested = self.resting <= stuck
+            if self.has_slid if rested else not self.steps_within(window):
+                return self._hold()
+            self.has_slid |= not rested
+        slipping = {holders[k][0] for k in self.find_slipping()}
+        pulling = np.flatnonzero(s.outputs[s.to.c_n] < -self.tolerances.force)
+        # Whether anything pulls where a contact slips by plan, its next formation says.
+        if len(pulling) and not slipping & self.slipping:
+            return self.let_go(pulling.tolist())
+        return self.slip() if slipping else None
+
+    def _decide(
+        self, turned: Sequence[int], *, time: float | None = None, enters: bool = False
+    ) -> bool:
+        """Choose the modes of contacts and joints at rest; whether all motion has ended.
+
+        With one freedom whatever slides or turns does so for as long as there is motion.
+        """
+        if self.formation.n_constraints < 4:
+            return choose_mode(self, turned, time=time, enters=enters)
+        signs = self.signs
+        for row in turned:
+            signs[row] *= -1
+            note_change(self, row, -signs[row], signs[row], self.t if time is None else time)
+        self.signs = signs
+        return False
+
+    def come_to_rest(self) -> Rested | Switched:
+        """End all motion, and the phase if a contact was to come to rest."""
+        if not self.is_there():
+            self.note(EventKind.REST, f"the object comes to rest {self.when()}")
+        return self._hold() if self.resting else Rested()
+
+    def _hold(self) -> Switched:
+        return Switched(", ".join(self.formation.names[row] for row in sorted(self.resting)))
+
+    def _drop_repeated(self) -> None:
+        """Take back forces after a jump that are those of a formation that is given up."""
+        if self.repeats():
+            self.records.pop()
+
+    def let_go(self, contacts: Sequence[int]) -> Released | Outcome:
+        """End as contacts would have to pull: a release if that is planned of one of them."""
+        names = self.formation.names
+        forces = dict(zip(names, self.s.outputs[self.s.to.c_n].tolist(), strict=True))
+        pulling = [names[k] for k in contacts]
+        if any(name in self.releasable for name in pulling):
+            self._drop_repeated()
+            return Released(min(forces[name] for name in self.releasable))
+        name = min(pulling, key=forces.__getitem__)
+        return self.lose(name, min(0.0, forces[name]))
+
+    def slip(self) -> Released | Switched | Outcome:
+        """End because a rolling contact slips, or starts to part where its release is planned."""
+        s, mode = self.s, self.leg.mode
+        cones = self._measure_reserves()
+        declared = [k for k in range(len(cones)) if mode.declares(k)]
+        planned = [k for k in self.find_slipping() if mode.holders[k][0] in self.slipping]
+        row = mode.holders[min(planned or declared, key=cones.__getitem__)][0]
+        name = self.formation.names[row]
+        if name in self.releasable:
+            return self.let_go([row])
+        c_n, c_t = (float(s.outputs[part][row]) for part in (s.to.c_n, s.to.c_t))
+        if row in self.slipping:
+            self._drop_repeated()
+            return Switched(name, -math.copysign(1.0, c_t))
+        return self.fail_by_slip(row, c_n, c_t)
+
+    def let_slip(self, events: Sequence[int]) -> Ending | None:
+        """Go on after friction has reached its bound; a declared rolling contact must not slip."""
+        mode, cone = self.leg.mode, self.leg.rows.cone
+        bounds = [
+            (k - cone.start) % len(mode.holders) for k in events if cone.start <= k < cone.stop
+        ]
+        if any(map(mode.declares, bounds)):
+            return self.slip()
+        return self.restart(self._find_turning(events))
+
+    def _find_turning(self, events: Sequence[int]) -> list[int]:
+        """Contacts, then joints, whose sliding or turning is among events."""
+        turning = self.leg.rows.turning
+        return [k - turning.start for k in events if turning.start <= k < turning.stop]
+
+    def _measure_reserves(self) -> list[float]:
+        """Friction margin of contacts and joints that stick, over the scene's force or torque."""
+        reserves: list[float] = self.values[self.leg.rows.cone].reshape(2, -1).min(axis=0).tolist()
+        return reserves
+
+    def find_slipping(self) -> list[int]:
+        """Which contacts that the phase lets roll are out of their cones."""
+        reserves, mode = self._measure_reserves(), self.leg.mode
+        return [k for k, x in enumerate(reserves) if x < -ROUNDING_FORCE and mode.declares(k)]
+
+    def turn(self, events: Sequence[int]) -> Ending | None:
+        """Go on where contacts or joints have come to rest; None if the motion goes on."""
+        now, window = self.t, self.tolerances.rest_window
+        # With two freedoms the last speeds fall to zero one after the other by rounding.
+        if (
+            self.formation.n_constraints < 4
+            and self.phase.end is End.REST
+            and self.is_there()
+            and is_slower(self.problem.scene, self.v, SLOW)
+            and self.stop - now <= window
+        ):
+            return Arrival(-self.rate, window)
+        if self.steps_within(self.tolerances.settling):
+            self._finish_piece()
+        return self.restart(self._find_turning(events), time=now)
+
+    def _finish_piece(self) -> None:
+        """Step to the torque step, without a record of the forces on the way."""
+        self.coast_to_step(hide=True)
+        self.records.pop()
+        self.note(EventKind.TORQUE_STEP, f"the torques step {self.when()}")
+
+    def steps_within(self, window: float) -> bool:
+        """Whether the torques step soon."""
+        return self.coming_step - self.t <= window
+
+    def coast(self, stop: float, hide: bool) -> None:
+        """Step to `stop`, whatever happens on the way; `hide` leaves out the forces on the way."""
+        while self.wanted[self.next_wanted] < stop:
+            place = self.wanted[self.next_wanted]
+            self.step_to(place - self.t)
+            self.accept(place)
+            if hide:
+                row = self.records[-1]
+                none = np.full(len(row.kept), np.nan)
+                self.records[-1] = row._replace(c_n=none, c_t=none)
+            self.next_wanted += 1
+        self.step_to(stop - self.t)
+        self.accept(stop)
+
+    def coast_to_step(self, hide: bool) -> None:
+        """Step to where the torques step next, as `coast` does, and go on to the next piece."""
+        while True:
+            self.coast(self.stop, hide)
+            if self.next_piece():
+                return
+            self.records.pop()
+
+    def is_there(self) -> bool:
+        """Whether the distance to the end of the phase counts as none, at rest."""
+        return abs(self.distance) < REACHED * self.until_unit
+
+    def _bridge(self) -> bool:
+        """Integrate from a reversal to its torque step, unrecorded; whether motion has ended."""
+        rows: list[int] = []
+        if self.steps_within(self.tolerances.settling):
+            self.records.pop()
+            self._finish_piece()
+        elif self._goes_on():
+            return False
+        else:
+            start = self.values
+            stretch = min(self.tolerances.settling, self.stop - self.t)
+            self.step_to(stretch)
+            rows = self._find_turning(self.find_first(start, stretch, self.leg.rows.turning))
+            if not rows:
+                self.look()
+                return False
+            self.records.pop()
+            self.coast(self.t + float(self.s.inputs[self.s.at.h]), hide=True)
+            self.records.pop()
+        ended = self._decide(rows)
+        self.observe()
+        return ended
+
+    def _goes_on(self) -> bool:
+        """Whether all that slides or turns is far too fast to come to rest in the shortest time."""
+        out, units = self.s.outputs, self.system.units[5:]
+        fastest = np.abs(out[5:10] / units).max()
+        strongest = np.abs(out[self.s.to.acceleration] / units).max() * self.system.scales.time
+        least = _FAR * SETTLING * (strongest + fastest**2)
+        return bool((self.values[self.leg.rows.turning][self.signs != 0] > least).all())
+
+    def find_first(self, start: Array, h: float, among: slice | None = None) -> list[int]:
+        """Shorten the step just tried, of length h [s], to its first event; its rows.
+
+        `start` are the event values at its start, `among` the rows to look at.
+        """
+        rows, slack = self.leg.rows, self.leg.slack
+        places = range(len(slack))[among] if among else range(len(slack))
+        # A value that starts within rounding of zero has to fall below that.
+        shift = np.where(start > slack, 0.0, slack)
+        before = start + shift
+        seen: list[int] = []
+        done: list[int] = []
+        while True:
+            after = self.values + shift
+            left = [k for k in places if after[k] < 0 and k not in done]
+            if not left:
+                return [k for k in seen if after[k] <= slack[k] or k == done[-1]]
+            seen += [k for k in left if k not in seen]
+            share = {k: max(before[k], 0.0) / (max(before[k], 0.0) - after[k]) for k in left}
+            k = rows.speed if rows.speed in left else min(left, key=share.__getitem__)
+
+            def value(step: float, place: int = k) -> float:
+                self.step_to(step)
+                return float(self.values[place] + shift[place])
+
+            near = 1e-2 * self.tolerances.shortest_step
+            h = find_root(value, h, float(before[k]), float(after[k]), near, 1e-3 * float(slack[k]))
+            done.append(k)
+            if h != self.s.inputs[self.s.at.h]:
+                self.step_to(h)
+            if k == rows.speed:
+                # When the motion stops all sliding does; what reversed before shows just before.
+                self.step_to(0.999 * h)
+                if (self.values[rows.turning] + shift[rows.turning] < 0).any():
+                    h *= 0.999
+                else:
+                    self.step_to(h)
+
+
+def project_velocity(formation: Formation, z: Array, v: Array) -> Array:
+    """Velocity nearest to `v` in the metric M5 that keeps every constraint, shape (5,)."""
+    P = formation.evaluate(z[None], v[None]).P[0]
+    return solve_impulses(formation.scene.mass_diagonal, P, P, v)[0]
