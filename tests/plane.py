@@ -6,12 +6,12 @@ Configurations, velocities and angles may have leading axes, which results then 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from wholearm.benchmark.precision.reference import solve_motion
+from wholearm.benchmark.stress.newton import Touch, locate
 from wholearm.common.arrays import Array
 from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation
@@ -141,108 +141,41 @@ def with_speed_limit(curve: Curve, limits: tuple[float, float]) -> Curve:
     return replace(curve, formation=Formation(slow, curve.formation.contacts))
 
 
-class Touching(NamedTuple):
-    """What vertex contacts touch: the corners' numbers, and of palm and links, shape (n_c, ...)."""
-
-    corner: NDArray[np.int64]
-    base: Array
-    radius: Array
-    side: Array
-    joint: NDArray[np.int64]
-    """Coordinate of the link's angle; that of the palm does not count."""
-    turns: NDArray[np.bool_]
-
-
-@lru_cache(maxsize=16)
-def list_touching(formation: Formation) -> Touching:
-    assert all(c.feature == "v" and c.surface in ("palm", "finger") for c in formation.contacts)
-    rows = []
-    for contact in formation.contacts:
-        k = contact.finger
-        if k is None:
-            rows.append((contact.index, (0.0, 0.0), 0.0, 1.0, 3, False))
-            continue
-        link, side = formation.scene.fingers[k], 1.0 if k == 0 else -1.0
-        x, y = np.asarray(link.base).tolist()
-        rows.append((contact.index, (x, y), link.radius, side, 3 + k, True))
-    return Touching(*(np.array(column) for column in zip(*rows, strict=True)))
-
-
-def touch(formation: Formation, z: Array) -> tuple[Array, Array]:
-    """Contact points and normals into the object of vertex contacts, shape (..., n_c, 2) each."""
-    own = list_touching(formation)
-    corners = place_corners(formation.scene, z)[..., own.corner, :]
-    heading = z[..., own.joint] * own.turns
-    normals = np.empty_like(corners)
-    normals[..., 0], normals[..., 1] = -own.side * np.sin(heading), own.side * np.cos(heading)
-    return corners, normals
-
-
-def turn_right(n: Array) -> Array:
-    """The tangents of some normals."""
-    t = np.empty_like(n)
-    t[..., 0], t[..., 1] = n[..., 1], -n[..., 0]
-    return t
+def locate_all(formation: Formation, z: Array) -> list[Touch]:
+    """The contacts of a formation at configurations, shape (..., 5)."""
+    return [locate(formation.scene, name, z.reshape(-1, 5)) for name in formation.names]
 
 
 def measure_gaps(formation: Formation, z: Array) -> Array:
-    """Gaps of a formation of vertex contacts, shape (..., n_c) [m]."""
-    own, (points, normals) = list_touching(formation), touch(formation, z)
-    return np.asarray(dot(points - own.base, normals) - own.radius)
+    """Gaps of a formation, shape (..., n_c) [m]."""
+    gaps = np.stack([own.gap for own in locate_all(formation, z)], axis=-1)
+    return np.asarray(gaps.reshape(*z.shape[:-1], -1))
 
 
 def measure_slip(formation: Formation, z: Array, v: Array) -> Array:
-    """Sliding velocities of a formation of vertex contacts, shape (..., n_c) [m/s]."""
+    """Sliding velocities of a formation, shape (..., n_c) [m/s]."""
     return np.asarray((stack_rows(formation, z)[1] @ v[..., None])[..., 0])
 
 
 def stack_rows(formation: Formation, z: Array) -> tuple[Array, Array]:
-    """A and A_t of a formation of vertex contacts, shape (..., n_c, 5) each."""
-    points, n = touch(formation, z)
-    return wrench(formation, z, points, n), wrench(formation, z, points, turn_right(n))
-
-
-def wrench(formation: Formation, z: Array, points: Array, forces: Array) -> Array:
-    """Forces on the object at some points, its moments, and moments of the links they push back."""
-    own = list_touching(formation)
-    rows = np.zeros((*forces.shape[:-1], 5))
-    rows[..., :2] = forces
-    rows[..., 2] = cross(points - z[..., None, :2], forces)
-    k = np.flatnonzero(own.turns)
-    rows[..., k, own.joint[k]] = -cross(points - own.base, forces)[..., k]
-    return rows
+    """A and A_t of a formation, shape (..., n_c, 5) each."""
+    rows = np.array([(own.normal, own.tangent) for own in locate_all(formation, z)])
+    A, A_t = rows.transpose(1, 2, 0, 3).reshape(2, *z.shape[:-1], -1, 5)
+    return A, A_t
 
 
 def accelerate(
     formation: Formation, z: Array, v: Array, tau: Array, Xi: Array, sigma: Array
 ) -> tuple[Array, Array]:
-    """Accelerations, shape (5,), and normal forces, shape (n_c,), of sliding vertex contacts."""
-    scene = formation.scene
-    body = scene.polygon
-    assert body.inertia is not None
-    mass = np.array([body.mass, body.mass, body.inertia, *(f.inertia for f in scene.fingers)])
-    drag = [f.viscous * v[3 + k] + f.dry * sigma[k] for k, f in enumerate(scene.fingers)]
-    applied = np.array([0.0, -body.mass * scene.gravity, 0.0, *(tau - drag)])
-    # Central differences along the motion, over a microsecond.
-    steps = np.array([[0.0], [1e-6], [-1e-6]])
-    (A, ahead, behind), (A_t, _, _) = stack_rows(formation, z + steps * v)
-    A_dot_v = (ahead - behind) @ v / 2e-6
-    G = A - (formation.friction * Xi)[:, None] * A_t
-    c_n = np.linalg.solve((A / mass) @ G.T, -A_dot_v - A @ (applied / mass))
-    return (applied + G.T @ c_n) / mass, c_n
+    """Accelerations, shape (5,), and normal forces, shape (n_c,), of sliding contacts."""
+    return solve_motion(formation.scene, formation.contacts, z, v, tau, Xi, sigma)
 
 
 def unbalance(formation: Formation, row: Samples, sigma: Array) -> tuple[Array, Array]:
     """What each body's balance misses, and the largest term in it, shape (..., 5) each.
 
-    Forces x and y and the moment of the object, then the moments of the joints.
-
-    Parameters
-    ----------
-    row : Samples
-        Of one instant, or of many along the first axis.
-    sigma : ndarray, shape (..., 2)
-        Directions of the joints.
+    Forces x and y and the moment of the object, then the moments of the joints, at one instant or
+    at many along the first axis; `sigma` has the directions of the joints, shape (..., 2).
     """
     scene = formation.scene
     body = scene.polygon
@@ -254,8 +187,7 @@ def unbalance(formation: Formation, row: Samples, sigma: Array) -> tuple[Array, 
     for k, link in enumerate(scene.fingers):
         drag[..., 3 + k] = -link.viscous * row.z_dot[..., 3 + k] - link.dry * sigma[..., k]
     terms = [weight, -np.array(masses) * row.z_ddot, joints, drag]
-    points, n = touch(formation, row.z)
-    forces = row.c_n[..., None] * n, row.c_t[..., None] * turn_right(n)
-    pushes = [wrench(formation, row.z, points, force) for force in forces]
+    A, A_t = stack_rows(formation, row.z)
+    pushes = [row.c_n[..., None] * A, row.c_t[..., None] * A_t]
     every = np.concatenate([np.stack(terms, axis=-2), *pushes], axis=-2)
     return np.asarray(every.sum(axis=-2)), np.asarray(np.abs(every).max(axis=-2))
