@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from once import once
-from plane import cross, point_to_segment
 from shipped import HEXAGON, problem_of
+from wholearm.benchmark.stress.newton import separate
 from wholearm.common.arrays import Array
 from wholearm.planning.plan import solve
 from wholearm.planning.result import Plan
@@ -70,16 +70,8 @@ def place_links(scene: Scene, z: Array) -> list[Array]:
 
 def measure_centres(scene: Scene, z: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Distance of the links' segments, 0 where they cross, and whether they do, shape (n,) each."""
-    one, other = place_links(scene, z)
-    distances = [point_to_segment(one[:, k], other[:, 0], other[:, 1]) for k in (0, 1)]
-    distances += [point_to_segment(other[:, k], one[:, 0], one[:, 1]) for k in (0, 1)]
-
-    def parted(a: Array, b: Array) -> NDArray[np.bool_]:
-        run = a[:, 1] - a[:, 0]
-        return np.asarray(cross(run, b[:, 0] - a[:, 0]) * cross(run, b[:, 1] - a[:, 0]) > 0)
-
-    crossed = ~parted(one, other) & ~parted(other, one)
-    return np.where(crossed, 0.0, np.min(distances, axis=0)), crossed
+    apart = separate(*place_links(scene, z))
+    return np.maximum(apart, 0.0), apart < 0
 
 
 def measure_fingers(scene: Scene, z: Array) -> Array:

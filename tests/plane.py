@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from wholearm.benchmark.precision.reference import solve_motion
-from wholearm.benchmark.stress.newton import Touch, locate
+from wholearm.benchmark.stress.newton import Touch, locate, separate
 from wholearm.common.arrays import Array
 from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation
@@ -53,22 +53,6 @@ def nearest_on_segment(point: Array, start: Array, end: Array) -> Array:
     return np.asarray(start + np.clip((point - start) @ run / (run @ run), 0, 1) * run)
 
 
-def polygon_to_segments(corners: Array, start: Array, ends: Array) -> Array:
-    """Distance of polygons, shape (..., n, 2), from segments that leave one point; 0: overlap."""
-    after, ends = np.roll(corners, -1, axis=-2), ends[..., None, :]
-    distances = [
-        point_to_segment(corners, start, ends),
-        point_to_segment(ends, corners, after),
-        point_to_segment(start, corners, after),
-    ]
-    least = np.minimum(np.minimum(*distances[:2]), distances[2]).min(axis=-1)
-    run = ends - start
-    side = cross(run, corners - start) * cross(run, after - start) < 0
-    turn = cross(after - corners, start - corners) * cross(after - corners, ends - corners)
-    inside = (cross(after - corners, start - corners) > 0).all(axis=-1)
-    return np.where((side & (turn < 0)).any(axis=-1) | inside, 0.0, least)
-
-
 def place_corners(scene: Scene, z: Array) -> Array:
     """World positions of the object's corners, shape (..., n_v, 2)."""
     return np.asarray(z[..., None, :2] + rotate(z[..., 2], scene.polygon.vertices))
@@ -83,10 +67,11 @@ def place_tips(scene: Scene, finger: int, angles: ArrayLike) -> Array:
 
 def finger_gap(scene: Scene, q: Array, finger: int, angles: ArrayLike) -> Array:
     """Distance between object and link at poses and joint angles, shape (n,); negative: overlap."""
-    link = scene.fingers[finger]
-    corners = place_corners(scene, q)
+    link, corners = scene.fingers[finger], place_corners(scene, q)
     tips = place_tips(scene, finger, np.atleast_1d(angles))
-    return polygon_to_segments(corners, np.asarray(link.base), tips) - link.radius
+    corners = np.broadcast_to(corners, (len(tips), *corners.shape[-2:]))
+    bones = np.stack(np.broadcast_arrays(np.asarray(link.base), tips), axis=1)
+    return separate(corners, bones) - link.radius
 
 
 def convex_polygon(rng: np.random.Generator, count: int, size: float = 0.05) -> Array:
