@@ -75,7 +75,7 @@ def test_no_test_takes_a_private_name() -> None:
     # What a test needs belongs to the interface of its module, under a name without underscore.
     tests = Path(__file__).parent.glob("*.py")
     found = {path.name: list_private_names(path.read_text(encoding="utf-8")) for path in tests}
-    assert len(found) > 40 and {name: taken for name, taken in found.items() if taken} == {}
+    assert len(found) > 30 and {name: taken for name, taken in found.items() if taken} == {}
 
 
 def test_the_readme_lists_every_package() -> None:

@@ -4,7 +4,8 @@ import dataclasses
 import json
 import math
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cache
 from itertools import pairwise
 from typing import Any, cast
 
@@ -12,16 +13,251 @@ import numpy as np
 import pytest
 
 from crossing import measure_fingers, slid
+from plane import make_formation, make_scene
 from planned import brake_less, change, plan, plan_landing
 from shipped import BOX, HEPTAGON, plan_of, problem_of
 from tipping import PALM, box, scale, tipped
+from wholearm.benchmark.stress.plan_check import check_plan as check_again
+from wholearm.benchmark.stress.plan_check import check_rates
 from wholearm.common.arrays import Array
-from wholearm.common.errors import InputError, ReplayError
+from wholearm.common.errors import InputError, JammingError, ReplayError
+from wholearm.contacts.formation import Formation
+from wholearm.geometry.tracing import trace_phases
+from wholearm.planning import replay_check as self_check
+from wholearm.planning.blocks import Planning, plan_blocks
+from wholearm.planning.options import PlanOptions
+from wholearm.planning.replay_check import (
+    RESIDUAL,
+    ReplayCheck,
+    check_plan,
+    find_residual,
+    replay_plan,
+)
 from wholearm.planning.table_check import make_table, sample_table
+from wholearm.problem.definition import Problem
+from wholearm.results.plan_record import ReplayFigures
+from wholearm.results.report import Report
 from wholearm.results.torque import TorqueProfile, read_rows
+from wholearm.results.trajectory import Motion, Samples, Trajectory
+from wholearm.scene.model import Friction, Scene
 from wholearm.simulation.simulate import simulate
-from wholearm.verification.verdict import Allowance
+from wholearm.verification.newton_euler import BODIES, Balance, balance
+from wholearm.verification.verdict import Allowance, find_least_force
 from wholearm.verification.verify import find_lowest, list_normal_forces, verify
+
+CONTACTS = "v0-palm v1-finger1 v3-finger2 e2-tip1 v2-tip2"
+
+
+def scene_of(mu: float = 0.3) -> Scene:
+    scene = make_scene(friction=mu)
+    right, left = (replace(link, viscous=0.02, dry=0.03) for link in scene.fingers)
+    return Scene(scene.polygon, (right, left), Friction(mu, 0.8 * mu, 0.6 * mu))
+
+
+def random_samples(formation: Formation, count: int = 30) -> Samples:
+    """States and forces that obey no equation, but friction that opposes the sliding."""
+    rng = np.random.default_rng(5)
+    z = rng.uniform(-1, 1, (count, 5)) * [0.05, 0.05, 1.0, 0.5, 0.5] + [0, 0.05, 0, 1.2, 1.9]
+    v, a = rng.uniform(-1, 1, (count, 5)), rng.uniform(-5, 5, (count, 5))
+    c_n = rng.uniform(0.1, 3.0, (count, formation.n_contacts))
+    v_t = np.einsum("nij,nj->ni", formation.evaluate(z, v).A_t, v)
+    tau = rng.uniform(-1, 1, (count, 2))
+    return Samples(z, v, a, tau, c_n, -formation.friction * np.sign(v_t) * c_n)
+
+
+def check(formation: Formation, samples: Samples) -> Balance:
+    return balance(formation.scene, formation.contacts, formation.rolling, samples)
+
+
+def units(scene: Scene) -> Array:
+    return np.array([scene.scales.force] * 2 + [scene.scales.torque] * 3)
+
+
+def test_virtual_power() -> None:
+    """Contacts do the power of c_n on gaps that open and of c_t on what slides, for any motion."""
+    scene = scene_of()
+    formation = make_formation(scene, CONTACTS)
+    samples = random_samples(formation)
+    z, v, a, tau, c_n, c_t = samples
+    found = check(formation, samples)
+    rows = formation.evaluate(z, v)
+    np.testing.assert_allclose(found.gaps * scene.scales.length, rows.C, atol=1e-14)
+    rates = np.einsum("nij,nj->ni", rows.A, v)
+    np.testing.assert_allclose(found.rates * scene.scales.speed, rates, atol=1e-13)
+    w = np.random.default_rng(6).uniform(-1, 1, z.shape)
+    power = -(scene.mass_diagonal * a * w).sum(axis=1) + w @ scene.applied_force
+    power += ((tau - scene.viscous[3:] * v[:, 3:]) * w[:, 3:]).sum(axis=1)
+    power -= (scene.dry[3:] * np.sign(v[:, 3:]) * w[:, 3:]).sum(axis=1)
+    power += (c_n * np.einsum("nij,nj->ni", rows.A, w)).sum(axis=1)
+    power += (c_t * np.einsum("nij,nj->ni", rows.A_t, w)).sum(axis=1)
+    expected = (found.forces * units(scene) * w).sum(axis=1)
+    np.testing.assert_allclose(expected, power, rtol=1e-11, atol=1e-12)
+    assert not found.against.any()
+
+
+def phases_of(problem: Problem, trajectory: Trajectory) -> list[tuple[Formation, Samples]]:
+    found = []
+    for phase, motion in zip(problem.phases, trajectory.motions, strict=True):
+        t = np.linspace(0.0, motion.duration, 301)[1:-1]
+        found.append((phase.formation, motion.evaluate(t)))
+    return found
+
+
+@pytest.mark.parametrize("case", [plan, plan_landing, lambda: (box(), tipped())])
+def test_motions_with_their_forces_balance(case: object) -> None:
+    """By inverse dynamics along curves and with three contacts, and a plan with a rolling one."""
+    assert callable(case)
+    for formation, samples in phases_of(*case()):
+        found = check(formation, samples)
+        assert not found.against.any()
+        size, _, text = found.find_worst()
+        # Configurations of the landing are closed to 1e-12.
+        assert size < 1e-9, text
+
+
+def test_friction_the_wrong_way_is_named() -> None:
+    formation, samples = phases_of(*plan())[1]
+    column = formation.names.index("v3-finger1")
+    c_t = samples.c_t.copy()
+    c_t[100:110, column] *= -1
+    found = check(formation, samples._replace(c_t=c_t))
+    assert found.against[100:110, column].all() and found.against.sum() == 10
+    # Friction is taken from the velocities, so that what balances is still the motion itself.
+    assert found.find_worst()[0] < 1e-9
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+def test_dry_friction_the_wrong_way_is_named(joint: int) -> None:
+    formation, samples = phases_of(*plan())[1]
+    dry, tau = formation.scene.dry[3 + joint], samples.tau.copy()
+    rows = slice(120, 123)
+    tau[rows, joint] -= 2 * dry * np.sign(samples.z_dot[rows, 3 + joint])
+    size, row, text = check(formation, samples._replace(tau=tau)).find_worst()
+    assert size == pytest.approx(2 * dry / formation.scene.scales.torque, rel=1e-6)
+    assert 120 <= row < 123
+    assert text.startswith(f"the equation of motion of {BODIES[3 + joint]} misses ")
+    assert text.endswith(f"joint {joint + 1} moves against the sense that its friction assumes")
+
+
+def test_at_rest_friction_may_be_anything_in_its_cone() -> None:
+    """An object that lies on the palm between two fingers that press it sideways."""
+    scene = scene_of()
+    formation = make_formation(scene, "v0-palm v1-palm")
+    rest = np.zeros((3, 5))
+    z = np.tile([0.0, 0.03, 0.0, 0.5, 2.6], (3, 1))
+    weight = scene.polygon.mass * scene.gravity
+    c_n = np.full((3, 2), weight / 2)
+    push = np.array([0.0, 0.9, 1.1]) * 0.3 * weight / 2
+    # One vertex is pushed one way and the other one the other way, as far as the cone and farther.
+    c_t = np.column_stack([push, -push])
+    tau = np.array([[0.03, -0.03], [-0.02, 0.0], [0.04, 0.0]])
+    found = check(formation, Samples(z, rest, rest, tau, c_n, c_t))
+    left = found.forces * units(scene)
+    np.testing.assert_allclose(left[:2], 0.0, atol=1e-13)
+    # Beyond the dry friction of joint 1, which is 0.03 N m.
+    np.testing.assert_allclose(left[2], [0, 0, 0, 0.01, 0], atol=1e-13)
+    uneven = np.column_stack([push, 0 * push])
+    forces = check(formation, Samples(z, rest, rest, 0 * tau, c_n, uneven)).forces
+    cone = 0.3 * weight / 2
+    np.testing.assert_allclose(forces[:, 0] * scene.scales.force, np.minimum(push, cone))
+
+
+def test_rolling_contacts_that_slip_are_named() -> None:
+    formation, samples = phases_of(box(), tipped())[1]
+    assert formation.rolling
+    v = samples.z_dot.copy()
+    v[50, 0] += 0.01 * formation.scene.scales.speed
+    found = check(formation, samples._replace(z_dot=v))
+    column = formation.names.index("v1-palm")
+    assert abs(found.rates[50, column]) == pytest.approx(0.01, rel=1e-6)
+    assert np.abs(np.delete(found.rates, 50, axis=0)).max() < 1e-9
+
+
+@dataclass(frozen=True)
+class Altered:
+    """A motion with one of its fields altered."""
+
+    motion: Motion
+    field: str
+    change: Array | float
+
+    @property
+    def duration(self) -> float:
+        return self.motion.duration
+
+    @property
+    def contacts(self) -> tuple[str, ...]:
+        return self.motion.contacts
+
+    def evaluate(self, t: Array) -> Samples:
+        rows = self.motion.evaluate(t)
+        return rows._replace(**{self.field: getattr(rows, self.field) + self.change})
+
+
+def test_a_good_plan_obeys_newton_and_euler(heptagon: Problem, trajectory: Trajectory) -> None:
+    assert check_again(heptagon, trajectory) == []
+
+
+@pytest.mark.parametrize(
+    ("field", "change", "words"),
+    [
+        ("tau", np.array([0.01, 0.0]), "equation of theta_1 misses"),
+        ("c_n", np.array([0.01, 0.0, 0.0, 0.0]), "equation of y misses"),
+        ("c_t", np.array([0.0, 0.0, 1e-3, 0.0]), "off Coulomb's"),
+        ("c_t", np.array([0.0, 0.0, 10.0, 0.0]), "outside its friction cone"),
+        ("z", np.array([0.0, -1e-5, 0.0, 0.0, 0.0]), "object and palm overlap"),
+        ("z", np.array([0.0, 1e-5, 0.0, 0.0, 0.0]), "gap of v1-palm"),
+        ("z_dot", np.array([0.01, 0.0, 0.0, 0.0, 0.0]), "z and its rate differ"),
+        ("z_ddot", np.array([1.0, 0.0, 0.0, 0.0, 0.0]), "z' and its rate differ"),
+        ("c_n", -0.2, "short of epsilon"),
+        ("tau", 5.0, "exceeds its limit"),
+    ],
+)
+def test_what_is_altered_is_named(
+    heptagon: Problem, trajectory: Trajectory, field: str, change: Array | float, words: str
+) -> None:
+    motions = list(trajectory.motions)
+    motions[3] = Altered(motions[3], field, change)
+    found = check_again(heptagon, replace(trajectory, motions=tuple(motions)))
+    assert any(words in text and "phase 4" in text for text in found), found
+
+
+def test_torques_that_are_not_the_motion_s_are_named(
+    heptagon: Problem, trajectory: Trajectory
+) -> None:
+    own = trajectory.torque
+    other = TorqueProfile(own.breaks, own.coefficients * 1.01)
+    found = check_again(heptagon, replace(trajectory, torque=other))
+    assert any("torque profile" in text for text in found)
+
+
+def test_an_end_elsewhere_is_named(heptagon: Problem, trajectory: Trajectory) -> None:
+    phases = list(heptagon.phases)
+    until = phases[-1].until
+    assert until.value is not None
+    phases[-1] = replace(phases[-1], until=replace(until, value=until.value + 1e-3))
+    found = check_again(replace(heptagon, phases=tuple(phases)), trajectory)
+    assert any("ends 0.001 from phi" in text for text in found)
+
+
+def test_a_kink_that_a_curvature_hides_is_no_difference(heptagon: Problem) -> None:
+    """A rate that is the same at four instants about the kink; its integral is known."""
+    t, step = np.linspace(-0.5, 0.5, 6, retstep=True)
+    bend = 1 / (2 * step)
+
+    def sample(x: Array, wrong: float = 0.0) -> Samples:
+        rate = np.abs(x) - bend * x**2
+        value = x * np.abs(x) / 2 - bend * x**3 / 3 + wrong * (x > 0)
+        none = np.zeros((len(x), 5))
+        tables = (np.repeat(column[:, None], 5, axis=1) for column in (value, rate))
+        return Samples(none, *tables, *3 * [none[:, :2]])
+
+    middles = sample((t[1:] + t[:-1]) / 2)
+    right = check_rates(heptagon.scene, t, sample(t), middles)
+    assert np.ptp(sample(t).z_ddot[1:5, 0]) < 1e-12
+    assert not any(text.startswith("z' and") for text in right)
+    wrong = check_rates(heptagon.scene, t, sample(t, step**2 / 2), middles)
+    assert any(text.startswith("z' and its rate differ by") for text in wrong)
 
 
 def test_a_good_plan_passes() -> None:
@@ -397,3 +633,153 @@ def test_samples_at_a_rate_are_reported(interpolation: str) -> None:
     assert find_errors(coarse).sum() > 2 * find_errors(fine).sum()
     unplayed = sample_table(problem, trajectory, 60.0, interpolation, replay=False)
     assert unplayed.figures["replay"] is None
+
+
+def test_a_plan_that_holds() -> None:
+    problem, trajectory = plan()
+    check, harsh = check_plan(problem, trajectory, Allowance(), Allowance(departure=1e-15))
+    assert harsh.failure is not None and " departs from the plan, by " in harsh.failure[1]
+    assert check.failure is None and check.residual.size < 1e-9
+    assert isinstance(check.report, Report)
+    # Every piece is a step, and few end elsewhere.
+    assert check.report.steps < 2 * len(trajectory.torque.coefficients) + 150
+
+
+def test_torques_that_do_not_carry_the_motion_are_found() -> None:
+    problem, trajectory = plan()
+    weak = replace(trajectory, torque=change(trajectory.torque, brake_less))
+    (check,) = check_plan(problem, weak, Allowance())
+    assert check.failure is not None and check.failure == (2, verify(problem, weak).reason)
+    # The first phase departs by the braking that it lacks.
+    assert check.find_culprit(problem.scene.scales, Allowance(departure=1e-5), np.zeros(1)) == 1
+
+
+def test_friction_the_wrong_way_is_found_by_the_residual() -> None:
+    problem, trajectory = plan()
+    tau, rows = trajectory.tau.copy(), np.flatnonzero(trajectory.phase == 2)[90:100]
+    dry = problem.scene.dry[4]
+    tau[rows, 1] -= 2 * dry * np.sign(trajectory.theta_dot[rows, 1])
+    wrong = replace(trajectory, tau=tau)
+    found = find_residual(problem, wrong)
+    assert found.phase == 3
+    assert found.size == pytest.approx(2 * dry / problem.scene.scales.torque, rel=1e-6)
+    assert "finger 2" in found.text and "as joint 2 moves against the sense" in found.text
+    times = [f"at t = {t:.5g} s, phase 3" for t in trajectory.t[rows]]
+    assert any(found.text.endswith(time) for time in times)
+    (check,) = check_plan(problem, wrong, Allowance())
+    assert check.failure == (3, found.text)
+
+
+@pytest.fixture(scope="module")
+def slide(heptagon: Problem) -> Problem:
+    """The heptagon's first three phases."""
+    return replace(heptagon, phases=heptagon.phases[:3])
+
+
+def test_a_contact_that_falls_a_little_short_is_pressed_more(slide: Problem) -> None:
+    """The plan is one for a smaller epsilon, and on as many intervals as there may be."""
+    from wholearm.planning.plan import assemble_plan
+
+    short, options = 1e-3, PlanOptions(intervals=10)
+    slide = replace(slide, phases=slide.phases[:1])
+    easy = replace(slide, epsilon=slide.epsilon - short)
+    planning = plan_blocks(easy, trace_phases(easy), options, lambda _: None)
+    finest = tuple(replace(own, finer=self_check.REFINEMENTS) for own in planning.blocks)
+    planning = replace(planning, problem=slide, blocks=finest)
+    held, trajectory, figures = replay_plan(
+        planning, assemble_plan(planning), assemble_plan, lambda _: None
+    )
+    assert figures.least_c_n.value > slide.epsilon
+    assert held.more == {0: pytest.approx(self_check.SPARE * short, rel=0.05)}
+    assert np.nanmin(trajectory.c_n) == pytest.approx(slide.epsilon + held.more[0], abs=1e-5)
+
+
+@cache
+def plan_coarsely(problem: Problem) -> Planning:
+    return plan_blocks(problem, trace_phases(problem), PlanOptions(intervals=10), lambda _: None)
+
+
+class Replayed:
+    """A plan whose replay jams in phase 2 until the block of that is refined often enough.
+
+    Solves and replays are not made: a refined block is the same one with another count.
+    """
+
+    def __init__(self, problem: Problem, patch: pytest.MonkeyPatch, cured: int) -> None:
+        (self.holds,) = check_plan(*plan(), Allowance())
+        self.planning = self.last = plan_coarsely(problem)
+        self.cured, self.usual_before = cured, 0
+        patch.setattr(self_check, "check_plan", self.check)
+        patch.setattr(self_check, "plan_alone", lambda *_: None)
+        patch.setattr(self_check, "refine_block", self.refine)
+
+    def refine(self, planning: Planning, index: int, *_: object) -> Planning:
+        own = list(planning.blocks)
+        own[index] = replace(own[index], finer=own[index].finer + 1)
+        return replace(planning, blocks=tuple(own))
+
+    def build(self, planning: Planning) -> Trajectory:
+        self.last = planning
+        return replace(plan()[1])
+
+    def check(self, *_: object) -> list[ReplayCheck]:
+        """By a strict allowance, and by the usual one."""
+        error = JammingError("v1-palm jams in phase 2 at t = 0.1 s")
+        error.phase = 2
+        finer = self.last.blocks[1].finer
+        good = finer >= self.cured, finer >= self.cured or finer < self.usual_before
+        return [self.holds if own else self.holds._replace(report=error) for own in good]
+
+    def run(self) -> tuple[Planning, Trajectory, ReplayFigures]:
+        return replay_plan(self.planning, self.build(self.planning), self.build, lambda _: None)
+
+
+@pytest.mark.parametrize("cured", [0, 2])
+def test_only_what_does_not_hold_is_refined(
+    slide: Problem, monkeypatch: pytest.MonkeyPatch, cured: int
+) -> None:
+    own = Replayed(slide, monkeypatch, cured)
+    planning, _, figures = own.run()
+    assert [block.finer for block in planning.blocks] == [0, cured, 0]
+    assert figures.refinements == (0, cured, 0) and figures.simulations == cured + 1
+    assert all(planning.blocks[k] is own.planning.blocks[k] for k in (0, 2))
+
+
+def test_refining_is_bounded_and_the_error_says_where(
+    slide: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(ReplayError) as caught:
+        Replayed(slide, monkeypatch, 99).run()
+    text = str(caught.value)
+    assert caught.value.exit_status == 1
+    assert text.startswith("the plan of phase 2 does not hold in its replay, with 8 times the ")
+    assert "the intervals: v1-palm jams in phase 2 at t = 0.1 s; " in text and "--no-replay" in text
+
+
+def test_meta_keeps_the_figures(heptagon: Problem, trajectory: Trajectory) -> None:
+    figures = trajectory.meta["replay"]
+    report = verify(heptagon, trajectory)
+    margins = [(c.least, c.contact, p.number) for p in report.phases for c in p.contacts]
+    # Parabolas through other instants dip a little differently.
+    assert figures["least_c_n"]["value"] == pytest.approx(min(margins)[0], abs=1e-5)
+    assert (figures["least_c_n"]["contact"], figures["least_c_n"]["phase"]) in [
+        margin[1:] for margin in margins if margin[0] < min(margins)[0] + 1e-6
+    ]
+    for own, phase in zip(figures["phases"], report.phases, strict=True):
+        assert own["arrival"] == pytest.approx(phase.arrival, abs=1e-9)
+        for key in ("end_deviation", "deviation"):
+            assert max(own[key]["m"], own[key]["rad"]) < Allowance().departure
+        assert own["end_speed"] < Allowance().rest_speed * heptagon.scene.scales.speed
+    assert figures["residual"] < RESIDUAL and len(figures["refinements"]) == 5
+
+
+def test_a_contact_that_is_let_go_counts_until_then() -> None:
+    """In an instant after the torques step, the formation given up would have it pull."""
+    problem, trajectory = plan_landing()
+    report = verify(problem, trajectory)
+    phase = report.phases[0]
+    assert phase.until == "release of v3-finger1"
+    margins = {margin.contact: margin for margin in phase.contacts}
+    assert margins["v3-finger1"].least > problem.epsilon - Allowance().measure_stray(problem)
+    assert find_least_force(phase) == min(phase.contacts, key=lambda margin: margin.least)
+    assert find_least_force(phase._replace(contacts=())) is None
