@@ -7,7 +7,6 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from once import once
 from shipped import HEXAGON, problem_of
@@ -68,12 +67,6 @@ def place_links(scene: Scene, z: Array) -> list[Array]:
     return ends
 
 
-def measure_centres(scene: Scene, z: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Distance of the links' segments, 0 where they cross, and whether they do, shape (n,) each."""
-    apart = separate(*place_links(scene, z))
-    return np.maximum(apart, 0.0), apart < 0
-
-
 def measure_fingers(scene: Scene, z: Array) -> Array:
-    """Gap between the links, shape (n,) [m]; no less than minus both radii."""
-    return measure_centres(scene, z)[0] - sum(link.radius for link in scene.fingers)
+    """Gap between the links, shape (n,) [m]; negative: minus the least push that parts them."""
+    return separate(*place_links(scene, z)) - sum(link.radius for link in scene.fingers)

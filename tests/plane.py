@@ -48,11 +48,6 @@ def point_to_segment(points: Array, start: Array, end: Array) -> Array:
     return np.asarray(np.hypot(away[..., 0], away[..., 1]))
 
 
-def nearest_on_segment(point: Array, start: Array, end: Array) -> Array:
-    run = end - start
-    return np.asarray(start + np.clip((point - start) @ run / (run @ run), 0, 1) * run)
-
-
 def place_corners(scene: Scene, z: Array) -> Array:
     """World positions of the object's corners, shape (..., n_v, 2)."""
     return np.asarray(z[..., None, :2] + rotate(z[..., 2], scene.polygon.vertices))

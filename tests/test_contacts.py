@@ -11,18 +11,16 @@ import pytest
 from plane import (
     SQUARE,
     convex_polygon,
-    cross,
     finger_gap,
     make_formation,
     make_scene,
-    nearest_on_segment,
     place_corners,
     place_tips,
-    point_to_segment,
     rotate,
 )
 from shipped import HEPTAGON, chart, problem_of
 from tipping import roll
+from wholearm.benchmark.stress.newton import locate
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.contacts.closing import (
@@ -39,7 +37,7 @@ from wholearm.contacts.closing import (
     place_flush,
 )
 from wholearm.contacts.cones import find_weakest, force_limit_rows, slip_margins
-from wholearm.contacts.elemental import Contact, build_features, candidate_contacts, parse_contact
+from wholearm.contacts.elemental import build_features, candidate_contacts, parse_contact
 from wholearm.contacts.formation import Formation, build_slip, find_touching
 from wholearm.mapping.borders import label_cells
 from wholearm.scene.model import Friction, Scene
@@ -63,40 +61,16 @@ def configurations(seed: int, count: int = 20) -> Array:
     return np.asarray(rng.uniform(low, high, (count, 5)))
 
 
-def measure_apart(scene: Scene, contact: Contact, z: Array) -> tuple[float, Array, Array]:
-    """Signed gap, closest point of the object, and normal into it, by plain geometry."""
-    corners = place_corners(scene, z)
-    corner = corners[contact.index]
-    if contact.finger is None:
-        return float(corner[1]), corner, np.array([0.0, 1.0])
-    link = scene.fingers[contact.finger]
-    base, tip = np.asarray(link.base), place_tips(scene, contact.finger, z[3 + contact.finger])
-    if contact.surface == "finger":
-        axis = (tip - base) / link.length
-        normal = np.array([-axis[1], axis[0]]) * (1 if contact.finger == 0 else -1)
-        # Far ends, so that the foot of the perpendicular is on the segment.
-        distance = float(point_to_segment(corner, base - 9 * axis, tip + 9 * axis))
-        side = np.sign(normal @ (corner - base))
-        return float(side * distance - link.radius), corner, normal
-    if contact.feature == "e":
-        after = corners[(contact.index + 1) % len(corners)]
-        run = after - corner
-        normal = np.array([-run[1], run[0]]) / np.hypot(*run)
-        point = nearest_on_segment(tip, corner - 9 * run, after + 9 * run)
-        side = np.sign(cross(run, corner - tip))
-        return float(side * np.hypot(*(tip - point)) - link.radius), point, normal
-    away = corner - tip
-    return float(np.hypot(*away) - link.radius), corner, away / np.hypot(*away)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_gap_is_the_distance_measured(scene: Scene, name: str) -> None:
-    formation = make_formation(scene, name)
+def test_gaps_and_rows_are_those_of_rigid_bodies(scene: Scene) -> None:
+    """Points and normals of bodies give the Jacobians of the C-functions."""
+    contacts = tuple(c for part in (None, 0, 1) for c in candidate_contacts(scene, part))
     z = configurations(1)
-    gaps = formation.evaluate(z, z).C[:, 0]
-    measured = [measure_apart(scene, formation.contacts[0], point)[0] for point in z]
-    np.testing.assert_allclose(gaps, measured, atol=1e-14)
-    assert {-1.0, 1.0} >= set(np.sign(gaps)) and np.ptp(gaps) > 0.01
+    rows = Formation(scene, contacts).evaluate(z, z)
+    for k, contact in enumerate(contacts):
+        touch = locate(scene, contact.name, z)
+        np.testing.assert_allclose(touch.gap, rows.C[:, k], atol=1e-14)
+        np.testing.assert_allclose(touch.normal, rows.A[:, k], atol=1e-14)
+        np.testing.assert_allclose(touch.tangent, rows.A_t[:, k], atol=1e-14)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -107,37 +81,6 @@ def test_rows_are_the_derivatives_of_the_gap(scene: Scene, name: str) -> None:
     for k, unit in enumerate(STEP * np.eye(5)):
         rise = formation.evaluate(z + unit, z).C - formation.evaluate(z - unit, z).C
         np.testing.assert_allclose(A[:, k], rise[:, 0] / (2 * STEP), atol=DIFFERENCE)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_velocities_at_the_contact_point(scene: Scene, name: str) -> None:
-    """A v and A_t v are the relative velocity of two material points, differenced in time."""
-    formation = make_formation(scene, name)
-    contact = formation.contacts[0]
-    rng = np.random.default_rng(3)
-    for z in configurations(3, 8):
-        gap, _, normal = measure_apart(scene, contact, z)
-        z[:2] -= gap * normal
-        gap, point, normal = measure_apart(scene, contact, z)
-        assert abs(gap) < 1e-15
-        v = rng.uniform(-1, 1, 5)
-        on_object = rotate(-z[2], point - z[:2])
-
-        def separate(
-            moved: Array, point: Array = point, start: Array = z, body: Array = on_object
-        ) -> Array:
-            world = moved[:2] + rotate(moved[2], body)
-            if contact.finger is None:
-                return np.asarray(world - point)
-            base = np.asarray(scene.fingers[contact.finger].base)
-            k = 3 + contact.finger
-            return np.asarray(world - base - rotate(moved[k] - start[k], point - base))
-
-        velocity = (separate(z + STEP * v) - separate(z - STEP * v)) / (2 * STEP)
-        kinematics = formation.evaluate(z[None], v[None])
-        tangent = np.array([normal[1], -normal[0]])
-        assert kinematics.A[0, 0] @ v == pytest.approx(normal @ velocity, abs=DIFFERENCE)
-        assert kinematics.A_t[0, 0] @ v == pytest.approx(tangent @ velocity, abs=DIFFERENCE)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -186,8 +129,8 @@ def test_slip_coordinate_integrates_the_sliding_velocity(scene: Scene, name: str
     function = ca.Function("slip", [z_symbol], [slip, ca.jacobian(slip, z_symbol)])
     rng = np.random.default_rng(6)
     for z in configurations(6, 8):
-        gap, _, normal = measure_apart(scene, formation.contacts[0], z)
-        z[:2] -= gap * normal
+        touch = locate(scene, name, z[None])
+        z[:2] -= touch.gap[0] * touch.normal[0, :2]
         v = rng.uniform(-1, 1, 5)
         A_t = formation.evaluate(z[None], v[None]).A_t[0]
         np.testing.assert_allclose(function(z)[1].full(), A_t, atol=1e-14)

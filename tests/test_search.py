@@ -18,6 +18,7 @@ import pytest
 
 import wholearm
 from plane import convex_polygon, make_scene
+from retelling import Retelling, Units
 from shipped import FOLDER, HEPTAGON, HEXAGON, problem_of
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
@@ -693,14 +694,7 @@ def test_routes_that_cannot_be_followed_are_named(heptagon: Problem) -> None:
 
 def test_lists_do_not_depend_on_units(heptagon: Problem) -> None:
     size = 700.0
-    table = copy.deepcopy(HEPTAGON_TABLE)
-    table["object"]["vertices"] = (size * np.array(table["object"]["vertices"])).tolist()
-    for finger in table["fingers"].values():
-        finger |= {key: size * finger[key] for key in ("length", "radius")}
-        finger["base"] = [size * value for value in finger["base"]]
-    table["start"]["x"] *= size
-    table["phases"][-1]["until"] = {"x": 0.0}
-    large = build_problem(table)
+    large = Retelling("large", Units.of(size, 1.0)).apply(heptagon)
     poses = [(0.045, -2.0), (-0.0637, -2.0), (-0.0505, -23.4), (0.03, 3.0)]
     one = list_degrees(heptagon, *poses)
     two = list_degrees(large, *((size * x, phi) for x, phi in poses))

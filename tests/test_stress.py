@@ -19,8 +19,7 @@ from wholearm.benchmark.stress.scenes import draw_case, random_scene
 from wholearm.benchmark.stress.slow_motion import fast_margin, inertia_ratio, slow_margin
 from wholearm.benchmark.stress.stress_study import STUDY, compare_values
 from wholearm.common.arrays import Array
-from wholearm.contacts.elemental import candidate_contacts
-from wholearm.contacts.formation import Formation, find_touching
+from wholearm.contacts.formation import find_touching
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.path_guess import load
 from wholearm.geometry.tracing import trace_phases
@@ -130,29 +129,6 @@ def test_places_where_a_contact_turns_are_on_the_grid(
         assert np.abs(s - turn).min() < 1e-3 * curve.length
     rates = slides(heptagon.scene, phase, z, z_s)
     assert (np.abs(rates[s == s[np.abs(s - turns[0]).argmin()]]).min()) < 1e-4
-
-
-def test_contacts_are_those_of_the_planner(heptagon: Problem) -> None:
-    """Points and normals of rigid bodies give the Jacobians of the C-functions."""
-    scene, random = heptagon.scene, np.random.default_rng(3)
-    z = heptagon.start + random.normal(0.0, 0.02, (7, 5))
-    contacts = tuple(c for part in (None, 0, 1) for c in candidate_contacts(scene, part))
-    rows = Formation(scene, contacts).evaluate(z, z)
-    for k, contact in enumerate(contacts):
-        touch = locate(scene, contact.name, z)
-        np.testing.assert_allclose(touch.gap, rows.C[:, k], atol=1e-14)
-        np.testing.assert_allclose(touch.normal, rows.A[:, k], atol=1e-14)
-        np.testing.assert_allclose(touch.tangent, rows.A_t[:, k], atol=1e-14)
-
-
-def test_a_gap_changes_by_the_rate_of_separation(heptagon: Problem) -> None:
-    scene, step = heptagon.scene, 1e-6
-    way = np.array([0.3, -0.2, 1.0, 0.7, -0.4])
-    for name in ("v2-palm", "v2-finger1", "v5-finger2", "e3-tip1", "v3-tip2"):
-        z = np.stack([heptagon.start - step * way, heptagon.start + step * way])
-        gaps = locate(scene, name, z).gap
-        rate = locate(scene, name, heptagon.start[None]).normal[0] @ way
-        np.testing.assert_allclose((gaps[1] - gaps[0]) / (2 * step), rate, rtol=1e-6)
 
 
 def test_what_is_left_of_the_equations_is_the_force_that_is_missing(

@@ -160,13 +160,6 @@ def inverse(
     return PathForces(C, T)
 
 
-def energy(formation: Formation, z: Array, v: Array) -> Array:
-    """Kinetic and potential energy at n states, shape (n,) [J]."""
-    scene = formation.scene
-    kinetic = 0.5 * (v**2) @ scene.mass_diagonal
-    return np.asarray(kinetic + scene.polygon.mass * scene.gravity * z[:, 1])
-
-
 def null_vector(matrix: Array, least: float = 0.0) -> Array:
     """Unit null vector of each (k, k + 1) matrix, by its minors (continuous), shape (n, k + 1).
 
