@@ -10,13 +10,11 @@ import numpy as np
 
 from once import once
 from shipped import HEXAGON, problem_of
+from wholearm import End, Plan, Problem, Scene
 from wholearm.benchmark.stress.newton import separate
 from wholearm.common.arrays import Array
 from wholearm.planning.plan import solve
-from wholearm.planning.result import Plan
-from wholearm.problem.definition import End, Problem
 from wholearm.problem.read import build_problem
-from wholearm.scene.model import Scene
 
 
 @cache

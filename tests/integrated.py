@@ -9,11 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from wholearm import Problem, TorqueProfile
 from wholearm.benchmark.precision.reference import evaluate_piece, find_piece, solve_motion
 from wholearm.common.arrays import Array
 from wholearm.mechanics.dynamics import Directions
-from wholearm.problem.definition import Problem
-from wholearm.results.torque import TorqueProfile
 
 
 class Integrated(NamedTuple):

@@ -10,14 +10,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from wholearm import Finger, Formation, Friction, Polygon, Scene
 from wholearm.benchmark.precision.reference import solve_motion
 from wholearm.benchmark.stress.newton import Touch, locate, separate
 from wholearm.common.arrays import Array
 from wholearm.contacts.elemental import parse_contact
-from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.results.trajectory import Samples
-from wholearm.scene.model import Finger, Friction, Polygon, Scene
 
 SQUARE = [[-0.03, -0.03], [0.03, -0.03], [0.03, 0.03], [-0.03, 0.03]]
 

@@ -12,15 +12,13 @@ import numpy as np
 from scipy.optimize import brentq
 
 from shipped import HEPTAGON, problem_of
+from wholearm import End, Formation, Phase, Problem, TorqueProfile, Until
 from wholearm.common.arrays import Array
 from wholearm.contacts.elemental import parse_contact
-from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import LAMBDA, Directions, inverse
-from wholearm.problem.definition import End, Phase, Problem, Until
 from wholearm.results.dwell_record import assemble
-from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Motion, Samples, Trajectory
 
 DEPENDENT = [1, 3, 4]

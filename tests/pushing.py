@@ -11,12 +11,9 @@ from itertools import pairwise
 import numpy as np
 
 from plane import accelerate, make_formation, make_scene, rotate, stack_rows
+from wholearm import Formation, Friction, Phase, Problem, Scene, TorqueProfile, Until
 from wholearm.common.arrays import Array
 from wholearm.contacts.closing import close_finger, place_flush
-from wholearm.contacts.formation import Formation
-from wholearm.problem.definition import Phase, Problem, Until
-from wholearm.results.torque import TorqueProfile
-from wholearm.scene.model import Friction, Scene
 
 FAR = Until(coordinate="x", value=-0.3)
 """An end that is never reached."""

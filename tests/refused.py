@@ -12,16 +12,15 @@ import pytest
 from once import once
 from shipped import HEPTAGON, problem_of
 from thrown import shove
+from wholearm import PlanOptions, Problem
 from wholearm.common.errors import InfeasibleError, Parameter
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning import advice
-from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.path_explain import FRICTION
 from wholearm.planning.path_domain.path_plan import plan_curves
 from wholearm.planning.time_domain import time_explain as explain
 from wholearm.planning.time_domain.time_explain import change_limit
 from wholearm.planning.time_domain.time_plan import plan_phases
-from wholearm.problem.definition import Problem
 
 INTERVALS = 15
 OPTIONS = PlanOptions(intervals=INTERVALS)

@@ -10,14 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from wholearm import Contact, Friction, Objective, Phase, Problem, Scene, TorqueProfile
 from wholearm.common.arrays import Array
-from wholearm.contacts.elemental import Contact
-from wholearm.planning.options import Objective
 from wholearm.planning.plan import solve
-from wholearm.problem.definition import Phase, Problem
 from wholearm.problem.read import build_problem
-from wholearm.results.torque import TorqueProfile
-from wholearm.scene.model import Friction, Scene
 
 
 class Units(NamedTuple):

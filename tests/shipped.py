@@ -6,12 +6,8 @@ from functools import cache
 from pathlib import Path
 
 from once import once
-from wholearm.geometry.path_guess import load
-from wholearm.mapping.formation_map import FormationMap, build_map
+from wholearm import FormationMap, Plan, Problem, Trajectory, build_map, load
 from wholearm.planning.plan import solve
-from wholearm.planning.result import Plan
-from wholearm.problem.definition import Problem
-from wholearm.results.trajectory import Trajectory
 
 FOLDER = Path(__file__).parents[1] / "problems"
 HEPTAGON = FOLDER / "heptagon_four_contacts.toml"

@@ -15,6 +15,7 @@ import pytest
 
 from misbehaving import allow, misbehave
 from shipped import FOLDER, HEPTAGON, SQUARE, problem_of, solved
+from wholearm import Finger, Friction, InputError, Polygon, Scene, TorqueProfile
 from wholearm.benchmark import STUDIES
 from wholearm.benchmark.corpus import compare
 from wholearm.benchmark.corpus_cases import FAMILIES, answer, list_cases
@@ -48,11 +49,8 @@ from wholearm.benchmark.skip import SkipPair, list_pairs, spend
 from wholearm.benchmark.study import Case, Row, Study, digest_source, measure_case
 from wholearm.cli.command import load_study, main
 from wholearm.common.crowd import Processes, run_all
-from wholearm.common.errors import InputError
 from wholearm.common.journal import Journal
 from wholearm.problem.read import build_problem, read_problem
-from wholearm.results.torque import TorqueProfile
-from wholearm.scene.model import Finger, Friction, Polygon, Scene
 from wholearm.solvers.ipopt import record_runs
 
 

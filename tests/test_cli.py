@@ -18,11 +18,10 @@ import pytest
 
 import wholearm
 from shipped import HEPTAGON, IMPACTS, solved
+from wholearm import PlanOptions, Trajectory, load_trajectory
 from wholearm.cli.command import build_parser, main
-from wholearm.planning.options import PlanOptions
 from wholearm.planning.result import describe_plan
 from wholearm.problem.table import write_toml
-from wholearm.results.trajectory import Trajectory, load_trajectory
 
 TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
 Edit = Callable[[dict[str, Any]], object]

@@ -20,9 +20,9 @@ from plane import (
 )
 from shipped import HEPTAGON, chart, problem_of
 from tipping import roll
+from wholearm import Friction, InputError, Scene
 from wholearm.benchmark.stress.newton import locate
 from wholearm.common.arrays import Array
-from wholearm.common.errors import InputError
 from wholearm.contacts.closing import (
     Numbers,
     close_finger,
@@ -40,7 +40,6 @@ from wholearm.contacts.cones import find_weakest, force_limit_rows, slip_margins
 from wholearm.contacts.elemental import build_features, candidate_contacts, parse_contact
 from wholearm.contacts.formation import Formation, build_slip, find_touching
 from wholearm.mapping.borders import label_cells
-from wholearm.scene.model import Friction, Scene
 
 KITE = [[-0.04, -0.03], [0.02, -0.035], [0.045, 0.01], [0.0, 0.05], [-0.045, 0.02]]
 NAMES = ["v3-palm", "v2-finger1", "v4-finger2", "e1-tip1", "e3-tip2", "v2-tip1", "v4-tip2"]

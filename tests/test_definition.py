@@ -19,8 +19,8 @@ import pytest
 
 import wholearm
 from shipped import BOX, FOLDER, HEPTAGON, plan_of, problem_of
+from wholearm import End, Goal, InputError, Problem, Until, compare, load, save
 from wholearm.cli.command import build_parser, main
-from wholearm.common.errors import InputError
 from wholearm.common.fields import (
     NONNEGATIVE,
     Range,
@@ -32,18 +32,13 @@ from wholearm.common.fields import (
 from wholearm.common.fields import (
     key as declare_key,
 )
-from wholearm.comparison.metrics import compare
-from wholearm.geometry.path_guess import load
 from wholearm.mapping.formation_list import write_template
 from wholearm.planning.options import CHOICES, Objective, PlanOptions
 from wholearm.planning.plan import solve
 from wholearm.problem import keys, read
-from wholearm.problem.definition import End, Problem, Until
-from wholearm.problem.goal import Goal
 from wholearm.problem.keys import TOP, build_schema, write_page
 from wholearm.problem.read import adopt_phases, build_problem, read_problem
 from wholearm.problem.table import describe_scene, format_until, write_table
-from wholearm.results.adopt import save
 from wholearm.scene.model import Finger, Friction, find_unit_hint
 
 TEXT = HEPTAGON.read_text(encoding="utf-8")

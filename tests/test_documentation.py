@@ -16,11 +16,10 @@ import pytest
 import wholearm
 from once import once
 from shipped import FOLDER, HEPTAGON, LANDING, chart, problem_of, solved
+from wholearm import Plan, Problem
 from wholearm.cli.arguments import name_simulator, protect
 from wholearm.cli.command import build_parser, main
 from wholearm.cli.help import TOPICS, read_page
-from wholearm.planning.result import Plan
-from wholearm.problem.definition import Problem
 
 ROOT = FOLDER.parent
 SOURCE = ROOT / "src" / "wholearm"

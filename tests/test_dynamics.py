@@ -26,15 +26,13 @@ from pushed import forward
 from shipped import BOX, FOLDER, HEPTAGON, IMPACTS, plan_of, problem_of
 from timed import landing, plan_landing
 from tipping import box, roll, tipped
-from wholearm import InputError, verify
+from wholearm import Formation, InputError, PlanOptions, TorqueProfile, load, verify
 from wholearm import solve as plan
 from wholearm.benchmark.stress.slow_motion import list_others, rest_margin
 from wholearm.common.arrays import Array
 from wholearm.common.errors import AmbiguityError, InfeasibleError
 from wholearm.contacts.closing import close_finger
-from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
-from wholearm.geometry.path_guess import load
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import (
     LAMBDA,
@@ -46,14 +44,12 @@ from wholearm.mechanics.dynamics import (
 from wholearm.mechanics.impact import Impact, ViolationKind, compute_impact, solve_impulses
 from wholearm.mechanics.statics import find_static_torques
 from wholearm.mechanics.uniqueness import find_minors
-from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.impact_sequence import ImpactSequence, make_sequence
 from wholearm.planning.path_domain.path_plan import plan_curves
 from wholearm.planning.time_domain.resting import find_block, list_ways, pushes_one_way
 from wholearm.planning.time_domain.stage import in_own_units, scale_state
 from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.read import build_problem, read_problem
-from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Samples
 from wholearm.scene.model import Friction, Scene
 from wholearm.simulation.contact_problem import (

@@ -13,9 +13,9 @@ import pytest
 
 from plane import point_to_segment, rotate
 from shipped import HEPTAGON, LANDING, plan_of, problem_of
+from wholearm import InputError, Plan, Problem, find_route, make_policy, verify, write_mjcf
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
-from wholearm.common.errors import InputError
 from wholearm.contacts.formation import Formation, find_touching
 from wholearm.engines.engine_replay import (
     Departure,
@@ -25,7 +25,6 @@ from wholearm.engines.engine_replay import (
     play_policy,
     replay_in,
 )
-from wholearm.engines.mjcf import write_mjcf
 from wholearm.engines.shapes import list_pairs
 from wholearm.engines.stretch import (
     LOOSE,
@@ -39,16 +38,11 @@ from wholearm.engines.stretch import (
     press_in,
 )
 from wholearm.planning.plan import solve
-from wholearm.planning.result import Plan
-from wholearm.policy.make import make_policy
 from wholearm.policy.playback import ClosedLoop
-from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem
 from wholearm.results.adopt import require_same_phases
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import load_trajectory
-from wholearm.search.find_route import find_route
-from wholearm.verification.verify import verify
 
 STEP = 1e-5
 

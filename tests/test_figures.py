@@ -32,11 +32,10 @@ from scipy import ndimage
 import tipping
 from crossing import hexagon
 from shipped import HEPTAGON, IMPACTS, LANDING, chart, plan_of, problem_of
-from wholearm import plots
+from wholearm import InputError, PlanOptions, Problem, TorqueProfile, Trajectory, plots, verify
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.common.document import Document, Result, Table, fixed, plain, restore, show
-from wholearm.common.errors import InputError
 from wholearm.contacts.closing import contact_table, evaluate_contacts
 from wholearm.figures.curves import draw_torques
 from wholearm.figures.map_figure import draw_map, find_room, split
@@ -46,15 +45,10 @@ from wholearm.figures.style import WIDTH, choose_styles
 from wholearm.mapping.borders import Window
 from wholearm.mapping.formation_list import write_template
 from wholearm.mapping.formation_map import FormationMap, build_map
-from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
 from wholearm.planning.result import Plan, Status, describe_plan, load_plan, write_meta
-from wholearm.problem.definition import Problem
 from wholearm.results.dwell_record import assemble
-from wholearm.results.torque import TorqueProfile
-from wholearm.results.trajectory import Trajectory
 from wholearm.solvers.ipopt import Solver, SolverStatistics, book, charge, open_ledger
-from wholearm.verification.verify import verify
 from wholearm.viewer import page
 from wholearm.viewer.motion_data import describe_motion, place_pushes
 from wholearm.viewer.movie import FRAMES, Movie, write_movie

@@ -31,9 +31,9 @@ from plane import (
 from retelling import Retelling
 from shipped import HEPTAGON, IMPACTS, LANDING, problem_of, solved
 from shipped import SQUARE as BOX_FILE
+from wholearm import End, Formation, Goal, InputError, Problem, Scene, Until, list_formations
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
-from wholearm.common.errors import InputError
 from wholearm.contacts.closing import (
     close_finger,
     close_fingers,
@@ -51,19 +51,14 @@ from wholearm.contacts.contact_limits import (
     evaluate_finger_gap,
 )
 from wholearm.contacts.elemental import build_features, parse_contact
-from wholearm.contacts.formation import Formation
 from wholearm.geometry.arcs import find_on, join, take
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_curve, trace_phases
 from wholearm.mapping.borders import NOWHERE, Window, label_cells
-from wholearm.mapping.formation_list import list_formations
 from wholearm.mapping.formation_map import CROSSED, Border, FormationMap, build_map, choose_window
 from wholearm.planning.lower_bound.lower_bound import look_along
 from wholearm.planning.lower_bound.speed_sweep import NoMotionError
-from wholearm.problem.definition import End, Problem, Until
-from wholearm.problem.goal import Goal
 from wholearm.problem.read import build_problem, read_problem
-from wholearm.scene.model import Scene
 from wholearm.search.border_limits import estimate_duration, find_border_limits
 from wholearm.search.edges import Link, cut_curve, time_parts
 from wholearm.search.places import RoadmapPlace, is_at, list_formations_at, make_place, unit_steps

@@ -16,6 +16,7 @@ import pytest
 from plane import SQUARE, convex_polygon, cross, make_finger, make_scene, rotate
 from retelling import RETELLINGS, Answer, Retelling, answer
 from shipped import HEPTAGON
+from wholearm import Finger, Friction, Polygon, Problem, Scene, load, verify
 from wholearm.common.arrays import Array
 from wholearm.common.errors import (
     LONGEST,
@@ -26,13 +27,9 @@ from wholearm.common.errors import (
     require_number,
 )
 from wholearm.common.fields import keys_of
-from wholearm.geometry.path_guess import load
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.plan import solve
-from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem
-from wholearm.scene.model import Finger, Friction, Polygon, Scene
-from wholearm.verification.verify import verify
 
 
 @pytest.mark.parametrize("value", [-1.0, math.nan, True, "1"])

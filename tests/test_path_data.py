@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from wholearm import Objective, PlanOptions, Problem
 from wholearm.common.arrays import Array, find_minima
 from wholearm.geometry.arcs import CostToGo
 from wholearm.geometry.curve import Curve, Segment, directions_of
 from wholearm.geometry.tracing import trace_phase, trace_phases
 from wholearm.mechanics.dynamics import ONE, PathForces, inverse, metric_weights
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
-from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain.elements import (
     DEGREE,
     FROM_REST,
@@ -35,7 +35,6 @@ from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.path_domain.speed_profile import Fastest, Narrow, find_fastest
 from wholearm.planning.path_domain.terms import LimitShape
 from wholearm.planning.path_domain.warm_start import start_at
-from wholearm.problem.definition import Problem
 
 PHASES = range(5)
 EPSILON = 0.05

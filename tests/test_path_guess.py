@@ -9,10 +9,9 @@ import pytest
 
 from plane import make_formation, measure_gaps, measure_slip, rotate
 from tipping import roll, tilting
+from wholearm import End, Formation, InputError, Phase, PlanOptions, Problem, Until
 from wholearm.common.arrays import Array
-from wholearm.common.errors import InputError
 from wholearm.contacts.elemental import parse_contact
-from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.explore import close_all, close_contacts
 from wholearm.geometry.path_guess import (
@@ -24,10 +23,8 @@ from wholearm.geometry.path_guess import (
     load,
 )
 from wholearm.geometry.tracing import trace_phases, until_distance
-from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.time_domain.time_plan import plan_phases
-from wholearm.problem.definition import End, Phase, Problem, Until
 
 HEPTAGON = Path(__file__).parents[1] / "problems" / "heptagon.toml"
 LANDING = "v1-palm v4-finger1 v6-finger2"

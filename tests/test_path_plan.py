@@ -22,9 +22,9 @@ from refused import INTERVALS, OPTIONS, ask, edited, plan, read_advice
 from shipped import HEPTAGON, IMPACTS, plan_of, problem_of
 from tipping import box, tip
 from toys import LIMIT, Toy, constant, find_time_growing, find_time_viscous, inertia
+from wholearm import Formation, Friction, Problem, Scene
 from wholearm.common.arrays import Array, Expression
 from wholearm.common.errors import InfeasibleError, JammingError, SolverError, WholearmError
-from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve, directions_of
 from wholearm.geometry.tracing import trace_phase, trace_phases
 from wholearm.mechanics.dynamics import LAMBDA, ONE, A, B, Directions, V, inverse
@@ -65,10 +65,8 @@ from wholearm.planning.path_domain.path_plan import plan_curves, plan_path
 from wholearm.planning.path_domain.terms import LimitShape
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
-from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem
 from wholearm.results.trajectory import Samples
-from wholearm.scene.model import Friction, Scene
 from wholearm.solvers.ipopt import open_ledger
 
 EPSILON = 0.05

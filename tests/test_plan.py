@@ -17,19 +17,16 @@ from crossing import measure_fingers
 from plane import finger_gap, measure_gaps, measure_slip, unbalance
 from shipped import FOLDER, HEPTAGON, plan_of, problem_of
 from thrown import shove
+from wholearm import Objective, Phase, PlanOptions, Problem, TorqueProfile, verify
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError, SolverError
 from wholearm.planning.blocks import Planning, explain_motors
-from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
 from wholearm.planning.stops import Plans, plan_stops
 from wholearm.planning.time_domain import time_plan
 from wholearm.planning.time_domain.time_motion import TimeMotion
-from wholearm.problem.definition import Phase, Problem
-from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Samples, Trajectory
-from wholearm.verification.verify import verify
 
 OBJECTIVES = ["time", "effort", "margin"]
 LIMIT = 2.0

@@ -18,15 +18,13 @@ import wholearm
 from planned import change, plan
 from shipped import BOX, FOLDER, HEPTAGON, HEXAGON, LANDING, problem_of
 from tipping import box, tipped
+from wholearm import InputError, Problem, Trajectory, compare, load_trajectory, simulate, verify
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
-from wholearm.common.errors import InputError
-from wholearm.comparison.metrics import compare
 from wholearm.contacts.cones import force_limit_rows
 from wholearm.figures import plots
 from wholearm.figures.analysis_figures import draw_comparison
 from wholearm.mechanics.dynamics import force_rows
-from wholearm.problem.definition import Problem
 from wholearm.problem.keys import name_keys
 from wholearm.problem.table import change_table
 from wholearm.quasistatic.slow_speeds import (
@@ -45,12 +43,9 @@ from wholearm.quasistatic.slow_speeds import (
 from wholearm.results.adopt import describe_origin, save
 from wholearm.results.report import Loss, Report
 from wholearm.results.torque import TorqueProfile, read_notes, read_torque_csv
-from wholearm.results.trajectory import Trajectory, load_trajectory
 from wholearm.simulation.events import Event, EventKind, Simulation
-from wholearm.simulation.simulate import simulate
 from wholearm.tuning.tuner import FACTOR, Bench, TrialOutcome, TuningStep, split_passages
 from wholearm.verification.torque_advice import find_approach
-from wholearm.verification.verify import verify
 
 
 @cache

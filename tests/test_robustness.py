@@ -21,13 +21,11 @@ import pytest
 
 import wholearm
 from retelling import Retelling, Units
+from wholearm import Formation, InputError, Plan, PlanOptions, Problem, TorqueProfile, load
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.common.crowd import connect, run_all
-from wholearm.common.errors import InputError
-from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve, directions_of
-from wholearm.geometry.path_guess import load
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import (
     Directions,
@@ -37,17 +35,13 @@ from wholearm.mechanics.dynamics import (
     stack_motion,
 )
 from wholearm.mechanics.statics import find_static_torques
-from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.range_cost import find_widest
-from wholearm.planning.result import Plan
 from wholearm.planning.robust.robust_rows import Guide, list_holds, measure_holds
 from wholearm.planning.time_domain.time_plan import plan_phases
-from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.problem.uncertainty import NAMES, PARAMETERS
-from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Motion, Samples
 from wholearm.robustness.error_model import Uncertainty, change_problem, change_torques
 from wholearm.robustness.sample_run import TimeWindow, Trial, make_trial

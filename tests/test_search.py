@@ -20,12 +20,12 @@ import wholearm
 from plane import convex_polygon, make_scene
 from retelling import Retelling, Units
 from shipped import FOLDER, HEPTAGON, HEXAGON, problem_of
+from wholearm import Formation, Goal, Phase, Plan, PlanOptions, Problem, Until, load_plan, verify
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.common.errors import Change, InfeasibleError, InputError, Parameter, SolverError
 from wholearm.common.signals import OutOfTime
 from wholearm.contacts.closing import close_fingers, contact_table
-from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.path_guess import guess_phase
 from wholearm.geometry.tracing import trace_phase
@@ -40,10 +40,6 @@ from wholearm.mapping.formation_list import (
 )
 from wholearm.planning.blocks import BlockPlan
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
-from wholearm.planning.options import PlanOptions
-from wholearm.planning.result import Plan, load_plan
-from wholearm.problem.definition import Phase, Problem, Until
-from wholearm.problem.goal import Goal
 from wholearm.problem.read import build_problem
 from wholearm.search import route_choice as choosing
 from wholearm.search.astar import RoadmapRoute, RouteSearch, SearchRule
@@ -73,7 +69,6 @@ from wholearm.search.places import list_formations_at, make_place
 from wholearm.search.result import bound_borders, describe_block
 from wholearm.search.roadmap import Roadmap, cross, go_to, map_labels
 from wholearm.search.route_choice import FINEST, STEPS, Chooser, Found, RefinedPath, ReleaseSearch
-from wholearm.verification.verify import verify
 
 TABLE = {k: v for k, v in tomllib.loads(HEPTAGON.read_text()).items() if k != "phases"}
 

@@ -13,6 +13,7 @@ import pytest
 
 from refused import ask_shoved
 from shipped import HEPTAGON, problem_of, tipping
+from wholearm import Problem, load_trajectory, plots
 from wholearm.benchmark.stress import refusals
 from wholearm.benchmark.stress.refusals import judge
 from wholearm.common.errors import (
@@ -24,7 +25,6 @@ from wholearm.common.errors import (
     Parameter,
     Shortfall,
 )
-from wholearm.figures import plots
 from wholearm.mechanics.limits import EPSILON
 from wholearm.planning.advice import (
     bracket,
@@ -35,9 +35,7 @@ from wholearm.planning.advice import (
     round_outwards,
 )
 from wholearm.planning.plan import solve
-from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem, read_problem
-from wholearm.results.trajectory import load_trajectory
 
 
 def refuse(problem: Problem, **options: Any) -> InfeasibleError:

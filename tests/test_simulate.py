@@ -36,18 +36,15 @@ from pushed import forward
 from pushing import pushed, rocking
 from retelling import RETELLINGS, Retelling
 from shipped import HEPTAGON, IMPACTS, plan_of, problem_of
+from wholearm import Formation, Phase, Problem, TorqueProfile, Trajectory, Until, simulate, verify
 from wholearm.benchmark.precision.reference import solve_motion
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, JammingError, SimulationError
 from wholearm.contacts.elemental import parse_contact
-from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions
 from wholearm.mechanics.impact import compute_impact
-from wholearm.problem.definition import Phase, Problem, Until
 from wholearm.problem.read import build_problem
-from wholearm.results.torque import TorqueProfile
-from wholearm.results.trajectory import Trajectory
 from wholearm.scene.model import Finger, Friction, Scene
 from wholearm.simulation import runge_kutta
 from wholearm.simulation.events import Event, EventKind, OutcomeKind, Simulation
@@ -55,9 +52,7 @@ from wholearm.simulation.hand import build_system
 from wholearm.simulation.modes import Grips, Mode, ModeRows, respond
 from wholearm.simulation.rest import Collapse, close_contacts, find_rest
 from wholearm.simulation.root_finding import find_root
-from wholearm.simulation.simulate import simulate
 from wholearm.simulation.stepper import Modes, ModeStepper, build_stepper
-from wholearm.verification.verify import verify
 
 
 def pick(index: int) -> tuple[Problem, CosineMotion]:

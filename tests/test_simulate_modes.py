@@ -16,15 +16,11 @@ from planned import plan_landing
 from pushing import Push, Roll, evaluate, linear, pushed, rocking
 from stepping import march
 from tipping import POINTS, box, constant, falling, ramp, roll, tipped
+from wholearm import End, Friction, Phase, Problem, Scene, TorqueProfile, Until, simulate, verify
 from wholearm.common.arrays import Array
 from wholearm.contacts.closing import close_finger, place_flush
 from wholearm.contacts.formation import Formation, find_touching
-from wholearm.problem.definition import End, Phase, Problem, Until
-from wholearm.results.torque import TorqueProfile
-from wholearm.scene.model import Friction, Scene
 from wholearm.simulation.events import EventKind, OutcomeKind, Simulation
-from wholearm.simulation.simulate import simulate
-from wholearm.verification.verify import verify
 
 
 def test_replay_keeps_the_vertex_where_it_is() -> None:

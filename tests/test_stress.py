@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from shipped import HEPTAGON, tipping
+from wholearm import Friction, Phase, PlanOptions, Problem, Scene, Trajectory, load
 from wholearm.benchmark.stress.cell_curves import find_best, list_ends
 from wholearm.benchmark.stress.damage import look, run_file
 from wholearm.benchmark.stress.event_tracing import follow, resample, slides
@@ -21,16 +22,11 @@ from wholearm.benchmark.stress.stress_study import STUDY, compare_values
 from wholearm.common.arrays import Array
 from wholearm.contacts.formation import find_touching
 from wholearm.geometry.curve import Curve
-from wholearm.geometry.path_guess import load
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions, reduced_inertia
-from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.path_plan import plan_path
-from wholearm.problem.definition import Phase, Problem
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.problem.table import write_toml
-from wholearm.results.trajectory import Trajectory
-from wholearm.scene.model import Friction, Scene
 
 
 def test_a_scene_is_drawn_alike_again_and_is_the_same_as_a_file() -> None:

@@ -14,17 +14,14 @@ import pytest
 from once import once
 from plane import measure_gaps, measure_slip, unbalance
 from shipped import HEPTAGON, IMPACTS, LANDING, plan_of, problem_of
+from wholearm import End, Formation, Plan, Problem, verify
 from wholearm.common.arrays import Array
-from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import metric_weights
 from wholearm.mechanics.impact import compute_impact
 from wholearm.planning.plan import solve
-from wholearm.planning.result import Plan
-from wholearm.problem.definition import End, Problem
 from wholearm.problem.read import build_problem
 from wholearm.results.trajectory import Samples, Trajectory
-from wholearm.verification.verify import verify
 
 PARTS = {"time": (0, 2), "effort": (1, 4)}
 """Phases that are planned: one impact; another, and a stop where no impact is possible."""

@@ -21,16 +21,14 @@ from plane import (
     rotate,
 )
 from tipping import roll, tip
+from wholearm import InputError, Problem, Scene, Until
 from wholearm.common.arrays import Array
-from wholearm.common.errors import InputError
 from wholearm.contacts.closing import close_finger, place_flush
 from wholearm.contacts.formation import Formation, find_touching
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_curve, trace_phases
 from wholearm.mechanics.dynamics import metric_weights
-from wholearm.problem.definition import Problem, Until
 from wholearm.problem.read import build_problem
-from wholearm.scene.model import Scene
 
 NEVER = Until(coordinate="x", value=9.0)
 

@@ -17,15 +17,14 @@ from plane import make_formation, make_scene
 from planned import brake_less, change, plan, plan_landing
 from shipped import BOX, HEPTAGON, plan_of, problem_of
 from tipping import PALM, box, scale, tipped
+from wholearm import Formation, Friction, PlanOptions, Problem, Report, Scene, simulate
 from wholearm.benchmark.stress.plan_check import check_plan as check_again
 from wholearm.benchmark.stress.plan_check import check_rates
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, JammingError, ReplayError
-from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning import replay_check as self_check
 from wholearm.planning.blocks import Planning, plan_blocks
-from wholearm.planning.options import PlanOptions
 from wholearm.planning.replay_check import (
     RESIDUAL,
     ReplayCheck,
@@ -34,13 +33,9 @@ from wholearm.planning.replay_check import (
     replay_plan,
 )
 from wholearm.planning.table_check import make_table, sample_table
-from wholearm.problem.definition import Problem
 from wholearm.results.plan_record import ReplayFigures
-from wholearm.results.report import Report
 from wholearm.results.torque import TorqueProfile, read_rows
 from wholearm.results.trajectory import Motion, Samples, Trajectory
-from wholearm.scene.model import Friction, Scene
-from wholearm.simulation.simulate import simulate
 from wholearm.verification.newton_euler import BODIES, Balance, balance
 from wholearm.verification.verdict import Allowance, find_least_force
 from wholearm.verification.verify import find_lowest, list_normal_forces, verify

@@ -11,12 +11,11 @@ import numpy as np
 from scipy.integrate import quad
 
 from plane import make_scene, rotate
+from wholearm import End, Friction, Phase, Problem, Scene, Until
 from wholearm.common.arrays import Array
 from wholearm.contacts.closing import close_finger, place_flush
 from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation, find_touching
-from wholearm.problem.definition import End, Phase, Problem, Until
-from wholearm.scene.model import Friction, Scene
 
 HALF = 0.03
 """Half a side of the square [m]."""

@@ -14,17 +14,15 @@ from scipy.integrate import solve_ivp
 from once import once
 from plane import accelerate
 from shipped import LANDING, plan_of, problem_of
+from wholearm import Formation, PlanOptions, Problem
 from wholearm.common.arrays import Array
-from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions
-from wholearm.planning.options import PlanOptions
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.time_domain.collocation import Scheme
 from wholearm.planning.time_domain.stage import StagePoints
 from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion
 from wholearm.planning.time_domain.time_plan import plan_phases
-from wholearm.problem.definition import Problem
 
 
 def landing() -> Problem:

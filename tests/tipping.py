@@ -9,14 +9,10 @@ import numpy as np
 
 from plane import make_formation, make_scene, rotate
 from shipped import BOX, plan_of, problem_of
+from wholearm import Formation, Friction, Phase, Problem, Scene, TorqueProfile, Trajectory, Until
 from wholearm.common.arrays import Array
-from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
-from wholearm.problem.definition import Phase, Problem, Until
-from wholearm.results.torque import TorqueProfile
-from wholearm.results.trajectory import Trajectory
-from wholearm.scene.model import Friction, Scene
 
 POINTS = [[-0.02, -0.05], [0.02, -0.05], [0.02, 0.05], [-0.02, 0.05]]
 """A slender box; fallen over vertex 1, its centroid is ever farther right of it."""
