@@ -19,7 +19,7 @@ from wholearm.problem.table import describe_scene
 from wholearm.results.dwell_record import change_torques, find_change_times
 from wholearm.results.torque import TorqueProfile, read_torque_csv
 from wholearm.simulation.events import EventKind, OutcomeKind
-from wholearm.simulation.tolerances import find_tolerances
+from wholearm.simulation.tolerances import REST_WINDOW
 from wholearm.verification.verify import describe_motors, find_commands
 
 
@@ -94,7 +94,7 @@ def test_breaks_just_before_the_end_of_a_phase_do_not_end_it(slow: tuple[Problem
     found = simulate(problem, dense)
     assert found.outcome.kind is OutcomeKind.GOAL_REACHED
     came = next(event.time for event in found.events if event.kind is EventKind.ARRIVAL)
-    assert came == pytest.approx(first, abs=find_tolerances(problem.scene).rest_window)
+    assert came == pytest.approx(first, abs=REST_WINDOW * problem.scene.scales.time)
 
 
 def test_a_phase_that_ends_early_keeps_its_torques_until_it_was_to_end(

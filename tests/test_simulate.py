@@ -49,10 +49,11 @@ from wholearm.scene.model import Finger, Friction, Scene
 from wholearm.simulation import runge_kutta
 from wholearm.simulation.events import Event, EventKind, OutcomeKind, Simulation
 from wholearm.simulation.hand import build_system
-from wholearm.simulation.modes import Grips, Mode, ModeRows, respond
+from wholearm.simulation.modes import Grips, Mode, respond
 from wholearm.simulation.rest import Collapse, close_contacts, find_rest
 from wholearm.simulation.root_finding import find_root
 from wholearm.simulation.stepper import Modes, ModeStepper, build_stepper
+from wholearm.simulation.system import ContactRows
 
 
 def pick(index: int) -> tuple[Problem, CosineMotion]:
@@ -522,7 +523,7 @@ def test_rates_are_those_of_the_formations_own_rows(grips: Grips) -> None:
         turn = 1e-7 * v
         ahead, back = (formation.evaluate((z + k * turn)[None], v[None]) for k in (1, -1))
         bends = (ahead.A_t[0] - back.A_t[0]) @ v / 2e-7
-        rows = ModeRows(kinematics.A[0], kinematics.A_t[0], kinematics.A_dot_v[0], bends)
+        rows = ContactRows(kinematics.A[0], kinematics.A_t[0], kinematics.A_dot_v[0], bends)
         response = respond(mode, signs, rows, v)
         assert response is not None
         load = np.array([1.0, *tau])

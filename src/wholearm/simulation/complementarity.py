@@ -85,8 +85,8 @@ class View(NamedTuple):
 
     out: Array  # outputs at its end
     values: Array  # those of the steps, then ranges of kept pairs: positive until an event
-    times: Array  # (m,) [s]: instants since its start
-    gaps: Array  # gaps, ranges (m, N) [m]: of all pairs then
+    times: Array  # (m + 1,) [s]: instants since its start, which is the first
+    gaps: Array  # gaps, ranges (m + 1, N) [m]: of all pairs then
     ranges: Array
 
 
@@ -413,7 +413,10 @@ class FreeRun(Run):
             starts = [self.resting and not self._is_still(free + a.change) for a in answers]
             away = [sum(a != b for a, b in zip(one, last, strict=True)) for one in modes]
             return answers[min(range(len(answers)), key=lambda k: (starts[k], away[k]))]
-        return self._answer(problem, last, pattern.describe(before))
+        likely = last, pattern.describe(before)
+        if answers and pattern.describe(answers[0]) in likely:
+            return answers[0]
+        return self._answer(problem, *likely)
 
     def _note_changes(self, closed: Sequence[int], modes: Modes, rests: bool) -> None:
         """Record what changes."""
@@ -557,19 +560,20 @@ class FreeRun(Run):
         s, n, out = self.s, self.system.n, self.s.outputs.copy()
         gaps, ranges = self.system.look(out[:n])
         values = self._list_values(ranges)
-        count = 1
-        if h > 0:
-            gone = np.abs(out[: 2 * n] - self.start.out[: 2 * n])
-            count += int(LOOKS * min(1.0, self._measure(gone[:n] + h * gone[n:]) / REACH))
-        times, gaps, ranges = h * np.arange(1, count + 1) / count, gaps[None], ranges[None]
+        if h == 0:
+            return View(out, values, np.zeros(1), gaps[None], ranges[None])
+        start = self.start
+        gone = np.abs(out[: 2 * n] - start.out[: 2 * n])
+        count = 1 + int(LOOKS * min(1.0, self._measure(gone[:n] + h * gone[n:]) / REACH))
+        times = h * np.arange(count + 1) / count
+        seen = [(start.gaps[-1:], start.ranges[-1:]), (gaps[None], ranges[None])]
         if count > 1:
-            ends = np.array([self.start.out, out])
+            ends = np.array([start.out, out])
             knots = ends[:, :n], ends[:, n : 2 * n], ends[:, s.to.acceleration]
             first = np.zeros(count - 1, dtype=np.int64)
-            z = interpolate_quintic(np.full(count - 1, h), times[:-1], knots, first)[0]
-            more = self.system.measure(z)
-            gaps, ranges = np.vstack([more[0], gaps]), np.vstack([more[1], ranges])
-        return View(out, values, times, gaps, ranges)
+            z = interpolate_quintic(np.full(count - 1, h), times[1:-1], knots, first)[0]
+            seen.insert(1, self.system.measure(z))
+        return View(out, values, times, *map(np.concatenate, zip(*seen, strict=True)))
 
     def happens(self) -> bool:
         """Whether an event value of the steps, or a range, is negative after the step just made."""
@@ -687,31 +691,24 @@ class FreeRun(Run):
         out = self.s.outputs
         return root if self._face(out[:n], out[n : 2 * n])[1][pair] else None
 
-    def _list_bounds(self) -> tuple[Array, Array, Array]:
-        """Gaps and ranges at the beginning of each part of a step, (m, N) each, and its time."""
-        start, end = self.start, self.end
-        gaps = np.vstack([start.gaps[-1:], end.gaps[:-1]])
-        return gaps, np.vstack([start.ranges[-1:], end.ranges[:-1]]), np.append(0.0, end.times[:-1])
-
     def _find_closing(self, passed: set[int]) -> Closing | None:
         """The first pair that closes within the step, and a bracket of when."""
         end, armed = self.end, self.armed[None]
-        if len(end.times) > 1:
+        if len(end.times) > 2:
             # What comes apart within the step may close again within it.
-            apart = end.gaps[:-1] > ARMED * self.unit
+            apart = end.gaps[1:-1] > ARMED * self.unit
             armed = np.logical_or.accumulate(np.vstack([armed, apart]), axis=0)
         level = np.where(armed, 0.0, self.level)
-        below = (end.gaps < level) & self.watched
-        if not np.count_nonzero(below):
-            return None
-        gaps, ranges, times = self._list_bounds()
-        crosses = below & (gaps >= level) & (np.maximum(end.ranges, ranges) > -1e-3 * self.unit)
+        crosses = (end.gaps[1:] < level) & (end.gaps[:-1] >= level) & self.watched
         crosses[:, list(passed)] = False
-        rows, pairs = np.nonzero(crosses)
+        if not np.count_nonzero(crosses):
+            return None
+        crosses &= np.maximum(end.ranges[1:], end.ranges[:-1]) > -1e-3 * self.unit
+        rows, pairs = crosses.nonzero()
         if not len(rows):
             return None
         row, pair = int(rows[0]), int(pairs[0])
-        return Closing(pair, float(level[row, pair]), float(times[row]), float(end.times[row]))
+        return Closing(pair, float(level[row, pair]), *end.times[row : row + 2].tolist())
 
     def _find_entering(self, passed: set[int]) -> Closing | None:
         """The first pair that comes into range apart or touching, and overlaps after that.
@@ -719,17 +716,16 @@ class FreeRun(Run):
         Out of range a gap has no meaning and may be negative throughout.
         """
         end = self.end
-        overlaps = (end.ranges > 0) & (end.gaps < -CLOSED * self.unit) & self.watched
-        if not np.count_nonzero(overlaps):
+        turns = (end.ranges[1:] > 0) & (end.ranges[:-1] <= 0) & self.watched
+        if not np.count_nonzero(turns):
             return None
-        _, ranges, times = self._list_bounds()
-        turns = overlaps & (ranges <= 0) & (end.gaps > -REACH * self.unit)
+        turns &= (end.gaps[1:] < -CLOSED * self.unit) & (end.gaps[1:] > -REACH * self.unit)
         turns[:, list(passed)] = False
         h = float(self.s.inputs[self.s.at.h])
         try:
             for row, pair in zip(*(part.tolist() for part in turns.nonzero()), strict=True):
-                left, right = float(times[row]), float(end.times[row])
-                entry = self._find_entry(pair, left, right, -float(ranges[row, pair]))
+                left, right = end.times[row : row + 2].tolist()
+                entry = self._find_entry(pair, left, right, -float(end.ranges[row, pair]))
                 gap = self._find_gap(entry, pair)
                 if gap > -SUNK * self.unit:
                     return Closing(pair, min(gap, 0.0) - 0.5 * CLOSED * self.unit, entry, right)

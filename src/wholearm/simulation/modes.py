@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..contacts.formation import Formation
+from .system import ContactRows
 
 INDEPENDENT = 1e-9  # least singular value of normalized constraints that are independent
 
@@ -138,13 +139,15 @@ def share_mode(formation: Formation, grips: Grips = FREE) -> Mode:
     return Mode(formation, grips)
 
 
-class ModeRows(NamedTuple):
-    """Constraint rows at one state."""
+def evaluate_rows(formation: Formation, z: Array, v: Array) -> ContactRows:
+    """Constraint rows of a formation at one state."""
+    at = _roll_all(formation).evaluate(z[None], v[None])
+    return ContactRows(at.A[0], at.A_t[0], *np.split(at.P_dot_v[0], 2))
 
-    A: Array  # A, A_t (n_c, 5):
-    A_t: Array
-    A_dot_v: Array  # A_dot_v, A_t_dot_v (n_c,):
-    A_t_dot_v: Array
+
+@lru_cache(maxsize=64)
+def _roll_all(formation: Formation) -> Formation:
+    return replace(formation, rolling=formation.contacts)
 
 
 class Response(NamedTuple):
@@ -157,7 +160,7 @@ class Response(NamedTuple):
     ratio: float  # reduced inertia over that without friction; jammed at zero and below
 
 
-def respond(mode: Mode, signs: Array, rows: ModeRows, v: Array) -> Response | None:
+def respond(mode: Mode, signs: Array, rows: ContactRows, v: Array) -> Response | None:
     """Solve the equations of motion at velocity v, (5,); None for dependent constraints.
 
     `signs`, (n_c + 2,), are those of contacts and joints, zero for what is held or rolls.
@@ -167,13 +170,13 @@ def respond(mode: Mode, signs: Array, rows: ModeRows, v: Array) -> Response | No
     joints = [3 + joint for joint in mode.grips.joints]
     slip = mode.rolled.sliding_friction * signs[:count]
     P: Array = rows.A
-    bend: Array = rows.A_dot_v
+    bend: Array = rows.bend
     G: Array = rows.A - slip[:, None] * rows.A_t
     inverse_mass = 1 / scene.mass_diagonal
     if rolling or joints:
         held = np.vstack([rows.A_t[rolling], np.eye(5)[joints]])
         P, G = np.vstack([P, held]), np.vstack([G, held])
-        bend = np.concatenate([bend, rows.A_t_dot_v[rolling], np.zeros(len(joints))])
+        bend = np.concatenate([bend, rows.bend_t[rolling], np.zeros(len(joints))])
     if mode.grips:
         lines = P * np.sqrt(inverse_mass)
         lines /= np.linalg.norm(lines, axis=1)[:, None]
@@ -193,7 +196,7 @@ def respond(mode: Mode, signs: Array, rows: ModeRows, v: Array) -> Response | No
         c = np.asarray(np.linalg.solve(K, right), dtype=float)
     acceleration = inverse_mass[:, None] * (applied + G.T @ c)
     rates = np.vstack([rows.A_t @ acceleration, acceleration[3:]])
-    rates[:count, 0] += rows.A_t_dot_v
+    rates[:count, 0] += rows.bend_t
     H, h = mode.force_limit_rows
     force_limits = H @ c
     force_limits[:, 0] += h

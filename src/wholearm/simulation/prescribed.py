@@ -41,16 +41,19 @@ from .sliding_signs import choose_mode, measure_rates, note_change
 from .stepper import Modes, ModeStepper
 from .tolerances import (
     CREEPING,
+    FIRST_STEP,
+    LONGEST_WINDOW,
     PASSED,
     REACHED,
+    REST_WINDOW,
     ROUNDING_FORCE,
     ROUNDING_LIMIT,
     ROUNDING_SPEED,
     SETTLING,
     SHORT,
+    SHORTEST_STEP,
     SLOW,
     STANDING,
-    find_tolerances,
     is_slower,
     measure_units,
     measure_until,
@@ -202,6 +205,8 @@ class Replay(Run):
 
     Attributes
     ----------
+    settling, rest_window, longest_window, shortest_step : [s], rounding : [N]
+                             see the constants of these names
     has_slid                 whether contacts that come to rest have slid in the phase
     slip_signs               signs of contacts, by name, that have just begun to slip
     side                     sign of (coordinate - value) before the end of the phase
@@ -226,7 +231,10 @@ class Replay(Run):
     ) -> None:
         system = build_system(problem.scene)
         super().__init__(system, torque, np.asarray(problem.start), np.zeros(5), tolerance, wanted)
-        self.problem, self.tolerances = problem, find_tolerances(problem.scene)
+        self.problem, time = problem, system.scales.time
+        self.settling, self.rest_window = SETTLING * time, REST_WINDOW * time
+        self.longest_window, self.shortest_step = LONGEST_WINDOW * time, SHORTEST_STEP * time
+        self.rounding = ROUNDING_FORCE * system.scales.force
         parts = torque.coefficients
         steps = find_torque_steps(parts[:-1], parts[1:], system)
         self.steps_at: list[bool] = [True, *steps.tolist()]
@@ -347,11 +355,11 @@ class Replay(Run):
         """Whether the last two records are of the same instant of one phase, but for rounding."""
         last = self.records[-2:]
         same = len(last) > 1 and last[0].phase == last[1].phase == self.phase.index
-        return same and self.t - last[0].t <= self.tolerances.settling
+        return same and self.t - last[0].t <= self.settling
 
     def lose(self, contact: str, c_n: float) -> Outcome:
         """End because `contact` would have to pull."""
-        how = "to zero" if c_n > -1e3 * self.tolerances.force else f"to {c_n:.3g} N"
+        how = "to zero" if c_n > -1e3 * self.rounding else f"to {c_n:.3g} N"
         text = f"c_n of {contact} falls {how} {self.when()}"
         self.note(EventKind.CONTACT_LOST, text, contact, c_n)
         return Outcome(OutcomeKind.CONTACT_LOST, text)
@@ -359,7 +367,7 @@ class Replay(Run):
     def fail_by_slip(self, row: int, c_n: float, c_t: float) -> Outcome:
         """End because a rolling contact slips: the `row`-th of the formation, with forces in N."""
         name, bound = self.formation.names[row], self.formation.friction[row] * c_n
-        how = "exceeds" if abs(c_t) - bound > 1e3 * self.tolerances.force else "reaches"
+        how = "exceeds" if abs(c_t) - bound > 1e3 * self.rounding else "reaches"
         text = f"{name} slips: |c_t| = {abs(c_t):.5g} N {how} mu c_n = {bound:.5g} N {self.when()}"
         self.note(EventKind.SLIP, text, name, bound - abs(c_t))
         return Outcome(OutcomeKind.SLIPS, text)
@@ -440,7 +448,7 @@ class Replay(Run):
                 self.note(EventKind.START, f"the object starts to move {self.when()}")
                 self.set_off(ending)
                 ending = self.move()
-                brief = brief + 1 if self.t - started < 100 * self.tolerances.shortest_step else 0
+                brief = brief + 1 if self.t - started < 100 * self.shortest_step else 0
                 if brief > 20:
                     raise SimulationError(f"starting and stopping do not end {self.where()}")
         if isinstance(ending, Outcome):
@@ -480,7 +488,7 @@ class Replay(Run):
             early = self.breaks[self.piece] < self.t < self.stop
             remaining = arrival.remaining if early else 0.0
             self.held_until = max(self.held_until, min(self.t + remaining, self.breaks[-1]))
-            self.settled_by = self.held_until + self.tolerances.rest_window
+            self.settled_by = self.held_until + self.rest_window
         return None
 
     def _rest(self) -> StartDeparture | Arrival | Released | Switched | Outcome:
@@ -489,7 +497,7 @@ class Replay(Run):
         self.look()
         self.record(still=True)
         if self.is_there():
-            return Arrival(0.0, self.tolerances.rest_window)
+            return Arrival(0.0, self.rest_window)
         rest = find_rest(self.formation, self.z)
         sticks = False
         while True:
@@ -510,7 +518,7 @@ class Replay(Run):
                     # Balance may be lost where the torques are about to step or to be the next
                     # phase's.
                     t = self.time(change.x)
-                    soon = self.coming_step - t <= self.tolerances.rest_window
+                    soon = self.coming_step - t <= self.rest_window
                     if not (t < self.settled_by or soon or self._touches()):
                         return self._collapse(rest, change)
             if self.t < self.settled_by < self.stop:
@@ -555,7 +563,7 @@ class Replay(Run):
 
     def move(self) -> Ending:
         """Integrate until the motion rests, arrives, releases its contacts or fails."""
-        self.h = min(self.h, self.tolerances.first_step)
+        self.h = min(self.h, FIRST_STEP * self.system.scales.time)
         ending: Ending = super().move()
         return ending
 
@@ -600,7 +608,7 @@ class Replay(Run):
             return False
         if coming + 1 >= len(self.breaks) or self.steps_at[coming]:
             return False
-        late = 2 * self._time_to_stop() > self.tolerances.rest_window
+        late = 2 * self._time_to_stop() > self.rest_window
         return late and self._measure_rate() < -CREEPING
 
     def pass_break(self) -> Ending | None:
@@ -609,7 +617,7 @@ class Replay(Run):
             rate, strikes = -self.rate, self._strikes()
             # Before a step that is still to come, the torques are those of the phase that ends.
             stepped = self.next_piece()
-            window = self.tolerances.settling if stepped else self.tolerances.rest_window
+            window = self.settling if stepped else self.rest_window
             return Arrival(rate, window, strikes)
         if self.t >= self.breaks[-1]:
             return self.run_out()
@@ -646,9 +654,9 @@ class Replay(Run):
         """The end of the phase is reached while moving."""
         # A planned motion that comes this early by its error would have stopped v / a later.
         stopping = 2 * self._time_to_stop()
-        remaining = min(stopping, self.tolerances.longest_window) if stopping < math.inf else 0.0
+        remaining = min(stopping, self.longest_window) if stopping < math.inf else 0.0
         slow = abs(self._measure_rate()) < SLOW
-        window = max(remaining, self.tolerances.settling) if slow else remaining
+        window = max(remaining, self.settling) if slow else remaining
         return Arrival(-self.rate, window, remaining=remaining)
 
     def _measure_rate(self) -> float:
@@ -669,17 +677,17 @@ class Replay(Run):
 
     def _pass_on(self) -> Arrival:
         """The end of a phase is passed; the torques of the next one may still have to come."""
-        window = settling = self.tolerances.settling
+        window = settling = self.settling
         rate, strikes = -self.rate, self.phase.end is End.IMPACT
         if self.passes and rate > 0:
             # A motion that is off by rounding comes the earlier the slower it is.
             early = PASSED * self.until_unit / rate
-            window = min(max(early, settling), self.tolerances.longest_window)
+            window = min(max(early, settling), self.longest_window)
         elif self.phase.until.contact is not None and not strikes:
             self.step_to(settling)
             slowing = (self.rate + rate) / settling
             if slowing > 0:
-                window = min(max(2 * rate / slowing, settling), self.tolerances.longest_window)
+                window = min(max(2 * rate / slowing, settling), self.longest_window)
         if self.steps_within(window):
             self.coast_to_step(hide=False)
         return Arrival(rate, window, strikes)
@@ -839,13 +847,13 @@ class Replay(Run):
         if not enters and self.resting and self.resting <= self.stuck:
             # A planned motion may all but come to rest a little before the torques step; until they
             # do it may slip and stick again.
-            window = min(self.tolerances.longest_window, self.t - self.last_step)
+            window = min(self.longest_window, self.t - self.last_step)
             rested = self.resting <= stuck
             if self.has_slid if rested else not self.steps_within(window):
                 return self._hold()
             self.has_slid |= not rested
         slipping = {holders[k][0] for k in self.find_slipping()}
-        pulling = np.flatnonzero(s.outputs[s.to.c_n] < -self.tolerances.force)
+        pulling = np.flatnonzero(s.outputs[s.to.c_n] < -self.rounding)
         # Whether anything pulls where a contact slips by plan, its next formation says.
         if len(pulling) and not slipping & self.slipping:
             return self.let_go(pulling.tolist())
@@ -935,7 +943,7 @@ class Replay(Run):
 
     def turn(self, events: Sequence[int]) -> Ending | None:
         """Go on where contacts or joints have come to rest; None if the motion goes on."""
-        now, window = self.t, self.tolerances.rest_window
+        now, window = self.t, self.rest_window
         # With two freedoms the last speeds fall to zero one after the other by rounding.
         if (
             self.formation.n_constraints < 4
@@ -945,7 +953,7 @@ class Replay(Run):
             and self.stop - now <= window
         ):
             return Arrival(-self.rate, window)
-        if self.steps_within(self.tolerances.settling):
+        if self.steps_within(self.settling):
             self._finish_piece()
         return self.restart(self._find_turning(events), time=now)
 
@@ -988,14 +996,14 @@ class Replay(Run):
     def _bridge(self) -> bool:
         """Integrate from a reversal to its torque step, unrecorded; whether motion has ended."""
         rows: list[int] = []
-        if self.steps_within(self.tolerances.settling):
+        if self.steps_within(self.settling):
             self.records.pop()
             self._finish_piece()
         elif self._goes_on():
             return False
         else:
             start = self.values
-            stretch = min(self.tolerances.settling, self.stop - self.t)
+            stretch = min(self.settling, self.stop - self.t)
             self.step_to(stretch)
             rows = self._find_turning(self.find_first(start, stretch, self.leg.rows.turning))
             if not rows:
@@ -1041,7 +1049,7 @@ class Replay(Run):
                 self.step_to(step)
                 return float(self.values[place] + shift[place])
 
-            near = 1e-2 * self.tolerances.shortest_step
+            near = 1e-2 * self.shortest_step
             h = find_root(value, h, float(before[k]), float(after[k]), near, 1e-3 * float(slack[k]))
             done.append(k)
             if h != self.s.inputs[self.s.at.h]:

@@ -26,8 +26,10 @@ from ..contacts.cones import find_weakest
 from ..contacts.formation import Formation
 from ..mechanics.dynamics import Directions
 from ..mechanics.statics import StaticTorques, find_pulls, find_static_torques
-from .modes import ModeRows, find_grips, list_units, respond, share_mode
-from .tolerances import ROUNDING_FORCE, find_tolerances, measure_units
+from ..scene.model import Scene
+from .modes import find_grips, list_units, respond, share_mode
+from .system import ContactRows
+from .tolerances import CLOSING, ROUNDING_FORCE, STILL, measure_units
 
 BALANCED = 1e-6  # distance beyond torques that can be held that counts as none, over the scene's
 _CLOSED = 3e-15  # gap that counts as rounding, relative to the scene's length
@@ -86,7 +88,7 @@ class StartMode(NamedTuple):
 
     def slides(self, tau: Array) -> bool:
         """Whether the formation accelerates in this mode if every contact can press or pull."""
-        load, least = np.array([1.0, *tau]), find_tolerances(self.touching.formation.scene).drive
+        load, least = np.array([1.0, *tau]), _measure_drive(self.touching.formation.scene)
         return (
             self.ratio > 0
             and self.drive(tau) > least
@@ -186,10 +188,10 @@ class Rest:
         return Touching(self.formation, self.z, self.near)
 
     @cached_property
-    def _rows(self) -> ModeRows:
+    def _rows(self) -> ContactRows:
         kinematics = self.formation.evaluate(self.z[None], np.zeros((1, 5)))
         none = np.zeros(self.formation.n_contacts)
-        return ModeRows(kinematics.A[0], kinematics.A_t[0], none, none)
+        return ContactRows(kinematics.A[0], kinematics.A_t[0], none, none)
 
     def _list_patterns(self, held: bool) -> Iterator[StartMode]:
         """Start modes with more freedoms: only those with sticking, or only the others."""
@@ -231,16 +233,16 @@ class Rest:
             return None
         declared = np.array([mode.declares(k) for k in range(len(mode.holders))] * 2, dtype=bool)
         kept = np.concatenate([np.ones(count, dtype=bool), declared])
-        tolerances, length = find_tolerances(scene), scene.scales.length
+        scales, length = scene.scales, scene.scales.length
         slips = signs[:, None] * response.rates
         graze = _GRAZE * np.repeat([1.0, length], [count, 2]) @ slips
         openings = self._others.gradient @ response.acceleration + graze
-        still = np.repeat([tolerances.still, tolerances.still_joint], [count, 2])
-        closing = np.full(len(openings), tolerances.closing)
+        still = STILL * np.repeat([scales.acceleration, 1 / scales.time**2], [count, 2])
+        closing = np.full(len(openings), CLOSING * scales.acceleration)
         if heading is not None:
             # All accelerations are multiples of this one.
             slips = (heading * scene.mass_diagonal @ response.acceleration)[None]
-            still, closing = np.array([-tolerances.drive]), np.zeros(len(openings))
+            still, closing = np.array([-_measure_drive(scene)]), np.zeros(len(openings))
         rounding = ROUNDING_FORCE * mode.force_limit_units
         return StartMode(
             directions=Directions(signs[:count], signs[count:]),
@@ -263,7 +265,7 @@ class Rest:
             if mode.moves(tau):
                 return mode.depart(x, tau)
         loss = self._find_loss(coefficients, x)
-        least = _CLEAR * find_tolerances(self.formation.scene).drive
+        least = _CLEAR * _measure_drive(self.formation.scene)
         margins = [mode.margins for mode in self.modes]
         rows = np.vstack(margins)
         first = np.cumsum([0, *(len(part) for part in margins[:-1])])
@@ -330,6 +332,11 @@ def _find_rates(formation: Formation, z: Array, step: float, heading: Array) -> 
     lift = inverse_mass[:, None] * P.T
     tangent = heading - lift @ np.linalg.solve(P @ lift, P @ heading)
     return np.concatenate([kinematics.A_t[0] @ tangent, tangent[3:]])
+
+
+def _measure_drive(scene: Scene) -> float:
+    """Acceleration in the metric M5 that counts as rounding [kg^(1/2) m/s^2]."""
+    return STILL * float(scene.scales.mass**0.5) * scene.scales.acceleration
 
 
 def _evaluate(coefficients: Array, x: float | Array) -> Array:

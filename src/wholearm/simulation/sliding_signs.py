@@ -15,8 +15,6 @@ for as long as any friction is. It counts as stuck.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from functools import lru_cache
 from itertools import product
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -25,10 +23,9 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..common.errors import JammingError, SimulationError
-from ..contacts.formation import Formation
 from ..scene.model import Scene
 from .events import describe_change
-from .modes import Mode, ModeRows, Unit, find_fixed, find_grips, list_units, respond
+from .modes import Mode, Unit, evaluate_rows, find_fixed, find_grips, list_units, respond
 from .tolerances import ROUNDING_FORCE, STANDING, is_slower
 
 if TYPE_CHECKING:
@@ -119,7 +116,7 @@ def _choose(
     run: Replay, signs: Array, still: Sequence[Unit], orders: Sequence[tuple[float, ...]]
 ) -> Choice:
     """Signs of the first clear combination or of the best; `JammingError` if none is consistent."""
-    formation, scales, ahead = run.formation, run.system.scales, run.tolerances.settling
+    formation, scales, ahead = run.formation, run.system.scales, run.settling
     loads = [np.array([1.0, *run.tau(t)]) for t in (run.t, run.t + ahead)]
     present, count, ratios = evaluate_rows(formation, run.z, run.v), formation.n_contacts, [1.0]
 
@@ -176,18 +173,6 @@ def _choose(
     raise JammingError(
         f"{names} jams {run.where()}: no combination of sliding and sticking is consistent"
     )
-
-
-def evaluate_rows(formation: Formation, z: Array, v: Array) -> ModeRows:
-    """Constraint rows of a formation at one state."""
-    kinematics = _roll_all(formation).evaluate(z[None], v[None])
-    normal, tangential = np.split(kinematics.P_dot_v[0], 2)
-    return ModeRows(kinematics.A[0], kinematics.A_t[0], normal, tangential)
-
-
-@lru_cache(maxsize=64)
-def _roll_all(formation: Formation) -> Formation:
-    return replace(formation, rolling=formation.contacts)
 
 
 def _take(run: Replay, signs: Array, still: Sequence[Unit]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
@@ -28,41 +27,6 @@ SHORTEST_STEP = 1e-13  # underflow of a step, over the scene's time and the elap
 STEP_OF_TORQUE = 2e-8  # jump of the torques at a break that counts as one
 STILL = 1e-10  # acceleration that counts as rounding
 CLOSING = 1e-7  # acceleration of a gap that is rounding: a difference quotient
-
-
-class Tolerances(NamedTuple):
-    """Some tolerances of a scene in SI units; see the constants of the same names."""
-
-    force: float  # [N]: rounding
-    limit: float  # [m]: rounding
-    settling: float  # settling, rest_window, longest_window, first_step, shortest_step [s]:
-    rest_window: float
-    longest_window: float
-    first_step: float
-    shortest_step: float
-    drive: float  # [kg^(1/2) m/s^2]: `STILL`, in the metric M5
-    still: float  # still, still_joint, closing [m/s^2], [rad/s^2], [m/s^2]:
-    still_joint: float
-    closing: float
-
-
-@lru_cache(maxsize=64)
-def find_tolerances(scene: Scene) -> Tolerances:
-    """The tolerances of a scene."""
-    scales = scene.scales
-    return Tolerances(
-        force=ROUNDING_FORCE * scales.force,
-        limit=ROUNDING_LIMIT * scales.length,
-        settling=SETTLING * scales.time,
-        rest_window=REST_WINDOW * scales.time,
-        longest_window=LONGEST_WINDOW * scales.time,
-        first_step=FIRST_STEP * scales.time,
-        shortest_step=SHORTEST_STEP * scales.time,
-        drive=STILL * scales.mass**0.5 * scales.acceleration,
-        still=STILL * scales.acceleration,
-        still_joint=STILL / scales.time**2,
-        closing=CLOSING * scales.acceleration,
-    )
 
 
 @lru_cache(maxsize=64)

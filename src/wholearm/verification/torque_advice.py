@@ -21,9 +21,9 @@ from ..mechanics.statics import find_holding_change
 from ..problem.definition import Phase, Problem
 from ..results.report import Approach, ForceAt, Loss, PhaseReport, TorqueAdvice, TuningHelp
 from ..simulation.events import EventKind, Simulation
-from ..simulation.modes import find_grips, list_units, respond, share_mode
+from ..simulation.modes import evaluate_rows, find_grips, list_units, respond, share_mode
 from ..simulation.rest import StartMode, find_rest
-from ..simulation.sliding_signs import evaluate_rows, measure_rates
+from ..simulation.sliding_signs import measure_rates
 from .verdict import Allowance
 from .verify import find_lowest
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, Literal, NamedTuple, overload
 
@@ -100,18 +100,20 @@ def verify(
 ) -> Report: ...
 @overload
 def verify(
-    problem: Problem,
-    what: Torques,
-    *,
-    contacts: Literal["free"],
-    tolerance: float = 1e-9,
-    departure: float = DEPARTURE,
-    restitution: float = 0.0,
-    progress: Callable[[str], None] | None = None,
+    problem: Problem, what: Torques, *, contacts: Literal["free"], **options: Any
 ) -> FreeReport: ...
 @exclusive
 def verify(
-    problem: Problem, what: Torques, *, contacts: str = "prescribed", **options: Any
+    problem: Problem,
+    what: Torques,
+    *,
+    contacts: str = "prescribed",
+    tolerance: float = 1e-9,
+    departure: float = DEPARTURE,
+    rest_speed: float = REST_SPEED,
+    uniqueness_margin: float = UNIQUENESS_MARGIN,
+    reduced: bool = False,
+    **options: Any,
 ) -> Report | FreeReport:
     """Simulate the torques of a plan, or given ones, open loop and report what happens.
 
@@ -140,21 +142,13 @@ def verify(
                                    number is out of its range
     JammingError, SimulationError  if the simulation cannot go on
     """
-    if contacts not in ("prescribed", "free"):
-        raise InputError("", "contacts", f"{contacts!r} given; known: prescribed, free")
-    return (verify_free if contacts == "free" else _verify)(problem, what, **options)
-
-
-def _verify(
-    problem: Problem,
-    what: Torques,
-    *,
-    tolerance: float = 1e-9,
-    departure: float = DEPARTURE,
-    rest_speed: float = REST_SPEED,
-    uniqueness_margin: float = UNIQUENESS_MARGIN,
-    reduced: bool = False,
-) -> Report:
+    if contacts == "free":
+        return verify_free(problem, what, tolerance=tolerance, departure=departure, **options)
+    if contacts != "prescribed" or options:
+        text = f"{contacts!r} given; known: prescribed, free"
+        raise InputError(
+            "", "contacts", f"{', '.join(options)} needs free ones" if options else text
+        )
     problem, torque, plan = adopt_torques(problem, what)
     allowance = Allowance(departure, rest_speed, uniqueness_margin=uniqueness_margin)
     require_same_contacts(problem, plan)
