@@ -35,8 +35,6 @@ WORK = {
     "vertices": ("reading", "map"),
 }
 """Kinds of work that are measured for each."""
-RADIUS = 0.05  # radius of the regular polygons [m]
-TURNS = (0.04, 0.045)  # places between which the phases go back and forth [m]
 FIELDS = {"seconds": "processor time [s]", "memory": "rise of memory [MB]"}
 """Quantities that are drawn, and their labels."""
 _LOOKS = {
@@ -125,7 +123,7 @@ def run_work(table: dict[str, Any], grows: str, work: str, size: int) -> None:
     (first, *_) = table["phases"]
     if grows == "vertices":
         angles = 2 * np.pi * np.arange(size) / size
-        corners = RADIUS * np.column_stack([np.cos(angles), np.sin(angles)])
+        corners = 0.05 * np.column_stack([np.cos(angles), np.sin(angles)])
         table = {**table, "object": {**table["object"], "vertices": corners.tolist()}}
         table |= {"start": {"flush": 0, "x": 0.0}, "fingers_collide": False}
         end = {"x": -0.01}
@@ -135,7 +133,7 @@ def run_work(table: dict[str, Any], grows: str, work: str, size: int) -> None:
             build_map(problem)
         return
     if grows == "phases":
-        ends = [{"x": TURNS[k % 2]} for k in range(size)]
+        ends = [{"x": (0.04, 0.045)[k % 2]} for k in range(size)]
         phases = [{"contacts": first["contacts"], "until": end} for end in ends]
         solve(build_problem({**table, "phases": phases}), replay=False)
         return

@@ -32,9 +32,7 @@ from .study import Case, Row, Study, format_table
 
 SHIPPED = ("heptagon", "hexagon", "square", "triangle")
 POLYGONS = 5  # random polygons, in the hexagon's hand
-RADIUS = 0.05  # of the circle that their vertices are near [m]
 ACROSS = 3.0  # largest x of a start or a goal, over the radius of gyration
-SECOND = 0.1  # how far the second query starts from the first one, over the radius of gyration
 TRIES = 200  # most routes that are drawn for one leg
 SLIDE = (0.1, 2.5)  # least and longest slide of a leg, over the radius of gyration
 CELL = ((-0.6, 1.0), (0.05, 0.5))
@@ -124,7 +122,7 @@ def draw_scene(seed: int, number: int, folder: Path) -> Table:
         rng = np.random.default_rng([seed, 1000 + kind])
         count = int(rng.integers(3, 8))
         angles = 2 * np.pi * (np.arange(count) + rng.uniform(-0.25, 0.25, count)) / count
-        corners = RADIUS * np.column_stack([np.cos(angles), np.sin(angles)])
+        corners = 0.05 * np.column_stack([np.cos(angles), np.sin(angles)])
         table["object"] = {"vertices": corners.round(4).tolist(), "mass": 0.2}
         table["name"] = f"polygon {kind - len(SHIPPED) + 1}"
     else:
@@ -158,7 +156,7 @@ def _draw_pose(rng: np.random.Generator, table: Table) -> dict[str, float]:
 
 def _move_goal(problem: Problem) -> Problem:
     """The problem with nearly the same goal."""
-    goal, step = problem.goals[0], SECOND * problem.scene.scales.length
+    goal, step = problem.goals[0], 0.1 * problem.scene.scales.length
     assert goal.x is not None
     table = {**problem.table, "goal": Goal(flush=goal.flush, x=goal.x + step).to_table()}
     return build_problem(table)

@@ -25,7 +25,6 @@ from ..solvers.ipopt import record_runs
 from .study import Case, Row, Study, format_table
 
 REPEATS = 3  # runs of which the medians are taken
-PUSHED = 0.03  # place that the object is pushed to by one finger or by both [m]
 AWAY = np.array([0.0, 0.0, 0.0, 0.0, 0.6])
 """Change of the start that turns an idle finger away [m, rad]."""
 COLUMNS = ("unknowns", "rows", "building", "solving")
@@ -115,7 +114,7 @@ def list_pairs(folder: str, **options: Any) -> list[SkipPair]:
     (phase,) = tip.phases
     sliding = replace(phase, formation=replace(phase.formation, rolling=()))
     slipping = replace(tip, phases=(sliding,))
-    both = replace(slide, phases=(replace(slide.phases[0], until=Until(None, "x", PUSHED)),))
+    both = replace(slide, phases=(replace(slide.phases[0], until=Until(None, "x", 0.03)),))
     held = both.phases[0].formation
     alone = replace(both.phases[0], formation=replace(held, contacts=held.contacts[:-1]))
     idle = replace(both, start=both.start + AWAY, phases=(alone,))

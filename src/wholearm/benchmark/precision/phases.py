@@ -37,7 +37,6 @@ REPEATS = 3  # largest number of runs that a median is of
 BUDGET = 0.3  # time after which a run is not repeated any more [s]
 SHIFT = 0.01  # shift of the geometric means [s]
 SHORT = 0.05  # time up to which something is done several times over, in about this time [s]
-MOST = 200  # largest number of times
 SOLVED = "solved"
 
 _Answer = TypeVar("_Answer")
@@ -243,7 +242,7 @@ def _time(work: Callable[[], _Answer]) -> tuple[float, _Answer]:
     wall, processor = time.perf_counter() - wall, time.process_time() - processor
     if wall > SHORT:
         return processor, answer
-    count = math.ceil(SHORT / max(wall, SHORT / MOST))
+    count = math.ceil(SHORT / max(wall, SHORT / 200))
     processor = time.process_time()
     for _ in range(count):
         work()

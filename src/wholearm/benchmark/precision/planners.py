@@ -49,8 +49,6 @@ from .simulators import check_plan
 
 LEAST_TIME, NO_DRAG = "least time", "least time without viscous friction"
 """Studies: all phases, and the same without viscous friction."""
-FINE = 1e-7
-"""Accuracy of a plan along a curve whose duration is the reference where there is no bound."""
 NEAR = 1e-7  # distance over the duration in which a step of the torques is that of a reversal
 APART = 1e-7  # distance of grid points from a reversal between them, over the curve's length
 TORQUE_NODES = 5  # instants in an interval that its torque's polynomial goes through
@@ -86,7 +84,7 @@ def find_least_time(instance: Instance) -> float:
     bound = bound_least_time((curve,), epsilon)
     if bound is not None:
         return bound.value
-    return plan_path(curve, epsilon, PlanOptions(accuracy=FINE), 1).motion.duration
+    return plan_path(curve, epsilon, PlanOptions(accuracy=1e-7), 1).motion.duration
 
 
 def _build_on_curve(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
@@ -225,7 +223,6 @@ IPOPT = {
     "print_level": 0, "sb": "yes", "tol": 1e-8, "bound_relax_factor": 0.0, "max_iter": 1000,
     "mu_strategy": "adaptive",
 }  # fmt: skip
-LEAST = 4  # intervals of a stretch, at least
 POINTS = 2  # collocation points of a segment
 
 
@@ -237,7 +234,7 @@ def build_yapss(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
     import yapss
 
     curve, stretches = instance.curve, list_stretches(instance.curve)
-    counts = [max(LEAST, round(int(setting) * stretch.share)) for stretch in stretches]
+    counts = [max(4, round(int(setting) * stretch.share)) for stretch in stretches]
     guesses = sample_slow_motion(instance, [POINTS * count + 1 for count in counts])
     n_c, k = curve.formation.n_contacts, len(stretches)
     ocp = yapss.Problem(

@@ -30,7 +30,6 @@ Key = tuple[str, str, str, str]
 """Study, instance, method and setting: what one median is of."""
 Medians = dict[Key, Median]
 MARKERS = "osD^vP*Xdh<>"  # markers of the methods of a panel
-SMALLEST = 1e-16  # error that is drawn for none at all
 
 
 class PeerComparison(NamedTuple):
@@ -170,7 +169,7 @@ def _draw_study(axes: Axes, medians: Medians, study: str) -> None:
                 continue
             error = float(np.median([abs(own.errors[0]) for own in found]))
             seconds = find_mean([own.solve + planning * own.build for own in found])
-            points.append((max(error, SMALLEST), seconds))
+            points.append((max(error, 1e-16), seconds))
             full.append(all(own.outcome == SOLVED for own in group))
         if not points:
             continue
@@ -189,9 +188,6 @@ def _draw_study(axes: Axes, medians: Medians, study: str) -> None:
     axes.set_ylabel(f"{'build and solve' if planning else 'run'} time, mean over phases [s]")
     if axes.lines:
         finish_axes(axes, fontsize=8, ncols=2)
-
-
-REFERENCE = 120.0  # processor time that the reference of a phase may take on top [s]
 
 
 class Precision(Study):
@@ -231,7 +227,7 @@ class Precision(Study):
 
     def limit(self, case: Case) -> float:
         """The time allowed, and that of the reference."""
-        return self.allowed + REFERENCE
+        return self.allowed + 120.0
 
     def run(self, case: Case) -> Row:
         """Measure one setting."""

@@ -68,7 +68,6 @@ def solve_motion(
 
 TOLERANCE = 2.3e-14  # of the integration, relative: the smallest that SciPy takes
 TINY = 1e-30  # imaginary step of time by which rows are differentiated [s]
-LOOSER = 100.0  # factor on the tolerance of the run that the reference's error is found with
 
 
 class Span(NamedTuple):
@@ -94,7 +93,7 @@ class Course(NamedTuple):
 def find_course(problem: Problem, torque: TorqueProfile, curve: Curve, reversals: int) -> Course:
     """Integrate torques along a phase whose directions reverse so often."""
     end, spans = _integrate(problem, torque, curve, reversals, TOLERANCE)
-    rough, _ = _integrate(problem, torque, curve, reversals, LOOSER * TOLERANCE)
+    rough, _ = _integrate(problem, torque, curve, reversals, 100.0 * TOLERANCE)
     return Course(problem, torque, spans, end, measure_error(problem, rough, end))
 
 

@@ -45,14 +45,12 @@ TOLERANCES = {
 DEGREES = {FEW: 14, MANY: 6}  # degrees of the torques' polynomials
 SLOW = 0.3
 """Square of the speed of the motion with few pieces, over that of a first guess of a plan."""
-LOOKS = 201  # instants at which contact forces of a motion are looked at
 STOP = 0.95
 """Share of the last stretch between reversals that is run: just before a stop all is ill-posed."""
 
 STEPS = 1000  # least number of steps of a replay
 CLOSE = 1e-2
 """Error of the end state, and of torques over their limits, up to which a plan counts as one."""
-PLACES = 9  # instants of every piece of the torques at which their limits are looked at
 
 Runner = Callable[[], Array]
 """Gives the state (z, z') at the end of a course, shape (10,)."""
@@ -205,7 +203,7 @@ def make_course(instance: Instance, study: str) -> Course | None:
         motion = make_slow_motion(instance, 2, SLOW)
     else:
         motion = plan_path(curve, problem.epsilon, PlanOptions(), 1).motion
-    looks = np.linspace(0.0, motion.duration, LOOKS)
+    looks = np.linspace(0.0, motion.duration, 201)
     if motion.evaluate(looks).c_n.min() <= 0:
         return None
     marks = find_reversals(motion)
@@ -237,7 +235,7 @@ def check_plan(instance: Instance, plan: PeerPlan) -> ReferenceCheck:
     rest = np.append(instance.curve.end, np.zeros(5))
     end = measure_error(problem, states[:, -1], rest)
     limit = problem.scene.torque_limit
-    places = np.cos(np.linspace(0.0, np.pi, PLACES))
+    places = np.cos(np.linspace(0.0, np.pi, 9))
     excess = float((np.abs(plan.torque.at_places(places)) / limit[:, None] - 1).max())
     missing = (problem.epsilon - float(forces.min())) / problem.scene.scales.force
     violation = max(0.0, excess, missing)

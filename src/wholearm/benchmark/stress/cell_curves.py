@@ -23,15 +23,9 @@ from .slow_motion import fast_margin, rest_margin
 
 PLACES = 40  # configurations along a curve
 INSIDE = 1e-4  # overlap, and distance beyond a feature, that passes, over the radius of gyration
-DRAWN = 400  # curves that are drawn at first; most leave the cell
-TRIED = 40  # curves of these whose margins are found
 BENT = (6, 10)  # rounds in which the best curves are bent, and curves in each
-BEST = 3  # curves that are bent further in each round
 LOOSE = 0.01
 """Rate of sliding over that of the whole below which a contact may stick: nearby curves roll."""
-ENDS = 16  # most places of the end on either side of the nearest one
-STEP = 0.08  # distance of the nearest of these, over the radius of gyration
-GROWTH = 1.12  # ratio of each distance to the one before
 SUFFICIENT = 1e-3  # margin with which a curve is as good as wanted
 
 Flags = NDArray[np.bool_]
@@ -59,7 +53,7 @@ def list_ends(scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]) -
     found = [first]
     for way in (1.0, -1.0):
         here, ahead = first, None
-        for step in STEP * scene.scales.length * GROWTH ** np.arange(ENDS):
+        for step in 0.08 * scene.scales.length * 1.12 ** np.arange(16):
             rows = _end_equations(scene, phase, here)[1] / scale
             tangent = np.linalg.svd(rows)[2][-1] / scale
             if ahead is None:
@@ -104,11 +98,11 @@ def find_best(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: Array)
             margins = _find_margins(scene, phase, epsilon, curves[k])
             best.append((*margins, controls[k], curves[k]))
         count += len(kept)
-        best = sorted(best, key=lambda one: -max(one[0], one[1]))[:BEST]
+        best = sorted(best, key=lambda one: -max(one[0], one[1]))[:3]
         return any(one[0] > SUFFICIENT for one in best)
 
     straight = np.linspace(0, 1, 4)[:, None] * (goals - start)[:, None] + start
-    if not look(straight, len(straight)) and not look(draw(DRAWN, 0.5), TRIED):
+    if not look(straight, len(straight)) and not look(draw(400, 0.5), 40):
         for turn in range(BENT[0]):
             if not best:
                 break

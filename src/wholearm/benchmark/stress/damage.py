@@ -271,8 +271,6 @@ def _pack(arrays: Mapping[str, Any], others: Mapping[str, bytes] = MappingProxyT
     return stream.getvalue()
 
 
-STATUSES = (0, 1, 2)
-LONGEST = 2000  # longest line on stderr that still counts as clear
 PROGRESS = re.compile(r"wholearm: \d+ s: ")  # lines that tell how long work goes on already
 
 
@@ -337,7 +335,7 @@ def look(
     """What is wrong with how a command ended."""
     texts = []
     lines = [line for line in err.splitlines() if not PROGRESS.match(line)]
-    if status not in STATUSES:
+    if status not in (0, 1, 2):
         texts.append(f"exit status {status}")
     if status == 0 and lines:
         texts.append(f"exit status 0 with {lines[0][:80]!r} on stderr")
@@ -346,7 +344,7 @@ def look(
     if status in (1, 2) and not reported:
         if len(lines) != 1 or not lines[0].startswith("wholearm: "):
             texts.append(f"{len(lines)} lines on stderr, beginning {err[:80]!r}")
-        elif len(lines[0]) > LONGEST:
+        elif len(lines[0]) > 2000:
             texts.append(f"a line of {len(lines[0])} characters on stderr")
         if out.strip():
             texts.append(f"exit status {status} with output {out[:80]!r}")

@@ -18,11 +18,9 @@ from ...problem.definition import Phase
 from ...scene.model import Scene
 from .newton import clearances, locate
 
-STEP = 0.02  # longest step over the radius of gyration
 LONGEST = 60.0  # longest curve, over the radius of gyration: several turns of the object
 OVERLAP = 1e-6
 """Overlap over the radius of gyration from which on two bodies count as running into each other."""
-STILL = 1e-9  # rate over the largest one below which something stands still
 MET = 1e-5  # distance over the radius of gyration (or angle) that counts as having reached `until`
 
 
@@ -112,7 +110,7 @@ def _march(scene: Scene, phase: Phase, z: Array, way: float) -> Trace:
         z,
         rtol=1e-9,
         atol=1e-10 * size / scale,
-        max_step=STEP * size,
+        max_step=0.02 * size,
         dense_output=True,
         events=(overlap, end),
     )
@@ -142,7 +140,7 @@ def resample(scene: Scene, phase: Phase, trace: Trace, count: int) -> tuple[Arra
 
     s = np.linspace(0.0, trace.length, count)
     rates = slide(s)
-    rates[np.abs(rates) < STILL * np.abs(rates).max()] = 0.0
+    rates[np.abs(rates) < 1e-9 * np.abs(rates).max()] = 0.0
     turns = [
         brentq(lambda x, row=row: slide(np.array([x]))[0, row], s[k], s[k + 1])
         for k, row in zip(*np.nonzero(rates[1:] * rates[:-1] < 0), strict=True)

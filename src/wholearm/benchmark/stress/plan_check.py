@@ -12,7 +12,6 @@ from .newton import Touch, balance, clearances, locate
 
 INSTANTS = 401
 """Instants of a phase that are looked at, besides some in short pieces of its torques."""
-BRIEF = 1e-6  # share of a phase below which a piece of its torques has no length
 ROUNDING = 1e-6  # what may be left of an equation, over the largest of its terms
 OVERLAP = 1e-6  # overlap and open gaps that pass for rounding, over the radius of gyration
 STILL = 1e-5  # speed over the scene's own below which friction may point either way
@@ -44,7 +43,7 @@ def _choose_times(plan: Trajectory, start: float, duration: float) -> Array:
     breaks = plan.torque.breaks - start
     ends = np.concatenate([[0.0], breaks[(breaks > 0.0) & (breaks < duration)], [duration]])
     runs = np.diff(ends)
-    short = (runs > BRIEF * duration) & (runs < 2 * duration / INSTANTS)
+    short = (runs > 1e-6 * duration) & (runs < 2 * duration / INSTANTS)
     inside = ends[:-1][short, None] + runs[short, None] * np.array([0.1, 0.5, 0.9])
     return np.unique(np.concatenate([np.linspace(0.0, duration, INSTANTS), inside.ravel()]))
 

@@ -17,15 +17,12 @@ from .cell_curves import best_end, find_best, list_ends
 from .event_tracing import Trace, follow, resample
 from .slow_motion import fast_margin, inertia_ratio, rest_margin, slow_margin
 
-PLACES = 60  # places along a curve at which limits are looked at
 CLEAR = 1e-3  # margin over the scene's weight, or a torque limit, from which a motion surely exists
 UNABLE = -1e-7  # margin below which none exists
 FREE = 0.02  # reduced inertia over that without friction above which nothing jams
 
 SURE = 0.02
 """What the best of many curves misses limits by, as a margin, where surely none keeps them."""
-HELD = 1e-3
-"""Length of a phase over the radius of gyration below which it may count as nothing to do."""
 
 
 class Verdict(NamedTuple):
@@ -59,7 +56,7 @@ def judge(
             continue
         if phase.formation.n_constraints == 4 and not phase.until.is_release:
             trace = _reach(problem.scene, phase, z)
-            if trace.length < HELD * problem.scene.scales.length:
+            if trace.length < 0.001 * problem.scene.scales.length:
                 return Verdict("close", f"phase {phase.number} has nothing to do")
             if not trace.reached:
                 return Verdict("confirmed", f"phase {phase.number}: {trace.ending}")
@@ -106,7 +103,7 @@ def _reach(scene: Scene, phase: Phase, z: Array) -> Trace:
 
 def _judge_curve(problem: Problem, phase: Phase, trace: Trace) -> Verdict:
     scene, epsilon = problem.scene, problem.epsilon
-    s, z, z_s = resample(scene, phase, trace, PLACES)
+    s, z, z_s = resample(scene, phase, trace, 60)
     slow = slow_margin(scene, phase, epsilon, z, z_s)
     free = float(inertia_ratio(scene, phase, z, z_s).min())
     at = f"phase {phase.number}"

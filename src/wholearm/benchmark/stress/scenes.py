@@ -32,12 +32,6 @@ from .slow_motion import slow_margin
 Table = dict[str, Any]
 Random = np.random.Generator
 
-SIZES, MASSES = (-3.0, 1.0), (-4.0, 3.0)
-"""Powers of ten: radius of the object [m], and its mass [kg]."""
-DECADES = (-6.0, 0.0)
-"""Powers of ten: joint inertia, viscous and dry friction, over what the object has of them."""
-POINTED = 0.5  # share of the scenes whose fingers have no thickness
-TRIES = 200  # hands that are drawn for one object before another object is
 PLACES = 60  # places along a border at which a route looks for its ends
 
 
@@ -48,10 +42,10 @@ def random_scene(rng: Random) -> Table:
     what touches at the start and is there to be replaced.
     """
     while True:
-        size, mass = 10.0 ** rng.uniform(*SIZES), 10.0 ** rng.uniform(*MASSES)
+        size, mass = 10.0 ** rng.uniform(-3.0, 1.0), 10.0 ** rng.uniform(-4.0, 3.0)
         corners = _draw_polygon(rng, size)
         body = {"vertices": corners.tolist(), "mass": mass}
-        for _ in range(TRIES):
+        for _ in range(200):
             table = _draw_hand(rng, body, size)
             try:
                 names = name_first(table)
@@ -78,12 +72,12 @@ def _draw_hand(rng: Random, body: Table, size: float) -> Table:
     """A problem with fingers, friction, and a start that may turn out to be impossible."""
     mass, gravity = body["mass"], 9.81
     reach = rng.uniform(1.2, 5.0)
-    pointed = rng.uniform() < POINTED
+    pointed = rng.uniform() < 0.5
     weight = mass * gravity
     fingers = {}
     for key, side in (("1", 1.0), ("2", -1.0)):
         length = size * reach * rng.uniform(0.8, 1.2)
-        inertia, drag, dry = 10.0 ** rng.uniform(*DECADES, 3)
+        inertia, drag, dry = 10.0 ** rng.uniform(-6.0, 0.0, 3)
         fingers[key] = {
             "base": [side * size * rng.uniform(0.3, 2.5), size * rng.uniform(-0.5, 0.3)],
             "length": length,
@@ -202,12 +196,6 @@ def _distance(piece: Piece, here: Array, size: Array) -> float:
     return float(np.hypot(*((points - here) / size).T).min())
 
 
-LISTS = 4  # routes that are drawn for one scene before another scene is
-LOOKS = 4  # places of a stretch at which it is looked whether a slow motion is possible
-WILLING = 0.7  # share of the cases whose route a slow motion can probably follow
-SCENES = 6  # scenes that are drawn for one case before its last list is taken as it is
-
-
 @dataclass(frozen=True)
 class Case:
     """A problem of the study."""
@@ -224,15 +212,15 @@ def draw_case(seed: int, number: int) -> Case:
     rng = np.random.default_rng([seed, number])
     kinds = list(TWISTS)
     kind = kinds[int(rng.integers(len(kinds)))]
-    willing, last = rng.uniform() < WILLING, None
-    for _ in range(SCENES):
+    willing, last = rng.uniform() < 0.7, None
+    for _ in range(6):
         try:
             table = TWISTS[kind](rng, random_scene(rng))
             table = {**table, "phases": [{"contacts": name_first(table), "until": {"x": 0.0}}]}
             problem = build_problem(table)
         except InputError:
             continue
-        for _ in range(LISTS):
+        for _ in range(4):
             try:
                 stretches = list_formations(problem, *random_route(rng, problem))
             except InputError:
@@ -255,7 +243,7 @@ def can_move(problem: Problem, stretches: Sequence[Stretch]) -> bool:
     """Whether a slow motion keeps all limits at a few places of every stretch of a route."""
     scene = problem.scene
     for stretch in stretches:
-        share = np.linspace(0.0, 1.0, LOOKS + 2)[1:-1, None] + np.array([0.0, 1e-4])
+        share = np.linspace(0.0, 1.0, 6)[1:-1, None] + np.array([0.0, 1e-4])
         poses = stretch.start + share.ravel()[:, None] * (stretch.stop - stretch.start)
         z = close_fingers(scene, *poses.T).z
         if np.isnan(z).any():

@@ -40,7 +40,6 @@ from .newton import Touch, locate
 
 Bounds = list[tuple[float | None, float | None]]
 
-FASTEST = 1e3  # largest speed that is considered, over the scene's own
 TANGENTS = np.geomspace(1e-6, 1.0, 13)
 """Places of the tangents that bound sqrt(b), over the largest b."""
 
@@ -72,7 +71,7 @@ def fast_margin(
     s, z, z_s = curve
     with np.errstate(divide="ignore"):
         joints = ((scene.speed_limit / np.abs(z_s[:, 3:])) ** 2).min(axis=1)
-    top = np.minimum(FASTEST**2, joints / scene.scales.speed**2)
+    top = np.minimum(1e6, joints / scene.scales.speed**2)
     top[[0, -1]] *= ~np.array(rests)
     z_ss = np.gradient(z_s, s, axis=0, edge_order=1)
     return _solve_along(scene, phase, epsilon, (s, z, z_s, z_ss), top, loose)
