@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -15,11 +14,11 @@ from numpy.polynomial import Chebyshev, Polynomial
 
 from plane import make_formation, measure_gaps
 from planned import plan_landing
-from shipped import FOLDER, HEPTAGON, problem_of
+from shipped import FOLDER, HEPTAGON, problem_of, tipping
 from thrown import shove
 from timed import landing
 from wholearm.common.arrays import Array
-from wholearm.common.errors import InfeasibleError, InputError, LimitPlace, Shortfall
+from wholearm.common.errors import InputError
 from wholearm.geometry.curve import find_tied, tangent_basis
 from wholearm.geometry.explore import close_contacts
 from wholearm.geometry.path_guess import find_end, list_ends
@@ -27,30 +26,25 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import metric_weights
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
-from wholearm.planning.time_domain import attempts, time_plan
-from wholearm.planning.time_domain import time_explain as explain
-from wholearm.planning.time_domain.attempts import (
+from wholearm.planning.time_domain import time_plan
+from wholearm.planning.time_domain.guesses import (
     GRADUAL,
+    LONGER,
     MOST,
     NEAREST,
     ONSETS,
-    Attempt,
-    Attempts,
+    OTHER,
+    STRAIGHT,
+    Guess,
+    Guesses,
     find_modes,
-    split_by_senses,
+    split_by_signs,
 )
-from wholearm.planning.time_domain.initial_path import guess_stages
 from wholearm.planning.time_domain.mode_search import mode_of
 from wholearm.planning.time_domain.search import TimeSearch, TimeSolution
 from wholearm.planning.time_domain.stage import Stage, bisect_intervals
 from wholearm.planning.time_domain.stage_kernels import goal_kernel
-from wholearm.planning.time_domain.time_plan import (
-    NEARER,
-    ContinuedEnd,
-    plan_phases,
-    refuse_pinned,
-    try_phases,
-)
+from wholearm.planning.time_domain.time_plan import plan_phases, try_phases
 from wholearm.problem.definition import End, Phase, Problem
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.simulation.simulate import simulate
@@ -58,44 +52,38 @@ from wholearm.verification.verdict import Allowance, describe_ends
 from wholearm.verification.verify import verify
 
 OPTIONS = PlanOptions(time_intervals=12, transcription="time")
-PACE = "{}, {} times as long as a fall over that height"
-AHEAD = [PACE.format("one to an end of the phases further on", falls) for falls in (2, 4, 1) * 2]
 
 
 def test_an_end_that_is_known_is_first_looked_for_straight() -> None:
     """As on a route, which is given it: pinned in a file the first guess is the same."""
-    problem = landing()
-    start, index = trace_phases(problem)[-1].end, 4
-    straight, nearest = "a straight path that keeps limits ", NEAREST
-    phase = problem.phases[index]
-    goal = find_end(phase, start, problem.phases[index + 1 :])
-    pins = (("x", float(goal[0])),)
-    pinned = replace(phase, until=replace(phase.until, pins=pins), end=End.REST)
-    for own, given in ((replace(phase, end=End.REST), goal), (pinned, None)):
-        search = TimeSearch.of(problem, OPTIONS)
-        attempts = Attempts(problem, [own], start, search, None, True)
-        names = [attempt.name for attempt in attempts.begin(given)]
-        assert names[-1] == nearest and len(names) <= 2
-        assert all(name.startswith(straight) for name in names[:-1])
-        found = attempts.begin(given)[0].stages[-1].guess.nodes[-1, 0]
+    problem = tipping()
+    (phase,), start = problem.phases, problem.start
+    goal = find_end(phase, start)
+    pinned = replace(phase, until=replace(phase.until, pins=(("x", float(goal[0])),)))
+    search = TimeSearch.of(problem, OPTIONS)
+    for own, given in ((phase, goal), (pinned, None)):
+        first, second, *_ = Guesses(problem, [own], start, search).every(given)
+        assert [first.name, second.name] == [STRAIGHT, NEAREST]
+        found = first.stages[-1].guess.nodes[-1, 0]
         np.testing.assert_allclose(found[:2] * problem.scene.scales.length, goal[:2], atol=1e-9)
-    # Without one there is nothing to go straight to, nor are there straight ways of two phases.
-    free = Attempts(problem, [phase], start, search, None, True)
-    assert [attempt.name for attempt in free.begin()] == [nearest]
+
+    names = [guess.name for guess in Guesses(problem, [phase], start, search).every()]
+    assert names[:3] == [NEAREST, NEAREST + GRADUAL, OTHER]
 
 
 @pytest.fixture
 def tried(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> list[str]:
-    """Names of attempts in the order in which they are made; one leads to a plan."""
+    """Names of guesses in the order in which they are tried; one leads to a plan."""
     names, good = list[str](), request.param
 
-    def pretend(search: TimeSearch, attempt: Attempt) -> TimeSolution:
-        names.append(attempt.name)
-        nlp, success = search.build(attempt.stages), attempt.name == good
-        return TimeSolution(attempt.stages, 1.0, 0.0, "Ipopt stopped", success, nlp, {})
+    def pretend(search: TimeSearch, guess: Guess, most: int = 0) -> TimeSolution:
+        names.append(guess.name)
+        nlp, success = search.build(guess.stages), guess.name == good
+        return TimeSolution(guess.stages, 1.0, 0.0, "Ipopt stopped", success, nlp, {})
 
-    monkeypatch.setattr(time_plan, "solve_attempt", pretend)
-    monkeypatch.setattr(time_plan, "find_short", lambda *_: (None, []))
+    monkeypatch.setattr(time_plan, "solve_coarse", pretend)
+    monkeypatch.setattr(time_plan, "may_gain", lambda *_: False)
+    monkeypatch.setattr(time_plan, "finish", lambda _, solution: solution)
     monkeypatch.setattr(time_plan, "list_plans", lambda *given: [given[-1]])
     return names
 
@@ -108,9 +96,12 @@ def test_a_single_guess_straight_to_a_place_is_no_other(
     problem = landing()
     start, phase = trace_phases(problem)[-1].end, replace(problem.phases[4], end=End.REST)
     goal = find_end(phase, start, problem.phases[5:])
-    monkeypatch.setattr(attempts, "pace_way", lambda *_: None)
+    monkeypatch.setattr(Guesses, "straight", lambda *_: None)
     assert try_phases(problem, [phase], start, OPTIONS, goal, single_guess=True) is None
     assert tried == []
+
+
+LATER = LONGER.format(NEAREST, 4.0)
 
 
 @pytest.mark.parametrize(
@@ -118,11 +109,11 @@ def test_a_single_guess_straight_to_a_place_is_no_other(
     [
         (NEAREST, [NEAREST]),
         (NEAREST + GRADUAL, [NEAREST, NEAREST + GRADUAL]),
-        (AHEAD[1], [NEAREST, NEAREST + GRADUAL, *AHEAD[:2]]),
+        (LATER, [NEAREST, NEAREST + GRADUAL, LATER]),
     ],
     indirect=["tried"],
 )
-def test_a_plan_names_the_attempt_that_led_to_it(tried: list[str], order: list[str]) -> None:
+def test_a_plan_names_the_guess_that_led_to_it(tried: list[str], order: list[str]) -> None:
     problem, _ = shove()
     plans: list[Any] = plan_phases(problem, problem.phases, problem.start, OPTIONS)
     assert plans == [order[-1]]
@@ -156,37 +147,6 @@ def test_a_landing_comes_to_rest_where_it_is_pinned() -> None:
         problem.scene, " ".join([*problem.phases[5].formation.names, "v2-palm"])
     )
     assert np.abs(measure_gaps(formation, end.z)).max() < 1e-6 * size
-
-
-def test_where_no_plan_ends_it_is_said_what_motions_nearer_to_it_are_short_of(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """All the way is asked for first, and then less of it: until a motion is found at all."""
-    problem, options = pin(landing(), 5, ("x", 0.0145)), PlanOptions(time_intervals=6)
-    start, phases = trace_phases(problem)[-1].end, problem.phases[4:]
-    search = TimeSearch.of(problem, options, None, None, math.inf, True)
-    stages = guess_stages(problem, phases, start, search.scheme, 6, 2.0)
-    nearest = TimeSolution(stages, 1.0, 0.0, "", True, search.build(stages), {})
-    free = guess_stages(landing(), landing().phases[4:], start, search.scheme, 6, 2.0)
-    ends = {stage.phase: stage.guess.nodes[-1, 0] for stage in free}
-    lack = Shortfall("torque", "finger 2", "torque limit", 1.0, "N m", LimitPlace(6, 0.1, ""), 0.5)
-    asked = list[float]()
-
-    def solve_elastic(_: TimeSearch, own: list[Stage]) -> list[Stage] | None:
-        until = own[-1].until
-        assert until is not None
-        asked.append(until.pins[0][1] * problem.scene.scales.length)
-        return own if len(asked) == 3 else None
-
-    monkeypatch.setattr(explain, "solve_elastic", solve_elastic)
-    monkeypatch.setattr(explain, "list_shortfalls", lambda _, own, __: [lack] if own else [])
-    with pytest.raises(InfeasibleError, match=r"ends at x = .* mm, .* at the nearest") as caught:
-        refuse_pinned(search, problem, phases, ContinuedEnd(None, nearest, ends, 0.2))
-    assert caught.value.shortfalls == (lack,)
-    begin = ends[5][0] * problem.scene.scales.length
-    assert abs(begin - 0.0145) > 1e-3
-    shares = [0.2 + 0.8 * part for part in (1.0, *NEARER)]
-    assert asked == pytest.approx([begin + share * (0.0145 - begin) for share in shares])
 
 
 def test_with_one_freedom_pins_have_to_agree_with_the_curve() -> None:
@@ -242,7 +202,7 @@ def turned(rates: Polynomial | Chebyshev) -> tuple[TimeSearch, Stage]:
     """
     problem, phase, z = corner()
     search = TimeSearch.of(problem, PlanOptions())
-    (stage, *_) = Attempts(problem, [phase], z, search, None, True).first.stages
+    (stage, *_) = Guesses(problem, [phase], z, search).nearest.stages
     (stage,) = bisect_intervals([stage], search.scheme, [np.full(stage.intervals, 2)])
     part, formation = stage.guess, stage.formation
     scale = np.abs(rates(np.linspace(0, 1, 99))).max()
@@ -283,7 +243,7 @@ TIED = {0, 1, 3}
 def test_pieces_move_one_way_and_make_up_the_stage() -> None:
     for places in (), (0.3,), (0.2, 0.7):
         search, stage = turned(Polynomial.fromroots(places) if places else Polynomial([1.0]))
-        pieces = split_by_senses(stage, search.scheme)
+        pieces = split_by_signs(stage, search.scheme)
         shares = np.diff([0.0, *places, 1.0])
         # Turns are found by straight lines between points.
         lasts = [own.guess.duration / stage.guess.duration for own in pieces]
@@ -307,7 +267,11 @@ class Given(TimeSearch):
     onsets: list[float]
 
     def solve(
-        self, stages: list[Stage], before: TimeSolution | None = None, most: int = 0
+        self,
+        stages: list[Stage],
+        before: TimeSolution | None = None,
+        most: int = 0,
+        raised: Any = None,
     ) -> TimeSolution:
         (stage,) = stages
         self.onsets.append(stage.onset)
@@ -337,6 +301,15 @@ def test_modes_are_those_of_the_motion_with_friction_that_sets_in_gradually(
             if rates.degree()
             else not found.stages[0].turns
         )
+
+
+def test_a_motion_that_slides_while_it_tips_is_planned() -> None:
+    problem = tipping()
+    options = PlanOptions(time_intervals=4, accuracy=1e-2)
+    (plan,) = plan_phases(problem, problem.phases, problem.start, options, explained=False)
+    samples = plan.motion.evaluate(np.linspace(0.0, plan.motion.duration, 50))
+    assert np.degrees(samples.z[-1, 2]) == pytest.approx(9.5, abs=1e-5)
+    assert samples.c_n.min() > problem.epsilon - 1e-6
 
 
 def test_a_vertex_in_a_corner_may_go_back_first() -> None:

@@ -15,13 +15,13 @@ from wholearm.common.arrays import Array
 from wholearm.mechanics.limits import CONE, PRESS, make_limits
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
-from wholearm.planning.time_domain.intersample import (
-    MISS,
-    IntersampleLimits,
+from wholearm.planning.time_domain.refinement import (
+    SETTINGS,
     check_between,
     find_misses,
+    measure_misses,
 )
-from wholearm.planning.time_domain.stage import Stage
+from wholearm.planning.time_domain.stage import LimitMisses, Stage
 from wholearm.planning.time_domain.time_motion import StageMotion
 from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.results.trajectory import Trajectory
@@ -34,7 +34,7 @@ def as_stage(motion: StageMotion, **fields: object) -> Stage:
     return replace(stage, **fields)  # type: ignore[arg-type]
 
 
-def in_newtons(stage: Stage, misses: IntersampleLimits, kind: str) -> Array:
+def in_newtons(stage: Stage, misses: LimitMisses, kind: str) -> Array:
     """Misses of one kind of limits of forces, shape (K, n)."""
     limits = make_limits(stage.formation, EPSILON)
     return (
@@ -43,7 +43,7 @@ def in_newtons(stage: Stage, misses: IntersampleLimits, kind: str) -> Array:
     )
 
 
-def check(stage: Stage, motion: StageMotion, *least: float) -> IntersampleLimits:
+def check(stage: Stage, motion: StageMotion, *least: float) -> LimitMisses:
     return find_misses(stage, check_between(stage, motion), *least)
 
 
@@ -66,8 +66,8 @@ def test_a_plan_keeps_limits_between_points_too() -> None:
         stage, size = as_stage(motion), motion.formation.scene.scales.force
         misses = check(stage, motion, EPSILON)
         assert misses.held.shape == (stage.intervals, motion.formation.n_contacts + 4)
-        assert misses.worst <= 1
-        assert motion.evaluate(instants(motion, 41)).c_n.min() > EPSILON - 2 * MISS * size
+        assert measure_misses(misses).max() <= 1
+        assert motion.evaluate(instants(motion, 41)).c_n.min() > EPSILON - 2 * SETTINGS.miss * size
 
 
 def test_forces_are_missed_by_what_their_least_value_lacks() -> None:
@@ -82,7 +82,7 @@ def test_forces_are_missed_by_what_their_least_value_lacks() -> None:
         # Parabolas through 25 checks, of forces that are smooth inside an interval.
         pressed = in_newtons(stage, misses, PRESS)
         np.testing.assert_allclose(pressed, expected, atol=1e-3 * np.ptp(dense))
-        assert misses.worst == pytest.approx(misses.held.max() / MISS)
+        assert measure_misses(misses).max() == pytest.approx(misses.held.max() / SETTINGS.miss)
         # A margin asks for as much as a larger epsilon.
         same = check(stage, motion, EPSILON, asked - EPSILON)
         again = in_newtons(stage, same, PRESS)

@@ -36,7 +36,7 @@ from wholearm.planning.path_domain.path_mesh import Mesh
 from wholearm.planning.path_domain.path_motion import PathMotion
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.path_domain.speed_profile import Fastest, find_fastest
-from wholearm.planning.time_domain.intersample import MISS, check_between, find_misses
+from wholearm.planning.time_domain.refinement import SETTINGS, check_between, find_misses
 from wholearm.planning.time_domain.search import TimeSearch
 from wholearm.planning.time_domain.stage import Stage
 from wholearm.planning.time_domain.time_explain import change_limit, list_shortfalls
@@ -193,7 +193,7 @@ def test_another_limit_binds_over_time(
         misses = find_misses(stage, check_between(stage, part), EPSILON)
         limits = make_limits(part.formation, EPSILON)
         of_motors = np.isin(limits.sides[0], limits.of("motor"))
-        assert misses.held[:, ~of_motors].max() < 2 * MISS
+        assert misses.held[:, ~of_motors].max() < 2 * SETTINGS.miss
         worst.append(misses.held[:, of_motors].max())
     assert max(worst) == pytest.approx(before - 1, rel=2e-2)
 

@@ -14,11 +14,11 @@ from wholearm.common.arrays import Array
 from wholearm.geometry.path_guess import guess_phase
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.time_domain.attempts import GAIN, choose_end
 from wholearm.planning.time_domain.collocation import Scheme, make_scheme
-from wholearm.planning.time_domain.initial_path import guess_stages
+from wholearm.planning.time_domain.guesses import guess_stages
 from wholearm.planning.time_domain.mode_search import LEAST_INTERVALS
 from wholearm.planning.time_domain.nlp_layout import pack
+from wholearm.planning.time_domain.refinement import SETTINGS, count_halvings, find_least
 from wholearm.planning.time_domain.search import TimeSearch, TimeSolution, carry_multipliers
 from wholearm.planning.time_domain.stage import (
     Stage,
@@ -28,14 +28,8 @@ from wholearm.planning.time_domain.stage import (
     in_own_units,
     resample,
 )
-from wholearm.planning.time_domain.tightening import (
-    AT_ONCE,
-    DEFECT,
-    count_halvings,
-    find_least,
-)
 from wholearm.planning.time_domain.time_motion import StageMotion
-from wholearm.planning.time_domain.time_plan import try_phases
+from wholearm.planning.time_domain.time_plan import GAIN, choose_end, try_phases
 from wholearm.problem.definition import Problem
 
 SCHEMES = [("radau", 2), ("radau", 4), ("legendre", 3)]
@@ -143,15 +137,15 @@ def stages() -> list[Stage]:
 def test_defects_that_shrink_with_the_order_need_one_round(name: str, degree: int) -> None:
     scheme = make_scheme(name, degree)
     rng = np.random.default_rng(1)
-    sizes = DEFECT * 10 ** rng.uniform(-3, 3, 40)
+    sizes = SETTINGS.defect * 10 ** rng.uniform(-3, 3, 40)
     defects = sizes[:, None, None] * rng.uniform(-1, 1, (40, 2, 5))
     defects[:, 1, 2] = -sizes
     times = count_halvings(np.zeros(40), defects, scheme)
     left = sizes * 0.5 ** (scheme.order * times)
-    assert (left <= DEFECT)[times < AT_ONCE].all()
+    assert (left <= SETTINGS.defect)[times < SETTINGS.at_once].all()
     # Once less would not have done.
-    assert (left * 2**scheme.order > DEFECT)[times > 0].all()
-    assert set(times[sizes < DEFECT].tolist()) == {0}
+    assert (left * 2**scheme.order > SETTINGS.defect)[times > 0].all()
+    assert set(times[sizes < SETTINGS.defect].tolist()) == {0}
 
 
 SCHEME = make_scheme("radau", 3)
@@ -213,7 +207,7 @@ def coarse(objective: str) -> TimeSolution:
     problem = landing()
     start = trace_phases(problem)[-1].end
     options = PlanOptions(objective=objective, time_intervals=8)
-    begun = try_phases(problem, problem.phases[4:], start, options, further=9)
+    begun = try_phases(problem, problem.phases[4:], start, options, further=True)
     assert begun is not None and isinstance(begun[0].solution, TimeSolution)
     return begun[0].solution
 

@@ -4,11 +4,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 
-import wholearm.planning.time_domain.attempts as attempts
+import wholearm.planning.time_domain.guesses as guesses
 import wholearm.planning.time_domain.mode_search as mode_search
 from plane import measure_slip
 from thrown import raised
@@ -17,7 +18,7 @@ from tipping import roll, tilting
 from wholearm.mechanics.dynamics import Directions
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
-from wholearm.planning.time_domain.initial_path import guess_stages
+from wholearm.planning.time_domain.guesses import guess_stages
 from wholearm.planning.time_domain.mode_search import (
     WORTH,
     StageMode,
@@ -26,9 +27,9 @@ from wholearm.planning.time_domain.mode_search import (
     link,
     mode_of,
 )
+from wholearm.planning.time_domain.refinement import SETTINGS
 from wholearm.planning.time_domain.search import TimeSearch, TimeSolution
 from wholearm.planning.time_domain.stage import Stage
-from wholearm.planning.time_domain.tightening import MOST
 from wholearm.planning.time_domain.time_motion import TimeMotion
 from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.definition import End, Problem, Until
@@ -77,7 +78,11 @@ class Priced(TimeSearch):
     asked: list[str]
 
     def solve(
-        self, stages: list[Stage], before: TimeSolution | None = None, most: int = 0
+        self,
+        stages: list[Stage],
+        before: TimeSolution | None = None,
+        most: int = 0,
+        raised: Any = None,
     ) -> TimeSolution:
         self.asked.append(word_of(stages))
         return self.answer(stages, self.costs.get(self.asked[-1], math.inf))
@@ -155,7 +160,7 @@ def test_plans_are_the_same_whichever_way_a_joint_is_guessed(
         return turn_joint(guess_stages(*given, **named), 1)  # type: ignore[arg-type]
 
     (right,) = plan_phases(problem, problem.phases, problem.start, OPTIONS)
-    monkeypatch.setattr(attempts, "guess_stages", guess_wrong)
+    monkeypatch.setattr(guesses, "guess_stages", guess_wrong)
     (plan,) = plan_phases(problem, problem.phases, problem.start, OPTIONS)
     assert plan.motion.duration == pytest.approx(right.motion.duration, rel=1e-3)
     for stage in plan.motion.stages:
@@ -196,7 +201,7 @@ def test_a_contact_slides_in_one_phase_and_rolls_in_the_next() -> None:
     # No interval is halved for ever, and neither phase shrinks to nothing.
     motions = [motion for motion in plan.motions if isinstance(motion, TimeMotion)]
     stages = [stage for motion in motions for stage in motion.stages]
-    assert sum(len(stage.points.fractions) for stage in stages) <= 2 * MOST
+    assert sum(len(stage.points.fractions) for stage in stages) <= 2 * SETTINGS.intervals
     assert min(motion.duration for motion in plan.motions) > 0.1 * plan.duration
     # What rolls does so all along; what slides has friction against its motion.
     for motion, rolls in zip(motions, (False, True), strict=True):

@@ -18,7 +18,6 @@ from wholearm.geometry.path_guess import (
     POINTS,
     PathGuess,
     guess_curve,
-    guess_onwards,
     guess_phase,
     load,
 )
@@ -208,23 +207,6 @@ def test_an_end_is_found_where_the_nearest_one_breaks_a_limit(hexagon: Problem) 
     assert formation.evaluate_limits(part.z).min() > -CLOSED
     # Edge 0 leaves the palm by the angle between finger 2 and the left end of the palm.
     np.testing.assert_allclose(part.z[-1, 2], part.z[-1, 4] - np.pi, atol=1e-9)
-
-
-def test_ends_ahead_lie_where_the_motion_goes(square: Problem) -> None:
-    before = guess_curve(trace_phases(square)[2])[-1]
-    landing, start = square.phases[3], before.z[-1]
-    (nearest,) = guess_phase(landing, start)
-    onwards = guess_onwards(landing, before)
-    assert onwards
-    heading = (start - before.z[-2])[0]
-    for part in onwards:
-        np.testing.assert_array_equal(part.z[0], start)
-        assert max(np.abs(measure_gaps(part.formation, z)).max() for z in part.z) < CLOSED
-        assert part.formation.evaluate_limits(part.z).min() > -CLOSED
-        # Edge 1 is down, farther the way that the object goes.
-        assert part.z[-1, 2] == pytest.approx(-np.pi / 2, abs=CLOSED)
-        assert (part.z[-1, 0] - nearest.z[-1, 0]) * heading > 0
-    assert guess_onwards(square.phases[2], before) == []
 
 
 def test_a_flush_edge_that_turns_is_planned_in_the_time_domain_too(square: Problem) -> None:

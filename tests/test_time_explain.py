@@ -20,9 +20,8 @@ from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.time_domain import time_explain, time_plan
-from wholearm.planning.time_domain.attempts import Attempts
 from wholearm.planning.time_domain.collocation import make_scheme
-from wholearm.planning.time_domain.initial_path import guess_stages
+from wholearm.planning.time_domain.guesses import Guesses, guess_stages
 from wholearm.planning.time_domain.search import TimeSearch
 from wholearm.planning.time_domain.stage import Stage
 from wholearm.planning.time_domain.time_explain import (
@@ -93,7 +92,7 @@ def test_torques_that_may_not_step_have_to_hold_the_end(tmp_path: Path, rate: fl
     (tmp_path / "pent.toml").write_text(PENTAGON)
     problem = read_problem(str(tmp_path / "pent.toml"))
     last = problem.phases[-1:]
-    stages = Attempts(problem, last, TURNED, search(problem), None, False).first.stages
+    stages = Guesses(problem, last, TURNED, search(problem)).nearest.stages
     refuse(search(problem), problem, last, stages, None)
     slow = problem.with_(torque_rate_limit=rate)
     message = why_not(lambda: refuse(search(slow), slow, slow.phases[-1:], stages, None))

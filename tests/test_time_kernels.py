@@ -15,7 +15,7 @@ from wholearm.mechanics.dynamics import split_forces
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.time_domain import stage_kernels as kernels
 from wholearm.planning.time_domain.collocation import blend, make_scheme
-from wholearm.planning.time_domain.initial_path import guess_stages
+from wholearm.planning.time_domain.guesses import guess_stages
 from wholearm.planning.time_domain.nlp_layout import Kernel
 from wholearm.planning.time_domain.search import TimeSearch
 from wholearm.planning.time_domain.stage_kernels import (

@@ -20,9 +20,8 @@ from wholearm.mechanics.dynamics import Directions, metric_weights
 from wholearm.planning.options import Objective
 from wholearm.planning.time_domain.collocation import Scheme, make_scheme
 from wholearm.planning.time_domain.equations import Target
-from wholearm.planning.time_domain.intersample import IntersampleLimits
 from wholearm.planning.time_domain.nlp_layout import pack
-from wholearm.planning.time_domain.stage import Stage, StagePoints
+from wholearm.planning.time_domain.stage import LimitMisses, Stage, StagePoints
 from wholearm.planning.time_domain.time_nlp import (
     TimeNLP,
     bound_unknowns,
@@ -118,7 +117,7 @@ def test_a_known_motion_keeps_the_limits(name: str, degree: int) -> None:
     nlp = build([stage], scheme)
     x = packed(nlp, [stage])
     low_x, high_x = bound_unknowns(nlp, [stage], scheme)
-    low, _ = raise_bounds(nlp, [stage], [IntersampleLimits.none(stage)], (low_x, high_x))
+    low, _ = raise_bounds(nlp, [stage], [LimitMisses.none(stage)], (low_x, high_x))
     nlp.rows.bounds[0][:] = low
     _, inequalities = misses(nlp, x)
     # Slip and joint speeds start from nothing.
@@ -169,7 +168,7 @@ def test_the_margin_raises_what_forces_have_to_exceed(name: str) -> None:
     scheme, stage = make_scheme(name, 3), driven(name, 3, 8)
     nlp = build([stage], scheme, Objective.MARGIN)
     low_x, high_x = bound_unknowns(nlp, [stage], scheme)
-    low, _ = raise_bounds(nlp, [stage], [IntersampleLimits.none(stage)], (low_x, high_x))
+    low, _ = raise_bounds(nlp, [stage], [LimitMisses.none(stage)], (low_x, high_x))
     assert not np.isfinite(low_x[nlp.layouts[0].forces]).any()
     # The polynomial through the points may pass a little below them at the ends of an interval.
     room = stage.guess.forces.min() - 0.05

@@ -29,7 +29,7 @@ from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions
-from wholearm.planning.options import Objective, PlanOptions
+from wholearm.planning.options import PlanOptions
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain.collocation import make_scheme
@@ -321,7 +321,7 @@ def test_the_effort_of_a_gentle_plan_is_least(
     assert least > landing().epsilon - SLACK
 
 
-def test_a_margin_below_epsilon_is_planned_again_from_the_least_time(
+def test_from_a_margin_below_epsilon_other_guesses_are_tried(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     problem, least = shove()
@@ -330,16 +330,16 @@ def test_a_margin_below_epsilon_is_planned_again_from_the_least_time(
     def plan() -> PhasePlan[TimeMotion]:
         return plan_phases(problem, problem.phases, problem.start, options, allowed)[0]
 
-    usual, solve_once, goals = plan(), TimeSearch.solve, list[Objective]()
+    usual, solve_once, solves = plan(), TimeSearch.solve, list[float]()
 
     def press_too_little(search: TimeSearch, *given: Any, **named: Any) -> TimeSolution:
-        goals.append(search.goal)
         solution = solve_once(search, *given, **named)
-        return solution._replace(margin=-1.0) if len(goals) == 1 else solution
+        solves.append(solution.margin)
+        return solution._replace(margin=-1.0) if len(solves) == 1 else solution
 
     monkeypatch.setattr(TimeSearch, "solve", press_too_little)
     assert plan().value == pytest.approx(usual.value, rel=1e-3)
-    assert goals[:2] == [Objective.MARGIN, Objective.TIME] and usual.value > problem.epsilon
+    assert solves[0] > 0 and usual.value > problem.epsilon
 
 
 def test_plans_are_the_same_every_time() -> None:

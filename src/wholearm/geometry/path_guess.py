@@ -22,7 +22,6 @@ from .tracing import require_touching, runs_on_curve, trace_phase, trace_phases
 POINTS = 25  # configurations along a guess
 RELEASE_AT = 0.8  # share of a curve at which a release is guessed
 _MOST_ACTIVE = 2  # most active limits at the end of a phase
-_AHEAD = (0.25, 0.5, 1.0, 2.0)  # distances at which ends are searched for, over that to the nearest
 _TURNS = np.linspace(-1.0, 1.0, 21)  # rotations from which another end is searched for [rad]
 
 
@@ -175,25 +174,6 @@ def _project(end: Ending, z: Array, slip: Array) -> tuple[Array | None, str]:
         active = (*active, worst)
         goal = close_contacts(formation, goal, slip, end.fixed, active)
     return None, reason
-
-
-def guess_onwards(phase: Phase, before: PathGuess) -> list[PathGuess]:
-    """Path guesses that continue another one, to ends nearest to places ahead; two freedoms."""
-    formation, z = phase.formation, before.z[-1]
-    if phase.until.contact is None or phase.until.pins or count_freedoms(formation, z) < 2:
-        return []
-    ending, slip = _close_end(phase).formation, formation.evaluate_slip(z[None])[0]
-    step = z - before.z[-2]
-    metric, guesses = metric_weights(formation.scene), []
-    nearest = close_contacts(ending, z, slip)
-    if nearest is None:
-        return []
-    far = np.sqrt((metric @ (nearest - z) ** 2) / (metric @ step**2))
-    for share in _AHEAD:
-        goal = close_contacts(ending, z + share * far * step, slip)
-        if goal is not None and is_inside(ending, goal):
-            guesses.append(connect(formation, z, goal))
-    return guesses
 
 
 def _close_end(phase: Phase) -> Ending:

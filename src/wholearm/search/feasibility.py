@@ -51,7 +51,7 @@ def measure_link(
     link: Link,
     steps: tuple[EdgeStep, ...],
     options: PlanOptions,
-    further: int = 0,
+    further: bool = False,
     straight: bool = True,
     first_only: bool = False,
 ) -> Measured | str:
@@ -60,7 +60,7 @@ def measure_link(
     Parameters
     ----------
     steps       the link's, or others between the same places
-    further     number of guesses beyond the first ones, if these fail
+    further     whether other guesses are tried if the first ones fail
     straight    first guess: straight through the cell; otherwise to the nearest end of the phase
     first_only  whether only the first guess is tried
     """
@@ -82,7 +82,7 @@ def measure_link(
             return f"{phases[0].until} holds already where it starts"
         alone = len(phases) == 1
         towards = goal.z if straight and alone else None
-        plans = try_phases(single, phases, z, rough, towards, further if alone else 0, first_only)
+        plans = try_phases(single, phases, z, rough, towards, further and alone, first_only)
     except NoMotionError:
         return "no motion keeps its limits along the border"
     except WholearmError as error:

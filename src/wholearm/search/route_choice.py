@@ -22,7 +22,6 @@ from .edges import Link, describe_steps, leave_at
 from .feasibility import Measured, leave_in_motion, measure_link
 from .result import BorderBound, bound_borders
 
-FURTHER = 2  # further guesses of a path through a cell, if the first ones lead to no plan
 FINEST = 0.03  # finest step of the place where a border is left, over the border's length
 STEPS = (4, 2, 1)  # steps of the pattern search, in the finest one
 ELSEWHERE = (0.15, -0.15)  # shifts of the place, over that length, if there is no plan from it
@@ -280,7 +279,7 @@ class Chooser:
 
     def _measure_link(self, link: Link) -> Found:
         """Plan a link through a cell, from other places of its border if that fails."""
-        found = measure_link(self.problem, link, link.steps, self.options, further=FURTHER)
+        found = measure_link(self.problem, link, link.steps, self.options, further=True)
         for move in ELSEWHERE if link.left else ():
             place = link.share + move
             if not isinstance(found, str):

@@ -320,12 +320,14 @@ def list_moves(
 
 
 def list_dropped(stages: Sequence[Stage]) -> Iterator[list[Stage]]:
-    """The stages without a vanished one, for each of these."""
-    for index, stage in enumerate(stages):
-        if stage.guess.duration < _GONE * stage.intervals:
-            left = drop(stages, index)
-            if left is not None:
-                yield link(merge(left))
+    """The stages without all vanished ones, and without each of these."""
+    gone = [k for k, stage in enumerate(stages) if stage.guess.duration < _GONE * stage.intervals]
+    for group in [gone, *([k] for k in gone)] if len(gone) > 1 else [[k] for k in gone]:
+        left: list[Stage] | None = list(stages)
+        for index in reversed(group):
+            left = drop(left, index) if left else None
+        if left:
+            yield link(merge(left))
 
 
 def _apply(
@@ -391,17 +393,18 @@ def _turn(
 def _pays(run: ModeRun, stage: Stage, savings: Array) -> bool:
     """Whether rolling over a run might gain, if the contact can roll."""
     own = (slice(run.begin, run.stop), slice(None), run.row)
-    return not _can_roll(stage, run) or float(savings[own].clip(min=0.0).sum()) > WORTH
-
-
-def _can_roll(stage: Stage, run: ModeRun) -> bool:
-    """Whether a run's row is a contact that may roll by itself, with friction and freedoms left."""
-    formation = stage.formation
-    if run.row >= formation.n_contacts or formation.n_constraints >= 4:
-        return False
     middle = stage.guess.z[(run.begin + run.stop) // 2, 0]
-    alone = len(find_tied(formation, middle, run.row)) == 1
-    return bool(alone and formation.friction[run.row] > 0)
+    return (
+        not can_roll(stage.formation, middle, run.row)
+        or float(savings[own].clip(min=0.0).sum()) > WORTH
+    )
+
+
+def can_roll(formation: Formation, z: Array, row: int) -> bool:
+    """Whether a row is a contact that may roll by itself, with friction and freedoms left."""
+    if row >= formation.n_contacts or formation.n_constraints >= 4:
+        return False
+    return bool(len(find_tied(formation, z, row)) == 1 and formation.friction[row] > 0)
 
 
 def _comes_to_rest(stages: Sequence[Stage], index: int, own: Sequence[Formation], row: int) -> bool:
@@ -418,9 +421,9 @@ def _change(
 ) -> list[Stage] | None:
     """Pieces of a stage with another direction over a run, or None if that cannot be."""
     stage = stages[index]
-    if sign == 0 and not _can_roll(stage, run):
-        return None
     middle = stage.guess.z[(run.begin + run.stop) // 2, 0]
+    if sign == 0 and not can_roll(stage.formation, middle, run.row):
+        return None
     mode = mode_of(stage).changed(find_tied(stage.formation, middle, run.row), sign)
     # Where the neighbour has that mode already, the instant between them is optimal.
     at_start, at_end = run.begin == 0, run.stop == stage.intervals

@@ -25,11 +25,11 @@ from ...contacts.formation import Formation
 from ...geometry.curve import tangent_basis
 
 MOVES = 1e-5  # least sum of accelerations, over the scene's own, that counts as a motion
-BEGINS = 0.3  # sum of accelerations of an initial direction, over the scene's own
 PUSHES = 1e-3  # least component along one direction, over all forces, that moves the object
 _SAME = 1e-9  # difference of two margins, over the scene's force, below which motions are the same
 _STILL = 1e-9  # rate over the largest one below which something does not move
 _PROBE = 1e-6  # steps that slopes of limits are taken over, in radii of gyration and rad
+_KINK = 1e-3  # difference of slopes on both sides, in radii of gyration, from which there is a kink
 _LEVEL = 1e-6  # slope of a limit, in radii of gyration, below which no motion changes it
 
 
@@ -57,7 +57,7 @@ def find_block(
     """
     best, modes = None, list(_list_modes(formation, z, ends))
     for mode in modes:
-        margin = _maximise(formation, mode, epsilon, MOVES)
+        margin = _maximise(formation, mode, epsilon)
         if margin is not None and margin.value >= 0:
             return None
         if margin is not None and (best is None or margin.value > best.value):
@@ -78,21 +78,10 @@ def find_change(
     """
     modes = _list_modes(formation, z, ends)
     if finger is None:
-        margins = [_maximise(formation, mode, 0.0, MOVES, cones=True) for mode in modes]
+        margins = [_maximise(formation, mode, 0.0, cones=True) for mode in modes]
         return max((m.value for m in margins if m is not None and m.value >= 0), default=None)
-    margins = [_maximise(formation, mode, epsilon, MOVES, finger=finger) for mode in modes]
+    margins = [_maximise(formation, mode, epsilon, finger=finger) for mode in modes]
     return min((-m.value for m in margins if m is not None), default=None)
-
-
-def list_headings(formation: Formation, z: Array, epsilon: float) -> list[Array]:
-    """Initial directions of motions from rest at `z`, (5,), by decreasing normal forces."""
-    headings: list[_Margin] = []
-    for mode in _list_modes(formation, z, ends=False):
-        one = _maximise(formation, mode, epsilon, BEGINS)
-        if one is not None and one.value >= 0:
-            if all(abs(one.value - other.value) > _SAME for other in headings):
-                headings.append(one)
-    return [one.acceleration for one in sorted(headings, key=lambda one: -one.value)]
 
 
 def pushes_one_way(formation: Formation, z: Array) -> bool:
@@ -153,23 +142,27 @@ def _list_modes(formation: Formation, z: Array, ends: bool) -> Iterator[_Mode]:
 
 
 def _list_opening(formation: Formation, z: Array) -> Array:
-    """Slopes of the closed gaps at `z`, shape (n, 5): from rest these may only open."""
-    met = np.abs(formation.evaluate_limits(z[None])[0]) < formation.scene.touching
+    """Slopes of the closed gaps at `z`, shape (n, 5): from rest these may only open.
+
+    Without those that have a kink there, as where a fingertip is at a vertex: no slope is theirs.
+    """
+    here = formation.evaluate_limits(z[None])[0]
+    met = np.abs(here) < formation.scene.touching
     steps = _PROBE * np.diag([*[formation.scene.scales.length] * 2, 1.0, 1.0, 1.0])
     around = formation.evaluate_limits(z + np.vstack([steps, -steps]))[:, met]
-    ahead, behind = np.split(around, 2)
-    return np.asarray((ahead - behind).T / (2 * steps.diagonal()))
+    ahead, behind = (part.T / steps.diagonal() for part in np.split(around - here[met], 2))
+    smooth = np.abs(ahead + behind).max(axis=1, initial=0.0) < _KINK * formation.scene.scales.length
+    return np.asarray((ahead - behind)[smooth] / 2)
 
 
 def _maximise(
     formation: Formation,
     mode: _Mode,
     epsilon: float,
-    speed: float,
     cones: bool = False,
     finger: int | None = None,
 ) -> _Margin | None:
-    """The largest r with c_n >= epsilon + r in a motion of at least a speed; None without any.
+    """The largest r with c_n >= epsilon + r in a motion; None without any.
 
     `cones` take epsilon + r for epsilon, too. With a `finger` its torque is at most -r, and
     c_n >= epsilon.
@@ -193,7 +186,7 @@ def _maximise(
     edges, least = mu[sticks, None] * (c_n[sticks] - cones * r), epsilon * mu[sticks]
     rows = [c_n - (finger is None) * r, edges - c_t, edges + c_t, motion, mode.opens @ y]
     lows = [np.full(n_c, epsilon), least, least, np.zeros(len(motion) + len(mode.opens))]
-    rows, lows = [*rows, motion.sum(axis=0)[None] * (MOVES / speed)], [*lows, np.array([MOVES])]
+    rows, lows = [*rows, motion.sum(axis=0)[None]], [*lows, np.array([MOVES])]
     limits = scene.torque_limit.copy()
     if finger is not None:
         limits[finger] = math.inf

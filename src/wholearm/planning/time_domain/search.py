@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -17,9 +18,9 @@ from ..options import Objective, PlanOptions
 from ..phase_plan import Tried
 from .collocation import Scheme, make_scheme
 from .equations import StageRows, Target
-from .intersample import IntersampleLimits
 from .nlp_layout import MARGIN, Indices, pack, unpack
 from .stage import (
+    LimitMisses,
     Stage,
     in_own_units,
     monitor,
@@ -75,11 +76,6 @@ class TimeSolution(NamedTuple):
         c_n = part.forces[..., : formation.n_contacts]
         price = np.einsum("nij,nj->ni", A_t, lam).reshape(c_n.shape)
         return np.asarray(2 * price * stage.directions.Xi * formation.friction * c_n)
-
-    @property
-    def is_lost(self) -> bool:
-        """Whether it failed on finer intervals than the first."""
-        return not self.success and not self.status.startswith("Ipopt")
 
 
 @dataclass
@@ -163,34 +159,40 @@ class TimeSearch:
         return self.ample - self.problem.epsilon
 
     def solve(
-        self, stages: list[Stage], before: TimeSolution | None = None, most: int = 150
+        self,
+        stages: list[Stage],
+        before: TimeSolution | None = None,
+        most: int = 150,
+        raised: Sequence[LimitMisses] | None = None,
     ) -> TimeSolution:
-        """Solve from the stages' guesses in at most `most` iterations.
+        """Solve from the stages' guesses in at most `most` iterations, with `raised` limits.
 
-        Formation limits violated at the points are added, and the NLP is solved again.
+        Without these, formation limits violated at the points are added, and the NLP is solved
+        again.
         """
         controls = self.scheme.controls
         if stages[0].guess.tau.shape[1] != controls:
             stages = [replace(s, guess=with_controls(s.guess, controls)) for s in stages]
+        margin = before.margin if before else 0.0
+        if raised and before and all(map(operator.is_, stages, before.stages)):
+            return self.run(before.nlp, stages, raised, before.multipliers, margin)
+        depth = _BROKEN * self.problem.scene.polygon.gyration_radius
         while True:
             nlp, multipliers = self.build(stages, most), None
             if before and [s.monitored for s in before.stages] == [s.monitored for s in stages]:
                 multipliers = carry_multipliers(
                     before.multipliers, before.nlp, nlp, self.scheme, before.stages, stages
                 )
-            raised = [IntersampleLimits.none(stage) for stage in stages]
-            margin = before.margin if before else 0.0
-            solution = self.run(nlp, stages, raised, multipliers, margin)
-            if not solution.success:
+            limits = raised or [LimitMisses.none(stage) for stage in stages]
+            solution = self.run(nlp, stages, limits, multipliers, margin)
+            if raised or not solution.success:
                 return solution
             tables = [
                 s.formation.evaluate_limits(s.guess.z.reshape(-1, 5)) for s in solution.stages
             ]
-            depth = _BROKEN * self.problem.scene.polygon.gyration_radius
-            extended = monitor(solution.stages, [table.min(axis=0) for table in tables], depth)
-            if extended is None:
+            stages = monitor(solution.stages, [table.min(axis=0) for table in tables], depth)
+            if stages is solution.stages:
                 return solution
-            stages = extended
 
     def build(self, stages: Sequence[Stage], most: int = 150) -> TimeNLP:
         """Build the NLP."""
@@ -204,7 +206,7 @@ class TimeSearch:
         self,
         nlp: TimeNLP,
         stages: Sequence[Stage],
-        limits: Sequence[IntersampleLimits],
+        limits: Sequence[LimitMisses],
         multipliers: Multipliers | None,
         margin: float,
     ) -> TimeSolution:

@@ -17,6 +17,7 @@ from ...common.arrays import Array
 from ...common.fields import keys_of
 from ...contacts.formation import Formation
 from ...mechanics.dynamics import Directions
+from ...mechanics.limits import make_limits
 from ...problem.definition import Phase, Problem, Until
 from ...problem.uncertainty import PARAMETERS
 from ...scene.model import Polygon, Scales, Scene
@@ -109,6 +110,32 @@ class Stage:
         slip = np.einsum("nij,nj->ni", self.formation.evaluate(z, v).A_t, v)
         rates = np.hstack([slip / self.formation.scene.polygon.gyration_radius, v[:, 3:]])
         return np.asarray(rates * np.concatenate(self.directions))
+
+
+class LimitMisses(NamedTuple):
+    """Nonnegative amounts by which limits of one stage are missed between points, or raised."""
+
+    held: Array  # (K, n_sides): of limits of forces, torques and speeds, over their scales
+    gap: Array  # (K, n_limits): of the formation's limits that are monitored
+    sense: Array  # (K, n_c + 2): of the rates of contacts and joints; zero for rolling contacts
+
+    @staticmethod
+    def none(stage: Stage) -> LimitMisses:
+        """Nothing is missed."""
+        formation = stage.formation
+        sides = len(make_limits(formation, 0.0).sides[0])
+        widths = (sides, len(formation.limits), formation.n_contacts + 2)
+        return LimitMisses(*(np.zeros((stage.intervals, width)) for width in widths))
+
+    def add(self, misses: LimitMisses, factors: Sequence[float]) -> LimitMisses:
+        """The sum with other amounts times a factor for each kind."""
+        triples = zip(self, misses, factors, strict=True)
+        return LimitMisses(*(own + factor * more for own, more, factor in triples))
+
+    def halve(self, times: NDArray[np.int64]) -> LimitMisses:
+        """On intervals halved so many times, (K,); zero on those that are."""
+        tables = (np.where(times[:, None] > 0, 0.0, own) for own in self)
+        return LimitMisses(*(np.repeat(own, 2**times, axis=0) for own in tables))
 
 
 @lru_cache(maxsize=16)
@@ -287,11 +314,14 @@ def halve(stages: Sequence[Stage], scheme: Scheme) -> list[Stage]:
     return bisect_intervals(stages, scheme, [np.ones(own.intervals, dtype=int) for own in stages])
 
 
-def monitor(stages: Sequence[Stage], least: Sequence[Array], depth: float) -> list[Stage] | None:
-    """Stages with the limits added whose least values, (n_limits,), are below -depth; or None."""
-    changed = []
+def monitor(stages: list[Stage], least: Sequence[Array], depth: float) -> list[Stage]:
+    """Stages with the limits added whose least values, (n_limits,), are below -depth.
+
+    The same list if there are none.
+    """
+    changed = list[Stage]()
     for stage, values in zip(stages, least, strict=True):
         broken = np.flatnonzero(values < -depth).tolist()
         changed.append(replace(stage, monitored=tuple(sorted({*stage.monitored, *broken}))))
     news = [one.monitored != other.monitored for one, other in zip(changed, stages, strict=True)]
-    return changed if any(news) else None
+    return changed if any(news) else stages

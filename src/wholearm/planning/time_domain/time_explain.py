@@ -18,7 +18,7 @@ from .. import advice
 from ..options import Objective, PlanOptions
 from ..stops import runs_along_curves
 from .collocation import Scheme, blend
-from .initial_path import PacedWay
+from .guesses import PathMargin
 from .search import TimeSearch
 from .stage import Stage, StagePoints, to_si
 from .time_motion import make_phase_motions
@@ -190,18 +190,18 @@ def is_met(
     return most > MET * parameter.value
 
 
-def refuse_ways(problem: Problem, phase: Phase, ways: Sequence[PacedWay]) -> None:
+def refuse_paths(problem: Problem, phase: Phase, margins: Sequence[PathMargin]) -> None:
     """Raise an InfeasibleError with the critical limit if along every path one is missed."""
-    if not ways or (best := max(ways, key=lambda way: way.margin)).margin > -MISSED:
+    if not margins or (best := max(margins)).value > -MISSED:
         return
-    critical = best.forces.find_critical()
     limits = make_limits(phase.formation, problem.epsilon).limits
-    limit = next(limit for limit in limits if (limit.kind, limit.part) == critical)
-    place, missed = LimitPlace(phase.number, math.nan, "the best of them"), -best.margin
-    shortfall = Shortfall(*critical, limit.text, missed * limit.scale, limit.unit, place, missed)
+    limit = next(own for own in limits if (own.kind, own.part) == best[1:])
+    place, missed = LimitPlace(phase.number, math.nan, "the best of them"), -best.value
+    amount = missed * limit.scale
+    shortfall = Shortfall(*best[1:], limit.text, amount, limit.unit, place, missed)
     raise InfeasibleError(
-        f"phase {phase.number} is infeasible along all ways to its end that were looked at, "
-        f"straight ones and bent ones, at any speed: {shortfall}",
+        f"phase {phase.number} is infeasible along all straight paths to its ends, at any speed: "
+        f"{shortfall}",
         [shortfall],
     )
 

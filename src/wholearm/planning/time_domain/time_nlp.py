@@ -47,7 +47,6 @@ from .equations import (
     join_stages,
     least_senses,
 )
-from .intersample import IntersampleLimits
 from .nlp_layout import (
     MARGIN,
     STATE,
@@ -60,7 +59,7 @@ from .nlp_layout import (
     assemble_nlp,
     lay_out,
 )
-from .stage import Stage
+from .stage import LimitMisses, Stage
 from .stage_kernels import NamedKernel, bend_kernel, effort_kernel, name_kernel
 
 SHORTEST = 1e-6  # least duration of an interval, in the scene's unit
@@ -257,7 +256,7 @@ def slope_kernel() -> NamedKernel:
 def raise_bounds(
     nlp: TimeNLP,
     stages: Sequence[Stage],
-    limits: Sequence[IntersampleLimits],
+    limits: Sequence[LimitMisses],
     bounds: tuple[Array, Array],
 ) -> tuple[Array, Array]:
     """Bounds of the NLP's rows; raises `bounds`, those of its unknowns, in place."""
@@ -282,7 +281,7 @@ def raise_bounds(
             low_x[held[: stage.formation.n_contacts]] = values[pressed][: len(held)]
         _free_equal(stage, own.limits, layout, (low_x, low))
         bound_by_limits(own.limits, bounds, more)
-        low[own.monitor_rows] += raised.gap[:, None]
+        low[own.monitor_rows] += raised.gap[:, None, list(stage.monitored)]
         low[own.senses] += raised.sense[:, None, list(stage.formation.rubbing_rows)]
         for joint, sigma in enumerate(stage.directions.sigma):
             rates, faster = layout.v[..., 3 + joint], raised.sense[:, -2 + joint, None]

@@ -1,61 +1,57 @@
-"""Plans of phases in the time domain by direct collocation, from a sequence of initial guesses.
+"""Plans of phases in the time domain by direct collocation, from a list of initial guesses.
 
-Phases joined in motion are one NLP, first solved on few intervals in the sliding directions of the
-guess; contact modes and intervals are then refined (`attempts.solve_attempt`). Where no guess leads
-to a plan, the elastic problem (least violation of limits) gives a better guess or the reason.
+Phases joined in motion are one NLP, first solved on few intervals from each guess in turn. A
+solution in whose contact modes nothing is left to gain is refined at once; otherwise it is compared
+with the one by friction homotopy, so that a plan does not depend on the guess alone. The better one
+goes through the mode search and the refinement. Where no guess leads to a plan, the elastic problem
+(least violation of limits) gives another guess, or the reason.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import chain
-from types import MappingProxyType
-from typing import TYPE_CHECKING, NamedTuple
+from itertools import chain, islice, takewhile
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...common.arrays import Array
-from ...common.errors import InfeasibleError, InputError, SolverError
+from ...common.errors import InfeasibleError, SolverError, WholearmError
 from ...geometry.arcs import CostToGo
-from ...geometry.curve import describe_pose
-from ...geometry.path_guess import find_end
-from ...mechanics.dynamics import Directions, measure_speed
+from ...mechanics.dynamics import measure_speed
 from ...mechanics.impact import Impact, compute_impact
-from ...mechanics.limits import CONE, PRESS, make_limits
-from ...problem.definition import ROWS, End, Phase, Problem
+from ...problem.definition import End, Phase, Problem
 from ...results.trajectory import Motion
-from ...sensitivity.slopes import find_slopes_at
-from ..advice import describe_shortfalls, name_phases, rank_shortfalls
 from ..options import Objective, PlanOptions
 from ..path_domain.impact_sequence import PER_SPEED, BlockImpact
 from ..phase_plan import PhasePlan
-from ..robust.robust_rows import find_edges
 from ..stops import PlanPart, Plans, end_of, plan_stops
-from .attempts import FEW, NEAREST, Attempt, Attempts, solve_attempt
-from .intersample import CHECKS, MISS, CheckPlaces, IntersampleLimits, check_between, find_misses
-from .mode_search import LEAST_INTERVALS, improve
-from .search import TimeSearch, TimeSolution
+from .guesses import NEAREST, Guess, Guesses, find_modes
+from .held_torques import hold_torques
+from .mode_search import LEAST_INTERVALS, WORTH, drop_gone, improve, list_neighbours, sign_sequence
+from .refinement import keep_within, refine
+from .search import Price, TimeSearch, TimeSolution
 from .stage import Stage, halve, in_own_units, resample, to_si, unit_of
-from .time_motion import TimeMotion, make_motions, make_phase_motions
+from .time_motion import TimeMotion, make_phase_motions
 
 if TYPE_CHECKING:
     from .time_explain import Replan
 
-_ROUNDS = 20  # most solves for ranges
-_PARAMETRIC = 5  # the first of them, in which limits are raised by what ranges change alone
-_OVER = 1.2  # factor on the misses by which limits are raised after that
-MOVED = "a plan that chooses where it ends"  # name of the guess
-FURTHER = 4  # guesses, beyond the first one, for a plan with free end
-PATIENCE = 50  # most solver iterations for one continuation step
-SHORTEST = 1 / 16  # shortest continuation step
-NEARER = (0.3, 0.1)  # shares of the remaining continuation at which violations are looked for
-CONVINCING = 2  # infeasible elastic solutions, from different guesses, that end the search
+ITERATIONS = 50  # most of the solver from a guess; successes take up to 25
+SPLIT = 80  # the same in modes of the homotopy
+FEW = 35  # the same where a single guess is tried
 BUDGET = 400  # solver iterations of one block after which no further guess is tried
+DEARER = 1.2  # cost of a refined plan, over that on few intervals, above which others are tried
+ROUNDING = 5e-7  # largest shortfall of a margin below epsilon by rounding, over the object's weight
+ROUNDS = 4  # most expansions of the cost-to-go
+GAIN = 1e-4  # least relative gain of moving the end
 ROUGH = 1e-2  # least accuracy where only the existence of a plan matters
 AT_REST = 1e-4  # speed below which an impact counts as a stop, in the scene's own units
+FREE = "a plan that chooses where it ends"  # name of a guess
+_Named = tuple[TimeSolution, str]  # a solution, and the name of its guess
 
 
 def plan_phases(
@@ -87,7 +83,7 @@ def plan_phases(
     begun             coarse plans (`only_begin`) from nearly the same `z`, to start from
     only_begin        whether to find modes on few intervals alone, without limits between points
     explained         whether to look for a change of the problem that makes a plan possible
-    patient           whether to try further guesses after the first
+    patient           whether to try other guesses than the first one
 
     Raises
     ------
@@ -97,37 +93,35 @@ def plan_phases(
     from .time_explain import refuse
 
     search = TimeSearch.of(problem, options, duration, to_go, ample, only_begin)
-    attempts = Attempts(problem, phases, z, search, to_go, patient)
-    resumed = _resume(search, attempts, begun[0]) if begun else None
-    if resumed is not None:
-        return list_plans(problem, search, phases, resumed, begun[0].attempt)
-    guesses = attempts.begin()
-    for attempt in guesses:
-        first, name = _solve_first(search, attempt, fastest, pinned)
-        if first.success:
-            break
-    # Straight to a pinned end modes may be found that are not the best: phase 3 of query 33.
-    enough = first.success and (len(guesses) == 1 or bool(fastest))
-    moved = ContinuedEnd() if enough else approach(search, problem, phases, z)
-    plans = [(first, name)] if first.success else []
-    plans += [(moved.solution, MOVED)] if moved.solution else []
-    if plans:
-        solution, name = min(plans, key=lambda pair: pair[0].cost)
-        return list_plans(problem, search, phases, solution, name)
+    guesses = Guesses(problem, phases, z, search, to_go)
+    found = _resume(search, guesses, begun[0]) if begun else None
+    stages = [own for plan in fastest for own in plan.stages if isinstance(own, Stage)]
+    rough = replace(options, accuracy=max(options.accuracy, ROUGH))
 
     def replan(other: Problem) -> object:
-        rough = replace(options, accuracy=max(options.accuracy, ROUGH))
         same = [other.phases[phase.index] for phase in phases]
         return plan_phases(other, same, z, rough, explained=False, patient=False)
 
-    refuse(search, problem, phases, attempts.first.stages, replan if explained else None)
-    outcomes = _try_all(search, problem, attempts, first)
-    name, solution, _ = outcomes[-1]
-    if solution.success:
-        return list_plans(problem, search, phases, solution, name)
-    if not any(short for *_, short in outcomes):
-        refuse_pinned(search, problem, phases, moved)
-    raise explain_lost(search, problem, attempts, outcomes, replan if explained else None)
+    explanation = replan if explained else None
+    if found is None:
+        listed = iter([guesses.nearest])
+        if patient:
+            listed = chain(guesses.every(), _free_ends(search, guesses))
+        if search.goal is Objective.MARGIN:
+            listed = _list_slow(search, listed, stages, pinned, guesses.nearest)
+        found = solve_guesses(
+            search,
+            listed,
+            lambda: refuse(search, problem, phases, guesses.nearest.stages, explanation),
+        )
+    if found is None and stages and search.goal is Objective.MARGIN:
+        # They keep epsilon within any duration that is no shorter.
+        search.tried.complete = False
+        kept = TimeSolution(stages, 0.0, 0.0, "", True, search.build(stages), {})
+        found = kept, fastest[0].attempt
+    if found is None:
+        found = _solve_elastic(search, guesses, explanation)
+    return list_plans(problem, search, phases, *found)
 
 
 def try_phases(
@@ -136,176 +130,214 @@ def try_phases(
     z: Array,
     options: PlanOptions,
     goal: Array | None = None,
-    further: int = 0,
+    further: bool = False,
     single_guess: bool = False,
 ) -> list[PhasePlan[TimeMotion]] | None:
     """Coarse plans of phases (`only_begin` of `plan_phases`), without a mode search or reasons.
 
     Parameters
     ----------
-    goal : (5,)  end of the first, straight guess of a single phase; otherwise its nearest end
-    further      number of further guesses
-    single_guess      whether to solve from one guess alone, for few iterations
+    goal : (5,)   end of the first, straight guess of a single phase; otherwise its nearest end
+    further       whether guesses after the first ones are tried
+    single_guess  whether to solve from one guess alone, for few iterations
     """
     search = TimeSearch.of(problem, replace(options, mode_search=False), only_begins=True)
-    attempts = Attempts(problem, phases, z, search, None, further > 0)
-    guesses = attempts.begin(goal)[: None if further else 1]
+    guesses = Guesses(problem, phases, z, search)
+    listed: Iterable[Guess] = guesses.every(goal)
     if single_guess:
         # The nearest end is another guess than a straight path that limits exclude.
-        guesses = [own._replace(most=FEW) for own in guesses if goal is None or own.name != NEAREST]
-    for attempt in chain(guesses, attempts.list_further(further)):
-        solution, name = solve_attempt(search, attempt), attempt.name
+        single = guesses.nearest if goal is None else guesses.straight(goal)
+        listed = [single] if single else []
+    elif not further:
+        listed = takewhile(lambda guess: not guess.homotopy, listed)
+    for guess in listed:
+        solution = solve_coarse(search, guess, FEW if single_guess else ITERATIONS)
         if solution.success:
+            first, *others = list_plans(problem, search, phases, solution, guess.name)
+            return [first._replace(complete=not options.mode_search), *others]
+    return None
+
+
+def solve_guesses(
+    search: TimeSearch, guesses: Iterable[Guess], refuse: Callable[[], None] | None = None
+) -> _Named | None:
+    """The best plan from guesses that are tried in their order; None without any.
+
+    If the first ones fail, `refuse` may raise an error that says why.
+    """
+    stop, coarse, best = search.tried.iterations + BUDGET, list[_Named](), None
+    for guess in guesses:
+        if coarse and not guess.homotopy:
+            continue
+        solution = solve_coarse(search, guess)
+        if solution.success:
+            coarse.append((solution, guess.name))
+        elif refuse and not coarse and guess.name == NEAREST:
+            refuse()
+        if coarse and (len(coarse) > 1 or guess.homotopy or not may_gain(search, solution)):
+            least = min(own.cost for own, _ in coarse)
+            best, coarse = _refine_best(search, coarse, best), []
+            if best and best[0].cost <= least + (DEARER - 1) * abs(least):
+                return best
+        if search.tried.iterations > stop:
             break
-    else:
-        moved = None if single_guess else approach(search, problem, phases, z).solution
-        if moved is None:
-            return None
-        solution, name = moved, MOVED
-    first, *others = list_plans(problem, search, phases, solution, name)
-    return [first._replace(complete=not options.mode_search), *others]
+    return _refine_best(search, coarse, best)
 
 
-def _solve_first(
-    search: TimeSearch, first: Attempt, fastest: Sequence[PhasePlan[Motion]], pinned: bool
-) -> tuple[TimeSolution, str]:
-    """Solution from the first guess, or for `margin` from time-optimal plans, and its name."""
-    slows = search.goal is Objective.MARGIN
-    stages = [stage for plan in fastest for stage in plan.stages if isinstance(stage, Stage)]
-    if stages and slows:
-        usual = fastest[0].attempt == first.name
-        slowed = _slow_down(search, stages, first, usual, pinned)
-        if slowed is not None:
-            return slowed, fastest[0].attempt
-    solution = solve_attempt(search, first)
-    if slows and not solution.success:
-        quick = solve_attempt(search.aiming(Objective.TIME), first)
-        if quick.success:
-            solution = _slow_down(search, quick.stages, first, False, pinned) or solution
-    return solution, first.name
+def solve_coarse(search: TimeSearch, guess: Guess, most: int = ITERATIONS) -> TimeSolution:
+    """Solve from a guess on its intervals, in its modes or those of the friction homotopy."""
+    stages = guess.stages
+    if guess.homotopy:
+        solution = find_modes(search, stages)
+        if not solution.success:
+            return solution
+        stages, most = solution.stages, SPLIT
+    solution = search.solve(stages, guess.before, search.wait(most))
+    if solution.success and solution.margin < -ROUNDING:
+        # A motion that presses too little may be far from one that presses enough.
+        return solution._replace(success=False, status="the largest c_n is below epsilon")
+    return solution
 
 
-def _resume(
-    search: TimeSearch, attempts: Attempts, coarse: PhasePlan[Motion]
-) -> TimeSolution | None:
-    """Solution from a coarse plan, in its modes; None without success."""
+def may_gain(search: TimeSearch, solution: TimeSolution) -> bool:
+    """Whether a solution suggests other contact modes."""
+    if not search.options.mode_search or search.has_ample(solution):
+        return False
+    known = sign_sequence(solution.stages)
+    return any(sign_sequence(moved) != known for moved in list_neighbours(search, solution))
+
+
+def _refine_best(
+    search: TimeSearch, coarse: Sequence[_Named], best: _Named | None
+) -> _Named | None:
+    """The best of refined solutions, unless coarse ones are dearer, and of one that is known."""
+    for solution, name in sorted(coarse, key=lambda own: own[0].cost):
+        if best and best[0].cost < solution.cost:
+            break
+        solution = finish(search, solution)
+        if solution.success and (best is None or solution.cost < best[0].cost):
+            best = solution, name
+    return best
+
+
+def finish(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
+    """Search modes, choose a free end, refine, and hold torques over control periods."""
+    if search.options.mode_search and not search.has_ample(solution):
+        solution = improve(search, solution)
+    if search.only_begins:
+        return solution
+    search, solution = choose_end(search, solution)
+    solution = refine(search, solution)
+    fewer = drop_gone(search, solution) if solution.success else solution
+    if fewer is not solution:
+        # Phase 3 of query 57 does not hold in its replay otherwise.
+        fewer = refine(search, fewer)
+        if fewer.success and fewer.cost - solution.cost < WORTH * abs(solution.cost):
+            solution = fewer
+    if solution.success and search.options.ranges:
+        return keep_within(search, solution)
+    if solution.success and search.problem.scene.control_period:
+        return hold_torques(search, solution)
+    return solution
+
+
+def choose_end(search: TimeSearch, solution: TimeSolution) -> tuple[TimeSearch, TimeSolution]:
+    """Add the cost-to-go at the end, expanded to first order, and solve again while that gains.
+
+    Also returns the search with the price of the last end.
+    """
+    best, least, to_go = (search, solution), None, search.to_go
+    if to_go is None:
+        return best
+    for _ in range(ROUNDS):
+        try:
+            value, gradient = to_go(solution.end)
+        except WholearmError:
+            break
+        total = solution.cost - search.charge(solution.end) + value
+        if least is not None and total > least - GAIN * abs(least):
+            break
+        least, best = total, (search, solution)
+        search = replace(search, price=Price(gradient, solution.end))
+        solution = search.solve(solution.stages, solution)
+        if not solution.success:
+            break
+    return best
+
+
+def _resume(search: TimeSearch, guesses: Guesses, coarse: PhasePlan[Motion]) -> _Named | None:
+    """Plan from a coarse plan, in its modes where these have been searched."""
     if not isinstance(coarse.solution, TimeSolution):
         return None
-    if coarse.complete or coarse.sequences > 1:
-        search.tried.sequences, search.tried.complete = coarse.sequences, coarse.complete
-        search = replace(search, options=replace(search.options, mode_search=False))
-    solution = solve_attempt(search, attempts.resume(coarse.solution))
-    return solution if solution.success else None
+    guess = guesses.resume(coarse.solution)._replace(name=coarse.attempt)
+    if not (coarse.complete or coarse.sequences > 1):
+        return solve_guesses(search, [guess, guesses.nearest.by_homotopy()])
+    search.tried.sequences, search.tried.complete = coarse.sequences, coarse.complete
+    search = replace(search, options=replace(search.options, mode_search=False))
+    return solve_guesses(search, [guess])
 
 
-_Outcome = tuple[str, TimeSolution, list[Stage]]
-"""Result of an attempt: its name, the solution, and the elastic one if that violates limits."""
+def _list_slow(
+    search: TimeSearch, guesses: Iterator[Guess], fastest: list[Stage], pinned: bool, first: Guess
+) -> Iterator[Guess]:
+    """Guesses for the largest margin: time-optimal stages, and others, `pinned` to their end."""
+    lasts = sum(stage.guess.duration for stage in fastest)
+    if fastest and search.duration is not None and lasts <= search.duration:
+        # On as few intervals as the first guess has.
+        coarse = list[Stage]()
+        count = sum(stage.intervals for stage in first.stages) / len({s.phase for s in fastest})
+        for stage in fastest:
+            phase = sum(each.guess.duration for each in fastest if each.phase == stage.phase)
+            intervals = max(LEAST_INTERVALS, round(count * stage.guess.duration / phase))
+            breaks = np.linspace(0.0, 1.0, intervals + 1)
+            coarse.append(replace(stage, guess=resample(stage.guess, search.scheme, breaks)))
+        guesses = chain([Guess("a motion of least time", coarse)], guesses)
+    end = fastest[-1].guess.nodes[-1, 0] if pinned and fastest else None
+    for guess in guesses:
+        yield guess._replace(stages=[*guess.stages[:-1], replace(guess.stages[-1], stop=end)])
 
 
-def _try_all(
-    search: TimeSearch, problem: Problem, attempts: Attempts, first: TimeSolution
-) -> list[_Outcome]:
-    """Solve from one guess after the other until one succeeds or enough are infeasible.
+def _free_ends(search: TimeSearch, guesses: Guesses) -> Iterator[Guess]:
+    """A coarse plan that chooses where phases end, which then are pinned."""
 
-    `first` is the solution from the first guess.
-    """
-    stop = search.tried.iterations + BUDGET
-    far, count, outcomes = False, 0, list[_Outcome]()
-    for attempt in attempts:
-        far = far or (not attempt.homotopy and attempts.are_far)
-        # Far from any plan, or after a violation, the elastic problem is solved at once.
-        elastic = far or count or attempt is attempts.first
-        solved = first if elastic and not attempt.homotopy else None
-        solution, short = _try(search, problem, attempt, solved)
-        outcomes.append((attempt.name, solution, short))
-        count += bool(short)
-        late = search.tried.iterations > stop
-        if solution.success or late or count == (1 if far else CONVINCING):
-            break
-    looked = not first.is_lost and any(name == NEAREST for name, *_ in outcomes)
-    if not (looked or count or outcomes[-1][1].success):
-        outcomes.append((NEAREST, first, find_short(search, problem, attempts.first.stages)[1]))
-    return outcomes
+    def free(phase: Phase) -> Phase:
+        # With one freedom pins have no effect.
+        pinned = phase.until.pins and phase.formation.n_constraints < 4
+        return replace(phase, until=replace(phase.until, pins=())) if pinned else phase
+
+    every, phases = guesses.problem.phases, [free(phase) for phase in guesses.phases]
+    if phases == list(guesses.phases):
+        return
+    problem = replace(guesses.problem, phases=tuple(map(free, every)))
+    own = replace(search, problem=in_own_units(problem), only_begins=True, to_go=None, price=None)
+    found = solve_guesses(own, Guesses(problem, phases, guesses.z, own).every())
+    if found is not None:
+        stages, known = list[Stage](), search.problem.phases
+        for stage in found[0].stages:
+            until = stage.until and known[stage.phase].until
+            stages.append(replace(stage, until=until))
+        yield Guess(FREE, stages, before=found[0])
 
 
-def _try(
-    search: TimeSearch, problem: Problem, attempt: Attempt, solved: TimeSolution | None
-) -> tuple[TimeSolution, list[Stage]]:
-    """Solve, unless `solved`; without success solve the elastic problem, and again from there."""
-    solution = solve_attempt(search, attempt) if solved is None else solved
-    if solution.success or attempt.homotopy:
-        return solution, []
-    # Finer intervals may show violations that coarse ones do not.
-    lost = solution.is_lost
-    stages = halve(solution.stages, search.scheme) if lost else attempt.stages
-    elastic, short = find_short(search, problem, stages)
-    if elastic is not None and not short and not lost:
-        solution = solve_attempt(search, attempt._replace(stages=elastic))
-        if not solution.success:
-            short = find_short(search, problem, halve(elastic, search.scheme))[1]
-    return solution, short
+def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) -> _Named:
+    """Plan from motions of least violation, or the error that says why there is none."""
+    from .time_explain import explain, list_shortfalls, refuse_paths, solve_elastic
 
-
-def find_short(
-    search: TimeSearch, problem: Problem, stages: list[Stage]
-) -> tuple[list[Stage] | None, list[Stage]]:
-    """The elastic solution, if there is one, and again if it violates limits."""
-    from .time_explain import list_shortfalls, solve_elastic
-
-    elastic = solve_elastic(search, stages)
-    if elastic is None or not list_shortfalls(problem, elastic, search.scheme):
-        return elastic, []
-    return elastic, elastic
-
-
-def explain_lost(
-    search: TimeSearch,
-    problem: Problem,
-    attempts: Attempts,
-    outcomes: Sequence[_Outcome],
-    replan: Replan | None,
-) -> InfeasibleError | SolverError:
-    """Error that says why no attempt has led to a plan; `replan` as for `explain`."""
-    from .time_explain import explain, refuse_ways
-
-    count = len({NEAREST, *(name for name, *_ in outcomes)})
-    reason = (
-        "the solver found neither a plan nor a motion that misses limits least, from "
-        f"{count} guess{'es' * (count > 1)} of the motion"
-    )
-    short = [stages for *_, stages in outcomes if stages]
+    problem, short = guesses.problem, list[list[Stage]]()
+    for guess in chain([guesses.nearest], islice(guesses.to_others(), 1)):
+        elastic = solve_elastic(search, guess.stages)
+        if elastic is not None and not list_shortfalls(problem, elastic, search.scheme):
+            found = solve_guesses(search, [guess._replace(stages=elastic)])
+            if found is not None:
+                return found
+            # Finer intervals may show violations that coarse ones do not.
+            elastic = solve_elastic(search, halve(elastic, search.scheme))
+        if elastic is not None and list_shortfalls(problem, elastic, search.scheme):
+            short.append(elastic)
     if not short:
-        refuse_ways(problem, attempts.phases[0], attempts.ways)
-    return explain(search, problem, attempts.phases, short, reason, replan)
-
-
-def _slow_down(
-    search: TimeSearch, fastest: list[Stage], attempt: Attempt, usual: bool, pinned: bool
-) -> TimeSolution | None:
-    """Solve for the largest margin from time-optimal stages, `pinned` to where these end.
-
-    The `usual` guess comes first if it has led to these. They keep epsilon within any duration that
-    is no shorter, and are the plan if no better is found. None if they take longer.
-    """
-    lasts, most = sum(stage.guess.duration for stage in fastest), search.duration
-    if most is None or lasts > most:
-        return None
-    first, coarse = attempt.stages, list[Stage]()
-    count = sum(stage.intervals for stage in first) / len({stage.phase for stage in fastest})
-    for stage in fastest:
-        phase = sum(each.guess.duration for each in fastest if each.phase == stage.phase)
-        intervals = max(LEAST_INTERVALS, round(count * stage.guess.duration / phase))
-        breaks = np.linspace(0.0, 1.0, intervals + 1)
-        coarse.append(replace(stage, guess=resample(stage.guess, search.scheme, breaks)))
-    end = coarse[-1].guess.nodes[-1, 0] if pinned else None
-    tries = ((first, False), (coarse, False)) if usual else ((coarse, False), (first, True))
-    for stages, homotopy in tries:
-        stages = [*stages[:-1], replace(stages[-1], stop=end)]
-        solution = solve_attempt(search, attempt._replace(stages=stages, homotopy=homotopy))
-        if solution.success:
-            return solution
-    search.tried.complete = False
-    return TimeSolution(fastest, 0.0, 0.0, solution.status, True, search.build(fastest), {})
+        refuse_paths(problem, guesses.phases[0], [margin for margin, _ in guesses.paths])
+    reason = "the solver found neither a plan nor a motion that misses limits least"
+    raise explain(search, problem, guesses.phases, short, reason, replan)
 
 
 def list_plans(
@@ -315,9 +347,7 @@ def list_plans(
     solution: TimeSolution,
     attempt: str,
 ) -> list[PhasePlan[TimeMotion]]:
-    """The plan of each phase, with limits within the ranges if there are any (`keep_within`)."""
-    if search.options.ranges and not search.only_begins:
-        solution = keep_within(search, solution, phases)
+    """The plan of each phase."""
 
     def evaluate(solution: TimeSolution) -> list[tuple[TimeMotion, float]]:
         """Motion and share of the objective of each phase."""
@@ -341,176 +371,6 @@ def list_plans(
     if search.only_begins:
         plans[0] = plans[0]._replace(solution=solution)
     return plans
-
-
-class ContinuedEnd(NamedTuple):
-    """Result of moving ends to where they are pinned, by continuation."""
-
-    solution: TimeSolution | None = None  # a plan that ends there; None if there is none
-    nearest: TimeSolution | None = None  # the plan that comes nearest instead
-    ends: Mapping[int, Array] = MappingProxyType({})  # where each phase, by its index, ended free
-    share: float = 0.0  # of the continuation from there, that the nearest plan has reached
-
-
-def approach(
-    search: TimeSearch, problem: Problem, phases: Sequence[Phase], z: Array
-) -> ContinuedEnd:
-    """Plan phases with free ends, then move these to where they are pinned, by continuation.
-
-    `search` is for the phases as they are, which start at `z`, shape (5,).
-    """
-    free = [_set_free(phase) for phase in phases]
-    if all(one is other for one, other in zip(free, phases, strict=True)):
-        return ContinuedEnd()
-    freed = replace(problem, phases=tuple(_set_free(phase) for phase in problem.phases))
-    goal = find_end(phases[0], z) if len(phases) == 1 else None
-    solution = _plan_free_end(search, freed, free, z, goal)
-    if solution is None:
-        return ContinuedEnd()
-    ends = {stage.phase: stage.guess.nodes[-1, 0] for stage in solution.stages}
-    reached, step = 0.0, 1.0
-    while reached < 1.0:
-        share = min(1.0, reached + step)
-        stages = [_pin(search, stage, ends[stage.phase], share) for stage in solution.stages]
-        moved = search.solve(stages, solution, most=search.wait(PATIENCE))
-        if moved.success:
-            final = share == 1.0 or not search.options.mode_search
-            solution, reached = moved if final else improve(search, moved), share
-        elif (step := step / 4) < SHORTEST:
-            return ContinuedEnd(None, solution, ends, reached)
-    if search.only_begins:
-        return ContinuedEnd(solution)
-    halvings = Attempts(problem, phases, z, search, None, False).first.halvings
-    last = solve_attempt(search, Attempt(MOVED, halvings, solution.stages, before=solution))
-    return ContinuedEnd(last) if last.success else ContinuedEnd(None, solution, ends, reached)
-
-
-def refuse_pinned(
-    search: TimeSearch, problem: Problem, phases: Sequence[Phase], moved: ContinuedEnd
-) -> None:
-    """Raise an error with the limits that an elastic motion to the pinned end violates.
-
-    Without one, a motion that ends nearer to it than any plan says why.
-    """
-    from .time_explain import list_shortfalls, solve_elastic
-
-    if moved.nearest is None:
-        return
-    for part in (1.0, *NEARER):
-        share = moved.share + part * (1.0 - moved.share)
-        nearest = moved.nearest.stages
-        stages = [_pin(search, stage, moved.ends[stage.phase], share) for stage in nearest]
-        elastic = solve_elastic(search, stages)
-        ranked = rank_shortfalls(list_shortfalls(problem, elastic or [], search.scheme))
-        if ranked and elastic:
-            lasts = (to_si(own[-1], problem) for own in (nearest, elastic))
-            ends = [describe_pose(last.guess.nodes[-1, 0]) for last in lasts]
-            text = name_phases([phase.number for phase in phases], "infeasible")
-            raise InfeasibleError(
-                f"{text}: a plan ends at {ends[0]} at the nearest, and at {ends[1]} "
-                f"{describe_shortfalls(ranked)}",
-                ranked,
-            )
-
-
-def _plan_free_end(
-    search: TimeSearch, free: Problem, phases: Sequence[Phase], z: Array, goal: Array | None
-) -> TimeSolution | None:
-    """A coarse plan that chooses where it ends."""
-    scaled = in_own_units(free)
-    search = replace(search, problem=scaled, only_begins=True, to_go=None, price=None)
-    attempts = Attempts(free, phases, z, search, None, True)
-    try:
-        for attempt in chain(attempts.begin(goal), attempts.list_further(FURTHER)):
-            solution = solve_attempt(search, attempt)
-            if solution.success:
-                return solution
-    except InputError:
-        pass  # A free end may be out of reach of the initial paths.
-    return None
-
-
-def _set_free(phase: Phase) -> Phase:
-    """The phase without pins; unchanged where they have no effect."""
-    if not phase.until.pins or phase.formation.n_constraints >= 4:
-        return phase
-    return replace(phase, until=replace(phase.until, pins=()))
-
-
-def _pin(search: TimeSearch, stage: Stage, end: Array, share: float) -> Stage:
-    """A stage with its pins moved by a share of the continuation from its free `end`."""
-    until = search.problem.phases[stage.phase].until
-    if stage.until is None or not until.pins:
-        return stage
-    pins = tuple(
-        (name, value + (1.0 - share) * (float(end[ROWS[name]]) - value))
-        for name, value in until.pins
-    )
-    return replace(stage, until=replace(until, pins=pins))
-
-
-def keep_within(
-    search: TimeSearch, solution: TimeSolution, phases: Sequence[Phase]
-) -> TimeSolution:
-    """Tighten limits until they hold, to first order, within the ranges of the options.
-
-    `solution` is accurate, with limits that hold between points; SolverError without a plan.
-    """
-    raised = [IntersampleLimits.none(stage) for stage in solution.stages]
-    error, epsilon, ranges = solution.error, search.problem.epsilon, search.options.ranges
-    where = name_phases([phase.number for phase in phases])
-    for iterate in range(_ROUNDS):
-        deviations, misses = list[Array](), list[IntersampleLimits]()
-        motions = make_motions(solution.stages, search.scheme)
-        for stage, motion in zip(solution.stages, motions, strict=True):
-            check = check_between(stage, motion)
-            deviation = find_deviations(stage, check, epsilon, ranges)
-            misses.append(find_misses(stage, check, epsilon, solution.margin, deviation))
-            table = deviation.reshape(stage.intervals, CHECKS, -1).max(axis=1)
-            deviations.append(np.where(table > MISS, table, 0.0))
-        if iterate and max(miss.worst for miss in misses) <= 1:
-            return solution._replace(error=error)
-        if iterate < _PARAMETRIC:
-            raised = [
-                old._replace(held=deviation, gap=old.gap + miss.gap)
-                for old, deviation, miss in zip(raised, deviations, misses, strict=True)
-            ]
-        else:
-            raised = [
-                IntersampleLimits(*(a + _OVER * b for a, b in zip(old, miss, strict=True)))
-                for old, miss in zip(raised, misses, strict=True)
-            ]
-        solution = search.run(
-            solution.nlp, solution.stages, raised, solution.multipliers, solution.margin
-        )
-        if not solution.success:
-            text = f"limits cannot be kept within the ranges: {solution.status}"
-            raise SolverError(f"{where}: {text}")
-    raise SolverError(f"{where}: limits are still missed within the ranges after {_ROUNDS} solves")
-
-
-def find_deviations(
-    stage: Stage, check: CheckPlaces, epsilon: float, ranges: Mapping[str, float]
-) -> Array:
-    """Change of each side of the limits by all ranges, relative to its scale, (n, n_sides)."""
-    formation, count = stage.formation, len(check.places)
-    names = [name for name, radius in ranges.items() if radius > 0 and name != "delay"]
-    limits = make_limits(formation, epsilon)
-    forces = limits.of(PRESS, CONE)
-    rows = limits.rows[forces][:, : formation.n_constraints]
-    signs = (np.broadcast_to(part, (count, *part.shape)) for part in stage.directions)
-    slopes = find_slopes_at(formation, check.samples, Directions(*signs), names)
-    c_t = check.samples.c_t[:, list(formation.rolling_rows)]
-    c = np.hstack([check.samples.c_n, c_t])
-    total = np.zeros((count, len(limits.low)))
-    for k, name in enumerate(names):
-        change = slopes[:, :, k] @ rows.T
-        edges = find_edges(formation, rows, name)
-        if edges is not None:
-            change = change + c @ edges.T - epsilon * edges.sum(axis=1)
-        total[:, forces] += ranges[name] * np.abs(change)
-    sides = limits.sides[0]
-    return np.asarray(total[:, sides] / limits.scales[sides])
 
 
 def plan_with_impacts(

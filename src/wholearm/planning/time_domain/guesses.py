@@ -1,0 +1,533 @@
+"""Initial guesses of phases that are one NLP: one ordered list, each with its name.
+
+A guess follows a path from geometry alone, from rest to rest in time. Contact modes are those of
+the path, or those of a motion with smoothed friction, tanh(rate / onset) in place of the sign
+(friction homotopy): such a motion needs no modes, and is split into stages by the signs of its
+rates. A contact whose rate rests there for a while, so that its friction is not all used, rolls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from ...common.arrays import Array
+from ...contacts.elemental import Contact
+from ...geometry.arcs import CostToGo
+from ...geometry.curve import find_tied, tangent_basis
+from ...geometry.explore import close_contacts, is_inside
+from ...geometry.path_guess import PathGuess, connect, find_end, guess_phase, list_ends
+from ...mechanics.dynamics import Directions, force_rows, metric_weights
+from ...mechanics.limits import SPEED, make_limits
+from ...problem.definition import End, Phase, Problem
+from .collocation import Scheme
+from .mode_search import LEAST_INTERVALS, StageMode, can_roll, divide, in_mode, link, merge, mode_of
+from .search import TimeSearch, TimeSolution
+from .stage import Stage, StagePoints, in_own_units, resample, scale_state
+
+NEAREST = "a motion to the nearest end of the phase"
+STRAIGHT = "a motion straight to the end"
+OTHER = "a motion straight to another end"
+GRADUAL = " with friction that sets in gradually"  # suffix of names where modes are found so
+LONGER = "{}, {:g} times as long as a fall over that height"
+PATHS = 3  # most paths to other ends
+STEP = 0.15  # distance of ends, over the length of the path to the nearest end
+GROWTH = 1.2  # ratio of successive distances
+STEPS = 12  # most ends on either side of the nearest one
+SURE = 1e-3  # margin above which a motion keeps its limits
+FASTEST = 9.0  # largest squared speed, over gravity times the radius of gyration
+INTERVALS = 10  # of a phase to start with
+FALLS = (2.0, 4.0, 1.0)  # guessed durations, over that of a fall over the path's length
+ONSETS = (0.1, 0.03)  # rates of the friction homotopy, in the scene's unit
+USED = 0.2  # friction at the last of them, over all there is, below which a contact rests
+RESTS = 0.1  # least duration of that, over that of its stage, that makes it roll
+SLOW = 1e-5  # rate over the largest at the same instant below which its sign is undetermined
+STILL = 1e-4  # largest rate at an instant, over that of all, below which all signs are undetermined
+BRIEF = 0.05  # least duration of a piece over that of its stage
+MOST = 8  # most pieces of a stage
+_LIGHT = 0.5  # normal forces of an initial guess, over the weight of the object
+_NEAR = 0.02  # distance over the radius of gyration at which a limit is monitored from the start
+_TOUCHES = 1e-5  # gap over the radius of gyration below which a released contact is closed
+_Change = tuple[float, dict[int, float]]  # place, share of a stage, and new signs of rows
+
+
+class Guess(NamedTuple):
+    """An initial guess."""
+
+    name: str
+    stages: list[Stage]
+    homotopy: bool = False  # whether its modes come from the friction homotopy
+    before: TimeSolution | None = None  # solution that the stages are from
+
+    def by_homotopy(self) -> Guess:
+        """The same path, in the modes of the friction homotopy."""
+        return self._replace(name=self.name + GRADUAL, homotopy=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Guesses:
+    """The guesses of phases in their order, each made when it is its turn."""
+
+    problem: Problem
+    phases: Sequence[Phase]
+    z: Array  # (5,): start
+    search: TimeSearch
+    to_go: CostToGo | None = None
+
+    @cached_property
+    def nearest(self) -> Guess:
+        """To the nearest end of each phase."""
+        return Guess(NEAREST, self._guess(None, FALLS[0]))
+
+    def straight(self, goal: Array) -> Guess | None:
+        """Straight to an end of a single phase with two freedoms, in the modes of that path."""
+        outline = self._connect(goal)
+        return self._follow(STRAIGHT, outline) if outline else None
+
+    @cached_property
+    def paths(self) -> list[tuple[PathMargin, PathGuess]]:
+        """Straight paths to the ends of a single phase, those first that keep limits most."""
+        goals = self._list_goals() if self._is_planar() else []
+        outlines = [own for goal in goals if (own := self._connect(goal))]
+        found = [(find_margin(own, self.problem.epsilon), own) for own in outlines]
+
+        def rank(path: tuple[PathMargin, PathGuess]) -> tuple[float, float]:
+            """Feasible paths by their length, others by their margin."""
+            (margin, _, _), outline = path
+            return (-SURE, outline.length) if margin > SURE else (-margin, 0.0)
+
+        return sorted((own for own in found if own[0].value > -np.inf), key=rank)
+
+    def to_others(self) -> Iterator[Guess]:
+        """Along the first of these paths."""
+        found = (self._follow(OTHER, outline) for _, outline in self.paths[:PATHS])
+        return (guess for guess in found if guess is not None)
+
+    def _is_planar(self) -> bool:
+        """Whether there is a single phase, with two freedoms, that does not end by a release."""
+        phase, *others = self.phases
+        free = tangent_basis(phase.formation, self.z).shape[1]
+        return free == 2 and not (others or phase.until.is_release)
+
+    def _connect(self, goal: Array) -> PathGuess | None:
+        """The straight path to an end; None if it is obstructed."""
+        if not self._is_planar():
+            return None
+        formation = self.phases[0].formation
+        outline = connect(formation, self.z, goal)
+        moves = np.diff(outline.z, axis=0).any(axis=1).all()
+        free = formation.evaluate_limits(outline.z).min() > -formation.scene.touching
+        return outline if moves and free else None
+
+    def _follow(self, name: str, outline: PathGuess) -> Guess | None:
+        """Along a path in its modes; None if these are too many."""
+        stages, scheme = self._guess(outline, FALLS[0]), self.search.scheme
+        pieces = [piece for stage in stages for piece in split_by_signs(stage, scheme)]
+        return Guess(name, link(merge(pieces))) if pieces else None
+
+    def resume(self, solution: TimeSolution) -> Guess:
+        """From a solution with nearly the same start."""
+        first, *others = solution.stages
+        nodes = first.guess.nodes.copy()
+        nodes[0, 0] = self.nearest.stages[0].guess.nodes[0, 0]
+        stages = [replace(first, guess=first.guess._replace(nodes=nodes)), *others]
+        return Guess("", self._leave_room(stages), before=solution)
+
+    def every(self, goal: Array | None = None) -> Iterator[Guess]:
+        """All of them; where the end is known, straight there comes first."""
+        if goal is None and self._is_planar() and self.phases[0].until.pins:
+            goal = find_end(self.phases[0], self.z)
+        straight = None if goal is None else self.straight(goal)
+        if straight is not None:
+            yield straight
+        yield self.nearest
+        yield self.nearest.by_homotopy()
+        if straight is not None:
+            yield straight.by_homotopy()
+        yield from self.to_others()
+        for falls in FALLS[1:]:
+            yield Guess(LONGER.format(NEAREST, falls), self._guess(None, falls))
+
+    def _list_goals(self) -> list[Array]:
+        """Ends of a phase: the nearest, (5,), and others on both sides of it."""
+        (phase,) = self.phases
+        formation, nearest = phase.formation, find_end(phase, self.z)
+        metric = np.sqrt(metric_weights(formation.scene))
+        step = STEP * float(np.linalg.norm((nearest - self.z) * metric))
+        slip, ends = formation.evaluate_slip(self.z[None])[0], list_ends(phase)
+        N = tangent_basis(formation, nearest) * metric[2] / metric[:, None] ** 2
+
+        def project(guess: Array, last: Array, step: float) -> Array | None:
+            for end in ends:
+                goal = close_contacts(end.formation, guess, slip, end.fixed, end.active)
+                if goal is None or not is_inside(end.formation, goal):
+                    continue
+                if 0.2 * step < np.linalg.norm((goal - last) * metric) < 5 * step:
+                    return goal
+            return None
+
+        goals, sides = [nearest], list[Array]()
+        for direction in (*N.T, *-N.T):
+            goal = project(nearest + step * direction, nearest, step)
+            # Directions across the ends lead back to the same.
+            if goal is not None and all((goal - nearest) @ (s - nearest) <= 0 for s in sides):
+                sides.append(goal)
+        for side in sides:
+            goal, last, length = side, nearest, step
+            for _ in range(STEPS):
+                goals.append(goal)
+                secant = (goal - last) * metric
+                length *= GROWTH
+                secant = length * secant / np.linalg.norm(secant) / metric
+                following = project(goal + secant, goal, length)
+                if following is None:
+                    break
+                last, goal = goal, following
+        return goals
+
+    def _guess(self, outline: PathGuess | None, falls: float) -> list[Stage]:
+        options = self.search.options
+        count = options.time_intervals or INTERVALS
+        given = self.problem, self.phases, self.z, self.search.scheme, count, falls, outline
+        return self._leave_room(
+            [
+                replace(stage, opening=options.opening, clearance=options.clearance)
+                for stage in guess_stages(*given)
+            ]
+        )
+
+    def _leave_room(self, stages: list[Stage]) -> list[Stage]:
+        """The stages, with an end clear of the contact that ends what follows."""
+        if self.to_go is None:
+            return stages
+        return [*stages[:-1], keep_apart(stages[-1], self.to_go.phase.until.contact)]
+
+
+class PathMargin(NamedTuple):
+    """Largest uniform margin of limits along a path at any speed, and the critical limit."""
+
+    value: float  # -inf without a motion
+    kind: str = ""  # of the limit with the largest sum of multipliers
+    part: str = ""
+
+
+def find_margin(outline: PathGuess, epsilon: float) -> PathMargin:
+    """Largest margin along a path, by a linear programme.
+
+    Unknowns are the squared speed b at the nodes, contact forces c in the intervals, and the
+    margin. Friction is against the path; viscous friction and limits of speeds are neglected.
+    """
+    from scipy.optimize import linprog
+
+    formation, scene = outline.formation, outline.formation.scene
+    dz, middles = np.diff(outline.z, axis=0), (outline.z[1:] + outline.z[:-1]) / 2
+    runs = np.sqrt(dz**2 @ metric_weights(scene))[:, None]
+    z_s, m, k = dz / runs, len(dz), np.arange(len(dz))
+    z_ss = np.gradient(z_s, np.cumsum(runs) - runs[:, 0] / 2, axis=0)
+    kinematics = formation.evaluate(middles, z_s)
+    Xi = np.where(np.einsum("nij,nj->ni", kinematics.A_t, z_s) < 0, -1.0, 1.0)
+    sigma = np.where(z_s[:, 3:] < 0, -1.0, 1.0)
+    G = force_rows(formation, kinematics, Directions(Xi, sigma))
+    force, width = scene.scales.force, G.shape[1]
+    size = m + 1 + m * width + 1
+    # M5 z'' - G^T c, with z'' = z_s s'' + z_ss b.
+    drive = np.zeros((m, 5, size))
+    mass, slope = scene.mass_diagonal * scene.scales.speed**2, z_s / (2 * runs)
+    drive[k, :, k], drive[k, :, k + 1] = mass * (z_ss / 2 - slope), mass * (z_ss / 2 + slope)
+    own = m + 1 + k[:, None] * width + np.arange(width)
+    drive[k[:, None], :, own] = -force * G
+    units = force * np.array([1.0, 1.0, scene.scales.length])
+    y, offset = np.zeros((m, width + 2, size)), np.zeros((m, width + 2))
+    y[k[:, None], np.arange(width), own] = force
+    y[:, width:], offset[:, width:] = drive[:, 3:], scene.dry[3:] * sigma
+    limits = make_limits(formation, epsilon).without(SPEED)
+    sides, signs, bounds = limits.sides
+    scales = signs / limits.scales[sides]
+    slopes = limits.rows[sides, :-2] * scales[:, None]
+    rows = -(slopes @ y)
+    rows[..., -1] = 1.0
+    free: list[tuple[float | None, float | None]] = [(None, None)] * (m * width)
+    answer = linprog(
+        -np.eye(size)[-1],
+        rows.reshape(-1, size),
+        (offset @ slopes.T - scales * bounds).ravel(),
+        (drive[:, :3] / units[:, None]).reshape(-1, size),
+        np.tile(scene.applied_force[:3] / units, m),
+        [(0.0, 0.0), *[(0.0, FASTEST)] * (m - 1), (0.0, 0.0), *free, (None, 1.0)],
+        method="highs",
+    )
+    if answer.status != 0:
+        return PathMargin(-np.inf)
+    shares = np.abs(answer.ineqlin.marginals).reshape(m, -1).sum(axis=0)
+    totals = np.bincount(limits.owners[sides], shares)
+    critical = limits.limits[int(totals.argmax())]
+    return PathMargin(float(answer.x[-1]), critical.kind, critical.part)
+
+
+def keep_apart(stage: Stage, contact: Contact | None) -> Stage:
+    """The stage, with its end clear of the contact that ends the next one."""
+    rows = [k for k, limit in enumerate(stage.formation.limits) if limit.gains(contact)]
+    return replace(stage, apart=tuple(rows), monitored=tuple(sorted({*stage.monitored, *rows})))
+
+
+def find_modes(search: TimeSearch, stages: Sequence[Stage]) -> TimeSolution:
+    """Solution by friction homotopy, with stages in its modes."""
+    modes = [mode_of(next(s for s in stages if s.phase == stage.phase)) for stage in stages]
+    stages = link(merge([in_mode(*pair) for pair in zip(stages, modes, strict=True)]))
+    solution: TimeSolution | None = None
+    for onset in ONSETS:
+        solution = search.solve([replace(stage, onset=onset) for stage in stages], solution, 50)
+        if not solution.success:
+            return solution
+        stages = solution.stages
+    assert solution is not None
+    pieces = [split_by_signs(stage, search.scheme) for stage in stages]
+    if not all(pieces):
+        status = "with friction that sets in gradually things turn too often"
+        return solution._replace(status=status, success=False)
+    exact = [replace(piece, onset=0.0) for own in pieces for piece in own]
+    return solution._replace(stages=link(merge(exact)))
+
+
+def split_by_signs(stage: Stage, scheme: Scheme) -> list[Stage]:
+    """Pieces of a stage in the modes of its rates, which have to be linked; none if too many."""
+    signs, changes = _find_changes(stage, scheme)
+    if len(changes) >= MOST:
+        return []
+    # Changes that coincide are moved apart: otherwise the motion would have to stop.
+    widths = np.diff([0.0, *(place for place, _ in changes), 1.0])
+    widths = np.maximum(widths, min(BRIEF / 2, 0.5 / len(widths)))
+    edges = [0.0, *np.cumsum(widths / widths.sum())[:-1].tolist(), 1.0]
+    parts = list[tuple[StagePoints, StageMode]]()
+    for (begin, stop), (_, new) in zip(pairwise(edges), [*changes, (1.0, {})], strict=True):
+        count = max(LEAST_INTERVALS, round((stop - begin) * stage.intervals))
+        guess = resample(stage.guess, scheme, np.linspace(0.0, 1.0, count + 1), begin, stop)
+        parts.append((guess, StageMode(tuple(signs))))
+        for row, sign in new.items():
+            signs[row] = sign
+    return divide(stage, parts)
+
+
+def _find_changes(stage: Stage, scheme: Scheme) -> tuple[list[float], list[_Change]]:
+    """Initial signs of rates, (n_c + 2,), and their changes in order of time.
+
+    Signs that hold for less than a brief time are those before.
+    """
+    part, formation = stage.guess, stage.formation
+    places, z = part.places(scheme.points).ravel(), part.z.reshape(-1, 5)
+    rates = stage.measure_senses(z, part.v.reshape(-1, 5)) * np.concatenate(stage.directions)
+    sizes = np.abs(rates).max(axis=1)
+    clear = (np.abs(rates) > SLOW * sizes[:, None]) & (sizes > STILL * sizes.max())[:, None]
+    first, every = np.array(mode_of(stage).signs), list[tuple[float, int, float]]()
+    for row, rate in enumerate(rates.T):
+        points = np.flatnonzero(clear[:, row])
+        if not len(points) or first[row] == 0:
+            continue
+        signs = np.sign(rate)
+        if stage.onset and can_roll(formation, z[len(z) // 2], row):
+            rests = np.abs(np.tanh(rate / stage.onset)) < USED
+            edges = np.flatnonzero(np.diff(np.concatenate([[0], rests.astype(int), [0]])))
+            for begin, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+                if places[stop - 1] - places[begin] > RESTS:
+                    signs[begin:stop] = 0.0
+        runs = [(0.0, float(signs[points[0]]))]
+        for i, j in pairwise(points.tolist()):
+            if signs[i] != signs[j]:
+                share = rate[i] / (rate[i] - rate[j]) if rate[i] * rate[j] < 0 else 0.5
+                runs.append((float(places[i] + share * (places[j] - places[i])), float(signs[j])))
+        while len(runs) > 1:
+            lasts = np.diff([place for place, _ in runs] + [1.0])
+            if lasts.min() >= BRIEF:
+                break
+            k = int(lasts.argmin())
+            runs = [(0.0, runs[1][1]), *runs[2:]] if k == 0 else runs[:k] + runs[k + 1 :]
+            runs = [own for n, own in enumerate(runs) if not n or own[1] != runs[n - 1][1]]
+        first[row] = runs[0][1]
+        every += [(place, row, sign) for place, sign in runs[1:]]
+    changes, near = list[_Change](), 2 * float(np.diff(places).max())
+    for place, row, sign in sorted(every):
+        before, rows = changes[-1] if changes else (-1.0, {})
+        tied = find_tied(formation, z[int(np.abs(places - place).argmin())], row)
+        if place - before < near and row not in rows and set(rows) & set(tied):
+            rows[row] = sign
+        else:
+            changes.append((place, {row: sign}))
+    # Where all rates reverse near each other the motion stops: that is one change.
+    joined, count = list[_Change](), int(np.count_nonzero(first))
+    while changes:
+        close = [own for own in changes if own[0] < changes[0][0] + near]
+        rows = {row: sign for _, own in close for row, sign in own.items()}
+        if len(rows) == sum(len(own) for _, own in close) == count:
+            joined.append((close[len(close) // 2][0], rows))
+            changes = changes[len(close) :]
+        else:
+            joined.append(changes.pop(0))
+    return first.tolist(), joined
+
+
+def guess_stages(
+    problem: Problem,
+    phases: Sequence[Phase],
+    z: Array,
+    scheme: Scheme,
+    intervals: int,
+    falls: float,
+    outline: PathGuess | None = None,
+) -> list[Stage]:
+    """Stages of phases in one NLP, with an initial guess, in the scene's own units.
+
+    The guessed duration is `falls` times that of a fall over the length of the initial paths. A
+    single phase may follow a given one.
+    """
+    parts = _list_parts(problem, phases, z, outline)
+    lengths = np.array([outline.length for _, outline, _ in parts])
+    ends = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()
+    # The path parameter of the guess is (1 - cos) / 2 over all stages.
+    total = falls * float(np.sqrt(lengths.sum()))
+    clock = np.arccos(1 - 2 * np.clip(ends, 0.0, 1.0)) / np.pi
+    stages: list[Stage] = []
+    released: tuple[int, ...] = ()
+    for k, (phase, outline, last) in enumerate(parts):
+        ahead = None
+        if phase.until.value is not None:
+            row, value = 0 if phase.until.coordinate == "x" else 2, phase.until.value
+            begin = next(other.z[0, row] for own, other, _ in parts if own is phase)
+            ahead = row, value, 1.0 if value > begin else -1.0
+        whole = lengths[[own is phase for own, _, _ in parts]].sum()
+        count = max(LEAST_INTERVALS, round(lengths[k] / whole * intervals))
+        guess = _guess(outline, scheme, count, clock[k : k + 2], ends[k : k + 2], total)
+        ends_in_impact = last and phase.end is End.IMPACT and k + 1 < len(parts)
+        if ends_in_impact:
+            guess = guess._replace(impulses=np.zeros(parts[k + 1][0].formation.n_constraints))
+        # Limits near zero along the path, and that of the phase's end.
+        near = phase.formation.evaluate_limits(outline.z).min(axis=0) < _NEAR
+        near |= [limit.gains(phase.until.contact) for limit in phase.formation.limits]
+        opens = k > 0 and parts[k - 1][0] is not phase
+        if opens:
+            touching = np.abs(phase.formation.evaluate_limits(outline.z[:1])[0]) < _TOUCHES
+            released = tuple(np.flatnonzero(touching).tolist())
+        stages.append(
+            Stage(
+                phase.index,
+                phase.formation,
+                outline.directions,
+                guess,
+                until=phase.until if last and not phase.until.is_release else None,
+                ends_in_impact=ends_in_impact,
+                monitored=tuple(sorted({*np.flatnonzero(near).tolist(), *released})),
+                released=released,
+                opens=opens,
+                ahead=ahead,
+            )
+        )
+    return link(stages)
+
+
+def _list_parts(
+    problem: Problem, phases: Sequence[Phase], z: Array, outline: PathGuess | None
+) -> list[tuple[Phase, PathGuess, bool]]:
+    """Phases with their initial paths, in own units, and whether each is the last of its phase."""
+    parts: list[tuple[Phase, PathGuess, bool]] = []
+    for k, phase in enumerate(phases):
+        outlines = [outline] if outline else guess_phase(phase, z, phases[k + 1 :])
+        if parts and parts[-1][0].end is End.SMOOTH:
+            outlines = [*_turn_first(outlines[0], parts[-1][1]), *outlines[1:]]
+        z = outlines[-1].z[-1]
+        for own in outlines:
+            scaled = in_own_units(problem).phases[phase.index]
+            own_z = scale_state(own.z, problem.scene.scales)
+            path = replace(own, formation=scaled.formation, z=own_z)
+            parts.append((scaled, path, own is outlines[-1]))
+    return parts
+
+
+def _guess(
+    outline: PathGuess, scheme: Scheme, count: int, clock: Array, ends: Array, total: float
+) -> StagePoints:
+    """Motion along an initial path, with normal forces nearest to equal ones.
+
+    `clock` and `ends` are shares of the time `total` [s] and length of all stages at both ends.
+    """
+    formation, scene = outline.formation, outline.formation.scene
+    knots = np.linspace(0.0, 1.0, len(outline.z))
+    slopes = np.gradient(outline.z, knots, axis=0)
+    bends = np.gradient(slopes, knots, axis=0)
+    breaks = np.linspace(0.0, 1.0, count + 1)
+
+    def follow(share: Array) -> tuple[Array, Array, Array]:
+        angle = np.pi * (clock[0] + share * (clock[1] - clock[0]))
+        span = max(ends[1] - ends[0], 1e-12)
+        place = ((1 - np.cos(angle)) / 2 - ends[0]) / span
+        rate = (np.pi / 2 * np.sin(angle) / (span * total))[..., None]
+        gain = (np.pi**2 / 2 * np.cos(angle) / (span * total**2))[..., None]
+        z, slope, bend = (
+            np.stack([np.interp(place, knots, column) for column in table.T], axis=-1)
+            for table in (outline.z, slopes, bends)
+        )
+        return z, slope * rate, slope * gain + bend * rate**2
+
+    z, v, a = follow(breaks[:-1, None] + scheme.points / count)
+    # G^T c + S tau is what the equations of motion need.
+    flat = [table.reshape(-1, 5) for table in (z, v, a)]
+    G = force_rows(formation, formation.evaluate(*flat[:2]), outline.directions)
+    applied = scene.applied_force - scene.dry * np.append(np.zeros(3), outline.directions.sigma)
+    needed = scene.mass_diagonal * flat[2] + scene.viscous * flat[1] - applied
+    c = np.zeros((len(G), formation.n_constraints))
+    c[:, : formation.n_contacts] = _LIGHT
+    missing = needed[:, :3] - np.einsum("nij,ni->nj", G[:, :, :3], c)
+    c += [
+        np.linalg.lstsq(rows.T, short, rcond=1e-6)[0]
+        for rows, short in zip(G[:, :, :3], missing, strict=True)
+    ]
+    c_n = c[:, : formation.n_contacts]
+    c_n[:] = np.clip(c_n, 0.1 * _LIGHT, 20.0)
+    # Torques of the motion, within limits, at about as many points as they have control points.
+    tau = needed[:, 3:] - np.einsum("nij,ni->nj", G[:, :, 3:], c)
+    limit = 0.9 * scene.torque_limit
+    tau = np.clip(tau, -limit, limit).reshape(*z.shape[:2], 2)
+    tau = tau[:, np.linspace(0, scheme.degree - 1, scheme.controls).round().astype(int)]
+    return StagePoints(
+        total * (clock[1] - clock[0]),
+        np.full(count, 1 / count),
+        np.stack(follow(breaks)[:2], axis=1),
+        z,
+        v,
+        a,
+        c.reshape(*z.shape[:2], -1),
+        tau,
+        np.zeros(0),
+    )
+
+
+def _turn_first(outline: PathGuess, before: PathGuess) -> list[PathGuess]:
+    """Split a path so that it starts in the sliding directions of the one before.
+
+    Velocities are continuous, so that other directions need reversals along the path.
+    """
+    # Rolling contacts have no direction to keep.
+    slides = np.delete(np.arange(before.formation.n_contacts), before.formation.rolling_rows)
+    known = {before.formation.names[k]: before.directions.Xi[k] for k in slides}
+    own, formation = np.concatenate(outline.directions), outline.formation
+    n_c = formation.n_contacts
+    signs = own.copy()
+    signs[n_c:] = before.directions.sigma
+    for k in range(n_c):
+        if k not in formation.rolling_rows:
+            together = [formation.names[i] for i in formation.turn_with(k)]
+            signs[k] = next((known[name] for name in together if name in known), signs[k])
+    differing = np.flatnonzero(signs != own).tolist()
+    turns = list(dict.fromkeys(formation.turn_with(k) for k in differing))
+    pieces = []
+    cuts = np.linspace(0, len(outline.z) - 1, len(turns) + 2).astype(int)
+    for k, (begin, stop) in enumerate(pairwise(cuts)):
+        turn = turns[k] if k < len(turns) else outline.turns
+        directions = Directions(*np.split(signs.copy(), [n_c]))
+        pieces.append(PathGuess(formation, outline.z[begin : stop + 1], directions, tuple(turn)))
+        if k < len(turns):
+            signs[list(turns[k])] = own[list(turns[k])]
+    return pieces

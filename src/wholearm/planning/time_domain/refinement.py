@@ -1,0 +1,420 @@
+"""Refinement of a solution: finer intervals where that pays, tighter limits where they are missed.
+
+Each iterate is checked once: limits at `checks` places of every interval, by the motion that its
+torques lead to. Intervals are halved where the relative cost of missed limits plus the gain of
+torques of any shape, by the minimum principle with the costates of the solution, is above the
+accuracy, or where collocation misses the motion. In the others limits are raised by what is missed.
+The next solve has both, and starts from the last one, until limits hold everywhere.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.arrays import Array, find_minima
+from ...mechanics.dynamics import Directions
+from ...mechanics.limits import CONE, PRESS, LimitSet, make_limits
+from ...results.trajectory import Samples
+from ...sensitivity.slopes import find_slopes_at
+from ..options import DEFAULT_ACCURACY, Objective
+from ..robust.robust_rows import find_edges
+from .collocation import Scheme
+from .equations import SLIDING, find_relieved, least_senses, price_sides
+from .search import TimeSearch, TimeSolution
+from .stage import LimitMisses, Stage, bisect_intervals, monitor
+from .time_motion import MotionResponse, StageMotion, make_motions
+
+
+@dataclass(frozen=True)
+class RefinementSettings:
+    """Tolerances in the scene's own units, and bounds of the number of intervals and solves."""
+
+    miss: float = 2.5e-7  # largest miss of a force limit between points, over the weight
+    graze: float = 3e-7  # deepest overlap between points, over the radius of gyration
+    falter: float = 0.1  # largest miss of half a least rate, over it: a replay might stick
+    defect: float = 2e-8  # largest collocation error of z and z' in an interval
+    dear: float = 1e-5  # largest relative cost of raised limits in an interval
+    spare: float = 0.5  # error after a halving, over the accuracy
+    # factors on misses by which limits of forces, gaps and rates are raised
+    over: tuple[float, float, float] = (1.5, 3.0, 3.0)
+    checks: int = 25  # places per interval at which limits are checked
+    at_once: int = 2  # most times that an interval is halved at once
+    intervals: int = 80  # most of a phase at the default accuracy, prop. to 1 / sqrt(accuracy)
+    parametric: int = 5  # first iterates in which limits are raised by what ranges change alone
+    iterates: int = 24
+    refinements: int = 8  # most iterates with finer intervals
+    patience: int = 80  # most solver iterations of one iterate
+
+
+SETTINGS = RefinementSettings()
+_AMPLE = 1e3  # slack, over what is much for a limit, of what does not count
+_PLACES = 7  # Gauss points of an interval at which torques are compared
+_HELD = 3.0  # rate over the least one below which that bound is active
+_CLOSE = 1e-6  # gap over the radius of gyration below which its limit is active
+_STEP = 1e-6  # step of z for slopes of gaps, over accelerations of a torque of 1
+_ROUNDING = 1e-9  # largest miss of a limit that counts as none, over its scale
+
+
+class CheckPlaces(NamedTuple):
+    """A stage at the places of the checks in each of its K intervals, one after the other."""
+
+    places: Array  # (K checks,): shares of the duration
+    samples: Samples  # motion and forces there
+    limits: Array  # (K checks, n_limits) [m]: values of every limit of the formation
+
+
+def refine(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
+    """Refine a solution until it is accurate and keeps limits between points."""
+    refined, coarse, failed = 0, math.nan, False
+    raised = [LimitMisses.none(stage) for stage in solution.stages]
+    depth = SETTINGS.graze * search.problem.scene.scales.length
+    for _ in range(SETTINGS.iterates):
+        motions = make_motions(solution.stages, search.scheme)
+        checks = [check_between(*pair) for pair in zip(solution.stages, motions, strict=True)]
+        misses, over = list[LimitMisses](), list[Array]()
+        for stage, check in zip(solution.stages, checks, strict=True):
+            misses.append(find_misses(stage, check, search.problem.epsilon, solution.margin))
+            over.append(measure_misses(misses[-1]))
+        lowest = [find_minima(_by_interval(check.limits)).min(axis=0) for check in checks]
+        stages = monitor(solution.stages, lowest, depth)
+        gains = _find_gains(search, solution, motions, coarse)
+        times = [np.zeros(stage.intervals, dtype=np.int64) for stage in stages]
+        if failed:
+            # Raised limits may leave nothing where shorter intervals miss less.
+            times = [(own > 1).astype(np.int64) for own in over]
+        elif refined < SETTINGS.refinements:
+            times = _choose_halvings(search, solution, motions, misses, gains) or times
+        worst, finer = max(own.max() for own in over), any(own.any() for own in times)
+        if worst <= 1 and not finer and stages is solution.stages:
+            return solution._replace(error=_sum(gains))
+        refined += finer
+        raised = [
+            own.add(miss, SETTINGS.over).halve(mine)
+            for own, miss, mine in zip(raised, misses, times, strict=True)
+        ]
+        stages = bisect_intervals(stages, search.scheme, times)
+        better = search.solve(stages, solution, search.wait(SETTINGS.patience), raised)
+        if better.success:
+            coarse, solution, failed = solution.cost, better, False
+            continue
+        if failed:
+            return better
+        raised, failed = [LimitMisses.none(stage) for stage in solution.stages], True
+    status = f"limits are still missed {worst:.2g} times what is allowed between points"
+    return solution._replace(status=status, success=False)
+
+
+def keep_within(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
+    """Tighten limits of a refined solution until they hold, to first order, within the ranges.
+
+    Limits are raised by what ranges change alone as long as that changes with the motion, and then
+    by what is missed.
+    """
+    raised = [LimitMisses.none(stage) for stage in solution.stages]
+    error, epsilon = solution.error, search.problem.epsilon
+    for iterate in range(SETTINGS.iterates):
+        deviations, misses = list[Array](), list[LimitMisses]()
+        motions = make_motions(solution.stages, search.scheme)
+        for stage, motion in zip(solution.stages, motions, strict=True):
+            check = check_between(stage, motion)
+            deviation = find_deviations(search, stage, check)
+            misses.append(find_misses(stage, check, epsilon, solution.margin, deviation))
+            table = _by_interval(deviation).max(axis=1)
+            deviations.append(np.where(table > SETTINGS.miss, table, 0.0))
+        if iterate and max(measure_misses(miss).max() for miss in misses) <= 1:
+            return solution._replace(error=error)
+        raised = [
+            own._replace(held=table, gap=own.gap + miss.gap)
+            if iterate < SETTINGS.parametric
+            else own.add(miss, SETTINGS.over)
+            for own, table, miss in zip(raised, deviations, misses, strict=True)
+        ]
+        solution = search.solve(solution.stages, solution, raised=raised)
+        if not solution.success:
+            break
+    status = f"limits cannot be kept within the ranges: {solution.status}"
+    return solution._replace(success=False, status=status)
+
+
+def _by_interval(table: Array) -> Array:
+    """Values at the places of the checks, shape (K, checks, n)."""
+    return table.reshape(-1, SETTINGS.checks, table.shape[1])
+
+
+def _sum(tables: Iterable[NDArray[Any]]) -> float:
+    return float(sum(table.sum() for table in tables))
+
+
+def measure_misses(miss: LimitMisses) -> Array:
+    """The largest miss of each interval, over its tolerance, shape (K,)."""
+    allowed = (SETTINGS.miss, SETTINGS.graze, SETTINGS.falter * SLIDING)
+    parts = (own.max(axis=1, initial=0.0) / a for own, a in zip(miss, allowed, strict=True))
+    return np.asarray(np.max(list(parts), axis=0))
+
+
+def check_between(stage: Stage, motion: StageMotion) -> CheckPlaces:
+    """Motion, forces and limits of a stage at the checks between its points."""
+    places = stage.guess.places(np.linspace(1e-9, 1 - 1e-9, SETTINGS.checks)).ravel()
+    samples = motion.evaluate(places * motion.duration)
+    return CheckPlaces(places, samples, stage.formation.evaluate_limits(samples.z))
+
+
+def find_misses(
+    stage: Stage,
+    check: CheckPlaces,
+    epsilon: float,
+    margin: float = 0.0,
+    deviations: Array | float = 0.0,
+) -> LimitMisses:
+    """Largest misses of limits in each interval.
+
+    c_n, but not friction cones, have to exceed epsilon by `margin`, and each side its bound by
+    `deviations` times its scale, shape (K checks, n_sides). Sides of torques alone are bounds of
+    their control points, and never missed.
+    """
+    formation, samples = stage.formation, check.samples
+    limits = make_limits(formation, epsilon)
+    c = [samples.c_n, samples.c_t[:, list(formation.rolling_rows)]]
+    values = np.hstack([*c, samples.tau, samples.z_dot[:, 3:]]) @ limits.rows.T
+    values[:, limits.of(PRESS)] -= margin
+    slack = limits.find_slack(values) / limits.scales[limits.sides[0]]
+    of_c, _, of_rates = limits.columns
+    bent = np.flatnonzero(of_c.any(axis=1) | of_rates.any(axis=1))
+    slack[:, ~np.isin(limits.sides[0], bent)] = 0.0
+    relieved = np.repeat(find_relieved(stage, limits), SETTINGS.checks, axis=0)
+    # Misses at the start of a stage do not depend on it.
+    gaps, watched = np.ones_like(check.limits), list(stage.monitored)
+    gaps[:, watched] = check.limits[:, watched] - np.minimum(check.limits[:1, watched], 0.0)
+    gaps[:, watched] -= stage.list_clearances(check.places, after=1 / 2) / 2
+    # Only contacts with friction have a sliding direction.
+    senses = stage.measure_senses(samples.z, samples.z_dot)
+    senses -= 0.5 * least_senses(stage, check.places)
+    senses[:, np.delete(np.arange(formation.n_contacts), formation.rubbing_rows)] = 1.0
+    tables = (slack - deviations + _AMPLE * relieved, gaps, senses)
+    return LimitMisses(*(np.maximum(-find_minima(_by_interval(own)), 0.0) for own in tables))
+
+
+def find_deviations(search: TimeSearch, stage: Stage, check: CheckPlaces) -> Array:
+    """Change of each side of the limits by all ranges, relative to its scale, (n, n_sides)."""
+    formation, count, epsilon = stage.formation, len(check.places), search.problem.epsilon
+    ranges: Mapping[str, float] = search.options.ranges
+    limits = make_limits(formation, epsilon)
+    sides, total = limits.sides[0], np.zeros((count, len(limits.low)))
+    names = [name for name, radius in ranges.items() if radius > 0 and name != "delay"]
+    if names:
+        forces = limits.of(PRESS, CONE)
+        rows = limits.rows[forces][:, : formation.n_constraints]
+        signs = (np.broadcast_to(part, (count, *part.shape)) for part in stage.directions)
+        slopes = find_slopes_at(formation, check.samples, Directions(*signs), names)
+        c_t = check.samples.c_t[:, list(formation.rolling_rows)]
+        c = np.hstack([check.samples.c_n, c_t])
+        for k, name in enumerate(names):
+            change = slopes[:, :, k] @ rows.T
+            edges = find_edges(formation, rows, name)
+            if edges is not None:
+                change = change + c @ edges.T - epsilon * edges.sum(axis=1)
+            total[:, forces] += ranges[name] * np.abs(change)
+    return np.asarray(total[:, sides] / limits.scales[sides])
+
+
+def _find_gains(
+    search: TimeSearch, solution: TimeSolution, motions: Sequence[StageMotion], coarse: float
+) -> list[Array]:
+    """Relative gain of better torques in each interval, shape (K,) each.
+
+    Zero for held torques. For rate-limited ones it is the gain of the last iterate, from the cost
+    `coarse`, distributed by the second differences of the control points.
+    """
+    stages, epsilon = solution.stages, search.problem.epsilon
+    if stages[0].periods:
+        return [np.zeros(stage.intervals) for stage in stages]
+    size = abs(solution.cost) + epsilon * (search.goal is Objective.MARGIN)
+    if search.problem.scene.has_slow_motors:
+        limit, shares = search.problem.scene.torque_limit, list[Array]()
+        for part in (stage.guess for stage in stages):
+            bends = np.abs(np.diff(part.tau, 2, axis=1) / limit).max(axis=(1, 2), initial=0.0)
+            shares.append(part.duration * part.fractions * bends)
+        gain = 0.01 if math.isnan(coarse) else abs(coarse - solution.cost) / size
+        return [share * (gain / max(_sum(shares), 1e-300)) for share in shares]
+    square, gains = float(search.goal is Objective.EFFORT), list[Array]()
+    for k, (stage, motion) in enumerate(zip(stages, motions, strict=True)):
+        rows = solution.nlp.rows_of[k]
+        lam = solution.multipliers["lam_g0"][rows.states].sum(axis=2)
+        costate = np.einsum("kdf,ksf->ksd", rows.bases, lam)
+        limits = make_limits(stage.formation, epsilon)
+        gains.append(find_gains(stage, motion, costate, limits, solution.margin, square) / size)
+    return gains
+
+
+def price_misses(solution: TimeSolution, misses: Sequence[LimitMisses]) -> list[Array]:
+    """Relative cost of raising limits by their misses in each interval, (K,), by multipliers."""
+    on_x, on_g = (np.abs(solution.multipliers[key]) for key in ("lam_x0", "lam_g0"))
+    prices = []
+    for k, miss in enumerate(misses):
+        layout, rows = solution.nlp.layouts[k], solution.nlp.rows_of[k].limits
+        scales = rows.limits.scales[rows.limits.sides[0]]
+        cost = (price_sides(rows, layout, on_x, on_g) * miss.held * scales).sum(axis=1)
+        prices.append(np.asarray(cost / max(abs(solution.cost), 1e-300)))
+    return prices
+
+
+def _choose_halvings(
+    search: TimeSearch,
+    solution: TimeSolution,
+    motions: Sequence[StageMotion],
+    misses: Sequence[LimitMisses],
+    gains: Sequence[Array],
+) -> list[NDArray[np.int64]]:
+    """How often to halve each interval; gains do not count with a given number of intervals."""
+    options, phases = search.options, len({stage.phase for stage in solution.stages})
+    share = max(1.0, math.sqrt(DEFAULT_ACCURACY / options.accuracy))
+    most = math.ceil(SETTINGS.intervals * share) * phases
+    if sum(stage.intervals for stage in solution.stages) >= most:
+        return []
+    prices = price_misses(solution, misses)
+    times = [
+        count_halvings(price, motion.defects, search.scheme)
+        for price, motion in zip(prices, motions, strict=True)
+    ]
+    shares = [gain + price for gain, price in zip(gains, prices, strict=True)]
+    if options.time_intervals is None and _sum(shares) > options.accuracy:
+        left = SETTINGS.spare * options.accuracy
+        if search.problem.scene.has_slow_motors:
+            # Their gains are those of the last iterate, and not of the next one.
+            left = max(left, 0.5 * _sum(shares))
+        more = spread_halvings(shares, left)
+        times = [np.maximum(*pair) for pair in zip(times, more, strict=True)]
+    wanted = sum(int((2**mine).sum()) for mine in times)
+    return times if wanted <= most else [np.minimum(mine, 1) for mine in times]
+
+
+def find_gains(
+    stage: Stage,
+    motion: StageMotion,
+    costate: Array,
+    limits: LimitSet,
+    margin: float,
+    square: float,
+) -> Array:
+    """Gain of free torques in each interval by minimising the Hamiltonian, in units of cost, (K,).
+
+    Parameters
+    ----------
+    costate : (K, 2, 5)  of z and z' at the start of each interval
+    margin               of c_n, but not of friction cones
+    square               weight of tau^T tau in the cost
+    """
+    x, weights = np.polynomial.legendre.leggauss(_PLACES)
+    x, lengths = (x + 1) / 2, np.diff(motion.breaks)
+    t = motion.breaks[:-1, None] + lengths[:, None] * x
+    response, n = motion.respond(np.append(t, motion.breaks[:-1])), t.size
+    here = MotionResponse(*(part[:n] for part in response))
+    switching = np.einsum("kd,kdj->kj", costate[:, 1], response.a_by_torque[n:])
+    switching = _interpolate(motion.breaks, switching, int(stage.opens), x)
+    slope = 2 * square * here.y[:, -4:-2] - switching
+    values = here.y @ limits.rows.T
+    values[:, limits.of(PRESS)] -= margin
+    own, signs, _ = limits.sides
+    size = limits.scales[own]
+    slack = np.maximum(limits.find_slack(values) / size, 0.0)
+    rows = np.einsum("mi,nij->nmj", limits.rows, here.y_by_torque)[:, own] * (signs / size)[:, None]
+    held = _find_held(stage, here, stage.guess.places(x))
+    rows = np.concatenate([rows, held, -held], axis=1)
+    slack = np.hstack([slack, np.zeros((n, 2 * held.shape[1]))])
+    gains = -find_least(slope, square, rows, slack).reshape(t.shape) @ weights / 2 * lengths
+    return np.asarray(gains + np.abs(np.einsum("ksd,ksd->k", costate, motion.defects)))
+
+
+def _find_held(stage: Stage, here: MotionResponse, places: Array) -> Array:
+    """Accelerations by torque of rates and gaps at their bounds, (n, m, 2); zero elsewhere."""
+    formation, z, v, by_torque = stage.formation, here.z, here.v, here.a_by_torque
+    least = least_senses(stage, places).reshape(len(z), -1)
+    least[:, np.delete(np.arange(formation.n_contacts), formation.rubbing_rows)] = -np.inf
+    senses = np.concatenate([formation.evaluate(z, v).A_t @ by_torque, by_torque[:, 3:]], axis=1)
+    slow = (stage.measure_senses(z, v) < _HELD * least) & (least > 0)
+    monitored, size = list(stage.monitored), formation.scene.scales.length
+    gaps = formation.evaluate_limits(z)[:, monitored]
+    moved = [formation.evaluate_limits(z + _STEP * by_torque[..., j]) for j in range(2)]
+    slopes = np.stack([(after[:, monitored] - gaps) / _STEP for after in moved], axis=-1)
+    close = gaps < _CLOSE * size
+    first = np.repeat(np.arange(len(places)) == 0, places.shape[1])
+    close |= first[:, None] & (np.isin(monitored, stage.released) & stage.opens)
+    active = np.concatenate([slow, close], axis=1)
+    held = active[..., None] * np.concatenate([senses, slopes], axis=1)
+    return np.asarray(held[:, np.flatnonzero(held.any(axis=(0, 2)))])
+
+
+def _interpolate(breaks: Array, values: Array, first: int, x: Array) -> Array:
+    """Cubic Hermite interpolation of values at starts of K intervals, at `x` of each, (K n, 2).
+
+    The ends, before value number `first` and after the last, are extrapolated by parabolas.
+    """
+    known = np.arange(min(first, len(values) - 1), len(values))
+    for end, near in ((0, known[:3]), (len(values), known[-3:])):
+        powers = np.arange(len(near))
+        at = (breaks[near] - breaks[end])[:, None] ** powers
+        value = np.linalg.solve(at, values[near])[:1]
+        values = np.vstack([value, values[1:]]) if end == 0 else np.vstack([values, value])
+    slopes = np.gradient(values, breaks, axis=0, edge_order=2)
+    x, lengths = x[:, None], np.diff(breaks)[:, None, None]
+    y = 1 - x
+    ends = y**2 * (1 + 2 * x) * values[:-1, None] + x**2 * (1 + 2 * y) * values[1:, None]
+    bends = y**2 * x * slopes[:-1, None] - x**2 * y * slopes[1:, None]
+    return np.asarray(ends + lengths * bends).reshape(-1, values.shape[1])
+
+
+def find_least(slope: Array, square: float, rows: Array, slack: Array) -> Array:
+    """Minimum of slope^T u + square u^T u subject to rows u + slack >= 0, for n problems in 2D.
+
+    By enumeration of vertices, edges, interior and the feasible u = 0; shapes (n, 2), (n, m, 2) and
+    (n, m) of slope, rows and slack.
+    """
+    first, second = np.array(list(combinations(range(rows.shape[1]), 2))).T
+    one, other = rows[:, first], rows[:, second]
+    across = one[..., 0] * other[..., 1] - one[..., 1] * other[..., 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        own = slack[:, first, None] * other - slack[:, second, None] * one
+        u = np.stack([-own[..., 1], own[..., 0]], axis=-1) / across[..., None]
+        if square:
+            free = (-slope / (2 * square))[:, None]
+            beyond = (np.einsum("nmj,noj->nm", rows, free) + slack)[..., None]
+            edges = free - rows * beyond / (rows**2).sum(axis=2, keepdims=True)
+            u = np.concatenate([u, edges, free], axis=1)
+        over = np.einsum("nmj,nuj->num", rows, u) + slack[:, None]
+        value = np.einsum("nj,nuj->nu", slope, u) + square * (u**2).sum(axis=2)
+    allowed = (over >= -_ROUNDING).all(axis=2) & np.isfinite(value)
+    return np.asarray(np.where(allowed, value, 0.0).min(axis=1, initial=0.0))
+
+
+def count_halvings(prices: Array, defects: Array, scheme: Scheme) -> NDArray[np.int64]:
+    """How often to halve each interval, by its relative cost of misses and collocation error, (K,).
+
+    Errors of collocation decrease with the scheme's order, costs with the third one.
+    """
+    price = np.maximum(prices / SETTINGS.dear, 1.0)
+    error = np.maximum(np.abs(defects).max(axis=(1, 2)) / SETTINGS.defect, 1.0)
+    times = np.maximum(np.log2(price) / 3, np.log2(error) / scheme.order)
+    return np.asarray(np.clip(np.ceil(times), 0, SETTINGS.at_once), dtype=np.int64)
+
+
+def spread_halvings(shares: Sequence[Array], most: float) -> list[NDArray[np.int64]]:
+    """How often to halve intervals, (K,) each, the largest first, until errors sum up to `most`.
+
+    Gains of better torques decrease with the square of the length.
+    """
+    left, times = np.concatenate(shares), np.zeros(sum(map(len, shares)), dtype=np.int64)
+    even = most / len(left)
+    while left.sum() > most:
+        worst = int(np.where(times < SETTINGS.at_once, left, 0.0).argmax())
+        if times[worst] == SETTINGS.at_once or left[worst] <= even:
+            break
+        left[worst] /= 4.0
+        times[worst] += 1
+    return np.split(times, np.cumsum([len(own) for own in shares])[:-1])
