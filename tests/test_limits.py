@@ -32,7 +32,7 @@ from wholearm.planning.lower_bound.speed_sweep import (
 )
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.path_data import prepare
-from wholearm.planning.path_domain.path_mesh import Mesh
+from wholearm.planning.path_domain.path_mesh import make_grid
 from wholearm.planning.path_domain.path_motion import PathMotion
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.path_domain.speed_profile import Fastest, find_fastest
@@ -252,7 +252,7 @@ def test_another_limit_is_kept_by_sweeps_search_and_policies(
     def measure(epsilon: float) -> Array:
         border = BorderEdge(place, curve, None, Terms(EPSILON, 0.0))
         least = bound_least_time([curve], EPSILON)
-        fastest = find_fastest(prepare(curve, EPSILON, Mesh().make_grid(curve, 10), 2), None)
+        fastest = find_fastest(prepare(curve, EPSILON, make_grid(curve, np.zeros(0), 10), 2), None)
         assert least is not None and isinstance(fastest, Fastest)
         return np.array(
             [

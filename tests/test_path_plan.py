@@ -49,7 +49,7 @@ from wholearm.planning.path_domain.elements import (
 )
 from wholearm.planning.path_domain.impact_sequence import make_sequence, plan_sequence
 from wholearm.planning.path_domain.path_data import PhaseData, prepare
-from wholearm.planning.path_domain.path_mesh import Mesh
+from wholearm.planning.path_domain.path_mesh import make_grid
 from wholearm.planning.path_domain.path_motion import PathMotion
 from wholearm.planning.path_domain.path_nlp import (
     PathNLP,
@@ -81,7 +81,7 @@ SHAPE = LimitShape(6, SIDES, (0, 1, 2, 3), (4, 5), (4, 5))
 @pytest.fixture(scope="module")
 def data(curves: tuple[Curve, ...]) -> PhaseData:
     """Phase 1 of the heptagon, which has a reversal."""
-    data = prepare(curves[0], EPSILON, Mesh().make_grid(curves[0], ELEMENTS), 1)
+    data = prepare(curves[0], EPSILON, make_grid(curves[0], np.zeros(0), ELEMENTS), 1)
     assert len(data.nonempty) == ELEMENTS * DEGREE
     return data
 
@@ -166,7 +166,7 @@ def test_constraints_are_the_limits(
 def test_a_slow_start_is_within_bounds_on_any_grid(curves: tuple[Curve, ...]) -> None:
     """However near to rest the first nodes are: along it b = 2 a s grows from nothing."""
     for elements in (ELEMENTS, 5 * ELEMENTS):
-        fine = prepare(curves[0], EPSILON, Mesh().make_grid(curves[0], elements), 1)
+        fine = prepare(curves[0], EPSILON, make_grid(curves[0], np.zeros(0), elements), 1)
         intervals, s = elements * (DEGREE + 1) - 1, fine.grid.s
         nlp = build_path_nlp(SHAPE, intervals, Objective.MARGIN)
         units = UNITS._replace(length=s[-1])
@@ -525,8 +525,12 @@ def test_a_stuck_solver_does_not_blame_the_limits(monkeypatch: pytest.MonkeyPatc
 def test_a_stuck_solver_within_ranges_says_that_there_is_a_plan_without(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    stuck = path_plan.Stuck([], "phase 1: Ipopt stopped", False)
-    monkeypatch.setattr(path_plan, "plan_within", lambda _: (stuck, (object(),)))
+    def plan(task: path_plan.Task) -> path_plan.PathIterate:
+        if task.options.ranges:
+            raise SolverError("Ipopt stopped")
+        return path_plan.refine(path_plan.PathIterate.begin(task, 20), 1e-2)
+
+    monkeypatch.setattr(path_plan, "_plan", plan)
     monkeypatch.setattr(path_plan, "explain_stuck", lambda *_: SolverError("unclear"))
     with pytest.raises(SolverError, match=r"stopped within the ranges .* try --robust 0\.5, or"):
         Toy(constant(1.0)).plan(robust=1.0)
@@ -667,7 +671,7 @@ def relax_by_linear_program(curve: Curve, epsilon: float, name: str) -> float | 
 
     Then everything is linear in a, b and the squeeze at the nodes.
     """
-    data = prepare(curve, epsilon, Mesh().make_grid(curve, INTERVALS // 4), 1)
+    data = prepare(curve, epsilon, make_grid(curve, np.zeros(0), INTERVALS // 4), 1)
     nodes, n_c = len(data.grid.s), 4
     forces, steps = data.nodes.forces, data.grid.steps
     assert not forces.of_tau[..., V].any()

@@ -16,7 +16,7 @@ from ..results.plan_record import RangeFigures
 from .blocks import Planning, plan_blocks
 from .options import Objective, PlanOptions
 from .path_domain.path_motion import PathMotion
-from .path_domain.path_plan import ROUGH, Iterate, Task, plan_curves
+from .path_domain.path_plan import ROUGH, Task, plan_curves
 from .path_domain.speed_profile import Fastest
 from .phase_plan import combine
 from .robust.robust_rows import Guide, list_holds, measure_holds
@@ -98,7 +98,7 @@ def find_widest(
     low, high, middle = 0.0, np.inf, min(1.0, most)
     while low < most and (np.isinf(high) or high - low > _CLOSE * high):
         task = Task(curves, epsilon, scale(middle), phases, None, guides=tuple(guides))
-        fastest = Iterate.begin(task, 1).fastest
+        fastest = task.find_fastest()
         if fastest is None:
             high = middle
         else:

@@ -26,7 +26,7 @@ from ...geometry.tracing import trace_phases
 from ...mechanics.dynamics import build_force_rows
 from ...planning.path_domain.first_guess import guess
 from ...planning.path_domain.path_data import prepare
-from ...planning.path_domain.path_mesh import Mesh
+from ...planning.path_domain.path_mesh import make_grid
 from ...planning.path_domain.path_motion import PathMotion
 from ...problem.definition import End, Problem
 from ...problem.read import read_problem
@@ -162,7 +162,7 @@ def sample_slow_motion(instance: Instance, counts: list[int]) -> list[tuple[Arra
 def make_slow_motion(instance: Instance, intervals: int, share: float = 1.0) -> PathMotion:
     """The motion that the planner guesses first, with a share of its squared speed."""
     curve = instance.curve
-    grid = Mesh().make_grid(curve, intervals + len(curve.segments))
+    grid = make_grid(curve, np.zeros(0), intervals + len(curve.segments))
     data = prepare(curve, instance.problem.epsilon, grid, 0)
     profile, _ = guess(data)
     slow = profile._replace(a=share * profile.a, b=share * profile.b)

@@ -24,7 +24,7 @@ from ...mechanics.path_limits import PathLimits
 from ...planning.lower_bound.lower_bound import bound_least_time
 from ...planning.options import Objective, PlanOptions
 from ...planning.path_domain.path_data import prepare
-from ...planning.path_domain.path_mesh import Mesh
+from ...planning.path_domain.path_mesh import make_grid
 from ...planning.path_domain.path_nlp import build_path_nlp
 from ...planning.path_domain.path_plan import plan_path
 from ...planning.path_domain.terms import LimitShape
@@ -92,7 +92,7 @@ def _build_on_curve(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
     curve, epsilon = instance.curve, instance.problem.epsilon
     options = PlanOptions(accuracy=float(setting))
     build_path_nlp.cache_clear()
-    data = prepare(curve, epsilon, Mesh().make_grid(curve, 10), 1)
+    data = prepare(curve, epsilon, make_grid(curve, np.zeros(0), 10), 1)
     build_path_nlp(LimitShape.of(data.limits), len(data.grid.steps), Objective.TIME)
     return lambda: _convert(instance, plan_path(curve, epsilon, options, 1))
 

@@ -30,7 +30,7 @@ def guess(data: PhaseData, time_weight: float = 0.0) -> tuple[Profile, Units]:
         low, high = find_internal_force_range(data, height)
         a, b = _parabola(data, height)
         kept = bool(((low <= high) & (low < np.inf)).all() and (b <= b_max).all())
-        return kept and not exceeds_rates(data, Profile(a, b, _find_middle(data, low, high)[1]))
+        return kept and not exceeds_rates(data, Profile(a, b, find_middle(data, low, high)[1]))
 
     # Bisection over heights from 2^-12 to 2^8 times that of a fall over this length.
     low_power, high_power = float(_SLOW), 8.0
@@ -81,7 +81,7 @@ def find_internal_force_range(data: PhaseData, height: float) -> tuple[Array, Ar
     return data.find_limits(data.nodes).find_internal_force_range(*_parabola(data, height))
 
 
-def _find_middle(data: PhaseData, low: Array, high: Array) -> tuple[Array, Array]:
+def find_middle(data: PhaseData, low: Array, high: Array) -> tuple[Array, Array]:
     """The internal force amid its range, and amid at most `_FIRM` of it; zero without a range."""
     finite, force = np.isfinite(low + high) & (low <= high), data.curve.formation.scene.scales.force
     near = np.minimum(high, low + _FIRM * np.maximum(force, np.abs(low)))
@@ -90,7 +90,7 @@ def _find_middle(data: PhaseData, low: Array, high: Array) -> tuple[Array, Array
 
 
 def _guess_at(data: PhaseData, height: float, time_weight: float = 0.0) -> tuple[Profile, Units]:
-    whole, middle = _find_middle(data, *find_internal_force_range(data, height))
+    whole, middle = find_middle(data, *find_internal_force_range(data, height))
     length, weight = float(data.grid.s[-1]), data.curve.formation.scene.scales.force
     duration = np.pi / 2 * length / np.sqrt(height)
     force = max(_LIGHT * weight, data.epsilon, float(np.abs(middle).mean()))

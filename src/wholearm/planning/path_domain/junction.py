@@ -33,7 +33,7 @@ from ..phase_plan import PhasePlan
 from ..stops import Plans, runs_along_curves, split_blocks
 from .first_guess import find_internal_force_range
 from .path_data import PhaseData, prepare
-from .path_mesh import Mesh
+from .path_mesh import make_grid
 
 if TYPE_CHECKING:
     from ..blocks import Planning
@@ -101,7 +101,7 @@ def choose_joint(
 
 def _list_torques(curve: Curve, epsilon: float, phase: int, place: int) -> tuple[Array, Array]:
     """Torques at an end of a curve at the limit of rest, (n, 2) [N m], and internal forces [N]."""
-    data = prepare(curve, epsilon, Mesh().make_grid(curve, _ELEMENTS, held=True), phase)
+    data = prepare(curve, epsilon, make_grid(curve, np.zeros(0), _ELEMENTS, held=True), phase)
     low, high = require_hold(data, phase, place)
     high = min(high, low + _WIDEST * curve.formation.scene.scales.force)
     share = np.linspace(_INSIDE, 1 - _INSIDE, _PLACES)

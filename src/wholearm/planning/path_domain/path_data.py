@@ -122,17 +122,14 @@ class PhaseData(NamedTuple):
         """The profile at `fractions` of every solid interval, interval by interval."""
         return Elements(self.grid, profile).at(fractions)
 
-    def misses(self, profile: Profile, margin: float) -> tuple[Array, Array, Array]:
-        """Violations in each solid interval, and least slack, (n_solid, n_sides) [N, N m] each.
-
-        Second comes the relative violation of the largest b, (n_solid,).
-        """
+    def misses(self, profile: Profile, margin: float) -> tuple[Array, Array]:
+        """Violations in each solid interval, (n_solid, n_sides) [N, N m]; of b, relatively."""
         here = self.interpolate(profile, self.sampling.checks)
         speed_slack = 1 - here.b / self.largest_b(self.checks)
         slack = np.column_stack([self.slack(self.checks, here, margin), speed_slack])
         least = find_minima(slack.reshape(len(self.nonempty), len(self.sampling.checks), -1))
-        short, spare = np.maximum(-least, 0.0), np.maximum(least, 0.0)
-        return short[:, :-1], short[:, -1], spare[:, :-1]
+        short = np.maximum(-least, 0.0)
+        return short[:, :-1], short[:, -1]
 
     def slack_at_neighbours(self, profile: Profile, margin: float, short: Array) -> Array:
         """The lesser slack of the two nodes of each solid interval, shape (n_solid, n_sides).
@@ -143,9 +140,9 @@ class PhaseData(NamedTuple):
         least = np.minimum(slack[self.nonempty], slack[self.nonempty + 1])
         return np.where(short > 0, np.maximum(least, 0.0), 0.0)
 
-    def spread_to_nodes(self, inside: Array, least: float = 0.0) -> Array:
+    def spread_to_nodes(self, inside: Array) -> Array:
         """The larger value of the two solid intervals beside each node, shape (N + 1, ...)."""
-        table = np.full((len(self.grid.s), *inside.shape[1:]), least)
+        table = np.zeros((len(self.grid.s), *inside.shape[1:]))
         table[self.nonempty] = inside
         table[self.nonempty + 1] = np.maximum(table[self.nonempty + 1], inside)
         return table

@@ -53,7 +53,6 @@ from .path_nlp import (
     unpack,
 )
 from .path_plan import Task, plan_curves
-from .speed_profile import is_hopeless
 from .terms import LimitShape
 
 _TRIED = (2.0, 10.0, 100.0)  # factors on torque rate limits with which plans are tried
@@ -191,8 +190,6 @@ def _solve_elastic(data: PhaseData, profile: Profile, units: Units) -> Profile |
 
 def _relax(data: PhaseData, profile: Profile, units: Units, parameter: Parameter) -> float | None:
     """The value at which one parameter just lets all others be kept, if there is one."""
-    if is_hopeless(data, parameter):
-        return None
     step = units.force if parameter.unit == "N" else parameter.value
     short = data.limits.fold(-data.slack(data.nodes, profile)).max(axis=0)
     weights = step * data.limits.weigh(parameter)

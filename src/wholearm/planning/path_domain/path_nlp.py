@@ -25,6 +25,8 @@ from .path_data import PhaseData
 from .terms import CHAINED, LEAST_B, SOFT, LimitShape, NLPColumns, list_columns, write_terms
 from .unique_start import SureStart
 
+_MU, _INSIDE = 1e-4, 1e-3  # complementarity of first multipliers, and the least slack in it
+
 
 class Units(NamedTuple):
     """Units of the NLP, in which its numbers are near 1 whatever the scene's size and mass are."""
@@ -77,26 +79,6 @@ class Tightening(NamedTuple):
         count = len(data.grid.s)
         limits = np.zeros((count, len(data.spans)))
         return Tightening(limits, np.ones(count), duration, limits, np.ones((count, 2, 2)))
-
-    def ease(self, spare: Array) -> Tightening:
-        """Tighten less, by the `spare` slack about each node."""
-        eased = np.minimum(self.missed, spare)
-        return self._replace(limits=self.limits - eased, missed=self.missed - eased)
-
-    def by(
-        self, reach: Array, limits: Array, speed_share: Array, late: float, motors: Array
-    ) -> Tightening:
-        """Tighten further: limits absolutely, b, duration and torque rates relatively.
-
-        Limits are first raised to `reach`, the slack at nodes, which would absorb the rest.
-        """
-        return Tightening(
-            np.maximum(self.limits, reach) + limits,
-            self.speed_share * (1 - speed_share),
-            None if self.duration is None else self.duration * (1 - late),
-            self.missed + limits,
-            self.motors * (1 - motors),
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,6 +216,24 @@ def make_bounds(
         "lbg": np.concatenate([equal, rows_low.ravel(), np.full(late, -np.inf), *motors_low]),
         "ubg": np.concatenate([equal, rows_high.ravel(), longest, *motors_high]),
     }
+
+
+def center(
+    nlp: PathNLP, data: PhaseData, units: Units, profile: Profile, margin: float
+) -> dict[str, Array]:
+    """Multipliers with which a motion is near the central path."""
+    (rows, signs, _), sizes = data.limits.sides, nlp.columns.g.sizes
+    slack = data.slack(data.nodes, profile, margin) / units.of(data.limits)[rows]
+    on_sides, on_rows = _MU / np.maximum(slack, _INSIDE), np.zeros((len(slack), nlp.shape.rows))
+    for side, row in enumerate(rows.tolist()):
+        on_rows[:, row] -= signs[side] * on_sides[:, side]
+    on_x = np.zeros(nlp.free.shape)
+    on_x[:, 0] = -_MU / np.maximum(profile.b / units.profile[0], _INSIDE)
+    # The chain's multiplier at a node is the sum of those of normal forces from there on.
+    chain = -1 - np.cumsum(on_rows[:, list(nlp.shape.presses)].sum(axis=1))[:-1]
+    known = {"limits": on_rows.ravel(), "chain": chain[: sizes["chain"]]}
+    on_g = nlp.columns.g.join(**{name: np.zeros(sizes[name]) for name in sizes} | known)
+    return {"lam_x0": on_x[nlp.free], "lam_g0": on_g}
 
 
 def pack(

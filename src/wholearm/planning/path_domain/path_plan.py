@@ -1,14 +1,15 @@
 """Minimum-time, minimum-effort and maximum-margin plans of phases with one degree of freedom.
 
-Direct collocation along the curve (`path_nlp`) with mesh refinement: solve, estimate the error,
-adapt the mesh, tighten limits between nodes, check. Elements are made to end where the solution
-switches, and doubled where it violates limits between nodes. Then limits are tightened by their
-violations until none exceeds `MISS`. The cost of that estimates the error.
+Direct collocation along the curve (`path_nlp`), refined by `planning.refine`. Elements end where
+the plan switches from one active limit to another: first where the minimum-time sweep does, then
+where the solution does. They are halved while violations between nodes cost more than the accuracy.
+Limits are tightened by their violations until none exceeds `MISS`; what that costs is the estimate
+of the error.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -28,64 +29,56 @@ from ...geometry.curve import Curve, describe_pose, directions_of
 from ...mechanics.dynamics import reduced_inertia
 from ...mechanics.uniqueness import describe_uniqueness, find_minors
 from ..advice import describe_changes, find_changes, name_phases
-from ..options import DEFAULT_ACCURACY, Objective, PlanOptions
+from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
+from ..refine import refine
 from ..robust.robust_rows import Guide, RobustLimits, spread
-from .elements import DEGREE, Elements, follow
+from .elements import DEGREE, Elements, Grid, Profile, follow
 from .first_guess import guess, guess_slowly
 from .path_data import PhaseData, cut, join, prepare
-from .path_mesh import MOST, SHIFTED, SLOW_MOST, SOFT, START, Mesh, Switch, adapt, find_ends
-from .path_motion import PathMotion, StalledError, fit_torque
+from .path_mesh import (
+    find_ends,
+    find_switches,
+    halve,
+    keep_apart,
+    make_grid,
+    match,
+    place_breaks,
+)
+from .path_motion import PathMotion, fit_torque
 from .path_nlp import (
     PathNLP,
     Tightening,
     Units,
     build_path_nlp,
+    center,
     make_bounds,
     pack,
     parameters,
     unpack,
 )
-from .rate_terms import UNLIMITED, MotorShape, find_rate_switches, ramp_up
-from .speed_profile import Fastest, find_fastest, is_hopeless
+from .rate_terms import UNLIMITED, MotorShape, equidistribute, find_hurry
+from .speed_profile import Fastest, find_fastest
 from .terms import LimitShape
 from .unique_start import WORTH, SureStart, find_sure_start
-from .violations import MISS, SOLVES, Misses, PathSolution, anticipate, price
-from .warm_start import balance, center, move_multipliers, start_at
 
 Plans = list[PhasePlan[PathMotion]]
 Pins = tuple[float | None, float | None]  # prescribed internal force at start and end [N]
+MISS = 2.5e-7  # largest violation between nodes, over the limits' scales; relative for b and time
+_RATE_MISS = 1e-4  # the same, relative, for torque rates and commands
+_OVER = 1.05  # tightening over the violation
 _LOOKS = 17  # places of a segment at which uniqueness is checked
-EARLY = 1e-5  # accuracy from which few elements will do, and limits are tightened before any solve
-_EXTRA = 8  # elements beyond one for each stretch, under rate limits
-_STEPS = 5  # their number is a multiple of it: fewer different NLPs to build
+_START, _SMOOTH, _RATE = 12, 20, 50  # elements of a phase; for effort; under rate limits
+_MOST = 80  # most elements of a phase
+_SHIFTED = 0.02  # relative loss by a break's distance from its switch, over the curve's length
 _SHARE = 0.5  # share of the accuracy for shifted switches
-# Share of the accuracy for missed limits, to first order: efforts have other errors.
-_DEAR = {Objective.TIME: 1.0, Objective.MARGIN: 1.0, Objective.EFFORT: 0.2}
-_LIKELY = 0.2  # share of that beyond which the elements are doubled, not only moved
-_LONGER = 0.2  # most that the NLP's duration may be allowed to be longer, relatively
-_SETTLED = 0.1  # share of the accuracy below which switches are not looked for again
-_UNLIMITED_TIGHTENING = 1e-2  # of limits in a plan without rate limits, over their scales
-_FIRST_TIGHTENINGS = (5e-4, 5e-5)  # the same with rate limits; the second for a high accuracy
-_RATE_TIGHTENING = 10.0  # of rates and commands, over that
-_MESHES = 6  # most mesh changes before limits are tightened
-_RATE_LIMITED_MESHES = 3  # the same under rate limits
-_AGAIN = 3  # most times that limits are tightened, each on a finer mesh
-_REFINEMENTS = (1, 2, 4)  # factors on the wanted number of elements
+_LONGER = 0.2  # most by which the NLP's duration may be another, relatively
+_MESHES, _RATE_MESHES = 6, 2  # most meshes whose breaks move, and those under rate limits
 _LINEARIZATIONS = 3  # most robust plans, each with rows for the speed of the one before
 # Violation at nodes by other signs than those of the rows, over the limits' scales, above which a
 # first plan is a reference only; case: two releases of a pentagon, whose plan takes 20 % longer.
 _OTHER_SIGNS = 0.05
-_WASTED = 0.02  # share of the accuracy that excessive tightening may cost
 ROUGH = 1e-2  # accuracy of plans that only have to exist
-
-
-class Stuck(NamedTuple):
-    """Failure of a plan."""
-
-    parts: list[PhaseData]  # the phases on their grids
-    reason: str
-    between: bool  # whether limits can be kept at the nodes of this grid, but not between them
 
 
 def plan_path(
@@ -128,112 +121,98 @@ def plan_curves(
     SolverError      if the solver does not converge
     """
     task = Task(curves, epsilon, options, phases, duration, pins=pins)
-    references = tuple[Guide, ...]()
+    guides = tuple[Guide, ...]()
 
     def replan(changed: Sequence[Curve], least: float) -> object:
-        options = _roughen(task.options)
-        changes = replace(task, curves=changed, epsilon=least, options=options, guides=references)
-        return _insist(_plan_finer(changes, insist=False))
+        changes = replace(task, curves=changed, epsilon=least, options=_roughen(task.options))
+        return _plan(replace(changes, guides=guides), insist=False)
 
     try:
-        result, references = plan_within(task)
+        if options.ranges:
+            # Rows are for the motion of a reference: first of a plan without ranges.
+            nominal = _plan(replace(task, options=replace(_roughen(options), ranges={})))
+            guides = nominal.guides
+        iterate = _plan_within(replace(task, guides=guides))
     except JammingError as jam:
         if not explained or len(curves) > 1:
             raise
         from .path_explain import explain_jam
 
         raise explain_jam(curves[0], epsilon, jam, replan) from None
-    if isinstance(result, Stuck):
+    except SolverError as stuck:
         if not explained:
-            raise SolverError(result.reason)
-        error = explain_stuck(task, result, replan)
-        if references and isinstance(error, SolverError):
+            raise
+        error = explain_stuck(task, f"{task.name}: {stuck}", replan)
+        if guides and isinstance(error, SolverError):
             # The reference is a plan without ranges; case: the block of two landings of a pentagon.
             raise SolverError(
-                f"{result.reason} within the ranges of numbers; without them there is a plan: try "
-                f"--robust {options.robust / 2:g}, or narrower [uncertainty], where 0 leaves a "
+                f"{task.name}: {stuck} within the ranges of numbers; without them there is a plan: "
+                f"try --robust {options.robust / 2:g}, or narrower [uncertainty], where 0 leaves a "
                 "number as it is"
-            )
-        raise error
-    if options.goal is Objective.MARGIN and result.plans[0].value < task.lost:
+            ) from None
+        raise error from None
+    if options.goal is Objective.MARGIN and iterate.plans[0].value < task.lost:
         least = SolverError(f"{task.name}: the margin found is below epsilon")
         raise _explain_duration(task) or least
-    plans = _bound_error(task, result.plans)
     # Rate-limited torques start at the limit of what friction can hold.
     surely = task.is_held or (options.goal is Objective.TIME and not options.ranges)
-    return plans if surely else _leave_rest(plans, result)
-
-
-def _bound_error(task: Task, plans: Plans) -> Plans:
-    """The plans, with the gap to a lower bound of the least time as error where that says more.
-
-    Estimated errors are checked above the accuracy, or where that is below the default.
-    """
-    options, error = task.options, plans[0].error
-    if options.goal is not Objective.TIME or options.ranges or task.is_held or task.unlimited:
-        return plans
-    if error <= options.accuracy and options.accuracy >= DEFAULT_ACCURACY:
-        return plans
-    from ..lower_bound.lower_bound import bound_least_time
-
-    bound = bound_least_time(task.curves, task.epsilon)
-    if bound is None or bound.value <= 0:
-        return plans
-    # A plan may be below the bound by the violations that it is allowed.
-    gap = max(sum(plan.value for plan in plans) / bound.value - 1, 0.0)
-    return [plan._replace(error=gap) for plan in plans]
+    return iterate.plans if surely else _leave_rest(iterate)
 
 
 def explain_stuck(
-    task: Task, stuck: Stuck, replan: Callable[[Sequence[Curve], float], object]
+    task: Task, reason: str, replan: Callable[[Sequence[Curve], float], object]
 ) -> WholearmError:
     """Why there is no plan: torque rate limits, the duration, or other limits."""
     from .path_explain import explain, explain_rate_limits
 
+    parts = PathIterate.begin(task, task.elements).parts
     if task.is_held:
-        return explain_rate_limits(task, stuck.parts, stuck.reason)
-    late, slow = _explain_duration(task), guess_slowly(join(stuck.parts))
-    return late or explain(stuck.parts, *slow, task.phases, stuck.reason, replan)
+        return explain_rate_limits(task, parts, reason)
+    late, slow = _explain_duration(task), guess_slowly(join(parts))
+    return late or explain(parts, *slow, task.phases, reason, replan)
 
 
-def plan_within(task: Task) -> tuple[Iterate | Stuck, tuple[Guide, ...]]:
-    """Plan within ranges by successive linearization, and the reference of the last one.
+def _plan(task: Task, insist: bool = True) -> PathIterate:
+    """Solve and refine; unless to `insist`, only where a sweep or a guess shows a motion."""
+    for curve, phase in zip(task.curves, task.phases, strict=True):
+        require_unique(curve, task.options.uniqueness_margin, phase)
+    first = PathIterate.begin(task, task.elements)
+    if not insist and not first.is_kept:
+        raise SolverError("no motion keeps the limits")
+    return refine(first, task.options.accuracy)
 
-    The first reference is a plan without ranges. Each next plan has rows for the speed of the one
-    before. Violations by other signs than theirs are tightened; if that costs too much, again.
+
+def _plan_within(task: Task) -> PathIterate:
+    """Plan; with a reference by successive linearization, each about the motion of the one before.
+
+    Violations by other signs than those of the rows are tightened; if that costs too much, again.
     """
-    options, references = task.options, tuple[Guide, ...]()
-    if not options.ranges:
-        return _plan_finer(task), references
-    result = _plan_finer(replace(task, options=replace(_roughen(options), ranges={})))
-    best: Iterate | None = None
-    for _ in range(_LINEARIZATIONS):
-        if isinstance(result, Stuck):
+    iterate = _plan(task)
+    for _ in range(_LINEARIZATIONS - 1 if task.guides else 0):
+        if iterate.error <= task.options.accuracy:
             break
-        references = _make_guides(plan.motion for plan in result.plans)
-        result = _plan_finer(replace(task, guides=references))
-        if isinstance(result, Iterate):
-            best = result
-            if result.plans[0].error <= options.accuracy:
-                break
-    return best or result, references
+        try:
+            iterate = _plan(replace(task, guides=iterate.guides))
+        except SolverError:
+            break
+    return iterate
 
 
-def _leave_rest(plans: Plans, iterate: Iterate) -> Plans:
+def _leave_rest(iterate: PathIterate) -> Plans:
     """The plans, or if friction can hold their start, others with one that it cannot hold.
 
     Those of least time start with the largest s'', but not as if friction were larger.
     """
-    task, margin = iterate.task, 0.0
+    task, plans, margin = iterate.task, iterate.plans, 0.0
     goal, ranges = task.options.goal, task.options.ranges
     if goal is Objective.MARGIN:
         margin = plans[0].value - task.epsilon
     start = find_sure_start(iterate.parts[0], plans[0].motion.profile, margin, ranges)
     if start is None:
         return plans
-    bounded = replace(iterate, task=replace(task, start=start)).solve()
-    other = bounded if isinstance(bounded, str) else _enforce_between(bounded)
-    if not isinstance(other, Iterate):
+    try:
+        other = refine(replace(iterate, task=replace(task, start=start)), task.options.accuracy)
+    except SolverError:
         return plans
     value = sum(plan.value for plan in plans)
     loss = value - sum(plan.value for plan in other.plans)
@@ -249,7 +228,7 @@ def _explain_duration(task: Task) -> InfeasibleError | None:
         return None
     fastest = replace(task.options, objective=Objective.TIME, duration=None)
     try:
-        plans = _insist(_plan(replace(task, options=fastest, duration=None)))
+        plans = _plan(replace(task, options=fastest, duration=None)).plans
     except WholearmError:
         return None
     least = sum(plan.value for plan in plans)
@@ -259,7 +238,7 @@ def _explain_duration(task: Task) -> InfeasibleError | None:
 
     def can_plan(_: Parameter, value: float) -> bool:
         try:
-            return _insist(_plan(replace(rough, duration=value)))[0].value >= task.epsilon
+            return _plan(replace(rough, duration=value)).plans[0].value >= task.epsilon
         except SolverError:
             return False
 
@@ -278,124 +257,6 @@ def _roughen(options: PlanOptions) -> PlanOptions:
     return replace(options, accuracy=max(options.accuracy, ROUGH))
 
 
-def _insist(result: Iterate | Stuck) -> Plans:
-    """The plans, or an error."""
-    if isinstance(result, Stuck):
-        raise SolverError(result.reason)
-    return result.plans
-
-
-def _plan_finer(task: Task, insist: bool = True) -> Iterate | Stuck:
-    """Plan, with two and four times the elements if tightened limits leave no motion, or no time.
-
-    If limits cannot be kept at the nodes, twice as many are tried only to `insist`. The failure
-    reported is that of the fewer elements.
-    """
-    for curve, phase in zip(task.curves, task.phases, strict=True):
-        require_unique(curve, task.options.uniqueness_margin, phase)
-    stuck: Stuck | None = None
-    for refinement in _REFINEMENTS:
-        result = _plan(task, refinement, insist)
-        if isinstance(result, Stuck):
-            if not result.between and (stuck or not insist):
-                return stuck or result
-            stuck = result
-        elif task.options.goal is not Objective.MARGIN or result.plans[0].value >= task.lost:
-            break
-    return result
-
-
-def _plan(task: Task, refinement: int = 1, insist: bool = True) -> Iterate | Stuck:
-    """Solve with mesh refinement; unless to `insist`, only where a sweep has found a motion."""
-    first = Iterate.begin(task, refinement)
-    if not first.is_kept and (not insist or is_hopeless(first.data)):
-        return Stuck(first.parts, f"{task.name}: no motion keeps the limits", between=False)
-    result: Iterate | Stuck = Stuck(first.parts, "", between=False)
-    for solved in first.solve_first():
-        if isinstance(solved, str):
-            result = Stuck(first.parts, f"{task.name}: {solved}", between=False)
-            continue
-        result = _refine(_linearize(solved, refinement))
-        if isinstance(result, Iterate):
-            break
-    return result
-
-
-def _linearize(iterate: Iterate, refinement: int) -> Iterate:
-    """Within ranges, the plan with rows for about its speed: no mesh mends rows for another one."""
-    for _ in range(_LINEARIZATIONS):
-        if not iterate.task.guides or iterate.violation_at_nodes <= _OTHER_SIGNS:
-            break
-        task = replace(iterate.task, guides=_make_guides(iterate.motions))
-        other = Iterate.begin(task, refinement).solve()
-        if isinstance(other, str):
-            break
-        iterate = other
-    return iterate
-
-
-def _make_guides(motions: Iterable[PathMotion]) -> tuple[Guide, ...]:
-    return tuple(Guide(motion.grid.s, *motion.profile) for motion in motions)
-
-
-def _refine(iterate: Iterate) -> Iterate | Stuck:
-    """Adapt the mesh and tighten limits between nodes until the estimated error is small enough."""
-    best: Iterate | Stuck | None = None
-    for _ in range(_AGAIN):
-        iterate = _adapt_mesh(iterate)
-        result = _enforce_between(iterate)
-        if best is not None and isinstance(result, Stuck):
-            return best
-        best = result
-        if isinstance(result, Stuck) or result.plans[0].error <= iterate.task.options.accuracy:
-            break
-        better = iterate.adapt(dearer=True)[1]
-        if better is not None and better.elements == iterate.elements and iterate.data.grid.held:
-            break
-        refined = better.solve() if better else ""
-        if isinstance(refined, str):
-            break
-        iterate = refined
-    assert best is not None
-    return best
-
-
-def _adapt_mesh(iterate: Iterate) -> Iterate:
-    """Adapt the mesh until switches converge and violations between nodes cost little."""
-    for _ in range(_RATE_LIMITED_MESHES if iterate.data.grid.held else _MESHES):
-        iterate, better = iterate.adapt()
-        if better is None:
-            break
-        refined = better.solve()
-        if isinstance(refined, str):
-            return replace(iterate, shift=better.shift)
-        if iterate.is_split and refined.merit > iterate.merit:
-            # Its breaks, off the switches, lose no more than the two differ by.
-            loss = (refined.merit - iterate.merit) / iterate.value
-            return replace(iterate, shift=min(refined.shift, loss / SHIFTED))
-        iterate = refined
-    return iterate
-
-
-def _enforce_between(iterate: Iterate) -> Iterate | Stuck:
-    """Tighten limits until they hold between nodes too."""
-    task, data = iterate.task, iterate.data
-    excessive = float(iterate.wasted.sum()) > _WASTED * task.options.accuracy
-    for _ in range(SOLVES):
-        misses = iterate.misses
-        if misses.find_worst(data) <= MISS and not excessive:
-            try:
-                iterate.plans  # noqa: B018
-            except StalledError as stall:
-                return Stuck(iterate.parts, f"{task.name}: {stall}", between=True)
-            return iterate
-        solved = iterate.tighten(excessive).solve()
-        if isinstance(solved, str):
-            return Stuck(iterate.parts, f"{task.name}: {solved}", between=True)
-        iterate, excessive = solved, False
-    return Stuck(iterate.parts, f"{task.name}: {misses.describe(data)}", between=True)
-
-
 @dataclass(frozen=True)
 class Task:
     """Arguments of `plan_curves`; with ranges also a reference for each curve."""
@@ -407,7 +268,6 @@ class Task:
     duration: float | None
     start: SureStart | None = None
     guides: tuple[Guide, ...] = ()
-    unlimited: bool = False  # whether torque rates and lags are left out
     pins: Pins = (None, None)
 
     @cached_property
@@ -421,7 +281,7 @@ class Task:
     @property
     def is_held(self) -> bool:
         """Whether motions start and end without acceleration, as torques may not step."""
-        return self.curves[0].formation.scene.has_slow_motors and not self.unlimited
+        return self.curves[0].formation.scene.has_slow_motors
 
     @property
     def name(self) -> str:
@@ -436,48 +296,29 @@ class Task:
     @property
     def elements(self) -> int:
         """Initial number of elements of each phase."""
-        intervals = self.options.intervals
-        if intervals is None:
-            few = START if self.options.accuracy >= EARLY else 2 * START
-            return max(few, SOFT) if self.is_held or self.options.goal is Objective.EFFORT else few
-        return max(-(-intervals // DEGREE), 3)
+        if self.options.intervals is None:
+            few = _SMOOTH if self.options.goal is Objective.EFFORT else _START
+            return _RATE if self.is_held else few
+        return max(-(-self.options.intervals // DEGREE), 3)
 
-    def lay_out(
-        self, meshes: tuple[Mesh, ...], wanted: int
-    ) -> tuple[int, tuple[Mesh, ...], list[PhaseData], PhaseData, PathNLP]:
-        """Elements of each phase, meshes, each phase on its mesh, all joined, and their NLP.
+    def lay_out(self, breaks: Sequence[Array], elements: int) -> list[PhaseData]:
+        """Each phase on elements with breaks: as many as wanted, if that is enough for these."""
+        pairs, last = list(zip(self.curves, breaks, strict=True)), len(breaks) - 1
+        elements = max(elements, *(len(find_ends(*pair)) - 1 for pair in pairs))
+        grids = [
+            make_grid(*pair, elements, (k == 0, k == last), self.is_held)
+            for k, pair in enumerate(pairs)
+        ]
+        columns = zip(self.curves, grids, self.phases, self.spreads, strict=True)
+        return [
+            prepare(curve, self.epsilon, grid, phase, limits)
+            for curve, grid, phase, limits in columns
+        ]
 
-        There are as many elements as wanted, if that is enough for the breaks.
-        """
-        pairs = list(zip(self.curves, meshes, strict=True))
-        ends = max(len(find_ends(curve, mesh.breaks)) for curve, mesh in pairs)
-        if self.is_held and self.options.intervals is None:
-            ends = -(-(ends + _EXTRA) // _STEPS) * _STEPS
-        elements, parts, last = max(wanted, ends), list[PhaseData](), len(meshes) - 1
-        for k, (curve, mesh) in enumerate(pairs):
-            grid = mesh.make_grid(curve, elements, (k == 0, k == last), self.is_held)
-            parts.append(prepare(curve, self.epsilon, grid, self.phases[k], self.spreads[k]))
-        data = join(parts)
-        motors = MotorShape.of(self.curves[0].formation.scene) if self.is_held else UNLIMITED
-        shape = LimitShape.of(data.limits, motors)
-        nlp = build_path_nlp(shape, len(data.grid.steps), self.options.goal)
-        return elements, meshes, parts, data, nlp
-
-    def place_breaks(self, switches: Sequence[Switch]) -> tuple[Mesh, ...]:
-        """Meshes with breaks at switches, which are at places along all curves.
-
-        None on a curve where a fixed number of elements is too few for them.
-        """
-        starts = np.cumsum([0.0, *(curve.length for curve in self.curves)])
-        of_curve = np.searchsorted(starts[1:-1], [place for place, _ in switches])
-        meshes = list[Mesh]()
-        for k, curve in enumerate(self.curves):
-            pairs = zip(switches, of_curve, strict=True)
-            local = [Switch(place - starts[k], jumps) for (place, jumps), at in pairs if at == k]
-            mesh = Mesh.of(curve, local, self.is_held)
-            few = self.options.intervals and len(find_ends(curve, mesh.breaks)) > self.elements
-            meshes.append(Mesh() if few else mesh)
-        return tuple(meshes)
+    def find_fastest(self) -> Fastest | None:
+        """The minimum-time speed profile, or the one of the allowed duration; None without one."""
+        data = join(self.lay_out([np.zeros(0)] * len(self.curves), self.elements))
+        return find_fastest(data, self.duration)
 
 
 def require_unique(curve: Curve, least: float, phase: int) -> None:
@@ -509,107 +350,181 @@ def require_unique(curve: Curve, least: float, phase: int) -> None:
         raise AmbiguityError(f"phase {phase}: {text}")
 
 
+class PathSolution(NamedTuple):
+    """A solution of the NLP, or the point to start from."""
+
+    profile: Profile
+    margin: float  # [N]: over epsilon
+    multipliers: dict[str, Array]
+    cost: float = np.inf  # in the units of the NLP
+    duration: float = 0.0  # [s]: by the quadrature of the NLP, where it is bounded
+
+
 @dataclass(frozen=True)
-class Iterate:
-    """A mesh with its NLP, and the solution on it or the point to start from."""
+class PathIterate:
+    """A mesh with its NLP, and the solution on it or the point to start from: a `Transcription`."""
 
     task: Task
-    elements: int  # of each phase
-    meshes: tuple[Mesh, ...]
-    parts: list[PhaseData]
+    breaks: tuple[Array, ...]  # [m]: of each curve, where elements end at switches
+    cuts: tuple[Array, ...]  # [m]: other ends of elements of each curve, if some were halved
+    parts: list[PhaseData]  # each phase on its grid
     data: PhaseData  # all phases as one
     nlp: PathNLP
     units: Units
-    solution: PathSolution  # the last one, or the point to start from
+    solution: PathSolution
     tightening: Tightening  # of the limits for that
-    fastest: Fastest | None  # minimum-time speed profile, near which plans are looked for
-    shift: float = np.inf  # estimated distance of switches from breaks, over the curve's length
-    interior: Iterate | None = None  # under rate limits: strictly feasible, to restart from
+    is_kept: bool  # whether some motion is known to keep limits, or negative margins would do
+    meshes: int = 0  # before this one
+    merit: float = np.inf  # estimated cost once limits hold between nodes, on the mesh before
+    shift: float | None = None  # of switches from breaks, if limits are tightened; see `switches`
 
     @staticmethod
-    def begin(task: Task, refinement: int) -> Iterate:
-        """Initial guess on elements that end at reversals alone, or from an unlimited plan."""
-        ramped = Iterate._add_ramps(task, refinement) if task.is_held else None
-        if ramped is not None:
-            return ramped
-        layout = task.lay_out(tuple(Mesh() for _ in task.curves), refinement * task.elements)
-        data, nlp = layout[3:]
+    def begin(task: Task, elements: int) -> PathIterate:
+        """Start from the minimum-time speed profile, or a parabola of the squared speed."""
+        breaks: Sequence[Array] = [np.zeros(0)] * len(task.curves)
+        parts = task.lay_out(breaks, elements)
+        data = join(parts)
         profile, units = guess(data, task.options.time_weight)
-        sweeps = task.options.goal is not Objective.EFFORT and not data.grid.held
-        fastest = find_fastest(data, task.duration) if sweeps else None
-        start = PathSolution(profile, 0.0, balance(nlp, data, units, profile))
-        none = Tightening.none(data, task.duration)
-        profiled = fastest if isinstance(fastest, Fastest) else None
-        first = Iterate(task, *layout, units, start, none, profiled)
-        if fastest is None:
-            return first
-        # Where it is not the duration that limits a margin, switches are not looked for.
-        meshes = task.place_breaks(fastest.switches)
-        return first._restart(meshes, refinement * task.elements, np.inf if profiled else 0.0)
+        margin, goal, fastest = 0.0, task.options.goal, None
+        kept = goal is Objective.MARGIN
+        if goal is not Objective.EFFORT and not task.is_held:
+            fastest = find_fastest(data, task.duration)
+        if fastest is not None:
+            margin, few = fastest.margin, task.options.intervals and elements
+            breaks = place_breaks(task.curves, fastest.switches, few)
+            parts = task.lay_out(breaks, elements)
+            data = join(parts)
+            profile = fastest.follow(data)
+        kept = kept or fastest is not None or bool(data.slack(data.nodes, profile).min() >= 0)
+        none = [np.zeros(0)] * len(parts)
+        return PathIterate.start(task, (breaks, none), parts, units, (profile, margin), kept)
 
     @staticmethod
-    def _add_ramps(task: Task, refinement: int) -> Iterate | None:
-        """Initial guess under rate limits: a plan without them, with ramps for torque steps."""
-        unlimited = Iterate.begin(replace(task, unlimited=True, pins=(None, None)), refinement)
-        plan = unlimited.tighten_all(_UNLIMITED_TIGHTENING).solve()
-        if isinstance(plan, str):
-            return None
-        duration = sum(motion.duration for motion in plan.motions)
-        ramped = ramp_up(plan.data, plan.solution.profile, duration, task.pins)
-        if ramped is None:
-            return None
-        starts = np.cumsum([0.0, *(curve.length for curve in task.curves)])
-        breaks = [mesh.breaks + start for mesh, start in zip(plan.meshes, starts, strict=False)]
-        meshes = task.place_breaks(ramped.find_breaks(np.concatenate(breaks)))
-        layout = task.lay_out(meshes, refinement * task.elements)
-        data, nlp = layout[3:]
-        profile = ramped.guess(plan.data.grid, plan.solution.profile, data.grid)
-        multipliers = plan.move_multipliers(nlp, data)
-        multipliers = center(nlp, data, plan.units, profile, multipliers, task.duration, task.pins)
-        start, none = PathSolution(profile, 0.0, multipliers), Tightening.none(data, task.duration)
-        return Iterate(task, *layout, plan.units, start, none, None)
+    def start(
+        task: Task,
+        edges: tuple[Sequence[Array], Sequence[Array]],
+        parts: list[PhaseData],
+        units: Units,
+        motion: tuple[Profile, float],
+        kept: bool,
+    ) -> PathIterate:
+        """Start near a motion and its margin [N], with multipliers near the central path.
 
-    def tighten_all(self, share: float) -> Iterate:
-        """The iterate with all limits tightened, so that its solution is strictly feasible."""
-        tight, scale = self.tightening, 1 - _RATE_TIGHTENING * share
-        limits = tight.limits + share * self.data.spans
-        tight = tight._replace(limits=limits, motors=tight.motors * scale)
-        return replace(self, tightening=tight)
+        `edges` are the breaks and the cuts.
+        """
+        data, (breaks, cuts) = join(parts), map(tuple, edges)
+        motors = MotorShape.of(task.curves[0].formation.scene) if task.is_held else UNLIMITED
+        shape = LimitShape.of(data.limits, motors)
+        nlp = build_path_nlp(shape, len(data.grid.steps), task.options.goal)
+        first = PathSolution(*motion, center(nlp, data, units, *motion))
+        none = Tightening.none(data, task.duration)
+        return PathIterate(task, breaks, cuts, parts, data, nlp, units, first, none, kept)
 
-    def refit(self) -> Iterate:
-        """The iterate on a mesh for its solution, with limits as they are."""
-        meshes = tuple(
-            Mesh.of(part.curve, find_rate_switches(part, motion.profile), True)
-            for part, motion in zip(self.parts, self.motions, strict=True)
+    def restart(self) -> PathIterate | None:
+        """The first one on twice the elements, once."""
+        elements = 2 * self.task.elements
+        if len(self.parts[0].grid.edges) >= elements:
+            return None
+        return PathIterate.begin(self.task, elements)
+
+    def solve(self) -> PathIterate:
+        """The solution on this mesh."""
+        nlp, data, units, start, task = self.nlp, self.data, self.units, self.solution, self.task
+        bounds = make_bounds(nlp, data, units, self.tightening, start=task.start, pins=task.pins)
+        if (bounds["lbg"] > bounds["ubg"]).any():
+            raise SolverError("limits that hold between the nodes too leave nothing")
+        result = nlp.solver(
+            x0=pack(nlp, start.profile, units, start.margin, data.grid.sizes),
+            p=parameters(nlp, data, units, task.options.time_weight),
+            **bounds,
+            **start.multipliers,
         )
-        return replace(self, interior=self)._restart(meshes, self.elements, 0.0)
+        stats = nlp.solver.stats()
+        if not stats["success"]:
+            raise SolverError(f"Ipopt stopped with {stats['return_status']}")
+        profile, margin = unpack(nlp, data.grid, result["x"].full()[:, 0], units)
+        multipliers = {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")}
+        duration = float(result["g"][-1]) * units.time if self.tightening.duration else 0.0
+        solution = PathSolution(profile, margin, multipliers, float(result["f"]), duration)
+        return replace(self, solution=solution)
 
-    def _restart(self, meshes: tuple[Mesh, ...], elements: int, shift: float) -> Iterate:
-        """Start on other meshes, from the minimum-time speed profile or else from this iterate."""
-        task, source = self.task, self.interior or self
-        layout = task.lay_out(meshes, elements)
-        data, nlp = layout[3:]
-        tightening = Tightening.none(data, self.allowed)
-        if self.fastest is None:
-            profile = Elements(source.data.grid, source.solution.profile).move(data.grid)
-            multipliers = source.move_multipliers(nlp, data)
-            if data.grid.held:
-                profile = follow(data.grid, profile.a, profile.lam)
-                multipliers = center(
-                    nlp, data, self.units, profile, multipliers, task.duration, task.pins
-                )
-            start = source.solution._replace(profile=profile, multipliers=multipliers)
-        else:
-            start, vertices = start_at(nlp, data, self.units, self.fastest)
-            if task.options.accuracy >= EARLY:
-                tightening = anticipate(data, start._replace(profile=vertices), tightening)
-        first = Iterate(task, *layout, self.units, start, tightening, self.fastest)
-        return replace(first, shift=shift, interior=self.interior)
+    def adapt(self) -> PathIterate | None:
+        """The next one to solve: with rows or breaks for this motion, halved, or tightened."""
+        task, accuracy = self.task, self.task.options.accuracy
+        again = self.meshes < _MESHES
+        if task.guides and again and self.violation_at_nodes > _OTHER_SIGNS:
+            # No mesh mends rows for another speed.
+            other = PathIterate.begin(replace(task, guides=self.guides), task.elements)
+            return replace(other, meshes=self.meshes + 1)
+        if task.is_held and self.meshes < _RATE_MESHES:
+            each = zip(self.parts, self.motions, strict=True)
+            return self._move([equidistribute(*own, task.elements) for own in each], self.cuts)
+        breaks, _ = self.switches
+        if self.loss > _SHARE * accuracy and again:
+            return self._move(breaks, self.cuts)
+        costs = self.due + self.paid
+        if costs.sum() > accuracy and task.options.intervals is None:
+            shares = np.split(costs, np.cumsum([len(part.grid.s) for part in self.parts])[:-1])
+            edges = [part.grid.edges for part in self.parts]
+            if max(map(len, edges)) + task.elements <= _MOST:
+                pairs = zip(edges, shares, strict=True)
+                return self._move(breaks, [halve(*pair, task.elements) for pair in pairs])
+        return self.tighten() if self.violation > 1 else None
 
-    def move_multipliers(self, nlp: PathNLP, data: PhaseData) -> dict[str, Array]:
-        """Multipliers of the solution on another grid of the same curves."""
-        old = self.solution.multipliers
-        return move_multipliers(self.nlp, nlp, old, self.data.grid, data.grid)
+    @cached_property
+    def switches(self) -> tuple[Sequence[Array], float]:
+        """Breaks at the switches of this motion, and how far they are from the present ones.
+
+        Over the curve's length. They are looked for before limits are tightened.
+        """
+        goal = self.task.options.goal
+        if self.task.is_held:
+            return self.breaks, 0.0 if self.meshes == _RATE_MESHES else np.inf
+        if goal is Objective.EFFORT or self.shift is not None:
+            return self.breaks, self.shift or 0.0
+        pairs = zip(self.parts, self.motions, self.breaks, strict=True)
+        found = [
+            match(before, find_switches(part, motion.profile, self.solution.margin), part.curve)
+            for part, motion, before in pairs
+        ]
+        return [breaks for breaks, _ in found], max(shift for _, shift in found)
+
+    def _move(self, breaks: Sequence[Array], cuts: Sequence[Array]) -> PathIterate:
+        """Start on other elements from this motion."""
+        every = zip(self.task.curves, breaks, cuts, strict=True)
+        ends = [keep_apart(curve, np.append(own, more)) for curve, own, more in every]
+        parts, old = self.task.lay_out(ends, self.task.elements), self.solution
+        grid = join(parts).grid
+        profile = Elements(self.data.grid, old.profile).move(grid)
+        if grid.held:
+            profile = follow(grid, profile.a, profile.lam)
+        motion, kept = (profile, old.margin), self.is_kept
+        made = PathIterate.start(self.task, (breaks, cuts), parts, self.units, motion, kept)
+        merit = old.cost + self.value * float(self.due.sum())
+        return replace(made, meshes=self.meshes + 1, merit=merit)
+
+    def tighten(self) -> PathIterate:
+        """The same with limits tightened by somewhat more than their violations."""
+        data, tight = self.data, self.tightening
+        (short, speeding), hurry, _ = self.misses
+        solution, duration = self.solution, self.task.duration
+        if duration is not None:
+            # The quadrature of the NLP is not that of the motion.
+            off = solution.duration / sum(motion.duration for motion in self.motions)
+            duration *= float(np.clip(off, 1 - _LONGER, 1 + _LONGER))
+        # Slack at nodes would absorb the rest.
+        reach = data.slack_at_neighbours(solution.profile, solution.margin, short)
+        added = _OVER * data.spread_to_nodes(short)
+        if data.grid.held:
+            added = _taper(added, data.grid)
+        tighter = Tightening(
+            np.maximum(tight.limits, data.spread_to_nodes(reach)) + added,
+            tight.speed_share * (1 - _OVER * data.spread_to_nodes(speeding)),
+            duration,
+            tight.missed + added,
+            tight.motors * (1 - _OVER * data.spread_to_nodes(hurry)),
+        )
+        return replace(self, tightening=tighter, shift=self.switches[1])
 
     @cached_property
     def motions(self) -> list[PathMotion]:
@@ -617,69 +532,28 @@ class Iterate:
         pairs = zip(self.parts, cut(self.parts, self.solution.profile), strict=True)
         return [PathMotion(part.curve, part.grid, profile) for part, profile in pairs]
 
-    @cached_property
-    def misses(self) -> Misses:
-        """Violations of limits between nodes."""
-        return Misses.of(self.data, self.solution, self.motions, self.task.duration)
-
     @property
-    def value(self) -> float:
-        """Scale of the cost's error."""
-        if self.task.options.goal is Objective.MARGIN:
-            return max(abs(self.task.epsilon + self.solution.margin) / self.units.force, 1e-9)
-        return max(abs(self.solution.cost), 1e-9)
+    def guides(self) -> tuple[Guide, ...]:
+        """The motion along each curve as a reference."""
+        return tuple(Guide(motion.grid.s, *motion.profile) for motion in self.motions)
 
     @cached_property
-    def due(self) -> Array:
-        """Relative cost at each node of tightening limits by their violations."""
-        missed = self.misses.short, self.misses.speeding, self.misses.hurry
-        return self._price(*map(self.data.spread_to_nodes, missed))
-
-    @cached_property
-    def paid(self) -> Array:
-        """Relative cost at each node of the tightening so far."""
-        tight = self.tightening
-        return self._price(tight.missed, 1 - tight.speed_share, 1 - tight.motors)
-
-    @cached_property
-    def wasted(self) -> Array:
-        """Relative cost at each node of tightening limits more than needed."""
-        spare = np.minimum(self.tightening.missed, self.misses.find_spare(self.data))
-        return self._price(spare, np.zeros(len(spare)), np.zeros((len(spare), 2, 2)))
-
-    def _price(self, *tightened: Array) -> Array:
-        costs = price(self.nlp, self.data, self.units, self.solution, *tightened)
-        return np.asarray(costs / self.value)
+    def misses(self) -> tuple[tuple[Array, Array], Array, float]:
+        """Violations between nodes: of limits and b, of torque rates, of the duration."""
+        duration, late = self.task.duration, 0.0
+        if duration:
+            late = sum(motion.duration for motion in self.motions) / duration - 1
+        hurry = find_hurry(self.data, self.solution.profile, self.motions)
+        return self.data.misses(self.solution.profile, self.solution.margin), hurry, late
 
     @property
-    def allowed(self) -> float | None:
-        """Bound of the NLP's duration with which the motion's is the allowed one [s]."""
-        wanted, duration = self.task.duration, self.solution.duration
-        if not wanted or not duration:
-            return wanted
-        total = sum(motion.duration for motion in self.motions)
-        return wanted * (1 + min(max(duration / total - 1, 0.0), _LONGER))
-
-    @property
-    def unspent(self) -> float:
-        """Relative gain of using the time that is left, to first order."""
-        if self.task.duration is None:
-            return 0.0
-        left = self.task.duration - sum(motion.duration for motion in self.motions)
-        each = float(self.solution.multipliers["lam_g0"][self.nlp.columns.g["duration"]].sum())
-        return max(each, 0.0) * max(left, 0.0) / self.units.time / self.value
-
-    @property
-    def merit(self) -> float:
-        """Estimated cost once limits hold between nodes."""
-        return self.solution.cost + self.value * float(self.due.sum())
-
-    @property
-    def is_kept(self) -> bool:
-        """Whether some motion is known to keep limits at nodes, or negative margins would do."""
-        if self.fastest is not None or self.task.options.goal is Objective.MARGIN:
-            return True
-        return bool(self.data.slack(self.data.nodes, self.solution.profile).min() >= 0)
+    def violation(self) -> float:
+        """The largest violation between nodes, over the allowed one."""
+        if any(motion.stalls for motion in self.motions):
+            return np.inf
+        (short, speeding), hurry, late = self.misses
+        over = (short / self.data.spans).max(), speeding.max(), late
+        return float(max(max(over) / MISS, hurry.max() / _RATE_MISS))
 
     @property
     def violation_at_nodes(self) -> float:
@@ -689,94 +563,60 @@ class Iterate:
         return -float((slack / self.data.spans).min())
 
     @property
-    def is_split(self) -> bool:
-        """Whether elements end where the plan switches."""
-        return any(len(mesh.breaks) for mesh in self.meshes)
+    def error(self) -> float:
+        """Estimated relative error: cost of the tightening, and of switches off their breaks."""
+        return float(self.paid.sum()) + self.loss
 
-    def solve(self) -> Iterate | str:
-        """Solve on this mesh; why the solver ended if there is no solution."""
-        nlp, data, units, start, task = self.nlp, self.data, self.units, self.solution, self.task
-        bounds = make_bounds(nlp, data, units, self.tightening, start=task.start, pins=task.pins)
-        if (bounds["lbg"] > bounds["ubg"]).any():
-            return "limits that hold between the nodes too leave nothing"
-        result = nlp.solver(
-            x0=pack(nlp, start.profile, units, start.margin, data.grid.sizes),
-            p=parameters(nlp, data, units, task.options.time_weight),
-            **bounds,
-            **start.multipliers,
-        )
-        stats = nlp.solver.stats()
-        if not stats["success"]:
-            return f"Ipopt stopped with {stats['return_status']}"
-        profile, margin = unpack(nlp, data.grid, result["x"].full()[:, 0], units)
-        multipliers = {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")}
-        duration = float(result["g"][-1]) * units.time if self.tightening.duration else 0.0
-        solution = PathSolution(profile, margin, multipliers, float(result["f"]), duration)
-        return replace(self, solution=solution)
+    @cached_property
+    def loss(self) -> float:
+        """Relative cost of switches off their breaks, by their distance or what the mesh gained."""
+        merit = self.solution.cost + self.value * float((self.due + self.paid).sum())
+        return min(_SHIFTED * self.switches[1], abs(merit - self.merit) / self.value, _SHIFTED)
 
-    def solve_first(self) -> Iterator[Iterate | str]:
-        """First solutions; under rate limits also on a mesh for one with tighter limits."""
-        if self.data.grid.held:
-            accurate, first = self.task.options.accuracy < EARLY, self
-            for share in _FIRST_TIGHTENINGS[: 1 + accurate]:
-                interior = first.tighten_all(share).solve()
-                if isinstance(interior, str):
-                    break
-                first = interior.refit()
-            if first is not self:
-                yield first.solve()
-        yield self.solve()
+    @property
+    def value(self) -> float:
+        """Scale of errors of the cost."""
+        cost = abs(self.solution.cost)
+        if self.task.options.goal is Objective.MARGIN:
+            cost = abs(self.task.epsilon + self.solution.margin) / self.units.force
+        return max(cost, 1e-9)
 
-    def tighten(self, ease: bool) -> Iterate:
-        """The iterate with limits tightened by their violations, eased first where too tight."""
+    @cached_property
+    def due(self) -> Array:
+        """Relative cost at each node of tightening limits by their violations."""
+        (short, speeding), hurry, _ = self.misses
+        return self._price(*map(self.data.spread_to_nodes, (short, speeding, hurry)))
+
+    @cached_property
+    def paid(self) -> Array:
+        """Relative cost at each node of the tightening so far."""
         tight = self.tightening
-        tight = tight.ease(self.misses.find_spare(self.data)) if ease else tight
-        return replace(self, tightening=self.misses.tighten(self.data, tight, self.solution))
+        return self._price(tight.missed, 1 - tight.speed_share, 1 - tight.motors)
 
-    def adapt(self, dearer: bool = False) -> tuple[Iterate, Iterate | None]:
-        """The iterate with its shift, and one on a better mesh; None if this one will do.
+    def _price(self, limits: Array, speed_share: Array, motors: Array) -> Array:
+        """First-order relative cost of tightening at each node, shape (n,).
 
-        Parameters
-        ----------
-        dearer  whether tightening limits has cost more than the accuracy
+        The sum of multipliers times the tightening of limits, (n, n_sides), b, (n,), and torque
+        rates and commands, (n, 2, 2).
         """
-        task, most = self.task, self.task.options.accuracy
-        prices = self.due + self.paid - self.wasted
-        shares = np.split(prices, np.cumsum([len(part.grid.s) for part in self.parts])[:-1])
-        most_elements = SLOW_MOST if self.data.grid.held and most >= EARLY else MOST
-        coarse = self.elements < most_elements and task.options.intervals is None
-        allowed = _DEAR[task.options.goal] * most
-        dear = dearer or bool(prices.sum() > allowed)
-        # Converged switches need not be looked for. Where much is violated they are not better
-        # known than by a sweep.
-        settled = SHIFTED * self.shift < _SETTLED * most
-        settled = settled or self.data.grid.held or (self.fastest is not None and dear and coarse)
-        goal, margin = None if settled else task.options.goal, self.solution.margin
-        phases = zip(self.parts, self.motions, shares, self.meshes, strict=True)
-        better = [
-            adapt(goal, part, motion.profile, margin, share, mesh)
-            for part, motion, share, mesh in phases
-        ]
-        shift = self.shift if settled else max(each.shift for each in better)
-        moved = SHIFTED * shift > _SHARE * most and not self.data.grid.held
-        # Violations say little before elements end at switches.
-        dear = dear and coarse and (dearer or self.is_split or not np.isinf(shift))
-        if not (moved or dear):
-            if self.unspent <= _SHARE * most:
-                return replace(self, shift=shift), None
-            longer = self.tightening._replace(duration=self.allowed)
-            return self, replace(self, tightening=longer, shift=shift)
-        expected = sum(each.price for each in better)
-        double = (dearer and coarse) or (dear and expected > _LIKELY * allowed)
-        meshes = tuple(each.mesh for each in better)
-        return self, self._restart(meshes, self.elements * (2 if double else 1), shift)
+        nlp, data, units, solution = self.nlp, self.data, self.units, self.solution
+        rows, signs, _ = data.limits.sides
+        on_g, count = solution.multipliers["lam_g0"], len(data.grid.s)
+        on_limits = on_g[nlp.columns.g["limits"]].reshape(count, -1)
+        on_sides = np.maximum(-signs * on_limits[:, rows], 0.0) / units.of(data.limits)[rows]
+        on_b = np.zeros(nlp.free.shape)
+        on_b[nlp.free] = solution.multipliers["lam_x0"]
+        on_b = np.maximum(on_b[:, 0], 0.0) * solution.profile.b / data.grid.sizes
+        costs = (on_sides * limits).sum(axis=1) + on_b / units.profile[0] * speed_share
+        for kind, (name, joints) in enumerate(nlp.shape.motors._asdict().items()):
+            on_rows = np.abs(on_g[nlp.columns.g[name]]).reshape(len(joints), count).T
+            costs += (on_rows * motors[:, kind, list(joints)]).sum(axis=1)
+        return np.asarray(costs / self.value)
 
     @cached_property
     def plans(self) -> Plans:
         """The plan of each phase; StalledError if one nearly stops between two nodes."""
-        options = self.task.options
-        error = float(self.paid.sum() + SHIFTED * min(self.shift, 1.0) + self.unspent)
-        plans = []
+        options, plans = self.task.options, []
         for part, motion in zip(self.parts, self.motions, strict=True):
             torque, squares = fit_torque(part, motion)
             value = {
@@ -784,5 +624,19 @@ class Iterate:
                 Objective.EFFORT: squares + options.time_weight * motion.duration,
                 Objective.MARGIN: self.task.epsilon + self.solution.margin,
             }[options.goal]
-            plans.append(PhasePlan(motion, torque, value, error=error))
+            plans.append(PhasePlan(motion, torque, value, error=self.error))
         return plans
+
+
+def _taper(short: Array, grid: Grid) -> Array:
+    """Violations at nodes, (n, n_sides), made continuous where two elements meet, as torques are.
+
+    A polynomial tightened at one end alone would oscillate.
+    """
+    table = short.reshape(-1, DEGREE + 1, short.shape[1])
+    ends = np.zeros((len(table) + 1, short.shape[1]))
+    ends[:-1], ends[1:] = table[:, 0], np.maximum(ends[1:], table[:, -1])
+    ends[:-1] = np.maximum(ends[:-1], table[:, 0])
+    y = np.linspace(0, 1, DEGREE + 1)[:, None]
+    along = ends[:-1, None] * (1 - y) + ends[1:, None] * y
+    return np.asarray(np.maximum(table, along).reshape(short.shape))

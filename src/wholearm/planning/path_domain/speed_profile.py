@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
-from ...common.errors import Parameter
-from ...mechanics.dynamics import ONE, V
+from ...mechanics.dynamics import ONE
 from ...mechanics.path_limits import PathLimits
 from ..lower_bound.speed_sweep import NoMotionError, SweepMode, find_duration, speed_sweep
+from .elements import Profile
+from .first_guess import find_middle
 from .path_data import PhaseData
 from .path_mesh import LimitSamples, Switch
 
@@ -23,10 +24,6 @@ from .path_mesh import LimitSamples, Switch
 _SHARES = {SweepMode.PUSH: 0.0, SweepMode.SWITCH: 0.0, SweepMode.BRAKE: 1.0, SweepMode.HELD: 0.5}
 _CLOSE = 1e-4  # relative tolerance of the duration for a margin
 _TRIES = 40  # most margins tried
-_SAME = 1e-4  # relative width of a bracket of the largest margin with any motion
-_WIDER = 5e-3  # relaxation in `is_hopeless`, over the limits' scales
-_FREE = 1e6  # the same for limits that do not count
-_GRADES = (1e-4, 1e-3, 1e-2)  # breaks next to an end that limits the margin, over the length
 
 
 class Fastest(NamedTuple):
@@ -43,60 +40,30 @@ class Fastest(NamedTuple):
         """The s'' of each interval, shape (N,) [m/s^2]."""
         return np.asarray(np.diff(self.b) / (2 * np.diff(self.s)))
 
-    def find_modes(self, places: Array) -> NDArray[np.int64]:
-        """Modes at some places [m]: never `SWITCH`."""
-        modes = self.modes[np.clip(np.searchsorted(self.s, places) - 1, 0, len(self.modes) - 1)]
-        jumps = np.array([place for place, jumps in self.switches if jumps])
-        for k in np.flatnonzero(modes == SweepMode.SWITCH).tolist():
-            jump = jumps[np.abs(jumps - places[k]).argmin()] if len(jumps) else places[k]
-            modes[k] = SweepMode.PUSH if places[k] < jump else SweepMode.BRAKE
-        return modes
+    def follow(self, data: PhaseData) -> Profile:
+        """The motion on a grid, with internal forces amid their range."""
+        a = np.interp(data.grid.s, (self.s[1:] + self.s[:-1]) / 2, self.slopes)
+        b = np.interp(data.grid.s, self.s, self.b)
+        limits = data.find_limits(data.nodes, self.margin)
+        low, high = limits.find_internal_force_range(a, b)
+        return Profile(a, b, find_middle(data, low, high)[1])
 
 
-class Narrow(NamedTuple):
-    """Breaks about a place that limits the margin, whatever the duration; graded at an end."""
-
-    switches: list[Switch]
-
-
-def find_fastest(data: PhaseData, duration: float | None) -> Fastest | Narrow | None:
+def find_fastest(data: PhaseData, duration: float | None) -> Fastest | None:
     """The minimum-time profile; with a duration [s], the one of that with the largest margin.
 
-    None if there is no motion.
+    None if there is no motion, or if not only the duration limits the margin.
     """
     samples, margin = LimitSamples.of(data, 0.0), 0.0
     try:
         if duration is not None:
             largest = _find_margin(data, samples, duration)
-            if largest is None or isinstance(largest, Narrow):
-                return largest
+            if largest is None:
+                return None
             samples, margin = LimitSamples.of(data, largest), largest
         return _find_at(samples, margin)
     except NoMotionError:
         return None
-
-
-def is_hopeless(data: PhaseData, spared: Parameter | None = None) -> bool:
-    """Whether no motion keeps slightly relaxed limits, without those of a `spared` parameter."""
-    samples, free = LimitSamples.of(data, 0.0), np.zeros(len(data.spans), dtype=bool)
-    if spared is not None:
-        free = data.limits.weigh(spared)[data.limits.sides[0]] > 0
-    cap = np.inf if spared is not None and spared.is_speed else 1 + _WIDER
-    wider = samples.sides.relax(_WIDER)
-    wider.rows[:, free, ONE] = _FREE
-    limits = wider._replace(cap=cap * wider.cap).eliminate()
-    viscous = np.abs(limits.rows[..., V])
-    if viscous.any():
-        # Viscous friction helps by no more than its value at the largest speed.
-        most = np.sqrt(limits.find_largest_b())[:, None]
-        helps = np.multiply(viscous, most, out=np.zeros_like(viscous), where=viscous > 0)
-        limits = limits.relax(np.minimum(helps, _FREE))
-        limits.rows[..., V] = 0.0
-    try:
-        _sweep(samples, limits, 1)
-    except NoMotionError:
-        return True
-    return False
 
 
 def _find_at(samples: LimitSamples, margin: float) -> Fastest:
@@ -132,7 +99,7 @@ def _sweep(
     return s, motion.b, motion.modes, (1 - part) * motion.b[:-1] + part * motion.b[1:]
 
 
-def _find_margin(data: PhaseData, samples: LimitSamples, duration: float) -> float | Narrow | None:
+def _find_margin(data: PhaseData, samples: LimitSamples, duration: float) -> float | None:
     """The margin [N] with which the minimum time is a duration [s]: Illinois false position."""
     force, limits = data.curve.formation.scene.scales.force, samples.rows
     rate = (LimitSamples.of(data, force).rows.rows - limits.rows)[..., ONE] / force
@@ -148,14 +115,12 @@ def _find_margin(data: PhaseData, samples: LimitSamples, duration: float) -> flo
         return None
     low, high, at_high, guess, side = 0.0, np.inf, -1.0, force, 0
     margin, last, slope = 0.0, at_low, -1.0
-    stuck: int | None = None
     for _ in range(_TRIES):
-        blocked = None
         try:
             value, b_guess = evaluate(guess, stride, b_guess)
             slope, margin, last = (value - last) / (guess - margin), guess, value
-        except NoMotionError as error:
-            value, blocked = -1.0, error.interval
+        except NoMotionError:
+            value = -1.0
         if abs(value) < _CLOSE:
             break
         if value > 0:
@@ -163,16 +128,7 @@ def _find_margin(data: PhaseData, samples: LimitSamples, duration: float) -> flo
             low, at_low = guess, value
         else:
             at_low, side = (at_low / 2 if side < 0 else at_low), -1
-            high, at_high, stuck = guess, value, blocked
-        if stuck is not None and high - low < _SAME * high:
-            ends = 2 * stride * np.arange(stuck, stuck + 2)
-            places = np.append(samples.s, samples.length)[ends]
-            graded = samples.length * np.array(_GRADES)
-            if places[0] < graded[-1]:
-                places = graded
-            elif places[1] > samples.length - graded[-1]:
-                places = samples.length - graded
-            return Narrow([Switch(float(place), False) for place in np.sort(places)])
+            high, at_high = guess, value
         guess = low + at_low / (at_low - at_high) * (high - low) if np.isfinite(high) else 2 * low
     else:
         return None

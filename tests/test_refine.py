@@ -1,0 +1,58 @@
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import pytest
+
+from wholearm import SolverError
+from wholearm.planning.refine import SOLVES, refine
+
+
+@dataclass(frozen=True)
+class Halving:
+    """A problem whose errors halve with every solve; it has no solution on the first meshes."""
+
+    unsolved: int = 0  # meshes without a solution
+    gone: int = 99  # solves after which there is none any more
+    least: int = 99  # solves after which nothing is left to adapt
+    mesh: int = 0
+    solves: int = 0
+
+    @property
+    def error(self) -> float:
+        return 2.0**-self.solves
+
+    @property
+    def violation(self) -> float:
+        return 8.0 * 2.0**-self.solves
+
+    def solve(self) -> Halving:
+        if self.mesh < self.unsolved or self.solves >= self.gone:
+            raise SolverError(f"no solution on mesh {self.mesh}")
+        return replace(self, solves=self.solves + 1)
+
+    def adapt(self) -> Halving | None:
+        return self if self.solves < self.least else None
+
+    def restart(self) -> Halving | None:
+        return replace(self, mesh=self.mesh + 1, solves=0) if self.mesh < 2 else None
+
+
+def test_refinement_ends_below_the_accuracy_without_violations() -> None:
+    assert refine(Halving(), 0.1).solves == 4
+    # Below the accuracy at once, but not without violations.
+    assert refine(Halving(), 1.0).solves == 3
+    assert refine(Halving(least=5), 1e-9).solves == 5
+    assert refine(Halving(), 0.0).solves == SOLVES
+
+
+def test_what_was_found_is_kept_where_the_next_one_has_no_solution() -> None:
+    assert refine(Halving(gone=6), 0.0).solves == 6
+
+
+def test_finer_meshes_are_tried_until_there_is_a_solution() -> None:
+    assert refine(Halving(unsolved=2), 0.1).mesh == 2
+    with pytest.raises(SolverError, match="no solution on mesh 0"):
+        refine(Halving(unsolved=3), 0.1)
+    with pytest.raises(SolverError, match="still missed between nodes"):
+        refine(Halving(least=2), 0.1)
