@@ -418,7 +418,7 @@ def test_torques_do_not_jitter(phase: int, objective: str) -> None:
 
 def test_one_build_serves_all_phases(curves: tuple[Curve, ...]) -> None:
     before = build_path_nlp.cache_info().misses
-    options = PlanOptions(intervals=47)
+    options = PlanOptions(intervals=51)
     costs = []
     for curve in curves:
         with open_ledger() as ledger:
@@ -530,10 +530,10 @@ def test_a_stuck_solver_within_ranges_says_that_there_is_a_plan_without(
             raise SolverError("Ipopt stopped")
         return path_plan.refine(path_plan.PathIterate.begin(task, 20), 1e-2)
 
-    monkeypatch.setattr(path_plan, "_plan", plan)
+    monkeypatch.setattr(path_plan, "plan_task", plan)
     monkeypatch.setattr(path_plan, "explain_stuck", lambda *_: SolverError("unclear"))
     with pytest.raises(SolverError, match=r"stopped within the ranges .* try --robust 0\.5, or"):
-        Toy(constant(1.0)).plan(robust=1.0)
+        Toy(constant(1.0)).plan(robust=1.0, ranges={"mass": 0.1})
 
 
 BOX_LIMIT = float(box().scene.torque_limit.max())

@@ -33,7 +33,7 @@ from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
 from ..refine import refine
 from ..robust.robust_rows import Guide, RobustLimits, spread
-from .elements import DEGREE, Elements, Grid, Profile, follow
+from .elements import DEGREE, Elements, Profile, follow
 from .first_guess import guess, guess_slowly
 from .path_data import PhaseData, cut, join, prepare
 from .path_mesh import (
@@ -125,12 +125,12 @@ def plan_curves(
 
     def replan(changed: Sequence[Curve], least: float) -> object:
         changes = replace(task, curves=changed, epsilon=least, options=_roughen(task.options))
-        return _plan(replace(changes, guides=guides), insist=False)
+        return plan_task(replace(changes, guides=guides), insist=False)
 
     try:
         if options.ranges:
             # Rows are for the motion of a reference: first of a plan without ranges.
-            nominal = _plan(replace(task, options=replace(_roughen(options), ranges={})))
+            nominal = plan_task(replace(task, options=replace(_roughen(options), ranges={})))
             guides = nominal.guides
         iterate = _plan_within(replace(task, guides=guides))
     except JammingError as jam:
@@ -140,14 +140,13 @@ def plan_curves(
 
         raise explain_jam(curves[0], epsilon, jam, replan) from None
     except SolverError as stuck:
-        if not explained:
-            raise
-        error = explain_stuck(task, f"{task.name}: {stuck}", replan)
+        reason = f"{task.name}: {stuck}"
+        error = explain_stuck(task, reason, replan) if explained else SolverError(reason)
         if guides and isinstance(error, SolverError):
             # The reference is a plan without ranges; case: the block of two landings of a pentagon.
             raise SolverError(
-                f"{task.name}: {stuck} within the ranges of numbers; without them there is a plan: "
-                f"try --robust {options.robust / 2:g}, or narrower [uncertainty], where 0 leaves a "
+                f"{reason} within the ranges of numbers; without them there is a plan: try "
+                f"--robust {options.robust / 2:g}, or narrower [uncertainty], where 0 leaves a "
                 "number as it is"
             ) from None
         raise error from None
@@ -172,7 +171,7 @@ def explain_stuck(
     return late or explain(parts, *slow, task.phases, reason, replan)
 
 
-def _plan(task: Task, insist: bool = True) -> PathIterate:
+def plan_task(task: Task, insist: bool = True) -> PathIterate:
     """Solve and refine; unless to `insist`, only where a sweep or a guess shows a motion."""
     for curve, phase in zip(task.curves, task.phases, strict=True):
         require_unique(curve, task.options.uniqueness_margin, phase)
@@ -187,12 +186,12 @@ def _plan_within(task: Task) -> PathIterate:
 
     Violations by other signs than those of the rows are tightened; if that costs too much, again.
     """
-    iterate = _plan(task)
+    iterate = plan_task(task)
     for _ in range(_LINEARIZATIONS - 1 if task.guides else 0):
         if iterate.error <= task.options.accuracy:
             break
         try:
-            iterate = _plan(replace(task, guides=iterate.guides))
+            iterate = plan_task(replace(task, guides=iterate.guides))
         except SolverError:
             break
     return iterate
@@ -228,7 +227,7 @@ def _explain_duration(task: Task) -> InfeasibleError | None:
         return None
     fastest = replace(task.options, objective=Objective.TIME, duration=None)
     try:
-        plans = _plan(replace(task, options=fastest, duration=None)).plans
+        plans = plan_task(replace(task, options=fastest, duration=None)).plans
     except WholearmError:
         return None
     least = sum(plan.value for plan in plans)
@@ -238,7 +237,7 @@ def _explain_duration(task: Task) -> InfeasibleError | None:
 
     def can_plan(_: Parameter, value: float) -> bool:
         try:
-            return _plan(replace(rough, duration=value)).plans[0].value >= task.epsilon
+            return plan_task(replace(rough, duration=value)).plans[0].value >= task.epsilon
         except SolverError:
             return False
 
@@ -515,8 +514,6 @@ class PathIterate:
         # Slack at nodes would absorb the rest.
         reach = data.slack_at_neighbours(solution.profile, solution.margin, short)
         added = _OVER * data.spread_to_nodes(short)
-        if data.grid.held:
-            added = _taper(added, data.grid)
         tighter = Tightening(
             np.maximum(tight.limits, data.spread_to_nodes(reach)) + added,
             tight.speed_share * (1 - _OVER * data.spread_to_nodes(speeding)),
@@ -626,17 +623,3 @@ class PathIterate:
             }[options.goal]
             plans.append(PhasePlan(motion, torque, value, error=self.error))
         return plans
-
-
-def _taper(short: Array, grid: Grid) -> Array:
-    """Violations at nodes, (n, n_sides), made continuous where two elements meet, as torques are.
-
-    A polynomial tightened at one end alone would oscillate.
-    """
-    table = short.reshape(-1, DEGREE + 1, short.shape[1])
-    ends = np.zeros((len(table) + 1, short.shape[1]))
-    ends[:-1], ends[1:] = table[:, 0], np.maximum(ends[1:], table[:, -1])
-    ends[:-1] = np.maximum(ends[:-1], table[:, 0])
-    y = np.linspace(0, 1, DEGREE + 1)[:, None]
-    along = ends[:-1, None] * (1 - y) + ends[1:, None] * y
-    return np.asarray(np.maximum(table, along).reshape(short.shape))
