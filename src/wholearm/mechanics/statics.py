@@ -137,8 +137,10 @@ def find_pulls(touching: Formation, z: Array, tau: Array) -> Array:
     """
     A = touching.evaluate(z[None], np.zeros((1, 5))).A[0]
     bounds = np.tile([0.0, np.inf], (len(A), 1))
-    pulls = _balance(touching, z, tau, 0.0, -A.T, bounds)
-    return np.full(len(A), np.inf) if pulls is None else touching.scene.scales.force * pulls
+    found = _balance(touching, z, tau, 0.0, -A.T, bounds)
+    if found is None:
+        return np.full(len(A), np.inf)
+    return touching.scene.scales.force * found[-len(A) :]
 
 
 def find_holding_change(
@@ -153,16 +155,32 @@ def find_holding_change(
     changes = np.where(np.isin([0, 1], free), most, 0.0).ravel() / scene.scales.torque
     joints = scene.scales.length * np.eye(5)[:, 3:]
     bounds = np.stack([np.zeros(4), changes], axis=1)
-    parts = _balance(touching, z, tau, least, np.hstack([joints, -joints]), bounds)
-    return None if parts is None else scene.scales.torque * (parts[:2] - parts[2:])
+    found = _balance(touching, z, tau, least, np.hstack([joints, -joints]), bounds)
+    return None if found is None else scene.scales.torque * (found[-4:-2] - found[-2:])
+
+
+def find_firmest_forces(touching: Formation, z: Array, tau: Array) -> Array:
+    """Contact forces c_n and c_t at rest with the largest least c_n, (2, n_c) [N]; NaN for none."""
+    count, least = touching.n_contacts, np.array([[-np.inf, np.inf]])
+    found = _balance(touching, z, tau, -np.inf, np.zeros((5, 1)), least, firmest=True)
+    if found is None:
+        return np.full((2, count), np.nan)
+    return touching.scene.scales.force * found[: 2 * count].reshape(2, count)
 
 
 def _balance(
-    touching: Formation, z: Array, tau: Array, least: float, more: Array, bounds: Array
+    touching: Formation,
+    z: Array,
+    tau: Array,
+    least: float,
+    more: Array,
+    bounds: Array,
+    firmest: bool = False,
 ) -> Array | None:
-    """Amounts x, (k,), of least sum of further forces `more`, (5, k), that balance at rest; None.
+    """Forces c_n, c_t, d and amounts x, (k,), of further ones `more`, (5, k), that balance at rest.
 
-    A linear programme in c_n >= least [N], |c_t| <= mu c_n, |d| <= D and x within `bounds`, (k, 2).
+    A linear programme in c_n >= least [N], |c_t| <= mu c_n, |d| <= D and x within `bounds`, (k, 2),
+    with the least sum of x, or the `firmest`, with the largest x below every c_n. None without any.
     Forces and x are in the scene's force, friction of the joints is in its torque.
     """
     from scipy.optimize import linprog
@@ -174,18 +192,20 @@ def _balance(
     load = (scene.applied_force + joints @ tau) / (scales.force * units)
     forces = np.hstack([at.A[0].T, at.A_t[0].T, -scales.length * joints, more]) / units[:, None]
     cone, one = -np.diag(touching.friction), np.eye(n_c)
-    cones = np.block([[cone, one], [cone, -one]])
-    cones = np.pad(cones, ((0, 0), (0, forces.shape[1] - 2 * n_c)))
+    rows = np.block([[cone, one], [cone, -one], [-one, 0 * one]])
+    rows = np.pad(rows, ((0, 0), (0, forces.shape[1] - 2 * n_c)))
+    rows[2 * n_c :, -1] = 1.0
+    rows = rows if firmest else rows[: 2 * n_c]
     dry = scene.dry[3:] / scales.torque
     normal, free = [(least / scales.force, np.inf)] * n_c, [(-np.inf, np.inf)] * n_c
     answer: Any = linprog(
-        np.repeat([0.0, 1.0], [2 * n_c + 2, more.shape[1]]),
-        A_ub=cones,
-        b_ub=np.zeros(2 * n_c),
+        np.repeat([0.0, -1.0 if firmest else 1.0], [2 * n_c + 2, more.shape[1]]),
+        A_ub=rows,
+        b_ub=np.zeros(len(rows)),
         A_eq=forces,
         b_eq=-load,
         bounds=[*normal, *free, *zip(-dry, dry, strict=True), *bounds],
         # Forces that are missing just beyond balance are small.
         options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
     )
-    return np.asarray(answer.x[2 * n_c + 2 :]) if answer.status == 0 else None
+    return np.asarray(answer.x) if answer.status == 0 else None

@@ -22,7 +22,7 @@ from ...contacts.formation import Formation
 from ...geometry.curve import Curve
 from ...geometry.tracing import trace_phase
 from ...mechanics.dynamics import LAMBDA, ONE
-from ...mechanics.statics import find_static_torques
+from ...mechanics.statics import find_firmest_forces, find_static_torques
 from ...problem.definition import Phase
 from ...results.dwell_record import TorqueChange, change_torques, find_change_times
 from ...results.plan_record import ModeSpan
@@ -177,7 +177,7 @@ def add_pause(
     """The plan of a phase that begins at `z`, with the pause before it."""
     if not joint.pause:
         return plan
-    forces = find_static_forces(formation, z, joint.before)
+    forces = find_firmest_forces(formation, z, joint.before)
     change = change_torques(formation.scene, joint.before, joint.after)
     effort = change.torque.integrate_squares() + options.time_weight * joint.pause
     value = {
@@ -206,39 +206,6 @@ def begin_from(plan: PhasePlan[Motion], formation: Formation, before: Array) -> 
     # Other contacts than the phase's may help to hold the object until it moves.
     forces = np.full((2, formation.n_contacts), np.nan)
     return _pause(plan, change, forces) if change.duration else plan
-
-
-def find_static_forces(formation: Formation, z: Array, tau: Array) -> Array:
-    """Contact forces that hold a formation at rest with the largest least c_n, (2, n_c) [N].
-
-    By linear programme; NaN where none do, as other contacts help to hold it.
-    """
-    from scipy.optimize import linprog
-
-    scene, n_c = formation.scene, formation.n_contacts
-    units = np.array([1.0, 1.0, *[scene.scales.length] * 3])
-    kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
-    normal, tangential = ((rows / units).T for rows in (kinematics.A[0], kinematics.A_t[0]))
-    joints = np.eye(5)[:, 3:]
-    load = (scene.applied_force + joints @ tau) / (scene.scales.force * units)
-    columns = np.hstack([normal, tangential, -joints, np.zeros((5, 1))])
-    cone, one, none = -np.diag(formation.friction), np.eye(n_c), np.zeros((n_c, 3))
-    rows = [np.hstack([cone, sign * one, none]) for sign in (1.0, -1.0)]
-    rows.append(np.hstack([-one, np.zeros((n_c, n_c + 2)), np.ones((n_c, 1))]))
-    free = [(None, None)]
-    dry = [(-d, d) for d in scene.dry[3:] / scene.scales.torque]
-    answer = linprog(
-        np.append(np.zeros(2 * n_c + 2), -1.0),
-        A_ub=np.vstack(rows),
-        b_ub=np.zeros(3 * n_c),
-        A_eq=columns,
-        b_eq=-load,
-        bounds=[*free * (2 * n_c), *dry, *free],
-        method="highs",
-    )
-    if answer.status:
-        return np.full((2, n_c), np.nan)
-    return np.asarray(scene.scales.force * answer.x[: 2 * n_c].reshape(2, n_c))
 
 
 def find_beside(
