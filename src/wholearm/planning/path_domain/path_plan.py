@@ -141,7 +141,8 @@ def plan_curves(
         raise explain_jam(curves[0], epsilon, jam, replan) from None
     except SolverError as stuck:
         reason = f"{task.name}: {stuck}"
-        error = explain_stuck(task, reason, replan) if explained else SolverError(reason)
+        within = replace(task, guides=guides)
+        error = explain_stuck(within, reason, replan) if explained else SolverError(reason)
         if guides and isinstance(error, SolverError):
             # The reference is a plan without ranges; case: the block of two landings of a pentagon.
             raise SolverError(
