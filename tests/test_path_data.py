@@ -30,7 +30,6 @@ from wholearm.planning.path_domain.path_mesh import halve, make_grid
 from wholearm.planning.path_domain.path_motion import PathMotion, fit_torque
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.path_domain.speed_profile import Fastest, find_fastest
-from wholearm.problem.definition import Problem
 
 PHASES = range(5)
 EPSILON = 0.05
