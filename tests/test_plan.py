@@ -15,7 +15,7 @@ from scipy.integrate import trapezoid
 
 from crossing import measure_fingers
 from plane import finger_gap, measure_gaps, measure_slip, unbalance
-from shipped import FOLDER, HEPTAGON, plan_of, problem_of
+from shipped import FOLDER, HEPTAGON, IMPACTS, plan_of, problem_of
 from thrown import shove
 from wholearm import Objective, Phase, PlanOptions, Problem, TorqueProfile, verify
 from wholearm.common.arrays import Array
@@ -52,17 +52,16 @@ def check_balance(problem: Problem, phase: int, rows: Samples, sigmas: Array) ->
 
 
 @pytest.mark.parametrize("objective", OBJECTIVES)
-def test_random_instants_obey_newton_and_euler(
-    heptagon: Problem, plans: dict[str, Trajectory], objective: str
-) -> None:
-    trajectory = plans[objective]
+@pytest.mark.parametrize("path", [HEPTAGON, IMPACTS], ids=lambda path: path.stem)
+def test_random_instants_obey_newton_and_euler(path: Path, objective: str) -> None:
+    problem, trajectory = problem_of(path), plan_of(path, objective)
     starts = trajectory.phase_starts
     for t in np.random.default_rng(1).uniform(0, trajectory.duration, 60):
         phase = int(np.searchsorted(starts, t, side="right")) - 1
         samples = trajectory.motions[phase].evaluate(np.array([t - starts[phase]]))
-        check_balance(heptagon, phase, samples, np.sign(samples.z_dot[:, 3:]))
+        check_balance(problem, phase, samples, np.sign(samples.z_dot[:, 3:]))
         np.testing.assert_array_equal(samples.z, trajectory.at(t).z)
-        assert samples.c_n.min() >= heptagon.epsilon - 1e-6
+        assert samples.c_n.min() >= problem.epsilon - 1e-6
         assert np.abs(samples.tau).max() <= LIMIT + 1e-6
 
 
