@@ -1,20 +1,33 @@
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache, lru_cache
+from typing import Any
 
 import numpy as np
 import pytest
 
-from plane import make_formation
-from timed import landing, tables
-from tipping import roll
+import wholearm.planning.time_domain.guesses as guesses
+import wholearm.planning.time_domain.mode_search as mode_search
+from crossing import make_way, measure_fingers
+from plane import finger_gap, make_formation, measure_slip
+from thrown import heave, raised
+from timed import instants, landing, plan_landing, stages_of, tables
+from tipping import roll, tilting
 from wholearm.common.arrays import Array
 from wholearm.contacts.formation import Formation
 from wholearm.mechanics.dynamics import Directions, split_forces
+from wholearm.mechanics.limits import CONE, PRESS, make_limits
+from wholearm.planning.options import PlanOptions
+from wholearm.planning.plan import solve
 from wholearm.planning.time_domain.collocation import make_scheme
+from wholearm.planning.time_domain.guesses import guess_stages
 from wholearm.planning.time_domain.mode_search import (
+    WORTH,
     StageMode,
+    improve,
     in_mode,
     link,
     list_moves,
@@ -32,7 +45,20 @@ from wholearm.planning.time_domain.nlp_layout import (
     pack,
     unpack,
 )
-from wholearm.planning.time_domain.stage import Stage, StagePoints, resample
+from wholearm.planning.time_domain.refinement import (
+    SETTINGS,
+    check_between,
+    find_misses,
+    measure_misses,
+)
+from wholearm.planning.time_domain.search import TimeSearch, TimeSolution
+from wholearm.planning.time_domain.stage import LimitMisses, Stage, StagePoints, resample
+from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion
+from wholearm.planning.time_domain.time_plan import plan_phases
+from wholearm.problem.definition import End, Problem, Until
+from wholearm.results.trajectory import Trajectory
+from wholearm.verification.verdict import DEPARTURE
+from wholearm.verification.verify import verify
 
 SCHEMES = [("radau", 2), ("radau", 3), ("legendre", 2), ("legendre", 4)]
 
@@ -316,3 +342,291 @@ def test_what_the_next_phase_lets_roll_slides_until_then() -> None:
         assert (0.0 in signs) == rolls
         # Turning is then what is left.
         assert (-mode_of(held).signs[0] in signs) != rolls
+
+
+EPSILON = 0.05
+
+
+def as_stage(motion: StageMotion, **fields: object) -> Stage:
+    stage = Stage(0, motion.formation, motion.directions, motion.points)
+    return replace(stage, **fields)  # type: ignore[arg-type]
+
+
+def in_newtons(stage: Stage, misses: LimitMisses, kind: str) -> Array:
+    """Misses of one kind of limits of forces, shape (K, n)."""
+    limits = make_limits(stage.formation, EPSILON)
+    return (
+        misses.held[:, np.isin(limits.sides[0], limits.of(kind))]
+        * stage.formation.scene.scales.force
+    )
+
+
+def check(stage: Stage, motion: StageMotion, *least: float) -> LimitMisses:
+    return find_misses(stage, check_between(stage, motion), *least)
+
+
+@lru_cache(maxsize=1)
+def landed() -> list[StageMotion]:
+    return stages_of(plan_landing(time_intervals=6))
+
+
+@lru_cache(maxsize=1)
+def heaved() -> StageMotion:
+    """The first phase of a plan with a rolling contact."""
+    problem, _ = heave()
+    plans = plan_phases(problem, problem.phases, problem.start, PlanOptions(time_intervals=6))
+    return plans[0].motion.stages[0]
+
+
+def test_a_plan_keeps_limits_between_points_too() -> None:
+    """It would not on so few intervals, were limits not tightened there."""
+    for motion in landed():
+        stage, size = as_stage(motion), motion.formation.scene.scales.force
+        misses = check(stage, motion, EPSILON)
+        assert misses.held.shape == (stage.intervals, motion.formation.n_contacts + 4)
+        assert measure_misses(misses).max() <= 1
+        assert motion.evaluate(instants(motion, 41)).c_n.min() > EPSILON - 2 * SETTINGS.miss * size
+
+
+def test_forces_are_missed_by_what_their_least_value_lacks() -> None:
+    inside = np.linspace(1e-9, 1 - 1e-9, 401)
+    for motion in landed():
+        stage = as_stage(motion)
+        t = motion.duration * motion.points.places(inside).ravel()
+        dense = motion.evaluate(t).c_n.reshape(stage.intervals, 401, -1)
+        asked = float(np.median(dense))
+        misses = check(stage, motion, asked)
+        expected = np.maximum(asked - dense.min(axis=1), 0.0)
+        # Parabolas through 25 checks, of forces that are smooth inside an interval.
+        pressed = in_newtons(stage, misses, PRESS)
+        np.testing.assert_allclose(pressed, expected, atol=1e-3 * np.ptp(dense))
+        assert measure_misses(misses).max() == pytest.approx(misses.held.max() / SETTINGS.miss)
+        # A margin asks for as much as a larger epsilon.
+        same = check(stage, motion, EPSILON, asked - EPSILON)
+        again = in_newtons(stage, same, PRESS)
+        np.testing.assert_allclose(again, pressed, atol=1e-12 * asked)
+
+
+def test_cones_are_missed_by_what_epsilon_takes_from_them_but_the_margin_does_not() -> None:
+    motion = heaved()
+    stage = as_stage(motion)
+    row = motion.formation.rolling_rows[0]
+    mu = motion.formation.friction[row]
+    dense = motion.evaluate(instants(motion, 200))
+    grip = mu * dense.c_n[:, row] - np.abs(dense.c_t[:, row])
+    least = grip.reshape(stage.intervals, 200).min(axis=1)
+    assert not in_newtons(stage, check(stage, motion, EPSILON), CONE).any()
+    large = 1.0 + least.min() / mu
+    misses = in_newtons(stage, check(stage, motion, large), CONE).max(axis=1)
+    np.testing.assert_allclose(misses, np.maximum(mu * large - least, 0), atol=0.02)
+    assert misses.max() > 1.0
+    assert not in_newtons(stage, check(stage, motion, EPSILON, large), CONE).any()
+
+
+@lru_cache(maxsize=1)
+def make_way_twice() -> tuple[Trajectory, Trajectory]:
+    """Plans of least effort with fingers that pass each other, and with solid ones."""
+    options: dict[str, Any] = {"time_intervals": 8, "replay": False}
+    passing, solid = (
+        solve(make_way(solid), "effort", **options).trajectory for solid in (False, True)
+    )
+    return passing, solid
+
+
+def test_the_links_are_kept_apart_between_points_too() -> None:
+    """Left alone, finger 1 would let the other link swing through it."""
+    passing, solid = make_way_twice()
+    scene = make_way(solid=True).scene
+    least = []
+    for plan in (passing, solid):
+        (motion,) = plan.motions
+        z = motion.evaluate(np.linspace(0.0, motion.duration, 4001)).z
+        least.append(float(measure_fingers(scene, z).min()))
+        for k in (0, 1):
+            assert finger_gap(scene, z[::20, :3], k, z[::20, 3 + k]).min() > -2e-8
+    assert least[0] < -5e-3 and least[1] > -2e-8
+    # With less that is allowed effort is larger, to the accuracy of plans.
+    assert solid.meta["value"] > (1 - 1e-4) * passing.meta["value"]
+
+
+OPTIONS = PlanOptions(time_intervals=10)
+
+
+def outlined(problem: Problem, count: int = 10) -> tuple[TimeSearch, list[Stage]]:
+    search = TimeSearch.of(problem, OPTIONS)
+    start = problem.start
+    return search, guess_stages(problem, problem.phases, start, search.scheme, count, 2.0)
+
+
+def turn_joint(stages: list[Stage], joint: int) -> list[Stage]:
+    """The same stages with a joint that turns the other way."""
+    turned = []
+    for stage in stages:
+        sigma = stage.directions.sigma.copy()
+        sigma[joint] *= -1
+        turned.append(replace(stage, directions=Directions(stage.directions.Xi, sigma)))
+    return link(turned)
+
+
+@cache
+def alphabet() -> dict[str, Stage]:
+    """A stage in several modes, by name: sequences below are words of these; "r" rolls."""
+    (stage,) = outlined(raised(), 4)[1]
+    signs = {"a": (1, -1, -1), "b": (1, 1, -1), "c": (1, -1, 1), "d": (1, 1, 1), "r": (0, -1, -1)}
+    return {
+        name: in_mode(stage, StageMode((float(palm), 1.0, 1.0, float(one), float(two))))
+        for name, (palm, one, two) in signs.items()
+    }
+
+
+def word_of(stages: list[Stage]) -> str:
+    names = {mode_of(stage): name for name, stage in alphabet().items()}
+    return "".join(names[mode_of(stage)] for stage in stages)
+
+
+class Priced(TimeSearch):
+    """A search whose solves cost what a table says, and fail for sequences that it leaves out."""
+
+    costs: Mapping[str, float]
+    asked: list[str]
+
+    def solve(
+        self,
+        stages: list[Stage],
+        before: TimeSolution | None = None,
+        most: int = 0,
+        raised: Any = None,
+    ) -> TimeSolution:
+        self.asked.append(word_of(stages))
+        return self.answer(stages, self.costs.get(self.asked[-1], math.inf))
+
+    def answer(self, stages: list[Stage], cost: float) -> TimeSolution:
+        return TimeSolution(stages, cost, 0.0, "", math.isfinite(cost), None, {})  # type: ignore[arg-type]
+
+
+LESS, MORE = 1 - 2 * WORTH, 1 + 2 * WORTH
+
+
+@pytest.mark.parametrize(
+    ("begin", "costs", "moves", "asked", "found"),
+    [
+        pytest.param(
+            "a", {"b": 0.9, "c": 0.8}, {"a": "b d", "b": "a c"}, "b c", "c", id="down, step by step"
+        ),
+        pytest.param("a", {"b": LESS}, {"a": "b"}, "b", "b", id="worth it"),
+        pytest.param("a", {"b": 1 - WORTH / 2}, {"a": "b"}, "b", "a", id="not worth it"),
+        pytest.param("ab", {"b": 1 + WORTH / 2}, {"ab": "b"}, "b", "b", id="one stage less"),
+        pytest.param("ab", {"b": MORE}, {"ab": "b"}, "b", "ab", id="one stage less, but dearer"),
+        # A stage of no length gains by the intervals beside it; then there is one stage less.
+        pytest.param(
+            "a", {"ba": 0.9, "a": 0.9}, {"a": "ba", "ba": "a"}, "ba a", "a", id="of no length"
+        ),
+        pytest.param("ab", {"c": 2.0}, {"ab": "c c"}, "c", "ab", id="the same one twice"),
+        pytest.param(
+            "a", {"r": 1.1, "b": 0.9}, {"a": "r", "r*": "b"}, "r b", "b", id="leans where it rolls"
+        ),
+        pytest.param("a", {"d": 0.5}, {"a": "b c bc d"}, "b c bc", "a", id="lost three times"),
+        pytest.param(
+            "a",
+            {"d": 0.5, "cd": 0.4},
+            {"a": "b c d", "d": "bc bd cd"},
+            "b c d bc bd cd",
+            "cd",
+            id="lost, and again after a gain",
+        ),
+    ],
+)
+def test_modes_change_for_as_long_as_that_gains(
+    monkeypatch: pytest.MonkeyPatch,
+    begin: str,
+    costs: dict[str, float],
+    moves: dict[str, str],
+    asked: str,
+    found: str,
+) -> None:
+    """Which sequences are solved for, in which order, and what is kept; the first one costs 1.
+
+    Moves from what rolls and is no better are those of contacts that lean, "r*".
+    """
+    own = Priced(**vars(outlined(raised(), 4)[0]))
+    own.costs, own.asked = costs, []
+
+    def list_moves(
+        search: TimeSearch, solution: TimeSolution, leaning: bool = False
+    ) -> list[list[Stage]]:
+        words = moves.get(word_of(solution.stages) + "*" * leaning, "").split()
+        return [[alphabet()[name] for name in word] for word in words]
+
+    monkeypatch.setattr(mode_search, "list_neighbours", list_moves)
+    best = improve(own, own.answer([alphabet()[name] for name in begin], 1.0))
+    assert own.asked == asked.split() and word_of(best.stages) == found
+    assert own.tried.sequences == 1 + len(own.asked)
+    assert own.tried.complete == ({*moves.get(found, "").split()} <= {begin, *own.asked})
+
+
+def test_plans_are_the_same_whichever_way_a_joint_is_guessed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem = raised()
+
+    def guess_wrong(*given: object, **named: object) -> list[Stage]:
+        return turn_joint(guess_stages(*given, **named), 1)  # type: ignore[arg-type]
+
+    (right,) = plan_phases(problem, problem.phases, problem.start, OPTIONS)
+    monkeypatch.setattr(guesses, "guess_stages", guess_wrong)
+    (plan,) = plan_phases(problem, problem.phases, problem.start, OPTIONS)
+    assert plan.motion.duration == pytest.approx(right.motion.duration, rel=1e-3)
+    for stage in plan.motion.stages:
+        samples = stage.evaluate(instants(stage, 12))
+        slip = measure_slip(stage.formation, samples.z, samples.z_dot)
+        joints = samples.z_dot[:, 3:]
+        assert (slip * stage.directions.Xi).min() > -1e-4 * np.abs(slip).max()
+        assert (joints * stage.directions.sigma).min() > -1e-4 * np.abs(joints).max()
+
+
+def test_what_may_slide_or_roll_is_faster_than_what_has_to_roll() -> None:
+    """Rolling throughout is one of its motions, with one freedom: the bound is along a curve."""
+    problem = tilting()
+    (phase,) = problem.phases
+    rolls = replace(phase, formation=roll(phase.formation, "v1-palm"))
+    bound = solve(replace(problem, phases=(rolls,)), intervals=10, replay=False).trajectory
+    plan = solve(problem, time_intervals=6, replay=False).trajectory
+    assert plan.duration < 0.95 * bound.duration
+    report = verify(problem, plan)
+    assert report.ok, report.to_text()
+
+
+def test_a_contact_slides_in_one_phase_and_rolls_in_the_next() -> None:
+    sliding = tilting()
+    (phase,) = sliding.phases
+    rolling = roll(phase.formation, "v1-palm")
+    first = replace(phase, until=Until(), end=End.SMOOTH)
+    last = replace(phase, index=1, formation=rolling)
+    problem = replace(sliding, phases=(first, last))
+    plan = solve(problem, time_intervals=5, replay=False).trajectory
+    report = verify(problem, plan)
+    assert report.ok, report.to_text()
+    assert report.phases[0].until == "change of v1-palm"
+    ends = np.cumsum([motion.duration for motion in plan.motions])
+    # How late a contact comes to rest, or slips, is an error of its speed over what slows it down,
+    # or of its force over how fast that grows: no more than a replay may depart.
+    assert report.phases[0].arrival == pytest.approx(ends[0], abs=DEPARTURE * ends[1])
+    # No interval is halved for ever, and neither phase shrinks to nothing.
+    motions = [motion for motion in plan.motions if isinstance(motion, TimeMotion)]
+    stages = [stage for motion in motions for stage in motion.stages]
+    assert sum(len(stage.points.fractions) for stage in stages) <= 2 * SETTINGS.intervals
+    assert min(motion.duration for motion in plan.motions) > 0.1 * plan.duration
+    # What rolls does so all along; what slides has friction against its motion.
+    for motion, rolls in zip(motions, (False, True), strict=True):
+        for stage in motion.stages:
+            samples = stage.evaluate(instants(stage, 12))
+            slip = measure_slip(stage.formation, samples.z, samples.z_dot)[:, 0]
+            mu = stage.formation.friction[0]
+            share = samples.c_t[:, 0] / (mu * samples.c_n[:, 0])
+            assert bool(stage.formation.rolling) == rolls
+            if rolls:
+                assert np.abs(slip).max() < 1e-9 and np.abs(share).max() < 1.0
+            else:
+                Xi = stage.directions.Xi[0]
+                assert mu > 0 and (slip * Xi).min() > -1e-4 * np.abs(slip).max()
+                np.testing.assert_allclose(share, -Xi, rtol=1e-9)

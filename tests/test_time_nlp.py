@@ -1,33 +1,684 @@
+"""The NLP over time: collocation, its kernels, and their assembly."""
+
 from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
+from plane import make_formation, measure_gaps, measure_slip, unbalance
 from planned import CosineMotion
 from shipped import HEPTAGON
-from timed import drive
+from timed import drive, landing
 from tipping import roll
-from wholearm.common.arrays import Array
+from wholearm.common.arrays import Array, Expression
+from wholearm.common.batch import FEW, SIZE, SOME, Batch
+from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve, tangent_basis
 from wholearm.geometry.path_guess import load
 from wholearm.geometry.tracing import trace_phases
-from wholearm.mechanics.dynamics import Directions, metric_weights
-from wholearm.planning.options import Objective
-from wholearm.planning.time_domain.collocation import Scheme, make_scheme
+from wholearm.mechanics.dynamics import Directions, metric_weights, split_forces
+from wholearm.planning.columns import Columns
+from wholearm.planning.options import Objective, PlanOptions
+from wholearm.planning.time_domain import stage_kernels as kernels
+from wholearm.planning.time_domain.collocation import Scheme, blend, fit_controls, make_scheme
 from wholearm.planning.time_domain.equations import Target
-from wholearm.planning.time_domain.nlp_layout import pack
+from wholearm.planning.time_domain.guesses import guess_stages
+from wholearm.planning.time_domain.nlp_layout import (
+    Block,
+    Kernel,
+    Triplets,
+    assemble_nlp,
+    build_kernel,
+    pack,
+)
+from wholearm.planning.time_domain.search import TimeSearch
 from wholearm.planning.time_domain.stage import LimitMisses, Stage, StagePoints
+from wholearm.planning.time_domain.stage_kernels import (
+    bend_kernel,
+    collocation_kernel,
+    effort_kernel,
+    end_kernel,
+    find_leaving,
+    goal_kernel,
+    impact_kernel,
+    new_rows,
+    opening_kernel,
+    point_kernel,
+)
 from wholearm.planning.time_domain.time_nlp import (
     TimeNLP,
     bound_unknowns,
     build_time_nlp,
     raise_bounds,
 )
+from wholearm.problem.definition import Problem, Until
+from wholearm.results.trajectory import Samples
+from wholearm.scene.model import Scene
+from wholearm.solvers.ipopt import build_solver, record_runs
+
+UNKNOWNS = 11
+CLOSE = 1e-12
+"""What rounding leaves of sums of terms that are about one."""
+
+
+def make_kernels() -> tuple[Kernel, Kernel, Kernel]:
+    """Two outputs of three unknowns; a share of the cost; and one that is linear in x."""
+    x, p = ca.SX.sym("x", 3), ca.SX.sym("p", 1)
+    y = ca.vertcat(ca.sin(x[0]) * x[1] + p * x[2] ** 2, ca.exp(x[2]) * x[0] - x[1])
+    a, q = ca.SX.sym("a", 2), ca.SX.sym("q", 2)
+    b, none = ca.SX.sym("b", 2), ca.SX.sym("r", 1)
+    return (
+        build_kernel(x, p, y),
+        build_kernel(a, q, q[0] * a[0] * a[1] + q[1] * a[0] ** 4),
+        build_kernel(b, none, none * b[0] - b[1]),
+    )
+
+
+def make_nlp(seed: int) -> tuple[Any, Expression, Expression, Expression]:
+    """An NLP of blocks, and the same one written row by row: x, f and g."""
+    rng = np.random.default_rng(seed)
+    pair, share, line = make_kernels()
+    order = rng.permutation(15)
+    rows = order[:8].reshape(4, 2), order[8:11].reshape(3, 1)
+    linear = np.sort(order[11:])
+
+    def choose(count: int, width: int) -> Any:
+        # Copies share unknowns, but none has one twice.
+        return np.array([rng.choice(UNKNOWNS, width, replace=False) for _ in range(count)])
+
+    blocks = [
+        Block(pair, choose(4, 3), rows[0], rng.normal(size=(4, 1))),
+        Block(share, choose(5, 2), np.zeros((5, 0), dtype=np.int64), rng.normal(size=(5, 2))),
+        Block(line, choose(3, 2), rows[1], rng.normal(size=(3, 1))),
+    ]
+    # The last linear row has no entries.
+    columns = np.concatenate([rng.choice(UNKNOWNS, 3, replace=False) for _ in range(3)])
+    entries = Triplets(np.repeat(linear[:3], 3), columns, rng.normal(size=9))
+    cost = rng.normal(size=UNKNOWNS)
+    built = assemble_nlp(UNKNOWNS, entries, linear, blocks, cost)
+    x = ca.MX.sym("x", UNKNOWNS)
+    f, g = ca.dot(ca.DM(cost), x), [ca.MX(0.0)] * 15
+    for row, column, value in zip(*entries, strict=True):
+        g[row] = g[row] + value * x[int(column)]
+    for block in blocks:
+        for k, own in enumerate(block.columns):
+            y = block.kernel.function(x[own.tolist()], ca.DM(block.parameters[k]))
+            if not block.rows.size:
+                f += y
+            for i, row in enumerate(block.rows[k]):
+                g[row] = y[i]
+    return built, x, f, ca.vertcat(*g)
+
+
+def evaluate(inputs: list[Expression], output: Expression, *values: Array) -> Array:
+    return np.asarray(ca.Function("f", inputs, [output])(*values).full())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_values_and_derivatives_are_those_of_the_same_nlp_in_one_piece(seed: int) -> None:
+    built, x, f, g = make_nlp(seed)
+    rng = np.random.default_rng(100 + seed)
+    lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", g.numel())
+    at, on_f, on_g = rng.normal(size=UNKNOWNS), rng.normal(size=1), rng.normal(size=g.numel())
+    nlp = built.nlp
+    for own, expected in ((nlp["f"], f), (nlp["g"], g)):
+        got = evaluate([nlp["x"]], own, at)
+        np.testing.assert_allclose(got, evaluate([x], expected, at), atol=CLOSE)
+    again, jacobian = built.derivatives["jac_g"](at, [])
+    np.testing.assert_allclose(again.full(), evaluate([x], g, at), atol=CLOSE)
+    np.testing.assert_allclose(jacobian.full(), evaluate([x], ca.jacobian(g, x), at), atol=CLOSE)
+    hessian = built.derivatives["hess_lag"](at, [], on_f, on_g)
+    full = ca.hessian(lam_f * f + ca.dot(lam_g, g), x)[0]
+    expected = evaluate([x, lam_f, lam_g], full, at, on_f, on_g)
+    np.testing.assert_allclose(hessian.full(), np.triu(expected), atol=CLOSE)
+    # Several copies meet in some entry, which adds up.
+    assert np.abs(expected).max() > 0.1
+
+
+def test_the_solver_takes_the_derivatives_that_it_is_given() -> None:
+    x = ca.SX.sym("x", 2)
+    # Rosenbrock's valley, one share of the cost, on a circle.
+    valley = build_kernel(x, ca.SX(0, 1), (1 - x[0]) ** 2 + 100 * (x[1] - x[0] ** 2) ** 2)
+    circle = build_kernel(x, ca.SX(0, 1), ca.sumsqr(x))
+    both, none = np.array([[0, 1]]), np.zeros((1, 0))
+    blocks = [
+        Block(valley, both, none.astype(np.int64), none),
+        Block(circle, both, np.array([[0]]), none),
+    ]
+    nothing = np.zeros(0, dtype=np.int64)
+    built = assemble_nlp(2, Triplets(nothing, nothing, np.zeros(0)), nothing, blocks, np.zeros(2))
+    quiet = {"ipopt": {"print_level": 0, "sb": "yes"}, "print_time": False}
+    solver = ca.nlpsol("solver", "ipopt", built.nlp, quiet | built.derivatives)
+    result = solver(x0=[0.3, 0.3], lbg=-np.inf, ubg=1.0)["x"].full()[:, 0]
+    # On the circle, by its angle.
+    angle = np.linspace(0, np.pi / 2, 2_000_001)
+    cost = (1 - np.cos(angle)) ** 2 + 100 * (np.sin(angle) - np.cos(angle) ** 2) ** 2
+    best = angle[cost.argmin()]
+    np.testing.assert_allclose(result, [np.cos(best), np.sin(best)], atol=2e-6)
+
+
+@pytest.mark.parametrize("which", range(3))
+def test_kernels_have_the_derivatives_of_their_expression(which: int) -> None:
+    kernel = make_kernels()[which]
+    rng = np.random.default_rng(which)
+    n_x, n_p = (kernel.function.size1_in(i) for i in range(2))
+    x, p, lam = rng.normal(size=n_x), rng.normal(size=n_p), rng.normal(size=kernel.outputs)
+    steps = 1e-5 * np.eye(n_x)
+
+    def dense(x: Array) -> Array:
+        J = np.zeros((kernel.outputs, n_x))
+        J[tuple(kernel.jacobian_at)] = kernel.jacobian(x, p).full()[:, 0]
+        return J
+
+    def value(x: Array) -> Array:
+        return np.asarray(kernel.function(x, p).full()[:, 0])
+
+    slopes = np.array([(value(x + h) - value(x - h)) / 2e-5 for h in steps]).T
+    # Differences of second order, over steps of 1e-5.
+    np.testing.assert_allclose(dense(x), slopes, atol=1e-8)
+    H = np.zeros((n_x, n_x))
+    H[tuple(kernel.hessian_at)] = kernel.hessian(x, p, lam).full()[:, 0]
+    bend = np.array([lam @ (dense(x + h) - dense(x - h)) / 2e-5 for h in steps])
+    np.testing.assert_allclose(H, np.triu(bend), atol=1e-8)
+
+
+def build(max_iter: int) -> Expression:
+    """Least x^2 + y^2 with x + y >= 1 and x >= 0.8."""
+    x = ca.SX.sym("x", 2)
+    nlp = {"x": x, "f": ca.dot(x, x), "g": x[0] + x[1]}
+    return build_solver("toy", nlp, 1e-9, max_iter=max_iter)
+
+
+@pytest.fixture(scope="module")
+def solver() -> Expression:
+    return build(50)
+
+
+def solve(solver: Expression, **start: Expression) -> dict[str, Expression]:
+    answer: dict[str, Expression] = solver(lbx=[0.8, -ca.inf], lbg=1.0, ubg=ca.inf, **start)
+    assert solver.stats()["success"]
+    return answer
+
+
+def test_bounds_are_kept_exactly(solver: Expression) -> None:
+    answer = solve(solver, x0=[3.0, 3.0])
+    # The barrier keeps inequalities strictly; relaxed bounds would be missed by 1e-8.
+    assert float(answer["x"][0]) >= 0.8
+    assert float(answer["g"]) >= 1.0
+    assert float(answer["x"][0]) == pytest.approx(0.8, abs=1e-7)
+    assert float(answer["x"][1]) == pytest.approx(0.2, abs=1e-7)
+
+
+def test_a_solution_is_kept_as_a_start(solver: Expression) -> None:
+    """It is pushed from its bounds by as little as was asked for, and not by Ipopt's 1 %."""
+    answer = solve(solver, x0=[3.0, 3.0])
+    start = {"x0": answer["x"], "lam_x0": answer["lam_x"], "lam_g0": answer["lam_g"]}
+    kept = build(0)(lbx=[0.8, -ca.inf], lbg=1.0, ubg=ca.inf, **start)
+    assert float(ca.norm_inf(kept["x"] - answer["x"])) < 1e-8
+    again = solve(solver, **start)
+    assert float(again["f"]) == pytest.approx(0.8**2 + 0.2**2, abs=1e-7)
+
+
+def test_failure_is_a_status_and_no_exception(solver: Expression) -> None:
+    solver(x0=[3.0, 3.0], lbx=[0.8, 0.8], ubx=[0.9, 0.9], lbg=5.0, ubg=ca.inf)
+    assert not solver.stats()["success"]
+
+
+def test_runs_are_recorded_with_their_sizes(solver: Expression) -> None:
+    with record_runs() as runs:
+        solve(solver, x0=[3.0, 3.0])
+        with record_runs() as inner:
+            solve(solver, x0=[0.9, 0.9])
+    solve(solver, x0=[3.0, 3.0])
+    assert len(runs) == 2 and inner == runs[1:]
+    for run in runs:
+        assert (run.unknowns, run.rows) == (2, 1)
+        # The row has both unknowns; the Hessian is diagonal.
+        assert (run.jacobian_nonzeros, run.hessian_nonzeros) == (2, 2)
+        assert run.iterations > 0 and run.seconds >= 0.0
+
+
+def build_function() -> ca.Function:
+    """(x, y) -> (outer product with a structural shape of its own, a sum)."""
+    x, y = ca.SX.sym("x", 3), ca.SX.sym("y", 2)
+    return ca.Function("f", [x, y], [ca.mtimes(x, y.T) + 1, ca.sin(ca.sum1(x)) * y[0]])
+
+
+@pytest.mark.parametrize(
+    "count", [0, 1, FEW, FEW + 1, SOME, SOME + 1, SIZE - 1, SIZE, SIZE + 1, 3 * SIZE + 5]
+)
+def test_batches_agree_with_single_calls(count: int) -> None:
+    rng = np.random.default_rng(count)
+    function = build_function()
+    x, y = rng.uniform(-1, 1, (count, 3)), rng.uniform(-1, 1, (count, 2))
+    outer, total = Batch(function)(x, y)
+    assert outer.shape == (count, 3, 2) and total.shape == (count, 1, 1)
+    for k in range(count):
+        one, other = function(x[k], y[k])
+        np.testing.assert_array_equal(outer[k], one.full())
+        np.testing.assert_array_equal(total[k], other.full())
+
+
+def test_results_survive_the_next_call() -> None:
+    batch = Batch(build_function())
+    first = batch(np.ones((2, 3)), np.ones((2, 2)))[0]
+    kept = first.copy()
+    batch(np.zeros((2, 3)), np.zeros((2, 2)))
+    np.testing.assert_array_equal(first, kept)
+
+
+def test_strided_arguments() -> None:
+    rng = np.random.default_rng(3)
+    wide = rng.uniform(-1, 1, (10, 6))
+    batch = Batch(build_function())
+    found = batch(wide[::2, ::2], wide[::-2, 4:])
+    expected = batch(wide[::2, ::2].copy(), wide[::-2, 4:].copy())
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+COLUMNS = Columns(z=5, h=1, tau=4)
+
+
+def test_blocks_are_joined_by_name_whatever_their_order() -> None:
+    tau, z = np.arange(24.0).reshape(2, 3, 4), np.arange(5.0)
+    joined = COLUMNS.join(tau=tau, z=z, h=np.full((2, 1, 1), 7.0))
+    assert joined.shape == (2, 3, 10)
+    np.testing.assert_array_equal(joined[..., COLUMNS["tau"]], tau)
+    np.testing.assert_array_equal(joined[1, 2, COLUMNS["z"]], z)
+    assert (joined[..., COLUMNS["h"]] == 7.0).all()
+
+
+def test_symbols_stand_where_numbers_do() -> None:
+    x = COLUMNS.make_symbols()
+    function = ca.Function("f", [x.every], [x.tau[1], x.h, x.z])
+    given = COLUMNS.join(z=np.arange(5.0), h=[5.0], tau=6.0 + np.arange(4.0))
+    second, h, z = (float(part[0]) for part in function(given))
+    assert (second, h, z) == (7.0, 5.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    "blocks",
+    [
+        {"z": np.zeros(5), "h": np.zeros(1)},
+        {"z": np.zeros(5), "h": np.zeros(1), "tau": np.zeros(3)},
+        {"z": np.zeros(5), "h": np.zeros(1), "torque": np.zeros(4)},
+    ],
+    ids=["missing", "too short", "another name"],
+)
+def test_what_was_not_declared_is_refused(blocks: dict[str, np.ndarray]) -> None:
+    with pytest.raises(ValueError, match=r"are given where .* are declared"):
+        COLUMNS.join(**blocks)
+    with pytest.raises(ValueError, match=r"are given where .* are declared"):
+        COLUMNS.write(**{name: ca.SX(block) for name, block in blocks.items()})
+
+
+NAMES = ["radau", "legendre"]
+DEGREES = [1, 2, 3, 4, 5, 6]
+ROOT = np.sqrt(6.0)
+
+
+@pytest.mark.parametrize(
+    "name, degree, points",
+    [
+        ("radau", 1, [1.0]),
+        ("radau", 2, [1 / 3, 1.0]),
+        ("radau", 3, [(4 - ROOT) / 10, (4 + ROOT) / 10, 1.0]),
+        # To the six digits that tables of the nodes on [-1, 1] print.
+        ("radau", 4, [(1 - 0.822824) / 2, (1 - 0.181066) / 2, (1 + 0.575319) / 2, 1.0]),
+        ("legendre", 1, [0.5]),
+        ("legendre", 2, [0.5 - np.sqrt(3) / 6, 0.5 + np.sqrt(3) / 6]),
+        ("legendre", 3, [0.5 - np.sqrt(15) / 10, 0.5, 0.5 + np.sqrt(15) / 10]),
+    ],
+)
+def test_points_are_the_tabulated_ones(name: str, degree: int, points: list[float]) -> None:
+    got = make_scheme(name, degree).points
+    np.testing.assert_allclose(got, points, atol=3e-7 if degree > 3 else 1e-14)
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+def test_legendre_points_and_weights_are_those_of_gauss(degree: int) -> None:
+    x, weights = np.polynomial.legendre.leggauss(degree)
+    scheme = make_scheme("legendre", degree)
+    np.testing.assert_allclose(scheme.points, (x + 1) / 2, atol=1e-14)
+    # Inverting the powers enlarges rounding a little.
+    np.testing.assert_allclose(scheme.weights, weights / 2, atol=1e-10)
+
+
+def test_schemes_have_butchers_coefficients() -> None:
+    two = [[5 / 12, -1 / 12], [3 / 4, 1 / 4]]
+    np.testing.assert_allclose(make_scheme("radau", 2).integrals, two, atol=1e-13)
+    three = [
+        [(88 - 7 * ROOT) / 360, (296 - 169 * ROOT) / 1800, (-2 + 3 * ROOT) / 225],
+        [(296 + 169 * ROOT) / 1800, (88 + 7 * ROOT) / 360, (-2 - 3 * ROOT) / 225],
+        [(16 - ROOT) / 36, (16 + ROOT) / 36, 1 / 9],
+    ]
+    np.testing.assert_allclose(make_scheme("radau", 3).integrals, three, atol=1e-14)
+    gauss = [[1 / 4, 1 / 4 - np.sqrt(3) / 6], [1 / 4 + np.sqrt(3) / 6, 1 / 4]]
+    np.testing.assert_allclose(make_scheme("legendre", 2).integrals, gauss, atol=1e-13)
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+@pytest.mark.parametrize("name", NAMES)
+def test_integrals_are_exact_up_to_the_degree(name: str, degree: int) -> None:
+    scheme = make_scheme(name, degree)
+    for power in range(degree):
+        exact = scheme.points ** (power + 1) / (power + 1)
+        # Rounding, which inverting the powers enlarges a little.
+        np.testing.assert_allclose(scheme.integrals @ scheme.points**power, exact, atol=1e-10)
+    over = scheme.integrals @ scheme.points**degree - scheme.points ** (degree + 1) / (degree + 1)
+    assert np.abs(over).max() > 1e-7
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+@pytest.mark.parametrize("name", NAMES)
+def test_the_whole_interval_is_integrated_to_the_order(name: str, degree: int) -> None:
+    scheme = make_scheme(name, degree)
+    assert scheme.order == {"radau": 2 * degree - 1, "legendre": 2 * degree}[name]
+    assert (scheme.weights > 0).all()
+    # The inverse of the powers has a condition number of up to 1e5.
+    for power in range(scheme.order):
+        assert scheme.weights @ scheme.points**power == pytest.approx(1 / (power + 1), abs=1e-10)
+    power = scheme.order
+    assert abs(scheme.weights @ scheme.points**power - 1 / (power + 1)) > 1e-8
+    if scheme.ends:
+        np.testing.assert_allclose(scheme.integrals[-1], scheme.weights, atol=1e-10)
+
+
+@pytest.mark.parametrize("degree, counts", [(1, (64, 128)), (2, (8, 16)), (3, (4, 8)), (4, (2, 4))])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_linear_equation_is_integrated_to_the_order(
+    name: str, degree: int, counts: tuple[int, int]
+) -> None:
+    rate = np.array([[-0.4, 2.0], [-2.0, -0.1]])
+    scheme = make_scheme(name, degree)
+    errors = []
+    for count in counts:
+        h, x = 1.0 / count, np.array([1.0, 0.5])
+        system = np.eye(2 * degree) - h * np.kron(scheme.integrals, rate)
+        for _ in range(count):
+            points = np.linalg.solve(system, np.tile(x, degree)).reshape(degree, 2)
+            x = x + h * scheme.weights @ points @ rate.T
+        errors.append(np.abs(x - expm(rate) @ [1.0, 0.5]).max())
+    slope = np.log2(errors[0] / errors[1])
+    # Two step sizes only, so the next term of the error still shows.
+    assert slope == pytest.approx(scheme.order, abs=0.3)
+    assert errors[1] < 2e-2
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_polynomials_lie_between_their_control_points(count: int) -> None:
+    rng, places = np.random.default_rng(count), np.linspace(0.0, 1.0, 41)
+    controls = rng.uniform(-1.0, 1.0, (count, 2))
+    values = blend(places, count) @ controls
+    assert (values <= controls.max(axis=0) + 1e-14).all()
+    assert (values >= controls.min(axis=0) - 1e-14).all()
+    np.testing.assert_allclose(values[[0, -1]], controls[[0, -1]], atol=1e-13)
+    # Of their degree they are: their control points follow from as many values.
+    at = np.sort(rng.uniform(0.0, 1.0, count))
+    np.testing.assert_allclose(
+        fit_controls(at, blend(at, count) @ controls, count), controls, atol=1e-6
+    )
+
+
+STEP = 1e-4
+"""Of central differences along a motion; what they leave out is of the size of its square."""
+CONTACTS = ["v1-palm", "v1-palm v3-finger1", "v1-palm v4-finger1 v6-finger2"]
+CONTACTS += [
+    "v0-palm v1-palm v3-finger1 v6-finger2",
+    "v0-palm v1-palm v2-finger1 v3-finger1 v5-finger2",
+]
+ROLLING = {
+    "v1-palm": ["v1-palm"],
+    "v1-palm v3-finger1": ["v3-finger1"],
+    "v1-palm v4-finger1 v6-finger2": ["v1-palm", "v6-finger2"],
+}
+
+
+def formations() -> list[Formation]:
+    """One to five contacts, all of them sliding or some of them rolling."""
+    scene = landing().scene
+    sliding = [make_formation(scene, names) for names in CONTACTS]
+    return sliding + [roll(make_formation(scene, n), *rolls) for n, rolls in ROLLING.items()]
+
+
+FORMATIONS = formations()
+every = pytest.mark.parametrize(
+    "formation",
+    FORMATIONS,
+    ids=lambda f: " ".join(c.name + " rolls" * (c in f.rolling) for c in f.contacts),
+)
+
+
+def call(kernel: Kernel, x: list[Array], *p: Array) -> Array:
+    given = np.concatenate([np.zeros(0), *p])
+    return np.asarray(kernel.function(np.concatenate(x), given).full()[:, 0])
+
+
+def draw(rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Random z near the heptagon's start, w and u; contacts do not have to be closed."""
+    z = landing().start + 0.05 * rng.normal(size=5) * [0.2, 0.2, 1, 1, 1]
+    return z, 0.3 * rng.normal(size=5), rng.normal(size=5)
+
+
+def constraints(formation: Formation, z: Array, w: Array, u: Array) -> tuple[Array, Array]:
+    """First and second derivatives of the gaps, and v_t and its derivative where contacts roll."""
+    rolling = list(formation.rolling_rows)
+
+    def move(s: float) -> tuple[Array, Array]:
+        return z + s * w + s**2 / 2 * u, w + s * u
+
+    before, here, after = (measure_gaps(formation, move(k * STEP)[0]) for k in (-1, 0, 1))
+    slip = [measure_slip(formation, *move(k * STEP))[rolling] for k in (-1, 0, 1)]
+    first = np.append((after - before) / (2 * STEP), slip[1])
+    second = np.append((after - 2 * here + before) / STEP**2, (slip[2] - slip[0]) / (2 * STEP))
+    return first, second
+
+
+@every
+def test_points_have_newton_and_euler_and_closed_contacts(formation: Formation) -> None:
+    rng = np.random.default_rng(formation.n_constraints)
+    n_c, n_p = formation.n_contacts, formation.n_constraints
+    for _ in range(3):
+        z, v, a = draw(rng)
+        forces, tau = rng.normal(size=n_p), rng.normal(size=(3, 2))
+        shares = rng.uniform(0.1, 0.3, 3)
+        Xi, sigma = rng.choice([-1.0, 1.0], n_c), rng.choice([-1.0, 1.0], 2)
+        first, least = (z + 0.02 * rng.normal(size=5) if formation.rolling else z[:0]), 0.3
+        x = [z, v, a, forces, tau.ravel(), first]
+        y = call(
+            point_kernel(formation, 3),
+            x,
+            Xi,
+            sigma,
+            np.array([*shares, *[least] * formation.n_contacts]),
+        )
+        gaps, rates, bends, balance, senses = np.split(y, np.cumsum([n_p, n_p, n_p, 5]))
+        np.testing.assert_allclose(gaps[:n_c], measure_gaps(formation, z), atol=1e-13)
+        expected = constraints(formation, z, v, a)
+        for got, one, size in zip((rates, bends), expected, (1e-7, 1e-5), strict=True):
+            np.testing.assert_allclose(got, one, atol=size)
+        now = shares @ tau
+        c_n, c_t = split_forces(formation, forces, Xi)
+        row = Samples(z, v, a, now, c_n, c_t)
+        missing, size_of = unbalance(formation, row, sigma)
+        # The kernel's rows are masses times accelerations less forces.
+        np.testing.assert_allclose(balance, -missing, atol=1e-12 * size_of.max())
+        slip = measure_slip(formation, z, v)
+        sliding = [k for k in range(n_c) if k not in formation.rolling_rows]
+        np.testing.assert_allclose(senses, (Xi * slip - least)[sliding], atol=1e-12)
+
+
+@every
+def test_rolling_contacts_keep_what_has_rolled_by(formation: Formation) -> None:
+    rng = np.random.default_rng(3)
+    n_c = formation.n_contacts
+    z, w, _ = draw(rng)
+    first = draw(rng)[0] if formation.rolling else z[:0]
+    y = call(end_kernel(formation), [z, w, first])
+    assert y.shape == (2 * formation.n_constraints,)
+    np.testing.assert_allclose(y[:n_c], measure_gaps(formation, z), atol=1e-13)
+    rates, _ = constraints(formation, z, w, 0 * w)
+    np.testing.assert_allclose(y[formation.n_constraints :], rates, atol=1e-7)
+    if formation.rolling:
+        # Sliding velocities add up to the slip coordinates' change, along any path.
+        places, weights = np.polynomial.legendre.leggauss(12)
+        run = z - first
+        rows = list(formation.rolling_rows)
+        speeds = [measure_slip(formation, first + (s + 1) / 2 * run, run)[rows] for s in places]
+        expected = weights / 2 @ np.array(speeds)
+        np.testing.assert_allclose(y[n_c : formation.n_constraints], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("until", [None, "v5-finger2", ("x", 0.01), ("phi", -0.3)])
+@pytest.mark.parametrize("turns", [(), (1, 4)])
+def test_ends_are_where_gaps_coordinates_and_rates_vanish(
+    until: str | tuple[str, float] | None, turns: tuple[int, ...]
+) -> None:
+    rng = np.random.default_rng(11)
+    scene = landing().scene
+    formation = make_formation(scene, "v0-palm v1-palm v3-finger1")
+    gained = roll(make_formation(scene, "v0-palm v1-palm v5-finger2"), "v0-palm")
+    z, w, _ = draw(rng)
+    expected: list[float] = []
+    end = None
+    if isinstance(until, str):
+        end = Until(parse_contact(until, scene))
+        expected.append(measure_gaps(make_formation(scene, until), z)[0])
+    elif until is not None:
+        end = Until(None, *until)
+        expected.append(z[0] - 0.01 if until[0] == "x" else z[2] + 0.3)
+    rates = [*measure_slip(formation, z, w), *w[3:]]
+    expected += [rates[row] for row in turns]
+    # A finger's contact comes up, and a contact with the palm stops sliding.
+    assert new_rows(formation, gained) == [2, 3]
+    one = make_formation(scene, "v5-finger2")
+    opening = constraints(one, z, w, 0 * w)[0][0]
+    expected += [opening, measure_slip(formation, z, w)[0]]
+    kernel = goal_kernel(formation, end, turns, gained)
+    assert kernel is not None
+    np.testing.assert_allclose(call(kernel, [z, w]), expected, atol=1e-6)
+
+
+def test_gaps_open_with_their_second_derivative() -> None:
+    rng = np.random.default_rng(5)
+    formation = FORMATIONS[2]
+    for contact in formation.contacts:
+        z, w, u = draw(rng)
+        kernel = opening_kernel(formation, contact)
+        one = Formation(formation.scene, (contact,))
+        second = constraints(one, z, w, u)[1][0]
+        np.testing.assert_allclose(call(kernel, [z, w, u]), second, atol=1e-5)
+
+
+@pytest.mark.parametrize("name, degree", [("radau", 3), ("legendre", 2)])
+@pytest.mark.parametrize("freedoms", [1, 2])
+def test_collocation_holds_for_what_polynomials_integrate(
+    name: str, degree: int, freedoms: int
+) -> None:
+    rng = np.random.default_rng(7)
+    scheme, h = make_scheme(name, degree), 0.3
+    # Rates that are polynomials of degree d - 1 are integrated exactly to every point and the end.
+    powers = rng.normal(size=(5, degree))
+    N, start = rng.normal(size=(5, freedoms)), rng.normal(size=5)
+
+    def state(x: float) -> Array:
+        parts = [h * powers[:, k] * x ** (k + 1) / (k + 1) for k in range(degree)]
+        return np.asarray(start + np.sum(parts, axis=0))
+
+    places = [*scheme.points, *([] if scheme.ends else [1.0])]
+    rates = [powers @ x ** np.arange(degree) for x in scheme.points]
+    x = [start, *map(state, places), *rates, np.array([h])]
+    kernel = collocation_kernel(name, degree, freedoms)
+    np.testing.assert_allclose(call(kernel, x, N.ravel(order="F")), 0.0, atol=1e-13)
+    # What is missed is missed along the columns of N, point after point.
+    shift = rng.normal(size=5)
+    x[1] = x[1] + shift
+    missed = call(kernel, x, N.ravel(order="F")).reshape(-1, freedoms)
+    np.testing.assert_allclose(missed[0], N.T @ shift, atol=1e-13)
+    np.testing.assert_allclose(missed[1:], 0.0, atol=1e-13)
+
+
+def test_only_what_bends_within_an_interval_costs() -> None:
+    straight, weight = np.linspace([1.0, 2.0], [3.0, -1.0], 4), np.array([0.5, 2.0])
+    bent = straight + np.array([0.0, 0.0, 0.3, 0.0])[:, None] * [1.0, 0.0]
+    got = [call(bend_kernel(4), [own.ravel(), np.array([0.1])], weight) for own in (straight, bent)]
+    np.testing.assert_allclose(got[0], 0.0, atol=1e-13)
+    # Second differences of 0.3 and -0.6 of the first torque.
+    np.testing.assert_allclose(got[1], 0.1 * 0.5 * (0.3**2 + 0.6**2), rtol=1e-12)
+
+
+@pytest.mark.parametrize("controls", [2, 3, 5])
+def test_effort_is_the_integral_of_squares(controls: int) -> None:
+    rng = np.random.default_rng(8)
+    tau, h = rng.normal(size=(controls, 2)), 0.02
+    places, weights = np.polynomial.legendre.leggauss(controls)
+    values = blend((places + 1) / 2, controls) @ tau
+    expected = h * weights / 2 @ (values**2).sum(axis=1)
+    got = call(effort_kernel(controls), [tau.ravel(), np.array([h])])
+    np.testing.assert_allclose(got, expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize("rolls", [(), ("v4-finger1",)])
+def test_impacts_balance_the_momentum_of_every_body(rolls: tuple[str, ...]) -> None:
+    rng = np.random.default_rng(9)
+    scene = landing().scene
+    before = make_formation(scene, "v1-palm v3-finger1 v6-finger2")
+    after = roll(make_formation(scene, "v1-palm v4-finger1 v6-finger2"), *rolls)
+    # An impact is over at once: what has no impulse is left out of the balance.
+    bare = [replace(link, viscous=0.0, dry=0.0) for link in scene.fingers]
+    still = Scene(scene.polygon, (bare[0], bare[1]), scene.friction, 0.0)
+    n_p, n_c = after.n_constraints, after.n_contacts
+    assert find_leaving(before, after) == [1]
+    for _ in range(3):
+        z, v_after, v_before = draw(rng)
+        impulses, Xi = rng.normal(size=n_p), rng.choice([-1.0, 1.0], n_c)
+        x = [v_after, v_before, z, impulses]
+        y = call(impact_kernel(before, after), x, Xi)
+        jump, held, leaving, cones = np.split(y, np.cumsum([5, n_p, 1]))
+        p_n, p_t = split_forces(after, impulses, Xi)
+        row = Samples(z, v_before, v_after - v_before, np.zeros(2), p_n, p_t)
+        missing, _ = unbalance(replace(after, scene=still), row, np.ones(2))
+        np.testing.assert_allclose(jump, -missing, atol=1e-13 * np.abs(missing).max())
+        rates, _ = constraints(after, z, v_after, 0 * z)
+        np.testing.assert_allclose(held, rates, atol=1e-6)
+        opening, _ = constraints(Formation(scene, before.contacts[1:2]), z, v_after, 0 * z)
+        np.testing.assert_allclose(leaving, opening, atol=1e-6)
+        rows = list(after.rolling_rows)
+        grip = after.friction[rows] * p_n[rows]
+        np.testing.assert_allclose(cones, [*(grip - p_t[rows]), *(grip + p_t[rows])], atol=1e-14)
+
+
+def test_limits_are_no_part_of_kernels(heptagon: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With other torque limits, nothing that has been built is built again."""
+    weaker = heptagon.with_(torque_limit=1.9, speed_limit2=20.0)
+    before, after = (problem.phases[0].formation for problem in (heptagon, weaker))
+    assert before is not after and point_kernel(before, 2) is point_kernel(after, 2)
+    assert before.function is after.function
+    stronger = heptagon.with_(torque_limit=2.1)
+    other = heptagon.with_(friction_palm=0.11).phases[0].formation
+    assert point_kernel(other, 2) is not point_kernel(before, 2)
+
+    def build(problem: Problem) -> None:
+        search = TimeSearch.of(problem, PlanOptions())
+        given = problem, problem.phases[:1], problem.start, search.scheme
+        assert search.build(guess_stages(*given, 4, 2.0)).solver is not None
+
+    build(weaker)
+
+    def refuse(*_: object) -> Kernel:
+        raise AssertionError("a kernel is built again")
+
+    monkeypatch.setattr(kernels, "build_kernel", refuse)
+    build(stronger)
+
 
 PHASE = 3
 """Of the heptagon, without a reversal."""
@@ -55,13 +706,13 @@ def driven(name: str, degree: int, count: int, contacts: int = 4) -> Stage:
     return Stage(PHASE, formation, directions, sample(make_scheme(name, degree), count))
 
 
-def build(
+def build_nlp(
     stages: list[Stage], scheme: Scheme, objective: Objective = Objective.TIME, weight: float = 3.0
 ) -> TimeNLP:
     return build_time_nlp(stages, scheme, Target(objective, 0.05, weight), 1)
 
 
-def call(nlp: TimeNLP, part: str, x: Array) -> Array:
+def evaluate_at(nlp: TimeNLP, part: str, x: Array) -> Array:
     values: Any = nlp.solver.function.get_function(part)(x, [])
     return np.asarray(values.full()[:, 0])
 
@@ -73,7 +724,7 @@ def packed(nlp: TimeNLP, stages: list[Stage], margin: float = 0.0) -> Array:
 def misses(nlp: TimeNLP, x: Array) -> tuple[Array, Array]:
     """What equations and inequalities miss; inequalities are negative where they hold."""
     low, high = nlp.rows.bounds
-    values = call(nlp, "nlp_g", x)
+    values = evaluate_at(nlp, "nlp_g", x)
     miss = np.maximum(low - values, values - high)
     return np.where(low == high, np.abs(miss), 0.0), np.where(low == high, -np.inf, miss)
 
@@ -81,7 +732,7 @@ def misses(nlp: TimeNLP, x: Array) -> tuple[Array, Array]:
 def collocation(name: str, degree: int, count: int, contacts: int) -> tuple[Array, Array]:
     """What collocation misses at inner points and at the ends of intervals."""
     scheme, stage = make_scheme(name, degree), driven(name, degree, count, contacts)
-    nlp = build([stage], scheme)
+    nlp = build_nlp([stage], scheme)
     equations, _ = misses(nlp, packed(nlp, [stage]))
     rows = nlp.rows_of[0]
     own = equations[rows.states]
@@ -114,7 +765,7 @@ def test_a_known_motion_satisfies_the_equations_to_the_schemes_order(
 @pytest.mark.parametrize("name, degree", SCHEMES)
 def test_a_known_motion_keeps_the_limits(name: str, degree: int) -> None:
     scheme, stage = make_scheme(name, degree), driven(name, degree, 8)
-    nlp = build([stage], scheme)
+    nlp = build_nlp([stage], scheme)
     x = packed(nlp, [stage])
     low_x, high_x = bound_unknowns(nlp, [stage], scheme)
     low, _ = raise_bounds(nlp, [stage], [LimitMisses.none(stage)], (low_x, high_x))
@@ -128,7 +779,7 @@ def test_a_known_motion_keeps_the_limits(name: str, degree: int) -> None:
 @pytest.mark.parametrize("name", ["radau", "legendre"])
 def test_every_unknown_matters(name: str, change: str, least: float) -> None:
     scheme, stage = make_scheme(name, 3), driven(name, 3, 8)
-    nlp = build([stage], scheme)
+    nlp = build_nlp([stage], scheme)
     rest = misses(nlp, packed(nlp, [stage]))[0]
     off = stage.guess._replace(**{change: getattr(stage.guess, change) + 1.0})
     equations, _ = misses(nlp, pack([off], nlp.layouts, 0.0))
@@ -141,7 +792,7 @@ def test_friction_the_wrong_way_breaks_a_limit(row: int) -> None:
     signs = np.concatenate(stage.directions)
     signs[row] *= -1
     wrong = replace(stage, directions=Directions(signs[:4], signs[4:]))
-    nlp = build([wrong], scheme)
+    nlp = build_nlp([wrong], scheme)
     x = packed(nlp, [wrong])
     low, high = bound_unknowns(nlp, [wrong], scheme)
     worst = max(misses(nlp, x)[1].max(), (low - x).max(), (x - high).max())
@@ -151,8 +802,8 @@ def test_friction_the_wrong_way_breaks_a_limit(row: int) -> None:
 @pytest.mark.parametrize("objective", [Objective.TIME, Objective.EFFORT, Objective.MARGIN])
 def test_what_is_made_least(objective: Objective) -> None:
     scheme, stage = make_scheme("radau", 3), driven("radau", 3, 8)
-    nlp = build([stage], scheme, objective)
-    cost = call(nlp, "nlp_f", packed(nlp, [stage], 0.7))[0]
+    nlp = build_nlp([stage], scheme, objective)
+    cost = evaluate_at(nlp, "nlp_f", packed(nlp, [stage], 0.7))[0]
     first, last = stage.guess.tau[0, 0], stage.guess.tau[-1, 1]
     squares = DURATION / 3 * (first @ first + first @ last + last @ last)
     least = {
@@ -166,14 +817,14 @@ def test_what_is_made_least(objective: Objective) -> None:
 @pytest.mark.parametrize("name", ["radau", "legendre"])
 def test_the_margin_raises_what_forces_have_to_exceed(name: str) -> None:
     scheme, stage = make_scheme(name, 3), driven(name, 3, 8)
-    nlp = build([stage], scheme, Objective.MARGIN)
+    nlp = build_nlp([stage], scheme, Objective.MARGIN)
     low_x, high_x = bound_unknowns(nlp, [stage], scheme)
     low, _ = raise_bounds(nlp, [stage], [LimitMisses.none(stage)], (low_x, high_x))
     assert not np.isfinite(low_x[nlp.layouts[0].forces]).any()
     # The polynomial through the points may pass a little below them at the ends of an interval.
     room = stage.guess.forces.min() - 0.05
     for extra, kept in ((0.9 * room, True), (1.02 * room, False)):
-        values = call(nlp, "nlp_g", packed(nlp, [stage], extra))
+        values = evaluate_at(nlp, "nlp_g", packed(nlp, [stage], extra))
         assert bool((values - low)[nlp.rows_of[0].limits.presses].min() > 0) is kept
 
 
@@ -206,7 +857,7 @@ def test_derivatives_of_the_whole_are_its_differences() -> None:
     table = np.zeros((*first.guess.forces.shape[:2], 5))
     table[..., :4] = first.guess.forces
     first = replace(first, formation=rolling, guess=first.guess._replace(forces=table))
-    nlp = build([first, second], scheme, Objective.MARGIN)
+    nlp = build_nlp([first, second], scheme, Objective.MARGIN)
     rng = np.random.default_rng(4)
     x = packed(nlp, [first, second], 0.1)
     step = rng.normal(size=len(x))
@@ -219,7 +870,9 @@ def test_derivatives_of_the_whole_are_its_differences() -> None:
 
     h = 1e-6
     exact = slope(x) @ step
-    change = (call(nlp, "nlp_g", x + h * step) - call(nlp, "nlp_g", x - h * step)) / (2 * h)
+    change = (evaluate_at(nlp, "nlp_g", x + h * step) - evaluate_at(nlp, "nlp_g", x - h * step)) / (
+        2 * h
+    )
     np.testing.assert_allclose(change, exact, atol=1e-6 * np.abs(exact).max())
     upper = hessian(x, [], 1.0, lam).full()
     bend = (upper + np.triu(upper, 1).T) @ step
