@@ -65,6 +65,7 @@ from wholearm.planning.path_domain.path_plan import plan_curves, plan_path
 from wholearm.planning.path_domain.terms import LimitShape
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
+from wholearm.planning.refine import refine
 from wholearm.problem.read import build_problem
 from wholearm.results.trajectory import Samples
 from wholearm.solvers.ipopt import open_ledger
@@ -528,7 +529,7 @@ def test_a_stuck_solver_within_ranges_says_that_there_is_a_plan_without(
     def plan(task: path_plan.Task) -> path_plan.PathIterate:
         if task.options.ranges:
             raise SolverError("Ipopt stopped")
-        return path_plan.refine(path_plan.PathIterate.begin(task, 20), 1e-2)
+        return refine(path_plan.PathIterate.begin(task, 20), 1e-2)
 
     monkeypatch.setattr(path_plan, "plan_task", plan)
     monkeypatch.setattr(path_plan, "explain_stuck", lambda *_: SolverError("unclear"))
