@@ -17,6 +17,7 @@ from .cell_curves import best_end, find_best, list_ends
 from .event_tracing import Trace, follow, resample
 from .slow_motion import fast_margin, inertia_ratio, rest_margin, slow_margin
 
+PLACES = 60  # places along a curve at which limits are looked at
 CLEAR = 1e-3  # margin over the scene's weight, or a torque limit, from which a motion surely exists
 UNABLE = -1e-7  # margin below which none exists
 FREE = 0.02  # reduced inertia over that without friction above which nothing jams
@@ -103,7 +104,7 @@ def _reach(scene: Scene, phase: Phase, z: Array) -> Trace:
 
 def _judge_curve(problem: Problem, phase: Phase, trace: Trace) -> Verdict:
     scene, epsilon = problem.scene, problem.epsilon
-    s, z, z_s = resample(scene, phase, trace, 60)
+    s, z, z_s = resample(scene, phase, trace, PLACES)
     slow = slow_margin(scene, phase, epsilon, z, z_s)
     free = float(inertia_ratio(scene, phase, z, z_s).min())
     at = f"phase {phase.number}"
