@@ -31,7 +31,6 @@ from wholearm.contacts.closing import (
     evaluate_contacts,
     evaluate_each,
     first_contact,
-    measure_gap,
     move,
     place,
     place_flush,
@@ -507,16 +506,6 @@ def test_rows_are_those_of_formations() -> None:
             (own.C, every.C),
         ):
             np.testing.assert_allclose(part[mine], other, rtol=1e-9, atol=1e-10)
-
-
-def test_gaps_are_those_of_formations() -> None:
-    scene, _, _, z = close(0.01)
-    contacts = np.random.default_rng(6).integers(0, len(contact_table(scene)), len(z))
-    gaps = measure_gap(scene, contacts, z)
-    for index in np.unique(contacts):
-        mine = contacts == index
-        own = evaluate_contacts(scene, [int(index)], z[mine]).C[:, 0]
-        np.testing.assert_allclose(gaps[mine], own, atol=1e-14)
 
 
 def test_rows_are_those_of_each_formation() -> None:

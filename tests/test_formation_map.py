@@ -38,12 +38,10 @@ from wholearm.contacts.closing import (
     close_finger,
     close_fingers,
     contact_table,
+    evaluate_each,
     first_contact,
-    measure_gap,
 )
-from wholearm.contacts.closing import (
-    place as place_labels,
-)
+from wholearm.contacts.closing import place as place_labels
 from wholearm.contacts.contact_limits import (
     FINGERS_TOUCH,
     build_apart,
@@ -62,7 +60,7 @@ from wholearm.problem.read import build_problem, read_problem
 from wholearm.search.border_limits import estimate_duration, find_border_limits
 from wholearm.search.edges import Link, cut_curve, time_parts
 from wholearm.search.places import RoadmapPlace, is_at, list_formations_at, make_place, unit_steps
-from wholearm.search.roadmap import BESIDE, Rays, Roadmap, can_start, shoot, time_paths
+from wholearm.search.roadmap import Rays, Roadmap, can_start, shoot, time_paths
 from wholearm.search.times import time_borders
 
 TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
@@ -694,6 +692,7 @@ def test_fingers_in_different_planes_pass_each_other() -> None:
 
 
 PARTS = 50
+FAR_GOAL = Goal(flush=0, x=9.0)  # that no border leads to
 
 
 @cache
@@ -720,11 +719,13 @@ def test_rays_stay_in_a_cell_of_the_place_until_a_contact_is_gained() -> None:
 def test_rays_end_right_before_what_they_gain_touches() -> None:
     own, rays = around_the_start()
     scene = own.scene
-    before = measure_gap(scene, rays.gained, place_labels(scene, rays.labels, rays.ends))
-    assert (before > 0).all()
+
+    def measure_gaps(ends: Array) -> Array:
+        return evaluate_each(scene, rays.gained[:, None], place_labels(scene, rays.labels, ends)).C
+
+    assert (measure_gaps(rays.ends) > 0).all()
     lengths = np.linalg.norm(rays.runs / unit_steps(scene), axis=1)[:, None]
-    ends = rays.ends + BESIDE * rays.runs / lengths
-    assert (measure_gap(scene, rays.gained, place_labels(scene, rays.labels, ends)) < 0).all()
+    assert (measure_gaps(rays.ends + 1e-4 * rays.runs / lengths) < 0).all()
 
 
 def test_no_way_is_faster_with_more_to_press() -> None:
@@ -782,7 +783,7 @@ def test_a_chain_of_impacts_is_bounded_as_its_plan_takes() -> None:
     until = [str(phase.until) for phase in phases]
     (own,) = (
         link
-        for chain, link in chart.pass_on(make_place(problem.scene, problem.start))
+        for _, link, _ in chart.list_along(make_place(problem.scene, problem.start), FAR_GOAL)
         if isinstance(link, Link) and [str(step.until) for step in link.steps] == until
     )
     assert [step.end for step in own.steps] == [End.IMPACT, End.IMPACT, End.REST]
@@ -794,9 +795,9 @@ def test_a_chain_of_impacts_is_bounded_as_its_plan_takes() -> None:
     for phase in phases:
         (link,) = (
             link
-            for border, link in chart.follow(place)
-            if isinstance(link, Link)
-            and set(border.formation.contacts) == set(phase.formation.contacts)
+            for chain in chart.follow(place)
+            if isinstance(link := chain.link, Link)
+            and set(chain.borders[0].formation.contacts) == set(phase.formation.contacts)
             and link.steps[0].until == phase.until
         )
         alone, place = alone + link.duration, link.stop
@@ -809,7 +810,9 @@ def test_no_chain_leads_through_an_impact_that_is_not_possible() -> None:
     place = make_place(problem.scene, problem.start)
     # With little friction there the impact onto v3-finger1 would tip edge 0 off the palm.
     assert [
-        chain for chain, _ in chart.pass_on(place) if str(chain.steps[0].until) == "v3-finger1"
+        chain
+        for chain, *_ in chart.list_along(place, FAR_GOAL)
+        if chain.steps and str(chain.steps[0].until) == "v3-finger1"
     ] == []
 
 
@@ -819,11 +822,11 @@ def test_chains_are_followed_a_border_at_a_time_to_where_all_of_them_lead() -> N
     place = make_place(problem.scene, problem.start)
     waiting, steps = list(chart.set_out(place, goal)), set()
     while waiting:
-        own = waiting.pop()
-        if isinstance(own.link, Link):
-            steps.add(own.link.steps)
-            waiting += chart.go_on(own.chain, goal) if own.whole else []
-    every = [link for _, link in chart.list_along(place, goal) if isinstance(link, Link)]
+        chain, link, whole = waiting.pop()
+        if isinstance(link, Link):
+            steps.add(link.steps)
+            waiting += chart.go_on(chain, goal) if whole else []
+    every = [link for _, link, _ in chart.list_along(place, goal) if isinstance(link, Link)]
     assert steps == {link.steps for link in every} and len(steps) > 3
 
 
@@ -847,7 +850,7 @@ def test_a_landing_is_led_to_where_the_goal_is() -> None:
     contacts = set(problem.phases[4].formation.contacts)
     ((index, border),) = (
         (k, own)
-        for k, (own, _) in enumerate(chart.follow(place))
+        for k, (own,) in enumerate(chain.borders for chain in chart.follow(place))
         if set(own.formation.contacts) == contacts
     )
     landings = chart.land_at(chart.release(border, index), goal)

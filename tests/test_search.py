@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 
 import wholearm
-from plane import convex_polygon, make_scene
 from retelling import Retelling, Units
 from shipped import FOLDER, HEPTAGON, HEXAGON, problem_of
 from wholearm import Formation, Goal, Phase, Plan, PlanOptions, Problem, Until, load_plan, verify
@@ -67,7 +66,7 @@ from wholearm.search.find_route import (
 )
 from wholearm.search.places import list_formations_at, make_place
 from wholearm.search.result import bound_borders, describe_block
-from wholearm.search.roadmap import Roadmap, cross, go_to, map_labels
+from wholearm.search.roadmap import Roadmap, cross, go_to
 from wholearm.search.route_choice import FINEST, STEPS, Chooser, Found, RefinedPath, ReleaseSearch
 
 TABLE = {k: v for k, v in tomllib.loads(HEPTAGON.read_text()).items() if k != "phases"}
@@ -132,17 +131,16 @@ def test_straight_ways_keep_their_limits_and_end_where_a_contact_is_gained() -> 
     ways = cross((start,), epsilon)
     assert ways
     for way in ways:
-        assert way.gained is not None
-        ending = Formation(scene, (*way.contacts, way.gained))
-        gaps = ending.evaluate(way.z[None], way.z[None]).C
+        (step,), z = way.steps, way.stop.z
+        gaps = Formation(scene, way.stop.contacts).evaluate(z[None], z[None]).C
         assert np.abs(gaps).max() < 0.02 * scene.scales.length
-        (formation,) = (f for f in list_formations_at(start, 3) if f.contacts == way.contacts)
-        pose = way.z[None, [0, 2]]
-        again = go_to(start, formation, pose, epsilon)
+        (formation,) = (f for f in list_formations_at(start, 3) if f.contacts == step.contacts)
+        pose = z[None, [0, 2]]
+        again = go_to(start, formation, pose, step.until, epsilon)
         assert again is not None and again.duration == pytest.approx(way.duration)
-        np.testing.assert_allclose(again.z, way.z, atol=1e-12)
+        np.testing.assert_allclose(again.stop.z, z, atol=1e-12)
         # With more to press no way is faster.
-        harder = go_to(start, formation, pose, 4 * epsilon)
+        harder = go_to(start, formation, pose, step.until, 4 * epsilon)
         assert harder is None or harder.duration >= way.duration
 
 
@@ -582,19 +580,6 @@ def test_near_miss_names_the_border_and_its_distance(heptagon: Problem) -> None:
     phi = scene.polygon.flush_angle(0) + 3 * near[1]
     palm = describe_miss(scene, np.array([0.045, phi]), np.array([0.0, phi]))
     assert "e0 flush on the palm, is up to -1.5 deg" in palm
-
-
-def test_places_of_the_grid_have_their_labels_however_often_the_object_has_turned() -> None:
-    rng = np.random.default_rng(1)
-    scene = make_scene(convex_polygon(rng, 5))
-    grid = map_labels(scene)
-    poses = np.column_stack([rng.uniform(-0.3, 0.3, 200), rng.uniform(-9, 9, 200)])
-    count = np.rint((poses - [grid.least, 0.0]) / grid.steps)
-    nearest = [grid.least, 0.0] + count * grid.steps
-    labels = label_cells(scene, *nearest.T)[:, [0, 2, 4]]
-    seen = grid.labels[grid.look_up(poses)]
-    assert (seen == labels).all()
-    assert (labels != NOWHERE).any() and (labels == NOWHERE).any()
 
 
 HEPTAGON_TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))

@@ -453,30 +453,6 @@ def move(scene: Scene, labels: Numbers, poses: Array, rates: Array) -> ExplicitM
     return ExplicitMotion(z, z_u, z_uu, Kinematics(0 * bend, A, A_t, bend, A, bend))
 
 
-def measure_gap(scene: Scene, contacts: Numbers, z: Array) -> Array:
-    """C-functions [m] of a contact of `closing.contact_table` each, at n configurations."""
-    gaps = np.empty(len(z))
-    on_palm = contacts < first_contact(scene, 0)
-    vertices = scene.polygon.vertices[contacts[on_palm]]
-    gaps[on_palm] = z[on_palm, 1] + _turn(vertices, z[on_palm, 2])[:, 1]
-    for finger, link in enumerate(scene.fingers):
-        sign, last = (1.0, first_contact(scene, 1)) if finger == 0 else (-1.0, np.inf)
-        mine = np.flatnonzero((contacts >= first_contact(scene, finger)) & (contacts < last))
-        for own in _list_touches(scene, finger, contacts[mine], z[mine]):
-            at = mine[own.rows]
-            angle = z[at, 3 + finger]
-            axis = np.column_stack([np.cos(angle), np.sin(angle)])
-            apart = own.corner - link.length * axis
-            if own.kind == SIDE:
-                gap = sign * cross_product(axis, own.corner)
-            elif own.kind == EDGE:
-                gap = -(own.outward * apart).sum(axis=1)
-            else:
-                gap = np.hypot(*apart.T)
-            gaps[at] = gap - link.radius
-    return gaps
-
-
 def _bend(
     own: _Touch, radius: float, tip: Array, normal: Array, rates: Array, rate: Array
 ) -> Array:

@@ -342,26 +342,11 @@ def split(cell: Numbers) -> Iterator[tuple[int, Flags]]:
 
     `cell` says for each place whose it is, negative: nobody's. Parts come by owner, from below.
     """
-    number = np.arange(cell.size).reshape(cell.shape)
-    before = None
-    # The least number of each part spreads along rows and columns until nothing changes.
-    while before is None or (number != before).any():
-        before = number
-        number = _spread(_spread(number, cell).T, cell.T).T
-    parts, first = np.unique(number, return_index=True)
-    owners = cell.ravel()[first]
-    for k in np.argsort(owners, kind="stable"):
-        if owners[k] >= 0:
-            yield int(owners[k]), number == parts[k]
+    from scipy.ndimage import label
 
-
-def _spread(number: Numbers, cell: Numbers) -> Numbers:
-    """The least number of each stretch of a row with one owner for all of it."""
-    starts = np.ones(cell.shape, dtype=bool)
-    starts[:, 1:] = cell[:, 1:] != cell[:, :-1]
-    stretch = np.cumsum(starts.ravel()) - 1
-    least = np.minimum.reduceat(number.ravel(), np.flatnonzero(starts.ravel()))
-    return np.asarray(least[stretch].reshape(cell.shape))
+    for owner in range(int(cell.max()) + 1):
+        parts, count = label(cell == owner)
+        yield from ((owner, parts == k) for k in range(1, count + 1))
 
 
 def find_room(region: Flags, step: Array) -> tuple[int, int, float]:
@@ -370,18 +355,13 @@ def find_room(region: Flags, step: Array) -> tuple[int, int, float]:
     `step` are the distances of rows and of columns, shape (2,). What lies beyond the grid
     is outside of the region.
     """
-    rows, columns = np.flatnonzero(region.any(axis=1)), np.flatnonzero(region.any(axis=0))
-    low = np.array([rows[0], columns[0]])
-    padded = np.pad(region[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], 1)
-    # Along columns first, then the nearest over all columns.
-    place = np.arange(len(padded))[:, None]
-    below = np.maximum.accumulate(np.where(padded, -np.inf, place), axis=0)
-    above = np.minimum.accumulate(np.where(padded, np.inf, place)[::-1], axis=0)[::-1]
-    upright = (step[0] * np.minimum(place - below, above - place)) ** 2
-    apart = (step[1] * np.subtract.outer(*(np.arange(padded.shape[1]),) * 2)) ** 2
-    room = np.array([(apart + row).min(axis=1) for row in upright])
+    from scipy.ndimage import distance_transform_edt, find_objects
+
+    (around,) = find_objects(region.astype(int))
+    room = distance_transform_edt(np.pad(region[around], 1), sampling=step)[1:-1, 1:-1]
     row, column = np.unravel_index(int(room.argmax()), room.shape)
-    return int(row + low[0] - 1), int(column + low[1] - 1), float(np.sqrt(room[row, column]))
+    place = int(row) + around[0].start, int(column) + around[1].start
+    return *place, float(room[row, column])
 
 
 def choose_tints(cell: Numbers, tints: int) -> Numbers:

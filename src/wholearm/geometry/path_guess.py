@@ -16,13 +16,12 @@ from ..mechanics.dynamics import Directions, metric_weights
 from ..problem.definition import Phase, Problem
 from ..problem.read import read_problem
 from .curve import Curve, tangent_basis
-from .explore import Ending, close_all, close_contacts, explore, is_inside
+from .explore import Ending, close_all, close_contacts, explore
 from .tracing import require_touching, runs_on_curve, trace_phase, trace_phases
 
 POINTS = 25  # configurations along a guess
 RELEASE_AT = 0.8  # share of a curve at which a release is guessed
 _MOST_ACTIVE = 2  # most active limits at the end of a phase
-_TURNS = np.linspace(-1.0, 1.0, 21)  # rotations from which another end is searched for [rad]
 
 
 @exclusive
@@ -127,15 +126,6 @@ def _find_goal(phase: Phase, z: Array, later: Sequence[Phase]) -> Array:
     def distance(goal: Array) -> float:
         return float(metric @ (goal - z) ** 2)
 
-    if not goals and phase.until.contact is not None:
-        end = _close_end(phase)
-        for turn in _TURNS:
-            turned = close_contacts(phase.formation, z, slip, ((2, z[2] + turn),))
-            goal = (
-                turned if turned is None else close_contacts(end.formation, turned, slip, end.fixed)
-            )
-            if goal is not None and is_inside(end.formation, goal):
-                goals.append(goal)
     if not goals:
         goal = explore(phase.formation, z, slip, endings)
         goals = [goal] if goal is not None else []

@@ -60,8 +60,7 @@ class CurveLimitRows(NamedTuple):
     slack: Array
     unit: Array  # (n, m) [N, N m]: margin at level 1
     presses: int  # how many of the m are of forces
-    ends: Array  # (k, n_c, 5) [N]: normal forces at the last place, in each corner of the ranges
-    scenes: tuple[Scene, ...]  # the scenes of these corners
+    scenes: tuple[Scene, ...]  # in the corners of the ranges
 
     @property
     def levels(self) -> Array:
@@ -112,13 +111,12 @@ def make_rows(curve: Curve, s: Array, motion: Motion) -> CurveLimitRows:
         slack.append(measure_slack(contact, respond(forces, torque)[0], torque, rates))
         error = _estimate_errors(formation, point, side, contact, motion[1], tau, delayed)
         unit.append(LEAST * contact.scales[contact.sides[0]] + error)
-    ends = slack[0][-1:, : formation.n_contacts]
     slack[1][have_same_signs(*sides)] = UNLIMITED
     slack.append(measure_slack(joint, np.zeros_like(forces.of_c), torque, rates))
     unit.append(np.tile(SPARE * joint.scales[joint.sides[0]], (len(s), 1)))
     table, count = np.concatenate(slack, axis=1), 2 * slack[0].shape[1]
     units = np.concatenate(unit, axis=1)
-    return CurveLimitRows(s, torque, table, units, count, ends, (formation.scene,))
+    return CurveLimitRows(s, torque, table, units, count, (formation.scene,))
 
 
 def have_same_signs(before: Directions, after: Directions) -> Array:
@@ -277,8 +275,7 @@ class Within(NamedTuple):
     sides: tuple[Corners, Corners]  # with friction before and after the nearest reversal
     same: Array  # (n,): where these are equal
     unit: Array  # (m + l,): margins at level 1, of forces and torques
-    ends: Array  # (k, n_c, 5) [N]: normal forces at the last place, in each corner of the ranges
-    scenes: tuple[Scene, ...]  # in these corners
+    scenes: tuple[Scene, ...]  # in the corners of the ranges
 
     def at(self, motion: Motion) -> tuple[CurveLimitRows, Array, Array]:
         """The law's limits near a motion; those of the reference, and their margins."""
@@ -290,7 +287,7 @@ class Within(NamedTuple):
         copies = forces.shape[1] // count
         unit = np.concatenate([np.tile(self.unit[:count], copies), self.unit[count:]])
         table, presses = np.tile(unit, (n, 1)), forces.shape[1]
-        rows = CurveLimitRows(self.s, self.torque, slack, table, presses, self.ends, self.scenes)
+        rows = CurveLimitRows(self.s, self.torque, slack, table, presses, self.scenes)
         kept = np.concatenate([KEPT * self.unit[:count], AUTHORITY * self.unit[count:]])
         again = np.tile(kept, 2 * len(motions))
         wanted = np.concatenate([np.tile(kept[:count], copies), kept[count:], again])
@@ -332,9 +329,6 @@ def find_within(
     left = measure_slack(joint, none, nominal, point.z_s[:, 3:])
     scales, most = (each.scales[each.sides[0]] for each in (contact, joint))
     unit = np.concatenate([np.maximum(LEAST * scales, least), SPARE * most])
-    ends, scenes = (
-        corners[0].rows[:, -1, : formation.n_contacts],
-        list_scenes(formation.scene, widths),
-    )
+    scenes = list_scenes(formation.scene, widths)
     same = have_same_signs(*sides)
-    return Within(s, nominal, left, (corners[0], corners[1]), same, unit, ends, scenes)
+    return Within(s, nominal, left, (corners[0], corners[1]), same, unit, scenes)

@@ -45,14 +45,7 @@ SHARES = (1.0, 0.5, 0.25)  # shares of the margin that are tried
 SLOWER = 1.5  # largest duration of a motion with a margin, over the plan's
 SAME = 1e-5  # distance from the plan's end that counts as none, over the scene's length and in rad
 Planner = Callable[[Problem], Trajectory]  # makes a plan of a problem
-ENOUGH = 5.0  # largest useful margin of a normal force
-LEAST = 0.3  # least margin with which a contact counts as closed
-DRIVE = 0.15  # least acceleration that closes an open contact, over the scene's unit
-# Deceleration along the next curve per margin, over the scene's unit: the gained contact need not
-# block the motion.
-BRAKE = 0.3
 FRICTION = (0.7, 1.0, 1.2)  # factors on all friction with which torques have to balance
-FULL = 0.98  # share of the torque limits that is used
 STILL = 1e-3  # speed along curves that counts as none, over the scene's
 USUAL = 2.5  # margin of normal forces where no ranges are known, in those of `curve_rows`
 DWELL = 3e-3  # time at rest before the next phase begins [s]
@@ -114,7 +107,7 @@ def make_policy(
     along = [block[0] if curve else None for block, curve in zip(blocks, curves, strict=True)]
     pieces = trace_pieces(problem, along, plan, Reserve(reserve, ranges, delay))
     tables, about = list[dict[str, Array]](), list[dict[str, Any]]()
-    for block, piece, after in zip(blocks, pieces, [*pieces[1:], None], strict=True):
+    for block, piece in zip(blocks, pieces, strict=True):
         lasts = {phase.number: float(np.diff(starts)[phase.index]) for phase in block}
         found: list[dict[str, Any]] = [
             {"number": k, "plan": t, "duration": t, "share": 0.0} for k, t in lasts.items()
@@ -126,7 +119,7 @@ def make_policy(
                 one["duration"] = span
         else:
             phase = block[0]
-            push = _find_end_torques(problem, phase, plan, piece, after)
+            push = _find_end_torques(problem, phase, plan, piece)
             tables.append(_tabulate_curve(piece, phase, push))
             found[0].update(duration=piece.duration, share=piece.share, reserves=piece.reserves)
             gained = phase.until.contact
@@ -157,20 +150,14 @@ def split(phases: Sequence[Phase]) -> list[tuple[Phase, ...]]:
 
 
 def _find_end_torques(
-    problem: Problem,
-    phase: Phase,
-    plan: Trajectory,
-    piece: ReferencePiece,
-    after: ReferencePiece | None,
+    problem: Problem, phase: Phase, plan: Trajectory, piece: ReferencePiece
 ) -> Array:
     """Torques that hold the end of a curve: the plan's if it has any."""
     last = int(np.flatnonzero(plan.phase == phase.index)[-1])
     if np.isnan(plan.c_n[last]).all():
         return np.asarray(plan.tau[last])
-    contact, push = phase.until.contact, None
-    if contact is not None:
-        push = find_push(piece.curve, contact, piece.rows, None if after is None else after.rows)
-        push = hold_end(problem, phase, piece.curve.end) if push is None else push
+    gained = phase.until.contact is not None
+    push = hold_end(problem, phase, piece.curve.end) if gained else None
     return find_still(piece.curve) if push is None else push
 
 
@@ -264,59 +251,10 @@ def find_arrival(curve: Curve, gained: Contact, rows: CurveLimitRows) -> Array:
     return np.vstack(found)
 
 
-def find_push(
-    curve: Curve, gained: Contact, rows: CurveLimitRows, after: CurveLimitRows | None
-) -> Array | None:
-    """Torques that balance with the gained contact and drive on without it, shape (2,), or None.
-
-    Linear programme: the least normal force over its margin is largest. In the balance friction is
-    that of the motion. `rows` are along the curve, `after` along the next one.
-    """
-    scene, both = curve.formation.scene, curve.formation.add(gained)
-    balances = _list_balances(curve, both, rows)
-    if not balances:
-        return None
-    count, unit = both.n_contacts, scene.scales.acceleration
-    reserves = _list_reserves(curve, rows)
-    # Rows of (1, tau, level) >= 0: forces with all contacts; a and forces without the gained one.
-    to_motion = _invert(rows.torque[-1])
-    forces = rows.ends.reshape(-1, 5)
-    open_forces = forces[:, [A, LAMBDA]] @ to_motion
-    open_forces[:, 0] += forces[:, ONE]
-    open_reserves = np.tile(reserves[:-1], len(rows.ends))
-    limits = [
-        *(np.column_stack([balance[:count], -reserves]) for balance in balances),
-        np.append(to_motion[0] - [DRIVE * unit, 0.0, 0.0], 0.0)[None],
-        np.column_stack([open_forces, -open_reserves]),
-    ]
-    # First with a brake along the next curve; without it where that is infeasible.
-    tables = [limits]
-    if after is not None:
-        tables.insert(0, [*limits, np.append(-_invert(after.torque[0])[0], -BRAKE * unit)[None]])
-    found = (_find_best(np.vstack(table), scene.torque_limit) for table in tables)
-    return next((tau for tau in found if tau is not None), None)
-
-
 def _list_reserves(curve: Curve, rows: CurveLimitRows) -> Array:
     """Margins of the normal forces at the end of a curve and, the largest of them, of one more."""
     reserves = rows.unit[-1, : curve.formation.n_contacts]
     return np.append(reserves, reserves.max())
-
-
-def _find_best(rows: Array, limit: Array) -> Array | None:
-    """Torques with the largest level, then least effort; rows (1, tau, level) >= 0."""
-    from scipy.optimize import linprog
-
-    # The effort, the largest torque over its limit, is the last column.
-    most = FULL * limit
-    table = np.pad(rows, ((0, 0), (0, 1)))
-    efforts = np.zeros((4, 5))
-    efforts[:, 1:3] = np.vstack([np.diag(1 / most), np.diag(-1 / most)])
-    efforts[:, 4] = 1.0
-    table = np.vstack([table, efforts])
-    bounds = [*((-tau, tau) for tau in most), (LEAST, ENOUGH), (0.0, 1.0)]
-    answer = linprog([0, 0, -1, 1], A_ub=-table[:, 1:], b_ub=table[:, 0], bounds=bounds)
-    return np.asarray(answer.x[:2]) if answer.status == 0 else None
 
 
 def _list_balances(curve: Curve, both: Formation, rows: CurveLimitRows) -> list[Array]:
@@ -344,12 +282,6 @@ def _balance(curve: Curve, both: Formation, factor: float) -> Array:
     right[3:, 0] += scene.dry[3:] * last.sigma
     right[3:, 1:] = -np.eye(2)
     return np.asarray(np.linalg.solve(G.T, right))
-
-
-def _invert(torque: Array) -> Array:
-    """Acceleration and internal force of (1, tau) at rest, (2, 3), from rows of torques, (2, 5)."""
-    back = np.linalg.inv(torque[:, [A, LAMBDA]])
-    return np.column_stack([-back @ torque[:, ONE], back])
 
 
 def find_still(curve: Curve) -> Array:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from ..common.signals import beat
 from ..problem.goal import Goal
-from .edges import Blocked, BorderEdge, Link
+from .edges import Blocked, Link
 from .places import Key, RoadmapPlace, is_at, measure_turn
 from .roadmap import Ahead, Chain, Roadmap
 
@@ -108,9 +108,9 @@ class RouteSearch:
             heapq.heappush(queue, (least, next(number), cost, route, place, work))
 
         def put_along(before: tuple[Link, ...], ahead: Ahead) -> None:
-            assert isinstance(ahead.link, Link)
-            work = ahead.chain if ahead.whole else None
-            put(RoadmapRoute((*before, ahead.link)), ahead.link.stop, work)
+            chain, link, whole = ahead
+            assert isinstance(link, Link)
+            put(RoadmapRoute((*before, link)), link.stop, chain if whole else None)
 
         for source in self.sources or (RoadmapRoute(()),):
             put(source, source.links[-1].stop if source.links else self.start, None)
@@ -136,38 +136,31 @@ class RouteSearch:
                 times[key] += 1
                 self.reached.setdefault(key, route)
                 for ahead in list(self.roadmap.set_out(place, self.goal)):
-                    if self._is_back(route, ahead.chain.borders[0]):
+                    if self._is_back(route, ahead[0]):
                         continue
-                    if isinstance(ahead.link, Link):
+                    if isinstance(ahead[1], Link):
                         put_along(route.links, ahead)
-                    elif times[key] == 1 and ahead.link not in self.blocked:
-                        self.blocked.append(ahead.link)
+                    elif times[key] == 1 and ahead[1] not in self.blocked:
+                        self.blocked.append(ahead[1])
                 if not place.landed:
-                    for index, (border, _) in enumerate(self.roadmap.follow(place)):
-                        if not self._is_back(route, border):
-                            put(route, place, (border, index), rule.leaving * time)
+                    for index, chain in enumerate(self.roadmap.follow(place)):
+                        if not self._is_back(route, chain):
+                            put(route, place, (chain.borders[0], index), rule.leaving * time)
                     put(route, place, "cells", CROSSING * time)
                 continue
             if isinstance(work, tuple):
-                border, index = work
-                links = self.roadmap.release(border, index)
-                links = [*links, *self.roadmap.land_at(links, self.goal)]
+                links = self.roadmap.release(*work)
             else:
-                links = [
-                    *self.roadmap.cross_cells(place),
-                    *self.roadmap.end_in_cell(place, self.goal),
-                ]
-                links += self.roadmap.land_at(links, self.goal)
-            for link in links:
-                if isinstance(link, Link):
-                    put(RoadmapRoute((*route.links, link)), link.stop, None)
-                elif link not in self.blocked:
-                    self.blocked.append(link)
+                links = self.roadmap.cross_cells(place)
+            moved = self.roadmap.land_at(links, self.goal)
+            ends = () if isinstance(work, tuple) else self.roadmap.end_in_cell(place, self.goal)
+            for link in (*links, *ends, *moved):
+                put(RoadmapRoute((*route.links, link)), link.stop, None)
 
     @staticmethod
-    def _is_back(route: RoadmapRoute, border: BorderEdge) -> bool:
-        """Whether a border is the one that a route has just followed."""
+    def _is_back(route: RoadmapRoute, chain: Chain) -> bool:
+        """Whether a chain begins with the border that a route has just followed."""
         if not route.links or route.links[-1].in_cell:
             return False
         last = route.links[-1].steps[-1].contacts
-        return set(last) == set(border.formation.contacts)
+        return set(last) == set(chain.borders[0].formation.contacts)

@@ -74,8 +74,9 @@ def list_cut_borders(search: RouteSearch) -> list[CutBorder]:
     """At most `CUT` borders of the cut, the nearest to the goal first."""
     found = list[CutBorder]()
     for blocked in list_cut(search):
-        for border, link in search.roadmap.follow(blocked.start):
-            if link is blocked:
+        for chain in search.roadmap.follow(blocked.start):
+            border = chain.borders[0]
+            if chain.link is blocked:
                 found.append(CutBorder(blocked, border))
                 break
             if set(border.formation.contacts) == set(blocked.steps[-1].contacts):

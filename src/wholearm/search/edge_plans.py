@@ -32,18 +32,9 @@ from ..planning.stops import end_of, split_blocks
 from ..problem.definition import ROWS, End, Phase, Problem
 from ..scene.model import Scene
 from ..solvers.ipopt import SolverStatistics, open_ledger
-from .astar import RoadmapRoute
 from .edges import EdgeStep, Link, describe_steps, find_headings, point_out
 from .feasibility import SINGULAR, Measured, make_phases
 from .places import measure_apart
-
-
-@dataclass(frozen=True, eq=False)
-class FailedCandidate:
-    """A route that has no plan."""
-
-    route: RoadmapRoute
-    reason: str
 
 
 class Lost(str):

@@ -38,10 +38,10 @@ class Measured(NamedTuple):
     begun: list[PhasePlan[TimeMotion]]
 
 
-def make_phases(problem: Problem, steps: Sequence[EdgeStep], index: int = 0) -> list[Phase]:
-    """Steps as phases, the first of them with an index."""
+def make_phases(problem: Problem, steps: Sequence[EdgeStep]) -> list[Phase]:
+    """Steps as phases."""
     return [
-        Phase(index + k, Formation(problem.scene, step.contacts), step.until, step.end)
+        Phase(k, Formation(problem.scene, step.contacts), step.until, step.end)
         for k, step in enumerate(steps)
     ]
 

@@ -247,11 +247,9 @@ def _plan_to_goal(
             if hurry is None and not isinstance(error, OutOfTime):
                 raise
             complete = False
-    others = tuple(Alternative(other, other.problem) for other, _ in made[1 : 1 + alternatives])
+    others = tuple(Alternative(other) for other, _ in made[1 : 1 + alternatives])
     failures, blocked = tuple(chooser.failures), tuple(search.blocked)
-    return Answer(
-        plan, plan.problem, route, bound, others, failures, blocked, search.settled, complete
-    )
+    return Answer(plan, route, bound, others, failures, blocked, search.settled, complete)
 
 
 def _describe_missing(chooser: Chooser, doing: str) -> str:

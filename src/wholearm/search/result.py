@@ -18,7 +18,6 @@ from ..problem.definition import Problem
 from ..problem.table import SAME, describe_phase, write_toml
 from .astar import EAGER, RoadmapRoute, RouteSearch
 from .cuts import list_cut
-from .edge_plans import FailedCandidate
 from .edges import ROUGHLY, Blocked, Link, describe_steps
 from .places import Key, RoadmapPlace, is_at
 from .roadmap import LONGEST
@@ -38,7 +37,11 @@ class Alternative(Result):
     """A route with its plan."""
 
     plan: Plan
-    problem: Problem  # its phases are the route
+
+    @property
+    def problem(self) -> Problem:
+        """The problem with phases, the route, in place of its goals."""
+        return self.plan.problem
 
     @property
     def headline(self) -> str:
@@ -68,19 +71,13 @@ class Alternative(Result):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Answer(Alternative):
-    """The best route that was found, with its plan.
-
-    Attributes
-    ----------
-    plan
-    problem  the problem with phases in place of its goals
-    """
+    """The best route that was found, with its plan."""
 
     route: RoadmapRoute  # to the last goal
     # lower bound of routes along borders; None with several goals or an interrupted search
     bound: BorderBound | None
     alternatives: tuple[Alternative, ...]
-    failures: tuple[FailedCandidate, ...]  # routes that were planned, or tried, in vain
+    failures: tuple[str, ...]  # why routes have no plan
     blocked: tuple[Blocked, ...]  # borders that no motion can follow
     settled: int  # places that were looked at
     complete: bool  # whether the search ended by itself
@@ -142,7 +139,7 @@ class Answer(Alternative):
             "complete": self.complete,
             "in_cells": self.route.in_cells,
             "alternatives": [other.values for other in self.alternatives],
-            "failures": [failure.reason for failure in self.failures],
+            "failures": list(self.failures),
             "blocked": [f"{_describe_border(b)}: {b.reason}" for b in self.blocked],
             "not_considered": NOT_CONSIDERED,
         }
@@ -155,7 +152,7 @@ def format_phases(problem: Problem) -> str:
 
 def describe_block(
     search: RouteSearch,
-    failures: Sequence[FailedCandidate],
+    failures: Sequence[str],
     opening: str = "",
     explain: Callable[[Blocked], str] = lambda blocked: blocked.reason,
 ) -> str:
@@ -170,7 +167,7 @@ def describe_block(
         text += f"{len(cut)} border{'s'[:many]} lead{'s'[many:]} on from there, "
         text += "all of them blocked" if many else "and is blocked"
     # After the first part, reasons give advice on the plan.
-    reasons = list(dict.fromkeys(failure.reason.split("; ")[0] for failure in failures))[:FAILED]
+    reasons = list(dict.fromkeys(reason.split("; ")[0] for reason in failures))[:FAILED]
     reasons += [f"{_describe_border(b)}: {explain(b)}" for b in cut[: LISTED - len(reasons)]]
     return "; ".join([text, *reasons, *([opening] if opening else [])])
 
@@ -226,8 +223,8 @@ def _find_shortest(
             return BorderBound(cost, False), ()
         settled.add(place.key)
         if place.key not in links_from:
-            pairs = search.roadmap.list_along(place, search.goal)
-            links_from[place.key] = [link for _, link in pairs if isinstance(link, Link)]
+            every = search.roadmap.list_along(place, search.goal)
+            links_from[place.key] = [link for _, link, _ in every if isinstance(link, Link)]
         for link in links_from[place.key]:
             bound = link.fine_bound if link in refined else ROUGHLY * link.bound
             heapq.heappush(queue, (cost + bound, next(order), link.stop, (*links, link)))

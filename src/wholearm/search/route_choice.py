@@ -17,7 +17,7 @@ from ..planning.options import Objective, PlanOptions
 from ..planning.result import Plan
 from ..problem.definition import Problem
 from .astar import CAREFUL, EAGER, RoadmapRoute, RouteSearch, SearchRule
-from .edge_plans import BackgroundTask, FailedCandidate, Lost, can_join, join_route, plan_phases
+from .edge_plans import BackgroundTask, Lost, can_join, join_route, plan_phases
 from .edges import Link, describe_steps, leave_at
 from .feasibility import Measured, leave_in_motion, measure_link
 from .result import BorderBound, bound_borders
@@ -126,7 +126,7 @@ class Chooser:
         self.options, self.roadmap, self.jobs = options, search.roadmap, jobs
         self.found: list[RoadmapRoute] = []
         self.made: list[tuple[Plan, RoadmapRoute]] = []
-        self.failures: list[FailedCandidate] = []
+        self.failures: list[str] = []
         self._prefetched: dict[Link, Found] = {}
         self._measurements = 0
         self._bound: tuple[float, BackgroundTask[BorderBound]] | None = None
@@ -166,7 +166,7 @@ class Chooser:
             # An interrupted one is still there, to be planned then.
             self.found.remove(route)
             if isinstance(plan, str):
-                self.failures.append(FailedCandidate(route, plan))
+                self.failures.append(plan)
                 if isinstance(plan, Lost):
                     self._lost.append(plan.links)
             else:

@@ -20,6 +20,7 @@ from ..common.errors import InputError, name_source
 from ..common.fields import SHARE
 from ..common.sharing import exclusive
 from ..contacts.contact_limits import takes_over
+from ..geometry.curve import find_root
 from ..problem.definition import End, Phase, Problem, Until
 from ..problem.read import require_phases
 from ..quasistatic.slow_speeds import SQUEEZE, find_torques, sample_path
@@ -37,7 +38,6 @@ LASTS = 40.0
 """How long a trial goes on after its last step of the torques, relative to the scene's time."""
 _BACK = 1e-6
 """Share of the way by which the end is farther away than before once the motion has turned back."""
-_NUDGE = 1e-6  # time over which a rate is a difference, relative to the scene's
 
 
 class TrialOutcome(Enum):
@@ -88,15 +88,6 @@ class TuningTrial(NamedTuple):
         return f"{text}, {abs(self.short):.3g} away from it"
 
 
-class Landing(NamedTuple):
-    """The object held at the end of a phase."""
-
-    z: Array  # (5,): where it is held
-    rests: bool  # whether everything rests there in the end
-    parted: float  # [s]: for how long a contact of the phase, or of the next, parts meanwhile
-    contact: str  # that contact
-
-
 def make_rows(steps: Sequence[TuningStep], end: float) -> Array:
     """A table of t and both torques, shape (n, 3), that steps from one constant to the next."""
     t = np.repeat([*(step.time for step in steps), end], 2)[1:-1]
@@ -136,14 +127,10 @@ class Bench:
         return self.pair is None and self.column == 2
 
     def measure(self, z: Array) -> Array:
-        """How far away the end of the passage is, from (n, 5) to (n,) [m or rad].
-
-        Where a contact goes on as that of a neighbouring feature it is how far it has to slide.
-        """
+        """How far away the end of the passage is, from (n, 5) to (n,) [m or rad]."""
         if self.pair is None:
             return self.sign * (z[:, self.column] - self.value)
-        gaps, ranges = self.system.measure(z)
-        return np.asarray(-ranges[:, self.pair] if self.passage.passed else gaps[:, self.pair])
+        return np.asarray(self.system.measure(z)[0][:, self.pair])
 
     def run(self, steps: Sequence[TuningStep]) -> TuningTrial:
         """Simulate torques until the end of the passage, or what keeps it from coming."""
@@ -154,33 +141,23 @@ class Bench:
         self.trials.append(self._judge(tuple(steps), simulation))
         return self.trials[-1]
 
-    def land(self, steps: Sequence[TuningStep], arrival: float, pause: float) -> Landing:
-        """Simulate torques that hold the object at the end of the passage.
+    def land(self, steps: Sequence[TuningStep], arrival: float, end: float) -> tuple[Array, str]:
+        """Simulate torques that hold the object from its arrival [s] to an end [s].
 
-        Parameters
-        ----------
-        arrival : [s]  when the end is reached
-        pause : [s]    how long it is held
+        Returns where it is then, (5,), and what does not hold; empty if everything rests and no
+        contact of the next phase, or else of the last one, has parted.
         """
         self.simulations += 1
-        end, passage = arrival + pause, self.passage
         simulation = simulate_free(self.problem, read_rows(make_rows(steps, end)), start=self.z)
-        stretches = simulation.stretches
-        if passage.passed:
-            # Whichever of the two presses where they meet.
-            stretches = tuple(
-                stretch._replace(contact=passage.passed)
-                if stretch.contact == self.until
-                else stretch
-                for stretch in stretches
-            )
-        later = passage.after or passage.phases[-1]
-        names = later.formation.names
-        pauses = {name: list_pauses(stretches, name, arrival, end) for name in names}
+        names, reason = (self.passage.after or self.passage.phases[-1]).formation.names, ""
+        pauses = {name: list_pauses(simulation.stretches, name, arrival, end) for name in names}
         parted = {name: max((b - a for a, b in own), default=0.0) for name, own in pauses.items()}
         worst = max(parted, key=parted.__getitem__)
-        rests = not simulation.z_dot[-1].any() and simulation.t[-1] == end
-        return Landing(simulation.z[-1], rests, parted[worst], worst)
+        if parted[worst] > REST_WINDOW * self.problem.scene.scales.time:
+            reason = f"{worst} parts for {1e3 * parted[worst]:.3g} ms"
+        elif simulation.z_dot[-1].any() or simulation.t[-1] != end:
+            reason = "the object does not come to rest there"
+        return simulation.z[-1], reason
 
     def _is_over(self, run: FreeRun) -> bool:
         if run.t == 0:
@@ -198,11 +175,9 @@ class Bench:
         ends, lost = self.passage.follow(simulation.events)
         arrival = ends[-1] if len(ends) == len(self.passage.phases) else math.inf
         if self.pair is None and gaps.min() <= 0:
-            from scipy.optimize import brentq
-
             row, motion = int(np.flatnonzero(gaps <= 0)[0]), simulation.trajectory
             a, b = (float(t) for t in simulation.t[row - 1 : row + 1])
-            arrival = float(brentq(lambda t: self.measure(motion.at([t]).z)[0], a, b, xtol=1e-14))
+            arrival = find_root(lambda t: float(self.measure(motion.at([t]).z)[0]), a, b)
         before = len(self.passage.phases) - 1
         start = [0.0, *ends][before] if len(ends) >= before else math.inf  # of the last phase
         turn = self._find_turn(simulation, gaps, start)
@@ -280,10 +255,6 @@ class Bench:
         z, v, a = run.z[at], run.z_dot[at], run.z_ddot[at]
         if self.pair is None:
             return (-self.sign * float(v[self.column]), self.sign * float(a[self.column]), z)
-        if self.passage.passed:
-            step = _NUDGE * self.problem.scene.scales.time
-            back, _, on = (float(x) for x in self.measure(z + np.outer([-step, 0, step], v)))
-            return (back - on) / (2 * step), 0.0, z
         rows = self.system.evaluate(z, v, [self.pair])
         return -float(rows.A[0] @ v), float(rows.A[0] @ a + rows.bend[0]), z
 
@@ -304,11 +275,6 @@ class Passage:
     def title(self) -> str:
         """The numbers of its phases, for people."""
         return name_numbers(self.phases[0].number, self.phases[-1].number)
-
-    @property
-    def passed(self) -> str:
-        """The contact that goes on as the one which ends it, empty if none does."""
-        return _find_predecessor(self.phases[-1], self.after)
 
     def list_pressed(self, index: int) -> list[str]:
         """The contacts of a phase that press to its end: without those that it releases."""
@@ -700,16 +666,13 @@ class _Setting(NamedTuple):
         reason, until = "", self.passage.until
         for tau in self._list_holds(rule, trial):
             steps = trial.steps if tau is None else (*trial.steps, TuningStep(trial.time, tau))
-            landing = rule.bench.land(steps, trial.time, self.pause)
+            z, text = rule.bench.land(steps, trial.time, trial.time + self.pause)
             own = replace(own, steps=steps, simulations=rule.bench.simulations)
+            if not text:
+                return own, z, ""
             unit = "rad/s" if rule.bench.is_angle else "m/s"
-            rate = f"{until} is reached at {trial.rate:.3g} {unit} at t = {trial.time:.5g} s, and "
-            if landing.parted > REST_WINDOW * self.problem.scene.scales.time:
-                reason = f"{rate}{landing.contact} parts for {1e3 * landing.parted:.3g} ms"
-            elif not landing.rests:
-                reason = f"{rate}the object does not come to rest there"
-            else:
-                return own, landing.z, ""
+            rate = f"{until} is reached at {trial.rate:.3g} {unit} at t = {trial.time:.5g} s"
+            reason = f"{rate}, and {text}"
         return own, None, reason
 
     def _list_holds(self, rule: TuningRule, trial: TuningTrial) -> list[tuple[float, float] | None]:
