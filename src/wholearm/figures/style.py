@@ -88,9 +88,9 @@ def choose_prefix(size: float) -> tuple[str, float]:
     return next((prefix, factor) for least, prefix, factor in _PREFIXES if size >= least)
 
 
-def count_decimals(size: float, digits: int = 3) -> int:
-    """Decimals that show so many significant digits of a value of this size, at least 3."""
-    return max(3, digits - 1 - math.floor(math.log10(size))) if size > 0 else 3
+def count_decimals(size: float) -> int:
+    """Decimals that show three significant digits of a value of this size, at least 3."""
+    return max(3, 2 - math.floor(math.log10(size))) if size > 0 else 3
 
 
 def unit_of(axes: Axes) -> str:

@@ -18,8 +18,8 @@ CLOSED = 3e-11  # largest gap of closed contacts, and coordinate error, in radii
 _STEP = 1e-5  # step of difference quotients of limits, in radii of gyration or rad
 
 
-Fixed = tuple[tuple[int, float], ...]
-"""Rows of z, and values that they have to take."""
+Fixed = tuple[tuple[int, float | Array], ...]
+"""Rows of z, and values that they have to take, one or (n,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +118,8 @@ def close_all(
         residual = np.hstack([kinematics.C, formation.evaluate_slip(z) - slip])
         rows = kinematics.P
         for row, value in fixed:
-            residual = np.column_stack([residual, z[:, row] - value])
+            own = np.broadcast_to(value, len(found))[left]
+            residual = np.column_stack([residual, z[:, row] - own])
             one = np.broadcast_to(np.eye(5)[row], (len(z), 1, 5))
             rows = np.concatenate([rows, one], axis=1)
         if active:

@@ -100,11 +100,11 @@ def make_policy(
     most = MOST * scales.acceleration
     settings = LoopSettings(period, delay, *speeds, DWELL, most, (limit[0], limit[1]))
     blocks = split(problem.phases)
-    curves = [len(block) == 1 and runs_on_curve(block[0]) for block in blocks]
+    along = [_find_curve(block) for block in blocks]
     starts = plan.phase_starts
     if reserve and planner is not None:
+        curves = [phase is not None for phase in along]
         plan = replan(planner, problem, blocks, curves, plan)
-    along = [block[0] if curve else None for block, curve in zip(blocks, curves, strict=True)]
     pieces = trace_pieces(problem, along, plan, Reserve(reserve, ranges, delay))
     tables, about = list[dict[str, Array]](), list[dict[str, Any]]()
     for block, piece in zip(blocks, pieces, strict=True):
@@ -147,6 +147,11 @@ def split(phases: Sequence[Phase]) -> list[tuple[Phase, ...]]:
         else:
             blocks.append([phase])
     return [tuple(block) for block in blocks]
+
+
+def _find_curve(block: Sequence[Phase]) -> Phase | None:
+    """The phase of a block that is one along a curve."""
+    return block[0] if len(block) == 1 and runs_on_curve(block[0]) else None
 
 
 def _find_end_torques(
@@ -402,8 +407,7 @@ def find_widest(problem: Problem, plan: Trajectory, delay: float) -> dict[int, f
         raise InputError("", "uncertainty", "is missing; without ranges none is the widest")
     relative = max(ranges.get(p.name, 0.0) for p in PARAMETERS if not p.unit)
     most = min(WIDEST / relative, WIDEST_FACTOR) if relative > 0 else WIDEST_FACTOR
-    blocks = split(problem.phases)
-    along = [b[0] if len(b) == 1 and runs_on_curve(b[0]) else None for b in blocks]
+    along = [_find_curve(block) for block in split(problem.phases)]
     pieces = trace_pieces(problem, along, plan, Reserve(most, ranges, delay))
     return {
         phase.number: most * piece.share

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..common.arrays import Array
 from ..geometry.curve import Curve, directions_of
 from ..geometry.tracing import trace_phase
-from ..mechanics.dynamics import LAMBDA, inverse, metric_weights
+from ..mechanics.dynamics import inverse, metric_weights
 from ..problem.definition import End, Phase, Problem
 from ..results.trajectory import Trajectory
 from .curve_rows import (
@@ -24,6 +24,7 @@ from .curve_rows import (
     measure_levels,
     split_limits,
 )
+from .regulator import find_planned_internal_force
 from .retiming import ENOUGH, Reach, retime
 
 INTERVALS = 120  # intervals of a curve's table, dense at its ends
@@ -215,11 +216,8 @@ def _follow(
     a = (point.z_s * plan.z_ddot[rows]) @ metric
     segment = np.searchsorted([part.stop for part in curve.segments[:-1]], s)
     forces = inverse(formation, *point[:3], directions_of(curve, segment), point.kinematics)
-    columns = [plan.contacts.index(name) for name in formation.names]
-    rolls = [columns[row] for row in formation.rolling_rows]
-    c = np.hstack([plan.c_n[rows][:, columns], plan.c_t[rows][:, rolls]])
-    # The other parts of the forces are orthogonal to that of the internal force.
-    return s, a, v**2, np.asarray(np.einsum("ni,ni->n", c, forces.of_c[..., LAMBDA]))
+    c_n, c_t = plan.c_n[rows], plan.c_t[rows]
+    return s, a, v**2, find_planned_internal_force(formation, forces, plan, c_n, c_t)
 
 
 def _place_nodes(curve: Curve) -> Array:

@@ -120,11 +120,19 @@ def _stretch(formation: Formation, plan: Trajectory, t: Array) -> RegulatedStret
     near = moves[np.abs(moves[None] - np.arange(len(t))[:, None]).argmin(axis=1)]
     directions = Directions(Xi[near], sigma[near])
     forces = inverse(formation, z, v, samples.z_ddot, directions, kinematics)
+    internal = find_planned_internal_force(formation, forces, plan, samples.c_n, samples.c_t)
+    return RegulatedStretch(formation, z, v, directions, forces, internal)
+
+
+def find_planned_internal_force(
+    formation: Formation, forces: PathForces, plan: Trajectory, c_n: Array, c_t: Array
+) -> Array:
+    """Internal force of a plan at n instants, (n,) [N], from its contact forces c_n, c_t (n, m)."""
     columns = [plan.contacts.index(name) for name in formation.names]
     rolls = [columns[row] for row in formation.rolling_rows]
-    c = np.hstack([samples.c_n[:, columns], samples.c_t[:, rolls]])
-    internal = np.asarray(np.einsum("ni,ni->n", c, forces.of_c[..., LAMBDA]))
-    return RegulatedStretch(formation, z, v, directions, forces, internal)
+    c = np.hstack([c_n[:, columns], c_t[:, rolls]])
+    # The other parts of the forces are orthogonal to that of the internal force.
+    return np.asarray(np.einsum("ni,ni->n", c, forces.of_c[..., LAMBDA]))
 
 
 def _split_modes(phase: Phase, plan: Trajectory, t: Array) -> list[tuple[Formation, Array]]:

@@ -21,6 +21,7 @@ from ..common.fields import SHARE
 from ..common.sharing import exclusive
 from ..contacts.formation import Formation, Kinematics
 from ..geometry.curve import Curve
+from ..geometry.explore import close_all
 from ..geometry.path_guess import RELEASE_AT, count_freedoms, find_end, guess_phase
 from ..geometry.tracing import trace_phase
 from ..mechanics.dynamics import (
@@ -34,15 +35,13 @@ from ..mechanics.dynamics import (
     reduced_inertia,
     split_forces,
 )
-from ..mechanics.limits import CONE, PRESS, SPEED
+from ..mechanics.limits import CONE, PRESS
 from ..problem.definition import End, Phase, Problem
 from ..problem.read import require_phases
 from ..results.torque import TorqueProfile
 from .squeeze import InternalForceLimits
 
 PLACES = 241  # about how many places of a phase are looked at
-_NEWTON = 20  # most steps that close contacts
-_CLOSED = 1e-11  # step that counts as none, in radii of gyration or radians
 _SCALED_SPEEDS = np.geomspace(1e-2, 1e2, 49)
 """Speeds at which a break is looked for, over the scene's speed."""
 _HALVINGS = 24  # steps of bisection
@@ -309,17 +308,19 @@ def evaluate_best(path: PathSamples, profile: UnitProfile) -> Evaluate:
 def evaluate_torques(path: PathSamples, tau: Array) -> Evaluate:
     """Least normal force by a steady speed, under given torques, shape (n, 2) [N m]."""
     limits = path.force_limits.limits
-    of_c, _, of_rates = limits.columns
-    owners, soft = limits.owners, limits.of("press", "cone")
-    weights = np.concatenate([limit.weight for limit in limits.limits])
-    fast = limits.of(SPEED)
+    of_c, of_tau, of_rates = limits.columns
+    owners, soft = limits.owners, limits.of(PRESS, CONE)
+    weights = np.concatenate([limit.weight for limit in limits.limits])[soft]
+    others = np.setdiff1d(np.arange(len(owners)), soft)
+    # Torques that keep a limit to rounding keep it.
+    slack = 1e-9 * limits.scales[others]
 
     def evaluate(speed: float) -> Least:
-        c = path.press_under(tau, speed)
-        force = (c @ of_c.T)[:, soft] / weights[soft]
-        rates = np.abs(speed * path.z_s[:, 3:] @ of_rates[fast].T)
-        over = (rates > limits.high[fast]).any(axis=1)
-        force[over] = -np.inf
+        rates = speed * path.z_s[:, 3:]
+        values = path.press_under(tau, speed) @ of_c.T + tau @ of_tau.T + rates @ of_rates.T
+        force, rest = values[:, soft] / weights, values[:, others]
+        over = (rest > limits.high[others] + slack) | (rest < limits.low[others] - slack)
+        force[over.any(axis=1)] = -np.inf
         place, row = np.unravel_index(int(force.argmin()), force.shape)
         return Least(float(force[place, row]), int(place), (int(owners[soft[row]]),))
 
@@ -452,17 +453,12 @@ def _straighten(
     """Arc lengths, z, z_s and z_ss along a straight line in (x, phi), and the formation there."""
     u = (1 - np.cos(np.linspace(0.0, np.pi, PLACES))) / 2
     way = goal - start
-    z, slip = start + u[:, None] * way, formation.evaluate_slip(start[None])[0]
-    metric, none, count = metric_weights(formation.scene), np.zeros_like(z), formation.n_constraints
+    line, slip = start + u[:, None] * way, formation.evaluate_slip(start[None])[0]
+    z = close_all(formation, line, slip, ((0, line[:, 0]), (2, line[:, 2])))
+    metric, count = metric_weights(formation.scene), formation.n_constraints
     pose = np.broadcast_to(np.eye(5)[[0, 2]], (PLACES, 2, 5))
-    for _ in range(_NEWTON):
-        at = formation.evaluate(z, none)
-        inverse_rows = np.linalg.inv(np.concatenate([at.P, pose], axis=1))
-        off = np.hstack([at.C, formation.evaluate_slip(z) - slip])
-        change = np.einsum("nij,nj->ni", inverse_rows[..., :count], off)
-        if np.abs(change * np.sqrt(metric)).max() < _CLOSED * formation.scene.scales.length:
-            break
-        z = z - change
+    P = formation.evaluate(z, np.zeros_like(z)).P
+    inverse_rows = np.linalg.inv(np.concatenate([P, pose], axis=1))
     z_u = inverse_rows[..., count:] @ way[[0, 2]]
     bend = formation.evaluate(z, z_u).P_dot_v
     z_uu = -np.einsum("nij,nj->ni", inverse_rows[..., :count], bend)

@@ -44,9 +44,9 @@ class RoadmapPlace:
         return describe_pose(self.z)
 
 
-def make_place(scene: Scene, z: Array, landed: bool = False) -> RoadmapPlace:
+def make_place(scene: Scene, z: Array) -> RoadmapPlace:
     """The place of a configuration, with all contacts that touch there."""
-    return RoadmapPlace(scene, z, find_touching(scene, z), landed)
+    return RoadmapPlace(scene, z, find_touching(scene, z))
 
 
 def close_place(place: RoadmapPlace) -> RoadmapPlace | None:
