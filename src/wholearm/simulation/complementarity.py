@@ -35,7 +35,7 @@ from .contact_problem import (
 from .events import EventKind, describe_change
 from .rest import find_roots
 from .root_finding import find_root
-from .run import Feedback, Run, StuckError, find_torque_steps
+from .run import Feedback, Run, StuckError
 from .stepper import Modes
 from .system import ContactRows, System
 from .tolerances import ROUNDING_FORCE, SHORTEST_STEP, STANDING, STILL
@@ -193,6 +193,9 @@ class FreeRun(Run):
             names = (self.system.names[pair] for pair in last.kept)
             forces = dict(zip(names, last.c_n.tolist(), strict=True))
         self.feedback.begin(self.piece, theta, theta_dot, forces)
+        if self.piece:
+            pieces = self.torque.coefficients[self.piece - 1 : self.piece + 1]
+            self.steps_at[self.piece] = bool(self.find_torque_steps(pieces)[0])
 
     def note_at(
         self, kind: EventKind, text: str, contact: str = "", value: float = math.nan
@@ -648,8 +651,7 @@ class FreeRun(Run):
         if not self.next_piece():
             return True
         self.feed()
-        before, after = self.torque.coefficients[self.piece - 1 : self.piece + 1]
-        if find_torque_steps(before[None], after[None], self.system)[0]:
+        if self.steps_at[self.piece]:
             self.s.look()
             self.start = self._view(0.0)
             if not self._holds(self.start):

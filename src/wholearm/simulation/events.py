@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from itertools import groupby
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -242,6 +243,9 @@ class Record(NamedTuple):
         return Record(t, phase, section, kept, *state, out[to.c_n], out[to.c_t], impact)
 
 
+_NUMBERS = attrgetter("t", "phase", "y", "acceleration", "tau", "impact")
+
+
 def collect(system: System, rows: Sequence[Record], contacts: Sequence[str]) -> dict[str, Any]:
     """Fields of a simulation that its records, in order, have, with the forces of some contacts."""
     n, columns = system.n, {name: column for column, name in enumerate(contacts)}
@@ -254,10 +258,8 @@ def collect(system: System, rows: Sequence[Record], contacts: Sequence[str]) -> 
             if (column := columns.get(system.names[pair])) is not None:
                 forces[:, first:last, column] = values[:, :, k].T
         first = last
-    names = ("t", "phase", "y", "acceleration", "tau", "impact")
-    t, phase, y, z_ddot, tau, impact = (
-        np.array([getattr(r, name) for r in rows]) for name in names
-    )
+    every = [np.array(column) for column in zip(*map(_NUMBERS, rows), strict=True)]
+    t, phase, y, z_ddot, tau, impact = every
     z, z_dot = y[:, :n], y[:, n : 2 * n]
     work, viscous, dry, contact = y[:, 2 * n :].T
     energies = Energies(system.stored(z, z_dot), work, viscous, dry, contact, impact)
@@ -267,18 +269,28 @@ def collect(system: System, rows: Sequence[Record], contacts: Sequence[str]) -> 
     }
 
 
-def list_stretches(records: Sequence[Record], names: Sequence[str]) -> tuple[FreeStretch, ...]:
+def list_stretches(rows: Sequence[Record], names: Sequence[str]) -> tuple[FreeStretch, ...]:
     """When each pair pressed, without a pause."""
     stretches: list[FreeStretch] = []
-    groups = [list(group) for _, group in groupby(records, lambda row: row.kept)]
-    for pair in dict.fromkeys(pair for group in groups for pair in group[0].kept):
-        for presses, run in groupby(groups, lambda group: pair in group[0].kept):  # noqa: B023
-            if presses:
-                rows = [row for group in run for row in group]
-                c_n = np.array([row.c_n[row.kept.index(pair)] for row in rows])
-                at = 0 if np.isnan(c_n).all() else int(np.nanargmin(c_n))
-                ends = rows[0].t, rows[-1].t
-                stretches.append(FreeStretch(names[pair], *ends, float(c_n[at]), rows[at].t))
+    pressing: dict[int, tuple[list[float], list[Array]]] = {}
+
+    def end(kept: Sequence[int]) -> None:
+        for pair in [pair for pair in pressing if pair not in kept]:
+            times, parts = pressing.pop(pair)
+            c_n = np.concatenate(parts)
+            at = 0 if np.isnan(c_n).all() else int(np.nanargmin(c_n))
+            least = float(c_n[at]), times[at]
+            stretches.append(FreeStretch(names[pair], times[0], times[-1], *least))
+
+    for kept, group in groupby(rows, lambda row: row.kept):
+        end(kept)
+        block = list(group)
+        forces = np.array([row.c_n for row in block])
+        for k, pair in enumerate(kept):
+            times, parts = pressing.setdefault(pair, ([], []))
+            times += [row.t for row in block]
+            parts.append(forces[:, k])
+    end(())
     return tuple(sorted(stretches, key=lambda stretch: (stretch.start, stretch.contact)))
 
 

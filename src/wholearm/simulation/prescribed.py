@@ -16,7 +16,6 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from itertools import product
 from typing import Any, NamedTuple, NoReturn
 
 import casadi as ca
@@ -28,16 +27,15 @@ from ..contacts.contact_limits import takes_over
 from ..contacts.elemental import GapLimit, build_features, build_gap
 from ..contacts.formation import Formation
 from ..mechanics.impact import ViolationKind, compute_impact, solve_impulses
-from ..mechanics.statics import find_static_torques
 from ..problem.definition import End, Phase, Problem, Until
 from ..results.torque import TorqueProfile
 from .events import EventKind, Outcome, OutcomeKind, Record
 from .hand import build_system
 from .modes import FREE, Grips, Mode, find_fixed, find_grips, list_units, share_mode
-from .rest import BALANCED, Collapse, Rest, StartDeparture, close_contacts, find_rest
+from .rest import Collapse, Rest, StartDeparture, close_contacts, find_rest
 from .root_finding import find_root
-from .run import Run, StuckError, find_torque_steps
-from .sliding_signs import choose_mode, measure_rates, note_change
+from .run import Run, StuckError
+from .sliding_signs import choose_mode, note_change
 from .stepper import Modes, ModeStepper
 from .tolerances import (
     CREEPING,
@@ -66,7 +64,6 @@ _OUTCOMES = {
     ViolationKind.CLOSING: OutcomeKind.LIMIT_REACHED,
     ViolationKind.HELD: OutcomeKind.HELD,
 }
-_HELD_AT = 5  # places of a piece of the torques at which they have to hold the object
 
 
 class LegRows(NamedTuple):
@@ -213,7 +210,6 @@ class Replay(Run):
     until_unit : [m or rad]  unit of the distance to the end of the phase
     passes                   whether the end may be passed at any speed, without an impact
     moving                   whether the motion goes on into the next phase
-    previous                 formation of the last phase that has ended at rest
     stuck                    contacts, then joints, that stick while the rest moves
     taken                    steps so far, but for those that coast
     """
@@ -235,14 +231,10 @@ class Replay(Run):
         self.settling, self.rest_window = SETTLING * time, REST_WINDOW * time
         self.longest_window, self.shortest_step = LONGEST_WINDOW * time, SHORTEST_STEP * time
         self.rounding = ROUNDING_FORCE * system.scales.force
-        parts = torque.coefficients
-        steps = find_torque_steps(parts[:-1], parts[1:], system)
-        self.steps_at: list[bool] = [True, *steps.tolist()]
         self.step_times = [b for b, s in zip(self.breaks, self.steps_at, strict=False) if s]
         self.held_until = self.settled_by = -math.inf
         self.until_unit = self.side = 1.0
         self.passes = self.moving = self.has_slid = False
-        self.previous: Formation | None = None
         self.stuck: set[int] = set()
         self.slip_signs: dict[str, float] = {}
         self.decided = (-math.inf, 0)
@@ -477,7 +469,6 @@ class Replay(Run):
         self.moving = self.phase.end is End.SMOOTH
         if self.moving:
             return None
-        self.previous = self.formation
         self.set_velocity(0.0)
         # The torques of the phase that has ended go on until they step, or end.
         coming = min(self.coming_step, self.breaks[-1])
@@ -519,22 +510,13 @@ class Replay(Run):
                     # phase's.
                     t = self.time(change.x)
                     soon = self.coming_step - t <= self.rest_window
-                    if not (t < self.settled_by or soon or self._touches()):
+                    if not (t < self.settled_by or soon):
                         return self._collapse(rest, change)
             if self.t < self.settled_by < self.stop:
                 self.wait(self.settled_by)
             else:
                 self.wait(self.stop)
                 self.next_piece()
-
-    def _touches(self) -> bool:
-        """Whether both phases' contacts balance rate-limited torques on the present piece."""
-        if self.previous is None or not self.problem.scene.has_slow_motors:
-            return False
-        contacts = dict.fromkeys((*self.formation.contacts, *self.previous.contacts))
-        static = find_static_torques(Formation(self.problem.scene, tuple(contacts)), self.z)
-        torques = np.array([self.tau(t) for t in np.linspace(self.t, self.stop, _HELD_AT).tolist()])
-        return bool(static.measure(torques).max() <= BALANCED * self.problem.scene.scales.torque)
 
     def _collapse(self, rest: Rest, change: Collapse) -> Released | Switched | Outcome:
         """End because nothing balances at rest."""
@@ -683,11 +665,6 @@ class Replay(Run):
             # A motion that is off by rounding comes the earlier the slower it is.
             early = PASSED * self.until_unit / rate
             window = min(max(early, settling), self.longest_window)
-        elif self.phase.until.contact is not None and not strikes:
-            self.step_to(settling)
-            slowing = (self.rate + rate) / settling
-            if slowing > 0:
-                window = min(max(2 * rate / slowing, settling), self.longest_window)
         if self.steps_within(window):
             self.coast_to_step(hide=False)
         return Arrival(rate, window, strikes)
@@ -785,20 +762,7 @@ class Replay(Run):
         movable = {row for unit in list_units(formation) for row in unit.rows}
         signs[[row for row in range(len(signs)) if row not in movable]] = 0.0
         self.signs = signs
-        if formation.n_constraints < 4:
-            return self.restart(enters=True)
-        slow = STANDING * measure_rates(self.problem.scene, formation.n_contacts)
-        still = np.flatnonzero((np.abs(rates) < slow) & (signs != 0)).tolist()
-        for choice in product((1.0, -1.0), repeat=len(still)):
-            tried = signs.copy()
-            tried[still] *= choice
-            self.signs = tried
-            self.look()
-            if self.s.outputs[self.s.to.ratio] > 0:
-                break
-        else:
-            self.signs = signs
-        return self.restart()
+        return self.restart(enters=formation.n_constraints < 4)
 
     def look_within(self, times: Array) -> list[float]:
         """Record states at increasing instants, (n,) [s], within steps; those of missed events."""
@@ -1054,13 +1018,6 @@ class Replay(Run):
             done.append(k)
             if h != self.s.inputs[self.s.at.h]:
                 self.step_to(h)
-            if k == rows.speed:
-                # When the motion stops all sliding does; what reversed before shows just before.
-                self.step_to(0.999 * h)
-                if (self.values[rows.turning] + shift[rows.turning] < 0).any():
-                    h *= 0.999
-                else:
-                    self.step_to(h)
 
 
 def project_velocity(formation: Formation, z: Array, v: Array) -> Array:

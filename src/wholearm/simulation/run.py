@@ -37,6 +37,7 @@ class Run(ABC):
     y : (2 n + LOSSES,)  z, z', then work, viscous, dry and contact losses
     s                    steps of the present modes
     piece                of the torques, which the present time belongs to
+    steps_at             whether the torques step at the start of each piece
     impact : [J]         energy lost to impacts so far
     wanted : [s]         instants at which steps have to end; infinity is last
     section              counts changes of modes: records are in order within each section
@@ -58,6 +59,7 @@ class Run(ABC):
         self.system, self.torque, self.tolerance = system, torque, tolerance
         self.breaks: list[float] = torque.breaks.tolist()
         self.t, self.piece = self.breaks[0], 0
+        self.steps_at: list[bool] = [True, *self.find_torque_steps(torque.coefficients).tolist()]
         self.y = np.concatenate([z, v, np.zeros(LOSSES)])
         self.h = FIRST_STEP * system.scales.time
         self.impact = 0.0
@@ -123,6 +125,12 @@ class Run(ABC):
         """Time at `x` of the present piece [s]."""
         start, stop = self.breaks[self.piece : self.piece + 2]
         return (start + stop + x * (stop - start)) / 2
+
+    def find_torque_steps(self, pieces: Array) -> NDArray[np.bool_]:
+        """Whether torques step between successive pieces, (n + 1, 2, d + 1), shape (n,)."""
+        jump = pieces[1:] @ (-1.0) ** np.arange(pieces.shape[2]) - pieces[:-1].sum(axis=2)
+        least = STEP_OF_TORQUE * self.system.scales.torque
+        return np.asarray(np.abs(jump).max(axis=1) > least)
 
     def set_velocity(self, v: Array | float) -> None:
         """Change the velocity, shape (n,); its kinetic energy is lost to impacts."""
@@ -247,12 +255,6 @@ class Run(ABC):
         else:
             record = Record.of(self.s, *here, self.impact)
         self.records.append(record)
-
-
-def find_torque_steps(before: Array, after: Array, system: System) -> NDArray[np.bool_]:
-    """Whether torques step from pieces to pieces, (n, 2, d + 1) each, (n,)."""
-    jump = after @ (-1.0) ** np.arange(after.shape[2]) - before.sum(axis=2)
-    return np.asarray(np.abs(jump).max(axis=1) > STEP_OF_TORQUE * system.scales.torque)
 
 
 @runtime_checkable

@@ -256,6 +256,9 @@ def _report_phase(
     impacts = [e for e in simulation.find(EventKind.IMPACT) if e.phase == index]
     stops = bool(arrivals) and phase.end is End.REST
     moves = find_departure(simulation, torque, index)
+    part, lost = (phase, simulation, rows, torque.breaks), EventKind.CONTACT_LOST
+    pressing = _find_least(*part, list_normal_forces(problem, simulation, phase, rows), lost)
+    slips = _find_least(*part, list_slips(simulation, phase, rows), EventKind.SLIP)
     end = worst = held = None
     if uniqueness:
         held = find_wedged(problem, phase, simulation, rows, REST_SPEED, moves)
@@ -268,8 +271,8 @@ def _report_phase(
         until=_describe_end(arrivals, phase),
         end=phase.end.value,
         start=float(simulation.t[rows[0]]),
-        contacts=list_contact_margins(problem, simulation, rows, phase, torque.breaks),
-        rolling=list_slip_margins(phase, simulation, rows, torque.breaks),
+        contacts=tuple(ContactMargin(*least, least[1] - problem.epsilon) for least in pressing),
+        rolling=tuple(SlipMargin(*least) for least in slips),
         arrival=arrivals[0].time if arrivals else None,
         arrival_rate=arrivals[0].value if arrivals and not phase.until.is_release else None,
         end_speed=measure_speed(problem.scene, simulation.z_dot[rows[-1]]) if stops else None,
@@ -472,24 +475,6 @@ def list_slips(simulation: Simulation, phase: Phase, rows: NDArray[np.int64]) ->
     c_n, c_t = simulation.c_n[rows][:, columns], simulation.c_t[rows][:, columns]
     names = [formation.names[row] for row in formation.rolling_rows]
     return dict(zip(names, slip_margins(formation, c_n, c_t).T, strict=True))
-
-
-def list_contact_margins(
-    problem: Problem, simulation: Simulation, rows: NDArray[np.int64], phase: Phase, breaks: Array
-) -> tuple[ContactMargin, ...]:
-    """Least normal forces in a phase, which the simulation has at `rows`."""
-    forces = list_normal_forces(problem, simulation, phase, rows)
-    least = _find_least(phase, simulation, rows, breaks, forces, EventKind.CONTACT_LOST)
-    return tuple(ContactMargin(name, c_n, t, c_n - problem.epsilon) for name, c_n, t in least)
-
-
-def list_slip_margins(
-    phase: Phase, simulation: Simulation, rows: NDArray[np.int64], breaks: Array
-) -> tuple[SlipMargin, ...]:
-    """Least margins to slipping in a phase, which the simulation has at `rows`."""
-    slips = list_slips(simulation, phase, rows)
-    least = _find_least(phase, simulation, rows, breaks, slips, EventKind.SLIP)
-    return tuple(SlipMargin(*margin) for margin in least)
 
 
 def _find_least(
