@@ -32,10 +32,8 @@ from wholearm.planning.lower_bound.speed_sweep import (
 )
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.path_data import prepare
-from wholearm.planning.path_domain.path_mesh import make_grid
 from wholearm.planning.path_domain.path_motion import PathMotion
 from wholearm.planning.path_domain.path_plan import plan_path
-from wholearm.planning.path_domain.speed_profile import Fastest, find_fastest
 from wholearm.planning.time_domain.refinement import SETTINGS, check_between, find_misses
 from wholearm.planning.time_domain.search import TimeSearch
 from wholearm.planning.time_domain.stage import Stage
@@ -252,15 +250,13 @@ def test_another_limit_is_kept_by_sweeps_search_and_policies(
     def measure(epsilon: float) -> Array:
         border = BorderEdge(place, curve, None, Terms(EPSILON, 0.0))
         least = bound_least_time([curve], EPSILON)
-        fastest = find_fastest(prepare(curve, EPSILON, make_grid(curve, np.zeros(0), 10), 2), None)
-        assert least is not None and isinstance(fastest, Fastest)
+        assert least is not None
         return np.array(
             [
                 least.value,
                 look_along([curve], EPSILON, 50),
                 estimate_duration([border.limits]),
                 time_parts(border, np.array([1.0]))[0],
-                float(find_duration(fastest.b, np.diff(fastest.s))),
                 time_paths(formation.scene, epsilon, *path)[0],
             ]
         )
