@@ -1,4 +1,4 @@
-"""Torques for tests: inverse dynamics along the curves, from rest to rest, without a planner."""
+"""Torques for tests: inverse dynamics along the curves, without a planner, and forward dynamics."""
 
 from __future__ import annotations
 
@@ -12,14 +12,24 @@ import numpy as np
 from scipy.optimize import brentq
 
 from shipped import HEPTAGON, problem_of
-from wholearm import End, Formation, Phase, Problem, TorqueProfile, Until
+from wholearm import End, Phase, Problem, TorqueProfile, Until
 from wholearm.common.arrays import Array
 from wholearm.contacts.elemental import parse_contact
+from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
-from wholearm.mechanics.dynamics import LAMBDA, Directions, inverse
+from wholearm.mechanics.dynamics import LAMBDA, Directions, build_forward, inverse
 from wholearm.results.dwell_record import assemble
 from wholearm.results.trajectory import Motion, Samples, Trajectory
+
+
+def forward(
+    formation: Formation, z: Array, v: Array, tau: Array, directions: Directions
+) -> tuple[Array, Array]:
+    """z'', shape (5,), and c, shape (n_c + R,), of one state."""
+    acceleration, c, _ = build_forward(formation)(z, v, tau, *directions)
+    return np.asarray(acceleration.full()[:, 0]), np.asarray(c.full()[:, 0])
+
 
 DEPENDENT = [1, 3, 4]
 """Coordinates y, theta_1 and theta_2, which follow from x and phi."""

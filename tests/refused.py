@@ -10,8 +10,8 @@ from contextlib import contextmanager
 import pytest
 
 from once import once
+from scenes import shove
 from shipped import HEPTAGON, problem_of
-from thrown import shove
 from wholearm import PlanOptions, Problem
 from wholearm.common.errors import InfeasibleError, Parameter
 from wholearm.geometry.tracing import trace_phases

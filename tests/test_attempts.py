@@ -15,18 +15,17 @@ from scipy.optimize import linprog, minimize
 
 from plane import make_formation, measure_gaps
 from planned import plan_landing
+from scenes import shove
 from shipped import FOLDER, HEPTAGON, problem_of, tipping
-from thrown import shove
 from timed import landing, stages_of, tables, total
 from timed import plan_landing as plan_landing_over_time
+from wholearm import End, InputError, Phase, PlanOptions, Problem, simulate, verify
 from wholearm.common.arrays import Array
-from wholearm.common.errors import InputError
 from wholearm.geometry.curve import find_tied, tangent_basis
 from wholearm.geometry.explore import close_contacts
 from wholearm.geometry.path_guess import find_end, guess_phase, list_ends
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import metric_weights
-from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain import time_plan
 from wholearm.planning.time_domain.collocation import Scheme, make_scheme
@@ -59,11 +58,8 @@ from wholearm.planning.time_domain.stage import (
 from wholearm.planning.time_domain.stage_kernels import goal_kernel
 from wholearm.planning.time_domain.time_motion import StageMotion
 from wholearm.planning.time_domain.time_plan import GAIN, choose_end, plan_phases, try_phases
-from wholearm.problem.definition import End, Phase, Problem
 from wholearm.problem.read import build_problem, read_problem
-from wholearm.simulation.simulate import simulate
 from wholearm.verification.verdict import Allowance, describe_ends
-from wholearm.verification.verify import verify
 
 OPTIONS = PlanOptions(time_intervals=12, transcription="time")
 

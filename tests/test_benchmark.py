@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from misbehaving import allow, misbehave
 from shipped import FOLDER, HEPTAGON, SQUARE, problem_of, solved
+from tiny_study import allow, misbehave
 from wholearm import Finger, Friction, InputError, Polygon, Scene, TorqueProfile
 from wholearm.benchmark import STUDIES
 from wholearm.benchmark.corpus import compare

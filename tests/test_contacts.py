@@ -18,8 +18,8 @@ from plane import (
     place_tips,
     rotate,
 )
+from scenes import roll
 from shipped import HEPTAGON, chart, problem_of
-from tipping import roll
 from wholearm import Friction, InputError, Scene
 from wholearm.benchmark.stress.newton import locate
 from wholearm.common.arrays import Array

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from held import balances
-from moreau import collide
+from independent import balances, collide
 from plane import (
     SQUARE,
     cross,
@@ -22,10 +21,10 @@ from plane import (
     stack_rows,
     unbalance,
 )
-from pushed import forward
+from planned import forward
+from scenes import box, roll, tipped
 from shipped import BOX, FOLDER, HEPTAGON, IMPACTS, plan_of, problem_of
 from timed import landing, plan_landing
-from tipping import box, roll, tipped
 from wholearm import Formation, InputError, PlanOptions, TorqueProfile, load, verify
 from wholearm import solve as plan
 from wholearm.benchmark.stress.slow_motion import list_others, rest_margin

@@ -14,10 +14,9 @@ import numpy as np
 import pytest
 
 from refused import advising, ask_shoved
+from scenes import box, shove
 from shipped import HEPTAGON, problem_of, tipping
-from thrown import shove
-from tipping import box
-from wholearm import load_trajectory, plots
+from wholearm import Objective, PlanOptions, Problem, load_trajectory, plots
 from wholearm.benchmark.stress import refusals
 from wholearm.benchmark.stress.refusals import judge
 from wholearm.common.errors import (
@@ -41,7 +40,6 @@ from wholearm.planning.advice import (
     rank_shortfalls,
     round_outwards,
 )
-from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
@@ -59,7 +57,6 @@ from wholearm.planning.time_domain.time_explain import (
 )
 from wholearm.planning.time_domain.time_motion import TimeMotion
 from wholearm.planning.time_domain.time_plan import plan_phases
-from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem, read_problem
 
 SCHEME = make_scheme("radau", 3, 3)

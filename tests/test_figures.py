@@ -29,8 +29,8 @@ from matplotlib.text import Text
 from PIL import Image, ImageColor
 from scipy import ndimage
 
-import tipping
-from crossing import hexagon
+import scenes
+from scenes import hexagon
 from shipped import HEPTAGON, IMPACTS, LANDING, chart, plan_of, problem_of
 from wholearm import InputError, PlanOptions, Problem, TorqueProfile, Trajectory, plots, verify
 from wholearm.cli.command import main
@@ -386,7 +386,7 @@ def test_settings_of_matplotlib_are_left_alone_and_pyplot_is_not_imported(
 
 
 def test_friction_cones_have_a_panel_of_their_own(figure: Figure) -> None:
-    plan = tipping.tipped()
+    plan = scenes.tipped()
     drawn = plots.force_margins(plan)
     check_layout(drawn)
     assert len(drawn.axes) == len(figure.axes) + 1
@@ -397,7 +397,7 @@ def test_friction_cones_have_a_panel_of_their_own(figure: Figure) -> None:
     known = ~np.isnan(t)
     column = plan.contacts.index("v1-palm")
     expected = np.where(
-        plan.phase == 1, plan.c_t[:, column] / (tipping.PALM * plan.c_n[:, column]), np.nan
+        plan.phase == 1, plan.c_t[:, column] / (scenes.PALM * plan.c_n[:, column]), np.nan
     )
     np.testing.assert_allclose(shares[known], expected, rtol=1e-12)
     assert np.nanmax(np.abs(shares)) < 1 and levels(cones) == [-1.0, 1.0, 0.0]

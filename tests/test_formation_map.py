@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from crossing import hexagon, measure_fingers
 from once import once
 from plane import (
     SQUARE,
@@ -29,6 +28,7 @@ from plane import (
     rotate,
 )
 from retelling import Retelling
+from scenes import hexagon, measure_fingers
 from shipped import HEPTAGON, IMPACTS, LANDING, problem_of, solved
 from shipped import SQUARE as BOX_FILE
 from wholearm import End, Formation, Goal, InputError, Problem, Scene, Until, list_formations

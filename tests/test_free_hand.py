@@ -17,24 +17,19 @@ from scipy.integrate import quad
 from plane import finger_gap, make_scene
 from planned import change, plan
 from shipped import HEPTAGON, HEXAGON
+from wholearm import Formation, Problem, TorqueProfile, Trajectory, simulate, simulate_free, verify
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, SimulationError
 from wholearm.contacts.elemental import parse_contact
-from wholearm.contacts.formation import Formation
-from wholearm.problem.definition import Problem
 from wholearm.problem.read import read_problem
 from wholearm.results.dwell_record import assemble
-from wholearm.results.torque import TorqueProfile
-from wholearm.results.trajectory import Trajectory
 from wholearm.scene.model import Finger, Friction, Polygon, Scales, Scene
 from wholearm.simulation.complementarity import FreeRun
 from wholearm.simulation.events import EventKind, FreeSimulation, OutcomeKind
 from wholearm.simulation.hand import build_system, measure_gaps
-from wholearm.simulation.simulate import simulate, simulate_free
 from wholearm.simulation.system import ContactPair, Structure, System
 from wholearm.verification.free import FreeReport, verify_free
-from wholearm.verification.verify import verify
 
 DURATION = 0.4
 """Of a random run [s]."""

@@ -11,7 +11,7 @@ import pytest
 from scipy.optimize import linprog
 
 from plane import SQUARE, make_formation, make_scene
-from tipping import roll
+from scenes import roll
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError, Parameter
 from wholearm.contacts.closing import contact_table

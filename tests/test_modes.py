@@ -11,16 +11,13 @@ import pytest
 
 import wholearm.planning.time_domain.guesses as guesses
 import wholearm.planning.time_domain.mode_search as mode_search
-from crossing import make_way, measure_fingers
 from plane import finger_gap, make_formation, measure_slip
-from thrown import heave, raised
+from scenes import heave, make_way, measure_fingers, raised, roll, tilting
 from timed import instants, landing, plan_landing, stages_of, tables
-from tipping import roll, tilting
+from wholearm import End, Formation, PlanOptions, Problem, Trajectory, Until, verify
 from wholearm.common.arrays import Array
-from wholearm.contacts.formation import Formation
 from wholearm.mechanics.dynamics import Directions, split_forces
 from wholearm.mechanics.limits import CONE, PRESS, make_limits
-from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain.collocation import make_scheme
 from wholearm.planning.time_domain.guesses import guess_stages
@@ -55,10 +52,7 @@ from wholearm.planning.time_domain.search import TimeSearch, TimeSolution
 from wholearm.planning.time_domain.stage import LimitMisses, Stage, StagePoints, resample
 from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion
 from wholearm.planning.time_domain.time_plan import plan_phases
-from wholearm.problem.definition import End, Problem, Until
-from wholearm.results.trajectory import Trajectory
 from wholearm.verification.verdict import DEPARTURE
-from wholearm.verification.verify import verify
 
 SCHEMES = [("radau", 2), ("radau", 3), ("legendre", 2), ("legendre", 4)]
 

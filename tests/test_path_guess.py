@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from plane import make_formation, measure_gaps, measure_slip, rotate
-from tipping import roll, tilting
+from scenes import roll, tilting
 from wholearm import End, Formation, InputError, Phase, PlanOptions, Problem, Until
 from wholearm.common.arrays import Array
 from wholearm.contacts.elemental import parse_contact

@@ -19,8 +19,8 @@ from scipy.optimize import linprog
 
 from plane import measure_slip, place_corners, unbalance, with_speed_limit
 from refused import INTERVALS, OPTIONS, ask, edited, plan, read_advice
+from scenes import box, tip
 from shipped import HEPTAGON, IMPACTS, plan_of, problem_of
-from tipping import box, tip
 from toys import LIMIT, Toy, constant, find_time_growing, find_time_viscous, inertia
 from wholearm import Formation, Friction, Problem, Scene
 from wholearm.common.arrays import Array, Expression

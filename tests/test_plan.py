@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
-from crossing import measure_fingers
 from plane import finger_gap, measure_gaps, measure_slip, unbalance
+from scenes import measure_fingers, shove
 from shipped import FOLDER, HEPTAGON, IMPACTS, plan_of, problem_of
-from thrown import shove
 from wholearm import Objective, Phase, PlanOptions, Problem, TorqueProfile, verify
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError, SolverError

@@ -14,11 +14,10 @@ from scipy.optimize import linprog
 
 import wholearm
 from shipped import HEPTAGON, IMPACTS, LANDING, plan_of, problem_of
+from wholearm import InputError, Plan, Policy, Problem, TorqueProfile, Trajectory, Uncertainty
 from wholearm.cli.command import main
-from wholearm.common.errors import InputError
 from wholearm.geometry.tracing import trace_phase
 from wholearm.mechanics.dynamics import build_forward
-from wholearm.planning.result import Plan
 from wholearm.policy.curve_law import (
     CurveLaw,
     LoopSettings,
@@ -28,14 +27,9 @@ from wholearm.policy.curve_law import (
 )
 from wholearm.policy.curve_rows import find_within, list_scenes
 from wholearm.policy.make import SAME, find_widest, hold_end, make_policy
-from wholearm.policy.playback import Policy
 from wholearm.policy.reference_motion import retime_within
 from wholearm.policy.regulator import RATE, Linear, regulate
 from wholearm.policy.retiming import retime
-from wholearm.problem.definition import Problem
-from wholearm.results.torque import TorqueProfile
-from wholearm.results.trajectory import Trajectory
-from wholearm.robustness.error_model import Uncertainty
 from wholearm.robustness.sample_run import make_trial
 from wholearm.simulation.simulate import simulate_free
 from wholearm.verification.policy_check import verify_policy

@@ -16,8 +16,8 @@ from scipy.optimize import linprog
 
 import wholearm
 from planned import change, plan
+from scenes import box, tipped
 from shipped import BOX, FOLDER, HEPTAGON, HEXAGON, LANDING, problem_of
-from tipping import box, tipped
 from wholearm import InputError, Problem, Trajectory, compare, load_trajectory, simulate, verify
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array

@@ -12,20 +12,17 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from held import balances
+from independent import balances
 from once import once
 from shipped import HEPTAGON, problem_of, solved
 from toys import LIMIT, Toy, constant
-from wholearm import simulate, solve
-from wholearm.common.errors import InputError
-from wholearm.contacts.formation import Formation
+from wholearm import Formation, InputError, Problem, simulate, simulate_free, solve
 from wholearm.planning import dwell as shares
 from wholearm.planning.dwell import DwellEnd, list_touching, settle_plans
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.result import Plan, describe_plan, load_plan, write_meta
 from wholearm.planning.stops import Plans
 from wholearm.planning.table_check import make_table
-from wholearm.problem.definition import Problem
 from wholearm.problem.read import read_own_problem
 from wholearm.problem.table import describe_scene
 from wholearm.results.dwell_record import assemble, change_torques, find_change_times
@@ -33,7 +30,6 @@ from wholearm.results.torque import TorqueProfile, read_torque_csv
 from wholearm.simulation.events import EventKind, OutcomeKind
 from wholearm.simulation.holding_torques import DRIVE, maximise_margin
 from wholearm.simulation.rest import close_contacts, find_rest
-from wholearm.simulation.simulate import simulate_free
 from wholearm.simulation.tolerances import REST_WINDOW
 from wholearm.verification.verify import describe_motors, find_commands, verify
 

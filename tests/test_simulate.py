@@ -17,9 +17,7 @@ import numpy as np
 import pytest
 
 import wholearm
-from crossing import hexagon, measure_fingers, shorten, slid
-from held import balances
-from integrated import integrate_phase
+from independent import balances, integrate_phase
 from plane import stack_rows
 from planned import (
     SQUEEZES,
@@ -29,12 +27,13 @@ from planned import (
     change,
     choose_squeeze,
     fit,
+    forward,
     plan,
     plan_landing,
 )
-from pushed import forward
 from pushing import pushed, rocking
 from retelling import RETELLINGS, Retelling
+from scenes import hexagon, measure_fingers, shorten, slid
 from shipped import HEPTAGON, IMPACTS, plan_of, problem_of
 from wholearm import Formation, Phase, Problem, TorqueProfile, Trajectory, Until, simulate, verify
 from wholearm.benchmark.precision.reference import solve_motion

@@ -11,17 +11,13 @@ import pytest
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
-from crossing import make_way
-from held import balances
-from integrated import integrate_phase
+from independent import balances, integrate_phase, march
 from once import once
 from plane import convex_polygon, make_formation, make_scene, measure_slip, place_corners
-from planned import CosineMotion, LandingMotion, change, choose_squeeze, join, plan_landing
-from pushed import forward
+from planned import CosineMotion, LandingMotion, change, choose_squeeze, forward, join, plan_landing
 from pushing import Push, Roll, evaluate, linear, pushed, rocking
+from scenes import POINTS, box, constant, falling, make_way, ramp, roll, tipped
 from shipped import HEXAGON, problem_of
-from stepping import march
-from tipping import POINTS, box, constant, falling, ramp, roll, tipped
 from wholearm import End, Friction, Phase, Problem, Scene, TorqueProfile, Until, simulate, verify
 from wholearm.common.arrays import Array
 from wholearm.contacts.closing import close_finger, place_flush

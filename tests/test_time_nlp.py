@@ -13,19 +13,17 @@ from scipy.linalg import expm
 
 from plane import make_formation, measure_gaps, measure_slip, unbalance
 from planned import CosineMotion
+from scenes import roll
 from shipped import HEPTAGON
 from timed import drive, landing
-from tipping import roll
+from wholearm import Formation, Objective, PlanOptions, Problem, Scene, Until, load
 from wholearm.common.arrays import Array, Expression
 from wholearm.common.batch import FEW, SIZE, SOME, Batch
 from wholearm.contacts.elemental import parse_contact
-from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve, tangent_basis
-from wholearm.geometry.path_guess import load
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions, metric_weights, split_forces
 from wholearm.planning.columns import Columns
-from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.time_domain import stage_kernels as kernels
 from wholearm.planning.time_domain.collocation import Scheme, blend, fit_controls, make_scheme
 from wholearm.planning.time_domain.equations import Target
@@ -58,9 +56,7 @@ from wholearm.planning.time_domain.time_nlp import (
     build_time_nlp,
     raise_bounds,
 )
-from wholearm.problem.definition import Problem, Until
 from wholearm.results.trajectory import Samples
-from wholearm.scene.model import Scene
 from wholearm.solvers.ipopt import build_solver, record_runs
 
 UNKNOWNS = 11

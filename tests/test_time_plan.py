@@ -15,8 +15,8 @@ import pytest
 from once import once
 from plane import make_formation, measure_gaps, measure_slip, unbalance
 from planned import CosineMotion
+from scenes import PALM, box, heave, lift, shove, tip, tipped
 from shipped import HEPTAGON, IMPACTS, LANDING, plan_of, problem_of
-from thrown import heave, lift, shove
 from timed import (
     drive,
     fastest_landing,
@@ -28,25 +28,20 @@ from timed import (
     tables,
     total,
 )
-from tipping import PALM, box, tip, tipped
-from wholearm import End, Plan
+from wholearm import End, Formation, Plan, PlanOptions, Problem, verify
 from wholearm.common.arrays import Array
-from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions, metric_weights
 from wholearm.mechanics.impact import compute_impact
-from wholearm.planning.options import PlanOptions
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain.collocation import make_scheme
 from wholearm.planning.time_domain.search import TimeSearch, TimeSolution
 from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion
 from wholearm.planning.time_domain.time_plan import plan_phases
-from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem
 from wholearm.results.trajectory import Samples, Trajectory
-from wholearm.verification.verify import verify
 
 SLACK = 1e-6
 """What a limit may be missed by between the places that the planner looks at [N or N m]."""

@@ -9,7 +9,6 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from crossing import hexagon, measure_fingers
 from plane import (
     SQUARE,
     convex_polygon,
@@ -20,7 +19,7 @@ from plane import (
     place_tips,
     rotate,
 )
-from tipping import roll, tip
+from scenes import hexagon, measure_fingers, roll, tip
 from wholearm import InputError, Problem, Scene, Until
 from wholearm.common.arrays import Array
 from wholearm.contacts.closing import close_finger, place_flush

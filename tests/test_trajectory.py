@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from tipping import tipped
+from scenes import tipped
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.results.dwell_record import assemble

@@ -12,11 +12,10 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from crossing import measure_fingers, slid
 from plane import make_formation, make_scene
 from planned import brake_less, change, plan, plan_landing
+from scenes import PALM, box, measure_fingers, scale, slid, tipped
 from shipped import BOX, HEPTAGON, plan_of, problem_of
-from tipping import PALM, box, scale, tipped
 from wholearm import Formation, Friction, PlanOptions, Problem, Report, Scene, simulate
 from wholearm.benchmark.stress.plan_check import check_plan as check_again
 from wholearm.benchmark.stress.plan_check import check_rates

@@ -1,0 +1,273 @@
+"""Hexagons between fingers that meet, thrown squares, and a box that tips over a vertex."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import replace
+from functools import cache, lru_cache
+
+import numpy as np
+from scipy.integrate import quad
+
+from once import once
+from plane import make_formation, make_scene, rotate
+from shipped import BOX, HEXAGON, plan_of, problem_of
+from wholearm import End, Friction, Phase, Plan, Problem, Scene, TorqueProfile, Trajectory, Until
+from wholearm.benchmark.stress.newton import separate
+from wholearm.common.arrays import Array
+from wholearm.contacts.closing import close_finger, place_flush
+from wholearm.contacts.elemental import parse_contact
+from wholearm.contacts.formation import Formation, find_touching
+from wholearm.geometry.curve import Curve
+from wholearm.geometry.tracing import trace_phases
+from wholearm.planning.plan import solve
+from wholearm.problem.read import build_problem
+
+
+@cache
+def hexagon(
+    lengths: tuple[float, float] = (0.18, 0.18), base: float = -0.08, solid: bool = True
+) -> Problem:
+    """The hexagon's problem; with links of equal length they touch halfway through the slide."""
+    table = tomllib.loads(HEXAGON.read_text(encoding="utf-8"))
+    for key, length in zip("12", lengths, strict=True):
+        table["fingers"][key]["length"] = length
+    table["fingers"]["2"]["base"][0] = base
+    return build_problem(table | {"fingers_collide": solid})
+
+
+@once
+def slid() -> Plan:
+    """The hexagon's phases before it tips, the last of them to rest."""
+    whole = problem_of(HEXAGON)
+    *moving, last = whole.phases[:3]
+    phases = (*moving, replace(last, end=End.REST))
+    return solve(replace(whole, phases=phases), intervals=20, replay=False)
+
+
+def shorten(problem: Problem) -> Problem:
+    """A problem like the hexagon's with the same phases only."""
+    return replace(problem, phases=problem.phases[:3])
+
+
+@cache
+def make_way(solid: bool) -> Problem:
+    """Finger 2 pushes the hexagon below a free finger 1, which has to make way for the other."""
+    table = tomllib.loads(HEXAGON.read_text(encoding="utf-8"))
+    for finger in table["fingers"].values():
+        finger["length"] = 0.19
+    table["fingers"]["2"]["base"][0] = -0.085
+    table["start"]["x"] = -0.03
+    push = {"contacts": ["v0-palm", "v1-palm", "v5-finger2"], "until": {"x": 0.0}}
+    return build_problem(table | {"fingers_collide": solid, "phases": [push]})
+
+
+def place_links(scene: Scene, z: Array) -> list[Array]:
+    """Ends of both segments at n configurations, shape (n, 2, 2) each [m]."""
+    ends = []
+    for link, angle in zip(scene.fingers, z[:, 3:].T, strict=True):
+        base = np.broadcast_to(np.asarray(link.base), (len(z), 2))
+        tip = base + link.length * np.column_stack([np.cos(angle), np.sin(angle)])
+        ends.append(np.stack([base, tip], axis=1))
+    return ends
+
+
+def measure_fingers(scene: Scene, z: Array) -> Array:
+    """Gap between the links, shape (n,) [m]; negative: minus the least push that parts them."""
+    return separate(*place_links(scene, z)) - sum(link.radius for link in scene.fingers)
+
+
+HALF = 0.03
+"""Half a side of the square [m]."""
+LEVER = HALF * np.sqrt(2.0)
+"""From its centroid to a vertex [m]."""
+
+
+@cache
+def shove(run: float = 0.01, mu: float = 0.3) -> tuple[Problem, float]:
+    """Finger 1 pushes the square over the palm, on which it then slides `run` [m] to rest.
+
+    Two contacts, three freedoms: the square's x and both fingers. And the time that takes [s].
+    """
+    scene = make_scene(friction=mu)
+    start = _close(scene, place_flush(scene, 0, 0.02), 0.6)
+    phases = _let_go(scene, start, 2, 3, Until(None, "x", run), Until(None, "x", 0.0))
+    return Problem("shove", scene, 0.05, start, phases), float(np.sqrt(2 * run / (mu * 9.81)))
+
+
+@cache
+def heave(turn: float = 0.15) -> tuple[Problem, float]:
+    """Finger 1 heaves the square over vertex 0, which rolls; it then rises by `turn` [rad] to rest.
+
+    One rolling contact, three freedoms: phi and both fingers. And the time that takes [s].
+    """
+    scene = _with_palm(0.1, 3.0)
+    start = _close(scene, _tip(scene, 0.15), 0.6)
+    ends = Until(None, "phi", 0.4 - turn), Until(None, "phi", 0.4)
+    phases = _let_go(scene, start, 1, 2, *ends, rolls=True)
+    return Problem("heave", scene, 0.05, start, phases), _rising_time(0.4 - turn, 0.4, True)
+
+
+@cache
+def lift(turn: float = 0.02) -> tuple[Problem, float]:
+    """Both fingers lift the square over vertex 0, which then slides without friction.
+
+    It rises by `turn` [rad] to rest, straight up, as nothing pushes it along the palm. One sliding
+    contact, four freedoms: x, phi and both fingers. And the time that takes [s].
+    """
+    scene = _with_palm(0.02, 0.0)
+    start = _close(scene, _tip(scene, 0.3), 0.0)
+    ends = Until(None, "phi", 0.4), Until(None, "phi", 0.4 + turn)
+    phases = _let_go(scene, start, 1, 3, *ends)
+    return Problem("lift", scene, 0.05, start, phases), _rising_time(0.4, 0.4 + turn, False)
+
+
+@cache
+def raised(stop: float = 0.5) -> Problem:
+    """Both fingers turn the square over vertex 0 to `stop` [rad], from rest to rest.
+
+    The vertex slides without friction, so that either finger may go either way.
+    """
+    scene = _with_palm(0.02, 0.0)
+    start = _close(scene, _tip(scene, 0.3), 0.0)
+    phase = Phase(0, Formation(scene, find_touching(scene, start)), Until(None, "phi", stop))
+    return Problem("raise", scene, 0.05, start, (phase,))
+
+
+@cache
+def parting() -> Problem:
+    """Finger 1 pushes a box over the palm that finger 2 touches as well at the start."""
+    corners = [[-0.045, -0.03], [0.045, -0.03], [0.045, 0.09], [-0.045, 0.09]]
+    scene = make_scene(corners, base=0.1)
+    start = _close(scene, place_flush(scene, 0, 0.0), 0.0)
+    formation = Formation(scene, find_touching(scene, start)[:3])
+    phase = Phase(0, formation, Until(None, "x", -0.015))
+    return Problem("part", scene, 0.05, start, (phase,))
+
+
+def _with_palm(fingers: float, palm: float) -> Scene:
+    scene = make_scene()
+    return Scene(scene.polygon, scene.fingers, Friction(palm, fingers, fingers), scene.gravity)
+
+
+def _tip(scene: Scene, phi: float) -> Array:
+    """Pose with vertex 0 on the palm at x = 0.03 m."""
+    return np.append([0.03, 0.0] - rotate(phi, scene.polygon.vertices[0]), phi)
+
+
+def _close(scene: Scene, q: Array, away: float) -> Array:
+    """Configuration with finger 1 closed and finger 2 turned `away` [rad] from the object."""
+    return np.array([*q, close_finger(scene, q, 0), close_finger(scene, q, 1) + away])
+
+
+def _let_go(
+    scene: Scene, z: Array, kept: int, count: int, first: Until, then: Until, rolls: bool = False
+) -> tuple[Phase, Phase]:
+    """Phases on the first `count` contacts that touch, and then on the first `kept` of them."""
+    touching = find_touching(scene, z)
+    assert len(touching) == count
+    rolling = (parse_contact("v0-palm", scene),) if rolls else ()
+    before, after = (Formation(scene, touching[:n], rolling) for n in (count, kept))
+    return Phase(0, before, first, End.SMOOTH), Phase(1, after, then)
+
+
+def _rising_time(start: float, stop: float, rolls: bool) -> float:
+    """Time in which the square rises over vertex 0 from `start` to rest at `stop` [s].
+
+    Its energy is kept. A vertex that rolls stays, one without friction stays below a centroid that
+    rises straight.
+    """
+    body = make_scene().polygon
+    assert body.inertia is not None
+    inertia, mass = body.inertia, body.mass
+
+    def height(phi: float) -> float:
+        return float(LEVER * np.sin(phi + np.pi / 4))
+
+    def slowness(s: float) -> float:
+        # phi = stop - s^2 takes away the singularity at the end.
+        phi = stop - s * s
+        share = 1.0 if rolls else np.cos(phi + np.pi / 4) ** 2
+        rise = mass * 9.81 * (height(stop) - height(phi))
+        return float(2 * s * np.sqrt((inertia + mass * LEVER**2 * share) / (2 * rise)))
+
+    return float(quad(slowness, 0.0, np.sqrt(stop - start))[0])
+
+
+POINTS = [[-0.02, -0.05], [0.02, -0.05], [0.02, 0.05], [-0.02, 0.05]]
+"""A slender box; fallen over vertex 1, its centroid is ever farther right of it."""
+
+
+def box() -> Problem:
+    return problem_of(BOX)
+
+
+def tipped() -> Trajectory:
+    """The plan of the box for least time."""
+    return plan_of(BOX)
+
+
+PALM = box().scene.friction.palm
+"""Friction with the palm."""
+
+
+def tip() -> Curve:
+    """The curve of the phase in which the box tips over vertex 1."""
+    return trace_phases(box())[1]
+
+
+@lru_cache(maxsize=1)
+def tilting() -> Problem:
+    """That phase alone, in which the vertex may slide as well."""
+    problem = box().with_(friction_palm=0.5, torque_limit=2.0)
+    formation = replace(problem.phases[1].formation, rolling=())
+    phase = Phase(0, formation, problem.phases[1].until)
+    return replace(problem, start=trace_phases(problem)[0].end, phases=(phase,))
+
+
+def roll(formation: Formation, *names: str) -> Formation:
+    """The formation with some of its contacts rolling."""
+    rolling = tuple(contact for contact in formation.contacts if contact.name in names)
+    assert len(rolling) == len(names)
+    return replace(formation, rolling=rolling)
+
+
+def falling(mu: float, lean: float) -> Problem:
+    """A box that falls over vertex 1, with both fingers far away and without friction.
+
+    Parameters
+    ----------
+    mu : float
+        Friction with the palm.
+    lean : float, [rad]
+        Of the line from vertex 1 to the centroid, to the right of upright, at the start.
+    """
+    scene = make_scene(POINTS, base=0.4)
+    free = [replace(link, viscous=0.0, dry=0.0) for link in scene.fingers]
+    scene = Scene(scene.polygon, (free[0], free[1]), Friction(mu, 0.1, 0.1))
+    phi = -lean - np.arctan2(0.02, 0.05)
+    start = np.array([*-rotate(phi, POINTS[1]), phi, np.pi / 2, np.pi / 2])
+    formation = roll(make_formation(scene, "v1-palm"), "v1-palm")
+    phase = Phase(0, formation, Until(coordinate="phi", value=phi - 1.4))
+    return Problem("falling box", scene, 0.0, start, (phase,))
+
+
+def scale(joint: int, factor: float, start: float, stop: float) -> TorqueProfile:
+    """The plan's torques with those of one joint multiplied from `start` to `stop` [s]."""
+    torque = tipped().torque
+    coefficients = torque.coefficients.copy()
+    first = torque.breaks[:-1]
+    coefficients[(first >= start - 1e-9) & (first < stop - 1e-9), joint] *= factor
+    return TorqueProfile(torque.breaks, coefficients)
+
+
+def constant(tau: tuple[float, float], duration: float) -> TorqueProfile:
+    return TorqueProfile(np.array([0.0, duration]), np.array([[[tau[0]], [tau[1]]]]))
+
+
+def ramp(start: tuple[float, float], rate: tuple[float, float], duration: float) -> TorqueProfile:
+    """Torques that start and rise evenly [N m, N m/s]."""
+    half: Array = np.array(rate) * duration / 2
+    return TorqueProfile(
+        np.array([0.0, duration]), np.column_stack([np.array(start) + half, half])[None]
+    )
