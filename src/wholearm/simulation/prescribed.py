@@ -343,12 +343,6 @@ class Replay(Run):
             )
         raise SimulationError(f"the step size of {names} underflows {self.where()}")
 
-    def repeats(self) -> bool:
-        """Whether the last two records are of the same instant of one phase, but for rounding."""
-        last = self.records[-2:]
-        same = len(last) > 1 and last[0].phase == last[1].phase == self.phase.index
-        return same and self.t - last[0].t <= self.settling
-
     def lose(self, contact: str, c_n: float) -> Outcome:
         """End because `contact` would have to pull."""
         how = "to zero" if c_n > -1e3 * self.rounding else f"to {c_n:.3g} N"
@@ -850,7 +844,9 @@ class Replay(Run):
 
     def _drop_repeated(self) -> None:
         """Take back forces after a jump that are those of a formation that is given up."""
-        if self.repeats():
+        last = self.records[-2:]
+        same = len(last) > 1 and last[0].phase == last[1].phase == self.phase.index
+        if same and self.t - last[0].t <= self.settling:
             self.records.pop()
 
     def let_go(self, contacts: Sequence[int]) -> Released | Outcome:

@@ -7,6 +7,7 @@ formations (`prescribed`), or that of linear complementarity problems (`compleme
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -16,7 +17,6 @@ from numpy.typing import ArrayLike
 from ..common.arrays import Array, sort_unique
 from ..common.errors import InputError, SimulationError, require_number
 from ..common.sharing import exclusive
-from ..contacts.elemental import parse_contact
 from ..problem.definition import Problem
 from ..problem.read import require_phases
 from ..results.adopt import Torques, adopt_torques
@@ -245,7 +245,9 @@ def _conclude(
     events = sorted(run.events, key=lambda event: event.time)
     if clock is not None:
         used = dict.fromkeys(names[pair] for row in records for pair in row.kept)
-        contacts += [n for n in used if n not in contacts and _is_named(n, problem)]
+        # Contacts that problem files have no name for are among the stretches alone.
+        unnamed = re.compile("tip|joint|.*-(back|joint)")
+        contacts += [n for n in used if n not in contacts and not unnamed.match(n)]
     fields = collect(run.system, records, contacts)
     if clock is not None:
         t = fields["t"]
@@ -280,15 +282,6 @@ def list_glimpses(problem: Problem, steps: Sequence[Step]) -> Glimpses:
         c_n[:, at] = step.stage_forces.reshape(len(nodes), -1)
         columns.append((step.t + nodes * step.h, np.full(len(nodes), step.leg.phase), c_n))
     return Glimpses(*(np.concatenate(column) for column in zip(*columns, strict=True)))
-
-
-def _is_named(name: str, problem: Problem) -> bool:
-    """Whether a pair is a contact that problem files know."""
-    try:
-        parse_contact(name, problem.scene)
-    except InputError:
-        return False
-    return True
 
 
 def _recall(problem: Problem, plan: Trajectory, row: int) -> Modes:
