@@ -13,11 +13,11 @@ from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 
 
-def choose_snapshots(trajectory: Trajectory, least: int = 6) -> NDArray[np.int64]:
+def choose_snapshots(trajectory: Trajectory) -> NDArray[np.int64]:
     """Rows of the trajectory to draw: phase boundaries, and instants between if they are few."""
     starts = trajectory.phase_starts
     parts = np.ones(len(starts) - 1, dtype=int)
-    while parts.sum() + 1 < least:
+    while parts.sum() + 1 < 6:
         parts[np.argmax(np.diff(starts) / parts)] += 1
     rows = [0, len(trajectory.t) - 1]
     for k, (start, end) in enumerate(pairwise(starts)):
@@ -53,10 +53,10 @@ def find_steps(trajectory: Trajectory) -> NDArray[np.int64]:
     return every[every < len(t)]
 
 
-def sample_torques(torque: TorqueProfile, least: int = 2000) -> tuple[Array, Array]:
+def sample_torques(torque: TorqueProfile) -> tuple[Array, Array]:
     """Times, shape (n,) [s], and torques, (n, 2) [N m], with both ends of every piece."""
     pieces, _, order = torque.coefficients.shape
-    count = 2 if order <= 2 else max(order, math.ceil(least / pieces))
+    count = 2 if order <= 2 else max(order, math.ceil(2000 / pieces))
     x = np.linspace(-1.0, 1.0, count)
     middle, half = (torque.breaks[1:] + torque.breaks[:-1]) / 2, np.diff(torque.breaks) / 2
     coefficients = np.ascontiguousarray(torque.coefficients)  # einsum's rounding depends on it

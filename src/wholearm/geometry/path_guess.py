@@ -78,12 +78,10 @@ def guess_curve(curve: Curve, share: float = 1.0) -> list[PathGuess]:
     return guesses
 
 
-def guess_phase(
-    phase: Phase, z: Array, later: Sequence[Phase] = (), release_at: float = RELEASE_AT
-) -> list[PathGuess]:
+def guess_phase(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> list[PathGuess]:
     """Path guesses of a phase from `z`, (5,), to its end; an `InputError` if there is none.
 
-    A phase that ends by a release heads for the end of `later` ones, at the share `release_at`.
+    A phase that ends by a release heads for the end of `later` ones, at the share `RELEASE_AT`.
     """
     formation = phase.formation
     require_touching(phase, z)
@@ -93,7 +91,7 @@ def guess_phase(
         raise InputError("", key, "the contacts leave no freedom to move")
     if freedoms == 1:
         curve = trace_phase(phase, z, later)
-        return guess_curve(curve, release_at if phase.until.is_release else 1.0)
+        return guess_curve(curve, RELEASE_AT if phase.until.is_release else 1.0)
     goal = _find_goal(phase, z, later)
     return [connect(formation, z, goal)]
 
