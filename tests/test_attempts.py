@@ -27,7 +27,7 @@ from wholearm.geometry.path_guess import find_end, guess_phase, list_ends
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import metric_weights
 from wholearm.planning.plan import solve
-from wholearm.planning.time_domain import time_plan
+from wholearm.planning.time_domain import guesses, time_plan
 from wholearm.planning.time_domain.collocation import Scheme, make_scheme
 from wholearm.planning.time_domain.guesses import (
     GRADUAL,
@@ -39,14 +39,14 @@ from wholearm.planning.time_domain.guesses import (
     STRAIGHT,
     Guess,
     Guesses,
+    PathMargin,
     find_modes,
     guess_stages,
     split_by_signs,
 )
 from wholearm.planning.time_domain.mode_search import LEAST_INTERVALS, mode_of
-from wholearm.planning.time_domain.nlp_layout import pack
 from wholearm.planning.time_domain.refinement import SETTINGS, count_halvings, find_least
-from wholearm.planning.time_domain.search import TimeSearch, TimeSolution, carry_multipliers
+from wholearm.planning.time_domain.search import TimeSearch, TimeSolution
 from wholearm.planning.time_domain.stage import (
     Stage,
     StagePoints,
@@ -55,8 +55,8 @@ from wholearm.planning.time_domain.stage import (
     in_own_units,
     resample,
 )
-from wholearm.planning.time_domain.stage_kernels import goal_kernel
 from wholearm.planning.time_domain.time_motion import StageMotion
+from wholearm.planning.time_domain.time_nlp import goal_kernel, pack
 from wholearm.planning.time_domain.time_plan import GAIN, choose_end, plan_phases, try_phases
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.verification.verdict import Allowance, describe_ends
@@ -64,9 +64,12 @@ from wholearm.verification.verdict import Allowance, describe_ends
 OPTIONS = PlanOptions(time_intervals=12, transcription="time")
 
 
-def test_an_end_that_is_known_is_first_looked_for_straight() -> None:
+def test_an_end_that_is_known_is_first_looked_for_straight(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """As on a route, which is given it: pinned in a file the first guess is the same."""
     problem = tipping()
+    monkeypatch.setattr(guesses, "find_margin", lambda *_, **__: PathMargin(0.1))
     (phase,), start = problem.phases, problem.start
     goal = find_end(phase, start)
     pinned = replace(phase, until=replace(phase.until, pins=(("x", float(goal[0])),)))
@@ -529,30 +532,6 @@ def coarse(objective: str) -> TimeSolution:
 def replace_scene(stages: list[Stage], problem: Problem) -> list[Stage]:
     """The same stages on the formations of another scene."""
     return [replace(stage, formation=problem.phases[stage.phase].formation) for stage in stages]
-
-
-def test_multipliers_are_shared_among_the_intervals_that_replace_one() -> None:
-    solution = coarse("time")
-    marked = [(np.arange(stage.intervals) + 1) % 2 for stage in solution.stages]
-    stages = bisect_intervals(solution.stages, SCHEME, marked)
-    search = search_for("time")
-    nlp = search.build(stages)
-    rng = np.random.default_rng(2)
-    given = {key: rng.normal(size=len(table)) for key, table in solution.multipliers.items()}
-    carried = carry_multipliers(given, solution.nlp, nlp, SCHEME, solution.stages, stages)
-    assert len(carried["lam_g0"]) == len(nlp.rows.bounds[0])
-    for k, own in enumerate(marked):
-        parent = np.repeat(np.arange(len(own)), 1 + own)
-        for layouts, key, name in (
-            ((solution.nlp.layouts, nlp.layouts), "lam_x0", "forces"),
-            ((solution.nlp.layouts, nlp.layouts), "lam_x0", "tau"),
-            ((solution.nlp.rows_of, nlp.rows_of), "lam_g0", "points"),
-        ):
-            old, new = (getattr(part[k], name) for part in layouts)
-            before, after = given[key][old], carried[key][new]
-            total = np.zeros_like(before)
-            np.add.at(total, parent, after)
-            np.testing.assert_allclose(total, before, rtol=1e-12)
 
 
 @pytest.mark.parametrize("contact", ["palm", "finger1", "finger2"])

@@ -14,7 +14,7 @@ import wholearm.planning.time_domain.mode_search as mode_search
 from plane import finger_gap, make_formation, measure_slip
 from scenes import heave, make_way, measure_fingers, raised, roll, tilting
 from timed import instants, landing, plan_landing, stages_of, tables
-from wholearm import End, Formation, PlanOptions, Problem, Trajectory, Until, verify
+from wholearm import End, Formation, Objective, PlanOptions, Problem, Trajectory, Until, verify
 from wholearm.common.arrays import Array
 from wholearm.mechanics.dynamics import Directions, split_forces
 from wholearm.mechanics.limits import CONE, PRESS, make_limits
@@ -32,16 +32,6 @@ from wholearm.planning.time_domain.mode_search import (
     mode_of,
     split,
 )
-from wholearm.planning.time_domain.nlp_layout import (
-    MARGIN,
-    STATE,
-    StageLayout,
-    V,
-    Z,
-    lay_out,
-    pack,
-    unpack,
-)
 from wholearm.planning.time_domain.refinement import (
     SETTINGS,
     check_between,
@@ -51,6 +41,17 @@ from wholearm.planning.time_domain.refinement import (
 from wholearm.planning.time_domain.search import TimeSearch, TimeSolution
 from wholearm.planning.time_domain.stage import LimitMisses, Stage, StagePoints, resample
 from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion
+from wholearm.planning.time_domain.time_nlp import (
+    MARGIN,
+    STATE,
+    StageLayout,
+    Target,
+    V,
+    Z,
+    lay_out,
+    pack,
+    unpack,
+)
 from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.verification.verdict import DEPARTURE
 
@@ -109,24 +110,20 @@ def owners(layouts: Sequence[StageLayout]) -> Array:
     return counts
 
 
-@pytest.mark.parametrize("elastic", [False, True])
-@pytest.mark.parametrize("with_margin", [False, True])
+@pytest.mark.parametrize("objective", [Objective.TIME, Objective.MARGIN, Objective.ELASTIC])
 @pytest.mark.parametrize("ends_in_impact", [False, True])
 @pytest.mark.parametrize("name, degree", SCHEMES)
 def test_every_unknown_has_one_place(
-    name: str, degree: int, ends_in_impact: bool, with_margin: bool, elastic: bool
+    name: str, degree: int, ends_in_impact: bool, objective: Objective
 ) -> None:
-    scheme = make_scheme(name, degree)
-    layouts = lay_out(
-        make_stages(name, degree, ends_in_impact),
-        scheme,
-        with_margin,
-        [6, 5, 3] if elastic else None,
-    )
+    scheme, stages = make_scheme(name, degree), make_stages(name, degree, ends_in_impact)
+    layouts = lay_out(stages, scheme, Target(objective, 0.05))
     np.testing.assert_array_equal(owners(layouts), 1.0)
-    assert layouts[0].nodes.shape == (4, 11 if with_margin else 10)
+    assert layouts[0].nodes.shape == (4, 10 + (objective is Objective.MARGIN))
     assert [len(layout.impulses) for layout in layouts] == [3 if ends_in_impact else 0, 0, 0]
-    assert [layout.short.shape[1] for layout in layouts] == ([6, 5, 3] if elastic else [0] * 3)
+    # Normal forces, friction cones and two torques may be short.
+    short = [6, 5, 3] if objective is Objective.ELASTIC else [0, 0, 0]
+    assert [layout.short.shape[1] for layout in layouts] == short
 
 
 @pytest.mark.parametrize("with_margin", [False, True])
@@ -136,7 +133,8 @@ def test_points_are_packed_and_unpacked(
     name: str, degree: int, ends_in_impact: bool, with_margin: bool
 ) -> None:
     stages = make_stages(name, degree, ends_in_impact)
-    layouts = lay_out(stages, make_scheme(name, degree), with_margin)
+    objective = Objective.MARGIN if with_margin else Objective.TIME
+    layouts = lay_out(stages, make_scheme(name, degree), Target(objective, 0.05))
     given = [stage.guess for stage in stages]
     x = pack(given, layouts, 0.7)
     assert x.shape == (layouts[-1].stop,)
@@ -279,24 +277,6 @@ def test_a_joint_that_is_held_back_is_let_turn_the_other_way(
     assert ([-1.0] in ways) == (stop - begin > 4)
     # Joints do not roll.
     assert all(0.0 not in way for way in ways)
-
-
-def test_what_is_held_back_on_both_sides_of_a_change_turns_on_both() -> None:
-    """On one side alone it would have to come to rest where the stages meet."""
-    first, last = hold_back(make_stage(THREE), 0, 5, 8), hold_back(make_stage(THREE), 0, 0, 3)
-    slid = mode_of(last).changed((0,), -mode_of(last).signs[0])
-    last = replace(last, directions=in_mode(last, slid).directions)
-    row = first.formation.n_contacts
-
-    def list_signs(stages: list[Stage]) -> list[list[float]]:
-        moves = list_moves(stages, SCHEME, own_formations(stages), 0.05)
-        return [[mode_of(part).signs[row] for part in own] for own in moves]
-
-    signs = list_signs([first, last])
-    assert signs[0] == [1.0, -1.0, -1.0, 1.0]
-    assert [1.0, -1.0, 1.0] in signs
-    # It may be at rest where phases meet.
-    assert [1.0, -1.0, -1.0, 1.0] not in list_signs([first, replace(last, phase=first.phase + 1)])
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

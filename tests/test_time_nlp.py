@@ -24,22 +24,18 @@ from wholearm.geometry.curve import Curve, tangent_basis
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions, metric_weights, split_forces
 from wholearm.planning.columns import Columns
-from wholearm.planning.time_domain import stage_kernels as kernels
+from wholearm.planning.time_domain import time_nlp
+from wholearm.planning.time_domain.assembly import Kernel, NlpRows, build_kernel
 from wholearm.planning.time_domain.collocation import Scheme, blend, fit_controls, make_scheme
-from wholearm.planning.time_domain.equations import Target
 from wholearm.planning.time_domain.guesses import guess_stages
-from wholearm.planning.time_domain.nlp_layout import (
-    Block,
-    Kernel,
-    Triplets,
-    assemble_nlp,
-    build_kernel,
-    pack,
-)
 from wholearm.planning.time_domain.search import TimeSearch
 from wholearm.planning.time_domain.stage import LimitMisses, Stage, StagePoints
-from wholearm.planning.time_domain.stage_kernels import (
+from wholearm.planning.time_domain.time_nlp import (
+    Target,
+    TimeNLP,
     bend_kernel,
+    bound_unknowns,
+    build_time_nlp,
     collocation_kernel,
     effort_kernel,
     end_kernel,
@@ -48,12 +44,8 @@ from wholearm.planning.time_domain.stage_kernels import (
     impact_kernel,
     new_rows,
     opening_kernel,
+    pack,
     point_kernel,
-)
-from wholearm.planning.time_domain.time_nlp import (
-    TimeNLP,
-    bound_unknowns,
-    build_time_nlp,
     raise_bounds,
 )
 from wholearm.results.trajectory import Samples
@@ -66,51 +58,54 @@ CLOSE = 1e-12
 
 def make_kernels() -> tuple[Kernel, Kernel, Kernel]:
     """Two outputs of three unknowns; a share of the cost; and one that is linear in x."""
-    x, p = ca.SX.sym("x", 3), ca.SX.sym("p", 1)
+    three, two, one = (Columns(x=size).make_symbols() for size in (3, 2, 2))
+    x, a, b = three.x, two.x, one.x
+    single, pair, none = (Columns(p=size).make_symbols() for size in (1, 2, 1))
+    p, q = single.p, pair.p
     y = ca.vertcat(ca.sin(x[0]) * x[1] + p * x[2] ** 2, ca.exp(x[2]) * x[0] - x[1])
-    a, q = ca.SX.sym("a", 2), ca.SX.sym("q", 2)
-    b, none = ca.SX.sym("b", 2), ca.SX.sym("r", 1)
     return (
-        build_kernel(x, p, y),
-        build_kernel(a, q, q[0] * a[0] * a[1] + q[1] * a[0] ** 4),
-        build_kernel(b, none, none * b[0] - b[1]),
+        build_kernel(three, single, y=y),
+        build_kernel(two, pair, y=q[0] * a[0] * a[1] + q[1] * a[0] ** 4),
+        build_kernel(one, none, y=none.p * b[0] - b[1]),
     )
 
 
 def make_nlp(seed: int) -> tuple[Any, Expression, Expression, Expression]:
-    """An NLP of blocks, and the same one written row by row: x, f and g."""
+    """An NLP of copies of kernels, and the same one written row by row: x, f and g."""
     rng = np.random.default_rng(seed)
     pair, share, line = make_kernels()
-    order = rng.permutation(15)
-    rows = order[:8].reshape(4, 2), order[8:11].reshape(3, 1)
-    linear = np.sort(order[11:])
+    rows, cost = NlpRows(), rng.normal(size=UNKNOWNS)
 
     def choose(count: int, width: int) -> Any:
         # Copies share unknowns, but none has one twice.
         return np.array([rng.choice(UNKNOWNS, width, replace=False) for _ in range(count)])
 
-    blocks = [
-        Block(pair, choose(4, 3), rows[0], rng.normal(size=(4, 1))),
-        Block(share, choose(5, 2), np.zeros((5, 0), dtype=np.int64), rng.normal(size=(5, 2))),
-        Block(line, choose(3, 2), rows[1], rng.normal(size=(3, 1))),
-    ]
-    # The last linear row has no entries.
-    columns = np.concatenate([rng.choice(UNKNOWNS, 3, replace=False) for _ in range(3)])
-    entries = Triplets(np.repeat(linear[:3], 3), columns, rng.normal(size=9))
-    cost = rng.normal(size=UNKNOWNS)
-    built = assemble_nlp(UNKNOWNS, entries, linear, blocks, cost)
+    copies = []
+    for kernel, count, width, given in ((pair, 4, 3, 1), (share, 5, 2, 2), (line, 3, 2, 1)):
+        columns, parameters = choose(count, width), rng.normal(size=(count, given))
+        if kernel is share:
+            own = np.zeros((count, 0), dtype=np.int64)
+            rows.add_cost(kernel, columns, parameters)
+        else:
+            own = rows.nonlinear(count, kernel.outputs)
+            rows.add_copies(kernel, columns, own, parameters)
+        copies.append((kernel, columns, own, parameters))
+        # Linear rows are among them; one has no entries.
+        linear = rows.linear(2)
+    columns, values = choose(1, 3), rng.normal(size=3)
+    rows.add_entries(linear[0], columns, values)
     x = ca.MX.sym("x", UNKNOWNS)
-    f, g = ca.dot(ca.DM(cost), x), [ca.MX(0.0)] * 15
-    for row, column, value in zip(*entries, strict=True):
-        g[row] = g[row] + value * x[int(column)]
-    for block in blocks:
-        for k, own in enumerate(block.columns):
-            y = block.kernel.function(x[own.tolist()], ca.DM(block.parameters[k]))
-            if not block.rows.size:
+    f, g = ca.dot(ca.DM(cost), x), [ca.MX(0.0)] * 17
+    for column, value in zip(columns[0], values, strict=True):
+        g[int(linear[0])] += value * x[int(column)]
+    for kernel, table, own, parameters in copies:
+        for k, each in enumerate(table):
+            y = kernel.function(x[each.tolist()], ca.DM(parameters[k]))
+            if not own.size:
                 f += y
-            for i, row in enumerate(block.rows[k]):
+            for i, row in enumerate(own[k]):
                 g[row] = y[i]
-    return built, x, f, ca.vertcat(*g)
+    return rows.assemble(cost), x, f, ca.vertcat(*g)
 
 
 def evaluate(inputs: list[Expression], output: Expression, *values: Array) -> Array:
@@ -123,14 +118,14 @@ def test_values_and_derivatives_are_those_of_the_same_nlp_in_one_piece(seed: int
     rng = np.random.default_rng(100 + seed)
     lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", g.numel())
     at, on_f, on_g = rng.normal(size=UNKNOWNS), rng.normal(size=1), rng.normal(size=g.numel())
-    nlp = built.nlp
+    nlp, derivatives = built
     for own, expected in ((nlp["f"], f), (nlp["g"], g)):
         got = evaluate([nlp["x"]], own, at)
         np.testing.assert_allclose(got, evaluate([x], expected, at), atol=CLOSE)
-    again, jacobian = built.derivatives["jac_g"](at, [])
+    again, jacobian = derivatives["jac_g"](at, [])
     np.testing.assert_allclose(again.full(), evaluate([x], g, at), atol=CLOSE)
     np.testing.assert_allclose(jacobian.full(), evaluate([x], ca.jacobian(g, x), at), atol=CLOSE)
-    hessian = built.derivatives["hess_lag"](at, [], on_f, on_g)
+    hessian = derivatives["hess_lag"](at, [], on_f, on_g)
     full = ca.hessian(lam_f * f + ca.dot(lam_g, g), x)[0]
     expected = evaluate([x, lam_f, lam_g], full, at, on_f, on_g)
     np.testing.assert_allclose(hessian.full(), np.triu(expected), atol=CLOSE)
@@ -139,19 +134,16 @@ def test_values_and_derivatives_are_those_of_the_same_nlp_in_one_piece(seed: int
 
 
 def test_the_solver_takes_the_derivatives_that_it_is_given() -> None:
-    x = ca.SX.sym("x", 2)
+    x = Columns(x=2).make_symbols()
     # Rosenbrock's valley, one share of the cost, on a circle.
-    valley = build_kernel(x, ca.SX(0, 1), (1 - x[0]) ** 2 + 100 * (x[1] - x[0] ** 2) ** 2)
-    circle = build_kernel(x, ca.SX(0, 1), ca.sumsqr(x))
-    both, none = np.array([[0, 1]]), np.zeros((1, 0))
-    blocks = [
-        Block(valley, both, none.astype(np.int64), none),
-        Block(circle, both, np.array([[0]]), none),
-    ]
-    nothing = np.zeros(0, dtype=np.int64)
-    built = assemble_nlp(2, Triplets(nothing, nothing, np.zeros(0)), nothing, blocks, np.zeros(2))
+    valley = build_kernel(x, y=(1 - x.x[0]) ** 2 + 100 * (x.x[1] - x.x[0] ** 2) ** 2)
+    circle = build_kernel(x, y=ca.sumsqr(x.x))
+    both, rows = np.array([[0, 1]]), NlpRows()
+    rows.add_cost(valley, both)
+    rows.add_copies(circle, both, rows.nonlinear(1, 1))
+    nlp, derivatives = rows.assemble(np.zeros(2))
     quiet = {"ipopt": {"print_level": 0, "sb": "yes"}, "print_time": False}
-    solver = ca.nlpsol("solver", "ipopt", built.nlp, quiet | built.derivatives)
+    solver = ca.nlpsol("solver", "ipopt", nlp, quiet | derivatives)
     result = solver(x0=[0.3, 0.3], lbg=-np.inf, ubg=1.0)["x"].full()[:, 0]
     # On the circle, by its angle.
     angle = np.linspace(0, np.pi / 2, 2_000_001)
@@ -672,7 +664,7 @@ def test_limits_are_no_part_of_kernels(heptagon: Problem, monkeypatch: pytest.Mo
     def refuse(*_: object) -> Kernel:
         raise AssertionError("a kernel is built again")
 
-    monkeypatch.setattr(kernels, "build_kernel", refuse)
+    monkeypatch.setattr(time_nlp, "build_kernel", refuse)
     build(stronger)
 
 

@@ -12,12 +12,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...common.arrays import Array
 from ...contacts.elemental import Contact
+from ...contacts.formation import Formation
 from ...geometry.arcs import CostToGo
 from ...geometry.curve import find_tied, tangent_basis
 from ...geometry.explore import close_contacts, is_inside
@@ -39,6 +40,10 @@ PATHS = 3  # most paths to other ends
 STEP = 0.15  # distance of ends, over the length of the path to the nearest end
 GROWTH = 1.2  # ratio of successive distances
 STEPS = 12  # most ends on either side of the nearest one
+NEAR = -0.3  # margin of a path above which a motion near it may keep its limits
+BRISK = 0.5  # share of a positive margin that the speed profile keeps
+GIVES = 0.02  # what it may lose of a negative margin
+SLOWEST = 0.02  # least sum of speeds at both ends of a piece, over the scene's, for its duration
 SURE = 1e-3  # margin above which a motion keeps its limits
 FASTEST = 9.0  # largest squared speed, over gravity times the radius of gyration
 INTERVALS = 10  # of a phase to start with
@@ -49,6 +54,7 @@ RESTS = 0.1  # least duration of that, over that of its stage, that makes it rol
 SLOW = 1e-5  # rate over the largest at the same instant below which its sign is undetermined
 STILL = 1e-4  # largest rate at an instant, over that of all, below which all signs are undetermined
 BRIEF = 0.05  # least duration of a piece over that of its stage
+LEAST_STEPS = 2  # fewest steps of a piece of a path that is not merged into another
 MOST = 8  # most pieces of a stage
 _LIGHT = 0.5  # normal forces of an initial guess, over the weight of the object
 _NEAR = 0.02  # distance over the radius of gyration at which a limit is monitored from the start
@@ -87,7 +93,10 @@ class Guesses:
     def straight(self, goal: Array) -> Guess | None:
         """Straight to an end of a single phase with two freedoms, in the modes of that path."""
         outline = self._connect(goal)
-        return self._follow(STRAIGHT, outline) if outline else None
+        margin = find_margin(outline, self.problem.epsilon, paced=True) if outline else None
+        if outline is None or margin is None or margin.value <= NEAR:
+            return None
+        return self._follow(STRAIGHT, outline, margin.profile)
 
     @cached_property
     def paths(self) -> list[tuple[PathMargin, PathGuess]]:
@@ -98,7 +107,7 @@ class Guesses:
 
         def rank(path: tuple[PathMargin, PathGuess]) -> tuple[float, float]:
             """Feasible paths by their length, others by their margin."""
-            (margin, _, _), outline = path
+            (margin, *_), outline = path
             return (-SURE, outline.length) if margin > SURE else (-margin, 0.0)
 
         return sorted((own for own in found if own[0].value > -np.inf), key=rank)
@@ -124,11 +133,14 @@ class Guesses:
         free = formation.evaluate_limits(outline.z).min() > -formation.scene.touching
         return outline if moves and free else None
 
-    def _follow(self, name: str, outline: PathGuess) -> Guess | None:
+    def _follow(
+        self, name: str, outline: PathGuess, profile: PathSpeed | None = None
+    ) -> Guess | None:
         """Along a path in its modes; None if these are too many."""
-        stages, scheme = self._guess(outline, FALLS[0]), self.search.scheme
-        pieces = [piece for stage in stages for piece in split_by_signs(stage, scheme)]
-        return Guess(name, link(merge(pieces))) if pieces else None
+        pieces = split_path(outline)
+        if len(pieces) > MOST:
+            return None
+        return Guess(name, self._guess(pieces, FALLS[0], profile))
 
     def resume(self, solution: TimeSolution) -> Guess:
         """From a solution with nearly the same start."""
@@ -139,8 +151,9 @@ class Guesses:
         return Guess("", self._leave_room(stages), before=solution)
 
     def every(self, goal: Array | None = None) -> Iterator[Guess]:
-        """All of them; where the end is known, straight there comes first."""
-        if goal is None and self._is_planar() and self.phases[0].until.pins:
+        """All of them; where the end is given or pinned, straight there comes first."""
+        given = goal is not None
+        if not given and self._is_planar() and self.phases[0].until.pins:
             goal = find_end(self.phases[0], self.z)
         straight = None if goal is None else self.straight(goal)
         if straight is not None:
@@ -149,9 +162,10 @@ class Guesses:
         yield self.nearest.by_homotopy()
         if straight is not None:
             yield straight.by_homotopy()
-        yield from self.to_others()
-        for falls in FALLS[1:]:
-            yield Guess(LONGER.format(NEAREST, falls), self._guess(None, falls))
+        if not given:
+            yield from self.to_others()
+            for falls in FALLS[1:]:
+                yield Guess(LONGER.format(NEAREST, falls), self._guess(None, falls))
 
     def _list_goals(self) -> list[Array]:
         """Ends of a phase: the nearest, (5,), and others on both sides of it."""
@@ -190,14 +204,16 @@ class Guesses:
                 last, goal = goal, following
         return goals
 
-    def _guess(self, outline: PathGuess | None, falls: float) -> list[Stage]:
+    def _guess(
+        self, pieces: list[PathGuess] | None, falls: float, profile: PathSpeed | None = None
+    ) -> list[Stage]:
         options = self.search.options
         count = options.time_intervals or INTERVALS
-        given = self.problem, self.phases, self.z, self.search.scheme, count, falls, outline
+        given = self.problem, self.phases, self.z, self.search.scheme, count, falls
         return self._leave_room(
             [
                 replace(stage, opening=options.opening, clearance=options.clearance)
-                for stage in guess_stages(*given)
+                for stage in guess_stages(*given, pieces, profile)
             ]
         )
 
@@ -208,16 +224,35 @@ class Guesses:
         return [*stages[:-1], keep_apart(stages[-1], self.to_go.phase.until.contact)]
 
 
+class PathSpeed(NamedTuple):
+    """Speed profile along a path."""
+
+    t: Array  # (n,) [s]
+    s: Array  # (n,): share of the length
+    v: Array  # (n,) [1/s]: its rate, piecewise linear in time
+    forces: Array  # (n - 1, n_c + R): in the intervals, over the weight of the object
+
+    def evaluate(self, passed: Array) -> tuple[Array, Array, Array]:
+        """Share of the length at shares of the time, and its derivatives by these."""
+        total = self.t[-1]
+        k = np.clip(np.searchsorted(self.t, passed * total) - 1, 0, len(self.forces) - 1)
+        begin, since = self.v[k], passed * total - self.t[k]
+        gain = (np.diff(self.v) / np.diff(self.t))[k]
+        place = self.s[k] + since * (begin + gain * since / 2)
+        return place, total * (begin + gain * since), total**2 * gain
+
+
 class PathMargin(NamedTuple):
     """Largest uniform margin of limits along a path at any speed, and the critical limit."""
 
     value: float  # -inf without a motion
     kind: str = ""  # of the limit with the largest sum of multipliers
     part: str = ""
+    profile: PathSpeed | None = None  # a fast one with nearly that margin
 
 
-def find_margin(outline: PathGuess, epsilon: float) -> PathMargin:
-    """Largest margin along a path, by a linear programme.
+def find_margin(outline: PathGuess, epsilon: float, paced: bool = False) -> PathMargin:
+    """Largest margin along a path, by a linear programme; if `paced` also a speed profile.
 
     Unknowns are the squared speed b at the nodes, contact forces c in the intervals, and the
     margin. Friction is against the path; viscous friction and limits of speeds are neglected.
@@ -251,22 +286,89 @@ def find_margin(outline: PathGuess, epsilon: float) -> PathMargin:
     slopes = limits.rows[sides, :-2] * scales[:, None]
     rows = -(slopes @ y)
     rows[..., -1] = 1.0
+    given = rows.reshape(-1, size), (offset @ slopes.T - scales * bounds).ravel()
+    equal = (drive[:, :3] / units[:, None]).reshape(-1, size)
+    equal_to = np.tile(scene.applied_force[:3] / units, m)
     free: list[tuple[float | None, float | None]] = [(None, None)] * (m * width)
-    answer = linprog(
-        -np.eye(size)[-1],
-        rows.reshape(-1, size),
-        (offset @ slopes.T - scales * bounds).ravel(),
-        (drive[:, :3] / units[:, None]).reshape(-1, size),
-        np.tile(scene.applied_force[:3] / units, m),
-        [(0.0, 0.0), *[(0.0, FASTEST)] * (m - 1), (0.0, 0.0), *free, (None, 1.0)],
-        method="highs",
-    )
+    inside = [(0.0, 0.0), *[(0.0, FASTEST)] * (m - 1), (0.0, 0.0), *free]
+
+    def maximise(gain: Array, least: float | None) -> Any:
+        every = [*inside, (least, 1.0)]
+        return linprog(-gain, *given, equal, equal_to, every, method="highs")
+
+    answer = maximise(np.eye(size)[-1], None)
     if answer.status != 0:
         return PathMargin(-np.inf)
     shares = np.abs(answer.ineqlin.marginals).reshape(m, -1).sum(axis=0)
     totals = np.bincount(limits.owners[sides], shares)
     critical = limits.limits[int(totals.argmax())]
-    return PathMargin(float(answer.x[-1]), critical.kind, critical.part)
+    margin, profile = float(answer.x[-1]), None
+    speeds, least = np.where(np.arange(size) <= m, 1.0, 0.0), min(BRISK * margin, margin - GIVES)
+    fast = maximise(speeds, least) if paced else None
+    if fast is not None and fast.status == 0:
+        v = scene.scales.speed * np.sqrt(np.maximum(fast.x[: m + 1], 0.0))
+        slow = SLOWEST * scene.scales.speed
+        t = np.append(0.0, np.cumsum(2 * runs[:, 0] / np.maximum(v[1:] + v[:-1], slow)))
+        length = np.append(0.0, np.cumsum(runs))
+        forces = fast.x[m + 1 : -1].reshape(m, width)
+        profile = PathSpeed(t, length / length[-1], v / length[-1], forces)
+    return PathMargin(margin, critical.kind, critical.part, profile)
+
+
+def split_path(outline: PathGuess) -> list[PathGuess]:
+    """A path as pieces between reversals, of which no two coincide: there motion would stop."""
+    z, formation = outline.z, outline.formation
+    steps, middles = np.diff(z, axis=0), (z[1:] + z[:-1]) / 2
+    slip = np.einsum("nij,nj->ni", formation.evaluate(middles, steps).A_t, steps)
+    rates = np.hstack([slip, steps[:, 3:]])
+    signs = np.where(rates < 0, -1.0, 1.0)
+    signs[:, list(formation.rolling_rows)] = 1.0
+    cuts = [0]
+    for k in range(1, len(signs)):
+        if (signs[k] != signs[cuts[-1]]).any():
+            if k - cuts[-1] < LEAST_STEPS:
+                signs[cuts[-1] : k] = signs[k]
+            else:
+                cuts.append(k)
+    if len(signs) - cuts[-1] < LEAST_STEPS and len(cuts) > 1:
+        signs[cuts.pop() :] = signs[cuts[-1]]
+    way, part = list[PathGuess](), z[:1]
+    for begin, stop in pairwise([*cuts, len(signs)]):
+        own, part = signs[begin].copy(), np.concatenate([part, z[begin + 1 : stop]])
+        turning = list[tuple[int, ...]]()
+        if stop < len(signs):
+            turning = _order_turns(formation, z[stop], own, signs[stop], rates[stop - 1 : stop + 1])
+        # The reversals are within the steps before and after the cut.
+        places = stop - 0.5 + (np.arange(len(turning)) + 1) / (len(turning) + 1)
+        for rows, place in zip(turning, places, strict=True):
+            k = int(place)
+            end = z[k] + (place - k) * (z[k + 1] - z[k]) if len(turning) > 1 else z[stop]
+            if len(part) == 1:
+                part = np.stack([part[0], (part[0] + end) / 2])
+            way.append(_make_stretch(formation, np.vstack([part, end]), own, rows))
+            own[list(rows)] *= -1
+            part = end[None]
+    way.append(_make_stretch(formation, np.vstack([part, z[-1:]]), own, ()))
+    return way
+
+
+def _make_stretch(formation: Formation, z: Array, signs: Array, rows: Sequence[int]) -> PathGuess:
+    Xi, sigma = np.split(signs.copy(), [formation.n_contacts])
+    return PathGuess(formation, z, Directions(Xi, sigma), tuple(rows))
+
+
+def _order_turns(
+    formation: Formation, z: Array, before: Array, after: Array, rates: Array
+) -> list[tuple[int, ...]]:
+    """Rows that reverse between two pieces, tied ones together, in order of time."""
+    rows = np.flatnonzero(before != after).tolist()
+    groups = {tuple(sorted(i for i in find_tied(formation, z, k) if i in rows)) for k in rows}
+
+    def cross(group: tuple[int, ...]) -> float:
+        first, last = rates[:, group[0]]
+        return float(first / (first - last)) if first * last < 0 else 0.5
+
+    return sorted(groups, key=lambda group: (cross(group), group))
 
 
 def keep_apart(stage: Stage, contact: Contact | None) -> Stage:
@@ -377,19 +479,23 @@ def guess_stages(
     scheme: Scheme,
     intervals: int,
     falls: float,
-    outline: PathGuess | None = None,
+    pieces: Sequence[PathGuess] | None = None,
+    profile: PathSpeed | None = None,
 ) -> list[Stage]:
     """Stages of phases in one NLP, with an initial guess, in the scene's own units.
 
     The guessed duration is `falls` times that of a fall over the length of the initial paths. A
-    single phase may follow a given one.
+    single phase may follow the pieces of a given one, with its speed profile.
     """
-    parts = _list_parts(problem, phases, z, outline)
+    parts = _list_parts(problem, phases, z, pieces)
     lengths = np.array([outline.length for _, outline, _ in parts])
     ends = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()
     # The path parameter of the guess is (1 - cos) / 2 over all stages.
     total = falls * float(np.sqrt(lengths.sum()))
     clock = np.arccos(1 - 2 * np.clip(ends, 0.0, 1.0)) / np.pi
+    if profile is not None:
+        total = float(profile.t[-1]) / problem.scene.scales.time
+        clock = np.interp(ends, profile.s, profile.t / profile.t[-1])
     stages: list[Stage] = []
     released: tuple[int, ...] = ()
     for k, (phase, outline, last) in enumerate(parts):
@@ -400,7 +506,7 @@ def guess_stages(
             ahead = row, value, 1.0 if value > begin else -1.0
         whole = lengths[[own is phase for own, _, _ in parts]].sum()
         count = max(LEAST_INTERVALS, round(lengths[k] / whole * intervals))
-        guess = _guess(outline, scheme, count, clock[k : k + 2], ends[k : k + 2], total)
+        guess = _guess(outline, scheme, count, clock[k : k + 2], ends[k : k + 2], total, profile)
         ends_in_impact = last and phase.end is End.IMPACT and k + 1 < len(parts)
         if ends_in_impact:
             guess = guess._replace(impulses=np.zeros(parts[k + 1][0].formation.n_constraints))
@@ -429,12 +535,12 @@ def guess_stages(
 
 
 def _list_parts(
-    problem: Problem, phases: Sequence[Phase], z: Array, outline: PathGuess | None
+    problem: Problem, phases: Sequence[Phase], z: Array, pieces: Sequence[PathGuess] | None
 ) -> list[tuple[Phase, PathGuess, bool]]:
     """Phases with their initial paths, in own units, and whether each is the last of its phase."""
     parts: list[tuple[Phase, PathGuess, bool]] = []
     for k, phase in enumerate(phases):
-        outlines = [outline] if outline else guess_phase(phase, z, phases[k + 1 :])
+        outlines = list(pieces or guess_phase(phase, z, phases[k + 1 :]))
         if parts and parts[-1][0].end is End.SMOOTH:
             outlines = [*_turn_first(outlines[0], parts[-1][1]), *outlines[1:]]
         z = outlines[-1].z[-1]
@@ -447,9 +553,15 @@ def _list_parts(
 
 
 def _guess(
-    outline: PathGuess, scheme: Scheme, count: int, clock: Array, ends: Array, total: float
+    outline: PathGuess,
+    scheme: Scheme,
+    count: int,
+    clock: Array,
+    ends: Array,
+    total: float,
+    profile: PathSpeed | None,
 ) -> StagePoints:
-    """Motion along an initial path, with normal forces nearest to equal ones.
+    """Motion along an initial path, with normal forces nearest to equal ones without a profile.
 
     `clock` and `ends` are shares of the time `total` [s] and length of all stages at both ends.
     """
@@ -460,32 +572,42 @@ def _guess(
     breaks = np.linspace(0.0, 1.0, count + 1)
 
     def follow(share: Array) -> tuple[Array, Array, Array]:
-        angle = np.pi * (clock[0] + share * (clock[1] - clock[0]))
-        span = max(ends[1] - ends[0], 1e-12)
-        place = ((1 - np.cos(angle)) / 2 - ends[0]) / span
-        rate = (np.pi / 2 * np.sin(angle) / (span * total))[..., None]
-        gain = (np.pi**2 / 2 * np.cos(angle) / (span * total**2))[..., None]
+        passed = clock[0] + share * (clock[1] - clock[0])
+        span, turn = max(ends[1] - ends[0], 1e-12), np.pi * passed
+        place, rate, gain = (
+            ((1 - np.cos(turn)) / 2, np.pi / 2 * np.sin(turn), np.pi**2 / 2 * np.cos(turn))
+            if profile is None
+            else profile.evaluate(passed)
+        )
+        place = (place - ends[0]) / span
+        rate, gain = rate[..., None] / (span * total), gain[..., None] / (span * total**2)
         z, slope, bend = (
             np.stack([np.interp(place, knots, column) for column in table.T], axis=-1)
             for table in (outline.z, slopes, bends)
         )
         return z, slope * rate, slope * gain + bend * rate**2
 
-    z, v, a = follow(breaks[:-1, None] + scheme.points / count)
+    at = breaks[:-1, None] + scheme.points / count
+    z, v, a = follow(at)
     # G^T c + S tau is what the equations of motion need.
     flat = [table.reshape(-1, 5) for table in (z, v, a)]
     G = force_rows(formation, formation.evaluate(*flat[:2]), outline.directions)
     applied = scene.applied_force - scene.dry * np.append(np.zeros(3), outline.directions.sigma)
     needed = scene.mass_diagonal * flat[2] + scene.viscous * flat[1] - applied
     c = np.zeros((len(G), formation.n_constraints))
-    c[:, : formation.n_contacts] = _LIGHT
-    missing = needed[:, :3] - np.einsum("nij,ni->nj", G[:, :, :3], c)
-    c += [
-        np.linalg.lstsq(rows.T, short, rcond=1e-6)[0]
-        for rows, short in zip(G[:, :, :3], missing, strict=True)
-    ]
-    c_n = c[:, : formation.n_contacts]
-    c_n[:] = np.clip(c_n, 0.1 * _LIGHT, 20.0)
+    if profile is None:
+        c[:, : formation.n_contacts] = _LIGHT
+        missing = needed[:, :3] - np.einsum("nij,ni->nj", G[:, :, :3], c)
+        c += [
+            np.linalg.lstsq(rows.T, short, rcond=1e-6)[0]
+            for rows, short in zip(G[:, :, :3], missing, strict=True)
+        ]
+        c_n = c[:, : formation.n_contacts]
+        c_n[:] = np.clip(c_n, 0.1 * _LIGHT, 20.0)
+    else:
+        passed = clock[0] + at.ravel() * (clock[1] - clock[0])
+        own = np.searchsorted(profile.t / profile.t[-1], passed) - 1
+        c[:] = profile.forces[np.clip(own, 0, len(profile.forces) - 1)]
     # Torques of the motion, within limits, at about as many points as they have control points.
     tau = needed[:, 3:] - np.einsum("nij,ni->nj", G[:, :, 3:], c)
     limit = 0.9 * scene.torque_limit
@@ -526,8 +648,7 @@ def _turn_first(outline: PathGuess, before: PathGuess) -> list[PathGuess]:
     cuts = np.linspace(0, len(outline.z) - 1, len(turns) + 2).astype(int)
     for k, (begin, stop) in enumerate(pairwise(cuts)):
         turn = turns[k] if k < len(turns) else outline.turns
-        directions = Directions(*np.split(signs.copy(), [n_c]))
-        pieces.append(PathGuess(formation, outline.z[begin : stop + 1], directions, tuple(turn)))
+        pieces.append(_make_stretch(formation, outline.z[begin : stop + 1], signs, turn))
         if k < len(turns):
             signs[list(turns[k])] = own[list(turns[k])]
     return pieces

@@ -21,10 +21,9 @@ from ...geometry.curve import find_tied
 from ...mechanics.dynamics import Directions, split_forces
 from ...scene.model import Scene
 from .collocation import Scheme
-from .equations import least_senses
 from .search import TimeSearch, TimeSolution
 from .stage import Stage, StagePoints, resample
-from .stage_kernels import new_rows
+from .time_nlp import least_senses, new_rows
 
 LEAST_INTERVALS = 3  # fewest intervals of a stage
 _STALLED = 1e-6  # rate over the largest at which a sliding direction counts as held
@@ -336,42 +335,17 @@ def _apply(
     own: Sequence[Formation],
     runs: list[tuple[ModeRun, int]],
 ) -> Iterator[list[Stage]]:
-    """Stages in another mode over a run.
-
-    First over runs that continue from stage to stage, which would have to reverse in between if
-    changed in one alone; then over whole stages that are mostly such a run; then over single runs.
-    """
+    """Stages in another mode over a run: whole stages that are mostly one, then single runs."""
     whole = [
-        [(run._replace(begin=0, stop=stages[k].intervals), k)]
+        (run._replace(begin=0, stop=stages[k].intervals), k)
         for run, k in runs
         if 2 * run.share > stages[k].guess.duration
     ]
-    groups = (_list_across(stages, runs), whole, [[pair] for pair in runs])
-    for group in groups:
-        for chain in sorted(group, key=lambda chain: -sum(run.share for run, _ in chain)):
-            pieces = [_turn(stages, index, run, own, scheme) for run, index in chain]
-            first, last = chain[0][1], chain[-1][1]
-            if None not in pieces:
-                changed = (stage for piece in pieces for stage in piece or ())
-                yield link(merge([*stages[:first], *changed, *stages[last + 1 :]]))
-
-
-def _list_across(
-    stages: Sequence[Stage], runs: Sequence[tuple[ModeRun, int]]
-) -> list[list[tuple[ModeRun, int]]]:
-    """Runs of one row that meet where stages of a phase do."""
-    by_key = {(k, run.row, run.sign, _sign(stages[k], run)): run for run, k in runs}
-    chains = []
-    for (k, row, sign, side), run in by_key.items():
-        chain = [(run, k)]
-        while (end := chain[-1])[0].stop == stages[end[1]].intervals:
-            after = by_key.get((end[1] + 1, row, sign, side))
-            if after is None or after.begin or stages[end[1] + 1].phase != stages[k].phase:
-                break
-            chain.append((after, end[1] + 1))
-        if len(chain) > 1:
-            chains.append(chain)
-    return chains
+    for group in (whole, runs):
+        for run, index in sorted(group, key=lambda pair: -pair[0].share):
+            pieces = _turn(stages, index, run, own, scheme)
+            if pieces is not None:
+                yield link(merge([*stages[:index], *pieces, *stages[index + 1 :]]))
 
 
 def _sign(stage: Stage, run: ModeRun) -> float:

@@ -26,10 +26,10 @@ from ...sensitivity.slopes import find_slopes_at
 from ..options import DEFAULT_ACCURACY, Objective
 from ..robust.robust_rows import find_edges
 from .collocation import Scheme
-from .equations import SLIDING, find_relieved, least_senses, price_sides
 from .search import TimeSearch, TimeSolution
 from .stage import LimitMisses, Stage, bisect_intervals, monitor
 from .time_motion import MotionResponse, StageMotion, make_motions
+from .time_nlp import SLIDING, find_relieved, least_senses, price_sides
 
 
 @dataclass(frozen=True)

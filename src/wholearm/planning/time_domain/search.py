@@ -17,8 +17,6 @@ from ...problem.definition import Problem
 from ..options import Objective, PlanOptions
 from ..phase_plan import Tried
 from .collocation import Scheme, make_scheme
-from .equations import StageRows, Target
-from .nlp_layout import MARGIN, Indices, pack, unpack
 from .stage import (
     LimitMisses,
     Stage,
@@ -29,7 +27,16 @@ from .stage import (
     unit_of,
     with_controls,
 )
-from .time_nlp import TimeNLP, bound_unknowns, build_time_nlp, raise_bounds
+from .time_nlp import (
+    MARGIN,
+    Target,
+    TimeNLP,
+    bound_unknowns,
+    build_time_nlp,
+    pack,
+    raise_bounds,
+    unpack,
+)
 
 FIRST_SIZE = 1e-2  # multipliers of a first guess
 Multipliers = dict[str, Array]  # of the unknowns' bounds, `lam_x0`, and of the rows, `lam_g0`
@@ -178,13 +185,8 @@ class TimeSearch:
             return self.run(before.nlp, stages, raised, before.multipliers, margin)
         depth = _BROKEN * self.problem.scene.polygon.gyration_radius
         while True:
-            nlp, multipliers = self.build(stages, most), None
-            if before and [s.monitored for s in before.stages] == [s.monitored for s in stages]:
-                multipliers = carry_multipliers(
-                    before.multipliers, before.nlp, nlp, self.scheme, before.stages, stages
-                )
             limits = raised or [LimitMisses.none(stage) for stage in stages]
-            solution = self.run(nlp, stages, limits, multipliers, margin)
+            solution = self.run(self.build(stages, most), stages, limits, None, margin)
             if raised or not solution.success:
                 return solution
             tables = [
@@ -255,68 +257,3 @@ def first_multipliers(
     (low, high), (low_g, high_g) = bounds, row_bounds
     bounded = np.isfinite(high).astype(float) - np.isfinite(low)
     return {"lam_x0": size * bounded, "lam_g0": np.where(high_g > low_g, -size, 0.0)}
-
-
-def carry_multipliers(
-    multipliers: Multipliers,
-    old: TimeNLP,
-    new: TimeNLP,
-    scheme: Scheme,
-    old_stages: Sequence[Stage],
-    new_stages: Sequence[Stage],
-) -> Multipliers:
-    """Multipliers of the same stages on other intervals.
-
-    Those of points are proportional to the interval's length; those of collocation are costates.
-    """
-    on_x, on_g = multipliers["lam_x0"], multipliers["lam_g0"]
-    lam_x, lam_g = np.zeros(new.layouts[-1].stop), np.zeros(len(new.rows.bounds[0]))
-    once = [_list_once(nlp) for nlp in (new, old)]
-    if len(once[0]) == len(once[1]):
-        lam_g[once[0]] = on_g[once[1]]
-
-    def spread(values: Array, share: Array) -> Array:
-        return np.asarray(values * share.reshape(-1, *[1] * (values.ndim - 1)))
-
-    for k, (before, after) in enumerate(zip(old_stages, new_stages, strict=True)):
-        coarse, fine = before.guess, after.guess
-        middles = fine.breaks[:-1] + fine.fractions / 2
-        parent = np.searchsorted(coarse.breaks, middles, side="right") - 1
-        share = fine.fractions / coarse.fractions[parent]
-        for name in ("tau", "v", "forces"):
-            columns = getattr(old.layouts[k], name)[parent]
-            lam_x[getattr(new.layouts[k], name)] = spread(on_x[columns], share)
-        rows, old_rows = new.rows_of[k], old.rows_of[k]
-        for mine, theirs in zip(rows.even, old_rows.even, strict=True):
-            lam_g[mine] = spread(on_g[theirs[parent]], share)
-        if rows.motors is not None and old_rows.motors is not None:
-            motors, old_motors = rows.motors, old_rows.motors
-            lam_g[motors.rates] = on_g[old_motors.rates[parent]]
-            lam_g[motors.commands] = on_g[old_motors.commands[parent]]
-            # Multipliers of continuous torques are a costate.
-            for joint in range(2 if len(coarse.breaks) > 2 else 0):
-                costate = on_g[old_motors.joins[:, joint]]
-                lam_g[motors.joins[:, joint]] = np.interp(
-                    fine.breaks[1:-1], coarse.breaks[1:-1], costate
-                )
-        costate = find_costate(old_rows, on_g, scheme)[parent]
-        start, length = coarse.breaks[parent, None], coarse.fractions[parent, None]
-        places = (fine.places(scheme.points) - start) / length
-        moved = np.stack([scheme.interpolate(x) @ c for x, c in zip(places, costate, strict=True)])
-        along = np.einsum("kdf,ksjd->ksjf", rows.bases, moved * scheme.weights[:, None])
-        lam_g[rows.states] = np.linalg.pinv(scheme.rungs.T) @ along
-    return {"lam_x0": lam_x, "lam_g0": lam_g}
-
-
-def find_costate(rows: StageRows, on_g: Array, scheme: Scheme) -> Array:
-    """Costate of z and z' at the points from multipliers of collocation, shape (K, 2, d, 5)."""
-    shares = scheme.rungs.T @ on_g[rows.states] / scheme.weights[:, None]
-    return np.asarray(np.einsum("kdf,ksjf->ksjd", rows.bases, shares))
-
-
-def _list_once(nlp: TimeNLP) -> Indices:
-    """Rows that do not belong to intervals."""
-    rows = [part.ravel() for r in nlp.rows_of for part in (*r.even, r.states, r.shares)]
-    slow = [r.motors for r in nlp.rows_of if r.motors is not None]
-    rows += [part.ravel() for m in slow for part in (m.joins, m.rates, m.commands)]
-    return np.delete(np.arange(len(nlp.rows.bounds[0])), np.concatenate(rows))

@@ -192,13 +192,13 @@ def is_met(
 
 def refuse_paths(problem: Problem, phase: Phase, margins: Sequence[PathMargin]) -> None:
     """Raise an InfeasibleError with the critical limit if along every path one is missed."""
-    if not margins or (best := max(margins)).value > -MISSED:
+    if not margins or (best := max(margins, key=lambda own: own.value)).value > -MISSED:
         return
     limits = make_limits(phase.formation, problem.epsilon).limits
-    limit = next(own for own in limits if (own.kind, own.part) == best[1:])
+    limit = next(own for own in limits if (own.kind, own.part) == best[1:3])
     place, missed = LimitPlace(phase.number, math.nan, "the best of them"), -best.value
     amount = missed * limit.scale
-    shortfall = Shortfall(*best[1:], limit.text, amount, limit.unit, place, missed)
+    shortfall = Shortfall(*best[1:3], limit.text, amount, limit.unit, place, missed)
     raise InfeasibleError(
         f"phase {phase.number} is infeasible along all straight paths to its ends, at any speed: "
         f"{shortfall}",

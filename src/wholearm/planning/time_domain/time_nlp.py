@@ -16,6 +16,17 @@ space of P at a guess of each interval, the differential equations are collocate
 
 No other row has h, so that a stage may vanish. Rates that equations keep at zero have no sign
 constraint, which would leave the solver no interior. All quantities are in the scene's units.
+
+Rate-limited torques have control points c_0 ... c_n in each interval and are continuous; with rate
+limit R
+
+    |c_k+1 - c_k| n <= R h,
+    |h c_k + lag (k (c_k - c_k-1) + (n - k) (c_k+1 - c_k))| <= limit h
+
+bound derivatives and commands throughout by their own control points. At both ends the torques hold
+the object at rest, with friction in the directions of motion. Contact forces are continuous, too:
+those of a contact that is released or gained softly vanish or set in within one interval, and a
+rolling contact that begins to slide comes to the edge of its cone.
 """
 
 from __future__ import annotations
@@ -25,42 +36,28 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 from itertools import groupby, pairwise
+from math import comb
 from typing import Any, NamedTuple
 
+import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from ...common.arrays import Array, Expression
-from ...geometry.curve import tangent_basis
+from ...common.errors import Parameter
+from ...contacts.contact_limits import build_limits
+from ...contacts.elemental import Contact, build_features, build_gap
+from ...contacts.formation import Formation
+from ...geometry.curve import find_tied, tangent_basis
+from ...mechanics.dynamics import build_force_rows
+from ...mechanics.limits import CONE, PRESS, SPEED, LimitSet, make_limits
+from ...problem.definition import Until
 from ...solvers.ipopt import SolverStatistics, book, build_solver
 from ..columns import Columns
 from ..options import Objective
-from .collocation import Scheme
-from .equations import (
-    LimitRows,
-    StageRows,
-    Target,
-    add_stage,
-    bound_by_limits,
-    find_relieved,
-    find_still,
-    hold_ends,
-    join_stages,
-    least_senses,
-)
-from .nlp_layout import (
-    MARGIN,
-    STATE,
-    Assembled,
-    Indices,
-    NlpRows,
-    StageLayout,
-    V,
-    Z,
-    assemble_nlp,
-    lay_out,
-)
-from .stage import LimitMisses, Stage
-from .stage_kernels import NamedKernel, bend_kernel, effort_kernel, name_kernel
+from .assembly import Indices, Kernel, NlpRows, build_kernel, share
+from .collocation import Scheme, blend, make_scheme
+from .stage import LimitMisses, Stage, StagePoints
 
 SHORTEST = 1e-6  # least duration of an interval, in the scene's unit
 _BEND = 1e-2  # weight of second differences of torques over their limits, which else may ring
@@ -68,13 +65,170 @@ _HURRY = 3e-4  # weight of time against violations
 CLEAR = 1e-3  # distance of a coordinate from its value at the phase's end; less near the end
 LONGEST = 120.0  # most processor time of one solve [s]
 NEAR, FAR = 1e-6, 1e-2  # distance of a start from its bounds: a solution, and a first guess
+SLIDING = 1e-5  # least rate of sliding contacts, over the radius of gyration, and of joints
+_WITHIN = np.array([0.3, 0.4, 0.5, 0.75, 0.85, 0.93])
+"""Places at which c_n is also bounded with rate-limited torques: minima are inside intervals."""
+_ROOM = 0.05  # most relative distance of a lagging motor's torque at rest from its limit
+Z, V = slice(0, 5), slice(5, 10)
+"""Slices of a node's unknowns: z and z'. With a margin, that follows."""
+STATE, MARGIN = 10, 10
+
+
+@dataclass(frozen=True, eq=False)
+class StageLayout:
+    """Indices of one stage's unknowns."""
+
+    nodes: Indices  # (K + 1, n): z and z' at the ends of intervals, and a margin if there is one
+    h: Indices  # (K,): durations of the intervals
+    tau: Indices  # (K, 2 m): control points of the torques in each interval, one after the other
+    z: Indices  # z, v, a (K, d, 5): z, z' and z'' at the collocation points
+    v: Indices
+    a: Indices
+    forces: Indices  # (K, d, n_f)
+    short: Indices  # (K, n) or (K, 0): shortfalls of limits in each interval
+    impulses: Indices  # of the impact that leads to the next stage, if one does
+    begin: (
+        Indices  # begin, finish: forces at rest at both ends of the motion, of continuous torques
+    )
+    finish: Indices
+
+    @property
+    def stop(self) -> int:
+        """Past its last unknown."""
+        return 1 + max(int(part.max(initial=-1)) for part in vars(self).values())
+
+
+def lay_out(
+    stages: Sequence[Stage],
+    scheme: Scheme,
+    target: Target,
+    held: bool = False,
+) -> list[StageLayout]:
+    """Indices of the unknowns of successive stages; `held`: torques hold both ends."""
+    layouts: list[StageLayout] = []
+    stop, d, with_margin = 0, scheme.degree, int(target.chained)
+    for stage, coming in zip(stages, [*stages[1:], None], strict=True):
+        point = Columns(z=5, v=5, a=5, forces=stage.formation.n_constraints)
+        end, short = (0 if scheme.ends else STATE), target.count_shortfalls(stage)
+        sizes = {"h": 1, "tau": 2 * scheme.controls, "points": d * point.count}
+        interval = Columns(**sizes, end=end, short=short, m=with_margin)
+        begin = stop + np.arange(point.sizes["forces"] * (held and not layouts))
+        first = stop + len(begin) + np.arange(STATE + with_margin)
+        starts = first[-1] + 1 + interval.count * np.arange(stage.intervals)
+        own = {
+            name: starts[:, None] + np.arange(part.start, part.stop)
+            for name, part in interval.slices.items()
+        }
+        points = own["points"].reshape(stage.intervals, d, point.count)
+        at = {name: points[..., part] for name, part in point.slices.items()}
+        ends = points[:, -1, :STATE] if scheme.ends else own["end"]
+        nodes = np.vstack([first, np.hstack([ends, own["m"]])])
+        stop = int(first[-1]) + 1 + interval.count * stage.intervals
+        ends_in_impact = coming is not None and stage.ends_in_impact
+        extra = coming.formation.n_constraints if coming is not None and ends_in_impact else 0
+        layouts.append(
+            StageLayout(
+                nodes=nodes,
+                h=own["h"][:, 0],
+                tau=own["tau"],
+                **at,
+                short=own["short"],
+                impulses=stop + np.arange(extra),
+                begin=begin,
+                finish=stop + np.arange(point.sizes["forces"] * (held and coming is None)),
+            )
+        )
+        stop += extra + len(layouts[-1].finish)
+    return layouts
+
+
+def pack(points: Sequence[StagePoints], layouts: Sequence[StageLayout], margin: float) -> Array:
+    """Unknowns as one vector."""
+    x = np.zeros(layouts[-1].stop)
+    for part, layout in zip(points, layouts, strict=True):
+        x[layout.z], x[layout.v], x[layout.a] = part.z, part.v, part.a
+        x[layout.forces], x[layout.tau] = part.forces, part.tau.reshape(len(part.tau), -1)
+        x[layout.h], x[layout.short] = part.duration * part.fractions, 1.0
+        x[layout.nodes[:, Z]], x[layout.nodes[:, V]] = part.nodes[:, 0], part.nodes[:, 1]
+        x[layout.nodes[:, MARGIN:]] = margin
+        x[layout.impulses] = part.impulses
+        x[layout.begin] = part.forces[0, 0, : len(layout.begin)]
+        x[layout.finish] = part.forces[-1, -1, : len(layout.finish)]
+    return x
+
+
+def unpack(x: Array, layouts: Sequence[StageLayout]) -> list[StagePoints]:
+    """What `pack` put together."""
+    parts = []
+    for own in layouts:
+        duration = float(x[own.h].sum())
+        nodes = x[own.nodes[:, :STATE]].reshape(-1, 2, 5)
+        z, v, a, forces = (x[part] for part in (own.z, own.v, own.a, own.forces))
+        tau = x[own.tau].reshape(len(own.tau), -1, 2)
+        fractions, impulses = x[own.h] / duration, x[own.impulses]
+        parts.append(StagePoints(duration, fractions, nodes, z, v, a, forces, tau, impulses))
+    return parts
+
+
+class Target(NamedTuple):
+    """Objective of an NLP."""
+
+    objective: Objective
+    epsilon: float  # [N]: least normal force
+    time_weight: float = 0.0  # [(N m)^2]: for `effort`
+    relaxation: Parameter | None = None  # the relaxed limit, for `relax`
+    price: Array | None = None  # (5,): linear cost of z at the end
+
+    @property
+    def chained(self) -> bool:
+        """Whether nodes have one more unknown, all of them copies: a margin or a relaxation."""
+        return self.objective in (Objective.MARGIN, Objective.RELAX)
+
+    def count_shortfalls(self, stage: Stage) -> int:
+        """Number of shortfalls in each interval of a stage: of every limit but those of speeds."""
+        limits = make_limits(stage.formation, self.epsilon).without(SPEED).limits
+        return len(limits) * (self.objective is Objective.ELASTIC)
+
+
+@dataclass(frozen=True, eq=False)
+class StageRows:
+    """Rows of one stage, interval by interval."""
+
+    # (K, m): constant margin, and contacts at ends of intervals without a point there
+    chain: Indices
+    states: Indices  # (K, 2, rungs, f): collocation of z and of z', along the columns of `bases`
+    bases: Array  # (K, 5, f): tangent space of each interval
+    points: Indices  # (K, d, m): equations and inequalities at the points
+    balance: Indices  # (K, d, 5): of these, the equations of motion
+    senses: Indices  # (K, d, n_rubbing): and the sliding directions of contacts with friction
+    limits: LimitRows
+    monitor_rows: Indices  # (K, d, m): limits of the formation
+
+
+@dataclass(frozen=True, eq=False)
+class LimitRows:
+    """Limits of one stage, as rows and as bounds of unknowns."""
+
+    limits: LimitSet
+    # (K, m, n_c): c_n at the start of each interval, and where bounds of unknowns are not enough
+    presses: Indices
+    others: Indices  # (K, d, n): at the points, sides of limits of several unknowns: friction cones
+    sides: NDArray[np.int64]  # (n,): which sides of the limits these are
+    bounded: dict[int, Indices]  # unknowns of the sides that are bounds of these
+    alone: bool  # whether c_n are bounded at the points themselves
+
+    @property
+    def pressed(self) -> NDArray[np.int64]:
+        """Sides of the limits that `presses` belong to."""
+        return np.flatnonzero(np.isin(self.limits.sides[0], self.limits.of(PRESS)))
 
 
 @dataclass(frozen=True, eq=False)
 class TimeNLP:
     """A built NLP."""
 
-    assembled: Assembled | None  # None in copies and files: CasADi's objects belong to one process
+    # expressions and derivatives; None in copies and files: CasADi's objects belong to one process
+    assembled: tuple[dict[str, Expression], dict[str, Expression]] | None
     max_iter: int  # most iterations of the solver
     layouts: list[StageLayout]
     rows: NlpRows
@@ -107,10 +261,9 @@ def build_time_nlp(
 ) -> TimeNLP:
     """Build the NLP of successive stages that end at rest."""
     started = time.perf_counter()
-    shortfalls = [target.count_shortfalls(stage) for stage in stages]
     # Regularized friction holds nothing at rest.
     held = stages[0].formation.scene.has_slow_motors and not stages[0].onset
-    layouts = lay_out(stages, scheme, target.chained, shortfalls, held)
+    layouts = lay_out(stages, scheme, target, held)
     rows, cost = NlpRows(), np.zeros(layouts[-1].stop)
     start = stages[0].guess.nodes[0].ravel()
     rows.add_entries(rows.linear(STATE, low=start, high=start), layouts[0].nodes[0, :STATE], 1.0)
@@ -135,7 +288,7 @@ def build_time_nlp(
     N = tangent_basis(last.formation, last.guess.nodes[-1, 0])
     rest = rows.linear(N.shape[1])
     rows.add_entries(rest[:, None], end[V], N.T)
-    built = assemble_nlp(len(cost), rows.triplets, rows.linear_rows, rows.blocks, cost)
+    built = rows.assemble(cost)
     book(SolverStatistics(build_time=time.perf_counter() - started))
     return TimeNLP(built, max_iter, layouts, rows, rows_of, duration_row)
 
@@ -154,6 +307,471 @@ def _add_costs(
     of_time = {Objective.TIME: 1.0, Objective.EFFORT: target.time_weight, Objective.ELASTIC: _HURRY}
     cost[layout.h] = of_time.get(target.objective, 0.0)
     cost[layout.short] = 1 / stage.intervals
+
+
+def add_stage(
+    rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool, target: Target
+) -> StageRows:
+    """Add the constraints of a stage."""
+    formation = stage.formation
+    node, ends = layout.nodes[:-1], layout.nodes[1:]
+    chain = rows.add_equal(ends[:, MARGIN:], node[:, MARGIN:])
+    states, bases = _collocate(rows, stage, layout, scheme)
+    if not stage.periods:
+        # Constant ratios of intervals, scaled like other rows.
+        shares, own = stage.intervals * stage.guess.fractions, rows.linear(stage.intervals - 1)
+        rows.add_entries(own, layout.h[:-1], shares[1:])
+        rows.add_entries(own, layout.h[1:], -shares[:-1])
+    points, balance, senses = _balance(rows, stage, layout, scheme, last)
+    first = node[:, Z] if formation.rolling else node[:, :0]
+    if not scheme.ends:
+        kernel = end_kernel(formation)
+        own = rows.nonlinear(stage.intervals, kernel.outputs)
+        rows.add_copies(kernel, kernel.x.join(z=ends[:, Z], v=ends[:, V], first=first), own)
+        chain = np.hstack([chain, own])
+    monitor_rows = _add_monitor_rows(rows, stage, layout, scheme)
+    gained = [formation.limits[k].gained for k in stage.released]
+    slow = formation.scene.has_slow_motors
+    # With continuous torques a released contact has no acceleration at first.
+    opening = stage.opening * (scheme.points[:, None] if slow else 1.0)
+    for contact in [c for c in gained if c is not None and stage.opens]:
+        kernel = opening_kernel(formation, contact)
+        columns = kernel.x.join(z=layout.z[0], v=layout.v[0], a=layout.a[0])
+        own = rows.nonlinear(scheme.degree, kernel.outputs, low=opening, high=np.inf)
+        rows.add_copies(kernel, columns, own)
+    until = stage.until
+    if stage.stop is not None:
+        until, N = None, tangent_basis(formation, stage.stop)
+        there = rows.linear(N.shape[1], low=N.T @ stage.stop, high=N.T @ stage.stop)
+        rows.add_entries(there[:, None], layout.nodes[-1, Z], N.T)
+    turns, gained_softly = _list_free_turns(stage), stage.gained
+    if _stops(stage):
+        turns, gained_softly = (), None
+        N = tangent_basis(formation, stage.guess.nodes[-1, 0])
+        rows.add_entries(rows.linear(N.shape[1])[:, None], layout.nodes[-1, V], N.T)
+    goal = goal_kernel(formation, until, turns, gained_softly)
+    if goal is not None:
+        end = layout.nodes[-1]
+        rows.add_copies(goal, goal.x.join(z=end[Z], v=end[V]), rows.nonlinear(goal.outputs))
+    limits = add_limits(rows, stage, layout, scheme, target)
+    if slow:
+        add_motors(rows, stage, layout, scheme)
+    return StageRows(chain, states, bases, points, balance, senses, limits, monitor_rows)
+
+
+def _list_free_turns(stage: Stage) -> tuple[int, ...]:
+    """One of each set of tied rows that reverse: dependent equations spoil the solver's steps."""
+    tied, free = set[int](), list[int]()
+    for row in stage.turns:
+        if row not in tied:
+            free.append(row)
+            tied.update(find_tied(stage.formation, stage.guess.nodes[-1, 0], row))
+    return tuple(free)
+
+
+def _stops(stage: Stage) -> bool:
+    """Whether everything stops at the end of a stage, as independent rates reverse there.
+
+    With one degree of freedom these are two, as one alone may have a zero.
+    """
+    return len(_list_free_turns(stage)) >= max(2, 5 - stage.formation.n_constraints)
+
+
+def _collocate(
+    rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme
+) -> tuple[Indices, Array]:
+    """Collocation of z and z' along the tangent space, and its bases."""
+    middles = stage.guess.z[:, scheme.degree // 2]
+    bases = np.array([tangent_basis(stage.formation, z) for z in middles])
+    K, _, f = bases.shape
+    kernel = collocation_kernel(scheme.name, scheme.degree, f)
+    parameters, collected = bases.transpose(0, 2, 1).reshape(K, -1), []
+    if not f:
+        return np.zeros((K, 2, len(scheme.rungs), 0), dtype=np.int64), bases
+    for state, rate, part in ((layout.z, layout.v, Z), (layout.v, layout.a, V)):
+        columns = kernel.x.join(
+            start=layout.nodes[:-1, part],
+            points=state.reshape(K, -1),
+            end=layout.nodes[1:, part][:, : 5 * (not scheme.ends)],
+            rates=rate.reshape(K, -1),
+            h=layout.h[:, None],
+        )
+        own = rows.nonlinear(K, kernel.outputs)
+        rows.add_copies(kernel, columns, own, kernel.p.join(N=parameters))
+        collected.append(own.reshape(K, -1, f))
+    return np.stack(collected, axis=1), bases
+
+
+def _balance(
+    rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool
+) -> tuple[Indices, Indices, Indices]:
+    """Equations of motion, contacts and sliding directions at the points, (K, d, n).
+
+    Also those of the equations of motion and of the sliding directions alone.
+    """
+    formation, shape = stage.formation, layout.z.shape[:2]
+    homotopy, node = stage.onset > 0, layout.nodes[:-1, None]
+    kernel = point_kernel(formation, scheme.controls, homotopy)
+    first = node[..., Z] if formation.rolling else node[..., :0]
+    state = {"z": layout.z, "v": layout.v, "a": layout.a}
+    columns = kernel.x.join(**state, forces=layout.forces, tau=layout.tau[:, None], first=first)
+    least = least_senses(stage, stage.guess.places(scheme.points))[..., : formation.n_contacts]
+    parameters = kernel.p.join(
+        Xi=stage.directions.Xi,
+        sigma=stage.directions.sigma,
+        shares=blend(scheme.points, scheme.controls),
+        least=np.maximum(least, 0.0),
+        onset=np.full(1 * homotopy, stage.onset),
+    )
+    still, senses = find_still(stage, last) if scheme.ends else set(), kernel.y["senses"]
+    low, high = np.zeros((*shape, kernel.outputs)), np.zeros(kernel.outputs)
+    high[senses] = np.inf
+    low[..., senses] = -np.inf if homotopy else 0.0
+    low[-1, -1, senses][[k in still for k in formation.rubbing_rows]] = -np.inf
+    own = rows.nonlinear(*shape, kernel.outputs, low=low, high=high)
+    rows.add_copies(kernel, columns, own, parameters)
+    return own, own[..., kernel.y["balance"]], own[..., senses]
+
+
+def least_rates(stage: Stage, places: Array) -> Array:
+    """Least rate at `places`, shares of a stage's duration, in their shape.
+
+    Zero at both ends, and with one degree of freedom, where friction cannot hold one contact alone;
+    none in the friction homotopy.
+    """
+    if stage.onset:
+        return np.full(np.shape(places), -np.inf)
+    free = stage.formation.n_constraints < 4
+    return np.asarray(SLIDING * free * np.minimum(1.0, 8 * np.minimum(places, 1 - places)))
+
+
+def least_senses(stage: Stage, places: Array) -> Array:
+    """Least rates of (contacts, joints) at `places`, in their shape and one more axis.
+
+    Zero for the second contact of a vertex.
+    """
+    contacts, least = stage.formation.contacts, least_rates(stage, places)[..., None]
+    vertices = [contact.index if contact.feature == "v" else None for contact in contacts]
+    again = [own is not None and own in vertices[:k] for k, own in enumerate(vertices)]
+    return np.where([*again, False, False], np.minimum(least, 0.0), least)
+
+
+def find_still(stage: Stage, last: bool) -> set[int]:
+    """Rows of (contacts, joints) that stand still at the end of a stage."""
+    if last or _stops(stage):
+        return set(range(stage.formation.n_contacts + 2))
+    coming = stage.gained.rolling if stage.gained else ()
+    rolls = [k for k, c in enumerate(stage.formation.contacts) if c in coming]
+    return {*stage.turns, *rolls}
+
+
+def _add_monitor_rows(rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:
+    """Nonnegative limits of the formation, but for the end's there, shape (K, d, m)."""
+    formation, (K, d) = stage.formation, layout.z.shape[:2]
+    if not stage.monitored:
+        return np.zeros((K, d, 0), dtype=np.int64)
+    places = stage.guess.places(scheme.points).ravel()
+    low = stage.list_clearances(places, after=1 / 3).reshape(K, d, -1)
+    goal = None if stage.until is None else stage.until.contact
+    reached = [formation.limits[k].gains(goal) for k in stage.monitored]
+    if scheme.ends:
+        low[-1, -1, reached] = -np.inf
+    own = rows.nonlinear(K, d, len(stage.monitored), low=low, high=np.inf)
+    kernel = monitor_kernel(formation, stage.monitored)
+    rows.add_copies(kernel, kernel.x.join(z=layout.z), own)
+    return own
+
+
+def join_stages(
+    rows: NlpRows,
+    pair: tuple[Stage, Stage],
+    layouts: tuple[StageLayout, StageLayout],
+    scheme: Scheme,
+) -> None:
+    """Continuous position and velocity from one stage to the next, or an impact."""
+    (stage, coming), layout = pair, layouts[0]
+    last, first = layout.nodes[-1], layouts[1].nodes[0]
+    if stage.formation.scene.has_slow_motors:
+        join_motors(rows, stage, layouts, scheme)
+    same = np.delete(np.arange(len(first)), V) if stage.ends_in_impact else slice(None)
+    rows.add_equal(first[same], last[same])
+    if stage.ends_in_impact:
+        kernel = impact_kernel(stage.formation, coming.formation)
+        high = np.zeros(kernel.outputs)
+        high[kernel.y["leaving"]] = high[kernel.y["cones"]] = np.inf
+        columns = kernel.x.join(after=first[V], before=last[V], z=last[Z], impulses=layout.impulses)
+        own = rows.nonlinear(kernel.outputs, high=high)
+        rows.add_copies(kernel, columns, own, kernel.p.join(Xi=coming.directions.Xi))
+
+
+class _Gives(NamedTuple):
+    """Slack of a row: an unknown of each interval, shape (K,), and its weight."""
+
+    unknowns: Indices
+    weight: float
+
+
+def add_limits(
+    rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme, target: Target
+) -> LimitRows:
+    """Add rows for the limits of a stage."""
+    limits = make_limits(stage.formation, target.epsilon)
+    gives = _list_gives(limits, layout, target)
+    presses = limits.of(PRESS)
+    own, signs, bounds = limits.sides
+    # Column of y of each side that is of one torque or joint speed alone; else -1.
+    column, n_forces = np.abs(limits.rows).argmax(axis=1), stage.formation.n_constraints
+    alone = ((limits.rows != 0).sum(axis=1) == 1) & (column >= n_forces)
+    single = np.where(alone, column - n_forces, -1)[own]
+    others = np.flatnonzero(~np.isin(own, presses) & (single < 0))
+    soft, slow = [gives[row] for row in presses], stage.formation.scene.has_slow_motors
+    pressed = _add_presses(rows, limits, layout, scheme, soft, slow)
+    added = rows.linear(*layout.z.shape[:2], len(others), high=np.inf)
+    for k, side in enumerate(others):
+        row = own[side]
+        _add_point_row(rows, added[..., k], signs[side] * limits.rows[row], layout, scheme)
+        _add_gives(rows, added[..., k], gives[row])
+    bounded = dict[int, Indices]()
+    for side in np.flatnonzero(single >= 0):
+        j = int(single[side])
+        # Control points of a torque, or speeds at the points.
+        unknowns = layout.tau[:, j::2] if j < 2 else layout.v[..., 1 + j]
+        if gives[own[side]] is None:
+            bounded[int(side)] = unknowns
+            continue
+        added_row = rows.linear(*unknowns.shape, low=signs[side] * bounds[side], high=np.inf)
+        rows.add_entries(added_row, unknowns, signs[side])
+        _add_gives(rows, added_row, gives[own[side]])
+    return LimitRows(limits, pressed, added, others, bounded, alone=not any(soft))
+
+
+def bound_by_limits(
+    rows: LimitRows, bounds: tuple[Array, Array], raised: Array | None = None
+) -> None:
+    """Bound torques and joint speeds, in place, by limits raised by shape (K, n_sides)."""
+    low, high = bounds
+    _, signs, values = rows.limits.sides
+    for side, unknowns in rows.bounded.items():
+        more = 0.0 if raised is None else raised[:, side, None]
+        if signs[side] > 0:
+            low[unknowns] = np.maximum(low[unknowns], values[side] + more)
+        else:
+            high[unknowns] = np.minimum(high[unknowns], values[side] - more)
+
+
+def price_sides(rows: LimitRows, layout: StageLayout, on_x: Array, on_g: Array) -> Array:
+    """Multiplier of each side of the limits in each interval, shape (K, n_sides).
+
+    `on_x` and `on_g` are absolute multipliers of the unknowns' bounds and of the rows.
+    """
+    price = np.zeros((len(layout.h), len(rows.limits.sides[0])))
+    c_n = layout.forces[..., : rows.presses.shape[2]]
+    price[:, rows.pressed] = on_x[c_n].sum(axis=1) + on_g[rows.presses].sum(axis=1)
+    price[:, rows.sides] = on_g[rows.others].sum(axis=1)
+    for side, unknowns in rows.bounded.items():
+        price[:, side] = on_x[unknowns].sum(axis=1)
+    return price
+
+
+def _list_gives(limits: LimitSet, layout: StageLayout, target: Target) -> list[_Gives | None]:
+    """Slack of each row, if it has one."""
+    gives: list[_Gives | None] = [None] * len(limits.low)
+    chain = layout.nodes[:-1, MARGIN:].ravel()
+    if target.objective is Objective.MARGIN:
+        for row in limits.of(PRESS):
+            gives[row] = _Gives(chain, -1.0)
+    elif target.objective is Objective.ELASTIC:
+        for row in limits.of(*{limit.kind for limit in limits.without(SPEED).limits}):
+            gives[row] = _Gives(layout.short[:, limits.owners[row]], 1.0)
+    elif target.relaxation is not None:
+        weights = limits.weigh(target.relaxation)
+        for row in np.flatnonzero(weights):
+            gives[row] = _Gives(chain, float(weights[row]))
+    return gives
+
+
+def _add_gives(rows: NlpRows, own: Indices, gives: _Gives | None) -> None:
+    if gives is not None:
+        rows.add_entries(own, gives.unknowns[:, None], gives.weight)
+
+
+def _add_presses(
+    rows: NlpRows,
+    limits: LimitSet,
+    layout: StageLayout,
+    scheme: Scheme,
+    gives: list[_Gives | None],
+    slow: bool,
+) -> Indices:
+    """Normal forces by the polynomials through the points, shape (K, m, n_c)."""
+    places = np.zeros(1) if scheme.ends else np.array([0.0, 1.0])
+    if slow:
+        places = np.append(places, _WITHIN)
+    if any(gives):
+        places = np.append(places, scheme.points)
+    c_n = layout.forces[:, :, limits.rows[limits.of(PRESS)].argmax(axis=1)]
+    presses = rows.linear(len(c_n), len(places), c_n.shape[2], high=np.inf)
+    for i, row in enumerate(scheme.interpolate(places)):
+        for j in np.flatnonzero(np.abs(row) > 1e-12):
+            rows.add_entries(presses[:, i], c_n[:, j], row[j])
+    for k, own in enumerate(gives):
+        _add_gives(rows, presses[..., k], own)
+    return presses
+
+
+def _add_point_row(
+    rows: NlpRows, own: Indices, row: Array, layout: StageLayout, scheme: Scheme
+) -> None:
+    """A row of y at every point, shape (K, d)."""
+    of_c, of_tau, of_rates = np.split(row, [layout.forces.shape[2], layout.forces.shape[2] + 2])
+    for unknowns, of_them in ((layout.forces, of_c), (layout.v[..., 3:], of_rates)):
+        for k in np.flatnonzero(of_them):
+            rows.add_entries(own, unknowns[..., k], of_them[k])
+    for k in np.flatnonzero(of_tau):
+        for i, shares in enumerate(blend(scheme.points, scheme.controls).T):
+            rows.add_entries(own, layout.tau[:, None, 2 * i + k], of_tau[k] * shares)
+
+
+def add_motors(rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme) -> None:
+    """Add the rows of one stage for rate-limited torques."""
+    scene, K, n = stage.formation.scene, stage.intervals, scheme.controls - 1
+    tau = layout.tau.reshape(K, scheme.controls, 2)
+    rows.add_equal(tau[1:, 0], tau[:-1, -1], 1 / scene.torque_limit)
+    limited = np.flatnonzero(np.isfinite(scene.torque_rate_limit))
+    rates = rows.linear(K, n, len(limited), 2, high=np.inf)
+    for k, joint in enumerate(limited):
+        limit = scene.torque_limit[joint]
+        rows.add_entries(
+            rates[:, :, k], layout.h[:, None, None], scene.torque_rate_limit[joint] / limit
+        )
+        for side, sign in enumerate((1.0, -1.0)):
+            own = rates[:, :, k, side]
+            rows.add_entries(own, tau[:, 1:, joint], -sign * n / limit)
+            rows.add_entries(own, tau[:, :-1, joint], sign * n / limit)
+    lagging = tuple(np.flatnonzero(scene.actuator_lag).tolist())
+    if lagging:
+        kernel = command_kernel(scheme.controls, lagging)
+        commands = rows.nonlinear(K, kernel.outputs, high=np.inf)
+        given = kernel.p.join(lag=scene.actuator_lag, limit=scene.torque_limit)
+        columns = kernel.x.join(tau=layout.tau, h=layout.h[:, None])
+        rows.add_copies(kernel, columns, commands, np.tile(given, (K, 1)))
+
+
+def join_motors(
+    rows: NlpRows, stage: Stage, layouts: tuple[StageLayout, StageLayout], scheme: Scheme
+) -> None:
+    """Continuous torques, forces and accelerations from a stage to the next."""
+    layout, coming = layouts
+    formation = stage.formation
+    scale = 1 / formation.scene.torque_limit
+    rows.add_equal(coming.tau[0, :2], layout.tau[-1, -2:], scale)
+    shares = scheme.interpolate(np.ones(1))[0]
+    for fading, slips in stage.fading:
+        own, share = rows.linear(1), float(formation.friction[fading]) if slips else 1.0
+        rows.add_entries(own, layout.forces[-1, :, fading], share * shares)
+        if slips:
+            tangential = formation.n_contacts + formation.rolling_rows.index(fading)
+            rows.add_entries(own, layout.forces[-1, :, tangential], slips * shares)
+    if scheme.ends and stage.gained is not None:
+        for contact in stage.gained.contacts:
+            if contact not in formation.contacts:
+                kernel = opening_kernel(stage.gained, contact)
+                at = (layout.z, layout.v, layout.a)
+                columns = kernel.x.join(**{k: v[-1, -1] for k, v in zip("zva", at, strict=True)})
+                rows.add_copies(kernel, columns, rows.nonlinear(kernel.outputs))
+
+
+def hold_ends(
+    rows: NlpRows, stages: Sequence[Stage], layouts: Sequence[StageLayout], epsilon: float
+) -> None:
+    """Torques hold the object at rest at both ends of a motion."""
+    for k, (place, tau) in ((0, (0, slice(None, 2))), (-1, (-1, slice(-2, None)))):
+        stage, layout = stages[k], layouts[k]
+        forces = layout.finish if k else layout.begin
+        kernel = hold_kernel(stage.formation)
+        columns = kernel.x.join(z=layout.nodes[place, Z], forces=forces, tau=layout.tau[place, tau])
+        given = kernel.p.join(Xi=stage.directions.Xi, sigma=stage.directions.sigma)
+        rows.add_copies(kernel, columns, rows.nonlinear(kernel.outputs), given)
+        formation = stage.formation
+        if not k and stage.phase:
+            # A command approaches a torque limit only asymptotically in the pause before.
+            scene, first = formation.scene, layout.tau[0, :2]
+            for joint in np.flatnonzero(scene.actuator_lag):
+                limit = scene.torque_limit[joint]
+                fastest = scene.torque_rate_limit[joint] * scene.actuator_lag[joint] / limit
+                most = 1 - min(_ROOM, float(fastest))
+                rows.add_entries(rows.linear(1, low=-most, high=most), first[joint], 1 / limit)
+        for r, row in enumerate(formation.rolling_rows):
+            mu = float(formation.friction[row])
+            own = rows.linear(2, low=mu * epsilon, high=np.inf)
+            rows.add_entries(own, forces[row], mu)
+            rows.add_entries(own, forces[formation.n_contacts + r], np.array([1.0, -1.0]))
+
+
+def find_relieved(stage: Stage, limits: LimitSet) -> NDArray[np.bool_]:
+    """Sides without effect in each interval, as forces vanish or set in or slip, (K, n_sides)."""
+    relieved = np.zeros((stage.intervals, len(limits.sides[0])), dtype=bool)
+    if not stage.formation.scene.has_slow_motors:
+        return relieved
+    names, owners = stage.formation.names, limits.owners[limits.sides[0]]
+
+    def find(contact: int, *kinds: str) -> list[bool]:
+        own = [limits.limits[k] for k in owners]
+        return [limit.kind in kinds and limit.part == names[contact] for limit in own]
+
+    for contact, slips in stage.fading:
+        relieved[-1] |= find(contact, *((CONE,) if slips else (PRESS, CONE)))
+    for contact in stage.growing:
+        relieved[0] |= find(contact, PRESS, CONE)
+    return relieved
+
+
+class _Piece(NamedTuple):
+    """An interval as a part of a period: stage, period, share of the stage, and unknowns."""
+
+    stage: int
+    period: int
+    share: float
+    h: int
+    tau: Indices
+
+
+def add_periods(rows: NlpRows, stages: Sequence[Stage], layouts: Sequence[StageLayout]) -> None:
+    """Durations of control periods, and their torques, constant or linear and continuous."""
+    scene = stages[0].formation.scene
+    linear, goes_on = scene.control_hold == "linear", scene.has_slow_motors
+    pieces = [
+        (stage.phase, _Piece(k, period, float(stage.guess.fractions[i]), int(layout.h[i]), tau))
+        for k, (stage, layout) in enumerate(zip(stages, layouts, strict=True))
+        for i, (period, tau) in enumerate(zip(stage.periods, layout.tau, strict=True))
+    ]
+    for _, found in groupby(pieces, key=lambda own: own[0]):
+        phase = [piece for _, piece in found]
+        last = phase[-1].period
+        for period, own in groupby(phase, key=lambda piece: piece.period):
+            _add_period(rows, list(own), scene.control_period, period == last, linear)
+        for before, after in pairwise(phase):
+            if not goes_on and (linear or before.period == after.period):
+                rows.add_equal(after.tau[:2], before.tau[-2:], 1 / scene.torque_limit)
+
+
+def _add_period(
+    rows: NlpRows, pieces: Sequence[_Piece], period: float, last: bool, linear: bool
+) -> None:
+    whole = rows.linear(1, low=0.0 if last else period, high=period)
+    rows.add_entries(whole, np.array([piece.h for piece in pieces]), 1.0)
+    for one, other in pairwise(pieces):
+        if one.stage == other.stage:
+            even = rows.linear(1)
+            size = one.share + other.share
+            rows.add_entries(even, np.array([one.h]), other.share / size)
+            rows.add_entries(even, np.array([other.h]), -one.share / size)
+        if linear:
+            kernel = slope_kernel()
+            columns = kernel.x.join(
+                before=one.tau, after=other.tau, h=np.array([one.h]), coming=np.array([other.h])
+            )
+            rows.add_copies(kernel, columns, rows.nonlinear(kernel.outputs))
 
 
 def bound_unknowns(nlp: TimeNLP, stages: Sequence[Stage], scheme: Scheme) -> tuple[Array, Array]:
@@ -193,64 +811,6 @@ def _stay_short(
     if stage.until is not None and scheme.ends:
         most[-1, -1] = side * np.inf
     bounds[int(side > 0)][layout.z[..., row]] = most
-
-
-class _Piece(NamedTuple):
-    """An interval as a part of a period: stage, period, share of the stage, and unknowns."""
-
-    stage: int
-    period: int
-    share: float
-    h: int
-    tau: Indices
-
-
-def add_periods(rows: NlpRows, stages: Sequence[Stage], layouts: Sequence[StageLayout]) -> None:
-    """Durations of control periods, and their torques, constant or linear and continuous."""
-    scene = stages[0].formation.scene
-    linear, goes_on = scene.control_hold == "linear", scene.has_slow_motors
-    pieces = [
-        (stage.phase, _Piece(k, period, float(stage.guess.fractions[i]), int(layout.h[i]), tau))
-        for k, (stage, layout) in enumerate(zip(stages, layouts, strict=True))
-        for i, (period, tau) in enumerate(zip(stage.periods, layout.tau, strict=True))
-    ]
-    for _, found in groupby(pieces, key=lambda own: own[0]):
-        phase = [piece for _, piece in found]
-        last = phase[-1].period
-        for period, own in groupby(phase, key=lambda piece: piece.period):
-            _add_period(rows, list(own), scene.control_period, period == last, linear)
-        for before, after in pairwise(phase):
-            if not goes_on and (linear or before.period == after.period):
-                limit, same = 1 / scene.torque_limit, rows.linear(2)
-                rows.add_entries(same, after.tau[:2], limit)
-                rows.add_entries(same, before.tau[-2:], -limit)
-
-
-def _add_period(
-    rows: NlpRows, pieces: Sequence[_Piece], period: float, last: bool, linear: bool
-) -> None:
-    whole = rows.linear(1, low=0.0 if last else period, high=period)
-    rows.add_entries(whole, np.array([piece.h for piece in pieces]), 1.0)
-    for one, other in pairwise(pieces):
-        if one.stage == other.stage:
-            even = rows.linear(1)
-            size = one.share + other.share
-            rows.add_entries(even, np.array([one.h]), other.share / size)
-            rows.add_entries(even, np.array([other.h]), -one.share / size)
-        if linear:
-            kernel = slope_kernel()
-            columns = kernel.x.join(
-                before=one.tau, after=other.tau, h=np.array([one.h]), coming=np.array([other.h])
-            )
-            rows.add_copies(kernel, columns, rows.nonlinear(kernel.outputs))
-
-
-@lru_cache(maxsize=1)
-def slope_kernel() -> NamedKernel:
-    """Difference of the slopes of linear torques in two intervals, times both durations."""
-    x = Columns(before=4, after=4, h=1, coming=1).make_symbols()
-    slopes = (x.before[2:] - x.before[:2]) * x.coming - (x.after[2:] - x.after[:2]) * x.h
-    return name_kernel(x, Columns().make_symbols(), slopes=slopes)
 
 
 def raise_bounds(
@@ -306,3 +866,204 @@ def _free_equal(
             low_x[layout.forces[-1, -1, contact]] = -np.inf
             low[rows.presses[-1, 1:2, contact]] = -np.inf
     low[rows.presses[0, 0, list(stage.growing)]] = -np.inf
+
+
+@share(32)
+def point_kernel(formation: Formation, controls: int, homotopy: bool = False) -> Kernel:
+    """Contact constraints, equations of motion, and rates of sliding contacts at a point.
+
+    `tau` are the control points of the torques, `shares` their Bernstein polynomials, `first` is z
+    at the start of the interval if a contact rolls, `least` are the least rates. In the `homotopy`
+    friction is regularized by tanh(rate / onset).
+    """
+    scene, n_c, rolls = formation.scene, formation.n_contacts, bool(formation.rolling)
+    x = Columns(z=5, v=5, a=5, forces=formation.n_constraints, tau=2 * controls, first=5 * rolls)
+    s = x.make_symbols()
+    p = Columns(Xi=n_c, sigma=2, shares=controls, least=n_c, onset=1 * homotopy).make_symbols()
+    gaps, P, P_dot_v, A_t = formation.build_constraints(s.z, s.v)
+    Xi, sigma = p.Xi, p.sigma
+    if homotopy:
+        Xi, sigma = ca.tanh(A_t @ s.v / p.onset), ca.tanh(s.v[3:] / p.onset)
+    if rolls:
+        gaps[n_c:] -= formation.roll_function(s.first, s.v)[0]
+    applied = (
+        ca.DM(scene.applied_force)
+        + ca.vertcat(0, 0, 0, ca.reshape(s.tau, 2, controls) @ p.shares)
+        - ca.DM(scene.dry) * ca.vertcat(0, 0, 0, sigma)
+        + build_force_rows(formation, P, A_t, Xi).T @ s.forces
+    )
+    return build_kernel(
+        s,
+        p,
+        gaps=gaps,
+        rates=P @ s.v,
+        bends=P @ s.a + P_dot_v,
+        balance=ca.DM(scene.mass_diagonal) * s.a + ca.DM(scene.viscous) * s.v - applied,
+        # With `:`, no rows of a single one are no rows, and not a row without columns.
+        senses=(p.Xi * (A_t @ s.v) - p.least)[list(formation.rubbing_rows), :],
+    )
+
+
+@share(32)
+def end_kernel(formation: Formation) -> Kernel:
+    """Contacts at the end of an interval without a point there; `first` is z at its start."""
+    x = Columns(z=5, v=5, first=5 * bool(formation.rolling)).make_symbols()
+    gaps, P, _, _ = formation.build_constraints(x.z, x.v)
+    if formation.rolling:
+        gaps[formation.n_contacts :] -= formation.roll_function(x.first, x.v)[0]
+    return build_kernel(x, gaps=gaps, rates=P @ x.v)
+
+
+@lru_cache(maxsize=32)
+def collocation_kernel(name: str, degree: int, freedoms: int) -> Kernel:
+    """Collocation along the tangent space: N^T (s_j - s_0 - h sum_l a_jl r_l).
+
+    s are the states at the `start`, the points and, if no point is there, the `end`; r are `rates`.
+    """
+    scheme: Scheme = make_scheme(name, degree)
+    table, rungs = scheme.rungs, len(scheme.rungs)
+    x = Columns(start=5, points=5 * degree, end=5 * (rungs - degree), rates=5 * degree, h=1)
+    s, p = x.make_symbols(), Columns(N=5 * freedoms).make_symbols()
+    here = ca.reshape(ca.vertcat(s.points, s.end), 5, rungs)
+    rates, N = ca.reshape(s.rates, 5, degree), ca.reshape(p.N, 5, freedoms)
+    steps = here - ca.repmat(s.start, 1, rungs) - s.h * (rates @ ca.DM(table).T)
+    return build_kernel(s, p, steps=N.T @ steps)
+
+
+@share(64)
+def monitor_kernel(formation: Formation, monitored: tuple[int, ...]) -> Kernel:
+    """Limits of a formation."""
+    x = Columns(z=5).make_symbols(z=build_features(formation.scene).z)
+    values = ca.vertcat(*(formation.limits[k].value for k in monitored))
+    return build_kernel(x, values=values)
+
+
+@share(64)
+def opening_kernel(formation: Formation, contact: Contact) -> Kernel:
+    """Second derivative of a contact's gap."""
+    x = Columns(z=5, v=5, a=5).make_symbols()
+    _, A, _, A_dot_v = Formation(formation.scene, (contact,)).function(x.z, x.v)
+    return build_kernel(x, opening=A @ x.a + A_dot_v)
+
+
+@share(64)
+def goal_kernel(
+    formation: Formation, until: Until | None, turns: tuple[int, ...], gained: Formation | None
+) -> Kernel | None:
+    """End of a phase, zero rates of reversals, and zero speeds of contacts gained; None if none."""
+    scene = formation.scene
+    x = Columns(z=5, v=5).make_symbols(z=build_features(scene).z)
+    z, v = x.z, x.v
+    parts: list[Expression] = []
+    if until is not None and until.contact is not None:
+        # Where a contact changes its name its gap has no gradient, but the end of its range has.
+        ranges = [limit for c in formation.contacts for limit in build_limits(c, scene)]
+        ends = [limit.value for limit in ranges if limit.gains(until.contact)]
+        parts.append(ends[0] if len(ends) == 1 else build_gap(until.contact, scene))
+    if until is not None:
+        parts += [z[row] - value for row, value in until.poses]
+    if turns:
+        rates = ca.vertcat(formation.function(z, v)[2] @ v, v[3:])
+        parts += [rates[k] for k in turns]
+    if gained is not None:
+        P = gained.build_constraints(z, v)[1]
+        parts += [P[i, :] @ v for i in new_rows(formation, gained)]
+    return build_kernel(x, goals=ca.vertcat(*parts)) if parts else None
+
+
+def new_rows(formation: Formation, following: Formation) -> list[int]:
+    """Constraint rows of a formation that the one before does not have."""
+    fresh = [i for i, c in enumerate(following.contacts) if c not in formation.contacts]
+    rolling = [following.contacts[row] for row in following.rolling_rows]
+    n_c = following.n_contacts
+    return fresh + [n_c + i for i, c in enumerate(rolling) if c not in formation.rolling]
+
+
+@lru_cache(maxsize=8)
+def effort_kernel(controls: int) -> Kernel:
+    """Integral of tau^T tau over an interval, by the control points of tau."""
+    x, n = Columns(tau=2 * controls, h=1).make_symbols(), controls - 1
+    products = [
+        [comb(n, i) * comb(n, j) / comb(2 * n, i + j) / (2 * n + 1) for j in range(controls)]
+        for i in range(controls)
+    ]
+    tau = ca.reshape(x.tau, 2, controls)
+    return build_kernel(x, effort=x.h * ca.trace(tau @ ca.DM(products) @ tau.T))
+
+
+@lru_cache(maxsize=8)
+def bend_kernel(controls: int) -> Kernel:
+    """Cost of second differences of the control points of torques."""
+    x, p = Columns(tau=2 * controls, h=1).make_symbols(), Columns(weight=2).make_symbols()
+    tau = ca.reshape(x.tau, 2, controls)
+    bends = tau[:, 2:] - 2 * tau[:, 1:-1] + tau[:, :-2]
+    return build_kernel(x, p, cost=x.h * ca.dot(p.weight, ca.sum2(bends**2)))
+
+
+def find_leaving(formation: Formation, following: Formation) -> list[int]:
+    """Contacts of a formation that the next one does not have."""
+    return [i for i, c in enumerate(formation.contacts) if c not in following.contacts]
+
+
+@share(32)
+def impact_kernel(formation: Formation, following: Formation) -> Kernel:
+    """A plastic impact M5 (v+ - v-) = G+^T p, P+ v+ = 0 onto the next formation, `Xi` after it.
+
+    Rates of gaps that open, and friction cones of rolling contacts, are nonnegative.
+    """
+    scene, n_c = following.scene, following.n_contacts
+    x = Columns(after=5, before=5, z=5, impulses=following.n_constraints).make_symbols()
+    p = Columns(Xi=n_c).make_symbols()
+    _, P, _, A_t = following.build_constraints(x.z, x.after)
+    push = build_force_rows(following, P, A_t, p.Xi).T @ x.impulses
+    A = formation.function(x.z, x.after)[1]
+    rolling = list(following.rolling_rows)
+    grip = ca.DM(following.friction)[rolling, :] * x.impulses[rolling, :]
+    return build_kernel(
+        x,
+        p,
+        jump=ca.DM(scene.mass_diagonal) * (x.after - x.before) - push,
+        held=P @ x.after,
+        leaving=A[find_leaving(formation, following), :] @ x.after,
+        cones=ca.vertcat(grip - x.impulses[n_c:, :], grip + x.impulses[n_c:, :]),
+    )
+
+
+@lru_cache(maxsize=8)
+def command_kernel(controls: int, joints: tuple[int, ...]) -> Kernel:
+    """Slack of the commands' control points to torque limits, over these and times h."""
+    x, n = Columns(tau=2 * controls, h=1).make_symbols(), controls - 1
+    p = Columns(lag=2, limit=2).make_symbols()
+    tau = ca.reshape(x.tau, 2, controls)
+    left: list[Expression] = [ca.SX(0, 1)]
+    for j in joints:
+        for k in range(controls):
+            rise = k * (tau[j, k] - tau[j, k - 1]) if k else 0
+            rise += (n - k) * (tau[j, k + 1] - tau[j, k]) if k < n else 0
+            command = (x.h * tau[j, k] + p.lag[j] * rise) / p.limit[j]
+            left += [x.h - command, x.h + command]
+    return build_kernel(x, p, left=ca.vertcat(*left))
+
+
+@share(32)
+def hold_kernel(formation: Formation) -> Kernel:
+    """The equations of motion at rest, without acceleration."""
+    scene, n_c = formation.scene, formation.n_contacts
+    x = Columns(z=5, forces=formation.n_constraints, tau=2).make_symbols()
+    p = Columns(Xi=n_c, sigma=2).make_symbols()
+    _, P, _, A_t = formation.build_constraints(x.z, ca.SX.zeros(5))
+    balance = (
+        ca.DM(scene.applied_force)
+        + ca.vertcat(0, 0, 0, x.tau)
+        - ca.DM(scene.dry) * ca.vertcat(0, 0, 0, p.sigma)
+        + build_force_rows(formation, P, A_t, p.Xi).T @ x.forces
+    )
+    return build_kernel(x, p, balance=balance)
+
+
+@lru_cache(maxsize=1)
+def slope_kernel() -> Kernel:
+    """Difference of the slopes of linear torques in two intervals, times both durations."""
+    x = Columns(before=4, after=4, h=1, coming=1).make_symbols()
+    slopes = (x.before[2:] - x.before[:2]) * x.coming - (x.after[2:] - x.after[:2]) * x.h
+    return build_kernel(x, slopes=slopes)

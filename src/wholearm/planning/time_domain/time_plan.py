@@ -23,7 +23,7 @@ from ...common.errors import InfeasibleError, SolverError, WholearmError
 from ...geometry.arcs import CostToGo
 from ...mechanics.dynamics import measure_speed
 from ...mechanics.impact import Impact, compute_impact
-from ...problem.definition import End, Phase, Problem
+from ...problem.definition import ROWS, End, Phase, Problem
 from ...results.trajectory import Motion
 from ..options import Objective, PlanOptions
 from ..path_domain.impact_sequence import PER_SPEED, BlockImpact
@@ -50,6 +50,7 @@ ROUNDS = 4  # most expansions of the cost-to-go
 GAIN = 1e-4  # least relative gain of moving the end
 ROUGH = 1e-2  # least accuracy where only the existence of a plan matters
 AT_REST = 1e-4  # speed below which an impact counts as a stop, in the scene's own units
+SHORTEST = 1 / 16  # shortest step of the continuation to a pinned end
 FREE = "a plan that chooses where it ends"  # name of a guess
 _Named = tuple[TimeSolution, str]  # a solution, and the name of its guess
 
@@ -315,25 +316,41 @@ def _list_slow(
 
 
 def _free_ends(search: TimeSearch, guesses: Guesses) -> Iterator[Guess]:
-    """A coarse plan that chooses where phases end, which then are pinned."""
-
-    def free(phase: Phase) -> Phase:
-        # With one freedom pins have no effect.
-        pinned = phase.until.pins and phase.formation.n_constraints < 4
-        return replace(phase, until=replace(phase.until, pins=())) if pinned else phase
-
-    every, phases = guesses.problem.phases, [free(phase) for phase in guesses.phases]
-    if phases == list(guesses.phases):
+    """A coarse plan that chooses where phases end, moved to where they are pinned."""
+    known, every = search.problem.phases, guesses.problem.phases
+    if not any(_set_free(phase) is not phase for phase in guesses.phases):
         return
-    problem = replace(guesses.problem, phases=tuple(map(free, every)))
+    problem = replace(guesses.problem, phases=tuple(map(_set_free, every)))
+    phases = [problem.phases[phase.index] for phase in guesses.phases]
     own = replace(search, problem=in_own_units(problem), only_begins=True, to_go=None, price=None)
     found = solve_guesses(own, Guesses(problem, phases, guesses.z, own).every())
-    if found is not None:
-        stages, known = list[Stage](), search.problem.phases
-        for stage in found[0].stages:
+    if found is None:
+        return
+    solution, reached, step = found[0], 0.0, 1.0
+    ends = {stage.phase: stage.guess.nodes[-1, 0] for stage in solution.stages}
+    while reached < 1.0:
+        share, stages = min(1.0, reached + step), list[Stage]()
+        for stage in solution.stages:
             until = stage.until and known[stage.phase].until
+            if until:
+                end = ends[stage.phase]
+                places = [(name, float(end[ROWS[name]]), value) for name, value in until.pins]
+                pins = tuple((name, a + share * (b - a)) for name, a, b in places)
+                until = replace(until, pins=pins)
             stages.append(replace(stage, until=until))
-        yield Guess(FREE, stages, before=found[0])
+        moved = search.solve(stages, solution, search.wait(ITERATIONS))
+        if moved.success:
+            solution, reached = moved, share
+        elif (step := step / 4) < SHORTEST:
+            return
+    yield Guess(FREE, solution.stages, before=solution)
+
+
+def _set_free(phase: Phase) -> Phase:
+    """The phase without pins; unchanged where they have no effect."""
+    if not phase.until.pins or phase.formation.n_constraints >= 4:
+        return phase
+    return replace(phase, until=replace(phase.until, pins=()))
 
 
 def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) -> _Named:
