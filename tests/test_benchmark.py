@@ -343,8 +343,8 @@ def test_the_table_has_a_row_for_each_part(pairs: dict[str, SkipPair]) -> None:
 
 
 COUNTS = FOLDER.with_name("results") / "bench_guard.json"
-NODES, CONTACTS = 100, 4
-"""Five nodes for each of twenty elements; sliding contacts."""
+NODES, CONTACTS = 60, 4
+"""Five nodes for each of twelve elements; sliding contacts."""
 
 
 def write_first_phase(folder: Path) -> str:

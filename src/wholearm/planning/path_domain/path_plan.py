@@ -67,7 +67,7 @@ MISS = 2.5e-7  # largest violation between nodes, over the limits' scales; relat
 _RATE_MISS = 1e-4  # the same, relative, for torque rates and commands
 _OVER = 1.05  # tightening over the violation
 _LOOKS = 17  # places of a segment at which uniqueness is checked
-_START, _RATE = 20, 50  # elements of a phase, and those under rate limits
+_START, _SMOOTH, _RATE = 12, 20, 50  # elements of a phase; for effort; under rate limits
 _MOST = 80  # most elements of a phase
 _SHIFTED = 0.02  # relative loss by a break's distance from its switch, over the curve's length
 _SHARE = 0.5  # share of the accuracy for shifted switches
@@ -304,7 +304,8 @@ class Task:
     def elements(self) -> int:
         """Initial number of elements of each phase."""
         if self.options.intervals is None:
-            return _RATE if self.is_held else _START
+            few = _SMOOTH if self.options.goal is Objective.EFFORT else _START
+            return _RATE if self.is_held else few
         return max(-(-self.options.intervals // DEGREE), 3)
 
     def lay_out(self, breaks: Sequence[Array], elements: int) -> list[PhaseData]:
