@@ -31,7 +31,15 @@ from ..phase_plan import PhasePlan
 from ..stops import PlanPart, Plans, end_of, plan_stops
 from .guesses import NEAREST, Guess, Guesses, find_modes
 from .held_torques import hold_torques
-from .mode_search import LEAST_INTERVALS, WORTH, drop_gone, improve, list_neighbours, sign_sequence
+from .mode_search import (
+    LEAST_INTERVALS,
+    PATIENCE,
+    WORTH,
+    drop_gone,
+    improve,
+    list_neighbours,
+    sign_sequence,
+)
 from .refinement import keep_within, refine
 from .search import Price, TimeSearch, TimeSolution
 from .stage import Stage, halve, in_own_units, resample, to_si, unit_of
@@ -244,8 +252,10 @@ def finish(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
         solution = improve(search, solution)
     if search.only_begins:
         return solution
-    search, solution = choose_end(search, solution)
-    solution = refine(search, solution)
+    search, coarse = choose_end(search, solution)
+    solution = refine(search, coarse)
+    if not solution.success and search.options.mode_search:
+        solution = _refine_neighbour(search, coarse) or solution
     fewer = drop_gone(search, solution) if solution.success else solution
     if fewer is not solution:
         # Phase 3 of query 57 does not hold in its replay otherwise.
@@ -257,6 +267,20 @@ def finish(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
     if solution.success and search.problem.scene.control_period:
         return hold_torques(search, solution)
     return solution
+
+
+def _refine_neighbour(search: TimeSearch, coarse: TimeSolution) -> TimeSolution | None:
+    """A refined solution in neighbouring modes that cost as much on few intervals.
+
+    Phase 2 of the route of query 10 has none in which a contact turns back without resting.
+    """
+    for stages in list_neighbours(search, coarse):
+        other = search.solve(stages, most=PATIENCE)
+        if other.success and other.cost - coarse.cost < WORTH * abs(coarse.cost):
+            refined = refine(search, other)
+            if refined.success:
+                return refined
+    return None
 
 
 def choose_end(search: TimeSearch, solution: TimeSolution) -> tuple[TimeSearch, TimeSolution]:
