@@ -14,12 +14,10 @@ from ..mechanics.statics import SURE
 from ..problem.uncertainty import PARAMETERS
 from ..results.plan_record import RangeFigures
 from .blocks import Planning, plan_blocks
-from .lower_bound.speed_sweep import NoMotionError, speed_sweep
 from .options import Objective, PlanOptions
-from .path_domain.path_data import join
-from .path_domain.path_mesh import LimitSamples
 from .path_domain.path_motion import PathMotion
 from .path_domain.path_plan import ROUGH, Task, plan_curves
+from .path_domain.speed_profile import Fastest
 from .phase_plan import combine
 from .robust.robust_rows import Guide, list_holds, measure_holds
 
@@ -100,10 +98,11 @@ def find_widest(
     low, high, middle = 0.0, np.inf, min(1.0, most)
     while low < most and (np.isinf(high) or high - low > _CLOSE * high):
         task = Task(curves, epsilon, scale(middle), phases, None, guides=tuple(guides))
-        try:
-            low, guides = middle, _sweep(task)
-        except NoMotionError:
+        fastest = task.find_fastest()
+        if fastest is None:
             high = middle
+        else:
+            low, guides = middle, _cut(fastest, curves)
         middle = min(2 * low, most) if np.isinf(high) else (low + high) / 2
     for _ in range(_TRIES):
         options = replace(scale(low), accuracy=ROUGH)
@@ -115,19 +114,12 @@ def find_widest(
     return 0.0
 
 
-def _sweep(task: Task) -> list[Guide]:
-    """The minimum-time profile along each curve; NoMotionError where there is none."""
-    data = join(task.lay_out([np.zeros(0)] * len(task.curves), task.elements))
-    samples = LimitSamples.of(data, 0.0)
-    places = np.append(samples.s, samples.length)
-    s, inner = places[::2], slice(1, None, 2)
-    part = (samples.s[inner] - s[:-1]) / np.diff(s)
-    cap = np.append(samples.rows.cap[::2], np.inf)
-    speeds = speed_sweep(samples.rows.pick(inner), np.diff(s), part, cap, None, 2)
+def _cut(fastest: Fastest, curves: Sequence[Curve]) -> list[Guide]:
+    """A minimum-time profile along each curve."""
     guides, start = [], 0.0
-    for curve in task.curves:
-        own = np.linspace(0.0, curve.length, len(s))
-        none = np.zeros_like(own)
-        guides.append(Guide(own, none, np.interp(own + start, s, speeds.b), none))
+    for curve in curves:
+        s = np.linspace(0.0, curve.length, len(fastest.s))
+        b, none = np.interp(s + start, fastest.s, fastest.b), np.zeros_like(s)
+        guides.append(Guide(s, none, b, none))
         start += curve.length
     return guides

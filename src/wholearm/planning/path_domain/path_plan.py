@@ -1,9 +1,10 @@
 """Minimum-time, minimum-effort and maximum-margin plans of phases with one degree of freedom.
 
 Direct collocation along the curve (`path_nlp`), refined by `planning.refine`. Elements end where
-the plan switches from one active limit to another. They are halved while violations between nodes
-cost more than the accuracy. Limits are tightened by their violations until none exceeds `MISS`;
-what that costs is the estimate of the error.
+the plan switches from one active limit to another: first where the minimum-time sweep does, then
+where the solution does. They are halved while violations between nodes cost more than the accuracy.
+Limits are tightened by their violations until none exceeds `MISS`; what that costs is the estimate
+of the error.
 """
 
 from __future__ import annotations
@@ -28,8 +29,6 @@ from ...geometry.curve import Curve, describe_pose, directions_of
 from ...mechanics.dynamics import reduced_inertia
 from ...mechanics.uniqueness import describe_uniqueness, find_minors
 from ..advice import describe_changes, find_changes, name_phases
-from ..lower_bound.lower_bound import GRID_INTERVALS, look_along
-from ..lower_bound.speed_sweep import NoMotionError
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
 from ..refine import refine
@@ -44,6 +43,7 @@ from .path_mesh import (
     keep_apart,
     make_grid,
     match,
+    place_breaks,
 )
 from .path_motion import PathMotion, fit_torque
 from .path_nlp import (
@@ -58,6 +58,7 @@ from .path_nlp import (
     unpack,
 )
 from .rate_terms import UNLIMITED, MotorShape, equidistribute, find_hurry
+from .speed_profile import Fastest, find_fastest
 from .terms import LimitShape
 from .unique_start import WORTH, SureStart, find_sure_start
 
@@ -172,12 +173,13 @@ def explain_stuck(
 
 
 def plan_task(task: Task, insist: bool = True) -> PathIterate:
-    """Solve and refine; unless to `insist`, only where a sweep finds a motion."""
+    """Solve and refine; unless to `insist`, only where a sweep or a guess shows a motion."""
     for curve, phase in zip(task.curves, task.phases, strict=True):
         require_unique(curve, task.options.uniqueness_margin, phase)
-    if not insist and not task.has_motion:
+    first = PathIterate.begin(task, task.elements)
+    if not insist and not first.is_kept:
         raise SolverError("no motion keeps the limits")
-    return refine(PathIterate.begin(task, task.elements), task.options.accuracy)
+    return refine(first, task.options.accuracy)
 
 
 def _plan_within(task: Task) -> PathIterate:
@@ -281,15 +283,6 @@ class Task:
         """Whether motions start and end without acceleration, as torques may not step."""
         return self.curves[0].formation.scene.has_slow_motors
 
-    @cached_property
-    def has_motion(self) -> bool:
-        """Whether a minimum-time sweep finds a motion, with ranges and rate limits left out."""
-        try:
-            look_along(self.curves, self.epsilon, GRID_INTERVALS)
-        except NoMotionError:
-            return False
-        return True
-
     @property
     def name(self) -> str:
         """The phases, for messages."""
@@ -321,6 +314,11 @@ class Task:
             prepare(curve, self.epsilon, grid, phase, limits)
             for curve, grid, phase, limits in columns
         ]
+
+    def find_fastest(self) -> Fastest | None:
+        """The minimum-time speed profile, or the one of the allowed duration; None without one."""
+        data = join(self.lay_out([np.zeros(0)] * len(self.curves), self.elements))
+        return find_fastest(data, self.duration)
 
 
 def require_unique(curve: Curve, least: float, phase: int) -> None:
@@ -375,41 +373,57 @@ class PathIterate:
     units: Units
     solution: PathSolution
     tightening: Tightening  # of the limits for that
+    is_kept: bool  # whether some motion is known to keep limits, or negative margins would do
     meshes: int = 0  # before this one
     merit: float = np.inf  # estimated cost once limits hold between nodes, on the mesh before
     shift: float | None = None  # of switches from breaks, if limits are tightened; see `switches`
 
     @staticmethod
     def begin(task: Task, elements: int) -> PathIterate:
-        """Start from a parabola of the squared speed."""
-        none = [np.zeros(0)] * len(task.curves)
-        parts = task.lay_out(none, elements)
-        profile, units = guess(join(parts), task.options.time_weight)
-        return PathIterate.start(task, none, none, parts, units, profile, 0.0)
+        """Start from the minimum-time speed profile, or a parabola of the squared speed."""
+        breaks: Sequence[Array] = [np.zeros(0)] * len(task.curves)
+        parts = task.lay_out(breaks, elements)
+        data = join(parts)
+        profile, units = guess(data, task.options.time_weight)
+        margin, goal, fastest = 0.0, task.options.goal, None
+        kept = goal is Objective.MARGIN
+        if goal is not Objective.EFFORT and not task.is_held:
+            fastest = find_fastest(data, task.duration)
+        if fastest is not None:
+            margin, few = fastest.margin, task.options.intervals and elements
+            breaks = place_breaks(task.curves, fastest.switches, few)
+            parts = task.lay_out(breaks, elements)
+            data = join(parts)
+            profile = fastest.follow(data)
+        kept = kept or fastest is not None or bool(data.slack(data.nodes, profile).min() >= 0)
+        none = [np.zeros(0)] * len(parts)
+        return PathIterate.start(task, (breaks, none), parts, units, (profile, margin), kept)
 
     @staticmethod
     def start(
         task: Task,
-        breaks: Sequence[Array],
-        cuts: Sequence[Array],
+        edges: tuple[Sequence[Array], Sequence[Array]],
         parts: list[PhaseData],
         units: Units,
-        profile: Profile,
-        margin: float,
+        motion: tuple[Profile, float],
+        kept: bool,
     ) -> PathIterate:
-        """Start near a motion and its margin [N], with multipliers near the central path."""
-        data, edges = join(parts), (tuple(breaks), tuple(cuts))
+        """Start near a motion and its margin [N], with multipliers near the central path.
+
+        `edges` are the breaks and the cuts.
+        """
+        data, (breaks, cuts) = join(parts), map(tuple, edges)
         motors = MotorShape.of(task.curves[0].formation.scene) if task.is_held else UNLIMITED
         shape = LimitShape.of(data.limits, motors)
         nlp = build_path_nlp(shape, len(data.grid.steps), task.options.goal)
-        first = PathSolution(profile, margin, center(nlp, data, units, profile, margin))
+        first = PathSolution(*motion, center(nlp, data, units, *motion))
         none = Tightening.none(data, task.duration)
-        return PathIterate(task, *edges, parts, data, nlp, units, first, none)
+        return PathIterate(task, breaks, cuts, parts, data, nlp, units, first, none, kept)
 
     def restart(self) -> PathIterate | None:
-        """The first one on twice the elements, once, if a sweep finds a motion."""
+        """The first one on twice the elements, once."""
         elements = 2 * self.task.elements
-        if len(self.parts[0].grid.edges) >= elements or not self.task.has_motion:
+        if len(self.parts[0].grid.edges) >= elements:
             return None
         return PathIterate.begin(self.task, elements)
 
@@ -446,10 +460,6 @@ class PathIterate:
             each = zip(self.parts, self.motions, strict=True)
             return self._move([equidistribute(*own, task.elements) for own in each], self.cuts)
         breaks, _ = self.switches
-        ends = max(len(find_ends(*pair)) for pair in zip(task.curves, breaks, strict=True))
-        if task.options.intervals is not None and ends > task.elements:
-            # A fixed number of elements is too few to end at all switches.
-            breaks, again = self.breaks, False
         if self.loss > _SHARE * accuracy and again:
             return self._move(breaks, self.cuts)
         costs = self.due + self.paid
@@ -488,7 +498,8 @@ class PathIterate:
         profile = Elements(self.data.grid, old.profile).move(grid)
         if grid.held:
             profile = follow(grid, profile.a, profile.lam)
-        made = PathIterate.start(self.task, breaks, cuts, parts, self.units, profile, old.margin)
+        motion, kept = (profile, old.margin), self.is_kept
+        made = PathIterate.start(self.task, (breaks, cuts), parts, self.units, motion, kept)
         merit = old.cost + self.value * float(self.due.sum())
         return replace(made, meshes=self.meshes + 1, merit=merit)
 
