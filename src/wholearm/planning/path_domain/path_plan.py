@@ -35,6 +35,7 @@ from ..refine import refine
 from ..robust.robust_rows import Guide, RobustLimits, spread
 from .elements import DEGREE, Elements, Profile, follow
 from .first_guess import guess, guess_slowly
+from .first_solution import start_at
 from .path_data import PhaseData, cut, join, prepare
 from .path_mesh import (
     find_ends,
@@ -397,7 +398,11 @@ class PathIterate:
             profile = fastest.follow(data)
         kept = kept or fastest is not None or bool(data.slack(data.nodes, profile).min() >= 0)
         none = [np.zeros(0)] * len(parts)
-        return PathIterate.start(task, (breaks, none), parts, units, (profile, margin), kept)
+        first = PathIterate.start(task, (breaks, none), parts, units, (profile, margin), kept)
+        if fastest is None:
+            return first
+        profile, multipliers = start_at(first.nlp, data, units, fastest)
+        return replace(first, solution=PathSolution(profile, margin, multipliers))
 
     @staticmethod
     def start(

@@ -40,6 +40,15 @@ class Fastest(NamedTuple):
         """The s'' of each interval, shape (N,) [m/s^2]."""
         return np.asarray(np.diff(self.b) / (2 * np.diff(self.s)))
 
+    def find_modes(self, places: Array) -> NDArray[np.int64]:
+        """Modes at some places [m]: never `SWITCH`."""
+        modes = self.modes[np.clip(np.searchsorted(self.s, places) - 1, 0, len(self.modes) - 1)]
+        jumps = np.array([place for place, jumps in self.switches if jumps])
+        for k in np.flatnonzero(modes == SweepMode.SWITCH).tolist():
+            jump = jumps[np.abs(jumps - places[k]).argmin()] if len(jumps) else places[k]
+            modes[k] = SweepMode.PUSH if places[k] < jump else SweepMode.BRAKE
+        return modes
+
     def follow(self, data: PhaseData) -> Profile:
         """The motion on a grid, with internal forces amid their range."""
         a = np.interp(data.grid.s, (self.s[1:] + self.s[:-1]) / 2, self.slopes)
