@@ -42,7 +42,9 @@ def cross(a: Array, b: Array) -> Array:
 def point_to_segment(points: Array, start: Array, end: Array) -> Array:
     """Distance of points, shape (..., 2), from segments, shape (..., 2)."""
     run = end - start
-    part = np.clip(dot(points - start, run) / dot(run, run), 0, 1)
+    # Borders may have a point twice, by rounding.
+    square = np.maximum(dot(run, run), np.finfo(float).tiny)
+    part = np.clip(dot(points - start, run) / square, 0, 1)
     away = points - start - part[..., None] * run
     return np.asarray(np.hypot(away[..., 0], away[..., 1]))
 
