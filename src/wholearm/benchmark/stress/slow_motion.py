@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import null_space
 from scipy.optimize import linprog
-from scipy.sparse import block_array, block_diag, diags_array, eye_array, kron
+from scipy.sparse import block_array, block_diag, coo_array, diags_array, eye_array, kron
 
 from ...common.arrays import Array
 from ...problem.definition import Phase
@@ -105,7 +105,7 @@ def _solve_along(
             every = kron(eye_array(n - 1), np.ones((matrix.shape[1], 1)))
             a, b, v = (diags_array(matrix[:, :, k].ravel()) @ every for k in range(3))
             c: list[Any] = [None, None]
-            c[side] = block_diag(list(matrix[:, :, 3:]))
+            c[side] = block_diag([coo_array(block) for block in matrix[:, :, 3:]])
             blocks.append([a @ slope + b @ place, v @ place, *c])
         upper[-1].append(np.tile(forces.share, n - 1)[:, None])
         most.append(-forces.least.ravel())
