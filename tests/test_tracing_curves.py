@@ -30,8 +30,8 @@ from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation, find_touching
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.explore import close_all, close_contacts
-from wholearm.geometry.path_guess import POINTS, PathGuess, guess_curve, guess_phase, load
-from wholearm.geometry.tracing import trace_curve, trace_phases, until_distance
+from wholearm.geometry.path_guess import POINTS, PathGuess, guess_curve, guess_phase
+from wholearm.geometry.tracing import load, trace_curve, trace_phases, until_distance
 from wholearm.mechanics.dynamics import metric_weights
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.time_domain.time_plan import plan_phases

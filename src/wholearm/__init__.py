@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from .engines.mjcf import write_mjcf
     from .figures import plots
     from .figures.map_figure import draw_map
-    from .geometry.path_guess import load
+    from .geometry.tracing import load
     from .mapping.formation_list import format_route, list_formations
     from .mapping.formation_map import FormationMap, build_map
     from .planning.options import Objective, PlanOptions
@@ -74,7 +74,7 @@ _NAMES = {
     "engines.engine_replay": "EngineReport PolicyReport play_policy replay_in",
     "engines.mjcf": "write_mjcf",
     "figures.map_figure": "draw_map",
-    "geometry.path_guess": "load",
+    "geometry.tracing": "load",
     "mapping.formation_list": "format_route list_formations",
     "mapping.formation_map": "FormationMap build_map",
     "planning.options": "Objective PlanOptions",

@@ -15,8 +15,7 @@ from pathlib import Path
 
 from ..common.errors import InputError
 from ..common.files import read_json, require_writable, write_text
-from ..geometry.path_guess import load
-from ..geometry.tracing import trace_phases
+from ..geometry.tracing import load, trace_phases
 from ..planning.plan import solve
 from ..problem.definition import Problem
 from ..simulation.runge_kutta import NODES

@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..geometry.path_guess import load
-from ..geometry.tracing import trace_phases
+from ..geometry.tracing import load, trace_phases
 from ..planning.plan import solve
 from ..problem.definition import End, Problem, Until
 from ..problem.read import build_problem

@@ -50,7 +50,7 @@ def predict(options: argparse.Namespace) -> int:
 def tune(options: argparse.Namespace) -> int:
     """Tune torques in steps of 10 %, print what became of each phase, write them if they hold."""
     from ..common.files import write_text
-    from ..geometry.path_guess import load
+    from ..geometry.tracing import load
     from ..tuning.tuner import tune as run
 
     require_output(options.output, ".csv")
@@ -66,7 +66,7 @@ def tune(options: argparse.Namespace) -> int:
 def compare(options: argparse.Namespace) -> int:
     """Replay plans and torques for one problem, print the tables, and draw the margins."""
     from ..comparison.metrics import compare as run
-    from ..geometry.path_guess import load
+    from ..geometry.tracing import load
 
     require_output(options.output)
     comparison = run(load(options.problem), options.files, show_progress())

@@ -108,7 +108,7 @@ def solve(options: argparse.Namespace) -> int:
     """Plan, and write the plan."""
     from ..common.fields import keys_of
     from ..common.files import together
-    from ..geometry.path_guess import load
+    from ..geometry.tracing import load
     from ..planning.options import PlanOptions
     from ..planning.plan import solve_with
     from ..planning.result import describe_plan
@@ -202,7 +202,7 @@ def verify(options: argparse.Namespace) -> int:
         notes = tell_origin(problem, (options.torques, torques), named, options.json)
     if getattr(torques, "meta", {}).get("problem") != problem.table:
         # What has been planned or replayed can be carried out.
-        from ..geometry.path_guess import check_phases
+        from ..geometry.tracing import check_phases
 
         check_phases(problem)
     if options.free:
@@ -297,7 +297,7 @@ def _replay(options: argparse.Namespace, torques: TorqueProfile) -> Trajectory:
     """The motion that torques alone lead to."""
     if options.problem is None:
         raise InputError(options.trajectory, "--problem", "is needed to replay torques")
-    from ..geometry.path_guess import load
+    from ..geometry.tracing import load
     from ..simulation.simulate import simulate
 
     return simulate(load(options.problem), torques, progress=show_progress()).trajectory

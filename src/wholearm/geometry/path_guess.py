@@ -8,37 +8,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import InputError, name_source
-from ..common.sharing import exclusive
+from ..common.errors import InputError
 from ..contacts.contact_limits import build_limits
 from ..contacts.formation import Formation
 from ..mechanics.dynamics import Directions, metric_weights
-from ..problem.definition import Phase, Problem
-from ..problem.read import read_problem
+from ..problem.definition import Phase
 from .curve import Curve, tangent_basis
 from .explore import Ending, close_all, close_contacts, explore
-from .tracing import require_touching, runs_on_curve, trace_phase, trace_phases
+from .tracing import require_touching, runs_on_curve, trace_phase
 
 POINTS = 25  # configurations along a guess
 RELEASE_AT = 0.8  # share of a curve at which a release is guessed
 _MOST_ACTIVE = 2  # most active limits at the end of a phase
-
-
-@exclusive
-def load(path: str) -> Problem:
-    """Read a problem file and check its phases geometrically, or raise an `InputError`."""
-    problem = read_problem(path)
-    check_phases(problem)
-    return problem
-
-
-def check_phases(problem: Problem) -> None:
-    """Raise an `InputError` if a formation does not touch, or an `until` is never reached."""
-    curves = trace_phases(problem)
-    z = curves[-1].end if curves else problem.start
-    with name_source(problem.source):
-        for phase in problem.phases[len(curves) :]:
-            z = find_end(phase, z, problem.phases[phase.index + 1 :])
 
 
 def find_end(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> Array:

@@ -16,9 +16,11 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import InputError, name_source
+from ..common.sharing import exclusive
 from ..contacts.formation import Formation, describe, find_touching
 from ..mechanics.dynamics import metric_weights
 from ..problem.definition import End, Phase, Problem, Until
+from ..problem.read import read_problem
 from ..scene.model import TOUCHING
 from .curve import Curve, Panel, border, describe_pose, find_root, refine
 
@@ -32,6 +34,27 @@ FIRST = 0.5  # length of the first panel that is tried, in radii of gyration
 ROUNDING = 3e-10  # below zero by no more than this, in radii of gyration, a limit counts as kept
 CLOSER = 4  # times that dips of a limit between two places are looked at more closely
 LONGEST = 60.0  # longest curve that is traced, in radii of gyration: several turns of the object
+
+
+@exclusive
+def load(path: str) -> Problem:
+    """Read a problem file and check its phases geometrically, or raise an `InputError`."""
+    problem = read_problem(path)
+    check_phases(problem)
+    return problem
+
+
+def check_phases(problem: Problem) -> None:
+    """Raise an `InputError` if a formation does not touch, or an `until` is never reached."""
+    curves = trace_phases(problem)
+    if len(curves) == len(problem.phases):
+        return
+    from .path_guess import find_end
+
+    z = curves[-1].end if curves else problem.start
+    with name_source(problem.source):
+        for phase in problem.phases[len(curves) :]:
+            z = find_end(phase, z, problem.phases[phase.index + 1 :])
 
 
 @lru_cache(maxsize=8)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import zip_longest
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from ..common.errors import (
     WholearmError,
     name_source,
 )
-from ..geometry.arcs import CostToGo
 from ..geometry.curve import Curve
 from ..geometry.tracing import trace_phase
 from ..mechanics.dynamics import measure_speed
@@ -33,14 +32,15 @@ from ..problem.definition import Phase, Problem
 from ..results.trajectory import Motion
 from ..scene.model import Scene
 from ..solvers.ipopt import charge
-from .advice import describe_changes, name_phases, round_outwards
 from .lower_bound.lower_bound import look_along
 from .lower_bound.speed_sweep import NoMotionError
 from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence, make_sequence, plan_sequence, plan_slowly
-from .path_domain.junction import find_beside, plan_with_pauses
 from .phase_plan import PhasePlan, Settled, add_up
 from .stops import Plans, end_of, leads_on, runs_along_curves, split_blocks
+
+if TYPE_CHECKING:
+    from ..geometry.arcs import CostToGo
 
 PLAIN = -1  # refinement level: first number of intervals, no search for modes
 BEGUN = -2  # refinement level: coarse plans, which may miss limits between points
@@ -317,6 +317,8 @@ def plan_block(
         with charge(block[0].number):
             try:
                 if problem.scene.has_slow_motors:
+                    from .path_domain.junction import plan_with_pauses
+
                     return plan_with_pauses(planning, block, plan, add_up(block, allowed)), None
                 return plan(add_up(block, allowed)), None
             except (InfeasibleError, SolverError) as error:
@@ -329,6 +331,8 @@ def plan_block(
     chain = make_sequence(block, curves)
     parts = chain.split()
     if problem.scene.has_slow_motors:
+        from .path_domain.junction import find_beside
+
         beside = find_beside(planning, block, chain.curves[-1].end, options)
         longest = [add_up(part.phases, allowed) for part in parts]
         return plan_slowly(parts, beside, problem.epsilon, options, longest), chain
@@ -402,6 +406,8 @@ def look_ahead(
                 raise SolverError(text) from None
         return sum(plan.value for plan in plan_block(planning, following, z, options)[0])
 
+    from ..geometry.arcs import CostToGo
+
     return CostToGo(phase, value)
 
 
@@ -436,6 +442,8 @@ def share_duration(
     total = 2 * sum(times) if duration is None else duration
     if total <= sum(times):
         # The least-time plan shows it; a little more leaves something to choose.
+        from .advice import describe_changes, round_outwards
+
         own = Parameter("duration", total, "s", 1, "duration")
         enough = Change(own, round_outwards(1.005 * sum(times), 1))
         raise InfeasibleError(
@@ -503,6 +511,8 @@ def explain_motors(
     keys = name_motors(planning.problem.scene)
     if not keys:
         return error
+    from .advice import name_phases
+
     where = name_phases([phase.number for phase in block])
     if isinstance(error, InfeasibleError):
         where += f" ({'; '.join(' '.join(phase.formation.names) for phase in block)})"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,7 +22,6 @@ from ..problem.read import require_phases
 from ..results.adopt import Torques, adopt_torques
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
-from .complementarity import FreeRun
 from .events import (
     EventKind,
     Glimpses,
@@ -38,6 +37,9 @@ from .run import Feedback, Law, Run
 from .runge_kutta import INNER_STAGES, NODES
 from .stepper import Modes
 from .tolerances import SLOW, is_slower
+
+if TYPE_CHECKING:
+    from .complementarity import FreeRun
 
 ROUNDS = 8  # most simulations, each with steps that end at events missed before
 Closer = Callable[[Simulation, Glimpses, int], ArrayLike]
@@ -222,6 +224,8 @@ def _simulate(
         if depths[worst] > 10 * touching:
             pairs = "palm and object", "finger 1 and object", "finger 2 and object", "both fingers"
             raise SimulationError(f"{pairs[worst]} overlap by {depths[worst]:.3g} m at the start")
+    from .complementarity import FreeRun
+
     run = FreeRun(system, profile, z, v, hint=hint, **options)
     run.play(touching, halt)
     given_up = next((e for e in run.events if e.kind is EventKind.GIVEN_UP), None)

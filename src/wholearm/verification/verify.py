@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple, overload
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +39,6 @@ from ..simulation.events import Event, EventKind, Glimpses, Simulation
 from ..simulation.simulate import Closer, simulate
 from ..simulation.tolerances import SETTLING
 from .force_uniqueness import find_departure, find_uniqueness_margin, find_wedged
-from .free import FreeReport, verify_free
 from .verdict import (
     DEPARTURE,
     REST_SPEED,
@@ -53,6 +52,9 @@ from .verdict import (
     judge_end,
     measure_speed,
 )
+
+if TYPE_CHECKING:
+    from .free import FreeReport
 
 _RATE_MISS = 1e-3  # largest relative miss of a torque's rate, or of a command, that is not reported
 STEPPED = 1e-5  # largest step of a torque that is none, over its limit
@@ -143,6 +145,8 @@ def verify(
     JammingError, SimulationError  if the simulation cannot go on
     """
     if contacts == "free":
+        from .free import verify_free
+
         return verify_free(problem, what, tolerance=tolerance, departure=departure, **options)
     if contacts != "prescribed" or options:
         text = f"{contacts!r} given; known: prescribed, free"

@@ -9,7 +9,7 @@ from functools import partial
 from ..common.document import Table
 from ..common.files import make_folder, write_text
 from ..figures import plots
-from ..geometry.path_guess import load
+from ..geometry.tracing import load
 from ..planning.result import Plan
 from ..search.solve import solve
 from ..verification.verify import verify

@@ -18,7 +18,7 @@ import numpy as np
 from ...common.errors import SolverError, WholearmError
 from ...common.fields import Range
 from ...common.files import make_folder, write_text
-from ...geometry.path_guess import check_phases, load
+from ...geometry.tracing import check_phases, load
 from ...planning.plan import solve
 from ...problem.definition import Problem
 from ...problem.read import build_problem, read_problem

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,8 +27,10 @@ from ...solvers.ipopt import charge
 from ..options import PlanOptions
 from ..phase_plan import PhasePlan
 from ..stops import PlanPart, Plans, end_of
-from .junction import Joint, add_pause, choose_joint
 from .path_plan import plan_curves
+
+if TYPE_CHECKING:
+    from .junction import Joint
 
 PER_SPEED = " per m/s"  # unit after impulses and rates, which are for unit speed before an impact
 BEND = 1e-6  # largest 1 - cosine between tangents that count as the same
@@ -147,6 +149,8 @@ def plan_slowly(
                      torques of the former, and the formation of the latter
     durations : [s]  the longest duration of each, for the objective `margin`
     """
+    from .junction import add_pause, choose_joint
+
     plans: Plans = []
     firsts: list[Curve | Formation | None] = [
         *(part.curves[0] for part in parts[1:]),

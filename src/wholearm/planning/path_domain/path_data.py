@@ -7,7 +7,7 @@ through the knots give them where limits are checked.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,10 @@ from ...geometry.curve import Curve, describe_pose, directions_of
 from ...mechanics.dynamics import PathForces, inverse, reduced_inertia
 from ...mechanics.limits import CONE, PRESS, TORQUE, LimitSet, make_limits
 from ...mechanics.path_limits import PathLimits, find_slack_rows, find_speed_cap, find_value_rows
-from ..robust.robust_rows import RobustLimits, spread_limits
 from .elements import Elements, Grid, Profile
+
+if TYPE_CHECKING:
+    from ..robust.robust_rows import RobustLimits
 
 
 class Sampling(NamedTuple):
@@ -205,6 +207,8 @@ def prepare(
     nodes, checks = every.pick(slice(None, len(grid.s))), knots.map(interpolate)
     limits = make_limits(formation, epsilon)
     if spread is not None:
+        from ..robust.robust_rows import spread_limits
+
         limits = spread_limits(limits)
         steps = sampling.checks * grid.steps[nonempty, None]
         inside = (grid.s[nonempty, None] + steps).ravel()

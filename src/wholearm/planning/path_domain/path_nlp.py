@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,9 @@ from ..options import Objective
 from .elements import Grid, Profile, follow
 from .path_data import PhaseData
 from .terms import CHAINED, LEAST_B, SOFT, LimitShape, NLPColumns, list_columns, write_terms
-from .unique_start import SureStart
+
+if TYPE_CHECKING:
+    from .unique_start import SureStart
 
 _MU, _INSIDE = 1e-4, 1e-3  # complementarity of first multipliers, and the least slack in it
 

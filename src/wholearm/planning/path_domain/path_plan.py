@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -28,11 +28,9 @@ from ...common.errors import (
 from ...geometry.curve import Curve, describe_pose, directions_of
 from ...mechanics.dynamics import reduced_inertia
 from ...mechanics.uniqueness import describe_uniqueness, find_minors
-from ..advice import describe_changes, find_changes, name_phases
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
 from ..refine import refine
-from ..robust.robust_rows import Guide, RobustLimits, spread
 from .elements import DEGREE, Elements, Profile, follow
 from .first_guess import guess, guess_slowly
 from .first_solution import start_at
@@ -61,7 +59,10 @@ from .path_nlp import (
 from .rate_terms import UNLIMITED, MotorShape, equidistribute, find_hurry
 from .speed_profile import Fastest, find_fastest
 from .terms import LimitShape
-from .unique_start import WORTH, SureStart, find_sure_start
+
+if TYPE_CHECKING:
+    from ..robust.robust_rows import Guide, RobustLimits
+    from .unique_start import SureStart
 
 Plans = list[PhasePlan[PathMotion]]
 Pins = tuple[float | None, float | None]  # prescribed internal force at start and end [N]
@@ -122,7 +123,7 @@ def plan_curves(
     SolverError      if the solver does not converge
     """
     task = Task(curves, epsilon, options, phases, duration, pins=pins)
-    guides = tuple[Guide, ...]()
+    guides: tuple[Guide, ...] = ()
 
     def replan(changed: Sequence[Curve], least: float) -> object:
         changes = replace(task, curves=changed, epsilon=least, options=_roughen(task.options))
@@ -204,6 +205,8 @@ def _leave_rest(iterate: PathIterate) -> Plans:
 
     Those of least time start with the largest s'', but not as if friction were larger.
     """
+    from .unique_start import WORTH, find_sure_start
+
     task, plans, margin = iterate.task, iterate.plans, 0.0
     goal, ranges = task.options.goal, task.options.ranges
     if goal is Objective.MARGIN:
@@ -235,6 +238,8 @@ def _explain_duration(task: Task) -> InfeasibleError | None:
     least = sum(plan.value for plan in plans)
     if least <= duration:
         return None
+    from ..advice import describe_changes, find_changes, name_phases
+
     rough = replace(task, options=_roughen(task.options))
 
     def can_plan(_: Parameter, value: float) -> bool:
@@ -276,6 +281,8 @@ class Task:
         """Robust force limits of each curve, None without ranges."""
         if not self.guides:
             return [None] * len(self.curves)
+        from ..robust.robust_rows import spread
+
         args = self.epsilon, self.options.ranges
         return [spread(*pair, *args) for pair in zip(self.curves, self.guides, strict=True)]
 
@@ -287,6 +294,8 @@ class Task:
     @property
     def name(self) -> str:
         """The phases, for messages."""
+        from ..advice import name_phases
+
         return name_phases(self.phases)
 
     @property
@@ -538,6 +547,8 @@ class PathIterate:
     @property
     def guides(self) -> tuple[Guide, ...]:
         """The motion along each curve as a reference."""
+        from ..robust.robust_rows import Guide
+
         return tuple(Guide(motion.grid.s, *motion.profile) for motion in self.motions)
 
     @cached_property
