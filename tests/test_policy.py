@@ -64,6 +64,22 @@ def test_the_squeeze_has_the_largest_least_level() -> None:
         assert level == pytest.approx(-best.fun, abs=1e-9)
 
 
+def test_limits_that_the_squeeze_does_not_change_leave_it_where_it_is(policy: Policy) -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        base, press = rng.normal(size=(2, 8))
+        level, squeeze = choose_internal_force(base.tolist(), [0.0] * 8, press.tolist(), 0.0)
+        limits = [*base.tolist(), level - 1.0], [0.0] * 9, [*press.tolist(), 0.0]
+        assert choose_internal_force(*limits, 0.0) == (level - 1.0, squeeze)
+    # A coefficient that is 0 but for rounding counts as 0.
+    tables = dict(policy.tables[0])
+    arrivals = []
+    for rounding in (0.0, 5e-15, -2e-17):
+        tables["arrival"] = np.array([[1.0, 0, 0, 0, rounding], [1.0, 0, 0, 0, 2.0]])
+        arrivals.append(CurveLaw(tables, policy.settings).arrival)
+    assert arrivals[0] == arrivals[1] == arrivals[2]
+
+
 def test_the_squeeze_makes_up_for_what_is_measured() -> None:
     rng = np.random.default_rng(5)
     moving = 0
