@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import re
 from functools import lru_cache
 from pathlib import Path
@@ -19,21 +18,12 @@ from wholearm import Finger, Friction, InputError, Polygon, Scene, TorqueProfile
 from wholearm.benchmark import STUDIES
 from wholearm.benchmark.corpus import compare
 from wholearm.benchmark.corpus_cases import FAMILIES, answer, list_cases
-from wholearm.benchmark.growth import SIZES, WORK, fit_exponent, run_work
+from wholearm.benchmark.growth import SIZES, WORK, run_work
 from wholearm.benchmark.growth import STUDY as GROWTH
 from wholearm.benchmark.guard import BANDS, count, read_stored
-from wholearm.benchmark.guard import compare as compare_counts
 from wholearm.benchmark.kernels import LARGEST, Environment, perturb_scenes
 from wholearm.benchmark.kernels import STUDY as KERNELS
-from wholearm.benchmark.kernels import compare as compare_plans
-from wholearm.benchmark.precision.phases import (
-    SHORT,
-    SOLVED,
-    Instance,
-    Median,
-    list_instances,
-    measure,
-)
+from wholearm.benchmark.precision.phases import SOLVED, Instance, list_instances
 from wholearm.benchmark.precision.planners import (
     LEAST_TIME,
     NO_DRAG,
@@ -41,7 +31,6 @@ from wholearm.benchmark.precision.planners import (
     find_least_time,
     run_planner,
 )
-from wholearm.benchmark.precision.precision_study import Medians, PeerComparison, find_times
 from wholearm.benchmark.precision.reference import Course, measure_error
 from wholearm.benchmark.precision.simulators import FEW, SIMULATORS, check_plan, make_course
 from wholearm.benchmark.skip import STUDY as SKIP
@@ -218,9 +207,6 @@ def test_two_runs_do_not_write_to_one_file(tmp_path: Path) -> None:
         assert journal.records == [{"scene": 0}]
 
 
-KEYS = ("grows", "work", "size")
-
-
 def make_rows() -> list[Row]:
     """Times that grow with the square of sizes, and memory in proportion to them."""
     return [
@@ -229,13 +215,6 @@ def make_rows() -> list[Row]:
         for work in WORK[grows]
         for k in sizes
     ]
-
-
-def test_exponents_are_those_of_powers_where_small_sizes_cost_the_same() -> None:
-    sizes = [10, 20, 40, 80, 160, 320]
-    for power in (0.5, 1.0, 2.0):
-        costs = np.maximum(np.power(sizes, power), np.power(80.0, power)).tolist()
-        assert fit_exponent(sizes, costs) == pytest.approx(power)
 
 
 def test_the_table_has_every_measurement_and_exponent() -> None:
@@ -262,13 +241,6 @@ def test_work_is_as_large_as_is_asked() -> None:
     assert max(run.unknowns for run in runs) > 3 * 50 - 2
     for size in (5, 6):
         run_work(table, "vertices", "reading", size)
-
-
-def test_what_is_drawn_and_listed_is_what_is_run() -> None:
-    options = argparse.Namespace(problem=str(HEPTAGON))
-    cases = list(GROWTH.list_cases(options))
-    assert [case[1:] for case in cases] == [tuple(map(row.get, KEYS)) for row in make_rows()]
-    assert GROWTH.alone and GROWTH.columns == (*KEYS, "seconds", "memory")
 
 
 INTERVALS, TIME_INTERVALS, POINTS, TOUCHING = 12, 4, 3, 4
@@ -363,25 +335,6 @@ def test_counts_of_one_phase_are_those_of_theory() -> None:
     assert found["phase 1 of 1: rows"] == NODES - 1 + (CONTACTS + 2) * NODES
     assert found["panels of curves"] >= 1 and set(BANDS) < set(found)
     assert found["iterations"] > 1 and found["evaluations of the replay"] > 12
-
-
-@pytest.mark.parametrize(
-    ("stored", "texts"),
-    [
-        ({"a: rows": 10, "iterations": 100}, []),
-        ({"a: rows": 11, "iterations": 300}, []),
-        ({"a: rows": 9, "iterations": 100}, ["p: a: rows has grown from 9 to 10"]),
-        ({"a: rows": 10, "iterations": 81}, []),
-        (
-            {"a: rows": 10, "iterations": 79},
-            ["p: iterations has grown from 79 to 100 (allowed: 99)"],
-        ),
-        ({"iterations": 100}, ["p: a: rows = 10 is new; --update stores it"]),
-        ({"a: rows": 10, "iterations": 100, "b: rows": 3}, ["p: b: rows is not counted any more"]),
-    ],
-)
-def test_what_has_grown_is_named(stored: dict[str, int], texts: list[str]) -> None:
-    assert compare_counts("p", {"a: rows": 10, "iterations": 100}, stored) == texts
 
 
 def test_the_command_stores_counts_and_fails_where_they_grow(
@@ -517,20 +470,6 @@ def test_refusals_agree_in_kind_and_in_what_is_short() -> None:
 GOOD: dict[str, Any] = {"value": 2.0, "modes": [["+ - -"]], "fault": ""}
 
 
-@pytest.mark.parametrize(
-    ("changes", "text"),
-    [
-        ({}, None),
-        ({"value": 2.0 * (1 + 5e-7)}, None),
-        ({"value": 2.0 * (1 + 2e-6)}, "value 2.000004 is off 2 by +2.0e-06"),
-        ({"modes": [["+ + -"]]}, "contact modes [['+ + -']] are not [['+ - -']]"),
-        ({"value": None, "fault": "phase 1 is infeasible"}, "phase 1 is infeasible"),
-    ],
-)
-def test_what_differs_is_named(changes: dict[str, Any], text: str | None) -> None:
-    assert compare_plans(GOOD | changes, GOOD) == ([text] if text else [])
-
-
 def test_answers_come_from_the_environment() -> None:
     found = KERNELS.run((*Environment(seed=3), str(SQUARE), "time"))
     assert found["fault"] == ""
@@ -654,33 +593,3 @@ def test_every_simulator_converges_to_the_reference(method: str) -> None:
         for tolerance in ("1e-5", "1e-9")
     ]
     assert errors[1] < 2e-7 and errors[1] < max(0.3 * errors[0], 1e-10)
-
-
-FINE = Median(0.5, 0.3, (-3e-7,))
-MEDIANS: Medians = {
-    ("study", "phase 1", "a, b", "1e-6"): FINE,
-    ("study", "phase 1", "a, b", "1e-3"): FINE._replace(solve=0.1, errors=(1e-4,)),
-    ("study", "phase 2", "a, b", "1e-6"): Median(0.5, 60.0, (math.nan,), "time limit"),
-}
-
-
-def test_some_errors_count_or_all() -> None:
-    median = Median(0.5, 0.2, (1e-4, 1e-2, 0.0))
-    assert median.reaches(1e-3, 1) and not median.reaches(1e-3) and median.reaches(1e-2)
-    assert FINE.reaches(3e-7) and not FINE.reaches(2e-7)
-    assert not median._replace(outcome="a contact is lost").reaches(1.0)
-
-
-def test_medians_keep_the_worst_error_and_the_first_failure() -> None:
-    errors, outcomes = iter([1e-7, -3e-7, 2e-7]), iter([SOLVED, "lost", "late"])
-    found = measure(lambda: lambda: 7, lambda _: ((next(errors),), next(outcomes)))
-    assert found.errors == (-3e-7,) and found.outcome == "lost"
-    assert 0 <= found.solve < SHORT and 0 <= found.build < SHORT
-
-
-def test_the_soonest_setting_counts_and_failures_never_do() -> None:
-    own = PeerComparison("study", "title", "a, b", (1e-3, 1e-6), False, None)
-    assert find_times(MEDIANS, "a, b", own, 1e-3) == {"phase 1": 0.1, "phase 2": math.inf}
-    assert find_times(MEDIANS, "a, b", own, 1e-6) == {"phase 1": 0.3, "phase 2": math.inf}
-    built = own._replace(building=True)
-    assert find_times(MEDIANS, "a, b", built, 1e-6) == {"phase 1": 0.8, "phase 2": math.inf}

@@ -18,9 +18,8 @@ from plane import (
     place_tips,
     rotate,
 )
-from scenes import roll
 from shipped import HEPTAGON, chart, problem_of
-from wholearm import Friction, InputError, Scene
+from wholearm import InputError, Scene
 from wholearm.benchmark.stress.newton import locate
 from wholearm.common.arrays import Array
 from wholearm.contacts.closing import (
@@ -35,7 +34,6 @@ from wholearm.contacts.closing import (
     place,
     place_flush,
 )
-from wholearm.contacts.cones import find_weakest, force_limit_rows, slip_margins
 from wholearm.contacts.elemental import build_features, candidate_contacts, parse_contact
 from wholearm.contacts.formation import Formation, build_slip, find_touching
 from wholearm.mapping.borders import label_cells
@@ -135,27 +133,6 @@ def test_slip_coordinate_integrates_the_sliding_velocity(scene: Scene, name: str
         rise = float(function(z + STEP * v)[0] - function(z - STEP * v)[0])
         # On a tip's arc truncation is (STEP / radius)^2.
         assert rise / (2 * STEP) == pytest.approx(A_t[0] @ v, abs=(STEP / 0.005) ** 2)
-
-
-@pytest.fixture
-def formation() -> Formation:
-    scene = replace(make_scene(SQUARE), friction=Friction(0.5, 0.2, 0.3))
-    return roll(make_formation(scene, "v0-finger2 v1-palm v2-finger1"), "v1-palm", "v2-finger1")
-
-
-def test_margin_to_slipping(formation: Formation) -> None:
-    c_n, c_t = np.array([[1.0, 2.0, 3.0]]), np.array([[9.0, -0.7, 0.8]])
-    np.testing.assert_allclose(slip_margins(formation, c_n, c_t), [[0.3, -0.2]])
-
-
-def test_what_gives_way_first(formation: Formation) -> None:
-    H = force_limit_rows(formation)
-    row, c_n, c_t = find_weakest(formation, H @ [1.0, 2.0, 3.0, 0.7, -0.9])
-    assert (row, c_n) == (2, 3.0) and c_t == pytest.approx(-0.9)
-    row, c_n, c_t = find_weakest(formation, H @ [1.0, 2.0, 3.0, 1.2, 0.1])
-    assert (row, c_n) == (1, 2.0) and c_t == pytest.approx(1.2)
-    # A contact that pulls has no cone to be in.
-    assert find_weakest(formation, H @ [1.0, 2.0, -0.1, 0.0, 0.0]) == (2, -0.1, None)
 
 
 # Distances of metres-sized coordinates in double precision.
@@ -381,30 +358,6 @@ def test_limit_is_the_clearance(
 def test_limit_knows_what_is_gained(names: str, text: str, gained: str | None) -> None:
     limits = {limit.text: limit.gained for limit in make_formation(WIDE, names).limits}
     assert limits[text] == (parse_contact(gained, WIDE) if gained else None)
-
-
-@pytest.mark.parametrize("finger", [0, 1])
-def test_a_limit_breaks_as_soon_as_a_free_link_overlaps(finger: int) -> None:
-    """Formations without contacts on a finger: its limits and the measured overlap agree."""
-    rng = np.random.default_rng(finger)
-    seen = {True: 0, False: 0}
-    for _ in range(12):
-        scene = make_scene(convex_polygon(rng, 5), length=0.22, base=0.13)
-        scene = replace(scene, fingers_collide=False)
-        q = random_pose(rng, scene)
-        lowest = int(place_corners(scene, q)[:, 1].argmin())
-        formation = make_formation(scene, f"v{lowest}-palm")
-        closed = [close_finger(scene, q, k) for k in (0, 1)]
-        # A free link opens a little or enters the object by less than its own thickness.
-        turn = rng.uniform(-0.02, 0.02)
-        outwards = [-1.0, 1.0]
-        angles = np.array(closed) + 0.1 * np.array(outwards)
-        angles[finger] = closed[finger] + turn
-        z = np.array([*q, *angles])
-        clear = bool((formation.evaluate_limits(z[None])[0] > 0).all())
-        assert clear == (finger_gap(scene, q, finger, angles[finger])[0] > 0)
-        seen[clear] += 1
-    assert min(seen.values()) > 3
 
 
 @pytest.mark.parametrize("finger", [0, 1])

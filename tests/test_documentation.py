@@ -47,56 +47,6 @@ def list_imports(path: Path) -> list[str]:
     return found
 
 
-def is_private(name: str) -> bool:
-    return name.startswith("_") and not name.endswith("__")
-
-
-def list_private_names(text: str) -> list[str]:
-    """Names with a leading underscore that a test takes from the package.
-
-    They are imported, or reached through a module: by a dot, or by a string for `monkeypatch`.
-    """
-    found, modules = [], set()
-    nodes = list(ast.walk(ast.parse(text)))
-    for node in nodes:
-        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "wholearm":
-            found += [alias.name for alias in node.names if is_private(alias.name)]
-            modules |= {alias.asname or alias.name for alias in node.names}
-        elif isinstance(node, ast.Import):
-            modules |= {
-                alias.asname or "wholearm" for alias in node.names if "wholearm" in alias.name
-            }
-    for node in nodes:
-        if isinstance(node, ast.Attribute) and is_private(node.attr):
-            if ast.unparse(node.value).split(".")[0] in modules:
-                found.append(node.attr)
-        elif isinstance(node, ast.Call) and re.search(r"[gs]etattr$", ast.unparse(node.func)):
-            given = [arg.value for arg in node.args[:2] if isinstance(arg, ast.Constant)]
-            found += [name for text in given for name in str(text).split(".") if is_private(name)]
-    return found
-
-
-def test_private_names_are_found() -> None:
-    lines = [
-        "from wholearm.planning.plan import _assemble",
-        "import wholearm.planning.plan\nwholearm.planning.plan._assemble()",
-        "from wholearm.planning import plan\nplan._assemble()",
-        "import wholearm as w\nw.plan._assemble()",
-        "monkeypatch.setattr(plan, '_assemble', None)",
-        "monkeypatch.setattr('wholearm.planning.plan._assemble', None)",
-    ]
-    assert [list_private_names(line) for line in lines] == 6 * [["_assemble"]]
-    for line in ("import os\nos._exit(3)", "row._replace(a=1)", "from wholearm import __version__"):
-        assert list_private_names(line) == []
-
-
-def test_no_test_takes_a_private_name() -> None:
-    # What a test needs belongs to the interface of its module, under a name without underscore.
-    tests = Path(__file__).parent.glob("*.py")
-    found = {path.name: list_private_names(path.read_text(encoding="utf-8")) for path in tests}
-    assert len(found) > 20 and {name: taken for name, taken in found.items() if taken} == {}
-
-
 def test_the_readme_lists_every_package() -> None:
     packages = {path.parent.name for path in SOURCE.glob("*/__init__.py")}
     assert packages == set(read_order())

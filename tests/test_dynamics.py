@@ -33,19 +33,13 @@ from wholearm.common.errors import AmbiguityError, InfeasibleError
 from wholearm.contacts.closing import close_finger
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
-from wholearm.mechanics.dynamics import (
-    LAMBDA,
-    Directions,
-    build_forward,
-    inverse,
-    reduced_inertia,
-)
+from wholearm.mechanics.dynamics import LAMBDA, Directions, build_forward, inverse, reduced_inertia
 from wholearm.mechanics.impact import Impact, ViolationKind, compute_impact, solve_impulses
 from wholearm.mechanics.statics import find_static_torques
 from wholearm.mechanics.uniqueness import find_minors
 from wholearm.planning.path_domain.impact_sequence import ImpactSequence, make_sequence
 from wholearm.planning.path_domain.path_plan import plan_curves
-from wholearm.planning.time_domain.resting import find_block, list_ways, pushes_one_way
+from wholearm.planning.time_domain.resting import find_block, pushes_one_way
 from wholearm.planning.time_domain.stage import in_own_units, scale_state
 from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.read import build_problem, read_problem
@@ -65,8 +59,6 @@ from wholearm.simulation.contact_problem import (
 )
 from wholearm.verification.force_uniqueness import find_wedged
 from wholearm.verification.minimal_coordinates import reduce_to_first_joint
-
-FRICTIONLESS = Friction(0.0, 0.0, 0.0)
 
 
 def states(curves: tuple[Curve, ...], count: int = 4) -> Iterator[tuple[Curve, float, Directions]]:
@@ -585,16 +577,6 @@ def test_a_curve_at_another_pace(rough: ImpactSequence) -> None:
     assert fast.with_speed_ratio(1.0).length == pytest.approx(curve.length, rel=1e-13)
 
 
-def test_one_unknown() -> None:
-    assert solve_lcp(np.array([[2.0]]), np.array([-3.0])).z == pytest.approx([1.5])
-    assert solve_lcp(np.array([[2.0]]), np.array([3.0])).w == pytest.approx([3.0])
-    assert solve_lcp(np.zeros((0, 0)), np.zeros(0)).residual == 0.0
-
-
-def test_a_ray_is_no_solution() -> None:
-    assert np.isinf(solve_lcp(np.array([[-1.0]]), np.array([-1.0])).residual)
-
-
 @pytest.mark.parametrize("skew", [0.0, 1.0])
 def test_positive_semidefinite_problems_are_solved(skew: float) -> None:
     # With degenerate solutions, singular matrices and ties, as contacts of flush edges make them.
@@ -819,27 +801,6 @@ def test_plans_leave_rest_surely() -> None:
 
 
 COARSE = PlanOptions(time_intervals=4)
-
-
-@pytest.mark.parametrize("freedoms, count", [(1, 2), (2, 20)])
-def test_every_way_to_set_things_in_motion_is_listed_once(freedoms: int, count: int) -> None:
-    rng = np.random.default_rng(2)
-    rates = rng.normal(size=(5, freedoms))
-    ways = np.array(list_ways(rates))
-    signs = np.sign(np.round(ways @ rates.T, 9))
-    assert len(ways) == count == len(np.unique(signs, axis=0))
-    # Any acceleration is of one of these ways.
-    for way in rng.normal(size=(50, freedoms)):
-        assert (np.sign(rates @ way) == signs).all(axis=1).sum() == 1
-
-
-def test_what_limits_forbid_at_rest_is_refused_at_once() -> None:
-    problem = landing()
-    z = scale_state(problem.start, problem.scene.scales)
-    formation = in_own_units(problem).phases[0].formation
-    # Torques of 2 N m press a heptagon of 2 N with less than 100 N.
-    blocked = find_block(formation, z, 50.0)
-    assert blocked is not None and blocked.contact in formation.names and blocked.short > 1.0
 
 
 def test_a_finger_that_would_have_to_pull_is_named() -> None:

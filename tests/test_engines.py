@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 
 from plane import point_to_segment, rotate
-from shipped import HEPTAGON, LANDING, plan_of, problem_of
+from shipped import HEPTAGON, plan_of, problem_of
 from wholearm import InputError, Plan, Problem, find_route, make_policy, verify, write_mjcf
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
-from wholearm.contacts.formation import Formation, find_touching
 from wholearm.engines.engine_replay import (
     Departure,
     EngineReport,
@@ -27,7 +26,6 @@ from wholearm.engines.engine_replay import (
 )
 from wholearm.engines.shapes import list_pairs
 from wholearm.engines.stretch import (
-    LOOSE,
     EngineDrive,
     EngineRun,
     Setting,
@@ -35,7 +33,6 @@ from wholearm.engines.stretch import (
     find_between,
     list_steps,
     list_stretches,
-    press_in,
 )
 from wholearm.planning.plan import solve
 from wholearm.policy.playback import ClosedLoop
@@ -382,16 +379,6 @@ def test_a_contact_that_is_not_planned_is_the_reason() -> None:
     assert judge(run).reason.startswith("v6-finger2 presses, which is not planned, at t = ")
 
 
-def test_phases_are_stretches_or_the_whole_plan_is() -> None:
-    plan = plan_of(HEPTAGON)
-    (whole,) = list_stretches(plan, True)
-    assert (whole.phases, whole.start, whole.stop) == (tuple(range(5)), 0.0, plan.duration)
-    third = list_stretches(plan, False)[2]
-    assert third.phases == (2,)
-    np.testing.assert_allclose([third.start, third.stop], plan.phase_starts[2:4])
-    assert tuple(third.c_n) == plan.motions[2].contacts
-
-
 def test_steps_of_a_constant_force_are_exact() -> None:
     # Velocity by the force, then position by the velocity: half a step's start makes it exact.
     problem, plan = problem_of(HEPTAGON), plan_of(HEPTAGON)
@@ -439,22 +426,3 @@ def test_a_plan_is_known_between_the_rows_of_its_file(tmp_path: Path) -> None:
     weaker = replace(loaded.torque, coefficients=0.9 * loaded.torque.coefficients)
     wrong = replace(loaded, torque=weaker)
     assert find_between(wrong) is wrong
-
-
-STIFFNESS = 1e8
-
-
-@pytest.mark.parametrize("phase", [0, 5])
-def test_contacts_press_and_what_was_let_go_is_loose(phase: int) -> None:
-    problem, plan = problem_of(LANDING), plan_of(LANDING)
-    stretch, length = list_stretches(plan, False)[phase], problem.scene.scales.length
-    names = problem.phases[phase].formation.names
-    z = press_in(problem, stretch, dict.fromkeys(names, STIFFNESS))
-    touching = Formation(problem.scene, find_touching(problem.scene, stretch.z))
-    before, after = (touching.evaluate(at[None], np.zeros((1, 5))).C[0] for at in (stretch.z, z))
-    gaps = dict(zip(touching.names, after - before, strict=True))
-    for name in names:
-        assert -gaps.pop(name) == pytest.approx(stretch.c_n[name] / STIFFNESS, rel=1e-4)
-    # The landing begins where the plan lets v3 go from the finger.
-    assert list(gaps) == ([] if phase == 0 else ["v3-finger1"])
-    assert all(gap == pytest.approx(LOOSE * length, rel=1e-4) for gap in gaps.values())

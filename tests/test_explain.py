@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import pickle
 import re
 from collections.abc import Callable
@@ -16,50 +15,23 @@ import pytest
 from refused import advising, ask_shoved
 from scenes import box, shove
 from shipped import HEPTAGON, problem_of, tipping
-from wholearm import Objective, PlanOptions, Problem, load_trajectory, plots
+from wholearm import PlanOptions, Problem, load_trajectory, plots
 from wholearm.benchmark.stress import refusals
 from wholearm.benchmark.stress.refusals import judge
-from wholearm.common.errors import (
-    Change,
-    InfeasibleError,
-    InputError,
-    JammingError,
-    LimitPlace,
-    Parameter,
-    Shortfall,
-    SolverError,
-)
+from wholearm.common.errors import InfeasibleError, InputError, JammingError, SolverError
 from wholearm.geometry.curve import Curve
-from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.limits import EPSILON
-from wholearm.planning.advice import (
-    bracket,
-    describe_changes,
-    describe_shortfalls,
-    find_changes,
-    rank_shortfalls,
-    round_outwards,
-)
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
-from wholearm.planning.time_domain import time_explain, time_plan
-from wholearm.planning.time_domain.collocation import make_scheme
-from wholearm.planning.time_domain.guesses import Guesses, guess_stages
+from wholearm.planning.time_domain import time_explain
+from wholearm.planning.time_domain.guesses import Guesses
 from wholearm.planning.time_domain.search import TimeSearch
-from wholearm.planning.time_domain.stage import Stage
-from wholearm.planning.time_domain.time_explain import (
-    change_limit,
-    explain,
-    list_shortfalls,
-    refuse,
-    solve_elastic,
-)
+from wholearm.planning.time_domain.time_explain import change_limit, explain, refuse
 from wholearm.planning.time_domain.time_motion import TimeMotion
 from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.read import build_problem, read_problem
 
-SCHEME = make_scheme("radau", 3, 3)
 TORQUE = "fingers.1.torque_limit"
 COARSE = PlanOptions(time_intervals=4)
 LEAST = 0.35 * 0.2 * 9.81
@@ -123,36 +95,10 @@ def test_torques_that_may_not_step_have_to_hold_the_end(tmp_path: Path, rate: fl
     assert "can be held there by no torques, however large" in message
 
 
-def outline(problem: Problem, index: int = 0) -> Stage:
-    """The first stage of a phase as it is guessed, but with c_n = 1 N, no c_t and no torques."""
-    start = trace_phases(problem)[index - 1].end if index else problem.start
-    stage = guess_stages(problem, problem.phases[index : index + 1], start, SCHEME, 4, 2.0)[0]
-    forces = np.zeros_like(stage.guess.forces)
-    forces[..., : stage.formation.n_contacts] = 1 / problem.scene.scales.force
-    tau = np.zeros_like(stage.guess.tau)
-    return replace(stage, guess=stage.guess._replace(forces=forces, tau=tau))
-
-
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Advice takes the time that it needs, however slow the machine is."""
     monkeypatch.setattr(time_explain, "ADVICE", np.inf)
-
-
-def test_changes_are_planned_with_the_options_as_given(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those of the solver are in the scene's units, and would be scaled twice."""
-    seen, plan = list[PlanOptions](), time_plan.plan_phases
-
-    def watch(problem: Problem, phases: Any, z: Any, options: PlanOptions, **rest: Any) -> Any:
-        seen.append(options)
-        raise SolverError("only asked")
-
-    problem = change_limit(shove()[0], EPSILON, 1.0)
-    options = replace(COARSE, objective=Objective.EFFORT, time_weight=0.3)
-    monkeypatch.setattr(time_plan, "plan_phases", watch)
-    with pytest.raises(InfeasibleError), advising(lambda own: own.key == EPSILON):
-        plan(problem, problem.phases, problem.start, options)
-    assert seen and all(own == replace(options, accuracy=time_plan.ROUGH) for own in seen)
 
 
 def test_a_force_that_weight_limits_has_its_closed_form() -> None:
@@ -204,48 +150,6 @@ def test_advice_is_that_along_the_curve(heptagon: Problem, curves: tuple[Curve, 
     assert within == pytest.approx(along, rel=0.02)
 
 
-def test_shortfalls_are_measured_where_they_are_worst() -> None:
-    """In a motion that is made up: c_n = 1 N but for single points, and single torques."""
-    problem = change_limit(shove()[0], EPSILON, 0.9)
-    stage = outline(problem)
-    forces, tau = stage.guess.forces.copy(), stage.guess.tau.copy()
-    scales = problem.scene.scales
-    forces[1, 0, 0], forces[3, 2, 0] = 0.4 / scales.force, 0.85 / scales.force
-    forces[2, 1, 2] = 0.9 / scales.force - 5e-5
-    tau[0, 1, 1], tau[2, 0, 1] = 2.25 / scales.torque, -2.75 / scales.torque
-    guess = stage.guess._replace(forces=forces, tau=tau, duration=0.8 / scales.time)
-    stage = replace(stage, guess=guess)
-    first, second = list_shortfalls(problem, [stage], SCHEME)
-    name = stage.formation.names[0]
-    # In the second and third of four even intervals; what is below 1e-4 of the weight is left out.
-    assert str(first) == f"c_n of {name} >= epsilon = 0.9 N is 0.5 N short at t = 0.3000 s, phase 1"
-    limit = "torque limit of finger 2 = 2 N m"
-    assert str(second) == f"{limit} is 0.75 N m short at t = 0.5000 s, phase 1"
-    # Another stage counts on from there, and only the worse place is kept.
-    fewer = forces[..., : problem.phases[1].formation.n_contacts]
-    later = replace(stage, phase=1, guess=guess._replace(forces=fewer - 0.1 / scales.force))
-    worse, same = list_shortfalls(problem, [stage, later], SCHEME)[:2]
-    assert worse.amount == pytest.approx(0.6) and worse.place.text == "t = 1.1000 s, phase 2"
-    assert same == second
-    assert list_shortfalls(change_limit(problem, EPSILON, 0.0), [outline(problem)], SCHEME) == []
-
-
-@pytest.mark.parametrize("side", [1.0, -1.0])
-def test_cones_of_rolling_contacts_can_be_short(side: float) -> None:
-    problem = box()
-    stage = outline(problem, 1)
-    formation = stage.formation
-    (row,) = formation.rolling_rows
-    forces = stage.guess.forces.copy()
-    forces[2, 1, formation.n_contacts] = 0.7 * side / problem.scene.scales.force
-    stage = replace(stage, guess=stage.guess._replace(forces=forces))
-    (found,) = list_shortfalls(problem, [stage], SCHEME)
-    mu = formation.friction[row]
-    cone = f"|c_t| <= {mu:g} (c_n - {problem.epsilon:g} N),"
-    assert found.limit == f"friction cone of {formation.names[row]}, {cone}"
-    assert found.amount == pytest.approx(0.7 - mu * (1 - problem.epsilon)) and found.unit == "N"
-
-
 def test_failures_that_no_limit_explains_are_the_solvers() -> None:
     problem, _ = shove()
     failed = explain(search(problem), problem, problem.phases, [], "Restoration_Failed", None)
@@ -257,17 +161,6 @@ def test_failures_that_no_limit_explains_are_the_solvers() -> None:
     slide, own = box(), replace(COARSE, transcription="time")
     failed = explain(TimeSearch.of(slide, own), slide, slide.phases[:1], [], "Failed", None)
     assert "leave out --transcription time" in str(failed)
-
-
-def test_easing_leaves_what_is_feasible_as_it_is() -> None:
-    problem, _ = shove()
-    stages = guess_stages(problem, problem.phases, problem.start, SCHEME, 4, 2.0)
-    elastic = solve_elastic(search(problem), stages)
-    assert elastic is not None and list_shortfalls(problem, elastic, SCHEME) == []
-    weaker = solve_elastic(search(change_limit(problem, EPSILON, 0.8)), stages)
-    assert weaker is not None
-    shortfalls = list_shortfalls(change_limit(problem, EPSILON, 0.8), weaker, SCHEME)
-    assert sum(short.amount for short in shortfalls) == pytest.approx(0.8 - LEAST, abs=5e-3)
 
 
 def ask_plan(problem: Problem, **options: Any) -> InfeasibleError:
@@ -404,101 +297,3 @@ def test_a_leg_into_the_palm_has_no_end() -> None:
     stop = (float(problem.start[0]) + 0.01, float(problem.start[2]) - 0.2)
     verdict = judge(problem, InfeasibleError("phase 1 is infeasible"), [stop])
     assert verdict.kind == "open" and "no place of its end" in verdict.reason
-
-
-STRONGEST = Parameter("torque limit of finger 2", 2.0, "N m", 1)
-PRESSING = Parameter("epsilon", 0.05, "N", -1)
-
-
-@pytest.mark.parametrize(
-    "value, sign, rounded",
-    [
-        (2.3412, 1, 2.35),
-        (2.3412, -1, 2.34),
-        (2.34, 1, 2.34),
-        (0.1 + 0.2, 1, 0.3),
-        (0.1 + 0.2, -1, 0.3),
-        (0.01234, -1, 0.0123),
-        (0.01234, 1, 0.0124),
-        (99.91, 1, 100.0),
-        (12345.0, 1, 12400.0),
-        (12345.0, -1, 12300.0),
-        (-0.01234, -1, -0.0124),
-        (0.0, 1, 0.0),
-        (math.inf, 1, math.inf),
-    ],
-)
-def test_rounding_goes_outwards(value: float, sign: int, rounded: float) -> None:
-    assert round_outwards(value, sign) == rounded
-
-
-def test_only_confirmed_changes_are_found() -> None:
-    """Limit 0 works at its rounded value, 1 needs some room, 2 cannot, 3 is never enough."""
-    parameters = [STRONGEST, PRESSING, *(STRONGEST._replace(key=key) for key in ("2", "3"))]
-    least = dict(zip(parameters, [2.341, 0.012, None, 3.0], strict=True))
-    asked: list[tuple[int, float]] = []
-
-    def can_plan(parameter: Parameter, value: float) -> bool:
-        index = parameters.index(parameter)
-        asked.append((index, value))
-        return index == 0 or (index == 1 and value < 0.012)
-
-    found = find_changes(parameters, least.__getitem__, can_plan)
-    assert found == [Change(STRONGEST, 2.35), Change(PRESSING, 0.0119)]
-    # The rest of what was asked goes outwards, and not far.
-    assert [value for index, value in asked if index == 1] == [0.012, 0.0119]
-    beyond = [value for index, value in asked if index == 3]
-    assert beyond == sorted(set(beyond)) and 3.0 == beyond[0] and beyond[-1] <= 4.5
-    assert not any(index == 2 for index, _ in asked)
-
-
-@pytest.mark.parametrize("limit, least", [(STRONGEST, 3.0), (PRESSING, 0.04)])
-@pytest.mark.parametrize("needed", [0.0, 0.004, 0.013, 0.06, 0.1, 0.3, 0.49])
-def test_more_than_the_least_is_found_closely(
-    limit: Parameter, least: float, needed: float
-) -> None:
-    """Plans may need more than what limits at the nodes ask for."""
-    border = least * (1 + limit.sign * needed)
-
-    def can_plan(_: Parameter, value: float) -> bool:
-        return limit.sign * (value - border) >= 0
-
-    (change,) = find_changes([limit], lambda _: least, can_plan)
-    assert -1e-12 < limit.sign * (change.value / border - 1) <= 0.03
-
-
-def test_nothing_falls_below_zero() -> None:
-    assert find_changes([PRESSING], lambda _: -0.01, lambda *_: True) == []
-    assert find_changes([PRESSING], lambda _: 0.0, lambda *_: True) == [Change(PRESSING, 0.0)]
-
-
-def test_changes_in_words() -> None:
-    changes = [Change(STRONGEST, 2.4), Change(PRESSING, 0.012)]
-    assert describe_changes(changes) == (
-        "feasible with torque limit of finger 2 = 2.4 N m instead of 2, "
-        "or epsilon = 0.012 N instead of 0.05"
-    )
-    assert describe_changes([]) == "no single limit makes it feasible"
-
-
-def test_shortfalls_are_ranked() -> None:
-    late, early = LimitPlace(2, 0.1, "t = 0.1000 s, phase 2"), LimitPlace(1, 0.0, "t = 0.0000 s")
-    limit = "torque limit of finger 1 = 2 N m"
-    small = Shortfall("torque", "finger 1", limit, 0.4, "N m", late, 0.2)
-    limit = "c_n of v3-finger1 >= epsilon = 0.05 N"
-    large = Shortfall("press", "v3-finger1", limit, 0.81234, "N", early, 0.4)
-    assert rank_shortfalls([small, large]) == [large, small]
-    assert describe_shortfalls([large, small]) == (
-        "c_n of v3-finger1 >= epsilon = 0.05 N is 0.812 N short at t = 0.0000 s; "
-        "torque limit of finger 1 = 2 N m is 0.4 N m short at t = 0.1000 s, phase 2"
-    )
-
-
-@pytest.mark.parametrize("sign, farthest, edge", [(-1, 0.0, 0.2), (1, 2.0, 0.7)])
-def test_bracket_comes_near_to_the_edge(sign: int, farthest: float, edge: float) -> None:
-    limit = Parameter("friction of palm", 0.5, "", sign)
-    value = bracket(limit, farthest, lambda value: sign * (value - edge) >= 0)
-    assert value is not None and sign * (value - edge) >= 0
-    assert abs(value - edge) <= abs(farthest - 0.5) / 30
-    assert bracket(limit, farthest, lambda _: False) is None
-    assert bracket(limit, 0.5, lambda _: True) is None

@@ -27,7 +27,6 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, PathPatch, Polygon
 from matplotlib.text import Text
 from PIL import Image, ImageColor
-from scipy import ndimage
 
 import scenes
 from scenes import hexagon
@@ -35,10 +34,10 @@ from shipped import HEPTAGON, IMPACTS, LANDING, chart, plan_of, problem_of
 from wholearm import InputError, PlanOptions, Problem, TorqueProfile, Trajectory, plots, verify
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
-from wholearm.common.document import Document, Result, Table, fixed, plain, restore, show
+from wholearm.common.document import Document, Result, Table, plain, restore
 from wholearm.contacts.closing import contact_table, evaluate_contacts
 from wholearm.figures.curves import draw_torques
-from wholearm.figures.map_figure import draw_map, find_room, split
+from wholearm.figures.map_figure import draw_map
 from wholearm.figures.plot_data import choose_snapshots, find_steps
 from wholearm.figures.snapshots import choose_numbers, draw_snapshot
 from wholearm.figures.style import WIDTH, choose_styles
@@ -48,7 +47,7 @@ from wholearm.mapping.formation_map import FormationMap, build_map
 from wholearm.planning.plan import solve
 from wholearm.planning.result import Plan, Status, describe_plan, load_plan, write_meta
 from wholearm.results.dwell_record import assemble
-from wholearm.solvers.ipopt import Solver, SolverStatistics, book, charge, open_ledger
+from wholearm.solvers.ipopt import Solver
 from wholearm.viewer import page
 from wholearm.viewer.motion_data import describe_motion, place_pushes
 from wholearm.viewer.movie import FRAMES, Movie, write_movie
@@ -240,14 +239,6 @@ def test_torque_lines_have_both_ends_of_every_step(axes: Axes) -> None:
     inside = t != 0.5
     np.testing.assert_allclose(tau[inside], profile.at(t[inside])[:, 0], atol=1e-12)
     np.testing.assert_allclose(data_of(other)[1], 1.0)
-
-
-def test_planned_torques_are_drawn_exactly(figure: Figure, planned: Trajectory) -> None:
-    for index in range(2):
-        t, tau = data_of(line_of(figure.axes[-1], f"finger {index + 1}"))
-        inside = np.abs(t[:, None] - planned.torque.breaks).min(axis=1) > 1e-9
-        expected = planned.torque.at(t[inside])[:, index]
-        np.testing.assert_allclose(tau[inside], expected, atol=1e-10)
 
 
 @pytest.mark.parametrize("row", [0, 320, -1])
@@ -524,24 +515,6 @@ def test_overlap_of_the_fingers_has_its_own_hatching(picture: Figure) -> None:
     assert isinstance(own, Patch) and isinstance(other, Patch)
     assert crossed.get_hatch() == own.get_hatch() != other.get_hatch()
     assert crossed.get_facecolor() == own.get_facecolor()
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_parts_and_their_rooms_are_those_of_scipy(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    field = ndimage.gaussian_filter(rng.normal(size=(40, 50)), rng.uniform(0.5, 4.0))
-    cell = np.digitize(field, np.quantile(field, [0.2, 0.5, 0.8])) - 1
-    step, parts = rng.uniform(0.2, 3.0, 2), list(split(cell))
-    expected = []
-    for k in range(3):
-        number, count = ndimage.label(cell == k)
-        expected += [(k, number == n + 1) for n in range(count)]
-    assert [k for k, _ in parts] == [k for k, _ in expected]
-    for (_, region), (_, other) in zip(parts, expected, strict=True):
-        np.testing.assert_array_equal(region, other)
-        room = ndimage.distance_transform_edt(np.pad(other, 1), sampling=step)[1:-1, 1:-1]
-        row, column, found = find_room(region, step)
-        assert found == pytest.approx(room.max()) == pytest.approx(room[row, column])
 
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -860,12 +833,6 @@ def test_long_tables_are_cut_as_text_and_have_a_rule_as_markdown() -> None:
     assert len(lines) == 2 + 5
 
 
-def test_numbers_are_written_with_significant_digits() -> None:
-    assert show(0.0123456, fixed(0.05)) == "0.0123" and show(-1e-9, fixed(0.05)) == "0.0000"
-    assert show(None, ".1f") == show(math.nan, ".1f") == "-"
-    assert show(0.25, ".0f", 100.0) == "25"
-
-
 NOT_IN_0_1_0 = (
     "rolling", "modes", "sequences", "complete", "attempts", "transcription", "duration",
     "time_intervals", "degree", "scheme", "opening", "clearance", "samples", "mode_search",
@@ -1040,17 +1007,3 @@ def test_every_solve_is_counted_once(
     assert json.loads(json.dumps(plan.meta["solves"])) == [
         phase.statistics.solves for phase in plan.phases
     ]
-
-
-def test_costs_are_booked_to_the_innermost_phase_and_every_ledger() -> None:
-    cost = SolverStatistics(3, 1, 0.5, 0.25)
-    book(cost)
-    with open_ledger() as outer:
-        book(cost)
-        with charge(2), open_ledger() as inner:
-            book(cost)
-            with charge(5):
-                book(cost)
-    assert (outer.of(0), outer.of(2), outer.of(5)) == (cost, cost, cost)
-    assert inner.of(0) == SolverStatistics() and inner.of(5) == cost
-    assert cost + cost == SolverStatistics(6, 2, 1.0, 0.5)

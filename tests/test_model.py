@@ -18,14 +18,7 @@ from retelling import RETELLINGS, Answer, Retelling, answer
 from shipped import HEPTAGON
 from wholearm import Finger, Friction, Polygon, Problem, Scene, load, verify
 from wholearm.common.arrays import Array
-from wholearm.common.errors import (
-    LONGEST,
-    InfeasibleError,
-    InputError,
-    JammingError,
-    name_source,
-    require_number,
-)
+from wholearm.common.errors import LONGEST, InfeasibleError, InputError, JammingError, name_source
 from wholearm.common.fields import keys_of
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.plan import solve
@@ -112,27 +105,11 @@ def test_every_number_of_a_finger_has_a_unit_of_the_scene() -> None:
     assert all(getattr(scene.scales, own.scale) > 0 for own in known.values())
 
 
-@pytest.mark.parametrize("value", [3, 3.0, np.float32(3), np.int64(3)])
-def test_require_number_takes_every_real_kind(value: Any) -> None:
-    number = require_number(value, "key")
-    assert number == 3.0 and type(number) is float
-
-
-@pytest.mark.parametrize("value", [np.bool_(True), np.complex128(1), b"1"])
-def test_require_number_refuses_what_is_not_real(value: Any) -> None:
-    with pytest.raises(InputError, match="key"):
-        require_number(value, "key")
-
-
 @pytest.mark.parametrize("given", ["\n" * 3, "\x00" * 5000, "x" * 5000, "\u2028", "\x1b[2J"])
 def test_a_message_is_one_line(given: str) -> None:
     text = str(InputError("a.toml", "name", f"{given} is not allowed"))
     assert text.isprintable() and len(text) <= LONGEST + 10
     assert text.startswith("a.toml: name: ") and text.endswith(" is not allowed")
-
-
-def test_letters_of_all_scripts_stay() -> None:
-    assert str(InputError("", "\u00e9", "\u4e2d")) == "\u00e9: \u4e2d"
 
 
 def test_a_source_is_given_to_errors_without_one() -> None:

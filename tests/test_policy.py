@@ -18,13 +18,7 @@ from wholearm import InputError, Plan, Policy, Problem, TorqueProfile, Trajector
 from wholearm.cli.command import main
 from wholearm.geometry.tracing import trace_phase
 from wholearm.mechanics.dynamics import build_forward
-from wholearm.policy.curve_law import (
-    CurveLaw,
-    LoopSettings,
-    MotionLaw,
-    Sensing,
-    choose_internal_force,
-)
+from wholearm.policy.curve_law import CurveLaw, MotionLaw, choose_internal_force
 from wholearm.policy.curve_rows import find_within, list_scenes
 from wholearm.policy.make import SAME, find_widest, hold_end, make_policy
 from wholearm.policy.reference_motion import retime_within
@@ -80,39 +74,6 @@ def test_limits_that_the_squeeze_does_not_change_leave_it_where_it_is(policy: Po
     assert arrivals[0] == arrivals[1] == arrivals[2]
 
 
-def test_the_squeeze_makes_up_for_what_is_measured() -> None:
-    rng = np.random.default_rng(5)
-    moving = 0
-    for _ in range(20):
-        table = np.zeros((1, 2, 3, 5))
-        table[:, :, :, 0], table[:, :, :, 4] = rng.uniform(1, 2, 3), rng.normal(size=3)
-        sensing = Sensing(["a", "b", "c"], "d", table, 0.5)
-        place, ends = (0, 0.5, 0.0, 0.0, 0.1), (-9.0, 9.0)
-        plain = table[0, 0, :, 0] + 0.1 * table[0, 0, :, 4]
-        if plain.min() < 0.3 * plain.mean():
-            continue
-        assert sensing.shift(place, *ends) == 0.0
-        # What is expected is there, then one force has 0.1 N less for long.
-        sensing.measure(dict(zip("abc", plain, strict=True)))
-        assert sensing.shift(place, *ends) == pytest.approx(0.0, abs=1e-12)
-        off = np.array([-0.1, 0.0, 0.0])
-        change = 0.0
-        for _ in range(60):
-            found = plain + off + change * table[0, 0, :, 4]
-            sensing.measure(dict(zip("abc", found, strict=True)))
-            change = sensing.shift(place, *ends)
-        parts = (plain + off + change * table[0, 0, :, 4]) / plain
-        rows = np.column_stack([np.ones(3), -table[0, 0, :, 4] / plain])
-        best = linprog([-1, 0], A_ub=rows, b_ub=1 + off / plain, bounds=[(None, 1), (None, None)])
-        assert parts.min() == pytest.approx(-best.fun, abs=1e-6)
-        moving += change != 0.0
-        assert not sensing.feels
-        for _ in range(2):
-            sensing.measure({"d": 1.0})
-        assert sensing.feels
-    assert moving > 5
-
-
 def test_the_fastest_motion_between_limits_of_the_acceleration() -> None:
     # |s''| <= 2 from rest to rest over a length of 1: halfway 2 sqrt(1 / 2) long, peak b = 2.
     s = np.linspace(0.0, 1.0, 21)
@@ -159,22 +120,6 @@ def test_without_a_reserve_it_is_as_fast_as_the_plan(
         assert with_reserve["duration"] < 1.3 * phase["plan"]
 
 
-def test_joints_say_where_the_hand_is(policy: Policy, plan: Plan) -> None:
-    law = policy.laws[0]
-    assert isinstance(law, CurveLaw)
-    law.begin()
-    motion = plan.trajectory.motions[0]
-    t = np.linspace(0.0, motion.duration, 41)
-    rows = motion.evaluate(t)
-    for z, z_dot in zip(rows.z, rows.z_dot, strict=True):
-        # A hand that is off the curve by 0.1 mrad is where the nearest one on it is.
-        theta = z[3:] + 1e-4 * np.array([-z_dot[4], z_dot[3]]) / (np.hypot(*z_dot[3:]) + 1e-9)
-        law.step(theta.tolist(), z_dot[3:].tolist(), None)
-        known = np.array([np.interp(law.s, law.nodes, column) for column in np.array(law.theta).T])
-        assert known == pytest.approx(z[3:], abs=2e-5)
-    assert law.s == pytest.approx(law.length, rel=1e-3)
-
-
 def test_a_policy_keeps_contacts_where_numbers_are_off(
     problem: Problem, plan: Plan, policy: Policy
 ) -> None:
@@ -199,33 +144,6 @@ def test_gains_are_those_of_the_riccati_equation() -> None:
     # Torques are held for a step.
     assert gains[0] == pytest.approx(best, rel=0.1)
     assert np.linalg.eigvals(A - inputs @ gains[0]).real.max() < -0.3 * RATE
-
-
-def test_joints_are_led_along_a_motion() -> None:
-    pace = LoopSettings(1e-3, 0.0, 1e-3, 1e-3, 3e-3, 1.0, (5.0, 5.0))
-    t = np.linspace(0.0, 0.2, 201)
-    theta = np.column_stack([1 - np.cos(5 * np.pi * t), 0 * t])
-    rates = np.column_stack([5 * np.pi * np.sin(5 * np.pi * t), 0 * t])
-    bent = np.column_stack([25 * np.pi**2 * np.cos(5 * np.pi * t), 0 * t])
-    inertia, gains = 0.01, np.hstack([np.diag([100.0] * 2), np.diag([2.0] * 2)])
-    law = MotionLaw(
-        {
-            "starts": np.array([0.0, 0.1]), "step": t[1:2], "theta": theta, "rates": rates,
-            "tau": inertia * bent, "gain": np.tile(gains, (201, 1, 1)), "push": np.zeros(2),
-            "still": np.array([1e-3]), "ways": np.eye(2),
-        },
-        pace,
-    )  # fmt: skip
-    # It begins off, and a torque that is not known of acts all the time.
-    place, speed = np.array([0.01, -0.01]), np.zeros(2)
-    for k in range(600):
-        tau = np.add(law.step(place.tolist(), speed.tolist(), None), [0.1, -0.1])
-        speed, before = speed + 1e-3 * tau / inertia, speed
-        place = place + 1e-3 * (speed + before) / 2
-        assert law.passed == (k >= 100)
-        if 60 < k < 200:
-            assert place == pytest.approx(theta[k + 1], abs=3e-3)
-    assert law.over and place == pytest.approx(theta[-1], abs=1e-6)
 
 
 def test_ends_that_a_plan_holds_are_held_with_its_torques(problem: Problem) -> None:

@@ -29,12 +29,10 @@ from wholearm.problem.keys import name_keys
 from wholearm.problem.table import change_table
 from wholearm.quasistatic.slow_speeds import (
     OWN,
-    Least,
     PathSamples,
     Prediction,
     Survival,
     UnitProfile,
-    find_break,
     find_torques,
     make_torques,
     predict,
@@ -43,7 +41,7 @@ from wholearm.quasistatic.slow_speeds import (
 from wholearm.results.adopt import describe_origin, save
 from wholearm.results.report import Loss, Report
 from wholearm.results.torque import TorqueProfile, read_notes, read_torque_csv
-from wholearm.simulation.events import Event, EventKind, Simulation
+from wholearm.simulation.events import EventKind, Simulation
 from wholearm.tuning.tuner import FACTOR, Bench, TrialOutcome, TuningStep, split_passages
 from wholearm.verification.torque_advice import find_approach
 
@@ -186,17 +184,6 @@ def test_the_straight_line_keeps_its_contacts_and_newtons_laws() -> None:
     rest -= np.einsum("nij,ni->nj", G, c)
     rest[:, 3:] += scene.dry[3:] * road.directions.sigma - tau
     assert np.abs(rest).max() < 1e-10
-
-
-def test_breaks_are_found_and_so_is_what_only_speed_keeps() -> None:
-    def fall(speed: float) -> Least:
-        return Least(1.0 - speed**2, 0, ())
-
-    found = find_break(fall, 0.19, 0.5)
-    assert found.speed == pytest.approx(0.9, rel=1e-6) and found.least.force < 0.19
-    assert find_break(lambda v: Least(1.0 + v, 0, ()), 0.5, 1.0).speed == math.inf
-    rising = find_break(lambda v: Least(v - 0.3, 0, ()), 0.0, 1.0)
-    assert rising.speed == 0.0 and rising.again == pytest.approx(0.3, rel=1e-6)
 
 
 def test_what_is_left_out_is_named() -> None:
@@ -355,17 +342,6 @@ def test_phases_that_nothing_stops_are_tuned_as_one() -> None:
     assert [p.title for p in split_passages(problem_of(LANDING))] == ["1", "2", "3", "4", "5-6"]
     found = split_passages(problem_of(HEXAGON))
     assert [p.title for p in found][-2:] == ["8", "9-11"] and len(found) == 9
-
-
-def test_a_passage_follows_what_happens_from_phase_to_phase() -> None:
-    passage = split_passages(problem_of(LANDING))[-1]
-    release = Event(0.1, 0, EventKind.CONTACT_LOST, "", "v3-finger1")
-    lands = Event(0.2, 0, EventKind.IMPACT, "", "v2-palm")
-    gone = Event(0.15, 0, EventKind.CONTACT_LOST, "", "v4-finger1")
-    assert passage.follow([release, lands]) == ([0.1, 0.2], None)
-    assert passage.follow([release, gone, lands]) == ([0.1], gone)
-    assert passage.follow([gone]) == ([], gone)
-    assert "v3-finger1" not in passage.list_pressed(0)
 
 
 @pytest.mark.parametrize(
@@ -582,13 +558,6 @@ def test_what_does_not_fit_is_refused(tmp_path: Path, capsys: pytest.CaptureFixt
     odd.write_text("# simulations = many\nt,tau1,tau2\n0,0,0\n1,0,0\n", encoding="utf-8")
     with pytest.raises(InputError, match="'many' given"):
         compare(problem, [str(odd)])
-
-
-def test_comments_of_torques_are_read(tmp_path: Path) -> None:
-    file = tmp_path / "noted.csv"
-    file.write_text("# found by hand\n# a = 1\nt,tau1,tau2\n0,1,2\n# b= c d\n1,3,4\n")
-    assert read_notes(str(file)) == {"a": "1", "b": "c d"}
-    assert read_torque_csv(str(file)).at(np.array([0.5]))[0] == pytest.approx([2.0, 3.0])
 
 
 def test_what_differs_from_the_problem_of_a_plan_is_said(

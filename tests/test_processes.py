@@ -33,7 +33,7 @@ from wholearm.common import signals as interrupts
 from wholearm.common.crowd import Processes, run_all
 from wholearm.common.errors import InputError
 from wholearm.common.files import read_arrays, together, write_whole
-from wholearm.common.sharing import Keeper, Store, exclusive, kept_property, retire_with
+from wholearm.common.sharing import Keeper, exclusive, kept_property, retire_with
 from wholearm.common.signals import check, guard, held
 from wholearm.common.workers import can_fork, count_cores, share
 from wholearm.simulation.simulate import simulate
@@ -670,39 +670,9 @@ def test_a_forked_process_can_plan() -> None:
     assert (run.returncode, run.stderr) == (0, b"")
 
 
-class Sharer:
-    """What shares a value with others."""
-
-
-def test_a_value_lives_as_long_as_one_of_its_owners() -> None:
-    built: list[object] = []
-
-    def build(_: object) -> list[int]:
-        built.append(value := [len(built)])
-        return value
-
-    store = Store(build, lambda _: "same")
-    first, second = Sharer(), Sharer()
-    assert store(first) is store(second)
-    kept = store(second)
-    del first
-    gc.collect()
-    third = Sharer()
-    assert store(third) is kept and len(built) == 1
-    del second, third
-    gc.collect()
-    assert store(Sharer()) == [1]
-
-
 def fail_halfway(stream: BinaryIO) -> None:
     stream.write(b"half")
     raise RuntimeError("stopped")
-
-
-def test_writes_the_whole_file_and_nothing_else(tmp_path: Path) -> None:
-    write_whole(tmp_path / "out.txt", lambda stream: stream.write(b"content"))
-    assert [path.name for path in tmp_path.iterdir()] == ["out.txt"]
-    assert (tmp_path / "out.txt").read_bytes() == b"content"
 
 
 def test_old_file_survives_a_failed_writer(tmp_path: Path) -> None:
@@ -775,14 +745,6 @@ def _header(shape: str, kind: str) -> bytes:
     return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + bytes(24)
 
 
-def test_only_what_is_asked_for_is_read(tmp_path: Path) -> None:
-    path = tmp_path / "a.npz"
-    np.savez(path, t=np.arange(3.0), other=np.ones(2))
-    arrays = read_arrays(path, ("t", "q"))
-    assert list(arrays) == ["t"]
-    np.testing.assert_array_equal(arrays["t"], np.arange(3.0))
-
-
 @pytest.mark.parametrize(
     ("shape", "kind"), [("(1000000000000,)", "<f8"), ("(3,)", "<U1000000"), ("(4,)", "<f8")]
 )
@@ -806,12 +768,4 @@ def test_a_member_that_is_too_large_is_not_unpacked(
     path = _write(tmp_path / "a.npz", {"t": bytes(2**18 + 1)})
     monkeypatch.setattr(archive, "LARGEST", 2**18)
     with pytest.raises(InputError, match="262145 bytes; allowed are up to 262144"):
-        read_arrays(path, ("t",))
-
-
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"\x93NUMPY\x01\x00", b"t,tau1,tau2"])
-def test_what_is_no_archive_is_refused(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "a.npz"
-    path.write_bytes(content)
-    with pytest.raises(InputError, match="is not a trajectory file"):
         read_arrays(path, ("t",))

@@ -37,8 +37,7 @@ from wholearm.mechanics.dynamics import (
 from wholearm.mechanics.statics import find_static_torques
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
-from wholearm.planning.range_cost import find_widest
-from wholearm.planning.robust.robust_rows import Guide, list_holds, measure_holds
+from wholearm.planning.robust.robust_rows import list_holds, measure_holds
 from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.problem.uncertainty import NAMES, PARAMETERS
@@ -590,20 +589,6 @@ def test_what_friction_may_hold_grows_with_the_ranges(hexed: Problem) -> None:
             scene = change_problem(hexed, own).scene
             static = find_static_torques(replace(formation, scene=scene), hexed.start)
             assert static.measure((tau * [1.0, 1 + own["gain2"]])[None])[0] >= least - 1e-9
-
-
-def test_the_widest_ranges_are_the_same_by_whatever_they_are_measured(curve: Curve) -> None:
-    plain = plan_path(curve, EPSILON, PlanOptions(accuracy=1e-2), 1).motion
-    guides, found = [Guide(plain.grid.s, *plain.profile)], []
-    for unit in (12.0, 15.0):
-
-        def scale(factor: float, unit: float = unit) -> PlanOptions:
-            ranges = {name: unit * factor * radius for name, radius in RADII.items()}
-            return PlanOptions(ranges=ranges, accuracy=1e-2)
-
-        found.append(unit * find_widest([curve], EPSILON, scale, [1], guides, 45.0 / unit))
-    assert 2.0 < found[0] < 45.0
-    assert found[1] == pytest.approx(found[0], rel=0.03)
 
 
 PROBLEMS = sorted((Path(__file__).parents[1] / "problems").glob("*.toml"))

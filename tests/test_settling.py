@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -18,10 +17,9 @@ from shipped import HEPTAGON, problem_of, solved
 from toys import LIMIT, Toy, constant
 from wholearm import Formation, InputError, Problem, simulate, simulate_free, solve
 from wholearm.planning import dwell as shares
-from wholearm.planning.dwell import DwellEnd, list_touching, settle_plans
+from wholearm.planning.dwell import list_touching, settle_plans
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.result import Plan, describe_plan, load_plan, write_meta
-from wholearm.planning.stops import Plans
 from wholearm.planning.table_check import make_table
 from wholearm.problem.read import read_own_problem
 from wholearm.problem.table import describe_scene
@@ -114,35 +112,6 @@ def test_a_start_that_is_short_makes_little_difference() -> None:
     start = shares.move_start(plan.problem, 1e-4)
     away = simulate_free(plan.problem, plan.trajectory, start=start).z[-1] - plan.trajectory.z[-1]
     assert np.hypot(*away[:2]) < 1e-4 and abs(away[2]) < np.radians(0.1)
-
-
-def test_shares_are_those_of_the_way_that_ends_best(monkeypatch: pytest.MonkeyPatch) -> None:
-    plain = solved(HEPTAGON)
-    problem = plain.problem.with_({"settle": "10 %", "phases[3].settle": 0.002})
-    motions = plain.trajectory.motions
-    plans = [PhasePlan(motion, plain.trajectory.torque, 0.0) for motion in motions]
-    tried, chosen = list[list[float]](), list[Sequence[DwellEnd | None]]()
-
-    def measure(_: Problem, __: Plans, ends: Sequence[DwellEnd | None]) -> float:
-        tried.append([0.0 if end is None else end.time for end in ends])
-        chosen.append(ends)
-        return problem.gap * (4.0, 3.9, 1.2, 1.1, 2.0, last)[len(tried) - 1]
-
-    monkeypatch.setattr(shares, "measure_off", measure)
-    last = 1.2
-    assert shares.share_time(problem, plans) == chosen[2]
-    assert len(tried) == len(shares.WAYS)
-    for way, ends in zip(shares.WAYS, chosen, strict=True):
-        for end in (end for end in ends if end is not None):
-            assert end.firm == way.firm and end.hold is not None
-            assert not (way.firm and end.hold.speed)
-    for own in tried:
-        assert own[2] == 0.002
-        assert sum(own) == pytest.approx(0.002 + 0.1 * plain.duration, rel=1e-12)
-    first, second, _, fourth, fifth = tried[0]
-    assert first == pytest.approx(2 * second) and second == pytest.approx(fourth)
-    assert fifth == pytest.approx(shares.STOP * fourth)
-    assert tried[1][0] == 0
 
 
 def test_held_ends_are_written_and_read(tmp_path: Path) -> None:

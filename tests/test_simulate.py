@@ -16,7 +16,6 @@ import casadi as ca
 import numpy as np
 import pytest
 
-import wholearm
 from independent import balances, integrate_phase
 from plane import stack_rows
 from planned import (
@@ -47,12 +46,8 @@ from wholearm.problem.read import build_problem
 from wholearm.scene.model import Finger, Friction, Scene
 from wholearm.simulation import runge_kutta
 from wholearm.simulation.events import Event, EventKind, OutcomeKind, Simulation
-from wholearm.simulation.hand import build_system
-from wholearm.simulation.modes import Grips, Mode, respond
-from wholearm.simulation.rest import Collapse, close_contacts, find_rest
+from wholearm.simulation.rest import Collapse, find_rest
 from wholearm.simulation.root_finding import find_root
-from wholearm.simulation.stepper import Modes, ModeStepper, build_stepper
-from wholearm.simulation.system import ContactRows
 
 
 def pick(index: int) -> tuple[Problem, CosineMotion]:
@@ -196,25 +191,6 @@ def test_baseline_agrees_with_the_dynamics(names: tuple[str, ...]) -> None:
         found = solve_motion(problem.scene, formation.contacts, z, v, tau, *directions)
         for a, b in zip(found, expected, strict=True):
             assert np.allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max())
-
-
-def test_looks_are_as_good_as_steps_and_end_none() -> None:
-    problem, motion = pick(1)
-    torque = motion.fit(1, 24)
-    times = np.linspace(0.03, 0.39, 60)
-    reference = simulate(problem, torque, tolerance=1e-13, times=times)
-    bare = simulate(problem, torque)
-    looked = simulate(
-        problem, torque, closer=lambda *known: times[known[2] :: 2][: 30 if known[2] < 2 else 0]
-    )
-    assert (looked.steps, looked.outcome) == (bare.steps, bare.outcome)
-    assert len(looked.t) == len(bare.t) + len(times) and (np.diff(looked.t) >= 0).all()
-    for name, bound in (("z", 1e-8), ("z_dot", 1e-8), ("z_ddot", 1e-6), ("c_n", 1e-6)):
-        own, exact = (
-            np.array([getattr(run, name)[np.flatnonzero(run.t == t)[-1]] for t in times])
-            for run in (looked, reference)
-        )
-        assert np.allclose(own, exact, rtol=0, atol=bound * (1 + np.nanmax(np.abs(exact))))
 
 
 def test_energy_is_conserved_without_friction() -> None:
@@ -408,24 +384,6 @@ def test_bad_tolerance(tolerance: float) -> None:
         simulate(problem, trajectory.torque, tolerance=tolerance)
 
 
-def test_rows_sum_to_nodes() -> None:
-    sums = [sum(row.values()) for row in runge_kutta.ROWS]
-    # The coefficients are rounded to 16 digits and reach 44.
-    assert np.allclose(sums, runge_kutta.NODES, atol=2e-14, rtol=0)
-
-
-@pytest.mark.parametrize("power", range(8))
-def test_weights_integrate_polynomials(power: int) -> None:
-    nodes = np.array(runge_kutta.NODES)
-    total = sum(w * nodes[j] ** power for j, w in runge_kutta.WEIGHTS.items())
-    assert total == pytest.approx(1 / (power + 1), abs=1e-14)
-
-
-@pytest.mark.parametrize("weights", [runge_kutta.ERROR_5, runge_kutta.ERROR_3])
-def test_error_weights_cancel(weights: dict[int, float]) -> None:
-    assert sum(weights.values()) == pytest.approx(0, abs=1e-14)
-
-
 def test_order_on_a_known_solution() -> None:
     """Two unknowns that move, and the integral of the rate of half the square of the first."""
     y, t, h = ca.SX.sym("y", 3), ca.SX.sym("t"), ca.SX.sym("h")
@@ -454,84 +412,6 @@ def test_error_estimate_bounds_the_error() -> None:
     for length in (0.2, 0.5, 1.0):
         state, estimate = (float(value) for value in step(1.0, 0.0, length))
         assert abs(state - np.exp(-length)) < float(estimate) * 2 * tolerance
-
-
-def load_stepper(formation: Formation, grips: Grips, degree: int) -> ModeStepper:
-    """Steps of a formation in which friction holds some contacts and joints."""
-    system = build_system(formation.scene)
-    pairs = [system.names.index(name) for name in formation.names]
-    stuck = tuple(tuple(pairs[row] for row in rows) for rows in grips.contacts)
-    modes = Modes(tuple(pairs), stuck, tuple(3 + joint for joint in grips.joints))
-    s = build_stepper(system.structure, modes, degree)
-    s.load(system, 1e-9)
-    return s
-
-
-def test_order_on_the_real_dynamics() -> None:
-    _, trajectory = plan()
-    motion = trajectory.motions[1]
-    # One smooth piece for the whole phase, so that only the steps limit the error.
-    torque = motion.fit(1, 24)  # type: ignore[attr-defined]
-    s = load_stepper(plan()[0].phases[1].formation, Grips(), 24)
-    segment = motion.curve.segments[0]  # type: ignore[attr-defined]
-
-    def integrate(count: int) -> np.ndarray:
-        inputs, at = s.inputs, s.at
-        start = motion.evaluate(np.array([0.05]))
-        inputs[at.y] = [*start.z[0], *start.z_dot[0], *np.zeros(4)]
-        inputs[at.Xi], inputs[at.sigma] = segment.Xi, [0, 0, 0, *segment.sigma]
-        inputs[at.piece], inputs[at.torque] = torque.breaks, torque.coefficients.ravel()
-        inputs[at.h] = 0.3 / count
-        for k in range(count):
-            inputs[at.t] = 0.05 + 0.3 * k / count
-            s.step()
-            inputs[at.y] = s.outputs[s.to.y]
-        return np.array(s.outputs[s.to.y])
-
-    fine = integrate(64)
-    errors = [np.abs(integrate(count) - fine).max() for count in (3, 6)]
-    # Errors stay above 1e-12, well clear of rounding.
-    assert errors[1] > 1e-13
-    assert np.log2(errors[0] / errors[1]) > 7.5
-    exact = motion.evaluate(np.array([0.35]))
-    # A single polynomial of degree 24 follows the torques to about 1e-8.
-    assert np.allclose(fine[:10], np.hstack([exact.z[0], exact.z_dot[0]]), atol=1e-7, rtol=0)
-
-
-@pytest.mark.parametrize("grips", [Grips(), Grips(contacts=((1,),)), Grips(joints=(0,))])
-def test_rates_are_those_of_the_formations_own_rows(grips: Grips) -> None:
-    problem = wholearm.load("problems/heptagon.toml")
-    free = problem.phases[2].formation
-    formations = [free] if len(grips) else [phase.formation for phase in problem.phases[:2]]
-    rng = np.random.default_rng(3)
-    for formation in formations:
-        # On the constraints, where gaps and slip of pairs are those of contacts.
-        z = close_contacts(formation, problem.start + 1e-3 * rng.standard_normal(5))
-        mode, s = Mode(formation, grips), load_stepper(formation, grips, 1)
-        v = rng.standard_normal(5)
-        signs = rng.choice([-1.0, 1.0], formation.n_contacts + 2)
-        signs[[row for rows in grips.contacts for row in rows]] = 0.0
-        signs[[formation.n_contacts + joint for joint in grips.joints]] = 0.0
-        tau = rng.standard_normal(2)
-        inputs, at, to = s.inputs, s.at, s.to
-        inputs[at.y], inputs[at.t] = [*z, *v, *np.zeros(4)], 0.7
-        inputs[at.Xi], inputs[at.sigma] = signs[:-2], [0, 0, 0, *signs[-2:]]
-        inputs[at.piece], inputs[at.torque] = (0.0, 2.0), [tau[0], 0.0, tau[1], 0.0]
-        s.look()
-        kinematics = formation.evaluate(z[None], v[None])
-        turn = 1e-7 * v
-        ahead, back = (formation.evaluate((z + k * turn)[None], v[None]) for k in (1, -1))
-        bends = (ahead.A_t[0] - back.A_t[0]) @ v / 2e-7
-        rows = ContactRows(kinematics.A[0], kinematics.A_t[0], kinematics.A_dot_v[0], bends)
-        response = respond(mode, signs, rows, v)
-        assert response is not None
-        load = np.array([1.0, *tau])
-        accelerations = response.acceleration @ load
-        assert s.outputs[to.acceleration] == pytest.approx(accelerations, rel=1e-6, abs=1e-9)
-        held = response.force_limits @ load
-        margins = s.outputs[to.values][: s.rows.cone.stop]
-        assert margins == pytest.approx(held / mode.force_limit_units, rel=1e-6)
-        assert s.outputs[to.c_n] == pytest.approx(held[: formation.n_contacts], rel=1e-6)
 
 
 @pytest.mark.parametrize("power", [1, 3, 5])

@@ -16,7 +16,7 @@ from once import once
 from plane import convex_polygon, make_formation, make_scene, measure_slip, place_corners
 from planned import CosineMotion, LandingMotion, change, choose_squeeze, forward, join, plan_landing
 from pushing import Push, Roll, evaluate, linear, pushed, rocking
-from scenes import POINTS, box, constant, falling, make_way, ramp, roll, tipped
+from scenes import POINTS, box, constant, falling, ramp, roll, tipped
 from shipped import HEXAGON, problem_of
 from wholearm import End, Friction, Phase, Problem, Scene, TorqueProfile, Until, simulate, verify
 from wholearm.common.arrays import Array
@@ -27,7 +27,7 @@ from wholearm.planning.plan import solve
 from wholearm.problem.read import build_problem
 from wholearm.simulation.events import EventKind, OutcomeKind, Simulation
 from wholearm.simulation.prescribed import project_velocity
-from wholearm.simulation.rest import StartDeparture, Touching, find_rest
+from wholearm.simulation.rest import StartDeparture, find_rest
 
 
 def test_replay_keeps_the_vertex_where_it_is() -> None:
@@ -733,42 +733,3 @@ def test_a_pointed_tip_gains_either_edge_at_a_vertex(until: str) -> None:
     first = simulation.z[simulation.phase == 0][-1]
     np.testing.assert_allclose(first, curves[0].end, atol=1e-9)
     np.testing.assert_allclose(simulation.z[-1], curves[1].end, atol=1e-9)
-
-
-@pytest.mark.parametrize("until", ["e4-tip2", "e5-tip2"])
-def test_two_freedoms_start_from_a_pointed_tip(until: str) -> None:
-    """Finger 2 pushes v5 to the right, off its tip or away from it, while finger 1 swings."""
-    problem = slide_to_the_tip(until)
-    formation = make_formation(problem.scene, "v0-palm v1-palm v5-finger2")
-    curve = trace_phases(problem)[0]
-    z = curve.end - np.array([0.0, 0.0, 0.0, 0.3, 0.0])
-    rest = find_rest(formation, z)
-    assert rest.near.sum() == 2  # the end of the link, and an edge at its tip
-    back, onwards = (sign * (curve.end - curve.start) for sign in (-1e-3, 1e-3))
-    touching = Touching(formation, z, rest.near)
-    (edge,) = touching.kinked
-    assert formation.limits[edge].text.endswith("touches the tip of finger 2")
-    # Along the line of the link the edge parts from the tip both ways.
-    assert touching.opens(back) and touching.opens(onwards)
-    departs = rest.wait(np.array([[-0.05], [-0.2]]), -1.0)
-    right = until == "e5-tip2"
-    assert (isinstance(departs, StartDeparture) and departs.heading[0] > 0) == right
-
-
-def test_a_link_that_is_free_may_graze_what_starts_to_move() -> None:
-    """Links of a plan may close by the little that its nodes do not see, but not press."""
-    problem = make_way(solid=True)
-    rest = find_rest(problem.phases[0].formation, problem.start)
-    assert rest.near.sum() == 1  # v3 on finger 1
-    tau = np.array([-0.287, -0.98])
-    way = next(way for way in rest.sliding if way.moves(tau))
-    touch = make_formation(problem.scene, "v3-finger1")
-    A = touch.evaluate(problem.start[None], np.zeros((1, 5))).A[0, 0]
-    lever = A[3] / problem.scene.fingers[0].inertia
-    opens = A @ way.depart(-1.0, tau).heading * way.drive(tau)
-    # The torque of finger 1 with which the gap has no acceleration.
-    even = tau - np.array([opens / lever, 0.0])
-    for closing, starts in (-1e-3, True), (2e-5, True), (1.0, False):
-        load = even - np.array([closing / lever, 0.0])
-        begun = rest.wait(load[:, None], -1.0)
-        assert (isinstance(begun, StartDeparture) and begun.x == -1.0) == starts

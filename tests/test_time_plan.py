@@ -64,9 +64,7 @@ from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain.guesses import guess_stages
 from wholearm.planning.time_domain.mode_search import link
-from wholearm.planning.time_domain.refinement import (
-    SETTINGS,
-)
+from wholearm.planning.time_domain.refinement import SETTINGS
 from wholearm.planning.time_domain.stage import Stage
 from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion
 from wholearm.planning.time_domain.time_plan import plan_phases

@@ -29,8 +29,8 @@ from wholearm.contacts.closing import close_finger, place_flush
 from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation, find_touching
 from wholearm.geometry.curve import Curve
-from wholearm.geometry.explore import close_all, close_contacts
-from wholearm.geometry.path_guess import POINTS, PathGuess, guess_curve, guess_phase
+from wholearm.geometry.explore import close_contacts
+from wholearm.geometry.path_guess import POINTS, PathGuess, guess_phase
 from wholearm.geometry.tracing import load, trace_curve, trace_phases, until_distance
 from wholearm.mechanics.dynamics import metric_weights
 from wholearm.planning.path_domain.path_plan import plan_path
@@ -426,22 +426,6 @@ def test_directions_are_those_of_travel(outlines: list[list[PathGuess]], phase: 
         np.testing.assert_array_equal(np.sign(speed[3:]), part.directions.sigma)
 
 
-def test_curves_are_split_where_something_turns(curves: tuple[Curve, ...]) -> None:
-    for curve in curves:
-        parts = guess_curve(curve)
-        assert len(parts) == len(curve.segments)
-        # Chords are shorter than the arc by the square of a 24th of it.
-        assert sum(part.length for part in parts) == pytest.approx(curve.length, rel=1e-3)
-        assert parts[-1].turns == ()
-        for part, following in pairwise(parts):
-            before, after = (np.concatenate(p.directions) for p in (part, following))
-            assert part.turns == tuple(np.flatnonzero(before != after)) != ()
-            speed = curve.evaluate(np.array([curve.segments[1].start])).z_s[0]
-            rates = [*measure_slip(part.formation, part.z[-1], speed), *speed[3:]]
-            # Rates per metre are about one; reversals are found to rounding.
-            assert np.abs([rates[row] for row in part.turns]).max() < 1e-8
-
-
 @pytest.mark.parametrize("row, value", [(0, 0.02), (2, -0.9)])
 def test_a_coordinate_can_be_what_ends_a_phase(
     flipping: Problem, released: Array, row: int, value: float
@@ -451,49 +435,6 @@ def test_a_coordinate_can_be_what_ends_a_phase(
     part = guess_phase(phase, released)[-1]
     assert part.z[-1, row] == pytest.approx(value, abs=1e-12)
     assert max(np.abs(measure_gaps(part.formation, z)).max() for z in part.z) < CLOSED
-
-
-def test_closing_moves_as_little_as_possible(flipping: Problem, released: Array) -> None:
-    formation = flipping.phases[5].formation
-    rng = np.random.default_rng(4)
-    for _ in range(5):
-        away = released + 1e-4 * rng.normal(size=5)
-        z = close_contacts(formation, away, np.zeros(0))
-        assert z is not None and np.abs(measure_gaps(formation, z)).max() < 1e-12
-        kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
-        scale = formation.scene.polygon.gyration_radius ** np.array([0, 0, 1, 1, 1])
-        free = np.linalg.svd(kinematics.A[0] / scale)[2][3:]
-        # The step is normal to what the contacts leave free, but for curvature.
-        moved = (z - away) * scale
-        assert np.abs(free @ moved).max() < 1e-2 * np.linalg.norm(moved)
-
-
-def test_configurations_are_closed_side_by_side(flipping: Problem, released: Array) -> None:
-    formation, phi = flipping.phases[5].formation, released[2] - 0.02
-    away = released + np.array([[0.0], [0.1], [1e3]]) * released[0] * np.eye(5)[0]
-    for z, start in zip(close_all(formation, away, np.zeros(0), ((2, phi),)), away, strict=True):
-        alone = close_contacts(formation, start, np.zeros(0), ((2, phi),))
-        assert alone is not None and np.abs(z - alone).max() < 1e-12 * (1 + np.abs(z).max())
-        assert z[2] == pytest.approx(phi, abs=1e-12)
-    assert np.isnan(close_all(formation, away, np.zeros(0), ((1, 1.0),))).all()
-
-
-def test_closing_keeps_what_has_rolled_by(flipping: Problem, released: Array) -> None:
-    formation = roll(flipping.phases[5].formation, "v1-palm")
-    vertex = formation.scene.polygon.vertices[1]
-
-    def place(z: Array) -> float:
-        return float(z[0] + rotate(z[2], vertex)[0])
-
-    slip = formation.evaluate_slip(released[None])[0]
-    tipped = released - 0.1 * np.eye(5)[2]
-    z = close_contacts(formation, tipped, slip)
-    assert z is not None and np.abs(measure_gaps(formation, z)).max() < 1e-12
-    # The vertex on the palm stays where it was, and the object turns about it.
-    assert place(z) == pytest.approx(place(released), abs=1e-12)
-    assert z[2] < released[2] - 0.01
-    part = guess_phase(Phase(5, formation, flipping.phases[5].until), released)[-1]
-    assert max(abs(place(z) - place(released)) for z in part.z) < 1e-12
 
 
 @pytest.mark.parametrize(
