@@ -27,7 +27,6 @@ from wholearm.contacts.closing import (
     close_finger,
     close_fingers,
     contact_table,
-    evaluate_contacts,
     evaluate_each,
     first_contact,
     move,
@@ -442,23 +441,6 @@ def test_rates_are_those_of_contacts_that_stay_closed() -> None:
     np.testing.assert_allclose(at.z_u[mild], (right - left)[mild] / (2 * step), atol=1e-6)
     bent = (right - 2 * at.z + left)[mild] / step**2
     np.testing.assert_allclose(at.z_uu[mild], bent, atol=1e-3)
-
-
-def test_rows_are_those_of_formations() -> None:
-    scene, labels, poses, _ = close(0.01)
-    ways = np.random.default_rng(5).normal(size=poses.shape) * [0.03, 1.0]
-    at = move(scene, labels, poses, ways)
-    for label in np.unique(labels, axis=0)[::8]:
-        mine = (labels == label).all(axis=1)
-        every = evaluate_contacts(scene, label.tolist(), at.z[mine], at.z_u[mine])
-        own = at.kinematics
-        for part, other in (
-            (own.A, every.A),
-            (own.A_t, every.A_t),
-            (own.P_dot_v, every.P_dot_v),
-            (own.C, every.C),
-        ):
-            np.testing.assert_allclose(part[mine], other, rtol=1e-9, atol=1e-10)
 
 
 def test_rows_are_those_of_each_formation() -> None:

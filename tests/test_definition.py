@@ -21,7 +21,7 @@ import wholearm
 from shipped import BOX, FOLDER, HEPTAGON, plan_of, problem_of
 from wholearm import End, Goal, InputError, Problem, Until, compare, load, save
 from wholearm.cli.command import build_parser, main
-from wholearm.common.fields import NONNEGATIVE, Range, declare, keys_of, read_keys, read_options
+from wholearm.common.fields import NONNEGATIVE, Range, declare, keys_of
 from wholearm.common.fields import key as declare_key
 from wholearm.mapping.formation_list import write_template
 from wholearm.planning.options import Objective, PlanOptions
@@ -498,65 +498,6 @@ def test_changes_by_name_and_files_know_it(table: dict[str, Any], tmp_path: Path
     assert get_stiffness(changed) == [0.0, 0.7]
     save(changed, str(tmp_path / "sprung.toml"))
     assert get_stiffness(read_problem(str(tmp_path / "sprung.toml"))) == [0.0, 0.7]
-
-
-FIELDS = """\
-problem             problem file
-[files PLAN ...]    more files
--o --output FILE    what to write (required)
---most-rounds N     how often it is tried = 3 in 1..9
---share             of the way, which is
-    a number = 0.5 in 0.0..1
---scheme NAME       of points = radau among radau|legendre
---robust [FACTOR]   within ranges = 0 in 0.0..1000
---fresh             begin anew
---no-replay         return it without a replay
-"""
-OPTIONS = {option.field.name: option for option in read_options(FIELDS)}
-
-
-@declare(*(OPTIONS[name].field for name in ("most_rounds", "share", "scheme", "replay")))
-@dataclass(frozen=True)
-class Given:
-    """Options of a class."""
-
-    most_rounds: int = OPTIONS["most_rounds"].field.default
-    share: float = OPTIONS["share"].field.default
-    scheme: str = OPTIONS["scheme"].field.default
-    replay: bool = OPTIONS["replay"].field.default
-
-    def __post_init__(self) -> None:
-        read_keys(self)
-
-
-def parse(*given: str) -> dict[str, Any]:
-    parser = argparse.ArgumentParser(exit_on_error=False)
-    for option in OPTIONS.values():
-        option.add(parser)
-    return vars(parser.parse_args(["a.toml", *given, "-o", "b"]))
-
-
-def test_options_have_the_defaults_of_their_table() -> None:
-    left_out = {"problem": "a.toml", "files": [], "output": "b", "scheme": "radau", "share": 0.5}
-    left_out |= {"most_rounds": 3, "robust": 0.0, "fresh": False, "replay": True}
-    assert parse() == left_out
-    assert Given() == Given(3, 0.5, "radau", True)
-    named = {"files": ["c", "d"], "most_rounds": 9, "share": 1.0, "fresh": True, "replay": False}
-    given = ("c", "d", "--most-rounds", "9", "--share", "1", "--fresh", "--no-replay")
-    assert parse(*given) == left_out | named
-    assert parse("--robust")["robust"] == 1.0 and parse("--robust", "2")["robust"] == 2.0
-
-
-def test_options_and_arguments_have_the_same_ranges() -> None:
-    text = "10 given; allowed are whole numbers from 1 to 9"
-    with pytest.raises(argparse.ArgumentError, match=text):
-        parse("--most-rounds", "10")
-    with pytest.raises(InputError, match=f"most_rounds: {text}"):
-        Given(most_rounds=10)
-    with pytest.raises(InputError, match="scheme: 'gauss' given; allowed are 'radau' and"):
-        Given(scheme="gauss")
-    with pytest.raises(InputError, match="replay: 0 given; allowed are true and false"):
-        Given(replay=0)  # type: ignore[arg-type]
 
 
 BAD: dict[str, list[Any]] = {

@@ -62,23 +62,6 @@ def test_packages_import_those_above_them() -> None:
         assert not below, f"{path.relative_to(SOURCE)} imports {below}"
 
 
-def test_the_simulator_shares_with_the_planner_what_it_says() -> None:
-    """The mechanics and the friction cones; formations and problems are the data model."""
-    folder = SOURCE / "simulation"
-    doc = ast.get_docstring(ast.parse((folder / "__init__.py").read_text(encoding="utf-8"))) or ""
-    shared = set()
-    for path in folder.glob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and node.level == 2:
-                module = node.module or ""
-                assert module.split(".")[0] in {*re.findall(r"`(\w+)`", doc), "common", "mechanics"}
-                if module.startswith("mechanics.") or module == "contacts.cones":
-                    assert f"`{module}`" in doc
-                    shared |= {alias.name for alias in node.names}
-    said = set(re.findall(r"`(\w+)`", doc)) - {"scene", "contacts", "problem", "results"}
-    assert shared == said
-
-
 def test_the_places_to_look_are_there() -> None:
     section = (ROOT / "README.md").read_text(encoding="utf-8").split("### Where to look")[1]
     rows = re.findall(r"^\| (?!\||-)(.*?) \| (`.*?) \| (`.*?) \|$", section.split("###")[0], re.M)

@@ -25,17 +25,8 @@ from wholearm.engines.engine_replay import (
     replay_in,
 )
 from wholearm.engines.shapes import list_pairs
-from wholearm.engines.stretch import (
-    EngineDrive,
-    EngineRun,
-    Setting,
-    apply_friction,
-    find_between,
-    list_steps,
-    list_stretches,
-)
+from wholearm.engines.stretch import EngineRun, Setting, find_between, list_steps, list_stretches
 from wholearm.planning.plan import solve
-from wholearm.policy.playback import ClosedLoop
 from wholearm.problem.read import build_problem
 from wholearm.results.adopt import require_same_phases
 from wholearm.results.torque import TorqueProfile
@@ -217,29 +208,6 @@ def test_a_policy_moves_the_hand_in_an_engine(engine: str) -> None:
     assert other.ok, other.to_text()
 
 
-def test_torques_of_a_policy_are_held_and_late() -> None:
-    class Loop(ClosedLoop):
-        def __init__(self) -> None:
-            self.period, self.delay, self.times = 1e-3, 4e-4, list[float]()
-
-        def held(self, t: float, *_: object) -> tuple[float, float]:
-            self.times.append(t)
-            return 1e3 * t, -1.0
-
-        over = False
-
-    scene, h, still = slide()[0].scene, 1e-4, np.zeros(2)
-    loop = Loop()
-    drive = EngineDrive(scene, loop, h)
-    tau = [drive.step(k * h, still, still).tolist() for k in range(30)]
-    assert loop.times == pytest.approx([0.0, 1e-3, 2e-3])
-    assert [own[0] for own in tau] == pytest.approx([0.0] * 14 + [1.0] * 10 + [2.0] * 6)
-    assert {own[1] for own in tau} == {-1.0}
-    # Dry friction is against the motion.
-    fast = drive.step(30 * h, still, np.array([1.0, -1.0]))
-    assert fast == pytest.approx([2.0 - scene.dry[3], -1.0 + scene.dry[4]])
-
-
 def test_what_mujoco_opens_plays_the_plan() -> None:
     mujoco = pytest.importorskip("mujoco", reason="wholearm[mujoco] is not installed")
     problem, plan = slide()
@@ -394,25 +362,6 @@ def test_steps_of_a_constant_force_are_exact() -> None:
     t = 7 * steps.h
     np.testing.assert_allclose(z, stretch.z + 0.3 * t + t**2, rtol=1e-13)
     np.testing.assert_allclose(steps.tau, 0.7)
-
-
-def test_torques_are_averages_around_positions() -> None:
-    problem, plan = problem_of(HEPTAGON), plan_of(HEPTAGON)
-    stretch = list_stretches(plan, False)[0]
-    ramp = TorqueProfile(np.array([0.0, 2.0]), np.array([[[1.0, 1.0], [2.0, 2.0]]]))
-    steps = list_steps(problem, stretch, ramp, 0.01)
-    t = steps.h * np.arange(1, len(steps.tau))
-    np.testing.assert_allclose(steps.tau[1:], np.column_stack([t, 2 * t]), rtol=1e-9)
-
-
-def test_dry_friction_has_the_planned_sign() -> None:
-    plan, scene = plan_of(HEPTAGON), problem_of(HEPTAGON).scene
-    t = np.linspace(1e-4, plan.duration - 1e-4, 997)
-    speeds = plan.at(t).z_dot[:, 3:]
-    taken = plan.torque.at(t) - apply_friction(scene, plan).at(t)
-    clear = np.abs(speeds) > 1e-3 * scene.scales.rate
-    assert clear.mean() > 0.95 and {*np.sign(speeds[clear])} == {-1.0, 1.0}
-    np.testing.assert_allclose(taken[clear], 0.01 * np.sign(speeds[clear]), atol=1e-9)
 
 
 def test_a_plan_is_known_between_the_rows_of_its_file(tmp_path: Path) -> None:

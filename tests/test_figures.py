@@ -34,12 +34,12 @@ from shipped import HEPTAGON, IMPACTS, LANDING, chart, plan_of, problem_of
 from wholearm import InputError, PlanOptions, Problem, TorqueProfile, Trajectory, plots, verify
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
-from wholearm.common.document import Document, Result, Table, plain, restore
+from wholearm.common.document import Document, Result, Table
 from wholearm.contacts.closing import contact_table, evaluate_contacts
 from wholearm.figures.curves import draw_torques
 from wholearm.figures.map_figure import draw_map
 from wholearm.figures.plot_data import choose_snapshots, find_steps
-from wholearm.figures.snapshots import choose_numbers, draw_snapshot
+from wholearm.figures.snapshots import draw_snapshot
 from wholearm.figures.style import WIDTH, choose_styles
 from wholearm.mapping.borders import Window
 from wholearm.mapping.formation_list import write_template
@@ -167,22 +167,6 @@ def test_strip_has_one_scale_and_its_bar(figure: Figure) -> None:
     assert "50 mm" in [text.get_text() for text in figure.texts]
     (bar,) = (own for own in figure.artists if isinstance(own, Line2D))
     assert np.ptp(data_of(bar)[0]) * figure.dpi / scales[0] == pytest.approx(0.05)
-
-
-@pytest.mark.parametrize("count", [3, 4, 7, 12, 30, 50])
-@pytest.mark.parametrize("thin", [1.0, 0.12])
-def test_numbers_at_vertices_stand_apart(count: int, thin: float) -> None:
-    angles = 2 * np.pi * (np.arange(count) + 0.5) / count
-    vertices = 40 * np.column_stack([np.cos(angles), thin * np.sin(angles)])
-    found = choose_numbers(vertices, [1])
-    places = {str(k): vertices[k] + own for k, own in found.items()}
-    for (one, a), (other, b) in itertools.combinations(places.items(), 2):
-        wide = 0.32 * 8 * (len(one) + len(other))
-        assert abs(a[0] - b[0]) > wide or abs(a[1] - b[1]) > 8
-    assert 1 in found
-    assert len(found) >= 3 or (thin < 1.0 and count > 4)
-    if count <= 7 and thin == 1.0:
-        assert len(found) == count
 
 
 @pytest.mark.parametrize(
@@ -792,17 +776,6 @@ def test_plain_values_are_json() -> None:
     assert values["ok"] is False and values["grade"] == "good" and "samples" not in values
     assert values["visits"][0]["place"] == {"x": 0.0125, "name": "edge & tip"}
     assert values["visits"][1] == {"number": 20, "place": None, "pair": [0.25, 0.125], "time": None}
-
-
-def test_what_is_made_plain_is_read_back() -> None:
-    again = restore(tuple[Visit, ...], json.loads(json.dumps(plain(TOUR.visits))))
-    assert again[0] == TOUR.visits[0] and again[1][:3] == TOUR.visits[1][:3]
-    assert math.isnan(again[1].time)
-    # What is missing is as by default; what is of another kind is an error.
-    assert restore(Place | None, {"x": 1}) == Place(1.0)
-    for kind, value in ((Place, {"x": "far"}), (Place, 3), (Place, {}), (tuple[Place, ...], 1)):
-        with pytest.raises((TypeError, ValueError, AttributeError)):
-            restore(kind, value)
 
 
 def test_html_has_the_same_cells_and_names_escaped() -> None:

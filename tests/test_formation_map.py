@@ -6,7 +6,6 @@ import copy
 import math
 import tomllib
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -30,18 +29,10 @@ from plane import (
 from retelling import Retelling
 from scenes import hexagon, measure_fingers
 from shipped import HEPTAGON, IMPACTS, LANDING, problem_of, solved
-from shipped import SQUARE as BOX_FILE
 from wholearm import End, Formation, Goal, InputError, Problem, Scene, Until, list_formations
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
-from wholearm.contacts.closing import (
-    close_finger,
-    close_fingers,
-    contact_table,
-    evaluate_each,
-    first_contact,
-)
-from wholearm.contacts.closing import place as place_labels
+from wholearm.contacts.closing import close_finger, close_fingers, contact_table, first_contact
 from wholearm.contacts.contact_limits import (
     FINGERS_TOUCH,
     build_apart,
@@ -57,8 +48,8 @@ from wholearm.planning.lower_bound.lower_bound import look_along
 from wholearm.planning.lower_bound.speed_sweep import NoMotionError
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.search.edges import Link, cut_curve
-from wholearm.search.places import RoadmapPlace, is_at, list_formations_at, make_place, unit_steps
-from wholearm.search.roadmap import Rays, Roadmap, shoot
+from wholearm.search.places import is_at, make_place
+from wholearm.search.roadmap import Roadmap
 from wholearm.search.times import time_borders
 
 TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
@@ -689,41 +680,7 @@ def test_fingers_in_different_planes_pass_each_other() -> None:
     assert FINGERS_TOUCH not in [limit.text for limit in formation.limits]
 
 
-PARTS = 50
 FAR_GOAL = Goal(flush=0, x=9.0)  # that no border leads to
-
-
-@cache
-def around_the_start() -> tuple[RoadmapPlace, Rays]:
-    problem = problem_of(BOX_FILE)
-    own = make_place(problem.scene, problem.start)
-    return own, shoot([own], problem.epsilon)
-
-
-def test_rays_stay_in_a_cell_of_the_place_until_a_contact_is_gained() -> None:
-    own, rays = around_the_start()
-    scene, table = own.scene, contact_table(own.scene)
-    cells = [cell.contacts for cell in list_formations_at(own, 3)]
-    assert len(np.unique(rays.gained)) > 1
-    for label, gained in zip(rays.labels, rays.gained, strict=True):
-        assert tuple(table[k] for k in label) in cells
-        assert table[gained] not in own.contacts
-    parts = np.arange(1, PARTS + 1) / PARTS
-    poses = rays.starts[:, None] + parts[:, None] * rays.runs[:, None]
-    labels = label_cells(scene, *poses.reshape(-1, 2).T)[:, [0, 2, 4]]
-    assert (labels.reshape(len(poses), -1, 3) == rays.labels[:, None]).all()
-
-
-def test_rays_end_right_before_what_they_gain_touches() -> None:
-    own, rays = around_the_start()
-    scene = own.scene
-
-    def measure_gaps(ends: Array) -> Array:
-        return evaluate_each(scene, rays.gained[:, None], place_labels(scene, rays.labels, ends)).C
-
-    assert (measure_gaps(rays.ends) > 0).all()
-    lengths = np.linalg.norm(rays.runs / unit_steps(scene), axis=1)[:, None]
-    assert (measure_gaps(rays.ends + 1e-4 * rays.runs / lengths) < 0).all()
 
 
 def look(curve: Curve, epsilon: float) -> float:

@@ -42,7 +42,7 @@ from wholearm.results.adopt import describe_origin, save
 from wholearm.results.report import Loss, Report
 from wholearm.results.torque import TorqueProfile, read_notes, read_torque_csv
 from wholearm.simulation.events import EventKind, Simulation
-from wholearm.tuning.tuner import FACTOR, Bench, TrialOutcome, TuningStep, split_passages
+from wholearm.tuning.tuner import FACTOR, TrialOutcome, split_passages
 from wholearm.verification.torque_advice import find_approach
 
 
@@ -326,16 +326,6 @@ def test_stops_are_no_more_than_allowed() -> None:
     assert not alone.ok and not found.ok and "phase 1" in found.reason
     parts = 3  # whole, its first half, and the first half of that
     assert found.simulations == parts * alone.simulations
-
-
-def test_a_contact_that_never_presses_is_lost() -> None:
-    problem = build_box()
-    (passage,) = split_passages(problem)
-    bench = Bench(problem, passage, problem.start)
-    # The left finger is pulled away.
-    trial = bench.run([TuningStep(0.0, (0.1, 0.2))])
-    assert trial.outcome is TrialOutcome.LOSES and trial.contact == "v3-finger2"
-    assert trial.time == 0.0
 
 
 def test_phases_that_nothing_stops_are_tuned_as_one() -> None:

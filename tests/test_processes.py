@@ -19,7 +19,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from threading import Thread
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -33,7 +32,6 @@ from wholearm.common import signals as interrupts
 from wholearm.common.crowd import Processes, run_all
 from wholearm.common.errors import InputError
 from wholearm.common.files import read_arrays, together, write_whole
-from wholearm.common.sharing import Keeper, exclusive, kept_property, retire_with
 from wholearm.common.signals import check, guard, held
 from wholearm.common.workers import can_fork, count_cores, share
 from wholearm.simulation.simulate import simulate
@@ -461,86 +459,6 @@ def test_four_threads_plan_and_replay_at_once() -> None:
     command = [sys.executable, "-X", "faulthandler", "-W", "error", "-c", IN_THREADS]
     run = subprocess.run([*command, SQUARE], capture_output=True, text=True)
     assert (run.returncode, run.stderr) == (0, "")
-
-
-class Tracked:
-    """Counts how many of its kind are alive."""
-
-    alive = 0
-
-    def __init__(self) -> None:
-        Tracked.alive += 1
-
-    def __del__(self) -> None:
-        type(self).alive -= 1
-
-
-@exclusive
-def nothing() -> None:
-    pass
-
-
-@pytest.fixture
-def tracked() -> type[Tracked]:
-    nothing()
-    Tracked.alive = 0
-    return Tracked
-
-
-class Owner(Keeper):
-    def __init__(self, number: int = 1) -> None:
-        self.number = number
-
-    @kept_property
-    def value(self) -> Tracked:
-        return Tracked()
-
-
-def in_another_thread(run: Callable[[], object]) -> None:
-    thread = Thread(target=run)
-    thread.start()
-    thread.join()
-
-
-def test_values_of_dropped_owners_are_deleted_under_the_lock(tracked: type[Tracked]) -> None:
-    owners = [Owner(), Owner()]
-    assert owners[0].value is owners[0].value
-    retire_with(owners[1], Tracked())
-    assert tracked.alive == 2
-    in_another_thread(owners.clear)
-    assert tracked.alive == 2
-    nothing()
-    assert tracked.alive == 0
-
-
-def test_a_kept_value_is_computed_once_by_many_threads(tracked: type[Tracked]) -> None:
-    owner, seen = Owner(), list[Tracked]()
-    threads = [Thread(target=lambda: seen.append(owner.value)) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len({id(value) for value in seen}) == 1
-    assert tracked.alive == 1
-
-
-def test_an_error_takes_no_local_variables_along(tracked: type[Tracked]) -> None:
-    def fail() -> None:
-        value = Tracked()
-        raise ValueError(f"{tracked.alive} {value.alive}")
-
-    @exclusive
-    def change() -> None:
-        own = Tracked()
-        try:
-            fail()
-        except ValueError as error:
-            raise KeyError(own.alive) from error
-
-    with pytest.raises(KeyError) as caught:
-        change()
-    assert isinstance(caught.value.__cause__, ValueError)
-    assert tracked.alive == 0
 
 
 @pytest.mark.usefixtures("unadvised")

@@ -35,7 +35,6 @@ from retelling import RETELLINGS, Retelling
 from scenes import hexagon, measure_fingers, shorten, slid
 from shipped import HEPTAGON, IMPACTS, plan_of, problem_of
 from wholearm import Formation, Phase, Problem, TorqueProfile, Trajectory, Until, simulate, verify
-from wholearm.benchmark.precision.reference import solve_motion
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, JammingError, SimulationError
 from wholearm.contacts.elemental import parse_contact
@@ -169,28 +168,6 @@ def test_agrees_with_the_baseline(index: int) -> None:
     run = integrate_phase(problem, 0, torque, state, directions, (0.0, stop))
     found = simulate(problem, torque, tolerance=1e-12, times=[stop]).at(stop)
     assert np.allclose(found, run.state, atol=1e-9, rtol=0)
-
-
-@pytest.mark.parametrize(
-    "names",
-    [
-        ("v0-palm", "v1-palm", "v2-finger1", "v5-finger2"),
-        ("v1-palm", "e3-tip1", "v6-finger2", "e6-tip2"),
-    ],
-)
-def test_baseline_agrees_with_the_dynamics(names: tuple[str, ...]) -> None:
-    problem, _ = plan()
-    formation = Formation(problem.scene, tuple(parse_contact(n, problem.scene) for n in names))
-    rng = np.random.default_rng(4)
-    for _ in range(5):
-        # Neither needs closed contacts: the equations are linear in the unknowns anywhere.
-        z, v = problem.start + 0.1 * rng.normal(size=5), rng.normal(size=5)
-        tau, signs = rng.normal(size=2), rng.choice([-1.0, 1.0], size=6)
-        directions = Directions(signs[:4], signs[4:])
-        expected = forward(formation, z, v, tau, directions)
-        found = solve_motion(problem.scene, formation.contacts, z, v, tau, *directions)
-        for a, b in zip(found, expected, strict=True):
-            assert np.allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max())
 
 
 def test_energy_is_conserved_without_friction() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import tomllib
 from dataclasses import replace
 from typing import Any
@@ -18,7 +17,7 @@ from wholearm.benchmark.stress.event_tracing import follow, resample, slides
 from wholearm.benchmark.stress.newton import balance, clearances, locate, separate
 from wholearm.benchmark.stress.scenes import draw_case, random_scene
 from wholearm.benchmark.stress.slow_motion import fast_margin, inertia_ratio, slow_margin
-from wholearm.benchmark.stress.stress_study import STUDY, compare_values
+from wholearm.benchmark.stress.stress_study import compare_values
 from wholearm.common.arrays import Array
 from wholearm.contacts.formation import find_touching
 from wholearm.geometry.curve import Curve
@@ -73,19 +72,6 @@ def test_values_that_noise_changes_are_found() -> None:
     assert compare_values(close) == []
     ((name, *_),) = compare_values([*close, row(1.0 + 5e-6, 3)])
     assert name == "a.toml, time"
-
-
-def test_the_table_counts_every_finding() -> None:
-    scene = {"kind": "any", "outcome": "planned", "verdict": "", "seconds": 1.0}
-    rows: list[dict[str, Any]] = [
-        {"case": ["scene", 0, 4, "time"], **scene, "findings": [["no answer", "a | b"]]},
-        {"case": ["file", 0, 2], "kind": "torque", "status": 1, "findings": [["traceback", "E"]]},
-        {"case": ["problem", "p.toml", "time", "noise", 0], "value": 1.0, "findings": []},
-    ]
-    text, findings = STUDY.report(rows, argparse.Namespace())
-    assert len(findings) == 2 and findings[0] == "scene 0 4 time: no answer: a | b"
-    assert "| no answer | 1 |" in text and "| traceback | 1 |" in text
-    assert "| p.toml | time | 1 | 1 | 0.0e+00 |" in text
 
 
 @pytest.mark.parametrize("index", [1, 3])

@@ -17,13 +17,12 @@ from plane import (
     make_formation,
     make_scene,
     measure_gaps,
-    measure_slip,
     place_corners,
     place_tips,
     rotate,
 )
-from scenes import hexagon, measure_fingers, roll, tilting, tip
-from wholearm import End, InputError, Phase, PlanOptions, Problem, Scene, Until
+from scenes import hexagon, measure_fingers, roll, tip
+from wholearm import InputError, Phase, PlanOptions, Problem, Scene, Until
 from wholearm.common.arrays import Array
 from wholearm.contacts.closing import close_finger, place_flush
 from wholearm.contacts.elemental import parse_contact
@@ -416,16 +415,6 @@ def test_outlines_end_where_their_phase_does(
             assert abs(until_distance(phase.formation, phase.until, end)[0]) < CLOSED
 
 
-@pytest.mark.parametrize("phase", range(6))
-def test_directions_are_those_of_travel(outlines: list[list[PathGuess]], phase: int) -> None:
-    for part in outlines[phase]:
-        middle = len(part.z) // 2
-        speed = part.z[middle + 1] - part.z[middle - 1]
-        slip = measure_slip(part.formation, part.z[middle], speed)
-        np.testing.assert_array_equal(np.sign(slip), part.directions.Xi)
-        np.testing.assert_array_equal(np.sign(speed[3:]), part.directions.sigma)
-
-
 @pytest.mark.parametrize("row, value", [(0, 0.02), (2, -0.9)])
 def test_a_coordinate_can_be_what_ends_a_phase(
     flipping: Problem, released: Array, row: int, value: float
@@ -508,33 +497,3 @@ def test_a_flush_edge_that_turns_is_planned_in_the_time_domain_too(square: Probl
     (plan,) = plan_phases(square, square.phases[2:3], curves[1].end, options)
     # Torques that are linear in each interval come a little behind the true least time.
     assert exact * (1 - 1e-4) < plan.motion.duration < 1.02 * exact
-
-
-def test_phases_without_ends_of_their_own_go_towards_the_next_end() -> None:
-    """However many of them there are: each is guessed to go half of the way that is left."""
-    sliding = tilting()
-    (phase,) = sliding.phases
-    rolling = roll(phase.formation, "v1-palm")
-    first, second = (
-        replace(phase, index=k, formation=formation, until=Until(), end=End.SMOOTH)
-        for k, formation in enumerate((phase.formation, rolling))
-    )
-    ways = []
-    for phases in ((first, second), (first,)):
-        problem = replace(sliding, phases=(*phases, replace(phase, index=len(phases))))
-        z = problem.start
-        for own in problem.phases:
-            ways.append(guess_phase(own, z, problem.phases[own.index + 1 :])[-1].z)
-            z = ways[-1][-1]
-    np.testing.assert_allclose(ways[0], ways[3], atol=1e-12)
-    gaps = [evaluate_gap(sliding, way[-1]) for way in ways]
-    start = evaluate_gap(sliding, sliding.start)
-    assert start > gaps[0] > gaps[1] > 0.1 * start
-    np.testing.assert_allclose([gaps[2], gaps[4]], 0.0, atol=1e-9)
-
-
-def evaluate_gap(problem: Problem, z: Array) -> float:
-    """Gap of what ends the last phase of a problem [m]."""
-    contact = problem.phases[-1].until.contact
-    assert contact is not None
-    return float(measure_gaps(make_formation(problem.scene, contact.name), z)[0])
