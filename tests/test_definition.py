@@ -26,9 +26,15 @@ from wholearm.common.fields import key as declare_key
 from wholearm.mapping.formation_list import write_template
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.plan import solve
-from wholearm.problem import keys, read
-from wholearm.problem.keys import TOP, build_schema, write_page
-from wholearm.problem.read import adopt_phases, build_problem, read_problem
+from wholearm.problem import read
+from wholearm.problem.read import (
+    TOP,
+    adopt_phases,
+    build_problem,
+    build_schema,
+    read_problem,
+    write_page,
+)
 from wholearm.problem.table import describe_scene, format_until, write_table
 from wholearm.scene.model import Finger, Friction, find_unit_hint
 
@@ -100,7 +106,7 @@ def test_both_freedoms_of_a_cell_may_be_given(given: dict[str, Any], text: str) 
     assert str(problem.phases[3].until) == text
     assert problem.table["phases"][3] == phase
     # What is written of the phase alone reads as the same.
-    written = write_table(dataclasses.replace(problem, table={}))["phases"][3]
+    written = write_table(problem)["phases"][3]
     assert list(written["until"]) == list(given)
     again = read_edited(put("phases.3", written)).phases[3].until
     assert again == problem.phases[3].until
@@ -446,7 +452,7 @@ class SprungFinger(Finger):
 @pytest.fixture
 def table(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     monkeypatch.setattr(read, "Finger", SprungFinger)
-    monkeypatch.setitem(keys.FINGER, "stiffness", keys_of(SprungFinger)["stiffness"])
+    monkeypatch.setitem(read.FINGER, "stiffness", keys_of(SprungFinger)["stiffness"])
     return copy.deepcopy(dict(read_problem(str(HEPTAGON)).table))
 
 
@@ -480,14 +486,14 @@ def test_messages_know_it(table: dict[str, Any], name: str, value: object, text:
 
 
 def test_schema_page_and_docstring_know_it(table: dict[str, Any]) -> None:
-    assert keys.build_schema()["definitions"]["finger"]["properties"]["stiffness"] == {
+    assert read.build_schema()["definitions"]["finger"]["properties"]["stiffness"] == {
         "type": "number",
         "minimum": 0,
         "default": 0.0,
         "description": "Spring of the joint [N m/rad].",
     }
     row = "| `stiffness` | N m/rad | 0 | 0.001 to 2 times the torque limit | Spring of the joint. |"
-    assert row in keys.write_page()
+    assert row in read.write_page()
     assert "Spring of the joint" in (SprungFinger.__doc__ or "")
 
 
@@ -660,7 +666,8 @@ def check_table(problem: Problem) -> None:
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_a_problem_has_a_valid_table_as_read_and_of_objects(path: Path) -> None:
     problem = read_problem(str(path))
-    assert replace(problem).table is problem.table
+    assert replace(problem).table == problem.table
+    assert build_problem(problem.table).table == problem.table
     made = rebuild(problem)
     assert made.source == ""
     for own in (problem, problem.with_(), made):
@@ -748,7 +755,7 @@ def test_what_a_file_may_not_say_no_change_may(
 
 
 def test_a_problem_without_a_table_cannot_be_changed_by_name(heptagon: Problem) -> None:
-    bare = replace(heptagon, table={})
+    bare = replace(heptagon, start=heptagon.start + 0.1 * np.eye(5)[2])
     assert replace(bare, epsilon=0.1).table == {}
     with pytest.raises(InputError, match="has no table"):
         bare.with_(epsilon=0.1)

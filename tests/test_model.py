@@ -282,7 +282,7 @@ def edited(friction: dict[str, float] | None = None, **joints: float) -> Problem
     table["phases"] = table["phases"][:1]
     table["friction"] |= friction or {}
     for key, value in joints.items():
-        for part in (table,) if key in table else table["fingers"].values():
+        for part in (table,) if key == "gravity" else table["fingers"].values():
             part[key] = value
     return build_problem(table)
 

@@ -25,7 +25,7 @@ from wholearm.contacts.cones import force_limit_rows
 from wholearm.figures import plots
 from wholearm.figures.analysis_figures import draw_comparison
 from wholearm.mechanics.dynamics import force_rows
-from wholearm.problem.keys import name_keys
+from wholearm.problem.read import name_keys
 from wholearm.problem.table import change_table
 from wholearm.quasistatic.slow_speeds import (
     OWN,

@@ -41,8 +41,7 @@ if TYPE_CHECKING:
     from .planning.result import Plan, Status, load_plan
     from .policy.make import make_policy
     from .policy.playback import Policy
-    from .problem.definition import End, Phase, Problem, Until
-    from .problem.goal import Goal
+    from .problem.definition import End, Goal, Phase, Problem, Until
     from .problem.read import place_start, read_formation, read_until
     from .quasistatic.slow_speeds import Prediction, predict
     from .results.adopt import save
@@ -81,8 +80,7 @@ _NAMES = {
     "planning.result": "Plan Status load_plan",
     "policy.make": "make_policy",
     "policy.playback": "Policy",
-    "problem.definition": "End Phase Problem Until",
-    "problem.goal": "Goal",
+    "problem.definition": "End Goal Phase Problem Until",
     "problem.read": "place_start read_formation read_until",
     "quasistatic.slow_speeds": "Prediction predict",
     "results.adopt": "save",

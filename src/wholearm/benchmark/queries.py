@@ -23,7 +23,6 @@ from ..common.errors import InfeasibleError, InputError, WholearmError
 from ..common.fields import Range
 from ..mapping.formation_list import format_route, list_formations
 from ..problem.definition import Problem
-from ..problem.goal import Goal
 from ..problem.read import build_problem, place_start, read_problem
 from ..search.find_route import find_route, forget_roadmaps
 from ..verification.verify import verify
@@ -158,8 +157,7 @@ def _move_goal(problem: Problem) -> Problem:
     """The problem with nearly the same goal."""
     goal, step = problem.goals[0], 0.1 * problem.scene.scales.length
     assert goal.x is not None
-    table = {**problem.table, "goal": Goal(flush=goal.flush, x=goal.x + step).to_table()}
-    return build_problem(table)
+    return replace(problem, goals=(replace(goal, x=goal.x + step),))
 
 
 Stops = list[tuple[float, float]]

@@ -144,7 +144,7 @@ def show_schema(options: argparse.Namespace) -> int:
     import json
 
     from ..common.files import require_writable, write_text
-    from ..problem.keys import build_schema, write_page
+    from ..problem.read import build_schema, write_page
 
     text = write_page() if options.table else json.dumps(build_schema(), indent=2) + "\n"
     if options.output is None:

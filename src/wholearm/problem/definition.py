@@ -6,17 +6,26 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import cached_property
 from typing import Any
 
 from ..common.arrays import Array
 from ..common.errors import InputError, name_source, read_share
-from ..common.fields import NONNEGATIVE, POSITIVE, TEXT, FieldKind, choice, declare, key, leave
+from ..common.fields import (
+    NONNEGATIVE,
+    NUMBER,
+    POSITIVE,
+    TEXT,
+    FieldKind,
+    choice,
+    declare,
+    key,
+    leave,
+)
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
-from ..scene.model import EPSILON, SETTLE, Scene
+from ..scene.model import EPSILON, PLACE, SETTLE, TURN, Scene
 from ..scene.model import SETTLE_GAP as GAP_RANGE
-from .goal import Goal
-from .table import change_table, match_table, write_table
 from .uncertainty import read_widths
 
 ROWS = {"x": 0, "phi": 2}  # rows of z that may be given where a phase ends
@@ -40,6 +49,7 @@ def _name_contact(more: str = "") -> dict[str, str]:
     return {"type": "string", "pattern": f"^([ev][0-9]+-tip[12]|v[0-9]+-(palm|finger[12])){more}$"}
 
 
+INDEX = leave({"type": "integer", "minimum": 0})  # number of an edge
 CONTACT = _name_contact()  # JSON Schema of the name of a contact
 DWELL = FieldKind(
     lambda given, key: (read_share if isinstance(given, str) else NONNEGATIVE.read)(given, key),
@@ -140,6 +150,40 @@ class Phase:
 
 
 @declare(
+    key("flush", "The edge that shall lie on the palm.", INDEX),
+    key(
+        "phi_deg",
+        "The angle that the object shall have instead [degrees].",
+        *(NUMBER, "", TURN),
+        attribute="phi",
+    ),
+    key("x", "Of the centroid [m]; anywhere if it is left out.", NUMBER, "length", PLACE),
+)
+@dataclass(frozen=True)
+class Goal:
+    """Where the object shall come to rest: with an edge on the palm or at an angle, phi [rad]."""
+
+    flush: int | None = None
+    phi: float | None = None
+    x: float | None = None
+
+    def __str__(self) -> str:
+        if self.flush is not None:
+            text = f"edge {self.flush} on the palm"
+        else:
+            text = f"phi = {math.degrees(self.phi or 0.0):g} deg"
+        return text if self.x is None else f"{text} at x = {self.x:g} m"
+
+    def find_angle(self, scene: Scene, near: float) -> float:
+        """The angle that the object shall have [rad], of all turns the nearest to one."""
+        if self.flush is None:
+            assert self.phi is not None
+            return self.phi
+        angle = scene.polygon.flush_angle(self.flush)
+        return angle + 2 * math.pi * round((near - angle) / (2 * math.pi))
+
+
+@declare(
     key("name", "", TEXT, default="unnamed"),
     key("epsilon", "Least normal force of every contact [N].", NONNEGATIVE, "force", EPSILON),
     key(
@@ -171,9 +215,6 @@ class Problem:
     # none of them for a map, or where there are goals; replays need one or more
     phases: tuple[Phase, ...]
     source: str = ""  # the file this was read from
-    # the contents of that file, which trajectory files carry along; in step with the rest. Empty
-    # where no file can say it: the start has no edge flush on the palm.
-    table: Mapping[str, Any] = field(default_factory=dict, repr=False)
     # half widths of the ranges of what is not known exactly, by name; those that are left out have
     # their defaults, see `problem.uncertainty`. None where the problem does not say.
     uncertainty: Mapping[str, float] | None = None
@@ -188,14 +229,22 @@ class Problem:
         phases = tuple(phase.move_to(self.scene) for phase in self.phases)
         object.__setattr__(self, "phases", phases)
         if self.checked:
-            object.__setattr__(self, "table", match_table(self))
             return
         from .read import check_problem
 
         with name_source(self.source):
             check_problem(self)
-        object.__setattr__(self, "table", match_table(self) if self.table else write_table(self))
         object.__setattr__(self, "checked", True)
+
+    @cached_property
+    def table(self) -> Mapping[str, Any]:
+        """The problem as the nested tables of a file, which trajectory files carry along.
+
+        Empty where no file can say it: the start has no edge flush on the palm, or an open finger.
+        """
+        from .table import write_table
+
+        return write_table(self)
 
     def __repr__(self) -> str:
         count = len(self.phases)
@@ -220,8 +269,8 @@ class Problem:
         """
         if not self.table:
             raise InputError(self.source, "", "the problem has no table that could be changed")
-        from .keys import name_keys
-        from .read import build_problem
+        from .read import build_problem, name_keys
+        from .table import change_table
 
         with name_source(self.source):
             table = change_table(self.table, {**(changes or {}), **named}, name_keys())

@@ -1,11 +1,14 @@
-"""Reading problems: files in TOML, their nested tables, the names of contacts; validation.
+"""Problem files: their keys, reading, validation, JSON Schema and a page of all keys.
 
-Every message names the file and the key, says what was given and what is allowed.
+Most keys are declared where their values are kept, in `Polygon`, `Finger`, `Friction`, `Scene`,
+`Problem`, `Phase` and `Goal`; what else a file has is declared here. Every message names the file
+and the key, says what was given and what is allowed.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -16,19 +19,71 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import InputError, name_source, require_number, require_vector
-from ..common.fields import collect_keys, keys_of
+from ..common.fields import (
+    NONNEGATIVE,
+    NUMBER,
+    POINT,
+    Field,
+    collect_keys,
+    keys_of,
+    leave,
+    name_fields,
+    refer,
+)
+from ..common.fields import key as declare
 from ..common.sharing import exclusive
 from ..contacts.closing import close_finger, name_reach, place_flush
 from ..contacts.contact_limits import evaluate_finger_gap
 from ..contacts.elemental import Contact, parse_contact
 from ..contacts.formation import Formation, describe, find_touching
-from ..scene.model import TURN, Finger, Friction, Polygon, Scene, check_place, check_ranges
-from . import keys
-from .definition import ROWS, End, Phase, Problem, Until
-from .goal import check_goal, name_goal, read_goals
-from .uncertainty import spread_widths
+from ..scene.model import FRICTION as COEFFICIENTS
+from ..scene.model import (
+    PLACE,
+    TURN,
+    Finger,
+    Friction,
+    Polygon,
+    Scene,
+    check_place,
+    check_ranges,
+)
+from .definition import CONTACT, INDEX, ROWS, End, Goal, Phase, Problem, Until
+from .uncertainty import GROUPS, LENGTH, PARAMETERS, spread_widths
 
 _T = TypeVar("_T")
+_GOAL = "allowed is a table with flush or phi_deg, and x"
+Table = Mapping[str, Field]
+"""Keys of a table by name."""
+
+
+_WIDTHS = {
+    field.name: replace(field, default=field.default * (LENGTH if field.unit == "m" else 1))
+    for field in PARAMETERS
+}
+OBJECT, FINGER, FRICTION, PHASE, GOAL = (
+    name_fields(*keys_of(field).values()) for field in (Polygon, Finger, Friction, Phase, Goal)
+)
+FINGERS = name_fields(
+    declare("1", "The right finger.", leave(refer("finger"))),
+    declare("2", "The left finger.", leave(refer("finger"))),
+)
+START = name_fields(
+    declare(
+        "flush", "The edge that lies on the palm; edge 0 runs from vertex 0 to vertex 1.", INDEX
+    ),
+    declare("x", "Of the centroid [m]; both fingers close on the object.", NUMBER, "length", PLACE),
+)
+UNTIL = name_fields(
+    declare("contact", "", leave(refer("contact"))),
+    declare("x", "[m]"),
+    declare("phi_deg", "[degrees]"),
+)
+UNCERTAINTY = {name: _WIDTHS[names[0]] for name, names in GROUPS.items()} | _WIDTHS
+_PARTS = name_fields(
+    *map(declare, ("object", "fingers", "friction", "start")),
+    *(declare(name, default=None) for name in ("uncertainty", "goal", "phases")),
+)
+TOP = name_fields(*keys_of(Problem).values(), *keys_of(Scene).values()) | _PARTS
 
 _THERE = 1e-3  # how far from a goal a plan may end, in radii of gyration and in rad
 
@@ -72,22 +127,21 @@ def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
 
 
 def _build_problem(table: Mapping[str, Any], source: str) -> Problem:
-    check_keys(table, "", keys.TOP)
+    check_keys(table, "", TOP)
     scene = _read_scene(table)
     check_ranges(scene)
-    start = _read_start(scene, _table(table, "start", keys.START))
+    start = _read_start(scene, _table(table, "start", START))
     given = table.get("phases", [])
     if not isinstance(given, list):
         raise InputError("", "phases", f"{given!r} is not a list of [[phases]]")
     uncertainty = None
     if "uncertainty" in table:
-        uncertainty = _table(table, "uncertainty", keys.UNCERTAINTY)
+        uncertainty = _table(table, "uncertainty", UNCERTAINTY)
     return Problem(
         scene=scene,
         start=start,
         phases=tuple(_read_phase(scene, i, entry) for i, entry in enumerate(given)),
         source=source,
-        table=table,
         uncertainty=uncertainty,
         goals=read_goals(table),
         **collect_keys(Problem, table),
@@ -135,12 +189,12 @@ def adopt_phases(problem: Problem, meta: Mapping[str, Any], q: Array, source: st
 
 
 def _read_scene(table: Mapping[str, Any]) -> Scene:
-    polygon = Polygon(**collect_keys(Polygon, _table(table, "object", keys.OBJECT)))
-    fingers = _table(table, "fingers", keys.FINGERS)
-    friction = Friction(**collect_keys(Friction, _table(table, "friction", keys.FRICTION)))
+    polygon = Polygon(**collect_keys(Polygon, _table(table, "object", OBJECT)))
+    fingers = _table(table, "fingers", FINGERS)
+    friction = Friction(**collect_keys(Friction, _table(table, "friction", FRICTION)))
     right, left = (
-        Finger(**collect_keys(Finger, _table(fingers, key, keys.FINGER, name)), name=name)
-        for key, name in ((key, f"fingers.{key}") for key in keys.FINGERS)
+        Finger(**collect_keys(Finger, _table(fingers, key, FINGER, name)), name=name)
+        for key, name in ((key, f"fingers.{key}") for key in FINGERS)
     )
     return Scene(polygon, (right, left), friction, **collect_keys(Scene, table))
 
@@ -181,12 +235,12 @@ def _read_phase(scene: Scene, index: int, entry: object) -> Phase:
     key = f"phases[{index + 1}]"
     if not isinstance(entry, dict):
         raise InputError("", key, f"{entry!r} is not a table")
-    check_keys(entry, key, keys.PHASE)
+    check_keys(entry, key, PHASE)
     names = entry["contacts"]
     if not isinstance(names, list) or not names:
         raise InputError("", f"{key}.contacts", f"{names!r} is not a list of contact names")
     formation = _at(f"{key}.contacts", lambda: read_formation(scene, names))
-    end = End(keys.PHASE["end"].kind.read(entry.get("end", "rest"), f"{key}.end"))
+    end = End(PHASE["end"].kind.read(entry.get("end", "rest"), f"{key}.end"))
     until = Until()
     if "until" in entry:
         until = _at(f"{key}.until", lambda: read_until(scene, entry["until"]))
@@ -228,7 +282,7 @@ def read_until(scene: Scene, given: object) -> Until:
     if isinstance(given, str):
         return Until(contact=parse_contact(given, scene))
     allowed = "allowed are a contact name, or a table with contact, phi_deg or x, or several"
-    if not isinstance(given, dict) or not given or not set(given) <= set(keys.UNTIL):
+    if not isinstance(given, dict) or not given or not set(given) <= set(UNTIL):
         raise InputError("", "", f"{given!r} does not end a phase; {allowed}")
     pins = []
     for key, number in ((key, require_number(given[key], "")) for key in given if key != "contact"):
@@ -249,9 +303,7 @@ def _at(key: str, read: Callable[[], _T]) -> _T:
         raise InputError("", key, error.problem) from None
 
 
-def _table(
-    parent: Mapping[str, Any], key: str, known: keys.Table, name: str = ""
-) -> Mapping[str, Any]:
+def _table(parent: Mapping[str, Any], key: str, known: Table, name: str = "") -> Mapping[str, Any]:
     """The table at a key, with all the keys that it has to have and no others."""
     value = parent[key]
     if not isinstance(value, dict):
@@ -260,7 +312,7 @@ def _table(
     return value
 
 
-def check_keys(table: Mapping[str, Any], where: str, known: keys.Table) -> None:
+def check_keys(table: Mapping[str, Any], where: str, known: Table) -> None:
     """Check that a table has what is required, and nothing unknown."""
     prefix = f"{where}." if where else ""
     for key in table:
@@ -307,12 +359,68 @@ def check_problem(problem: Problem) -> None:
     for phase, following in zip_longest(problem.phases, problem.phases[1:]):
         _check_end(phase, following)
     for index, goal in enumerate(problem.goals):
-        key = name_goal(problem.goals, index, problem.table)
+        key = name_goal(problem.goals, index)
         check_goal(problem.scene, goal, key)
         if problem.phases:
             raise InputError("", key, "given with [[phases]]; allowed is one of the two")
     _check_fingers(problem)
     _check_first_formation(problem)
+
+
+def check_goal(scene: Scene, goal: Goal, key: str) -> None:
+    """Check a goal; `key` is where it stands in a file.
+
+    Raises
+    ------
+    InputError  if it is not one
+    """
+    if (goal.flush is None) == (goal.phi is None):
+        both = "flush and phi_deg are both" if goal.phi is not None else "neither flush nor phi_deg"
+        raise InputError("", key, f"{both} given; allowed is one of the two")
+    count = scene.polygon.n_vertices
+    if goal.phi is not None:
+        TURN.check(f"{key}.phi_deg", round(math.degrees(goal.phi), 9), "degrees")
+    elif not isinstance(goal.flush, int) or isinstance(goal.flush, bool):
+        raise InputError("", f"{key}.flush", f"{goal.flush!r} is not an edge; allowed are integers")
+    elif not 0 <= goal.flush < count:
+        text = f"{goal.flush!r} is not an edge; allowed are 0 to {count - 1}"
+        raise InputError("", f"{key}.flush", text)
+    if goal.x is not None:
+        check_place(scene, f"{key}.x", goal.x)
+
+
+def read_goals(table: Mapping[str, Any]) -> tuple[Goal, ...]:
+    """The goals of a problem file, in the order in which they are visited.
+
+    Raises
+    ------
+    InputError  if what is given is neither a table nor a list of tables, or a key is unknown
+    """
+    given = table.get("goal", [])
+    several = isinstance(given, list)
+    return tuple(
+        _read_goal(entry, f"goal[{index}]" if several else "goal")
+        for index, entry in enumerate(given if several else [given], start=1)
+    )
+
+
+def name_goal(goals: Sequence[Goal], index: int) -> str:
+    """The key of a goal, by its index from 0."""
+    return "goal" if len(goals) == 1 else f"goal[{index + 1}]"
+
+
+def _read_goal(entry: object, key: str) -> Goal:
+    if not isinstance(entry, Mapping):
+        raise InputError("", key, f"{entry!r} given; {_GOAL}")
+    for name in entry:
+        if name not in ("flush", "phi_deg", "x"):
+            raise InputError("", f"{key}.{name}", f"unknown key; {_GOAL}")
+    phi, x = entry.get("phi_deg"), entry.get("x")
+    return Goal(
+        entry.get("flush"),
+        None if phi is None else math.radians(require_number(phi, f"{key}.phi_deg")),
+        None if x is None else require_number(x, f"{key}.x"),
+    )
 
 
 def require_phases(problem: Problem) -> None:
@@ -440,3 +548,106 @@ def _check_first_formation(problem: Problem) -> None:
     if not set(first) <= set(touching):
         text = f"{describe(first)} given, but the closed fingers touch {describe(touching)}"
         raise InputError("", "phases[1].contacts", text)
+
+
+def name_keys() -> dict[str, tuple[str, ...]]:
+    """Short names for `Problem.with_` and the dotted keys that each stands for."""
+    names: dict[str, tuple[str, ...]] = {key: (key,) for key in TOP}
+    names |= {key: (f"object.{key}",) for key in OBJECT}
+    names |= {key: (f"start.{key}",) for key in START}
+    names |= {f"friction_{key}": (f"friction.{key}",) for key in FRICTION}
+    names["friction"] = tuple(f"friction.{key}" for key in FRICTION)
+    for finger, field in FINGER.items():
+        name = f"finger_{finger}" if finger in OBJECT else finger
+        names |= {f"{name}{number}": (f"fingers.{number}.{finger}",) for number in FINGERS}
+        if field.kind is not POINT:
+            names[name] = tuple(f"fingers.{number}.{finger}" for number in FINGERS)
+    return names
+
+
+def build_schema() -> dict[str, Any]:
+    """The JSON Schema of problem files."""
+    goal = {"oneOf": [{"required": ["flush"]}, {"required": ["phi_deg"]}]}
+    until = {
+        "type": "object",
+        "additionalProperties": False,
+        "minProperties": 1,
+        "properties": _describe(UNTIL),
+    }
+    ends = [
+        {"required": ["until"]},
+        {"required": ["end"], "properties": {"end": {"const": "smooth"}}},
+    ]
+    phase = _describe_table(PHASE) | {"anyOf": ends}
+    phase["properties"]["until"]["oneOf"] = [refer("contact"), until]
+    goals = [refer("goal"), {"type": "array", "items": refer("goal")}]
+    parts = {
+        "object": _describe_table(OBJECT),
+        "fingers": _describe_table(FINGERS),
+        "friction": _describe_table(FRICTION, "Coefficients of friction with the object."),
+        "start": _describe_table(START),
+        "uncertainty": _describe_table(
+            UNCERTAINTY, "Ranges of what is not known exactly, for robustness and solve --robust."
+        ),
+        "goal": {
+            "description": "Where the object shall come to lie, in place of phases; several are "
+            "visited in order.",
+            "oneOf": goals,
+        },
+        "phases": {"type": "array", "items": phase},
+    }
+    whole = _describe_table(
+        TOP,
+        "A polygon, a hand of a palm and two fingers, a start, and the contact formations to go "
+        "through. SI units.",
+    )
+    whole["properties"] |= parts
+    definitions = {
+        "contact": CONTACT,
+        "goal": _describe_table(GOAL) | goal,
+        "point": {"type": "array", "minItems": 2, "maxItems": 2, "items": {"type": "number"}},
+        "coefficient": {**NONNEGATIVE.schema, "maximum": COEFFICIENTS.high},
+        "finger": _describe_table(FINGER),
+    }
+    first = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "wholearm problem"}
+    return first | whole | {"definitions": definitions}
+
+
+def _describe(table: Table) -> dict[str, Any]:
+    return {name: field.schema for name, field in table.items()}
+
+
+def _describe_table(table: Table, text: str = "") -> dict[str, Any]:
+    """The schema of a table."""
+    return {
+        "type": "object",
+        **({"description": text} if text else {}),
+        "additionalProperties": False,
+        "required": [name for name, field in table.items() if field.required],
+        "properties": _describe(table),
+    }
+
+
+def write_page() -> str:
+    """All keys of a problem file, as tables in Markdown."""
+    tables = {
+        "At the top": TOP,
+        "`[object]`": OBJECT,
+        "`[fingers.1]`, `[fingers.2]`": FINGER,
+        "`[friction]`": FRICTION,
+        "`[start]`": START,
+        "`[uncertainty]`": UNCERTAINTY,
+        "`[goal]`": GOAL,
+        "`[[phases]]`": PHASE,
+    }
+    parts = []
+    for title, table in tables.items():
+        lines = [f"| {title} | unit | default | allowed | |", "|---|---|---|---|---|"]
+        for name, field in table.items():
+            if name not in _PARTS:
+                text = re.sub(r" ?\[[^]]*\]", "", field.text)
+                default = "required" if field.required else field.describe_default()
+                allowed = ", ".join(filter(None, (one.describe() for one in field.ranges)))
+                lines.append(f"| `{name}` | {field.unit} | {default} | {allowed} | {text} |")
+        parts.append("\n".join(lines) + "\n")
+    return "\n".join(parts)

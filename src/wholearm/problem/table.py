@@ -1,4 +1,4 @@
-"""The table of a problem file: changed by name, in step with its problem, written as TOML."""
+"""The table of a problem file: made of a problem, changed by name, written as TOML."""
 
 from __future__ import annotations
 
@@ -18,13 +18,12 @@ from ..common.fields import Field, keys_of
 from ..common.files import require_ending, write_text
 from ..contacts.closing import close_finger, place_flush
 from ..scene.model import Polygon, Scene
-from .goal import match_goals
 
 if TYPE_CHECKING:
-    from .definition import Phase, Problem, Until
+    from .definition import Goal, Phase, Problem, Until
 
 
-SAME = 9  # decimals of an angle in degrees that are no rounding
+SAME = 9  # decimals of an angle in degrees that a printed phase has at most
 _STEP = re.compile(r"([^.\[\]]+)|\[([1-9][0-9]*)\]")
 
 
@@ -96,37 +95,13 @@ def _to_plain(value: Any) -> Any:
     return [_to_plain(item) for item in value] if isinstance(value, list | tuple) else value
 
 
-def match_table(problem: Problem) -> Mapping[str, Any]:
-    """Return the problem's table with everything that differs from the problem written into it.
-
-    Empty where there is none, or where the start is no edge flush on the palm with both fingers
-    closed, which is all that a file can say.
-    """
-    table = problem.table
-    if not table:
-        return table
-    known = _list_values(("", problem), *_list_parts(problem.scene))
-    differing = {key: value for key, value, own in known if not _agrees(table, key, value, own)}
-    if problem.uncertainty != table.get("uncertainty"):
-        differing["uncertainty"] = _to_plain(problem.uncertainty)
-    start = _match_start(table["start"], problem)
-    if start is None:
-        return {}
-    phases = [_match_phase(table.get("phases", []), phase) for phase in problem.phases]
-    goals = match_goals(problem.goals, table) if problem.goals else None
-    same = start is table["start"] and phases == table.get("phases", [])
-    if not differing and same and goals == table.get("goal"):
-        return table
-    changed = copy.deepcopy({**table, "start": start, "phases": phases})
-    _set(changed, "goal", goals)
-    for key, value in differing.items():
-        _set(changed, key, value)
-    return changed
-
-
 def write_table(problem: Problem) -> Mapping[str, Any]:
-    """The table of a problem that has none; empty where no file can say its start."""
-    start = _match_start({"flush": 0, "x": None}, problem)
+    """The nested tables of a problem file, without defaults.
+
+    Empty where the start is no edge flush on the palm with both fingers closed, which is all that
+    a file can say.
+    """
+    start = _find_start(problem)
     if start is None:
         return {}
     table: dict[str, Any] = {
@@ -134,16 +109,30 @@ def write_table(problem: Problem) -> Mapping[str, Any]:
         for key, value, own in _list_values(("", problem))
         if own.required or value != own.shown_default
     }
-    phases = [_match_phase([], phase) for phase in problem.phases]
-    table |= {"object": {}, "fingers": {"1": {}, "2": {}}, "friction": {}}
-    table |= {"start": start, "phases": phases}
+    table |= {"object": {}, "fingers": {"1": {}, "2": {}}, "friction": {}, "start": start}
     if problem.uncertainty is not None:
         table["uncertainty"] = _to_plain(problem.uncertainty)
-    if problem.goals:
-        table["goal"] = match_goals(problem.goals, {})
-    for key, value in describe_scene(problem.scene).items():
-        _set(table, key, value)
+    goals = [_describe_goal(goal) for goal in problem.goals]
+    if goals:
+        table["goal"] = goals[0] if len(goals) == 1 else goals
+    elif problem.phases:
+        table["phases"] = [describe_phase(phase) for phase in problem.phases]
+    for prefix, part in _list_parts(problem.scene):
+        for key, value, own in _list_values((prefix, part)):
+            if own.required or value != own.shown_default:
+                _set(table, key, value)
     return table
+
+
+def _describe_goal(goal: Goal) -> dict[str, Any]:
+    own = {"flush": goal.flush, "phi_deg": goal.phi and to_degrees(goal.phi), "x": goal.x}
+    return {key: value for key, value in own.items() if value is not None}
+
+
+def to_degrees(angle: float, digits: int = 15) -> float:
+    """An angle [rad] in degrees, with the fewest decimals, at most `digits`, that say the same."""
+    rounded = [round(math.degrees(angle), count) for count in range(6, digits + 1)]
+    return next((one for one in rounded if math.radians(one) == angle), rounded[-1])
 
 
 def describe_scene(scene: Scene) -> dict[str, Any]:
@@ -167,19 +156,7 @@ def _list_values(*parts: tuple[str, object]) -> Iterator[tuple[str, Any, Field]]
             yield f"{prefix}{own.name}", None if value == math.inf else value, own
 
 
-def _agrees(table: Mapping[str, Any], key: str, value: object, own: Field) -> bool:
-    """Whether a table has a value, or leaves out a default."""
-    *path, last = key.split(".")
-    place: Any = table
-    for step in path:
-        place = place[step]
-    if key == "object.inertia" and value is None and last in place:
-        uniform = Polygon(place["vertices"], place["mass"]).inertia
-        return bool(place[last] == uniform)
-    return bool(place.get(last, own.shown_default) == value)
-
-
-def _match_start(start: Mapping[str, Any], problem: Problem) -> Mapping[str, Any] | None:
+def _find_start(problem: Problem) -> dict[str, Any] | None:
     """The table of the start, or None if no edge is flush there or a finger is not closed."""
     q, scene = problem.start[:3], problem.scene
     try:
@@ -188,28 +165,15 @@ def _match_start(start: Mapping[str, Any], problem: Problem) -> Mapping[str, Any
         return None
     if np.abs(problem.start[3:] - closed).max() > 1e-9:
         return None
-    edges = [start["flush"], *range(scene.polygon.n_vertices)]
-    for edge in edges:
-        flush = edge < scene.polygon.n_vertices and place_flush(scene, edge, float(q[0]))
-        if flush is not False and np.abs(flush - q).max() <= 1e-12 * scene.scales.length:
-            same = edge == start["flush"] and q[0] == start["x"]
-            return start if same else {"flush": edge, "x": float(q[0])}
+    for edge in range(scene.polygon.n_vertices):
+        flush = place_flush(scene, edge, float(q[0]))
+        if np.abs(flush - q).max() <= 1e-12 * scene.scales.length:
+            return {"flush": edge, "x": float(q[0])}
     return None
 
 
-def _match_phase(entries: Sequence[Mapping[str, Any]], phase: Phase) -> Mapping[str, Any]:
-    """The entry that says what a phase is, or a new one."""
-    own = describe_phase(phase)
-    for entry in (*entries[phase.index : phase.index + 1], *entries):
-        same = _is_same(entry.get("until"), own.get("until"))
-        same = same and all(entry.get(key) == own.get(key) for key in ("contacts", "settle"))
-        if same and entry.get("end", "rest") == phase.end.value:
-            return entry
-    return own
-
-
-def describe_phase(phase: Phase, digits: int | None = None) -> dict[str, Any]:
-    """A phase as an entry of a file, with angles rounded to so many decimals."""
+def describe_phase(phase: Phase, digits: int = 15) -> dict[str, Any]:
+    """A phase as an entry of a file, with angles of at most so many decimals."""
     own: dict[str, Any] = {"contacts": name_contacts(phase)}
     if not phase.until.is_release:
         own["until"] = write_until(phase.until, digits)
@@ -218,32 +182,19 @@ def describe_phase(phase: Phase, digits: int | None = None) -> dict[str, Any]:
     return own if phase.end.value == "rest" else own | {"end": phase.end.value}
 
 
-def write_until(until: Until, digits: int | None = None) -> Any:
-    """What ends a phase, as its file has it: a name, or a table, with rounded angles if asked."""
+def write_until(until: Until, digits: int = 15) -> Any:
+    """What ends a phase, as its file has it: a name, or a table."""
     if until.contact is not None and not until.pins:
         return until.contact.name
     own: dict[str, Any] = {} if until.contact is None else {"contact": until.contact.name}
     for row, value in until.poses:
-        angle = math.degrees(value)
-        angle = angle if digits is None else round(angle, digits)
-        own["phi_deg" if row else "x"] = angle + 0.0 if row else value + 0.0
+        own["phi_deg" if row else "x"] = (to_degrees(value, digits) if row else value) + 0.0
     return own
 
 
 def format_until(until: Until) -> str:
     """The value of `until` in a problem file, to read."""
     return _write(write_until(until, SAME))
-
-
-def _is_same(given: Any, own: Any) -> bool:
-    """Whether an `until` says the same as another one, in the same order."""
-    if not isinstance(given, Mapping) or not isinstance(own, Mapping):
-        return bool(given == own)
-    # An angle of a file is known in radians, to whose rounding its degrees are the same.
-    return list(given) == list(own) and all(
-        math.radians(value) == math.radians(own[key]) if key == "phi_deg" else value == own[key]
-        for key, value in given.items()
-    )
 
 
 def name_contacts(phase: Phase) -> list[str]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from typing import Any, Protocol
 
 from ..common.errors import InputError
 from ..common.files import require_ending, write_text
 from ..common.journal import Difference, describe_differences, find_differences
 from ..problem.definition import Problem
-from ..problem.read import adopt_phases, require_phases
+from ..problem.read import adopt_phases, build_problem, require_phases
 from ..problem.table import save_problem
 from .torque import TorqueProfile, format_rows, place_rows
 from .trajectory import Trajectory
@@ -153,6 +154,9 @@ def describe_origin(problem: Problem, meta: Mapping[str, Any], what: str = "plan
 
 
 def _find(own: Mapping[str, Any], problem: Problem) -> Iterator[Difference]:
+    with suppress(InputError):
+        # Files of earlier versions have the tables as they were written by hand.
+        own = build_problem(own).table or own
     # Phases take the place of goals in plans.
     free = (*_FREE, ".phases") if "goal" in problem.table else _FREE
     return find_differences(own, problem.table, free)

@@ -16,7 +16,7 @@ from itertools import count
 from typing import NamedTuple
 
 from ..common.signals import beat
-from ..problem.goal import Goal
+from ..problem.definition import Goal
 from .edges import Blocked, Link
 from .places import Key, RoadmapPlace, is_at, measure_turn
 from .roadmap import Ahead, Chain, Roadmap

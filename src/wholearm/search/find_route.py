@@ -41,8 +41,8 @@ from ..contacts.formation import Formation
 from ..planning.advice import unadvised
 from ..planning.options import Objective, PlanOptions
 from ..planning.plan import solve_with
-from ..problem.definition import Phase, Problem
-from ..problem.goal import Goal, name_goal
+from ..problem.definition import Goal, Phase, Problem
+from ..problem.read import name_goal
 from ..problem.table import describe_scene
 from ..scene.model import Scene
 from .astar import EAGER, RoadmapRoute, RouteSearch
@@ -148,7 +148,7 @@ def find_route_with(
             start = problem.start if not before else before[-1].links[-1].stop.z
             place = make_place(problem.scene, start)
             if is_at(place, goal):
-                key = name_goal(problem.goals, index, problem.table)
+                key = name_goal(problem.goals, index)
                 reason = f"{goal} holds already where the motion starts"
                 raise InputError(problem.source, key, reason)
             require_reach(problem.scene, goal, float(start[2]))

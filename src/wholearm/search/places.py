@@ -14,8 +14,7 @@ from ..contacts.formation import Formation, find_touching
 from ..geometry.curve import Curve, describe_pose, find_root, refine
 from ..geometry.explore import close_contacts
 from ..geometry.tracing import HELD
-from ..problem.definition import Until
-from ..problem.goal import Goal
+from ..problem.definition import Goal, Until
 from ..scene.model import Scene
 
 ACROSS = np.linspace(-1.5, 1.5, 13)  # sampled x of goals without x, in radii of gyration

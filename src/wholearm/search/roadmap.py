@@ -37,8 +37,7 @@ from ..planning.lower_bound.path_terms import GIVE
 from ..planning.lower_bound.speed_sweep import make_cosine_grid, speed_sweep
 from ..planning.path_domain.impact_sequence import BEND, compute_curve_impact
 from ..planning.result import Plan
-from ..problem.definition import End, Phase, Problem, Until
-from ..problem.goal import Goal
+from ..problem.definition import End, Goal, Phase, Problem, Until
 from ..scene.model import Scene
 from .border_limits import Unstopped
 from .edges import (

@@ -150,7 +150,6 @@ def in_own_units(problem: Problem) -> Problem:
         epsilon=problem.epsilon / scales.force,
         start=scale_state(problem.start, scales),
         phases=phases,
-        table={},
     )
 
 
