@@ -23,14 +23,14 @@ from wholearm.mechanics import limits as limits_module
 from wholearm.mechanics.dynamics import LAMBDA, ONE, A, B, V, build_forward, inverse, stack_motion
 from wholearm.mechanics.limits import CONE, PRESS, LimitSet, MotionLimit, make_limits
 from wholearm.mechanics.path_limits import PathLimits, find_speed_cap
-from wholearm.planning.lower_bound.lower_bound import bound_least_time, look_along
-from wholearm.planning.lower_bound.speed_sweep import (
+from wholearm.mechanics.speed_sweep import (
     NoMotionError,
     SweepMode,
     find_duration,
     make_cosine_grid,
     speed_sweep,
 )
+from wholearm.planning.lower_bound.lower_bound import bound_least_time, look_along
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.path_data import prepare
 from wholearm.planning.path_domain.path_motion import PathMotion

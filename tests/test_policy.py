@@ -21,9 +21,8 @@ from wholearm.mechanics.dynamics import build_forward
 from wholearm.policy.curve_law import CurveLaw, MotionLaw, choose_internal_force
 from wholearm.policy.curve_rows import find_within, list_scenes
 from wholearm.policy.make import SAME, find_widest, hold_end, make_policy
-from wholearm.policy.reference_motion import retime_within
+from wholearm.policy.reference_motion import retime, retime_within
 from wholearm.policy.regulator import RATE, Linear, regulate
-from wholearm.policy.retiming import retime
 from wholearm.robustness.sample_run import make_trial
 from wholearm.simulation.simulate import simulate_free
 from wholearm.verification.policy_check import verify_policy

@@ -28,12 +28,12 @@ from ..common.errors import (
 from ..geometry.curve import Curve
 from ..geometry.tracing import trace_phase
 from ..mechanics.dynamics import measure_speed
+from ..mechanics.speed_sweep import NoMotionError
 from ..problem.definition import Phase, Problem
 from ..results.trajectory import Motion
 from ..scene.model import Scene
 from ..solvers.ipopt import charge
 from .lower_bound.lower_bound import look_along
-from .lower_bound.speed_sweep import NoMotionError
 from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence, make_sequence, plan_sequence, plan_slowly
 from .phase_plan import PhasePlan, Settled, add_up

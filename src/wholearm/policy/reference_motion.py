@@ -12,6 +12,8 @@ from ..common.arrays import Array
 from ..geometry.curve import Curve, directions_of
 from ..geometry.tracing import trace_phase
 from ..mechanics.dynamics import inverse, metric_weights
+from ..mechanics.path_limits import PathLimits
+from ..mechanics.speed_sweep import ControllableSet, find_controllable, find_duration
 from ..problem.definition import End, Phase, Problem
 from ..results.trajectory import Trajectory
 from .curve_rows import (
@@ -25,7 +27,6 @@ from .curve_rows import (
     split_limits,
 )
 from .regulator import find_planned_internal_force
-from .retiming import ENOUGH, Reach, retime
 
 INTERVALS = 120  # intervals of a curve's table, dense at its ends
 PLACES = 400  # places of a curve at which the nearest one is searched first
@@ -35,6 +36,12 @@ ARRIVAL = 3e-3  # time constant of the approach to the end [s]
 # Squared speeds over the plan's that are tried until there is a margin, or less of it: relative
 # errors of torques matter less where torques are small.
 SLOWER = (1.0, 0.5, 0.25, 0.12, 0.06)
+# Shares of the margin that are tried, the largest first. Negative ones: limits of a plan hold
+# between its own nodes, so that at others they may be violated a little.
+SHARES = (*(0.8**k for k in range(12)), 0.04, 0.0, -0.1, -0.2, -0.4, -0.8)
+SLOWEST = 0.1  # least b over the plan's of a motion with a margin: slow motions can stick
+PARTS = (0.5, 0.2, 0.0)  # upper limits of the share of all intervals, if some interval has less
+NEAR, ENOUGH = 0.8, 0.4  # least share, over such a limit and in all, that needs no further one
 REFINE = 2  # iterations between a slower motion's internal force and its margins
 ROUNDS = 3  # iterations between worst corners and motion
 LEAST_SHARE = 0.5  # least share of the margins within ranges; with less the ranges are too wide
@@ -48,7 +55,7 @@ class ReferencePiece(NamedTuple):
 
     curve: Curve
     rows: CurveLimitRows
-    reach: Reach
+    reach: ControllableSet
     share: float  # least share of the margin
     begins: float  # [m^2/s^2]: the plan's b at the start
     passes: float  # ratio of b after and before the impact at the end; zero at rest
@@ -57,8 +64,7 @@ class ReferencePiece(NamedTuple):
     @property
     def duration(self) -> float:
         """Duration of the reference [s]."""
-        speeds = np.sqrt(self.b)
-        return float((2 * np.diff(self.rows.s) / (speeds[1:] + speeds[:-1])).sum())
+        return float(find_duration(self.b, np.diff(self.rows.s)))
 
     @property
     def reserves(self) -> dict[str, float]:
@@ -98,7 +104,7 @@ def trace_pieces(
     before: ReferencePiece | None = None
     for k, piece in enumerate(pieces):
         if piece is not None:
-            first = float(piece.reach.most[0])
+            first = float(piece.reach.high[0])
             if before is not None and before.passes:
                 first = float(before.b[-1]) * before.passes
             piece = pieces[k] = piece._replace(b=piece.reach.run(first))
@@ -118,7 +124,7 @@ def _trace(
     touch, begins, passes, end = TOUCH * problem.scene.scales.speed, float(b[0]), 0.0, None
     if phase.end is End.IMPACT and after is not None and b[-1] > touch**2:
         passes = after.begins / float(b[-1])
-        end = float(after.reach.least[0] / passes), float(after.reach.most[0] / passes)
+        end = float(after.reach.low[0] / passes), float(after.reach.high[0] / passes)
     else:
         b = np.minimum(b, (touch + (curve.length - s) / ARRIVAL) ** 2)
     if reserve.ranges is not None and reserve.size:
@@ -126,7 +132,7 @@ def _trace(
         within, share = retime_within(curve, s, planned, reserve.scale(), problem.epsilon, end)
         if within is not None:
             return ReferencePiece(curve, *within, share, begins, passes, b)
-    best: tuple[CurveLimitRows, Reach, float] | None = None
+    best: tuple[CurveLimitRows, ControllableSet, float] | None = None
     for factor in SLOWER:
         motion = factor * a, factor * b
         rows = make_rows(curve, s, (*motion, internal))
@@ -148,6 +154,39 @@ def _trace(
     return ReferencePiece(curve, rows, found, share, begins, passes, b)
 
 
+def retime(
+    s: Array,
+    slack: Array,
+    reserve: Array,
+    cap: Array,
+    end: tuple[float, float] | None = None,
+    parts: Sequence[float] = PARTS,
+) -> ControllableSet:
+    """Controllable motions nowhere faster than a plan, with the largest least share of margins.
+
+    Parameters
+    ----------
+    s : (n,) [m]          nodes
+    slack : (n, m, 5)     limits at the nodes, as in `CurveLimitRows`
+    reserve : (n, m)      their margins
+    cap : (n,) [m^2/s^2]  largest b
+    end : [m^2/s^2]       least and largest b at the last node; by default the last of `cap`
+    parts                 upper limits of the share, tried where some interval has less
+    """
+    limits, floor, end = PathLimits(slack, cap), SLOWEST * cap, end or (cap[-1], cap[-1])
+    best: ControllableSet | None = None
+    for part in (1.0, *parts):
+        # A large share in one interval can reduce that of another one.
+        shares = [part, *(share for share in SHARES if share < part)]
+        found = find_controllable(limits, reserve, np.diff(s), floor, end, shares)
+        if best is None or found.share.min() > best.share.min():
+            best = found
+        if best.share.min() >= min(NEAR * part, ENOUGH):
+            break
+    assert best is not None
+    return best
+
+
 def retime_within(
     curve: Curve,
     s: Array,
@@ -155,7 +194,7 @@ def retime_within(
     widths: Mapping[str, float],
     least: float,
     end: tuple[float, float] | None = None,
-) -> tuple[tuple[CurveLimitRows, Reach] | None, float]:
+) -> tuple[tuple[CurveLimitRows, ControllableSet] | None, float]:
     """The fastest motion that keeps its limits within the largest feasible share of ranges.
 
     Fixed-point iteration between the worst corners of the ranges and the motion.
@@ -173,13 +212,13 @@ def retime_within(
     tuple  the law's limits and the motions, None if there are none; and the share of the ranges
     """
 
-    def find(share: float) -> tuple[CurveLimitRows, Reach] | None:
+    def find(share: float) -> tuple[CurveLimitRows, ControllableSet] | None:
         scaled = {name: min(share * width, WIDEST) for name, width in widths.items()}
         within, motion = find_within(curve, s, np.sqrt(plan[1]), scaled, least), plan
         for _ in range(ROUNDS):
             rows, whole, wanted = within.at(motion)
             found = retime(s, whole, wanted, plan[1], end, ())
-            b = found.run(float(found.most[0]))
+            b = found.run(float(found.high[0]))
             if found.share.min() < LEAST_SHARE:
                 return None
             a = np.gradient(b, s) / 2

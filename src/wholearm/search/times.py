@@ -14,9 +14,9 @@ from ..mapping.formation_map import Border
 from ..mechanics.dynamics import Directions, inverse, metric_weights, reduced_inertia
 from ..mechanics.limits import make_limits
 from ..mechanics.path_limits import PathLimits
+from ..mechanics.speed_sweep import make_cosine_grid, speed_sweep
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN, find_minors
 from ..planning.lower_bound.path_terms import GIVE
-from ..planning.lower_bound.speed_sweep import make_cosine_grid, speed_sweep
 from ..problem.definition import Problem
 
 NODES = 24  # intervals of a border

@@ -17,8 +17,7 @@ from ...common.arrays import Array
 from ...geometry.curve import Curve
 from ...mechanics.dynamics import ONE, A, B, V
 from ...mechanics.path_limits import Extreme, PathLimits
-from .path_terms import PathGrid, PathTerms
-from .speed_sweep import (
+from ...mechanics.speed_sweep import (
     NoMotionError,
     SpeedProfile,
     SweepMode,
@@ -26,6 +25,7 @@ from .speed_sweep import (
     join_caps,
     speed_sweep,
 )
+from .path_terms import PathGrid, PathTerms
 
 _TOLERANCE = 3e-8  # loss of the bound, and its error, relative to the time
 GRID_INTERVALS = 100  # of the first grid

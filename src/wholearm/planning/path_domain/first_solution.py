@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ...common.arrays import Array
 from ...mechanics.path_limits import PathLimits
-from ..lower_bound.speed_sweep import SweepMode
+from ...mechanics.speed_sweep import SweepMode
 from ..options import Objective
 from .elements import DEGREE, FROM_REST, INSIDE, TO_REST, Grid, Profile, find_basis
 from .path_data import PhaseData

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ...common.arrays import Array
 from ...mechanics.dynamics import ONE
 from ...mechanics.path_limits import PathLimits
-from ..lower_bound.speed_sweep import NoMotionError, SweepMode, find_duration, speed_sweep
+from ...mechanics.speed_sweep import NoMotionError, SweepMode, find_duration, speed_sweep
 from .elements import Profile
 from .first_guess import find_middle
 from .path_data import PhaseData

@@ -7,17 +7,19 @@ constant and the limits are kept at one place. Many paths are swept at once.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...common.arrays import Array
-from ...mechanics.dynamics import ONE, A, B, V
-from ...mechanics.path_limits import PathLimits
+from ..common.arrays import Array
+from .dynamics import ONE, A, B, V
+from .path_limits import PathLimits
 
 _ROUNDING = 1e-12  # negative b at the end that is rounding, over the largest b
+_TIED = 1e-9  # overlap of bounds of b that is rounding, over the largest b
 _SETTLED = 2e-3  # relative change of b at which the linearization is good: the error is its square
 _UNBOUNDED = 1e100  # b [m^2/s^2] where no limit bounds it; case: the map of a rolling octagon
 
@@ -117,13 +119,7 @@ def _sweep(
     rows: Array, steps: Array, part: Array, cap: Array, b_guess: Array | None
 ) -> SpeedProfile:
     """One sweep of w paths, with rows (w, N, m, 4)."""
-    one, of_b = rows[..., ONE], rows[..., B]
-    if b_guess is not None:
-        speed = np.sqrt(np.maximum(b_guess, 0.0))[..., None]
-        drag = np.divide(rows[..., V], 2 * speed, out=np.zeros_like(one), where=speed > 0)
-        of_b, one = of_b + drag, one + rows[..., V] * speed / 2
-    of_a = rows[..., A] / (2 * steps)[:, None]
-    before, after = (1 - part)[:, None] * of_b - of_a, part[:, None] * of_b + of_a
+    before, after, one = _split(rows, steps, part, b_guess)
     before, after, one = (np.ascontiguousarray(x.swapaxes(0, 1)) for x in (before, after, one))
     # From one node's b, bounds of the other's: slopes and values at zero, interval by interval.
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -165,6 +161,19 @@ def _sweep(
     return SpeedProfile(np.maximum(b, 0.0).T, modes.T, blocked)
 
 
+def _split(
+    rows: Array, steps: Array, part: Array, b_guess: Array | None = None
+) -> tuple[Array, Array, Array]:
+    """Coefficients of rows before b + after b' + one >= 0 of b and b' at the ends of intervals."""
+    one, of_b = rows[..., ONE], rows[..., B]
+    if b_guess is not None:
+        speed = np.sqrt(np.maximum(b_guess, 0.0))[..., None]
+        drag = np.divide(rows[..., V], 2 * speed, out=np.zeros_like(one), where=speed > 0)
+        of_b, one = of_b + drag, one + rows[..., V] * speed / 2
+    of_a = rows[..., A] / (2 * steps)[:, None]
+    return (1 - part)[:, None] * of_b - of_a, part[:, None] * of_b + of_a, one
+
+
 def _find_corners(before: Array, after: Array, one: Array) -> Array:
     """Largest b from which rows before b + after b' + one >= 0, (w, m), leave some b' >= 0."""
     none = np.zeros((len(one), 1))
@@ -176,3 +185,91 @@ def _find_corners(before: Array, after: Array, one: Array) -> Array:
     bounded = (rise > 0) & (fall > 0) & (slope < 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.where(bounded, value / -slope, np.inf).min(axis=(1, 2)))
+
+
+class ControllableSet(NamedTuple):
+    """Squared speeds at n nodes of a path from which its end can be reached."""
+
+    low: Array  # low, high (n,) [m^2/s^2]: range of b
+    high: Array
+    share: Array  # (n - 1,): share of the margins that each interval keeps
+    rows: list[Array]  # (m, 3): limits before b + after b' + one >= 0 of each interval
+
+    def run(self, first: float) -> Array:
+        """Forward pass: b at the nodes of the fastest motion from b = `first`, shape (n,)."""
+        b = np.full(len(self.low), first)
+        for k, (before, after, one) in enumerate(rows.T for rows in self.rows):
+            falls = after < 0
+            fastest = float(((before[falls] * b[k] + one[falls]) / -after[falls]).min())
+            b[k + 1] = min(max(fastest, self.low[k + 1]), self.high[k + 1])
+        return b
+
+
+def find_controllable(
+    limits: PathLimits,
+    margins: Array,
+    steps: Array,
+    floor: Array,
+    end: tuple[float, float],
+    shares: Sequence[float],
+) -> ControllableSet:
+    """Backward pass in which each interval keeps the largest feasible share of margins.
+
+    The limits are kept at both ends of each interval, each with its own internal force. Viscous
+    terms are those at the largest speed.
+
+    Parameters
+    ----------
+    limits          at the n nodes, with the internal force: rows (n, m, 5)
+    margins : (n, m)  slack that a share of 1 leaves
+    steps, floor    lengths of the intervals, (n - 1,), and least b at the nodes, (n,)
+    end             least and largest b at the last node
+    shares          that are tried, the largest first; with the last one only `limits.cap` is
+                    feasible if nothing is
+    """
+    rows, tight = (each.eliminate().rows.copy() for each in (limits, limits.relax(-margins)))
+    losses = rows[..., ONE] - tight[..., ONE]
+    rows[..., ONE] += rows[..., V] * np.sqrt(limits.cap)[:, None]
+    first = _split(rows[:-1], steps, np.zeros(len(steps)))
+    last = _split(rows[1:], steps, np.ones(len(steps)))
+    table = np.stack([np.hstack(pair) for pair in zip(first, last, strict=True)], axis=-1)
+    losses = np.hstack([losses[:-1], losses[1:]])
+    low, high, share = floor.copy(), limits.cap.copy(), np.full(len(steps), shares[-1])
+    low[-1], high[-1] = end
+    found = list[Array]()
+    for k in range(len(steps) - 1, -1, -1):
+        box = np.array([[0.0, -1.0, high[k + 1]], [0.0, 1.0, -low[k + 1]]])
+        bounding = (table[k, :, :2] != 0).any(axis=1) | (losses[k] != 0)
+        here, loss = table[k, bounding], losses[k, bounding]
+        chosen, least, most = box, floor[k], limits.cap[k]
+        begin, stop = 0, len(shares)
+        while begin < stop:
+            middle = begin if begin == 0 else (begin + stop) // 2
+            tried = np.vstack([here, box])
+            tried[:-2, 2] -= shares[middle] * loss
+            slowest, fastest = _find_range(tried)
+            slowest, fastest = max(slowest, floor[k]), min(fastest, limits.cap[k])
+            if slowest <= fastest + _TIED * limits.cap[k]:
+                chosen, least, most, stop = tried, slowest, fastest, middle
+                share[k] = shares[middle]
+            else:
+                begin = middle + 1
+        found.append(chosen)
+        low[k], high[k] = least, most
+    return ControllableSet(low, high, share, found[::-1])
+
+
+def _find_range(rows: Array) -> tuple[float, float]:
+    """Least and largest b for which rows before b + after b' + one >= 0, (m, 3), leave some b'."""
+    before, after, one = (rows / np.abs(rows).max(axis=1, keepdims=True).clip(1e-300)).T
+    up, down, flat = after > 0, after < 0, after == 0
+    rise, fall = after[up, None], -after[down]
+    value = np.append(fall * one[up, None] + rise * one[down], one[flat])
+    slope = np.append(fall * before[up, None] + rise * before[down], before[flat])
+    if (value[slope == 0] < -_ROUNDING).any():
+        return 1.0, -1.0
+    low, high = slope > 0, slope < 0
+    return (
+        float((-value[low] / slope[low]).max(initial=-np.inf)),
+        float((-value[high] / slope[high]).min(initial=np.inf)),
+    )
