@@ -25,6 +25,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 def pytest_addoption(parser: pytest.Parser) -> None:
     text = "multiply every number of every scene by 1 + k 2^-52, k from -4 to 4, drawn by SEED"
     parser.addoption("--rounding", type=int, metavar="SEED", help=text)
+    text = "run every command line of the documentation, also those that take seconds to minutes"
+    parser.addoption("--slow", action="store_true", help=text)
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -9,7 +9,9 @@ import shlex
 import subprocess
 import sys
 import tomllib
+from collections.abc import Callable
 from functools import cache
+from glob import glob
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ import pytest
 
 import wholearm
 from once import once
-from shipped import FOLDER, HEPTAGON, LANDING, chart, problem_of, solved
+from shipped import FOLDER, HEPTAGON, HEXAGON, LANDING, chart, problem_of, solved
 from wholearm import Plan, Problem
 from wholearm.cli.arguments import name_simulator, protect
 from wholearm.cli.command import build_parser, main
@@ -161,8 +163,21 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     tuned = read(FOLDER / "torques" / "heptagon_tuned.csv")
     (tmp_path / "tuned.csv").write_text(tuned, encoding="utf-8")
     block = list_blocks(FOLDER / "README.md", "toml")[0]
-    (tmp_path / "flip.toml").write_text(block, encoding="utf-8")
+    for name in ("flip.toml", "goal.toml"):
+        (tmp_path / name).write_text(block, encoding="utf-8")
+    wholearm.save(problem_of(HEPTAGON), "problem.toml")
     return tmp_path
+
+
+@once
+def flip() -> Plan:
+    return wholearm.solve(wholearm.load("flip.toml"))
+
+
+@once
+def pent() -> Plan:
+    assert main(shlex.split(next(line for line in LINES if "new pent" in line))[1:]) == 0
+    return wholearm.solve(wholearm.load("pent.toml"))
 
 
 @once
@@ -206,23 +221,40 @@ def test_shell_lines_are_read(line: str, folder: Path) -> None:
             assert error.code == 0
 
 
-@pytest.mark.parametrize("pages", [PAGES, [FOLDER / "README.md"]], ids=["package", "problems"])
-def test_quick_shell_lines_run(
-    pages: list[Path], folder: Path, capsys: pytest.CaptureFixture[str]
+PLANS: dict[str, Callable[[], Any]] = {
+    "hexagon.npz": lambda: solved(HEXAGON),
+    "time.npz": lambda: solved(HEPTAGON),
+    "margin.npz": lambda: solved(HEPTAGON, "margin"),
+    "policy.npz": lambda: policy(),
+    "flip.npz": lambda: flip(),
+    "pent.npz": lambda: pent(),
+}
+"""Files that other lines of the documentation have written."""
+RUN = [
+    line
+    for line in LINES
+    if len(line.split()) > 2 and line.split()[1] != "bench" and not re.search("COMMAND|FILE", line)
+]
+
+
+@pytest.mark.parametrize("line", RUN)
+def test_shell_lines_run(
+    line: str, folder: Path, request: pytest.FixtureRequest, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    solved(LANDING).save("pent.npz")
-    run = 0
-    for line in dict.fromkeys(line for path in pages for line in list_lines(path)):
-        words = shlex.split(line)
-        if (
-            len(words) < 3
-            or words[1] not in QUICK
-            or not {"--policy", "--free", "free"}.isdisjoint(words)
-        ):
-            continue
-        run += 1
-        assert main(words[1:]) == 0, (line, capsys.readouterr().err)
-    assert run >= 2
+    words = shlex.split(line)[1:]
+    quick = words[0] in QUICK and not {"--policy", "--free", "free"} & {*words}
+    if not quick and not request.config.getoption("--slow"):
+        pytest.skip("slow: --slow runs it")
+    if "mujoco" in words:
+        pytest.importorskip("mujoco")
+    if "pent.toml" in words:
+        pent()
+    made = {option + 1 for option, word in enumerate(words) if word in ("-o", "--torques")}
+    for place, word in enumerate(words):
+        if word in PLANS and place not in made:
+            PLANS[word]().save(word)
+    words = [own for word in words for own in (glob(word) if "*" in word else [word])]
+    assert main(words) == 0, capsys.readouterr().err
 
 
 def test_results_are_one_line_and_motions_a_picture() -> None:
@@ -294,3 +326,20 @@ def test_set_up_takes_two_commands_which_are_those_of_ci() -> None:
     script = read(ROOT / ".ci" / "run")
     assert testing in script.splitlines()
     assert solving.split("wholearm ")[1].split(" -o")[0] in script
+
+
+def test_the_simulator_shares_with_the_planner_what_it_says() -> None:
+    """The mechanics and the friction cones; formations and problems are the data model."""
+    folder = SOURCE / "simulation"
+    doc = ast.get_docstring(ast.parse((folder / "__init__.py").read_text(encoding="utf-8"))) or ""
+    shared = set()
+    for path in folder.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.level == 2:
+                module = node.module or ""
+                assert module.split(".")[0] in {*re.findall(r"`(\w+)`", doc), "common", "mechanics"}
+                if module.startswith("mechanics.") or module == "contacts.cones":
+                    assert f"`{module}`" in doc
+                    shared |= {alias.name for alias in node.names}
+    said = set(re.findall(r"`(\w+)`", doc)) - {"scene", "contacts", "problem", "results"}
+    assert shared == said

@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+import wholearm
 from independent import balances, integrate_phase
 from plane import stack_rows
 from planned import (
@@ -35,6 +36,7 @@ from retelling import RETELLINGS, Retelling
 from scenes import hexagon, measure_fingers, shorten, slid
 from shipped import HEPTAGON, IMPACTS, plan_of, problem_of
 from wholearm import Formation, Phase, Problem, TorqueProfile, Trajectory, Until, simulate, verify
+from wholearm.benchmark.precision.reference import solve_motion
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, JammingError, SimulationError
 from wholearm.contacts.elemental import parse_contact
@@ -45,8 +47,12 @@ from wholearm.problem.read import build_problem
 from wholearm.scene.model import Finger, Friction, Scene
 from wholearm.simulation import runge_kutta
 from wholearm.simulation.events import Event, EventKind, OutcomeKind, Simulation
-from wholearm.simulation.rest import Collapse, find_rest
+from wholearm.simulation.hand import build_system
+from wholearm.simulation.modes import Grips, Mode, respond
+from wholearm.simulation.rest import Collapse, close_contacts, find_rest
 from wholearm.simulation.root_finding import find_root
+from wholearm.simulation.stepper import Modes, ModeStepper, build_stepper
+from wholearm.simulation.system import ContactRows
 
 
 def pick(index: int) -> tuple[Problem, CosineMotion]:
@@ -656,3 +662,110 @@ def test_answers_agree(make: Callable[[], Told], telling: Retelling) -> None:
     assert np.abs((other.z[-1] - ends) / [length, length, 1.0, 1.0, 1.0]).max() < 1e-8
     assert other.steps == pytest.approx(first.steps, abs=3)
     assert np.abs(other.energies.residual).max() < 1e-9 * np.abs(other.energies.work).max()
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("v0-palm", "v1-palm", "v2-finger1", "v5-finger2"),
+        ("v1-palm", "e3-tip1", "v6-finger2", "e6-tip2"),
+    ],
+)
+def test_baseline_agrees_with_the_dynamics(names: tuple[str, ...]) -> None:
+    problem, _ = plan()
+    formation = Formation(problem.scene, tuple(parse_contact(n, problem.scene) for n in names))
+    rng = np.random.default_rng(4)
+    for _ in range(5):
+        # Neither needs closed contacts: the equations are linear in the unknowns anywhere.
+        z, v = problem.start + 0.1 * rng.normal(size=5), rng.normal(size=5)
+        tau, signs = rng.normal(size=2), rng.choice([-1.0, 1.0], size=6)
+        directions = Directions(signs[:4], signs[4:])
+        expected = forward(formation, z, v, tau, directions)
+        found = solve_motion(problem.scene, formation.contacts, z, v, tau, *directions)
+        for a, b in zip(found, expected, strict=True):
+            assert np.allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max())
+
+
+@pytest.mark.parametrize("power", range(8))
+def test_weights_integrate_polynomials(power: int) -> None:
+    nodes = np.array(runge_kutta.NODES)
+    total = sum(w * nodes[j] ** power for j, w in runge_kutta.WEIGHTS.items())
+    assert total == pytest.approx(1 / (power + 1), abs=1e-14)
+
+
+def load_stepper(formation: Formation, grips: Grips, degree: int) -> ModeStepper:
+    """Steps of a formation in which friction holds some contacts and joints."""
+    system = build_system(formation.scene)
+    pairs = [system.names.index(name) for name in formation.names]
+    stuck = tuple(tuple(pairs[row] for row in rows) for rows in grips.contacts)
+    modes = Modes(tuple(pairs), stuck, tuple(3 + joint for joint in grips.joints))
+    s = build_stepper(system.structure, modes, degree)
+    s.load(system, 1e-9)
+    return s
+
+
+def test_order_on_the_real_dynamics() -> None:
+    _, trajectory = plan()
+    motion = trajectory.motions[1]
+    # One smooth piece for the whole phase, so that only the steps limit the error.
+    torque = motion.fit(1, 24)  # type: ignore[attr-defined]
+    s = load_stepper(plan()[0].phases[1].formation, Grips(), 24)
+    segment = motion.curve.segments[0]  # type: ignore[attr-defined]
+
+    def integrate(count: int) -> np.ndarray:
+        inputs, at = s.inputs, s.at
+        start = motion.evaluate(np.array([0.05]))
+        inputs[at.y] = [*start.z[0], *start.z_dot[0], *np.zeros(4)]
+        inputs[at.Xi], inputs[at.sigma] = segment.Xi, [0, 0, 0, *segment.sigma]
+        inputs[at.piece], inputs[at.torque] = torque.breaks, torque.coefficients.ravel()
+        inputs[at.h] = 0.3 / count
+        for k in range(count):
+            inputs[at.t] = 0.05 + 0.3 * k / count
+            s.step()
+            inputs[at.y] = s.outputs[s.to.y]
+        return np.array(s.outputs[s.to.y])
+
+    fine = integrate(64)
+    errors = [np.abs(integrate(count) - fine).max() for count in (3, 6)]
+    # Errors stay above 1e-12, well clear of rounding.
+    assert errors[1] > 1e-13
+    assert np.log2(errors[0] / errors[1]) > 7.5
+    exact = motion.evaluate(np.array([0.35]))
+    # A single polynomial of degree 24 follows the torques to about 1e-8.
+    assert np.allclose(fine[:10], np.hstack([exact.z[0], exact.z_dot[0]]), atol=1e-7, rtol=0)
+
+
+@pytest.mark.parametrize("grips", [Grips(), Grips(contacts=((1,),)), Grips(joints=(0,))])
+def test_rates_are_those_of_the_formations_own_rows(grips: Grips) -> None:
+    problem = wholearm.load("problems/heptagon.toml")
+    free = problem.phases[2].formation
+    formations = [free] if len(grips) else [phase.formation for phase in problem.phases[:2]]
+    rng = np.random.default_rng(3)
+    for formation in formations:
+        # On the constraints, where gaps and slip of pairs are those of contacts.
+        z = close_contacts(formation, problem.start + 1e-3 * rng.standard_normal(5))
+        mode, s = Mode(formation, grips), load_stepper(formation, grips, 1)
+        v = rng.standard_normal(5)
+        signs = rng.choice([-1.0, 1.0], formation.n_contacts + 2)
+        signs[[row for rows in grips.contacts for row in rows]] = 0.0
+        signs[[formation.n_contacts + joint for joint in grips.joints]] = 0.0
+        tau = rng.standard_normal(2)
+        inputs, at, to = s.inputs, s.at, s.to
+        inputs[at.y], inputs[at.t] = [*z, *v, *np.zeros(4)], 0.7
+        inputs[at.Xi], inputs[at.sigma] = signs[:-2], [0, 0, 0, *signs[-2:]]
+        inputs[at.piece], inputs[at.torque] = (0.0, 2.0), [tau[0], 0.0, tau[1], 0.0]
+        s.look()
+        kinematics = formation.evaluate(z[None], v[None])
+        turn = 1e-7 * v
+        ahead, back = (formation.evaluate((z + k * turn)[None], v[None]) for k in (1, -1))
+        bends = (ahead.A_t[0] - back.A_t[0]) @ v / 2e-7
+        rows = ContactRows(kinematics.A[0], kinematics.A_t[0], kinematics.A_dot_v[0], bends)
+        response = respond(mode, signs, rows, v)
+        assert response is not None
+        load = np.array([1.0, *tau])
+        accelerations = response.acceleration @ load
+        assert s.outputs[to.acceleration] == pytest.approx(accelerations, rel=1e-6, abs=1e-9)
+        held = response.force_limits @ load
+        margins = s.outputs[to.values][: s.rows.cone.stop]
+        assert margins == pytest.approx(held / mode.force_limit_units, rel=1e-6)
+        assert s.outputs[to.c_n] == pytest.approx(held[: formation.n_contacts], rel=1e-6)

@@ -16,21 +16,26 @@ from planned import CosineMotion
 from scenes import roll
 from shipped import HEPTAGON
 from timed import drive, landing
-from wholearm import Formation, Objective, load
+from wholearm import Formation, Objective, Scene, load
 from wholearm.common.arrays import Array, Expression
 from wholearm.common.batch import FEW, SIZE, SOME, Batch
-from wholearm.geometry.curve import Curve
+from wholearm.geometry.curve import Curve, tangent_basis
 from wholearm.geometry.tracing import trace_phases
-from wholearm.mechanics.dynamics import Directions, split_forces
-from wholearm.planning.time_domain.assembly import Kernel
-from wholearm.planning.time_domain.collocation import Scheme, make_scheme
+from wholearm.mechanics.dynamics import Directions, metric_weights, split_forces
+from wholearm.planning.columns import Columns
+from wholearm.planning.time_domain.assembly import Kernel, NlpRows, build_kernel
+from wholearm.planning.time_domain.collocation import Scheme, blend, fit_controls, make_scheme
 from wholearm.planning.time_domain.stage import LimitMisses, Stage, StagePoints
 from wholearm.planning.time_domain.time_nlp import (
     Target,
     TimeNLP,
     bound_unknowns,
     build_time_nlp,
+    collocation_kernel,
     end_kernel,
+    find_leaving,
+    impact_kernel,
+    opening_kernel,
     pack,
     point_kernel,
     raise_bounds,
@@ -459,3 +464,247 @@ def test_derivatives_of_the_whole_are_its_differences(objective: Objective) -> N
     bend = (upper + np.triu(upper, 1).T) @ step
     change = (pull(x + h * step) - pull(x - h * step)) / (2 * h)
     np.testing.assert_allclose(change, bend, atol=1e-6 * np.abs(bend).max())
+
+
+UNKNOWNS = 11
+
+
+CLOSE = 1e-12
+
+
+def make_kernels() -> tuple[Kernel, Kernel, Kernel]:
+    """Two outputs of three unknowns; a share of the cost; and one that is linear in x."""
+    three, two, one = (Columns(x=size).make_symbols() for size in (3, 2, 2))
+    x, a, b = three.x, two.x, one.x
+    single, pair, none = (Columns(p=size).make_symbols() for size in (1, 2, 1))
+    p, q = single.p, pair.p
+    y = ca.vertcat(ca.sin(x[0]) * x[1] + p * x[2] ** 2, ca.exp(x[2]) * x[0] - x[1])
+    return (
+        build_kernel(three, single, y=y),
+        build_kernel(two, pair, y=q[0] * a[0] * a[1] + q[1] * a[0] ** 4),
+        build_kernel(one, none, y=none.p * b[0] - b[1]),
+    )
+
+
+def make_nlp(seed: int) -> tuple[Any, Expression, Expression, Expression]:
+    """An NLP of copies of kernels, and the same one written row by row: x, f and g."""
+    rng = np.random.default_rng(seed)
+    pair, share, line = make_kernels()
+    rows, cost = NlpRows(), rng.normal(size=UNKNOWNS)
+
+    def choose(count: int, width: int) -> Any:
+        # Copies share unknowns, but none has one twice.
+        return np.array([rng.choice(UNKNOWNS, width, replace=False) for _ in range(count)])
+
+    copies = []
+    for kernel, count, width, given in ((pair, 4, 3, 1), (share, 5, 2, 2), (line, 3, 2, 1)):
+        columns, parameters = choose(count, width), rng.normal(size=(count, given))
+        if kernel is share:
+            own = np.zeros((count, 0), dtype=np.int64)
+            rows.add_cost(kernel, columns, parameters)
+        else:
+            own = rows.nonlinear(count, kernel.outputs)
+            rows.add_copies(kernel, columns, own, parameters)
+        copies.append((kernel, columns, own, parameters))
+        # Linear rows are among them; one has no entries.
+        linear = rows.linear(2)
+    columns, values = choose(1, 3), rng.normal(size=3)
+    rows.add_entries(linear[0], columns, values)
+    x = ca.MX.sym("x", UNKNOWNS)
+    f, g = ca.dot(ca.DM(cost), x), [ca.MX(0.0)] * 17
+    for column, value in zip(columns[0], values, strict=True):
+        g[int(linear[0])] += value * x[int(column)]
+    for kernel, table, own, parameters in copies:
+        for k, each in enumerate(table):
+            y = kernel.function(x[each.tolist()], ca.DM(parameters[k]))
+            if not own.size:
+                f += y
+            for i, row in enumerate(own[k]):
+                g[row] = y[i]
+    return rows.assemble(cost), x, f, ca.vertcat(*g)
+
+
+def evaluate(inputs: list[Expression], output: Expression, *values: Array) -> Array:
+    return np.asarray(ca.Function("f", inputs, [output])(*values).full())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_values_and_derivatives_are_those_of_the_same_nlp_in_one_piece(seed: int) -> None:
+    built, x, f, g = make_nlp(seed)
+    rng = np.random.default_rng(100 + seed)
+    lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", g.numel())
+    at, on_f, on_g = rng.normal(size=UNKNOWNS), rng.normal(size=1), rng.normal(size=g.numel())
+    nlp, derivatives = built
+    for own, expected in ((nlp["f"], f), (nlp["g"], g)):
+        got = evaluate([nlp["x"]], own, at)
+        np.testing.assert_allclose(got, evaluate([x], expected, at), atol=CLOSE)
+    again, jacobian = derivatives["jac_g"](at, [])
+    np.testing.assert_allclose(again.full(), evaluate([x], g, at), atol=CLOSE)
+    np.testing.assert_allclose(jacobian.full(), evaluate([x], ca.jacobian(g, x), at), atol=CLOSE)
+    hessian = derivatives["hess_lag"](at, [], on_f, on_g)
+    full = ca.hessian(lam_f * f + ca.dot(lam_g, g), x)[0]
+    expected = evaluate([x, lam_f, lam_g], full, at, on_f, on_g)
+    np.testing.assert_allclose(hessian.full(), np.triu(expected), atol=CLOSE)
+    # Several copies meet in some entry, which adds up.
+    assert np.abs(expected).max() > 0.1
+
+
+@pytest.mark.parametrize("which", range(3))
+def test_kernels_have_the_derivatives_of_their_expression(which: int) -> None:
+    kernel = make_kernels()[which]
+    rng = np.random.default_rng(which)
+    n_x, n_p = (kernel.function.size1_in(i) for i in range(2))
+    x, p, lam = rng.normal(size=n_x), rng.normal(size=n_p), rng.normal(size=kernel.outputs)
+    steps = 1e-5 * np.eye(n_x)
+
+    def dense(x: Array) -> Array:
+        J = np.zeros((kernel.outputs, n_x))
+        J[tuple(kernel.jacobian_at)] = kernel.jacobian(x, p).full()[:, 0]
+        return J
+
+    def value(x: Array) -> Array:
+        return np.asarray(kernel.function(x, p).full()[:, 0])
+
+    slopes = np.array([(value(x + h) - value(x - h)) / 2e-5 for h in steps]).T
+    # Differences of second order, over steps of 1e-5.
+    np.testing.assert_allclose(dense(x), slopes, atol=1e-8)
+    H = np.zeros((n_x, n_x))
+    H[tuple(kernel.hessian_at)] = kernel.hessian(x, p, lam).full()[:, 0]
+    bend = np.array([lam @ (dense(x + h) - dense(x - h)) / 2e-5 for h in steps])
+    np.testing.assert_allclose(H, np.triu(bend), atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "name, degree, points",
+    [
+        ("radau", 1, [1.0]),
+        ("radau", 2, [1 / 3, 1.0]),
+        ("radau", 3, [(4 - ROOT) / 10, (4 + ROOT) / 10, 1.0]),
+        # To the six digits that tables of the nodes on [-1, 1] print.
+        ("radau", 4, [(1 - 0.822824) / 2, (1 - 0.181066) / 2, (1 + 0.575319) / 2, 1.0]),
+        ("legendre", 1, [0.5]),
+        ("legendre", 2, [0.5 - np.sqrt(3) / 6, 0.5 + np.sqrt(3) / 6]),
+        ("legendre", 3, [0.5 - np.sqrt(15) / 10, 0.5, 0.5 + np.sqrt(15) / 10]),
+    ],
+)
+def test_points_are_the_tabulated_ones(name: str, degree: int, points: list[float]) -> None:
+    got = make_scheme(name, degree).points
+    np.testing.assert_allclose(got, points, atol=3e-7 if degree > 3 else 1e-14)
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+def test_legendre_points_and_weights_are_those_of_gauss(degree: int) -> None:
+    x, weights = np.polynomial.legendre.leggauss(degree)
+    scheme = make_scheme("legendre", degree)
+    np.testing.assert_allclose(scheme.points, (x + 1) / 2, atol=1e-14)
+    # Inverting the powers enlarges rounding a little.
+    np.testing.assert_allclose(scheme.weights, weights / 2, atol=1e-10)
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+@pytest.mark.parametrize("name", NAMES)
+def test_integrals_are_exact_up_to_the_degree(name: str, degree: int) -> None:
+    scheme = make_scheme(name, degree)
+    for power in range(degree):
+        exact = scheme.points ** (power + 1) / (power + 1)
+        # Rounding, which inverting the powers enlarges a little.
+        np.testing.assert_allclose(scheme.integrals @ scheme.points**power, exact, atol=1e-10)
+    over = scheme.integrals @ scheme.points**degree - scheme.points ** (degree + 1) / (degree + 1)
+    assert np.abs(over).max() > 1e-7
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_polynomials_lie_between_their_control_points(count: int) -> None:
+    rng, places = np.random.default_rng(count), np.linspace(0.0, 1.0, 41)
+    controls = rng.uniform(-1.0, 1.0, (count, 2))
+    values = blend(places, count) @ controls
+    assert (values <= controls.max(axis=0) + 1e-14).all()
+    assert (values >= controls.min(axis=0) - 1e-14).all()
+    np.testing.assert_allclose(values[[0, -1]], controls[[0, -1]], atol=1e-13)
+    # Of their degree they are: their control points follow from as many values.
+    at = np.sort(rng.uniform(0.0, 1.0, count))
+    np.testing.assert_allclose(
+        fit_controls(at, blend(at, count) @ controls, count), controls, atol=1e-6
+    )
+
+
+def test_gaps_open_with_their_second_derivative() -> None:
+    rng = np.random.default_rng(5)
+    formation = FORMATIONS[2]
+    for contact in formation.contacts:
+        z, w, u = draw(rng)
+        kernel = opening_kernel(formation, contact)
+        one = Formation(formation.scene, (contact,))
+        second = constraints(one, z, w, u)[1][0]
+        np.testing.assert_allclose(call(kernel, [z, w, u]), second, atol=1e-5)
+
+
+@pytest.mark.parametrize("name, degree", [("radau", 3), ("legendre", 2)])
+@pytest.mark.parametrize("freedoms", [1, 2])
+def test_collocation_holds_for_what_polynomials_integrate(
+    name: str, degree: int, freedoms: int
+) -> None:
+    rng = np.random.default_rng(7)
+    scheme, h = make_scheme(name, degree), 0.3
+    # Rates that are polynomials of degree d - 1 are integrated exactly to every point and the end.
+    powers = rng.normal(size=(5, degree))
+    N, start = rng.normal(size=(5, freedoms)), rng.normal(size=5)
+
+    def state(x: float) -> Array:
+        parts = [h * powers[:, k] * x ** (k + 1) / (k + 1) for k in range(degree)]
+        return np.asarray(start + np.sum(parts, axis=0))
+
+    places = [*scheme.points, *([] if scheme.ends else [1.0])]
+    rates = [powers @ x ** np.arange(degree) for x in scheme.points]
+    x = [start, *map(state, places), *rates, np.array([h])]
+    kernel = collocation_kernel(name, degree, freedoms)
+    np.testing.assert_allclose(call(kernel, x, N.ravel(order="F")), 0.0, atol=1e-13)
+    # What is missed is missed along the columns of N, point after point.
+    shift = rng.normal(size=5)
+    x[1] = x[1] + shift
+    missed = call(kernel, x, N.ravel(order="F")).reshape(-1, freedoms)
+    np.testing.assert_allclose(missed[0], N.T @ shift, atol=1e-13)
+    np.testing.assert_allclose(missed[1:], 0.0, atol=1e-13)
+
+
+@pytest.mark.parametrize("rolls", [(), ("v4-finger1",)])
+def test_impacts_balance_the_momentum_of_every_body(rolls: tuple[str, ...]) -> None:
+    rng = np.random.default_rng(9)
+    scene = landing().scene
+    before = make_formation(scene, "v1-palm v3-finger1 v6-finger2")
+    after = roll(make_formation(scene, "v1-palm v4-finger1 v6-finger2"), *rolls)
+    # An impact is over at once: what has no impulse is left out of the balance.
+    bare = [replace(link, viscous=0.0, dry=0.0) for link in scene.fingers]
+    still = Scene(scene.polygon, (bare[0], bare[1]), scene.friction, 0.0)
+    n_p, n_c = after.n_constraints, after.n_contacts
+    assert find_leaving(before, after) == [1]
+    for _ in range(3):
+        z, v_after, v_before = draw(rng)
+        impulses, Xi = rng.normal(size=n_p), rng.choice([-1.0, 1.0], n_c)
+        x = [v_after, v_before, z, impulses]
+        y = call(impact_kernel(before, after), x, Xi)
+        jump, held, leaving, cones = np.split(y, np.cumsum([5, n_p, 1]))
+        p_n, p_t = split_forces(after, impulses, Xi)
+        row = Samples(z, v_before, v_after - v_before, np.zeros(2), p_n, p_t)
+        missing, _ = unbalance(replace(after, scene=still), row, np.ones(2))
+        np.testing.assert_allclose(jump, -missing, atol=1e-13 * np.abs(missing).max())
+        rates, _ = constraints(after, z, v_after, 0 * z)
+        np.testing.assert_allclose(held, rates, atol=1e-6)
+        opening, _ = constraints(Formation(scene, before.contacts[1:2]), z, v_after, 0 * z)
+        np.testing.assert_allclose(leaving, opening, atol=1e-6)
+        rows = list(after.rolling_rows)
+        grip = after.friction[rows] * p_n[rows]
+        np.testing.assert_allclose(cones, [*(grip - p_t[rows]), *(grip + p_t[rows])], atol=1e-14)
+
+
+@pytest.mark.parametrize("contacts", [4, 3])
+def test_the_tangent_basis_is_what_contacts_leave_free(contacts: int) -> None:
+    stage = driven("radau", 3, 8, contacts)
+    z, formation = stage.guess.nodes[0, 0], stage.formation
+    N = tangent_basis(formation, z)
+    assert N.shape == (5, 5 - contacts)
+    P = formation.evaluate(z[None], np.zeros((1, 5))).P[0]
+    # Along the columns of N over the metric contacts stay closed; N^T are coordinates along them.
+    metric = metric_weights(formation.scene)[:, None] / formation.scene.polygon.gyration_radius**2
+    np.testing.assert_allclose(P @ (N / metric), 0.0, atol=1e-13)
+    np.testing.assert_allclose(N.T @ (N / metric), np.eye(5 - contacts), atol=1e-13)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import linprog, minimize
 
 import wholearm.planning.time_domain.guesses as guesses
 from once import once
@@ -64,10 +65,12 @@ from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain.guesses import guess_stages
 from wholearm.planning.time_domain.mode_search import link
-from wholearm.planning.time_domain.refinement import SETTINGS
-from wholearm.planning.time_domain.stage import Stage
+from wholearm.planning.time_domain.refinement import SETTINGS, find_least
+from wholearm.planning.time_domain.search import TimeSearch, TimeSolution
+from wholearm.planning.time_domain.stage import Stage, in_own_units
 from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion
-from wholearm.planning.time_domain.time_plan import plan_phases
+from wholearm.planning.time_domain.time_nlp import pack
+from wholearm.planning.time_domain.time_plan import plan_phases, try_phases
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.results.trajectory import Samples
 from wholearm.verification.verdict import DEPARTURE, Allowance, describe_ends
@@ -810,3 +813,61 @@ def test_the_estimated_error_is_about_that_of_a_finer_plan() -> None:
     lost = total(coarse) / total(fine) - 1
     assert fine[0].error < PlanOptions().accuracy < coarse[0].error == coarse[1].error
     assert lost == pytest.approx(coarse[0].error - fine[0].error, rel=0.6)
+
+
+def replace_scene(stages: list[Stage], problem: Problem) -> list[Stage]:
+    """The same stages on the formations of another scene."""
+    return [replace(stage, formation=problem.phases[stage.phase].formation) for stage in stages]
+
+
+@pytest.mark.parametrize("contact", ["palm", "finger1", "finger2"])
+def test_friction_is_worth_what_a_little_less_of_it_saves(contact: str) -> None:
+    """By the envelope theorem: as much as the Lagrangian falls, all else as it is."""
+    problem, share = landing(), 1e-3
+    start = trace_phases(problem)[-1].end
+    least = PlanOptions(objective="effort", time_intervals=8)
+    begun = try_phases(problem, problem.phases[4:], start, least, further=True)
+    assert begun is not None and isinstance(begun[0].solution, TimeSolution)
+    solution = begun[0].solution
+    mu = getattr(landing().scene.friction, contact)
+    other = landing().with_({f"friction_{contact}": (1 - share) * mu})
+    values = list[float]()
+    for problem in (landing(), other):
+        stages = replace_scene(solution.stages, in_own_units(problem))
+        nlp = TimeSearch.of(problem, least).build(stages)
+        x = pack([stage.guess for stage in stages], nlp.layouts, 0.0)
+        g = nlp.solver.function.get_function("nlp_g")(x, [])
+        values.append(float(solution.multipliers["lam_g0"] @ g.full()[:, 0]))
+    own = [
+        solution.price_friction(k)[..., [n.endswith(contact) for n in stage.formation.names]].sum()
+        for k, stage in enumerate(solution.stages)
+    ]
+    # The other way is less by twice of all there is.
+    assert values[0] - values[1] == pytest.approx(share / 2 * sum(own), rel=1e-6, abs=1e-12)
+
+
+def draw(rng: np.random.Generator, count: int) -> tuple[Array, Array, Array]:
+    """Slopes, and rows of a polygon about zero with their slack, some of them touching it."""
+    box = np.tile(np.concatenate([np.eye(2), -np.eye(2)]), (count, 1, 1))
+    rows = np.concatenate([rng.normal(size=(count, 3, 2)), box], axis=1)
+    slack = rng.uniform(0.0, 2.0, rows.shape[:2]) * (rng.uniform(size=rows.shape[:2]) > 0.2)
+    return rng.normal(size=(count, 2)), rows, slack
+
+
+def test_the_least_over_a_polygon_is_that_of_a_linear_programme() -> None:
+    slopes, rows, slack = draw(np.random.default_rng(0), 30)
+    least = find_least(slopes, 0.0, rows, slack)
+    for k, slope in enumerate(slopes):
+        answer = linprog(slope, -rows[k], slack[k], bounds=(None, None))
+        assert least[k] == pytest.approx(answer.fun, abs=1e-9)
+    assert (least < -0.1).sum() > 10
+
+
+def test_the_least_square_over_a_polygon_is_that_of_a_solver() -> None:
+    slopes, rows, slack = draw(np.random.default_rng(1), 30)
+    least = find_least(slopes, 0.4, rows, slack)
+    for k, slope in enumerate(slopes):
+        limits = {"type": "ineq", "fun": lambda u, k=k: rows[k] @ u + slack[k]}
+        answer = minimize(lambda u, g=slope: g @ u + 0.4 * u @ u, np.zeros(2), constraints=limits)
+        assert least[k] == pytest.approx(answer.fun, abs=1e-6)
+    assert len(set(np.round(least, 6))) > 10
