@@ -10,12 +10,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import lru_cache, reduce
+from itertools import pairwise
 from typing import NamedTuple
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.arrays import Array
+from ..common.arrays import Array, Expression
 from ..results.torque import TorqueProfile
 from ..results.trajectory import interpolate_quintic
 from .contact_problem import (
@@ -36,8 +39,8 @@ from .events import EventKind, describe_change
 from .rest import find_roots
 from .root_finding import find_root
 from .run import Feedback, Run, StuckError
-from .stepper import Modes
-from .system import ContactRows, System
+from .stepper import Modes, ModeStepper
+from .system import ContactRows, Structure, System
 from .tolerances import ROUNDING_FORCE, SHORTEST_STEP, STANDING, STILL
 
 CLOSED = 1e-10  # gap that counts as closed at an event, relative to the scene's length
@@ -80,13 +83,11 @@ class Closing(NamedTuple):
     right: float
 
 
-class View(NamedTuple):
-    """Event values at the end of a step, and gaps within it."""
+class Samples(NamedTuple):
+    """Gaps of all pairs within a step."""
 
-    out: Array  # outputs at its end
-    values: Array  # those of the steps, then ranges of kept pairs: positive until an event
     times: Array  # (m + 1,) [s]: instants since its start, which is the first
-    gaps: Array  # gaps, ranges (m + 1, N) [m]: of all pairs then
+    gaps: Array  # gaps, ranges (m + 1, N) [m]
     ranges: Array
 
 
@@ -95,10 +96,9 @@ class FreeRun(Run):
 
     Attributes
     ----------
-    armed : (N,)  pairs that have been apart, so that their closing is an event
-    resting       whether everything rests
-    unique        whether the present modes were certainly the only solution
-    residual      largest residual of a contact problem so far
+    resting   whether everything rests
+    unique    whether the present modes were certainly the only solution
+    residual  largest residual of a contact problem so far
     """
 
     def __init__(
@@ -117,8 +117,8 @@ class FreeRun(Run):
         super().__init__(system, torque, z, v, tolerance, wanted)
         self.restitution = restitution
         self.modes = hint or Modes(sigma=(0.0,) * system.n)
-        self.armed = np.zeros(len(system.names), dtype=bool)
         self.decisions, self.decided_at = 0, -math.inf
+        self.watch, self.unit = Watch(system), system.scales.length
         self.resting = self.unique = False
         self._begin_piece()
 
@@ -223,7 +223,6 @@ class FreeRun(Run):
                 break
             rows = system.evaluate(self.z, self.v, near).A / root
             self.y[: system.n] -= np.linalg.lstsq(rows, gaps[near], rcond=1e-9)[0] / root
-        self.armed = system.look(self.z)[0] > ARMED * system.scales.length
 
     def _face(self, z: Array, v: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Gaps of all pairs at a state, and which of them face each other, shape (N,) each."""
@@ -526,72 +525,62 @@ class FreeRun(Run):
     def move(self) -> None:
         """Integrate with the present modes until an event, or until the torques step or end."""
         self.load(self.modes)
-        s, system, modes, rows = self.s, self.system, self.modes, self.s.rows
-        s.stay(system, self.z)
-        s.look()
-        self.near = 1e-3 * SHORTEST_STEP * max(system.scales.time, abs(self.t))
-        self.unit, self.kept = system.scales.length, list(modes.kept)
-        self.watched = np.ones(len(system.names), dtype=bool)
-        self.watched[self.kept] = False
+        s, modes, rows, watch = self.s, self.modes, self.s.rows, self.watch
+        s.stay(self.system, self.z)
+        self.near = 1e-3 * SHORTEST_STEP * max(self.system.scales.time, abs(self.t))
+        self.kept = list(modes.kept)
+        watch.watched[:] = 1.0
+        watch.watched[self.kept] = 0.0
         counts = [rows.cone.stop, rows.size - rows.cone.stop, len(self.kept)]
         self.slack = np.repeat([ROUNDING_FORCE, SPEED_ROUNDING, CLOSED], counts)
-        self.start = self._view(0.0)
-        gaps = self.start.gaps[-1]
+        self._look()
         # What touches already may sink by rounding; what is behind something else never closes.
-        shallow = gaps > -SUNK * self.unit
-        sunk = np.minimum(gaps, 0.0) - 0.5 * CLOSED * self.unit
-        self.level = np.where(shallow, sunk, -np.inf)
+        sunk = np.minimum(watch.gaps, 0.0) - 0.5 * CLOSED * self.unit
+        watch.level[:] = np.where(watch.gaps > -SUNK * self.unit, sunk, -np.inf)
         # Values that start below zero may stay there: modes are judged a moment later.
-        self.floor = np.maximum(self.slack, self.slack - self.start.values)
+        self.floor = np.maximum(self.slack, self.slack - self.start)
         self.h = min(self.h, self._time_to_return())
         self.record()
         super().move()
 
+    def _look(self) -> None:
+        """Start from the present state."""
+        self.s.look()
+        self.start = self._list_values()
+        self.watch.advance()
+
     @property
     def longest(self) -> float:
         """Longest step from the present state: one of `REACH`, in units of the scene."""
-        out, n = self.start.out, self.system.n
-        speed, push = self._measure(out[n : 2 * n]), self._measure(out[self.s.to.acceleration])
-        return 2 * REACH / (speed + math.sqrt(speed**2 + 2 * push * REACH) + 1e-300)
+        return self.watch.longest
 
-    def _measure(self, motion: Array) -> float:
-        """Largest of coordinates or their rates, in units of the scene."""
-        return float(np.abs(motion / self.system.units[: self.system.n]).max())
-
-    def _view(self, h: float) -> View:
-        """Look at the step just made, of length h."""
-        s, n, out = self.s, self.system.n, self.s.outputs.copy()
-        gaps, ranges = self.system.look(out[:n])
-        values = self._list_values(ranges)
-        if h == 0:
-            return View(out, values, np.zeros(1), gaps[None], ranges[None])
-        start = self.start
-        gone = np.abs(out[: 2 * n] - start.out[: 2 * n])
-        count = 1 + int(LOOKS * min(1.0, self._measure(gone[:n] + h * gone[n:]) / REACH))
+    def _sample(self, h: float) -> Samples:
+        """Gaps and ranges within the step just made, of length h."""
+        watch, n = self.watch, self.system.n
+        count = 1 + int(LOOKS * min(1.0, watch.travel / REACH))
         times = h * np.arange(count + 1) / count
-        seen = [(start.gaps[-1:], start.ranges[-1:]), (gaps[None], ranges[None])]
+        seen = [(watch.gaps[None], watch.ranges[None]), (watch.ahead[None], watch.spans[None])]
         if count > 1:
-            ends = np.array([start.out, out])
-            knots = ends[:, :n], ends[:, n : 2 * n], ends[:, s.to.acceleration]
+            knots = np.stack([watch.motion, watch.end], axis=0).reshape(2, 3, n).swapaxes(0, 1)
             first = np.zeros(count - 1, dtype=np.int64)
-            z = interpolate_quintic(np.full(count - 1, h), times[1:-1], knots, first)[0]
+            z = interpolate_quintic(np.full(count - 1, h), times[1:-1], tuple(knots), first)[0]
             seen.insert(1, self.system.measure(z))
-        return View(out, values, times, *map(np.concatenate, zip(*seen, strict=True)))
+        return Samples(times, *map(np.concatenate, zip(*seen, strict=True)))
 
     def happens(self) -> bool:
         """Whether an event value of the steps, or a range, is negative after the step just made."""
-        ranges = self.system.look(self.s.outputs[: self.system.n])[1]
-        return bool((self._list_values(ranges) < -self.slack).any())
+        return bool((self._list_values() < -self.slack).any())
 
-    def _list_values(self, ranges: Array) -> Array:
-        """Event values after the step just made, where `ranges` of all pairs are, (N,) [m]."""
+    def _list_values(self) -> Array:
+        """Event values after the step just made: those of the step, then ranges of kept pairs."""
+        self.watch.look(self.s)
         values = self.s.outputs[self.s.to.values]
-        return np.concatenate([values, ranges[self.kept] / self.unit])
+        return np.concatenate([values, self.watch.spans[self.kept] / self.unit])
 
     def _find_value(self, h: float, row: int) -> float:
         """One event value at another end of the step."""
         self._step_to(h)
-        return float(self._list_values(self.system.look(self.s.outputs[: self.system.n])[1])[row])
+        return float(self._list_values()[row])
 
     def _find_gap(self, h: float, pair: int) -> float:
         """A pair's gap at another end of the step [m]."""
@@ -604,14 +593,16 @@ class FreeRun(Run):
 
     def locate(self, h: float, t: float) -> bool:
         """Shorten the step just made, of length `h`, to its first event; whether there is one."""
+        values, floor, watch = self._list_values(), self.floor, self.watch
+        if not (watch.alarm or (values < -floor).any() or watch.may_close(REACH / LOOKS)):
+            return False
         passed: set[int] = set()
-        floor, found = self.floor, False
-        first = np.maximum(self.start.values + floor, 0)
+        found, first = False, np.maximum(self.start + floor, 0)
         while True:
             self._step_to(h)
-            self.end = end = self._view(h)
-            values = end.values + floor
-            closing = self._find_closing(passed) or self._find_entering(passed)
+            values = self._list_values() + floor
+            seen = self._sample(h)
+            closing = self._find_closing(seen, passed) or self._find_entering(seen, passed)
             low = (values < 0).nonzero()[0]
             if not len(low) and closing is None:
                 return found
@@ -634,13 +625,13 @@ class FreeRun(Run):
 
     def keep(self, t: float) -> None:
         """Take the step just made, to time `t`, and record its end."""
-        end, self.t = self.end, t
-        self.y = end.out[self.s.to.y].copy()
+        self.t, s = t, self.s
+        self.y = s.outputs[s.to.y].copy()
         self.record()
-        self.armed = end.gaps[-1] > ARMED * self.unit
-        self.floor = np.where(end.values > 0, self.slack, self.floor)
-        self.s.inputs[self.s.at.y], self.s.inputs[self.s.at.t] = self.y, t
-        self.start = end
+        self.start = self._list_values()
+        self.watch.advance()
+        self.floor = np.where(self.start > 0, self.slack, self.floor)
+        s.inputs[s.at.y], s.inputs[s.at.t] = self.y, t
 
     def handle(self, found: bool) -> bool:
         """End the motion at an event."""
@@ -652,16 +643,15 @@ class FreeRun(Run):
             return True
         self.feed()
         if self.steps_at[self.piece]:
-            self.s.look()
-            self.start = self._view(0.0)
-            if not self._holds(self.start):
+            self._look()
+            if not self._holds():
                 return True
             self.record()
         return None
 
-    def _holds(self, end: View) -> bool:
+    def _holds(self) -> bool:
         """Whether the modes are the only solution after a torque step, by more than rounding."""
-        modes, rows = self.s.modes, self.s.rows
+        modes, rows, watch = self.s.modes, self.s.rows, self.watch
         if not self.unique or modes.stuck or modes.held:
             return False
         counts = [rows.cone.stop, rows.size - rows.cone.stop, len(self.kept)]
@@ -670,8 +660,8 @@ class FreeRun(Run):
         signs = np.array([*self.modes.Xi, *self.modes.sigma])
         clear[rows.slide.start : rows.turn.stop][signs == 0] = -1
         near = CLOSED * self.unit
-        touches = (np.abs(end.gaps[-1]) < near) & (end.ranges[-1] > -near)
-        return bool((end.values > clear).all()) and not (touches & self.watched).any()
+        touches = (np.abs(watch.gaps) < near) & (watch.ranges > -near) & (watch.watched > 0)
+        return bool((self.start > clear).all()) and not touches.any()
 
     def _find_contact(self, h: float, closing: Closing) -> float | None:
         """When a pair closes within a step; None if it does not, or where the two do not face."""
@@ -681,7 +671,7 @@ class FreeRun(Run):
         def value(step: float) -> float:
             return self._find_gap(step, pair) - level
 
-        first = value(left) if left > 0 else float(self.start.gaps[-1, pair]) - level
+        first = value(left) if left > 0 else float(self.watch.gaps[pair]) - level
         last = value(right)
         if last >= 0 and right < h:
             # The bracket is that of an interpolation, which grazing may mislead.
@@ -693,41 +683,33 @@ class FreeRun(Run):
         out = self.s.outputs
         return root if self._face(out[:n], out[n : 2 * n])[1][pair] else None
 
-    def _find_closing(self, passed: set[int]) -> Closing | None:
+    def _find_closing(self, seen: Samples, passed: set[int]) -> Closing | None:
         """The first pair that closes within the step, and a bracket of when."""
-        end, armed = self.end, self.armed[None]
-        if len(end.times) > 2:
-            # What comes apart within the step may close again within it.
-            apart = end.gaps[1:-1] > ARMED * self.unit
-            armed = np.logical_or.accumulate(np.vstack([armed, apart]), axis=0)
-        level = np.where(armed, 0.0, self.level)
-        crosses = (end.gaps[1:] < level) & (end.gaps[:-1] >= level) & self.watched
+        # What comes apart within the step may close again within it.
+        apart = np.logical_or.accumulate(seen.gaps[:-1] > ARMED * self.unit, axis=0)
+        level = np.where(apart, 0.0, self.watch.level)
+        crosses = (seen.gaps[1:] < level) & (seen.gaps[:-1] >= level) & (self.watch.watched > 0)
         crosses[:, list(passed)] = False
-        if not np.count_nonzero(crosses):
-            return None
-        crosses &= np.maximum(end.ranges[1:], end.ranges[:-1]) > -1e-3 * self.unit
+        crosses &= np.maximum(seen.ranges[1:], seen.ranges[:-1]) > -1e-3 * self.unit
         rows, pairs = crosses.nonzero()
         if not len(rows):
             return None
         row, pair = int(rows[0]), int(pairs[0])
-        return Closing(pair, float(level[row, pair]), *end.times[row : row + 2].tolist())
+        return Closing(pair, float(level[row, pair]), *seen.times[row : row + 2].tolist())
 
-    def _find_entering(self, passed: set[int]) -> Closing | None:
+    def _find_entering(self, seen: Samples, passed: set[int]) -> Closing | None:
         """The first pair that comes into range apart or touching, and overlaps after that.
 
         Out of range a gap has no meaning and may be negative throughout.
         """
-        end = self.end
-        turns = (end.ranges[1:] > 0) & (end.ranges[:-1] <= 0) & self.watched
-        if not np.count_nonzero(turns):
-            return None
-        turns &= (end.gaps[1:] < -CLOSED * self.unit) & (end.gaps[1:] > -REACH * self.unit)
+        turns = (seen.ranges[1:] > 0) & (seen.ranges[:-1] <= 0) & (self.watch.watched > 0)
+        turns &= (seen.gaps[1:] < -CLOSED * self.unit) & (seen.gaps[1:] > -REACH * self.unit)
         turns[:, list(passed)] = False
         h = float(self.s.inputs[self.s.at.h])
         try:
             for row, pair in zip(*(part.tolist() for part in turns.nonzero()), strict=True):
-                left, right = end.times[row : row + 2].tolist()
-                entry = self._find_entry(pair, left, right, -float(end.ranges[row, pair]))
+                left, right = seen.times[row : row + 2].tolist()
+                entry = self._find_entry(pair, left, right, -float(seen.ranges[row, pair]))
                 gap = self._find_gap(entry, pair)
                 if gap > -SUNK * self.unit:
                     return Closing(pair, min(gap, 0.0) - 0.5 * CLOSED * self.unit, entry, right)
@@ -750,8 +732,9 @@ class FreeRun(Run):
 
     def _time_to_return(self) -> float:
         """Half the time in which the nearest pair that has just parted would close again [s]."""
-        near = self.watched & ~self.armed & (np.abs(self.start.gaps[-1]) < CLOSED * self.unit)
-        if not np.count_nonzero(near):
+        gaps, watched = self.watch.gaps, self.watch.watched > 0
+        near = watched & (gaps <= ARMED * self.unit) & (gaps > -CLOSED * self.unit)
+        if not near.any():
             return math.inf
         rows = self.system.evaluate(self.z, self.v, near.nonzero()[0].tolist())
         rate = rows.A @ self.v
@@ -759,6 +742,114 @@ class FreeRun(Run):
         # What parts more slowly was closed when the modes were chosen.
         back = (rate >= self.chatter) & (bend < 0)
         return float((-rate[back] / bend[back]).min(initial=np.inf))
+
+
+class Watch:
+    """Compiled look for pairs that close within a step, with the numbers of one run.
+
+    Attributes
+    ----------
+    motion, gaps, ranges    (3 n,) z, z' and z'', and (N,) [m], at the start of the step
+    end, ahead, spans       the same at its end
+    level : (N,) [m]        gap at which a pair that touches closes
+    watched : (N,)          1 for pairs that do not press
+    longest : [s]           longest step from the start
+    """
+
+    def __init__(self, system: System) -> None:
+        n, count = system.n, len(system.names)
+        sizes = np.cumsum([0, 3 * n, count, count, count, count, 3 * n, 1])
+        given, found, within = np.zeros(sizes[-1]), np.zeros(2 * count + 3), np.zeros(1)
+        parts = [given[first:last] for first, last in pairwise(sizes)]
+        self.motion, self.gaps, self.ranges, self.level, self.watched, self.end, self._h = parts
+        self.ahead, self.spans = found[:count], found[count : 2 * count]
+        self._start, self._seen = given[3 * n : 3 * n + 2 * count], found[: 2 * count]
+        self._flags, self._within, self._places = found[-3:], within, 2 * n
+        numbers = np.concatenate([system.geometry, system.units, [system.scales.length]])
+        self._calls = []
+        for function, store in zip(_build_watch(system.structure), (found, within), strict=True):
+            buffer, call = function.buffer()
+            buffer.set_arg(0, given.data)
+            buffer.set_arg(1, numbers.data)
+            buffer.set_res(0, store.data)
+            self._calls.append((call, buffer, numbers))
+
+    def look(self, s: ModeStepper) -> None:
+        """Evaluate gaps and ranges at the end of the step just made."""
+        split, out = self._places, s.outputs
+        self.end[:split], self.end[split:] = out[:split], out[s.to.acceleration]
+        self._h[0] = s.inputs[s.at.h]
+        self._calls[0][0]()
+
+    def advance(self) -> None:
+        """Start the next step from the end of this one."""
+        self.motion[:], self._start[:] = self.end, self._seen
+        self.longest = float(self._flags[0])
+
+    @property
+    def alarm(self) -> bool:
+        """Whether some pair has closed, or has come into range and overlaps, by the end."""
+        return bool(self._flags[1])
+
+    @property
+    def travel(self) -> float:
+        """Length of the step in units of the scene."""
+        return float(self._flags[2])
+
+    def may_close(self, least: float) -> bool:
+        """Whether some pair may close within the step, if it is at least so long."""
+        if self.travel < least:
+            return False
+        self._calls[1][0]()
+        return bool(self._within[0])
+
+
+@lru_cache(maxsize=16)
+def _build_watch(structure: Structure) -> tuple[Expression, Expression]:
+    """CasADi functions of the vectors of `Watch`.
+
+    The first one returns gaps, ranges, longest step, alarm and travel. The second one returns
+    whether a pair may close within the step: a cubic with values and rates at both ends is between
+    its Bezier coefficients, and gaps and ranges are taken to be there but for a hundredth of the
+    spread of these.
+    """
+    n, count = structure.n, len(structure.pairs)
+    sizes = [3 * n, count, count, count, count, 3 * n, 1]
+    given = ca.SX.sym("given", sum(sizes))
+    motion, gap, span, level, watched, end, h = ca.vertsplit(given, np.cumsum([0, *sizes]).tolist())
+    g = structure.geometry.shape[0]
+    numbers = ca.SX.sym("numbers", g + 2 * n + 1)
+    geometry, units, unit = numbers[:g], numbers[g : g + n], numbers[-1]
+    gaps, ranges = ca.horzsplit(structure.gap_function(end[:n], geometry))
+    gone = ca.fabs(end[: 2 * n] - motion[: 2 * n])
+    travel = ca.mmax((gone[:n] + h * gone[n:]) / units)
+    speed, push = (ca.mmax(ca.fabs(part) / units) for part in (end[n : 2 * n], end[2 * n :]))
+    longest = 2 * REACH / (speed + ca.sqrt(speed**2 + 2 * push * REACH) + 1e-300)
+    least = ca.if_else(gap > ARMED * unit, 0, level)
+
+    def combine(*conditions: Expression) -> Expression:
+        return reduce(ca.logic_and, conditions)
+
+    closes = combine(gaps < least, gap >= least)
+    enters = combine(ranges > 0, span <= 0, gaps < -CLOSED * unit, gaps > -REACH * unit)
+    alarm = ca.mmax(watched * ca.logic_or(closes, enters))
+    found = ca.vertcat(gaps, ranges, longest, alarm, travel)
+    look = ca.Function("look", [given, numbers], [ca.densify(found)])
+    v = ca.SX.sym("v", n)
+    both = structure.gap_function(structure.z, geometry)
+    rates = ca.reshape(ca.jtimes(ca.vec(both), structure.z, v), -1, 2)
+    rate = ca.Function("rate", [structure.z, v, geometry], [both, rates])
+    (first, opens), (last, closing) = (
+        rate(state[:n], state[n : 2 * n], geometry) for state in (motion, end)
+    )
+    points = [first, first + h * opens / 3, last - h * closing / 3, last]
+    lowest, highest = reduce(ca.fmin, points), reduce(ca.fmax, points)
+    error = 1e-2 * (highest - lowest) + CLOSED * unit
+    (low, inside), (high, outside) = map(ca.horzsplit, (lowest - error, highest + error))
+    closes = combine(gap >= least, low < least, outside > -1e-3 * unit)
+    enters = combine(inside <= 0, outside > 0, low < -CLOSED * unit, high > -REACH * unit)
+    flag = ca.mmax(watched * ca.logic_or(closes, enters))
+    return look, ca.Function("within", [given, numbers], [ca.densify(flag)])
 
 
 def _find_breach(margins: Array, x: float) -> float:

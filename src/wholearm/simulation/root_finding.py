@@ -18,18 +18,21 @@ def find_root(
     """Root in [low, high] of a function that falls from f_low >= 0 to f_high < 0.
 
     Regula falsi of Anderson and Bjorck until the bracket is as narrow as `near` or the function is
-    within `flat`. After three steps that have not halved the bracket, as near a triple root, the
-    next is a bisection.
+    within `flat`. After a step that has not halved the bracket the next one is that of the square
+    root of the function, which finds double roots, and after two the next one is a bisection.
     """
     if f_low <= 0:
         return low
-    slow, width = 0, abs(high - low)
+    slow, width = -1, abs(high - low)
     while abs(high - low) > near:
         middle = high - f_high * (high - low) / (f_high - f_low)
         slow = slow + 1 if 2 * abs(high - low) > width else 0
         if not slow:
             width = abs(high - low)
-        if slow > 3:
+        if slow == 1:
+            share = 1 / (1 + math.sqrt(-f_low / f_high))
+            middle = high - share * (high - low)
+        if slow > 1:
             middle, slow, width = (low + high) / 2, 0, abs(high - low)
         elif abs(middle - high) < near:
             middle = high + math.copysign(near, low - high)
