@@ -54,7 +54,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> None:
 @pytest.fixture(autouse=True)
 def quiet(monkeypatch: pytest.MonkeyPatch) -> None:
     """No line of progress on stderr, however long a command takes on this machine."""
-    monkeypatch.setattr("wholearm.cli.output.EVERY", math.inf)
+    monkeypatch.setattr("wholearm.cli.command.EVERY", math.inf)
 
 
 @pytest.fixture(scope="session")

@@ -21,9 +21,8 @@ import wholearm
 from once import once
 from shipped import FOLDER, HEPTAGON, HEXAGON, LANDING, chart, problem_of, solved
 from wholearm import Plan, Problem
-from wholearm.cli.arguments import name_simulator, protect
-from wholearm.cli.command import build_parser, main
-from wholearm.cli.help import TOPICS, read_page
+from wholearm.cli.arguments import TOPICS, prepare
+from wholearm.cli.command import build_parser, main, read_page
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "wholearm"
@@ -216,7 +215,7 @@ def test_shell_lines_are_read(line: str, folder: Path) -> None:
         if len(words) == 2:
             words.append("--help")
         try:
-            make_parser().parse_args(protect(name_simulator(words[1:])))
+            make_parser().parse_args(prepare(words[1:]))
         except SystemExit as error:
             assert error.code == 0
 

@@ -26,7 +26,7 @@ import pytest
 
 import wholearm
 from shipped import FOLDER, HEPTAGON, LANDING, plan_of, problem_of
-from wholearm.cli.route import hasten
+from wholearm.cli.command import hasten
 from wholearm.common import files as archive
 from wholearm.common import signals as interrupts
 from wholearm.common.crowd import Processes, run_all

@@ -38,9 +38,7 @@ def misbehave(how: str) -> str:
 class Steps(Study):
     name, title = "steps", "Steps to one"
     columns = ("number", "steps")
-
-    def add_options(self, parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("--most", type=int, default=6)
+    options = "--most N  numbers = 6 in 0..100\n"
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
         return ((number,) for number in range(options.most))

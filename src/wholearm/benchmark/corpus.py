@@ -40,17 +40,13 @@ class Corpus(Study):
     of_code, folder, shipped = True, "build", True
     stored = ("--answers", "results/corpus.json")
     problems = Path("problems")
-
-    def add_options(self, parser: argparse.ArgumentParser) -> None:
-        """Which cases."""
-        text = "cases whose names match, such as 'plan heptagon *' (all)"
-        parser.add_argument("--only", nargs="+", default=["*"], metavar="PATTERN", help=text)
+    options = "--only PATTERN ...  cases whose names match, such as 'plan heptagon *' (all)\n"
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
         """Those that are asked for."""
         self.problems = Path(options.problems)
         for case in list_cases():
-            if any(fnmatch(" ".join(map(str, case)), own) for own in options.only):
+            if any(fnmatch(" ".join(map(str, case)), own) for own in options.only or "*"):
                 yield case
 
     def list_inputs(self, options: argparse.Namespace) -> list[Path]:

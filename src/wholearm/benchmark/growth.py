@@ -54,11 +54,7 @@ class Growth(Study):
     name, title, timed = "growth", "How cost and memory grow", True
     alone = True
     columns = ("grows", "work", "size", "seconds", "memory")
-
-    def add_options(self, parser: argparse.ArgumentParser) -> None:
-        """Which problem."""
-        text = "problem file (TOML) whose first phase is made larger"
-        parser.add_argument("problem", help=text)
+    options = "problem  problem file (TOML) whose first phase is made larger\n"
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
         """What grows, what is done, and the size."""

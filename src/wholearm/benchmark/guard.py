@@ -34,10 +34,7 @@ class Guard(Study):
 
     name, title, keeps = "guard", "Counts against stored ones", False
     stored = ("--counts", "results/bench_guard.json")
-
-    def add_options(self, parser: argparse.ArgumentParser) -> None:
-        """Which problems."""
-        parser.add_argument("problems", nargs="+", metavar="FILE", help="problem files (TOML)")
+    options = "problems FILE ...  problem files (TOML)\n"
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
         """The problems."""

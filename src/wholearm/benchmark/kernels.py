@@ -28,7 +28,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..common.fields import Range
 from ..common.files import read_json, write_text
 from ..scene.model import Finger, Friction, Polygon, Scene
 from .study import Case, Row, Study, format_table
@@ -87,7 +86,7 @@ def _change_number(value: float, label: str) -> float:
 OBJECTIVES = ("time", "effort", "margin")
 TOLERANCE = 1e-6
 """Largest relative difference of values: what Ipopt and the refinement of limits leave open."""
-STORED, UPDATE = "results/corpus.json", "`bench corpus --update` writes it anew"
+UPDATE = "`bench corpus --update` writes it anew"
 SUPPORTED = re.compile(r"^Core: (\w+)", re.M)
 
 
@@ -130,26 +129,20 @@ class Kernels(Study):
     """Plans of the corpus in several environments against its answers."""
 
     name, title, keeps = "kernels", "Answers by environment", False
-
-    def add_options(self, parser: argparse.ArgumentParser) -> None:
-        """Which problems and environments, and what their answers are compared with."""
-        parser.add_argument("problems", nargs="+", metavar="FILE", help="problem files (TOML)")
-        text = "kernels of OpenBLAS, as for OPENBLAS_CORETYPE (default: the processor's own)"
-        parser.add_argument("--kernels", nargs="+", default=[""], metavar="NAME", help=text)
-        text = "seeds of changes to all numbers in the last bits; 0 for none (0)"
-        read = Range(0, 2**63).parse
-        parser.add_argument("--seeds", nargs="+", type=read, default=[0], metavar="K", help=text)
-        text = "interpreters that have the package (default: this one)"
-        parser.add_argument("--pythons", nargs="+", default=[sys.executable], help=text)
-        text = f"answers of the corpus ({STORED})"
-        parser.add_argument("--answers", metavar="FILE", default=STORED, help=text)
-        parser.add_argument("-o", "--output", metavar="FILE", help="write the table (Markdown)")
+    options = """\
+problems FILE ...  problem files (TOML)
+--kernels NAME ...  kernels of OpenBLAS, as for OPENBLAS_CORETYPE (the processor's own)
+--seeds K ...       of changes to all numbers in the last bits (0, none) in 0..1000000000
+--pythons PYTHON ...  interpreters that have the package (this one)
+--answers FILE      of the corpus = results/corpus.json
+-o --output FILE    table to write (Markdown)
+"""
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
         """Every problem and objective in each environment."""
         read_json(options.answers, UPDATE)
-        given = options.pythons, options.kernels, options.seeds, options.problems, OBJECTIVES
-        return product(*given)
+        places = options.pythons or [sys.executable], options.kernels or [""], options.seeds or [0]
+        return product(*places, options.problems, OBJECTIVES)
 
     def run(self, case: Case) -> Row:
         """Value, contact modes and failures of a plan made by a process of an environment."""

@@ -20,7 +20,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ..common.errors import InfeasibleError, InputError, WholearmError
-from ..common.fields import Range
 from ..mapping.formation_list import format_route, list_formations
 from ..problem.definition import Problem
 from ..problem.read import build_problem, place_start, read_problem
@@ -43,11 +42,7 @@ class Queries(Study):
 
     name, title = "queries", "From pose to pose"
     shipped = seeded = True
-
-    def add_options(self, parser: argparse.ArgumentParser) -> None:
-        """How many queries."""
-        read = Range(0, 2**63).parse
-        parser.add_argument("--queries", type=read, default=250, help="how many (250)")
+    options = "--queries N  how many = 250 in 0..1000000000\n"
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
         """Seed, number, and folder of the problems."""

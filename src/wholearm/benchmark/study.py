@@ -25,7 +25,6 @@ from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 from .. import __version__
 from ..common.crowd import Processes, run_all
-from ..common.fields import Range
 from ..common.files import make_folder, together, write_text
 from ..common.journal import Journal
 
@@ -83,8 +82,26 @@ class Study:
     columns: tuple[str, ...] = ()  # entries of rows that are written as CSV; none for no such file
     packages: tuple[str, ...] = ()  # further ones whose versions are stated
 
-    def add_options(self, parser: argparse.ArgumentParser) -> None:
-        """Add what the command line takes beside the options that every study has."""
+    options = ""  # table of options beside those that every study has, as of `read_options`
+
+    def list_options(self) -> str:
+        """The table of all options."""
+        parts = [self.options]
+        if not self.timed:
+            parts.append("--jobs N  processes (as many as cores) in 1..256\n")
+        if self.shipped:
+            parts.append("--problems DIR  folder of problem files = problems\n")
+        if self.seeded:
+            parts.append(f"--seed K  of everything drawn = 0 in 0..{2**63}\n")
+        if self.stored:
+            option, path = self.stored
+            parts.append(f"{option} FILE  of what is stored = {path}\n")
+            parts.append("--update  store what is found now\n")
+        if self.keeps:
+            parts.append("--fresh  run all cases anew, whatever records the folder has\n")
+            parts.append("--again  run again the cases that had findings\n")
+            parts.append(f"-o --output DIR  folder for records and tables = {self.folder}\n")
+        return "".join(parts)
 
     def stamp(self, options: argparse.Namespace) -> dict[str, Any]:
         """What records belong to, beside study and version: a seed, for example."""
@@ -118,32 +135,6 @@ class Study:
 def name_case(row: Row) -> str:
     """A case in words."""
     return " ".join(map(str, row["case"]))
-
-
-def add_common(parser: argparse.ArgumentParser, study: Study) -> None:
-    """Add the options that every study has."""
-    if not study.timed:
-        cores = os.cpu_count() or 1
-        text = f"processes ({cores}, as many as cores)"
-        parser.add_argument("--jobs", type=Range(1, 256).parse, default=cores, help=text)
-    if study.shipped:
-        text = "folder of problem files (problems)"
-        parser.add_argument("--problems", default="problems", metavar="DIR", help=text)
-    if study.seeded:
-        read = Range(0, 2**63).parse
-        parser.add_argument("--seed", type=read, default=0, help="of everything drawn (0)")
-    if study.stored is not None:
-        option, path = study.stored
-        text = f"file of what is stored ({path})"
-        parser.add_argument(option, metavar="FILE", default=path, help=text)
-        parser.add_argument("--update", action="store_true", help="store what is found now")
-    if study.keeps:
-        text = "run all cases anew instead of going on with the records in the folder"
-        parser.add_argument("--fresh", action="store_true", help=text)
-        text = "run again the cases that had findings"
-        parser.add_argument("--again", action="store_true", help=text)
-        text = f"folder for records and tables ({study.folder})"
-        parser.add_argument("-o", "--output", metavar="DIR", default=study.folder, help=text)
 
 
 def run_study(
@@ -259,7 +250,8 @@ def _run(
     """Cases with their rows, as they end."""
     # Each process has one thread of OpenBLAS.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    jobs = min(1 if study.timed else options.jobs, len(cases) or 1)
+    jobs = 1 if study.timed else options.jobs or os.cpu_count() or 1
+    jobs = min(jobs, len(cases) or 1)
     run = partial(measure_case, study)
     for case, answer in run_all(run, cases, Processes(jobs, study.limit, study.alone), jobs):
         row = _fail(str(answer)) if isinstance(answer, Exception) else answer

@@ -1,52 +1,46 @@
-"""What each command is for, what carries it out, and which files and options it takes."""
+"""Commands with their files and options, and the parser of them."""
 
 from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
-from importlib import import_module
-from typing import NoReturn
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
 
 from ..common.errors import InputError
 from ..common.fields import read_options
 from ..mechanics.margin_key import MARGIN
 from ..planning.options import PLANNER
-from .help import TOPICS
 
-SIMULATORS = ("told", "free")  # what `plot --simulate` takes; the first one if it is left out
+TOPICS = {
+    "python": "",
+    "file-format": "problem",
+    "model": "mechanics",
+    "contacts": "contacts",
+    "planning": "planning",
+    "path-domain": "planning/path_domain",
+    "time-domain": "planning/time_domain",
+    "robust-plans": "planning/robust",
+    "verification": "verification",
+    "messages": "cli",
+    "search": "search",
+    "map": "mapping",
+    "policy": "policy",
+    "robustness": "robustness",
+    "engines": "engines",
+    "slow-motions": "quasistatic",
+    "tuning": "tuning",
+    "comparison": "comparison",
+    "simulation": "simulation",
+    "free-simulation": "simulation",
+    "output-files": "results",
+    "figures": "figures",
+    "movies": "viewer",
+    "studies": "benchmark",
+}
+"""Folder of the page of each topic."""
 
-
-class Parser(argparse.ArgumentParser):
-    """A parser whose errors are ours."""
-
-    def error(self, message: str) -> NoReturn:
-        """Refuse the command line."""
-        text = message.removeprefix("argument ")
-        raise InputError("", "", f"{text}; see {self.prog} --help")
-
-
-@dataclass(frozen=True)
-class Command:
-    """A command: what it is for, module and function that carry it out, and its options."""
-
-    text: str
-    run: str
-    options: str
-
-    def add(self, parser: argparse.ArgumentParser) -> None:
-        """Give what the command takes to its parser."""
-        for own in read_options(self.options):
-            own.add(parser)
-        parser.set_defaults(run=self._run)
-
-    def _run(self, options: argparse.Namespace) -> int:
-        module, name = self.run.split(":")
-        status: int = getattr(import_module(f".{module}", __package__), name)(options)
-        return status
-
-
+SIMULATORS = ("told", "free")  # what `--simulate` takes; the first one if it is left out
 PROBLEM = "problem  problem file (TOML)\n"
 PLAN = "plan  trajectory file (.npz)\n"
 JSON = "--json  print the result as JSON\n"
@@ -68,17 +62,17 @@ SEARCH = """\
 """
 
 TABLE = f"""\
-[[new]]  help:write  write a problem file to begin with
+[[new]]  write_problem  write a problem file to begin with
 name               the problem's name; NAME.toml is written
 --polygon CORNERS  corners of the regular polygon, 3 to 50 = 7 in 3..50
 --size             from its centre to its corners [m] = 0.05 in 1e-6..1e6
 --vertices 'X,Y ...'  corners of the object instead, anticlockwise [m], as in '0,0 0.08,0
     0.08,0.03 0,0.09'
 --mass             of the object [kg] (0.2 at a size of 0.05 m, growing with the area) in 1e-6..1e6
-[[schema]]  help:show_schema  print the JSON Schema of problem files, for editors
+[[schema]]  show_schema  print the JSON Schema of problem files, for editors
 -o --output FILE  file to write, instead of printing
 --table           all keys with unit, default and range as tables (Markdown) instead
-[[solve]]  command:solve  plan joint torques for a problem file
+[[solve]]  solve  plan joint torques for a problem file
 {PROBLEM}\
 -o --output FILE        trajectory file to write (default: NAME.npz)
 --torques FILE          also write the torques as CSV
@@ -86,7 +80,7 @@ name               the problem's name; NAME.toml is written
     (none) in 1e-9..1e12
 --interpolation NAME    of samples: linear, or hold for sample-and-hold (linear)
 {PLANNER}{MARGIN}{SEARCH}{JSON}\
-[[verify]]  command:verify  replay torques open loop and check the motion
+[[verify]]  verify  replay torques open loop and check the motion
 {PROBLEM}\
 torques           trajectory file (.npz) or torques (.csv: t,tau1,tau2)
 --tolerance       of the simulator's steps, relative to the scene's scales = 1e-9 in 1e-14..1e-2
@@ -104,7 +98,7 @@ torques           trajectory file (.npz) or torques (.csv: t,tau1,tau2)
 --restitution     Poisson's coefficient of impacts, 0 to 1, with --free (0: plastic) in 0.0..1.0
 -o --output FILE  trajectory file to write (.npz) of the replayed motion, for plot
 {JSON}\
-[[plot]]  command:plot  draw force margins, torques and snapshots
+[[plot]]  plot  draw force margins, torques and snapshots
 trajectory         trajectory file (.npz), or torques to replay (.csv)
 --problem FILE     problem file (TOML) for torques
 -o --output FILE   figure to write (.png, .pdf, .svg) (required)
@@ -112,7 +106,7 @@ trajectory         trajectory file (.npz), or torques to replay (.csv)
     among told|free
 --width            of the figure [in], 3 to 40 (10) in 3.0..40
 --motion           also draw the object's pose, and the joints' angles and speeds
-[[predict]]  analysis:predict  see up to which speed slow motions keep every contact
+[[predict]]  predict  see up to which speed slow motions keep every contact
 {PROBLEM}\
 -o --output FILE  figure to write (.png, .pdf, .svg) of the least normal force over speed
 {SQUEEZE}\
@@ -120,7 +114,7 @@ trajectory         trajectory file (.npz), or torques to replay (.csv)
 --speed V         mean speed along the phases for these [m/s], over which they are spread in time
     (0.05) in 1e-9..1e6
 {JSON}\
-[[tune]]  analysis:tune  tune torques from quasistatic ones by steps of 10 percent
+[[tune]]  tune  tune torques from quasistatic ones by steps of 10 percent
 {PROBLEM}\
 -o --output FILE  torques to write (.csv)
 --brake           let each phase have one more step of its torques, which stops it at its end
@@ -130,30 +124,30 @@ trajectory         trajectory file (.npz), or torques to replay (.csv)
 --share           raises beyond the first that reaches the end: 0 none, 1 all that keep contacts
     = 1 in 0.0..1.0
 {JSON}\
-[[compare]]  analysis:compare  put plans and torques for a problem side by side
+[[compare]]  compare  put plans and torques for a problem side by side
 {PROBLEM}\
 files FILE ...    trajectory files (.npz) or torques (.csv) for that problem
 -o --output FILE  figure to write (.png, .pdf, .svg) of the force margins of all
 {JSON}\
-[[route]]  route:route  find the contact formations that lead to a goal, and plan
+[[route]]  route  find the contact formations that lead to a goal, and plan
 problem           problem file (TOML) with [goal] in place of [[phases]]
 -o --output FILE  figure to write (.png, .pdf, .svg) of the route over the map
 --alternatives N  how many routes of other formations are listed beside the best one = 0 in 0..100
 --objective NAME  of the plans: time, effort or margin; routes are looked for by time = time
 {SEARCH}{JSON}\
-[[map]]  route:draw  draw the contact formations over (x, phi)
+[[map]]  draw_map  draw the contact formations over (x, phi)
 {PROBLEM}\
 -o --output FILE  figure to write (.png, .pdf, .svg; default: map_NAME.png)
 --plan FILE       trajectory file (.npz) to draw over it
 --phi LOW,HIGH    range of phi [deg] (default: the plan's)
 --list X,PHI ...  print the formations along a route of two or more poses [m, deg] as [[phases]]
 {MARGIN}\
-[[export]]  engines:export  write scene and plan for a physics engine
+[[export]]  export  write scene and plan for a physics engine
 {PROBLEM}\
 [plan]            trajectory file (.npz) that the model plays
 --mjcf FILE       file to write (.xml): the scene in MuJoCo's format (required)
 --step            time step of the model [s] (from the scene) in 1e-15..1e6
-[[replay]]  engines:replay  replay a plan in MuJoCo or Drake and compare it with the plan
+[[replay]]  replay  replay a plan in MuJoCo or Drake and compare it with the plan
 {PROBLEM}{PLAN}\
 --engine NAME     mujoco or drake, installed with the extra of that name (required)
 --whole           from start to end, instead of phase by phase from each planned start
@@ -165,7 +159,7 @@ problem           problem file (TOML) with [goal] in place of [[phases]]
     in rad (3e-3 for mujoco, 1.5e-3 for drake; of a policy's end, 3e-2) in 1e-9..1e3
 --refine N        also replay with steps of a half, a quarter, ... to N halvings = 0 in 0..6
 {JSON}\
-[[policy]]  policy:policy  make torques a function of the joints, by feedback
+[[policy]]  policy  make torques a function of the joints, by feedback
 {PLAN}\
 -o --output FILE  policy to write (.npz; default: NAME_policy.npz)
 --reserve         normal force that is kept in reserve along the way: where plan or problem have
@@ -180,7 +174,7 @@ problem           problem file (TOML) with [goal] in place of [[phases]]
     (1e-3) in 1e-9..1e3
 --write-anyway    write the policy although its simulation does not hold, marked so in its file
 {JSON}\
-[[robustness]]  analysis:robustness  see how much error a plan bears
+[[robustness]]  robustness  see how much error a plan bears
 {PROBLEM}{PLAN}\
 --samples             samples to replay, a Latin hypercube of all ranges = 1000 in 1..1000000
 --seed                of the samples = 0 in 0..9223372036854775808
@@ -203,55 +197,96 @@ problem           problem file (TOML) with [goal] in place of [[phases]]
 --jobs                worker processes (default: all cores) in 1..256
 --scheduler ADDRESS   run on the cluster of this Dask scheduler (extra: cluster)
 {JSON}\
-[[animate]]  viewer:animate  make a movie of a plan, or a page that plays it
+[[animate]]  animate  make a movie of a plan, or a page that plays it
 trajectory         trajectory file (.npz)
 -o --output FILE   what to write: .gif, .mp4 (needs ffmpeg), or .html, which plays in any browser
     (required)
 --speed            speed over real time, 0.1 is ten times slower = 0.1 in 1e-6..1e3
 --simulate [free]  draw the simulated motion behind; free: simulated without telling which contacts
     hold among told|free
-[[report]]  viewer:report  put a problem and its plans into one page to open anywhere
+[[report]]  report  put a problem and its plans into one page to open anywhere
 {PROBLEM}\
 [files PLAN ...]  trajectory files (.npz) or torques (.csv); none: plan the least time
 -o --output FILE  page to write (default: NAME.html)
-[[gallery]]  viewer:gallery  plan problems and show them all on one page
+[[gallery]]  gallery  plan problems and show them all on one page
 files PROBLEM ...  problem files (TOML)
 -o --output FILE   page to write (.md); figures and movies go to a folder beside it
     = results/gallery.md
-[[help]]  help:show  print a page of the documentation, or list its topics
+[[help]]  show_page  print a page of the documentation, or list its topics
 [topic TOPIC]  what the page is about (left out: list the topics) among {"|".join(TOPICS)}
-[[completion]]  help:complete  print what makes a shell complete all this
+[[completion]]  complete  print what makes a shell complete all this
 shell  bash, zsh or tcsh; needs the extra completion
 """
-"""Commands but `bench`, which has studies of its own: name, module and function that carry it out,
-what it is for, and then its files and options as of `read_options`."""
-_ROWS = [own.partition("\n") for own in re.split(r"^(?=\[\[\w+\]\]  )", TABLE, flags=re.M)[1:]]
-_HEADS = [(re.split(r" {2,}", head), options) for head, _, options in _ROWS]
-COMMANDS = {name.strip("[]"): Command(text, run, own) for (name, run, text), own in _HEADS}
+"""Commands but `bench`: name, function that carries it out, what it is for, and then its files and
+options as of `read_options`."""
 
 
-def name_simulator(given: Sequence[str]) -> list[str]:
-    """Give `--simulate` the simulator that it leaves out."""
-    named: list[str] = []
-    for text in given:
-        if named[-1:] == ["--simulate"]:
-            named[-1] += f"={text if text in SIMULATORS else SIMULATORS[0]}"
-            if text in SIMULATORS:
-                continue
-        named.append(text)
-    return [f"{text}={SIMULATORS[0]}" if text == "--simulate" else text for text in named]
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are ours, and which can be filled when it is first used.
 
-
-def protect(given: Sequence[str]) -> list[str]:
-    """Keep argparse from taking pairs of numbers that start with a minus for options.
-
-    Of several pairs it would take one alone after an equals sign.
+    Pairs of numbers that begin with a minus are no options.
     """
-    texts = list[str]()
-    for text in given:
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._negative_number_matcher = re.compile(r"-\.?\d")
+        self.fill: Callable[[], object] | None = None
+
+    def complete(self) -> None:
+        """Add what is left out until then."""
+        fill, self.fill = self.fill, None
+        if fill is not None:
+            fill()
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse, with all options."""
+        self.complete()
+        return super().parse_known_args(args, namespace)
+
+    def format_help(self) -> str:
+        """The help, with all options."""
+        self.complete()
+        return super().format_help()
+
+    def error(self, message: str) -> NoReturn:
+        """Refuse the command line."""
+        text = message.removeprefix("argument ")
+        raise InputError("", "", f"{text}; see {self.prog} --help")
+
+
+def add_parser(parsers: Any, name: str, text: str, table: str = "") -> Parser:
+    """Add the parser of a command or study that is for what the text says."""
+    parser: Parser = parsers.add_parser(
+        name, help=text, description=f"{text[0].upper()}{text[1:]}."
+    )
+    add_options(parser, table)
+    return parser
+
+
+def add_options(parser: argparse.ArgumentParser, table: str) -> None:
+    """Give options and files of a table, as of `read_options`, to a parser."""
+    for option in read_options(table) if table else ():
+        option.add(parser)
+
+
+def add_commands(parsers: Any, runs: dict[str, Any]) -> None:
+    """Add the parsers of all commands of `TABLE`, which are carried out by functions by name."""
+    for part in re.split(r"^(?=\[\[)", TABLE, flags=re.M)[1:]:
+        head, _, table = part.partition("\n")
+        name, run, text = re.split(r" {2,}", head)
+        add_parser(parsers, name.strip("[]"), text, table).set_defaults(run=runs[run])
+
+
+def prepare(given: Sequence[str]) -> list[str]:
+    """Arguments as argparse takes them: `--simulate` with its simulator, `--list` without a sign.
+
+    It would take a file for the simulator that is left out, and of several pairs one alone after
+    an equals sign.
+    """
+    left, texts = [*given], list[str]()
+    while left:
+        text = left.pop(0)
+        if text == "--simulate":
+            text += f"={left.pop(0) if left and left[0] in SIMULATORS else SIMULATORS[0]}"
         texts += ["--list", text[7:]] if text.startswith("--list=") else [text]
-    return [f" {text}" if _is_pair(text) else text for text in texts]
-
-
-def _is_pair(text: str) -> bool:
-    return text[:1] == "-" and text[1:2] in tuple(".0123456789") and "," in text
+    return texts

@@ -1,7 +1,8 @@
-"""The command line: ``wholearm solve``, ``verify``, ``plot``, the studies of ``bench``, the parser.
+"""The command line: each command reads its files, calls a public function and prints the result.
 
 Exit status 0 means done and all contacts held, 1 infeasible or a contact lost or a goal missed,
 2 bad input, 130 interrupted, 143 terminated. Each command imports what it needs and nothing else.
+Progress on stderr is a line that changes in a terminal, and else a line every ten seconds.
 """
 
 from __future__ import annotations
@@ -9,38 +10,35 @@ from __future__ import annotations
 import argparse
 import errno
 import json
+import math
 import os
+import posixpath
+import re
 import sys
-from collections.abc import Sequence
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
-from importlib import import_module
+from importlib import import_module, resources
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .. import __version__
-from ..benchmark import STUDIES
-from ..common.errors import InputError, WholearmError, name_source
-from ..common.signals import guard
-from .arguments import COMMANDS, Parser, name_simulator, protect
-from .output import (
-    announce,
-    clear_progress,
-    name_files,
-    print_result,
-    progress_log,
-    require_output,
-    show_progress,
-    tell_origin,
-)
+import wholearm
+
+from ..common.errors import InputError, ReplayError, WholearmError, name_source
+from ..common.signals import check, guard, listen
+from .arguments import TOPICS, Parser, add_commands, add_options, add_parser, prepare
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from ..benchmark.study import Study
-    from ..planning.result import Plan
+    from ..common.document import Result
     from ..planning.table_check import TorqueTable
-    from ..policy.playback import Policy
-    from ..problem.definition import Problem
     from ..results.report import Report
-    from ..results.torque import TorqueProfile
-    from ..results.trajectory import Trajectory
+    from ..simulation.events import Simulation
     from ..verification.free import FreeReport
 
 
@@ -52,8 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(given: Sequence[str]) -> int:
     try:
-        named = protect(name_simulator(given))
-        options = build_parser().parse_args(named)
+        options = build_parser().parse_args(prepare(given))
         with progress_log():
             status: int = options.run(options)
         sys.stdout.flush()
@@ -86,56 +83,212 @@ def _silence_output() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def build_parser() -> argparse.ArgumentParser:
+def build_parser() -> Parser:
     """Return the parser of all commands."""
     parser = Parser(prog="wholearm", description="Plan and verify whole-arm manipulation.")
-    version = f"wholearm {__version__}"
+    version = f"wholearm {wholearm.__version__}"
     parser.add_argument("--version", action="version", version=version, help="print the version")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    for name, own in COMMANDS.items():
-        own.add(commands.add_parser(name, help=own.text, description=_to_sentence(own.text)))
+    add_commands(commands, globals())
     text = "run studies: measure, compare with stored answers, look for what must not be"
-    add_bench(commands.add_parser("bench", help=text, description=_to_sentence(text)))
+    bench = add_parser(commands, "bench", text)
+    bench.fill = partial(_fill_bench, bench)
     return parser
 
 
-def _to_sentence(text: str) -> str:
-    """With a capital first, and a full stop."""
-    return f"{text[0].upper()}{text[1:]}."
+EVERY = 10.0  # time between lines of progress where stderr is no terminal [s]
+
+
+class _Lines:
+    """Lines for a log: what is being done, for how long already."""
+
+    def __init__(self) -> None:
+        listen(self.look)
+        self.begin(0)
+
+    def begin(self, process: int) -> None:
+        """Count from now on, for the work of a process."""
+        self._process, self._text = process, "working"
+        self._begun = self._last = time.monotonic()
+
+    def say(self, text: str) -> None:
+        self._text = text
+        self.look()
+
+    def look(self) -> None:
+        """Print what was said last, if it is time."""
+        now = time.monotonic()
+        # A forked process has the same work, whose progress its parent tells.
+        if now - self._last >= EVERY and os.getpid() == self._process:
+            self._last = now
+            _complain(f"{now - self._begun:.0f} s: {self._text}")
+
+
+_LINES = _Lines()  # those of the command, which may show progress of several things
+
+
+@contextmanager
+def progress_log() -> Iterator[None]:
+    """Where stderr is no terminal, have a line logged every ten seconds of a command."""
+    if not sys.stderr.isatty():
+        _LINES.begin(os.getpid())
+    try:
+        yield
+    finally:
+        _LINES.begin(0)
+
+
+def show_progress() -> Callable[[str], None]:
+    """What shows progress."""
+    if not sys.stderr.isatty():
+        return _LINES.say
+
+    def show(text: str) -> None:
+        print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
+
+    return show
+
+
+def clear_progress() -> None:
+    """Remove the progress line."""
+    if sys.stderr.isatty():
+        show_progress()("")
+
+
+def require_output(path: str | None, *endings: str) -> None:
+    """Check, before long work, that a file can be written; without endings it is a figure."""
+    if path is None:
+        return
+    from ..common.files import require_ending, require_writable
+
+    if not endings:
+        from ..figures.plots import require_format
+
+        require_format(path)
+    require_writable(path)
+    if endings:
+        require_ending(path, *endings)
+
+
+def finish(
+    options: argparse.Namespace,
+    result: Result | None,
+    *paths: str | None,
+    notes: Mapping[str, Any] | None = None,
+) -> int:
+    """Print a result as text, or with --json and with notes as JSON, and which files are written.
+
+    Returns the exit status.
+    """
+    clear_progress()
+    as_json = getattr(options, "json", False)
+    if result is not None and as_json:
+        print(json.dumps({**result.to_dict(), **(notes or {})}, indent=2))
+    elif result is not None:
+        print(result.to_text())
+    written = ", ".join(filter(None, paths))
+    if written and not as_json:
+        print(f"wrote {written}")
+    return 0 if result is None else result.exit_status
+
+
+def stem_of(path: str) -> str:
+    """The name of a file without folder and ending."""
+    return os.path.splitext(os.path.basename(path))[0]
+
+
+def read_problem(options: argparse.Namespace) -> wholearm.Problem:
+    """The problem of a command, whose phases are not traced."""
+    from ..problem.read import read_problem
+
+    return read_problem(options.problem)
+
+
+LoadedPlan = tuple[
+    "wholearm.Problem", "wholearm.Trajectory", "wholearm.Policy | None", dict[str, list[str]]
+]
+"""A problem with the phases of a plan, the plan, its policy if one is given, and notes."""
+
+
+def load_plan(options: argparse.Namespace, path: str, silent: bool = False) -> LoadedPlan:
+    """The problem of a command with the phases of a plan, the plan, its policy, and notes.
+
+    The policy is none where none is given, the notes as of `tell_origin`.
+    """
+    from ..problem.read import adopt_phases
+
+    plan, problem, policy = wholearm.load_trajectory(path), read_problem(options), None
+    known, sensor = getattr(options, "policy", None), getattr(options, "sensor", False)
+    if known is not None:
+        policy = wholearm.Policy.load(known).with_sensor(sensor)
+    problem = adopt_phases(problem, plan.meta, plan.q[-1], path)
+    named = None if policy is None else (str(known), policy)
+    notes = tell_origin(problem, (path, plan), named, silent)
+    return problem, plan, policy, notes
+
+
+def tell_origin(
+    problem: wholearm.Problem,
+    plan: tuple[str, wholearm.Trajectory],
+    policy: tuple[str, wholearm.Policy] | None = None,
+    silent: bool = False,
+) -> dict[str, list[str]]:
+    """Print a line for what was made for another problem.
+
+    Parameters
+    ----------
+    plan, policy  the file and what is in it
+    silent        leave printing to the caller
+
+    Returns
+    -------
+    dict  the lines as `notes`, for JSON; empty if there are none
+
+    Raises
+    ------
+    InputError  if one of them makes no sense for the problem; names its file
+    """
+    from ..results.adopt import describe_origin
+
+    given = [("plan", plan[0], plan[1].meta)]
+    if policy is not None:
+        given.append(("policy", policy[0], policy[1].about))
+    notes: list[str] = []
+    for what, source, meta in given:
+        with name_source(source):
+            notes += filter(None, [describe_origin(problem, meta, what)])
+    for note in () if silent else notes:
+        print(note)
+    return {"notes": notes} if notes else {}
 
 
 def solve(options: argparse.Namespace) -> int:
     """Plan, and write the plan."""
     from ..common.fields import keys_of
     from ..common.files import together
-    from ..geometry.tracing import load
-    from ..planning.options import PlanOptions
     from ..planning.plan import solve_with
     from ..planning.result import describe_plan
     from ..scene.model import find_unit_hint
 
-    output = options.output or f"{os.path.splitext(os.path.basename(options.problem))[0]}.npz"
-    given = {key: getattr(options, key) for key in keys_of(PlanOptions)}
-    plan_options = PlanOptions(**{key: own for key, own in given.items() if own is not None})
+    output = options.output or f"{stem_of(options.problem)}.npz"
+    given = {key: getattr(options, key) for key in keys_of(wholearm.PlanOptions)}
+    plan_options = wholearm.PlanOptions(**{k: own for k, own in given.items() if own is not None})
     require_output(output, ".npz")
     require_output(options.torques, ".csv")
     _check_sampling(options)
-    problem = load(options.problem)
+    problem = wholearm.load(options.problem)
     if hint := find_unit_hint(problem.scene):
         _complain(f"{options.problem}: {hint}")
     for key in ("cache", "jobs"):
         if getattr(options, key) is not None and not problem.goals:
             raise InputError("", f"--{key}", "is for problems with [goal]")
+    found = ""
     try:
         if problem.goals:
-            from .route import find
-
-            asked = {key: getattr(options, key) for key in ("cache", "jobs", "time_limit")}
-            answer = find(problem, plan_options, **asked)
+            answer = find_route(options, problem, plan_options)
             plan, found = answer.plan, answer.to_text()
         else:
             plan = solve_with(problem, plan_options, show_progress(), options.time_limit)
-            found = ""
         table = None if options.torques is None else _make_table(options, plan)
     except WholearmError as error:
         clear_progress()
@@ -171,81 +324,46 @@ def _check_sampling(options: argparse.Namespace) -> None:
     require_sampling(options.sample_rate, options.interpolation or "linear")
 
 
-def _make_table(options: argparse.Namespace, plan: Plan) -> TorqueTable:
+def _make_table(options: argparse.Namespace, plan: wholearm.Plan) -> TorqueTable:
     """The torque table that is asked for, replayed."""
     from ..planning.table_check import make_table, sample_table
 
+    given = plan.problem, plan.trajectory
     if options.sample_rate is None:
-        return make_table(plan.problem, plan.trajectory, options.replay)
+        return make_table(*given, options.replay)
     interpolation = options.interpolation or "linear"
-    return sample_table(
-        plan.problem, plan.trajectory, options.sample_rate, interpolation, options.replay
-    )
+    return sample_table(*given, options.sample_rate, interpolation, options.replay)
 
 
 def verify(options: argparse.Namespace) -> int:
     """Replay torques, and print the verdict."""
-    from ..problem.read import adopt_phases, read_problem
-    from ..results.trajectory import Trajectory
-    from ..verification.verify import verify as run
-
     require_output(options.output, ".npz")
-    keys = ("tolerance", "departure", "rest_speed", "uniqueness_margin")
+    keys = ("tolerance", "departure", "rest_speed", "uniqueness_margin", "restitution")
     given = {key: own for key in keys if (own := getattr(options, key)) is not None}
     _check_free(options)
-    problem = read_problem(options.problem)
-    torques = _read_torques(options.torques)
-    policy, notes = _read_policy(options, torques), {}
-    if isinstance(torques, Trajectory):
-        problem = adopt_phases(problem, torques.meta, torques.q[-1], options.torques)
-        named = None if policy is None else (options.policy, policy)
-        notes = tell_origin(problem, (options.torques, torques), named, options.json)
+    policy, notes = None, dict[str, list[str]]()
+    torques: wholearm.Trajectory | wholearm.TorqueProfile
+    if not _is_table(options.torques):
+        problem, torques, policy, notes = load_plan(options, options.torques, options.json)
+    elif options.policy is not None:
+        raise InputError(options.torques, "", "torques alone given; --policy needs the plan (.npz)")
+    else:
+        problem, torques = read_problem(options), wholearm.read_torque_csv(options.torques)
     if getattr(torques, "meta", {}).get("problem") != problem.table:
         # What has been planned or replayed can be carried out.
         from ..geometry.tracing import check_phases
 
         check_phases(problem)
-    if options.free:
-        given |= {} if options.restitution is None else {"restitution": options.restitution}
-        report: Report | FreeReport = _simulate_free(problem, torques, policy, given)
+    if policy is not None and isinstance(torques, wholearm.Trajectory):
+        report: Report | FreeReport = wholearm.verify_policy(problem, torques, policy, **given)
+    elif options.free:
+        report = wholearm.verify_free(problem, torques, progress=show_progress(), **given)
     else:
-        announce(f"replaying {len(problem.phases)} phases")
-        report = run(problem, torques, reduced=options.reduced, **given)
+        show_progress()(f"replaying {len(problem.phases)} phases")
+        report = wholearm.verify(problem, torques, reduced=options.reduced, **given)
     if options.output is not None:
         report.trajectory.save(options.output)
-    status = print_result(options, report, notes)
-    name_files(options, options.output)
-    return status
-
-
-def _read_policy(options: argparse.Namespace, torques: Trajectory | TorqueProfile) -> Policy | None:
-    """The policy that is to carry out a plan, if one is given."""
-    if options.policy is None:
-        return None
-    from ..policy.playback import Policy
-    from ..results.torque import TorqueProfile
-
-    if isinstance(torques, TorqueProfile):
-        raise InputError(options.torques, "", "torques alone given; --policy needs the plan (.npz)")
-    return Policy.load(options.policy).with_sensor(options.sensor)
-
-
-def _simulate_free(
-    problem: Problem,
-    torques: Trajectory | TorqueProfile,
-    policy: Policy | None,
-    given: dict[str, float],
-) -> FreeReport:
-    """The report of torques, or of a policy, with no contacts told."""
-    from ..results.trajectory import Trajectory
-
-    if policy is None or not isinstance(torques, Trajectory):
-        from ..verification.free import verify_free
-
-        return verify_free(problem, torques, progress=show_progress(), **given)
-    from ..verification.policy_check import verify_policy
-
-    return verify_policy(problem, torques, policy, **given)
+    return finish(options, report, options.output, notes=notes)
 
 
 def _check_free(options: argparse.Namespace) -> None:
@@ -261,93 +379,549 @@ def _check_free(options: argparse.Namespace) -> None:
         raise InputError("", "--sensor", "needs --policy")
 
 
-def _read_torques(path: str) -> Trajectory | TorqueProfile:
+def _is_table(path: str) -> bool:
+    """Whether a file is one of torques alone, and no trajectory."""
     from ..common.files import require_ending
-    from ..results.torque import read_torque_csv
-    from ..results.trajectory import load_trajectory
 
-    csv = require_ending(path, ".npz", ".csv") == ".csv"
-    return read_torque_csv(path) if csv else load_trajectory(path)
+    return require_ending(path, ".npz", ".csv") == ".csv"
 
 
 def plot(options: argparse.Namespace) -> int:
     """Draw a plan, or the replay of torques."""
-    from ..figures import plots
-    from ..results.trajectory import Trajectory
-    from .viewer import overlay
-
     require_output(options.output)
-    trajectory = _read_torques(options.trajectory)
-    if not isinstance(trajectory, Trajectory):
-        trajectory = _replay(options, trajectory)
-    elif options.problem is not None:
-        raise InputError("", "--problem", "is for torques (.csv); trajectories bring their own")
+    if not _is_table(options.trajectory):
+        trajectory = wholearm.load_trajectory(options.trajectory)
+        if options.problem is not None:
+            raise InputError("", "--problem", "is for torques (.csv); trajectories bring their own")
+    else:
+        torques = wholearm.read_torque_csv(options.trajectory)
+        if options.problem is None:
+            raise InputError(options.trajectory, "--problem", "is needed to replay torques")
+        problem = wholearm.load(options.problem)
+        trajectory = wholearm.simulate(problem, torques, progress=show_progress()).trajectory
     with name_source(options.trajectory):
-        simulation = overlay(options.simulate, trajectory) if options.simulate else None
+        simulation = overlay(options.simulate, trajectory)
         width = {} if options.width is None else {"width": options.width}
-        figure = plots.force_margins(
+        figure = wholearm.plots.force_margins(
             trajectory, simulation=simulation, motion=options.motion, **width
         )
-    plots.save(figure, options.output)
-    name_files(options, options.output)
+    wholearm.plots.save(figure, options.output)
+    return finish(options, None, options.output)
+
+
+def overlay(simulator: str | None, trajectory: wholearm.Trajectory) -> Simulation | None:
+    """Simulate the torques of a trajectory; `simulator` is told or free, or None for nothing."""
+    if simulator is None:
+        return None
+    from ..problem.read import read_own_problem
+
+    problem, say = read_own_problem(trajectory.meta), show_progress()
+    if simulator == "free":
+        say("simulating the whole")
+        return wholearm.simulate_free(problem, trajectory).show(trajectory.contacts)
+    return wholearm.simulate(problem, trajectory.torque, progress=say)
+
+
+def predict(options: argparse.Namespace) -> int:
+    """Predict up to which speed quasistatic motions keep contacts, and write what is asked for."""
+    from ..quasistatic.slow_speeds import make_torques
+
+    require_output(options.output)
+    require_output(options.torques, ".csv")
+    if options.torques is None and options.speed is not None:
+        raise InputError("", "--speed", "is for --torques FILE, the torques to write")
+    problem = read_problem(options)
+    prediction = wholearm.predict(problem, squeeze=options.squeeze, progress=show_progress())
+    if options.output is not None:
+        from ..figures.analysis_figures import draw_prediction
+
+        wholearm.plots.save(draw_prediction(prediction), options.output)
+    if options.torques is not None:
+        wholearm.save(make_torques(prediction, options.speed or 0.05), options.torques)
+    return finish(options, prediction, options.output, options.torques)
+
+
+def tune(options: argparse.Namespace) -> int:
+    """Tune torques in steps of 10 %, print what became of each phase, write them if they hold."""
+    from ..common.files import write_text
+
+    require_output(options.output, ".csv")
+    given = {key: getattr(options, key) for key in ("brake", "stops", "squeeze", "share")}
+    tuning = wholearm.tune(wholearm.load(options.problem), **given, progress=show_progress())
+    output = options.output if tuning.ok else None
+    if output is not None:
+        write_text(output, tuning.to_csv())
+    return finish(options, tuning, output)
+
+
+def compare(options: argparse.Namespace) -> int:
+    """Replay plans and torques for one problem, print the tables, and draw the margins."""
+    require_output(options.output)
+    problem = wholearm.load(options.problem)
+    comparison = wholearm.compare(problem, options.files, show_progress())
+    if options.output is not None:
+        from ..figures.analysis_figures import draw_comparison
+
+        wholearm.plots.save(draw_comparison(comparison), options.output)
+    return finish(options, comparison, options.output)
+
+
+def robustness(options: argparse.Namespace) -> int:
+    """Replay samples, and print what becomes of them."""
+    from ..common.crowd import Processes, connect
+    from ..problem.uncertainty import spread_widths
+
+    # A file for each study that differs by more than numbers: its problem, phase and policy.
+    parts = [stem_of(options.problem), "robustness"]
+    parts += [] if options.phase is None else [f"phase{options.phase}"]
+    parts += [] if options.policy is None else [stem_of(options.policy)]
+    parts += ["sensor"] if options.sensor else []
+    output = options.output or f"{'_'.join(parts)}.jsonl"
+    require_output(output, ".jsonl")
+    require_output(options.figure)
+    if options.sensor and options.policy is None:
+        raise InputError("", "--sensor", "needs --policy")
+    problem, plan, policy, notes = load_plan(options, options.plan, options.json)
+    widths: dict[str, float] = {}
+    for text in options.vary:
+        name, _, value = text.partition("=")
+        try:
+            widths[name] = float(value)
+        except ValueError:
+            given = f"{text!r} given; NAME=WIDTH is needed, such as mass=0.1"
+            raise InputError("", "--vary", given) from None
+    known = problem.ranges | spread_widths(widths, "range of {}")
+    goal = options.goal_distance, math.radians(options.goal_angle)
+    start: Callable[[], Executor] = partial(Processes, options.jobs)
+    if options.scheduler is not None:
+        start = partial(connect, options.scheduler)
+    study = wholearm.assess_robustness(
+        problem,
+        plan,
+        samples=options.samples,
+        seed=options.seed,
+        uncertainty=wholearm.Uncertainty(
+            known, options.sample_rate or None, options.tolerance, *goal
+        ),
+        phase=options.phase,
+        policy=policy,
+        path=output,
+        fresh=options.fresh,
+        start=start,
+        progress=show_progress(),
+    )
+    if options.figure is not None:
+        from ..figures.analysis_figures import draw_robustness
+
+        wholearm.plots.save(draw_robustness(study), options.figure)
+    return finish(options, study, output, options.figure, notes=notes)
+
+
+def route(options: argparse.Namespace) -> int:
+    """Find a route, print its phases, and draw it if that is asked for."""
+    require_output(options.output)
+    plan_options = wholearm.PlanOptions(objective=options.objective)
+    answer = find_route(options, read_problem(options), plan_options, options.alternatives)
+    clear_progress()
+    print(
+        f"{json.dumps(answer.to_dict(), indent=2)}\n" if options.json else answer.to_text(), end=""
+    )
+    if options.output is not None:
+        _save_map(answer.problem, answer.plan.trajectory, options.output)
+        print(f"wrote {options.output}", file=sys.stderr)
     return 0
 
 
-def _replay(options: argparse.Namespace, torques: TorqueProfile) -> Trajectory:
-    """The motion that torques alone lead to."""
-    if options.problem is None:
-        raise InputError(options.trajectory, "--problem", "is needed to replay torques")
-    from ..geometry.tracing import load
-    from ..simulation.simulate import simulate
+def find_route(
+    options: argparse.Namespace,
+    problem: wholearm.Problem,
+    plan_options: wholearm.PlanOptions,
+    alternatives: int = 0,
+) -> wholearm.Answer:
+    """Find a route, with a progress line, in two processes if nothing else is asked for."""
+    from ..common.workers import count_cores
+    from ..search.find_route import find_route_with
 
-    return simulate(load(options.problem), torques, progress=show_progress()).trajectory
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", UserWarning)
+        warnings.showwarning = _warn
+        return find_route_with(
+            problem,
+            plan_options,
+            alternatives,
+            show_progress(),
+            None if options.cache is None else Path(options.cache),
+            min(2, count_cores()) if options.jobs is None else options.jobs,
+            time_limit=options.time_limit,
+            hurry=hasten,
+        )
 
 
-class StudyParser(Parser):
-    """A parser that asks the study for its options when it is used: only then is that imported."""
+def _warn(message: Warning | str, *_: object, **__: object) -> None:
+    clear_progress()
+    _complain(f"warning: {message}")
 
-    study = ""
 
-    def complete(self) -> None:
-        """Add the options of the study."""
-        if self.study:
-            from ..benchmark.study import add_common
+def hasten() -> None:
+    """Say that the best route so far is being planned; raises where the command was terminated."""
+    # After SIGTERM nothing is planned any more.
+    check()
+    clear_progress()
+    _complain("planning the best route; again to stop")
 
-            study = load_study(self.study)
-            self.study = ""
-            add_common(self, study)
-            study.add_options(self)
-            self.set_defaults(run=partial(_run_study, study))
 
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse, with all options."""
-        self.complete()
-        return super().parse_known_args(args, namespace)
+def _save_map(
+    problem: wholearm.Problem,
+    plan: wholearm.Trajectory | None,
+    output: str,
+    phi: tuple[float, float] | None = None,
+    **limit: Any,
+) -> None:
+    from ..mapping.formation_map import choose_window
 
-    def format_help(self) -> str:
-        """The help, with all options."""
-        self.complete()
-        return super().format_help()
+    window = choose_window(problem, phi)
+    chart = wholearm.build_map(problem, window=window, progress=show_progress(), **limit)
+    wholearm.plots.save(wholearm.draw_map(chart, plan), output)
+    clear_progress()
+
+
+def draw_map(options: argparse.Namespace) -> int:
+    """Draw the map, or list the formations along a route, or both."""
+    poses = [_read_pair(text, "--list", "X,PHI in m and degrees") for text in options.list or ()]
+    phi = options.phi and _read_pair(options.phi, "--phi", "LOW,HIGH in degrees")
+    if phi and not 0 < phi[1] - phi[0] <= 360:
+        raise InputError("", "--phi", f"{options.phi!r} given; LOW < HIGH <= LOW + 360 is needed")
+    if poses:
+        radians = [(x, math.radians(angle)) for x, angle in poses]
+        formations = wholearm.list_formations(read_problem(options), *radians)
+        print(wholearm.format_route(formations), end="")
+        if options.output is None:
+            return 0
+    output = options.output or f"map_{stem_of(options.problem)}.png"
+    require_output(output)
+    problem = read_problem(options)
+    plan = None if options.plan is None else wholearm.load_trajectory(options.plan)
+    if plan is not None:
+        tell_origin(problem, (options.plan, plan), silent=bool(poses))
+    margin = options.uniqueness_margin
+    limit = {} if margin is None else {"uniqueness_margin": margin}
+    _save_map(problem, plan, output, phi, **limit)
+    print(f"wrote {output}", file=sys.stderr if poses else sys.stdout)
+    return 0
+
+
+def _read_pair(text: str, key: str, allowed: str) -> tuple[float, float]:
+    from ..common.errors import require_number
+
+    try:
+        first, second = (require_number(float(part), key) for part in text.split(","))
+    except ValueError:
+        raise InputError("", key, f"{text.strip()!r} given; allowed is {allowed}") from None
+    return first, second
+
+
+def _check_step(options: argparse.Namespace, problem: wholearm.Problem) -> None:
+    """Check that an engine gets along with the time step, if one is given."""
+    from ..common.fields import Range
+
+    known = Range(1e-6, 1e-1, lambda scene, _: scene.scales.time, "times the scene's time")
+    if options.step is not None:
+        known.check("--step", options.step, "s", problem.scene)
+
+
+def _load_replayed(options: argparse.Namespace, silent: bool) -> LoadedPlan:
+    """As `load_plan`, of a plan with the phases of the problem."""
+    from ..results.adopt import require_same_phases
+
+    if _is_table(options.plan):
+        text = "torques alone have no motion to compare with; verify -o FILE.npz writes one"
+        raise InputError(options.plan, "", text)
+    problem, plan, policy, notes = load_plan(options, options.plan, silent)
+    with name_source(options.plan):
+        require_same_phases(problem, plan)
+    return problem, plan, policy, notes
+
+
+def export(options: argparse.Namespace) -> int:
+    """Write the scene, with a plan if one is given."""
+    from ..common.files import write_text
+
+    require_output(options.mjcf, ".xml")
+    problem, plan = read_problem(options), None
+    _check_step(options, problem)
+    if options.plan is not None:
+        problem, plan, *_ = _load_replayed(options, silent=False)
+    with name_source(options.problem):
+        write_text(options.mjcf, wholearm.write_mjcf(problem, plan, step=options.step))
+    return finish(options, None, options.mjcf)
+
+
+def replay(options: argparse.Namespace) -> int:
+    """Replay a plan in an engine, and print the report."""
+    from ..engines.engine_replay import ALLOWED, ENGINES, require_engine
+
+    require_engine(options.engine)
+    problem, plan, policy, notes = _load_replayed(options, options.json)
+    setting = ENGINES[options.engine].setting
+    _check_step(options, problem)
+    if options.step is not None:
+        setting = setting._replace(step=options.step / problem.scene.scales.time)
+    if options.softness is not None:
+        setting = setting._replace(softness=options.softness)
+    given: dict[str, Any] = {"whole": options.whole, "setting": setting}
+    given["progress"] = show_progress()
+    if policy is None:
+        given |= {"allowed": options.departure, "halvings": options.refine}
+        with name_source(options.problem):
+            return finish(
+                options, wholearm.replay_in(options.engine, problem, plan, **given), notes=notes
+            )
+    if options.refine:
+        raise InputError("", "--refine", "is for plans by the clock, not with --policy")
+    given["allowed"] = ALLOWED if options.departure is None else options.departure
+    with name_source(options.policy):
+        report = wholearm.play_policy(options.engine, problem, plan, policy, **given)
+    return finish(options, report, notes=notes)
+
+
+def policy(options: argparse.Namespace) -> int:
+    """Make torques a function of the joints, simulate that, and write it if it holds."""
+    from ..policy.make import find_widest
+    from ..problem.read import read_own_problem
+
+    output = options.output or f"{stem_of(options.plan)}_policy.npz"
+    require_output(output, ".npz")
+    plan = wholearm.load_trajectory(options.plan)
+    problem = read_own_problem(plan.meta, options.plan)
+    given = {key: getattr(options, key) for key in ("reserve", "period", "delay", "torque_limit")}
+    allowed = {} if options.departure is None else {"departure": options.departure}
+    say = show_progress()
+
+    def plan_anew(own: wholearm.Problem) -> wholearm.Trajectory:
+        from ..planning.plan import solve
+
+        return solve(own, replay=False, progress=say).trajectory
+
+    def advise() -> str:
+        """Whether a faster loop would do: what is lost between two periods is lost by lateness."""
+        quick = {**given, "period": min(2e-4, options.period), "delay": 0.0}
+        if (quick["period"], 0.0) == (options.period, options.delay):
+            return f"a period below {options.period:g} s may do"
+        own = wholearm.make_policy(problem, plan, **quick, planner=plan_anew)
+        words = f"--period {quick['period']:g} --delay 0"
+        held = wholearm.verify_policy(problem, plan, own, **allowed).ok
+        return f"{words} would do" if held else f"{words} would not do either"
+
+    with name_source(options.plan):
+        say("making the policy")
+        made = wholearm.make_policy(problem, plan, **given, planner=plan_anew)
+        say("simulating the policy")
+        report = wholearm.verify_policy(problem, plan, made, **allowed)
+        if options.largest:
+            say("looking for the widest ranges")
+            each = find_widest(problem, plan, options.delay)
+            made.about["largest"] = {str(number): factor for number, factor in each.items()}
+    clear_progress()
+    failures = "; ".join(report.failures)
+    if not report.ok and options.write_anyway:
+        # The mark by which a program, or a reader of the file, knows.
+        made.about["failures"] = list(report.failures)
+        _complain(f"warning: {output}: written although in the free simulation, {failures}")
+    elif not report.ok:
+        opened = [loss.gap for phase in report.phases for loss in phase.losses]
+        enough = ""
+        if len(opened) == len(report.failures):
+            # Nothing but openings: rounded up to two digits.
+            share = f"{1.05 * max(opened) / problem.scene.scales.length:.2g}"
+            enough = f"--departure {share} allows that; "
+        raise ReplayError(
+            f"{options.plan}: no policy is written: in the free simulation, {failures}; "
+            f"{enough}{advise()}; --write-anyway writes it all the same"
+        )
+    made.save(output)
+    status = finish(options, made)
+    if not options.json:
+        print(f"{made.duration:.6f} s in all, the plan {plan.duration:.6f} s; wrote {output}")
+    return status
+
+
+def gallery(options: argparse.Namespace) -> int:
+    """Plan problems, and write their page."""
+    from ..viewer.gallery import write_gallery
+
+    require_output(options.output, ".md")
+    write_gallery(options.files, options.output, show_progress())
+    return finish(options, None, options.output)
+
+
+def animate(options: argparse.Namespace) -> int:
+    """Write a movie, or a page."""
+    from ..problem.read import read_own_problem
+
+    require_output(options.output, ".gif", ".mp4", ".html")
+    trajectory = wholearm.load_trajectory(options.trajectory)
+    with name_source(options.trajectory):
+        problem = read_own_problem(trajectory.meta)
+        simulation = overlay(options.simulate, trajectory)
+        ghost = None if simulation is None else simulation.trajectory
+        if options.output.lower().endswith(".html"):
+            from ..common.files import write_text
+            from ..viewer import page
+            from ..viewer.motion_data import describe_motion
+
+            motion = describe_motion(trajectory, problem, ghost) | {"speed": options.speed}
+            write_text(options.output, page.build_page(problem.name, [page.write_player(motion)]))
+        else:
+            from ..viewer.movie import Movie, write_movie
+
+            movie = Movie(problem, trajectory, ghost, options.speed)
+            write_movie(movie, options.output, show_progress())
+    return finish(options, None, options.output)
+
+
+def report(options: argparse.Namespace) -> int:
+    """Write the page of a problem and its plans."""
+    from ..common.files import write_text
+    from ..viewer.report_page import build_report
+
+    stem = stem_of(options.problem)
+    output = options.output or f"{stem}.html"
+    require_output(output, ".html")
+    problem, say = read_problem(options), show_progress()
+    with tempfile.TemporaryDirectory() as folder:
+        paths = options.files or [os.path.join(folder, f"{stem}.npz")]
+        if not options.files:
+            wholearm.solve(problem, progress=say).save(paths[0])
+        text = Path(options.problem).read_text(encoding="utf-8")
+        content = build_report(problem, paths, text, say)
+    write_text(output, content)
+    return finish(options, None, output)
+
+
+def show_page(options: argparse.Namespace) -> int:
+    """Print a page of the documentation, or the topics."""
+    if options.topic is not None:
+        print(read_page(TOPICS[options.topic]), end="")
+        return 0
+    for topic, folder in TOPICS.items():
+        print(f"{topic:16} {read_page(folder).splitlines()[0].removeprefix('# ')}")
+    return 0
+
+
+def read_page(folder: str) -> str:
+    """The page of a folder, with topics in place of links to other pages."""
+    page = resources.files("wholearm").joinpath(*folder.split("/"), "README.md")
+    topics = {posixpath.join(own, "README.md"): topic for topic, own in TOPICS.items()}
+
+    def name(link: re.Match[str]) -> str:
+        target = posixpath.normpath(posixpath.join(folder, link[2]))
+        return f"{link[1]} (wholearm help {topics[target]})" if target in topics else link[1]
+
+    text = page.read_text(encoding="utf-8")
+    return re.sub(r"\[([^\]]+)\]\(([^)#]*)(?:#[^)]*)?\)", name, text)
+
+
+def complete(options: argparse.Namespace) -> int:
+    """Print what a shell needs to complete commands."""
+    shells = ("bash", "zsh", "tcsh")
+    if options.shell not in shells:
+        raise InputError("", "shell", f"{options.shell!r} given; allowed are {', '.join(shells)}")
+    try:
+        import shtab
+    except ImportError:
+        text = "is not installed; pip install 'wholearm[completion]' brings it"
+        raise InputError("", "shtab", text) from None
+    parser = build_parser()
+    _complete_files(parser, shtab.FILE, shtab.DIRECTORY)
+    print(shtab.complete(parser, options.shell))
+    return 0
+
+
+def _complete_files(parser: Parser, files: object, folders: object) -> None:
+    """Let all arguments that name files or folders be completed so."""
+    parser.complete()
+    named = {"problem", "plan", "trajectory", "torques", "files", "output"}
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for own in action.choices.values():
+                _complete_files(own, files, folders)
+        elif action.metavar == "DIR":
+            action.complete = folders  # type: ignore[attr-defined]
+        elif action.metavar in ("FILE", "PLAN") or (action.dest in named and not action.type):
+            action.complete = files  # type: ignore[attr-defined]
+
+
+def write_problem(options: argparse.Namespace) -> int:
+    """Write a problem file to begin with."""
+    import numpy as np
+
+    from ..common.files import require_writable, write_text
+    from ..mapping.formation_list import write_template
+
+    output, vertices = f"{options.name.removesuffix('.toml')}.toml", None
+    require_writable(output)
+    if os.path.exists(output):
+        raise InputError(output, "", "is there already; choose another name")
+    if text := options.vertices:
+        try:
+            vertices = np.array([[float(x) for x in own.split(",")] for own in text.split()])
+        except ValueError:
+            given = f"{text!r} given; needed are corners as x,y in m, as in '0,0 0.08,0 0.04,0.06'"
+            raise InputError("", "--vertices", given) from None
+    with name_source("--vertices" if vertices is not None else ""):
+        content = write_template(
+            stem_of(output), options.polygon, options.size, options.mass, vertices
+        )
+    write_text(output, content)
+    print(f"wrote {output}; next: wholearm solve {output}")
+    return 0
+
+
+def show_schema(options: argparse.Namespace) -> int:
+    """Print or write the schema, or the tables of keys."""
+    from ..common.files import require_writable, write_text
+    from ..problem.read import build_schema, write_page
+
+    text = write_page() if options.table else json.dumps(build_schema(), indent=2) + "\n"
+    if options.output is None:
+        print(text, end="")
+        return 0
+    require_writable(options.output)
+    write_text(options.output, text)
+    return finish(options, None, options.output)
+
+
+def _fill_bench(bench: Parser) -> None:
+    """Give the parser of ``bench`` its studies, which are imported when they are used."""
+    from ..benchmark import STUDIES
+
+    studies = bench.add_subparsers(metavar="STUDY", parser_class=Parser)
+    for name, (_, text) in STUDIES.items():
+        parser = add_parser(studies, name, text)
+        parser.fill = partial(_fill_study, parser, name)
+    bench.set_defaults(run=_list_studies)
+
+
+def _fill_study(parser: Parser, name: str) -> None:
+    study = load_study(name)
+    add_options(parser, study.list_options())
+    parser.set_defaults(run=partial(_run_study, study))
 
 
 def load_study(name: str) -> Study:
     """The study of a name."""
+    from ..benchmark import STUDIES
+
     module = STUDIES[name][0]
     package = "wholearm.benchmark" if module.startswith(".") else None
     study: Study = import_module(module, package).STUDY
     return study
 
 
-def add_bench(bench: argparse.ArgumentParser) -> None:
-    """Give the parser of ``bench`` its studies."""
-    studies = bench.add_subparsers(metavar="STUDY", parser_class=StudyParser)
-    for name, (_, text) in STUDIES.items():
-        studies.add_parser(name, help=text, description=_to_sentence(text)).study = name
-    bench.set_defaults(run=_list_studies)
-
-
 def _list_studies(options: argparse.Namespace) -> int:
     """Print the names of all studies, with a line each."""
+    from ..benchmark import STUDIES
+
     width = max(map(len, STUDIES))
     print("\n".join(f"{name:{width}}  {text}" for name, (_, text) in STUDIES.items()))
     return 0
@@ -356,9 +930,9 @@ def _list_studies(options: argparse.Namespace) -> int:
 def _run_study(study: Study, options: argparse.Namespace) -> int:
     from ..benchmark.study import run_study
 
-    report = run_study(study, options, show_progress())
+    found = run_study(study, options, show_progress())
     clear_progress()
-    print(report.text, end="")
-    for path in report.written:
+    print(found.text, end="")
+    for path in found.written:
         print(f"wrote {path}")
-    return 1 if report.findings else 0
+    return 1 if found.findings else 0

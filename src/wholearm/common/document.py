@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from html import escape
@@ -284,3 +284,52 @@ def fixed(size: float, digits: int = 3) -> str:
     """The format that gives a value of this size so many significant digits; no zero is minus."""
     places = digits - 1 - math.floor(math.log10(size)) if size > 0 else digits
     return f"z.{min(max(places, 0), 15)}f"
+
+
+class Difference(NamedTuple):
+    """A key with two values, as text; `nothing` where one table does not have it."""
+
+    key: str
+    one: str
+    other: str
+
+
+def find_differences(
+    one: Any, other: Any, free: tuple[str, ...] = (), key: str = ""
+) -> Iterator[Difference]:
+    """The keys in which two nested tables differ, in their order.
+
+    Parameters
+    ----------
+    one, other  mappings, lists, and what they hold
+    free        names, at any depth, in which they may differ; only at the top if they begin with a
+                dot
+    key         of the tables themselves
+    """
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        for name in dict.fromkeys([*one, *other]):
+            if name in free or (not key and f".{name}" in free):
+                continue
+            inner = f"{key}.{name}" if key else str(name)
+            yield from find_differences(one.get(name), other.get(name), free, inner)
+    elif isinstance(one, list | tuple) and isinstance(other, list | tuple):
+        if len(one) != len(other):
+            yield Difference(key, f"{len(one)} entries", f"{len(other)}")
+            return
+        for k, pair in enumerate(zip(one, other, strict=True), start=1):
+            yield from find_differences(*pair, free, f"{key}[{k}]")
+    elif one != other:
+        yield Difference(key, _write(one), _write(other))
+
+
+def _write(value: Any) -> str:
+    text = f"{value:.12g}" if isinstance(value, float) else repr(value)
+    text = "nothing" if value is None else text
+    return text if len(text) <= 40 else f"{text[:37]}..."
+
+
+def describe_differences(found: Iterable[Difference], one: str, other: str) -> str:
+    """The first differences in words; `one` and `other` say where the values stand."""
+    shown, rest = (parts := list(found))[:3], parts[3:]
+    text = ", ".join(f"{own.key} ({own.one} {one}, {own.other} {other})" for own in shown)
+    return text + (f", and {len(rest)} more" if rest else "")

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import os
 import stat
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
+from .document import describe_differences, find_differences
 from .errors import InputError
 from .signals import held
 
-_SHOWN = 3  # differences that are written out; the others are counted
 try:
     import fcntl
 except ImportError:  # not on Windows
@@ -141,53 +140,3 @@ def _parse(line: bytes) -> dict[str, Any] | None:
     except ValueError:
         return None
     return record if isinstance(record, dict) else None
-
-
-class Difference(NamedTuple):
-    """A key with two values, as text; `nothing` where one table does not have it."""
-
-    key: str
-    one: str
-    other: str
-
-
-def find_differences(
-    one: Any, other: Any, free: tuple[str, ...] = (), key: str = ""
-) -> Iterator[Difference]:
-    """The keys in which two nested tables differ, in their order.
-
-    Parameters
-    ----------
-    one, other  mappings, lists, and what they hold
-    free        names, at any depth, in which they may differ; only at the top if they begin with a
-                dot
-    key         of the tables themselves
-    """
-    if isinstance(one, Mapping) and isinstance(other, Mapping):
-        for name in dict.fromkeys([*one, *other]):
-            if name in free or (not key and f".{name}" in free):
-                continue
-            inner = f"{key}.{name}" if key else str(name)
-            yield from find_differences(one.get(name), other.get(name), free, inner)
-    elif isinstance(one, list | tuple) and isinstance(other, list | tuple):
-        if len(one) != len(other):
-            yield Difference(key, f"{len(one)} entries", f"{len(other)}")
-            return
-        for k, pair in enumerate(zip(one, other, strict=True), start=1):
-            yield from find_differences(*pair, free, f"{key}[{k}]")
-    elif one != other:
-        yield Difference(key, _write(one), _write(other))
-
-
-def _write(value: Any) -> str:
-    text = "nothing" if value is None else repr(value)
-    if isinstance(value, float):
-        text = f"{value:.12g}"
-    return text if len(text) <= 40 else f"{text[:37]}..."
-
-
-def describe_differences(found: Iterable[Difference], one: str, other: str) -> str:
-    """The first differences in words; `one` and `other` say where the values stand."""
-    shown, rest = (parts := list(found))[:_SHOWN], parts[_SHOWN:]
-    text = ", ".join(f"{own.key} ({own.one} {one}, {own.other} {other})" for own in shown)
-    return text + (f", and {len(rest)} more" if rest else "")

@@ -10,8 +10,7 @@ import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
-from ..common.batch import Batch
-from ..common.sharing import Store, exclusive
+from ..common.sharing import Batch, Store, exclusive
 from ..scene.model import Scene
 from .elemental import (
     Contact,

@@ -20,8 +20,7 @@ import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
-from ..common.batch import Batch
-from ..common.sharing import Keeper, Store, exclusive, kept_property
+from ..common.sharing import Batch, Keeper, Store, exclusive, kept_property
 from ..scene.model import Scene
 from .contact_limits import build_clearance, list_limits
 from .elemental import Contact, GapLimit, build_features, build_gap, build_rows, candidate_contacts

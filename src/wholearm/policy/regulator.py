@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.batch import Batch
+from ..common.sharing import Batch
 from ..contacts.formation import Formation
 from ..mechanics.dynamics import (
     LAMBDA,

@@ -7,9 +7,9 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from typing import Any, Protocol
 
+from ..common.document import Difference, describe_differences, find_differences
 from ..common.errors import InputError
 from ..common.files import require_ending, write_text
-from ..common.journal import Difference, describe_differences, find_differences
 from ..problem.definition import Problem
 from ..problem.read import adopt_phases, build_problem, require_phases
 from ..problem.table import save_problem

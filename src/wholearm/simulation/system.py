@@ -18,8 +18,7 @@ import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
-from ..common.batch import Batch
-from ..common.sharing import Keeper, kept_property
+from ..common.sharing import Batch, Keeper, kept_property
 from ..scene.model import Scales
 
 _ANYWHERE = 1e9  # range of features that face each other wherever they are [m]

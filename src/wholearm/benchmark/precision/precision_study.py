@@ -15,7 +15,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from ...common.errors import InputError
-from ...common.fields import Range
 from ...figures.style import PALETTE
 from ..study import Case, Row, Study, finish_axes, format_table
 from .phases import BUDGET, REPEATS, SHIFT, SHORT, SOLVED, Median, find_mean, list_instances
@@ -197,15 +196,10 @@ class Precision(Study):
     columns = ("study", "phase", "method", "setting", "build", "solve", "errors", "outcome")
     packages, shipped = ("toppra", "yapss"), True
     allowed = 60.0
-
-    def add_options(self, parser: argparse.ArgumentParser) -> None:
-        """Which methods, and for how long."""
-        text = "measure this part only: simulation or planning"
-        parser.add_argument("--part", choices=("simulation", "planning"), help=text)
-        text = "measure these methods only, by the names that the table has"
-        parser.add_argument("--peers", nargs="+", default=[*METHODS], metavar="NAME", help=text)
-        text = "processor time that one setting of a method may take on one phase [s] (60)"
-        parser.add_argument("--limit", type=Range(1e-3, 1e6).parse, default=60.0, help=text)
+    options = """\
+--peers NAME ...  measure these methods only, by the names that the table has (all)
+--limit S         processor time that one setting may take on one phase [s] = 60.0 in 1e-3..1e6
+"""
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
         """Study, phase, method, setting, and the files that phases are from."""
@@ -218,10 +212,9 @@ class Precision(Study):
             if method not in METHODS:
                 text = f"{method!r} given; allowed are {'; '.join(METHODS)}"
                 raise InputError("", "--peers", text)
-        parts = {"simulation": SIMULATION, "planning": PLANNING}
-        studies = parts.get(options.part, SIMULATION + PLANNING)
-        for study, (method, own) in product(studies, METHODS.items()):
-            if method in options.peers and study in own.choices and own.is_installed:
+        for study, (method, own) in product(SIMULATION + PLANNING, METHODS.items()):
+            asked = method in (options.peers or METHODS)
+            if asked and study in own.choices and own.is_installed:
                 phases = [instance.name for instance in list_instances(files, study != NO_DRAG)]
                 yield from product([study], phases, [method], own.choices[study], [files])
 

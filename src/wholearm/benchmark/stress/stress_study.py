@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from ...common.errors import SolverError, WholearmError
-from ...common.fields import Range
 from ...common.files import make_folder, write_text
 from ...geometry.tracing import check_phases, load
 from ...planning.plan import solve
@@ -57,16 +56,12 @@ class Stress(Study):
 
     name, title = "stress", "Stress study"
     strict = seeded = True
-
-    def add_options(self, parser: argparse.ArgumentParser) -> None:
-        """How much of each."""
-        read = Range(0, 10**7).parse
-        parser.add_argument("--scenes", type=read, default=1000, help="generated scenes (1000)")
-        parser.add_argument("--files", type=read, default=0, help="damaged files (0)")
-        text = "problem files to plan with noise, and with other masses and forces"
-        parser.add_argument("--problems", nargs="+", default=[], metavar="FILE", help=text)
-        text = "run scene K alone, and write its problem file"
-        parser.add_argument("--only", type=read, metavar="K", help=text)
+    options = """\
+--scenes N           generated scenes = 1000 in 0..10000000
+--files N            damaged files = 0 in 0..10000000
+--problems FILE ...  problem files to plan with noise, and with other masses and forces
+--only K             run scene K alone, and write its problem file in 0..10000000
+"""
 
     def stamp(self, options: argparse.Namespace) -> dict[str, Any]:
         """Records are of one seed."""

@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...common.arrays import Array
-from ...common.batch import Batch
-from ...common.sharing import Store
+from ...common.sharing import Batch, Store
 from ...contacts.elemental import Contact
 from ...contacts.formation import Formation
 from ...mechanics.dynamics import Directions, build_forward, metric_weights, split_forces
