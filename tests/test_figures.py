@@ -36,10 +36,9 @@ from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.common.document import Document, Result, Table
 from wholearm.contacts.closing import contact_table, evaluate_contacts
-from wholearm.figures.curves import draw_torques
+from wholearm.figures.curves import draw_torques, find_steps
 from wholearm.figures.map_figure import draw_map
-from wholearm.figures.plot_data import choose_snapshots, find_steps
-from wholearm.figures.snapshots import draw_snapshot
+from wholearm.figures.snapshots import choose_snapshots, draw_snapshot
 from wholearm.figures.style import WIDTH, choose_styles
 from wholearm.mapping.borders import Window
 from wholearm.mapping.formation_list import write_template

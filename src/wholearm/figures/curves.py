@@ -13,13 +13,13 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.scale import SymmetricalLogTransform
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..contacts.elemental import parse_contact
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
-from .plot_data import cone_shares, find_steps, sample_torques
 from .style import (
     BAND,
     FINGERS,
@@ -27,8 +27,6 @@ from .style import (
     INK,
     LOST,
     LOW,
-    SIMULATED,
-    SIMULATED_2,
     Styles,
     choose_prefix,
     write,
@@ -36,6 +34,46 @@ from .style import (
 
 if TYPE_CHECKING:
     from ..simulation.events import Simulation
+
+
+# What is simulated; the torque of finger 2 has longer gaps, to be told from that of finger 1.
+SIMULATED: Any = {"color": "black", "linestyle": (0, (1, 2)), "linewidth": 1.0, "zorder": 5}
+
+
+def find_steps(trajectory: Trajectory) -> NDArray[np.int64]:
+    """Rows before which forces step: a new phase, a torque's step, a reversed sliding direction.
+
+    Steps of torques below a tenth of the largest cannot be seen.
+    """
+    profile = trajectory.torque
+    before = profile.coefficients[:-1].sum(axis=2)
+    signs = (-1.0) ** np.arange(profile.coefficients.shape[2])
+    after = (profile.coefficients[1:] * signs).sum(axis=2)
+    stepping = np.abs(after - before).max(axis=1) > 0.1 * np.abs(profile.coefficients).max()
+    breaks, starts = profile.breaks[1:-1], trajectory.phase_starts
+    inner = np.abs(breaks[:, None] - starts).min(axis=1) > 1e-9 * trajectory.duration
+    t = trajectory.t
+    # Where a time is there twice, in a replay, the step is between the two rows.
+    repeated = np.flatnonzero(np.diff(t) == 0) + 1
+    steps = np.searchsorted(t, np.setdiff1d(breaks[stepping & inner], t[repeated]), side="right")
+    phases = np.append(np.flatnonzero(np.diff(trajectory.phase)) + 1, repeated)
+    # The friction of a contact that rolls passes zero without a step.
+    slid = np.where(trajectory.rolling, 0.0, trajectory.c_t)
+    turns = np.flatnonzero((slid[1:] * slid[:-1] < 0).any(axis=1)) + 1
+    every = np.unique(np.concatenate([steps, phases, turns]))
+    # Torques may go on after a motion that has failed.
+    return every[every < len(t)]
+
+
+def sample_torques(torque: TorqueProfile) -> tuple[Array, Array]:
+    """Times, shape (n,) [s], and torques, (n, 2) [N m], with both ends of every piece."""
+    pieces, _, order = torque.coefficients.shape
+    count = 2 if order <= 2 else max(order, math.ceil(2000 / pieces))
+    x = np.linspace(-1.0, 1.0, count)
+    middle, half = (torque.breaks[1:] + torque.breaks[:-1]) / 2, np.diff(torque.breaks) / 2
+    coefficients = np.ascontiguousarray(torque.coefficients)  # einsum's rounding depends on it
+    tau = np.einsum("kjd,xd->kxj", coefficients, np.vander(x, order, increasing=True))
+    return (middle[:, None] + half[:, None] * x).ravel(), tau.reshape(-1, 2)
 
 
 def draw_margins(
@@ -115,7 +153,7 @@ def draw_cones(
     """
     fingers = [parse_contact(name, scene).finger for name in trajectory.contacts]
     mu = np.array([scene.friction.of(finger) for finger in fingers])
-    shares = cone_shares(trajectory.rolling, mu, trajectory.c_n, trajectory.c_t)
+    shares = trajectory.c_t / np.where(trajectory.rolling, mu * trajectory.c_n, np.nan)
     steps = find_steps(trajectory)
     t, lines = np.insert(trajectory.t, steps, np.nan), []
     for index in np.flatnonzero(trajectory.rolling.any(axis=0)):
@@ -131,7 +169,7 @@ def draw_cones(
     if simulation is not None:
         first = np.flatnonzero(np.diff(trajectory.phase, prepend=-1))
         rolls = trajectory.rolling[first][simulation.phase]
-        values = cone_shares(rolls, mu, simulation.c_n, simulation.c_t)
+        values = simulation.c_t / np.where(rolls, mu * simulation.c_n, np.nan)
         axes.plot(simulation.t, values, **SIMULATED)
     return lines
 
@@ -163,19 +201,17 @@ def draw_motion(panels: Sequence[Axes], trajectory: Trajectory) -> None:
     """Draw the object's pose, and the joints' angles and speeds, over time on three axes."""
     t = trajectory.t
     pose = np.column_stack([1e3 * trajectory.q[:, :2], np.degrees(trajectory.q[:, 2])])
-    for column, (name, colour, line) in enumerate(
-        (("x [mm]", "#0072B2", "-"), ("y [mm]", "#E69F00", (0, (5, 1.5))), ("phi [deg]", INK, "-."))
-    ):
+    looks: Any = (("x [mm]", "#0072B2", "-"), ("y [mm]", "#E69F00", (0, (5, 1.5))))
+    for column, (name, colour, line) in enumerate((*looks, ("phi [deg]", INK, "-."))):
         panels[0].plot(t, pose[:, column], color=colour, linestyle=line, label=name)
     panels[0].set_ylabel("pose")
-    values = (np.degrees(trajectory.theta), trajectory.theta_dot)
-    for axes, own, name in zip(
-        panels[1:], values, ("joint angle\n[deg]", "joint speed\n[rad/s]"), strict=True
-    ):
-        for index, (colour, _) in enumerate(FINGERS):
-            look: Any = {"color": colour, "linewidth": 2.2 - 0.8 * index}
-            axes.plot(t, own[:, index], label=f"finger {index + 1}", **look)
-        axes.set_ylabel(name)
+    panels[1].set_ylabel("joint angle\n[deg]")
+    panels[2].set_ylabel("joint speed\n[rad/s]")
+    for index, (colour, _) in enumerate(FINGERS):
+        look: Any = {"color": colour, "linewidth": 2.2 - 0.8 * index}
+        look["label"] = f"finger {index + 1}"
+        panels[1].plot(t, np.degrees(trajectory.theta[:, index]), **look)
+        panels[2].plot(t, trajectory.theta_dot[:, index], **look)
     for axes in panels:
         axes.grid(axis="y", color=GRID, linewidth=0.4)
 
@@ -189,7 +225,8 @@ def draw_simulation(
     c_n = np.insert(simulation.c_n, gaps, np.nan, axis=0)
     lines = margins.plot(np.insert(t, gaps, np.nan), c_n - epsilon, **SIMULATED)
     lines[0].set_label("simulated")
-    for index, look in enumerate((SIMULATED, SIMULATED_2)):
+    other = {"linestyle": (0, (3, 5)), "linewidth": 0.9}
+    for index, look in enumerate((SIMULATED, SIMULATED | other)):
         label = f"simulated {index + 1}"
         lines += torques.plot(t, simulation.tau[:, index], label=label, **look)
     return lines

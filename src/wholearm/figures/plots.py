@@ -8,11 +8,9 @@ from __future__ import annotations
 import math
 import os
 import textwrap
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import matplotlib
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..common.errors import InputError, require_number
@@ -21,8 +19,6 @@ from ..common.sharing import exclusive
 from ..contacts.contact_limits import evaluate_finger_gap
 from ..problem.read import read_own_problem
 from ..results.adopt import Torques, narrow
-from ..results.trajectory import Trajectory
-from ..scene.model import Scene
 from .curves import (
     draw_cones,
     draw_margins,
@@ -50,11 +46,6 @@ if TYPE_CHECKING:
 _FORMATS: dict[str, dict[str, Any]] = {
     ".png": {"Software": None}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None},
 }  # fmt: skip
-_LEFT, _RIGHT, _BOTTOM, _TOP, _GAP = 0.80, 1.30, 0.55, 0.40, 0.22  # margins [in]
-_MARGINS, _TORQUES, _CONES, _MOTION = 3.6, 1.75, 0.85, 1.2  # heights of panels [in]
-_SHORT = 0.65  # heights of panels of a slim figure, over those of a wide one
-_SLIM = 7.0  # width below which legends stand at the foot, as in a column of a paper [in]
-_LINE = 0.17  # height of a line of text [in]
 
 
 @exclusive
@@ -93,25 +84,33 @@ def force_margins(
     problem = read_own_problem(meta)
     epsilon = require_number(meta.get("epsilon", problem.epsilon), "meta.epsilon")
     scene, styles = problem.scene, choose_styles(trajectory.contacts)
-    # From the foot of the figure to its title.
-    rolls, slim = bool(trajectory.rolling.any()), width < _SLIM
+    parts = [textwrap.shorten(str(meta.get("name", "")), 36, placeholder="\u2026")]
+    known = meta.get("objective")
+    parts.append(f"objective {known}" if known else str(meta.get("status", "")))
+    parts += [f"duration {trajectory.duration:.4g} s", f"\u03b5 = {epsilon:g} N"]
+    if scene.fingers_collide:
+        least = float(evaluate_finger_gap(scene, trajectory.z).min())
+        text = f"{1e3 * least:.3g} mm" if least < 0.9995 else f"{least:.3g} m"
+        parts.append(f"finger gap \u2265 {text}".replace("-", "\u2212"))
+    # From the foot of the figure to its title, in inches. A slim one has its legend at the foot.
+    rolls, slim, line = bool(trajectory.rolling.any()), width < 7.0, 0.17
     strip = lay_out_strip(trajectory, scene, width - 0.3, slim)
     columns = max(1, int((width - 0.3) / 1.05))
     keys = len(trajectory.contacts) + 3 + (simulation is not None)
-    foot = _BOTTOM + (_LINE * math.ceil(keys / columns) + 0.1 if slim else 0.0)
-    share = _SHORT if slim else 1.0
-    sizes = [_MOTION * share] * 3 * motion + [_TORQUES * share] + [_CONES] * rolls
-    sizes.append(_MARGINS * share)
-    size_of_title = 8.5 if slim else 10.5
-    whole = _title(trajectory, scene, epsilon, " \u00b7 " if slim else "  \u00b7  ")
+    foot = 0.55 + (line * math.ceil(keys / columns) + 0.1 if slim else 0.0)
+    share = 0.65 if slim else 1.0
+    sizes = [1.2 * share] * 3 * motion + [1.75 * share] + [0.85] * rolls + [3.6 * share]
+    size_of_title, between = (8.5, " \u00b7 ") if slim else (10.5, "  \u00b7  ")
+    whole = between.join(part.replace(" ", "\u00a0") for part in parts if part)
     title = textwrap.wrap(whole, max(24, int(11.5 * width * 10.5 / size_of_title)))
-    top = foot + sum(sizes) + _GAP * (len(sizes) - 1) + 0.3 + strip.height
-    with open_figure(width, top + _TOP + _LINE * (len(title) - 1)) as figure:
+    left, gap = 0.8, 0.22
+    top = foot + sum(sizes) + gap * (len(sizes) - 1) + 0.3 + strip.height
+    with open_figure(width, top + 0.4 + line * (len(title) - 1)) as figure:
         draw_strip(figure, top, strip, trajectory, scene, styles)
-        wide, low, places = width - _LEFT - (0.12 if slim else _RIGHT), foot, []
+        wide, low, places = width - left - (0.12 if slim else 1.3), foot, []
         for size in sizes:
-            places.append((_LEFT, low, wide, size))
-            low += size + _GAP
+            places.append((left, low, wide, size))
+            low += size + gap
         margins = inset(figure, *places[-1])
         torques, *others = (
             inset(figure, *place, sharex=margins)
@@ -127,37 +126,26 @@ def force_margins(
             draw_cones(others[0], trajectory, scene, styles, simulation)
         if motion:
             draw_motion(others[-3:], trajectory)
+        lowest = others[-1] if motion else torques
+        for axes in panels:
+            draw_phases(axes, trajectory.phase_starts, labels=axes is margins)
+            if axes is not lowest:
+                axes.tick_params(labelbottom=False)
+            if not slim:
+                list_contacts(axes, 72 * axes.get_position().height * figure.get_figheight())
         if slim:
+            legend: dict[str, Any] = {}
             for axes, name in ((margins, "margin"), (torques, "torque")):
                 axes.set_ylabel(f"{name} {unit_of(axes)}")
-            _draw_legend(figure, [margins, torques], columns)
-        _label(figure, panels, others[-1] if motion else torques, trajectory, slim)
+                lines, labels = axes.get_legend_handles_labels()
+                legend |= zip(labels, lines, strict=True)
+            look: Any = {"loc": "lower left", "bbox_to_anchor": (0.02, 0.005), "fontsize": 8}
+            look |= {"ncols": columns, "columnspacing": 1.0}
+            figure.legend([*legend.values()], [*legend], **look)
+        lowest.set(xlabel="time $t$ [s]", xlim=(0.0, trajectory.duration))
+        figure.align_ylabels(panels)
         write_title(figure, "\n".join(title), size_of_title)
     return figure
-
-
-def _label(
-    figure: Figure, panels: Sequence[Axes], lowest: Axes, trajectory: Trajectory, slim: bool
-) -> None:
-    """Mark phases on panels over time, name the time on the lowest, and give each its legend."""
-    for axes in panels:
-        draw_phases(axes, trajectory.phase_starts, labels=axes is panels[0])
-        if axes is not lowest:
-            axes.tick_params(labelbottom=False)
-        if not slim:
-            list_contacts(axes, 72 * axes.get_position().height * figure.get_figheight())
-    lowest.set(xlabel="time $t$ [s]", xlim=(0.0, trajectory.duration))
-    figure.align_ylabels([*panels])
-
-
-def _draw_legend(figure: Figure, panels: Sequence[Axes], columns: int) -> None:
-    """One legend of several panels at the foot of a figure."""
-    every = [axes.get_legend_handles_labels() for axes in panels]
-    known = {
-        label: line for lines, labels in every for line, label in zip(lines, labels, strict=True)
-    }
-    look: Any = {"loc": "lower left", "bbox_to_anchor": (0.02, 0.005), "fontsize": 8}
-    figure.legend([*known.values()], [*known], ncols=columns, columnspacing=1.0, **look)
 
 
 def require_format(path: str | os.PathLike[str]) -> str:
@@ -180,15 +168,3 @@ def save(figure: Figure, path: str | os.PathLike[str], *, resolution: int = 180)
     options: Any = {"format": ending[1:], "metadata": _FORMATS[ending], "dpi": resolution}
     with matplotlib.rc_context(STYLE):
         write_whole(path, lambda stream: figure.savefig(stream, **options))
-
-
-def _title(trajectory: Trajectory, scene: Scene, epsilon: float, between: str) -> str:
-    parts = [textwrap.shorten(str(trajectory.meta.get("name", "")), 36, placeholder="\u2026")]
-    known = trajectory.meta.get("objective")
-    parts.append(f"objective {known}" if known else str(trajectory.meta.get("status", "")))
-    parts += [f"duration {trajectory.duration:.4g} s", f"\u03b5 = {epsilon:g} N"]
-    if scene.fingers_collide:
-        gap = float(evaluate_finger_gap(scene, trajectory.z).min())
-        text = f"{1e3 * gap:.3g} mm" if gap < 0.9995 else f"{gap:.3g} m"
-        parts.append(f"finger gap \u2265 {text}".replace("-", "\u2212"))
-    return between.join(part.replace(" ", "\u00a0") for part in parts if part)

@@ -16,25 +16,20 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon as Outline
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
+from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..common.sharing import exclusive
 from ..contacts.elemental import build_features, build_geometry, parse_contact
 from ..results.trajectory import Trajectory
 from ..scene.model import Finger, Scene
-from .plot_data import choose_snapshots
 from .style import BODY, FINGERS, INK, PALM, Styles, add_line, count_decimals, inset, write
 
 NUMBER = 8.0  # size of the numbers at vertices [points]
-_FEW = 5  # most vertices of an object whose numbers may stand outside; case: a ruler, 120 x 15 mm
-_CAPTION = 0.42  # height of the caption of a snapshot [in]
-_ROOM = (1.38, 0.78)
-"""Width that a snapshot needs for its caption, on average, in wide and in slim figures [in]."""
-_ROWS = 3  # most rows of a strip; of more snapshots some are left out, evenly
-_STRIP = 1.75  # greatest height of a row of snapshots [in]
-_BAR = 0.2  # height of the bar that gives the scale, above a strip [in]
+CAPTION, BAR = 0.42, 0.2  # height of a snapshot's caption, and of the bar that gives the scale [in]
 
 
+@exclusive
 def draw_snapshot(
     axes: Axes,
     scene: Scene,
@@ -56,7 +51,9 @@ def draw_snapshot(
     ends = np.concatenate([bases, vertices[vertices[:, 1] < scene.touching, 0]])
     artists = [draw_palm(axes, scene, ends.min(), ends.max()), *draw_bodies(axes, scene, z)]
     draw_joints(axes, scene)
-    for name, point in zip(contacts, place_contacts(scene, z, contacts), strict=True):
+    places = [build_geometry(parse_contact(name, scene), scene).point for name in contacts]
+    place = ca.Function("points", [build_features(scene).z], [ca.horzcat(*places)])
+    for name, point in zip(contacts, place(z).full().T, strict=True):
         face, _, marker = styles[name]
         look: Any = {"mfc": face, "mec": "white", "mew": 0.9, "zorder": 6, "label": name}
         artists += axes.plot(*point, marker, ms=6.5, **look)
@@ -111,7 +108,8 @@ def choose_numbers(
     """Choose which vertices of a polygon are numbered, and where the numbers stand.
 
     All of them where there is room, or every second, fifth, tenth, ... one, and those of `first`
-    before others. A number stands inside, or outside of a thin object with few vertices.
+    before others. A number stands inside, or outside of an object with up to 5
+    vertices, which may be thin.
 
     Parameters
     ----------
@@ -135,7 +133,7 @@ def choose_numbers(
         """Those of the chosen that stand clear of the ones before."""
         numbers: dict[int, Array] = {}
         for index in chosen:
-            for shift in (shifts[index], -shifts[index])[: 1 + (count <= _FEW)]:
+            for shift in (shifts[index], -shifts[index])[: 1 + (count <= 5)]:
                 place = vertices[index] + shift
                 far = [
                     np.abs(vertices[k] + own - place)
@@ -165,14 +163,6 @@ def turn(z: Array, points: Array) -> Array:
     return np.asarray(z[:2] + points @ np.array([[c, s], [-s, c]]))
 
 
-@exclusive
-def place_contacts(scene: Scene, z: Array, contacts: Sequence[str]) -> Array:
-    """World positions of contacts, shape (n_c, 2) [m]."""
-    points = [build_geometry(parse_contact(name, scene), scene).point for name in contacts]
-    function = ca.Function("points", [build_features(scene).z], [ca.horzcat(*points)])
-    return np.asarray(function(z).full().T)
-
-
 def trace_link(finger: Finger, angle: float) -> Array:
     """Outline of a link, a capsule, shape (n, 2) [m]."""
     base, axis = np.asarray(finger.base), np.array([math.cos(angle), math.sin(angle)])
@@ -180,6 +170,20 @@ def trace_link(finger: Finger, angle: float) -> Array:
     turns = np.concatenate([half, np.pi + half])
     centres = np.repeat([base + finger.length * axis, base], len(half), axis=0)
     return np.asarray(centres + finger.radius * np.column_stack([np.cos(turns), np.sin(turns)]))
+
+
+def choose_snapshots(trajectory: Trajectory) -> NDArray[np.int64]:
+    """Rows of the trajectory to draw: phase boundaries, and instants between if they are few."""
+    starts = trajectory.phase_starts
+    parts = np.ones(len(starts) - 1, dtype=int)
+    while parts.sum() + 1 < 6:
+        parts[np.argmax(np.diff(starts) / parts)] += 1
+    rows = [0, len(trajectory.t) - 1]
+    for k, (start, end) in enumerate(pairwise(starts)):
+        own = np.flatnonzero(trajectory.phase == k)
+        for t in np.linspace(start, end, parts[k] + 1)[:-1]:
+            rows.append(own[np.abs(trajectory.t[own] - t).argmin()])
+    return np.unique(rows)
 
 
 class Strip(NamedTuple):
@@ -194,13 +198,16 @@ class Strip(NamedTuple):
     @property
     def height(self) -> float:
         """Of all rows with their captions and the bar above them [in]."""
-        return _BAR + len(self.rows) * (self.scale * (self.high - self.low) + _CAPTION)
+        return BAR + len(self.rows) * (self.scale * (self.high - self.low) + CAPTION)
 
 
 def lay_out_strip(trajectory: Trajectory, scene: Scene, width: float, slim: bool) -> Strip:
-    """Choose the snapshots of a strip that is `width` wide [in]."""
-    every, wide = choose_snapshots(trajectory), max(2, int(width / _ROOM[slim]))
-    kept = np.linspace(0, len(every) - 1, min(len(every), _ROWS * wide)).round().astype(int)
+    """Choose the snapshots of a strip that is `width` wide [in], three rows of them at most.
+
+    A caption needs 1.38 in, or 0.78 in a slim figure, on average.
+    """
+    every, wide = choose_snapshots(trajectory), max(2, int(width / (0.78 if slim else 1.38)))
+    kept = np.linspace(0, len(every) - 1, min(len(every), 3 * wide)).round().astype(int)
     chosen = [int(row) for row in every[kept]]
     lines = math.ceil(len(chosen) / wide)
     cuts = np.linspace(0, len(chosen), lines + 1).round().astype(int)
@@ -213,7 +220,7 @@ def lay_out_strip(trajectory: Trajectory, scene: Scene, width: float, slim: bool
         (width - 0.12 * max(1, len(row) - 1)) / sum(np.ptp(boxes[k][:, 0]) for k in row)
         for row in rows
     ]
-    return Strip(rows, boxes, low, high, min(*widest, _STRIP / (high - low)))
+    return Strip(rows, boxes, low, high, min(*widest, 1.75 / (high - low)))
 
 
 def draw_strip(
@@ -228,9 +235,15 @@ def draw_strip(
     room, last = figure.get_figwidth() - 0.3, strip.rows[-1][-1]
     height = strip.scale * (strip.high - strip.low)
     decimals = count_decimals(trajectory.duration)
-    _draw_scale(figure, top, strip)
+    # A bar of a round length, about a quarter of an inch long, gives the scale.
+    power = 10.0 ** math.floor(math.log10(0.5 / strip.scale))
+    length = next(k * power for k in (5.0, 2.0, 1.0) if k * power <= 0.5 / strip.scale)
+    ends, inches = [0.2, 0.2 + strip.scale * length], figure.dpi_scale_trans
+    figure.add_artist(Line2D(ends, [top - 0.06] * 2, color=INK, linewidth=2.0, transform=inches))
+    text = f"{1e3 * length:g} mm" if length < 1 else f"{length:g} m"
+    figure.text(ends[1] + 0.06, top - 0.06, text, va="center", fontsize=8, transform=inches)
     for line, row in enumerate(strip.rows, start=1):
-        bottom = top - _BAR - line * height - (line - 1) * _CAPTION
+        bottom = top - BAR - line * height - (line - 1) * CAPTION
         widths = [strip.scale * float(np.ptp(strip.boxes[k][:, 0])) for k in row]
         left, space = 0.15, (room - sum(widths)) / max(1, len(row) - 1)
         for k, width in zip(row, widths, strict=True):
@@ -246,18 +259,6 @@ def draw_strip(
             caption = f"{trajectory.t[k]:.{decimals}f} s\n{place}"
             write(axes, caption, (0.5, 0), (0, -3), xycoords="axes fraction", va="top")
             left += width + space
-
-
-def _draw_scale(figure: Figure, top: float, strip: Strip) -> None:
-    """Draw a bar of a round length, about a quarter of an inch long, below `top` [in]."""
-    power = 10.0 ** math.floor(math.log10(0.5 / strip.scale))
-    length = next(k * power for k in (5.0, 2.0, 1.0) if k * power <= 0.5 / strip.scale)
-    ends, inches = [0.2, 0.2 + strip.scale * length], figure.dpi_scale_trans
-    bar = Line2D(ends, [top - 0.06] * 2, color=INK, linewidth=2.0, transform=inches)
-    figure.add_artist(bar)
-    text = f"{1e3 * length:g} mm" if length < 1 else f"{length:g} m"
-    look: Any = {"va": "center", "fontsize": 8, "transform": inches}
-    figure.text(ends[1] + 0.06, top - 0.06, text, **look)
 
 
 def measure_box(scene: Scene, z: Array) -> Array:

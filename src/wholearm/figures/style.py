@@ -36,12 +36,7 @@ STYLE: Any = {
     "ytick.labelsize": 9.0, "legend.handlelength": 1.6, "legend.borderpad": 0.0,
     "pdf.fonttype": 42, "svg.fonttype": "path", "svg.hashsalt": "wholearm",
 }  # fmt: skip
-SIMULATED: Any = {"color": "black", "linestyle": (0, (1, 2)), "linewidth": 1.0, "zorder": 5}
-SIMULATED_2: Any = SIMULATED | {"linestyle": (0, (3, 5)), "linewidth": 0.9}
-"""What is simulated; the torque of finger 2, to be told from that of finger 1."""
 PALM = 0.12  # thickness of the palm, over the object's radius of gyration
-_PREFIXES = ((3e4, "k", 1e-3), (0.3, "", 1.0), (3e-4, "m", 1e3), (0.0, "\u00b5", 1e6))
-"""Least size of a quantity, its prefix, and the factor that goes with it."""
 
 
 class ContactStyle(NamedTuple):
@@ -85,7 +80,8 @@ def add_line(axes: Axes, points: Array, **look: Any) -> Artist:
 
 def choose_prefix(size: float) -> tuple[str, float]:
     """SI prefix with which values up to `size` have few digits, and the factor to it."""
-    return next((prefix, factor) for least, prefix, factor in _PREFIXES if size >= least)
+    steps = ((3e4, "k", 1e-3), (0.3, "", 1.0), (3e-4, "m", 1e3), (0.0, "\u00b5", 1e6))
+    return next((prefix, factor) for least, prefix, factor in steps if size >= least)
 
 
 def count_decimals(size: float) -> int:

@@ -13,7 +13,7 @@ from ..common.arrays import Array, find_runs
 from ..common.sharing import exclusive
 from ..contacts.closing import Numbers
 from ..contacts.elemental import build_features, build_geometry, parse_contact
-from ..figures.plot_data import find_steps
+from ..figures.curves import find_steps
 from ..figures.style import FINGERS, choose_styles
 from ..problem.definition import Problem
 from ..results.trajectory import Trajectory

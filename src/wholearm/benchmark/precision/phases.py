@@ -50,44 +50,28 @@ class Instance(NamedTuple):
     curve: Curve
 
 
-def keep_curves(problem: Problem) -> Problem | None:
-    """The first phases of a problem as far as each is a curve of four sliding contacts.
-
-    These are what peers know; None if already the first phase is not.
-    """
-    curves = trace_phases(problem)
-    rolling = [bool(phase.formation.rolling) for phase in problem.phases[: len(curves)]]
-    count = [*rolling, True].index(True)
-    kept = tuple(replace(phase, end=End.REST) for phase in problem.phases[:count])
-    return replace(problem, phases=kept) if kept else None
-
-
 @lru_cache(maxsize=4)
 def list_instances(paths: tuple[str, ...], drag: bool = True) -> tuple[Instance, ...]:
-    """Every phase of problem files that is such a curve; those that files share once.
+    """First phases of problem files that are curves of four sliding contacts: what peers know.
 
-    Without `drag` joints have no viscous friction.
+    Those that files share are there once. Without `drag` joints have no viscous friction.
     """
     instances: dict[object, Instance] = {}
     for path in paths:
-        read = read_problem(path)
-        problem = keep_curves(read if drag else read.with_(viscous=0.0))
-        if problem is None:
-            continue
-        for phase, curve in zip(problem.phases, trace_phases(problem), strict=True):
-            alone = replace(problem, start=curve.start, phases=(replace(phase, index=0),))
-            instance = Instance(f"{Path(path).stem} {phase.number}", alone, curve)
-            instances.setdefault(_identify(instance), instance)
+        problem = read_problem(path)
+        problem = problem if drag else problem.with_(viscous=0.0)
+        scene = problem.scene
+        for phase, curve in zip(problem.phases, trace_phases(problem), strict=False):
+            if phase.formation.rolling:
+                break
+            single = replace(phase, index=0, end=End.REST)
+            alone = replace(problem, start=curve.start, phases=(single,))
+            places = np.round(np.append(curve.start, curve.end), 9) + 0.0
+            limits = (problem.epsilon, *scene.torque_limit, *scene.speed_limit)
+            same = scene.equations, limits, phase.formation.names, tuple(places)
+            name = f"{Path(path).stem} {phase.number}"
+            instances.setdefault(same, Instance(name, alone, curve))
     return tuple(instances.values())
-
-
-def _identify(instance: Instance) -> object:
-    """Equal for phases that are the same in different files."""
-    problem = instance.problem
-    (phase,), scene = problem.phases, problem.scene
-    limits = (problem.epsilon, *scene.torque_limit, *scene.speed_limit)
-    places = np.round(np.append(problem.start, instance.curve.end), 9) + 0.0
-    return scene.equations, limits, phase.formation.names, tuple(places)
 
 
 def pick(name: str, paths: tuple[str, ...], drag: bool = True) -> Instance:

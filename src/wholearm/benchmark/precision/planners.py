@@ -49,9 +49,6 @@ from .simulators import check_plan
 
 LEAST_TIME, NO_DRAG = "least time", "least time without viscous friction"
 """Studies: all phases, and the same without viscous friction."""
-NEAR = 1e-7  # distance over the duration in which a step of the torques is that of a reversal
-APART = 1e-7  # distance of grid points from a reversal between them, over the curve's length
-TORQUE_NODES = 5  # instants in an interval that its torque's polynomial goes through
 
 
 def run_planner(study: str, name: str, method: str, setting: str, files: tuple[str, ...]) -> Median:
@@ -60,7 +57,7 @@ def run_planner(study: str, name: str, method: str, setting: str, files: tuple[s
     if module := PLANNERS[method].module:
         # No timing is to include the import.
         __import__(module)
-    least = _find_least_time(name, study, files)
+    least = find_least_time(instance)
 
     def judge(plan: PeerPlan) -> tuple[tuple[float, ...], str]:
         end, violation, outcome = check_plan(instance, plan)
@@ -70,11 +67,7 @@ def run_planner(study: str, name: str, method: str, setting: str, files: tuple[s
     return measure(partial(PLANNERS[method].build, instance, setting), judge)
 
 
-@lru_cache(maxsize=4)
-def _find_least_time(name: str, study: str, files: tuple[str, ...]) -> float:
-    return find_least_time(pick(name, files, study != NO_DRAG))
-
-
+@lru_cache(maxsize=64)
 def find_least_time(instance: Instance) -> float:
     """Lower bound of the least time by a sweep over speeds, which shares nothing with the NLP [s].
 
@@ -121,7 +114,7 @@ def _convert(instance: Instance, plan: PhasePlan[Any]) -> PeerPlan:
 
         time = brentq(pass_by, 0.0, motion.duration, xtol=1e-15)
         nearest = float(breaks[np.abs(breaks - time).argmin()])
-        marks.append(nearest if abs(nearest - time) < NEAR * motion.duration else time)
+        marks.append(nearest if abs(nearest - time) < 1e-7 * motion.duration else time)
     return PeerPlan(OPTIMUM, motion.duration, plan.torque, tuple(marks))
 
 
@@ -141,10 +134,11 @@ def build_toppra(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
 
     toppra.setup_logging("ERROR")
     length = instance.curve.length
+    apart = 1e-7 * length  # of grid points from a reversal between them
     grid = length * (1 - np.cos(np.linspace(0.0, np.pi, int(setting) + 1))) / 2
     for part in instance.curve.segments[:-1]:
-        near = np.abs(grid - part.stop) > 4 * APART * length
-        grid = np.append(grid[near], part.stop + APART * length * np.array([-1.0, 1.0]))
+        near = np.abs(grid - part.stop) > 4 * apart
+        grid = np.append(grid[near], part.stop + apart * np.array([-1.0, 1.0]))
         grid.sort()
     stops = [part.stop for part in instance.curve.segments[:-1]]
     _, limits = _limit(instance, grid, np.searchsorted(stops, grid))
@@ -214,16 +208,9 @@ def _make_plan(instance: Instance, grid: Array, speeds: Array) -> PeerPlan:
         forces, _ = _limit(instance, grid[k] + run, owner[k])
         return forces.tau(a[k], (speeds[k] + a[k] * local) ** 2, internal)
 
-    profile = TorqueProfile.fit(times, torque, TORQUE_NODES - 1)
+    profile = TorqueProfile.fit(times, torque, 4)
     marks = times[np.searchsorted(grid, stops)]
     return PeerPlan(OPTIMUM, float(times[-1]), profile, tuple(marks))
-
-
-IPOPT = {
-    "print_level": 0, "sb": "yes", "tol": 1e-8, "bound_relax_factor": 0.0, "max_iter": 1000,
-    "mu_strategy": "adaptive",
-}  # fmt: skip
-POINTS = 2  # collocation points of a segment
 
 
 def build_yapss(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
@@ -235,7 +222,7 @@ def build_yapss(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
 
     curve, stretches = instance.curve, list_stretches(instance.curve)
     counts = [max(4, round(int(setting) * stretch.share)) for stretch in stretches]
-    guesses = sample_slow_motion(instance, [POINTS * count + 1 for count in counts])
+    guesses = sample_slow_motion(instance, [2 * count + 1 for count in counts])
     n_c, k = curve.formation.n_contacts, len(stretches)
     ocp = yapss.Problem(
         name="phase", nx=k * [10], nu=k * [2 + n_c], nh=k * [n_c], nq=k * [0], nd=11 * (k - 1)
@@ -255,7 +242,7 @@ def build_yapss(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
         guess.time = t + before
         guess.state = np.hstack([slow.z, slow.z_dot]).T
         guess.control = np.hstack([slow.tau, slow.c_n]).T
-        ocp.mesh.phase[index].collocation_points = count * [POINTS]
+        ocp.mesh.phase[index].collocation_points = count * [2]
         ocp.mesh.phase[index].fraction = count * [1 / count]
     first, last = ocp.bounds.phase[0], ocp.bounds.phase[k - 1]
     first.initial_time.lower = first.initial_time.upper = 0.0
@@ -265,7 +252,10 @@ def build_yapss(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
     ocp.bounds.discrete.lower[:] = ocp.bounds.discrete.upper[:] = 0.0
     ocp.derivatives.method, ocp.derivatives.order = "auto", "second"
     ocp.spectral_method = "lg"
-    for name, value in IPOPT.items():
+    for name, value in {
+        "print_level": 0, "sb": "yes", "tol": 1e-8, "bound_relax_factor": 0.0, "max_iter": 1000,
+        "mu_strategy": "adaptive",
+    }.items():  # fmt: skip
         setattr(ocp.ipopt_options, name, value)
 
     def run() -> PeerPlan:

@@ -31,6 +31,23 @@ Medians = dict[Key, Median]
 MARKERS = "osD^vP*Xdh<>"  # markers of the methods of a panel
 
 
+INTRODUCTION = f"""\
+Times are medians of processor time over up to {REPEATS} runs (one where that takes over {BUDGET:g}
+s) in one thread; what takes less than {SHORT:g} s is averaged over that time. Means are geometric
+ones, shifted by {1e3 * SHIFT:g} ms, over the phases of all problems, each with the setting that
+reaches the error soonest; what does not reach it counts with the time limit.
+
+Phases whose slow motion would lose a contact have no few pieces of torque, and where a method was
+not run on a phase, ours does not count there either.
+
+Errors of states are relative to the scene's length and time. A plan counts as solved if its
+torques, replayed open loop by other equations than its own, keep every contact and end within 1e-2
+of the end. Its three errors are those of the phase time, against the lower bound of `solve
+--certify`, of the replayed end state, and the worst violation between nodes, over the object's
+weight or the torque limit.
+"""
+
+
 class PeerComparison(NamedTuple):
     """What one table compares."""
 
@@ -62,32 +79,6 @@ def read_medians(rows: Iterable[Row]) -> Medians:
         for row in rows
         if "errors" in row
     }
-
-
-def format_report(medians: Medians, limit: float) -> str:
-    """All tables as Markdown."""
-    lines = [
-        f"Times are medians of processor time over up to {REPEATS} runs (one where that takes over "
-        f"{BUDGET:g} s) in one thread; what takes less than {SHORT:g} s is averaged over that "
-        f"time. Means are geometric ones, shifted by {1e3 * SHIFT:g} ms, over the phases of all "
-        "problems, each with the setting that reaches the error soonest; what does not reach it "
-        f"counts with the time limit, {limit:g} s.",
-        "",
-        "Phases whose slow motion would lose a contact have no few pieces of torque, and where a "
-        "method was not run on a phase, ours does not count there either.",
-        "",
-        "Errors of states are relative to the scene's length and time. A plan counts as solved if "
-        "its torques, replayed open loop by other equations than its own, keep every contact and "
-        "end within 1e-2 of the end. Its three errors are those of the phase time, against the "
-        "lower bound of `solve --certify`, of the replayed end state, and the worst violation "
-        "between nodes, over the object's weight or the torque limit.",
-        "",
-    ]
-    for comparison in COMPARISONS:
-        lines += _format_targets(medians, comparison, limit)
-    table = [(name, own.settings) for name, own in METHODS.items()]
-    lines += ["## Settings", "", *format_table(["method", "settings"], table, 2)]
-    return "\n".join([*lines, ""])
 
 
 def find_times(
@@ -131,30 +122,12 @@ def _format_targets(medians: Medians, own: PeerComparison, limit: float) -> list
             cells += [shown[0], f"{reached} of {len(names)}", shown[1]]
         table.append(cells)
     heads = [head for t in own.targets for head in (f"{t:g} [s]", "reached", "times ours")]
-    return [f"## {_begin(own.title)}", "", *format_table(["method", *heads], table), ""]
-
-
-def _begin(text: str) -> str:
-    return text[0].upper() + text[1:]
-
-
-def group_settings(medians: Medians, study: str, method: str) -> dict[str, list[Median]]:
-    """Medians of a method on all phases of a study, by setting."""
-    found: dict[str, list[Median]] = {}
-    for key, median in medians.items():
-        if (key[0], key[2]) == (study, method):
-            found.setdefault(key[3], []).append(median)
-    return found
-
-
-def draw_medians(medians: Medians) -> Figure:
-    """Mean run time over the error that half of the phases keep, one line for each method."""
-    figure = Figure(figsize=(11.0, 9.0), layout="constrained")
-    FigureCanvasAgg(figure)
-    studies = PLANNING + SIMULATION
-    for axes, study in zip(figure.subplots(2, 2).flat, studies, strict=True):
-        _draw_study(axes, medians, study)
-    return figure
+    return [
+        f"## {own.title[0].upper()}{own.title[1:]}",
+        "",
+        *format_table(["method", *heads], table),
+        "",
+    ]
 
 
 def _draw_study(axes: Axes, medians: Medians, study: str) -> None:
@@ -162,7 +135,11 @@ def _draw_study(axes: Axes, medians: Medians, study: str) -> None:
     planning = study in PLANNING
     for index, method in enumerate(list_methods(medians, study)):
         points, full = [], []
-        for group in group_settings(medians, study, method).values():
+        settings: dict[str, list[Median]] = {}
+        for (own, _, which, setting), median in medians.items():
+            if (own, which) == (study, method):
+                settings.setdefault(setting, []).append(median)
+        for group in settings.values():
             found = [own for own in group if np.isfinite(own.errors[0])]
             if 2 * len(found) < len(group):
                 continue
@@ -181,7 +158,7 @@ def _draw_study(axes: Axes, medians: Medians, study: str) -> None:
             axes.plot(*zip(*hollow, strict=True), **look)
     axes.set_xscale("log")
     axes.set_yscale("log")
-    axes.set_title(_begin(study))
+    axes.set_title(f"{study[0].upper()}{study[1:]}")
     what = "relative error of the phase time" if planning else "error of z and z' in scene units"
     axes.set_xlabel(f"{what}, median over phases [-]")
     axes.set_ylabel(f"{'build and solve' if planning else 'run'} time, mean over phases [s]")
@@ -231,11 +208,21 @@ class Precision(Study):
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
         """All tables."""
-        return format_report(read_medians(rows), options.limit), []
+        medians = read_medians(rows)
+        lines = [INTRODUCTION]
+        for comparison in COMPARISONS:
+            lines += _format_targets(medians, comparison, options.limit)
+        table = [(name, own.settings) for name, own in METHODS.items()]
+        lines += ["## Settings", "", *format_table(["method", "settings"], table, 2)]
+        return "\n".join(lines), []
 
     def draw(self, rows: Sequence[Row]) -> Figure:
-        """Times over errors."""
-        return draw_medians(read_medians(rows))
+        """Mean run time over the error that half of the phases keep, one line for each method."""
+        figure, medians = Figure(figsize=(11.0, 9.0), layout="constrained"), read_medians(rows)
+        FigureCanvasAgg(figure)
+        for axes, study in zip(figure.subplots(2, 2).flat, PLANNING + SIMULATION, strict=True):
+            _draw_study(axes, medians, study)
+        return figure
 
 
 STUDY = Precision()

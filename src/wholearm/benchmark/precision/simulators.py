@@ -42,13 +42,6 @@ TOLERANCES = {
     MANY: ("1e-06", "1e-09", "1e-12"),
 }
 """Tolerances of each study."""
-DEGREES = {FEW: 14, MANY: 6}  # degrees of the torques' polynomials
-SLOW = 0.3
-"""Square of the speed of the motion with few pieces, over that of a first guess of a plan."""
-STOP = 0.95
-"""Share of the last stretch between reversals that is run: just before a stop all is ill-posed."""
-
-STEPS = 1000  # least number of steps of a replay
 CLOSE = 1e-2
 """Error of the end state, and of torques over their limits, up to which a plan counts as one."""
 
@@ -68,44 +61,6 @@ def build_own(course: Course, setting: str) -> Runner:
     return run
 
 
-def build_scipy(course: Course, setting: str) -> Runner:
-    """SciPy's DOP853 on a CasADi function, with the same relative and absolute tolerance."""
-    from scipy.integrate import solve_ivp
-
-    t, y, p, ode, _ = write_rates(course)
-    rates = _Buffered(ca.Function("rates", [t, y, p], [ode]))
-    options: Any = {"method": "DOP853", "rtol": float(setting), "atol": float(setting)}
-
-    def run() -> Array:
-        state = np.append(course.problem.start, np.zeros(5))
-        for span in course.spans:
-            rates.p[:] = pack_span(course, span)
-            solution = solve_ivp(rates, (span.start, span.stop), state, **options)
-            if solution.status:
-                raise RuntimeError(solution.message)
-            state = solution.y[:, -1]
-        return np.asarray(state)
-
-    return run
-
-
-class _Buffered:
-    """A CasADi function of t, y and p that is called without making arrays for its arguments."""
-
-    def __init__(self, function: Expression) -> None:
-        self.buffer, self.call = function.buffer()
-        self.t, self.y = np.zeros(1), np.zeros(10)
-        self.p, self.out = np.zeros(function.numel_in(2)), np.zeros(10)
-        for index, array in enumerate((self.t, self.y, self.p)):
-            self.buffer.set_arg(index, array.data)
-        self.buffer.set_res(0, self.out.data)
-
-    def __call__(self, t: float, y: Array) -> Array:
-        self.t[0], self.y[:] = t, y
-        self.call()
-        return self.out.copy()
-
-
 def write_rates(course: Course) -> tuple[Any, ...]:
     """The right-hand side and contact forces, as expressions of t, y and `pack_span`'s numbers."""
     formation = course.problem.phases[0].formation
@@ -114,15 +69,12 @@ def write_rates(course: Course) -> tuple[Any, ...]:
     Xi, sigma = ca.SX.sym("Xi", n_c), ca.SX.sym("sigma", 2)
     flat, piece = ca.SX.sym("flat", 2 * terms), ca.SX.sym("piece", 2)
     p = ca.vertcat(Xi, sigma, flat, piece)
-    found = build_forward(formation)(y[:5], y[5:], _write_torque(t, flat, piece), Xi, sigma)
-    return t, y, p, ca.vertcat(y[5:], found[0]), found[1]
-
-
-def _write_torque(t: Expression, flat: Expression, piece: Expression) -> Expression:
-    """The torques of a piece, whose coefficients come column by column."""
     x = (2 * t - piece[0] - piece[1]) / (piece[1] - piece[0])
-    coefficients = ca.reshape(flat, 2, -1)
-    return ca.vertcat(*(ca.polyval(coefficients[k, ::-1].T, x) for k in range(2)))
+    # Coefficients come column by column.
+    powers = ca.reshape(flat, 2, -1)[:, ::-1]
+    tau = ca.vertcat(*(ca.polyval(powers[k, :].T, x) for k in range(2)))
+    found = build_forward(formation)(y[:5], y[5:], tau, Xi, sigma)
+    return t, y, p, ca.vertcat(y[5:], found[0]), found[1]
 
 
 def pack_span(course: Course, span: Span) -> Array:
@@ -159,9 +111,6 @@ def build_cvodes(course: Course, setting: str) -> Runner:
 
 SIMULATORS = {
     "wholearm": Method("events, contact forces and energies included", build_own, TOLERANCES),
-    "DOP853, CasADi": Method(
-        "rtol = atol = tolerance; CasADi function with buffers that stay", build_scipy, TOLERANCES
-    ),
     "cvodes": Method(
         "abstol = reltol = tolerance; Adams, functional iteration; all stretches in one call",
         build_cvodes,
@@ -175,11 +124,9 @@ def run_simulator(
     study: str, name: str, method: str, setting: str, files: tuple[str, ...]
 ) -> Median | None:
     """Run one setting of one simulator on one phase; None if the phase has no course."""
-    course = _get_course(name, study, files)
+    course = make_course(pick(name, files), study)
     if course is None:
         return None
-    # No timing is to include its import.
-    import scipy.integrate  # noqa: F401
 
     def judge(state: Array) -> tuple[tuple[float, ...], str]:
         error = measure_error(course.problem, state, course.end)
@@ -189,28 +136,24 @@ def run_simulator(
 
 
 @lru_cache(maxsize=64)
-def _get_course(name: str, study: str, files: tuple[str, ...]) -> Course | None:
-    return make_course(pick(name, files), study)
-
-
 def make_course(instance: Instance, study: str) -> Course | None:
-    """The course of a phase, until just before it comes to rest.
+    """The course of a phase: of 95 % of its last stretch, as just before a stop all is ill-posed.
 
     None if the slow motion would lose a contact.
     """
     problem, curve = instance.problem, instance.curve
     if study == FEW:
-        motion = make_slow_motion(instance, 2, SLOW)
+        motion, degree = make_slow_motion(instance, 2, 0.3), 14
     else:
-        motion = plan_path(curve, problem.epsilon, PlanOptions(), 1).motion
+        motion, degree = plan_path(curve, problem.epsilon, PlanOptions(), 1).motion, 6
     looks = np.linspace(0.0, motion.duration, 201)
     if motion.evaluate(looks).c_n.min() <= 0:
         return None
     marks = find_reversals(motion)
-    stop = marks[-2] + STOP * (marks[-1] - marks[-2])
+    stop = marks[-2] + 0.95 * (marks[-1] - marks[-2])
     breaks = motion.times[np.append(motion.grid.steps > 0, True)]
     breaks = np.append(breaks[breaks < stop], stop)
-    torque = TorqueProfile.fit(breaks, lambda t: motion.evaluate(t).tau, DEGREES[study])
+    torque = TorqueProfile.fit(breaks, lambda t: motion.evaluate(t).tau, degree)
     return find_course(problem, torque, curve, len(marks) - 2)
 
 
@@ -249,10 +192,10 @@ def check_plan(instance: Instance, plan: PeerPlan) -> ReferenceCheck:
 
 
 def _split(instance: Instance, plan: PeerPlan) -> tuple[Span, ...]:
-    """Steps of the replay: within pieces of the torques, and between reversals."""
+    """Steps of the replay, 1000 or more: within pieces of the torques, and between reversals."""
     breaks, stop = plan.torque.breaks, plan.torque.breaks[-1]
     inner = np.append(breaks, plan.marks)
-    even = np.linspace(0.0, stop, STEPS + 1)
+    even = np.linspace(0.0, stop, 1001)
     ends = np.unique(np.concatenate([inner, even[1:-1]]))
     ends = ends[np.append(np.diff(ends) > 1e-12 * stop, True)]
     middle = (ends[1:] + ends[:-1]) / 2
