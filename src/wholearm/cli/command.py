@@ -436,9 +436,11 @@ def predict(options: argparse.Namespace) -> int:
         from ..figures.analysis_figures import draw_prediction
 
         wholearm.plots.save(draw_prediction(prediction), options.output)
+    status = finish(options, prediction)
     if options.torques is not None:
         wholearm.save(make_torques(prediction, options.speed or 0.05), options.torques)
-    return finish(options, prediction, options.output, options.torques)
+    finish(options, None, options.output, options.torques)
+    return status
 
 
 def tune(options: argparse.Namespace) -> int:

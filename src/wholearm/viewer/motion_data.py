@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -18,9 +17,6 @@ from ..figures.style import FINGERS, choose_styles
 from ..problem.definition import Problem
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
-
-_DIGITS = 6  # significant digits of numbers in a page: more than a screen shows
-MOST = 4000  # samples of a motion in a page
 
 
 class Pushes(NamedTuple):
@@ -47,7 +43,7 @@ def place_pushes(scene: Scene, trajectory: Trajectory) -> Pushes:
 
 
 def describe_motion(
-    trajectory: Trajectory, problem: Problem, ghost: Trajectory | None = None, most: int = MOST
+    trajectory: Trajectory, problem: Problem, ghost: Trajectory | None = None, most: int = 4000
 ) -> dict[str, Any]:
     """Everything that a page needs to play a motion, as plain values.
 
@@ -64,7 +60,7 @@ def describe_motion(
         {
             "name": name,
             "colour": styles[name].colour,
-            "dashes": _list_dashes(styles[name].line),
+            "dashes": [] if styles[name].line == "-" else list(styles[name].line[1]),
             "friction": scene.friction.of(parse_contact(name, scene).finger),
             "spans": _list_spans(scene, trajectory, pushes, index, rows),
         }
@@ -128,11 +124,6 @@ def describe_hand(scene: Scene) -> dict[str, Any]:
     }
 
 
-def _list_dashes(line: Any) -> Sequence[float]:
-    """Lengths of dashes and gaps of one of Matplotlib's line styles; none where it is solid."""
-    return [] if isinstance(line, str) else list(line[1])
-
-
 def _fix(values: Array, scene: Scene) -> Any:
     """Nested lists of places, directions or angles [m, rad]."""
     return np.round(values, count_places(scene)).tolist()
@@ -144,10 +135,8 @@ def count_places(scene: Scene) -> int:
 
 
 def _round(values: Array) -> Any:
-    """Nested lists of numbers that are short as text, None where there is no number."""
-    flat: list[Any] = [
-        None if v != v else float(f"{v:.{_DIGITS}g}") for v in values.ravel().tolist()
-    ]
+    """Nested lists of numbers with six digits, None where there is no number."""
+    flat: list[Any] = [None if v != v else float(f"{v:.6g}") for v in values.ravel().tolist()]
     for size in values.shape[:0:-1]:
         flat = [flat[k : k + size] for k in range(0, len(flat), size)]
     return flat

@@ -53,14 +53,8 @@ from ..results.trajectory import Trajectory
 from .motion_data import place_pushes
 
 FRAMES = 25  # frames in a second of the movie
-_MOST = 3000  # frames of a movie: two minutes
-_SIZE = (8.0, 7.4)
-RESOLUTION = 90  # dots per inch of a movie that is 8 inches wide
-_REACH = 0.3  # length of the largest force's arrow, over the picture's
-_BEYOND = 1.15  # length of friction cones over that of the arrows in them
 TURNS, GHOST = "#D55E00", "#bbbbbb"
 """Colours of torques and the cursor, and of what is drawn behind."""
-_TURN = 1.5 * math.pi  # angle of the arc of a torque at its limit
 
 
 class _Scene:
@@ -82,9 +76,10 @@ class _Scene:
         strengths = np.hypot(*forces.T).T[..., None]
         strongest = float(np.nanmax(strengths, initial=0.0)) or 1.0
         scales = np.sqrt(np.maximum(strengths, 1e-12 * strongest) * strongest)
-        self._points, self._arrows = points, _REACH * self._size * forces / scales
+        self._points, self._arrows = points, 0.3 * self._size * forces / scales
         self._presses = np.isfinite(forces).all(axis=2)
-        reach = _BEYOND * np.maximum(np.hypot(*self._arrows.T).T, 0.03 * self._size)[..., None]
+        # Friction cones are longer than the arrows in them.
+        reach = 1.15 * np.maximum(np.hypot(*self._arrows.T).T, 0.03 * self._size)[..., None]
         tangents = np.stack([normals[..., 1], -normals[..., 0]], axis=-1) * friction[:, None]
         sides = [points + reach * (normals + sign * tangents) for sign in (1, -1)]
         self._cones = np.stack([points, *sides], axis=2)  # (n, m, 3, 2)
@@ -101,7 +96,7 @@ class _Scene:
     def draw(self, t: float) -> list[Artist]:
         """Everything at an instant, in the order of drawing."""
         axes, own, artists = self._axes, self._trajectory, list[Artist]()
-        row, z = _find(own.t, t), _blend(own.t, own.z, t)
+        row, z = max(0, int(np.searchsorted(own.t, t, side="right")) - 1), _blend(own.t, own.z, t)
         if self._ghost is not None:
             behind = _blend(self._ghost.t, self._ghost.z, t)
             artists += draw_bodies(axes, self._scene, behind, ec=GHOST, fc="none")
@@ -121,15 +116,11 @@ class _Scene:
             dot: Any = {"marker": "o", "ms": 5.5, "mfc": self._colours[k], "mec": "white"}
             artists.append(add_line(axes, self._points[row, [k]], **dot))
         for finger, torque in zip(self._scene.fingers, own.tau[row].tolist(), strict=True):
-            swept = _TURN * torque / finger.torque_limit
+            # At the limit an arc of three quarters.
+            swept = 1.5 * math.pi * torque / finger.torque_limit
             arc = _trace_arc(np.asarray(finger.base), swept, 0.05 * self._size)
             artists.append(add_line(axes, arc, color=TURNS, lw=1.6))
         return artists + draw_joints(axes, self._scene)
-
-
-def _find(times: Array, t: float) -> int:
-    """The last sample at or before `t`."""
-    return max(0, int(np.searchsorted(times, t, side="right")) - 1)
 
 
 def _blend(times: Array, values: Array, t: float) -> Array:
@@ -174,12 +165,13 @@ class Movie:
         trajectory: Trajectory,
         ghost: Trajectory | None = None,
         speed: float = 0.1,
-        resolution: int = RESOLUTION,
+        resolution: int = 90,
     ) -> None:
         speed = require_number(speed, "--speed", positive=True)
         frames = math.ceil(trajectory.duration / speed * FRAMES) + 1
-        if frames > _MOST:
-            least = trajectory.duration * FRAMES / _MOST
+        most = 120 * FRAMES
+        if frames > most:
+            least = trajectory.duration * FRAMES / most
             text = f"{speed:g} given; from {least:.2g} on, movies are short enough"
             raise InputError("", "--speed", text)
         self.times = np.linspace(0.0, trajectory.duration, max(2, frames))
@@ -190,7 +182,7 @@ class Movie:
     def draw(self) -> Iterator[Array]:
         """Pictures one by one, shape (height, width, 4), uint8."""
         problem, own = self._problem, self._trajectory
-        with open_figure(*_SIZE, dpi=self._resolution) as figure:
+        with open_figure(8.0, 7.4, dpi=self._resolution) as figure:
             canvas: Any = figure.canvas
             scene = _Scene(figure.add_axes((0.02, 0.47, 0.96, 0.49)), problem, own, self._ghost)
             margins = figure.add_axes((0.09, 0.225, 0.74, 0.215))
@@ -199,7 +191,7 @@ class Movie:
             draw_torques(torques, own.torque, problem.scene.torque_limit)
             for axes, room in ((margins, 0.235), (torques, 0.14)):
                 draw_phases(axes, own.phase_starts, labels=axes is margins)
-                list_contacts(axes, 72 * _SIZE[1] * room, 8.0)
+                list_contacts(axes, 72 * 7.4 * room, 8.0)
             margins.set_ylabel(f"margin {unit_of(margins)}")
             margins.tick_params(labelbottom=False)
             label = rf"$\tau$ {unit_of(torques)}"
@@ -212,11 +204,8 @@ class Movie:
                 canvas.restore_region(still)
                 moving = scene.draw(t)
                 for axes in (margins, torques):
-                    cursor: Any = {
-                        "color": TURNS,
-                        "lw": 1.3,
-                        "transform": axes.get_xaxis_transform(),
-                    }
+                    cursor: Any = {"color": TURNS, "lw": 1.3}
+                    cursor["transform"] = axes.get_xaxis_transform()
                     moving.append(add_line(axes, np.array([[t, 0.0], [t, 1.0]]), **cursor))
                 text = f"{problem.name}   t = {t:.{decimals}f} s"
                 moving.append(figure.text(0.02, 0.975, text, **look))
@@ -235,7 +224,13 @@ def write_movie(
     ------
     InputError  if there is no ffmpeg for an MP4, or the file cannot be written
     """
-    pictures = _count(movie, progress)
+
+    def draw() -> Iterator[Array]:
+        for k, picture in enumerate(movie.draw(), start=1):
+            progress(f"frame {k} of {len(movie.times)}")
+            yield picture
+
+    pictures = draw()
     if str(path).lower().endswith(".gif"):
         images = [Image.fromarray(picture[..., :3]) for picture in pictures]
         # One palette for all, so that what stays the same is stored once.
@@ -265,12 +260,6 @@ def _choose_palette(images: Sequence[Image.Image]) -> Image.Image:
     palette = Image.new("P", (1, 1))
     palette.putpalette(exact + tints[: 3 * 96])
     return palette
-
-
-def _count(movie: Movie, progress: Callable[[str], None]) -> Iterator[Array]:
-    for k, picture in enumerate(movie.draw(), start=1):
-        progress(f"frame {k} of {len(movie.times)}")
-        yield picture
 
 
 def _encode(pictures: Iterator[Array], path: str | os.PathLike[str]) -> bytes:

@@ -8,9 +8,6 @@ from html import escape
 from importlib import resources
 from typing import Any
 
-PLAYER = "motion"
-CHART = "chart"
-
 
 def build_page(title: str, parts: Iterable[str]) -> str:
     """A page of HTML with the style and the scripts that its parts need.
@@ -19,21 +16,12 @@ def build_page(title: str, parts: Iterable[str]) -> str:
     ----------
     parts  as the other functions of this module make them
     """
-    style, script = (_read(name) for name in ("viewer.css", "viewer.js"))
+    folder = resources.files(__package__)
+    style, script = (folder.joinpath(f"viewer.{kind}").read_text("utf-8") for kind in ("css", "js"))
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
     head += f"<title>{escape(title)}</title><style>{style}</style>"
     body = "\n".join([f"<h1>{escape(title)}</h1>", *parts, f"<script>{script}</script>"])
     return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head><body>\n{body}\n</body></html>\n'
-
-
-def write_heading(text: str) -> str:
-    """A heading of a section."""
-    return f"<h2>{escape(text)}</h2>"
-
-
-def write_text(text: str, title: str) -> str:
-    """Text as it stands, folded away under a title."""
-    return fold(f"<pre>{escape(text)}</pre>", title)
 
 
 def fold(content: str, title: str) -> str:
@@ -43,7 +31,7 @@ def fold(content: str, title: str) -> str:
 
 def write_player(motion: dict[str, Any]) -> str:
     """A motion to play; see `motion_data.describe_motion`."""
-    return f'<div class="{PLAYER}">{_embed(motion)}</div>'
+    return f'<div class="motion">{_embed(motion)}</div>'
 
 
 def write_chart(drawing: str, places: dict[str, Any]) -> str:
@@ -51,14 +39,10 @@ def write_chart(drawing: str, places: dict[str, Any]) -> str:
     hint = "Click a cell, a border or a crossing to see what touches there."
     told = f'<div class="choice"><p>{hint}</p><div class="pose"></div></div>'
     wide = f'<div class="scroll"><div class="map">{drawing}</div></div>'
-    return f'<div class="{CHART}">{wide}{told}{_embed(places)}</div>'
+    return f'<div class="chart">{wide}{told}{_embed(places)}</div>'
 
 
 def _embed(value: dict[str, Any]) -> str:
     """Plain values for a script; a name with a tag in it cannot end them."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     return f'<script type="application/json">{text}</script>'
-
-
-def _read(name: str) -> str:
-    return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")

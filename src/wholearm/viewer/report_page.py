@@ -7,6 +7,7 @@ import math
 import platform
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from html import escape
 from typing import Any
 
 import matplotlib
@@ -28,10 +29,6 @@ from ..results.trajectory import Trajectory
 from ..search.times import time_borders
 from . import page
 from .motion_data import count_places, describe_hand, describe_motion
-
-_SAMPLES = 8000  # of all motions in a page, which they leave at some 3 MB
-_RESOLUTION = 90  # grid of the map: its borders are exact, only cells are drawn by it
-_MOST = 40  # points of a border; more cannot be told apart by clicks
 
 
 def build_report(
@@ -60,16 +57,17 @@ def build_report(
     parts = [comparison.summary.to_html()]
     for contender in comparison.contenders:
         progress(f"writing {contender.name}")
-        parts += _describe(contender, _SAMPLES // len(comparison.contenders))
+        # All motions together leave a page at some 3 MB.
+        parts += _describe(contender, 8000 // len(comparison.contenders))
     first = next((own.planned for own in comparison.contenders if own.planned is not None), None)
     progress("map")
-    chart = chart or build_map(problem, _RESOLUTION, choose_window(problem, None))
+    chart = chart or build_map(problem, 90, choose_window(problem, None))
     machine = f"Python {platform.python_version()}, {platform.machine()}"
     parts += [
-        page.write_heading("Contact formations"),
+        "<h2>Contact formations</h2>",
         page.write_chart(*describe_map(chart, first)),
-        page.write_heading("Problem"),
-        page.write_text(text or str(problem), "the problem file"),
+        "<h2>Problem</h2>",
+        page.fold(f"<pre>{escape(text or str(problem))}</pre>", "the problem file"),
         Document(f"wholearm {__version__}, {machine}").to_html(),
     ]
     return page.build_page(problem.name, parts)
@@ -80,14 +78,14 @@ def _describe(contender: Contender, most: int) -> list[str]:
 
     Of its motion `most` samples are taken, about.
     """
-    problem, planned = contender.problem, contender.planned
-    parts = [page.write_heading(contender.name)]
+    problem, planned, report = contender.problem, contender.planned, contender.report
+    parts = [f"<h2>{escape(contender.name)}</h2>"]
     parts.append(Document("", contender.verdict, contender.reason).to_html())
     replayed = None
-    if contender.report is not None:
+    if report is not None:
         # Torques that lose a contact at once leave no motion to show.
         with suppress(SimulationError):
-            replayed = contender.report.trajectory
+            replayed = report.trajectory
     shown = planned or replayed
     if shown is not None and problem is not None:
         ghost = replayed if planned is not None else None
@@ -99,8 +97,8 @@ def _describe(contender: Contender, most: int) -> list[str]:
         tables = [list_phases(problem, shown), list_joints(shown)]
         tables.append(Table(["planning took", "[s]:.4g"], took))
         parts.append(Document("", parts=tables).to_html())
-    if contender.report is not None:
-        parts.append(page.fold(contender.report.document.to_html(), "what verify says"))
+    if report is not None:
+        parts.append(page.fold(report.document.to_html(), "what verify says"))
     return parts
 
 
@@ -179,7 +177,8 @@ def describe_map(chart: FormationMap, plan: Trajectory | None = None) -> tuple[s
         places.append(describe(chart.formations[index], text, z[None]) | {"wide": True})
     flush = [border for border in chart.borders if border.flush is not None]
     for border, times in zip(flush, time_borders(chart.problem, flush), strict=True):
-        rows = np.unique(np.linspace(0, len(border.z) - 1, _MOST).round().astype(int))
+        # More than 40 points cannot be told apart by clicks.
+        rows = np.unique(np.linspace(0, len(border.z) - 1, 40).round().astype(int))
         places.append(describe(border.contacts, _describe_border(border, times), border.z[rows]))
     for crossing in chart.crossings:
         text = f"a crossing at {_name_place(crossing.point)}"
