@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -40,21 +41,12 @@ if TYPE_CHECKING:
     from ..robustness.sampling import Robustness
 
 _DOT = "  \u00b7  "  # between the parts of a title
-# Of comparisons [in]: width, height of a panel, room at its left, right, below and above all, and
-# the height of a line above each panel.
-_WIDTH, _HEIGHT, _LEFT, _RIGHT, _BOTTOM, _TOP, _LINE = 10.0, 2.45, 0.80, 1.30, 0.40, 0.35, 0.25
-# Of predictions: most panels side by side; size of one with what is written about it, and room at
-# its left, right, bottom and top [in].
-_COLUMNS, _PANEL, _ROOM = 3, (3.7, 2.85), (0.62, 0.15, 0.50, 0.80)
-_WIDE = 20.0  # largest speed over the least from which on fewer speeds have labels
-_REACH = 2.2  # largest force shown, over that near rest
 _KINDS = (
     ("contacts kept too", PALETTE[2], "o"),
     ("goal reached", PALETTE[0], "s"),
     ("goal missed", PALETTE[6], "x"),
 )
 """What becomes of a sample, its colour and its mark."""
-_LEAST = 1e-4  # what lesser distances [mm] and angles [deg] are drawn as
 
 
 @exclusive
@@ -63,57 +55,52 @@ def draw_comparison(comparison: Comparison) -> Figure:
 
     Replays are drawn; where nothing has moved a panel says so.
     """
-    shown = [(contender, _find_motion(contender)) for contender in comparison.contenders]
+    shown = list[tuple[Contender, Trajectory | None]]()
+    for own in comparison.contenders:
+        motion = None
+        with suppress(SimulationError):
+            motion = None if own.report is None else own.report.trajectory
+        shown.append((own, motion))
     motions = [motion for _, motion in shown if motion is not None]
     styles = choose_styles(tuple(dict.fromkeys(name for own in motions for name in own.contacts)))
     longest = max((motion.duration for motion in motions), default=1.0)
-    high = 0.15 + _TOP + len(motions) * (_HEIGHT + _LINE + _BOTTOM) + len(shown) * _LINE
+    # Height of a panel, and of a line of text above it, and room at both sides [in].
+    tall, line, left, right = 2.45, 0.25, 0.8, 1.3
+    high = 0.5 + len(motions) * (tall + line + 0.4) + len(shown) * line
     covered = np.concatenate([[0.0], *(own.c_n.ravel() - comparison.epsilon for own in motions)])
-    with open_figure(_WIDTH, high) as figure:
+    with open_figure(10.0, high) as figure:
         title = f"{comparison.name}{_DOT}force margins{_DOT}\u03b5 = {comparison.epsilon:g} N"
         write_title(figure, title)
         look: Any = {"fontsize": 9, "color": INK, "parse_math": False, "va": "bottom"}
         look["transform"] = figure.dpi_scale_trans
-        high -= _TOP
+        high -= 0.35
         for own, motion in shown:
-            high -= _LINE
-            figure.text(_LEFT, high, _describe(own), **look)
+            high -= line
+            what = f"{own.duration:.4g} s" if own.ok else own.reason
+            between = _DOT if own.ok else ": "
+            figure.text(left, high, f"{own.name}{_DOT}{own.verdict}{between}{what}", **look)
             if motion is None:
                 continue
-            high -= _HEIGHT + _LINE
-            axes = inset(figure, _LEFT, high, _WIDTH - _LEFT - _RIGHT, _HEIGHT)
-            high -= _BOTTOM
+            high -= tall + line
+            axes = inset(figure, left, high, 10.0 - left - right, tall)
+            high -= 0.4
             draw_margins(axes, motion, comparison.epsilon, styles, covered)
             axes.set_xlim(0.0, longest)
             draw_phases(axes, motion.phase_starts, span=longest)
-            list_contacts(axes, 72 * _HEIGHT)
+            list_contacts(axes, 72 * tall)
             axes.set_ylabel(f"$c_n - \\varepsilon$ {unit_of(axes)}")
             axes.set_xlabel("time $t$ [s]" if motion is motions[-1] else "")
     return figure
-
-
-def _find_motion(own: Contender) -> Trajectory | None:
-    """The replayed motion; None if there is none."""
-    if own.report is None:
-        return None
-    try:
-        return own.report.trajectory
-    except SimulationError:
-        return None
-
-
-def _describe(own: Contender) -> str:
-    more = [own.verdict, f"{own.duration:.4g} s"] if own.ok else [f"{own.verdict}: {own.reason}"]
-    return _DOT.join([own.name, *more])
 
 
 @exclusive
 def draw_prediction(prediction: Prediction) -> Figure:
     """Draw the least normal force over speed: a panel for each phase, a line for each motion."""
     phases = [phase for phase in prediction.phases if phase.curves is not None]
-    columns = min(_COLUMNS, max(len(phases), 2))
+    columns = min(3, max(len(phases), 2))
     rows = max(math.ceil(len(phases) / columns), 1)
-    (wide, tall), (left, right, bottom, top) = _PANEL, _ROOM
+    # Size of a panel with what is written about it, and the room that this takes [in].
+    (wide, tall), (left, right, bottom, top) = (3.7, 2.85), (0.62, 0.15, 0.50, 0.80)
     with open_figure(columns * wide, rows * tall + 0.45) as figure:
         for k, phase in enumerate(phases):
             row, column = divmod(k, columns)
@@ -132,7 +119,7 @@ def _draw_phase(axes: Axes, phase: PhasePrediction, epsilon: float) -> None:
     curves = phase.curves
     assert curves is not None
     rest = max([epsilon, *(float(force[0]) for force in curves.force.values())])
-    low, high = -0.35 * rest, _REACH * rest
+    low, high = -0.35 * rest, 2.2 * rest
     axes.axhspan(0.0, epsilon, color=LOW, linewidth=0, zorder=1)
     axes.axhspan(low, 0.0, color=LOST, linewidth=0, zorder=1)
     axes.axhline(epsilon, color="black", linewidth=1.0, zorder=2)
@@ -152,7 +139,7 @@ def _draw_phase(axes: Axes, phase: PhasePrediction, epsilon: float) -> None:
     above |= {"fontsize": 9, "fontweight": "bold"}
     write(axes, title, (0, 1), (0, 41), color=INK, **above)
     axes.set(xscale="log", xlim=(curves.speed[0], curves.speed[-1]), ylim=(low, high))
-    wide = curves.speed[-1] > _WIDE * curves.speed[0]
+    wide = curves.speed[-1] > 20.0 * curves.speed[0]
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if wide else (1.0, 2.0, 3.0, 5.0)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
@@ -222,7 +209,8 @@ def _draw_ends(axes: Axes, study: Robustness) -> None:
     known = study.trial.uncertainty
     goal = 1e3 * known.find_distance(study.trial.problem.scene), math.degrees(known.angle)
     given = [(1e3 * own["distance"], math.degrees(own["angle"])) for own in records]
-    places = np.maximum(np.array(given).reshape(-1, 2), _LEAST)
+    least = 1e-4  # [mm] and [deg]: lesser ones are drawn so
+    places = np.maximum(np.array(given).reshape(-1, 2), least)
     kinds = np.array([find_kind(record) for record in records])
     for kind, (label, colour, marker) in enumerate(_KINDS):
         own = places[kinds == kind]
@@ -234,9 +222,9 @@ def _draw_ends(axes: Axes, study: Robustness) -> None:
     low = 0.8 * 10 ** np.floor(np.log10(around.min(axis=0)))
     high = 1.25 * 10 ** np.ceil(np.log10(around.max(axis=0)))
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    least = [f" (at least {_LEAST:g})" if min(own) <= _LEAST else "" for own in around.T.tolist()]
-    axes.set_xlabel(f"distance from the goal [mm]{least[0]}")
-    axes.set_ylabel(f"angle from the goal [deg]{least[1]}")
+    notes = [f" (at least {least:g})" if min(own) <= least else "" for own in around.T.tolist()]
+    axes.set_xlabel(f"distance from the goal [mm]{notes[0]}")
+    axes.set_ylabel(f"angle from the goal [deg]{notes[1]}")
     axes.axvline(goal[0], color=INK, linewidth=0.8, linestyle=(0, (1, 2)))
     axes.axhline(goal[1], color=INK, linewidth=0.8, linestyle=(0, (1, 2)))
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, fontsize=8)

@@ -33,31 +33,18 @@ SIZE = (11.0, 7.9)  # in
 BOX = (0.75, 1.0, 9.4, 6.2)  # axes: left, bottom, width, height [in]
 PLACE = "place-"
 _LINE, _FREE, _AMBIGUOUS = "#9aa1ab", "#7a838f", "#AA3377"
-_WAYS: Any = (("#0072B2", 1.0, "forth"), ("#D55E00", -1.0, "back"))
+_FORTH, _BACK = "#0072B2", "#D55E00"
 _LOST: Any = {"fc": "#ececec", "ec": "#b8b8b8", "hatch": "////", "lw": 0.0}
 _OVERLAP: Any = {"fc": "#f6e3ee", "ec": "#CC79A7", "hatch": "\\\\\\\\", "lw": 0.0}
-_UNREACHED = {
-    "finger 1 too short": -1,
-    "finger 2 too short": -2,
-    "joint 1 in or above the object": -3,
-    "joint 2 in or above the object": -4,
-    "fingers overlap": CROSSED,
-}
-"""What is written where nothing can be reached, and its code in `FormationMap.cell`."""
 _TINTS = ("#f3f6fb", "#fbf6ea", "#eef7f0", "#f9eff4", "#f4f1fb", "#eef6f8", "#f7f7ee")
 _PASSING: Any = {"lw": 0.7, "ls": (0, (1, 1.6))}
 _DOTTED: Any = {"lw": 2.2, "ls": (0, (1.5, 1.5))}
 _PLAN: Any = {"color": INK, "lw": 5.0, "alpha": 0.42, "solid_capstyle": "round"}
-# All that follow are in printer's points.
-_ASIDE = 2.6  # offset of directed lines from the border
-_SPACING = 42.0  # distance between arrow heads on a directed line
-_HEAD = np.array([[3.4, 0.0], [-2.6, 2.5], [-2.6, -2.5]])  # of directed lines
-_DISC = 16.0  # room for the number of a phase
-_LETTER, _HEIGHT = 4.4, 9.0  # size of a letter of a label
-_CLEAR = 8.0  # distance of labels from the plan
+# Corners of arrow heads of directed lines, and of arrows inside cells [points].
+_HEAD = np.array([[3.4, 0.0], [-2.6, 2.5], [-2.6, -2.5]])
 _ARROW = np.array(
     [[1.2, 0.5], [5.4, 0.5], [5.2, 2.0], [9.2, 0.0], [5.2, -2.0], [5.4, -0.5], [1.2, -0.5]]
-)  # inside cells, from the place on
+)
 
 
 @exclusive
@@ -74,8 +61,10 @@ def draw_map(chart: FormationMap, plan: Trajectory | Moved | None = None) -> Fig
     Figure  with one axes: x [mm] and phi [deg]
     """
     problem = chart.problem
-    path = None if plan is None else adopt_motion(problem, plan)[1]
-    paths = trace_problem(problem) if path is None else trace_plan(path)
+    paths = trace_problem(problem) if plan is None else []
+    if plan is not None:
+        motion = adopt_motion(problem, plan)[1]
+        paths = [motion.q[motion.phase == k][:, [0, 2]] for k in np.unique(motion.phase)]
     with open_figure(*SIZE) as figure:
         drawing = _Drawing(figure, chart, paths)
         drawing.draw_cells()
@@ -107,8 +96,17 @@ class _Drawing:
         self.gids = (f"{PLACE}{k}" for k in count())
 
     def draw_cells(self) -> None:
-        """Fill the cells, and hatch what cannot be reached."""
-        tints, cell = choose_tints(self.chart.cell, len(_TINTS)), self.chart.cell
+        """Fill the cells, in other tints than their neighbours, and hatch what is not reached."""
+        cell = self.chart.cell
+        size = int(cell.max()) + 1
+        touching = np.zeros((size, size), dtype=bool)
+        for one, other in ((cell[1:], cell[:-1]), (cell[:, 1:], cell[:, :-1])):
+            both = (one >= 0) & (other >= 0) & (one != other)
+            touching[one[both], other[both]] = touching[other[both], one[both]] = True
+        tints = np.full(size, -1)
+        for k in np.argsort(-touching.sum(axis=1), kind="stable"):
+            used = set(tints[touching[k]].tolist())
+            tints[k] = next((tint for tint in range(len(_TINTS)) if tint not in used), 0)
         for index, region in self.parts:
             face, gid = _TINTS[tints[index]], next(self.gids)
             self._add(self._outline(region), fc=face, lw=0, aa=False, gid=gid, zorder=0)
@@ -141,12 +139,15 @@ class _Drawing:
         for path in self.paths:
             across = (np.subtract.outer(self.x, path[:, 0]) * self.scale[0]) ** 2
             upright = (np.subtract.outer(self.phi, path[:, 1]) * self.scale[1]) ** 2
-            clear &= (across[None] + upright[:, None]).min(axis=2) > _CLEAR**2
+            # 8 points from the plan.
+            clear &= (across[None] + upright[:, None]).min(axis=2) > 64.0
         names = [" | ".join(map(_shorten, own)) for own in self.chart.formations]
         boxes = [self._write_inside(names[k], region & clear) for k, region in self.parts]
         look: Any = {"color": "#666666", "style": "italic"}
         look["path_effects"] = [withStroke(linewidth=2.2, foreground="white")]  # over the hatching
-        for name, code in _UNREACHED.items():
+        texts = ["joint 2 in or above the object", "joint 1 in or above the object"]
+        texts += ["finger 2 too short", "finger 1 too short"]
+        for name, code in [*zip(texts, range(-4, 0), strict=True), ("fingers overlap", CROSSED)]:
             self._write_inside(name, self.chart.cell == code, **look)
         return [box for box in boxes if box is not None]
 
@@ -155,7 +156,7 @@ class _Drawing:
         if not region.any():
             return None
         step = np.array([self.phi[1] - self.phi[0], self.x[1] - self.x[0]]) * self.scale[::-1]
-        flat = np.array([_HEIGHT / 2 + 2.0, _LETTER * len(text) / 2 + 1.0])
+        flat = np.array([6.5, 2.2 * len(text) + 1.0])  # a letter is 4.4 points wide
         # Measured in half labels, the room around a place is the largest label that fits. Cells of
         # discs are narrow: there it stands upright.
         for half, turn in ((flat, 0), (flat[::-1], 90)):
@@ -193,8 +194,9 @@ class _Drawing:
             for border, points in zip(flush, lines, strict=True):
                 yield from (points[run] for run in find_runs(getattr(border, name), least=2))
 
-        for colour, way, name in _WAYS:
-            strips = [shift(run * self.scale, way * _ASIDE) for run in cut(every, name)]
+        for colour, way, name in ((_FORTH, 1.0, "forth"), (_BACK, -1.0, "back")):
+            # 2.6 points beside the border.
+            strips = [shift(run * self.scale, way * 2.6) for run in cut(every, name)]
             self._add_lines([own / self.scale for own in strips], colour, lw=1.3, zorder=4)
             heads = np.concatenate([np.empty((0, 3, 2)), *(place_heads(s, way) for s in strips)])
             self._add(heads / self.scale, fc=colour, lw=0, zorder=5)
@@ -216,7 +218,7 @@ class _Drawing:
         lines = [path * self.scale for path in self.paths]
         look: Any = {"fontsize": 8.0, "color": "white", "fontweight": "bold", "zorder": 9}
         look["bbox"] = {"boxstyle": "circle,pad=0.22", "fc": INK, "ec": "white", "lw": 0.8}
-        places = place_discs(lines, _DISC, *corners)
+        places = place_discs(lines, 16.0, *corners)
         for number, (line, place) in enumerate(zip(lines, places, strict=True), start=1):
             add_line(self.axes, line / self.scale, zorder=3.5, **_PLAN)
             leader = np.array([find_middle(line), place]) / self.scale
@@ -235,10 +237,9 @@ class _Drawing:
         """What lines and colours mean."""
         arrow: Any = {"marker": ">", "ms": 5, "lw": 1.4}
         line, chart = partial(Line2D, [], []), self.chart
-        (forth, *_), (back, *_) = _WAYS
         handles: list[Any] = [
-            line(color=forth, label="quasistatic motion possible, +x or +\u03c6", **arrow),
-            line(color=back, label="possible, \u2212x or \u2212\u03c6", **arrow),
+            line(color=_FORTH, label="quasistatic motion possible, +x or +\u03c6", **arrow),
+            line(color=_BACK, label="possible, \u2212x or \u2212\u03c6", **arrow),
             line(color=_LINE, lw=0.9, label="border: an edge flush, four contacts"),
             line(color=_LINE, label="side of the link gives way to its tip", **_PASSING),
             line(color=INK, marker="o", ms=4, ls="none", label="crossing: five contacts"),
@@ -272,11 +273,6 @@ def _shorten(contact: Contact) -> str:
     return f"{contact.corner}{'*' if rounded else ''}"
 
 
-def trace_plan(plan: Trajectory) -> list[Array]:
-    """Path of each phase of a trajectory, (n, 2) [m, rad]."""
-    return [plan.q[plan.phase == k][:, [0, 2]] for k in np.unique(plan.phase)]
-
-
 def _head(run: Array) -> Array:
     """Unit vectors along `run`, (n, 2), zero where it is."""
     return np.asarray(run / np.maximum(np.hypot(*run.T), 1e-12)[:, None])
@@ -305,9 +301,9 @@ def find_middle(points: Array, share: float = 0.5) -> Array:
 
 
 def place_heads(points: Array, way: float) -> Array:
-    """Corners of arrow heads on a polyline, shape (n, 3, 2)."""
+    """Corners of arrow heads on a polyline, one every 42 points, shape (n, 3, 2)."""
     s = _measure(points)
-    number = int(s[-1] // _SPACING) + int(s[-1] > 12.0)
+    number = int(s[-1] // 42.0) + int(s[-1] > 12.0)
     places = (np.arange(number) + 0.5) * s[-1] / max(number, 1)
     k = np.searchsorted(s, places)
     run = _head(way * (points[k] - points[k - 1]))
@@ -362,20 +358,3 @@ def find_room(region: Flags, step: Array) -> tuple[int, int, float]:
     row, column = np.unravel_index(int(room.argmax()), room.shape)
     place = int(row) + around[0].start, int(column) + around[1].start
     return *place, float(room[row, column])
-
-
-def choose_tints(cell: Numbers, tints: int) -> Numbers:
-    """A tint for each cell, different from its neighbours' as far as there are enough.
-
-    `cell` says for each place of a grid whose it is, negative: nobody's.
-    """
-    size = int(cell.max()) + 1
-    touching = np.zeros((size, size), dtype=bool)
-    for one, other in ((cell[1:], cell[:-1]), (cell[:, 1:], cell[:, :-1])):
-        both = (one >= 0) & (other >= 0) & (one != other)
-        touching[one[both], other[both]] = touching[other[both], one[both]] = True
-    chosen = np.full(size, -1)
-    for k in np.argsort(-touching.sum(axis=1), kind="stable"):
-        used = set(chosen[touching[k]].tolist())
-        chosen[k] = next((tint for tint in range(tints) if tint not in used), 0)
-    return chosen

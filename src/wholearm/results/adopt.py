@@ -62,12 +62,8 @@ def adopt_torques(
 
 def require_same_contacts(problem: Problem, plan: Trajectory | None) -> None:
     """Check that a plan, if there is one, has the contacts of a problem."""
-    odd = (
-        set()
-        if plan is None
-        else set(plan.contacts) ^ {contact.name for contact in problem.contacts}
-    )
-    if odd:
+    known = {contact.name for contact in problem.contacts}
+    if plan is not None and (odd := {*plan.contacts} ^ known):
         text = f"trajectory and problem differ in {', '.join(sorted(odd))}"
         raise InputError("", "contacts", text)
 
@@ -106,8 +102,6 @@ def save(what: Torques | Problem, path: str | os.PathLike[str]) -> None:
 
 _FREE = (".name", ".epsilon", ".settle_gap", ".uncertainty", ".goal", "settle")
 """Keys of a problem in which its plans may differ from it; those with a dot at the top only."""
-_OTHER_HAND = 0.1
-"""Change of a link, over its length, from which on it is another hand: no error of measurement."""
 
 
 def require_made_for(problem: Problem, meta: Mapping[str, Any]) -> None:
@@ -172,7 +166,8 @@ def _require_sense(found: Difference, problem: Problem, what: str) -> None:
                 change = abs(float(found.one) - float(found.other))
             except ValueError:
                 continue
-            if change > _OTHER_HAND * finger.length:
+            # No error of measurement.
+            if change > 0.1 * finger.length:
                 other = "it is one of another hand"
     if other:
         text = f"{found.one} in the {what}, {found.other} here; {other}"

@@ -25,12 +25,6 @@ from ..scene.model import Scene
 from .torque import TorqueProfile
 from .trajectory import Motion, Samples, Trajectory
 
-_STEP = 1e-6  # largest step of torques that is none, over their limits
-_FLOOR = 5e-4
-"""Least room that is counted on between a torque and its limit, over that: none takes for ever."""
-_QUICK = 1e12  # rate of torques that stands for any, in their limits [1/s]
-_DEGREE = 6  # degree of the polynomials in pieces that are as long as the shortest lag at most
-
 
 @dataclass(frozen=True, eq=False)
 class TorqueChange:
@@ -70,7 +64,8 @@ class TorqueChange:
         def evaluate(t: Array) -> Array:
             return self.before + self.share(t)[:, None] * (self.after - self.before)
 
-        return TorqueProfile.fit(breaks, evaluate, _DEGREE if fades else 1)
+        # Pieces are as long as the shortest lag at most.
+        return TorqueProfile.fit(breaks, evaluate, 6 if fades else 1)
 
 
 def change_torques(scene: Scene, before: Array, after: Array) -> TorqueChange:
@@ -91,11 +86,13 @@ def _divide(scene: Scene, before: Array, after: Array) -> tuple[Array, Array, Ar
     """Pieces of the least time: sigma at their ends, and how long, how fast and fading they are."""
     limit, lags = scene.torque_limit, np.flatnonzero(scene.actuator_lag)
     step = np.abs(after - before)
-    much = np.asarray((step > _STEP * limit).any(axis=-1))
-    step = np.maximum(step, _STEP**2 * limit)
+    # A step of a millionth of the limit is none.
+    much = np.asarray((step > 1e-6 * limit).any(axis=-1))
+    step = np.maximum(step, 1e-12 * limit)
     side = np.where(after < before, -1.0, 1.0)
-    room = np.maximum(limit - side * after, _FLOOR * limit) + step
-    fastest = np.minimum(scene.torque_rate_limit, _QUICK * limit)
+    # Without any room between torque and limit it would take for ever.
+    room = np.maximum(limit - side * after, 5e-4 * limit) + step
+    fastest = np.minimum(scene.torque_rate_limit, 1e12 * limit)
     steady = (fastest / step).min(axis=-1)
     decay = np.array([0.0, *(1 / scene.actuator_lag[lags])])
     starts = [steady, *((room / step)[..., j] / scene.actuator_lag[j] for j in lags)]

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TextIO
 
 import numpy as np
 
@@ -14,8 +16,6 @@ from ..common.arrays import Array
 from ..common.errors import InputError, require_number
 
 ERROR = 1e-5  # largest error of the straight lines between rows, relative to the largest torque
-STEP = 1e-6
-"""Jump at a break from which on the rows keep it as a step, relative to the largest torque."""
 INTERPOLATIONS = ("linear", "hold")
 _PLACES = np.linspace(-1.0, 1.0, 17)  # places in each piece of torques at which it is looked at
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(6)
@@ -74,17 +74,17 @@ class TorqueProfile:
         """The same torques from `start` to `stop` [s], those of the ends held beyond them."""
         near = 1e-12 * max(abs(start), abs(stop))
         inner = self.breaks[(self.breaks > start + near) & (self.breaks < stop - near)]
-        new = np.array([start, *inner, stop])
-        pieces = np.zeros((len(new) - 1, *self.coefficients.shape[1:]))
-        for piece, (a, b) in zip(pieces, pairwise(new.tolist()), strict=True):
-            middle = (a + b) / 2
-            if not self.breaks[0] < middle < self.breaks[-1]:
-                piece[:, 0] = self.at(np.array([middle]))[0]
-                continue
-            k = int(np.searchsorted(self.breaks, middle, side="right")) - 1
-            first, last = self.breaks[k : k + 2].tolist()
-            piece[:] = _restrict(self.coefficients[k], first, last, a, b)
-        return TorqueProfile(new, pieces)
+        profile = TorqueProfile.fit(
+            np.array([start, *inner, stop]), self.at, self.coefficients.shape[2] - 1
+        )
+        # Whole pieces stay as they are to the last bit.
+        first = np.searchsorted(self.breaks, profile.breaks[:-1])
+        first = np.minimum(first, len(self.coefficients) - 1)
+        whole = (self.breaks[first] == profile.breaks[:-1]) & (
+            self.breaks[first + 1] == profile.breaks[1:]
+        )
+        profile.coefficients[whole] = self.coefficients[first[whole]]
+        return profile
 
     @staticmethod
     def fit(breaks: Array, function: Callable[[Array], Array], degree: int) -> TorqueProfile:
@@ -126,21 +126,6 @@ class TorqueProfile:
         return TorqueProfile(breaks, np.stack([middle, half], axis=2))
 
 
-def _restrict(coefficients: Array, start: float, stop: float, a: float, b: float) -> Array:
-    """The same polynomials over a part [a, b] of [start, stop]."""
-    if a == start and b == stop:
-        return coefficients
-    # x = shift + scale u, where u runs from -1 to 1 over the part.
-    scale, shift = (b - a) / (stop - start), (a + b - start - stop) / (stop - start)
-    result = np.zeros_like(coefficients)
-    power = np.zeros(coefficients.shape[1])
-    power[0] = 1.0
-    for k in range(coefficients.shape[1]):
-        result += coefficients[:, k : k + 1] * power
-        power = shift * power + scale * np.append(0.0, power[:-1])
-    return result
-
-
 def read_torque_csv(path: str) -> TorqueProfile:
     """Read torques from a CSV file with the columns ``t,tau1,tau2`` (s, N m, N m).
 
@@ -152,18 +137,13 @@ def read_torque_csv(path: str) -> TorqueProfile:
     InputError  if the file cannot be read, a column is missing, a value is not a finite number, or
                 the times do not start at 0 and increase
     """
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as stream:
-            reader = csv.reader(stream)
-            numbered = [
-                (reader.line_num, row)
-                for row in reader
-                if any(map(str.strip, row)) and not row[0].lstrip().startswith("#")
-            ]
-    except OSError as error:
-        raise InputError(str(path), "", f"cannot be read: {error.strerror}") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(str(path), "", f"is not CSV: {error}") from None
+    with _open(path) as stream:
+        reader = csv.reader(stream)
+        numbered = [
+            (reader.line_num, row)
+            for row in reader
+            if any(map(str.strip, row)) and not row[0].lstrip().startswith("#")
+        ]
     header = [cell.strip() for cell in numbered[0][1]] if numbered else []
     for column in COLUMNS:
         if column not in header:
@@ -196,14 +176,21 @@ def read_notes(path: str) -> dict[str, str]:
     ------
     InputError  if the file cannot be read
     """
+    with _open(path) as stream:
+        comments = [line[1:].split("=", 1) for line in stream if line.startswith("#")]
+    return {pair[0].strip(): pair[1].strip() for pair in comments if len(pair) == 2}
+
+
+@contextmanager
+def _open(path: str) -> Iterator[TextIO]:
+    """A CSV file; what is wrong with it is an `InputError`."""
     try:
-        with open(path, encoding="utf-8-sig") as stream:
-            comments = [line[1:].split("=", 1) for line in stream if line.startswith("#")]
+        with open(path, newline="", encoding="utf-8-sig") as stream:
+            yield stream
     except OSError as error:
         raise InputError(str(path), "", f"cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError as error:
+    except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(str(path), "", f"is not CSV: {error}") from None
-    return {pair[0].strip(): pair[1].strip() for pair in comments if len(pair) == 2}
 
 
 def _read_row(path: str, line: int, row: list[str], where: list[int]) -> list[float]:
@@ -228,7 +215,7 @@ def place_rows(
 ) -> Array:
     """Rows (t, tau_1, tau_2) whose straight lines give torques back, shape (n, 3) [s, N m, N m].
 
-    Every break of the torques has a row, and two where they step.
+    Every break of the torques has a row, and two where they step by 1e-6 of the largest or more.
 
     Parameters
     ----------
@@ -244,7 +231,7 @@ def place_rows(
     breaks = torque.breaks
     alternate = (-1.0) ** np.arange(torque.coefficients.shape[2])
     jump = torque.coefficients[1:] @ alternate - torque.coefficients[:-1].sum(axis=2)
-    steps = breaks[1:-1][np.abs(jump).max(axis=1) > STEP * largest]
+    steps = breaks[1:-1][np.abs(jump).max(axis=1) > 1e-6 * largest]
     ends = np.concatenate([breaks[:1], steps, breaks[-1:]])
     at = np.searchsorted(knots, ends)
     stretches = [knots[i : j + 1] for i, j in pairwise(at)]

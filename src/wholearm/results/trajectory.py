@@ -162,7 +162,13 @@ class Trajectory(Drawn):
         ------
         InputError  if the file cannot be written
         """
-        write_trajectory(self, path)
+        require_ending(path, ".npz")
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS}
+        arrays["contacts"] = np.array(self.contacts)
+        arrays["torque_breaks"] = self.torque.breaks
+        arrays["torque_coefficients"] = self.torque.coefficients
+        arrays["meta"] = np.array(json.dumps(dict(self.meta)))
+        write_whole(path, lambda stream: np.savez(stream, **arrays))
 
     def save_torques(self, path: str | os.PathLike[str]) -> None:
         """Write the torques as CSV, ``t,tau1,tau2``, a repeated time being a step.
@@ -232,42 +238,22 @@ def sample_phases(
     arrays: Mapping[str, Any], contacts: tuple[str, ...]
 ) -> tuple[SampledMotion, ...]:
     """The motion of each phase, from the arrays of a trajectory by name."""
-    return tuple(_sample(arrays, contacts, index) for index in sort_unique(arrays["phase"]))
-
-
-def _sample(arrays: Mapping[str, Any], contacts: tuple[str, ...], index: float) -> SampledMotion:
-    rows = arrays["phase"] == index
-    held = ~np.isnan(arrays["c_n"][rows]).all(axis=0)
-    parts = {name: array[rows] for name, array in arrays.items()}
-    samples = Samples(
-        np.hstack([parts["q"], parts["theta"]]),
-        np.hstack([parts["q_dot"], parts["theta_dot"]]),
-        np.hstack([parts["q_ddot"], parts["theta_ddot"]]),
-        parts["tau"],
-        parts["c_n"][:, held],
-        parts["c_t"][:, held],
-    )
-    names = tuple(name for name, here in zip(contacts, held, strict=True) if here)
-    return SampledMotion(parts["t"], names, samples)
+    motions = []
+    for index in sort_unique(arrays["phase"]):
+        parts = {name: array[arrays["phase"] == index] for name, array in arrays.items()}
+        held = ~np.isnan(parts["c_n"]).all(axis=0)
+        names = ("q", "theta"), ("q_dot", "theta_dot"), ("q_ddot", "theta_ddot")
+        z, z_dot, z_ddot = (np.hstack([parts[one], parts[other]]) for one, other in names)
+        forces = parts["tau"], parts["c_n"][:, held], parts["c_t"][:, held]
+        own = tuple(name for name, here in zip(contacts, held, strict=True) if here)
+        motions.append(SampledMotion(parts["t"], own, Samples(z, z_dot, z_ddot, *forces)))
+    return tuple(motions)
 
 
 _ARRAYS = {
     "t": (), "q": (3,), "theta": (2,), "q_dot": (3,), "theta_dot": (2,), "q_ddot": (3,),
     "theta_ddot": (2,), "tau": (2,), "c_n": (-1,), "c_t": (-1,), "phase": (),
 }  # fmt: skip
-_FARTHEST = 1e6
-"""Largest coordinate [m or rad]: nothing in a problem is farther away or turned more."""
-
-
-def write_trajectory(trajectory: Trajectory, path: str | os.PathLike[str]) -> None:
-    """Write a trajectory; see `Trajectory.save`."""
-    require_ending(path, ".npz")
-    arrays: dict[str, Any] = {name: getattr(trajectory, name) for name in _ARRAYS}
-    arrays["contacts"] = np.array(trajectory.contacts)
-    arrays["torque_breaks"] = trajectory.torque.breaks
-    arrays["torque_coefficients"] = trajectory.torque.coefficients
-    arrays["meta"] = np.array(json.dumps(dict(trajectory.meta)))
-    write_whole(path, lambda stream: np.savez(stream, **arrays))
 
 
 def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
@@ -325,7 +311,8 @@ def _check_shape(source: str, name: str, arrays: Mapping[str, Any], tail: tuple[
         raise InputError(source, name, f"holds {array.dtype}; numbers are needed")
     elif np.isinf(array).any() or (name not in ("c_n", "c_t") and np.isnan(array).any()):
         raise InputError(source, name, "holds numbers that are not finite")
-    most = _FARTHEST if name in ("q", "theta") else MOST
+    # Nothing in a problem is farther away, or turned more.
+    most = 1e6 if name in ("q", "theta") else MOST
     if name != "contacts" and (np.abs(array.astype(float)) > most).any():
         raise InputError(source, name, f"holds numbers beyond {most:g}, the largest allowed")
 

@@ -6,7 +6,7 @@ import hashlib
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -36,8 +36,6 @@ contact slides the other way forces step, at another time when numbers are off."
 Task = tuple[int, tuple[float, ...]]
 """Number and values of a sample."""
 SAMPLES = Range(1, 10**6)  # samples of a study
-DRAWN = 200  # samples whose paths are kept, for figures
-_ROWS = 8  # contacts lost first that the text lists; the others are counted
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -82,7 +80,8 @@ class Robustness(Result):
     @property
     def first_lost(self) -> dict[str, Share]:
         """Which contact goes first, by number of the phase and name, the most frequent first."""
-        names = Counter(_name_loss(record) for record in self.records if record["lost"])
+        lost = [(own["lost"], own.get("phase")) for own in self.records if own["lost"]]
+        names = Counter(f"{name} in phase {k}" if k is not None else name for name, k in lost)
         return {name: count_share(n, len(self.records)) for name, n in names.most_common()}
 
     @property
@@ -97,8 +96,8 @@ class Robustness(Result):
         shares = [(f"goal reached within {off}", str(self.reached))]
         shares.append(("and all planned contacts kept", str(self.kept)))
         lost = [(name, str(share)) for name, share in self.first_lost.items()]
-        rest = sum(share.hits for share in list(self.first_lost.values())[_ROWS:])
-        others = [(f"{len(lost) - _ROWS} others", f"{rest} times")] if lost[_ROWS:] else []
+        rest = sum(share.hits for share in list(self.first_lost.values())[8:])
+        others = [(f"{len(lost) - 8} others", f"{rest} times")] if lost[8:] else []
         ended = Counter(record["ended"] for record in self.records if record["ended"])
         rows = []
         for own in least.of:
@@ -107,7 +106,11 @@ class Robustness(Result):
             slope = slope if own.slope == own.slope else "a contact is lost at once"
             rows.append((own.name, width, slope, own.over_range))
         heads = ["parameter", "range (+-)", "d(least c_n)/d:.5g", "over the range [N]:.4g"]
-        missed = "" if self.nominal["reached"] else _name_miss(self.nominal)
+        end, missed = self.nominal, ""
+        if not end["reached"]:
+            missed = str(end["ended"])
+            if "distance" in end:
+                missed = f"{1e3 * end['distance']:.3g} mm and {math.degrees(end['angle']):.3g} deg"
         place_of = f" on {least.contact} at t = {least.time:.4g} s"
         return Document(
             f"{trial.problem.name}, {place}",
@@ -115,7 +118,7 @@ class Robustness(Result):
             parts=[
                 Table(["", "share of the samples"], shares),
                 f"without anything off the goal is missed too: by {missed}" if missed else "",
-                Table(["contact lost first", "share of the samples"], lost[:_ROWS] + others),
+                Table(["contact lost first", "share of the samples"], lost[:8] + others),
                 *(f"{count} ended early: {text}" for text, count in ended.most_common(3)),
                 f"least c_n: {least.c_n:.4g} N{place_of}" if least.contact else "",
                 Table(heads, rows),
@@ -134,28 +137,13 @@ class Robustness(Result):
             "seed": self.seed,
             "ranges": trial.uncertainty.widths,
             "sample_rate": trial.uncertainty.sample_rate,
-            "reached": _list_share(self.reached),
-            "kept": _list_share(self.kept),
-            "first_lost": {name: _list_share(share) for name, share in self.first_lost.items()},
+            "reached": self.reached.table,
+            "kept": self.kept.table,
+            "first_lost": {name: share.table for name, share in self.first_lost.items()},
             "least_c_n": {"contact": least.contact, "time": least.time, "c_n": least.c_n},
             "sensitivities": [dict(zip(keys, own, strict=True)) for own in least.of],
             "nominal": {key: own for key, own in self.nominal.items() if key != "path"},
         }
-
-
-def _name_miss(record: dict[str, Any]) -> str:
-    if "distance" not in record:
-        return str(record["ended"])
-    return f"{1e3 * record['distance']:.3g} mm and {math.degrees(record['angle']):.3g} deg"
-
-
-def _list_share(share: Share) -> dict[str, float]:
-    return {"count": share.hits, "share": share.value, "low": share.low, "high": share.high}
-
-
-def _name_loss(record: dict[str, Any]) -> str:
-    phase = record.get("phase")
-    return record["lost"] if phase is None else f"{record['lost']} in phase {phase}"
 
 
 def assess_robustness(
@@ -205,7 +193,11 @@ def assess_robustness(
             sizes.append(samples - sum(sizes))
             journal.add({"samples": sizes[-1]})
         found = {k: record for k, record in known.items() if k < samples}
-        drawn = _draw(own, sizes, seed)[:samples]
+        # Latin hypercubes one after another: one more each time that the study is enlarged.
+        starts = [sum(sizes[:k]) for k in range(len(sizes))]
+        parts = zip(starts, sizes, strict=True)
+        cubes = [own.draw(size, (seed, k) if k else seed) for k, size in parts]
+        drawn = np.vstack(cubes)[:samples]
         tasks = ((k, tuple(drawn[k].tolist())) for k in range(samples) if k not in found)
         good = sum(record["reached"] for record in found.values())
         for (number, _), answer in run_all(partial(_run, trial), tasks, (start or Processes)()):
@@ -223,17 +215,11 @@ def assess_robustness(
     return Robustness(trial, drawn, seed, records, known_now)
 
 
-def _draw(uncertainty: Uncertainty, sizes: Sequence[int], seed: int) -> Array:
-    """Latin hypercubes one after another: a study has one more each time that it is enlarged."""
-    starts = [sum(sizes[:k]) for k in range(len(sizes))]
-    parts = zip(starts, sizes, strict=True)
-    return np.vstack([uncertainty.draw(n, (seed, k) if k else seed) for k, n in parts])
-
-
 def _run(trial: Trial, task: Task) -> dict[str, Any]:
     number, sample = task
     record = trial.run(np.array(sample))
-    if number >= DRAWN:
+    # Figures need no more paths.
+    if number >= 200:
         record.pop("path", None)
     return record
 
@@ -357,6 +343,11 @@ class Share:
     def value(self) -> float:
         """The share itself; NaN of none."""
         return self.hits / self.total if self.total else math.nan
+
+    @property
+    def table(self) -> dict[str, float]:
+        """All of it, as JSON has it."""
+        return {"count": self.hits, "share": self.value, "low": self.low, "high": self.high}
 
     def __str__(self) -> str:
         if not self.total:
