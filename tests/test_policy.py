@@ -197,7 +197,7 @@ def test_no_policy_is_written_that_does_not_carry_out_its_plan(
     first, last = policy.tables
     weak = Policy([first, {**last, "torque": 0.2 * last["torque"]}], policy.settings)
     weak.about = policy.about
-    monkeypatch.setattr("wholearm.policy.make.make_policy", lambda *_, **__: weak)
+    monkeypatch.setattr("wholearm.make_policy", lambda *_, **__: weak)
     output = tmp_path / "policy.npz"
     assert main(["policy", str(tmp_path / "plan.npz"), "-o", str(output)]) == 1
     said = capsys.readouterr().err

@@ -16,12 +16,6 @@ from typing import Any
 from .errors import InputError
 from .workers import Spawning
 
-AHEAD = 64  # tasks that are submitted before the first is answered
-CHANCES = 3  # processes that a task may lose
-MEMORY = 6 * 2**30
-"""Address space of a process [byte]: a claim beyond it fails instead of swapping."""
-PATIENCE = 20.0
-"""Wall-clock time that a task may take over its bound of processor time: others may run too."""
 _CPU = getattr(signal, "SIGPROF", 27)  # signal that ends a process whose processor time is used up
 
 
@@ -34,7 +28,7 @@ class DiedError(Exception):
 
 
 def run_all(
-    run: Callable[[Any], Any], tasks: Iterable[Any], executor: Executor, ahead: int = AHEAD
+    run: Callable[[Any], Any], tasks: Iterable[Any], executor: Executor, ahead: int = 64
 ) -> Iterator[tuple[Any, Any]]:
     """Each task and what `run` returns for it, or the exception that it raises, as they end.
 
@@ -65,13 +59,13 @@ def run_all(
 class Processes(ThreadPoolExecutor):
     """Spawned processes, each led by a thread. One that dies or hangs costs its own task alone.
 
-    Futures raise `DiedError` where a task loses its process.
+    Futures raise `DiedError` where a task loses its process three times, or its time is up.
 
     Parameters
     ----------
     jobs   number of processes; as many as cores if left out
-    limit  processor time that a task may take [s]. By the wall clock it may take `PATIENCE` times
-           that.
+    limit  processor time that a task may take [s]. By the wall clock it may take 20 times that, as
+           others may run too.
     alone  whether each task has a new process, where nothing is kept from others
     """
 
@@ -104,7 +98,7 @@ class Processes(ThreadPoolExecutor):
 
     def _lead(self, run: Callable[[Any], Any], task: Any) -> Any:
         """The result of a task, by a process that this thread has for itself meanwhile."""
-        for chance in range(1, CHANCES + 1):
+        for chance in (1, 2, 3):
             worker = self._idle.pop() if self._idle else _Worker(self._context)
             self._workers.add(worker)
             reusable = False
@@ -115,7 +109,7 @@ class Processes(ThreadPoolExecutor):
                 reusable = not self._alone
                 break
             except DiedError as error:
-                if error.late or self._closed or chance == CHANCES:
+                if error.late or self._closed or chance == 3:
                     raise
             finally:
                 if reusable:
@@ -142,7 +136,7 @@ class _Worker:
         begun, late = time.monotonic(), False
         try:
             self.pipe.send((run, task, limit))
-            if self.pipe.poll(PATIENCE * limit if math.isfinite(limit) else None):
+            if self.pipe.poll(20.0 * limit if math.isfinite(limit) else None):
                 succeeded, result = self.pipe.recv()
                 return succeeded, result
             late = True
@@ -164,8 +158,9 @@ def _serve(pipe: Connection) -> None:
     try:
         import resource
 
-        hard = resource.getrlimit(resource.RLIMIT_AS)[1]
-        soft = MEMORY if hard == resource.RLIM_INFINITY else min(MEMORY, hard)
+        # A claim beyond 6 GB fails instead of swapping.
+        most, hard = 6 * 2**30, resource.getrlimit(resource.RLIMIT_AS)[1]
+        soft = most if hard == resource.RLIM_INFINITY else min(most, hard)
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
     except ImportError:  # on Windows
         pass

@@ -60,7 +60,6 @@ def restore(kind: Any, value: Any) -> Any:
     return kind(value)
 
 
-LONGEST = 100  # characters of a `repr`
 SCALES = {"mm": 1e3, "mm/s": 1e3, "ms": 1e3, "deg": 180 / math.pi, "%": 1e2}
 """What numbers in SI units are multiplied by in a column of that unit."""
 
@@ -137,8 +136,9 @@ class Table(NamedTuple):
     def to_markdown(self) -> str:
         """The table as Markdown."""
         rule = ["---:" if form else "---" for form in self.forms]
-        lines = (" | ".join(map(_escape_bar, line)) for line in (self.heads, rule, *self.cells))
-        return "\n".join(f"| {line} |" for line in lines)
+        lines = [[cell.replace("|", "\\|") for cell in line] for line in (self.heads, *self.cells)]
+        lines.insert(1, rule)
+        return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 class Document(NamedTuple):
@@ -194,7 +194,7 @@ class Brief:
 
     def __repr__(self) -> str:
         line = f"{type(self).__name__}({self.headline})"
-        return line if len(line) <= LONGEST else f"{line[: LONGEST - 4]}...)"
+        return line if len(line) <= 100 else f"{line[:96]}...)"
 
 
 class Drawn(Brief):
@@ -257,10 +257,6 @@ class Result(Brief):
 
     def _repr_html_(self) -> str:
         return self.document.to_html()
-
-
-def _escape_bar(text: str) -> str:
-    return text.replace("|", "\\|")
 
 
 def _find(item: Any, name: str) -> Any:

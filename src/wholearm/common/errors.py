@@ -71,9 +71,6 @@ class Shortfall(NamedTuple):
         return f"{self.limit} is {self.amount:.3g} {self.unit} short at {self.place.text}"
 
 
-LONGEST = 1000  # characters of a message beyond which its middle is left out
-
-
 class WholearmError(Exception):
     """Base of every error that this package raises on purpose.
 
@@ -110,9 +107,9 @@ class InputError(WholearmError):
 
 
 def _to_line(text: str) -> str:
-    """One line without control characters, its middle left out where it is very long."""
+    """One line without control characters, its middle left out beyond 1000 characters."""
     text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
-    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
+    return text if len(text) <= 1000 else f"{text[:500]} ... {text[-500:]}"
 
 
 @contextmanager

@@ -181,36 +181,26 @@ def read_arrays(path: str | os.PathLike[str], names: Iterable[str]) -> dict[str,
     ------
     InputError  if the file cannot be read, is no archive of arrays, or claims what it does not hold
     """
-    source = str(path)
+    source, arrays = str(path), dict[str, Any]()
     try:
         with open(path, "rb") as stream:
             if stream.read(6) == b"\x93NUMPY":
                 raise InputError(source, "", "is not a trajectory file: one array, no archive")
-            stream.seek(0)
-            return _read_archive(source, stream, names)
+            with zipfile.ZipFile(stream) as archive:
+                known = {info.filename: info for info in archive.infolist()}
+                for name in names:
+                    info = known.get(f"{name}.npy")
+                    if info is None:
+                        continue
+                    if info.file_size > LARGEST:
+                        problem = f"holds {info.file_size} bytes; allowed are up to {LARGEST}"
+                        raise InputError(source, name, problem)
+                    with archive.open(info) as member:
+                        arrays[name] = _read_array(source, name, member.read())
     except OSError as error:
         raise InputError(source, "", f"cannot be read: {error.strerror or error}") from None
-    except _BROKEN as error:
-        raise InputError(source, "", f"is not a trajectory file: {error}") from None
-
-
-_BROKEN = (ValueError, EOFError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error)
-
-
-def _read_archive(source: str, stream: BinaryIO, names: Iterable[str]) -> dict[str, Any]:
-    arrays = {}
-    with zipfile.ZipFile(stream) as archive:
-        known = {info.filename: info for info in archive.infolist()}
-        for name in names:
-            info = known.get(f"{name}.npy")
-            if info is None:
-                continue
-            if info.file_size > LARGEST:
-                problem = f"holds {info.file_size} bytes; allowed are up to {LARGEST}"
-                raise InputError(source, name, problem)
-            with archive.open(info) as member:
-                content = member.read()
-            arrays[name] = _read_array(source, name, content)
+    except (ValueError, EOFError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error) as e:
+        raise InputError(source, "", f"is not a trajectory file: {e}") from None
     return arrays
 
 

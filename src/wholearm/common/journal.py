@@ -44,7 +44,7 @@ class Journal:
             self._stream: BinaryIO = open(path, "ab+", buffering=0)
             try:
                 if stat.S_ISREG(os.fstat(self._stream.fileno()).st_mode):
-                    _lock(self._stream.fileno(), path)
+                    self._lock()
                     if fresh:
                         self._stream.truncate(0)
                     self._stream.seek(0)
@@ -74,17 +74,24 @@ class Journal:
         """
         self.records.append(record)
         try:
-            self._write(_to_line(record))
+            self._write((json.dumps(record) + "\n").encode())
         except OSError as error:
             raise self._fail(error) from None
 
     def _begin(self, given: bytes, again: bool) -> None:
         """Take the records that are there, and leave whole lines, begun by the stamp."""
-        head = _to_line(self._stamp)
+        head = (json.dumps(self._stamp) + "\n").encode()
         whole = head
         # Half of the first line is what a full disk leaves.
         if not head.startswith(given):
-            self._require_stamp(given)
+            other, kind, text = _parse(given.split(b"\n", 1)[0]) or {}, self._stamp["study"], ""
+            if other.get("study") != kind:
+                text = f"no {kind} study"
+            elif found := list(find_differences(other, self._stamp)):
+                text = f"another study: {describe_differences(found, 'in the file', 'now')}"
+            if text:
+                what = f"holds {text}; --fresh begins anew, or choose another with -o"
+                raise InputError(self.path, "", what)
             first, *lines = given[: given.rfind(b"\n") + 1].splitlines(keepends=True)
             known = [(line, _parse(line)) for line in lines]
             kept = [own for own in known if not (again and (own[1] or {}).get("findings"))]
@@ -97,40 +104,22 @@ class Journal:
                 self._stream.truncate(0)
                 self._write(whole)
 
-    def _require_stamp(self, given: bytes) -> None:
-        """Check that the file is one of this study."""
-        other, kind = _parse(given.split(b"\n", 1)[0]) or {}, self._stamp["study"]
-        if other.get("study") != kind:
-            text = f"no {kind} study"
-        elif differences := list(find_differences(other, self._stamp)):
-            text = f"another study: {describe_differences(differences, 'in the file', 'now')}"
-        else:
-            return
-        what = f"holds {text}; --fresh begins anew, or choose another with -o"
-        raise InputError(self.path, "", what)
-
     def _write(self, line: bytes) -> None:
         left = memoryview(line)
         while left:
             left = left[self._stream.write(left) :]
 
+    def _lock(self) -> None:
+        """Keep others from the file until it is closed, or this process ends."""
+        try:
+            if fcntl is not None:
+                fcntl.flock(self._stream.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            text = "another run is writing to it; wait for its end, or choose another with -o"
+            raise InputError(self.path, "", text) from None
+
     def _fail(self, error: OSError) -> InputError:
         return InputError(self.path, "", f"cannot be written: {error.strerror}")
-
-
-def _lock(descriptor: int, path: str) -> None:
-    """Keep others from a file until it is closed, or this process ends."""
-    if fcntl is None:
-        return
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        text = "another run is writing to it; wait for its end, or choose another with -o"
-        raise InputError(path, "", text) from None
-
-
-def _to_line(record: dict[str, Any]) -> bytes:
-    return (json.dumps(record) + "\n").encode()
 
 
 def _parse(line: bytes) -> dict[str, Any] | None:

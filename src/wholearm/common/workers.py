@@ -29,8 +29,6 @@ from .signals import WATCHER
 _T = TypeVar("_T")
 Task = Callable[[], _T]
 
-DEEP = 20_000  # depth of recursion that pickling may take
-_NUMBER = 2  # bytes of a task's number
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _sharing = False
 
@@ -86,7 +84,7 @@ def _share(
 ) -> list[_T]:
     """Results of tasks, done by this process and `count` others."""
     source, sink = os.pipe()
-    os.write(sink, b"".join(k.to_bytes(_NUMBER, "big") for k in range(len(tasks))))
+    os.write(sink, b"".join(k.to_bytes(2, "big") for k in range(len(tasks))))
     os.close(sink)
     children = list[_Child]()
     try:
@@ -96,7 +94,8 @@ def _share(
         for child in children:
             # A child that was ended, or met an error, sends nothing.
             with suppress(EOFError, OSError):
-                results |= _unpickle(child.answers.recv_bytes(), known)
+                answer = io.BytesIO(child.answers.recv_bytes())
+                results |= _Unpickler(answer, known).load()
         return [results[k] if k in results else task() for k, task in enumerate(tasks)]
     finally:
         os.close(source)
@@ -184,7 +183,7 @@ def _take(tasks: Sequence[Task[_T]], source: int, parent: int | None = None) -> 
     the end, so that the first of them raises it, whoever has met it.
     """
     results = dict[int, _T]()
-    while parent in (None, os.getppid()) and (number := os.read(source, _NUMBER)):
+    while parent in (None, os.getppid()) and (number := os.read(source, 2)):
         index = int.from_bytes(number, "big")
         with suppress(Exception):
             results[index] = tasks[index]()
@@ -214,13 +213,9 @@ class _Unpickler(pickle.Unpickler):
 def _pickle(value: object, numbers: dict[int, int]) -> bytes:
     stream = io.BytesIO()
     deepest = sys.getrecursionlimit()
-    sys.setrecursionlimit(max(deepest, DEEP))
+    sys.setrecursionlimit(max(deepest, 20_000))
     try:
         _Pickler(stream, numbers).dump(value)
     finally:
         sys.setrecursionlimit(deepest)
     return stream.getvalue()
-
-
-def _unpickle(data: bytes, known: Sequence[object]) -> Any:
-    return _Unpickler(io.BytesIO(data), known).load()
