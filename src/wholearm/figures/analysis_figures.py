@@ -55,7 +55,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
 
     Replays are drawn; where nothing has moved a panel says so.
     """
-    shown = list[tuple[Contender, Trajectory | None]]()
+    shown: list[tuple[Contender, Trajectory | None]] = []
     for own in comparison.contenders:
         motion = None
         with suppress(SimulationError):
