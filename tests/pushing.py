@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -59,6 +59,19 @@ def rocking(scale: float = 1.0) -> TorqueProfile:
     return linear(np.arange(7) / 10, 0.14 * scale * share, [1e-3] * 7)
 
 
+def fit_stages(torque: Callable[[float, int], Array], times: Sequence[float]) -> TorqueProfile:
+    """Torques at a time of a stage as polynomials, which may step between the stages."""
+    breaks, coefficients, degree = [0.0], [], 7
+    nodes = np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
+    for stage, ends in enumerate(pairwise(times)):
+        for low, high in pairwise(np.linspace(*ends, 7)):
+            t = (low + high + nodes * (high - low)) / 2
+            values = np.array([torque(float(one), stage) for one in t])
+            coefficients.append(np.polynomial.polynomial.polyfit(nodes, values, degree).T)
+            breaks.append(high)
+    return TorqueProfile(np.array(breaks), np.array(coefficients))
+
+
 class Push:
     """The box of `pushed` moved by plan: twice to the left by `run` [m], and still between.
 
@@ -110,19 +123,8 @@ class Push:
         )
         return float((x_ddot - first) / (second - first))
 
-    def fit(self, pieces: int = 6, degree: int = 7) -> TorqueProfile:
-        """The torques as polynomials, which may step between the stages."""
-        breaks, coefficients = [0.0], []
-        nodes = np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
-        for stage in range(3):
-            edges = np.linspace(self.times[stage], self.times[stage + 1], pieces + 1)
-            for low, high in pairwise(edges):
-                t = (low + high + nodes * (high - low)) / 2
-                values = [self.torque(float(one), stage) for one in t]
-                own = np.polynomial.polynomial.polyfit(nodes, values, degree)
-                coefficients.append([own, [1e-3] + [0.0] * degree])
-                breaks.append(high)
-        return TorqueProfile(np.array(breaks), np.array(coefficients))
+    def fit(self) -> TorqueProfile:
+        return fit_stages(lambda t, stage: np.array([self.torque(t, stage), 1e-3]), self.times)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,15 +195,5 @@ class Roll:
         answer = np.linalg.solve(np.hstack([force.T, np.eye(5)[:, 3:]]), right)
         return np.asarray(answer[3:])
 
-    def fit(self, pieces: int = 6, degree: int = 7) -> TorqueProfile:
-        """The torques as polynomials, which step between the stages."""
-        breaks, coefficients = [0.0], []
-        nodes = np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
-        for stage in range(3):
-            edges = np.linspace(self.times[stage], self.times[stage + 1], pieces + 1)
-            for low, high in pairwise(edges):
-                t = (low + high + nodes * (high - low)) / 2
-                values = np.array([self.torque(float(one), stage) for one in t])
-                coefficients.append(np.polynomial.polynomial.polyfit(nodes, values, degree).T)
-                breaks.append(high)
-        return TorqueProfile(np.array(breaks), np.array(coefficients))
+    def fit(self) -> TorqueProfile:
+        return fit_stages(self.torque, self.times)

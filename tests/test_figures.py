@@ -62,18 +62,8 @@ class Replayed:
 
 
 @pytest.fixture(scope="module")
-def problem(heptagon: Problem) -> Problem:
-    return heptagon
-
-
-@pytest.fixture(scope="module")
-def planned(trajectory: Trajectory) -> Trajectory:
-    return trajectory
-
-
-@pytest.fixture(scope="module")
-def figure(planned: Trajectory) -> Figure:
-    return plots.force_margins(planned)
+def figure(trajectory: Trajectory) -> Figure:
+    return plots.force_margins(trajectory)
 
 
 @pytest.fixture
@@ -181,30 +171,30 @@ def test_units_suit_the_size(axes: Axes, size: float, prefix: str) -> None:
 
 
 def test_margins_are_the_trajectory_with_breaks_at_phases(
-    figure: Figure, planned: Trajectory
+    figure: Figure, trajectory: Trajectory
 ) -> None:
-    margins, steps = figure.axes[-2], find_steps(planned)
-    assert set(np.flatnonzero(np.diff(planned.phase)) + 1) <= set(steps)
-    added = np.insert(np.zeros(len(planned.t), dtype=bool), np.repeat(steps, 2), True)
-    for index, name in enumerate(planned.contacts):
+    margins, steps = figure.axes[-2], find_steps(trajectory)
+    assert set(np.flatnonzero(np.diff(trajectory.phase)) + 1) <= set(steps)
+    added = np.insert(np.zeros(len(trajectory.t), dtype=bool), np.repeat(steps, 2), True)
+    for index, name in enumerate(trajectory.contacts):
         t, values = data_of(line_of(margins, name))
-        np.testing.assert_array_equal(t[~added], planned.t)
-        np.testing.assert_array_equal(values[~added], planned.c_n[:, index] - 0.05)
+        np.testing.assert_array_equal(t[~added], trajectory.t)
+        np.testing.assert_array_equal(values[~added], trajectory.c_n[:, index] - 0.05)
         # At a step the line breaks upright: it lasts until then, and goes on from there.
-        np.testing.assert_array_equal(t[added], np.repeat(planned.t[steps], 2))
-        before = planned.c_n[steps - 1, index] - 0.05
+        np.testing.assert_array_equal(t[added], np.repeat(trajectory.t[steps], 2))
+        before = trajectory.c_n[steps - 1, index] - 0.05
         np.testing.assert_array_equal(values[added][::2], before)
         assert np.isnan(values[added][1::2]).all()
 
 
 def test_zero_line_and_limits_are_there(
-    figure: Figure, planned: Trajectory, problem: Problem
+    figure: Figure, trajectory: Trajectory, heptagon: Problem
 ) -> None:
     margins, torques = figure.axes[-2:]
     assert 0.0 in levels(margins)
     low, high = margins.get_ylim()
-    assert low < -problem.epsilon and high > np.nanmax(planned.c_n) - problem.epsilon
-    limits = problem.scene.torque_limit
+    assert low < -heptagon.epsilon and high > np.nanmax(trajectory.c_n) - heptagon.epsilon
+    limits = heptagon.scene.torque_limit
     assert sorted(y for y in levels(torques) if y) == sorted([*limits, *-limits])
     for line in torques.lines:
         if line.get_label() == "limits":
@@ -225,9 +215,11 @@ def test_torque_lines_have_both_ends_of_every_step(axes: Axes) -> None:
 
 
 @pytest.mark.parametrize("row", [0, 320, -1])
-def test_snapshot_is_to_scale(axes: Axes, planned: Trajectory, problem: Problem, row: int) -> None:
-    z, names = planned.z[row], planned.motions[planned.phase[row]].contacts
-    scene, styles = problem.scene, choose_styles(planned.contacts)
+def test_snapshot_is_to_scale(
+    axes: Axes, trajectory: Trajectory, heptagon: Problem, row: int
+) -> None:
+    z, names = trajectory.z[row], trajectory.motions[trajectory.phase[row]].contacts
+    scene, styles = heptagon.scene, choose_styles(trajectory.contacts)
     _, *links, body = draw_snapshot(axes, scene, z, names, styles)[:4]
     c, s = np.cos(z[2]), np.sin(z[2])
     corners = [(z[0] + c * x - s * y, z[1] + s * x + c * y) for x, y in scene.polygon.vertices]
@@ -250,41 +242,41 @@ def test_snapshot_is_to_scale(axes: Axes, planned: Trajectory, problem: Problem,
     assert numbers == [str(i) for i in range(7)]
 
 
-def test_snapshots_are_at_least_six_and_one_of_every_phase(planned: Trajectory) -> None:
+def test_snapshots_are_at_least_six_and_one_of_every_phase(trajectory: Trajectory) -> None:
     for phases in ([0], [0, 1], [0, 1, 2], [0, 1, 2, 3], list(range(5)), [0, 1] * 5):
-        trajectory = repeat(planned, phases)
-        rows = choose_snapshots(trajectory)
+        other = repeat(trajectory, phases)
+        rows = choose_snapshots(other)
         assert len(rows) == max(6, len(phases) + 1)
-        assert rows[0] == 0 and rows[-1] == len(trajectory.t) - 1
+        assert rows[0] == 0 and rows[-1] == len(other.t) - 1
         assert (np.diff(rows) > 0).all()
-        boundaries = np.flatnonzero(np.diff(trajectory.phase)) + 1
+        boundaries = np.flatnonzero(np.diff(other.phase)) + 1
         assert set(boundaries) <= set(rows)
 
 
 @pytest.mark.parametrize("width", [3.5, 7.0])
-def test_text_is_inside_and_apart_in_other_widths(width: float, planned: Trajectory) -> None:
-    figure = plots.force_margins(planned, width=width, motion=True)
+def test_text_is_inside_and_apart_in_other_widths(width: float, trajectory: Trajectory) -> None:
+    figure = plots.force_margins(trajectory, width=width, motion=True)
     assert figure.get_figwidth() == width
     check_layout(figure)
     pose, angles, speeds = figure.axes[-3:]
-    assert data_of(line_of(pose, "x [mm]"))[1][-1] == pytest.approx(1e3 * planned.q[-1, 0])
+    assert data_of(line_of(pose, "x [mm]"))[1][-1] == pytest.approx(1e3 * trajectory.q[-1, 0])
     assert data_of(line_of(angles, "finger 2"))[1][0] == pytest.approx(
-        np.degrees(planned.theta[0, 1])
+        np.degrees(trajectory.theta[0, 1])
     )
-    assert np.nanmax(data_of(line_of(speeds, "finger 1"))[1]) == planned.theta_dot[:, 0].max()
+    assert np.nanmax(data_of(line_of(speeds, "finger 1"))[1]) == trajectory.theta_dot[:, 0].max()
 
 
 @pytest.mark.parametrize("width", [2.0, 50.0, float("nan")])
-def test_widths_that_are_no_paper_are_refused(width: float, planned: Trajectory) -> None:
+def test_widths_that_are_no_paper_are_refused(width: float, trajectory: Trajectory) -> None:
     with pytest.raises(InputError, match="width"):
-        plots.force_margins(planned, width=width)
+        plots.force_margins(trajectory, width=width)
 
 
-def test_simulation_is_drawn_over_the_plan(planned: Trajectory) -> None:
-    c_n = planned.c_n.copy()
+def test_simulation_is_drawn_over_the_plan(trajectory: Trajectory) -> None:
+    c_n = trajectory.c_n.copy()
     c_n[100, 0] = -3.0
-    simulation: Any = Replayed(planned.t, planned.phase, planned.tau, c_n)
-    figure = plots.force_margins(planned, simulation=simulation)
+    simulation: Any = Replayed(trajectory.t, trajectory.phase, trajectory.tau, c_n)
+    figure = plots.force_margins(trajectory, simulation=simulation)
     margins, torques = figure.axes[-2:]
     line = line_of(margins, "simulated")
     t, values = data_of(line)
@@ -300,9 +292,9 @@ def test_simulation_is_drawn_over_the_plan(planned: Trajectory) -> None:
 
 
 def test_save_writes_the_format_of_the_ending_and_the_same_bytes(
-    planned: Trajectory, tmp_path: Path
+    trajectory: Trajectory, tmp_path: Path
 ) -> None:
-    short = repeat(planned, [0])
+    short = repeat(trajectory, [0])
     # Letters take a PDF long.
     figure, wordless = plots.force_margins(short), Figure()
     wordless.add_subplot().set_axis_off()
@@ -329,23 +321,23 @@ def test_save_refuses_other_endings(figure: Figure, tmp_path: Path, name: str) -
     assert not list(tmp_path.iterdir())
 
 
-def test_trajectory_without_its_problem_is_refused(planned: Trajectory) -> None:
-    bare = dataclasses.replace(planned, meta={"epsilon": 0.05})
+def test_trajectory_without_its_problem_is_refused(trajectory: Trajectory) -> None:
+    bare = dataclasses.replace(trajectory, meta={"epsilon": 0.05})
     with pytest.raises(InputError, match=r"meta\.problem"):
         plots.force_margins(bare)
 
 
-def test_odd_names_are_drawn_as_they_are(planned: Trajectory) -> None:
-    short = repeat(planned, [0])
+def test_odd_names_are_drawn_as_they_are(trajectory: Trajectory) -> None:
+    short = repeat(trajectory, [0])
     for name in ("cost $5 and \\frac{" + 20 * " a long name", ""):
-        meta = {**planned.meta, "name": name}
+        meta = {**trajectory.meta, "name": name}
         check_layout(plots.force_margins(dataclasses.replace(short, meta=meta)))
 
 
 def test_settings_of_matplotlib_are_left_alone_and_pyplot_is_not_imported(
-    planned: Trajectory, tmp_path: Path
+    trajectory: Trajectory, tmp_path: Path
 ) -> None:
-    planned.save(tmp_path / "plan.npz")
+    trajectory.save(tmp_path / "plan.npz")
     code = (
         "import sys, matplotlib, wholearm\n"
         "before = matplotlib.rcParams.copy()\n"

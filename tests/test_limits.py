@@ -489,15 +489,6 @@ def test_a_motion_has_to_be_as_fast_as_the_end_asks_for(cap: float) -> None:
         assert speed_sweep(*sweep).b == pytest.approx([0.0, 4.0, 0.0], abs=1e-12)
 
 
-def test_rest_is_possible_where_some_acceleration_is() -> None:
-    rows = np.zeros((4, 2, 4))
-    rows[..., A] = [[1.0, -1.0], [1.0, -1.0], [1.0, -1.0], [0.0, 0.0]]
-    rows[..., ONE] = [[1.0, 1.0], [3.0, -2.0], [-2.0, 3.0], [-1.0, 1.0]]
-    limits = PathLimits(rows, np.full(4, np.inf))
-    assert limits.can_rest().tolist() == [True, False, True, False]
-    assert limits.can_rest(-1.0).tolist() == [True, True, False, False]
-
-
 def test_a_margin_takes_the_duration_that_is_allowed(curves: tuple[Curve, ...]) -> None:
     least = bound_least_time([curves[0]], EPSILON)
     assert least is not None

@@ -675,7 +675,7 @@ def test_plans_of_a_chain_come_near_the_bound() -> None:
 def test_the_bound_shares_nothing_with_the_nlp() -> None:
     folder = Path(__file__).parents[1] / "src/wholearm/planning/lower_bound"
     files = list(folder.glob("*.py"))
-    assert len(files) > 3
+    assert len(files) > 1
     for path in files:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ImportFrom):

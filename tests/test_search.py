@@ -52,9 +52,9 @@ from wholearm.search.find_route import (
     require_reach,
     store_roadmap,
 )
-from wholearm.search.places import list_formations_at, make_place
+from wholearm.search.places import make_place
 from wholearm.search.result import bound_borders, describe_block
-from wholearm.search.roadmap import Roadmap, cross, go_to
+from wholearm.search.roadmap import Roadmap
 
 TABLE = {k: v for k, v in tomllib.loads(HEPTAGON.read_text()).items() if k != "phases"}
 
@@ -109,26 +109,6 @@ def test_a_place_along_a_border_is_a_goal() -> None:
     route = next(search(Goal(flush=0, x=0.03)).run())
     (link,) = route.links
     assert abs(link.stop.z[0] - 0.03) < 1e-9 and link.steps[0].until.value == 0.03
-
-
-def test_straight_ways_keep_their_limits_and_end_where_a_contact_is_gained() -> None:
-    scene, epsilon = chart().scene, chart().epsilon
-    _, route = to_edge_6()
-    start = route.links[1].stop
-    ways = cross((start,), epsilon)
-    assert ways
-    for way in ways:
-        (step,), z = way.steps, way.stop.z
-        gaps = Formation(scene, way.stop.contacts).evaluate(z[None], z[None]).C
-        assert np.abs(gaps).max() < 0.02 * scene.scales.length
-        (formation,) = (f for f in list_formations_at(start, 3) if f.contacts == step.contacts)
-        pose = z[None, [0, 2]]
-        again = go_to(start, formation, pose, step.until, epsilon)
-        assert again is not None and again.duration == pytest.approx(way.duration)
-        np.testing.assert_allclose(again.stop.z, z, atol=1e-12)
-        # With more to press no way is faster.
-        harder = go_to(start, formation, pose, step.until, 4 * epsilon)
-        assert harder is None or harder.duration >= way.duration
 
 
 def test_a_problem_with_a_goal_is_planned() -> None:

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,9 +17,9 @@ from once import once
 from shipped import HEPTAGON, problem_of, solved
 from toys import LIMIT, Toy, constant
 from wholearm import Formation, InputError, Problem, simulate, simulate_free, solve
-from wholearm.planning import dwell as shares
+from wholearm.planning import dwell
 from wholearm.planning.dwell import list_touching, settle_plans
-from wholearm.planning.phase_plan import PhasePlan
+from wholearm.planning.phase_plan import PhasePlan, Settled
 from wholearm.planning.result import Plan, describe_plan, load_plan, write_meta
 from wholearm.planning.table_check import make_table
 from wholearm.problem.read import read_own_problem
@@ -35,23 +36,42 @@ HELD = (0.019, 0.01, 0.01, 0.01, 0.0)
 """For how long ends are held here [s]."""
 
 
-@once
-def settled() -> Plan:
-    """The plan of the four contacts with its ends held, without planning it again."""
+def hold(changes: dict[str, Any]) -> tuple[Problem, Settled]:
+    """The plans of the four contacts with their ends held, without planning them again."""
     plain = solved(HEPTAGON)
-    changes = {"settle": HELD[1], "phases[1].settle": HELD[0], "phases[5].settle": HELD[-1]}
     problem, trajectory = plain.problem.with_(changes), plain.trajectory
-    starts = trajectory.phase_starts
-    cuts = [trajectory.torque.cut(*ends) for ends in pairwise(starts.tolist())]
+    cuts = [trajectory.torque.cut(*ends) for ends in pairwise(trajectory.phase_starts.tolist())]
     parts = [TorqueProfile(own.breaks - own.breaks[0], own.coefficients) for own in cuts]
     pairs = zip(trajectory.motions, parts, strict=True)
-    found = settle_plans(problem, [PhasePlan(motion, torque, 0.0) for motion, torque in pairs])
+    plans = [PhasePlan(motion, torque, 0.0) for motion, torque in pairs]
+    return problem, settle_plans(problem, plans)
+
+
+@once
+def settled() -> Plan:
+    """The plan of the four contacts with its ends held."""
+    plain = solved(HEPTAGON)
+    changes = {"settle": HELD[1], "phases[1].settle": HELD[0], "phases[5].settle": HELD[-1]}
+    problem, found = hold(changes)
     torque = TorqueProfile.chain([plan.torque for plan in found.plans])
-    motion = assemble([plan.motion for plan in found.plans], torque, trajectory.meta, 201)
+    motion = assemble([plan.motion for plan in found.plans], torque, plain.trajectory.meta, 201)
     both = zip(plain.phases, found.settlings, strict=True)
     phases = tuple(phase._replace(settling=own) for phase, own in both)
     plan = replace(plain, problem=problem, trajectory=motion, phases=phases)
     return replace(plan, trajectory=replace(motion, meta=write_meta(plan)))
+
+
+def test_a_share_of_the_duration_is_spread_over_the_ends() -> None:
+    """The whole then ends where it was planned to, also from starts that are off by the gap."""
+    problem, found = hold({"settle": "10 %", "phases[3].settle": 0.002})
+    times = [own.duration if own else 0.0 for own in found.settlings]
+    assert times[2] == 0.002 and min(times) > 0
+    assert sum(times) == pytest.approx(0.002 + 0.1 * solved(HEPTAGON).duration, rel=1e-12)
+    torque = TorqueProfile.chain([plan.torque for plan in found.plans])
+    for off in (0.0, problem.gap, -problem.gap):
+        z = simulate_free(problem, torque, start=dwell.move_start(problem, off)).z[-1]
+        away = np.abs(z - solved(HEPTAGON).trajectory.z[-1])
+        assert max(away[:2].max(), problem.scene.scales.length * away[2:].max()) < problem.gap
 
 
 def test_held_ends_balance_with_all_that_touches() -> None:
@@ -109,7 +129,7 @@ def test_a_start_that_is_short_makes_little_difference() -> None:
     """No more than the 0.1 mm that it is off to the right, and 0.1 degrees."""
     plan = settled()
     assert plan.duration < 1.1 * solved(HEPTAGON).duration
-    start = shares.move_start(plan.problem, 1e-4)
+    start = dwell.move_start(plan.problem, 1e-4)
     away = simulate_free(plan.problem, plan.trajectory, start=start).z[-1] - plan.trajectory.z[-1]
     assert np.hypot(*away[:2]) < 1e-4 and abs(away[2]) < np.radians(0.1)
 

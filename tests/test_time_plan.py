@@ -8,6 +8,7 @@ import tomllib
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -499,27 +500,34 @@ def test_transitions_agree_with_those_along_the_curves(objective: str) -> None:
             assert row["saves"] is None and row["reason"] == other["reason"]
 
 
-@pytest.mark.parametrize("objective", ["time", "effort"])
-def test_velocities_jump_by_the_impact_law(objective: str) -> None:
-    plan, own = planned(objective), problem(objective)
-    metric = metric_weights(own.scene)
+@pytest.mark.parametrize(
+    "objective, over_time", [*product(("time", "effort"), (True, False)), ("margin", False)]
+)
+def test_velocities_jump_by_the_impact_law(objective: str, over_time: bool) -> None:
+    """Over time impacts are solved for, along curves they are known."""
+    plan, own = plan_of(IMPACTS, objective), problem_of(IMPACTS)
+    if over_time:
+        plan, own = planned(objective), problem(objective)
+    metric, close = metric_weights(own.scene), 1e-5 if over_time else 1e-9
     for k, row in enumerate(plan.meta["transitions"]):
         if not row["possible"]:
             continue
         before, after = (phase.formation for phase in own.phases[k : k + 2])
         end, start = ends_of(plan, k)
         z, v, v_next = end.z[0], end.z_dot[0], start.z_dot[0]
-        np.testing.assert_allclose(start.z[0], z, rtol=0, atol=1e-7)
+        np.testing.assert_allclose(start.z[0], z, rtol=0, atol=1e-2 * close)
         p = find_impulses(after, z, v, v_next)
         assert p.min() > 0
         speed = np.sqrt(metric @ v**2)
         assert speed > 0.1 and row["speed"] == pytest.approx(speed)
         assert p.min() == pytest.approx(row["least_impulse"] * speed, rel=1e-4)
         assert np.sqrt(metric @ v_next**2) == pytest.approx(row["velocity_ratio"] * speed, rel=1e-5)
-        np.testing.assert_allclose(v_next, compute_impact(before, after, z, v).v, rtol=0, atol=1e-5)
+        impact = compute_impact(before, after, z, v)
+        np.testing.assert_allclose(v_next, impact.v, rtol=0, atol=close)
+        assert impact.least[0] == row["least_impulse_contact"]
         # The contacts of the next formation neither part nor press into one another.
         assert np.abs(measure_gaps(after, z)).max() < 1e-8
-        assert np.abs(after.evaluate(z[None], v_next[None]).A[0] @ v_next).max() < 1e-5
+        assert np.abs(after.evaluate(z[None], v_next[None]).A[0] @ v_next).max() < close
         energies = [0.5 * own.scene.mass_diagonal @ u**2 for u in (v, v_next)]
         assert energies[1] < energies[0]
 
@@ -552,11 +560,6 @@ OBJECTIVES = ["time", "effort", "margin"]
 
 
 @pytest.fixture(scope="module")
-def passing() -> Problem:
-    return problem_of(IMPACTS)
-
-
-@pytest.fixture(scope="module")
 def plans() -> dict[str, Trajectory]:
     return {objective: plan_of(IMPACTS, objective) for objective in OBJECTIVES}
 
@@ -567,27 +570,6 @@ def edited(*stops: int) -> Problem:
     for number in stops:
         table["phases"][number - 1]["end"] = "rest"
     return build_problem(table)
-
-
-@pytest.mark.parametrize("objective", OBJECTIVES)
-def test_velocities_of_sequences_jump_by_the_impact_law(
-    passing: Problem, plans: dict[str, Trajectory], objective: str
-) -> None:
-    trajectory = plans[objective]
-    for k, row in enumerate(trajectory.meta["transitions"][:2]):
-        before, after = (phase.formation for phase in passing.phases[k : k + 2])
-        end, start = ends_of(trajectory, k)
-        impact = compute_impact(before, after, end.z[0], end.z_dot[0])
-        np.testing.assert_allclose(start.z, end.z, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(start.z_dot[0], impact.v, rtol=0, atol=1e-9)
-        assert impact.p.min() > 0
-        speed = np.sqrt(end.z_dot[0] ** 2 @ metric_weights(passing.scene))
-        assert row["speed"] == pytest.approx(speed) and speed > 0.1
-        name, impulse = impact.least
-        assert name == row["least_impulse_contact"]
-        assert impulse == pytest.approx(row["least_impulse"] * speed)
-        later = np.sqrt(start.z_dot[0] ** 2 @ metric_weights(passing.scene))
-        assert row["velocity_ratio"] == pytest.approx(later / speed)
 
 
 @pytest.mark.parametrize("objective", OBJECTIVES)

@@ -415,17 +415,6 @@ def test_outlines_end_where_their_phase_does(
             assert abs(until_distance(phase.formation, phase.until, end)[0]) < CLOSED
 
 
-@pytest.mark.parametrize("row, value", [(0, 0.02), (2, -0.9)])
-def test_a_coordinate_can_be_what_ends_a_phase(
-    flipping: Problem, released: Array, row: int, value: float
-) -> None:
-    until = Until(None, "x" if row == 0 else "phi", value)
-    phase = Phase(5, flipping.phases[5].formation, until)
-    part = guess_phase(phase, released)[-1]
-    assert part.z[-1, row] == pytest.approx(value, abs=1e-12)
-    assert max(np.abs(measure_gaps(part.formation, z)).max() for z in part.z) < CLOSED
-
-
 @pytest.mark.parametrize(
     "names, until, key, reason",
     [

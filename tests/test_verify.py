@@ -35,7 +35,7 @@ from wholearm.results.torque import TorqueProfile, read_rows
 from wholearm.results.trajectory import Motion, Samples, Trajectory
 from wholearm.verification.newton_euler import BODIES, Balance, balance
 from wholearm.verification.verdict import Allowance, find_least_force
-from wholearm.verification.verify import verify
+from wholearm.verification.verify import list_normal_forces, verify
 
 CONTACTS = "v0-palm v1-finger1 v3-finger2 e2-tip1 v2-tip2"
 
@@ -500,6 +500,18 @@ def test_a_phase_with_a_rolling_contact_may_have_four_constraints() -> None:
     assert {row.phase for row in report.reduced} == four
     for row in report.reduced:
         assert row.residual == pytest.approx(0.0, abs=1e-9 * abs(row.Phi_3))
+
+
+def test_a_contact_let_go_softly_counts_until_it_passes_epsilon() -> None:
+    problem, trajectory = plan_landing()
+    simulation, low = simulate(problem, trajectory), problem.epsilon / 2
+    rows, column = np.flatnonzero(simulation.phase == 0), simulation.contacts.index("v3-finger1")
+    c_n = simulation.c_n.copy()
+    c_n[rows, column] = 2 * problem.epsilon
+    c_n[rows[[3, -2, -1]], column] = low, low, 0.0
+    given = replace(simulation, c_n=c_n)
+    forces = list_normal_forces(problem, given, problem.phases[0], rows)["v3-finger1"]
+    assert np.isnan(forces[-2:]).all() and np.nanmin(forces) == forces[3] == low
 
 
 def wiggle(torque: TorqueProfile, piece: int, size: float) -> TorqueProfile:
