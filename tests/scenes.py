@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import cache, lru_cache
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.integrate import quad
 
 from once import once
@@ -261,8 +262,8 @@ def scale(joint: int, factor: float, start: float, stop: float) -> TorqueProfile
     return TorqueProfile(torque.breaks, coefficients)
 
 
-def constant(tau: tuple[float, float], duration: float) -> TorqueProfile:
-    return TorqueProfile(np.array([0.0, duration]), np.array([[[tau[0]], [tau[1]]]]))
+def constant(tau: ArrayLike, duration: float = 0.2) -> TorqueProfile:
+    return TorqueProfile(np.array([0.0, duration]), np.reshape(tau, (1, 2, 1)).astype(float))
 
 
 def ramp(start: tuple[float, float], rate: tuple[float, float], duration: float) -> TorqueProfile:

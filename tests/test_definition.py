@@ -155,34 +155,22 @@ THREE = {
         (put("epsilonn", 1), "epsilonn", "did you mean 'epsilon'"),
         (put("fingers.1.torque_limits", 1), "fingers.1.torque_limits", "'torque_limit'"),
         (put("phases.1.contact", []), "phases[2].contact", "did you mean 'contacts'"),
-        (put("phases", 3), "phases", "3 is not a list of [[phases]]"),
         (put("name", 3), "name", "not a string"),
         (put("epsilon", -0.1), "epsilon", ">= 0"),
         (put("epsilon", True), "epsilon", "True"),
         (put("fingers_collide", 0), "fingers_collide", "0 given; allowed are true and false"),
-        (put("object", 3), "object", "not a table"),
         (put("object.mass", -0.2), "object.mass", "positive"),
         (put("object.inertia", 0), "object.inertia", "positive"),
-        (put("object.vertices", [[0, 0], [0, 1], [1, 0]]), "object.vertices", "clockwise"),
-        (put("fingers.2.base", [1]), "fingers.2.base", "2 numbers"),
         (put("fingers.2.base", [0.09, 0]), "fingers.1.base", "not to the right"),
-        (put("fingers.2.speed_limit", -1), "fingers.2.speed_limit", "positive"),
-        (put("start.flush", 7), "start.flush", "0 to 6"),
         (put("start.flush", 0.0), "start.flush", "0 to 6"),
-        (put("start.x", "left"), "start.x", "'left'"),
         (put("start.x", 9.0), "start", "finger 1 is too short"),
         (put("fingers.2.base", [0.03, 0.02]), "fingers.2.base", "inside the object"),
         (put("phases.0.contacts", []), "phases[1].contacts", "contact names"),
         (put("phases.2.contacts.1", "v7-palm"), "phases[3].contacts", "0 to 6"),
-        (put("phases.2.contacts.1", "thumb"), "phases[3].contacts", "'thumb' is not a contact"),
-        (put("phases.2.contacts.1", 5), "phases[3].contacts", "5 is not a contact"),
-        (put("phases.2.contacts.1", "v0-palm"), "phases[3].contacts", "v0-palm is given twice"),
         (put("phases.0.contacts.2", "v4-finger1"), "phases[1].contacts", "fingers touch"),
         (put("start.x", 0.0), "phases[1].contacts", "v3-finger1 v5-finger2"),
         (put("phases.0.contacts.1", "v1-palm rolling"), "phases[1].contacts", "makes 5"),
         (put("phases.0.contacts.1", "v1-palm rolls"), "phases[1].contacts", "' rolling' may"),
-        (put("phases.0.contacts.1", "v0-palm rolling"), "phases[1].contacts", "given twice"),
-        (put("phases.3.until", "v0-palm rolling"), "phases[4].until", "not a contact"),
         (put("phases.3.until", "v0-palmm"), "phases[4].until", "not a contact"),
         (put("phases.3.until", "v1-palm"), "phases[4].until", "already"),
         (put("phases.3.until", {"phi": 1}), "phases[4].until", ALLOWED_UNTIL),
@@ -194,6 +182,7 @@ THREE = {
     ],
 )
 def test_bad_input_names_the_key(edit: Edit, key: str, text: str) -> None:
+    """More of it is in the corpus, with whole messages."""
     with pytest.raises(InputError) as caught:
         read_edited(edit)
     assert caught.value.key == key
@@ -526,19 +515,6 @@ def test_bad_options_are_named(key: str, given: Any) -> None:
         PlanOptions(**options)
     assert caught.value.key == key and caught.value.exit_status == 2
     assert repr(given) in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("given", "of"),
-    [
-        ({"objective": "time", "duration": 1.0}, "margin"),
-        ({"objective": "effort", "duration": 1.0}, "margin"),
-        ({"objective": "effort", "certify": True}, "time"),
-    ],
-)
-def test_options_of_another_objective_are_refused(given: dict[str, Any], of: str) -> None:
-    with pytest.raises(InputError, match=f"is for the objective {of} only"):
-        PlanOptions(**given)
 
 
 def list_numbers(parser: argparse.ArgumentParser) -> list[tuple[str, argparse.Action]]:

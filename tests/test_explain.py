@@ -18,9 +18,17 @@ from shipped import HEPTAGON, problem_of, tipping
 from wholearm import PlanOptions, Problem, load_trajectory, plots
 from wholearm.benchmark.stress import refusals
 from wholearm.benchmark.stress.refusals import judge
-from wholearm.common.errors import InfeasibleError, InputError, JammingError, SolverError
+from wholearm.common.errors import (
+    Change,
+    InfeasibleError,
+    InputError,
+    JammingError,
+    Parameter,
+    SolverError,
+)
 from wholearm.geometry.curve import Curve
 from wholearm.mechanics.limits import EPSILON
+from wholearm.planning.advice import find_changes
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
@@ -297,3 +305,35 @@ def test_a_leg_into_the_palm_has_no_end() -> None:
     stop = (float(problem.start[0]) + 0.01, float(problem.start[2]) - 0.2)
     verdict = judge(problem, InfeasibleError("phase 1 is infeasible"), [stop])
     assert verdict.kind == "open" and "no place of its end" in verdict.reason
+
+
+STRONGEST = Parameter("torque limit of finger 2", 2.0, "N m", 1)
+PRESSING = Parameter("epsilon", 0.05, "N", -1)
+
+
+def test_only_confirmed_changes_are_found() -> None:
+    """One works at its rounded value, one needs some room, one cannot, one is never enough."""
+    parameters = [STRONGEST, PRESSING, *(STRONGEST._replace(key=key) for key in ("2", "3"))]
+    least = dict(zip(parameters, [2.341, 0.012, None, 3.0], strict=True))
+
+    def can_plan(parameter: Parameter, value: float) -> bool:
+        return parameter == STRONGEST or (parameter == PRESSING and value < 0.012)
+
+    found = find_changes(parameters, least.__getitem__, can_plan)
+    assert found == [Change(STRONGEST, 2.35), Change(PRESSING, 0.0119)]
+    assert find_changes([PRESSING], lambda _: -0.01, lambda *_: True) == []
+
+
+@pytest.mark.parametrize("limit, least", [(STRONGEST, 3.0), (PRESSING, 0.04)])
+@pytest.mark.parametrize("needed", [0.0, 0.013, 0.1, 0.49])
+def test_more_than_the_least_is_found_closely(
+    limit: Parameter, least: float, needed: float
+) -> None:
+    """Plans may need more than what limits at the nodes ask for."""
+    border = least * (1 + limit.sign * needed)
+
+    def can_plan(_: Parameter, value: float) -> bool:
+        return limit.sign * (value - border) >= 0
+
+    (change,) = find_changes([limit], lambda _: least, can_plan)
+    assert -1e-12 < limit.sign * (change.value / border - 1) <= 0.03

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from plane import finger_gap, make_scene
+from plane import finger_gap, make_scene, rotate
 from planned import change, plan
 from shipped import HEPTAGON, HEXAGON
 from wholearm import Formation, Problem, TorqueProfile, Trajectory, simulate, simulate_free, verify
@@ -369,11 +369,6 @@ def simulate_body(
     run = FreeRun(system, torque, np.array(z, float), np.array(v, float), restitution)
     run.play(1e-9 * system.scales.length)
     return run
-
-
-def rotate(angle: float, points: Array) -> Array:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.asarray(points @ np.array([[c, s], [-s, c]]), dtype=float)
 
 
 def measure_energy(run: FreeRun) -> float:

@@ -16,7 +16,7 @@ from scipy.optimize import linprog
 
 import wholearm
 from planned import change, plan
-from scenes import box, tipped
+from scenes import box, constant, tipped
 from shipped import BOX, FOLDER, HEPTAGON, HEXAGON, LANDING, problem_of
 from wholearm import InputError, Problem, Trajectory, compare, load_trajectory, simulate, verify
 from wholearm.cli.command import main
@@ -420,12 +420,12 @@ def tau_at(report: Report, loss: Loss) -> Array:
 @pytest.mark.parametrize("tau", [(0.05, 0.05), (-0.2, 0.0), (0.9, 0.1), (-0.2, 0.2)])
 def test_advice_at_rest_lets_the_object_start_or_rest(tau: tuple[float, float]) -> None:
     problem = first_phase()
-    report = verify(problem, TorqueProfile(np.array([0.0, 1e-3]), np.array([tau])[..., None]))
+    report = verify(problem, constant(tau, 1e-3))
     (loss,) = report.help.losses
     assert loss.at_rest and loss.time == 0.0 and loss.changes
     for mend in loss.changes:
         assert not mend.but
-        again = TorqueProfile(np.array([0.0, 1e-3]), np.array([mend.to])[..., None])
+        again = constant(mend.to, 1e-3)
         simulation = simulate(problem, again)
         assert not simulation.find(EventKind.CONTACT_LOST)
         assert bool(simulation.find(EventKind.START)) != mend.holds
@@ -489,16 +489,17 @@ def test_the_closest_approach_and_a_motion_that_turns_back() -> None:
     assert "turns back at" in found.to_text()
 
 
-def push(first: float = 0.3, second: float = 0.0) -> TorqueProfile:
-    """Constant torques; the given ones drive the first phase through its end."""
-    return TorqueProfile(np.array([0.0, 0.5]), np.array([[[first], [second]]]))
+PUSH = constant((0.3, 0.0), 0.5)
+"""They drive the first phase through its end."""
 
 
 def write(folder: Path) -> list[str]:
-    """A replay of `push`, its torques with a note, torques that let go, and such that hold."""
+    """A replay of `PUSH`, its torques with a note, torques that let go, and such that hold."""
     paths = [str(folder / name) for name in ("moved.npz", "noted.csv", "lost.csv", "still.csv")]
-    save(simulate(first_phase(), push()), paths[0])
-    for path, torque in zip(paths[1:], (push(), push(0.05, 0.05), push(0.0, 0.0)), strict=True):
+    save(simulate(first_phase(), PUSH), paths[0])
+    for path, torque in zip(
+        paths[1:], (PUSH, constant((0.05, 0.05), 0.5), constant((0.0, 0.0), 0.5)), strict=True
+    ):
         save(torque, path)
     noted = Path(paths[1])
     noted.write_text("# simulations = 37\n" + noted.read_text(encoding="utf-8"), encoding="utf-8")
@@ -509,7 +510,7 @@ def test_figures_are_those_of_verify(tmp_path: Path) -> None:
     problem, paths = first_phase(), write(tmp_path)
     found = compare(problem, paths)
     moved, noted, lost, still = found.contenders
-    report = verify(problem, push())
+    report = verify(problem, PUSH)
     energy = report.energy
     assert moved.name == "moved.npz" and noted.simulations == 37 and moved.simulations is None
     for own in (moved, noted):
@@ -594,11 +595,6 @@ def simulation(torque: TorqueProfile) -> Simulation:
     return simulate(problem_of(HEPTAGON), torque, times=np.linspace(0, 2, 301))
 
 
-def press(tau_1: float, tau_2: float) -> TorqueProfile:
-    """Constant torques for a tenth of a second."""
-    return TorqueProfile.join_rows(np.array([0.0, 0.1]), np.array([[tau_1, tau_2]] * 2))
-
-
 def test_a_replay_is_a_trajectory(simulation: Simulation, torque: TorqueProfile) -> None:
     found = simulation.trajectory
     assert isinstance(found, Trajectory) and found.torque is torque
@@ -632,7 +628,7 @@ def test_a_replay_that_fails_is_drawn_and_saved(tmp_path: Path) -> None:
     """It loses a contact on its way; another never moves, so that no force is known."""
     problem, trajectory = plan()
     weak = TorqueProfile(trajectory.torque.breaks, trajectory.torque.coefficients * 0.9)
-    for torque in (weak, press(0.3, -0.8)):
+    for torque in (weak, constant((0.3, -0.8), 0.1)):
         report = verify(problem, torque)
         assert not report.ok
         figure = plots.force_margins(report)

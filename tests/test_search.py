@@ -55,6 +55,7 @@ from wholearm.search.find_route import (
 from wholearm.search.places import make_place
 from wholearm.search.result import bound_borders, describe_block
 from wholearm.search.roadmap import Roadmap
+from wholearm.search.route_choice import FINEST, Found, RefinedPath, ReleaseSearch
 
 TABLE = {k: v for k, v in tomllib.loads(HEPTAGON.read_text()).items() if k != "phases"}
 
@@ -290,6 +291,20 @@ def test_links_planned_at_the_same_time_make_the_same_plan() -> None:
     for mine, theirs, kept_one in zip(one.phases, other.phases, again.phases, strict=True):
         assert mine.statistics.solves > 0 and mine.statistics.iterations > 0
         assert theirs.statistics.iterations == kept_one.statistics.iterations
+
+
+@pytest.mark.parametrize(("best", "end"), [(0, -1), (-7, -8), (5, -20), (-3, -3)])
+def test_a_border_is_left_where_that_is_best(best: int, end: int) -> None:
+    """Paths through cells take longer away from a best place, and there is none beyond an end."""
+
+    def plan(path: RefinedPath) -> Found:
+        if path.move is None or path.move < end:
+            return "no guess leads to a plan"
+        return Measured(1 + FINEST * abs(path.move - best), (), [])
+
+    found, *others = ReleaseSearch(plan, Measured(1 + FINEST * abs(best), (), [])).run()
+    assert found.duration == pytest.approx(1, abs=1e-9)
+    assert all(own.duration >= found.duration for own in others)
 
 
 PHI = np.radians(-35.0)

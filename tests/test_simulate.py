@@ -33,7 +33,7 @@ from planned import (
 )
 from pushing import pushed, rocking
 from retelling import RETELLINGS, Retelling
-from scenes import hexagon, measure_fingers, shorten, slid
+from scenes import constant, hexagon, measure_fingers, shorten, slid
 from shipped import HEPTAGON, IMPACTS, plan_of, problem_of
 from wholearm import Formation, Phase, Problem, TorqueProfile, Trajectory, Until, simulate, verify
 from wholearm.benchmark.precision.reference import solve_motion
@@ -76,10 +76,6 @@ def rebuild(problem: Problem, **edits: object) -> Problem:
 
 def smooth_fingers(scene: Scene) -> tuple[Finger, ...]:
     return tuple(dataclasses.replace(f, viscous=0.0, dry=0.0) for f in scene.fingers)
-
-
-def constant(tau: tuple[float, float], duration: float = 0.2) -> TorqueProfile:
-    return TorqueProfile(np.array([0.0, duration]), np.array(tau).reshape(1, 2, 1))
 
 
 def test_imports_nothing_of_the_planner() -> None:
@@ -306,7 +302,7 @@ def test_another_limit_ends_the_motion() -> None:
     phase = Phase(0, problem.phases[0].formation, Until(coordinate="x", value=-1.0))
     aimless = dataclasses.replace(problem, phases=(phase,))
     tau = motion.evaluate(np.array([0.0])).tau[0]
-    simulation = simulate(aimless, constant((float(tau[0]), float(tau[1])), 2.0))
+    simulation = simulate(aimless, constant(tau, 2.0))
     assert simulation.outcome.kind is OutcomeKind.LIMIT_REACHED
     assert "v6 touches finger 2" in simulation.outcome.text
     assert np.abs(simulation.z[-1] - motion.curve.end).max() < 1e-7
@@ -350,7 +346,7 @@ def test_a_jammed_formation_at_rest() -> None:
     # Torques that nothing balances have no motion to go with either.
     tau = motion.evaluate(np.array([0.0])).tau[0]
     with pytest.raises(JammingError, match="jams at rest in phase 1 at t = 0 s"):
-        simulate(rough, constant((float(tau[0]), float(tau[1]))))
+        simulate(rough, constant(tau))
 
 
 def test_formation_that_does_not_close_is_an_error() -> None:

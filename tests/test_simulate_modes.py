@@ -502,10 +502,6 @@ def landing_of(duration: float = 0.2) -> LandingMotion:
     return motion
 
 
-def constant_torques(tau: Array, duration: float) -> TorqueProfile:
-    return TorqueProfile(np.array([0.0, duration]), tau.reshape(1, 2, 1))
-
-
 def brake_less(starts: Array, c: Array) -> Array:
     """Near the end of the landing."""
     c[starts > 0.66] *= 0.97
@@ -654,7 +650,7 @@ def test_start_with_two_freedoms() -> None:
         A_t = phase.formation.evaluate(z[None], np.zeros((1, 5))).A_t[0]
         assert (directions.Xi * (A_t @ acceleration) > 0).all()
         assert (directions.sigma * acceleration[3:] > 0).all() and (c_n > 0).all()
-        torque, stop = constant_torques(tau, 0.01), 0.005
+        torque, stop = constant(tau, 0.01), 0.005
         simulation = simulate(moving, torque, tolerance=1e-12, times=[stop])
         assert simulation.events[0].kind is EventKind.START and simulation.events[0].time == 0
         state = np.append(z, np.zeros(5))
@@ -669,7 +665,7 @@ def test_start_with_a_contact_that_sticks() -> None:
     z = landing_of().evaluate(np.array([0.1])).z[0]
     still = replace_phases(dataclasses.replace(problem, start=z), phase)
     tau = np.array([0.4, -0.4])
-    simulation = simulate(still, constant_torques(tau, 0.01))
+    simulation = simulate(still, constant(tau, 0.01))
     assert simulation.events[0].kind is EventKind.START
     row = np.flatnonzero(~np.isnan(simulation.c_n[:, 0]))[0]
     reserve = phase.formation.friction * simulation.c_n[row] - np.abs(simulation.c_t[row])
