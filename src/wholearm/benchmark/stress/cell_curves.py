@@ -22,10 +22,6 @@ from .newton import clearances, locate
 from .slow_motion import fast_margin, rest_margin
 
 PLACES = 40  # configurations along a curve
-INSIDE = 1e-4  # overlap, and distance beyond a feature, that passes, over the radius of gyration
-BENT = (6, 10)  # rounds in which the best curves are bent, and curves in each
-LOOSE = 0.01
-"""Rate of sliding over that of the whole below which a contact may stick: nearby curves roll."""
 SUFFICIENT = 1e-3  # margin with which a curve is as good as wanted
 
 Flags = NDArray[np.bool_]
@@ -43,10 +39,14 @@ class Best(NamedTuple):
 
 def list_ends(scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]) -> Array:
     """Places at which a phase with two freedoms ends, those near the pose `stop`, shape (n, 5)."""
+
+    def project_end(z: Array) -> Array | None:
+        return project(scene, z, lambda z: _end_equations(scene, phase, z))
+
     # A joint may turn far on the way there, so that contacts are followed step by step.
     line = z[[0, 2]] + np.linspace(0.0, 1.0, 4)[:, None] * (np.array(stop) - z[[0, 2]])
-    first = _project_end(scene, phase, bend(scene, phase, z, line[None])[0, -1])
-    first = _project_end(scene, phase, z) if first is None else first
+    first = project_end(bend(scene, phase, z, line[None])[0, -1])
+    first = project_end(z) if first is None else first
     if first is None:
         return np.zeros((0, 5))
     scale = np.sqrt(weights(scene))
@@ -60,7 +60,7 @@ def list_ends(scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]) -
                 tangent = way * tangent
             elif (tangent * scale) @ (ahead * scale) < 0:
                 tangent = -tangent
-            after = _project_end(scene, phase, here + step * tangent)
+            after = project_end(here + step * tangent)
             if after is None or np.linalg.norm((after - here) * scale) > 3 * step:
                 break
             here, ahead = after, tangent
@@ -103,17 +103,18 @@ def find_best(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: Array)
 
     straight = np.linspace(0, 1, 4)[:, None] * (goals - start)[:, None] + start
     if not look(straight, len(straight)) and not look(draw(400, 0.5), 40):
-        for turn in range(BENT[0]):
+        # The best curves are bent in six rounds, ten of them in each.
+        for turn in range(6):
             if not best:
                 break
             spread = 0.3 * 0.7**turn
-            parents = np.array([best[k % len(best)][2] for k in range(4 * BENT[1])])
+            parents = np.array([best[k % len(best)][2] for k in range(40)])
             moves = spread * size * rng.normal(size=(len(parents), 3, 2))
             children = parents.copy()
             children[:, 1:3] += moves[:, :2]
             nearest = goals - (parents[:, 3] + moves[:, 2])[:, None]
             children[:, 3] = goals[(np.abs(nearest) / size).sum(axis=2).argmin(axis=1)]
-            if look(children, BENT[1]):
+            if look(children, 10):
                 break
     if not best:
         return Best(-np.inf, -np.inf, z[None], 0, len(ends))
@@ -159,8 +160,11 @@ def place(scene: Scene, phase: Phase, z: Array, before: Array) -> Array:
 
 
 def inside(scene: Scene, phase: Phase, z: Array) -> Flags:
-    """Whether contacts touch within their features at n configurations, and nothing overlaps."""
-    least = INSIDE * scene.scales.length
+    """Whether contacts touch within their features at n configurations, and nothing overlaps.
+
+    Up to 1e-4 of the radius of gyration.
+    """
+    least = 1e-4 * scene.scales.length
     good = np.isfinite(z).all(axis=1)
     for name in phase.formation.names:
         touch = locate(scene, name, z)
@@ -178,13 +182,9 @@ def _find_margins(scene: Scene, phase: Phase, epsilon: float, z: Array) -> tuple
     s = np.append(0.0, np.cumsum(runs))
     curve = s, z, np.gradient(z, s, axis=0, edge_order=2)
     plain = fast_margin(scene, phase, epsilon, curve)
-    loose = plain if plain > 0 else fast_margin(scene, phase, epsilon, curve, loose=LOOSE)
+    # What slides slowly may stick: nearby curves roll.
+    loose = plain if plain > 0 else fast_margin(scene, phase, epsilon, curve, loose=0.01)
     return np.nan_to_num(plain, nan=-np.inf), np.nan_to_num(loose, nan=-np.inf)
-
-
-def _project_end(scene: Scene, phase: Phase, z: Array) -> Array | None:
-    """The nearest configuration at which a phase ends, or None."""
-    return project(scene, z, lambda z: _end_equations(scene, phase, z))
 
 
 def _end_equations(scene: Scene, phase: Phase, z: Array) -> tuple[Array, Array]:

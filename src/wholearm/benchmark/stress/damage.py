@@ -271,9 +271,6 @@ def _pack(arrays: Mapping[str, Any], others: Mapping[str, bytes] = MappingProxyT
     return stream.getvalue()
 
 
-PROGRESS = re.compile(r"wholearm: \d+ s: ")  # lines that tell how long work goes on already
-
-
 def run_file(seed: int, number: int) -> dict[str, Any]:
     """Run the command line on one damaged file in this process, and look at what it leaves."""
     from ...__main__ import start
@@ -310,11 +307,8 @@ def _list_commands(kind: str, path: str, own: str, out: str) -> list[list[str]]:
     if kind == "problem":
         solving = ["solve", path, "-o", f"{out}.npz", "--intervals", "20"]
         asking = [["verify", path, f"{own[:-5]}.csv"], ["map", path, "--list", "0.02,0", "-0.01,0"]]
-        return (
-            4 * [solving]
-            + 2 * [[*solving, "--torques", f"{out}.csv"], *asking]
-            + [["map", path, *narrow]]
-        )
+        asking.append([*solving, "--torques", f"{out}.csv"])
+        return [*4 * [solving], *2 * asking, ["map", path, *narrow]]
     checking = 14 * [["verify", own, path]] + 2 * [["verify", own, path, "--json"]]
     if kind == "torque":
         return checking
@@ -334,7 +328,8 @@ def look(
 ) -> list[tuple[str, str]]:
     """What is wrong with how a command ended."""
     texts = []
-    lines = [line for line in err.splitlines() if not PROGRESS.match(line)]
+    # Lines that tell how long work goes on already do not count.
+    lines = [line for line in err.splitlines() if not re.match(r"wholearm: \d+ s: ", line)]
     if status not in (0, 1, 2):
         texts.append(f"exit status {status}")
     if status == 0 and lines:

@@ -18,10 +18,8 @@ from ...problem.definition import Phase
 from ...scene.model import Scene
 from .newton import clearances, locate
 
-LONGEST = 60.0  # longest curve, over the radius of gyration: several turns of the object
 OVERLAP = 1e-6
 """Overlap over the radius of gyration from which on two bodies count as running into each other."""
-MET = 1e-5  # distance over the radius of gyration (or angle) that counts as having reached `until`
 
 
 class Trace(NamedTuple):
@@ -106,7 +104,7 @@ def _march(scene: Scene, phase: Phase, z: Array, way: float) -> Trace:
     overlap.terminal, overlap.direction, end.terminal = True, -1.0, True  # type: ignore[attr-defined]
     run: Any = solve_ivp(
         lambda _, z: tangents(z[None])[0],
-        (0.0, LONGEST * size),
+        (0.0, 60.0 * size),  # several turns of the object
         z,
         rtol=1e-9,
         atol=1e-10 * size / scale,
@@ -120,7 +118,7 @@ def _march(scene: Scene, phase: Phase, z: Array, way: float) -> Trace:
     if run.status == 1 and not met:
         text = ", ".join(k for k, room in find_room(last).items() if room < -OVERLAP * size / 2)
         if until.contact is not None:
-            touch, near = locate(scene, until.contact.name, last[None]), MET * size
+            touch, near = locate(scene, until.contact.name, last[None]), 1e-5 * size
             met = bool(max(abs(touch.gap[0]), -touch.low[0], -touch.high[0]) <= near)
     return Trace(run.sol, float(run.t[-1]), last, tangents, str(until) if met else text, met)
 

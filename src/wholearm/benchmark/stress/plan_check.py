@@ -15,8 +15,6 @@ INSTANTS = 401
 ROUNDING = 1e-6  # what may be left of an equation, over the largest of its terms
 OVERLAP = 1e-6  # overlap and open gaps that pass for rounding, over the radius of gyration
 STILL = 1e-5  # speed over the scene's own below which friction may point either way
-THIN = 2e-3
-"""What a normal force may lack of epsilon, over epsilon: what `verification.verify` allows."""
 
 
 def check_plan(problem: Problem, plan: Trajectory) -> list[str]:
@@ -24,28 +22,26 @@ def check_plan(problem: Problem, plan: Trajectory) -> list[str]:
     found: list[str] = []
     before: Array | None = None
     for phase, motion, start in zip(problem.phases, plan.motions, plan.phase_starts, strict=False):
-        t = _choose_times(plan, start, motion.duration)
+        # Some of the instants are in pieces of the torques that are short.
+        breaks, duration = plan.torque.breaks - start, motion.duration
+        ends = np.concatenate([[0.0], breaks[(breaks > 0.0) & (breaks < duration)], [duration]])
+        runs = np.diff(ends)
+        short = (runs > 1e-6 * duration) & (runs < 2 * duration / INSTANTS)
+        inside = ends[:-1][short, None] + runs[short, None] * np.array([0.1, 0.5, 0.9])
+        t = np.unique(np.concatenate([np.linspace(0.0, duration, INSTANTS), inside.ravel()]))
         rows = motion.evaluate(t)
         texts = _check_phase(problem, phase, rows)
         middles = motion.evaluate((t[1:] + t[:-1]) / 2)
         texts += check_rates(problem.scene, t, rows, middles)
-        texts += _check_profile(problem.scene, plan, start + t, rows)
-        if before is not None:
-            texts += _check_joint(problem, phase, before, rows)
-        texts += _check_end(problem, phase, rows)
+        # The torques as functions of time are those of the motion, between their steps.
+        near = np.abs((start + t)[:, None] - plan.torque.breaks).min(axis=1)
+        miss = np.abs(plan.torque.at(start + t) - rows.tau)[near > 1e-9 * plan.duration]
+        share = (miss / problem.scene.torque_limit).max(initial=0.0)
+        texts += [f"the torque profile is {share:.2g} of the limit off"] if share > 1e-4 else []
+        texts += _check_ends(problem, phase, before, rows)
         before = np.array([rows.z[-1], rows.z_dot[-1]])
         found += [f"phase {phase.number}: {text}" for text in texts]
     return found
-
-
-def _choose_times(plan: Trajectory, start: float, duration: float) -> Array:
-    """Instants of a phase, some of them in pieces of its torques that are short [s]."""
-    breaks = plan.torque.breaks - start
-    ends = np.concatenate([[0.0], breaks[(breaks > 0.0) & (breaks < duration)], [duration]])
-    runs = np.diff(ends)
-    short = (runs > 1e-6 * duration) & (runs < 2 * duration / INSTANTS)
-    inside = ends[:-1][short, None] + runs[short, None] * np.array([0.1, 0.5, 0.9])
-    return np.unique(np.concatenate([np.linspace(0.0, duration, INSTANTS), inside.ravel()]))
 
 
 def _check_phase(problem: Problem, phase: Phase, rows: Samples) -> list[str]:
@@ -87,7 +83,8 @@ def _check_forces(problem: Problem, phase: Phase, rows: Samples, touches: list[T
     names, rolling = phase.formation.names, phase.formation.rolling_rows
     for k, (name, touch) in enumerate(zip(names, touches, strict=True)):
         c_n, c_t = rows.c_n[:, k], rows.c_t[:, k]
-        lack = problem.epsilon * (1 - THIN) - c_n.min()
+        # A normal force may lack what `verification.verify` allows.
+        lack = problem.epsilon * (1 - 2e-3) - c_n.min()
         if lack > ROUNDING * force:
             texts.append(f"c_n of {name} is {lack:.3g} N short of epsilon")
         slip = (touch.tangent * rows.z_dot).sum(axis=1)
@@ -146,30 +143,18 @@ def _spread(values: Array, middles: Array) -> Array:
     return np.asarray(windows.max(axis=0) - windows.min(axis=0))
 
 
-def _check_profile(scene: Scene, plan: Trajectory, t: Array, rows: Samples) -> list[str]:
-    """Whether the torques as functions of time are those of the motion, between their steps."""
-    near = np.abs(t[:, None] - plan.torque.breaks).min(axis=1)
-    miss = np.abs(plan.torque.at(t) - rows.tau)[near > 1e-9 * plan.duration]
-    share = (miss / scene.torque_limit).max(initial=0.0)
-    return [f"the torque profile is {share:.2g} of the limit off"] if share > 1e-4 else []
-
-
-def _check_joint(problem: Problem, phase: Phase, before: Array, rows: Samples) -> list[str]:
-    """Whether a phase goes on from where the one before ended."""
-    size, speed = problem.scene.scales.length, problem.scene.scales.speed
-    texts = []
-    if np.abs(rows.z[0] - before[0]).max() > 1e-6 * max(1.0, size):
-        texts.append("starts somewhere else than the phase before ends")
-    ends = problem.phases[phase.index - 1].end
-    step = np.abs(rows.z_dot[0] - before[1])[:2].max()
-    if ends is not End.IMPACT and step > 1e-5 * max(speed, float(np.abs(rows.z_dot).max())):
-        texts.append(f"velocity steps by {step:.3g} m/s at the start")
-    return texts
-
-
-def _check_end(problem: Problem, phase: Phase, rows: Samples) -> list[str]:
+def _check_ends(problem: Problem, phase: Phase, before: Array | None, rows: Samples) -> list[str]:
+    """Whether a phase goes on from where the one before ended, and ends as it has to."""
     scene, until, texts = problem.scene, phase.until, []
     size, z, offs = scene.scales.length, rows.z[-1], [0.0]
+    fastest, speed = float(np.abs(rows.z_dot).max()), scene.scales.speed
+    if before is not None:
+        if np.abs(rows.z[0] - before[0]).max() > 1e-6 * max(1.0, size):
+            texts.append("starts somewhere else than the phase before ends")
+        step = np.abs(rows.z_dot[0] - before[1])[:2].max()
+        struck = problem.phases[phase.index - 1].end is End.IMPACT
+        if not struck and step > 1e-5 * max(speed, fastest):
+            texts.append(f"velocity steps by {step:.3g} m/s at the start")
     pins = [*until.pins]
     if until.contact is not None:
         offs.append(float(np.abs(locate(scene, until.contact.name, rows.z[-1:]).gap[0])) / size)
@@ -180,7 +165,7 @@ def _check_end(problem: Problem, phase: Phase, rows: Samples) -> list[str]:
     if max(offs) > 1e-5:
         texts.append(f"ends {max(offs):.3g} from {until}")
     if phase.end is End.REST:
-        speed = np.abs(rows.z_dot[-1]) * np.array([1.0, 1.0, size, size, size])
-        if speed.max() > 1e-5 * max(scene.scales.speed, float(np.abs(rows.z_dot).max()) * size):
-            texts.append(f"ends at {speed.max():.3g} m/s, not at rest")
+        left = np.abs(rows.z_dot[-1]) * np.array([1.0, 1.0, size, size, size])
+        if left.max() > 1e-5 * max(speed, fastest * size):
+            texts.append(f"ends at {left.max():.3g} m/s, not at rest")
     return texts

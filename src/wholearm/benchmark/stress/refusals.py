@@ -12,18 +12,12 @@ from ...common.arrays import Array
 from ...common.errors import InputError, WholearmError
 from ...planning.plan import solve
 from ...problem.definition import End, Phase, Problem
-from ...scene.model import Scene
 from .cell_curves import best_end, find_best, list_ends
 from .event_tracing import Trace, follow, resample
 from .slow_motion import fast_margin, inertia_ratio, rest_margin, slow_margin
 
 PLACES = 60  # places along a curve at which limits are looked at
 CLEAR = 1e-3  # margin over the scene's weight, or a torque limit, from which a motion surely exists
-UNABLE = -1e-7  # margin below which none exists
-FREE = 0.02  # reduced inertia over that without friction above which nothing jams
-
-SURE = 0.02
-"""What the best of many curves misses limits by, as a margin, where surely none keeps them."""
 
 
 class Verdict(NamedTuple):
@@ -56,7 +50,11 @@ def judge(
         if planned and not concerned:
             continue
         if phase.formation.n_constraints == 4 and not phase.until.is_release:
-            trace = _reach(problem.scene, phase, z)
+            # The shortest curve that reaches the phase's end, or the longer one if none does.
+            trace = max(
+                follow(problem.scene, phase, z),
+                key=lambda own: (own.reached, -own.length if own.reached else own.length),
+            )
             if trace.length < 0.001 * problem.scene.scales.length:
                 return Verdict("close", f"phase {phase.number} has nothing to do")
             if not trace.reached:
@@ -96,25 +94,20 @@ def _find_start(problem: Problem, number: int, objective: str) -> Array | None:
     return np.asarray(motion.evaluate(np.array([motion.duration])).z[0])
 
 
-def _reach(scene: Scene, phase: Phase, z: Array) -> Trace:
-    """The shortest curve that reaches the phase's end, or the longer one if none does."""
-    traces = follow(scene, phase, z)
-    return max(traces, key=lambda own: (own.reached, -own.length if own.reached else own.length))
-
-
 def _judge_curve(problem: Problem, phase: Phase, trace: Trace) -> Verdict:
     scene, epsilon = problem.scene, problem.epsilon
     s, z, z_s = resample(scene, phase, trace, PLACES)
     slow = slow_margin(scene, phase, epsilon, z, z_s)
     free = float(inertia_ratio(scene, phase, z, z_s).min())
     at = f"phase {phase.number}"
-    if free < FREE:
+    # Of the reduced inertia without friction.
+    if free < 0.02:
         return Verdict("confirmed" if free < 0.0 else "close", f"{at}: inertia ratio {free:.3g}")
     if slow > CLEAR:
         return Verdict("refuted", f"{at}: a slow motion keeps all limits by {slow:.3g}")
     rests = (_stops_before(problem, phase), phase.end is End.REST)
     fast = fast_margin(scene, phase, epsilon, (s, z, z_s), rests)
-    if fast < UNABLE:
+    if fast < -1e-7:
         return Verdict("confirmed", f"{at}: no motion keeps all limits, {fast:.3g} short")
     if np.isnan(fast):
         return Verdict("open", f"{at}: the linear programme has no answer")
@@ -147,4 +140,5 @@ def _judge_cell(problem: Problem, phase: Phase, z: Array, stop: tuple[float, flo
         return Verdict("refuted", text)
     text += f", {best.loose:.3g} if slow contacts may stick"
     least = max(best.margin, best.loose)
-    return Verdict("confirmed" if best.curves and least < -SURE else "close", text)
+    # Where the best of many curves misses limits by so much, surely none keeps them.
+    return Verdict("confirmed" if best.curves and least < -0.02 else "close", text)

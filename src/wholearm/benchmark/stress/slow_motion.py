@@ -40,9 +40,6 @@ from .newton import Touch, locate
 
 Bounds = list[tuple[float | None, float | None]]
 
-TANGENTS = np.geomspace(1e-6, 1.0, 13)
-"""Places of the tangents that bound sqrt(b), over the largest b."""
-
 
 def slow_margin(scene: Scene, phase: Phase, epsilon: float, z: Array, z_s: Array) -> float:
     """Least margin of all places, each at its best, for vanishing speed."""
@@ -116,7 +113,7 @@ def _solve_along(
     if len(moving):
         # v is below the tangents of sqrt(b), and above its chord.
         some, root = eye_array(n, format="csr")[moving], np.sqrt(top[moving])
-        for share in np.sqrt(TANGENTS):
+        for share in np.geomspace(1e-3, 1.0, 13):
             upper.append([-diags_array(0.5 / (share * root)) @ some, some, None, None, None])
             most.append(share * root / 2)
         upper.append([diags_array(1 / root) @ some, -some, None, None, None])
@@ -227,8 +224,6 @@ def _maximise(A_ub: Any, b_ub: Any, A_eq: Any, b_eq: Any, bounds: Bounds) -> flo
     return float(-answer.fun) if answer.status == 0 else -np.inf if answer.status == 2 else np.nan
 
 
-TOUCHES = 1e-6
-"""Gap over the radius of gyration below which a contact touches that the phase does without."""
 STILL = 1e-9  # rate over the largest one below which something stands still
 
 
@@ -266,7 +261,7 @@ def rest_margin(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: bool
 
 def list_others(scene: Scene, phase: Phase, z: Array) -> list[Touch]:
     """Contacts that touch at `z` but are none of the phase's: they may only open."""
-    near, count = TOUCHES * scene.scales.length, len(scene.polygon.vertices)
+    near, count = 1e-6 * scene.scales.length, len(scene.polygon.vertices)
     names = [f"v{k}-{part}" for k, part in product(range(count), ("palm", "finger1", "finger2"))]
     names += [f"e{k}-tip{finger}" for k, finger in product(range(count), (1, 2))]
     touches = [locate(scene, n, z[None]) for n in sorted({*names} - {*phase.formation.names})]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import product
 from typing import Any
 
@@ -19,7 +19,6 @@ from ...common.errors import SolverError, WholearmError
 from ...common.files import make_folder, write_text
 from ...geometry.tracing import check_phases, load
 from ...planning.plan import solve
-from ...problem.definition import Problem
 from ...problem.read import build_problem, read_problem
 from ...problem.table import write_toml
 from ...verification.verify import verify
@@ -31,8 +30,6 @@ from .scenes import Case as Scene
 from .scenes import draw_case
 
 OBJECTIVES = ("time", "effort", "margin")
-LIMITS = {"scene": 30.0, "file": 20.0, "problem": 60.0}
-"""Processor time that a scene and an objective (two plans), a file and a problem may take [s]."""
 SAME = 1e-6  # relative difference of two values that rounding may make
 TRIALS = {"noise": 8, "change": 20}
 """Times that noise is added to the masses, and that masses, friction, drag and limits change."""
@@ -86,14 +83,28 @@ class Stress(Study):
                     yield from product(["problem"], [path], OBJECTIVES, [what], [number])
 
     def limit(self, case: Case) -> float:
-        """By the kind of the case."""
-        return LIMITS[case[0]]
+        """By the kind of the case: a scene is planned twice."""
+        return {"scene": 30.0, "file": 20.0}.get(case[0], 60.0)
 
     def run(self, case: Case) -> Row:
-        """Run one case."""
+        """Run one case: a scene with and without noise, a file, or a problem with other numbers."""
         kind, *arguments = case
-        runs: dict[str, Callable[..., Row]] = {"scene": run_scene, "file": run_file}
-        return runs.get(kind, run_trial)(*arguments)
+        if kind == "file":
+            return run_file(*arguments)
+        if kind == "problem":
+            path, objective, what, number = arguments
+            table = change(read_problem(path).table, what, np.random.default_rng(number))
+            row = _plan(table, objective)
+            if row["outcome"] == "refused":
+                row["findings"].append(("no plan for a shipped problem", row["text"]))
+            return row
+        seed, number, objective = arguments
+        scene = draw_case(seed, number)
+        row = _plan(scene.table, objective, scene)
+        if row["outcome"] != "failed":
+            noisy = change(scene.table, "noise", np.random.default_rng(number))
+            row["findings"] += _compare(row, _plan(noisy, objective))
+        return {"kind": scene.kind, **row}
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
         """Tables of each part, and every finding."""
@@ -122,29 +133,9 @@ class Stress(Study):
 STUDY = Stress()
 
 
-def run_scene(seed: int, number: int, objective: str) -> Row:
-    """Plan a generated scene, with and without noise, and look again at what is said of it."""
-    scene = draw_case(seed, number)
-    row = _plan(scene.table, objective, scene)
-    if row["outcome"] != "failed":
-        noisy = change(scene.table, "noise", np.random.default_rng(number))
-        row["findings"] += _compare(row, _plan(noisy, objective))
-    return {"kind": scene.kind, **row}
-
-
-def run_trial(path: str, objective: str, what: str, number: int) -> Row:
-    """Plan, replay and check a shipped problem with other numbers."""
-    table = change(read_problem(path).table, what, np.random.default_rng(number))
-    row = _plan(table, objective)
-    refused = (
-        [("no plan for a shipped problem", row["text"])] if row["outcome"] == "refused" else []
-    )
-    return row | {"findings": row["findings"] + refused}
-
-
 def _plan(table: Mapping[str, Any], objective: str, scene: Scene | None = None) -> Row:
     """Load, plan, replay and check; of a scene, judge the refusal."""
-    problem, loaded = None, False
+    problem, loaded, refusal = None, False, None
     row: Row = {"outcome": "failed", "value": None, "text": "", "findings": [], "verdict": ""}
     findings: list[Finding] = row["findings"]
     try:
@@ -163,29 +154,24 @@ def _plan(table: Mapping[str, Any], objective: str, scene: Scene | None = None) 
         elif isinstance(error, SolverError):
             findings.append(("no answer", str(error)))
         else:
-            row["outcome"] = "refused"
-            if scene is not None:
-                row["verdict"], more = _judge(problem, error, scene, loaded)
-                findings += more
+            row["outcome"], refusal = "refused", error
     except Exception as error:
         findings.append(describe_error(error))
-    return row
-
-
-def _judge(
-    problem: Problem | None, error: WholearmError, scene: Scene, loaded: bool
-) -> tuple[str, list[Finding]]:
-    """What a second look at a refusal finds; lists from the map have to load."""
+    if scene is None or refusal is None:
+        return row
     kind, reason = "open", ""
     try:
         if problem is not None:
-            kind, reason = judge(problem, error, scene.stops)
+            kind, reason = judge(problem, refusal, scene.stops)
     except Exception as failure:
         kind, reason = "failed", describe_error(failure)[1]
+    row["verdict"], kinds = kind, dict[str, str]()
+    kinds["refuted"], kinds["failed"] = "refusal where a motion exists", "check that failed"
     if not loaded and scene.kind.endswith("from the map"):
-        return kind, [("list that does not load", f"{error} ({kind}: {reason})")]
-    kinds = {"refuted": "refusal where a motion exists", "failed": "check that failed"}
-    return kind, [(kinds[kind], f"{error} ({reason})")] if kind in kinds else []
+        findings.append(("list that does not load", f"{refusal} ({kind}: {reason})"))
+    elif kind in kinds:
+        findings.append((kinds[kind], f"{refusal} ({reason})"))
+    return row
 
 
 def _compare(one: Row, other: Row) -> list[Finding]:
