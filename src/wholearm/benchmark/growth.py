@@ -35,17 +35,14 @@ WORK = {
     "vertices": ("reading", "map"),
 }
 """Kinds of work that are measured for each."""
-FIELDS = {"seconds": "processor time [s]", "memory": "rise of memory [MB]"}
-"""Quantities that are drawn, and their labels."""
+FIELDS = {"seconds": ("s", "processor time [s]"), "memory": ("MB", "rise of memory [MB]")}
+"""Quantities that are measured, their units and labels."""
 _LOOKS = {
     "least time": ("#0072B2", "o"),
     "margin": ("#D55E00", "s"),
     "reading": ("#009E73", "^"),
     "map": ("#CC79A7", "D"),
 }
-
-
-UNITS = {"s": "seconds", "MB": "memory"}
 
 
 class Growth(Study):
@@ -74,7 +71,7 @@ class Growth(Study):
         for grows, sizes in SIZES.items():
             lines += [f"## {grows.capitalize()}", ""]
             table = []
-            for work, (unit, field) in product(WORK[grows], UNITS.items()):
+            for work, (field, (unit, _)) in product(WORK[grows], FIELDS.items()):
                 known, values = select(rows, grows, work, field)
                 shown = [f"{value:.3g}" for value in values] + [""] * (len(sizes) - len(values))
                 exponent = fit_exponent(known, values)
@@ -88,7 +85,7 @@ class Growth(Study):
         FigureCanvasAgg(figure)
         grid = figure.subplots(2, len(SIZES), squeeze=False)
         for column, grows in zip(grid.T, SIZES, strict=True):
-            for axes, (field, label) in zip(column, FIELDS.items(), strict=True):
+            for axes, (field, (_, label)) in zip(column, FIELDS.items(), strict=True):
                 for work in WORK[grows]:
                     sizes, values = select(rows, grows, work, field)
                     colour, marker = _LOOKS[work]

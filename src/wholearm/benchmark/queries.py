@@ -29,12 +29,6 @@ from .stress.scenes import Table
 from .study import Case, Row, Study, format_table
 
 SHIPPED = ("heptagon", "hexagon", "square", "triangle")
-POLYGONS = 5  # random polygons, in the hexagon's hand
-ACROSS = 3.0  # largest x of a start or a goal, over the radius of gyration
-TRIES = 200  # most routes that are drawn for one leg
-SLIDE = (0.1, 2.5)  # least and longest slide of a leg, over the radius of gyration
-CELL = ((-0.6, 1.0), (0.05, 0.5))
-"""What one cell adds to x, over the radius of gyration, and takes from phi [rad]."""
 
 
 class Queries(Study):
@@ -69,7 +63,8 @@ class Queries(Study):
             return row | {"kind": "plan that fails", "findings": list(failures[:1])}
         started = time.process_time()
         try:
-            find_route(_move_goal(problem))
+            goal, step = problem.goals[0], 0.1 * problem.scene.scales.length
+            find_route(problem.with_({"goal": {"flush": goal.flush, "x": (goal.x or 0.0) + step}}))
             row["second"] = time.process_time() - started
         except WholearmError:
             pass
@@ -107,8 +102,7 @@ STUDY = Queries()
 
 def draw_scene(seed: int, number: int, folder: Path) -> Table:
     """The table of the scene of a query, without start or phases of its own."""
-    kinds = len(SHIPPED) + POLYGONS
-    kind = number % kinds
+    kind = number % (len(SHIPPED) + 5)
     name = SHIPPED[kind] if kind < len(SHIPPED) else "hexagon"
     table = dict(read_problem(str(folder / f"{name}.toml")).table)
     table.pop("phases")
@@ -139,20 +133,13 @@ def _draw_pose(rng: np.random.Generator, table: Table) -> dict[str, float]:
     scene = build_problem(table).scene
     size = scene.scales.length
     while True:
-        edge, x = int(rng.integers(count)), round(size * rng.uniform(-ACROSS, ACROSS), 4)
+        edge, x = int(rng.integers(count)), round(size * rng.uniform(-3.0, 3.0), 4)
         try:
             place_start(scene, edge, x)
             build_problem({**table, "start": {"flush": edge, "x": x}})
         except InputError:
             continue
         return {"flush": edge, "x": x}
-
-
-def _move_goal(problem: Problem) -> Problem:
-    """The problem with nearly the same goal."""
-    goal, step = problem.goals[0], 0.1 * problem.scene.scales.length
-    assert goal.x is not None
-    return replace(problem, goals=(replace(goal, x=goal.x + step),))
 
 
 Stops = list[tuple[float, float]]
@@ -167,31 +154,31 @@ class QueryLeg(NamedTuple):
 
 
 def draw_leg(seed: int, number: int, folder: Path) -> QueryLeg | None:
-    """Draw a leg of a shipped scene; None if no route of `TRIES` can be listed."""
+    """Draw a leg of a shipped scene: a slide, and one to three cells.
+
+    None if no route of 200 can be listed.
+    """
     rng = np.random.default_rng([seed, number])
     name = SHIPPED[number % len(SHIPPED)]
     table: Table = dict(read_problem(str(folder / f"{name}.toml")).table)
     base = build_problem(table)
     size, (x0, phi0) = base.scene.scales.length, base.start[[0, 2]].tolist()
-    for _ in range(TRIES):
-        x, phi = x0 - size * rng.uniform(*SLIDE), phi0
+    for _ in range(200):
+        x, phi = x0 - size * rng.uniform(0.1, 2.5), phi0
         poses = [(x0, phi0), (x, phi)]
         for _ in range(int(rng.integers(1, 4))):
-            x, phi = x + size * rng.uniform(*CELL[0]), phi - rng.uniform(*CELL[1])
+            x, phi = x + size * rng.uniform(-0.6, 1.0), phi - rng.uniform(0.05, 0.5)
             poses.append((x, phi))
         try:
             route = list_formations(base, *poses)
             phases = tomllib.loads(format_route(route))["phases"]
-            problem = _leave_open(build_problem({**table, "phases": phases}))
+            problem = build_problem({**table, "phases": phases})
         except InputError:
             continue
+        # Ends are the planner's to choose: what a refusal says holds for all places.
+        open_ends = (replace(own, until=replace(own.until, pins=())) for own in problem.phases)
+        problem = replace(problem, phases=tuple(open_ends))
         if any(phase.formation.n_constraints == 3 for phase in problem.phases):
             stops = [(float(part.stop[0]), float(part.stop[1])) for part in route]
             return QueryLeg(name, problem, stops)
     return None
-
-
-def _leave_open(problem: Problem) -> Problem:
-    """The problem with ends that the planner chooses: what a refusal says holds for all places."""
-    phases = (replace(phase, until=replace(phase.until, pins=())) for phase in problem.phases)
-    return replace(problem, phases=tuple(phases))

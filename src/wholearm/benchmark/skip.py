@@ -23,9 +23,6 @@ from ..problem.read import build_problem
 from ..solvers.ipopt import record_runs
 from .study import Case, Row, Study, format_table
 
-REPEATS = 3  # runs of which the medians are taken
-AWAY = np.array([0.0, 0.0, 0.0, 0.0, 0.6])
-"""Change of the start that turns an idle finger away [m, rad]."""
 COLUMNS = ("unknowns", "rows", "building", "solving")
 
 
@@ -38,7 +35,7 @@ class Skip(Study):
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
         """Each part, without and with it, several times."""
         parts = [pair.part for pair in list_pairs(options.problems)]
-        return product([options.problems], parts, (False, True), range(REPEATS))
+        return product([options.problems], parts, (False, True), range(3))
 
     def run(self, case: Case) -> Row:
         """Plan once."""
@@ -116,7 +113,8 @@ def list_pairs(folder: str, **options: Any) -> list[SkipPair]:
     both = replace(slide, phases=(replace(slide.phases[0], until=Until(None, "x", 0.03)),))
     held = both.phases[0].formation
     alone = replace(both.phases[0], formation=replace(held, contacts=held.contacts[:-1]))
-    idle = replace(both, start=both.start + AWAY, phases=(alone,))
+    # The idle finger is turned away.
+    idle = replace(both, start=both.start + np.array([0, 0, 0, 0, 0.6]), phases=(alone,))
     run = _pick(joined, 0, 2)
     stop = replace(run, phases=(replace(run.phases[0], end=End.REST), *run.phases[1:]))
     return [
