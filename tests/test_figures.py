@@ -48,8 +48,8 @@ from wholearm.planning.result import Plan, Status, describe_plan, load_plan, wri
 from wholearm.results.dwell_record import assemble
 from wholearm.solvers.ipopt import Solver
 from wholearm.viewer import page
-from wholearm.viewer.motion_data import describe_motion, place_pushes
 from wholearm.viewer.movie import FRAMES, Movie, write_movie
+from wholearm.viewer.page import describe_motion, place_pushes
 from wholearm.viewer.report_page import build_report, describe_map, list_joints, list_phases
 
 

@@ -23,7 +23,7 @@ from wholearm.policy.curve_rows import find_within, list_scenes
 from wholearm.policy.make import SAME, find_widest, hold_end, make_policy
 from wholearm.policy.reference_motion import retime, retime_within
 from wholearm.policy.regulator import RATE, Linear, regulate
-from wholearm.robustness.sample_run import make_trial
+from wholearm.robustness.sampling import make_trial
 from wholearm.simulation.simulate import simulate_free
 from wholearm.verification.policy_check import verify_policy
 

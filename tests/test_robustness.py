@@ -43,12 +43,14 @@ from wholearm.problem.read import build_problem, read_problem
 from wholearm.problem.uncertainty import NAMES, PARAMETERS
 from wholearm.results.trajectory import Motion, Samples
 from wholearm.robustness.error_model import Uncertainty, change_problem, change_torques
-from wholearm.robustness.sample_run import TimeWindow, Trial, make_trial
 from wholearm.robustness.sampling import (
     Robustness,
+    TimeWindow,
+    Trial,
     Z,
     assess_robustness,
     count_share,
+    make_trial,
     measure_sensitivities,
 )
 from wholearm.sensitivity.slopes import find_force_slopes, find_slopes_at

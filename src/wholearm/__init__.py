@@ -26,8 +26,7 @@ if TYPE_CHECKING:
         SolverError,
         WholearmError,
     )
-    from .comparison.metrics import compare
-    from .comparison.side_by_side import Comparison
+    from .comparison.metrics import Comparison, compare
     from .contacts.elemental import Contact
     from .contacts.formation import Formation
     from .engines.engine_replay import EngineReport, PolicyReport, play_policy, replay_in
@@ -66,8 +65,7 @@ __version__ = "0.1.0"
 _NAMES = {
     "common.errors": "AmbiguityError Change InfeasibleError InputError JammingError ReplayError "
     "Shortfall SimulationError SolverError WholearmError",
-    "comparison.metrics": "compare",
-    "comparison.side_by_side": "Comparison",
+    "comparison.metrics": "Comparison compare",
     "contacts.elemental": "Contact",
     "contacts.formation": "Formation",
     "engines.engine_replay": "EngineReport PolicyReport play_policy replay_in",

@@ -769,9 +769,8 @@ def animate(options: argparse.Namespace) -> int:
         if options.output.lower().endswith(".html"):
             from ..common.files import write_text
             from ..viewer import page
-            from ..viewer.motion_data import describe_motion
 
-            motion = describe_motion(trajectory, problem, ghost) | {"speed": options.speed}
+            motion = page.describe_motion(trajectory, problem, ghost) | {"speed": options.speed}
             write_text(options.output, page.build_page(problem.name, [page.write_player(motion)]))
         else:
             from ..viewer.movie import Movie, write_movie

@@ -35,7 +35,7 @@ from .style import (
 )
 
 if TYPE_CHECKING:
-    from ..comparison.side_by_side import Comparison, Contender
+    from ..comparison.metrics import Comparison, Contender
     from ..quasistatic.slow_speeds import PhasePrediction, Prediction, Survival
     from ..results.trajectory import Trajectory
     from ..robustness.sampling import Robustness

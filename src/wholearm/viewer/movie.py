@@ -50,7 +50,7 @@ from ..figures.style import (
 )
 from ..problem.definition import Problem
 from ..results.trajectory import Trajectory
-from .motion_data import place_pushes
+from .page import place_pushes
 
 FRAMES = 25  # frames in a second of the movie
 TURNS, GHOST = "#D55E00", "#bbbbbb"

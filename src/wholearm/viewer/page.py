@@ -1,12 +1,26 @@
-"""Pages in one file, which open without a network: text, tables, pictures and players."""
+"""Pages in one file, which open without a network: text, tables, pictures, players of motions."""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable
 from html import escape
 from importlib import resources
-from typing import Any
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from ..common.arrays import Array, find_runs
+from ..common.sharing import exclusive
+from ..contacts.closing import Numbers
+from ..contacts.elemental import build_features, build_geometry, parse_contact
+from ..figures.curves import find_steps
+from ..figures.style import FINGERS, choose_styles
+from ..problem.definition import Problem
+from ..results.trajectory import Trajectory
+from ..scene.model import Scene
 
 
 def build_page(title: str, parts: Iterable[str]) -> str:
@@ -30,12 +44,12 @@ def fold(content: str, title: str) -> str:
 
 
 def write_player(motion: dict[str, Any]) -> str:
-    """A motion to play; see `motion_data.describe_motion`."""
+    """A motion to play; see `describe_motion`."""
     return f'<div class="motion">{_embed(motion)}</div>'
 
 
 def write_chart(drawing: str, places: dict[str, Any]) -> str:
-    """A map whose places can be clicked; see `chart.describe_map`."""
+    """A map whose places can be clicked; see `report_page.describe_map`."""
     hint = "Click a cell, a border or a crossing to see what touches there."
     told = f'<div class="choice"><p>{hint}</p><div class="pose"></div></div>'
     wide = f'<div class="scroll"><div class="map">{drawing}</div></div>'
@@ -46,3 +60,126 @@ def _embed(value: dict[str, Any]) -> str:
     """Plain values for a script; a name with a tag in it cannot end them."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     return f'<script type="application/json">{text}</script>'
+
+
+class Pushes(NamedTuple):
+    """Where contacts are, and what they do to the object."""
+
+    points: Array  # (n, m, 2) [m]
+    normals: Array  # (n, m, 2): into the object
+    # (n, m, 2) [N]: c_n n + c_t t; NaN where a contact is not in the formation, or no force is
+    # known
+    forces: Array
+
+
+@exclusive
+def place_pushes(scene: Scene, trajectory: Trajectory) -> Pushes:
+    """Contacts and their forces at the samples of a trajectory."""
+    places = [build_geometry(parse_contact(name, scene), scene) for name in trajectory.contacts]
+    rows = [ca.vertcat(place.point, place.normal) for place in places]
+    evaluate = ca.Function("places", [build_features(scene).z], [ca.vertcat(*rows)])
+    values = evaluate(trajectory.z.T).full().T.reshape(len(trajectory.t), -1, 4)
+    points, normals = values[..., :2], values[..., 2:]
+    tangents = np.stack([normals[..., 1], -normals[..., 0]], axis=-1)
+    forces = trajectory.c_n[..., None] * normals + trajectory.c_t[..., None] * tangents
+    return Pushes(points, normals, forces)
+
+
+def describe_motion(
+    trajectory: Trajectory, problem: Problem, ghost: Trajectory | None = None, most: int = 4000
+) -> dict[str, Any]:
+    """Everything that a page needs to play a motion, as plain values.
+
+    Parameters
+    ----------
+    problem  its scene and epsilon
+    ghost    another motion of the same hand, drawn behind: a replay
+    most     about as many samples are taken at most
+    """
+    scene, pushes = problem.scene, place_pushes(problem.scene, trajectory)
+    styles, every = choose_styles(trajectory.contacts), find_steps(trajectory)
+    rows = _choose_rows(trajectory, every, most)
+    contacts = [
+        {
+            "name": name,
+            "colour": styles[name].colour,
+            "dashes": [] if styles[name].line == "-" else list(styles[name].line[1]),
+            "friction": scene.friction.of(parse_contact(name, scene).finger),
+            "spans": _list_spans(scene, trajectory, pushes, index, rows),
+        }
+        for index, name in enumerate(trajectory.contacts)
+    ]
+    behind = None
+    if ghost is not None:
+        few = _choose_rows(ghost, every[:0], most)
+        behind = {"t": _round(ghost.t[few]), "z": _fix(ghost.z[few], scene)}
+    return describe_hand(scene) | {
+        "epsilon": problem.epsilon,
+        "t": _round(trajectory.t[rows]),
+        "z": _fix(trajectory.z[rows], scene),
+        "tau": _round(trajectory.tau[rows]),
+        "phase": trajectory.phase[rows].tolist(),
+        "starts": _round(trajectory.phase_starts),
+        "steps": np.searchsorted(rows, every).tolist(),
+        "contacts": contacts,
+        "ghost": behind,
+    }
+
+
+def _choose_rows(trajectory: Trajectory, steps: Numbers, most: int) -> Numbers:
+    """Rows to show: all, or each so-manieth, ends of phases and both sides of steps."""
+    count = len(trajectory.t)
+    joints = np.flatnonzero(np.diff(trajectory.phase)) + 1
+    ends = np.concatenate([[0, count - 1], joints - 1, joints, steps - 1, steps])
+    return np.union1d(np.arange(0, count, -(-count // most)), ends).astype(np.int64)
+
+
+def _list_spans(
+    scene: Scene, trajectory: Trajectory, pushes: Pushes, index: int, rows: Numbers
+) -> list[dict[str, Any]]:
+    """When a contact presses: the first row, and from there on places, normals and forces."""
+    c = np.column_stack([trajectory.c_n[rows, index], trajectory.c_t[rows, index]])
+    return [
+        {
+            "first": run.start,
+            "point": _fix(pushes.points[rows[run], index], scene),
+            "normal": _fix(pushes.normals[rows[run], index], scene),
+            "c": _round(c[run]),
+        }
+        for run in find_runs(np.isfinite(c).all(axis=1), least=2)
+    ]
+
+
+def describe_hand(scene: Scene) -> dict[str, Any]:
+    """The object and the fingers, as plain values."""
+    return {
+        "vertices": scene.polygon.vertices.tolist(),
+        "fingers": [
+            {
+                "base": np.asarray(finger.base).tolist(),
+                "length": finger.length,
+                "radius": finger.radius,
+                "limit": finger.torque_limit,
+                "colours": colours,
+            }
+            for finger, colours in zip(scene.fingers, FINGERS, strict=True)
+        ],
+    }
+
+
+def _fix(values: Array, scene: Scene) -> Any:
+    """Nested lists of places, directions or angles [m, rad]."""
+    return np.round(values, count_places(scene)).tolist()
+
+
+def count_places(scene: Scene) -> int:
+    """Decimals of places and angles in a page: 5 for an object of a centimetre or more."""
+    return max(5, 3 - math.floor(math.log10(scene.scales.length)))
+
+
+def _round(values: Array) -> Any:
+    """Nested lists of numbers with six digits, None where there is no number."""
+    flat: list[Any] = [None if v != v else float(f"{v:.6g}") for v in values.ravel().tolist()]
+    for size in values.shape[:0:-1]:
+        flat = [flat[k : k + size] for k in range(0, len(flat), size)]
+    return flat

@@ -17,8 +17,7 @@ from ..common.arrays import Array
 from ..common.document import Document, Table, fixed, show
 from ..common.errors import SimulationError
 from ..common.sharing import exclusive
-from ..comparison.metrics import compare
-from ..comparison.side_by_side import Contender
+from ..comparison.metrics import Contender, compare
 from ..contacts.closing import close_fingers
 from ..contacts.elemental import Contact
 from ..figures.map_figure import BOX, PLACE, SIZE, draw_map, find_room, split
@@ -28,7 +27,7 @@ from ..problem.definition import Problem
 from ..results.trajectory import Trajectory
 from ..search.times import time_borders
 from . import page
-from .motion_data import count_places, describe_hand, describe_motion
+from .page import count_places, describe_hand, describe_motion
 
 
 def build_report(
