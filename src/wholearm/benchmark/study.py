@@ -18,6 +18,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -150,20 +151,28 @@ def run_study(
         path, fresh, again = f"{stem}.jsonl", options.fresh, options.again
         if study.of_code:
             stamp["source"] = digest_source(study.list_inputs(options))
-            fresh = fresh or not _continues(path, stamp["source"])
+            # Records of other code are no records.
+            with suppress(OSError, UnicodeDecodeError), open(path, encoding="utf-8") as stream:
+                fresh = fresh or stamp["source"] not in stream.readline()
     with Journal(path, stamp, fresh, again) as journal:
         done = {_key(row["case"]): row for row in journal.records}
         left = [case for case in cases if case not in done]
-        begun, found = time.monotonic(), 0
+        begun, wrong = time.monotonic(), 0
         for count, (case, row) in enumerate(_run(study, left, options), start=1):
             journal.add(row)
             done[case] = row
-            found += bool(row.get("findings"))
+            wrong += bool(row.get("findings"))
             ahead = (time.monotonic() - begun) / count * (len(left) - count) / 60
             text = f"{study.name}: {len(cases) - len(left) + count} of {len(cases)} cases"
-            progress(f"{text}, {found} with findings, {ahead:.0f} min left")
+            progress(f"{text}, {wrong} with findings, {ahead:.0f} min left")
     rows = [done[case] for case in cases]
-    text, findings = _report(study, rows, options)
+    good = [row for row in rows if "failed" not in row]
+    body, found = study.report(good, options)
+    findings = [f"{name_case(row)}: {row['failed']}" for row in rows if "failed" in row] + found
+    parts = [f"# {study.title}", describe_machine(study.packages), body.strip()]
+    if findings:
+        parts.append("\n".join(["## Findings", "", *(f"* {text}" for text in findings)]))
+    text = "\n\n".join(parts) + "\n"
     if not study.keeps:
         return StudyReport(text, findings, [])
     written = [f"{stem}.md"]
@@ -171,29 +180,20 @@ def run_study(
         write_text(written[0], text)
         if study.columns:
             written.append(f"{stem}.csv")
-            write_text(written[-1], _write_csv(rows, study.columns))
-        figure = study.draw([row for row in rows if "failed" not in row])
+            table = io.StringIO()
+            writer = csv.DictWriter(
+                table, study.columns, extrasaction="ignore", lineterminator="\n"
+            )
+            writer.writeheader()
+            writer.writerows(rows)
+            write_text(written[-1], table.getvalue())
+        figure = study.draw(good)
         if figure is not None:
             from ..figures.plots import save
 
             written.append(f"{stem}.png")
             save(figure, written[-1])
     return StudyReport(text, findings, written)
-
-
-def _report(
-    study: Study, rows: Sequence[Row], options: argparse.Namespace
-) -> tuple[str, list[str]]:
-    """The text of a study, and its findings: cases that have failed among them."""
-    table, findings = study.report([row for row in rows if "failed" not in row], options)
-    findings = [
-        *(f"{name_case(row)}: {row['failed']}" for row in rows if "failed" in row),
-        *findings,
-    ]
-    parts = [f"# {study.title}", describe_machine(study.packages), table.strip()]
-    if findings:
-        parts.append("\n".join(["## Findings", "", *(f"* {text}" for text in findings)]))
-    return "\n\n".join(parts) + "\n", findings
 
 
 def describe_machine(packages: Sequence[str] = ()) -> str:
@@ -233,15 +233,6 @@ def digest_source(inputs: Iterable[Path] = ()) -> str:
     for path in inputs:
         found.update(path.name.encode() + path.read_bytes())
     return found.hexdigest()[:16]
-
-
-def _continues(path: str, source: str) -> bool:
-    """Whether a file of records was begun with this source code."""
-    try:
-        with open(path, encoding="utf-8") as stream:
-            return source in stream.readline()
-    except (OSError, UnicodeDecodeError):
-        return True
 
 
 def _run(
@@ -311,14 +302,6 @@ def find_peak() -> float:
 def _key(case: Any) -> Any:
     """A case as it was before it was written."""
     return tuple(map(_key, case)) if isinstance(case, list | tuple) else case
-
-
-def _write_csv(rows: Iterable[Row], columns: Sequence[str]) -> str:
-    stream = io.StringIO()
-    writer = csv.DictWriter(stream, columns, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return stream.getvalue()
 
 
 def _name_processor() -> str:
