@@ -23,7 +23,6 @@ from wholearm.benchmark.growth import STUDY as GROWTH
 from wholearm.benchmark.guard import BANDS, count, read_stored
 from wholearm.benchmark.kernels import LARGEST, Environment, perturb_scenes
 from wholearm.benchmark.kernels import STUDY as KERNELS
-from wholearm.benchmark.precision.phases import SOLVED, Instance, list_instances
 from wholearm.benchmark.precision.planners import (
     LEAST_TIME,
     NO_DRAG,
@@ -32,7 +31,15 @@ from wholearm.benchmark.precision.planners import (
     run_planner,
 )
 from wholearm.benchmark.precision.reference import Course, measure_error
-from wholearm.benchmark.precision.simulators import FEW, SIMULATORS, check_plan, make_course
+from wholearm.benchmark.precision.simulators import (
+    FEW,
+    SIMULATORS,
+    SOLVED,
+    Instance,
+    check_plan,
+    list_instances,
+    make_course,
+)
 from wholearm.benchmark.skip import STUDY as SKIP
 from wholearm.benchmark.skip import SkipPair, list_pairs, spend
 from wholearm.benchmark.study import Case, Row, Study, digest_source, measure_case

@@ -9,16 +9,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from ...common.arrays import Array
-from ...geometry.curve import directions_of
-from ...mechanics.dynamics import ONE, A, B, PathForces, inverse
+from ...common.arrays import Array, Expression
+from ...contacts.formation import Formation
+from ...geometry.curve import Curve, Segment, directions_of
+from ...mechanics.dynamics import ONE, A, B, PathForces, build_force_rows, inverse
 from ...mechanics.limits import make_limits
 from ...mechanics.path_limits import PathLimits
 from ...planning.lower_bound.lower_bound import bound_least_time
@@ -31,24 +32,71 @@ from ...planning.path_domain.terms import LimitShape
 from ...planning.phase_plan import PhasePlan
 from ...planning.time_domain.time_plan import plan_phases
 from ...results.torque import TorqueProfile
-from .phases import (
+from ...results.trajectory import Samples
+from .simulators import (
     NO_PLAN,
     OPTIMUM,
     Instance,
     Median,
     Method,
     PeerPlan,
-    PhaseStretch,
-    build_plant,
-    list_stretches,
+    check_plan,
+    find_reversals,
+    make_slow_motion,
     measure,
     pick,
-    sample_slow_motion,
 )
-from .simulators import check_plan
 
 LEAST_TIME, NO_DRAG = "least time", "least time without viscous friction"
 """Studies: all phases, and the same without viscous friction."""
+
+
+class PhaseStretch(NamedTuple):
+    """A stretch of a phase without a reversal, as peers plan it."""
+
+    part: Segment
+    share: float  # of the curve's length
+    target: float  # coordinate `progress` at its end
+    progress: int  # coordinate of the object that runs along the phase: x, or phi where it turns
+
+
+def build_plant(formation: Formation) -> Expression:
+    """CasADi function (z, z', tau, c_n, Xi, sigma) -> (z'', A z'' + A' z')."""
+    scene, n_c = formation.scene, formation.n_contacts
+    z, v, c_n = ca.SX.sym("z", 5), ca.SX.sym("v", 5), ca.SX.sym("c_n", n_c)
+    tau, Xi, sigma = ca.SX.sym("tau", 2), ca.SX.sym("Xi", n_c), ca.SX.sym("sigma", 2)
+    _, P, P_dot_v, A_t = formation.build_constraints(z, v)
+    friction = ca.DM(scene.viscous) * v + ca.DM(scene.dry) * ca.vertcat(0, 0, 0, sigma)
+    applied = ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, tau) - friction
+    G = build_force_rows(formation, P, A_t, Xi)
+    acceleration = (applied + G.T @ c_n) / ca.DM(scene.mass_diagonal)
+    missed = P @ acceleration + P_dot_v
+    return ca.Function("plant", [z, v, tau, c_n, Xi, sigma], [acceleration, missed])
+
+
+def list_stretches(curve: Curve) -> list[PhaseStretch]:
+    """The stretches of a phase."""
+    ends = curve.evaluate(np.array([0.0, *(part.stop for part in curve.segments)])).z
+    progress = 2 if abs(ends[-1] - ends[0])[2] > 1e-6 else 0
+    return [
+        PhaseStretch(part, (part.stop - part.start) / curve.length, float(end[progress]), progress)
+        for part, end in zip(curve.segments, ends[1:], strict=True)
+    ]
+
+
+def sample_slow_motion(instance: Instance, counts: list[int]) -> list[tuple[Array, Samples]]:
+    """Times from its start and samples of each stretch of a slow motion, at so many instants.
+
+    It keeps all limits, with its internal force amid its range.
+    """
+    motion = make_slow_motion(instance, 5)
+    marks, stretches = find_reversals(motion), []
+    for start, stop, count in zip(marks, marks[1:], counts, strict=False):
+        # The ends of a stretch are evaluated within it.
+        t = np.linspace(start, stop, count)
+        inside = np.clip(t, start + 1e-9 * (stop - start), stop - 1e-9 * (stop - start))
+        stretches.append((t - start, motion.evaluate(inside)))
+    return stretches
 
 
 def run_planner(study: str, name: str, method: str, setting: str, files: tuple[str, ...]) -> Median:

@@ -17,9 +17,21 @@ from matplotlib.figure import Figure
 from ...common.errors import InputError
 from ...figures.style import PALETTE
 from ..study import Case, Row, Study, finish_axes, format_table
-from .phases import BUDGET, REPEATS, SHIFT, SHORT, SOLVED, Median, find_mean, list_instances
 from .planners import LEAST_TIME, NO_DRAG, PLANNERS, run_planner
-from .simulators import FEW, MANY, SIMULATORS, run_simulator
+from .simulators import (
+    BUDGET,
+    FEW,
+    MANY,
+    REPEATS,
+    SHIFT,
+    SHORT,
+    SIMULATORS,
+    SOLVED,
+    Median,
+    find_mean,
+    list_instances,
+    run_simulator,
+)
 
 METHODS = SIMULATORS | PLANNERS
 """All methods by name, in the order of the tables."""
