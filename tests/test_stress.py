@@ -11,10 +11,10 @@ import pytest
 
 from shipped import HEPTAGON, tipping
 from wholearm import Friction, Phase, PlanOptions, Problem, Scene, Trajectory, load
-from wholearm.benchmark.stress.cell_curves import find_best, list_ends
 from wholearm.benchmark.stress.damage import look, run_file
 from wholearm.benchmark.stress.event_tracing import follow, resample, slides
 from wholearm.benchmark.stress.newton import balance, clearances, locate, separate
+from wholearm.benchmark.stress.refusals import find_best, list_ends
 from wholearm.benchmark.stress.scenes import draw_case, random_scene
 from wholearm.benchmark.stress.slow_motion import fast_margin, inertia_ratio, slow_margin
 from wholearm.benchmark.stress.stress_study import compare_values
