@@ -222,7 +222,7 @@ def place_rows(
     error                      what the lines may miss, relative to the largest torque
     rate_limit : (2,) [N m/s]  largest rates, which lines keep if the torques do
     """
-    peak = np.abs(_sample(torque.coefficients)).max(axis=(0, 1))
+    peak = np.abs(torque.at_places(_PLACES)).max(axis=(0, 2))
     largest = float(peak.max())
     if largest == 0.0:
         ends = torque.breaks[[0, -1]]
@@ -303,9 +303,10 @@ def read_rows(rows: Array) -> TorqueProfile:
 def _divide(torque: TorqueProfile, error: float) -> Array:
     """Breaks of the torques, and places between them where a line would miss more than `error`."""
     breaks, h, x = torque.breaks, np.diff(torque.breaks), _PLACES
-    bends = _sample(np.asarray(np.polynomial.polynomial.polyder(torque.coefficients, 2, axis=2)))
+    second = np.polynomial.polynomial.polyder(torque.coefficients, 2, axis=2)
+    bends = TorqueProfile(breaks, np.asarray(second)).at_places(_PLACES)
     # A line over a part of length p misses p^2 / 8 times the second derivative.
-    density = np.sqrt(np.abs(bends).max(axis=2) / (8 * error))
+    density = np.sqrt(np.abs(bends).max(axis=1) / (8 * error))
     inner = (density[:, 1:] + density[:, :-1]) / 2 * np.diff(x)
     total = np.concatenate([np.zeros((len(h), 1)), np.cumsum(inner, axis=1)], axis=1)
     counts = np.maximum(1, np.ceil(total[:, -1])).astype(int)
@@ -335,12 +336,6 @@ def _slow_down(rows: Array, torque: TorqueProfile, rate_limit: Array) -> None:
         if not wrong.any():
             return
         rows[:, 1:][wrong] = exact[wrong]
-
-
-def _sample(coefficients: Array) -> Array:
-    """Values of polynomials, shape (k, 2, d + 1), at some places in each: shape (k, n, 2)."""
-    powers = _PLACES[:, None] ** np.arange(coefficients.shape[2])
-    return np.asarray(np.einsum("kjd,nd->knj", coefficients, powers))
 
 
 def _fit_lines(torque: TorqueProfile, knots: Array) -> Array:

@@ -39,16 +39,10 @@ class Verdict(NamedTuple):
     reason: str
 
 
-def judge(
-    problem: Problem,
-    error: WholearmError,
-    stops: list[tuple[float, float]],
-    objective: str = "time",
-) -> Verdict:
+def judge(problem: Problem, error: WholearmError, stops: list[tuple[float, float]]) -> Verdict:
     """Judge a refusal to plan a problem whose phases stop at the poses `stops` (x, phi).
 
-    Phases after one with two freedoms begin where the plan of the phases before ends, for the
-    `objective` that was asked for.
+    Phases after one with two freedoms begin where the least-time plan of the phases before ends.
     """
     match = re.search(r"phases? (\d+)|phases\[(\d+)\]", str(error))
     number = int(match[1] or match[2]) if match else None
@@ -78,7 +72,7 @@ def judge(
             continue
         if concerned and phase.index < len(stops):
             return _judge_cell(problem, phase, z, stops[phase.index])
-        before = None if concerned or number is None else _find_start(problem, number, objective)
+        before = None if concerned or number is None else _find_start(problem, number)
         if before is None:
             return Verdict("open", f"phase {phase.number} ends where the planner chooses")
         z, planned = before, True
@@ -87,17 +81,13 @@ def judge(
     return open_end
 
 
-def _find_start(problem: Problem, number: int, objective: str) -> Array | None:
-    """Where the plan of the phases before one ends at rest; None if there is none.
-
-    For the largest margin, phases go on from where plans of least time end.
-    """
+def _find_start(problem: Problem, number: int) -> Array | None:
+    """Where the least-time plan of the phases before one ends at rest; None if there is none."""
     before = problem.phases[: number - 1]
     if not before or before[-1].end is not End.REST:
         return None
     try:
-        goal = "time" if objective == "margin" else objective
-        plan = solve(replace(problem, phases=before), goal, replay=False)
+        plan = solve(replace(problem, phases=before), replay=False)
     except WholearmError:
         return None
     motion = plan.trajectory.motions[-1]
