@@ -100,28 +100,22 @@ class Queries(Study):
 STUDY = Queries()
 
 
-def draw_scene(seed: int, number: int, folder: Path) -> Table:
-    """The table of the scene of a query, without start or phases of its own."""
+def draw_query(seed: int, number: int, folder: Path) -> Problem:
+    """The problem of a query: a shipped scene, or one of five random polygons in a shipped hand."""
     kind = number % (len(SHIPPED) + 5)
     name = SHIPPED[kind] if kind < len(SHIPPED) else "hexagon"
     table = dict(read_problem(str(folder / f"{name}.toml")).table)
     table.pop("phases")
     if kind >= len(SHIPPED):
-        rng = np.random.default_rng([seed, 1000 + kind])
-        count = int(rng.integers(3, 8))
-        angles = 2 * np.pi * (np.arange(count) + rng.uniform(-0.25, 0.25, count)) / count
+        own = np.random.default_rng([seed, 1000 + kind])
+        count = int(own.integers(3, 8))
+        angles = 2 * np.pi * (np.arange(count) + own.uniform(-0.25, 0.25, count)) / count
         corners = 0.05 * np.column_stack([np.cos(angles), np.sin(angles)])
         table["object"] = {"vertices": corners.round(4).tolist(), "mass": 0.2}
         table["name"] = f"polygon {kind - len(SHIPPED) + 1}"
     else:
         table["name"] = name
-    return table
-
-
-def draw_query(seed: int, number: int, folder: Path) -> Problem:
-    """The problem of a query."""
     rng = np.random.default_rng([seed, number])
-    table = draw_scene(seed, number, folder)
     first = _draw_pose(rng, table)
     while (last := _draw_pose(rng, table)) == first:
         pass

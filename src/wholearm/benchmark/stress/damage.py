@@ -21,7 +21,7 @@ from functools import lru_cache, reduce
 from operator import getitem
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -79,15 +79,6 @@ METAS = (
 """What takes the place of a trajectory's `meta`."""
 
 
-class Mutant(NamedTuple):
-    """A file with something wrong in it."""
-
-    kind: str  # {"problem", "torque", "trajectory"}
-    what: str  # what was done
-    ending: str  # of the file's name
-    content: bytes | None  # none stands for a folder
-
-
 @lru_cache(maxsize=1)
 def base_files() -> tuple[bytes, bytes, bytes]:
     """A valid problem file, torque file and trajectory file of the same plan."""
@@ -105,19 +96,6 @@ def base_files() -> tuple[bytes, bytes, bytes]:
     told = {"timings": {}, "build_times": none, "solve_times": none}
     arrays["meta"] = np.array(json.dumps(meta | told))
     return write_toml(BASE).encode(), torques, _pack(arrays)
-
-
-def draw_mutant(seed: int, number: int) -> Mutant:
-    """Draw file `number` of a seed."""
-    rng = np.random.default_rng([seed, number, 1])
-    k = (0, 0, 1, 2, 2)[number % 5]
-    kind, ending = ("problem", "torque", "trajectory")[k], (".toml", ".csv", ".npz")[k]
-    own: Callable[[Random, bytes], tuple[str, bytes | None]]
-    own = (_damage_problem, damage_torques, _damage_archive)[k]
-    what, content = (_damage_bytes if rng.uniform() < 0.25 else own)(rng, base_files()[k])
-    if rng.uniform() < 0.01:
-        ending = pick(rng, [".TOML", ".txt", "", ".npy", ".CSV", ".npz.csv"])
-    return Mutant(kind, what, ending, content)
 
 
 def pick(rng: Random, options: Sequence[Any]) -> Any:
@@ -272,21 +250,27 @@ def _pack(arrays: Mapping[str, Any], others: Mapping[str, bytes] = MappingProxyT
 
 
 def run_file(seed: int, number: int) -> dict[str, Any]:
-    """Run the command line on one damaged file in this process, and look at what it leaves."""
+    """Run the command line on a file of a seed in this process, and look at what it leaves."""
     from ...__main__ import start
 
-    mutant, rng = draw_mutant(seed, number), np.random.default_rng([seed, number, 2])
-    problem, torques, _ = base_files()
+    rng, k = np.random.default_rng([seed, number, 1]), (0, 0, 1, 2, 2)[number % 5]
+    kind, ending = ("problem", "torque", "trajectory")[k], (".toml", ".csv", ".npz")[k]
+    own: Callable[[Random, bytes], tuple[str, bytes | None]]
+    own = (_damage_problem, damage_torques, _damage_archive)[k]
+    what, content = (_damage_bytes if rng.uniform() < 0.25 else own)(rng, base_files()[k])
+    if rng.uniform() < 0.01:
+        ending = pick(rng, [".TOML", ".txt", "", ".npy", ".CSV", ".npz.csv"])
+    rng, (problem, torques, _) = np.random.default_rng([seed, number, 2]), base_files()
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
-        file, own, table = (folder / n for n in (f"mutant{mutant.ending}", "own.toml", "own.csv"))
-        own.write_bytes(problem)
+        file, valid, table = (folder / n for n in (f"mutant{ending}", "own.toml", "own.csv"))
+        valid.write_bytes(problem)
         table.write_bytes(torques)
-        if mutant.content is None:
+        if content is None:
             file.mkdir()
         else:
-            file.write_bytes(mutant.content)
-        command = pick(rng, _list_commands(mutant.kind, str(file), str(own), str(folder / "out")))
+            file.write_bytes(content)
+        command = pick(rng, _list_commands(kind, str(file), str(valid), str(folder / "out")))
         before, out, err = set(folder.iterdir()), io.StringIO(), io.StringIO()
         status: int | None = None
         try:
@@ -298,7 +282,7 @@ def run_file(seed: int, number: int) -> dict[str, Any]:
             findings = [describe_error(error)]
     text = " ".join([command[0], *map(os.path.basename, command[1:])])
     answer = {"command": text, "status": status, "findings": findings}
-    return {"kind": mutant.kind, "what": mutant.what, **answer}
+    return {"kind": kind, "what": what, **answer}
 
 
 def _list_commands(kind: str, path: str, own: str, out: str) -> list[list[str]]:
