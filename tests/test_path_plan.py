@@ -49,6 +49,9 @@ from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
 from wholearm.problem.read import build_problem
 from wholearm.results.trajectory import Samples
+from wholearm.search.border_limits import estimate_duration
+from wholearm.search.edges import BorderEdge, Terms
+from wholearm.search.places import make_place
 
 EPSILON = 0.05
 
@@ -736,3 +739,8 @@ def test_a_place_that_motions_hardly_pass_is_found_on_any_first_grid(
         least.append(found.value)
     assert least == pytest.approx([least[-1]] * len(least), rel=1e-5)
     assert look_along(curves, epsilon, 1000) == pytest.approx(least[-1], rel=1e-3)
+    # Nor does the search for routes give up the border on which it lies.
+    slow = curves[1]
+    place = make_place(slow.formation.scene, slow.start)
+    estimate = estimate_duration([BorderEdge(place, slow, None, Terms(epsilon, 0.1)).limits])
+    assert estimate == pytest.approx(look_along([slow], epsilon, 1000), rel=0.05)

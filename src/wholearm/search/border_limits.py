@@ -44,10 +44,12 @@ class BorderLimits(NamedTuple):
         return self._replace(limits=self.limits.scale(ratio), steps=self.steps / ratio)
 
 
-def find_border_limits(curve: Curve, epsilon: float, uniqueness_margin: float) -> BorderLimits:
+def find_border_limits(
+    curve: Curve, epsilon: float, uniqueness_margin: float, intervals: int = INTERVALS
+) -> BorderLimits:
     """Limits along a curve with arc length as parameter; epsilon [N] is the least normal force."""
     terms = PathTerms((curve,), epsilon)
-    grid = terms.make_grid(INTERVALS)
+    grid = terms.make_grid(intervals)
     nodes, count = terms.place(grid.angles), len(grid.owners) + 2
     middles = terms.place((grid.angles[1:] + grid.angles[:-1]) / 2)
     last = len(curve.segments) - 1

@@ -120,7 +120,11 @@ class BorderEdge:
     @cached_property
     def limits(self) -> BorderLimits:
         """Limits of motions along it."""
-        return find_border_limits(self.curve, *self.terms)
+        limits = find_border_limits(self.curve, *self.terms)
+        if limits.closed or not isinstance(estimate_duration([limits]), str):
+            return limits
+        # Where motions hardly pass, a coarse grid may let none pass.
+        return find_border_limits(self.curve, *self.terms, 8 * INTERVALS)
 
     @property
     def formation(self) -> Formation:
