@@ -54,7 +54,7 @@ from wholearm.planning.time_domain.stage import Stage
 from wholearm.planning.time_domain.time_explain import change_limit, list_shortfalls
 from wholearm.planning.time_domain.time_motion import TimeMotion
 from wholearm.planning.time_domain.time_plan import plan_phases
-from wholearm.policy.curve_rows import make_rows
+from wholearm.policy.reference import make_rows
 from wholearm.problem.definition import Problem
 from wholearm.quasistatic.squeeze import InternalForceLimits
 from wholearm.scene.model import Friction

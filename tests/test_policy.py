@@ -19,9 +19,8 @@ from wholearm.cli.command import main
 from wholearm.geometry.tracing import trace_phase
 from wholearm.mechanics.dynamics import build_forward
 from wholearm.policy.curve_law import CurveLaw, MotionLaw, choose_internal_force
-from wholearm.policy.curve_rows import find_within, list_scenes
 from wholearm.policy.make import SAME, find_widest, hold_end, make_policy
-from wholearm.policy.reference_motion import retime, retime_within
+from wholearm.policy.reference import find_within, list_scenes, retime, retime_within
 from wholearm.policy.regulator import RATE, Linear, regulate
 from wholearm.robustness.sampling import make_trial
 from wholearm.simulation.simulate import simulate_free

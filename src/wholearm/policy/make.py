@@ -35,24 +35,23 @@ from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion, Trajectory
 from ..simulation.holding_torques import Standstill, find_hold
 from .curve_law import LoopSettings, choose_internal_force
-from .curve_rows import CurveLimitRows, find_forces, leave_one
 from .playback import Policy
-from .reference_motion import TOUCH, WIDEST, ReferencePiece, Reserve, trace_pieces
+from .reference import (
+    SETTINGS,
+    CurveLimitRows,
+    ReferencePiece,
+    Reserve,
+    find_forces,
+    leave_one,
+    trace_pieces,
+)
 from .regulator import RATE, ROOM, end_within, follow
 
 WIDEST_FACTOR = 64.0  # largest factor on ranges
-SHARES = (1.0, 0.5, 0.25)  # shares of the margin that are tried
-SLOWER = 1.5  # largest duration of a motion with a margin, over the plan's
 SAME = 1e-5  # distance from the plan's end that counts as none, over the scene's length and in rad
-Planner = Callable[[Problem], Trajectory]  # makes a plan of a problem
-FRICTION = (0.7, 1.0, 1.2)  # factors on all friction with which torques have to balance
-STILL = 1e-3  # speed along curves that counts as none, over the scene's
-USUAL = 2.5  # margin of normal forces where no ranges are known, in those of `curve_rows`
+STILL = 1e-3  # speed that counts as none, over the scene's
 DWELL = 3e-3  # time at rest before the next phase begins [s]
-CLOSING = 0.02  # time in which final torques are to close a contact [s]
-SHOWN = 1e-3  # least joint motion of a displacement, over the largest
-WEAK = 10.0  # torques over the dry friction of the joints, below which friction decides on rest
-MOST = 0.5  # largest acceleration of the integral, over the scene's
+Planner = Callable[[Problem], Trajectory]  # makes a plan of a problem
 COLUMNS = [ONE, B, V, A, LAMBDA]  # order of coefficients in the tables of a policy
 
 
@@ -86,7 +85,7 @@ def make_policy(
     """
     problem, plan = adopt_motion(problem, plan)
     ranges = find_ranges(problem, plan)
-    reserve = (USUAL if ranges is None else 1.0) if reserve is None else reserve
+    reserve = (2.5 if ranges is None else 1.0) if reserve is None else reserve
     reserve = require_number(reserve, "reserve", nonnegative=True)
     period = require_number(period, "period", positive=True)
     delay = require_number(delay, "delay", nonnegative=True)
@@ -96,9 +95,15 @@ def make_policy(
     scales, limit = problem.scene.scales, problem.scene.torque_limit.tolist()
     if torque_limit is not None:
         limit = [require_number(torque_limit, "torque_limit", positive=True)] * 2
-    speeds = TOUCH * scales.speed, STILL * scales.speed
-    most = MOST * scales.acceleration
-    settings = LoopSettings(period, delay, *speeds, DWELL, most, (limit[0], limit[1]))
+    settings = LoopSettings(
+        period=period,
+        delay=delay,
+        touch=SETTINGS.touch * scales.speed,
+        still=STILL * scales.speed,
+        dwell=DWELL,
+        most=0.5 * scales.acceleration,
+        limit=(limit[0], limit[1]),
+    )
     blocks = split(problem.phases)
     along = [_find_curve(block) for block in blocks]
     starts = plan.phase_starts
@@ -172,7 +177,7 @@ def hold_end(problem: Problem, phase: Phase, z: Array) -> Array | None:
     contacts = phase.formation.contacts if contact is None else (*phase.formation.contacts, contact)
     touching = Formation(problem.scene, contacts)
     place = Standstill(z, phase.formation, contact, touching)
-    hold = find_hold(place, problem.epsilon, problem.gap, CLOSING)
+    hold = find_hold(place, problem.epsilon, problem.gap, 0.02)
     return None if hold is None else hold.tau
 
 
@@ -211,7 +216,7 @@ def _list_free_joints(problem: Problem, phase: Phase, z: Array) -> Array:
     P = both.evaluate(z, np.zeros_like(z)).P[0] / units
     left = np.linalg.svd(P)[2][len(P) :] / units
     basis, sizes, _ = np.linalg.svd(left[:, 3:].T, full_matrices=False)
-    return np.asarray(basis.T[sizes > SHOWN * (1.0 / units[3])])
+    return np.asarray(basis.T[sizes > 1e-3 / units[3]])
 
 
 def _tabulate_curve(piece: ReferencePiece, phase: Phase, push: Array) -> dict[str, Array]:
@@ -229,7 +234,8 @@ def _tabulate_curve(piece: ReferencePiece, phase: Phase, push: Array) -> dict[st
         "push": push,
         "passes": np.array([piece.passes]),
         "arrival": arrival[..., COLUMNS],
-        "keeps": np.array([float((np.abs(push) < WEAK * dry).all())]),
+        # Friction of the joints decides on rest where torques are not much larger.
+        "keeps": np.array([float((np.abs(push) < 10 * dry).all())]),
         "forces": find_forces(piece.curve, rows.s, np.sqrt(piece.b))[..., COLUMNS],
     }
 
@@ -247,36 +253,27 @@ def find_arrival(curve: Curve, gained: Contact, rows: CurveLimitRows) -> Array:
 
     Empty where forces at rest are not unique.
     """
-    both, found = curve.formation.add(gained), [np.zeros((0, 5))]
-    reserves = _list_reserves(curve, rows)
-    for balance in _list_balances(curve, both, rows):
+    both, own = curve.formation.add(gained), curve.formation.scene
+    if both.n_constraints != 5:
+        return np.zeros((0, 5))
+    # Torques have to balance with other friction, too, and in corners of the ranges.
+    cases = [(own, factor) for factor in (0.7, 1.0, 1.2)]
+    cases += [(scene, 1.0) for scene in rows.scenes if scene != own]
+    try:
+        balances = [_balance(curve, replace(both, scene=scene), mu) for scene, mu in cases]
+    except np.linalg.LinAlgError:
+        return np.zeros((0, 5))
+    margins, found = rows.unit[-1, : curve.formation.n_contacts], list[Array]()
+    for balance in balances:
         forces = balance[: both.n_contacts, 1:] @ rows.torque[-1]
         forces[:, ONE] += balance[: both.n_contacts, 0]
-        found.append(forces / reserves[:, None])
+        found.append(forces / np.append(margins, margins.max())[:, None])
     return np.vstack(found)
-
-
-def _list_reserves(curve: Curve, rows: CurveLimitRows) -> Array:
-    """Margins of the normal forces at the end of a curve and, the largest of them, of one more."""
-    reserves = rows.unit[-1, : curve.formation.n_contacts]
-    return np.append(reserves, reserves.max())
-
-
-def _list_balances(curve: Curve, both: Formation, rows: CurveLimitRows) -> list[Array]:
-    """Balances with factors of friction and in scenes of ranges; none if forces are not unique."""
-    if both.n_constraints != 5:
-        return []
-    try:
-        found = [_balance(curve, both, factor) for factor in FRICTION]
-        scenes = [scene for scene in rows.scenes if scene != curve.formation.scene]
-        return found + [_balance(curve, replace(both, scene=scene), 1.0) for scene in scenes]
-    except np.linalg.LinAlgError:
-        return []
 
 
 def _balance(curve: Curve, both: Formation, factor: float) -> Array:
     """Constraint forces of (1, tau) at rest at the end of a curve, shape (5, 3)."""
-    scene, last = curve.formation.scene, curve.segments[-1]
+    scene, last = both.scene, curve.segments[-1]
     point = curve.evaluate(np.array([curve.length]))
     kinematics = both.evaluate(point.z, point.z_s)
     slides = np.sign(kinematics.A_t[0] @ point.z_s[0])
@@ -313,7 +310,7 @@ def replan(
     while k < len(blocks):
         after = k + 1
         if not curves[k] and _lacks_margin(problem, blocks[k], plan):
-            for share in SHARES:
+            for share in (1.0, 0.5, 0.25):
                 found = _replan_blocks(planner, problem, blocks[k:], curves[k:], plan, share)
                 if found is not None:
                     new, after = found[0], k + found[1]
@@ -353,7 +350,7 @@ def _replan_blocks(
     for count, (block, curve) in enumerate(zip(blocks, curves, strict=True), start=1):
         part = _solve(planner, problem, block, z, 0.0 if curve else share)
         lasts = starts[block[-1].index + 1] - starts[block[0].index]
-        if part is None or (not curve and part.duration > SLOWER * lasts):
+        if part is None or (not curve and part.duration > 1.5 * lasts):
             return None
         found += part.motions
         z = part.z[-1]
@@ -399,14 +396,14 @@ def _pin(phase: Phase, z: Array) -> Phase:
 def find_widest(problem: Problem, plan: Trajectory, delay: float) -> dict[int, float]:
     """The largest factor on the ranges of each phase along a curve, by its number.
 
-    It is at most `WIDEST_FACTOR`, and no relative range exceeds `WIDEST`. The delay [s] is that of
-    the torques, as far as known. InputError if neither plan nor problem have ranges.
+    It is at most `WIDEST_FACTOR`, and no relative range exceeds `SETTINGS.widest`. The delay [s] is
+    that of the torques, as far as known. InputError if neither plan nor problem have ranges.
     """
     ranges = find_ranges(problem, plan)
     if ranges is None:
         raise InputError("", "uncertainty", "is missing; without ranges none is the widest")
     relative = max(ranges.get(p.name, 0.0) for p in PARAMETERS if not p.unit)
-    most = min(WIDEST / relative, WIDEST_FACTOR) if relative > 0 else WIDEST_FACTOR
+    most = min(SETTINGS.widest / relative, WIDEST_FACTOR) if relative > 0 else WIDEST_FACTOR
     along = [_find_curve(block) for block in split(problem.phases)]
     pieces = trace_pieces(problem, along, plan, Reserve(most, ranges, delay))
     return {
