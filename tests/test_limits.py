@@ -26,7 +26,7 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics import limits as limits_module
 from wholearm.mechanics.dynamics import LAMBDA, ONE, A, B, V, build_forward, inverse, stack_motion
 from wholearm.mechanics.limits import CONE, PRESS, LimitSet, MotionLimit, make_limits
-from wholearm.mechanics.path_limits import PathLimits, find_speed_cap
+from wholearm.mechanics.path_limits import InternalForceLimits, PathLimits, find_speed_cap
 from wholearm.mechanics.speed_sweep import (
     NoMotionError,
     SweepMode,
@@ -56,7 +56,6 @@ from wholearm.planning.time_domain.time_motion import TimeMotion
 from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.policy.reference import make_rows
 from wholearm.problem.definition import Problem
-from wholearm.quasistatic.squeeze import InternalForceLimits
 from wholearm.scene.model import Friction
 from wholearm.search.border_limits import estimate_duration
 from wholearm.search.edges import BorderEdge, Terms, time_parts

@@ -29,9 +29,9 @@ from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, Kinematics
 from ..mechanics.dynamics import Directions, force_rows, inverse, metric_weights
 from ..mechanics.margin_key import UNIQUENESS
+from ..mechanics.path_limits import InternalForceLimits
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN, find_minors
 from ..problem.definition import Problem
-from ..quasistatic.squeeze import InternalForceLimits
 from ..scene.model import Scene
 from .borders import (
     NOWHERE,

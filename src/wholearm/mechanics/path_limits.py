@@ -13,10 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
+from ..contacts.formation import Formation
 from .dynamics import LAMBDA, ONE, A, B, PathForces, V, stack_motion
-from .limits import LimitSet
+from .limits import CONE, PRESS, LimitSet, make_limits
 
 TIED = 1e-9  # relative difference of two bounds that is rounding: pairs of a limit without lambda
+FLAT = 1e-12  # slope over lambda below which a limit does not depend on it, over its scale
 
 
 class Extreme(NamedTuple):
@@ -180,3 +182,87 @@ def find_speed_cap(limits: LimitSet, rates: Array) -> Array:
                 largest = (np.where(rate > 0, high, low) / rate) ** 2
             cap = np.fmin(cap, largest)
     return cap
+
+
+class BestInternalForce(NamedTuple):
+    """Internal force (squeeze) with the largest least normal force at n places."""
+
+    # (n,) [N]: the largest epsilon that all contacts keep; minus infinity where other limits are
+    # missed with any internal force
+    least: Array
+    internal_force: Array  # (n,) [N]
+    # (n, 2): limits, as indices into the set, that keep it from being larger, those of contacts
+    # first
+    owners: NDArray[np.int64]
+
+
+class InternalForceLimits(NamedTuple):
+    """Limits at n places of a path as functions of the internal force."""
+
+    limits: LimitSet  # for an epsilon of zero
+    at: PathLimits  # all sides, also of joint speeds
+
+    @staticmethod
+    def of(formation: Formation, forces: PathForces, rates: Array) -> InternalForceLimits:
+        """Those of a formation at places with d theta / ds = `rates`, (n, 2)."""
+        limits = make_limits(formation, 0.0)
+        rows = find_slack_rows(limits, forces, rates)
+        rows[..., LAMBDA] *= np.abs(rows[..., LAMBDA]) > FLAT
+        return InternalForceLimits(limits, PathLimits(rows, np.full(len(rows), np.inf)))
+
+    @property
+    def far(self) -> float:
+        """Internal force that stands for an infinite one [N]."""
+        return 1e6 * float(self.limits.scales[self.limits.of(PRESS)[0]])
+
+    def _split(self) -> tuple[NDArray[np.bool_], Array, NDArray[np.int64]]:
+        """Which sides give way to epsilon, by how much per newton, and the limits they are of."""
+        rows = self.limits.sides[0]
+        weights = np.concatenate([limit.weight for limit in self.limits.limits])[rows]
+        soft = np.isin(rows, self.limits.of(PRESS, CONE)) & (weights > 0)
+        weights = np.where(soft, weights, 0.0) / self.limits.scales[rows]
+        return soft, weights, self.limits.owners[rows]
+
+    def find_span(self, a: Array, b: Array, epsilon: Array | float) -> tuple[Array, Array]:
+        """Least and largest internal force with which all limits are kept, shape (n,) [N].
+
+        The least is above the largest where there is none.
+        """
+        loss = np.multiply.outer(np.broadcast_to(epsilon, a.shape), self._split()[1])
+        low, high = self.at.relax(-loss).find_internal_force_range(a, b)
+        return np.maximum(low, -self.far), np.minimum(high, self.far)
+
+    def find_best(self, a: Array, b: Array) -> BestInternalForce:
+        """The internal force with the largest least normal force, at a = s'', b = s'^2.
+
+        The largest epsilon of c_n >= epsilon and of the cones of rolling contacts, within the other
+        limits: a linear programme in two unknowns, solved by its vertices.
+        """
+        soft, weights, owners = self._split()
+        offset, slope = self.at.find_slack(a, b, 0 * a), self.at.rows[..., LAMBDA]
+        others = self.at._replace(rows=self.at.rows[:, ~soft])
+        low, high = others.find_internal_force_range(a, b)
+        feasible = np.maximum(low, -self.far) <= np.minimum(high, self.far)
+        low, high = np.clip([low, high], -self.far, self.far)
+        # In newtons of epsilon.
+        rest, rise = offset[:, soft] / weights[soft], slope[:, soft] / weights[soft]
+        i, j = np.triu_indices(soft.sum(), 1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            corners = (rest[:, j] - rest[:, i]) / (rise[:, i] - rise[:, j])
+        corners = np.where(np.isfinite(corners), corners, low[:, None])
+        tried = np.clip(np.column_stack([low, high, corners]), low[:, None], high[:, None])
+        least = (rest[:, None] + rise[:, None] * tried[..., None]).min(axis=2)
+        k, best = np.arange(len(a)), least.argmax(axis=1)
+        internal, value = tried[k, best], np.where(feasible, least[k, best], -np.inf)
+        slack = offset + slope * internal[:, None]
+        found = np.isfinite(value)
+        slack[:, soft] -= np.where(found, value, 0.0)[:, None] * weights[soft]
+        # Where other limits cannot be kept it is these that are to blame.
+        slack[np.ix_(~found, soft)] = np.inf
+        pair = np.argsort(np.where(found[:, None], np.abs(slack), slack), axis=1)[:, :2]
+        # Where it has no effect, only those that are missed.
+        bent = np.abs(np.take_along_axis(slope, pair, axis=1)) > FLAT
+        free = np.take_along_axis(slack, pair, axis=1)[:, 1] > TIED
+        pair[:, 1] = np.where(free & ~bent.any(axis=1), pair[:, 0], pair[:, 1])
+        rank = np.sort(owners[pair] + len(self.limits.limits) * ~soft[pair], axis=1)
+        return BestInternalForce(value, internal, rank % len(self.limits.limits))

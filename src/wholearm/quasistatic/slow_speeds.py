@@ -1,7 +1,7 @@
 """Speeds up to which motions along the paths of phases keep every contact, without planning.
 
-Inverse dynamics along a path at given s' and s''; the internal force is the best one at each place
-(`squeeze`), or that of quasistatic torques. Breaks are found by bisection over the speed.
+Inverse dynamics along a path at given s' and s''; the internal force is the best one at each place,
+or that of quasistatic torques. Breaks are found by bisection over the speed.
 """
 
 from __future__ import annotations
@@ -36,22 +36,15 @@ from ..mechanics.dynamics import (
     split_forces,
 )
 from ..mechanics.limits import CONE, PRESS
+from ..mechanics.path_limits import InternalForceLimits
 from ..problem.definition import End, Phase, Problem
 from ..problem.read import require_phases
 from ..results.torque import TorqueProfile
-from .squeeze import InternalForceLimits
 
 PLACES = 241  # about how many places of a phase are looked at
-_SCALED_SPEEDS = np.geomspace(1e-2, 1e2, 49)
-"""Speeds at which a break is looked for, over the scene's speed."""
-_HALVINGS = 24  # steps of bisection
 SQUEEZE = 0.5
 """Internal force of quasistatic torques: 0 least, 1 with the largest least normal force."""
 OWN = "own torques"  # name of the motion under the torques of the quasistatic one
-_SPEEDS = 61  # speeds of a curve
-_SHOWN = 1.4
-"""Largest speed of curves over the largest at which something breaks; its cube for the least."""
-_ROWS = 8  # every so many places of a phase quasistatic torques are kept
 
 
 @exclusive
@@ -182,10 +175,10 @@ def find_torques(path: PathSamples, epsilon: float, share: float) -> Quasistatic
 
 
 def _thin_out(path: PathSamples, torques: QuasistaticTorques) -> QuasistaticTorques:
-    """Fewer places, with both ends and both sides of every reversal."""
+    """Every eighth place, with both ends and both sides of every reversal."""
     ends = np.diff(path.s) == 0
     kept = np.append(True, ends) | np.append(ends, True)
-    kept[::_ROWS] = True
+    kept[::8] = True
     return QuasistaticTorques(*(part[kept] for part in torques))
 
 
@@ -238,8 +231,8 @@ def _draw(
         for speed in (survival.speed, survival.lost, survival.again)
         if speed
     ]
-    ends = (min(every) / _SHOWN**3, _SHOWN * max(every)) if every else (0.1 * unit, 10 * unit)
-    speeds = np.geomspace(*ends, _SPEEDS)
+    ends = (0.36 * min(every), 1.4 * max(every)) if every else (0.1 * unit, 10 * unit)
+    speeds = np.geomspace(*ends, 61)
     forces = {
         name: np.array([evaluate(speed).force for speed in speeds.tolist()])
         for name, (evaluate, _) in motions.items()
@@ -338,14 +331,15 @@ def find_break(evaluate: Evaluate, wanted: float, unit: float, above: float = 0.
     """
     start, low = evaluate(0.0), above
     holds = start.force >= wanted
-    for high in (unit * _SCALED_SPEEDS[unit * _SCALED_SPEEDS > above]).tolist():
+    speeds = unit * np.geomspace(1e-2, 1e2, 49)
+    for high in speeds[speeds > above].tolist():
         least = evaluate(high)
         if (least.force >= wanted) != holds:
             break
         low = high
     else:
         return Break(np.inf, start, 0.0) if holds else Break(0.0, start, np.inf)
-    for _ in range(_HALVINGS):
+    for _ in range(24):
         middle = (low + high) / 2
         found = evaluate(middle)
         if (found.force >= wanted) == holds:

@@ -78,50 +78,20 @@ def _get_press(scene: Any, _: object) -> float:
     return float(max(scene.polygon.mass * scene.gravity, *press))
 
 
-MASS = Range(1e-6, 1e6)
-INERTIA = Range(1e-2, 1e2, lambda _, body: body.uniform_inertia, "times uniform density")
-GRAVITY = Range(1e-3, 1e5)
 FRICTION = Range(0.0, 10.0)
 PLACE = Range(-300.0, 300.0, lambda scene, _: scene.polygon.size, _SIZE)
 """Coordinates of joints and of the object."""
 TURN = Range(-3600.0, 3600.0)  # angle of the object at which a phase ends [degrees]
-LENGTH = Range(0.03, 100.0, PLACE.scale, _SIZE)
-RADIUS = Range(1e-4, 1.0, lambda _, finger: finger.length, "times the length, or 0")
-JOINT = Range(
-    1e-8, 1e3, lambda scene, finger: scene.polygon.mass * finger.length**2, "times m length^2"
-)
-TORQUE = Range(
-    1e-6,
-    1e3,
-    lambda scene, finger: scene.polygon.mass * scene.gravity * finger.length or None,
-    "times m g length",
-)
-STRENGTH = Range(1e-6, 1e6, _get_strength, "times finger 2's strength")
-VISCOUS = Range(
-    *(0.0, 200.0),
-    lambda scene, finger: _get_drive(scene, finger) * scene.scales.time,
-    f"{_DRIVE}, x {{time}}",
-)
-DRY = Range(0.0, 1e3, _get_drive, _DRIVE)
-SPEED = Range(1e-3, 1e6, lambda scene, _: scene.scales.rate, "radians in {time}")
-TORQUE_RATE = Range(
-    1e-4,
-    1e9,
-    lambda scene, finger: finger.torque_limit / scene.scales.time,
-    "torque limits in {time}",
-)
-LAG = Range(0.0, 1e2, lambda scene, _: scene.scales.time, "x {time}")
-CONTROL_PERIOD = Range(1e-3, 1e2, LAG.scale, "times the scene's time")
-SETTLE = Range(1e-4, 1e3, LAG.scale, "times the scene's time, or 0")
+
+
+def relate_time(low: float, high: float, text: str) -> Range:
+    """A range of multiples of the scene's time."""
+    return Range(low, high, lambda scene, _: scene.scales.time, text)
+
+
+SETTLE = relate_time(1e-4, 1e3, "times the scene's time, or 0")
 SETTLE_GAP = Range(1e-6, 0.1, lambda scene, _: scene.scales.length, "times the scene's length")
 EPSILON = Range(0.0, 1e3, _get_press, "times what presses at most")
-
-
-LARGE, THIN = 2.0, 1e-2
-"""Size [m] from which on so little mass over its square [kg/m^2] looks like corners in mm: a sheet
-of paper has 0.08."""
-SLOW = 1.0
-"""Control period over the scene's time that looks like one in ms: shipped scenes have 0.06 s."""
 
 
 def check_ranges(scene: Scene) -> None:
@@ -148,9 +118,10 @@ def check_ranges(scene: Scene) -> None:
 def find_unit_hint(scene: Scene) -> str:
     """What looks as if it were in mm or ms, with the key first; empty where nothing does."""
     size, time = scene.polygon.size, scene.scales.time
-    if size > LARGE and scene.polygon.mass < THIN * size**2:
+    # A sheet of paper has 0.08 kg/m^2.
+    if size > 2.0 and scene.polygon.mass < 0.01 * size**2:
         return f"object.vertices: {size:g} m across at {scene.polygon.mass:g} kg; are they in mm?"
-    if scene.control_period > SLOW * time:
+    if scene.control_period > time:
         many = scene.control_period / time
         text = f"{scene.control_period:g} s is {many:.3g} times a fall over the radius of gyration"
         return f"control_period: {text}; is it in ms?"
@@ -162,26 +133,18 @@ def check_place(scene: Scene, key: str, value: float) -> None:
     PLACE.check(key, value, "m", scene)
 
 
-SIZES = (1e-4, 1e3)
-"""Least and largest distance between the two corners of a polygon that are farthest apart [m]."""
-FAR = 1e3  # largest distance of given corners from the origin, over that distance
-SLENDER = 1e-3  # least width of a polygon, over that distance
-SHORTEST_EDGE = 1e-4  # least length of an edge, over that distance
-MOST_VERTICES = 500  # most corners of a polygon
-
-
 def _read_corners(given: object, key: str) -> Array:
     if not isinstance(given, list | tuple | np.ndarray) or len(given) < 3:
         raise InputError("", key, f"{given!r} is not a list of 3 or more points")
-    if len(given) > MOST_VERTICES:
-        allowed = f"allowed are 3 to {MOST_VERTICES}"
+    if len(given) > 500:
+        allowed = "allowed are 3 to 500"
         raise InputError("", key, f"{len(given)} corners given; {allowed}")
     return frozen([POINT.read(point, f"{key}[{k}]") for k, point in enumerate(given)])
 
 
 CORNERS = FieldKind(
     _read_corners,
-    {"type": "array", "minItems": 3, "maxItems": MOST_VERTICES, "items": POINT.schema},
+    {"type": "array", "minItems": 3, "maxItems": 500, "items": POINT.schema},
 )
 
 
@@ -192,11 +155,12 @@ CORNERS = FieldKind(
         *(CORNERS, "length"),
         attribute="points",
     ),
-    key("mass", "[kg]", POSITIVE, "mass", MASS),
+    key("mass", "[kg]", POSITIVE, "mass", Range(1e-6, 1e6)),
     key(
         "inertia",
         "About the centroid [kg m^2]; by default that of uniform density.",
-        *(POSITIVE, "inertia", INERTIA),
+        *(POSITIVE, "inertia"),
+        Range(1e-2, 1e2, lambda _, body: body.uniform_inertia, "times uniform density"),
     ),
 )
 @dataclass(frozen=True, eq=False)
@@ -273,46 +237,36 @@ class Polygon:
 
 
 def _check_size(corners: Array) -> float:
-    """Largest distance between two corners [m], if that is neither too small nor too large."""
-    key, (least, largest) = "object.vertices", SIZES
-    if np.abs(corners).max() > FAR * largest:
-        far = corners[int(np.abs(corners).max(axis=1).argmax())].tolist()
-        raise InputError("", key, f"{far} given; allowed are coordinates up to {FAR * largest:g} m")
+    """Largest distance between two corners [m], if it and the corners are within limits."""
+    least, largest, far = 1e-4, 1e3, float(np.abs(corners).max())
+    if far > 1e3 * largest:
+        corner = corners[int(np.abs(corners).max(axis=1).argmax())].tolist()
+        text = f"{corner} given; allowed are coordinates up to {1e3 * largest:g} m"
+        raise InputError("", "object.vertices", text)
     size = float(np.hypot(*(corners[:, None] - corners).transpose(2, 0, 1)).max())
     if not least <= size <= largest:
-        raise InputError(
-            "", key, f"{size:.3g} m from corner to corner; allowed are {least:g} to {largest:g} m"
-        )
-    if np.abs(corners).max() > FAR * size:
-        raise InputError(
-            "",
-            key,
-            f"{np.abs(corners).max():.3g} m from the origin; allowed are {FAR * size:.3g} m, "
-            f"{FAR:g} times the polygon's size",
-        )
+        text = f"{size:.3g} m from corner to corner; allowed are {least:g} to {largest:g} m"
+        raise InputError("", "object.vertices", text)
+    if far > 1e3 * size:
+        text = f"allowed are {1e3 * size:.3g} m, 1000 times the polygon's size"
+        raise InputError("", "object.vertices", f"{far:.3g} m from the origin; {text}")
     return size
 
 
 def _check_shape(corners: Array, edges: Array, size: float) -> None:
     """Check that a convex polygon is not too slender, and that it has no too short edge."""
-    lengths = np.hypot(*edges.T)
-    shortest = int(lengths.argmin())
-    if lengths[shortest] < SHORTEST_EDGE * size:
+    shortest, slender, lengths = 1e-4, 1e-3, np.hypot(*edges.T)
+    k = int(lengths.argmin())
+    if lengths[k] < shortest * size:
+        text = f"allowed are {shortest * size:.3g} m and more, {shortest:g} of the polygon's size"
         raise InputError(
-            "",
-            f"object.vertices[{shortest}]",
-            f"the edge from there has {lengths[shortest]:.3g} m; allowed are "
-            f"{SHORTEST_EDGE * size:.3g} m and more, {SHORTEST_EDGE:g} of the polygon's size",
+            "", f"object.vertices[{k}]", f"the edge from there has {lengths[k]:.3g} m; {text}"
         )
     away = cross_product(edges[:, None], corners - corners[:, None]) / lengths[:, None]
     width = float(away.max(axis=1).min())
-    if width < SLENDER * size:
-        raise InputError(
-            "",
-            "object.vertices",
-            f"the polygon is {width:.3g} m wide; allowed are {SLENDER * size:.3g} m and more, "
-            f"{SLENDER:g} of its size",
-        )
+    if width < slender * size:
+        text = f"allowed are {slender * size:.3g} m and more, {slender:g} of its size"
+        raise InputError("", "object.vertices", f"the polygon is {width:.3g} m wide; {text}")
 
 
 def cross_product(a: Array, b: Array) -> Array:
@@ -320,34 +274,84 @@ def cross_product(a: Array, b: Array) -> Array:
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
 
-LIGHT = 1e-4  # weight, over what the weaker finger can press with, that is next to nothing
-HOLDS = ("constant", "linear")  # how torques may be held over control periods
 TOUCHING = 3e-6  # gap below which features count as touching, in radii of gyration of the object
+HOLDS = ("constant", "linear")  # how torques may be held over control periods
 
 
 @declare(
     key("base", "The joint [m].", POINT, "length", PLACE),
-    key("length", "From the joint to the centre of the tip [m].", POSITIVE, "length", LENGTH),
-    key("radius", "Half thickness of the link [m].", NONNEGATIVE, "length", RADIUS, default=0.0),
-    key("inertia", "About the joint [kg m^2].", POSITIVE, "inertia", JOINT),
+    key(
+        "length",
+        "From the joint to the centre of the tip [m].",
+        *(POSITIVE, "length"),
+        Range(0.03, 100.0, PLACE.scale, _SIZE),
+    ),
+    key(
+        "radius",
+        "Half thickness of the link [m].",
+        *(NONNEGATIVE, "length"),
+        Range(1e-4, 1.0, lambda _, finger: finger.length, "times the length, or 0"),
+        default=0.0,
+    ),
+    key(
+        "inertia",
+        "About the joint [kg m^2].",
+        *(POSITIVE, "inertia"),
+        Range(
+            *(1e-8, 1e3),
+            lambda scene, finger: scene.polygon.mass * finger.length**2,
+            "times m length^2",
+        ),
+    ),
     key(
         "viscous",
         "Viscous friction of the joint [N m s].",
-        *(NONNEGATIVE, "drag", VISCOUS),
+        *(NONNEGATIVE, "drag"),
+        Range(
+            *(0.0, 200.0),
+            lambda scene, finger: _get_drive(scene, finger) * scene.scales.time,
+            f"{_DRIVE}, x {{time}}",
+        ),
         default=0.0,
     ),
-    key("dry", "Dry friction of the joint [N m].", NONNEGATIVE, "torque", DRY, default=0.0),
-    key("torque_limit", "[N m]", POSITIVE, "torque", TORQUE, STRENGTH),
-    key("speed_limit", "Of the joint [rad/s]; none by default.", POSITIVE, "rate", SPEED),
+    key(
+        "dry",
+        "Dry friction of the joint [N m].",
+        *(NONNEGATIVE, "torque"),
+        Range(0.0, 1e3, _get_drive, _DRIVE),
+        default=0.0,
+    ),
+    key(
+        "torque_limit",
+        "[N m]",
+        *(POSITIVE, "torque"),
+        Range(
+            *(1e-6, 1e3),
+            lambda scene, finger: scene.polygon.mass * scene.gravity * finger.length or None,
+            "times m g length",
+        ),
+        Range(1e-6, 1e6, _get_strength, "times finger 2's strength"),
+    ),
+    key(
+        "speed_limit",
+        "Of the joint [rad/s]; none by default.",
+        *(POSITIVE, "rate"),
+        Range(1e-3, 1e6, lambda scene, _: scene.scales.rate, "radians in {time}"),
+    ),
     key(
         "torque_rate_limit",
         "How quickly the torque may change [N m/s]; none by default: it may step.",
-        *(POSITIVE, "torque_rate", TORQUE_RATE),
+        *(POSITIVE, "torque_rate"),
+        Range(
+            *(1e-4, 1e9),
+            lambda scene, finger: finger.torque_limit / scene.scales.time,
+            "torque limits in {time}",
+        ),
     ),
     key(
         "actuator_lag",
         "Time constant with which the torque follows its command [s].",
-        *(NONNEGATIVE, "time", LAG),
+        *(NONNEGATIVE, "time", relate_time(0.0, 1e2, "x {time}")),
     ),
 )
 @dataclass(frozen=True, eq=False)
@@ -441,7 +445,7 @@ class Scales(NamedTuple):
 
 
 @declare(
-    key("gravity", "[m/s^2]", NONNEGATIVE, "acceleration", GRAVITY),
+    key("gravity", "[m/s^2]", NONNEGATIVE, "acceleration", Range(1e-3, 1e5)),
     key(
         "fingers_collide",
         "Whether the links stop each other; false where they move in different planes.",
@@ -450,7 +454,7 @@ class Scales(NamedTuple):
     key(
         "control_period",
         "Period over which torques are held; with 0 they are free [s].",
-        *(NONNEGATIVE, "time", CONTROL_PERIOD),
+        *(NONNEGATIVE, "time", relate_time(1e-3, 1e2, "times the scene's time")),
     ),
     key(
         "control_hold",
@@ -492,7 +496,7 @@ class Scene:
         mass = self.polygon.mass
         press = min(finger.torque_limit / finger.length for finger in self.fingers)
         weight = mass * self.gravity
-        force = weight if weight > LIGHT * press else press / 100
+        force = weight if weight > 1e-4 * press else press / 100
         return Scales(self.polygon.gyration_radius, mass, force)
 
     @cached_property

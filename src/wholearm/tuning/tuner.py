@@ -34,10 +34,44 @@ from ..verification.free import FreeReport, find_losses, verify_free
 from ..verification.verdict import DEPARTURE
 
 _GAINS = (EventKind.GAINED, EventKind.IMPACT, EventKind.PASS)
-LASTS = 40.0
-"""How long a trial goes on after its last step of the torques, relative to the scene's time."""
-_BACK = 1e-6
-"""Share of the way by which the end is farther away than before once the motion has turned back."""
+FACTOR = 1.1
+"""What raises a torque by 10 %; lowering divides by it, so that each torque comes again."""
+
+
+@dataclass(frozen=True)
+class TuningSettings:
+    """Accuracies and limits of the search; times and speeds are over those of the scene."""
+
+    lasts: float = 40.0  # how long a trial goes on after its last step of the torques
+    pause: float = 0.2  # how long the object is held at the end of each phase
+    back: float = 1e-6  # increase of the distance from the end, over the way, that is turning back
+    # Speed at which a brake may reach the end: contacts part for less than a moment then.
+    slow: float = 3e-5
+    coarse: float = 50.0  # factor on that while brakes are compared
+    raises: int = 60  # most times a torque is raised or lowered: a factor of 300
+    # By how many steps the supporting torque is raised at once, as each takes a search, and at
+    # most. Case: hexagon, phases 7 and 9.
+    support_step: int = 3
+    support: int = 13
+    brake_step: int = 2  # by how many steps the acting torque is lowered while it brakes too little
+    gain: float = 0.02  # least share of the time by which another 10 % brings the end sooner
+    failures: int = 2  # torques that stop nothing after which the search ends, once one has
+    trials: int = 24  # most trials that look for the instant to brake
+    losses: int = 4  # most of them that may lose a contact
+    # Bracket of that instant, over its time, at which the end is either reached fast (over the
+    # drive's speed) or missed by far (over the way): when to brake does not matter then.
+    bracket: float = 1e-3
+    fast: float = 0.1
+    far: float = 0.02
+    grid: int = 16  # instants to brake at that are tried, where all let the object arrive
+    sections: int = 45  # most golden sections to the one at which it arrives most slowly
+    hold: int = 6  # how many times the acting torque is lowered to hold the end, less one
+    simulations: int = 600  # of one start, after which nothing further is tried
+    stops: int = 7  # most stops of a phase: halves of halves of halves
+
+
+SETTINGS = TuningSettings()
+_GOLDEN = (3 - math.sqrt(5)) / 2
 
 
 class TrialOutcome(Enum):
@@ -134,7 +168,7 @@ class Bench:
 
     def run(self, steps: Sequence[TuningStep]) -> TuningTrial:
         """Simulate torques until the end of the passage, or what keeps it from coming."""
-        end = steps[-1].time + LASTS * self.problem.scene.scales.time
+        end = steps[-1].time + SETTINGS.lasts * self.problem.scene.scales.time
         torque = read_rows(make_rows(steps, end))
         simulation = simulate_free(self.problem, torque, start=self.z, halt=self._is_over)
         self.simulations += 1
@@ -168,7 +202,7 @@ class Bench:
         if len(self.passage.phases) > 1:
             return False
         gap = float(self.measure(run.z[None])[0])
-        return gap > (1 + _BACK) * self.way or (self.pair is None and gap <= 0)
+        return gap > (1 + SETTINGS.back) * self.way or (self.pair is None and gap <= 0)
 
     def _judge(self, steps: tuple[TuningStep, ...], simulation: FreeSimulation) -> TuningTrial:
         gaps = self.measure(simulation.z)
@@ -214,7 +248,7 @@ class Bench:
         """When the end, once nearer, is farther away again [s], infinite if it never is."""
         rows = np.flatnonzero(simulation.t >= start)
         risen = gaps[rows] - np.minimum.accumulate(gaps[rows]) if len(rows) else gaps[:0]
-        back = np.flatnonzero(risen > _BACK * abs(self.way))
+        back = np.flatnonzero(risen > SETTINGS.back * abs(self.way))
         return float(simulation.t[rows[back[0]]]) if len(back) else math.inf
 
     def _list_losses(
@@ -446,35 +480,6 @@ class Tuning(Result):
         return self.judge(self.name, self.reason, [tuned, f"{self.simulations} simulations{last}"])
 
 
-FACTOR = 1.1
-"""What raises a torque by 10 %; lowering divides by it, so that each torque comes again."""
-SLOW = 3e-5
-"""Speed at which the end of a phase may be reached by a brake, relative to the scene's: contacts
-part for less than a moment then."""
-_COARSE_SPEED = 50.0  # how much faster than that an end is reached while brakes are compared
-_MAX_RAISES = 60  # most times a torque is raised or lowered: a factor of 300
-_SUPPORT_STEP = 3
-"""So many times the supporting torque is raised at once, by a third, as each needs searches."""
-MAX_SIMULATIONS = 600  # simulations from one start, after which nothing further is tried
-_MAX_SUPPORT = 13  # it is raised fewer times than this
-_MIN_GAIN = 0.02  # share of the time by which another 10 % has to bring the end sooner
-_COARSE_STEP = 2  # so many times the acting torque is lowered at once while it brakes too little
-_GRID = 16  # instants to brake at that are looked at, where each of them lets the object arrive
-_MAX_SECTIONS = 45  # most steps to the one at which it arrives most slowly, by golden sections
-_GOLDEN = (3 - math.sqrt(5)) / 2
-_MAX_FAILURES = 2  # so many torques that stop nothing end that, once one has
-_MAX_TRIALS = 24  # most trials that look for the instant to brake
-_MIN_BRACKET = 1e-3
-"""Share of the time in which the end is either reached at speed or not at all: what starts the
-motion again, or lets it turn back, is not a matter of when to brake."""
-_FAR, _FAST = 0.02, 0.1  # shares of the way and of the drive's speed that are much for that
-_EARLIEST = 1e-3  # share of a drive's time, before which a brake is none
-_MAX_LOSSES = 4  # most of them that may lose a contact
-PAUSE = 0.2  # how long the object is held at the end of each phase, relative to the scene's time
-MOST_STOPS = 7  # stops of a phase that may be allowed at most: halves of halves of halves
-_HOLD_STEPS = 6  # how many times the acting torque is lowered for that, less one
-
-
 @exclusive
 def tune(
     problem: Problem,
@@ -507,8 +512,8 @@ def tune(
     """
     require_phases(problem)
     squeeze, share = SHARE.read(squeeze, "squeeze"), SHARE.read(share, "share")
-    if isinstance(stops, bool) or not isinstance(stops, int) or not 0 <= stops <= MOST_STOPS:
-        raise InputError("", "stops", f"{stops!r} given; allowed are 0 to {MOST_STOPS}")
+    if isinstance(stops, bool) or not isinstance(stops, int) or not 0 <= stops <= SETTINGS.stops:
+        raise InputError("", "stops", f"{stops!r} given; allowed are 0 to {SETTINGS.stops}")
     if stops and not brake:
         raise InputError("", "stops", f"{stops} given without a brake; allowed then is 0")
     tell = progress or (lambda text: None)
@@ -572,7 +577,7 @@ class _Setting(NamedTuple):
     @property
     def pause(self) -> float:
         """How long the object is held at the end [s]."""
-        return PAUSE * self.problem.scene.scales.time
+        return SETTINGS.pause * self.problem.scene.scales.time
 
     def halve(self, z: Array) -> tuple[_Setting, _Setting] | None:
         """Both halves of the way from `z`, the first until x or phi is what it is there."""
@@ -690,12 +695,12 @@ class _Setting(NamedTuple):
             acting, (first, second) = balance.acting, (float(tau) for tau in balance.tau[0])
         lowered = [
             (first / FACTOR**n, second) if acting == 0 else (first, second / FACTOR**n)
-            for n in range(1, _HOLD_STEPS)
+            for n in range(1, SETTINGS.hold)
         ]
         if after is None:
             arrived = np.array(trial.steps[-1].tau)
-            arrived[1 - acting] /= FACTOR**_HOLD_STEPS
-            held = [tuple((arrived / FACTOR ** (_HOLD_STEPS * n)).tolist()) for n in range(3)]
+            arrived[1 - acting] /= FACTOR**SETTINGS.hold
+            held = [tuple((arrived / FACTOR ** (SETTINGS.hold * n)).tolist()) for n in range(3)]
             return [None, *lowered, *held]
         return [None, *lowered]
 
@@ -766,13 +771,13 @@ class TuningRule:
         self.tau, self.last = tau, last
         self.limit = bench.problem.scene.torque_limit
         scales = bench.problem.scene.scales
-        self.slow = SLOW * scales.speed / (scales.length if bench.is_angle else 1.0)
+        self.slow = SETTINGS.slow * scales.speed / (scales.length if bench.is_angle else 1.0)
         self.time = scales.time
 
     @property
     def is_exhausted(self) -> bool:
         """Whether there have been so many simulations that no other torques are tried."""
-        return self.bench.simulations > MAX_SIMULATIONS
+        return self.bench.simulations > SETTINGS.simulations
 
     @property
     def is_free(self) -> bool:
@@ -792,7 +797,7 @@ class TuningRule:
         The last trial says what was lost, or that the object did not slide.
         """
         found = []
-        for raised in range(_MAX_RAISES):
+        for raised in range(SETTINGS.raises):
             tau = self.scale(raised)
             if self.is_exhausted or abs(tau[self.acting]) > self.limit[self.acting]:
                 break
@@ -817,7 +822,7 @@ class TuningRule:
         # With two freedoms either torque sets the object in motion again, if it is too much there.
         likely = [last, 0] if self.is_free else [0, last]
         for supported in dict.fromkeys(
-            [*likely, *range(_SUPPORT_STEP, _MAX_SUPPORT, _SUPPORT_STEP)]
+            [*likely, *range(SETTINGS.support_step, SETTINGS.support, SETTINGS.support_step)]
         ):
             if abs(self.scale(0, supported)[1 - self.acting]) > self.limit[1 - self.acting]:
                 continue
@@ -832,22 +837,22 @@ class TuningRule:
     def _count_steps(self, finger: int) -> int:
         """How many times a torque is raised, lowered if negative, until it is that of the end."""
         share = float(self.last[finger] / self.tau[finger]) if self.tau[finger] else 1.0
-        return math.floor(math.log(max(share, FACTOR**-_MAX_RAISES)) / math.log(FACTOR))
+        return math.floor(math.log(max(share, FACTOR**-SETTINGS.raises)) / math.log(FACTOR))
 
     def _lower(self, drive: TuningTrial, first: int, supported: int) -> TuningDrive | None:
         """Lower the acting torque while that brings the end sooner; None if nothing stops there."""
         best: TuningDrive | None = None
         raised, missed = first, 0
-        while raised > -_MAX_RAISES and missed < _MAX_FAILURES and not self.is_exhausted:
+        while raised > -SETTINGS.raises and missed < SETTINGS.failures and not self.is_exhausted:
             steps = [*drive.steps, TuningStep(0.0, self.scale(raised, supported))]
-            trial = self._place(steps, drive, best and best.trial, _COARSE_SPEED * self.slow)
+            trial = self._place(steps, drive, best and best.trial, SETTINGS.coarse * self.slow)
             if trial is None:
                 if best is None and self.bench.trials[-1].outcome is TrialOutcome.LOSES:
                     break
                 missed += best is not None
-                raised -= _COARSE_STEP
+                raised -= SETTINGS.brake_step
                 continue
-            if best and trial.time > (1 - _MIN_GAIN) * best.trial.time:
+            if best and trial.time > (1 - SETTINGS.gain) * best.trial.time:
                 break
             best = TuningDrive(raised, trial, supported)
             if trial.rate < self.slow:
@@ -874,28 +879,28 @@ class TuningRule:
             at = high * (1 - 1e-4)
         elif near is not None:
             at = min(1.02 * near.steps[-1].time, 0.5 * (near.steps[-1].time + high))
-        for count in range(_MAX_TRIALS):
+        for count in range(SETTINGS.trials):
             steps = [*steps[:-1], steps[-1]._replace(time=at)]
             trial = self._run(steps, f"brake at {at:.5g} s")
             if trial.outcome is TrialOutcome.ARRIVES:
                 if trial.rate < slow:
                     return trial
-                if at < _EARLIEST * drive.time:
+                if at < SETTINGS.bracket * drive.time:
                     return self._graze(steps, drive) if self.is_free else None
                 high, above, rate = at, self._overshoot(trial, slow), trial.rate
                 below /= 2 if side < 0 else 1
                 side = -1
             else:
                 losses += trial.outcome is TrialOutcome.LOSES
-                if losses > _MAX_LOSSES:
+                if losses > SETTINGS.losses:
                     return None
                 low, short = at, trial.short
                 # How far it is through several phases is not known.
                 below = above if short == math.inf else max(short, 1e-12 * self.bench.way)
                 above /= 2 if side > 0 else 1
                 side = 1
-            jumps = short > _FAR * self.bench.way and rate > _FAST * drive.rate
-            if jumps and high - low < _MIN_BRACKET * high:
+            jumps = short > SETTINGS.far * self.bench.way and rate > SETTINGS.fast * drive.rate
+            if jumps and high - low < SETTINGS.bracket * high:
                 return None
             share = below / (below + above) if count % 4 != 3 else 0.5
             at = low + (high - low) * min(max(share, 0.02), 0.98)
@@ -915,17 +920,17 @@ class TuningRule:
             trial = self._run(again, f"brake at {at:.5g} s")
             return trial.rate if trial.outcome is TrialOutcome.ARRIVES else math.inf, trial
 
-        grid = [drive.time * (k + 1) / (_GRID + 1) for k in range(_GRID)]
+        grid = [drive.time * (k + 1) / (SETTINGS.grid + 1) for k in range(SETTINGS.grid)]
         found = [run(at) for at in grid]
-        k = min(range(1, _GRID - 1), key=lambda k: found[k][0])
+        k = min(range(1, SETTINGS.grid - 1), key=lambda k: found[k][0])
         low, at, high = grid[k - 1 : k + 2]
         rate, best = found[k]
         if rate > min(found[k - 1][0], found[k + 1][0]):
             return None
-        for count in range(_MAX_SECTIONS):
+        for count in range(SETTINGS.sections):
             if rate < self.slow:
                 return best
-            if count == _GRID and rate > 2 * _COARSE_SPEED * self.slow:
+            if count == SETTINGS.grid and rate > 2 * SETTINGS.coarse * self.slow:
                 return None
             left = at - low > high - at
             other = at - _GOLDEN * (at - low) if left else at + _GOLDEN * (high - at)
@@ -958,8 +963,8 @@ def list_starts(tau: Array, acting: int) -> list[Array]:
     hard = float(tau[:, 0].max() if acting else tau[:, 1].min())
     values = list(dict.fromkeys([start, hard]))
     if start and hard / start > 1:
-        count = math.ceil(math.log(hard / start) / math.log(FACTOR) / _SUPPORT_STEP)
-        values += [start * FACTOR ** (_SUPPORT_STEP * n) for n in range(1, count)]
+        count = math.ceil(math.log(hard / start) / math.log(FACTOR) / SETTINGS.support_step)
+        values += [start * FACTOR ** (SETTINGS.support_step * n) for n in range(1, count)]
     found = np.tile(tau[0], (len(values), 1))
     found[:, other] = values
     return list(found)
