@@ -23,7 +23,6 @@ from .contact_limits import FINGERS_TOUCH, evaluate_finger_gap
 from .elemental import Contact, candidate_contacts
 from .formation import Formation, Kinematics
 
-_PLACES = 1000  # places along x that are tried
 Numbers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 TOO_SHORT, JOINT_COVERED, FINGERS_CROSS = 1, 2, 3
@@ -33,7 +32,6 @@ in its way."""
 SIDE, EDGE, ARC = 0, 1, 2
 """What of a link and an object touch: its side a vertex, its tip an edge, its tip a vertex."""
 AROUND = 3  # neighbouring vertices that are looked at where a finger closes
-LEVEL = 1e-12  # how far below a joint the object is still level with it, over the link's length
 CHUNK = 4096  # poses that are closed at a time, so that they stay in the cache
 
 
@@ -202,7 +200,7 @@ def find_nearby(scene: Scene, finger: int, x: Array, y: Array, phi: Array) -> tu
     height = joint @ outward.T - offsets
     seen = height > radius
     lowest = (np.column_stack([s, c]) @ body.T).min(axis=1) - dy
-    clear = seen.any(axis=1) & (lowest > -LEVEL * link.length) & (link.length > radius)
+    clear = seen.any(axis=1) & (lowest > -1e-12 * link.length) & (link.length > radius)
     # Finger 1 comes to the end of the chain, finger 2 to its start.
     onwards = after if finger == 0 else before
     last = (seen & ~seen[:, onwards]).argmax(axis=1)
@@ -353,7 +351,7 @@ def find_reach(scene: Scene) -> tuple[float, float]:
 def name_reach(scene: Scene, phi: float) -> str:
     """For which x [m] both fingers close, and not into each other, as part of a message."""
     low, high = find_reach(scene)
-    x = np.linspace(low, max(low, high), _PLACES)
+    x = np.linspace(low, max(low, high), 1000)
     closes = (close_fingers(scene, x, np.full(len(x), phi)).obstacle == 0).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], closes.astype(int), [0]])))
     spans = [

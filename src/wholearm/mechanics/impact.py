@@ -25,7 +25,6 @@ from ..contacts.formation import Formation
 from .dynamics import Directions, force_rows, measure_speed, metric_weights, reduced_inertia
 
 ROUNDING = 1e-6  # momentum or speed, in the metric of curves, that counts as rounding
-_STEP = 1e-5  # step of the difference quotient of limits, in radii of gyration or radians
 
 
 class ViolationKind(Enum):
@@ -169,7 +168,7 @@ def _rates(
     ]
     if others:
         scene = after.scene
-        h = _STEP * scene.scales.length / max(measure_speed(scene, v), np.finfo(float).tiny)
+        h = 1e-5 * scene.scales.length / max(measure_speed(scene, v), np.finfo(float).tiny)
         ahead, behind = after.evaluate_limits(np.array([z + h * v, z - h * v]))[:, others]
         rates += list((ahead - behind) / (2 * h))
         texts += [after.limits[k].text for k in others]

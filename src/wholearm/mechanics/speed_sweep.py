@@ -19,8 +19,6 @@ from .dynamics import ONE, A, B, V
 from .path_limits import PathLimits
 
 _ROUNDING = 1e-12  # negative b at the end that is rounding, over the largest b
-_TIED = 1e-9  # overlap of bounds of b that is rounding, over the largest b
-_SETTLED = 2e-3  # relative change of b at which the linearization is good: the error is its square
 _UNBOUNDED = 1e100  # b [m^2/s^2] where no limit bounds it; case: the map of a rolling octagon
 
 
@@ -105,7 +103,8 @@ def speed_sweep(
         before = np.where(profile.b < _UNBOUNDED, profile.b, 0.0)
         near = before[:, :-1] + part * np.diff(before)
         profile = _sweep(rows, steps, part, cap, near)
-        if np.abs(profile.b - before).max() < _SETTLED * profile.b.max():
+        # The error of the linearization is the square of the change.
+        if np.abs(profile.b - before).max() < 2e-3 * profile.b.max():
             break
     if not shape and profile.blocked[0] >= 0:
         raise NoMotionError(int(profile.blocked[0]))
@@ -249,7 +248,7 @@ def find_controllable(
             tried[:-2, 2] -= shares[middle] * loss
             slowest, fastest = _find_range(tried)
             slowest, fastest = max(slowest, floor[k]), min(fastest, limits.cap[k])
-            if slowest <= fastest + _TIED * limits.cap[k]:
+            if slowest <= fastest + 1e-9 * limits.cap[k]:
                 chosen, least, most, stop = tried, slowest, fastest, middle
                 share[k] = shares[middle]
             else:

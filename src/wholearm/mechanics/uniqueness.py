@@ -27,7 +27,6 @@ from ..contacts.formation import Formation, Kinematics
 from .margin_key import UNIQUENESS
 
 UNIQUENESS_MARGIN: float = UNIQUENESS.default
-_INDEPENDENT = 1e-12  # least Gram determinant of independent normalized contact rows
 _SLIDES, _STICKS, _SLIPS = " ", " sticking", (" slipping +", " slipping -")
 
 
@@ -88,7 +87,8 @@ def find_minors(
         rubbed = K[:, of_rows, choices.forces[:, None, :]]
         below = np.asarray(np.linalg.det(smooth), dtype=float)
         own: Array = np.ones_like(below)
-        least = _INDEPENDENT * np.einsum("...ii->...i", smooth).prod(axis=-1)
+        # Least Gram determinant of independent rows.
+        least = 1e-12 * np.einsum("...ii->...i", smooth).prod(axis=-1)
         np.divide(np.linalg.det(rubbed), below, out=own, where=below > least)
         ratios.append(own)
         modes += choices.modes

@@ -7,7 +7,7 @@ limits, affine in a, b, s' and the internal force (`reference`). Each period of 
 * predicts both for the middle of the interval in which its torques are held;
 * asks for a = mean reference a + proportional and integral feedback on the speed;
 * takes the internal force with the largest least level of all limits and, if that level is below
-  `LEVEL`, moves a towards the reference until it is kept.
+  its floor, moves a towards the reference until it is kept.
 
 At the end the motion continues at touching speed until the joints stop while the drive rises, or
 until they are well beyond the end: the contact is made. The torques of the next law then hold the
@@ -20,43 +20,51 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from math import ceil, isfinite, sqrt
 from typing import Any, NamedTuple
 
 SAME = 1e-12  # difference of levels that counts as none
-# Coefficient of the internal force that counts as 0, over the largest of the table. Case: arrival
-# of phase 4 of heptagon_four_contacts, which has one of 5e-15 or -2e-17, by rounding.
-FLAT = 1e-9
-SMOOTH = 0.3  # weight of the last sample in the bias of a force
-FELT = 0.1  # measured force of a closed contact, over the mean of all
-FEW = 0.2  # least reference force, over the mean of all
-SHARE = 0.3  # largest feedback torque, over the torque limit
-END_INTEGRAL = 30.0  # gain on the integral of the final angle error, over that on the error [1/s]
-# Level of limits below which feedback is reduced: absolute, and over that of the reference.
-LEVEL, PART = 1.0, 0.5
-LEAST = 0.3  # least level with the gained contact that changes the internal force
-IGNORED = 1e6  # level from which on a limit is left out
-CORRECTION = 0.25  # gain on the speed, times the sum of period and delay
-MEMORY = 0.2  # gain on the integral of the speed, over the square of that on the speed
-LEAST_SPEED = 0.4  # least speed while braking, over the touching speed: no reversal of friction
-SLOW = 0.5  # speed over the reference's below which the motion does not brake with it
-LAST = 0.02  # last part of the curve, on which standing still counts as arrival
-STARTING = 10  # periods after the start in which standing still does not count
-THERE = 1e-3  # last part of the curve that counts as its end
-NEAR = 0.1  # last part of the curve in which an impact is expected, if the end is passed at speed
-LATE = 5.0  # periods after which an impact counts as over, if the joints do not show it
-SHORT = 4.0  # factor on the dwell time if the joints stop before the end
-CATCH = 10.0  # distance over which the reference is shifted, over the error of the start
-GROWTH = 0.01  # time over which the touching speed grows beyond the end [s]
-FASTEST = 4.0  # largest factor of that growth
-STOPPED = 0.3  # speed over the touching speed below which the joints have stopped
-DRIVE = 0.3  # drive that stopped joints have to withstand, over the largest a of the integral
-RISE = 2  # periods in which the drive rises to that
-LONGEST = 3.0  # least dwell times after which joints may creep
-BARRED = 0.1  # deceleration along the next curve, over the same, by which a contact stops joints
-# Distance beyond the end at which a contact is made, as time at touching speed [s]: if it does not
-# stop the joints, if it is there at the beginning, if it stops them.
-SOON, AHEAD, FAR = 0.02, 0.05, 0.3
+
+
+@dataclass(frozen=True)
+class LawSettings:
+    """Gains and thresholds of the law along a curve."""
+
+    # Gain on the speed, times the sum of period and delay; on its integral, over the square of that
+    # on the speed; largest feedback torque over time, over the torque limit.
+    gain: float = 0.25
+    integral: float = 0.2
+    share: float = 0.3
+    # Level of limits below which feedback is reduced: absolute, and over that of the reference.
+    level: float = 1.0
+    part: float = 0.5
+    # Least level with the gained contact that changes the internal force. Case: arrival of phase 4
+    # of heptagon_four_contacts.
+    arrival: float = 0.3
+    last: float = 0.02  # last part of the curve, on which standing still counts as arrival
+    near: float = 0.1  # last part of the curve in which an impact is expected
+    late: float = 5.0  # periods after which an impact counts as over, if the joints do not show it
+    catch: float = 10.0  # distance over which the reference is shifted, over the error of the start
+    growth: float = 0.01  # time over which the touching speed grows beyond the end [s], ...
+    fastest: float = 4.0  # ... and how many times by at most
+    # Drive that stopped joints have to withstand, over the largest a of the integral. Case: phase 2
+    # of heptagon_four_contacts, which does not end without it.
+    drive: float = 0.3
+    creep: float = 3.0  # dwell times after which joints may creep: with low friction they do
+    # Distance beyond the end at which a contact is made, as time at touching speed [s]: if it does
+    # not stop the joints, if it is there at the beginning, if it stops them.
+    soon: float = 0.02
+    ahead: float = 0.05
+    far: float = 0.3
+    # Of measured forces: weight of the last sample in the bias; force of a closed contact and least
+    # reference force, over the mean of all.
+    smooth: float = 0.3
+    felt: float = 0.1
+    few: float = 0.2
+
+
+LAW = LawSettings()
 Rows = list[list[float]]
 
 
@@ -94,11 +102,11 @@ class CurveLaw:
             for before, after in zip(self.theta, self.theta[1:], strict=False)
         ]
         self.squares = [one * one + two * two or 1e-30 for one, two in self.chords]
-        self.levels, self.level_rises = _split(tables["levels"], IGNORED)
+        self.levels, self.level_rises = _split(tables["levels"], most=1e6)
         self.torque, self.torque_rises = _split(tables["torque"])
         self.floor = self._find_floor()
-        self.gain = CORRECTION / (settings.period + settings.delay)
-        self.memory = MEMORY * self.gain**2 * settings.period
+        self.gain = LAW.gain / (settings.period + settings.delay)
+        self.memory = LAW.integral * self.gain**2 * settings.period
         self.turn: tuple[float, float] | None = None
         self.after: CurveLaw | None = None
         self.beyond = 0.0
@@ -117,14 +125,14 @@ class CurveLaw:
         self.after = after
         tau = self._act(len(self.steps) - 1, 1.0, 0.0, 0.0, self.gain * self.settings.touch, True)
         a, _ = find_motion(after.torque[0], tau)
-        self.beyond = (FAR if a < -BARRED * self.settings.most else SOON) * self.settings.touch
+        self.beyond = (LAW.far if a < -0.1 * self.settings.most else LAW.soon) * self.settings.touch
 
     def begin(self, at_end: bool = False) -> None:
         """Start anew, at the beginning or just before the end."""
         self.j = len(self.steps) - 1 if at_end else 0
         self.over = self.pushes = False
         self.sum = self.a = self.ran = self.rested = self.drive = self.held = 0.0
-        self.limit = AHEAD * self.settings.touch if at_end else self.beyond
+        self.limit = LAW.ahead * self.settings.touch if at_end else self.beyond
         self.s, self.v, self.level = self.nodes[self.j], 0.0, 0.0
         self.off, self.fresh = 0.0, not at_end
         if self.sensing is not None:
@@ -156,22 +164,22 @@ class CurveLaw:
             return self._press(theta, rates)
         # The reference begins where the motion does.
         off = self.off
-        place = s - off * max(1.0 - (s - off) / (CATCH * abs(off)), 0.0) if off else s
+        place = s - off * max(1.0 - (s - off) / (LAW.catch * abs(off)), 0.0) if off else s
         b = self._look(j, place)
         wanted = max(sqrt(b) if b > 0.0 else 0.0, settings.touch)
         if self.after is not None:
-            wanted += min(max(s - self.length, 0.0) / GROWTH, FASTEST * settings.touch)
+            wanted += min(max(s - self.length, 0.0) / LAW.growth, LAW.fastest * settings.touch)
         error = wanted - v
         reach = half * max(v, settings.touch)
         planned = (self._look(j, place + reach) - self._look(j, place - reach)) / (4.0 * reach)
         j, share = self._locate(j, s)
-        if planned < 0.0 and v < SLOW * wanted:
+        # Much slower than the reference the motion does not brake with it.
+        if planned < 0.0 and v < 0.5 * wanted:
             planned = 0.0
         self.sum = min(max(self.sum + self.memory * error, -settings.most), settings.most)
         a = planned + self.gain * error + self.sum + self.drive
-        slowest = (LEAST_SPEED * settings.touch - (v - half * self.a)) / (
-            settings.period + settings.delay
-        )
+        # Faster than 0.4 of the touching speed, so that no friction reverses while braking.
+        slowest = (0.4 * settings.touch - (v - half * self.a)) / (settings.period + settings.delay)
         return self._act(j, share, v, planned, max(a, slowest), s >= self.length)
 
     def hold(self, theta: Sequence[float], rates: Sequence[float]) -> tuple[float, float]:
@@ -183,14 +191,15 @@ class CurveLaw:
 
     def _is_made(self, s: float, v: float) -> bool:
         """Whether the contact is made, or the end is reached; `s` and `v` are predicted."""
-        touch, near = self.settings.touch, s > (1.0 - LAST) * self.length
-        started = self.ran > STARTING * self.settings.period
+        # Standing still counts from some periods after the start on.
+        touch, near = self.settings.touch, s > (1.0 - LAW.last) * self.length
+        started = self.ran > 10 * self.settings.period
         if self.after is None:
             slow = started and near and self.v < self.settings.still
             return slow or (s >= self.length and v < 3.0 * touch)
-        rise = DRIVE * self.settings.most
-        if started and near and self.v < STOPPED * touch:
-            self.drive += rise / RISE
+        rise = LAW.drive * self.settings.most
+        if started and near and self.v < 0.3 * touch:
+            self.drive += rise / 2
         else:
             self.drive = 0.0
         limit, self.limit = self.limit, self.beyond
@@ -215,9 +224,9 @@ class CurveLaw:
 
     def _has_turned(self, rates: Sequence[float]) -> bool:
         """Whether an impact has turned the joint velocity to the direction of the next curve."""
-        if self.s < (1.0 - NEAR) * self.length or self.turn is None:
+        if self.s < (1.0 - LAW.near) * self.length or self.turn is None:
             return False
-        if self.s > self.length + LATE * self.settings.period * self.v:
+        if self.s > self.length + LAW.late * self.settings.period * self.v:
             return True
         (e, f), (g, h), (one, two) = self.chords[-1], self.turn, rates
         across = abs(one * f - two * e) / sqrt(self.squares[-1])
@@ -247,7 +256,7 @@ class CurveLaw:
                 level = min(
                     level, choose_internal_force(*self._list_levels(j, share, sqrt(b_end)), a)[0]
                 )
-            found.append(min(LEVEL, PART * level))
+            found.append(min(LAW.level, LAW.part * level))
         return found
 
     def _list_levels(
@@ -286,7 +295,7 @@ class CurveLaw:
                 rates.append(ca)
                 press.append(cl)
             both, other = choose_internal_force(base, rates, press, a)
-            if both > LEAST:
+            if both > LAW.arrival:
                 level, internal = both, other
         self.a, self.level = a, level
         tau, low, high = list[tuple[float, float]](), -1e30, 1e30
@@ -313,9 +322,10 @@ class CurveLaw:
             tau = self.after.hold(theta, rates)
             # With low friction the joints creep on.
             self.held += settings.period
-            v = 0.0 if self.held > LONGEST * dwell else self.after.v
-        elif self.s < (1.0 - THERE) * self.length:
-            dwell *= SHORT
+            v = 0.0 if self.held > LAW.creep * dwell else self.after.v
+        elif self.s < (1.0 - 1e-3) * self.length:
+            # The joints have stopped before the end.
+            dwell *= 4.0
         self.rested = self.rested + settings.period if abs(v) < settings.still else 0.0
         self.over = self.rested > dwell + settings.delay
         return tau
@@ -336,7 +346,7 @@ def _clear_rounding(table: Any) -> Any:
     """The table with 0 for coefficients of the internal force that are 0 but for rounding."""
     size = abs(table[..., 4])
     table = table.copy()
-    table[..., 4][size <= FLAT * size.max(initial=0.0)] = 0.0
+    table[..., 4][size <= 1e-9 * size.max(initial=0.0)] = 0.0
     return table
 
 
@@ -426,7 +436,7 @@ class MotionLaw:
             a, b, c, d = self.gain[-1 if now >= self.end else k][row]
             feedback = a * one + b * two + c * fast_one + d * fast_two
             most = settings.limit[row]
-            feedback = min(max(feedback, -SHARE * most), SHARE * most)
+            feedback = min(max(feedback, -LAW.share * most), LAW.share * most)
             tau = first + share * (after - first) - feedback
             found.append(min(max(tau, -most), most))
         return found[0], found[1]
@@ -436,7 +446,7 @@ class MotionLaw:
         found_one = found_two = 0.0
         for k, (p, q) in enumerate(self.ways):
             off = p * one + q * two
-            self.left[k] += END_INTEGRAL * self.settings.period * off
+            self.left[k] += 30.0 * self.settings.period * off
             found_one += p * (off + self.left[k])
             found_two += q * (off + self.left[k])
         return found_one, found_two
@@ -483,12 +493,12 @@ class Sensing:
         if not forces or len(self.expected) < self.lag:
             return
         mean = sum(self.expected[0]) / len(self.names)
-        presses = forces.get(self.gained, 0.0) > FELT * mean
+        presses = forces.get(self.gained, 0.0) > LAW.felt * mean
         self.felt = self.felt + 1 if presses else 0
         for k, (name, known) in enumerate(zip(self.names, self.expected[0], strict=True)):
             force = forces.get(name)
             if force is not None and isfinite(force):
-                self.bias[k] += SMOOTH * (force - known - self.bias[k])
+                self.bias[k] += LAW.smooth * (force - known - self.bias[k])
 
     def shift(
         self, place: tuple[int, float, float, float, float], low: float, high: float
@@ -506,7 +516,7 @@ class Sensing:
             force = c + share * d + (cb + share * db) * v * v + (ca + share * da) * a
             plain.append(force + by * internal)
             press.append(by)
-        least = FEW * sum(abs(f) for f in plain) / len(plain)
+        least = LAW.few * sum(abs(f) for f in plain) / len(plain)
         sizes = [max(f, least) or 1.0 for f in plain]
         parts = [(f + off) / size for f, off, size in zip(plain, self.bias, sizes, strict=True)]
         rates = [f / size for f, size in zip(press, sizes, strict=True)]

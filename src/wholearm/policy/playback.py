@@ -297,8 +297,7 @@ def _read_tables(
     return found
 
 
-ROOM = 1.0  # Time that a simulation goes on after the policy's own, over that
-EXTRA = 0.05  # Time in which the contact of the first phase may close, in addition [s]
+ROOM = 1.0  # time that a simulation goes on after the policy's own, over that
 
 
 class ClosedLoop:
@@ -336,9 +335,9 @@ class ClosedLoop:
         return self.policy.index == last and self.policy.laws[last].over
 
     def find_duration(self, last: int) -> float:
-        """Nominal duration of the phases up to the `last` [s]."""
+        """Nominal duration of the phases up to the `last` [s], the first one's contact open."""
         phases = self.policy.about["phases"][self.first - 1 : last]
-        return EXTRA + sum(float(phase["duration"]) for phase in phases)
+        return 0.05 + sum(float(phase["duration"]) for phase in phases)
 
     def held(
         self, t: float, theta: Array, theta_dot: Array, forces: Mapping[str, float]

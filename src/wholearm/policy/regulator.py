@@ -29,14 +29,6 @@ from ..problem.definition import Phase, Problem
 from ..results.trajectory import Trajectory
 
 RATE = 100.0  # rate at which errors decay if torques change no contact force [1/s]
-PRESSED = 0.1  # acceleration that costs as much as doubling a contact force, over the scene's unit
-LEAST = 0.05  # least contact force in that, over the scene's unit of force
-STEP = 1e-6  # step of differences, in rad and over the scene's unit of time
-STANDS = 1e-6  # joint speed that counts as none, over the scene's
-# Angle error that is worth a whole torque limit [rad]; it bounds gains where joints hardly show, or
-# torques hardly change, the motion of the object.
-SOFT = 0.02
-SPEEDS = tuple(1 - 0.05 * k for k in range(11))  # squares of speeds over the plan's that are tried
 ROOM = 0.1  # margin for feedback: normal force over the scene's unit, share of a torque limit
 
 
@@ -103,7 +95,7 @@ def follow(problem: Problem, phases: tuple[Phase, ...], plan: Trajectory, t: Arr
         loads = [(np.abs(part.find_torques(b)) / limit).max() for part in parts]
         return float(min(min(forces) / unit, (1 - max(loads)) / ROOM))
 
-    b = max(SPEEDS, key=find_margin)
+    b = max((1 - 0.05 * k for k in range(11)), key=find_margin)
     found = [row for part in parts for row in _linearise(problem, part, b)]
     tau = np.concatenate([part.find_torques(b) for part in parts])
     return Followed(b, tau, regulate(found, float(t[1] - t[0]) / np.sqrt(b)))
@@ -116,7 +108,7 @@ def _stretch(formation: Formation, plan: Trajectory, t: Array) -> RegulatedStret
     kinematics = formation.evaluate(z, v)
     Xi, sigma = np.sign(np.einsum("nij,nj->ni", kinematics.A_t, v)), np.sign(v[:, 3:])
     # At rest directions are those of the nearest instant in motion.
-    moves = np.flatnonzero(np.abs(v[:, 3:]).max(axis=1) > STANDS * formation.scene.scales.rate)
+    moves = np.flatnonzero(np.abs(v[:, 3:]).max(axis=1) > 1e-6 * formation.scene.scales.rate)
     near = moves[np.abs(moves[None] - np.arange(len(t))[:, None]).argmin(axis=1)]
     directions = Directions(Xi[near], sigma[near])
     forces = inverse(formation, z, v, samples.z_ddot, directions, kinematics)
@@ -156,7 +148,7 @@ def _linearise(problem: Problem, part: RegulatedStretch, b: float) -> list[Linea
     formation, scales, n = part.formation, problem.scene.scales, len(part.z)
     z, v, tau = part.z, part.z_dot * np.sqrt(b), part.find_torques(b)
     (Xi, sigma), kinematics = part.directions, formation.evaluate(z, v)
-    forward = Batch(build_forward(formation))
+    forward, step = Batch(build_forward(formation)), 1e-6
 
     def move(z: Array, v: Array, tau: Array) -> tuple[Array, Array]:
         acceleration, c, _ = forward(z, v, tau, Xi, sigma)
@@ -176,18 +168,21 @@ def _linearise(problem: Problem, part: RegulatedStretch, b: float) -> list[Linea
         B[:, :, k] = np.einsum("nfi,ni->nf", back, shifted - rest)
         press[:, :, k] = pressed - forces
     for k in range(f):
-        place = z + STEP * N[:, :, k]
+        place = z + step * N[:, :, k]
         other = _span(formation, formation.evaluate(place, v).P)
         other *= np.sign(np.einsum("nif,nif->nf", other, N))[:, None, :] if f == 1 else 1.0
         shifted, _ = move(place, np.einsum("nif,nf->ni", other, speed), tau)
-        A[:, f:, k] = np.einsum("nfi,ni->nf", back, shifted - rest) / STEP
-        step = STEP / scales.time
-        shifted, _ = move(z, v + step * N[:, :, k], tau)
-        A[:, f:, f + k] = np.einsum("nfi,ni->nf", back, shifted - rest) / step
-    share = press / np.maximum(np.abs(forces), LEAST * scales.force)[:, :, None]
-    unit = PRESSED * scales.acceleration / scales.length
+        A[:, f:, k] = np.einsum("nfi,ni->nf", back, shifted - rest) / step
+        rate = step / scales.time
+        shifted, _ = move(z, v + rate * N[:, :, k], tau)
+        A[:, f:, f + k] = np.einsum("nfi,ni->nf", back, shifted - rest) / rate
+    # Doubling a contact force, at least 0.05 units, costs as much as 0.1 units of acceleration.
+    share = press / np.maximum(np.abs(forces), 0.05 * scales.force)[:, :, None]
+    unit = 0.1 * scales.acceleration / scales.length
     cost = B.transpose(0, 2, 1) @ B + unit**2 * share.transpose(0, 2, 1) @ share
-    cost += np.diag((RATE**2 * SOFT / problem.scene.torque_limit) ** 2)
+    # An angle error of 0.02 rad is worth a whole torque limit: it bounds gains where joints hardly
+    # show, or torques hardly change, the motion of the object.
+    cost += np.diag((RATE**2 * 0.02 / problem.scene.torque_limit) ** 2)
     return [Linear(*row) for row in zip(joints, A, B, cost, strict=True)]
 
 

@@ -29,8 +29,6 @@ from ..scene.model import SETTLE_GAP as GAP_RANGE
 from .uncertainty import read_widths
 
 ROWS = {"x": 0, "phi": 2}  # rows of z that may be given where a phase ends
-SETTLE_GAP = 3e-3
-"""Gap that closes where the end of a phase is held, over the scene's length: 0.1 mm of 35 mm."""
 
 
 class End(Enum):
@@ -303,7 +301,7 @@ class Problem:
     @property
     def gap(self) -> float:
         """By how much a contact may be open that closes at such an end [m]."""
-        default = SETTLE_GAP * self.scene.scales.length
+        default = 3e-3 * self.scene.scales.length  # 0.1 mm of 35 mm
         return default if self.settle_gap is None else self.settle_gap
 
     @property

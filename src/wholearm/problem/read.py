@@ -85,8 +85,6 @@ _PARTS = name_fields(
 )
 TOP = name_fields(*keys_of(Problem).values(), *keys_of(Scene).values()) | _PARTS
 
-_THERE = 1e-3  # how far from a goal a plan may end, in radii of gyration and in rad
-
 ROLLING = " rolling"  # follows the name of a contact that rolls in a phase's `contacts`
 
 
@@ -180,9 +178,9 @@ def adopt_phases(problem: Problem, meta: Mapping[str, Any], q: Array, source: st
     """
     if not problem.goals:
         return problem
-    goal, (x, _, phi) = problem.goals[-1], q.tolist()
-    turned = abs(goal.find_angle(problem.scene, phi) - phi) > _THERE
-    if turned or (goal.x is not None and abs(goal.x - x) > _THERE * problem.scene.scales.length):
+    goal, (x, _, phi), far = problem.goals[-1], q.tolist(), 1e-3
+    turned = abs(goal.find_angle(problem.scene, phi) - phi) > far
+    if turned or (goal.x is not None and abs(goal.x - x) > far * problem.scene.scales.length):
         place = f"x = {1e3 * x:.4g} mm, phi = {math.degrees(phi):.4g} deg"
         raise InputError(source, "goal", f"the plan ends at {place}, and not with {goal}")
     return replace(problem, phases=read_own_problem(meta, source).phases, goals=())
