@@ -64,7 +64,7 @@ class ReferenceSettings:
     touch: float = 3e-3  # speed s' at which contacts are made, over the scene's
     arrival: float = 3e-3  # time constant of the approach to the end [s]
     # Squared speeds over the plan's, tried until there is a margin: relative errors of torques
-    # matter less where torques are small. Case: square, phase 1.
+    # matter less where torques are small. Case: square, phase 2.
     slower: tuple[float, ...] = (1.0, 0.25)
     slowest: float = 0.1  # least b over the plan's of a motion with a margin: slow ones can stick
     # Shares of the margin that are tried, the largest first. Negative ones: limits of a plan hold

@@ -50,7 +50,7 @@ class TuningSettings:
     coarse: float = 50.0  # factor on that while brakes are compared
     raises: int = 60  # most times a torque is raised or lowered: a factor of 300
     # By how many steps the supporting torque is raised at once, as each takes a search, and at
-    # most. Case: hexagon, phases 7 and 9.
+    # most. Case: hexagon, phase 7.
     support_step: int = 3
     support: int = 13
     brake_step: int = 2  # by how many steps the acting torque is lowered while it brakes too little
