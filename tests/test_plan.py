@@ -291,7 +291,7 @@ def test_the_keys_that_keep_a_phase_from_a_plan_are_named(heptagon: Problem) -> 
     problem = heptagon.with_(torque_rate_limit1=80.0, actuator_lag=0.002)
     error = SolverError("no plan for phase 1 (...): none was found")
     none = [None] * len(problem.phases)
-    planning = Planning(problem, (), PlanOptions(), (), [*none], [*none])
+    planning = Planning(problem, (), PlanOptions(), (), [*none])
     own = planning, problem.phases[:1], planning.options, error
 
     def replan(other: Planning, phases: Sequence[Phase], options: PlanOptions) -> Any:

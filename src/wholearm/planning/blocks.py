@@ -13,8 +13,6 @@ from functools import cached_property
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from ..common.arrays import Array
 from ..common.errors import (
     Change,
@@ -37,7 +35,7 @@ from .lower_bound.lower_bound import look_along
 from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence, make_sequence, plan_sequence, plan_slowly
 from .phase_plan import PhasePlan, Settled, add_up
-from .stops import Plans, end_of, leads_on, runs_along_curves, split_blocks
+from .stops import Plans, end_of, runs_along_curves, split_blocks
 
 if TYPE_CHECKING:
     from ..geometry.arcs import CostToGo
@@ -50,7 +48,6 @@ CLEAR = 0.05  # relative violation above which no better plan of earlier phases 
 COARSE = 80  # intervals along a curve that are doubled where none are given
 AMPLE = 1.1  # saturation of the margin, over the least normal force of other phases
 MOVED = 1e-9  # distance of two starts, in radii of gyration or radians
-APART = 1e-6  # the same, above which time-optimal plans are others
 FREE = {"torque_rate_limit": None, "actuator_lag": None, "control_period": None}  # free torques
 ROUGH = 1e-2  # least accuracy where only the existence of a plan matters
 SHORT = 5e-7  # largest shortfall of a margin below epsilon by rounding, over the scene's force
@@ -63,8 +60,6 @@ class BlockPlan:
     phases: tuple[Phase, ...]
     start: Array  # (5,)
     finer: int  # refinement level: doublings of its intervals, or `PLAIN` or `BEGUN`
-    duration: float | None  # [s]: longest, for the objective `margin`
-    fastest: Plans  # time-optimal plans from this start, if they were made for it
     plans: Plans  # one for each of its phases
     chain: ImpactSequence | None  # its curves; None in the time domain
 
@@ -99,12 +94,10 @@ class Planning:
     curves: tuple[Curve, ...]  # of the first phases, as far as ends follow from geometry alone
     options: PlanOptions
     blocks: tuple[BlockPlan, ...]
-    # shares, allowed [s]: longest duration of each phase, for the objective `margin`: in proportion
-    # to time-optimal plans, and as used after blocks turned out to start elsewhere
-    shares: list[float | None]
+    # [s]: longest duration of each phase for the objective `margin`, in proportion to time-optimal
+    # plans
     allowed: list[float | None]
-    least: Plans = field(default_factory=list)  # these time-optimal plans
-    pinned: bool = False  # whether blocks end where those plans do
+    least: Plans = field(default_factory=list)  # these plans; blocks end where they do
     ahead: bool = True  # whether blocks end by the cost-to-go, which `margin` and `least` do not
     sketches: bool = False  # whether least times-to-go are those of a speed sweep
     # [N]: by how much c_n of blocks, by their indices, have to exceed epsilon, if at all
@@ -146,16 +139,11 @@ def plan_blocks(
     with name_source(problem.source):
         require_steps(problem, options)
     finer, none = [0] * len(split_blocks(problem)), list[float | None]([None] * len(problem.phases))
-    planning = Planning(problem, curves, options, (), none, none)
+    planning = Planning(problem, curves, options, (), none)
     if options.goal is Objective.MARGIN:
         first = replace(planning, options=_for_time(options), ahead=False)
         least = plan_each(_begin_each(first, report), finer, report).plans
-        planning = replace(planning, shares=share_duration(least, options.duration), least=least)
-        try:
-            return _require_margin(plan_each(planning, finer, report))
-        except (InfeasibleError, InputError, SolverError):
-            # Ends of blocks with the largest margin may leave the next ones without a plan.
-            planning = replace(planning, pinned=True)
+        planning = replace(planning, allowed=share_duration(least, options.duration), least=least)
         return _require_margin(plan_each(planning, finer, report))
     return plan_each(_begin_each(planning, report), finer, report)
 
@@ -192,7 +180,7 @@ def press_more(
 
 def plan_each(planning: Planning, finer: Sequence[int], report: Callable[[str], None]) -> Planning:
     """Plan block after block at its refinement level, but for those that are planned so."""
-    made = replace(planning, blocks=(), allowed=list(planning.shares))
+    made = replace(planning, blocks=())
     for level, block in zip_longest(finer, planning.blocks):
         made = plan_next(made, level, block, report)
     return made
@@ -228,24 +216,15 @@ def plan_next(
 ) -> Planning:
     """Plan the next block at a refinement level, unless `known` is that.
 
-    A coarse one (`BEGUN`) is the guess. Where the block starts elsewhere than in the time-optimal
-    plans, the allowed durations are shared out again.
+    A coarse one (`BEGUN`) is the guess.
     """
     problem, options, least = planning.problem, planning.options, planning.least
     phases = split_blocks(problem)[len(planning.blocks)]
     z = planning.blocks[-1].end if planning.blocks else problem.start
     if finer == BEGUN and runs_along_curves(phases, options):
         finer = 0
-    allowed = list(planning.allowed)
     moved = known is None or _distance(problem.scene, known.start, z) > MOVED
-    fastest: Plans = [] if moved or known is None else known.fastest
-    if moved and least and _starts_off(problem.scene, least[phases[0].index].motion, z):
-        fastest = plan_block(planning, phases, z, _for_time(options))[0]
-    if fastest:
-        share_again(allowed, phases, least, fastest)
-    duration = add_up(phases, allowed)
-    wanted = finer, duration
-    if known is None or moved or (known.finer, known.duration) != wanted:
+    if known is None or moved or known.finer != finer:
         numbers = "-".join(str(phase.number) for phase in phases)
         report(f"phase {numbers} of {len(problem.phases)}: {options.goal.value}")
         own = _refine(options, known, finer)
@@ -257,15 +236,15 @@ def plan_next(
                 phases,
                 z,
                 own,
-                allowed,
+                planning.allowed,
                 to_go=look_ahead(planning, phases, own) if planning.ahead else None,
                 ample=find_ample(planning.blocks),
-                fastest=fastest or [least[phase.index] for phase in phases if least],
+                fastest=[least[phase.index] for phase in phases if least],
                 begun=known.plans if known and known.finer == BEGUN else (),
                 only_begin=finer == BEGUN,
             )
-        known = BlockPlan(phases, z, *wanted, fastest, *made)
-    return replace(planning, blocks=(*planning.blocks, known), allowed=allowed)
+        known = BlockPlan(phases, z, finer, *made)
+    return replace(planning, blocks=(*planning.blocks, known))
 
 
 def find_ample(blocks: Sequence[BlockPlan]) -> float:
@@ -306,7 +285,7 @@ def plan_block(
         from .time_domain.time_plan import plan_with_impacts
 
         def plan(duration: float | None) -> Plans:
-            pinned = planning.pinned or leads_on(problem, block, options)
+            pinned = block[-1].index + 1 < len(problem.phases)
             return plan_with_impacts(
                 problem, block, z, options, duration, pinned=pinned, **over_time
             )
@@ -366,11 +345,6 @@ def _distance(scene: Scene, one: Array, other: Array) -> float:
     return measure_speed(scene, one - other) / scene.scales.length
 
 
-def _starts_off(scene: Scene, motion: Motion, z: Array) -> bool:
-    """Whether a motion does not start at `z`."""
-    return _distance(scene, motion.evaluate(np.zeros(1)).z[0], z) > APART
-
-
 def look_ahead(
     planning: Planning,
     block: Sequence[Phase],
@@ -409,29 +383,6 @@ def look_ahead(
     from ..geometry.arcs import CostToGo
 
     return CostToGo(phase, value)
-
-
-def share_again(
-    allowed: list[float | None],
-    block: Sequence[Phase],
-    least: Sequence[PhasePlan[Motion]],
-    fastest: Sequence[PhasePlan[Motion]],
-) -> None:
-    """Scale a block's allowed durations to its least ones, at the cost of later phases."""
-    later = range(block[-1].index + 1, len(allowed))
-    rest = sum(allowed[k] or 0.0 for k in later)
-    if not rest:
-        return
-    gain = 0.0
-    for phase, plan in zip(block, fastest, strict=True):
-        own = allowed[phase.index]
-        if own is not None:
-            ratio = plan.motion.duration / least[phase.index].motion.duration
-            gain += own * (ratio - 1)
-            allowed[phase.index] = own * ratio
-    for k in later:
-        own = allowed[k]
-        allowed[k] = None if own is None else own * (1 - gain / rest)
 
 
 def share_duration(

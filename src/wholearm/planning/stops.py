@@ -93,10 +93,3 @@ def runs_along_curves(block: Sequence[Phase], options: PlanOptions) -> bool:
         and not phase.until.is_release
         for phase in block
     )
-
-
-def leads_on(problem: Problem, block: Sequence[Phase], options: PlanOptions) -> bool:
-    """Whether a block in the time domain is followed by another one."""
-    following = problem.phases[block[-1].index + 1 :]
-    own = next((part for part in split_blocks(problem) if part[0] in following), None)
-    return own is not None and not runs_along_curves(own, options)

@@ -258,7 +258,7 @@ class _LinkPlanner:
         single = replace(self.problem, start=z, phases=tuple(phases), goals=())
         count = len(phases) - len(follows)
         none = list[float | None]([None] * len(phases))
-        planning = Planning(single, tuple(curves), self.options, (), none, none, sketches=True)
+        planning = Planning(single, tuple(curves), self.options, (), none, sketches=True)
         with open_ledger(apart=True) as ledger, name_source(self.problem.source):
             for part in split_blocks(single):
                 first, guess = part[0], None
@@ -267,7 +267,7 @@ class _LinkPlanner:
                 ends = first.end is not End.REST or first.index == count - 1
                 if measured and measured.begun and ends:
                     start = planning.blocks[-1].end if planning.blocks else z
-                    guess = BlockPlan(part, start, BEGUN, None, [], list(measured.begun), None)
+                    guess = BlockPlan(part, start, BEGUN, list(measured.begun), None)
                 planning = plan_next(planning, 0, guess, self.report)
         costs = tuple(ledger.of(phase.number) for phase in phases[:count])
         pinned = [
@@ -288,7 +288,7 @@ def _assemble(problem: Problem, links: Sequence[PlannedLink], options: PlanOptio
         phases += moved
     whole = replace(problem, phases=tuple(phases), goals=())
     none = list[float | None]([None] * len(phases))
-    return Planning(whole, (), options, tuple(blocks), none, none, ahead=False)
+    return Planning(whole, (), options, tuple(blocks), none, ahead=False)
 
 
 @dataclass(frozen=True, eq=False)
