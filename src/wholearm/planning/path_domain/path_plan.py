@@ -30,7 +30,7 @@ from ...mechanics.dynamics import reduced_inertia
 from ...mechanics.uniqueness import describe_uniqueness, find_minors
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
-from ..refine import refine
+from ..refine import SOLVES, refine
 from .elements import DEGREE, Elements, Profile, follow
 from .first_guess import guess, guess_slowly
 from .first_solution import start_at
@@ -181,7 +181,15 @@ def plan_task(task: Task, insist: bool = True) -> PathIterate:
     first = PathIterate.begin(task, task.elements)
     if not insist and not first.is_kept:
         raise SolverError("no motion keeps the limits")
-    return refine(first, task.options.accuracy)
+    accuracy = task.options.accuracy
+    iterate = refine(first, accuracy)
+    while iterate.error > accuracy and 10 * accuracy < ROUGH:
+        # Where an accuracy is not reached, a plan for a larger one may be better.
+        accuracy *= 10
+        options = replace(task.options, accuracy=accuracy)
+        other = refine(replace(first, task=replace(task, options=options)), accuracy)
+        iterate = min(iterate, other, key=lambda own: own.objective)
+    return iterate
 
 
 def _plan_within(task: Task) -> PathIterate:
@@ -218,11 +226,8 @@ def _leave_rest(iterate: PathIterate) -> Plans:
         other = refine(replace(iterate, task=replace(task, start=start)), task.options.accuracy)
     except SolverError:
         return plans
-    value = sum(plan.value for plan in plans)
-    loss = value - sum(plan.value for plan in other.plans)
-    if goal is Objective.EFFORT:
-        loss = -loss
-    return other.plans if loss <= (np.inf if ranges else WORTH * value) else plans
+    loss = other.objective - iterate.objective
+    return other.plans if ranges or loss <= WORTH * abs(iterate.objective) else plans
 
 
 def _explain_duration(task: Task) -> InfeasibleError | None:
@@ -387,6 +392,7 @@ class PathIterate:
     meshes: int = 0  # before this one
     merit: float = np.inf  # estimated cost once limits hold between nodes, on the mesh before
     shift: float | None = None  # of switches from breaks, if limits are tightened; see `switches`
+    before: PathIterate | None = None  # the solution on the mesh before
 
     @staticmethod
     def begin(task: Task, elements: int) -> PathIterate:
@@ -435,7 +441,9 @@ class PathIterate:
         return PathIterate(task, breaks, cuts, parts, data, nlp, units, first, none, kept)
 
     def restart(self) -> PathIterate | None:
-        """The first one on twice the elements, once."""
+        """The solution on the mesh before with tightened limits, or the first on twice the elements."""
+        if self.before is not None:
+            return replace(self.before.tighten(), meshes=SOLVES)
         elements = 2 * self.task.elements
         if len(self.parts[0].grid.edges) >= elements:
             return None
@@ -477,7 +485,8 @@ class PathIterate:
         if self.loss > _SHARE * accuracy and again:
             return self._move(breaks, self.cuts)
         costs = self.due + self.paid
-        if costs.sum() > accuracy and task.options.intervals is None:
+        finer = task.options.intervals is None and self.meshes < SOLVES
+        if costs.sum() > accuracy and finer:
             shares = np.split(costs, np.cumsum([len(part.grid.s) for part in self.parts])[:-1])
             edges = [part.grid.edges for part in self.parts]
             if max(map(len, edges)) + task.elements <= _MOST:
@@ -515,7 +524,8 @@ class PathIterate:
         motion, kept = (profile, old.margin), self.is_kept
         made = PathIterate.start(self.task, (breaks, cuts), parts, self.units, motion, kept)
         merit = old.cost + self.value * float(self.due.sum())
-        return replace(made, meshes=self.meshes + 1, merit=merit)
+        before = replace(self, before=None)
+        return replace(made, meshes=self.meshes + 1, merit=merit, before=before)
 
     def tighten(self) -> PathIterate:
         """The same with limits tightened by somewhat more than their violations."""
@@ -640,3 +650,9 @@ class PathIterate:
             }[options.goal]
             plans.append(PhasePlan(motion, torque, value, error=self.error))
         return plans
+
+    @property
+    def objective(self) -> float:
+        """Value of the plans' objective, the margin's with the opposite sign."""
+        values = [plan.value for plan in self.plans]
+        return -values[0] if self.task.options.goal is Objective.MARGIN else sum(values)
