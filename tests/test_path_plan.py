@@ -42,9 +42,8 @@ from wholearm.planning.path_domain.impact_sequence import make_sequence, plan_se
 from wholearm.planning.path_domain.path_data import prepare
 from wholearm.planning.path_domain.path_mesh import make_grid
 from wholearm.planning.path_domain.path_motion import PathMotion
-from wholearm.planning.path_domain.path_nlp import PathNLP, build_path_nlp
+from wholearm.planning.path_domain.path_nlp import LimitShape, PathNLP, build_path_nlp
 from wholearm.planning.path_domain.path_plan import plan_curves, plan_path
-from wholearm.planning.path_domain.terms import LimitShape
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
 from wholearm.problem.read import build_problem

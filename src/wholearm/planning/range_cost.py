@@ -15,9 +15,9 @@ from ..problem.uncertainty import PARAMETERS
 from ..results.plan_record import RangeFigures
 from .blocks import Planning, plan_blocks
 from .options import Objective, PlanOptions
+from .path_domain.path_mesh import Fastest
 from .path_domain.path_motion import PathMotion
 from .path_domain.path_plan import ROUGH, Task, plan_curves
-from .path_domain.speed_profile import Fastest
 from .phase_plan import combine
 from .robust.robust_rows import Guide, list_holds, measure_holds
 

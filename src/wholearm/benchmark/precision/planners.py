@@ -26,9 +26,8 @@ from ...planning.lower_bound.lower_bound import bound_least_time
 from ...planning.options import Objective, PlanOptions
 from ...planning.path_domain.path_data import prepare
 from ...planning.path_domain.path_mesh import make_grid
-from ...planning.path_domain.path_nlp import build_path_nlp
+from ...planning.path_domain.path_nlp import LimitShape, build_path_nlp
 from ...planning.path_domain.path_plan import plan_path
-from ...planning.path_domain.terms import LimitShape
 from ...planning.phase_plan import PhasePlan
 from ...planning.time_domain.time_plan import plan_phases
 from ...results.torque import TorqueProfile

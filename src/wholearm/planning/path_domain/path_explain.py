@@ -43,6 +43,7 @@ from .junction import require_hold
 from .path_data import PhaseData, cut, join
 from .path_motion import PathMotion, fit_torque
 from .path_nlp import (
+    LimitShape,
     Relaxation,
     Tightening,
     Units,
@@ -53,7 +54,6 @@ from .path_nlp import (
     unpack,
 )
 from .path_plan import Task, plan_curves
-from .terms import LimitShape
 
 _TRIED = (2.0, 10.0, 100.0)  # factors on torque rate limits with which plans are tried
 _ROUGH = 4.0  # largest factor on the friction of a rolling contact

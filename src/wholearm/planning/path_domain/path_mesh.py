@@ -1,4 +1,7 @@
-"""Grids of elements that end where a motion switches from one active limit to another."""
+"""Grids of elements that end where a motion switches from one active limit to another.
+
+Where a plan of least time switches is first told by a reachability sweep (`Fastest`).
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from numpy.typing import NDArray
 from ...common.arrays import Array, sort_unique
 from ...geometry.curve import Curve
 from ...mechanics.path_limits import PathLimits
+from ...mechanics.speed_sweep import NoMotionError, SweepMode, speed_sweep
 from .elements import DEGREE, Elements, Grid, Profile, lay_out
 from .path_data import PhaseData
 
@@ -24,6 +28,8 @@ _THIN = 1e-3  # range of s'', over its largest, below which limits leave no choi
 _ORDER = 6  # power of an element's length that its cost falls with
 _APART = 1e-5  # least length of an element that switches lead to, over the curve's
 _NEAR = 0.02  # distance at which a switch belongs to a break, over the curve's length
+# Distance of s'' from its largest, over the range that limits allow, in intervals of a sweep.
+_SHARES = {SweepMode.PUSH: 0.0, SweepMode.SWITCH: 0.0, SweepMode.BRAKE: 1.0, SweepMode.HELD: 0.5}
 
 
 def make_grid(
@@ -271,3 +277,53 @@ class _Looks(NamedTuple):
             return None
         i = int(crossed[0])
         return float(s[i] + steps[i] * gap[i] / (gap[i] - gap[i + 1]))
+
+
+class Fastest(NamedTuple):
+    """Minimum-time speed profile of a sweep."""
+
+    s: Array  # (N + 1,) [m]
+    b: Array  # (N + 1,) [m^2/s^2]
+    modes: NDArray[np.int64]  # (N,): `SweepMode` in each interval
+    switches: list[Switch]
+
+    @property
+    def slopes(self) -> Array:
+        """The s'' of each interval, shape (N,) [m/s^2]."""
+        return np.asarray(np.diff(self.b) / (2 * np.diff(self.s)))
+
+    def find_modes(self, places: Array) -> NDArray[np.int64]:
+        """Modes at some places [m]: never `SWITCH`."""
+        modes = self.modes[np.clip(np.searchsorted(self.s, places) - 1, 0, len(self.modes) - 1)]
+        jumps = np.array([place for place, jumps in self.switches if jumps])
+        for k in np.flatnonzero(modes == SweepMode.SWITCH).tolist():
+            jump = jumps[np.abs(jumps - places[k]).argmin()] if len(jumps) else places[k]
+            modes[k] = SweepMode.PUSH if places[k] < jump else SweepMode.BRAKE
+        return modes
+
+
+def find_fastest(data: PhaseData) -> Fastest | None:
+    """The minimum-time profile by a reachability sweep; None if there is no motion."""
+    samples = LimitSamples.of(data, 0.0)
+    places = np.append(samples.s, samples.length)
+    s, middle = places[::2], samples.rows.pick(slice(1, None, 2))
+    steps = np.diff(s)
+    part, cap = (samples.s[1::2] - s[:-1]) / steps, np.append(samples.rows.cap[::2], np.inf)
+    try:
+        b, modes, _ = speed_sweep(middle, steps, part, cap, sweeps=2)
+    except NoMotionError:
+        return None
+    b_middle = (1 - part) * b[:-1] + part * b[1:]
+    pushed, braked = (middle.extreme(b_middle, largest).a for largest in (True, False))
+    # In an interval with a switch s'' is first the largest, then the least.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first = (np.diff(b) / 2 - braked * steps) / (pushed - braked)
+    places, index = samples.s, np.arange(len(samples.s)) // 2
+    switched = modes[index] == SweepMode.SWITCH
+    late = switched & (places - s[index] > first[index])
+    share = np.array([_SHARES[SweepMode(mode)] for mode in modes.tolist()])[index] + late
+    here = np.interp(places, s, b)
+    before = (b[:-1] - 2 * pushed * s[:-1])[index] + 2 * pushed[index] * places
+    after = (b[1:] - 2 * braked * s[1:])[index] + 2 * braked[index] * places
+    here = np.where(switched, np.where(late, after, before), here)
+    return Fastest(s, b, modes, samples.find_switches(here, share, index))

@@ -32,11 +32,12 @@ from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
 from ..refine import SOLVES, refine
 from .elements import DEGREE, Elements, Profile, follow
-from .first_guess import guess, guess_slowly
-from .first_solution import start_at
+from .first_guess import center, guess, guess_slowly, start_at
 from .path_data import PhaseData, cut, join, prepare
 from .path_mesh import (
+    Fastest,
     find_ends,
+    find_fastest,
     find_switches,
     halve,
     keep_apart,
@@ -46,19 +47,17 @@ from .path_mesh import (
 )
 from .path_motion import PathMotion, fit_torque
 from .path_nlp import (
+    LimitShape,
     PathNLP,
     Tightening,
     Units,
     build_path_nlp,
-    center,
     make_bounds,
     pack,
     parameters,
     unpack,
 )
 from .rate_terms import UNLIMITED, MotorShape, equidistribute, find_hurry
-from .speed_profile import Fastest, find_fastest
-from .terms import LimitShape
 
 if TYPE_CHECKING:
     from ..robust.robust_rows import Guide, RobustLimits
@@ -331,9 +330,8 @@ class Task:
         ]
 
     def find_fastest(self) -> Fastest | None:
-        """The minimum-time speed profile, or the one of the allowed duration; None without one."""
-        data = join(self.lay_out([np.zeros(0)] * len(self.curves), self.elements))
-        return find_fastest(data, self.duration)
+        """The minimum-time speed profile of a sweep; None without one."""
+        return find_fastest(join(self.lay_out([np.zeros(0)] * len(self.curves), self.elements)))
 
 
 def require_unique(curve: Curve, least: float, phase: int) -> None:
@@ -397,51 +395,48 @@ class PathIterate:
     @staticmethod
     def begin(task: Task, elements: int) -> PathIterate:
         """Start from the minimum-time speed profile, or a parabola of the squared speed."""
-        breaks: Sequence[Array] = [np.zeros(0)] * len(task.curves)
-        parts = task.lay_out(breaks, elements)
+        none: Sequence[Array] = [np.zeros(0)] * len(task.curves)
+        parts, goal, fastest = task.lay_out(none, elements), task.options.goal, None
         data = join(parts)
         profile, units = guess(data, task.options.time_weight)
-        margin, goal, fastest = 0.0, task.options.goal, None
-        kept = goal is Objective.MARGIN
-        if goal is not Objective.EFFORT and not task.is_held:
-            fastest = find_fastest(data, task.duration)
-        if fastest is not None:
-            margin, few = fastest.margin, task.options.intervals and elements
-            breaks = place_breaks(task.curves, fastest.switches, few)
-            parts = task.lay_out(breaks, elements)
-            data = join(parts)
-            profile = fastest.follow(data)
-        kept = kept or fastest is not None or bool(data.slack(data.nodes, profile).min() >= 0)
-        none = [np.zeros(0)] * len(parts)
-        first = PathIterate.start(task, (breaks, none), parts, units, (profile, margin), kept)
+        if goal is Objective.TIME and not task.is_held:
+            fastest = find_fastest(data)
         if fastest is None:
-            return first
-        profile, multipliers = start_at(first.nlp, data, units, fastest)
-        return replace(first, solution=PathSolution(profile, margin, multipliers))
+            kept = goal is Objective.MARGIN or bool(data.slack(data.nodes, profile).min() >= 0)
+            first = PathIterate.on(task, (none, none), parts, units, kept)
+            return first.start(profile, 0.0)
+        few = task.options.intervals and elements
+        breaks = place_breaks(task.curves, fastest.switches, few)
+        parts = task.lay_out(breaks, elements)
+        first = PathIterate.on(task, (breaks, none), parts, units, True)
+        profile, multipliers = start_at(first.nlp, first.data, units, fastest)
+        return replace(first, solution=PathSolution(profile, 0.0, multipliers))
 
     @staticmethod
-    def start(
+    def on(
         task: Task,
         edges: tuple[Sequence[Array], Sequence[Array]],
         parts: list[PhaseData],
         units: Units,
-        motion: tuple[Profile, float],
         kept: bool,
     ) -> PathIterate:
-        """Start near a motion and its margin [N], with multipliers near the central path.
-
-        `edges` are the breaks and the cuts.
-        """
+        """The NLP on elements with these breaks and cuts, without a point to start from."""
         data, (breaks, cuts) = join(parts), map(tuple, edges)
         motors = MotorShape.of(task.curves[0].formation.scene) if task.is_held else UNLIMITED
         shape = LimitShape.of(data.limits, motors)
         nlp = build_path_nlp(shape, len(data.grid.steps), task.options.goal)
-        first = PathSolution(*motion, center(nlp, data, units, *motion))
+        zero = np.zeros_like(data.grid.s)
+        first = PathSolution(Profile(zero, zero, zero), 0.0, {})
         none = Tightening.none(data, task.duration)
         return PathIterate(task, breaks, cuts, parts, data, nlp, units, first, none, kept)
 
+    def start(self, profile: Profile, margin: float) -> PathIterate:
+        """The same near a motion and its margin [N], with multipliers near the central path."""
+        multipliers = center(self.nlp, self.data, self.units, profile, margin)
+        return replace(self, solution=PathSolution(profile, margin, multipliers))
+
     def restart(self) -> PathIterate | None:
-        """The solution on the mesh before with tightened limits, or the first on twice the elements."""
+        """The solution on the mesh before with tightened limits, or twice the elements, once."""
         if self.before is not None:
             return replace(self.before.tighten(), meshes=SOLVES)
         elements = 2 * self.task.elements
@@ -521,11 +516,11 @@ class PathIterate:
         profile = Elements(self.data.grid, old.profile).move(grid)
         if grid.held:
             profile = follow(grid, profile.a, profile.lam)
-        motion, kept = (profile, old.margin), self.is_kept
-        made = PathIterate.start(self.task, (breaks, cuts), parts, self.units, motion, kept)
+        made = PathIterate.on(self.task, (breaks, cuts), parts, self.units, self.is_kept)
         merit = old.cost + self.value * float(self.due.sum())
         before = replace(self, before=None)
-        return replace(made, meshes=self.meshes + 1, merit=merit, before=before)
+        made = replace(made, meshes=self.meshes + 1, merit=merit, before=before)
+        return made.start(profile, old.margin)
 
     def tighten(self) -> PathIterate:
         """The same with limits tightened by somewhat more than their violations."""
