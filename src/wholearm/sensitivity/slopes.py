@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -195,12 +196,7 @@ class _State(NamedTuple):
         """The formation at other places, with one length that is off."""
         formation, v = self.formation, self.z_s
         if name.startswith("length"):
-            finger, fingers = int(name[-1]) - 1, list(formation.scene.fingers)
-            if any(c.surface == "tip" and c.finger == finger for c in formation.contacts):
-                longer = fingers[finger].length + change
-                fingers[finger] = replace(fingers[finger], length=longer)
-                scene = replace(formation.scene, fingers=(fingers[0], fingers[1]))
-                formation = replace(formation, scene=scene)
+            formation = _lengthen(formation, int(name[-1]) - 1, change)
         found = formation.evaluate(z, v)
         if not name.startswith("base"):
             return found
@@ -214,6 +210,17 @@ class _State(NamedTuple):
             return np.where(own.reshape(-1, *[1] * (one.ndim - 2)), other, one)
 
         return Kinematics(*map(choose, found, moved))
+
+
+@lru_cache(maxsize=16)  # compiled functions of a formation cost more than evaluating them
+def _lengthen(formation: Formation, finger: int, change: float) -> Formation:
+    """The formation with a longer link, if its tip is in contact."""
+    if not any(c.surface == "tip" and c.finger == finger for c in formation.contacts):
+        return formation
+    fingers = list(formation.scene.fingers)
+    fingers[finger] = replace(fingers[finger], length=fingers[finger].length + change)
+    scene = replace(formation.scene, fingers=(fingers[0], fingers[1]))
+    return replace(formation, scene=scene)
 
 
 def _move_least(P: Array, right: Array, metric: Array) -> Array:
