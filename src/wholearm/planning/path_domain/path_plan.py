@@ -474,18 +474,17 @@ class PathIterate:
             each = zip(self.parts, self.motions, strict=True)
             return self._move([equidistribute(*own, task.elements) for own in each], self.cuts)
         costs = self.due + self.paid
-        # The first mesh of the largest margin has no breaks.
-        bare = task.options.goal is Objective.MARGIN and self.meshes == 0
-        # No mesh mends rows of ranges that are for another motion.
-        fixed = bool(task.guides) or self.meshes == SOLVES
-        if bare or (_GAP * costs.sum() > accuracy and not fixed):
+        costly = _GAP * float(costs.sum()) > accuracy
+        # Largest margins begin without breaks. No mesh mends rows of ranges for another motion.
+        fixed = bool(task.guides) and (self.meshes > 0 or task.options.goal is not Objective.MARGIN)
+        if (self.meshes == 0 or costly) and self.meshes < SOLVES and not fixed:
             breaks, shift = self.find_switches()
             if shift > _MOVED * accuracy and again:
                 return self._move(breaks, self.cuts)
-            shares = np.split(costs, np.cumsum([len(part.grid.s) for part in self.parts])[:-1])
             edges = [part.grid.edges for part in self.parts]
             most = max(map(len, edges)) + task.elements
-            if task.options.intervals is None and most <= _MOST:
+            if costly and task.options.intervals is None and most <= _MOST:
+                shares = np.split(costs, np.cumsum([len(part.grid.s) for part in self.parts])[:-1])
                 pairs = zip(edges, shares, strict=True)
                 return self._move(breaks, [halve(*pair, task.elements) for pair in pairs])
         return self.tighten() if self.violation > 1 else None
