@@ -46,7 +46,7 @@ from wholearm.geometry.tracing import trace_curve, trace_phases
 from wholearm.mapping.borders import NOWHERE, Window, label_cells
 from wholearm.mapping.formation_map import CROSSED, Border, FormationMap, build_map, choose_window
 from wholearm.mechanics.speed_sweep import NoMotionError
-from wholearm.planning.lower_bound.lower_bound import look_along
+from wholearm.planning.lower_bound import look_along
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.search.edges import Link, cut_curve
 from wholearm.search.places import is_at, make_place

@@ -34,7 +34,7 @@ from wholearm.mechanics.speed_sweep import (
     make_cosine_grid,
     speed_sweep,
 )
-from wholearm.planning.lower_bound.lower_bound import bound_least_time, look_along
+from wholearm.planning.lower_bound import bound_least_time, look_along
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.elements import (
     DEGREE,

@@ -35,7 +35,7 @@ from wholearm.mapping.formation_list import (
     split_leg,
     tolerance,
 )
-from wholearm.planning.lower_bound.lower_bound import bound_least_time
+from wholearm.planning.lower_bound import bound_least_time
 from wholearm.problem.read import build_problem
 from wholearm.search.astar import RoadmapRoute, RouteSearch
 from wholearm.search.cuts import link_changed, list_cut, list_cut_borders, list_openings

@@ -19,7 +19,7 @@ from scipy.optimize import brentq
 from wholearm.common.arrays import Array
 from wholearm.geometry.curve import Curve, Segment
 from wholearm.mechanics.dynamics import LAMBDA, A, Directions, PathForces, V
-from wholearm.planning.lower_bound import path_terms
+from wholearm.planning import lower_bound
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain import path_data, unique_start
 from wholearm.planning.path_domain.path_motion import PathMotion
@@ -107,7 +107,7 @@ class Toy:
     def in_place(self) -> Iterator[None]:
         """Let the planner and the lower bound see this toy's forces."""
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(path_terms, "inverse", self._inverse)
+            patch.setattr(lower_bound, "inverse", self._inverse)
             patch.setattr(path_data, "inverse", self._inverse)
             patch.setattr(path_data, "reduced_inertia", lambda *_: np.ones(1))
             # A toy has no shape that friction could hold at rest.

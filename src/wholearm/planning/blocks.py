@@ -31,7 +31,7 @@ from ..problem.definition import Phase, Problem
 from ..results.trajectory import Motion
 from ..scene.model import Scene
 from ..solvers.ipopt import charge
-from .lower_bound.lower_bound import look_along
+from .lower_bound import look_along
 from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence, make_sequence, plan_sequence, plan_slowly
 from .phase_plan import PhasePlan, Settled, add_up

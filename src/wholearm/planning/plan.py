@@ -30,7 +30,7 @@ from ..results.trajectory import Trajectory
 from ..solvers.ipopt import Ledger, charge, open_ledger
 from ..verification.force_uniqueness import find_uniqueness_margin, find_wedged
 from .blocks import BlockPlan, Planning, plan_blocks
-from .lower_bound.lower_bound import bound_least_time
+from .lower_bound import bound_least_time
 from .options import Objective, PlanOptions
 from .path_domain import impact_sequence
 from .phase_plan import add_up, combine

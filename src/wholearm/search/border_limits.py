@@ -15,7 +15,7 @@ from ..mechanics.dynamics import metric_weights, reduced_inertia
 from ..mechanics.path_limits import PathLimits
 from ..mechanics.speed_sweep import NoMotionError, find_duration, speed_sweep
 from ..mechanics.uniqueness import find_minors
-from ..planning.lower_bound.path_terms import PathTerms, find_limits
+from ..planning.lower_bound import PathTerms, find_limits
 
 INTERVALS = 24  # intervals of the speed sweep along a border
 CHECKED = 12  # further places of each segment that are checked for jamming and uniqueness

@@ -18,8 +18,7 @@ from ..geometry.tracing import HELD, trace_curve
 from ..mechanics.dynamics import metric_weights
 from ..mechanics.path_limits import PathLimits
 from ..mechanics.speed_sweep import make_cosine_grid, speed_sweep
-from ..planning.lower_bound.lower_bound import bound_least_time, bound_roughly
-from ..planning.lower_bound.path_terms import find_limits
+from ..planning.lower_bound import bound_least_time, bound_roughly, find_limits
 from ..problem.definition import End, Until
 from .border_limits import (
     INTERVALS,

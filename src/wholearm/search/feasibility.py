@@ -15,7 +15,7 @@ from ..geometry.path_guess import find_end
 from ..geometry.tracing import trace_phase
 from ..mechanics.dynamics import metric_weights
 from ..mechanics.speed_sweep import NoMotionError
-from ..planning.lower_bound.lower_bound import look_along
+from ..planning.lower_bound import look_along
 from ..planning.options import Objective, PlanOptions
 from ..planning.phase_plan import PhasePlan
 from ..planning.time_domain.time_motion import TimeMotion

@@ -16,7 +16,7 @@ from ..mechanics.limits import make_limits
 from ..mechanics.path_limits import PathLimits
 from ..mechanics.speed_sweep import make_cosine_grid, speed_sweep
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN, find_minors
-from ..planning.lower_bound.path_terms import GIVE
+from ..planning.lower_bound import GIVE
 from ..problem.definition import Problem
 
 NODES = 24  # intervals of a border

@@ -22,7 +22,7 @@ from ...geometry.curve import Curve, Segment, directions_of
 from ...mechanics.dynamics import ONE, A, B, PathForces, build_force_rows, inverse
 from ...mechanics.limits import make_limits
 from ...mechanics.path_limits import PathLimits
-from ...planning.lower_bound.lower_bound import bound_least_time
+from ...planning.lower_bound import bound_least_time
 from ...planning.options import Objective, PlanOptions
 from ...planning.path_domain.path_data import prepare
 from ...planning.path_domain.path_mesh import make_grid

@@ -28,7 +28,7 @@ from ...common.errors import (
 from ...geometry.curve import Curve, describe_pose, directions_of
 from ...mechanics.dynamics import reduced_inertia
 from ...mechanics.uniqueness import describe_uniqueness, find_minors
-from ..options import Objective, PlanOptions
+from ..options import DEFAULT_ACCURACY, Objective, PlanOptions
 from ..phase_plan import PhasePlan
 from ..refine import SOLVES, refine
 from .elements import DEGREE, Elements, Profile, follow
@@ -182,7 +182,7 @@ def plan_task(task: Task, insist: bool = True) -> PathIterate:
         raise SolverError("no motion keeps the limits")
     accuracy = task.options.accuracy
     iterate = refine(first, accuracy)
-    while iterate.error > accuracy and 10 * accuracy < ROUGH and not task.guides:
+    while iterate.error > accuracy and accuracy < DEFAULT_ACCURACY:
         # Where an accuracy is not reached, a plan for a larger one may be better.
         accuracy *= 10
         options = replace(task.options, accuracy=accuracy)
@@ -475,18 +475,19 @@ class PathIterate:
             return self._move([equidistribute(*own, task.elements) for own in each], self.cuts)
         costs = self.due + self.paid
         costly = _GAP * float(costs.sum()) > accuracy
-        # Largest margins begin without breaks. No mesh mends rows of ranges for another motion.
-        fixed = bool(task.guides) and (self.meshes > 0 or task.options.goal is not Objective.MARGIN)
+        # No mesh mends rows of ranges for another motion.
+        tight = bool(self.tightening.missed.any())
+        fixed = bool(task.guides) and (tight or self.violation_at_nodes > MISS)
         if (self.meshes == 0 or costly) and self.meshes < SOLVES and not fixed:
             breaks, shift = self.find_switches()
             if shift > _MOVED * accuracy and again:
                 return self._move(breaks, self.cuts)
             edges = [part.grid.edges for part in self.parts]
-            most = max(map(len, edges)) + task.elements
-            if costly and task.options.intervals is None and most <= _MOST:
+            count = min(task.elements, _MOST - max(map(len, edges)))
+            if costly and task.options.intervals is None and 2 * count >= task.elements:
                 shares = np.split(costs, np.cumsum([len(part.grid.s) for part in self.parts])[:-1])
                 pairs = zip(edges, shares, strict=True)
-                return self._move(breaks, [halve(*pair, task.elements) for pair in pairs])
+                return self._move(breaks, [halve(*pair, count) for pair in pairs])
         return self.tighten() if self.violation > 1 else None
 
     def find_switches(self) -> tuple[Sequence[Array], float]:
