@@ -201,9 +201,12 @@ def _plan_within(task: Task) -> PathIterate:
         if iterate.error <= task.options.accuracy:
             break
         try:
-            iterate = plan_task(replace(task, guides=iterate.guides))
+            other = plan_task(replace(task, guides=iterate.guides))
         except SolverError:
             break
+        if other.objective >= iterate.objective:
+            break
+        iterate = other
     return iterate
 
 
