@@ -204,7 +204,6 @@ class Replay(Run):
     ----------
     settling, rest_window, longest_window, shortest_step : [s], rounding : [N]
                              see the constants of these names
-    has_slid                 whether contacts that come to rest have slid in the phase
     slip_signs               signs of contacts, by name, that have just begun to slip
     side                     sign of (coordinate - value) before the end of the phase
     until_unit : [m or rad]  unit of the distance to the end of the phase
@@ -234,7 +233,7 @@ class Replay(Run):
         self.step_times = [b for b, s in zip(self.breaks, self.steps_at, strict=False) if s]
         self.held_until = self.settled_by = -math.inf
         self.until_unit = self.side = 1.0
-        self.passes = self.moving = self.has_slid = False
+        self.passes = self.moving = False
         self.stuck: set[int] = set()
         self.slip_signs: dict[str, float] = {}
         self.decided = (-math.inf, 0)
@@ -388,11 +387,6 @@ class Replay(Run):
         """When the torques step next, after the present piece, or infinity [s]."""
         k = bisect_left(self.step_times, self.stop)
         return self.step_times[k] if k < len(self.step_times) else math.inf
-
-    @property
-    def last_step(self) -> float:
-        """When the torques last stepped, at their start or later [s]."""
-        return self.step_times[bisect_left(self.step_times, self.stop) - 1]
 
     def when(self) -> str:
         """Present time and phase, to end a sentence."""
@@ -690,7 +684,6 @@ class Replay(Run):
         self.stuck = set()
         self.take()
         self.releasable, self.resting, self.slipping = (), frozenset(), frozenset()
-        self.has_slid = False
         if phase.end is End.REST or following is None or not until.is_release:
             return
         names, kept = formation.names, following.formation.names
@@ -793,7 +786,6 @@ class Replay(Run):
 
         `turned`: contacts, then joints, that came to rest at `time` [s]; `enters`: a new formation.
         """
-        stuck = self.stuck
         if self._decide(turned, time=time, enters=enters):
             return self.come_to_rest()
         self.observe()
@@ -803,13 +795,7 @@ class Replay(Run):
         if not s.outputs[s.to.ratio] > 0:
             self.fail_to_step(float(s.outputs[s.to.ratio]))
         if not enters and self.resting and self.resting <= self.stuck:
-            # A planned motion may all but come to rest a little before the torques step; until they
-            # do it may slip and stick again.
-            window = min(self.longest_window, self.t - self.last_step)
-            rested = self.resting <= stuck
-            if self.has_slid if rested else not self.steps_within(window):
-                return self._hold()
-            self.has_slid |= not rested
+            return self._hold()
         slipping = {holders[k][0] for k in self.find_slipping()}
         pulling = np.flatnonzero(s.outputs[s.to.c_n] < -self.rounding)
         # Whether anything pulls where a contact slips by plan, its next formation says.
@@ -903,16 +889,7 @@ class Replay(Run):
 
     def turn(self, events: Sequence[int]) -> Ending | None:
         """Go on where contacts or joints have come to rest; None if the motion goes on."""
-        now, window = self.t, self.rest_window
-        # With two freedoms the last speeds fall to zero one after the other by rounding.
-        if (
-            self.formation.n_constraints < 4
-            and self.phase.end is End.REST
-            and self.is_there()
-            and is_slower(self.problem.scene, self.v, SLOW)
-            and self.stop - now <= window
-        ):
-            return Arrival(-self.rate, window)
+        now = self.t
         if self.steps_within(self.settling):
             self._finish_piece()
         return self.restart(self._find_turning(events), time=now)
