@@ -333,7 +333,7 @@ def _list_slow(
             intervals = max(LEAST_INTERVALS, round(count * stage.guess.duration / phase))
             breaks = np.linspace(0.0, 1.0, intervals + 1)
             coarse.append(replace(stage, guess=resample(stage.guess, search.scheme, breaks)))
-        guesses = chain([Guess("a motion of least time", coarse)], guesses)
+        guesses = chain(islice(guesses, 1), [Guess("a motion of least time", coarse)], guesses)
     end = fastest[-1].guess.nodes[-1, 0] if pinned and fastest else None
     for guess in guesses:
         yield guess._replace(stages=[*guess.stages[:-1], replace(guess.stages[-1], stop=end)])
