@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from fnmatch import fnmatch
@@ -26,7 +27,10 @@ report have four digits, and a least force is one at an instant.
 """
 USUAL = 1e-4  # for all others: the accuracy that plans are made with
 LOCAL = ("plan over time", "goal", "scene", "leg")
-"""Families whose optimum need not be the only one: values agree within `USUAL`."""
+"""Families whose optimum need not be the only one: values agree within `USUAL`.
+
+Values are flat at an optimum: motions whose values differ by `USUAL` differ by its root.
+"""
 SAMPLES = 1  # how many samples may end otherwise, of those at the edge of what a plan bears
 WORDS = ("words", "text", "advice", "help", "reason")
 """Entries that do not count as an answer: words, and advice, which ends by processor time."""
@@ -111,7 +115,9 @@ def compare(family: str, found: Any, stored: Any) -> tuple[str, list[str]]:
 
 
 def _allowed(family: str, key: str) -> float:
-    return USUAL if key == "value" and family in LOCAL else TOLERANCES.get(key, USUAL)
+    if family not in LOCAL:
+        return TOLERANCES.get(key, USUAL)
+    return USUAL if key == "value" else max(TOLERANCES.get(key, 0.0), math.sqrt(USUAL))
 
 
 def _differ(family: str, key: str, found: Any, stored: Any) -> Iterator[tuple[bool, str]]:
