@@ -3,7 +3,8 @@
 A query has a start and a goal, each an edge on the palm and an x at which both fingers close on the
 object, drawn at random for the shipped scenes and for random polygons in the hexagon's hand. Each
 query is asked twice: first of a scene that nothing is known of, then for a goal a little further
-on, with what is known. `draw_leg` draws routes that need no search.
+on, with what is known. With ``--printed`` the phases that `route` prints are planned instead of the
+second query, in place of the goal. `draw_leg` draws routes that need no search.
 """
 
 from __future__ import annotations
@@ -15,12 +16,13 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..common.errors import InfeasibleError, InputError, WholearmError
 from ..mapping.formation_list import format_route, list_formations
+from ..planning.plan import solve
 from ..problem.definition import Problem
 from ..problem.read import build_problem, place_start, read_problem
 from ..search.find_route import find_route, forget_roadmaps
@@ -29,6 +31,7 @@ from .stress.scenes import Table
 from .study import Case, Row, Study, format_table
 
 SHIPPED = ("heptagon", "hexagon", "square", "triangle")
+SAME = 1e-4  # relative difference of values of plans that count as the same
 
 
 class Queries(Study):
@@ -36,40 +39,66 @@ class Queries(Study):
 
     name, title = "queries", "From pose to pose"
     shipped = seeded = True
-    options = "--queries N  how many = 250 in 0..1000000000\n"
+    options = """\
+--queries N   how many = 250 in 0..1000000000
+--polygons N  how many more, each about a new polygon in a shipped hand = 0 in 0..1000000000
+--objective NAME  of the plans: time, effort or margin = time
+--printed     plan the phases that are printed, in place of a second query
+"""
+
+    def stamp(self, options: argparse.Namespace) -> dict[str, Any]:
+        """Seed and what is asked."""
+        return {key: getattr(options, key) for key in ("seed", "objective", "printed")}
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
-        """Seed, number, and folder of the problems."""
-        return ((options.seed, k, options.problems) for k in range(options.queries))
+        """What is drawn, its seed and number, folder of the problems, and what is asked."""
+        asked = options.problems, options.objective, options.printed
+        for kind, count in (("query", options.queries), ("polygon", options.polygons)):
+            yield from ((kind, options.seed, k, *asked) for k in range(count))
 
     def limit(self, case: Case) -> float:
         """Two searches."""
         return 180.0
 
     def run(self, case: Case) -> Row:
-        """Ask a query, and a second one."""
-        problem = draw_query(case[0], case[1], Path(case[2]))
+        """Ask a query, and a second one or what is planned for the phases that are printed."""
+        drawn, seed, number, folder, objective, printed = case
+        draw = draw_polygon_query if drawn == "polygon" else draw_query
+        problem = draw(seed, number, Path(folder))
         forget_roadmaps()
         row: Row = {"text": f"{problem.name}: {problem.table['start']} to {problem.goals[0]}"}
         started = time.process_time()
         try:
-            answer = find_route(problem)
+            answer = find_route(problem, objective)
         except WholearmError as error:
             kind = "blocked" if isinstance(error, InfeasibleError) else "no answer"
             return row | {"kind": kind, "first": time.process_time() - started, "why": str(error)}
         row["first"] = time.process_time() - started
+        row |= {"gap": answer.gap, "value": answer.plan.value, "phases": len(answer.plan.phases)}
         failures = verify(answer.problem, answer.plan).failures
         if failures:
             return row | {"kind": "plan that fails", "findings": list(failures[:1])}
         started = time.process_time()
         try:
-            goal, step = problem.goals[0], 0.1 * problem.scene.scales.length
-            find_route(problem.with_({"goal": {"flush": goal.flush, "x": (goal.x or 0.0) + step}}))
+            if printed:
+                table = {key: own for key, own in problem.table.items() if key != "goal"}
+                phases = tomllib.loads(answer.to_text())
+                plan = solve(build_problem(table | phases), objective)
+            else:
+                goal, step = problem.goals[0], 0.1 * problem.scene.scales.length
+                further = {"flush": goal.flush, "x": (goal.x or 0.0) + step}
+                find_route(problem.with_({"goal": further}), objective)
+        except WholearmError as error:
+            if printed:
+                return row | {"kind": "refused as printed", "findings": [str(error)]}
+        else:
             row["second"] = time.process_time() - started
-        except WholearmError:
-            pass
-        phases, duration = len(answer.problem.phases), answer.plan.duration
-        return row | {"kind": "solved", "gap": answer.gap, "duration": duration, "phases": phases}
+            if printed:
+                row["off"] = plan.value / answer.plan.value - 1
+        if abs(row.get("off", 0.0)) > SAME:
+            found = f"{plan.value:.6g} {plan.unit} as printed, {answer.plan.value:.6g} found"
+            return row | {"kind": "another plan as printed", "findings": [found]}
+        return row | {"kind": "solved"}
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
         """What came of them, and the times."""
@@ -79,7 +108,7 @@ class Queries(Study):
         for name, times in (
             ("all", [row["first"] for row in rows]),
             *((kind, [row["first"] for row in rows if row["kind"] == kind]) for kind in kinds),
-            ("second query", [row["second"] for row in rows if "second" in row]),
+            ("second query or plan", [row["second"] for row in rows if "second" in row]),
         ):
             if times:
                 shown = (f"{own:.2f}" for own in np.percentile(times, [50, 95, 100]))
@@ -89,11 +118,14 @@ class Queries(Study):
         ratios = [row["second"] / row["first"] for row in rows if "second" in row]
         gaps = [row["gap"] for row in rows if row.get("gap") is not None]
         if ratios:
-            lines += ["", f"Second over first query: median {np.median(ratios):.3f}."]
+            lines += ["", f"Second over first: median {np.median(ratios):.3f}."]
         if gaps:
             text = f"Gap of {len(gaps)} routes along borders alone: at most {100 * max(gaps):.2g} %"
             lines += [f"{text}, median {100 * np.median(gaps):.2g} %."]
-        wrong = [row for row in rows if row["kind"] == "plan that fails"]
+        if off := [abs(row["off"]) for row in rows if "off" in row]:
+            same = f"{sum(own <= SAME for own in off)} of {len(off)} plans of printed phases"
+            lines += ["", f"{same} are the same to {SAME:g}; largest difference {max(off):.2g}."]
+        wrong = [row for row in rows if "findings" in row]
         return "\n".join(lines), [f"{row['text']}: {row['findings'][0]}" for row in wrong]
 
 
@@ -108,14 +140,34 @@ def draw_query(seed: int, number: int, folder: Path) -> Problem:
     table.pop("phases")
     if kind >= len(SHIPPED):
         own = np.random.default_rng([seed, 1000 + kind])
-        count = int(own.integers(3, 8))
-        angles = 2 * np.pi * (np.arange(count) + own.uniform(-0.25, 0.25, count)) / count
-        corners = 0.05 * np.column_stack([np.cos(angles), np.sin(angles)])
-        table["object"] = {"vertices": corners.round(4).tolist(), "mass": 0.2}
+        table["object"] = {"vertices": _draw_corners(own, int(own.integers(3, 8))), "mass": 0.2}
         table["name"] = f"polygon {kind - len(SHIPPED) + 1}"
     else:
         table["name"] = name
-    rng = np.random.default_rng([seed, number])
+    return _draw_goal(np.random.default_rng([seed, number]), table)
+
+
+def draw_polygon_query(seed: int, number: int, folder: Path) -> Problem:
+    """The problem of a query about a polygon of its own, of 3 to 8 corners, in a shipped hand."""
+    rng = np.random.default_rng([seed, number, 2])
+    base = read_problem(str(folder / f"{('heptagon', 'hexagon', 'triangle')[number % 3]}.toml"))
+    table = {key: own for key, own in base.table.items() if key != "phases"}
+    corners = _draw_corners(rng, int(rng.integers(3, 9)))
+    table["object"] = {"vertices": corners, "mass": base.scene.polygon.mass}
+    parts = ("palm", "finger1", "finger2")
+    table["friction"] = {part: round(float(rng.uniform(0.03, 0.15)), 3) for part in parts}
+    table["name"] = f"new polygon {number + 1}"
+    return _draw_goal(rng, table)
+
+
+def _draw_corners(rng: np.random.Generator, count: int) -> list[list[float]]:
+    angles = 2 * np.pi * (np.arange(count) + rng.uniform(-0.25, 0.25, count)) / count
+    corners = 0.05 * np.column_stack([np.cos(angles), np.sin(angles)])
+    return [[float(x), float(y)] for x, y in corners.round(4)]
+
+
+def _draw_goal(rng: np.random.Generator, table: Table) -> Problem:
+    """A problem from one drawn pose to another."""
     first = _draw_pose(rng, table)
     while (last := _draw_pose(rng, table)) == first:
         pass
