@@ -300,6 +300,13 @@ def test_links_lead_somewhere(path: Path) -> None:
             assert anchor in map(name_anchor, headings), f"{target}#{anchor}"
 
 
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_modules_that_pages_name_are_there(path: Path) -> None:
+    for name in re.findall(r"`([\w./]+\.py)`", read(path)):
+        places = (ROOT, SOURCE, path.parent, SOURCE / "planning")
+        assert any((place / name).exists() for place in places), name
+
+
 def test_pages_are_short_and_topics_of_help(capsys: pytest.CaptureFixture[str]) -> None:
     beside = {page.parent for page in PAGES[1:]}
     assert beside == {SOURCE / folder for folder in TOPICS.values()}
