@@ -391,7 +391,6 @@ QUICK: tuple[Case, ...] = (
     *(("scene", number, "margin") for number in (2, 17, 44)),
     *(("leg", number, "time") for number in (24, 36)),
     ("torques", "heptagon", 0.9),
-    ("tune", "heptagon_four_contacts"),
     ("free", "heptagon_four_contacts"),
     ("policy", "heptagon_four_contacts"),
     ("robustness", "heptagon_four_contacts"),
