@@ -253,7 +253,9 @@ def test_shell_lines_run(
         if word in PLANS and place not in made:
             PLANS[word]().save(word)
     words = [own for word in words for own in (glob(word) if "*" in word else [word])]
-    assert main(words) == 0, capsys.readouterr().err
+    status = main(words)
+    # Torques that are compared may lose a contact, which the exit status says.
+    assert status == 0 or (words[0], status) == ("compare", 1), capsys.readouterr().err
 
 
 def test_results_are_one_line_and_motions_a_picture() -> None:
