@@ -22,7 +22,6 @@ class Objective(Enum):
     RELAX = "relax"  # least relaxation of one limit; used to say what would make a plan possible
 
 
-CHOICES = ("time", "effort", "margin")  # objectives that a user can ask for
 PLANNER = """\
 --objective NAME    time, effort or margin = time among time|effort|margin
 --accuracy          relative error of the objective below which refining ends = 1e-4 in 1e-8..0.1
