@@ -12,11 +12,12 @@ from numpy.typing import ArrayLike
 
 from wholearm import Finger, Formation, Friction, Polygon, Scene
 from wholearm.benchmark.precision.reference import solve_motion
-from wholearm.benchmark.stress.newton import Touch, locate, separate
+from wholearm.benchmark.stress.event_tracing import separate
 from wholearm.common.arrays import Array
 from wholearm.contacts.elemental import parse_contact
 from wholearm.geometry.curve import Curve
 from wholearm.results.trajectory import Samples
+from wholearm.verification.newton_euler import Touch, locate
 
 SQUARE = [[-0.03, -0.03], [0.03, -0.03], [0.03, 0.03], [-0.03, 0.03]]
 

@@ -20,7 +20,6 @@ from plane import (
 )
 from shipped import HEPTAGON, chart, problem_of
 from wholearm import InputError, Scene
-from wholearm.benchmark.stress.newton import locate
 from wholearm.common.arrays import Array
 from wholearm.contacts.closing import (
     Numbers,
@@ -36,6 +35,7 @@ from wholearm.contacts.closing import (
 from wholearm.contacts.elemental import build_features, candidate_contacts, parse_contact
 from wholearm.contacts.formation import Formation, build_slip, find_touching
 from wholearm.mapping.borders import label_cells
+from wholearm.verification.newton_euler import locate
 
 KITE = [[-0.04, -0.03], [0.02, -0.035], [0.045, 0.01], [0.0, 0.05], [-0.045, 0.02]]
 NAMES = ["v3-palm", "v2-finger1", "v4-finger2", "e1-tip1", "e3-tip2", "v2-tip1", "v4-tip2"]

@@ -12,8 +12,8 @@ import pytest
 from shipped import HEPTAGON, tipping
 from wholearm import Friction, Phase, PlanOptions, Problem, Scene, Trajectory, load
 from wholearm.benchmark.stress.damage import look, run_file
-from wholearm.benchmark.stress.event_tracing import follow, resample, slides
-from wholearm.benchmark.stress.newton import balance, clearances, locate, separate
+from wholearm.benchmark.stress.event_tracing import clearances, follow, resample, separate, slides
+from wholearm.benchmark.stress.plan_check import balance
 from wholearm.benchmark.stress.refusals import find_best, list_ends
 from wholearm.benchmark.stress.scenes import draw_case, random_scene
 from wholearm.benchmark.stress.slow_motion import fast_margin, inertia_ratio, slow_margin
@@ -26,6 +26,7 @@ from wholearm.mechanics.dynamics import Directions, reduced_inertia
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.problem.table import write_toml
+from wholearm.verification.newton_euler import locate
 
 
 def test_a_scene_is_drawn_alike_again_and_is_the_same_as_a_file() -> None:

@@ -71,12 +71,19 @@ class Balance(NamedTuple):
         return sizes[worst], row, text
 
 
-class _ContactForce(NamedTuple):
-    """A contact at n instants: its point and normal, shape (n, 2), and gap, shape (n,) [m]."""
+class Touch(NamedTuple):
+    """A contact at n configurations."""
 
-    point: Array
+    gap: Array  # (n,) [m]
+    # low, high (n,) [m]: how far the contact is inside both ends of the feature that it slides on;
+    # infinite where the feature has no end of its own
+    low: Array
+    high: Array
+    # normal, tangent (n, 5): rows that give the rate of separation and of sliding from z', and the
+    # force on z from c_n and c_t
     normal: Array
-    gap: Array
+    tangent: Array
+    friction: float  # coefficient mu
 
 
 def balance(
@@ -94,36 +101,22 @@ def balance(
     still              speed that counts as none, relative to the scene's speed; angular speeds
                        count times the scene's length
     """
-    z, v, scales, body = samples.z, samples.z_dot, scene.scales, scene.polygon
+    z, v, scales = samples.z, samples.z_dot, scene.scales
     slow = still * scales.speed
-    assert body.inertia is not None
-    inertias = np.array([body.mass, body.mass, body.inertia, *(f.inertia for f in scene.fingers)])
-    left = -inertias * samples.z_ddot
-    left[:, 1] -= body.mass * scene.gravity
+    left = scene.applied_force - scene.mass_diagonal * samples.z_ddot
     left[:, 3:] += samples.tau
     gaps, rates = np.zeros(samples.c_n.shape), np.zeros(samples.c_n.shape)
     against = np.zeros((len(z), len(contacts) + 2), dtype=bool)
     for k, contact in enumerate(contacts):
-        touch = _touch(scene, contact, z)
-        n, t = touch.normal, -_quarter(touch.normal)
-        base = (0.0, 0.0) if contact.finger is None else scene.fingers[contact.finger].base
-        arm, lever = touch.point - z[:, :2], touch.point - np.asarray(base)
-        slip = v[:, :2] + v[:, 2:3] * _quarter(arm)
-        if contact.finger is not None:
-            slip = slip - v[:, 3 + contact.finger, None] * _quarter(lever)
-        v_n, v_t = (slip * n).sum(axis=1), (slip * t).sum(axis=1)
-        c_n, c_t = samples.c_n[:, k], samples.c_t[:, k]
-        bound = scene.friction.of(contact.finger) * c_n
+        touch, c_n, c_t = locate(scene, contact.name, z), samples.c_n[:, k], samples.c_t[:, k]
+        v_n, v_t = dot(touch.normal, v), dot(touch.tangent, v)
+        bound = touch.friction * c_n
         slides = np.abs(v_t) > slow
         if contact in rolling:
             slides[:] = False
             v_n = np.maximum(np.abs(v_n), np.abs(v_t))
         friction = np.where(slides, -bound * np.sign(v_t), np.clip(c_t, -bound, bound))
-        force = c_n[:, None] * n + friction[:, None] * t
-        left[:, :2] += force
-        left[:, 2] += cross_product(arm, force)
-        if contact.finger is not None:
-            left[:, 3 + contact.finger] -= cross_product(lever, force)
+        left += c_n[:, None] * touch.normal + friction[:, None] * touch.tangent
         gaps[:, k], rates[:, k] = touch.gap, v_n
         against[:, k] = slides & (np.abs(friction - c_t) > 1e-6 * scales.force)
     for k, link in enumerate(scene.fingers):
@@ -138,38 +131,58 @@ def balance(
     return Balance(left, gaps / scales.length, rates / scales.speed, against, names)
 
 
-def _touch(scene: Scene, contact: Contact, z: Array) -> _ContactForce:
-    """Where a contact touches at n configurations."""
-    corners = scene.polygon.vertices
-    count = len(corners)
-    vertex = z[:, :2] + _rotate(z[:, 2], corners[contact.index])
-    if contact.finger is None:
-        return _ContactForce(vertex, np.tile([0.0, 1.0], (len(z), 1)), vertex[:, 1])
-    link = scene.fingers[contact.finger]
-    heading = z[:, 3 + contact.finger]
-    along = np.stack([np.cos(heading), np.sin(heading)], axis=1)
-    if contact.surface == "finger":
-        normal = _quarter(along) if contact.finger == 0 else -_quarter(along)
-        gap = ((vertex - np.asarray(link.base)) * normal).sum(axis=1) - link.radius
-        return _ContactForce(vertex, normal, gap)
-    tip = np.asarray(link.base) + link.length * along
-    if contact.feature == "v":
-        offset = vertex - tip
-        distance = np.linalg.norm(offset, axis=1)
-        return _ContactForce(vertex, offset / distance[:, None], distance - link.radius)
-    run = _rotate(z[:, 2], corners[(contact.index + 1) % count] - corners[contact.index])
-    # The corners go round anticlockwise, so the inside is to the left of an edge.
-    normal = _quarter(run / np.linalg.norm(run, axis=1)[:, None])
-    gap = -((tip - vertex) * normal).sum(axis=1) - link.radius
-    return _ContactForce(tip + link.radius * normal, normal, gap)
+def place_object(scene: Scene, z: Array) -> Array:
+    """World positions of the vertices at n configurations, shape (n, n_v, 2) [m]."""
+    c, s = np.cos(z[:, 2]), np.sin(z[:, 2])
+    turn = np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
+    return np.asarray(z[:, None, :2] + scene.polygon.vertices @ turn.transpose(0, 2, 1))
 
 
-def _rotate(angle: Array, vector: Array) -> Array:
-    """A vector turned by n angles, shape (n, 2)."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.stack([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]], axis=1)
+def link_axis(scene: Scene, z: Array, finger: int) -> Array:
+    """Unit vectors from joint to tip, shape (n, 2)."""
+    return np.stack([np.cos(z[:, 3 + finger]), np.sin(z[:, 3 + finger])], axis=1)
 
 
-def _quarter(vectors: Array) -> Array:
-    """Vectors, shape (n, 2), turned by a right angle to the left."""
-    return np.stack([-vectors[:, 1], vectors[:, 0]], axis=1)
+def locate(scene: Scene, name: str, z: Array) -> Touch:
+    """The contact called `name` at n configurations `z`, shape (n, 5), which may be complex."""
+    feature, part = name.split("-")
+    index, corners = int(feature[1:]), place_object(scene, z)
+    point = corner = corners[:, index]
+    normal, low, high = np.tile([0.0, 1.0], (len(z), 1)), *2 * [np.full(len(z), np.inf)]
+    gap, finger = corner[:, 1], None if part == "palm" else int(part[-1]) - 1
+    if finger is not None:
+        link, axis = scene.fingers[finger], link_axis(scene, z, finger)
+        base = np.asarray(link.base)
+        tip = base + link.length * axis
+        if part.startswith("finger"):
+            normal = (1 - 2 * finger) * np.stack([-axis[:, 1], axis[:, 0]], axis=1)
+            gap, low = dot(normal, corner - base) - link.radius, dot(axis, corner - base)
+            high = link.length - low
+        elif feature[0] == "v":
+            distance = norm(corner - tip)
+            normal = (corner - tip) / np.where(distance == 0, 1.0, distance)[:, None]
+            gap, low = distance - link.radius, dot(axis, corner - tip)
+        else:
+            along = corners[:, (index + 1) % corners.shape[1]] - corner
+            length = norm(along)
+            along = along / length[:, None]
+            normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
+            gap, low = -dot(normal, tip - corner) - link.radius, dot(along, tip - corner)
+            high, point = length - low, tip + link.radius * normal
+    tangent = np.stack([normal[:, 1], -normal[:, 0]], axis=1)
+    rows = np.zeros((2, len(z), 5), dtype=z.dtype)
+    for row, direction in zip(rows, (normal, tangent), strict=True):
+        row[:, :2], row[:, 2] = direction, cross_product(point - z[:, :2], direction)
+        if finger is not None:
+            row[:, 3 + finger] = -cross_product(point - base, direction)
+    return Touch(gap, low, high, rows[0], rows[1], scene.friction.of(finger))
+
+
+def dot(a: Array, b: Array) -> Array:
+    """Products of vectors along the last axis."""
+    return np.asarray((a * b).sum(axis=-1))
+
+
+def norm(a: Array) -> Array:
+    """Lengths of vectors along the last axis, also as analytic functions of complex ones."""
+    return np.sqrt(dot(a, a))

@@ -1,7 +1,7 @@
 """An independent reference for simulators: Newton-Euler equations at the tightest tolerance.
 
 The Newton-Euler equations of object and fingers, with contacts that are points with normals of
-rigid bodies (`benchmark.stress.newton`), are solved together with the contact conditions as one
+rigid bodies (`verification.newton_euler`), are solved together with the contact conditions as one
 linear system. Nothing is shared with the package's own contacts and dynamics; friction keeps the
 directions that it is given. They are integrated by SciPy's DOP853 from step to step of the torques,
 in double precision. Directions reverse where the sliding velocity vanishes.
@@ -22,7 +22,7 @@ from ...geometry.curve import Curve, Segment
 from ...problem.definition import Problem
 from ...results.torque import TorqueProfile
 from ...scene.model import Scene
-from ..stress.newton import locate
+from ...verification.newton_euler import locate
 
 
 def find_piece(torque: TorqueProfile, t: float) -> int:

@@ -1,7 +1,9 @@
 """Curve of a phase as an ordinary differential equation with events, apart from the planner.
 
-It knows neither C-functions nor limits of formations. The motion ends where a contact leaves the
-feature that it slides on, where two bodies run into each other, or at the phase's `until`.
+It knows neither C-functions nor limits of formations: contacts are those of
+`verification.newton_euler`, distances are by separating axes. The motion ends where a contact
+leaves the feature that it slides on, where two bodies run into each other, or at the phase's
+`until`.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from scipy.optimize import brentq
 from ...common.arrays import Array
 from ...problem.definition import Phase
 from ...scene.model import Scene
-from .newton import clearances, locate
+from ...verification.newton_euler import dot, link_axis, locate, norm, place_object
 
 OVERLAP = 1e-6
 """Overlap over the radius of gyration from which on two bodies count as running into each other."""
@@ -153,3 +155,50 @@ def slides(scene: Scene, phase: Phase, z: Array, z_s: Array) -> Array:
     """Rates of sliding of the contacts and of the joints along z_s, shape (n, n_c + 2)."""
     rows = [(locate(scene, n, z).tangent * z_s).sum(axis=1) for n in phase.formation.names]
     return np.column_stack([*rows, z_s[:, 3:]])
+
+
+def clearances(scene: Scene, z: Array) -> dict[str, Array]:
+    """Signed distances [m] of every solid pair at n configurations, each of shape (n,).
+
+    Exact where a pair overlaps by a little or faces flat to vertex; elsewhere a lower bound of the
+    distance, with the right sign. The palm does not stop a link.
+    """
+    corners, bones = place_object(scene, z), list[Array]()
+    apart = {"object and palm": corners[..., 1].min(axis=1)}
+    for finger, link in enumerate(scene.fingers):
+        base = np.broadcast_to(np.asarray(link.base), (len(z), 2))
+        bones.append(np.stack([base, base + link.length * link_axis(scene, z, finger)], axis=1))
+        gap = separate(corners, bones[finger]) - link.radius
+        apart[f"object and finger {finger + 1}"] = gap
+    if scene.fingers_collide:
+        thick = sum(link.radius for link in scene.fingers)
+        apart["finger 1 and finger 2"] = separate(*bones) - thick
+    return apart
+
+
+def separate(first: Array, second: Array) -> Array:
+    """Signed distance of convex polygons or segments, shape (n, k, 2) and (n, m, 2), as (n,).
+
+    Positive: the distance. Negative: minus the depth of the overlap.
+    """
+    depth = np.maximum(_reach(first, second), _reach(second, first))
+    distance = np.minimum(_nearest(first, second), _nearest(second, first))
+    return np.where(depth > 0, distance, depth)
+
+
+def _reach(first: Array, second: Array) -> Array:
+    """Largest gap along the normals of the first body's edges, both ways for a segment."""
+    along = np.roll(first, -1, axis=1) - first
+    along = along / np.maximum(norm(along), 1e-300)[..., None]
+    outward = np.stack([along[..., 1], -along[..., 0]], axis=-1)
+    other = np.einsum("nkd,nmd->nkm", outward, second).min(axis=2)
+    return np.asarray((other - dot(outward, first)).max(axis=1))
+
+
+def _nearest(points: Array, body: Array) -> Array:
+    """Least distance of the points of one body to the edges of another, shape (n,)."""
+    along = np.roll(body, -1, axis=1) - body
+    apart = points[:, :, None] - body[:, None]
+    square = np.maximum(dot(along, along), 1e-300)
+    share = np.clip(dot(apart, along[:, None]) / square[:, None], 0.0, 1.0)
+    return np.asarray(norm(apart - share[..., None] * along[:, None]).min(axis=(1, 2)))

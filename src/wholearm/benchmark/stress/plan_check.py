@@ -8,7 +8,8 @@ from ...common.arrays import Array
 from ...problem.definition import End, Phase, Problem
 from ...results.trajectory import Samples, Trajectory
 from ...scene.model import Scene
-from .newton import Touch, balance, clearances, locate
+from ...verification.newton_euler import Touch, locate
+from .event_tracing import clearances
 
 INSTANTS = 401
 """Instants of a phase that are looked at, besides some in short pieces of its torques."""
@@ -42,6 +43,26 @@ def check_plan(problem: Problem, plan: Trajectory) -> list[str]:
         before = np.array([rows.z[-1], rows.z_dot[-1]])
         found += [f"phase {phase.number}: {text}" for text in texts]
     return found
+
+
+def balance(
+    scene: Scene, touches: list[Touch], motion: tuple[Array, Array], tau: Array, forces: Array
+) -> Array:
+    """What is left of Newton's and Euler's laws at n instants, shape (n, 5) [N, N m].
+
+    Parameters
+    ----------
+    motion : (n, 5)           z' and z''
+    tau : (n, 2) [N m]
+    forces : (2, n, n_c) [N]  c_n and c_t
+    """
+    z_dot, z_ddot = motion
+    rest = scene.mass_diagonal * z_ddot + scene.viscous * z_dot + scene.dry * np.sign(z_dot)
+    rest = rest - scene.applied_force
+    rest[:, 3:] -= tau
+    for touch, c_n, c_t in zip(touches, forces[0].T, forces[1].T, strict=True):
+        rest -= c_n[:, None] * touch.normal + c_t[:, None] * touch.tangent
+    return np.asarray(rest)
 
 
 def _check_phase(problem: Problem, phase: Phase, rows: Samples) -> list[str]:

@@ -21,8 +21,8 @@ from ...common.errors import InputError, WholearmError
 from ...planning.plan import solve
 from ...problem.definition import End, Phase, Problem
 from ...scene.model import Scene
-from .event_tracing import Trace, constrain, follow, project, resample, weights
-from .newton import clearances, locate
+from ...verification.newton_euler import locate
+from .event_tracing import Trace, clearances, constrain, follow, project, resample, weights
 from .slow_motion import fast_margin, inertia_ratio, rest_margin, slow_margin
 
 PLACES = 60  # places along a curve at which limits are looked at

@@ -26,7 +26,7 @@ from ...mapping.formation_list import Stretch, format_route, list_formations, to
 from ...problem.definition import Phase, Problem
 from ...problem.read import build_problem
 from ...scene.model import Finger, Friction, Polygon, Scene
-from .newton import locate
+from ...verification.newton_euler import locate
 from .slow_motion import slow_margin
 
 Table = dict[str, Any]

@@ -17,7 +17,7 @@ and the sectors between them. Accelerations may vanish, and what stands still ma
 friction in its cone, so that only more is allowed than any motion needs: where even the best margin
 is negative, nothing moves.
 
-Forces are from bodies and points alone (`benchmark.stress.newton`).
+Forces are from bodies and points alone (`verification.newton_euler`).
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from scipy.sparse import block_array, block_diag, coo_array, diags_array, eye_ar
 from ...common.arrays import Array
 from ...problem.definition import Phase
 from ...scene.model import Scene
+from ...verification.newton_euler import Touch, locate
 from .event_tracing import slides
-from .newton import Touch, locate
 
 Bounds = list[tuple[float | None, float | None]]
 
