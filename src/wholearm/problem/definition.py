@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..common.arrays import Array
 from ..common.errors import InputError, name_source, read_share
@@ -47,8 +47,27 @@ def _name_contact(more: str = "") -> dict[str, str]:
     return {"type": "string", "pattern": f"^([ev][0-9]+-tip[12]|v[0-9]+-(palm|finger[12])){more}$"}
 
 
+class ModeGuess(NamedTuple):
+    """A contact mode of the initial guess of a phase, with time and pose at its end."""
+
+    t: float  # [s]: from the start of the phase
+    x: float  # [m]
+    phi: float  # [rad]
+    # of the sliding velocities of the contacts, 0 if one rolls, and of the joint velocities
+    signs: tuple[float, ...]
+
+
 INDEX = leave({"type": "integer", "minimum": 0})  # number of an edge
 CONTACT = _name_contact()  # JSON Schema of the name of a contact
+_MODE = {
+    "type": "object",
+    "additionalProperties": False,
+    "required": ["t", "x", "phi_deg", "signs"],
+    "properties": {
+        **{name: {"type": "number"} for name in ("t", "x", "phi_deg")},
+        "signs": {"type": "string", "pattern": "^[-+0]+ [-+]{2}$"},
+    },
+}
 DWELL = FieldKind(
     lambda given, key: (read_share if isinstance(given, str) else NONNEGATIVE.read)(given, key),
     {"anyOf": [NONNEGATIVE.schema, {"type": "string", "pattern": "^[^%]+%\\s*$"}]},
@@ -124,6 +143,14 @@ class Until:
         "For how long its end is held, instead of the problem's [s].",
         *(NONNEGATIVE, "time", SETTLE),
     ),
+    key(
+        "guess",
+        "Initial guess in place of the planner's own, for phases planned over time: contact modes "
+        "in order, each with time t since the start of the phase [s], x [m] and phi_deg at its "
+        "end, and the signs of the sliding velocities of `contacts` (0 if one rolls) and of the "
+        "joint velocities, such as '-+0 ++'.",
+        leave({"type": "array", "minItems": 1, "items": _MODE}),
+    ),
 )
 @dataclass(frozen=True, eq=False)
 class Phase:
@@ -134,6 +161,7 @@ class Phase:
     until: Until
     end: End = End.REST
     settle: float | None = None
+    guess: tuple[ModeGuess, ...] | None = None
 
     @property
     def number(self) -> int:

@@ -47,7 +47,7 @@ from ..scene.model import (
     check_place,
     check_ranges,
 )
-from .definition import CONTACT, INDEX, ROWS, End, Goal, Phase, Problem, Until
+from .definition import CONTACT, INDEX, ROWS, End, Goal, ModeGuess, Phase, Problem, Until
 from .uncertainty import GROUPS, LENGTH, PARAMETERS, spread_widths
 
 _T = TypeVar("_T")
@@ -78,6 +78,7 @@ UNTIL = name_fields(
     declare("x", "[m]"),
     declare("phi_deg", "[degrees]"),
 )
+MODE = name_fields(*map(declare, ("t", "x", "phi_deg", "signs")))
 UNCERTAINTY = {name: _WIDTHS[names[0]] for name, names in GROUPS.items()} | _WIDTHS
 _PARTS = name_fields(
     *map(declare, ("object", "fingers", "friction", "start")),
@@ -138,7 +139,7 @@ def _build_problem(table: Mapping[str, Any], source: str) -> Problem:
     return Problem(
         scene=scene,
         start=start,
-        phases=tuple(_read_phase(scene, i, entry) for i, entry in enumerate(given)),
+        phases=tuple(read_phase(scene, i, entry) for i, entry in enumerate(given)),
         source=source,
         uncertainty=uncertainty,
         goals=read_goals(table),
@@ -229,7 +230,8 @@ def place_start(scene: Scene, flush: int, x: float) -> Array:
     return z
 
 
-def _read_phase(scene: Scene, index: int, entry: object) -> Phase:
+def read_phase(scene: Scene, index: int, entry: object) -> Phase:
+    """The phase of an entry of `[[phases]]`; an `InputError` for what is none."""
     key = f"phases[{index + 1}]"
     if not isinstance(entry, dict):
         raise InputError("", key, f"{entry!r} is not a table")
@@ -242,7 +244,42 @@ def _read_phase(scene: Scene, index: int, entry: object) -> Phase:
     until = Until()
     if "until" in entry:
         until = _at(f"{key}.until", lambda: read_until(scene, entry["until"]))
-    return Phase(index, formation, until, end, entry.get("settle"))
+    guess = _read_guess(formation, entry["guess"], f"{key}.guess") if "guess" in entry else None
+    return Phase(index, formation, until, end, entry.get("settle"), guess)
+
+
+def _read_guess(formation: Formation, given: object, key: str) -> tuple[ModeGuess, ...]:
+    """The contact modes of an initial guess."""
+    if not isinstance(given, list) or not given:
+        raise InputError("", key, f"{given!r} is not a list of contact modes")
+    scene, modes = formation.scene, list[ModeGuess]()
+    count = formation.n_contacts
+    for row, entry in enumerate(given, start=1):
+        name = f"{key}[{row}]"
+        if not isinstance(entry, Mapping):
+            raise InputError("", name, f"{entry!r} is not a table")
+        check_keys(entry, name, MODE)
+        t, x, phi = (require_number(entry[own], f"{name}.{own}") for own in ("t", "x", "phi_deg"))
+        if t <= (modes[-1].t if modes else 0.0):
+            raise InputError("", f"{name}.t", f"{t:g} given; allowed is more than before")
+        check_place(scene, f"{name}.x", x)
+        TURN.check(f"{name}.phi_deg", phi, "degrees")
+        signs = entry["signs"]
+        if not isinstance(signs, str) or not re.fullmatch(rf"[-+0]{{{count}}} [-+]{{2}}", signs):
+            text = f"allowed are {count} of -, +, 0 for {describe(formation.contacts)}"
+            raise InputError("", f"{name}.signs", f"{signs!r} given; {text}, and - or + per joint")
+        for k, contact in enumerate(formation.contacts):
+            rolls = contact in formation.rolling
+            if rolls and signs[k] != "0":
+                raise InputError(
+                    "", f"{name}.signs", f"{signs!r} given; {contact} rolls: allowed is 0"
+                )
+            if signs[k] == "0" and formation.friction[k] == 0:
+                text = f"{contact} cannot roll without friction"
+                raise InputError("", f"{name}.signs", f"{signs!r} given; {text}")
+        values = tuple({"-": -1.0, "0": 0.0, "+": 1.0}[sign] for sign in signs if sign != " ")
+        modes.append(ModeGuess(t, x, math.radians(phi), values))
+    return tuple(modes)
 
 
 def read_formation(scene: Scene, names: Sequence[object]) -> Formation:

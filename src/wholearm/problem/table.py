@@ -20,7 +20,7 @@ from ..contacts.closing import close_finger, place_flush
 from ..scene.model import Polygon, Scene
 
 if TYPE_CHECKING:
-    from .definition import Goal, Phase, Problem, Until
+    from .definition import Goal, ModeGuess, Phase, Problem, Until
 
 
 SAME = 9  # decimals of an angle in degrees that a printed phase has at most
@@ -179,7 +179,15 @@ def describe_phase(phase: Phase, digits: int = 15) -> dict[str, Any]:
         own["until"] = write_until(phase.until, digits)
     if phase.settle is not None:
         own["settle"] = phase.settle
+    if phase.guess:
+        own["guess"] = [_write_mode(mode, digits) for mode in phase.guess]
     return own if phase.end.value == "rest" else own | {"end": phase.end.value}
+
+
+def _write_mode(mode: ModeGuess, digits: int) -> dict[str, Any]:
+    signs = "".join("-0+"[round(sign) + 1] for sign in mode.signs)
+    place = {"t": mode.t, "x": mode.x, "phi_deg": to_degrees(mode.phi, digits)}
+    return place | {"signs": f"{signs[:-2]} {signs[-2:]}"}
 
 
 def write_until(until: Until, digits: int = 15) -> Any:
@@ -242,6 +250,8 @@ def _write(value: Any) -> str:
     """A value, with all digits of a number."""
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{_quote(k)} = {_write(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, list | tuple) and value and isinstance(value[0], Mapping):
+        return "[\n" + "".join(f"    {_write(item)},\n" for item in value) + "]"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_write, value)) + "]"
     return json.dumps(value, ensure_ascii=False) if isinstance(value, str | bool) else repr(value)

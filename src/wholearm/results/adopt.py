@@ -100,7 +100,7 @@ def save(what: Torques | Problem, path: str | os.PathLike[str]) -> None:
         trajectory.save(path)
 
 
-_FREE = (".name", ".epsilon", ".settle_gap", ".uncertainty", ".goal", "settle")
+_FREE = (".name", ".epsilon", ".settle_gap", ".uncertainty", ".goal", "settle", "guess")
 """Keys of a problem in which its plans may differ from it; those with a dot at the top only."""
 
 

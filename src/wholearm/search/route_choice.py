@@ -190,7 +190,7 @@ class Chooser:
             background = BackgroundTask(partial(bound_borders, self.search, enough))
             self._bound = enough, background
         joined = join_route(
-            problem, links, options, self.roadmap.joined, report, self.jobs, background
+            problem, links, options, self.roadmap.joined, report, self.jobs, background, joins
         )
         if joins or isinstance(joined, str):
             return joined

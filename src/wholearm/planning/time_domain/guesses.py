@@ -8,7 +8,7 @@ rates. A contact whose rate rests there for a while, so that its friction is not
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -17,10 +17,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...common.arrays import Array
+from ...common.errors import InputError
 from ...contacts.elemental import Contact
 from ...contacts.formation import Formation
 from ...geometry.arcs import CostToGo
-from ...geometry.curve import find_tied, tangent_basis
+from ...geometry.curve import describe_pose, find_tied, tangent_basis
 from ...geometry.explore import close_contacts, is_inside
 from ...geometry.path_guess import PathGuess, connect, find_end, guess_phase, list_ends
 from ...mechanics.dynamics import Directions, force_rows, metric_weights
@@ -33,6 +34,7 @@ from .stage import Stage, StagePoints, in_own_units, resample, scale_state
 
 NEAREST = "a motion to the nearest end of the phase"
 STRAIGHT = "a motion straight to the end"
+GIVEN = "the contact modes that the problem gives"
 OTHER = "a motion straight to another end"
 GRADUAL = " with friction that sets in gradually"  # suffix of names where modes are found so
 LONGER = "{}, {:g} times as long as a fall over that height"
@@ -89,6 +91,55 @@ class Guesses:
     def nearest(self) -> Guess:
         """To the nearest end of each phase."""
         return Guess(NEAREST, self._guess(None, FALLS[0]))
+
+    @cached_property
+    def given(self) -> Guess | None:
+        """In the contact modes and through the poses that the phases give; None if one has none.
+
+        Configurations are a cubic spline in time through the poses, from rest to rest.
+        """
+        if not all(phase.guess for phase in self.phases):
+            return None
+        from scipy.interpolate import CubicSpline
+
+        scales, scheme = self.problem.scene.scales, self.search.scheme
+        t, z, ends = [0.0], [self.z], [0.0]
+        for phase in self.phases:
+            slip = phase.formation.evaluate_slip(z[-1][None])[0]
+            free = phase.formation.n_constraints <= 3
+            for mode in phase.guess or ():
+                place, pins = z[-1].copy(), ((0, mode.x), (2, mode.phi))
+                place[[0, 2]] = mode.x, mode.phi
+                closed = close_contacts(phase.formation, place, slip, pins if free else ())
+                if closed is None:
+                    key = f"phases[{phase.number}].guess"
+                    where = describe_pose(place)
+                    raise InputError("", key, f"contacts do not close at {where}")
+                t.append(ends[-1] + mode.t)
+                z.append(closed)
+            ends.append(t[-1])
+        path = CubicSpline(
+            np.array(t) / scales.time, scale_state(np.array(z), scales), 0, "clamped"
+        )
+        stages = list[Stage]()
+        whole = join_modes(self.nearest.stages)
+        for stage, phase, begin in zip(whole, self.phases, ends[:-1], strict=True):
+            edges = np.array([0.0, *(mode.t for mode in phase.guess or ())])
+            count, start, span = stage.intervals, begin / scales.time, edges[-1] / scales.time
+
+            def follow(share: Array, start: float = start, span: float = span) -> list[Array]:
+                return [path(start + share * span, order) for order in range(3)]
+
+            guess = _add_forces(stage.formation, stage.directions, scheme, count, span, follow)
+            guess = guess._replace(impulses=stage.guess.impulses)
+            parts = list[tuple[StagePoints, StageMode]]()
+            pairs = pairwise((edges / edges[-1]).tolist())
+            for (first, last), mode in zip(pairs, phase.guess or (), strict=True):
+                pieces = max(LEAST_INTERVALS, round((last - first) * count))
+                breaks = np.linspace(0.0, 1.0, pieces + 1)
+                parts.append((resample(guess, scheme, breaks, first, last), StageMode(mode.signs)))
+            stages += divide(stage, parts)
+        return Guess(GIVEN, self._leave_room(link(merge(stages))))
 
     def straight(self, goal: Array) -> Guess | None:
         """Straight to an end of a single phase with two freedoms, in the modes of that path."""
@@ -379,8 +430,7 @@ def keep_apart(stage: Stage, contact: Contact | None) -> Stage:
 
 def find_modes(search: TimeSearch, stages: Sequence[Stage]) -> TimeSolution:
     """Solution by friction homotopy, with stages in its modes."""
-    modes = [mode_of(next(s for s in stages if s.phase == stage.phase)) for stage in stages]
-    stages = link(merge([in_mode(*pair) for pair in zip(stages, modes, strict=True)]))
+    stages = link(join_modes(stages))
     solution: TimeSolution | None = None
     for onset in ONSETS:
         solution = search.solve([replace(stage, onset=onset) for stage in stages], solution, 50)
@@ -394,6 +444,12 @@ def find_modes(search: TimeSearch, stages: Sequence[Stage]) -> TimeSolution:
         return solution._replace(status=status, success=False)
     exact = [replace(piece, onset=0.0) for own in pieces for piece in own]
     return solution._replace(stages=link(merge(exact)))
+
+
+def join_modes(stages: Sequence[Stage]) -> list[Stage]:
+    """One stage for each phase, in the mode of its first one."""
+    modes = [mode_of(next(s for s in stages if s.phase == stage.phase)) for stage in stages]
+    return merge([in_mode(*pair) for pair in zip(stages, modes, strict=True)])
 
 
 def split_by_signs(stage: Stage, scheme: Scheme) -> list[Stage]:
@@ -565,7 +621,7 @@ def _guess(
 
     `clock` and `ends` are shares of the time `total` [s] and length of all stages at both ends.
     """
-    formation, scene = outline.formation, outline.formation.scene
+    formation = outline.formation
     knots = np.linspace(0.0, 1.0, len(outline.z))
     slopes = np.gradient(outline.z, knots, axis=0)
     bends = np.gradient(slopes, knots, axis=0)
@@ -587,15 +643,38 @@ def _guess(
         )
         return z, slope * rate, slope * gain + bend * rate**2
 
-    at = breaks[:-1, None] + scheme.points / count
-    z, v, a = follow(at)
+    duration, c = total * (clock[1] - clock[0]), None
+    if profile is not None:
+        at = breaks[:-1, None] + scheme.points / count
+        passed = clock[0] + at.ravel() * (clock[1] - clock[0])
+        own = np.searchsorted(profile.t / profile.t[-1], passed) - 1
+        c = profile.forces[np.clip(own, 0, len(profile.forces) - 1)]
+    return _add_forces(formation, outline.directions, scheme, count, duration, follow, c)
+
+
+def _add_forces(
+    formation: Formation,
+    directions: Directions,
+    scheme: Scheme,
+    count: int,
+    duration: float,
+    follow: Callable[[Array], Sequence[Array]],
+    c: Array | None = None,
+) -> StagePoints:
+    """A motion on `count` equal intervals, with forces `c`, (count d, n_c + R), and torques.
+
+    `follow` takes shares of the `duration` and gives z, z' and z''. Without `c`, normal forces are
+    those nearest to equal ones.
+    """
+    scene, breaks = formation.scene, np.linspace(0.0, 1.0, count + 1)
+    z, v, a = follow(breaks[:-1, None] + scheme.points / count)
     # G^T c + S tau is what the equations of motion need.
     flat = [table.reshape(-1, 5) for table in (z, v, a)]
-    G = force_rows(formation, formation.evaluate(*flat[:2]), outline.directions)
-    applied = scene.applied_force - scene.dry * np.append(np.zeros(3), outline.directions.sigma)
+    G = force_rows(formation, formation.evaluate(*flat[:2]), directions)
+    applied = scene.applied_force - scene.dry * np.append(np.zeros(3), directions.sigma)
     needed = scene.mass_diagonal * flat[2] + scene.viscous * flat[1] - applied
-    c = np.zeros((len(G), formation.n_constraints))
-    if profile is None:
+    if c is None:
+        c = np.zeros((len(G), formation.n_constraints))
         c[:, : formation.n_contacts] = _LIGHT
         missing = needed[:, :3] - np.einsum("nij,ni->nj", G[:, :, :3], c)
         c += [
@@ -604,17 +683,13 @@ def _guess(
         ]
         c_n = c[:, : formation.n_contacts]
         c_n[:] = np.clip(c_n, 0.1 * _LIGHT, 20.0)
-    else:
-        passed = clock[0] + at.ravel() * (clock[1] - clock[0])
-        own = np.searchsorted(profile.t / profile.t[-1], passed) - 1
-        c[:] = profile.forces[np.clip(own, 0, len(profile.forces) - 1)]
     # Torques of the motion, within limits, at about as many points as they have control points.
     tau = needed[:, 3:] - np.einsum("nij,ni->nj", G[:, :, 3:], c)
     limit = 0.9 * scene.torque_limit
     tau = np.clip(tau, -limit, limit).reshape(*z.shape[:2], 2)
     tau = tau[:, np.linspace(0, scheme.degree - 1, scheme.controls).round().astype(int)]
     return StagePoints(
-        total * (clock[1] - clock[0]),
+        duration,
         np.full(count, 1 / count),
         np.stack(follow(breaks)[:2], axis=1),
         z,

@@ -29,7 +29,7 @@ from ..options import Objective, PlanOptions
 from ..path_domain.impact_sequence import PER_SPEED, BlockImpact
 from ..phase_plan import PhasePlan
 from ..stops import PlanPart, Plans, end_of, plan_stops
-from .guesses import NEAREST, Guess, Guesses, find_modes
+from .guesses import GIVEN, NEAREST, Guess, Guesses, find_modes
 from .held_torques import hold_torques
 from .mode_search import (
     LEAST_INTERVALS,
@@ -50,6 +50,7 @@ if TYPE_CHECKING:
 
 ITERATIONS = 50  # most of the solver from a guess; successes take up to 25
 SPLIT = 80  # the same in modes of the homotopy
+MODES_GIVEN = 150  # the same in modes that the problem gives; phase 9 of query 28 takes 83
 FEW = 35  # the same where a single guess is tried
 BUDGET = 400  # solver iterations of one block after which no further guess is tried
 DEARER = 1.2  # cost of a refined plan, over that on few intervals, above which others are tried
@@ -112,6 +113,10 @@ def plan_phases(
         return plan_phases(other, same, z, rough, explained=False, patient=False)
 
     explanation = replan if explained else None
+    if found is None and guesses.given:
+        # The modes as given are the only ones that refine phase 3 of the route of query 19.
+        kept = replace(search, options=replace(search.options, mode_search=False))
+        found = solve_guesses(search, [guesses.given]) or solve_guesses(kept, [guesses.given])
     if found is None:
         listed = iter([guesses.nearest])
         if patient:
@@ -203,6 +208,8 @@ def solve_coarse(search: TimeSearch, guess: Guess, most: int = ITERATIONS) -> Ti
         if not solution.success:
             return solution
         stages, most = solution.stages, SPLIT
+    if guess.name == GIVEN:
+        most = MODES_GIVEN
     solution = search.solve(stages, guess.before, search.wait(most))
     if solution.success and solution.margin < -ROUNDING:
         # A motion that presses too little may be far from one that presses enough.
