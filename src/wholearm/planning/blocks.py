@@ -130,20 +130,11 @@ class Planning:
 
 
 def plan_blocks(
-    problem: Problem,
-    curves: tuple[Curve, ...],
-    options: PlanOptions,
-    report: Callable[[str], None],
-    known: Sequence[BlockPlan | None] = (),
+    problem: Problem, curves: tuple[Curve, ...], options: PlanOptions, report: Callable[[str], None]
 ) -> Planning:
     """Plan every block of a problem, each from where the one before ends; raises without a plan.
 
-    Parameters
-    ----------
-    curves  those of the first phases (`trace_phases`)
-    report  told what is being done
-    known   plans of blocks along curves, kept where blocks start at the same places; not of the
-            objective `margin`
+    `curves` are those of the first phases (`trace_phases`); `report` is told what is being done.
     """
     with name_source(problem.source):
         require_steps(problem, options)
@@ -154,7 +145,7 @@ def plan_blocks(
         least = plan_each(_begin_each(first, report), finer, report).plans
         planning = replace(planning, allowed=share_duration(least, options.duration), least=least)
         return _require_margin(plan_each(planning, finer, report))
-    return plan_each(_begin_each(planning, report, known), finer, report, known)
+    return plan_each(_begin_each(planning, report), finer, report)
 
 
 def plan_alone(planning: Planning, report: Callable[[str], None]) -> Planning | None:
@@ -187,22 +178,15 @@ def press_more(
     return _require_margin(plan_each(planning, finer, report))
 
 
-def plan_each(
-    planning: Planning,
-    finer: Sequence[int],
-    report: Callable[[str], None],
-    known: Sequence[BlockPlan | None] = (),
-) -> Planning:
+def plan_each(planning: Planning, finer: Sequence[int], report: Callable[[str], None]) -> Planning:
     """Plan block after block at its refinement level, but for those that are planned so."""
     made = replace(planning, blocks=())
-    for level, block in zip_longest(finer, planning.blocks or known):
+    for level, block in zip_longest(finer, planning.blocks):
         made = plan_next(made, level, block, report)
     return made
 
 
-def _begin_each(
-    planning: Planning, report: Callable[[str], None], known: Sequence[BlockPlan | None] = ()
-) -> Planning:
+def _begin_each(planning: Planning, report: Callable[[str], None]) -> Planning:
     """Coarse plans of the blocks as far as they exist, if one in the time domain is followed.
 
     An error is raised only if it does not depend on where exactly the block before ends.
@@ -213,7 +197,7 @@ def _begin_each(
         return planning
     for index in range(len(blocks)):
         try:
-            begun = plan_next(begun, BEGUN, known[index] if known else None, report)
+            begun = plan_next(begun, BEGUN, None, report)
         except WholearmError as error:
             if not any(over_time[:index]) or _is_clear(error):
                 raise

@@ -23,19 +23,17 @@ from ..geometry.curve import Curve
 from ..geometry.path_guess import count_freedoms
 from ..geometry.tracing import trace_phase
 from ..planning.advice import unadvised
-from ..planning.blocks import BEGUN, BlockPlan, Planning, plan_blocks, plan_next
+from ..planning.blocks import BEGUN, BlockPlan, Planning, plan_next
 from ..planning.options import PlanOptions
 from ..planning.plan import assemble_plan, finish_plan, solve_with
 from ..planning.replay_check import Checked
 from ..planning.result import Plan
 from ..planning.stops import end_of, split_blocks
-from ..planning.time_domain.time_motion import TimeMotion
 from ..problem.definition import ROWS, End, ModeGuess, Phase, Problem
 from ..problem.read import read_phase
 from ..problem.table import SAME as PRINTED_ANGLE
 from ..problem.table import describe_phase
-from ..results.plan_record import ROLLS
-from ..results.trajectory import Motion
+from ..results.plan_record import ROLLS, ModeSpan
 from ..scene.model import Scene
 from ..solvers.ipopt import SolverStatistics, open_ledger
 from .edges import EdgeStep, Link, describe_steps, find_headings, point_out
@@ -58,15 +56,18 @@ class Lost(str):
 
 
 def plan_phases(
-    problem: Problem, options: PlanOptions, cache: dict[object, Plan | str]
+    problem: Problem,
+    options: PlanOptions,
+    cache: dict[object, Plan | str],
+    report: Callable[[str], None],
 ) -> Plan | str:
     """The plan of a route's phases, or why there is none; `cache` has those made before."""
-    phases = tuple((phase.formation.names, phase.until, phase.end) for phase in problem.phases)
+    phases = tuple((p.formation.names, p.until, p.end, p.guess) for p in problem.phases)
     key = (tuple(np.round(problem.start, 12).tolist()), phases, repr(options))
     if key not in cache:
         try:
             with unadvised():
-                cache[key] = solve_with(problem, options)
+                cache[key] = solve_with(problem, options, report)
         except WholearmError as error:
             cache[key] = str(error)
         except np.linalg.LinAlgError:
@@ -74,10 +75,42 @@ def plan_phases(
     return cache[key]
 
 
+def list_printed(plan: Plan, guesses: bool) -> tuple[Phase, ...]:
+    """The phases of a plan as they are printed and read again.
+
+    With `guesses` phases over time begin with the modes and poses of the plan, rounded.
+    """
+    phases, start = list[Phase](), 0.0
+    for phase, planned in zip(plan.problem.phases, plan.phases, strict=True):
+        if guesses and planned.modes:
+            phase = replace(phase, guess=_list_modes(plan, start, planned.modes))
+        entry = describe_phase(phase, PRINTED_ANGLE)
+        phases.append(read_phase(plan.problem.scene, phase.index, entry))
+        start += planned.duration
+    return tuple(phases)
+
+
+def _list_modes(plan: Plan, start: float, spans: Sequence[ModeSpan]) -> tuple[ModeGuess, ...]:
+    """Contact modes of a phase that starts at `start` [s], and the poses at their ends."""
+    modes, length = list[ModeGuess](), plan.problem.scene.scales.length
+    for span in spans:
+        x, _, phi, *_ = plan.at(np.array([start + span.stop])).z[0].tolist()
+        t, x = _round(span.stop, GUESSED * spans[-1].stop), _round(x, GUESSED * length)
+        # In degrees, as it is printed.
+        phi = math.radians(_round(math.degrees(phi), math.degrees(GUESSED)))
+        signs = tuple(SIGNS[own] for own in (*span.contacts.values(), *span.joints))
+        modes.append(ModeGuess(t, x, phi, signs))
+    return tuple(modes)
+
+
+def _round(value: float, unit: float) -> float:
+    """A value with the decimals of a unit."""
+    return round(value, math.ceil(-math.log10(unit)))
+
+
 # Distances are in radii of gyration and radians.
 OFF = 1e-4  # distance of a traced end from a border's end that makes it another one
 GUESSED = 1e-6  # guesses are rounded to this, in the same unit, or over the duration
-LONGER = 0.01  # by how much a plan of printed phases may last longer than the route's, over that
 SIGNS = {"+": 1.0, "-": -1.0, ROLLS: 0.0}
 PINNED = 1e-9  # pinned coordinates of landings are rounded to this, in the same unit
 SAME = 9  # decimals of configurations that count as equal, in the same unit
@@ -112,12 +145,8 @@ def join_route(
     report: Callable[[str], None],
     jobs: int = 1,
     background: BackgroundTask[Any] | None = None,
-    printed: bool = True,
 ) -> Plan | str:
     """The plan of a route, joined from plans of its links, or why there is none.
-
-    If `printed` it is the plan of the phases as they are printed, which start from these plans,
-    unless that lasts longer.
 
     Parameters
     ----------
@@ -147,8 +176,6 @@ def join_route(
                     guesses[other].pop(0)
                     continue
                 planning, checked = _assemble(problem, planned, options), None
-                if printed and (plan := _plan_as_printed(planning, planned, report)):
-                    return plan
                 if options.replay:
                     report("replaying the plan")
                     checked = Checked.of(planning.problem, assemble_plan(planning))
@@ -175,56 +202,6 @@ def join_route(
         return str(error) if culprit is None else Lost.at(_blame(links, culprit), str(error))
     except np.linalg.LinAlgError:
         return SINGULAR
-
-
-def _plan_as_printed(
-    planning: Planning, links: Sequence[PlannedLink], report: Callable[[str], None]
-) -> Plan | None:
-    """The plan of the phases of a planning as they are printed.
-
-    Phases over time start from the modes and poses of the planning, rounded. None if there is no
-    such plan, or it lasts longer by more than `LONGER`.
-    """
-    start, phases, known = time.perf_counter(), list[Phase](), list[BlockPlan | None]()
-    longest = (1 + LONGER) * sum(plan.motion.duration for plan in planning.plans)
-    try:
-        for block in planning.blocks:
-            over_time, own = block.chain is None, list[Phase]()
-            for phase, plan in zip(block.phases, block.plans, strict=True):
-                phase = replace(phase, guess=_list_modes(plan.motion) if over_time else None)
-                entry = describe_phase(phase, PRINTED_ANGLE)
-                own.append(read_phase(planning.problem.scene, phase.index, entry))
-            phases += own
-            known.append(None if over_time else replace(block, phases=tuple(own)))
-        problem = replace(planning.problem, phases=tuple(phases))
-        with open_ledger() as ledger:
-            for number, cost in enumerate((cost for link in links for cost in link.costs), 1):
-                ledger.add(number, cost)
-            again = plan_blocks(problem, (), planning.options, report, known)
-            if sum(plan.motion.duration for plan in again.plans) > longest:
-                return None
-            return finish_plan(again, report, ledger, (start, start))
-    except (WholearmError, np.linalg.LinAlgError):
-        return None
-
-
-def _list_modes(motion: Motion) -> tuple[ModeGuess, ...]:
-    """Contact modes of a motion over time, and the poses at their ends, rounded."""
-    assert isinstance(motion, TimeMotion)
-    found, length = list[ModeGuess](), motion.stages[0].formation.scene.scales.length
-    for span in motion.modes:
-        x, _, phi, *_ = motion.evaluate(np.array([span.stop])).z[0].tolist()
-        signs = tuple(SIGNS[own] for own in (*span.contacts.values(), *span.joints))
-        t, x = _round(span.stop, GUESSED * motion.duration), _round(x, GUESSED * length)
-        # In degrees, as it is printed.
-        phi = math.radians(_round(math.degrees(phi), math.degrees(GUESSED)))
-        found.append(ModeGuess(t, x, phi, signs))
-    return tuple(found)
-
-
-def _round(value: float, unit: float) -> float:
-    """A value with the decimals of a unit."""
-    return round(value, math.ceil(-math.log10(unit)))
 
 
 def _blame(links: Links, culprit: int) -> tuple[Link, ...]:

@@ -17,7 +17,7 @@ from ..planning.options import Objective, PlanOptions
 from ..planning.result import Plan
 from ..problem.definition import Problem
 from .astar import CAREFUL, EAGER, RoadmapRoute, RouteSearch, SearchRule
-from .edge_plans import BackgroundTask, Lost, can_join, join_route, plan_phases
+from .edge_plans import BackgroundTask, Lost, can_join, join_route, list_printed, plan_phases
 from .edges import Link, describe_steps, leave_at
 from .feasibility import Measured, leave_in_motion, measure_link
 from .result import BorderBound, bound_borders
@@ -90,6 +90,7 @@ class ReleaseSearch:
 
 
 FASTER = 0.7  # least ratio of planned to straight-path durations through cells; by experience
+LONGER = 1.01  # by how much a plan of printed phases may last longer than that of the links
 TRIED = 6  # most routes without a plan, beyond those asked for
 OTHERS = 2  # most slower plans of a link that are tried if the fastest fails the replay
 BEYOND = 1.1  # largest estimate of a route over that of the best one
@@ -173,11 +174,15 @@ class Chooser:
                 self.made.append((plan, route))
 
     def _plan(self, route: RoadmapRoute, report: Callable[[str], None]) -> Plan | str:
-        """The plan of a route from its links or, if these cannot be joined, from their ends."""
+        """The plan of the phases that are printed for a route.
+
+        Their ends are those of plans of the route's links. If these can be joined, they are the
+        initial guess, too, and kept where the plan from them lasts longer.
+        """
         problem, options = self.problem, self.options
         joins = can_join(problem, options)
         if not joins:
-            options = replace(options, objective=Objective.TIME, duration=None, replay=False)
+            options = replace(options, objective=Objective.TIME, duration=None)
             problem, options = free_torques(problem, options)
         links = [(link, self._list_plans(link)) for r in (*self.before, route) for link in r.links]
         if problem is not self.problem:
@@ -189,13 +194,16 @@ class Chooser:
             enough = BEYOND * self.estimate(route)
             background = BackgroundTask(partial(bound_borders, self.search, enough))
             self._bound = enough, background
-        joined = join_route(
-            problem, links, options, self.roadmap.joined, report, self.jobs, background, joins
-        )
-        if joins or isinstance(joined, str):
+        join = partial(join_route, problem, links, cache=self.roadmap.joined, report=report)
+        quick = replace(options, replay=False)
+        joined = join(options=quick, jobs=self.jobs, background=background)
+        if isinstance(joined, str):
             return joined
-        problem = replace(self.problem, phases=joined.problem.phases, goals=())
-        return plan_phases(problem, self.options, self.roadmap.plans)
+        printed = replace(self.problem, phases=list_printed(joined, guesses=joins), goals=())
+        plan = plan_phases(printed, self.options, self.roadmap.plans, report)
+        if joins and (isinstance(plan, str) or plan.duration > LONGER * joined.duration):
+            return join(options=options)
+        return plan
 
     def bound(self, duration: float, in_cells: bool) -> BorderBound:
         """Lower bound of all routes along borders; up to `duration` of a plan `in_cells`."""

@@ -92,54 +92,63 @@ class Guesses:
         """To the nearest end of each phase."""
         return Guess(NEAREST, self._guess(None, FALLS[0]))
 
-    @cached_property
-    def given(self) -> Guess | None:
-        """In the contact modes and through the poses that the phases give; None if one has none.
+    def given(self) -> Iterator[Guess]:
+        """In the contact modes that the phases give, if all do.
 
-        Configurations are a cubic spline in time through the poses, from rest to rest.
+        First through their poses too, then along the paths to the nearest ends, for as long as the
+        modes last.
         """
         if not all(phase.guess for phase in self.phases):
-            return None
+            return
+        whole, unit = join_modes(self.nearest.stages), self.problem.scene.scales.time
+        through = self._follow_poses(whole)
+        nearest = [stage.guess for stage in whole]
+        for name, guesses in ((GIVEN, through), (f"{GIVEN}, and the path of {NEAREST}", nearest)):
+            stages = list[Stage]()
+            for stage, phase, guess in zip(whole, self.phases, guesses, strict=True):
+                modes, parts = phase.guess or (), list[tuple[StagePoints, StageMode]]()
+                guess = guess._replace(duration=modes[-1].t / unit)
+                edges = [0.0, *(mode.t / modes[-1].t for mode in modes)]
+                for begin, stop, mode in zip(edges, edges[1:], modes, strict=False):
+                    count = max(LEAST_INTERVALS, round((stop - begin) * stage.intervals))
+                    breaks = np.linspace(0.0, 1.0, count + 1)
+                    part = resample(guess, self.search.scheme, breaks, begin, stop)
+                    parts.append((part, StageMode(mode.signs)))
+                stages += divide(stage, parts)
+            yield Guess(name, self._leave_room(link(merge(stages))))
+
+    def _follow_poses(self, whole: Sequence[Stage]) -> list[StagePoints]:
+        """Motions of whole phases: cubic splines in time through the poses that these give."""
         from scipy.interpolate import CubicSpline
 
-        scales, scheme = self.problem.scene.scales, self.search.scheme
-        t, z, ends = [0.0], [self.z], [0.0]
+        scales, t, z, starts = self.problem.scene.scales, [0.0], [self.z], list[float]()
         for phase in self.phases:
-            slip = phase.formation.evaluate_slip(z[-1][None])[0]
-            free = phase.formation.n_constraints <= 3
+            starts.append(t[-1])
+            slip, key = phase.formation.evaluate_slip(z[-1][None])[0], f"phases[{phase.number}]"
             for mode in phase.guess or ():
-                place, pins = z[-1].copy(), ((0, mode.x), (2, mode.phi))
+                place = z[-1].copy()
                 place[[0, 2]] = mode.x, mode.phi
-                closed = close_contacts(phase.formation, place, slip, pins if free else ())
+                # With one freedom both may not agree to the last digit.
+                free = phase.formation.n_constraints <= 3
+                pins = ((0, mode.x), (2, mode.phi)) if free else ()
+                closed = close_contacts(phase.formation, place, slip, pins)
                 if closed is None:
-                    key = f"phases[{phase.number}].guess"
-                    where = describe_pose(place)
-                    raise InputError("", key, f"contacts do not close at {where}")
-                t.append(ends[-1] + mode.t)
+                    text = f"the contacts do not close at {describe_pose(place)}"
+                    raise InputError("", f"{key}.guess", text)
+                t.append(starts[-1] + mode.t)
                 z.append(closed)
-            ends.append(t[-1])
-        path = CubicSpline(
-            np.array(t) / scales.time, scale_state(np.array(z), scales), 0, "clamped"
-        )
-        stages = list[Stage]()
-        whole = join_modes(self.nearest.stages)
-        for stage, phase, begin in zip(whole, self.phases, ends[:-1], strict=True):
-            edges = np.array([0.0, *(mode.t for mode in phase.guess or ())])
-            count, start, span = stage.intervals, begin / scales.time, edges[-1] / scales.time
+        own_t, own_z = np.array(t) / scales.time, scale_state(np.array(z), scales)
+        path, found = CubicSpline(own_t, own_z, bc_type="clamped"), list[StagePoints]()
+        for stage, start, stop in zip(whole, starts, [*starts[1:], t[-1]], strict=True):
+            begin, span = start / scales.time, (stop - start) / scales.time
 
-            def follow(share: Array, start: float = start, span: float = span) -> list[Array]:
-                return [path(start + share * span, order) for order in range(3)]
+            def follow(share: Array, begin: float = begin, span: float = span) -> list[Array]:
+                return [path(begin + share * span, order) for order in range(3)]
 
-            guess = _add_forces(stage.formation, stage.directions, scheme, count, span, follow)
-            guess = guess._replace(impulses=stage.guess.impulses)
-            parts = list[tuple[StagePoints, StageMode]]()
-            pairs = pairwise((edges / edges[-1]).tolist())
-            for (first, last), mode in zip(pairs, phase.guess or (), strict=True):
-                pieces = max(LEAST_INTERVALS, round((last - first) * count))
-                breaks = np.linspace(0.0, 1.0, pieces + 1)
-                parts.append((resample(guess, scheme, breaks, first, last), StageMode(mode.signs)))
-            stages += divide(stage, parts)
-        return Guess(GIVEN, self._leave_room(link(merge(stages))))
+            given = stage.formation, stage.directions, self.search.scheme, stage.intervals
+            points = _add_forces(*given, span, follow)
+            found.append(points._replace(impulses=stage.guess.impulses))
+        return found
 
     def straight(self, goal: Array) -> Guess | None:
         """Straight to an end of a single phase with two freedoms, in the modes of that path."""
