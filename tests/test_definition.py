@@ -35,7 +35,14 @@ from wholearm.problem.read import (
     read_problem,
     write_page,
 )
-from wholearm.problem.table import describe_scene, format_until, write_table
+from wholearm.problem.table import (
+    describe_phase,
+    describe_scene,
+    format_until,
+    write_table,
+    write_toml,
+)
+from wholearm.results.adopt import describe_origin
 from wholearm.scene.model import Finger, Friction, find_unit_hint
 
 TEXT = HEPTAGON.read_text(encoding="utf-8")
@@ -113,6 +120,38 @@ def test_both_freedoms_of_a_cell_may_be_given(given: dict[str, Any], text: str) 
     assert tomllib.loads(f"until = {format_until(again)}")["until"] == pytest.approx(given)
 
 
+MODES = [
+    {"t": 0.01, "x": -0.0212, "phi_deg": -51.25, "signs": "-+0 +-"},
+    {"t": 0.1, "x": -0.03, "phi_deg": -61.9, "signs": "-++ ++"},
+]
+
+
+LATER = ["v3-finger1", "v0-finger2"]
+
+
+def guessing(*changes: tuple[int, str, Any]) -> dict[str, Any]:
+    """A phase with an initial guess, some values of which are others."""
+    modes: list[dict[str, Any]] = [dict(mode) for mode in MODES]
+    for row, key, value in changes:
+        modes[row][key] = value
+    return {"contacts": ["v1-palm", *LATER], "until": "v2-palm", "guess": modes}
+
+
+def test_an_initial_guess_is_read_and_written_as_the_same() -> None:
+    problem = read_edited(put("phases.3", guessing()))
+    first, last = problem.phases[3].guess or ()
+    assert first.t == 0.01 and first.signs == (-1.0, 1.0, 0.0, 1.0, -1.0)
+    assert last.x == -0.03 and last.phi == math.radians(-61.9)
+    written = describe_phase(problem.phases[3])
+    assert written["guess"] == MODES
+    text = write_toml({"phases": [written]})
+    assert tomllib.loads(text)["phases"] == [written]
+    # A plan is not another problem's for that.
+    bare = guessing()
+    del bare["guess"]
+    assert describe_origin(read_edited(put("phases.3", bare)), {"problem": problem.table}) == ""
+
+
 def test_a_problem_for_a_map_needs_no_phases() -> None:
     problem = read_edited(lambda table: table.pop("phases"))
     assert problem.phases == () and repr(problem).endswith("0 phases)")
@@ -179,6 +218,18 @@ THREE = {
         (put("phases.3", THREE), "phases[4].until", "gives 3 conditions; allowed are 2"),
         (put("phases.3.until", {"x": math.nan}), "phases[4].until", "finite"),
         (put("phases.3.until", {"phi_deg": "1"}), "phases[4].until", "'1'"),
+        (put("phases.3", guessing() | {"guess": []}), "phases[4].guess", "contact modes"),
+        (put("phases.3", guessing() | {"guess": [3]}), "phases[4].guess[1]", "not a table"),
+        (put("phases.3", guessing((1, "t", 0.01))), "phases[4].guess[2].t", "more than before"),
+        (put("phases.3", guessing((0, "x", 99.0))), "phases[4].guess[1].x", "99"),
+        (put("phases.3", guessing((0, "phi_deg", "1"))), "phases[4].guess[1].phi_deg", "'1'"),
+        (put("phases.3", guessing((0, "signs", "-+ +-"))), "phases[4].guess[1].signs", "3 of -"),
+        (put("phases.3", guessing((0, "sign", 1))), "phases[4].guess[1].sign", "'signs'"),
+        (
+            put("phases.3", guessing() | {"contacts": ["v1-palm rolling", *LATER]}),
+            "phases[4].guess[1].signs",
+            "v1-palm rolls: allowed is 0",
+        ),
     ],
 )
 def test_bad_input_names_the_key(edit: Edit, key: str, text: str) -> None:

@@ -6,6 +6,7 @@ import copy
 import json
 import math
 import tomllib
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -16,7 +17,7 @@ import pytest
 
 import wholearm
 from retelling import Retelling, Units
-from shipped import FOLDER, HEPTAGON, HEXAGON, problem_of
+from shipped import FOLDER, HEPTAGON, HEXAGON, LANDING, problem_of, solved
 from wholearm import Formation, Goal, Phase, Plan, PlanOptions, Problem, load_plan, verify
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
@@ -36,10 +37,11 @@ from wholearm.mapping.formation_list import (
     tolerance,
 )
 from wholearm.planning.lower_bound import bound_least_time
+from wholearm.planning.time_domain.guesses import GIVEN
 from wholearm.problem.read import build_problem
 from wholearm.search.astar import RoadmapRoute, RouteSearch
 from wholearm.search.cuts import link_changed, list_cut, list_cut_borders, list_openings
-from wholearm.search.edge_plans import BackgroundTask, Cache, join_route
+from wholearm.search.edge_plans import BackgroundTask, Cache, join_route, list_printed
 from wholearm.search.edges import Link
 from wholearm.search.feasibility import Measured
 from wholearm.search.find_route import (
@@ -53,7 +55,7 @@ from wholearm.search.find_route import (
     store_roadmap,
 )
 from wholearm.search.places import make_place
-from wholearm.search.result import bound_borders, describe_block
+from wholearm.search.result import bound_borders, describe_block, format_phases
 from wholearm.search.roadmap import Roadmap
 from wholearm.search.route_choice import FINEST, Found, RefinedPath, ReleaseSearch
 
@@ -170,7 +172,7 @@ def test_a_goal_out_of_the_hand_s_reach_is_refused_without_a_search() -> None:
 
 
 def test_python_and_time_limits_end_a_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupt(*_: object) -> None:
+    def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(SolverError, match="time limit is over, and there is no plan yet"):
@@ -209,6 +211,22 @@ def test_route_prints_phases_that_load(tmp_path: Path, capsys: pytest.CaptureFix
     # What needs phases says where they come from.
     assert main(["predict", str(path)]) == 2
     assert "`wholearm route FILE` finds" in capsys.readouterr().err
+
+
+def test_printed_phases_have_the_plan_that_they_are_printed_for() -> None:
+    """Read again they begin with the modes and poses of that plan, but for rounding."""
+    plan = solved(LANDING)
+    printed = replace(plan.problem, phases=list_printed(plan, guesses=True))
+    table = {key: own for key, own in plan.problem.table.items() if key != "phases"}
+    again = build_problem(table | tomllib.loads(format_phases(printed)))
+    over_time = [phase.number for phase in plan.phases if phase.modes]
+    assert over_time and [p.number for p in again.phases if p.guess] == over_time
+    for one, other in zip(printed.phases, again.phases, strict=True):
+        assert (one.until, one.end, one.guess) == (other.until, other.end, other.guess)
+    found = wholearm.solve(again, replay=False)
+    assert found.phases[over_time[0] - 1].attempt == GIVEN
+    # The issue allows 1e-4; both refine to that accuracy.
+    assert found.duration == pytest.approx(plan.duration, rel=1e-4)
 
 
 def test_what_is_advised_opens_the_way() -> None:

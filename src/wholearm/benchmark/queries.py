@@ -22,6 +22,7 @@ import numpy as np
 
 from ..common.errors import InfeasibleError, InputError, WholearmError
 from ..mapping.formation_list import format_route, list_formations
+from ..planning.options import PlanOptions
 from ..planning.plan import solve
 from ..problem.definition import Problem
 from ..problem.read import build_problem, place_start, read_problem
@@ -52,7 +53,8 @@ class Queries(Study):
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
         """What is drawn, its seed and number, folder of the problems, and what is asked."""
-        asked = options.problems, options.objective, options.printed
+        objective = PlanOptions(objective=options.objective).goal.value
+        asked = options.problems, objective, options.printed
         for kind, count in (("query", options.queries), ("polygon", options.polygons)):
             yield from ((kind, options.seed, k, *asked) for k in range(count))
 
