@@ -35,11 +35,10 @@ from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import LAMBDA, Directions, build_forward, inverse, reduced_inertia
 from wholearm.mechanics.impact import Impact, ViolationKind, compute_impact, solve_impulses
-from wholearm.mechanics.statics import find_static_torques
+from wholearm.mechanics.statics import Statics, pushes_one_way
 from wholearm.mechanics.uniqueness import find_minors
 from wholearm.planning.path_domain.impact_sequence import ImpactSequence, make_sequence
 from wholearm.planning.path_domain.path_plan import plan_curves
-from wholearm.planning.time_domain.resting import find_block, pushes_one_way
 from wholearm.planning.time_domain.stage import in_own_units, scale_state
 from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.read import build_problem, read_problem
@@ -760,7 +759,7 @@ def test_torques_that_friction_can_hold_are_those_of_the_linear_programme(path: 
     problem = problem_of(path)
     rng, scene = np.random.default_rng(5), problem.scene
     for curve in trace_phases(problem)[::2]:
-        static = find_static_torques(curve.formation, curve.start)
+        static = Statics(curve.formation, curve.start).torque_polygon()
         tau = rng.uniform(-1.0, 1.0, (12, 2)) * scene.torque_limit
         for own, beyond in zip(tau, static.measure(tau), strict=True):
             if abs(beyond) > 1e-4 * scene.scales.torque:
@@ -843,7 +842,7 @@ def test_planner_and_linear_programme_agree_on_what_rests(phase: int, ends: bool
     own, scaled = in_own_units(problem), scale_state(z, problem.scene.scales)
     while high - low > 1e-3:
         middle = (low + high) / 2
-        held = find_block(own.phases[phase].formation, scaled, middle, ends)
+        held = Statics(own.phases[phase].formation, scaled).find_block(middle, ends)
         low, high = (middle, high) if held is None else (low, middle)
     force = scene.scales.force
     assert rest_margin(scene, cell, force * (high + 0.01), z, ends) < 0.0

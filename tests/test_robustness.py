@@ -34,7 +34,7 @@ from wholearm.mechanics.dynamics import (
     metric_weights,
     stack_motion,
 )
-from wholearm.mechanics.statics import find_static_torques
+from wholearm.mechanics.statics import Statics
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.robust.robust_rows import list_holds, measure_holds
@@ -581,7 +581,7 @@ def test_options_that_make_no_sense_are_refused(given: dict[str, float], text: s
 def test_what_friction_may_hold_grows_with_the_ranges(hexed: Problem) -> None:
     formation, tau = hexed.phases[0].formation, np.array([0.05, -0.02])
     ranges = {"friction_palm": 0.3, "friction_finger1": 0.3, "mass": 0.1, "gain2": 0.05}
-    exact = find_static_torques(formation, hexed.start).measure(tau[None])[0]
+    exact = Statics(formation, hexed.start).torque_polygon().measure(tau[None])[0]
     assert measure_holds(list_holds(formation, hexed.start, {}), tau) == pytest.approx(exact)
     rng, within = np.random.default_rng(3), list_holds(formation, hexed.start, ranges)
     for tau in rng.uniform(-1.0, 1.0, (20, 2)):
@@ -589,7 +589,7 @@ def test_what_friction_may_hold_grows_with_the_ranges(hexed: Problem) -> None:
         for _ in range(5):
             own = {name: width * rng.uniform(-1, 1) for name, width in ranges.items()}
             scene = change_problem(hexed, own).scene
-            static = find_static_torques(replace(formation, scene=scene), hexed.start)
+            static = Statics(replace(formation, scene=scene), hexed.start).torque_polygon()
             assert static.measure((tau * [1.0, 1 + own["gain2"]])[None])[0] >= least - 1e-9
 
 

@@ -1,17 +1,25 @@
-"""Static equilibrium with Coulomb friction: torques that hold, and forces that would be missing.
+"""Statics at rest with Coulomb friction: torques that hold, missing forces, and starts of motion.
 
-With contact forces c_n, c_t inside the friction cones and friction d of the joints, balance is
+With contact forces c_n, c_t, friction d of the joints and accelerations a, at rest
 
-    g + S (tau - d) + A^T c_n + A_t^T c_t = 0,   |c_t| <= mu c_n,   |d| <= D.
+    M5 a = g + S (tau - d) + A^T c_n + A_t^T c_t,   A a = 0,   |c_t| <= mu c_n,   |d| <= D.
 
-Its projection onto the torques is a convex polygon, perhaps unbounded. Corners are basic solutions
-of the object's three rows, rays are internal forces. Beyond it a motion begins in any case; within
-it friction may hold everything at rest (static indeterminacy).
+Without acceleration this is balance. Its projection onto the torques is a convex polygon, perhaps
+unbounded: by duality, its sides are extreme rays of the polar of the cone of contact forces. Beyond
+it a motion begins in any case; within it friction may hold everything (static indeterminacy).
+
+In a contact mode friction follows from the acceleration: a contact slides with c_t = -mu Xi c_n and
+Xi A_t a > 0, or sticks with A_t a = 0; closed gaps of other contacts can only open. With two
+degrees of freedom the modes are the sectors and rays between a few lines. Whether a motion can
+begin is one linear programme for each of them. For a motion that comes to rest the acceleration is
+against its direction. Forces may be indeterminate here, as where only a finger starts; the start
+modes of `simulation.rest` are those with forces that torques determine.
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Iterator
+from functools import cached_property, lru_cache
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -20,21 +28,26 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..contacts.formation import Formation
-from ..scene.model import Scene
 from .dynamics import null_vector
 
 SURE = 1e-3  # distance from torques that friction can hold, over the scene's, at which it moves
+MOVES = 1e-5  # least sum of accelerations, over the scene's own, that counts as a motion
 _TINY = 1e-9  # what counts as zero of numbers of the order of one
+_PROBE = 1e-6  # steps that slopes of limits are taken over, in radii of gyration and rad
+_SMOOTH = 1e-3  # difference of slopes on both sides, in radii of gyration, up to which there is one
+_LEVEL = 1e-6  # slope of a limit, in radii of gyration, below which no motion changes it
+_PUSHES = 1e-3  # least component along one direction, over all forces, that moves the object
+_TORQUES = np.hstack([np.eye(5)[:, 3:], -np.eye(5)[:, 3:]])  # as two positive parts, (5, 4)
 
 
-class StaticTorques(NamedTuple):
+class TorquePolygon(NamedTuple):
     """The polygon normals @ tau <= bounds, with normals of length one."""
 
     normals: Array  # (m, 2)
     bounds: Array  # (m,) [N m]: a single one of minus infinity where nothing can be held
 
     def measure(self, tau: Array) -> Array:
-        """How far torques, shape (n, 2), are beyond the polygon; negative inside, (n,) [N m]."""
+        """How far torques, shape (n, 2), are beyond a side; negative inside, (n,) [N m]."""
         if not len(self.normals):
             return np.full(len(tau), -np.inf)
         return np.asarray((tau @ self.normals.T - self.bounds).max(axis=1))
@@ -49,79 +62,254 @@ class StaticTorques(NamedTuple):
         return bool(linprog(np.zeros(2), self.normals, self.bounds, bounds=box).status == 2)
 
 
-def find_static_torques(touching: Formation, z: Array, least: float = 0.0) -> StaticTorques:
-    """Torque polygon in which contact forces and joint friction can balance gravity at `z`, (5,).
+class BlockedStart(NamedTuple):
+    """The contact with the largest tension, in the mode where that is least."""
 
-    `touching` has all contacts that touch; `least` [N] is the apex of every cone, c_n >= least and
-    |c_t| <= mu (c_n - least).
-    """
-    scene, kinematics = touching.scene, touching.evaluate(z[None], np.zeros((1, 5)))
-    normal, slip = kinematics.A[0], touching.friction[:, None] * kinematics.A_t[0]
-    # Edges of all cones, (2 n_c, 5), as forces on (q, theta).
-    edges = np.stack([normal - slip, normal + slip], axis=1).reshape(-1, 5)
-    static = _project(scene, edges, scene.applied_force + least * normal.sum(axis=0))
-    return static._replace(bounds=static.bounds + np.abs(static.normals) @ scene.dry[3:])
+    contact: str  # empty if torques alone prevent a motion
+    short: float  # [N]: least shortfall of c_n below epsilon
 
 
-def _project(scene: Scene, edges: Array, applied: Array) -> StaticTorques:
-    """Torques that balance an applied force, shape (5,), with nonnegative amounts of the edges."""
-    scales = scene.scales
-    # Forces count in the scene's force, torques in its torque.
-    units = np.array([1.0, 1.0, *[scales.length] * 3])
-    edges, load = edges / units, applied[:3] / (scales.force * units[:3])
-    E, joints = edges[:, :3], -edges[:, 3:]
-    # Without friction the edges may leave a direction of the load out.
-    _, values, basis = np.linalg.svd(E)
-    basis = basis[: int((values > _TINY * values[0]).sum())]
-    if np.abs(load - load @ basis.T @ basis).max() > _TINY:
-        return StaticTorques(np.array([[1.0, 0.0]]), np.array([-np.inf]))
-    E, load = E @ basis.T, basis @ load
-    corners, rays = _find_corners(E, joints, load), _find_rays(E, joints)
-    if not len(corners):
-        return StaticTorques(np.array([[1.0, 0.0]]), np.array([-np.inf]))
-    sides = np.concatenate([_find_sides(corners), rays, np.eye(2)])
-    normals = np.stack([sides[:, 1], -sides[:, 0]], axis=1)
-    normals = np.concatenate([normals, -normals])
-    normals /= np.linalg.norm(normals, axis=1)[:, None]
-    normals = normals[(normals @ rays.T <= _TINY).all(axis=1)]
-    bounds = scales.torque * (normals @ corners.T).max(axis=1)
-    return StaticTorques(normals, bounds - normals @ applied[3:])
+class _Mode(NamedTuple):
+    """Motions that begin or end at rest with the same friction: accelerations are N y."""
+
+    N: Array  # (5, f)
+    rates: Array  # (n_c + 2, f): of sliding and turning
+    opens: Array  # (k, f): of closed gaps, that can only open
+    signs: Array  # (n_c + 2,): of sliding and turning, zero for what sticks or is held
 
 
-def _find_sides(corners: Array) -> Array:
-    """Sides of the convex hull of points in the plane, (m, 2): all others are on one side."""
-    first, second = corners[_choose(len(corners), 2)].swapaxes(0, 1)
-    sides = second - first
-    sides, first = (part[np.linalg.norm(sides, axis=1) > _TINY] for part in (sides, first))
-    across = np.stack([sides[:, 1], -sides[:, 0]], axis=1)
-    off = across @ corners.T - (across * first).sum(axis=1)[:, None]
-    small = _TINY * np.linalg.norm(sides, axis=1)[:, None]
-    return np.asarray(sides[(off <= small).all(axis=1) | (off >= -small).all(axis=1)])
+class _Answer(NamedTuple):
+    """Solution of a linear programme, in SI units."""
+
+    c_n: Array  # c_n, c_t (n_c,) [N]
+    c_t: Array
+    x: Array  # (k,): amounts of the given forces
 
 
-def _find_corners(E: Array, joints: Array, load: Array) -> Array:
-    """Torques of the basic solutions of E^T e = -load with e >= 0, shape (m, 2)."""
-    chosen = _choose(len(E), E.shape[1])
-    matrix = E[chosen].transpose(0, 2, 1)
-    # Elimination of a singular matrix may divide by zero; its determinant is zero, or not a number.
-    with np.errstate(all="ignore"):
-        regular = np.abs(np.linalg.det(matrix)) > _TINY
-    matrix, chosen = matrix[regular], chosen[regular]
-    right = np.broadcast_to(-load[:, None], (len(matrix), len(load), 1))
-    amounts = np.linalg.solve(matrix, right)[..., 0]
-    held = (amounts >= -_TINY).all(axis=1)
-    return np.asarray(np.einsum("ni,nij->nj", amounts[held], joints[chosen[held]]))
+class Statics:
+    """A formation, usually of all contacts that touch, at rest at a configuration."""
+
+    def __init__(self, formation: Formation, z: Array) -> None:
+        self.formation, self.z, self.scene = formation, z, formation.scene
+        self.kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
+        self.A, self.A_t = self.kinematics.A[0], self.kinematics.A_t[0]
+        scales = self.scene.scales
+        # Forces on z count in the scene's force and, as torques, in its torque.
+        self._units = scales.force * np.array([1.0, 1.0, *[scales.length] * 3])
+
+    def torque_polygon(self, least: float = 0.0) -> TorquePolygon:
+        """Torques with which contact forces and friction of the joints can balance gravity.
+
+        The apex of every cone is `least` [N]: c_n >= least and |c_t| <= mu (c_n - least).
+        """
+        scales, slip = self.scene.scales, self.formation.friction[:, None] * self.A_t
+        edges = scales.force * np.concatenate([self.A - slip, self.A + slip]) / self._units
+        load = (self.scene.applied_force + least * self.A.sum(axis=0)) / self._units
+        # Without friction the edges may leave a direction of the load out.
+        _, values, basis = np.linalg.svd(edges[:, :3])
+        basis = basis[: int((values > _TINY * values[0]).sum())]
+        nothing = TorquePolygon(np.array([[1.0, 0.0]]), np.array([-np.inf]))
+        if np.abs(load[:3] - load[:3] @ basis.T @ basis).max() > _TINY:
+            return nothing
+        edges, load = (
+            np.hstack([part[..., :3] @ basis.T, part[..., 3:]]) for part in (edges, load)
+        )
+        # Rays u with edges @ u >= 0 give u @ (load, tau) <= 0. Friction of the joints moves a side
+        # out, and adds sides along the axes.
+        size = edges.shape[1]
+        rows = np.concatenate([edges, np.eye(size)[-2:]])
+        rays = null_vector(rows[_choose(len(rows), size - 1)], _TINY)
+        rays = np.concatenate([rays, -rays])
+        rays = rays[(rays @ edges.T >= -_TINY).all(axis=1)]
+        lengths, bounds = np.linalg.norm(rays[:, -2:], axis=1), -rays @ load
+        sides = lengths > _TINY
+        if (bounds[~sides] < -_TINY).any():
+            return nothing
+        normals = rays[sides, -2:] / lengths[sides, None]
+        bounds = scales.torque * bounds[sides] / lengths[sides]
+        return TorquePolygon(normals, bounds + np.abs(normals) @ self.scene.dry[3:])
+
+    def find_pulls(self, tau: Array) -> Array:
+        """Pulls p >= 0 of the contacts, (n_c,) [N], of least sum with which forces balance.
+
+        Contact forces are those of cones less p along the normals. Infinite if no pulls balance.
+        """
+        free = np.tile([0.0, np.inf], (len(self.A), 1))
+        answer = self._solve(tau, -self.A.T, free, np.ones(len(self.A)))
+        return np.full(len(self.A), np.inf) if answer is None else answer.x
+
+    def find_holding_change(self, tau: Array, least: float, free: tuple[int, ...]) -> Array | None:
+        """Change of the torques `free`, (2,) [N m], of least sum of sizes that holds, or None.
+
+        Torques stay within their limits, with c_n >= least [N] and |c_t| <= mu c_n.
+        """
+        most = [np.maximum(self.scene.torque_limit + side * tau, 0.0) for side in (-1.0, 1.0)]
+        bounds = np.stack([np.zeros(4), np.where(np.isin([0, 1], free), most, 0.0).ravel()], axis=1)
+        answer = self._solve(tau, _TORQUES, bounds, np.ones(4), least)
+        return None if answer is None else answer.x[:2] - answer.x[2:]
+
+    def find_firmest_forces(self, tau: Array) -> Array:
+        """Contact forces c_n and c_t with the largest least c_n, (2, n_c) [N]; NaN for none."""
+        free = np.array([[-np.inf, np.inf]])
+        answer = self._solve(tau, np.zeros((5, 1)), free, -np.ones(1), presses=True)
+        return np.full((2, len(self.A)), np.nan) if answer is None else np.array(answer[:2])
+
+    def find_block(self, epsilon: float, ends: bool = False) -> BlockedStart | None:
+        """Why no motion begins from rest, or `ends` at rest; None if one may.
+
+        Formations with more than two degrees of freedom always may.
+        """
+        best, modes = None, list(self._list_modes(ends))
+        for mode in modes:
+            answer = self._start(mode, epsilon)
+            if answer is not None and answer.x[-1] >= 0:
+                return None
+            if answer is not None and (best is None or answer.x[-1] > best.x[-1]):
+                best = answer
+        if best is None:
+            return BlockedStart("", 0.0) if modes else None
+        # Contacts that lack equally much: the first, not the one that rounding chooses.
+        equal = best.c_n <= best.c_n.min() + _TINY * self.scene.scales.force
+        return BlockedStart(self.formation.names[int(equal.argmax())], -float(best.x[-1]))
+
+    def find_epsilon(self, ends: bool = False) -> float | None:
+        """The largest epsilon with which a motion can begin, or end here [N], or None."""
+        answers = [self._start(mode, 0.0, cones=True) for mode in self._list_modes(ends)]
+        found = [float(one.x[-1]) for one in answers if one is not None]
+        return max((value for value in found if value >= 0), default=None)
+
+    def find_torque_limit(self, epsilon: float, finger: int, ends: bool = False) -> float | None:
+        """The least torque limit of a finger with which a motion can begin, or end here [N m]."""
+        answers = [self._start(mode, epsilon, finger) for mode in self._list_modes(ends)]
+        found = [float(one.x[[finger, 2 + finger]].sum()) for one in answers if one is not None]
+        return min(found, default=None)
+
+    @cached_property
+    def _freedoms(self) -> Array:
+        """Basis of the accelerations that the contacts allow, shape (5, f)."""
+        root = np.sqrt(self.scene.mass_diagonal)
+        _, values, right = np.linalg.svd(self.kinematics.P[0] / root)
+        return np.asarray(right[int((values > _TINY * values[0]).sum()) :].T / root[:, None])
+
+    def _list_modes(self, ends: bool) -> Iterator[_Mode]:
+        """Every mode of a motion with one or two degrees of freedom; none with more."""
+        N, side = self._freedoms, -1.0 if ends else 1.0
+        if not 1 <= N.shape[1] <= 2:
+            return
+        rates = np.vstack([self.A_t @ N, N[3:]])
+        opens = self._list_opening() @ N
+        opens = opens[np.abs(opens).max(axis=1, initial=0.0) > _LEVEL * np.abs(N).max()]
+        for y in list_sectors(rates):
+            speed = rates @ y
+            signs = np.sign(np.where(np.abs(speed) > _TINY * np.abs(rates).max(), speed, 0))
+            signs[list(self.formation.rolling_rows)] = 0.0
+            yield _Mode(side * N, rates, side * opens, signs)
+
+    def _list_opening(self) -> Array:
+        """Slopes of the closed gaps, shape (n, 5): from rest these may only open.
+
+        Without those that have a kink here, as where a fingertip is at a vertex.
+        """
+        scene, evaluate = self.scene, self.formation.evaluate_limits
+        here = evaluate(self.z[None])[0]
+        met = np.abs(here) < scene.touching
+        steps = _PROBE * np.diag([*[scene.scales.length] * 2, 1.0, 1.0, 1.0])
+        around = evaluate(self.z + np.vstack([steps, -steps]))[:, met]
+        ahead, behind = (part.T / steps.diagonal() for part in np.split(around - here[met], 2))
+        smooth = np.abs(ahead + behind).max(axis=1, initial=0.0) < _SMOOTH * scene.scales.length
+        return np.asarray((ahead - behind)[smooth] / 2)
+
+    def _start(
+        self, mode: _Mode, least: float, finger: int | None = None, cones: bool = False
+    ) -> _Answer | None:
+        """A motion with c_n >= least + r, or None; x are both parts of the torques, then r.
+
+        With the largest r; or of a `finger`, within no limit, the least torque, with r = 0. The
+        apex of the cones of what sticks is `least`, and with `cones` r higher.
+        """
+        none, most, cost = np.zeros(2), self.scene.torque_limit.copy(), np.zeros(5)
+        if finger is not None:
+            most[finger], cost[[finger, 2 + finger]] = np.inf, 1.0
+        else:
+            cost[-1] = -1.0
+        r = [-np.inf, np.inf] if finger is None else [0.0, 0.0]
+        bounds = np.vstack([np.stack([np.zeros(4), np.tile(most, 2)], axis=1), r])
+        forces = np.column_stack([_TORQUES, np.zeros(5)])
+        return self._solve(none, forces, bounds, cost, least, least, mode, True, cones)
+
+    def _solve(
+        self,
+        tau: Array,
+        forces: Array,
+        bounds: Array,
+        cost: Array,
+        least: float = 0.0,
+        apex: float = 0.0,
+        mode: _Mode | None = None,
+        presses: bool = False,
+        cones: bool = False,
+    ) -> _Answer | None:
+        """Linear programme: amounts x of given forces, (5, k), of least cost, (k,), that balance.
+
+        They stay within `bounds`, (k, 2), with c_n >= least [N] and, of what sticks, |c_t| <=
+        mu (c_n - apex). All sticks, or a motion begins in a `mode`. `presses` and `cones` add the
+        last of x to `least` and to `apex`. None if there are none.
+        """
+        from scipy.optimize import linprog
+
+        scene, n_c, mu = self.scene, len(self.A), self.formation.friction
+        force, torque = scene.scales.force, scene.scales.torque
+        if mode is None:
+            none = np.zeros((n_c + 2, 0))
+            mode = _Mode(np.zeros((5, 0)), none, none[:0], np.zeros(n_c + 2))
+        f, signs, still = mode.N.shape[1], mode.signs, mode.signs == 0
+        # Unknowns y, c_n, c_t, friction d of the joints, and x, each in a unit of its own.
+        sizes = np.abs(forces / self._units[:, None]).max(axis=0)
+        given = 1 / np.where(sizes > 0, sizes, 1 / force)
+        units = np.concatenate([np.ones(f), np.full(2 * n_c, force), np.full(2, torque), given])
+        y, c_n, c_t, d, x = np.split(np.diag(units), np.cumsum([f, n_c, n_c, 2]))
+        inertia = (scene.mass_diagonal[:, None] * mode.N) @ y
+        pushes = self.A.T @ c_n + self.A_t.T @ c_t - np.eye(5)[:, 3:] @ d + forces @ x - inertia
+        load = scene.applied_force + np.eye(5)[:, 3:] @ tau
+        slides, sticks = ~still[:n_c], still[:n_c]
+        friction = c_t[slides] + (mu * signs[:n_c])[slides, None] * c_n[slides]
+        equal = np.vstack([pushes / self._units[:, None], friction / force, mode.rates[still] @ y])
+        cone = mu[sticks, None] * (c_n[sticks] - cones * x[-1])
+        edge, motion = apex * mu[sticks], signs[~still, None] * mode.rates[~still] @ y
+        rows = [(cone - c_t[sticks]) / force, (cone + c_t[sticks]) / force]
+        lows = [edge / force, edge / force, np.zeros(len(motion) + len(mode.opens))]
+        rows += [motion, mode.opens @ y]
+        if f:
+            rows, lows = [*rows, motion.sum(axis=0)[None]], [*lows, np.array([MOVES])]
+        rows.append((c_n - presses * x[-1]) / force)
+        lows.append(np.full(n_c, least / force))
+        dry = np.stack([-scene.dry[3:], scene.dry[3:]], axis=1)
+        dry = np.where(still[n_c:, None], dry, (scene.dry[3:] * signs[n_c:])[:, None])
+        unbounded = np.tile([-np.inf, np.inf], (f + 2 * n_c, 1))
+        answer: Any = linprog(
+            cost @ x,
+            A_ub=-np.vstack(rows),
+            b_ub=-np.concatenate(lows),
+            A_eq=equal,
+            b_eq=np.concatenate([-load / self._units, np.zeros(len(equal) - 5)]),
+            bounds=np.vstack([unbounded, dry / torque, bounds / given[:, None]]),
+            # Forces that are missing just beyond balance are small.
+            options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
+        )
+        if answer.status != 0:
+            return None
+        return _Answer(c_n @ answer.x, c_t @ answer.x, x @ answer.x)
 
 
-def _find_rays(E: Array, joints: Array) -> Array:
-    """Unit torques of internal forces, E^T e = 0 with e >= 0, shape (m, 2)."""
-    chosen = _choose(len(E), E.shape[1] + 1)
-    null = null_vector(E[chosen].transpose(0, 2, 1), _TINY)
-    null *= np.where(null.sum(axis=1) < 0, -1.0, 1.0)[:, None]
-    internal = (null >= -_TINY).all(axis=1)
-    rays = np.einsum("ni,nij->nj", null[internal], joints[chosen[internal]])
-    sizes = np.linalg.norm(rays, axis=1)
-    return np.asarray(rays[sizes > _TINY] / sizes[sizes > _TINY, None])
+def list_sectors(rates: Array) -> list[Array]:
+    """One acceleration, shape (f,), for each combination of signs of rates, shape (n, f)."""
+    if rates.shape[1] == 1:
+        return [np.ones(1), -np.ones(1)]
+    rows = rates[np.abs(rates).max(axis=1) > _TINY * np.abs(rates).max()]
+    across = np.arctan2(-rows[:, 0], rows[:, 1])
+    angles = np.unique(np.round(np.concatenate([across, across + np.pi]) % (2 * np.pi), 12))
+    middles = (angles + np.append(angles[1:], angles[0] + 2 * np.pi)) / 2
+    return [np.array([np.cos(t), np.sin(t)]) for t in np.concatenate([middles, angles])]
 
 
 @lru_cache(maxsize=16)
@@ -130,82 +318,20 @@ def _choose(count: int, k: int) -> NDArray[np.int64]:
     return np.array(list(combinations(range(count), k)), dtype=np.int64).reshape(-1, k)
 
 
-def find_pulls(touching: Formation, z: Array, tau: Array) -> Array:
-    """Pulls p >= 0 of the contacts, (n_c,) [N], of least sum with which forces balance at rest.
+def pushes_one_way(formation: Formation, z: Array) -> bool:
+    """Whether contact forces share a half-space at all of `z`, (n, 5): no motion comes to rest.
 
-    Contact forces are those of cones less p along the normals. Infinite if no pulls balance.
-    """
-    A = touching.evaluate(z[None], np.zeros((1, 5))).A[0]
-    bounds = np.tile([0.0, np.inf], (len(A), 1))
-    found = _balance(touching, z, tau, 0.0, -A.T, bounds)
-    if found is None:
-        return np.full(len(A), np.inf)
-    return touching.scene.scales.force * found[-len(A) :]
-
-
-def find_holding_change(
-    touching: Formation, z: Array, tau: Array, least: float, free: tuple[int, ...]
-) -> Array | None:
-    """Change of the torques `free`, (2,) [N m], of least sum of sizes that holds at rest, or None.
-
-    Torques stay within their limits, with c_n >= least [N] and |c_t| <= mu c_n.
-    """
-    scene = touching.scene
-    most = [np.maximum(scene.torque_limit + side * tau, 0.0) for side in (-1.0, 1.0)]
-    changes = np.where(np.isin([0, 1], free), most, 0.0).ravel() / scene.scales.torque
-    joints = scene.scales.length * np.eye(5)[:, 3:]
-    bounds = np.stack([np.zeros(4), changes], axis=1)
-    found = _balance(touching, z, tau, least, np.hstack([joints, -joints]), bounds)
-    return None if found is None else scene.scales.torque * (found[-4:-2] - found[-2:])
-
-
-def find_firmest_forces(touching: Formation, z: Array, tau: Array) -> Array:
-    """Contact forces c_n and c_t at rest with the largest least c_n, (2, n_c) [N]; NaN for none."""
-    count, least = touching.n_contacts, np.array([[-np.inf, np.inf]])
-    found = _balance(touching, z, tau, -np.inf, np.zeros((5, 1)), least, firmest=True)
-    if found is None:
-        return np.full((2, count), np.nan)
-    return touching.scene.scales.force * found[: 2 * count].reshape(2, count)
-
-
-def _balance(
-    touching: Formation,
-    z: Array,
-    tau: Array,
-    least: float,
-    more: Array,
-    bounds: Array,
-    firmest: bool = False,
-) -> Array | None:
-    """Forces c_n, c_t, d and amounts x, (k,), of further ones `more`, (5, k), that balance at rest.
-
-    A linear programme in c_n >= least [N], |c_t| <= mu c_n, |d| <= D and x within `bounds`, (k, 2),
-    with the least sum of x, or the `firmest`, with the largest x below every c_n. None without any.
-    Forces and x are in the scene's force, friction of the joints is in its torque.
+    So if w^T f > 0 for all edges f of friction cones, and w^T g >= 0: then w^T M q' only grows.
     """
     from scipy.optimize import linprog
 
-    scene, n_c = touching.scene, touching.n_contacts
-    scales, at = scene.scales, touching.evaluate(z[None], np.zeros((1, 5)))
-    units = np.array([1.0, 1.0, *[scales.length] * 3])
-    joints = np.eye(5)[:, 3:]
-    load = (scene.applied_force + joints @ tau) / (scales.force * units)
-    forces = np.hstack([at.A[0].T, at.A_t[0].T, -scales.length * joints, more]) / units[:, None]
-    cone, one = -np.diag(touching.friction), np.eye(n_c)
-    rows = np.block([[cone, one], [cone, -one], [-one, 0 * one]])
-    rows = np.pad(rows, ((0, 0), (0, forces.shape[1] - 2 * n_c)))
-    rows[2 * n_c :, -1] = 1.0
-    rows = rows if firmest else rows[: 2 * n_c]
-    dry = scene.dry[3:] / scales.torque
-    normal, free = [(least / scales.force, np.inf)] * n_c, [(-np.inf, np.inf)] * n_c
-    answer: Any = linprog(
-        np.repeat([0.0, -1.0 if firmest else 1.0], [2 * n_c + 2, more.shape[1]]),
-        A_ub=rows,
-        b_ub=np.zeros(len(rows)),
-        A_eq=forces,
-        b_eq=-load,
-        bounds=[*normal, *free, *zip(-dry, dry, strict=True), *bounds],
-        # Forces that are missing just beyond balance are small.
-        options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
+    kinematics, mu = formation.evaluate(z, np.zeros_like(z)), formation.friction[:, None]
+    edges = [kinematics.A + side * mu * kinematics.A_t for side in (-1.0, 1.0)]
+    forces = np.concatenate(edges, axis=1)[..., :3].reshape(-1, 3)
+    rows = np.column_stack([-forces, np.ones(len(forces))])
+    gravity = np.append(-formation.scene.applied_force[:3], 0.0)
+    bounds = [(-1.0, 1.0)] * 3 + [(0.0, 1.0)]
+    answer = linprog(
+        [0, 0, 0, -1], np.vstack([rows, gravity]), np.zeros(len(rows) + 1), bounds=bounds
     )
-    return np.asarray(answer.x) if answer.status == 0 else None
+    return bool(answer.status == 0 and answer.x[-1] > _PUSHES)

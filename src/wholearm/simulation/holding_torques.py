@@ -26,7 +26,7 @@ from ..common.errors import SimulationError
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..mechanics.impact import ViolationKind, compute_impact
-from ..mechanics.statics import SURE, find_static_torques
+from ..mechanics.statics import SURE, Statics
 from .rest import StartMode, find_rest
 
 LEAST = 1e-2  # least margin over saturation of torques that hold or close
@@ -85,7 +85,7 @@ def _list_holding(place: Standstill, epsilon: float) -> Array:
     """Rows that have to be positive at rest, over their saturation values, shape (k, 3)."""
     touching, z = place.touching, place.z
     scene = touching.scene
-    static = find_static_torques(touching, z, epsilon)
+    static = Statics(touching, z).torque_polygon(epsilon)
     rows = [np.column_stack([static.bounds, -static.normals]) / (AMPLE * scene.scales.torque)]
     A = touching.evaluate(z[None], np.zeros((1, 5))).A[0]
     count = np.linalg.matrix_rank(A / np.sqrt(scene.mass_diagonal), tol=_SMALL)
@@ -136,7 +136,7 @@ def _find_closing(
     scene, z = place.formation.scene, place.z + gap * opening
     scales, limits = scene.scales, scene.torque_limit
     normal = Formation(scene, (place.gained,)).evaluate(z[None], np.zeros((1, 5))).A[0][0]
-    held = find_static_torques(place.formation, z)
+    held = Statics(place.formation, z).torque_polygon()
     creep = _CREEP * np.repeat(
         [scales.acceleration, 1 / scales.time**2], [place.formation.n_contacts, 2]
     )

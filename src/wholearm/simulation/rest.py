@@ -25,7 +25,7 @@ from ..common.errors import SimulationError
 from ..contacts.cones import find_weakest
 from ..contacts.formation import Formation
 from ..mechanics.dynamics import Directions
-from ..mechanics.statics import StaticTorques, find_pulls, find_static_torques
+from ..mechanics.statics import Statics, TorquePolygon
 from ..scene.model import Scene
 from .modes import find_grips, list_units, respond, share_mode
 from .system import ContactRows
@@ -177,9 +177,9 @@ class Rest:
         return Formation(self.formation.scene, (*self.formation.contacts, *others))
 
     @cached_property
-    def held(self) -> StaticTorques:
+    def held(self) -> TorquePolygon:
         """Torques that friction can hold, but for `BALANCED`."""
-        static = find_static_torques(self.touching, self.z)
+        static = Statics(self.touching, self.z).torque_polygon()
         rounding = BALANCED * self.formation.scene.scales.torque
         return static._replace(bounds=static.bounds + rounding)
 
@@ -299,7 +299,7 @@ class Rest:
         jammed = [mode.ratio <= 0 for mode in self.sliding]
         jams = any(jammed) if self.heading is not None else all(jammed)
         free = [mode for mode in self.modes if mode.slides(tau)]
-        pulls = find_pulls(self.touching, self.z, tau)
+        pulls = Statics(self.touching, self.z).find_pulls(tau)
         if free or np.isinf(pulls).all():
             load = np.array([1.0, *tau])
             weakest = min((mode.force_limits @ load for mode in free or self.sliding), key=np.min)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..contacts.formation import Formation, Kinematics
-from ..mechanics.statics import SURE, find_static_torques
+from ..mechanics.statics import SURE, Statics
 from ..mechanics.uniqueness import find_minors
 from ..problem.definition import Phase, Problem
 from ..results.report import UniquenessMargin
@@ -86,7 +86,7 @@ def find_wedged(
             return None
         contacts += problem.phases[phase.index - 1].formation.contacts
     touching = Formation(scene, tuple(dict.fromkeys(contacts)))
-    static = find_static_torques(touching, motion.z[rows[0]])
+    static = Statics(touching, motion.z[rows[0]]).torque_polygon()
     start, stop = max(start, float(motion.t[rows[0]])), float(motion.t[rows[-1]])
     t = np.linspace(start, stop, 4 * PLACES)
     # At its end the torques are those of the next phase.

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..common.arrays import Array
 from ..contacts.formation import Formation
 from ..mechanics.limits import CONE, PRESS, LimitSet, make_limits
-from ..mechanics.statics import find_holding_change
+from ..mechanics.statics import Statics
 from ..problem.definition import Phase, Problem
 from ..results.report import Approach, ForceAt, Loss, PhaseReport, TorqueAdvice, TuningHelp
 from ..simulation.events import EventKind, Simulation
@@ -222,7 +222,7 @@ def find_resting_changes(
         found = ((path, find_least_change(*sides, free)) for path, sides in starts)
         least = [(path, unit * one) for path, one in found if one is not None]
         moved = [change for path, change in least if path.moves(tau + change)]
-        held = None if moved else find_holding_change(formation, z, tau, epsilon, free)
+        held = None if moved else Statics(formation, z).find_holding_change(tau, epsilon, free)
         if moved:
             changes.append(make_advice(min(moved, key=np.linalg.norm), tau))
         elif held is not None:

@@ -22,7 +22,7 @@ from ...contacts.formation import Formation
 from ...geometry.curve import Curve
 from ...geometry.tracing import trace_phase
 from ...mechanics.dynamics import LAMBDA, ONE
-from ...mechanics.statics import find_firmest_forces, find_static_torques
+from ...mechanics.statics import Statics
 from ...problem.definition import Phase
 from ...results.dwell_record import TorqueChange, change_torques, find_change_times
 from ...results.plan_record import ModeSpan
@@ -83,7 +83,7 @@ def choose_joint(
     else:
         before, ends = ending[None], np.full(1, np.nan)
     formation = beginning.formation if isinstance(beginning, Curve) else beginning
-    scene, static = formation.scene, find_static_torques(formation, z)
+    scene, static = formation.scene, Statics(formation, z).torque_polygon()
     beyond = static.measure(before)
     held = beyond <= _VERGE * scene.scales.torque
     if not held.any():
@@ -177,7 +177,7 @@ def add_pause(
     """The plan of a phase that begins at `z`, with the pause before it."""
     if not joint.pause:
         return plan
-    forces = find_firmest_forces(formation, z, joint.before)
+    forces = Statics(formation, z).find_firmest_forces(joint.before)
     change = change_torques(formation.scene, joint.before, joint.after)
     effort = change.torque.integrate_squares() + options.time_weight * joint.pause
     value = {

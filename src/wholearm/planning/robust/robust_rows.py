@@ -29,7 +29,7 @@ from ...geometry.curve import Curve, CurvePoint, directions_of
 from ...mechanics.dynamics import Directions, PathForces, inverse, stack_motion
 from ...mechanics.limits import CONE, PRESS, LimitSet, make_limits
 from ...mechanics.path_limits import PathLimits
-from ...mechanics.statics import StaticTorques, find_static_torques
+from ...mechanics.statics import Statics, TorquePolygon
 from ...problem.uncertainty import PARAMETERS
 from ...scene.model import Friction
 from ...sensitivity.slopes import find_force_slopes
@@ -204,7 +204,7 @@ def _find_signs(
 class RobustHold(NamedTuple):
     """Torques that friction can hold at rest: times `gains`, shape (2,), within a polygon."""
 
-    static: StaticTorques
+    static: TorquePolygon
     gains: Array
 
 
@@ -222,7 +222,7 @@ def list_holds(formation: Formation, z: Array, ranges: Mapping[str, float]) -> l
     for mass in _spread(ranges.get("mass", 0.0)):
         polygon = replace(scene.polygon, mass=scene.polygon.mass * mass)
         corner = replace(formation, scene=replace(scene, polygon=polygon, friction=friction))
-        static = find_static_torques(corner, z)
+        static = Statics(corner, z).torque_polygon()
         holds += [RobustHold(static, np.array(gain)) for gain in gains]
     return holds
 

@@ -12,6 +12,7 @@ from ...common.errors import InfeasibleError, LimitPlace, Parameter, Shortfall, 
 from ...geometry.curve import describe_pose
 from ...geometry.path_guess import count_freedoms
 from ...mechanics.limits import EPSILON, PRESS, make_limits
+from ...mechanics.statics import Statics, pushes_one_way
 from ...problem.definition import Phase, Problem
 from ...scene.model import Scales
 from .. import advice
@@ -47,16 +48,14 @@ def refuse(
     The end counts if it is one point, of a single phase with one degree of freedom. `replan` is as
     for `explain`.
     """
-    from .resting import find_block, find_change
-
     epsilon, last = search.problem.epsilon, stages[-1]
     stage, node, phase = stages[0], 0, phases[0]
-    blocked = find_block(stage.formation, stage.guess.nodes[0, 0], epsilon)
+    blocked = Statics(stage.formation, stage.guess.nodes[0, 0]).find_block(epsilon)
     say = "from rest at its start, {}, no motion begins in any contact mode"
     alone = len(phases) == 1 and not phase.until.is_release
     if blocked is None and alone and count_freedoms(last.formation, last.guess.nodes[-1, 0]) == 1:
         stage, node = last, -1
-        blocked = find_block(last.formation, last.guess.nodes[-1, 0], epsilon, ends=True)
+        blocked = Statics(last.formation, last.guess.nodes[-1, 0]).find_block(epsilon, ends=True)
         say = "at its end, {}, no motion comes to rest in any contact mode"
     if blocked is None:
         _refuse_pushed(problem, phases[0], stages if alone else ())
@@ -78,13 +77,16 @@ def refuse(
         )
     else:
         text += " within the torque limits"
-    ends, z = node == -1, stage.guess.nodes[node, 0]
+    ends, statics = node == -1, Statics(stage.formation, stage.guess.nodes[node, 0])
 
     def find_value(parameter: Parameter) -> float | None:
         if parameter.is_speed:
             return None
-        finger = None if parameter.key == EPSILON else int(parameter.key.split(".")[1]) - 1
-        value = find_change(stage.formation, z, epsilon, finger, ends)
+        if parameter.key == EPSILON:
+            value = statics.find_epsilon(ends)
+        else:
+            finger = int(parameter.key.split(".")[1]) - 1
+            value = statics.find_torque_limit(epsilon, finger, ends)
         return _unit_of(parameter, problem.scene.scales) * value if value else None
 
     raise _advise(problem, phase, text, find_value, replan, shortfalls)
@@ -92,8 +94,6 @@ def refuse(
 
 def _refuse_pushed(problem: Problem, phase: Phase, stages: Sequence[Stage]) -> None:
     """Raise an error if contacts can push the object only one way, along all of the guess."""
-    from .resting import pushes_one_way
-
     if not stages or stages[0].formation.n_constraints > 2:
         return
     z = np.concatenate([stage.guess.z.reshape(-1, 5) for stage in stages])
@@ -108,10 +108,8 @@ def _refuse_pushed(problem: Problem, phase: Phase, stages: Sequence[Stage]) -> N
 
 def _refuse_unheld(problem: Problem, phase: Phase, stage: Stage, node: int) -> None:
     """Raise an error if rate-limited torques cannot hold the object at rest at an end."""
-    from ...mechanics.statics import find_static_torques
-
     z, limit = to_si(stage, problem).guess.nodes[node, 0], problem.scene.torque_limit
-    held = find_static_torques(phase.formation, z)
+    held = Statics(phase.formation, z).torque_polygon()
     if not held.is_empty(limit):
         return
     most = "however large" if held.is_empty(np.full(2, np.inf)) else "within their limits"
