@@ -50,7 +50,7 @@ from wholearm.simulation.events import Event, EventKind, OutcomeKind, Simulation
 from wholearm.simulation.hand import build_system
 from wholearm.simulation.modes import Grips, Mode, respond
 from wholearm.simulation.rest import Collapse, close_contacts, find_rest
-from wholearm.simulation.root_finding import find_root
+from wholearm.simulation.run import find_root
 from wholearm.simulation.stepper import Modes, ModeStepper, build_stepper
 from wholearm.simulation.system import ContactRows
 

@@ -33,8 +33,9 @@ from .dynamics import null_vector
 SURE = 1e-3  # distance from torques that friction can hold, over the scene's, at which it moves
 MOVES = 1e-5  # least sum of accelerations, over the scene's own, that counts as a motion
 _TINY = 1e-9  # what counts as zero of numbers of the order of one
-_PROBE = 1e-6  # steps that slopes of limits are taken over, in radii of gyration and rad
-_SMOOTH = 1e-3  # difference of slopes on both sides, in radii of gyration, up to which there is one
+GRAZE = 1e-3  # largest closing acceleration of a gap that grazes, over sliding and turning
+_STEP = 3e-5  # step that slopes of limits are taken over, in radii of gyration and rad
+_KINK = 1e-2  # difference of slopes on both sides, in radii of gyration, from which there is a kink
 _LEVEL = 1e-6  # slope of a limit, in radii of gyration, below which no motion changes it
 _PUSHES = 1e-3  # least component along one direction, over all forces, that moves the object
 _TORQUES = np.hstack([np.eye(5)[:, 3:], -np.eye(5)[:, 3:]])  # as two positive parts, (5, 4)
@@ -185,39 +186,56 @@ class Statics:
         return min(found, default=None)
 
     @cached_property
-    def _freedoms(self) -> Array:
+    def freedoms(self) -> Array:
         """Basis of the accelerations that the contacts allow, shape (5, f)."""
         root = np.sqrt(self.scene.mass_diagonal)
         _, values, right = np.linalg.svd(self.kinematics.P[0] / root)
         return np.asarray(right[int((values > _TINY * values[0]).sum()) :].T / root[:, None])
 
+    @cached_property
+    def near(self) -> NDArray[np.bool_]:
+        """Which limits of the formation are zero here, shape (n_limits,)."""
+        limits = self.formation.evaluate_limits(self.z[None])[0]
+        return np.asarray(np.abs(limits) < self.scene.touching)
+
+    @cached_property
+    def opening(self) -> tuple[Array, NDArray[np.int64]]:
+        """Slopes of the closed gaps, (k, 5), which can only open; which limits have kinks instead.
+
+        So has a pointed fingertip at a vertex.
+        """
+        if not self.near.any():
+            return np.zeros((0, 5)), np.zeros(0, dtype=np.int64)
+        length, evaluate = self.scene.scales.length, self.formation.evaluate_limits
+        steps = _STEP * np.array([length, length, 1.0, 1.0, 1.0])
+        around = evaluate(self.z + np.vstack([np.diag(steps), -np.diag(steps)]))
+        ahead, behind = np.split((around - evaluate(self.z[None]))[:, self.near], 2)
+        kinked = (ahead + behind).max(axis=0) > _KINK * _STEP * length
+        return (ahead - behind)[:, ~kinked].T / (2 * steps), np.flatnonzero(self.near)[kinked]
+
+    def opens(self, acceleration: Array) -> bool:
+        """Whether what has a kink does not close along an acceleration, shape (5,)."""
+        kinked, length = self.opening[1], self.scene.scales.length
+        if not len(kinked):
+            return True
+        step = _STEP / np.abs(acceleration / [length, length, 1.0, 1.0, 1.0]).max()
+        places = self.z + np.array([[0.0], [step]]) * acceleration
+        here, ahead = self.formation.evaluate_limits(places)[:, kinked]
+        return bool((ahead - here >= -GRAZE * _STEP * length).all())
+
     def _list_modes(self, ends: bool) -> Iterator[_Mode]:
         """Every mode of a motion with one or two degrees of freedom; none with more."""
-        N, side = self._freedoms, -1.0 if ends else 1.0
+        N, side = self.freedoms, -1.0 if ends else 1.0
         if not 1 <= N.shape[1] <= 2:
             return
         rates = np.vstack([self.A_t @ N, N[3:]])
-        opens = self._list_opening() @ N
+        opens = self.opening[0] @ N
         opens = opens[np.abs(opens).max(axis=1, initial=0.0) > _LEVEL * np.abs(N).max()]
         for y in list_sectors(rates):
             speed = rates @ y
             signs = np.sign(np.where(np.abs(speed) > _TINY * np.abs(rates).max(), speed, 0))
             signs[list(self.formation.rolling_rows)] = 0.0
             yield _Mode(side * N, rates, side * opens, signs)
-
-    def _list_opening(self) -> Array:
-        """Slopes of the closed gaps, shape (n, 5): from rest these may only open.
-
-        Without those that have a kink here, as where a fingertip is at a vertex.
-        """
-        scene, evaluate = self.scene, self.formation.evaluate_limits
-        here = evaluate(self.z[None])[0]
-        met = np.abs(here) < scene.touching
-        steps = _PROBE * np.diag([*[scene.scales.length] * 2, 1.0, 1.0, 1.0])
-        around = evaluate(self.z + np.vstack([steps, -steps]))[:, met]
-        ahead, behind = (part.T / steps.diagonal() for part in np.split(around - here[met], 2))
-        smooth = np.abs(ahead + behind).max(axis=1, initial=0.0) < _SMOOTH * scene.scales.length
-        return np.asarray((ahead - behind)[smooth] / 2)
 
     def _start(
         self, mode: _Mode, least: float, finger: int | None = None, cones: bool = False

@@ -37,8 +37,7 @@ from .contact_problem import (
 )
 from .events import EventKind, describe_change
 from .rest import find_roots
-from .root_finding import find_root
-from .run import Feedback, Run, StuckError
+from .run import Feedback, Run, StuckError, find_root
 from .stepper import Modes, ModeStepper
 from .system import ContactRows, Structure, System
 from .tolerances import ROUNDING_FORCE, SHORTEST_STEP, STANDING, STILL

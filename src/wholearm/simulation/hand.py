@@ -26,7 +26,7 @@ import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
-from ..common.sharing import exclusive
+from ..common.sharing import Batch, Store
 from ..contacts.contact_limits import FINGERS_TOUCH, build_apart, build_finger_gap
 from ..contacts.elemental import build_features, rotate_quarter
 from ..scene.model import Scene
@@ -75,37 +75,23 @@ def build_system(scene: Scene) -> System:
     )
 
 
-def is_apart(system: System, z: Array, touching: float) -> bool:
-    """Whether some separating line shows each pair apart by -`touching` [m]; sufficient only."""
-    gaps = dict(zip(system.names, system.measure(z[None])[0][0] >= -touching, strict=True))
-
-    def hold(*names: str) -> bool:
-        return all(gaps[name] for name in names)
-
-    corners = range(sum(name.endswith("-palm") for name in system.names))
-    parts = [hold(*(f"v{i}-palm" for i in corners))]
-    for k in "12":
-        sides = [hold(*(f"v{i}-{side}{k}" for i in corners)) for side in ("finger", "back")]
-        edges = [hold(f"e{i}-tip{k}", f"e{i}-joint{k}") for i in corners]
-        parts.append(any(sides + edges))
-    if "tip1-finger2" in gaps:
-        lines = [(a, b, side) for a, b in ("12", "21") for side in ("finger", "back")]
-        parts.append(any(hold(f"tip{a}-{s}{b}", f"joint{a}-{s}{b}") for a, b, s in lines))
-    return all(parts)
-
-
-@exclusive
 def measure_gaps(scene: Scene, z: Array) -> Array:
     """Gaps of the bodies at n configurations, shape (n, 4) [m], negative where they overlap.
 
     Object and palm, object and links 1 and 2, link and link (infinite where they pass each other):
     the largest separation in any direction, independent of the pairs.
     """
+    return _GAPS(scene)(z)[0][..., 0]
+
+
+def _build_gaps(scene: Scene) -> Batch:
     features = build_features(scene)
     gaps = [ca.mmin(features.vertices[1, :]), *(build_apart(scene, k) for k in range(2))]
     gaps.append(build_finger_gap(scene) if scene.fingers_collide else ca.inf)
-    function = ca.Function("gaps", [features.z], [ca.densify(ca.vertcat(*gaps))])
-    return np.asarray(function(z.T).full().T)
+    return Batch(ca.Function("gaps", [features.z], [ca.densify(ca.vertcat(*gaps))]))
+
+
+_GAPS = Store(_build_gaps, lambda scene: (scene.shape, scene.fingers_collide))
 
 
 @lru_cache(maxsize=16)

@@ -33,8 +33,7 @@ from .events import EventKind, Outcome, OutcomeKind, Record
 from .hand import build_system
 from .modes import FREE, Grips, Mode, find_fixed, find_grips, list_units, share_mode
 from .rest import Collapse, Rest, StartDeparture, close_contacts, find_rest
-from .root_finding import find_root
-from .run import Run, StuckError
+from .run import Run, StuckError, find_root
 from .sliding_signs import choose_mode, note_change
 from .stepper import Modes, ModeStepper
 from .tolerances import (
@@ -57,7 +56,6 @@ from .tolerances import (
     measure_until,
 )
 
-_FAR = 100.0  # speed over its change at which nothing reverses: lever arms are below that
 _OUTCOMES = {
     ViolationKind.PULL: OutcomeKind.CONTACT_LOST,
     ViolationKind.SLIP: OutcomeKind.SLIPS,
@@ -936,8 +934,6 @@ class Replay(Run):
         if self.steps_within(self.settling):
             self.records.pop()
             self._finish_piece()
-        elif self._goes_on():
-            return False
         else:
             start = self.values
             stretch = min(self.settling, self.stop - self.t)
@@ -952,14 +948,6 @@ class Replay(Run):
         ended = self._decide(rows)
         self.observe()
         return ended
-
-    def _goes_on(self) -> bool:
-        """Whether all that slides or turns is far too fast to come to rest in the shortest time."""
-        out, units = self.s.outputs, self.system.units[5:]
-        fastest = np.abs(out[5:10] / units).max()
-        strongest = np.abs(out[self.s.to.acceleration] / units).max() * self.system.scales.time
-        least = _FAR * SETTLING * (strongest + fastest**2)
-        return bool((self.values[self.leg.rows.turning][self.signs != 0] > least).all())
 
     def find_first(self, start: Array, h: float, among: slice | None = None) -> list[int]:
         """Shorten the step just tried, of length h [s], to its first event; its rows.

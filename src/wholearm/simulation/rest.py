@@ -18,14 +18,13 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..common.errors import SimulationError
 from ..contacts.cones import find_weakest
 from ..contacts.formation import Formation
 from ..mechanics.dynamics import Directions
-from ..mechanics.statics import Statics, TorquePolygon
+from ..mechanics.statics import GRAZE, Statics, TorquePolygon
 from ..scene.model import Scene
 from .modes import find_grips, list_units, respond, share_mode
 from .system import ContactRows
@@ -34,9 +33,6 @@ from .tolerances import CLOSING, ROUNDING_FORCE, STILL, measure_units
 BALANCED = 1e-6  # distance beyond torques that can be held that counts as none, over the scene's
 _CLOSED = 3e-15  # gap that counts as rounding, relative to the scene's length
 _AHEAD = 1e-5  # step along the free direction for the signs of what is stationary, in scene units
-_STEP = 3e-5  # step of the difference quotient, in units of the scene
-_KINK = 1e-2  # rise of a limit both ways, over the step, from which it has a kink and no gradient
-_GRAZE = 1e-3  # largest closing acceleration of a gap that grazes, over sliding and turning
 _CLEAR = 1e3  # least starting acceleration halfway to the next change, over rounding
 
 
@@ -73,7 +69,7 @@ class StartMode(NamedTuple):
     slack: Array  # rounding of force limits, slips, grips and openings
     ratio: float  # reduced inertia over that without friction; jammed at zero and below
     heading: Array | None  # (5,): with one freedom, the direction
-    touching: Touching
+    statics: Statics
 
     @property
     def margins(self) -> Array:
@@ -88,12 +84,12 @@ class StartMode(NamedTuple):
 
     def slides(self, tau: Array) -> bool:
         """Whether the formation accelerates in this mode if every contact can press or pull."""
-        load, least = np.array([1.0, *tau]), _measure_drive(self.touching.formation.scene)
+        load, least = np.array([1.0, *tau]), _measure_drive(self.statics.scene)
         return (
             self.ratio > 0
             and self.drive(tau) > least
             and bool((self.margins[len(self.force_limits) :] @ load >= 0).all())
-            and self.touching.opens(self.acceleration @ load)
+            and self.statics.opens(self.acceleration @ load)
         )
 
     def moves(self, tau: Array) -> bool:
@@ -106,44 +102,13 @@ class StartMode(NamedTuple):
         return StartDeparture(x, heading, self.directions)
 
 
-class Touching:
-    """Limits `near` zero at `z` of what touches outside the formation, with gradient (k, 5).
-
-    A pointed tip at a vertex has a kink instead.
-    """
-
-    def __init__(self, formation: Formation, z: Array, near: NDArray[np.bool_]) -> None:
-        self.formation, self.z = formation, z
-        self.units = measure_units(formation.scene)[:5]
-        self.gradient, self.kinked = np.zeros((0, 5)), np.zeros(0, dtype=np.int64)
-        if not near.any():
-            return
-        ahead = _STEP * self.units
-        values = formation.evaluate_limits(z + np.vstack([np.diag(ahead), -np.diag(ahead)]))
-        values = (values - formation.evaluate_limits(z[None]))[:, near]
-        rises = (values[:5] + values[5:]).max(axis=0)
-        kinked = rises > _KINK * _STEP * formation.scene.scales.length
-        self.kinked = np.flatnonzero(near)[kinked]
-        self.gradient = (values[:5] - values[5:])[:, ~kinked].T / (2 * ahead)
-
-    def opens(self, acceleration: Array) -> bool:
-        """Whether what has a kink does not close along an acceleration, shape (5,)."""
-        if not len(self.kinked):
-            return True
-        step = _STEP / np.abs(acceleration / self.units).max()
-        places = self.z + np.array([[0.0], [step]]) * acceleration
-        here, ahead = self.formation.evaluate_limits(places)[:, self.kinked]
-        closing = _GRAZE * _STEP * self.formation.scene.scales.length
-        return bool((ahead - here >= -closing).all())
-
-
 @dataclass(frozen=True, eq=False)
 class Rest:
     """A formation at rest at a configuration."""
 
     formation: Formation
     z: Array  # (5,)
-    near: NDArray[np.bool_]  # (n_limits,): which limits of the formation are zero here
+    statics: Statics  # of the formation
     heading: Array | None  # (5,): with one freedom the direction, of length one in the metric M5
 
     @cached_property
@@ -170,28 +135,19 @@ class Rest:
         yield from self.sticking
 
     @cached_property
-    def touching(self) -> Formation:
-        """Every contact that touches, in the formation or not."""
-        gained = [self.formation.limits[k].gained for k in np.flatnonzero(self.near)]
+    def touching(self) -> Statics:
+        """That of every contact that touches, in the formation or not."""
+        gained = [self.formation.limits[k].gained for k in np.flatnonzero(self.statics.near)]
         others = (contact for contact in gained if contact is not None)
-        return Formation(self.formation.scene, (*self.formation.contacts, *others))
+        contacts = *self.formation.contacts, *others
+        return Statics(Formation(self.formation.scene, contacts), self.z)
 
     @cached_property
     def held(self) -> TorquePolygon:
         """Torques that friction can hold, but for `BALANCED`."""
-        static = Statics(self.touching, self.z).torque_polygon()
+        polygon = self.touching.torque_polygon()
         rounding = BALANCED * self.formation.scene.scales.torque
-        return static._replace(bounds=static.bounds + rounding)
-
-    @cached_property
-    def _others(self) -> Touching:
-        return Touching(self.formation, self.z, self.near)
-
-    @cached_property
-    def _rows(self) -> ContactRows:
-        kinematics = self.formation.evaluate(self.z[None], np.zeros((1, 5)))
-        none = np.zeros(self.formation.n_contacts)
-        return ContactRows(kinematics.A[0], kinematics.A_t[0], none, none)
+        return polygon._replace(bounds=polygon.bounds + rounding)
 
     def _list_patterns(self, held: bool) -> Iterator[StartMode]:
         """Start modes with more freedoms: only those with sticking, or only the others."""
@@ -212,7 +168,7 @@ class Rest:
         """Directions of contacts and joints along the only freedom, (n_c + 2,); zero for none."""
         formation, scales = self.formation, self.formation.scene.scales
         step = _AHEAD / np.abs(heading / measure_units(formation.scene)[:5]).max()
-        rates = np.concatenate([self._rows.A_t @ heading, heading[3:]])
+        rates = np.concatenate([self.statics.A_t @ heading, heading[3:]])
         rates[list(formation.rolling_rows)] = 0.0
         # How fast each slides or turns over how fast anything moves.
         scale = _AHEAD / step * np.repeat([scales.length, 1.0], [formation.n_contacts, 2])
@@ -228,15 +184,16 @@ class Rest:
         """The start mode of some signs, (n_c + 2,); None if its forces are not determined."""
         formation, scene, count = self.formation, self.formation.scene, self.formation.n_contacts
         mode = share_mode(formation, find_grips(formation, signs))
-        response = respond(mode, signs, self._rows, np.zeros(5))
+        rows = ContactRows(self.statics.A, self.statics.A_t, np.zeros(count), np.zeros(count))
+        response = respond(mode, signs, rows, np.zeros(5))
         if response is None:
             return None
         declared = np.array([mode.declares(k) for k in range(len(mode.holders))] * 2, dtype=bool)
         kept = np.concatenate([np.ones(count, dtype=bool), declared])
         scales, length = scene.scales, scene.scales.length
         slips = signs[:, None] * response.rates
-        graze = _GRAZE * np.repeat([1.0, length], [count, 2]) @ slips
-        openings = self._others.gradient @ response.acceleration + graze
+        graze = GRAZE * np.repeat([1.0, length], [count, 2]) @ slips
+        openings = self.statics.opening[0] @ response.acceleration + graze
         still = STILL * np.repeat([scales.acceleration, 1 / scales.time**2], [count, 2])
         closing = np.full(len(openings), CLOSING * scales.acceleration)
         if heading is not None:
@@ -255,7 +212,7 @@ class Rest:
             slack=np.concatenate([rounding[kept], still, rounding[~kept], closing]),
             ratio=response.ratio,
             heading=heading,
-            touching=self._others,
+            statics=self.statics,
         )
 
     def wait(self, coefficients: Array, x: float) -> StartDeparture | Collapse | None:
@@ -299,28 +256,27 @@ class Rest:
         jammed = [mode.ratio <= 0 for mode in self.sliding]
         jams = any(jammed) if self.heading is not None else all(jammed)
         free = [mode for mode in self.modes if mode.slides(tau)]
-        pulls = Statics(self.touching, self.z).find_pulls(tau)
+        pulls = self.touching.find_pulls(tau)
         if free or np.isinf(pulls).all():
             load = np.array([1.0, *tau])
             weakest = min((mode.force_limits @ load for mode in free or self.sliding), key=np.min)
             row, least, c_t = find_weakest(self.formation, weakest)
             return Collapse(x, self.formation.names[row], least, jams, c_t)
-        return Collapse(x, self.touching.names[int(pulls.argmax())], -float(pulls.max()), jams)
+        return Collapse(
+            x, self.touching.formation.names[int(pulls.argmax())], -float(pulls.max()), jams
+        )
 
 
 def find_rest(formation: Formation, z: Array) -> Rest:
     """Formation at rest at `z`, (5,); `SimulationError` for dependent contacts or no freedom."""
-    root = np.sqrt(formation.scene.mass_diagonal)
-    P = formation.evaluate(z[None], np.zeros((1, 5))).P[0]
-    _, values, right = np.linalg.svd(P / root)
-    rank = int((values > 1e-9 * values[0]).sum())
-    if rank < len(P) or rank == 5:
+    statics = Statics(formation, z)
+    freedoms = statics.freedoms.shape[1]
+    if freedoms > 5 - formation.n_constraints or not freedoms:
         raise SimulationError(
-            f"{' '.join(formation.names)} leaves {5 - rank} freedoms, and no forces that are "
+            f"{' '.join(formation.names)} leaves {freedoms} freedoms, and no forces that are "
             "determined; it cannot start from rest"
         )
-    near = np.abs(formation.evaluate_limits(z[None])[0]) < formation.scene.touching
-    return Rest(formation, z, near, right[4] / root if rank == 4 else None)
+    return Rest(formation, z, statics, statics.freedoms[:, 0] if freedoms == 1 else None)
 
 
 def _find_rates(formation: Formation, z: Array, step: float, heading: Array) -> Array:

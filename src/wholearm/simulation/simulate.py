@@ -31,7 +31,7 @@ from .events import (
     collect,
     list_stretches,
 )
-from .hand import build_system, is_apart, measure_gaps
+from .hand import build_system, measure_gaps
 from .prescribed import Replay, Step
 from .run import Feedback, Law, Run
 from .runge_kutta import INNER_STAGES, NODES
@@ -218,12 +218,11 @@ def _simulate(
 ) -> Simulation:
     z, v = np.split(state, 2)
     system, touching = build_system(problem.scene), problem.scene.touching
-    if not is_apart(system, z, touching):
-        depths = -measure_gaps(problem.scene, z[None])[0]
-        worst = int(depths.argmax())
-        if depths[worst] > 10 * touching:
-            pairs = "palm and object", "finger 1 and object", "finger 2 and object", "both fingers"
-            raise SimulationError(f"{pairs[worst]} overlap by {depths[worst]:.3g} m at the start")
+    depths = -measure_gaps(problem.scene, z[None])[0]
+    worst = int(depths.argmax())
+    if depths[worst] > 10 * touching:
+        pairs = "palm and object", "finger 1 and object", "finger 2 and object", "both fingers"
+        raise SimulationError(f"{pairs[worst]} overlap by {depths[worst]:.3g} m at the start")
     from .complementarity import FreeRun
 
     run = FreeRun(system, profile, z, v, hint=hint, **options)
