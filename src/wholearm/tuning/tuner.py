@@ -611,21 +611,13 @@ class _Setting(NamedTuple):
         if found is None:
             text = "no quasistatic motion keeps every contact, where tuning would start"
             return own, None, text
-        bench = Bench(self.problem, self.passage, z)
-        first = self._tune_by(found.acting, own, bench, found)
-        if first[1] is not None or first[0].raised is not None:
-            return first
-        # No torque of that finger reaches the end.
-        second = self._tune_by(1 - found.acting, own, bench, found)
-        return first if second[1] is None else second
-
-    def _tune_by(self, acting: int, own: PhaseTuning, bench: Bench, balance: _Balance) -> _Attempt:
-        """Tune it by the torque of one finger, with supporting torques until one serves."""
+        bench, acting = Bench(self.problem, self.passage, z), found.acting
         title = f"phase {self.passage.title} of {len(self.problem.phases)}, finger {acting + 1}"
         best: _Attempt | None = None
         tell: Callable[[str], None] = lambda text: self.tell(f"{title}: {text}")  # noqa: E731
-        for tau in list_starts(balance.tau, acting):
-            rule = TuningRule(bench, tau, balance.tau[-1], acting, tell)
+        # Supporting torques until one serves.
+        for tau in list_starts(found.tau, acting):
+            rule = TuningRule(bench, tau, found.tau[-1], acting, tell)
             attempt = self._tune_from(rule, replace(own, acting=acting + 1))
             if attempt[1] is not None:
                 return attempt
