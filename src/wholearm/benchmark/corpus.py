@@ -39,7 +39,6 @@ LOCAL = ("plan over time", "goal", "scene", "leg")
 
 Values are flat at an optimum: motions whose values differ by `USUAL` differ by its root.
 """
-SAMPLES = 1  # how many samples may end otherwise, of those at the edge of what a plan bears
 WORDS = ("words", "text", "advice", "help", "reason")
 """Entries that do not count as an answer: words, and advice, which ends by processor time."""
 COUNTED = ("goals", "kept")  # entries that count samples
@@ -142,7 +141,8 @@ def _differ(family: str, key: str, found: Any, stored: Any) -> Iterator[tuple[bo
     if numbers is not None and others is not None and len(numbers) == len(others):
         off = max(abs(a - b) for a, b in zip(numbers, others, strict=True))
         scale = max(map(abs, [*numbers, *others]))
-        if off > (SAMPLES if key in COUNTED else _allowed(family, key) * scale):
+        # One sample at the edge of what a plan bears may end otherwise.
+        if off > (1 if key in COUNTED else _allowed(family, key) * scale):
             yield key in WORDS, f"{_show(found)}, stored {_show(stored)}, off by {off:.2g}"
     elif isinstance(found, list) and isinstance(stored, list) and len(found) == len(stored):
         for one, other in zip(found, stored, strict=True):

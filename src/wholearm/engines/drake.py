@@ -26,12 +26,7 @@ from .stretch import (
     record,
 )
 
-SINKING = 6e-3
-"""penetration by the scene's force, over the scene's length and the relative step."""
-STICTION = 1e-5  # stiction tolerance, over the scene's speed
-DISSIPATION = 1000.0  # Hunt-Crossley damping of contacts, times the scene's speed
 _EVERY = 4  # Steps from one look at the forces to the next: contacts swing ten times as slowly
-_ROUGH = 1e12  # Friction of vertices and edges, which makes that of a pair twice the other shape's
 
 
 def play(
@@ -120,7 +115,7 @@ def _build(
     _add_bodies(plant, scene)
     pairs = _add_shapes(plant, graph, scene, setting)
     plant.Finalize()
-    plant.set_stiction_tolerance(STICTION * scene.scales.speed)
+    plant.set_stiction_tolerance(1e-5 * scene.scales.speed)
     if not plays:
         return builder.Build(), plant, pairs
     # Held from half a step before each step on, so that rounding of times does not matter.
@@ -186,8 +181,8 @@ def _add_shapes(plant: Any, graph: Any, scene: Scene, setting: Setting) -> dict[
 
     numbers = {}
     for number, pair in enumerate(list_pairs(scene)):
-        # Drake combines two frictions as 2 a b / (a + b).
-        one, two = (_ROUGH, pair.friction / 2) if pair.friction else (0.0, 0.0)
+        # Drake combines two frictions as 2 a b / (a + b), which is 2 b for a large a.
+        one, two = (1e12, pair.friction / 2) if pair.friction else (0.0, 0.0)
         ids = [register(pair.first, one), register(pair.second, two)]
         numbers[frozenset(ids)] = number
     manager = graph.collision_filter_manager()
@@ -200,8 +195,8 @@ def _add_shapes(plant: Any, graph: Any, scene: Scene, setting: Setting) -> dict[
 
 
 def _find_stiffness(scene: Scene, setting: Setting) -> float:
-    """That of a pair [N/m]."""
-    return scene.scales.force / (SINKING * setting.step * setting.softness * scene.scales.length)
+    """That of a pair, which sinks in by 6e-3 lengths under the scene's force [N/m]."""
+    return scene.scales.force / (6e-3 * setting.step * setting.softness * scene.scales.length)
 
 
 def _make_material(scene: Scene, setting: Setting, friction: float) -> Any:
@@ -212,7 +207,7 @@ def _make_material(scene: Scene, setting: Setting, friction: float) -> Any:
     material = ProximityProperties()
     AddContactMaterial(
         material,
-        dissipation=DISSIPATION / scene.scales.speed,
+        dissipation=1000.0 / scene.scales.speed,
         point_stiffness=2 * _find_stiffness(scene, setting),
         friction=CoulombFriction(friction, friction),
     )

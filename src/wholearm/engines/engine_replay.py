@@ -35,9 +35,7 @@ from .stretch import (
 )
 
 PARTS = 5  # equal parts of a stretch at whose ends the error is listed
-OPEN = 0.1  # gap of an open contact, over the allowed error
 SLOW = 0.1  # share of the planned sliding speed below which a contact sticks
-MOVES = 2e-3  # sliding speed of a contact that slides, over the scene's speed
 PRESS = 0.25  # least normal force that counts, over the scene's force: 0.5 N in `problems/`
 _INSTANTS = 2000  # samples of a phase over which planned forces are averaged
 # Allowed error of the final pose, over the scene's length and in rad; soft contacts cause 2e-3.
@@ -362,8 +360,8 @@ def _list_changes(
     pressing = run.press[rows[rows > 0] - 1].copy()
     for k, name in enumerate(formation.names):
         pressing[:, run.find_columns(name, problem.scene)] = 0.0
-        yield from _find_runs(run.t[rows], actual.C[:, k] > OPEN * reach, f"{name} opens")
-        moves = MOVES * scales.speed
+        yield from _find_runs(run.t[rows], actual.C[:, k] > 0.1 * reach, f"{name} opens")
+        moves = 2e-3 * scales.speed
         if k in formation.rolling_rows:
             yield from _find_runs(run.t[rows], np.abs(slides[:, k]) > moves, f"{name} slips")
             continue

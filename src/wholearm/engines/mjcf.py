@@ -23,9 +23,7 @@ from .stretch import apply_friction
 
 SHARE = 1e-6
 """Weight of a joint's angle in its tendon, over the scene's time; that of the clock is 1."""
-DRIVE = 1e9  # Force that drives the clock, over what all springs may exert
 BEND = 1e-3  # Largest error of the ramps, relative to the largest torque
-RISE = 1e-6  # Least time from row to row, over the time step
 CLOCK = "clock"
 HIDDEN = {"group": 3}
 """Group of joints and actuators for which MuJoCo's viewer has no sliders, unless asked for."""
@@ -180,8 +178,8 @@ def list_ramps(scene: Scene, plan: Trajectory, step: float) -> tuple[Array, Arra
     t, again = rows[:, 0] - step / 2, np.flatnonzero(np.diff(rows[:, 0]) <= 0)
     t[again] -= step / 2
     t[again + 1] += step / 2
-    # Rows that are nearer to a step than that keep their order.
-    t = np.maximum.accumulate(t) + RISE * step * np.arange(len(t))
+    # Rows that are nearer to a step than that keep their order, a millionth of a step apart.
+    t = np.maximum.accumulate(t) + 1e-6 * step * np.arange(len(t))
     return t, rows[:, 1:]
 
 
@@ -190,7 +188,8 @@ def add_clock(root: Element, scene: Scene, plan: Trajectory, step: float) -> Non
     t, tau = list_ramps(scene, plan, step)
     share = SHARE * scene.scales.time
     rises = np.diff(tau, axis=0) / share
-    drive = DRIVE * (np.abs(rises).sum() + np.abs(tau[0]).sum() / share + scene.scales.force)
+    # The clock is driven by much more force than all springs exert.
+    drive = 1e9 * (np.abs(rises).sum() + np.abs(tau[0]).sum() / share + scene.scales.force)
     body = add(_find(root, "worldbody"), "body", name=CLOCK)
     add(body, "inertial", pos=[0, 0, 0], mass=scene.scales.mass, diaginertia=[1, 1, 1])
     add(body, "joint", name=CLOCK, type="slide", axis=[0, 0, 1], damping=drive, **HIDDEN)

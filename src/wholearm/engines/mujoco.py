@@ -23,8 +23,6 @@ from .stretch import (
     record,
 )
 
-_LITTLE = 1e-6  # depth at which stiffnesses are read, over the scene's length
-
 
 def play(
     problem: Problem, stretch: EngineStretch, torque: TorqueProfile | ClosedLoop, setting: Setting
@@ -67,7 +65,7 @@ def play(
 
     # MuJoCo computes stiffnesses from time constants and inertias; they are read at a small depth.
     nowhere = dict.fromkeys(stretch.c_n, np.inf)
-    little = _LITTLE * problem.scene.scales.length
+    little = 1e-6 * problem.scene.scales.length
     touching = {name: max(force, 0.0) / little for name, force in stretch.c_n.items()}
     data.qpos[:] = press_in(problem, stretch, {**nowhere, **touching})
     mujoco.mj_forward(model, data)

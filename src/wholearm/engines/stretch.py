@@ -23,18 +23,8 @@ from ..simulation.simulate import simulate
 from .shapes import Pair, find_pairs
 
 SAME = 1e-4  # difference of replay and plan that counts as none, over the scene's length and in rad
-LATE = 1e-3  # difference of phase ends, over the scene's time: rest is approached slowly
-_ROWS = 400  # samples of each phase of the reference replay, besides its steps
-_INSTANTS = 2000  # samples of each phase for reversals of joints
 ROWS = 200  # approximate rows of a result per phase
-FEWEST = 5000  # least steps of a stretch: contacts oscillate after a jump of torques
 _LOOKS = 8  # samples of each step over which torques are averaged
-_LEAST = 1e-3  # first of these samples after the start, in steps
-CREEP = 10.0
-"""regularization speed of dry friction, over its change of speed in a step."""
-LOOSE = 3e-7  # gap of contacts without a force, over the scene's length
-_APART = 0.1
-"""Share of a contact's row that no other contact has, from which on it is another place."""
 
 
 class EngineStretch(NamedTuple):
@@ -133,12 +123,13 @@ def list_steps(
     Torques by feedback are zero here.
     """
     duration = stretch.stop - stretch.start
-    count = max(int(np.ceil(duration / (step * problem.scene.scales.time) - 1e-9)), FEWEST)
+    # Contacts oscillate after a jump of torques: that takes some steps.
+    count = max(int(np.ceil(duration / (step * problem.scene.scales.time) - 1e-9)), 5000)
     h = duration / count
     tau = np.zeros((count, 2))
     if isinstance(torque, TorqueProfile):
         t = (np.arange(count * _LOOKS) + 0.5) * (h / _LOOKS) - h / 2
-        samples = torque.at(stretch.start + np.maximum(t, _LEAST * h))
+        samples = torque.at(stretch.start + np.maximum(t, 1e-3 * h))
         tau = np.asarray(samples.reshape(count, _LOOKS, 2).mean(axis=1))
     v = stretch.z_dot - h / 2 * stretch.z_ddot
     rows = min(count, ROWS * len(stretch.phases))
@@ -177,7 +168,7 @@ def apply_friction(scene: Scene, plan: Trajectory) -> TorqueProfile:
     """The torques of a plan less D sgn(theta') of its own joint velocities, with its steps."""
     torque, reversals = plan.torque, list[Array]()
     for start, motion in zip(plan.phase_starts[:-1], plan.motions, strict=True):
-        t = np.linspace(0.0, motion.duration, _INSTANTS)
+        t = np.linspace(0.0, motion.duration, 2000)
         for speed in motion.evaluate(t).z_dot[:, 3:].T:
             back = np.flatnonzero(speed[1:-2] * speed[2:-1] < 0) + 1
             share = speed[back] / (speed[back] - speed[back + 1])
@@ -197,7 +188,7 @@ def apply_friction(scene: Scene, plan: Trajectory) -> TorqueProfile:
 def find_between(plan: Trajectory) -> Trajectory:
     """The replay of a plan in its own problem, or the plan itself where that is not the same."""
     starts = plan.phase_starts
-    times = np.linspace(starts[:-1], starts[1:], _ROWS)
+    times = np.linspace(starts[:-1], starts[1:], 400)
     try:
         problem = read_own_problem(plan.meta)
         replay = simulate(problem, plan.torque, times=times.ravel()).trajectory
@@ -208,7 +199,8 @@ def find_between(plan: Trajectory) -> Trajectory:
     late = np.abs(replay.phase_starts - starts).max()
     inside = np.clip(plan.t, 0.0, replay.duration)
     error = np.abs(replay.at(inside).z - plan.z) / [*2 * [problem.scene.scales.length], 1, 1, 1]
-    same = late < LATE * problem.scene.scales.time and error.max() < SAME
+    # Rest is approached slowly: ends of phases may differ more.
+    same = late < 1e-3 * problem.scene.scales.time and error.max() < SAME
     return replay if same else plan
 
 
@@ -224,7 +216,7 @@ def press_in(problem: Problem, stretch: EngineStretch, stiffness: Mapping[str, f
     A = Formation(scene, contacts).evaluate(stretch.z[None], stretch.z_dot[None]).A[0]
     weight = 1 / np.sqrt(scene.mass_diagonal)
     rows = _list_independent(A * weight, formation.n_contacts)
-    depth = np.full(len(contacts), -LOOSE * scene.scales.length)
+    depth = np.full(len(contacts), -3e-7 * scene.scales.length)
     for k, name in enumerate(formation.names):
         depth[k] = stretch.c_n[name] / stiffness[name]
     return np.asarray(stretch.z - weight * (np.linalg.pinv((A * weight)[rows]) @ depth[rows]))
@@ -236,7 +228,8 @@ def _list_independent(rows: Array, kept: int) -> list[int]:
     for row in range(kept, len(rows)):
         basis = unit[chosen]
         rest = unit[row] - np.linalg.pinv(basis) @ (basis @ unit[row])
-        if np.linalg.norm(rest) > _APART:
+        # Contacts at one place share all of their rows but rounding.
+        if np.linalg.norm(rest) > 0.1:
             chosen.append(row)
     return chosen
 
@@ -257,7 +250,8 @@ class EngineDrive:
         self.loop, self.h = loop, h
         self.dry = scene.dry[3:]
         inertia = np.array([finger.inertia for finger in scene.fingers])
-        self.creep = np.maximum(CREEP * self.dry * h / inertia, np.finfo(float).tiny)
+        # Regularization speed of dry friction: ten times what it changes in a step.
+        self.creep = np.maximum(10.0 * self.dry * h / inertia, np.finfo(float).tiny)
         self.samples, self.tau = 0, np.zeros(2)
         self.coming: deque[tuple[float, Array]] = deque()
         self.over = False

@@ -13,12 +13,7 @@ from ..problem.definition import Phase
 from .curve import Curve, Panel, Segment
 from .tracing import trace_phase
 
-_STEP = 1e-2  # step of the difference quotient, over the length of the curve that follows
-NEAR = 0.2  # distance from nodes, in radii of gyration, beyond which a place is off a curve
 ON = 1e-9  # distance from a curve, in radii of gyration, up to which a place is on it
-ROUNDS = 8  # most steps of Newton's method to the nearest place of a curve
-SHORTEST = 1e-7  # shortest segment, over the length of its curve
-LEAST = 1e-9  # the same of panels; what is missing at an end is extrapolated
 
 
 def find_on(curve: Curve, z: Array) -> float | None:
@@ -27,10 +22,10 @@ def find_on(curve: Curve, z: Array) -> float | None:
     nodes = np.concatenate([panel.z for panel in curve.panels])
     away = (nodes - z) ** 2 @ weights
     first = int(away.argmin())
-    if away[first] > (NEAR * rho) ** 2:
+    if away[first] > (0.2 * rho) ** 2:
         return None
     s = float(np.concatenate([panel.s for panel in curve.panels])[first])
-    for _ in range(ROUNDS):
+    for _ in range(8):
         s = min(max(s, 0.0), curve.length)
         at, tangent = curve.interpolate(np.array([s]))
         change = float((z - at[0]) * weights @ tangent[0])
@@ -48,7 +43,8 @@ def take(curve: Curve, start: float, stop: float) -> Curve:
     panels = []
     for panel in curve.panels:
         first, last = max(float(panel.s[0]), low), min(float(panel.s[-1]), high)
-        if last - first < LEAST * length:
+        # What is missing at an end is extrapolated.
+        if last - first < 1e-9 * length:
             continue
         own = panel if (first, last) == (panel.s[0], panel.s[-1]) else _cut(panel, first, last)
         columns = (high - own.s)[::-1], own.z[::-1], -own.z_s[::-1]
@@ -57,7 +53,7 @@ def take(curve: Curve, start: float, stop: float) -> Curve:
     segments = []
     for part in curve.segments:
         ends = max(part.start, low), min(part.stop, high)
-        if ends[1] - ends[0] > SHORTEST * length:
+        if ends[1] - ends[0] > 1e-7 * length:
             first, last = sorted(sign * (end - start) for end in ends)
             # Zero has no sign.
             segments.append(Segment(first, last, sign * part.Xi + 0.0, sign * part.sigma + 0.0))
@@ -115,7 +111,7 @@ class CostToGo:
     def expand(self, z: Array) -> tuple[float, Array]:
         """The cost from `z`, shape (5,), and its gradient along the curve, shape (5,)."""
         curve = trace_phase(self.phase, z)
-        step = _STEP * curve.length
+        step = 1e-2 * curve.length
         point = curve.evaluate(np.array([0.0, step]))
         here, ahead = (self.value(place) for place in point.z)
         slope = (ahead - here) / step

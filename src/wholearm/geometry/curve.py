@@ -21,7 +21,6 @@ from ..common.arrays import Array
 from ..contacts.formation import Formation, Kinematics
 from ..mechanics.dynamics import Directions, metric_weights
 
-REFINE = 3  # places per node of a panel at which limits and reversals are looked for
 _TIED = 1e-6  # relative error of two rates that are proportional, and relative rate of none
 
 
@@ -225,8 +224,8 @@ def find_tied(formation: Formation, z: Array, row: int) -> tuple[int, ...]:
 
 
 def refine(s: Array, stop: float) -> Array:
-    """Places to look at along a panel with nodes `s`, up to `stop`."""
-    grid = np.interp(np.linspace(0, len(s) - 1, REFINE * len(s)), np.arange(len(s)), s)
+    """Places to look at along a panel with nodes `s`, up to `stop`: three for each node."""
+    grid = np.interp(np.linspace(0, len(s) - 1, 3 * len(s)), np.arange(len(s)), s)
     return np.append(grid[grid < stop], min(stop, s[-1]))
 
 

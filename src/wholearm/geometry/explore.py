@@ -12,10 +12,7 @@ from ..contacts.formation import Formation
 from ..mechanics.dynamics import metric_weights
 
 GRID = (120, 60)  # places across x and phi at which a formation is looked at
-SEEDS = 24  # most places from which an end is looked for: those that are nearest to it
 STILL = 1e-4  # distance from the start, in radii of gyration, that counts as none
-CLOSED = 3e-11  # largest gap of closed contacts, and coordinate error, in radii of gyration
-_STEP = 1e-5  # step of difference quotients of limits, in radii of gyration or rad
 
 
 Fixed = tuple[tuple[int, float | Array], ...]
@@ -55,7 +52,7 @@ def explore(formation: Formation, z: Array, slip: Array, ends: list[Ending]) -> 
     found, least = None, np.inf
     for end in ends:
         off = end.measure(places)
-        order = np.argsort(off)[:SEEDS]
+        order = np.argsort(off)[:24]
         for k in order[np.argsort((places[order] - z) ** 2 @ metric)]:
             goal = close_contacts(end.formation, places[k], slip, end.fixed, end.active)
             if goal is None or not is_inside(end.formation, goal):
@@ -109,7 +106,7 @@ def close_all(
     """
     metric, rho = metric_weights(formation.scene), formation.scene.scales.length
     sizes = np.full(formation.n_constraints, rho)
-    steps = _STEP * np.diag([rho, rho, 1.0, 1.0, 1.0])
+    steps = 1e-5 * np.diag([rho, rho, 1.0, 1.0, 1.0])
     sizes = np.append(sizes, [rho if row < 2 else 1.0 for row, _ in fixed])
     sizes = np.append(sizes, np.full(len(active), rho))
     found, z, left = np.full(z.shape, np.nan), z.copy(), np.arange(len(z))
@@ -134,7 +131,7 @@ def close_all(
         # Long steps overshoot where links turn; a tenth of a radian keeps to one branch.
         turned = np.abs(change[:, 2:]).max(axis=1, keepdims=True)
         z = z - change * np.minimum(1.0, 0.1 / np.maximum(turned, 1e-12))
-        closed = np.abs(residual).max(axis=1) < CLOSED
+        closed = np.abs(residual).max(axis=1) < 3e-11
         found[left[closed]] = z[closed]
         z, left = z[~closed], left[~closed]
         if not len(left):

@@ -28,11 +28,8 @@ NODES = 17  # nodes of a panel
 RESOLVED = 1e-13  # largest trailing Chebyshev coefficient of a panel, over the object's size
 NEWTON = 3e-8  # last Newton change, in radii of gyration: the next is about its square
 SHORTER = 0.5  # factor on the length of a panel whose points are not found
-AIM = 0.3  # trailing coefficient that the length of a panel is chosen for, over the largest one
 HELD = 3e-5  # distance to `until`, in radii of gyration or rad, that counts as none
-FIRST = 0.5  # length of the first panel that is tried, in radii of gyration
 ROUNDING = 3e-10  # below zero by no more than this, in radii of gyration, a limit counts as kept
-CLOSER = 4  # times that dips of a limit between two places are looked at more closely
 LONGEST = 60.0  # longest curve that is traced, in radii of gyration: several turns of the object
 
 
@@ -184,7 +181,7 @@ def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) ->
         return Curve(formation, tuple(panels), s, text, reached)
 
     slip = formation.evaluate_slip(z[None])[0]
-    step, start, tangent, guess = FIRST * rho, 0.0, heading, None
+    step, start, tangent, guess = 0.5 * rho, 0.0, heading, None
     while start < LONGEST * rho:
         panel, factor, guess = build_panel(formation, slip, z, tangent, start, step, guess)
         step *= factor
@@ -221,7 +218,7 @@ def _first_crossing(
     """First arc length at which margins [rho or rad] fall below zero, and which ones do so."""
     grid = refine(panel.s, panel.s[-1])
     values = margins(panel.interpolate(grid)[0])
-    for _ in range(CLOSER):
+    for _ in range(4):
         inner = _refine_dips(grid, values)
         if not len(inner):
             break
@@ -313,7 +310,8 @@ def build_panel(
     speed = np.sqrt(z_u**2 @ metric)
     scaled = np.column_stack([(points - z) * np.sqrt(metric) / rho, speed])
     tail = np.abs(analyse @ scaled)[-2:].max()
-    factor = (AIM * RESOLVED / max(tail, 1e-3 * RESOLVED)) ** (1 / (NODES - 1))
+    # A trailing coefficient of 0.3 of the largest one is aimed at.
+    factor = (0.3 * RESOLVED / max(tail, 1e-3 * RESOLVED)) ** (1 / (NODES - 1))
     if speed.max() > 1.5 or tail > RESOLVED:
         return None, max(min(factor, 0.8), SHORTER**2), Guess(step, analyse @ points)
     return Panel(start + step * (integrate @ speed), points, z_u / speed[:, None]), factor, None

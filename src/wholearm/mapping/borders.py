@@ -34,13 +34,7 @@ from ..contacts.closing import (
 from ..contacts.elemental import Contact
 from ..scene.model import Scene
 
-PARTS, DIVISIONS = 16, 13  # parts of an interval and repetitions of the search for a change
-CROWDED = 8  # most changes between two neighbouring places
-# Differences [rad] of a closed finger from a border's angle that count as none: where it touches
-# one of the border's contacts (at the ends of a link angles lose digits), and in general.
-SAME_ANGLE, ROUNDING = 1e-7, 1e-11
-ASIDE = 3e-8  # step beside a pointed tip at a vertex to find both contacts, in radii of gyration
-LEVEL = 3e-11  # height of vertices that count as on the line of a link, in radii of gyration
+PARTS = 16  # of an interval in which a change of labels is looked for
 LONGEST = 0.06  # longest step in x between points of a border, in radii of gyration
 NOWHERE = -1  # fills the labels of places that are no border
 
@@ -217,7 +211,7 @@ def _circle_track(
             neighbours = (index - 1) % count, (index + 1) % count
             own, *others = _corners_at(scene, phi, vertex, index, *neighbours)
             away = [((other - own) * inwards).sum(axis=1) for other in others]
-            supported = np.minimum(*away) > -LEVEL * scene.scales.length
+            supported = np.minimum(*away) > -3e-11 * scene.scales.length
             pair = np.broadcast_to([side, arc], (len(x), 2))
         else:
             axis = np.column_stack([np.cos(angle), np.sin(angle)])
@@ -227,7 +221,7 @@ def _circle_track(
             supported &= sign * (m[:, 1] * axis[:, 0] - m[:, 0] * axis[:, 1]) <= 0
             pair = np.broadcast_to([arc, first + count + edge], (len(x), 2))
         if link.radius == 0:
-            aside = ASIDE * scene.scales.length
+            aside = 3e-8 * scene.scales.length
             beside = [close_fingers(scene, x + d, phi).touched[:, finger] for d in (-aside, aside)]
             pair = np.sort(np.column_stack(beside), axis=1)
             about = np.isin(pair, [side, *(first + count + (index - k) % count for k in (0, 1))])
@@ -260,7 +254,8 @@ def _is_closed(closed: ClosedFinger, finger: int, angle: Array, pair: Numbers) -
     with np.errstate(invalid="ignore"):
         off = np.abs(np.mod(closed.z[:, 3 + finger] - angle + np.pi, 2 * np.pi) - np.pi)
         touches = (closed.touched[:, [finger]] == pair).any(axis=1)
-        return np.asarray((off < ROUNDING) | (touches & (off < SAME_ANGLE)))
+        # At the ends of a link angles lose digits.
+        return np.asarray((off < 1e-11) | (touches & (off < 1e-7)))
 
 
 def name_contacts(table: tuple[Contact, ...], label: Numbers) -> tuple[Contact, ...]:
@@ -333,11 +328,12 @@ def _find_changes(
     low, high, owner = places[changed], places[changed + 1], owners[changed]
     old, last = labels[changed], labels[changed + 1]
     found: dict[int, list[tuple[float, float, Numbers]]] = {}
-    for _ in range(CROWDED):
+    # Eight changes between two neighbouring places at most.
+    for _ in range(8):
         if not len(low):
             break
         stop = high
-        for _ in range(DIVISIONS):
+        for _ in range(13):
             inner = low[:, None] + (high - low)[:, None] * np.arange(1, PARTS) / PARTS
             seen = every.label(np.repeat(owner, PARTS - 1), inner.ravel())
             same = (seen.reshape(*inner.shape, -1) == old[:, None]).all(axis=2)

@@ -6,6 +6,7 @@ inside a cell (two degrees of freedom), four on its borders (one), five at cross
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -45,16 +46,11 @@ from .borders import (
 )
 from .formation_list import trace_problem
 
-BEYOND = np.radians(6.0)  # reach of the window beyond the flush angles next to the plan [rad]
-BESIDE = 0.25  # largest reach over half the distance of these angles
 WAYS = ("+x", "-x", "+phi", "-phi")  # directions of travel inside a cell
 REGULAR = 1e-9  # least ratio of singular values of independent contacts; least determinant likewise
 _WAYS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 Flush = tuple[int | None, int]  # a finger (None for the palm) and an edge that lies flush on it
-SAMPLES = 100  # samples of borders per radian of the window, and least number across it
-ARROWS = 24  # places across the map at which directions inside cells are checked
 CROSSED = -5  # cell of the places where the closed fingers would overlap
-SAME_PLACE = 3e-5  # distance of ends of borders that are one crossing, in radii of gyration and rad
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +148,7 @@ def build_map(
     cells[obstacle == 0] = cell.ravel()
     table = contact_table(scene)
     report("map: borders")
-    samples = round(SAMPLES * max(1.0, window.phi[1] - window.phi[0]))
+    samples = round(100 * max(1.0, window.phi[1] - window.phi[0]))
     tracks = list(list_tracks(scene, window, samples))
     borders = _build_borders(problem, cut(scene, tracks, window), limit)
     report("map: crossings and directions")
@@ -210,7 +206,7 @@ def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]
     """Places where ends of borders meet with five or more contacts in all."""
     ends = [(border, k) for border in borders for k in (0, -1)]
     points = np.array([border.points[k] for border, k in ends]).reshape(-1, 2)
-    size = SAME_PLACE * np.array([scene.scales.length, 1.0])
+    size = 3e-5 * np.array([scene.scales.length, 1.0])
     table = contact_table(scene)
     crossings, free = [], np.ones(len(points), dtype=bool)
     for k in range(len(points)):
@@ -237,7 +233,7 @@ def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]
 def _check_cells(problem: Problem, window: Window, limit: float) -> tuple[Array, Flags, Flags]:
     """Feasible directions of motion at a lattice of places inside cells."""
     scene = problem.scene
-    x, phi = (np.linspace(*ends, ARROWS + 1) for ends in (window.x, window.phi))
+    x, phi = (np.linspace(*ends, 25) for ends in (window.x, window.phi))
     x, phi = np.meshgrid((x[1:] + x[:-1]) / 2, (phi[1:] + phi[:-1]) / 2)
     places = np.column_stack([x.ravel(), phi.ravel()])
     labels = label_cells(scene, *places.T)
@@ -393,7 +389,7 @@ def _cover_phases(problem: Problem) -> tuple[float, float]:
     # An edge that is flush at an end of the plan does not count.
     before, after = float(flush[flush < low - 1e-6].max()), float(flush[flush > high + 1e-6].min())
     # The next edge but one stays outside.
-    beyond = min(BEYOND, BESIDE * (after - before) / 2)
+    beyond = min(math.radians(6.0), (after - before) / 8)
     return before - beyond, after + beyond
 
 

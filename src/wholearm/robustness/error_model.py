@@ -18,7 +18,6 @@ from ..scene.model import Scene
 
 REACHED = 0.03
 """How far from the planned place a goal counts as reached, over the scene's length: 1 mm of 33."""
-TOLERANCE = 1e-6  # of the simulations of samples, if no other is given, relative to the scene
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,7 @@ class Uncertainty:
     # for torques as planned
     sample_rate: float | None = 1000.0
     # of the simulations of samples, relative to the scene: far below what counts as the goal
-    tolerance: float = TOLERANCE
+    tolerance: float = 1e-6
     # [m]: how far from the planned place a goal counts as reached; `REACHED` of the scene's length
     # if left out
     distance: float | None = None

@@ -35,7 +35,6 @@ from ..simulation.simulate import simulate_free
 from .error_model import Uncertainty, change_problem, change_torques
 
 Z = 1.959963984540054  # standard normal quantile of 0.975
-STEP = 1e-3  # step of the differences, over the half width of a range
 APART = 0.01
 """How far from events the instant is at which a force is looked at, over the duration: where a
 contact slides the other way forces step, at another time when numbers are off."""
@@ -506,7 +505,7 @@ def measure_sensitivities(trial: Trial) -> Sensitivities:
     found = []
     for own in trial.uncertainty.varied if contact else ():
         width = trial.uncertainty.widths[own.name]
-        step = STEP * width
+        step = 1e-3 * width
         ends = (0.0, step) if own.name == "delay" else (-step, step)
         forces = [_find_force(trial, own.name, value, contact, time) for value in ends]
         slope = (forces[1] - forces[0]) / (ends[1] - ends[0])

@@ -28,8 +28,6 @@ from ..mechanics.dynamics import A, B, Directions, PathForces, V, force_rows, me
 from ..results.trajectory import Samples
 
 COUNT = 5  # number of coefficients: of 1, a, b, s' and the internal force
-_STEP = 1e-5  # step of the differences of kinematics, over the scene's length
-_LOOSE = 1e-6  # weight of the fingers' angles where they follow the object
 
 
 class _Change(NamedTuple):
@@ -89,7 +87,7 @@ def find_slopes_at(
     tau = samples.tau[..., None] * np.eye(COUNT)[0]
     acceleration = samples.z_ddot[..., None] * np.eye(COUNT)[0]
     # Fingers follow the object, however far.
-    metric = metric_weights(formation.scene) * np.array([1, 1, 1, *[_LOOSE] * 2])
+    metric = metric_weights(formation.scene) * np.array([1, 1, 1, 1e-6, 1e-6])
     unit = np.broadcast_to(np.eye(5)[0], z.shape)
     dz = unit + _move_least(kinematics.P, -kinematics.P[..., 0], metric)
     along = dz, np.zeros_like(dz)
@@ -161,7 +159,8 @@ class _State(NamedTuple):
 
     @property
     def _step(self) -> float:
-        return _STEP * self.formation.scene.scales.length
+        """Step of the differences of kinematics [m]."""
+        return 1e-5 * self.formation.scene.scales.length
 
     def _difference(self, name: str, dz: Array) -> Kinematics:
         """Derivative of the kinematics by a length that is off, where places move with it."""

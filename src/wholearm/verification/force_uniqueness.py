@@ -19,7 +19,6 @@ from .verdict import measure_speed
 
 PLACES = 33
 """Instants of a phase at which uniqueness margins are looked at, and at which torques are."""
-_LEANS = 1 - 1e-6  # share of U c_n from which on a tangential force is that of sliding
 
 
 def find_uniqueness_margin(
@@ -40,7 +39,7 @@ def find_uniqueness_margin(
     if not len(rows):
         return None
     c_n, c_t = (forces[rows][:, columns] for forces in (motion.c_n, motion.c_t))
-    slides = np.abs(c_t) >= _LEANS * formation.friction * np.abs(c_n)
+    slides = np.abs(c_t) >= (1 - 1e-6) * formation.friction * np.abs(c_n)
     Xi = -np.sign(c_t * c_n)
     kinematics = formation.evaluate(motion.z[rows], motion.z_dot[rows])
     margins = []

@@ -35,8 +35,6 @@ SLOW = 1e-6
 """Speed below which the direction of friction is looked for, relative to the scene's speed."""
 _TORQUES = ((0,), (1,), (0, 1))  # which torques change: one alone, or both
 _KINDS = {EventKind.CONTACT_LOST: "lost", EventKind.SLIP: "slips"}
-LEAST = 1e-3  # least normal force to aim at, over the scene's force, where epsilon is less
-MIN_SPEED = 1e-6  # speed above which a direction of motion counts, over the scene's speed
 
 
 def find_help(
@@ -73,7 +71,7 @@ def _examine_loss(
         return None
     row = _find_row(simulation, index, contact, kind, time)
     z, v, tau = simulation.z[row], simulation.z_dot[row], simulation.tau[row]
-    epsilon = max(problem.epsilon, LEAST * problem.scene.scales.force)
+    epsilon = max(problem.epsilon, 1e-3 * problem.scene.scales.force)
     distance = _measure_distance(phase, z[None], v[None])
     columns = [simulation.contacts.index(name) for name in formation.names]
     rests = bool(np.isnan(simulation.c_n[row, columns]).all())
@@ -136,9 +134,8 @@ def find_approach(problem: Problem, simulation: Simulation) -> Approach | None:
     gaps, gradient, _ = distance
     rates = -np.einsum("ni,ni->n", gradient, v)
     least, time = find_lowest(t, gaps, simulation.torque.breaks)
-    going = np.flatnonzero(
-        np.abs(rates) > MIN_SPEED * (1 / scales.time if is_angle else scales.speed)
-    )
+    unit = scales.rate if is_angle else scales.speed
+    going = np.flatnonzero(np.abs(rates) > 1e-6 * unit)
     turns = going[np.flatnonzero(np.diff(np.sign(rates[going])))]
     return Approach(
         phase=phase.number,

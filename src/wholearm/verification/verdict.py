@@ -23,16 +23,6 @@ from ..simulation.events import EventKind, OutcomeKind, Simulation
 DEPARTURE = 1e-3
 """Largest distance of a replay from its plan, relative to the scene's length, and in rad."""
 REST_SPEED = 2e-2  # speed at the end of a phase that passes for rest, relative to the scene's speed
-STRAY = 2e-3
-"""Largest shortfall of a normal force of a plan below epsilon, relative to epsilon: a replay
-strays."""
-ROUNDING = 5e-7  # the same by rounding, relative to the scene's force
-GOAL = 3e-4
-"""Distance to the end of the last phase that counts as there, relative to the scene's length, and
-in rad."""
-ROUGH_UNIQUENESS = 1e-3
-"""By how much uniqueness margins of a replay may be less than those of its plan."""
-OVERLAP = 3e-5  # overlap of the links that passes for touching, relative to the scene's length
 
 
 @declare(
@@ -55,7 +45,7 @@ class Allowance:
     # speed where a phase ends at rest, over the scene's speed; angular speeds count times the
     # scene's length
     rest_speed: float = REST_SPEED
-    stray: float = STRAY  # how far normal forces of a plan may fall below epsilon, over epsilon
+    stray: float = 2e-3  # how far normal forces of a plan may fall below epsilon, over epsilon
     # least uniqueness margin of contact forces (`mechanics.uniqueness`)
     uniqueness_margin: float = UNIQUENESS_MARGIN
 
@@ -67,15 +57,15 @@ class Allowance:
         return replace(self, departure=share * self.departure, stray=share * self.stray)
 
     def measure_stray(self, problem: Problem) -> float:
-        """How far normal forces of a plan may fall below epsilon [N]."""
-        return ROUNDING * problem.scene.scales.force + self.stray * problem.epsilon
+        """How far normal forces of a plan may fall below epsilon, rounding included [N]."""
+        return 5e-7 * problem.scene.scales.force + self.stray * problem.epsilon
 
 
 def describe_overlap(
     scene: Scene, phases: Sequence[PhaseReport], gap: FingerGap | None
 ) -> list[Failure]:
-    """A sentence on links that overlap."""
-    if gap is None or gap.least >= -OVERLAP * scene.scales.length:
+    """A sentence on links that overlap by more than passes for touching."""
+    if gap is None or gap.least >= -3e-5 * scene.scales.length:
         return []
     number = [phase.number for phase in phases if phase.start <= gap.time][-1]
     text = f"{FINGERS_TOUCH} at t = {gap.time:.5g} s: they overlap by {-gap.least:.3g} m"
@@ -95,7 +85,7 @@ def judge_end(problem: Problem, simulation: Simulation, allowance: Allowance) ->
     near = (
         outcome.kind is OutcomeKind.GOAL_MISSED
         and int(simulation.phase[-1]) == last.index
-        and missed <= GOAL * (1.0 if is_angle else problem.scene.scales.length)
+        and missed <= 3e-4 * (1.0 if is_angle else problem.scene.scales.length)
         and measure_speed(problem.scene, simulation.z_dot[-1])
         <= allowance.rest_speed * problem.scene.scales.speed
     )
@@ -196,7 +186,8 @@ def describe_ambiguity(
     failures = []
     for phase in phases:
         least = phase.uniqueness_margin
-        if least is None or least.value >= allowance.uniqueness_margin - ROUGH_UNIQUENESS:
+        # Those of a replay may be a little less than those of its plan.
+        if least is None or least.value >= allowance.uniqueness_margin - 1e-3:
             continue
         place = describe_pose(simulation.z[np.searchsorted(simulation.t, least.time)])
         text = describe_uniqueness(least.value, least.contacts, place, allowance.uniqueness_margin)

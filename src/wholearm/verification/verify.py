@@ -56,8 +56,6 @@ from .verdict import (
 if TYPE_CHECKING:
     from .free import FreeReport
 
-_RATE_MISS = 1e-3  # largest relative miss of a torque's rate, or of a command, that is not reported
-STEPPED = 1e-5  # largest step of a torque that is none, over its limit
 _LOOKS = 33  # instants of each piece of the torques that are looked at
 SHORTEST = 2 * SETTLING
 """Interval below which forces may jump, and rounding spoils a parabola, relative to the scene's
@@ -66,8 +64,6 @@ MISSED = 1e-6  # miss of a limit, over what is much for it, from which on it is 
 ROWS = 20
 """About how many rows of each phase of a trajectory its replay is compared with; without one, about
 how many even parts of each phase are looked at."""
-POINTS = 8  # instants around what seems to be a dip
-LOOKS = 3  # how often what the looks before leave open is looked at closer
 _DIP = 1e-7
 """How far below all that is known a dip has to seem, relative to the scene's force or length."""
 Dips = list[tuple[float, float]]
@@ -406,7 +402,7 @@ def make_closer(problem: Problem, breaks: Array) -> Closer:
     def look(simulation: Simulation, glimpses: Glimpses, looks: int) -> Array:
         before, phases = left.copy(), problem.phases[: int(simulation.phase[-1]) + 1]
         left.clear()
-        for phase in phases if looks < LOOKS else ():
+        for phase in phases if looks < 3 else ():
             if looks and not any(index == phase.index for index, _ in before):
                 continue
             for one in _list_series(problem, simulation, glimpses, phase, breaks):
@@ -414,7 +410,7 @@ def make_closer(problem: Problem, breaks: Array) -> Closer:
                 known = before.get(key, [])
                 dips = [d for dip in known for d in one.narrow(dip)] if looks else one.find_dips()
                 left.update({key: dips} if dips else {})
-        every = [np.linspace(*dip, POINTS + 2)[1:-1] for dips in left.values() for dip in dips]
+        every = [np.linspace(*dip, 10)[1:-1] for dips in left.values() for dip in dips]
         return np.concatenate([np.zeros(0), *every])
 
     return look
@@ -610,7 +606,7 @@ def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float
         if np.isinf(fastest) and not lag:
             continue
         worst = int(steps[:, joint].argmax()) if len(steps) else 0
-        if len(steps) and steps[worst, joint] > STEPPED * limit:
+        if len(steps) and steps[worst, joint] > 1e-5 * limit:
             t = float(torque.breaks[worst + 1])
             text = f"{name} steps by {steps[worst, joint]:.3g} N m at t = {t:.5g} s"
             why = (
@@ -624,7 +620,7 @@ def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float
         for of, most, text in kinds:
             size = np.abs(of)
             piece, look = np.unravel_index(int(size.argmax()), size.shape)
-            if size[piece, look] > most * (1 + _RATE_MISS):
+            if size[piece, look] > most * (1 + 1e-3):
                 start, stop = torque.breaks[[piece, piece + 1]]
                 t = float(start + (stop - start) * look / (_LOOKS - 1))
                 said = text.format(size[piece, look], most)
