@@ -476,22 +476,21 @@ def test_refusals_agree_in_kind_and_in_what_is_short() -> None:
     assert compare("leg", refused, None)[0] == "differs"
 
 
-GOOD: dict[str, Any] = {"value": 2.0, "modes": [["+ - -"]], "fault": ""}
+GOOD: dict[str, Any] = {"objective": "time", "value": 2.0, "modes": [["+"]], "replay": {"ok": True}}
 
 
 def test_answers_come_from_the_environment() -> None:
-    found = KERNELS.run((*Environment(seed=3), str(SQUARE), "time"))
-    assert found["fault"] == ""
+    found = KERNELS.run((*Environment(seed=3), str(SQUARE), "time"))["answer"]
     assert found["value"] == pytest.approx(solved(SQUARE).value, rel=1e-6)
-    absent = KERNELS.run((*Environment(), "absent.toml", "time"))
-    assert absent["value"] is None and "absent.toml: cannot be read" in absent["fault"]
+    absent = KERNELS.run((*Environment(), "absent.toml", "time"))["answer"]
+    assert "absent.toml: cannot be read" in absent["refused"]
 
 
 def test_the_command_fails_where_answers_differ(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def answer_all(_: object, cases: list[Case], *__: object) -> list[tuple[Case, Row]]:
-        return [(case, dict(GOOD)) for case in cases]
+        return [(case, {"answer": GOOD}) for case in cases]
 
     monkeypatch.setattr("wholearm.benchmark.study.run_all", answer_all)
     stored, table = tmp_path / "answers.json", tmp_path / "table.md"
@@ -506,7 +505,7 @@ def test_the_command_fails_where_answers_differ(
     stored.write_text(json.dumps(known | {"plan a time": GOOD | {"value": 1.0}}), encoding="utf-8")
     capsys.readouterr()
     assert main(command) == 1
-    assert "plan a time: value 2 is off 1 by +1.0e+00" in capsys.readouterr().out
+    assert "plan a time: value: 2.0, stored 1.0, off by 1" in capsys.readouterr().out
 
 
 def test_numbers_change_in_the_last_bits_and_stay_so(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,6 +13,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
+from statistics import NormalDist
 from types import SimpleNamespace
 from typing import Any
 
@@ -47,7 +48,6 @@ from wholearm.robustness.sampling import (
     Robustness,
     TimeWindow,
     Trial,
-    Z,
     assess_robustness,
     count_share,
     make_trial,
@@ -56,6 +56,7 @@ from wholearm.robustness.sampling import (
 from wholearm.sensitivity.slopes import find_force_slopes, find_slopes_at
 from wholearm.simulation.events import EventKind
 
+Z = NormalDist().inv_cdf(0.975)
 PROBLEM = Path(__file__).parents[1] / "problems" / "heptagon_four_contacts.toml"
 NONE = dict.fromkeys(("inertia", "friction", "geometry", "start_x", "gain", "delay"), 0.0)
 FEW = Uncertainty({**NONE, "friction_finger1": 0.1}, sample_rate=None)

@@ -5,8 +5,7 @@ one machine stand in for another. Further Pythons bring other versions of the li
 change the numbers of the scenes themselves in the last bits.
 
 Each problem is planned and verified for every objective, in a process for each environment. The
-value of the objective and the sequence of contact modes of each phase are compared with those that
-the corpus has stored.
+answers are compared with those that the corpus has stored.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import random
 import re
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from functools import cache
 from itertools import product
@@ -30,6 +29,7 @@ import numpy as np
 
 from ..common.files import read_json, write_text
 from ..scene.model import Finger, Friction, Polygon, Scene
+from .corpus import compare
 from .study import Case, Row, Study, format_table
 
 LARGEST = 4  # largest change of a number, in units of 2^-52 of it
@@ -84,10 +84,7 @@ def _change_number(value: float, label: str) -> float:
 
 
 OBJECTIVES = ("time", "effort", "margin")
-TOLERANCE = 1e-6
-"""Largest relative difference of values: what Ipopt and the refinement of limits leave open."""
 UPDATE = "`bench corpus --update` writes it anew"
-SUPPORTED = re.compile(r"^Core: (\w+)", re.M)
 
 
 class Environment(NamedTuple):
@@ -121,7 +118,7 @@ def find_kernel(kernel: str = "", python: str = sys.executable) -> str:
     """Name of the kernel that NumPy takes where one is asked for, empty if it has no OpenBLAS."""
     code = "import os; os.environ['OPENBLAS_VERBOSE'] = '2'; import numpy"
     run = Environment(python, kernel).run(["-c", code])
-    match = SUPPORTED.search(run.stdout + run.stderr)
+    match = re.search(r"^Core: (\w+)", run.stdout + run.stderr, re.M)
     return match[1] if match else ""
 
 
@@ -145,13 +142,13 @@ problems FILE ...  problem files (TOML)
         return product(*places, options.problems, OBJECTIVES)
 
     def run(self, case: Case) -> Row:
-        """Value, contact modes and failures of a plan made by a process of an environment."""
+        """The answer to a case of the corpus, by a process of an environment."""
         *given, path, objective = case
         asked = [path, objective, str(given[-1])]
         run = Environment(*given).run(["-m", "wholearm.benchmark.kernels", *asked])
         if run.returncode:
-            return {"value": None, "modes": [], "fault": run.stderr.strip()[-300:]}
-        return dict(json.loads(run.stdout))
+            return {"answer": {"refused": run.stderr.strip()[-300:]}}
+        return {"answer": json.loads(run.stdout)}
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
         """A row for each environment, and what differs."""
@@ -160,12 +157,13 @@ problems FILE ...  problem files (TOML)
             mine = [row for row in rows if tuple(row["case"][:3]) == environment]
             label, same, offs = Environment(*environment).describe(), 0, [0.0]
             for row in mine:
-                name = f"plan {Path(row['case'][3]).stem} {row['case'][4]}"
-                texts = compare(row, known.get(name))
-                findings += [f"{label}: {name}: {'; '.join(texts)}"] if texts else []
-                same += not texts
-                if row["value"] and known.get(name):
-                    offs.append(abs(row["value"] / known[name]["value"] - 1))
+                name, answer = f"plan {Path(row['case'][3]).stem} {row['case'][4]}", row["answer"]
+                stored = known.get(name)
+                kind, texts = compare("plan", answer, stored)
+                findings += [f"{label}: {name}: {texts[0]}"] if kind == "differs" else []
+                same += kind == "same"
+                if stored and "value" in answer and "value" in stored:
+                    offs.append(abs(answer["value"] / stored["value"] - 1))
             table.append((label, len(mine), same, f"{max(offs):.1e}"))
         heads = ["environment", "answers", "as stored", "largest difference of a value"]
         lines = format_table(heads, table, 4)
@@ -177,29 +175,13 @@ problems FILE ...  problem files (TOML)
 STUDY = Kernels()
 
 
-def compare(found: Mapping[str, Any], stored: Mapping[str, Any] | None) -> list[str]:
-    """Differences of an answer from the one that is stored."""
-    if found["fault"]:
-        return [found["fault"]]
-    if stored is None:
-        return [f"no answer is stored; {UPDATE}"]
-    texts, off = [], found["value"] / stored["value"] - 1
-    if abs(off) > TOLERANCE:
-        texts.append(f"value {found['value']:.9g} is off {stored['value']:.9g} by {off:+.1e}")
-    if found["modes"] != stored["modes"]:
-        texts.append(f"contact modes {found['modes']} are not {stored['modes']}")
-    return texts
-
-
 def _answer(path: str, objective: str, seed: str) -> None:
     """Print the answer that the parent process asks for."""
     from .corpus_cases import answer
 
     if int(seed):
         perturb_scenes(int(seed))
-    row = answer(("plan", Path(path).stem, objective), Path(path).parent)
-    fault = row["text"] if "text" in row else "; ".join(row["replay"]["failures"])
-    print(json.dumps({"value": None, "modes": [], **row, "fault": fault}))
+    print(json.dumps(answer(("plan", Path(path).stem, objective), Path(path).parent)))
 
 
 if __name__ == "__main__":

@@ -37,7 +37,6 @@ from .stretch import (
 PARTS = 5  # equal parts of a stretch at whose ends the error is listed
 SLOW = 0.1  # share of the planned sliding speed below which a contact sticks
 PRESS = 0.25  # least normal force that counts, over the scene's force: 0.5 N in `problems/`
-_INSTANTS = 2000  # samples of a phase over which planned forces are averaged
 # Allowed error of the final pose, over the scene's length and in rad; soft contacts cause 2e-3.
 ALLOWED = 1e-2
 
@@ -339,7 +338,7 @@ def _average(plan: Trajectory, part: _Part, run: EngineRun) -> list[Force]:
     ends = run.cut(every, part.phase.until.contact, scene)
     ends = ends if len(ends) else every[:1]
     time = run.t[ends[-1]] - plan.phase_starts[part.phase.index]
-    middles = (np.arange(_INSTANTS) + 0.5) * min(time, motion.duration) / _INSTANTS
+    middles = (np.arange(2000) + 0.5) / 2000 * min(time, motion.duration)
     planned = np.nanmean(motion.evaluate(middles).c_n, axis=0).tolist()
     share = np.diff(run.t)[ends - 1]
     press = share @ run.press[ends - 1] / share.sum()

@@ -13,12 +13,11 @@ from ..problem.definition import Phase
 from .curve import Curve, Panel, Segment
 from .tracing import trace_phase
 
-ON = 1e-9  # distance from a curve, in radii of gyration, up to which a place is on it
-
 
 def find_on(curve: Curve, z: Array) -> float | None:
     """Where a configuration, shape (5,), is on a curve [m]; None if it is not on it."""
     rho, weights = curve.formation.scene.scales.length, metric_weights(curve.formation.scene)
+    near = 1e-9 * rho
     nodes = np.concatenate([panel.z for panel in curve.panels])
     away = (nodes - z) ** 2 @ weights
     first = int(away.argmin())
@@ -29,11 +28,11 @@ def find_on(curve: Curve, z: Array) -> float | None:
         s = min(max(s, 0.0), curve.length)
         at, tangent = curve.interpolate(np.array([s]))
         change = float((z - at[0]) * weights @ tangent[0])
-        if abs(change) < ON / 100 * rho:
+        if abs(change) < near / 100:
             break
         s += change
     off = float(np.sqrt((z - at[0]) ** 2 @ weights))
-    return s if off < ON * rho else None
+    return s if off < near else None
 
 
 def take(curve: Curve, start: float, stop: float) -> Curve:

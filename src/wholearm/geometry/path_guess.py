@@ -19,7 +19,6 @@ from .tracing import require_touching, runs_on_curve, trace_phase
 
 POINTS = 25  # configurations along a guess
 RELEASE_AT = 0.8  # share of a curve at which a release is guessed
-_MOST_ACTIVE = 2  # most active limits at the end of a phase
 
 
 def find_end(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> Array:
@@ -129,7 +128,7 @@ def list_ends(phase: Phase) -> list[Ending]:
 
 
 def _project(end: Ending, z: Array, slip: Array) -> tuple[Array | None, str]:
-    """Nearest end by an active-set method with up to `_MOST_ACTIVE` limits, or what blocks it."""
+    """Nearest end by an active-set method with up to two limits, or what blocks it."""
     formation, active, reason = end.formation, end.active, ""
     goal = close_contacts(formation, z, slip, end.fixed, active)
     while goal is not None:
@@ -138,7 +137,7 @@ def _project(end: Ending, z: Array, slip: Array) -> tuple[Array | None, str]:
             return goal, ""
         worst = int(limits.argmin())
         reason = f": {formation.limits[worst].text} first"
-        if worst in active or len(active) == _MOST_ACTIVE + len(end.active):
+        if worst in active or len(active) == 2 + len(end.active):
             break
         active = (*active, worst)
         goal = close_contacts(formation, goal, slip, end.fixed, active)

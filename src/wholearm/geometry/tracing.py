@@ -26,7 +26,6 @@ from .curve import Curve, Panel, border, describe_pose, find_root, refine
 
 NODES = 17  # nodes of a panel
 RESOLVED = 1e-13  # largest trailing Chebyshev coefficient of a panel, over the object's size
-NEWTON = 3e-8  # last Newton change, in radii of gyration: the next is about its square
 SHORTER = 0.5  # factor on the length of a panel whose points are not found
 HELD = 3e-5  # distance to `until`, in radii of gyration or rad, that counts as none
 ROUNDING = 3e-10  # below zero by no more than this, in radii of gyration, a limit counts as kept
@@ -302,9 +301,10 @@ def build_panel(
         points = points + change
         kinematics = formation.evaluate(points, points)
         before, size = size, np.abs(change * np.sqrt(metric)).max()
-        if size < NEWTON * rho or size > 10 * rho or (count > 2 and size > before / 2):
+        # The next change is about the square of this one.
+        if size < 3e-8 * rho or size > 10 * rho or (count > 2 and size > before / 2):
             break
-    if not size < NEWTON * rho:
+    if not size < 3e-8 * rho:
         return None, SHORTER, None
     z_u = np.linalg.solve(border(kinematics.P, projection), np.eye(5)[:, 4:])[..., 0]
     speed = np.sqrt(z_u**2 @ metric)

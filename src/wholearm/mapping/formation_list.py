@@ -42,32 +42,18 @@ from .borders import (
     Window,
     cut,
     flush_track,
-    label_cells,
     label_closed,
     name_contacts,
     palm_track,
 )
 
-_MOST = 50  # Corners of a polygon that a file still shows well
 _SIZE, _MASS = 0.05, 0.2  # radius [m] and mass [kg] of the reference object
-# x of the left joint and of the start over the size, of polygons with five and more corners and of
-# others; and the length of the slide. The right joint is at 1.6.
-_LEFT, _START, _SLIDE = (-1.6, -0.2), (0.3, 1.2), 0.4
-# Other hands and starts for given vertices.
-_OTHERS = tuple(product((True, False), (1.2, 0.8, 0.3, 0.0)))
 _COMMENTS = 31  # Column of the comments
 NEAR = (0.015, float(np.radians(0.5)))  # tolerance of poses: x in radii of gyration, phi in rad
 MISSED = 4.0  # largest distance of a leg from a border that is reported, over `NEAR`
 PLACES = 401  # samples of a leg
-SAME_PLACE = 1e-3  # length of a part, over `NEAR`, below which its ends are one crossing
-BESIDE = 1e-6  # gap between parts, over `NEAR`, that counts as unreachable
-SHORTEST = 0.3  # largest tolerance along a leg, over its length
-AT_START = 1e-4  # length of a first part, over `NEAR`, that counts as rounding
 INSIDE = 0.2  # distance of a leg's end from an obstacle, over `NEAR`
-PROBES = 9  # samples of an excursion into a neighbouring cell
 DIGITS = 1e-5  # rounding of the coordinates that end phases, in radii of gyration and rad
-REPLANS = 12  # most times that the rest of a leg is split anew
-BEFORE = 0.98  # share of a part at which intermediate phases end: short of the change of contacts
 Span = tuple[Numbers, float, float]  # a label, and the parameters between which a leg has it
 Step = tuple[tuple[Contact, ...], Until]  # contacts of a phase, and its end
 
@@ -232,7 +218,7 @@ def walk_leg(problem: Problem, index: int, z: Array, start: Array, stop: Array) 
     """Phases along a leg, with their final configurations.
 
     A phase with two degrees of freedom ends at the nearest place, not on the leg, except for the
-    last one. If the phases that follow cannot start there, the rest of the leg is split anew.
+    last one.
 
     Parameters
     ----------
@@ -245,22 +231,14 @@ def walk_leg(problem: Problem, index: int, z: Array, start: Array, stop: Array) 
     InputError  if the leg cannot be followed
     """
     walked: list[Walked] = []
-    parts, replans = split_leg(problem.scene, start, stop), 0
+    parts, near = split_leg(problem.scene, start, stop), tolerance(problem.scene)
     while parts:
-        near = tolerance(problem.scene)
         while len(parts) > 1 and (np.abs(parts[0].stop - parts[0].start) < near).all():
             # A first part within `NEAR` is left out if the next one can start here.
             if not _can_start(problem.scene, z, parts[1].contacts):
                 break
             parts = parts[1:]
-        try:
-            walked += _walk_part(problem, index + len(walked), z, parts[:2])
-        except InputError as error:
-            moved = (np.abs(z[[0, 2]] - parts[0].start) > 1e-3 * near).any()
-            if not moved or replans == REPLANS:
-                raise InputError("", "route", error.problem) from None
-            parts, replans = split_leg(problem.scene, z[[0, 2]], stop), replans + 1
-            continue
+        walked += _walk_part(problem, index + len(walked), z, parts[:2])
         z, parts = walked[-1][1], parts[1:]
     return walked
 
@@ -272,9 +250,8 @@ def _list_missing(scene: Scene, z: Array, contacts: tuple[Contact, ...]) -> list
 
 
 def _walk_part(problem: Problem, index: int, z: Array, parts: list[Part]) -> list[Walked]:
-    """The first feasible phases through a part; preferably such that the next part can start."""
+    """The first feasible phases through a part after which the next part can start."""
     first: InputError | None = None
-    spare: list[Walked] = []
     scene, part = problem.scene, parts[0]
     for steps in _list_steps(scene, z, part, len(parts) == 1):
         end, walked = z, list[Walked]()
@@ -301,9 +278,8 @@ def _walk_part(problem: Problem, index: int, z: Array, parts: list[Part]) -> lis
                 continue
         if len(parts) == 1 or _can_start(scene, end, parts[1].contacts):
             return walked
-        spare = spare or walked
-    if spare:
-        return spare
+        names = ", ".join(contact.name for contact in parts[1].contacts)
+        first = first or InputError("", "", f"cannot go on at {describe_pose(end)} with {names}")
     assert first is not None
     raise first
 
@@ -335,9 +311,10 @@ def _list_steps(scene: Scene, z: Array, part: Part, last: bool) -> Iterator[list
         yield from ([(held, Until(contact=missing[0])), *steps] for steps in simple)
         return
     yield from simple
-    # Intermediate phases by x and phi lead to near the end: another end may be nearer.
+    # Phases to x and phi, just short of the change of contacts, come before: from the start another
+    # end may be nearer. Case: leg 3 of `list 1` of the corpus.
     rows = (part.coordinate,) if len(part.contacts) == 4 else (0, 1)
-    aim = part.start + (BEFORE if part.gained else 1.0) * (part.stop - part.start)
+    aim = part.start + (0.98 if part.gained else 1.0) * (part.stop - part.start)
     between = [(part.contacts, end_at(scene, row, aim)) for row in rows]
     for count in range(1, len(rows) + 1):
         for chosen in permutations(between, count):
@@ -367,8 +344,7 @@ def split_leg(scene: Scene, start: Array, stop: Array) -> list[Part]:
     """Split a leg into parts with one formation each.
 
     A leg with both ends within `NEAR` of one border follows the border; any other is straight.
-    An end that near a change of contacts is moved to it, and a straight leg that leaves a cell by
-    no more than that, and comes back, stays in it.
+    An end that near a change of contacts is moved to it.
 
     Parameters
     ----------
@@ -380,10 +356,10 @@ def split_leg(scene: Scene, start: Array, stop: Array) -> list[Part]:
     """
     leg = choose_leg(scene, start, stop)
     low, high = min(leg.start, leg.stop), max(leg.start, leg.stop)
-    near = min(leg.near, SHORTEST * (high - low))
+    near = min(leg.near, 0.3 * (high - low))
     sign = 1 if leg.stop >= leg.start else -1
     # The start is that of the leg before, up to rounding.
-    margins = (AT_START * near, near)[::sign]
+    margins = (1e-4 * near, near)[::sign]
     kept = [
         piece
         for piece in cut(scene, [leg.track])
@@ -391,7 +367,8 @@ def split_leg(scene: Scene, start: Array, stop: Array) -> list[Part]:
     ]
     _require_reached(scene, leg, kept, [low + near, high - near])
     spans = [(p.label, float(p.places[0]), float(p.places[-1])) for p in kept]
-    spans = [span for span in spans if span[2] - span[1] > SAME_PLACE * leg.near] or spans
+    # The ends of shorter parts are one crossing.
+    spans = [span for span in spans if span[2] - span[1] > 1e-3 * leg.near] or spans
     if sign < 0:
         spans = [(label, last, first) for label, first, last in spans[::-1]]
     # The track goes on a little beyond the leg; a change of contacts that near ends the leg.
@@ -402,8 +379,6 @@ def split_leg(scene: Scene, start: Array, stop: Array) -> list[Part]:
     at_change = sign * (last - leg.stop) < 0.99 * near
     if not at_change:
         spans[-1] = (label, first, leg.stop)
-    if leg.track.flush is None:
-        spans = _drop_excursions(scene, leg, spans)
     return _build_parts(scene, leg, spans, at_change)
 
 
@@ -434,36 +409,11 @@ def _build_parts(scene: Scene, leg: Leg, spans: list[Span], at_change: bool) -> 
     return parts
 
 
-def _drop_excursions(scene: Scene, leg: Leg, spans: list[Span]) -> list[Span]:
-    """Remove excursions within `NEAR`, in which a straight leg loses a contact and regains it."""
-    labels = np.array([label for label, _, _ in spans])
-    box = np.array(list(product((-1, 0, 1), repeat=2))) * tolerance(scene)
-    for column in (0, 2, 4):
-        contacts = labels[:, column]
-        for k in range(1, len(spans)):
-            again = np.flatnonzero(contacts[k:] == contacts[k - 1])
-            if not len(again) or again[0] == 0:
-                continue
-            first, last = spans[k][1], spans[k + int(again[0]) - 1][2]
-            # Each place has to be within `NEAR` of where the contact touches.
-            x, phi = leg.track.pose(np.linspace(first, last, PROBES))
-            poses = (np.column_stack([x, phi])[:, None] + box).reshape(-1, 2)
-            near = label_cells(scene, *poses.T).reshape(PROBES, len(box), -1)[..., column]
-            if (near == contacts[k - 1]).any(axis=1).all():
-                contacts[k : k + int(again[0])] = contacts[k - 1]
-    kept: list[Span] = []
-    for label, (_, first, last) in zip(labels, spans, strict=True):
-        if kept and (kept[-1][0] == label).all():
-            _, first, _ = kept.pop()
-        kept.append((label, first, last))
-    return kept
-
-
 def _require_reached(scene: Scene, leg: Leg, kept: list[Piece], ends: list[float]) -> None:
     inner = [float(s) for piece in kept for s in piece.places[[0, -1]]]
     ends = [ends[0], *inner, ends[1]]
     for before, after in zip(ends[::2], ends[1::2], strict=True):
-        if after - before > BESIDE * leg.near:
+        if after - before > 1e-6 * leg.near:
             pose = leg.at((before + after) / 2)
             text = describe_obstacle(close_fingers(scene, pose[:1], pose[1:]))
             text = text or "there the border has ended"
@@ -560,13 +510,9 @@ def _locate(track: Track, pose: Array, near: Array) -> tuple[float, float]:
     straight = float(off(np.array([phi]))[0])
     if straight < 1:
         return phi, straight
-    for count in (101, 41, 41):
-        places = np.linspace(low, high, count)
-        away = off(places)
-        k = int(away.argmin())
-        if away[k] > 2 * MISSED:
-            break
-        low, high = float(places[max(k - 1, 0)]), float(places[min(k + 1, count - 1)])
+    places = np.linspace(low, high, PLACES)
+    away = off(places)
+    k = int(away.argmin())
     return float(places[k]), float(away[k])
 
 
@@ -613,8 +559,8 @@ def write_template(
     if vertices is not None:
         body = Polygon(vertices, 1.0)
         corners, size = body.n_vertices, float(np.hypot(*body.vertices.T).max())
-    if not 3 <= corners <= _MOST:
-        raise InputError("", "--polygon", f"{corners} given; allowed are 3 to {_MOST}")
+    if not 3 <= corners <= 50:
+        raise InputError("", "--polygon", f"{corners} given; allowed are 3 to 50")
     scale = require_number(size, "--size", positive=True) / _SIZE
     weight = _MASS * scale**2 if mass is None else require_number(mass, "--mass", positive=True)
     if vertices is None:
@@ -622,7 +568,9 @@ def write_template(
         # Rounded, so that a corner above the centroid is at zero.
         vertices = size * np.column_stack([np.cos(angles), np.sin(angles)]).round(12)
     few = corners < 5
-    tried = [(few, _START[few]), *(_OTHERS if given else ())]
+    tried = [(few, 1.2 if few else 0.3)]
+    # For given vertices the hand and the start of others may do.
+    tried += product((True, False), (1.2, 0.8, 0.3, 0.0)) if given else ()
     for last, (wide, start) in zip([*tried[1:], None], tried, strict=True):
         try:
             return _write(name, vertices, size, weight, wide, start)
@@ -653,7 +601,7 @@ def _write(name: str, vertices: Array, size: float, weight: float, few: bool, st
         f"vertices = [{', '.join(f'[{_show(x)}, {_show(y)}]' for x, y in vertices)}]",
         _row("mass", _show(weight), "kg"),
     ]
-    for number, side, word in ((1, 1.6, "right"), (2, _LEFT[few], "left")):
+    for number, side, word in ((1, 1.6, "right"), (2, -0.2 if few else -1.6, "left")):
         base = f"[{_show(side * size)}, {_show(-0.2 * size)}]"
         lines += [f"\n{f'[fingers.{number}]':<{_COMMENTS}}# {word}", _row("base", base, "m, joint")]
         lines += [_row(key, _show(value), text) for key, (value, text) in finger.items()]
@@ -664,7 +612,7 @@ def _write(name: str, vertices: Array, size: float, weight: float, few: bool, st
     text = "\n".join(lines) + "\n"
     problem = build_problem(tomllib.loads(text))
     x, _, phi = (float(value) for value in problem.start[:3])
-    route = list_formations(problem, (x, phi), ((start - _SLIDE) * size, phi))
+    route = list_formations(problem, (x, phi), ((start - 0.4) * size, phi))
     return text + "\n" + format_route(route)
 
 

@@ -50,7 +50,6 @@ from .regulator import RATE, ROOM, end_within, follow
 WIDEST_FACTOR = 64.0  # largest factor on ranges
 SAME = 1e-5  # distance from the plan's end that counts as none, over the scene's length and in rad
 STILL = 1e-3  # speed that counts as none, over the scene's
-DWELL = 3e-3  # time at rest before the next phase begins [s]
 Planner = Callable[[Problem], Trajectory]  # makes a plan of a problem
 COLUMNS = [ONE, B, V, A, LAMBDA]  # order of coefficients in the tables of a policy
 
@@ -100,7 +99,7 @@ def make_policy(
         delay=delay,
         touch=SETTINGS.touch * scales.speed,
         still=STILL * scales.speed,
-        dwell=DWELL,
+        dwell=3e-3,
         most=0.5 * scales.acceleration,
         limit=(limit[0], limit[1]),
     )
@@ -130,7 +129,7 @@ def make_policy(
             gained = phase.until.contact
             found[0]["gained"] = "" if gained is None else gained.name
         if piece is None or not piece.passes:
-            found[-1]["duration"] += DWELL + delay
+            found[-1]["duration"] += settings.dwell + delay
         about += found
     duration = sum(phase["duration"] for phase in about)
     whole: dict[str, Any] = {"name": problem.name, "duration": duration, "phases": about}

@@ -34,7 +34,6 @@ from ..simulation.events import EventKind, FreeSimulation, OutcomeKind, list_pau
 from ..simulation.simulate import simulate_free
 from .error_model import Uncertainty, change_problem, change_torques
 
-Z = 1.959963984540054  # standard normal quantile of 0.975
 APART = 0.01
 """How far from events the instant is at which a force is looked at, over the duration: where a
 contact slides the other way forces step, at another time when numbers are off."""
@@ -579,10 +578,11 @@ class Share:
 
 
 def count_share(count: int, total: int) -> Share:
-    """A share with its interval: the probabilities p with |count/total - p| <= Z sigma(p)."""
+    """A share with its interval: the probabilities p with |count/total - p| <= z sigma(p)."""
     if not total:
         return Share(0, 0, 0.0, 1.0)
-    share, spread = count / total, Z**2 / total
+    z = 1.959963984540054  # standard normal quantile of 0.975
+    share, spread = count / total, z**2 / total
     centre = (share + spread / 2) / (1 + spread)
     half = math.sqrt(share * (1 - share) * spread + spread**2 / 4) / (1 + spread)
     # At the ends the interval begins and ends exactly there, but for rounding.

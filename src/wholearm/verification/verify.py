@@ -56,7 +56,6 @@ from .verdict import (
 if TYPE_CHECKING:
     from .free import FreeReport
 
-_LOOKS = 33  # instants of each piece of the torques that are looked at
 SHORTEST = 2 * SETTLING
 """Interval below which forces may jump, and rounding spoils a parabola, relative to the scene's
 time."""
@@ -595,7 +594,7 @@ def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float
     scene = problem.scene
     if not scene.has_slow_motors:
         return []
-    x = np.linspace(-1, 1, _LOOKS)
+    x = np.linspace(-1, 1, 33)
     values, ones = torque.at_places(x), find_commands(torque, np.ones(2)).at_places(x)
     rates, commands = ones - values, values + scene.actuator_lag[:, None] * (ones - values)
     steps = np.abs(values[1:, :, 0] - values[:-1, :, -1])
@@ -622,7 +621,7 @@ def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float
             piece, look = np.unravel_index(int(size.argmax()), size.shape)
             if size[piece, look] > most * (1 + 1e-3):
                 start, stop = torque.breaks[[piece, piece + 1]]
-                t = float(start + (stop - start) * look / (_LOOKS - 1))
+                t = float(start + (stop - start) * (1 + x[look]) / 2)
                 said = text.format(size[piece, look], most)
                 misses.append((t, f"{name} {said}, at t = {t:.5g} s"))
     return misses

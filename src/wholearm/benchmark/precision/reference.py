@@ -52,7 +52,8 @@ def solve_motion(
     The unknowns are those of Eqs. (1) and (2) with the friction of Eq. (3) put in, together with
     the contact conditions differentiated twice: rates of their rows by complex steps.
     """
-    ahead = (z + 1j * TINY * z_dot)[None]
+    tiny = 1e-30  # [s]
+    ahead = (z + 1j * tiny * z_dot)[None]
     touches = [locate(scene, contact.name, ahead) for contact in contacts]
     rows = np.array([touch.normal[0] for touch in touches])
     slide = np.array([touch.friction * touch.tangent[0].real for touch in touches])
@@ -62,12 +63,8 @@ def solve_motion(
     matrix = np.zeros((5 + count, 5 + count))
     matrix[range(5), range(5)] = scene.mass_diagonal
     matrix[:5, 5:], matrix[5:, :5] = (Xi[:, None] * slide - rows.real).T, rows.real
-    solution = np.linalg.solve(matrix, np.append(force, -rows.imag @ z_dot / TINY))
+    solution = np.linalg.solve(matrix, np.append(force, -rows.imag @ z_dot / tiny))
     return np.asarray(solution[:5]), np.asarray(solution[5:])
-
-
-TOLERANCE = 2.3e-14  # of the integration, relative: the smallest that SciPy takes
-TINY = 1e-30  # imaginary step of time by which rows are differentiated [s]
 
 
 class Span(NamedTuple):
@@ -92,8 +89,9 @@ class Course(NamedTuple):
 
 def find_course(problem: Problem, torque: TorqueProfile, curve: Curve, reversals: int) -> Course:
     """Integrate torques along a phase whose directions reverse so often."""
-    end, spans = _integrate(problem, torque, curve, reversals, TOLERANCE)
-    rough, _ = _integrate(problem, torque, curve, reversals, 100.0 * TOLERANCE)
+    # The smallest tolerance that SciPy takes, and a larger one.
+    end, spans = _integrate(problem, torque, curve, reversals, 2.3e-14)
+    rough, _ = _integrate(problem, torque, curve, reversals, 2.3e-12)
     return Course(problem, torque, spans, end, measure_error(problem, rough, end))
 
 

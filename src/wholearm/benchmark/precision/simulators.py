@@ -203,8 +203,6 @@ TOLERANCES = {
     MANY: ("1e-06", "1e-09", "1e-12"),
 }
 """Tolerances of each study."""
-CLOSE = 1e-2
-"""Error of the end state, and of torques over their limits, up to which a plan counts as one."""
 
 Runner = Callable[[], Array]
 """Gives the state (z, z') at the end of a course, shape (10,)."""
@@ -345,8 +343,8 @@ def check_plan(instance: Instance, plan: PeerPlan) -> ReferenceCheck:
     violation = max(0.0, excess, missing)
     tests = (
         (forces.min() > 0, "a contact is lost between nodes"),
-        (end <= CLOSE, "the replay ends elsewhere"),
-        (excess <= CLOSE, "a torque limit is missed between nodes"),
+        (end <= 1e-2, "the replay ends elsewhere"),
+        (excess <= 1e-2, "a torque limit is missed between nodes"),
     )
     outcome = next((text for holds, text in tests if not holds), SOLVED)
     return ReferenceCheck(end, violation, outcome)

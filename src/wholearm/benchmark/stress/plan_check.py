@@ -11,8 +11,6 @@ from ...scene.model import Scene
 from ...verification.newton_euler import Touch, locate
 from .event_tracing import clearances
 
-INSTANTS = 401
-"""Instants of a phase that are looked at, besides some in short pieces of its torques."""
 ROUNDING = 1e-6  # what may be left of an equation, over the largest of its terms
 OVERLAP = 1e-6  # overlap and open gaps that pass for rounding, over the radius of gyration
 STILL = 1e-5  # speed over the scene's own below which friction may point either way
@@ -27,9 +25,9 @@ def check_plan(problem: Problem, plan: Trajectory) -> list[str]:
         breaks, duration = plan.torque.breaks - start, motion.duration
         ends = np.concatenate([[0.0], breaks[(breaks > 0.0) & (breaks < duration)], [duration]])
         runs = np.diff(ends)
-        short = (runs > 1e-6 * duration) & (runs < 2 * duration / INSTANTS)
+        short = (runs > 1e-6 * duration) & (runs < duration / 200)
         inside = ends[:-1][short, None] + runs[short, None] * np.array([0.1, 0.5, 0.9])
-        t = np.unique(np.concatenate([np.linspace(0.0, duration, INSTANTS), inside.ravel()]))
+        t = np.unique(np.concatenate([np.linspace(0.0, duration, 401), inside.ravel()]))
         rows = motion.evaluate(t)
         texts = _check_phase(problem, phase, rows)
         middles = motion.evaluate((t[1:] + t[:-1]) / 2)
