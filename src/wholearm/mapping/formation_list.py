@@ -42,6 +42,7 @@ from .borders import (
     Window,
     cut,
     flush_track,
+    label_cells,
     label_closed,
     name_contacts,
     palm_track,
@@ -344,7 +345,8 @@ def split_leg(scene: Scene, start: Array, stop: Array) -> list[Part]:
     """Split a leg into parts with one formation each.
 
     A leg with both ends within `NEAR` of one border follows the border; any other is straight.
-    An end that near a change of contacts is moved to it.
+    An end that near a change of contacts is moved to it, and a straight leg that leaves a cell by
+    no more than that, and comes back, stays in it.
 
     Parameters
     ----------
@@ -379,6 +381,8 @@ def split_leg(scene: Scene, start: Array, stop: Array) -> list[Part]:
     at_change = sign * (last - leg.stop) < 0.99 * near
     if not at_change:
         spans[-1] = (label, first, leg.stop)
+    if leg.track.flush is None:
+        spans = _drop_excursions(scene, leg, spans)
     return _build_parts(scene, leg, spans, at_change)
 
 
@@ -407,6 +411,31 @@ def _build_parts(scene: Scene, leg: Leg, spans: list[Span], at_change: bool) -> 
             coordinate = 0 if leg.track.flush[0] is None else 1
         parts.append(Part(mine, begin, end, gained, coordinate, inside))
     return parts
+
+
+def _drop_excursions(scene: Scene, leg: Leg, spans: list[Span]) -> list[Span]:
+    """Remove excursions within `NEAR`, in which a straight leg loses a contact and regains it."""
+    labels = np.array([label for label, _, _ in spans])
+    box = np.array(list(product((-1, 0, 1), repeat=2))) * tolerance(scene)
+    for column in (0, 2, 4):
+        contacts = labels[:, column]
+        for k in range(1, len(spans)):
+            again = np.flatnonzero(contacts[k:] == contacts[k - 1])
+            if not len(again) or again[0] == 0:
+                continue
+            first, last = spans[k][1], spans[k + int(again[0]) - 1][2]
+            # Each place has to be within `NEAR` of where the contact touches.
+            x, phi = leg.track.pose(np.linspace(first, last, 9))
+            poses = (np.column_stack([x, phi])[:, None] + box).reshape(-1, 2)
+            near = label_cells(scene, *poses.T).reshape(9, len(box), -1)[..., column]
+            if (near == contacts[k - 1]).any(axis=1).all():
+                contacts[k : k + int(again[0])] = contacts[k - 1]
+    kept: list[Span] = []
+    for label, (_, first, last) in zip(labels, spans, strict=True):
+        if kept and (kept[-1][0] == label).all():
+            _, first, _ = kept.pop()
+        kept.append((label, first, last))
+    return kept
 
 
 def _require_reached(scene: Scene, leg: Leg, kept: list[Piece], ends: list[float]) -> None:
