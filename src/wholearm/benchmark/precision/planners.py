@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from ...common.arrays import Array, Expression
 from ...contacts.formation import Formation
@@ -134,7 +133,7 @@ def _build_on_curve(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
     build_path_nlp.cache_clear()
     data = prepare(curve, epsilon, make_grid(curve, np.zeros(0), 10), 1)
     build_path_nlp(LimitShape.of(data.limits), len(data.grid.steps), Objective.TIME)
-    return lambda: _convert(instance, plan_path(curve, epsilon, options, 1))
+    return lambda: _convert(plan_path(curve, epsilon, options, 1))
 
 
 def _build_over_time(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
@@ -145,24 +144,14 @@ def _build_over_time(instance: Instance, setting: str) -> Callable[[], PeerPlan]
 
     def run() -> PeerPlan:
         (plan,) = plan_phases(problem, problem.phases, problem.start, options)
-        return _convert(instance, plan)
+        return _convert(plan)
 
     return run
 
 
-def _convert(instance: Instance, plan: PhasePlan[Any]) -> PeerPlan:
-    """Our plan as those of peers are given: reversals are where the way passes their places."""
-    motion, breaks, marks = plan.motion, plan.torque.breaks, []
-    for stretch in list_stretches(instance.curve)[:-1]:
-
-        def pass_by(t: float, stretch: PhaseStretch = stretch) -> float:
-            z = motion.evaluate(np.array([t])).z[0]
-            return float(z[stretch.progress] - stretch.target)
-
-        time = brentq(pass_by, 0.0, motion.duration, xtol=1e-15)
-        nearest = float(breaks[np.abs(breaks - time).argmin()])
-        marks.append(nearest if abs(nearest - time) < 1e-7 * motion.duration else time)
-    return PeerPlan(OPTIMUM, motion.duration, plan.torque, tuple(marks))
+def _convert(plan: PhasePlan[Any]) -> PeerPlan:
+    """Our plan as those of peers are given."""
+    return PeerPlan(OPTIMUM, plan.motion.duration, plan.torque)
 
 
 def _limit(instance: Instance, s: Array, owner: NDArray[np.int64]) -> tuple[PathForces, PathLimits]:
@@ -256,8 +245,7 @@ def _make_plan(instance: Instance, grid: Array, speeds: Array) -> PeerPlan:
         return forces.tau(a[k], (speeds[k] + a[k] * local) ** 2, internal)
 
     profile = TorqueProfile.fit(times, torque, 4)
-    marks = times[np.searchsorted(grid, stops)]
-    return PeerPlan(OPTIMUM, float(times[-1]), profile, tuple(marks))
+    return PeerPlan(OPTIMUM, float(times[-1]), profile)
 
 
 def build_yapss(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
@@ -353,14 +341,13 @@ def _read(solution: Any) -> PeerPlan:
     status = solution.nlp_info.ipopt_status
     if status != 0:
         return NO_PLAN._replace(status=str(solution.nlp_info.ipopt_status_message))
-    times, rows, marks = [], [], []
+    times, rows = [], []
     for phase in solution.phase:
         tau = np.asarray(phase.control)[:2].T
         times.append([phase.initial_time, *np.ravel(phase.time_c), phase.final_time])
         rows.append(np.vstack([tau[:1], tau, tau[-1:]]))
-        marks.append(float(phase.final_time))
     torque = TorqueProfile.join_rows(np.concatenate(times), np.concatenate(rows))
-    return PeerPlan(OPTIMUM, marks[-1], torque, tuple(marks[:-1]))
+    return PeerPlan(OPTIMUM, float(times[-1][-1]), torque)
 
 
 _CURVE = ("1e-2", "1e-3", "1e-4", "1e-5", "1e-6")

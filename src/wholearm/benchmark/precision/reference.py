@@ -90,8 +90,8 @@ class Course(NamedTuple):
 def find_course(problem: Problem, torque: TorqueProfile, curve: Curve, reversals: int) -> Course:
     """Integrate torques along a phase whose directions reverse so often."""
     # The smallest tolerance that SciPy takes, and a larger one.
-    end, spans = _integrate(problem, torque, curve, reversals, 2.3e-14)
-    rough, _ = _integrate(problem, torque, curve, reversals, 2.3e-12)
+    end, spans, _ = integrate(problem, torque, curve, reversals, 2.3e-14)
+    rough, *_ = integrate(problem, torque, curve, reversals, 2.3e-12)
     return Course(problem, torque, spans, end, measure_error(problem, rough, end))
 
 
@@ -102,28 +102,36 @@ def measure_error(problem: Problem, state: Array, exact: Array) -> float:
     return float(np.abs((state - exact) / np.append(unit, unit / scales.time)).max())
 
 
-def _integrate(
+def integrate(
     problem: Problem, torque: TorqueProfile, curve: Curve, reversals: int, tolerance: float
-) -> tuple[Array, tuple[Span, ...]]:
-    """The state at the end, and the stretches on the way there."""
+) -> tuple[Array, tuple[Span, ...], float]:
+    """State at the end of torques, the stretches on the way there, and the least c_n of all steps.
+
+    Contacts stay closed: those that are lost pull.
+    """
     contacts, formation = problem.phases[0].formation.contacts, curve.formation
-    t, y, spans = 0.0, np.append(problem.start, np.zeros(5)), list[Span]()
+    t, y, spans, least = 0.0, np.append(problem.start, np.zeros(5)), list[Span](), np.inf
     parts = [*curve.segments[: reversals + 1]]
     while t < torque.breaks[-1]:
         part, piece = parts[0], find_piece(torque, t)
 
-        def rates(t: float, y: Array, part: Segment = part, piece: int = piece) -> Array:
+        def solve(
+            t: float, y: Array, part: Segment = part, piece: int = piece
+        ) -> tuple[Array, Array]:
             tau = evaluate_piece(torque, piece, t)
-            found = solve_motion(problem.scene, contacts, y[:5], y[5:], tau, part.Xi, part.sigma)
-            return np.concatenate([y[5:], found[0]])
+            return solve_motion(problem.scene, contacts, y[:5], y[5:], tau, part.Xi, part.sigma)
+
+        def rates(t: float, y: Array, solve: Any = solve) -> Array:
+            return np.concatenate([y[5:], solve(t, y)[0]])
 
         events = [_find_reversal(formation, *parts[:2])] if len(parts) > 1 else []
         options: dict[str, Any] = {"rtol": tolerance, "atol": tolerance, "events": events}
         run = solve_ivp(rates, (t, torque.breaks[piece + 1]), y, "DOP853", **options)
+        least = min([least, *(solve(*own)[1].min() for own in zip(run.t, run.y.T, strict=True))])
         start, t, y = t, float(run.t[-1]), run.y[:, -1]
         spans.append(Span(start, t, piece, part.Xi, part.sigma))
         parts = parts[1:] if run.status == 1 else parts
-    return y, tuple(spans)
+    return y, tuple(spans), float(least)
 
 
 def _find_reversal(formation: Formation, before: Segment, after: Segment) -> Any:

@@ -2,8 +2,7 @@
 
 Phases have one freedom, on four sliding contacts. All simulators but ours are told when directions
 reverse, from the reference, and are restarted there and where the torques step. Plans are replayed
-open loop from rest by fixed steps of the classical Runge-Kutta method; directions reverse when the
-plan says so, and lost contacts pull by what is measured.
+open loop from rest by the equations of the reference; lost contacts pull by what is measured.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ from ...problem.definition import End, Problem
 from ...problem.read import read_problem
 from ...results.torque import TorqueProfile
 from ...simulation.simulate import simulate
-from .reference import Course, Span, find_course, measure_error
+from .reference import Course, Span, find_course, integrate, measure_error
 
 REPEATS = 3  # largest number of runs that a median is of
 BUDGET = 0.3  # time after which a run is not repeated any more [s]
@@ -93,10 +92,9 @@ class PeerPlan(NamedTuple):
     status: str  # `OPTIMUM`, or why there is no plan
     duration: float  # [s]
     torque: TorqueProfile
-    marks: tuple[float, ...]  # [s]: when directions reverse
 
 
-NO_PLAN = PeerPlan("", 1.0, TorqueProfile(np.array([0.0, 1.0]), np.zeros((1, 2, 1))), ())
+NO_PLAN = PeerPlan("", 1.0, TorqueProfile(np.array([0.0, 1.0]), np.zeros((1, 2, 1))))
 """What there is where nothing was found."""
 
 
@@ -151,7 +149,7 @@ def measure(
     judge: Callable[[_Answer], tuple[tuple[float, ...], str]],
 ) -> Median:
     """Build and run as often as the time allows; `judge` gives the errors and the outcome."""
-    builds, solves, errors, outcomes = [], [], [], []
+    builds, solves, answers = [], [], []
     with warnings.catch_warnings():
         # Warnings of peers are not ours.
         warnings.simplefilter("ignore")
@@ -161,12 +159,10 @@ def measure(
             took, answer = _time(run)
             builds.append(built)
             solves.append(took)
-            enough = time.process_time() - began > BUDGET
-            found, outcome = judge(answer)
-            errors.append(found)
-            outcomes.append(outcome)
-            if enough:
+            answers.append(answer)
+            if time.process_time() - began > BUDGET:
                 break
+    errors, outcomes = zip(*map(judge, answers), strict=True)
     worst = tuple(max(column, key=abs) for column in zip(*errors, strict=True))
     outcome = next((outcome for outcome in outcomes if outcome != SOLVED), SOLVED)
     return Median(statistics.median(builds), statistics.median(solves), worst, outcome)
@@ -221,7 +217,7 @@ def build_own(course: Course, setting: str) -> Runner:
 
 
 def write_rates(course: Course) -> tuple[Any, ...]:
-    """The right-hand side and contact forces, as expressions of t, y and `pack_span`'s numbers."""
+    """Symbols t, y and p, the numbers of `pack_span`, and the right-hand side."""
     formation = course.problem.phases[0].formation
     n_c, terms = formation.n_contacts, course.torque.coefficients.shape[2]
     t, y = ca.SX.sym("t"), ca.SX.sym("y", 10)
@@ -233,7 +229,7 @@ def write_rates(course: Course) -> tuple[Any, ...]:
     powers = ca.reshape(flat, 2, -1)[:, ::-1]
     tau = ca.vertcat(*(ca.polyval(powers[k, :].T, x) for k in range(2)))
     found = build_forward(formation)(y[:5], y[5:], tau, Xi, sigma)
-    return t, y, p, ca.vertcat(y[5:], found[0]), found[1]
+    return t, y, p, ca.vertcat(y[5:], found[0])
 
 
 def pack_span(course: Course, span: Span) -> Array:
@@ -251,7 +247,7 @@ def pack_course(course: Course) -> tuple[Expression, Expression]:
 
 def build_cvodes(course: Course, setting: str) -> Runner:
     """CasADi's interface to cvodes; all stretches are one call, by `mapaccum`."""
-    tolerance, (t, y, p, ode, _) = float(setting), write_rates(course)
+    tolerance, (t, y, p, ode) = float(setting), write_rates(course)
     ends, x = ca.SX.sym("ends", 2), ca.SX.sym("x")
     half, now = (ends[1] - ends[0]) / 2, (ends[0] + ends[1] + x * (ends[1] - ends[0])) / 2
     system = {"x": y, "t": x, "p": ca.vertcat(p, ends), "ode": half * ca.substitute(ode, t, now)}
@@ -329,54 +325,19 @@ def check_plan(instance: Instance, plan: PeerPlan) -> ReferenceCheck:
     """Replay a plan."""
     if plan.status != OPTIMUM:
         return ReferenceCheck(math.nan, math.nan, plan.status)
-    problem = instance.problem
-    spans = _split(instance, plan)
-    course = Course(problem, plan.torque, spans, np.zeros(10), 0.0)
-    step = _build_step(course).mapaccum(len(spans))
-    states, forces = (part.full() for part in step(*pack_course(course)))
-    rest = np.append(instance.curve.end, np.zeros(5))
-    end = measure_error(problem, states[:, -1], rest)
+    problem, curve = instance.problem, instance.curve
+    reversals = len(curve.segments) - 1
+    state, _, least = integrate(problem, plan.torque, curve, reversals, 1e-10)
+    end = measure_error(problem, state, np.append(curve.end, np.zeros(5)))
     limit = problem.scene.torque_limit
     places = np.cos(np.linspace(0.0, np.pi, 9))
     excess = float((np.abs(plan.torque.at_places(places)) / limit[:, None] - 1).max())
-    missing = (problem.epsilon - float(forces.min())) / problem.scene.scales.force
+    missing = (problem.epsilon - least) / problem.scene.scales.force
     violation = max(0.0, excess, missing)
     tests = (
-        (forces.min() > 0, "a contact is lost between nodes"),
+        (least > 0, "a contact is lost between nodes"),
         (end <= 1e-2, "the replay ends elsewhere"),
         (excess <= 1e-2, "a torque limit is missed between nodes"),
     )
     outcome = next((text for holds, text in tests if not holds), SOLVED)
     return ReferenceCheck(end, violation, outcome)
-
-
-def _split(instance: Instance, plan: PeerPlan) -> tuple[Span, ...]:
-    """Steps of the replay, 1000 or more: within pieces of the torques, and between reversals."""
-    breaks, stop = plan.torque.breaks, plan.torque.breaks[-1]
-    inner = np.append(breaks, plan.marks)
-    even = np.linspace(0.0, stop, 1001)
-    ends = np.unique(np.concatenate([inner, even[1:-1]]))
-    ends = ends[np.append(np.diff(ends) > 1e-12 * stop, True)]
-    middle = (ends[1:] + ends[:-1]) / 2
-    pieces = np.clip(np.searchsorted(breaks, middle, side="right") - 1, 0, len(breaks) - 2)
-    owners = np.searchsorted(plan.marks, middle)
-    parts = instance.curve.segments
-    return tuple(
-        Span(float(start), float(end), int(piece), parts[owner].Xi, parts[owner].sigma)
-        for start, end, piece, owner in zip(ends[:-1], ends[1:], pieces, owners, strict=True)
-    )
-
-
-def _build_step(course: Course) -> Expression:
-    """CasADi function (y, parameters) -> (y at the end, contact forces at start and end)."""
-    t, y, p, ode, forces = write_rates(course)
-    rates = ca.Function("rates", [t, y, p], [ode, forces])
-    ends = ca.SX.sym("ends", 2)
-    h, middle = ends[1] - ends[0], (ends[0] + ends[1]) / 2
-    k1, before = rates(ends[0], y, p)
-    k2, _ = rates(middle, y + h / 2 * k1, p)
-    k3, _ = rates(middle, y + h / 2 * k2, p)
-    k4, _ = rates(ends[1], y + h * k3, p)
-    after = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    _, then = rates(ends[1], after, p)
-    return ca.Function("step", [y, ca.vertcat(p, ends)], [after, ca.vertcat(before, then)])
