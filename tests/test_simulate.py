@@ -45,7 +45,7 @@ from wholearm.mechanics.dynamics import Directions
 from wholearm.mechanics.impact import compute_impact
 from wholearm.problem.read import build_problem
 from wholearm.scene.model import Finger, Friction, Scene
-from wholearm.simulation import runge_kutta
+from wholearm.simulation import stepper
 from wholearm.simulation.events import Event, EventKind, OutcomeKind, Simulation
 from wholearm.simulation.hand import build_system
 from wholearm.simulation.modes import Grips, Mode, respond
@@ -371,7 +371,7 @@ def test_order_on_a_known_solution() -> None:
         assert state.shape == (2, 1)
         return ca.vertcat(state[1], -state[0], state[0] * state[1]) * ca.cos(time)
 
-    step = ca.Function("step", [y, t, h], [runge_kutta.build_step(rate, y, t, h, 2)[0]])
+    step = ca.Function("step", [y, t, h], [stepper.build_step(rate, y, t, h, 2)[0]])
     errors = []
     for count in (8, 16):
         state = np.array([0.0, 1.0, 0.0])
@@ -384,9 +384,9 @@ def test_order_on_a_known_solution() -> None:
 
 def test_error_estimate_bounds_the_error() -> None:
     y, t, h = ca.SX.sym("y", 1), ca.SX.sym("t"), ca.SX.sym("h")
-    end, fifth, third = runge_kutta.build_step(lambda s, _: -s, y, t, h, 1)
+    end, fifth, third = stepper.build_step(lambda s, _: -s, y, t, h, 1)
     tolerance = 1e-6
-    error = runge_kutta.build_error(fifth, third, y, 1.0, tolerance)
+    error = stepper.build_error(fifth, third, y, 1.0, tolerance)
     step = ca.Function("step", [y, t, h], [end, error])
     for length in (0.2, 0.5, 1.0):
         state, estimate = (float(value) for value in step(1.0, 0.0, length))
@@ -684,8 +684,8 @@ def test_baseline_agrees_with_the_dynamics(names: tuple[str, ...]) -> None:
 
 @pytest.mark.parametrize("power", range(8))
 def test_weights_integrate_polynomials(power: int) -> None:
-    nodes = np.array(runge_kutta.NODES)
-    total = sum(w * nodes[j] ** power for j, w in runge_kutta.WEIGHTS.items())
+    nodes = np.array(stepper.NODES)
+    total = sum(w * nodes[j] ** power for j, w in stepper.WEIGHTS.items())
     assert total == pytest.approx(1 / (power + 1), abs=1e-14)
 
 

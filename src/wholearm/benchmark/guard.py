@@ -18,8 +18,8 @@ from ..common.files import read_json, require_writable, write_text
 from ..geometry.tracing import load, trace_phases
 from ..planning.plan import solve
 from ..problem.definition import Problem
-from ..simulation.runge_kutta import NODES
 from ..simulation.simulate import simulate
+from ..simulation.stepper import NODES
 from ..solvers.ipopt import IpoptRun, record_runs
 from .study import Case, Row, Study
 

@@ -40,7 +40,7 @@ from .rest import find_roots
 from .run import Feedback, Run, StuckError, find_root
 from .stepper import Modes, ModeStepper
 from .system import ContactRows, Structure, System
-from .tolerances import ROUNDING_FORCE, SHORTEST_STEP, STANDING, STILL
+from .tolerances import ROUNDING_FORCE, SETTLING, SHORTEST_STEP, STANDING, STILL
 
 CLOSED = 1e-10  # gap that counts as closed at an event, relative to the scene's length
 SUNK = 1e-6  # overlap up to which features touch, over the scene's length; else they are behind
@@ -50,13 +50,11 @@ BURST = 3e-4
 """Time, relative to the scene's, in which `MANY` impacts raise `CHATTER` tenfold, and twice as many
 a hundredfold: fingers may knock an object to and fro for ever."""
 MANY = 20
-AHEAD = 2e-5  # delay at which modes are evaluated, over the scene's time: a force's trend counts
-CLEAR = 1e-3  # forces and rates, over the largest, that do not vanish within `AHEAD`
+CLEAR = 1e-3  # forces and rates, over the largest, that do not vanish within `SETTLING`
 DEPENDENT = 1e-7  # share of a row that others leave, below which it is no constraint of its own
 SPEED_ROUNDING = 1e-12  # sliding or turning speed that counts as rounding, over the scene's
 TURNING = 1e-4  # speed, over the scene's, below which a reversal may be near
 ARMED = 1e-13  # gap from which on a pair has been apart, relative to the scene's length
-NO_PROGRESS = 60  # most decisions in a row without any time passing
 LOOKS = 8  # instants of the longest step at which gaps are looked at, its end among them
 REACH = 0.3  # longest step, in units of the scene: gaps are sampled every `REACH` / `LOOKS`
 EXACT = 1e-14  # gap of a closed contact, over the scene's length: some ten roundings
@@ -116,7 +114,6 @@ class FreeRun(Run):
         super().__init__(system, torque, z, v, tolerance, wanted)
         self.restitution = restitution
         self.modes = hint or Modes(sigma=(0.0,) * system.n)
-        self.decisions, self.decided_at = 0, -math.inf
         self.watch, self.unit = Watch(system), system.scales.length
         self.resting = self.unique = False
         self._begin_piece()
@@ -135,9 +132,7 @@ class FreeRun(Run):
             rests = self._decide(found)
             if moved and self.stands():
                 rests = self._decide(self._find_closed())
-            self.decisions = self.decisions + 1 if self.t == self.decided_at else 0
-            self.decided_at = self.t
-            if self.decisions > NO_PROGRESS:
+            if not self.gets_on():
                 self.note_at(EventKind.GIVEN_UP, "decisions do not end")
                 return
             if rests is None:
@@ -231,7 +226,7 @@ class FreeRun(Run):
         faces = ranges > near
         at_end = (ranges > -near) & ~faces
         if np.count_nonzero(at_end):
-            faces |= at_end & (self.system.look(z + AHEAD * scales.time * v)[1] >= ranges)
+            faces |= at_end & (self.system.look(z + SETTLING * scales.time * v)[1] >= ranges)
         return gaps, faces
 
     def _find_closed(self) -> ClosedContacts:
@@ -324,7 +319,7 @@ class FreeRun(Run):
         closed = self._find_closed()
         pattern = Pattern(self, closed)
         free = system.push(self.v, self.tau(self.t), pattern.sigma) / system.mass
-        answer = solve(self._pose(closed, self.v + AHEAD * system.scales.time * free))
+        answer = solve(self._pose(closed, self.v + SETTLING * system.scales.time * free))
         if answer is None:
             return False
         # With the modes that it ends in, the impact at the instant itself is linear.
@@ -355,7 +350,7 @@ class FreeRun(Run):
             self.project_velocity(np.vstack([rows.A, rows.A_t[sticks]]))
             closed = ClosedContacts(pairs, system.evaluate(self.z, self.v, pairs))
         pattern = Pattern(self, closed)
-        later = AHEAD * system.scales.time
+        later = SETTLING * system.scales.time
         coming = free = lift * system.push(self.v, self.tau(self.t), pattern.sigma)
         problem, rows = pattern.pose(free, pattern.rows), pattern.rows
         answer = first = self._answer(problem, pattern.recall(self.modes))

@@ -31,12 +31,10 @@ from .rest import StartMode, find_rest
 
 LEAST = 1e-2  # least margin over saturation of torques that hold or close
 AMPLE = 0.1  # saturation of margins of forces, torques, accelerations, over the scene's
-DRIVE = 0.02  # least acceleration towards a contact that is still open, over the scene's
+DRIVE = 0.02  # least acceleration towards an open contact, ample sliding, over the scene's
 SLOW = 0.2  # least margin of slowly closing torques, over that of torques that only hold
-_CREEP = 0.02  # saturation of sliding and turning with assumed signs, over the scene's
 _STILL = 3e-5  # relative rate of opening that counts as none
 _SMALL = 1e-9  # relative rate at which a contact does not part
-_FAR = 1e3  # largest margin
 
 
 class Standstill(NamedTuple):
@@ -137,7 +135,7 @@ def _find_closing(
     scales, limits = scene.scales, scene.torque_limit
     normal = Formation(scene, (place.gained,)).evaluate(z[None], np.zeros((1, 5))).A[0][0]
     held = Statics(place.formation, z).torque_polygon()
-    creep = _CREEP * np.repeat(
+    creep = DRIVE * np.repeat(
         [scales.acceleration, 1 / scales.time**2], [place.formation.n_contacts, 2]
     )
     best: Hold | None = None
@@ -177,7 +175,7 @@ def _find_parting(place: Standstill, v: Array) -> tuple[str, ...]:
 def maximise_margin(
     limits: Array, rows: Array, bounds: Array | None = None
 ) -> tuple[Array, float] | None:
-    """Torques up to `limits`, (2,), with the largest margin m <= `_FAR`, and m; None without any.
+    """Torques up to `limits`, (2,), with the largest margin m <= 1000, and m; None without any.
 
     They keep rows @ (1, tau) >= m and bounds @ (1, tau) >= 0, of shapes (k, 3) and (l, 3).
     """
@@ -190,6 +188,6 @@ def maximise_margin(
         [0.0, 0.0, -1.0],
         A_ub=sides[:, 1:] * [-1.0, -1.0, 1.0],
         b_ub=sides[:, 0],
-        bounds=[*((-most, most) for most in limits.tolist()), (None, _FAR)],
+        bounds=[*((-most, most) for most in limits.tolist()), (None, 1e3)],
     )
     return (answer.x[:2], float(answer.x[2])) if answer.status == 0 else None

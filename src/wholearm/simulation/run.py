@@ -14,8 +14,7 @@ from ..common.arrays import Array
 from ..common.errors import SimulationError, require_number
 from ..results.torque import TorqueProfile
 from .events import Event, EventKind, Record
-from .runge_kutta import ORDER
-from .stepper import LOSSES, Modes, ModeStepper, build_stepper
+from .stepper import LOSSES, ORDER, Modes, ModeStepper, build_stepper
 from .system import System
 from .tolerances import FIRST_STEP, SETTLING, SHORTEST_STEP, STEP_OF_TORQUE
 
@@ -115,6 +114,7 @@ class Run(ABC):
         within = wanted[(wanted >= self.breaks[0]) & (wanted <= self.breaks[-1])]
         self.wanted, self.next_wanted = [*within.tolist(), math.inf], 0
         self.residual = 0.0
+        self.decisions, self.decided_at = 0, -math.inf
 
     @property
     def z(self) -> Array:
@@ -155,6 +155,13 @@ class Run(ABC):
     @abstractmethod
     def pass_break(self) -> Any:
         """Go on to the next piece of the torques; how that ends the motion, if it does."""
+
+    def gets_on(self) -> bool:
+        """Count a decision on contact modes; whether some time passes within 60 in a row."""
+        least = 100 * SHORTEST_STEP * self.system.scales.time
+        self.decisions = self.decisions + 1 if self.t - self.decided_at <= least else 0
+        self.decided_at = self.t
+        return self.decisions <= 60
 
     def tau(self, t: float) -> Array:
         """Torques of the present piece at `t`, also beyond its end, shape (2,) [N m]."""

@@ -34,8 +34,7 @@ from .events import (
 from .hand import build_system, measure_gaps
 from .prescribed import Replay, Step
 from .run import Feedback, Law, Run
-from .runge_kutta import INNER_STAGES, NODES
-from .stepper import Modes
+from .stepper import INNER_STAGES, NODES, Modes
 from .tolerances import SLOW, is_slower
 
 if TYPE_CHECKING:

@@ -13,13 +13,12 @@ from ..scene.model import Scene
 ROUNDING_FORCE = 1e-9  # shortfall of a force, torque or friction margin that is rounding
 ROUNDING_SPEED = 2e-13  # largest negative speed that counts as rounding
 ROUNDING_LIMIT = 3e-8  # overlap that is rounding: the contact just given up starts at zero
-SHORT = 3e-5  # largest overlap at the start of a phase: one may end this much short
-REACHED = 3e-5  # distance to the end of a phase that counts as there, when at rest
+REACHED = 3e-5  # distance to the end of a phase that counts as there, at rest: the next overlaps
 PASSED = 1e-5  # distance past the end of a phase at speed: error of a long motion before it
 SLOW = 2e-4  # speed that counts as rest at the end of a phase
 CREEPING = 1e-7  # speed of a fading motion that is not there yet: above integration error
 STANDING = 1e-9  # speed that counts as none in friction: either sign by integration error
-SETTLING = 2e-5  # longest time by which rounding moves a planned event before a torque break
+SETTLING = 2e-5  # longest time by which rounding moves an event; modes are judged as late
 REST_WINDOW = 2e-3  # time of rest before a torque break: too short for contacts to part
 LONGEST_WINDOW = 2e-2  # longest time between an arrival at speed and its torque break
 FIRST_STEP = 2e-2  # length of the first step tried from rest
@@ -47,3 +46,9 @@ def measure_until(scene: Scene, until: Until) -> float:
 def is_slower(scene: Scene, v: Array, bound: float) -> bool:
     """Whether no component of z', shape (5,), exceeds `bound` times the scene's unit of it."""
     return bool((np.abs(v) < bound * measure_units(scene)[5:]).all())
+
+
+def measure_rates(scene: Scene, count: int) -> Array:
+    """The scene's speed for `count` contacts, then that of joints, shape (count + 2,)."""
+    scales = scene.scales
+    return np.repeat([scales.speed, 1 / scales.time], [count, 2])

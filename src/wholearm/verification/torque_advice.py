@@ -23,7 +23,7 @@ from ..results.report import Approach, ForceAt, Loss, PhaseReport, TorqueAdvice,
 from ..simulation.events import EventKind, Simulation
 from ..simulation.modes import evaluate_rows, find_grips, list_units, respond, share_mode
 from ..simulation.rest import StartMode, find_rest
-from ..simulation.sliding_signs import measure_rates
+from ..simulation.tolerances import measure_rates
 from .verdict import Allowance
 from .verify import find_lowest
 
