@@ -11,10 +11,11 @@ that roll there. After an impact every contact of the next formation has to pres
 
 Where a sliding or joint velocity reaches zero, Coulomb's law decides. A contact at rest may slide
 with a sign if it then accelerates with it, or stick if its c_t stays in the cone; a joint likewise.
-Each combination is one linear system, and every contact has to press. Forces are evaluated a short time later, which tells one that leaves its cone from one that returns.
-The first combination that is consistent by more than rounding is taken, or else the one with the
-largest margin. What has just come to rest tries to reverse, then to stick, then to continue; all
-else tries its present mode, or to slip if its cone is just reached.
+Each combination is one linear system, and every contact has to press. Forces are evaluated a short
+time later, which tells one that leaves its cone from one that returns. The first combination that
+is consistent by more than rounding is taken, or else the one with the largest margin. What has just
+come to rest tries to reverse, then to stick, then to continue; all else tries its present mode, or
+to slip if its cone is just reached.
 
 What cannot move because something else sticks has no independent constraint. Its friction is
 indeterminate and has either sign: margins elsewhere are monotonic in it, so some sign is consistent
