@@ -569,7 +569,8 @@ class FreeRun(Run):
         """Event values after the step just made: those of the step, then ranges of kept pairs."""
         self.watch.look(self.s)
         values = self.s.outputs[self.s.to.values]
-        return np.concatenate([values, self.watch.spans[self.kept] / self.unit])
+        self.values = np.concatenate([values, self.watch.spans[self.kept] / self.unit])
+        return self.values
 
     def _find_value(self, h: float, row: int) -> float:
         """One event value at another end of the step."""
@@ -622,7 +623,8 @@ class FreeRun(Run):
         self.t, s = t, self.s
         self.y = s.outputs[s.to.y].copy()
         self.record()
-        self.start = self._list_values()
+        # `locate` has looked at the end of the step last.
+        self.start = self.values
         self.watch.advance()
         self.floor = np.where(self.start > 0, self.slack, self.floor)
         s.inputs[s.at.y], s.inputs[s.at.t] = self.y, t
