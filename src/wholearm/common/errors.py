@@ -100,16 +100,12 @@ class InputError(WholearmError):
         self.key = key
         self.problem = problem
         text = ": ".join(part for part in (source, key, problem) if part)
-        super().__init__(_to_line(text))
+        # One line without control characters, its middle left out beyond 1000 characters.
+        text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+        super().__init__(text if len(text) <= 1000 else f"{text[:500]} ... {text[-500:]}")
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
         return type(self), (self.source, self.key, self.problem)
-
-
-def _to_line(text: str) -> str:
-    """One line without control characters, its middle left out beyond 1000 characters."""
-    text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
-    return text if len(text) <= 1000 else f"{text[:500]} ... {text[-500:]}"
 
 
 @contextmanager

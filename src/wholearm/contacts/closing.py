@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.arrays import Array
+from ..common.arrays import Array, find_runs
 from ..common.errors import InputError
 from ..scene.model import Finger, Scene, cross_product
 from .contact_limits import FINGERS_TOUCH, evaluate_finger_gap
@@ -354,12 +354,8 @@ def name_reach(scene: Scene, phi: float) -> str:
     low, high = find_reach(scene)
     x = np.linspace(low, max(low, high), 1000)
     closes = (close_fingers(scene, x, np.full(len(x), phi)).obstacle == 0).all(axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], closes.astype(int), [0]])))
-    spans = [
-        _round(float(x[first]), float(x[end - 1]))
-        for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
-        if end - first > 1
-    ]
+    runs = find_runs(closes, least=2)
+    spans = [_round(float(x[run.start]), float(x[run.stop - 1])) for run in runs]
     if not spans:
         return "at that angle the hand closes at no x"
     every = " and ".join(f"from {first:g} to {last:g}" for first, last in spans)

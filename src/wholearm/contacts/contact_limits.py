@@ -76,11 +76,6 @@ def _separate(one: _Segment, two: _Segment) -> Expression:
     return ca.mmax(ca.vertcat(*parts))
 
 
-def build_finger_limit(scene: Scene) -> list[GapLimit]:
-    """Return the limit that the gap between the links is; none where they pass each other."""
-    return [GapLimit(build_finger_gap(scene), FINGERS_TOUCH)] if scene.fingers_collide else []
-
-
 @lru_cache(maxsize=1)
 def _build_gap_function() -> Batch:
     """Gap between the axes of any two links, of theta and (base, length) of each."""
@@ -115,7 +110,9 @@ def list_limits(scene: Scene, contacts: Sequence[Contact]) -> list[GapLimit]:
             clearances = clearances if held else face(scene, finger, clearances)
             clearances += build_obstacles(scene, finger, held)
         limits += clearances
-    return limits + build_finger_limit(scene)
+    if scene.fingers_collide:
+        limits.append(GapLimit(build_finger_gap(scene), FINGERS_TOUCH))
+    return limits
 
 
 def _list_clearances(scene: Scene, finger: int | None, held: Sequence[Contact]) -> list[GapLimit]:

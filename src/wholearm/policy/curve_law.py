@@ -159,7 +159,8 @@ class CurveLaw:
             self.over = self._has_turned(rates)
             if self.over:
                 return self.push
-        if self._is_made(s, v) or (self.sensing and self.sensing.feels):
+        # A gained contact is felt if it has force in two consecutive samples.
+        if self._is_made(s, v) or (self.sensing and self.sensing.felt > 1):
             self.pushes, self.a = True, 0.0
             return self._press(theta, rates)
         # The reference begins where the motion does.
@@ -481,11 +482,6 @@ class Sensing:
         self.bias = [0.0] * len(self.names)
         self.expected: deque[list[float]] = deque(maxlen=self.lag)
         self.heard, self.felt = False, 0
-
-    @property
-    def feels(self) -> bool:
-        """Whether the gained contact has force in two consecutive samples."""
-        return self.felt > 1
 
     def measure(self, forces: Mapping[str, float] | None) -> None:
         """Process a sample; contacts that are missing or NaN have no sensor."""

@@ -181,12 +181,6 @@ def find_internal_force(rows: CurveLimitRows, a: Array, b: Array) -> Array:
     return np.array([choose_internal_force(one, [0.0] * len(one), by, 0.0)[1] for one, by in pairs])
 
 
-def measure_levels(rows: CurveLimitRows, a: Array, b: Array) -> Array:
-    """Levels of all limits for a motion with that internal force, shape (n, m)."""
-    motion = stack_motion(a, b, find_internal_force(rows, a, b))
-    return np.asarray(np.einsum("nmi,ni->nm", rows.levels, motion))
-
-
 def find_forces(curve: Curve, s: Array, speed: Array) -> Array:
     """Normal forces at both ends of the intervals between places, (n - 1, 2, n_c, 5) [N]."""
     formation, point = curve.formation, curve.evaluate(s)
@@ -399,8 +393,10 @@ class ReferencePiece(NamedTuple):
         """Least level of each contact's normal force along the reference."""
         rows, names = self.rows, self.curve.formation.names
         a = np.diff(self.b) / (2 * np.diff(rows.s))
+        a = np.append(a, a[-1])
         count = len(split_limits(self.curve.formation)[0].low)
-        levels = measure_levels(rows, np.append(a, a[-1]), self.b)[:, : rows.presses]
+        motion = stack_motion(a, self.b, find_internal_force(rows, a, self.b))
+        levels = np.einsum("nmi,ni->nm", rows.levels[:, : rows.presses], motion)
         least = levels.min(axis=0).reshape(-1, count).min(axis=0)
         return dict(zip(names, least[: len(names)].tolist(), strict=True))
 

@@ -20,7 +20,7 @@ from ..contacts.closing import close_finger, place_flush
 from ..scene.model import Polygon, Scene
 
 if TYPE_CHECKING:
-    from .definition import Goal, ModeGuess, Phase, Problem, Until
+    from .definition import ModeGuess, Phase, Problem, Until
 
 
 SAME = 9  # decimals of an angle in degrees that a printed phase has at most
@@ -112,7 +112,11 @@ def write_table(problem: Problem) -> Mapping[str, Any]:
     table |= {"object": {}, "fingers": {"1": {}, "2": {}}, "friction": {}, "start": start}
     if problem.uncertainty is not None:
         table["uncertainty"] = _to_plain(problem.uncertainty)
-    goals = [_describe_goal(goal) for goal in problem.goals]
+    goals = [
+        {"flush": own.flush, "phi_deg": own.phi and to_degrees(own.phi), "x": own.x}
+        for own in problem.goals
+    ]
+    goals = [{key: own[key] for key in own if own[key] is not None} for own in goals]
     if goals:
         table["goal"] = goals[0] if len(goals) == 1 else goals
     elif problem.phases:
@@ -122,11 +126,6 @@ def write_table(problem: Problem) -> Mapping[str, Any]:
             if own.required or value != own.shown_default:
                 _set(table, key, value)
     return table
-
-
-def _describe_goal(goal: Goal) -> dict[str, Any]:
-    own = {"flush": goal.flush, "phi_deg": goal.phi and to_degrees(goal.phi), "x": goal.x}
-    return {key: value for key, value in own.items() if value is not None}
 
 
 def to_degrees(angle: float, digits: int = 15) -> float:

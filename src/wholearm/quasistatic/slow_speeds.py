@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..common.arrays import Array
+from ..common.arrays import Array, find_runs
 from ..common.document import Document, Result, Table, fixed
 from ..common.errors import InfeasibleError, name_source, require_number
 from ..common.fields import SHARE
@@ -140,7 +139,9 @@ def _predict_phase(
         path="line" if path.curve is None else "curve",
         length=path.length,
         slow=_name(path, motions["steady"][0](0.0)),
-        kept=_list_stretches(path, held),
+        kept=tuple(
+            (_place(path, run.start), _place(path, run.stop - 1)) for run in find_runs(held)
+        ),
         survivals=survivals,
         torques=None if torques is None else _thin_out(path, torques),
         curves=_draw(survivals, motions, unit),
@@ -212,13 +213,6 @@ def _name(path: PathSamples, least: Least) -> Weakest:
 
 def _place(path: PathSamples, row: int) -> Place:
     return Place(float(path.s[row]), float(path.z[row, 0]), float(path.z[row, 2]))
-
-
-def _list_stretches(path: PathSamples, held: NDArray[np.bool_]) -> tuple[tuple[Place, Place], ...]:
-    """Stretches of places that are held, by both of their ends."""
-    steps = np.flatnonzero(np.diff(np.concatenate([[0], held.astype(int), [0]])))
-    pairs = steps.reshape(-1, 2)
-    return tuple((_place(path, a), _place(path, b - 1)) for a, b in pairs.tolist())
 
 
 def _draw(

@@ -34,7 +34,6 @@ from ..results.report import (
 )
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
-from ..scene.model import Scene
 from ..simulation.events import Event, EventKind, Glimpses, Simulation
 from ..simulation.simulate import Closer, simulate
 from ..simulation.tolerances import SETTLING
@@ -185,7 +184,10 @@ def observe(
         _report_phase(problem, simulation, torque, plan, index, uniqueness)
         for index in range(int(simulation.phase[-1]) + 1)
     )
-    gap = find_finger_gap(problem.scene, simulation, torque.breaks)
+    gap, shortest = None, SHORTEST * problem.scene.scales.time
+    if problem.scene.fingers_collide:
+        gaps = evaluate_finger_gap(problem.scene, simulation.z)
+        gap = FingerGap(*find_lowest(simulation.t, gaps, torque.breaks, shortest))
     return Observation(problem, torque, plan, tolerance, simulation, phases, gap)
 
 
@@ -517,14 +519,6 @@ def describe_misses(
                 f"{limit.text} is exceeded by {over} at t = {t[worst]:.5g} s, phase {phase.number}"
             )
     return texts
-
-
-def find_finger_gap(scene: Scene, simulation: Simulation, breaks: Array) -> FingerGap | None:
-    """Least gap between the links in a replay; None if they pass each other."""
-    if not scene.fingers_collide:
-        return None
-    gaps, shortest = evaluate_finger_gap(scene, simulation.z), SHORTEST * scene.scales.time
-    return FingerGap(*find_lowest(simulation.t, gaps, breaks, shortest))
 
 
 def find_lowest(
