@@ -214,11 +214,17 @@ class Chooser:
         joined = join(options=quick, jobs=self.jobs, background=background)
         if isinstance(joined, str):
             return joined
-        printed = replace(self.problem, phases=list_printed(joined, guesses=joins), goals=())
-        plan = plan_phases(printed, self.options, self.roadmap.plans, report)
-        if joins and (isinstance(plan, str) or plan.duration > LONGER * joined.duration):
-            return join(options=options)
-        return plan
+        plan: Plan | str = ""
+        # Without guesses: query 61, whose guess leads to worse contact modes.
+        for guesses in (True, False) if joins else (False,):
+            phases = list_printed(joined, guesses)
+            printed = replace(self.problem, phases=phases, goals=())
+            plan = plan_phases(printed, self.options, self.roadmap.plans, report)
+            if not joins or (
+                not isinstance(plan, str) and plan.duration < LONGER * joined.duration
+            ):
+                return plan
+        return join(options=options)
 
     def bound(self, duration: float, in_cells: bool) -> BorderBound:
         """Lower bound of all routes along borders; up to `duration` of a plan `in_cells`."""
