@@ -214,7 +214,6 @@ class Chooser:
         joined = join(options=quick, jobs=self.jobs, background=background)
         if isinstance(joined, str):
             return joined
-        plan: Plan | str = ""
         # Without guesses: query 61, whose guess leads to worse contact modes.
         for guesses in (True, False) if joins else (False,):
             phases = list_printed(joined, guesses)
