@@ -113,8 +113,8 @@ def plan_phases(
         return plan_phases(other, same, z, rough, explained=False, patient=False)
 
     explanation = replan if explained else None
-    if found is None:
-        found = _keep_modes(search, guesses)
+    if found is None and guesses.given:
+        found = solve_guesses(search, [guesses.given])
     if found is None:
         listed = iter([guesses.nearest])
         if patient:
@@ -206,7 +206,7 @@ def solve_coarse(search: TimeSearch, guess: Guess, most: int = ITERATIONS) -> Ti
         if not solution.success:
             return solution
         stages, most = solution.stages, SPLIT
-    if guess.name.startswith(GIVEN):
+    if guess.name == GIVEN:
         most = MODES_GIVEN
     solution = search.solve(stages, guess.before, search.wait(most))
     if solution.success and solution.margin < -ROUNDING:
@@ -322,19 +322,6 @@ def _resume(search: TimeSearch, guesses: Guesses, coarse: PhasePlan[Motion]) -> 
     search.tried.sequences, search.tried.complete = coarse.sequences, coarse.complete
     search = replace(search, options=replace(search.options, mode_search=False))
     return solve_guesses(search, [guess])
-
-
-def _keep_modes(search: TimeSearch, guesses: Guesses) -> _Named | None:
-    """Plan from the contact modes that the problem gives; with a mode search, then as they are.
-
-    Phase 3 of the route of query 19 has a plan in these modes alone, and not through its poses.
-    """
-    kept = replace(search, options=replace(search.options, mode_search=False))
-    for k, guess in enumerate(guesses.given()):
-        for own in (kept,) if k else (search, kept):
-            if found := solve_guesses(own, [guess]):
-                return found
-    return None
 
 
 def _list_slow(
