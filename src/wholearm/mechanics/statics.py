@@ -31,13 +31,10 @@ from ..contacts.formation import Formation
 from .dynamics import null_vector
 
 SURE = 1e-3  # distance from torques that friction can hold, over the scene's, at which it moves
-MOVES = 1e-5  # least sum of accelerations, over the scene's own, that counts as a motion
 _TINY = 1e-9  # what counts as zero of numbers of the order of one
 GRAZE = 1e-3  # largest closing acceleration of a gap that grazes, over sliding and turning
 _STEP = 3e-5  # step that slopes of limits are taken over, in radii of gyration and rad
 _KINK = 1e-2  # difference of slopes on both sides, in radii of gyration, from which there is a kink
-_LEVEL = 1e-6  # slope of a limit, in radii of gyration, below which no motion changes it
-_PUSHES = 1e-3  # least component along one direction, over all forces, that moves the object
 _TORQUES = np.hstack([np.eye(5)[:, 3:], -np.eye(5)[:, 3:]])  # as two positive parts, (5, 4)
 
 
@@ -230,7 +227,8 @@ class Statics:
             return
         rates = np.vstack([self.A_t @ N, N[3:]])
         opens = self.opening[0] @ N
-        opens = opens[np.abs(opens).max(axis=1, initial=0.0) > _LEVEL * np.abs(N).max()]
+        # No motion changes what is level.
+        opens = opens[np.abs(opens).max(axis=1, initial=0.0) > 1e-6 * np.abs(N).max()]
         for y in list_sectors(rates):
             speed = rates @ y
             signs = np.sign(np.where(np.abs(speed) > _TINY * np.abs(rates).max(), speed, 0))
@@ -298,7 +296,7 @@ class Statics:
         lows = [edge / force, edge / force, np.zeros(len(motion) + len(mode.opens))]
         rows += [motion, mode.opens @ y]
         if f:
-            rows, lows = [*rows, motion.sum(axis=0)[None]], [*lows, np.array([MOVES])]
+            rows, lows = [*rows, motion.sum(axis=0)[None]], [*lows, np.array([1e-5])]
         rows.append((c_n - presses * x[-1]) / force)
         lows.append(np.full(n_c, least / force))
         dry = np.stack([-scene.dry[3:], scene.dry[3:]], axis=1)
@@ -352,4 +350,4 @@ def pushes_one_way(formation: Formation, z: Array) -> bool:
     answer = linprog(
         [0, 0, 0, -1], np.vstack([rows, gravity]), np.zeros(len(rows) + 1), bounds=bounds
     )
-    return bool(answer.status == 0 and answer.x[-1] > _PUSHES)
+    return bool(answer.status == 0 and answer.x[-1] > 1e-3)

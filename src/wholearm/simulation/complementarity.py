@@ -36,7 +36,7 @@ from .contact_problem import (
     try_modes,
 )
 from .events import EventKind, describe_change
-from .rest import find_roots
+from .rest import find_breach
 from .run import Feedback, Run, StuckError, find_root
 from .stepper import Modes, ModeStepper
 from .system import ContactRows, Structure, System
@@ -45,23 +45,15 @@ from .tolerances import ROUNDING_FORCE, SETTLING, SHORTEST_STEP, STANDING, STILL
 CLOSED = 1e-10  # gap that counts as closed at an event, relative to the scene's length
 SUNK = 1e-6  # overlap up to which features touch, over the scene's length; else they are behind
 CHATTER = 1e-6  # speed of the last impact, over the scene's: separation stays below rounding
-COARSE = 1e3  # the same over the tolerance, where that is coarser than impacts need
-BURST = 3e-4
-"""Time, relative to the scene's, in which `MANY` impacts raise `CHATTER` tenfold, and twice as many
-a hundredfold: fingers may knock an object to and fro for ever."""
-MANY = 20
-CLEAR = 1e-3  # forces and rates, over the largest, that do not vanish within `SETTLING`
+MANY = (
+    20  # impacts in 3e-4 of the scene's time that raise `CHATTER` tenfold; twice as many 100-fold
+)
 DEPENDENT = 1e-7  # share of a row that others leave, below which it is no constraint of its own
-SPEED_ROUNDING = 1e-12  # sliding or turning speed that counts as rounding, over the scene's
-TURNING = 1e-4  # speed, over the scene's, below which a reversal may be near
 ARMED = 1e-13  # gap from which on a pair has been apart, relative to the scene's length
 LOOKS = 8  # instants of the longest step at which gaps are looked at, its end among them
 REACH = 0.3  # longest step, in units of the scene: gaps are sampled every `REACH` / `LOOKS`
-EXACT = 1e-14  # gap of a closed contact, over the scene's length: some ten roundings
-CHATTER_PAUSE = 1e-3  # time between two notes of chatter of a pair, over the scene's
 ROUNDS = 30  # most impacts at one instant; what is left after them is plastic
 _NONE = np.zeros(0)
-_NOTHING = (_NONE, np.zeros(0, dtype=np.int64), _NONE, _NONE)
 
 
 class ClosedContacts(NamedTuple):
@@ -160,12 +152,14 @@ class FreeRun(Run):
     @property
     def chatter(self) -> float:
         """Speed of impacts that count as the last one [m/s]."""
-        since, recent = self.t - BURST * self.system.scales.time, 0
+        # Fingers may knock an object to and fro for ever.
+        since, recent = self.t - 3e-4 * self.system.scales.time, 0
         for event in reversed(self.events):
             if event.time < since:
                 break
             recent += event.kind is EventKind.IMPACT
-        least = max(CHATTER, COARSE * self.tolerance)
+        # Impacts need no finer steps than these.
+        least = max(CHATTER, 1e3 * self.tolerance)
         return least * self.system.scales.speed * 10.0 ** min(recent // MANY, 2)
 
     def next_piece(self) -> bool:
@@ -269,7 +263,7 @@ class FreeRun(Run):
         v = self.v + answer.change
         if bouncing and self.restitution:
             v = self._expand(closed, answer, v)
-        pause = CHATTER_PAUSE * self.system.scales.time
+        pause = 1e-3 * self.system.scales.time
         for k, pair in enumerate(closed.pairs):
             if rates[k] >= -STANDING * self.system.scales.speed or answer.c_n[k] <= 0:
                 continue
@@ -358,7 +352,8 @@ class FreeRun(Run):
             return None
         acceleration = free + first.change
         self.unique = problem.is_unique
-        if not self.unique or not is_clear(problem, first, CLEAR):
+        # What is clearer does not vanish within that time.
+        if not self.unique or not is_clear(problem, first, 1e-3):
             v = self.v + later * acceleration
             rows = system.evaluate(self.z + later * (self.v + v) / 2, v, pattern.closed)
             coming = lift * system.push(v, self.tau(self.t + later), pattern.sigma)
@@ -483,7 +478,7 @@ class FreeRun(Run):
         """Let time pass at rest until forces leave their bounds, or the torques end."""
         self.record(still=True)
         while True:
-            breach = _find_breach(self._list_margins(), self.fraction(self.t))
+            breach = find_breach(self._list_margins(), self.fraction(self.t))
             self.wait(self.time(breach) if breach < 1 else self.stop)
             if breach < 1 or not self.next_piece():
                 return
@@ -526,7 +521,7 @@ class FreeRun(Run):
         watch.watched[:] = 1.0
         watch.watched[self.kept] = 0.0
         counts = [rows.cone.stop, rows.size - rows.cone.stop, len(self.kept)]
-        self.slack = np.repeat([ROUNDING_FORCE, SPEED_ROUNDING, CLOSED], counts)
+        self.slack = np.repeat([ROUNDING_FORCE, 1e-12, CLOSED], counts)
         self._look()
         # What touches already may sink by rounding; what is behind something else never closes.
         sunk = np.minimum(watch.gaps, 0.0) - 0.5 * CLOSED * self.unit
@@ -651,7 +646,7 @@ class FreeRun(Run):
         if not self.unique or modes.stuck or modes.held:
             return False
         counts = [rows.cone.stop, rows.size - rows.cone.stop, len(self.kept)]
-        clear = np.repeat([10 * ROUNDING_FORCE, TURNING, 10 * CLOSED], counts)
+        clear = np.repeat([10 * ROUNDING_FORCE, 1e-4, 10 * CLOSED], counts)
         # What has no direction has no speed that could reverse.
         signs = np.array([*self.modes.Xi, *self.modes.sigma])
         clear[rows.slide.start : rows.turn.stop][signs == 0] = -1
@@ -674,7 +669,8 @@ class FreeRun(Run):
             right, last = h, value(h)
         if last >= 0:
             return None
-        root = find_root(value, right, first, last, self.near, EXACT * self.unit, left)
+        # Some ten roundings of the gap count as closed.
+        root = find_root(value, right, first, last, self.near, 1e-14 * self.unit, left)
         self._step_to(root)
         out = self.s.outputs
         return root if self._face(out[:n], out[n : 2 * n])[1][pair] else None
@@ -848,18 +844,6 @@ def _build_watch(structure: Structure) -> tuple[Expression, Expression]:
     return look, ca.Function("within", [given, numbers], [ca.densify(flag)])
 
 
-def _find_breach(margins: Array, x: float) -> float:
-    """First `x` at which a polynomial turns negative; at least 1 if none does before."""
-    first = 2.0
-    for row in margins:
-        if np.polyval(row[::-1], x) < 0:
-            return x
-        slope = np.polyder(row[::-1])
-        roots = [r for r in find_roots(row) if x < r < min(first, 1.0) and np.polyval(slope, r) < 0]
-        first = min([first, *roots])
-    return first
-
-
 class Pattern:
     """Closed pairs and coordinates at rest, and sliding signs of the others."""
 
@@ -881,8 +865,6 @@ class Pattern:
         """Contact problem of rows, from accelerations without contacts, `free` (n,)."""
         system, lift, standing = self.system, 1 / self.system.mass, self.standing
         G, b_n = rows.A - self.rub * rows.A_t, rows.A @ free + rows.bend
-        if not len(standing) and not len(self.joints):
-            return ContactProblem(lift, rows.A, G, b_n, np.zeros((0, system.n)), *_NOTHING)
         none = np.zeros(len(self.joints))
         return ContactProblem(
             lift,

@@ -27,13 +27,8 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array
 
-PIVOTS = (1e-8, 1e-11)  # least pivots to try, above and below the rounding of redundant rows
-GOOD = 1e-10  # residual with which an attempt is the last one, relative to the largest entry of q
-TIE = 1e-12  # difference of ratios that counts as none, relative to the largest entry of q
-TURNS = 60  # most pivots for each unknown
 RESIDUAL = 1e-8  # largest residual of a solution, relative to the largest rate without contacts
 EDGE = 1e-9  # reserve of friction that counts as none, relative to its bound or the largest force
-MOST = 4000  # most combinations of modes that are looked through for other answers
 SAME = 1e-6  # difference of rates that is none, over the largest rate without contacts
 SINGULAR = 1e-9  # determinant of a scaled system that counts as zero
 APART, STICKS, FORTH, BACK = range(4)
@@ -163,7 +158,7 @@ def _combine(
     options: list[tuple[int, ...]]
     options = [(APART, STICKS, FORTH, BACK) if i in owner else (APART, STICKS) for i in range(k)]
     options += [(STICKS, FORTH, BACK) for _ in range(owner.count(-1))]
-    if choice is None and math.prod(len(option) for option in options) > MOST:
+    if choice is None and math.prod(len(option) for option in options) > 4000:
         return None
     every = list(product(*options)) if choice is None else [choice]
     choices = np.array(every, dtype=int).reshape(len(every), len(options))
@@ -237,9 +232,10 @@ def solve_lcp(M: Array, q: Array) -> ContactSolution:
     if n == 0 or (q >= 0).all():
         return ContactSolution(np.zeros(n), q.copy(), 0.0)
     solutions = []
-    for least in PIVOTS:
+    # Least pivots above and below the rounding of redundant rows.
+    for least in (1e-8, 1e-11):
         solutions.append(_pivot(M, q, size, least))
-        if solutions[-1].residual <= GOOD * size:
+        if solutions[-1].residual <= 1e-10 * size:
             break
     return min(solutions, key=lambda solution: solution.residual)
 
@@ -253,7 +249,7 @@ def _pivot(M: Array, q: Array, size: float, least: float) -> ContactSolution:
     table[:, -1] = -1.0
     basis = np.arange(1, n + 1)
     row, entering = _choose(table, np.arange(n), -np.ones(n)), 2 * n + 1
-    for _ in range(TURNS * n):
+    for _ in range(60 * n):
         leaving = int(basis[row])
         table[row] /= table[row, entering]
         factors = table[:, entering].copy()
@@ -269,7 +265,7 @@ def _pivot(M: Array, q: Array, size: float, least: float) -> ContactSolution:
             break
         # The artificial unknown goes as soon as it may: its level is what is missing.
         ratios = table[rising, 0] / column[rising]
-        low = rising[ratios <= ratios.min() + TIE]
+        low = rising[ratios <= ratios.min() + 1e-12]
         last = low[basis[low] == 2 * n + 1]
         row = int(last[0]) if len(last) else _choose(table, rising, column[rising])
     return ContactSolution(np.full(n, np.nan), np.full(n, np.nan), np.inf)

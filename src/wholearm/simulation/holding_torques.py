@@ -33,7 +33,6 @@ LEAST = 1e-2  # least margin over saturation of torques that hold or close
 AMPLE = 0.1  # saturation of margins of forces, torques, accelerations, over the scene's
 DRIVE = 0.02  # least acceleration towards an open contact, ample sliding, over the scene's
 SLOW = 0.2  # least margin of slowly closing torques, over that of torques that only hold
-_STILL = 3e-5  # relative rate of opening that counts as none
 _SMALL = 1e-9  # relative rate at which a contact does not part
 
 
@@ -118,7 +117,7 @@ def find_opening(place: Standstill) -> Array | None:
     P, along = place.formation.evaluate(*at).P[0] / root, normal / root
     free = along - P.T @ np.linalg.lstsq(P.T, along, rcond=_SMALL)[0]
     rate = float(free @ along)
-    if rate <= _STILL * float(along @ along):
+    if rate <= 3e-5 * float(along @ along):
         return None
     return np.asarray(free / root / rate)
 

@@ -23,11 +23,6 @@ from ..common.arrays import Array
 from ..contacts.formation import Formation
 from .system import ContactRows
 
-INDEPENDENT = 1e-9  # least singular value of normalized constraints that are independent
-
-
-FIXED = 1e-7  # share of a freedom below which constraints leave none
-
 
 @dataclass(frozen=True)
 class Grips:
@@ -180,7 +175,7 @@ def respond(mode: Mode, signs: Array, rows: ContactRows, v: Array) -> Response |
     if mode.grips:
         lines = P * np.sqrt(inverse_mass)
         lines /= np.linalg.norm(lines, axis=1)[:, None]
-        if len(P) > 5 or np.linalg.svd(lines, compute_uv=False)[-1] <= INDEPENDENT:
+        if len(P) > 5 or np.linalg.svd(lines, compute_uv=False)[-1] <= 1e-9:
             return None
     applied = np.zeros((5, 3))
     applied[:, 0] = scene.applied_force - scene.viscous * v
@@ -213,4 +208,4 @@ def find_fixed(mode: Mode, A: Array, A_t: Array) -> NDArray[np.bool_]:
     P = np.vstack(held) / root
     basis = np.linalg.svd(P / np.linalg.norm(P, axis=1)[:, None], full_matrices=False)[2]
     rest = free - (free @ basis.T) @ basis
-    return np.asarray(np.linalg.norm(rest, axis=1) < FIXED * length)
+    return np.asarray(np.linalg.norm(rest, axis=1) < 1e-7 * length)

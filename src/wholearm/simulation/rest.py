@@ -28,12 +28,10 @@ from ..mechanics.statics import GRAZE, Statics, TorquePolygon
 from ..scene.model import Scene
 from .modes import find_grips, list_units, respond, share_mode
 from .system import ContactRows
-from .tolerances import CLOSING, ROUNDING_FORCE, STILL, measure_units
+from .tolerances import ROUNDING_FORCE, STILL, measure_units
 
 BALANCED = 1e-6  # distance beyond torques that can be held that counts as none, over the scene's
-_CLOSED = 3e-15  # gap that counts as rounding, relative to the scene's length
 _AHEAD = 1e-5  # step along the free direction for the signs of what is stationary, in scene units
-_CLEAR = 1e3  # least starting acceleration halfway to the next change, over rounding
 
 
 class StartDeparture(NamedTuple):
@@ -195,7 +193,8 @@ class Rest:
         graze = GRAZE * np.repeat([1.0, length], [count, 2]) @ slips
         openings = self.statics.opening[0] @ response.acceleration + graze
         still = STILL * np.repeat([scales.acceleration, 1 / scales.time**2], [count, 2])
-        closing = np.full(len(openings), CLOSING * scales.acceleration)
+        # Difference quotients are as good as 1e-7.
+        closing = np.full(len(openings), 1e-7 * scales.acceleration)
         if heading is not None:
             # All accelerations are multiples of this one.
             slips = (heading * scene.mass_diagonal @ response.acceleration)[None]
@@ -222,7 +221,7 @@ class Rest:
             if mode.moves(tau):
                 return mode.depart(x, tau)
         loss = self._find_loss(coefficients, x)
-        least = _CLEAR * _measure_drive(self.formation.scene)
+        least = 1e3 * _measure_drive(self.formation.scene)
         margins = [mode.margins for mode in self.modes]
         rows = np.vstack(margins)
         first = np.cumsum([0, *(len(part) for part in margins[:-1])])
@@ -246,9 +245,7 @@ class Rest:
         normals, bounds = self.held
         if not np.isfinite(bounds).all():
             return x
-        starts, middles = _split(normals @ coefficients - _constant(bounds, coefficients), x)
-        beyond = self.held.measure(_evaluate(coefficients, middles).T) > 0
-        return float(starts[beyond.argmax()]) if beyond.any() else np.inf
+        return find_breach(_constant(bounds, coefficients) - normals @ coefficients, x)
 
     def _collapse(self, coefficients: Array, x: float) -> Collapse:
         """The contact that gives way at `x`."""
@@ -317,6 +314,13 @@ def _split(polynomials: Array, x: float) -> tuple[Array, Array]:
     return starts, (starts + np.append(starts[1:], 1.0)) / 2
 
 
+def find_breach(polynomials: Array, x: float) -> float:
+    """First place in [x, 1] at which a polynomial of some, (n, d + 1), turns negative; infinity."""
+    starts, middles = _split(polynomials, x)
+    low = (_evaluate(polynomials, middles) < 0).any(axis=0)
+    return float(starts[low.argmax()]) if low.any() else np.inf
+
+
 def find_roots(polynomial: Array) -> list[float]:
     """Real roots of a polynomial given by ascending coefficients."""
     significant = np.flatnonzero(np.abs(polynomial) > 1e-14 * np.abs(polynomial).max())
@@ -335,7 +339,7 @@ def close_contacts(
     A `SimulationError` says which contact cannot be closed.
     """
     inverse_mass = 1 / formation.scene.mass_diagonal
-    closed = _CLOSED * formation.scene.scales.length
+    closed = 3e-15 * formation.scene.scales.length
     for _ in range(8):
         kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
         gaps, rows = kinematics.C[0], kinematics.A[0]

@@ -16,11 +16,9 @@ from ..results.torque import TorqueProfile
 from .events import Event, EventKind, Record
 from .stepper import LOSSES, ORDER, Modes, ModeStepper, build_stepper
 from .system import System
-from .tolerances import FIRST_STEP, SETTLING, SHORTEST_STEP, STEP_OF_TORQUE
+from .tolerances import FIRST_STEP, SETTLING, SHORTEST_STEP
 
 SAME = 1e-9  # distance of two instants that counts as none, relative to the period
-_ROUNDED = 1e-15  # speed that rounding leaves, relative to the largest one
-_GROWTH = 40.0  # largest growth of a step: at order 8 an error of 1e-13 of the tolerance allows it
 
 
 def find_root(
@@ -181,7 +179,7 @@ class Run(ABC):
     def find_torque_steps(self, pieces: Array) -> NDArray[np.bool_]:
         """Whether torques step between successive pieces, (n + 1, 2, d + 1), shape (n,)."""
         jump = pieces[1:] @ (-1.0) ** np.arange(pieces.shape[2]) - pieces[:-1].sum(axis=2)
-        least = STEP_OF_TORQUE * self.system.scales.torque
+        least = 2e-8 * self.system.scales.torque
         return np.asarray(np.abs(jump).max(axis=1) > least)
 
     def set_velocity(self, v: Array | float) -> None:
@@ -197,7 +195,7 @@ class Run(ABC):
         scaled /= np.sqrt((scaled**2).sum(axis=1))[:, None]
         speed = root * self.v
         along = scaled @ speed
-        if np.abs(along).max(initial=0.0) > _ROUNDED * np.abs(speed).max():
+        if np.abs(along).max(initial=0.0) > 1e-15 * np.abs(speed).max():
             self.set_velocity(self.v - np.linalg.lstsq(scaled, along, rcond=1e-9)[0] / root)
 
     def load(self, modes: Modes) -> None:
@@ -262,7 +260,8 @@ class Run(ABC):
             error = float(outputs[to.error])
             sudden = outputs[to.dip] < -1e-6 and h > SETTLING / 10 * time
             if error <= 1 and not (sudden and not self.happens()):
-                grown = h * min(_GROWTH, 0.9 * max(error, 1e-300) ** (-1 / ORDER))
+                # A growth of 40 at order 8 is that of an error of 1e-13 of the tolerance.
+                grown = h * min(40.0, 0.9 * max(error, 1e-300) ** (-1 / ORDER))
                 self.h = grown if h >= self.h else max(self.h, grown)
                 self.steps += 1
                 return h, whole

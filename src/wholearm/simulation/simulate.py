@@ -40,7 +40,6 @@ from .tolerances import SLOW, is_slower
 if TYPE_CHECKING:
     from .complementarity import FreeRun
 
-ROUNDS = 8  # most simulations, each with steps that end at events missed before
 Closer = Callable[[Simulation, Glimpses, int], ArrayLike]
 """Simulation, forces within its steps and number of calls so far -> further instants to check."""
 
@@ -188,7 +187,7 @@ def _replay(
     closer: Closer | None,
     progress: Callable[[str], None] | None,
 ) -> Simulation:
-    for attempts in range(ROUNDS, 0, -1):
+    for attempts in range(8, 0, -1):
         run = Replay(problem, profile, tolerance, wanted)
         outcome, missed_by = run.play(progress)
         simulation = _conclude(run, problem, outcome, missed_by)

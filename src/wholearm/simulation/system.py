@@ -21,8 +21,6 @@ from ..common.arrays import Array, Expression
 from ..common.sharing import Batch, Keeper, kept_property
 from ..scene.model import Scales
 
-_ANYWHERE = 1e9  # range of features that face each other wherever they are [m]
-
 
 @dataclass(frozen=True, eq=False)
 class ContactPair:
@@ -79,7 +77,7 @@ class Structure(Keeper):
     def gap_function(self) -> Expression:
         """CasADi function (z, geometry) -> gaps and ranges of all pairs, shape (N, 2)."""
         gaps = ca.vertcat(ca.SX(0, 1), *(pair.gap for pair in self.pairs))
-        least = [ca.mmin(ca.vertcat(_ANYWHERE, *pair.ranges)) for pair in self.pairs]
+        least = [ca.mmin(ca.vertcat(1e9, *pair.ranges)) for pair in self.pairs]
         both = ca.densify(ca.horzcat(gaps, ca.vertcat(ca.SX(0, 1), *least)))
         return ca.Function("gaps", [self.z, self.geometry], [both])
 

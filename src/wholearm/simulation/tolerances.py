@@ -23,9 +23,7 @@ REST_WINDOW = 2e-3  # time of rest before a torque break: too short for contacts
 LONGEST_WINDOW = 2e-2  # longest time between an arrival at speed and its torque break
 FIRST_STEP = 2e-2  # length of the first step tried from rest
 SHORTEST_STEP = 1e-13  # underflow of a step, over the scene's time and the elapsed time
-STEP_OF_TORQUE = 2e-8  # jump of the torques at a break that counts as one
 STILL = 1e-10  # acceleration that counts as rounding
-CLOSING = 1e-7  # acceleration of a gap that is rounding: a difference quotient
 
 
 @lru_cache(maxsize=64)
