@@ -43,12 +43,14 @@ from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.problem.uncertainty import NAMES, PARAMETERS
 from wholearm.results.trajectory import Motion, Samples
-from wholearm.robustness.error_model import Uncertainty, change_problem, change_torques
 from wholearm.robustness.sampling import (
     Robustness,
     TimeWindow,
     Trial,
+    Uncertainty,
     assess_robustness,
+    change_problem,
+    change_torques,
     count_share,
     make_trial,
     measure_sensitivities,

@@ -47,8 +47,7 @@ if TYPE_CHECKING:
     from .results.report import Report
     from .results.torque import TorqueProfile, read_torque_csv
     from .results.trajectory import Trajectory, load_trajectory
-    from .robustness.error_model import Uncertainty
-    from .robustness.sampling import Robustness, assess_robustness
+    from .robustness.sampling import Robustness, Uncertainty, assess_robustness
     from .scene.model import Finger, Friction, Polygon, Scene
     from .search.find_route import find_route
     from .search.result import Answer
@@ -85,8 +84,7 @@ _NAMES = {
     "results.report": "Report",
     "results.torque": "TorqueProfile read_torque_csv",
     "results.trajectory": "Trajectory load_trajectory",
-    "robustness.error_model": "Uncertainty",
-    "robustness.sampling": "Robustness assess_robustness",
+    "robustness.sampling": "Robustness Uncertainty assess_robustness",
     "scene.model": "Finger Friction Polygon Scene",
     "search.find_route": "find_route",
     "search.result": "Answer",
