@@ -964,6 +964,8 @@ class Replay(Run):
         if self.steps_within(self.settling):
             self.records.pop()
             self._finish_piece()
+        elif self._goes_on():
+            return False
         else:
             start = self.values
             stretch = min(self.settling, self.stop - self.t)
@@ -978,6 +980,15 @@ class Replay(Run):
         ended = self._decide(rows)
         self.observe()
         return ended
+
+    def _goes_on(self) -> bool:
+        """Whether all that slides or turns is far too fast to come to rest in the shortest time."""
+        out, units = self.s.outputs, self.system.units[5:]
+        fastest = np.abs(out[5:10] / units).max()
+        strongest = np.abs(out[self.s.to.acceleration] / units).max() * self.system.scales.time
+        # Lever arms are below 100 units of the scene.
+        least = 100 * SETTLING * (strongest + fastest**2)
+        return bool((self.values[self.leg.rows.turning][self.signs != 0] > least).all())
 
     def find_first(self, start: Array, h: float, among: slice | None = None) -> list[int]:
         """Shorten the step just tried, of length h [s], to its first event; its rows.
