@@ -105,16 +105,6 @@ class Grid(NamedTuple):
         # The two ends are no unknowns.
         return np.maximum(sizes, np.finfo(float).tiny)
 
-    @property
-    def link_sizes(self) -> Array:
-        """Scale of the rows of b' = 2 a, shape (N,)."""
-        return np.asarray(np.maximum(self.sizes[1:], self.sizes[:-1]))
-
-    @property
-    def weights(self) -> Array:
-        """Length of both intervals at each node, shape (N + 1,) [m]."""
-        return np.asarray(np.append(0.0, self.steps) + np.append(self.steps, 0.0))
-
     def interpolate(self, values: Array, other: Grid) -> Array:
         """Values at the nodes of another grid of the same curves, linear between those here."""
         # Of two nodes at one place, each belongs to the side of its element.
