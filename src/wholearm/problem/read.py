@@ -266,7 +266,7 @@ def _read_guess(formation: Formation, given: object, key: str) -> tuple[ModeGues
         TURN.check(f"{name}.phi_deg", phi, "degrees")
         signs = entry["signs"]
         if not isinstance(signs, str) or not re.fullmatch(rf"[-+0]{{{count}}} [-+]{{2}}", signs):
-            text = f"allowed are {count} of -, +, 0 for {describe(formation.contacts)}"
+            text = f"allowed are {count} of -, +, 0 for {' '.join(formation.names)}"
             raise InputError("", f"{name}.signs", f"{signs!r} given; {text}, and - or + per joint")
         for k, contact in enumerate(formation.contacts):
             rolls = contact in formation.rolling
