@@ -219,9 +219,9 @@ class Chooser:
             phases = list_printed(joined, guesses)
             printed = replace(self.problem, phases=phases, goals=())
             plan = plan_phases(printed, self.options, self.roadmap.plans, report)
-            if not joins or (
-                not isinstance(plan, str) and plan.duration < LONGER * joined.duration
-            ):
+            if not joins:
+                return plan
+            if isinstance(plan, Plan) and plan.duration < LONGER * joined.duration:
                 return plan
         return join(options=options)
 
