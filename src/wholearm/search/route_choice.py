@@ -11,23 +11,15 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import NamedTuple, TypeVar
 
-import numpy as np
-
-from ..common.errors import WholearmError
 from ..common.workers import Task, share
-from ..geometry.tracing import trace_phase
-from ..mechanics.speed_sweep import NoMotionError
 from ..planning.blocks import free_torques
-from ..planning.lower_bound import look_along
 from ..planning.options import Objective, PlanOptions
 from ..planning.result import Plan
-from ..planning.stops import end_of
-from ..problem.definition import End, Problem
+from ..problem.definition import Problem
 from .astar import CAREFUL, EAGER, RoadmapRoute, RouteSearch, SearchRule
-from .border_limits import INTERVALS
 from .edge_plans import BackgroundTask, Lost, can_join, join_route, list_printed, plan_phases
-from .edges import EdgeStep, Link, describe_steps, leave_at
-from .feasibility import Measured, leave_in_motion, make_phases, measure_link
+from .edges import Link, describe_steps, leave_at
+from .feasibility import Measured, leave_in_motion, measure_link
 from .result import BorderBound, bound_borders
 
 FINEST = 0.03  # finest step of the place where a border is left, over the border's length
@@ -53,7 +45,6 @@ class ReleaseSearch:
 
     plan: Callable[[RefinedPath], Found]
     best: Measured
-    cost: Callable[[Measured], float]  # duration with that of the border that follows [s]
     _others: list[Measured] = field(default_factory=list)
     _prefetched: dict[RefinedPath, Found] = field(default_factory=dict)
     _tried: set[RefinedPath] = field(default_factory=lambda: {RefinedPath(0)})
@@ -92,16 +83,10 @@ class ReleaseSearch:
         found = self._prefetched[path] if path in self._prefetched else self.plan(path)
         if isinstance(found, str):
             return False
-        better = self.cost(found) < GAIN * self.cost(self.best)
+        better = found.duration < GAIN * self.best.duration
         self._others.append(self.best if better else found)
         self.best = found if better else self.best
         return better
-
-
-def _follow(link: Link | None) -> tuple[EdgeStep, ...]:
-    """The border that a link begins with, to rest; nothing for others."""
-    along = link is not None and not link.in_cell
-    return (link.steps[0]._replace(end=End.REST),) if link and along else ()
 
 
 FASTER = 0.7  # least ratio of planned to straight-path durations through cells; by experience
@@ -290,13 +275,8 @@ class Chooser:
         for link in links:
             report(f"planning {describe_steps(link.steps)} in other ways")
         plans = {link: roadmap.measured[link] for link in links}
-        after = dict(zip(route.links, [*route.links[1:], None], strict=True))
         searches = [
-            ReleaseSearch(
-                partial(self._release, link),
-                plan,
-                partial(self._add_following, _follow(after[link])),
-            )
+            ReleaseSearch(partial(self._release, link), plan)
             for link, plan in plans.items()
             if isinstance(plan, Measured)
         ]
@@ -332,20 +312,6 @@ class Chooser:
         return measure_link(
             self.problem, link, steps, self.options, straight=path.straight, first_only=True
         )
-
-    def _add_following(self, following: Sequence[EdgeStep], plan: Measured) -> float:
-        """Duration of a link's plan and of the border that follows it, as if that ended at rest.
-
-        Goal 15 of the corpus: the fastest way to a border lands where that takes longer.
-        """
-        if not following:
-            return plan.duration
-        (phase,) = make_phases(self.problem, following)
-        try:
-            curve = trace_phase(phase, end_of(plan.begun[-1])[0])
-            return plan.duration + look_along((curve,), self.problem.epsilon, INTERVALS)
-        except (NoMotionError, WholearmError, np.linalg.LinAlgError):
-            return math.inf
 
     def _is_lost(self, route: RoadmapRoute) -> bool:
         """Whether a route contains links that had no plan on another one."""
