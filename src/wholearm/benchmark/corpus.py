@@ -25,13 +25,14 @@ TOLERANCES = {
     "advice": 5e-2,
     "numbers": 1e-3,
     "least": 1e-3,
+    "margins": 1e-3,
     "stops": 2e-3,
 }
 """Relative to the largest number of an entry: what Ipopt and the refinement of limits leave open.
 
 An amount is the shortfall of a motion that solves another problem, advice a bisection. Numbers of a
-report have four digits, and a least force is one at an instant. Phases of a policy stop at samples,
-1 ms apart in simulations of more than 1 s.
+report have four digits; a least force or margin is one at an instant. Phases of a policy stop at
+samples, 1 ms apart in simulations of more than 1 s.
 """
 USUAL = 1e-4  # for all others: the accuracy that plans are made with
 LOCAL = ("plan over time", "goal", "scene", "leg")
