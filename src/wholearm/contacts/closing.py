@@ -3,8 +3,7 @@
 Contacts are counted as in `contact_table`: those with the palm, with finger 1 and with finger 2. A
 label is three of these numbers. Configurations with given labels are functions of (x, phi) in
 closed form: the height follows from the vertex on the palm, each joint angle from what the finger
-touches. Rates along a straight path (x', phi') with parameter u and x'' = phi'' = 0 follow row by
-row from A z' = 0.
+touches; so do their rates along a straight path (x', phi') with parameter u and x'' = phi'' = 0.
 """
 
 from __future__ import annotations
@@ -380,47 +379,118 @@ class ExplicitMotion(NamedTuple):
     kinematics: Kinematics  # rows of the three contacts, with A' z_u
 
 
+class _Touch(NamedTuple):
+    """Poses at which a finger touches in one manner; vectors are in the world, from its joint."""
+
+    rows: Numbers  # which of the poses
+    kind: int
+    # arm, corner, outward (n, 2): the vertex from the centroid and from the joint; for an edge, the
+    # one where it begins, and its outward normal
+    arm: Array
+    corner: Array
+    outward: Array
+
+
 def place(scene: Scene, labels: Numbers, poses: Array) -> Array:
     """Configurations (n, 5) at poses (x, phi), labels (n, 3); NaN where a tip cannot reach."""
-    z, phi, body = np.full((len(poses), 5), np.nan), poses[:, 1], scene.polygon.vertices
+    z = np.full((len(poses), 5), np.nan)
     z[:, [0, 2]] = poses
-    z[:, 1] = -_turn(body[labels[:, 0]], phi)[:, 1]
+    z[:, 1] = -_turn(scene.polygon.vertices[labels[:, 0]], poses[:, 1])[:, 1]
     for finger, link in enumerate(scene.fingers):
         sign = 1.0 if finger == 0 else -1.0
-        kinds, indices = np.divmod(labels[:, 1 + finger] - first_contact(scene, finger), len(body))
-        corners = _turn(body[indices], phi) + z[:, :2] - np.asarray(link.base)
-        outward = _turn(_list_edges(scene)[2][indices], phi)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            angles = [_find_angle(link, sign, k, corners, outward) for k in (SIDE, EDGE, ARC)]
-        # Counted from where the finger hangs outside, from which it closes.
-        outside = -np.pi / 2 if finger == 0 else 3 * np.pi / 2
-        swept = np.mod(sign * (np.choose(kinds, angles) - outside), 2 * np.pi)
-        z[:, 3 + finger] = outside + sign * swept
+        for own in _list_touches(scene, finger, labels[:, 1 + finger], z):
+            with np.errstate(invalid="ignore", divide="ignore"):
+                angle = _find_angle(link, sign, own.kind, own.corner, own.outward)
+            # Counted from where the finger hangs outside, from which it closes.
+            outside = -np.pi / 2 if finger == 0 else 3 * np.pi / 2
+            swept = np.mod(sign * (angle - outside), 2 * np.pi)
+            z[own.rows, 3 + finger] = outside + sign * swept
     return z
 
 
 def move(scene: Scene, labels: Numbers, poses: Array, rates: Array) -> ExplicitMotion:
     """Rates along straight paths at poses (x, phi), rates (x', phi'), (n, 2), and labels (n, 3)."""
     z = place(scene, labels, poses)
-    A = evaluate_each(scene, labels, z).A
-
-    def complete(v: Array, right: Array) -> Array:
-        """Height and joint angles with A v = right: each is in one row alone."""
-        with np.errstate(invalid="ignore", divide="ignore"):
-            for row, column in enumerate((1, 3, 4)):
-                v[:, column] = (right[:, row] - (A[:, row] * v).sum(axis=1)) / A[:, row, column]
-        return v
-
-    z_u = np.zeros_like(z)
+    z_u, z_uu = np.zeros_like(z), np.zeros_like(z)
+    A, A_t, bend = np.zeros((len(z), 3, 5)), np.zeros((len(z), 3, 5)), np.zeros((len(z), 3))
+    arm, turn = _turn(scene.polygon.vertices[labels[:, 0]], z[:, 2]), rates[:, 1]
+    A[:, 0, 1], A[:, 0, 2] = 1.0, arm[:, 0]
+    A_t[:, 0, 0], A_t[:, 0, 2] = 1.0, -arm[:, 1]
+    bend[:, 0] = -(turn**2) * arm[:, 1]
     z_u[:, [0, 2]] = rates
-    z_u = complete(z_u, np.zeros(labels.shape))
-    kinematics = evaluate_each(scene, labels, z, z_u)
-    return ExplicitMotion(z, z_u, complete(np.zeros_like(z), -kinematics.A_dot_v), kinematics)
+    z_u[:, 1], z_uu[:, 1] = -arm[:, 0] * turn, -bend[:, 0]
+    for finger, link in enumerate(scene.fingers):
+        sign, joint = (1.0 if finger == 0 else -1.0), 3 + finger
+        for own in _list_touches(scene, finger, labels[:, 1 + finger], z):
+            at, angle = own.rows, z[own.rows, joint]
+            axis = np.column_stack([np.cos(angle), np.sin(angle)])
+            tip, point = link.length * axis, own.corner
+            if own.kind == SIDE:
+                normal = sign * _quarter(axis)
+            elif own.kind == EDGE:
+                normal = -own.outward
+                point = tip + link.radius * normal
+            else:
+                normal = (point - tip) / link.radius
+            lever = own.arm + point - own.corner
+            for rows, along in ((A, normal), (A_t, -_quarter(normal))):
+                rows[at, 1 + finger, :2] = along
+                rows[at, 1 + finger, 2] = cross_product(lever, along)
+                rows[at, 1 + finger, joint] = -cross_product(point, along)
+            held = A[at, 1 + finger]
+            with np.errstate(invalid="ignore", divide="ignore"):
+                rate = -(held[:, :3] * z_u[at, :3]).sum(axis=1) / held[:, joint]
+                z_u[at, joint] = rate
+                bent = _bend(own, link.radius, tip, normal, z_u[at], rate)
+                z_uu[at, joint] = -(bent + held[:, 1] * z_uu[at, 1]) / held[:, joint]
+            bend[at, 1 + finger] = bent
+    return ExplicitMotion(z, z_u, z_uu, Kinematics(0 * bend, A, A_t, bend, A, bend))
+
+
+def _bend(
+    own: _Touch, radius: float, tip: Array, normal: Array, rates: Array, rate: Array
+) -> Array:
+    """The gap's second derivative at constant rates of object, (n, 5), and joint, shape (n,)."""
+    turn = rates[:, 2:3]
+    rate = rate[:, None]
+    moved, fallen = rates[:, :2] + turn * _quarter(own.arm), -(turn**2) * own.arm
+    if own.kind == SIDE:
+        parts = -(rate**2) * normal * own.corner + normal * fallen
+        parts = parts + 2 * rate * _quarter(normal) * moved
+        return np.asarray(parts.sum(axis=1))
+    # The tip's centre as seen from the vertex.
+    apart, closing = tip - own.corner, rate * _quarter(tip) - moved
+    bent = -(rate**2) * tip - fallen
+    if own.kind == EDGE:
+        out = own.outward
+        parts = -(turn**2) * out * apart + 2 * turn * _quarter(out) * closing + out * bent
+        return np.asarray(parts.sum(axis=1))
+    inwards, bends = (normal * closing).sum(axis=1), (normal * bent).sum(axis=1)
+    return np.asarray(((closing**2).sum(axis=1) - inwards**2) / radius - bends)
+
+
+def _list_touches(scene: Scene, finger: int, contacts: Numbers, z: Array) -> Iterator[_Touch]:
+    kinds, indices = np.divmod(contacts - first_contact(scene, finger), scene.polygon.n_vertices)
+    body, base = scene.polygon.vertices, np.asarray(scene.fingers[finger].base)
+    for kind in (SIDE, EDGE, ARC):
+        rows = np.flatnonzero(kinds == kind)
+        if len(rows):
+            index, at = indices[rows], z[rows]
+            arm = _turn(body[index], at[:, 2])
+            outward = _turn(_list_edges(scene)[2][index], at[:, 2]) if kind == EDGE else arm
+            yield _Touch(rows, kind, arm, arm + at[:, :2] - base, outward)
 
 
 def _turn(vectors: Array, phi: Array) -> Array:
-    """Vectors, shape (n, 2), turned by n angles."""
     c, s = np.cos(phi), np.sin(phi)
-    return np.column_stack(
-        [c * vectors[:, 0] - s * vectors[:, 1], s * vectors[:, 0] + c * vectors[:, 1]]
-    )
+    turned = np.empty_like(vectors)
+    turned[:, 0] = c * vectors[:, 0] - s * vectors[:, 1]
+    turned[:, 1] = s * vectors[:, 0] + c * vectors[:, 1]
+    return turned
+
+
+def _quarter(vectors: Array) -> Array:
+    """Vectors turned by +90 degrees."""
+    turned = np.empty_like(vectors)
+    turned[:, 0], turned[:, 1] = -vectors[:, 1], vectors[:, 0]
+    return turned
