@@ -90,7 +90,9 @@ class ReleaseSearch:
 
 
 FASTER = 0.7  # least ratio of planned to straight-path durations through cells; by experience
-LONGER = 1.01  # by how much a plan of printed phases may last longer than that of the links
+AGREES = 1 + 1e-4  # ratio of a plan of printed phases to that of the links, above which another
+# initial guess is tried
+LONGER = 1.01  # the same above which the plan of the links is kept
 TRIED = 6  # most routes without a plan, beyond those asked for
 OTHERS = 2  # most slower plans of a link that are tried if the fastest fails the replay
 BEYOND = 1.1  # largest estimate of a route over that of the best one
@@ -199,6 +201,7 @@ class Chooser:
         joined = join(options=quick, jobs=self.jobs, background=background)
         if isinstance(joined, str):
             return joined
+        made = list[Plan]()
         # Without guesses: query 61, whose guess leads to worse contact modes.
         for guesses in (True, False) if joins else (False,):
             phases = list_printed(joined, guesses)
@@ -206,8 +209,13 @@ class Chooser:
             plan = plan_phases(printed, self.options, self.roadmap.plans, report)
             if not joins:
                 return plan
-            if isinstance(plan, Plan) and plan.duration < LONGER * joined.duration:
-                return plan
+            if isinstance(plan, Plan):
+                made.append(plan)
+                if plan.duration < AGREES * joined.duration:
+                    break
+        best = min(made, key=lambda plan: plan.duration, default=None)
+        if best is not None and best.duration < LONGER * joined.duration:
+            return best
         return join(options=options)
 
     def bound(self, duration: float, in_cells: bool) -> BorderBound:
