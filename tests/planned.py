@@ -166,7 +166,7 @@ class LandingMotion:
             C, A = self.formation.evaluate(z, np.zeros_like(z))[:2]
             step = np.linalg.solve(A[:, :, DEPENDENT], -C[..., None])[..., 0]
             # Far from the start a whole step could leave the solution's neighbourhood.
-            z[:, DEPENDENT] += step * np.minimum(1.0, 0.2 / np.abs(step).max())
+            z[:, DEPENDENT] += step / max(1.0, float(np.abs(step).max()) / 0.2)
         return z
 
     def move(self, t: Array) -> tuple[Array, Array, Array, Array]:
