@@ -59,15 +59,6 @@ class ModeGuess(NamedTuple):
 
 INDEX = leave({"type": "integer", "minimum": 0})  # number of an edge
 CONTACT = _name_contact()  # JSON Schema of the name of a contact
-_MODE = {
-    "type": "object",
-    "additionalProperties": False,
-    "required": ["t", "x", "phi_deg", "signs"],
-    "properties": {
-        **{name: {"type": "number"} for name in ("t", "x", "phi_deg")},
-        "signs": {"type": "string", "pattern": "^[-+0]+ [-+]{2}$"},
-    },
-}
 DWELL = FieldKind(
     lambda given, key: (read_share if isinstance(given, str) else NONNEGATIVE.read)(given, key),
     {"anyOf": [NONNEGATIVE.schema, {"type": "string", "pattern": "^[^%]+%\\s*$"}]},
@@ -149,7 +140,7 @@ class Until:
         "in order, each with time t since the start of the phase [s], x [m] and phi_deg at its "
         "end, and the signs of the sliding velocities of `contacts` (0 if one rolls) and of the "
         "joint velocities, such as '-+0 ++'.",
-        leave({"type": "array", "minItems": 1, "items": _MODE}),
+        leave({"type": "array", "minItems": 1}),
     ),
 )
 @dataclass(frozen=True, eq=False)

@@ -78,7 +78,10 @@ UNTIL = name_fields(
     declare("x", "[m]"),
     declare("phi_deg", "[degrees]"),
 )
-MODE = name_fields(*map(declare, ("t", "x", "phi_deg", "signs")))
+MODE = name_fields(
+    *map(declare, ("t", "x", "phi_deg")),
+    declare("signs", "", leave({"type": "string", "pattern": "^[-+0]+ [-+]{2}$"})),
+)
 UNCERTAINTY = {name: _WIDTHS[names[0]] for name, names in GROUPS.items()} | _WIDTHS
 _PARTS = name_fields(
     *map(declare, ("object", "fingers", "friction", "start")),
@@ -615,6 +618,7 @@ def build_schema() -> dict[str, Any]:
     ]
     phase = _describe_table(PHASE) | {"anyOf": ends}
     phase["properties"]["until"]["oneOf"] = [refer("contact"), until]
+    phase["properties"]["guess"]["items"] = _describe_table(MODE)
     goals = [refer("goal"), {"type": "array", "items": refer("goal")}]
     parts = {
         "object": _describe_table(OBJECT),

@@ -276,7 +276,8 @@ class _LinkPlanner:
         lands = link.in_cell and following is not None and not following.in_cell
         follows = (following.steps[0]._replace(end=End.REST),) if following and lands else ()
         place = key_configuration(self.problem.scene, z)
-        settings = repr(replace(self.options, samples=2))
+        # Neither samples nor checks of whole plans matter to those of links.
+        settings = repr(replace(self.options, samples=2, replay=False, certify=False))
         key = (place, key_steps(link.steps), key_steps(follows), guess is None, settings)
         if key not in self.cache:
             self.report(f"planning {describe_steps(link.steps)}")

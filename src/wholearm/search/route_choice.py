@@ -197,7 +197,7 @@ class Chooser:
             background = BackgroundTask(partial(bound_borders, self.search, enough))
             self._bound = enough, background
         join = partial(join_route, problem, links, cache=self.roadmap.joined, report=report)
-        quick = replace(options, replay=False)
+        quick = replace(options, replay=False, certify=False)
         joined = join(options=quick, jobs=self.jobs, background=background)
         if isinstance(joined, str):
             return joined
