@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 ITERATIONS = 50  # most of the solver from a guess; successes take up to 25
 SPLIT = 80  # the same in modes of the homotopy
-MODES_GIVEN = 150  # the same in modes that the problem gives; phase 9 of query 28 takes 83
+MODES_GIVEN = 150  # the same in modes that the problem gives; phase 1 of query 29 takes 67
 FEW = 35  # the same where a single guess is tried
 BUDGET = 400  # solver iterations of one block after which no further guess is tried
 DEARER = 1.2  # cost of a refined plan, over that on few intervals, above which others are tried
