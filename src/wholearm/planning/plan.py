@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -36,10 +36,6 @@ from .path_domain import impact_sequence
 from .phase_plan import add_up, combine
 from .result import Plan, PlannedPhase, Status, Timings, write_meta
 from .stops import PlanPart, plan_stops
-
-if TYPE_CHECKING:
-    from .replay_check import Checked
-
 
 OVER_TIME = "planned over time"
 NO_MOTION = "the sweep over the phase plane finds no motion"
@@ -122,15 +118,14 @@ def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]
                 about = {"name": problem.name, "epsilon": problem.epsilon, "problem": problem.table}
                 error.motion = replace(error.motion, meta=error.motion.meta | about)
             raise
-        return finish_plan(planning, report, ledger, (started, traced))
+        return _finish(planning, report, ledger, (started, traced))
 
 
-def finish_plan(
+def _finish(
     planning: Planning,
     report: Callable[[str], None],
     ledger: Ledger,
     begun: tuple[float, float],
-    checked: Checked | None = None,
 ) -> Plan:
     """Verify the planned blocks by simulation, assess them, and collect the plan.
 
@@ -138,19 +133,16 @@ def finish_plan(
     ----------
     ledger       statistics of the solver
     begun : [s]  when tracing the phases began and ended, by `time.perf_counter`
-    checked      trajectory and replay of the planning, if known
     """
     problem, options = planning.problem, planning.options
-    trajectory, figures = checked.trajectory if checked else assemble_plan(planning), None
+    trajectory, figures = assemble_plan(planning), None
     unique = check_uniqueness(problem, trajectory, options.uniqueness_margin)
     planned = time.perf_counter()
     if options.replay:
         from .replay_check import replay_plan
 
         first = trajectory
-        planning, trajectory, figures = replay_plan(
-            planning, trajectory, assemble_plan, report, checked
-        )
+        planning, trajectory, figures = replay_plan(planning, trajectory, assemble_plan, report)
         if trajectory is not first:
             unique = check_uniqueness(problem, trajectory, options.uniqueness_margin)
     replayed = time.perf_counter()
@@ -306,16 +298,16 @@ def certify(planning: Planning) -> Certificate:
 
 
 def _bound(block: BlockPlan, epsilon: float) -> Iterator[TimeBound]:
-    numbers = [phase.number for phase in block.phases]
-    durations = [plan.motion.duration for plan in block.plans]
+    times = {
+        phase.number: plan.motion.duration
+        for phase, plan in zip(block.phases, block.plans, strict=True)
+    }
     if block.chain is None:
-        yield TimeBound(tuple(numbers), sum(durations), None, None, OVER_TIME)
+        yield TimeBound(tuple(times), sum(times.values()), None, None, OVER_TIME)
         return
-    # The chain of a link of a route has numbers of its own: its phases are told by their order.
-    first = 0
     for part in block.chain.split():
-        own = slice(first, first := first + len(part.phases))
-        phases, duration = tuple(numbers[own]), sum(durations[own])
+        phases = tuple(phase.number for phase in part.phases)
+        duration = sum(times[number] for number in phases)
         found = bound_least_time(part.continuous_curves, epsilon)
         if found is None:
             yield TimeBound(phases, duration, None, None, NO_MOTION)

@@ -79,59 +79,30 @@ class ReplayCheck(NamedTuple):
         return self.failure[0]
 
 
-class Checked(NamedTuple):
-    """Replay of a planning."""
-
-    trajectory: Trajectory
-    strictly: ReplayCheck  # by stricter tolerances than those of `verify`
-    usually: ReplayCheck  # by those
-    scales: Scales
-
-    @staticmethod
-    def of(problem: Problem, trajectory: Trajectory) -> Checked:
-        """Replay a trajectory."""
-        usual, strict = Allowance(), Allowance().scale(STRICT)
-        strictly, usually = check_plan(problem, trajectory, strict, usual)
-        return Checked(trajectory, strictly, usually, problem.scene.scales)
-
-    @property
-    def culprit(self) -> int | None:
-        """Number of the phase to plan anew; None if the plan holds."""
-        if self.strictly.failure is None:
-            return None
-        durations = np.diff(self.trajectory.phase_starts)
-        return self.strictly.find_culprit(self.scales, Allowance().scale(STRICT), durations)
-
-
 def replay_plan(
     planning: Planning,
     trajectory: Trajectory,
     build: Callable[[Planning], Trajectory],
     report: Callable[[str], None],
-    checked: Checked | None = None,
 ) -> tuple[Planning, Trajectory, ReplayFigures]:
     """Replay a plan and refine blocks until it holds; ReplayError if it does not.
 
-    `build` gives the trajectory of another planning. If the first replay is known (`checked`), the
-    tolerances of `verify` are enough for it.
+    `build` gives the trajectory of another planning. Blocks are refined, too, if the plan holds by
+    the tolerances of `verify` only.
     """
-    problem = planning.problem
+    problem, usual = planning.problem, Allowance()
+    strict = usual.scale(STRICT)
     simulations, known = 0, None
     while True:
         simulations += 1
-        if checked is None:
-            report("replaying the plan")
-            found = Checked.of(problem, trajectory)
-        else:
-            usually = checked.usually
-            found = checked if usually.failure else checked._replace(strictly=usually)
-        checked, check, accepted = None, found.strictly, found.usually
+        report("replaying the plan")
+        check, accepted = check_plan(problem, trajectory, strict, usual)
         if check.failure is None:
             break
         if accepted.failure is None:
             known = planning, trajectory, accepted
-        number = found.culprit
-        assert number is not None
+        durations = np.diff(trajectory.phase_starts)
+        number = check.find_culprit(problem.scene.scales, strict, durations)
         better = _improve(planning, number, accepted, report)
         if better is None and known is not None:
             planning, trajectory, check = known

@@ -1,4 +1,4 @@
-"""Plans of routes, joined from plans of their links, each from rest to rest.
+"""Plans of the links of routes, each from rest to rest, and of the phases that are printed.
 
 The plan of a link depends on the others only by the configurations at its ends. Where a link
 through a cell lands on a border is optimized together with the first phase of the next link.
@@ -7,7 +7,6 @@ through a cell lands on a border is optimized together with the first phase of t
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, MutableMapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,7 +15,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import InputError, ReplayError, WholearmError, name_source
+from ..common.errors import InputError, WholearmError, name_source
 from ..common.sharing import exclusive
 from ..common.workers import Task, share
 from ..geometry.curve import Curve
@@ -25,17 +24,16 @@ from ..geometry.tracing import trace_phase
 from ..planning.advice import unadvised
 from ..planning.blocks import BEGUN, BlockPlan, Planning, plan_next
 from ..planning.options import PlanOptions
-from ..planning.plan import assemble_plan, finish_plan, solve_with
-from ..planning.replay_check import Checked
+from ..planning.plan import solve_with
 from ..planning.result import Plan
 from ..planning.stops import end_of, split_blocks
+from ..planning.time_domain.time_motion import TimeMotion
 from ..problem.definition import ROWS, End, ModeGuess, Phase, Problem
 from ..problem.read import read_phase
 from ..problem.table import SAME as PRINTED_ANGLE
 from ..problem.table import describe_phase
-from ..results.plan_record import ROLLS, ModeSpan
+from ..results.plan_record import ROLLS
 from ..scene.model import Scene
-from ..solvers.ipopt import SolverStatistics, open_ledger
 from .edges import EdgeStep, Link, describe_steps, find_headings, point_out
 from .feasibility import SINGULAR, Measured, make_phases
 from .places import measure_apart
@@ -44,7 +42,7 @@ from .places import measure_apart
 class Lost(str):
     """Why a route has no plan, with the links for which that is so on every route."""
 
-    # the one whose planning or replay fails, after the one that lands at its start, if any
+    # the one whose planning fails, after the one that lands at its start, if any
     links: tuple[Link, ...] = ()
 
     @classmethod
@@ -75,27 +73,27 @@ def plan_phases(
     return cache[key]
 
 
-def list_printed(plan: Plan, guesses: bool) -> tuple[Phase, ...]:
-    """The phases of a plan as they are printed and read again.
+def list_printed(scene: Scene, links: Sequence[PlannedLink], guesses: bool) -> tuple[Phase, ...]:
+    """The phases of planned links as they are printed and read again.
 
-    With `guesses` phases over time begin with the modes and poses of the plan, rounded.
+    With `guesses` phases over time begin with the modes and poses of their plans, rounded.
     """
-    phases, start = list[Phase](), 0.0
-    for phase, planned in zip(plan.problem.phases, plan.phases, strict=True):
-        if guesses and planned.modes:
-            phase = replace(phase, guess=_list_modes(plan, start, planned.modes))
-        entry = describe_phase(phase, PRINTED_ANGLE)
-        phases.append(read_phase(plan.problem.scene, phase.index, entry))
-        start += planned.duration
+    phases = list[Phase]()
+    for link in links:
+        plans = (plan for block in link.blocks for plan in block.plans)
+        for phase, plan in zip(link.phases, plans, strict=True):
+            if guesses and isinstance(plan.motion, TimeMotion):
+                phase = replace(phase, guess=_list_modes(plan.motion, scene.scales.length))
+            phases.append(read_phase(scene, len(phases), describe_phase(phase, PRINTED_ANGLE)))
     return tuple(phases)
 
 
-def _list_modes(plan: Plan, start: float, spans: Sequence[ModeSpan]) -> tuple[ModeGuess, ...]:
-    """Contact modes of a phase that starts at `start` [s], and the poses at their ends."""
-    modes, length = list[ModeGuess](), plan.problem.scene.scales.length
-    for span in spans:
-        x, _, phi, *_ = plan.at(np.array([start + span.stop])).z[0].tolist()
-        t, x = _round(span.stop, GUESSED * spans[-1].stop), _round(x, GUESSED * length)
+def _list_modes(motion: TimeMotion, length: float) -> tuple[ModeGuess, ...]:
+    """Contact modes of a motion, and the poses at their ends."""
+    modes = list[ModeGuess]()
+    for span in motion.modes:
+        x, _, phi, *_ = motion.evaluate(np.array([span.stop])).z[0].tolist()
+        t, x = _round(span.stop, GUESSED * motion.duration), _round(x, GUESSED * length)
         # In degrees, as it is printed.
         phi = math.radians(_round(math.degrees(phi), math.degrees(GUESSED)))
         signs = tuple(SIGNS[own] for own in (*span.contacts.values(), *span.joints))
@@ -130,14 +128,14 @@ class BackgroundTask(Generic[T]):
     result: T | None = None  # what it has returned
 
 
-def can_join(problem: Problem, options: PlanOptions) -> bool:
-    """Whether plans from rest to rest can be joined: for least time with torques free to jump."""
+def are_alike(problem: Problem, options: PlanOptions) -> bool:
+    """Whether plans of links are as those of a route: of least time with torques free to jump."""
     scene = problem.scene
     return options.goal.value == "time" and not (scene.has_slow_motors or scene.control_period)
 
 
 @exclusive
-def join_route(
+def plan_links(
     problem: Problem,
     links: Links,
     options: PlanOptions,
@@ -145,8 +143,8 @@ def join_route(
     report: Callable[[str], None],
     jobs: int = 1,
     background: BackgroundTask[Any] | None = None,
-) -> Plan | str:
-    """The plan of a route, joined from plans of its links, or why there is none.
+) -> list[PlannedLink] | Lost:
+    """Plans of the links of a route, or why there are none.
 
     Parameters
     ----------
@@ -157,57 +155,25 @@ def join_route(
     jobs        most processes that plan links at the same time
     background  a task for one of these processes
     """
-    options = options.scale_ranges(problem.ranges)
-    start, planner = time.perf_counter(), _LinkPlanner(problem, options, cache, report)
-    guesses, culprit = [[*measured, None] for _, measured in links], None
-    try:
-        with unadvised():
-            first = [(link, plans[0]) for (link, _), plans in zip(links, guesses, strict=True)]
+    planner = _LinkPlanner(problem, options.scale_ranges(problem.ranges), cache, report)
+    guesses = [[*measured, None] for _, measured in links]
+    with unadvised():
+        while True:
+            chosen = [(link, plans[0]) for (link, _), plans in zip(links, guesses, strict=True)]
             if jobs > 1:
-                planner.plan_parallel(first, jobs, background)
-            while True:
-                chosen = [(link, plans[0]) for (link, _), plans in zip(links, guesses, strict=True)]
-                planned, reason = planner.plan(chosen)
-                if reason:
-                    culprit = len(planned)
-                    blamed = range(culprit, culprit - len(_blame(links, culprit)), -1)
-                    if (other := next((k for k in blamed if len(guesses[k]) > 1), None)) is None:
-                        return Lost.at(_blame(links, culprit), reason)
-                    guesses[other].pop(0)
-                    continue
-                planning, checked = _assemble(problem, planned, options), None
-                if options.replay:
-                    report("replaying the plan")
-                    checked = Checked.of(planning.problem, assemble_plan(planning))
-                    owners = [k for k, link in enumerate(planned) for _ in link.phases]
-                    culprit = None if checked.culprit is None else owners[checked.culprit - 1]
-                    holds = checked.usually.failure is None
-                    if culprit is not None and not holds and len(guesses[culprit]) > 1:
-                        guesses[culprit].pop(0)
-                        continue
-                try:
-                    with open_ledger() as ledger:
-                        costs = (cost for link in planned for cost in link.costs)
-                        for number, cost in enumerate(costs, 1):
-                            ledger.add(number, cost)
-                        return finish_plan(planning, report, ledger, (start, start), checked)
-                except ReplayError:
-                    # A landing may be replanned with regard to the border after it.
-                    if culprit is None or len(_blame(links, culprit)) == 1:
-                        raise
-                    if len(guesses[culprit - 1]) == 1:
-                        raise
-                    del guesses[culprit - 1][:-1]
-    except WholearmError as error:
-        return str(error) if culprit is None else Lost.at(_blame(links, culprit), str(error))
-    except np.linalg.LinAlgError:
-        return SINGULAR
-
-
-def _blame(links: Links, culprit: int) -> tuple[Link, ...]:
-    """A link that has no plan, after the one that lands at its start, if any."""
-    first = culprit - 1 if culprit and links[culprit - 1][0].in_cell else culprit
-    return tuple(link for link, _ in links[first : culprit + 1])
+                planner.plan_parallel(chosen, jobs, background)
+                jobs = 1
+            planned, reason = planner.plan(chosen)
+            if not reason:
+                return planned
+            # The link that lands where the culprit starts may have landed at another place.
+            first = len(planned)
+            first -= first > 0 and links[first - 1][0].in_cell
+            blamed = range(len(planned), first - 1, -1)
+            other = next((k for k in blamed if len(guesses[k]) > 1), None)
+            if other is None:
+                return Lost.at(tuple(link for link, _ in links[first : len(planned) + 1]), reason)
+            guesses[other].pop(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,7 +268,7 @@ class _LinkPlanner:
         count = len(phases) - len(follows)
         none = list[float | None]([None] * len(phases))
         planning = Planning(single, tuple(curves), self.options, (), none, sketches=True)
-        with open_ledger(apart=True) as ledger, name_source(self.problem.source):
+        with name_source(self.problem.source):
             for part in split_blocks(single):
                 first, guess = part[0], None
                 if first.index >= count:
@@ -312,26 +278,11 @@ class _LinkPlanner:
                     start = planning.blocks[-1].end if planning.blocks else z
                     guess = BlockPlan(part, start, BEGUN, list(measured.begun), None)
                 planning = plan_next(planning, 0, guess, self.report)
-        costs = tuple(ledger.of(phase.number) for phase in phases[:count])
         pinned = [
             pin_landing(phase, end_of(plan)[0])
             for phase, plan in zip(phases[:count], planning.plans, strict=True)
         ]
-        return PlannedLink(tuple(pinned), planning.blocks, costs)
-
-
-def _assemble(problem: Problem, links: Sequence[PlannedLink], options: PlanOptions) -> Planning:
-    """The planning of a route whose links are planned."""
-    phases, blocks = list[Phase](), list[BlockPlan]()
-    for link in links:
-        moved = [replace(phase, index=phase.index + len(phases)) for phase in link.phases]
-        for block in link.blocks:
-            numbered = tuple(moved[phase.index] for phase in block.phases)
-            blocks.append(replace(block, phases=numbered))
-        phases += moved
-    whole = replace(problem, phases=tuple(phases), goals=())
-    none = list[float | None]([None] * len(phases))
-    return Planning(whole, (), options, tuple(blocks), none, ahead=False)
+        return PlannedLink(tuple(pinned), planning.blocks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -340,7 +291,6 @@ class PlannedLink:
 
     phases: tuple[Phase, ...]  # counted from the first of the link
     blocks: tuple[BlockPlan, ...]
-    costs: tuple[SolverStatistics, ...]  # of the solver, for each phase
 
     @property
     def end(self) -> Array:

@@ -17,7 +17,7 @@ from ..planning.options import Objective, PlanOptions
 from ..planning.result import Plan
 from ..problem.definition import Problem
 from .astar import CAREFUL, EAGER, RoadmapRoute, RouteSearch, SearchRule
-from .edge_plans import BackgroundTask, Lost, can_join, join_route, list_printed, plan_phases
+from .edge_plans import BackgroundTask, Lost, are_alike, list_printed, plan_links, plan_phases
 from .edges import Link, describe_steps, leave_at
 from .feasibility import Measured, leave_in_motion, measure_link
 from .result import BorderBound, bound_borders
@@ -90,9 +90,8 @@ class ReleaseSearch:
 
 
 FASTER = 0.7  # least ratio of planned to straight-path durations through cells; by experience
-AGREES = 1 + 1e-4  # ratio of a plan of printed phases to that of the links, above which another
+AGREES = 1 + 1e-4  # ratio of a plan of printed phases to those of the links, above which another
 # initial guess is tried
-LONGER = 1.01  # the same above which the plan of the links is kept
 TRIED = 6  # most routes without a plan, beyond those asked for
 OTHERS = 2  # most slower plans of a link that are tried if the fastest fails the replay
 BEYOND = 1.1  # largest estimate of a route over that of the best one
@@ -178,12 +177,12 @@ class Chooser:
     def _plan(self, route: RoadmapRoute, report: Callable[[str], None]) -> Plan | str:
         """The plan of the phases that are printed for a route.
 
-        Their ends are those of plans of the route's links. If these can be joined, they are the
-        initial guess, too, and kept where the plan from them lasts longer.
+        Their ends are those of plans of the route's links. If these have the torques and the
+        objective of the plan, they are the initial guess, too.
         """
         problem, options = self.problem, self.options
-        joins = can_join(problem, options)
-        if not joins:
+        alike = are_alike(problem, options)
+        if not alike:
             options = replace(options, objective=Objective.TIME, duration=None)
             problem, options = free_torques(problem, options)
         links = [(link, self._list_plans(link)) for r in (*self.before, route) for link in r.links]
@@ -196,27 +195,23 @@ class Chooser:
             enough = BEYOND * self.estimate(route)
             background = BackgroundTask(partial(bound_borders, self.search, enough))
             self._bound = enough, background
-        join = partial(join_route, problem, links, cache=self.roadmap.joined, report=report)
-        quick = replace(options, replay=False, certify=False)
-        joined = join(options=quick, jobs=self.jobs, background=background)
-        if isinstance(joined, str):
-            return joined
-        made = list[Plan]()
+        planned = plan_links(
+            problem, links, options, self.roadmap.joined, report, self.jobs, background
+        )
+        if isinstance(planned, Lost):
+            return planned
+        reached = sum(link.duration for link in planned)
+        best: Plan | str = ""
         # Without guesses: query 61, whose guess leads to worse contact modes.
-        for guesses in (True, False) if joins else (False,):
-            phases = list_printed(joined, guesses)
+        for guesses in (True, False) if alike else (False,):
+            phases = list_printed(problem.scene, planned, guesses)
             printed = replace(self.problem, phases=phases, goals=())
             plan = plan_phases(printed, self.options, self.roadmap.plans, report)
-            if not joins:
-                return plan
-            if isinstance(plan, Plan):
-                made.append(plan)
-                if plan.duration < AGREES * joined.duration:
-                    break
-        best = min(made, key=lambda plan: plan.duration, default=None)
-        if best is not None and best.duration < LONGER * joined.duration:
-            return best
-        return join(options=options)
+            if not isinstance(best, Plan) or (isinstance(plan, Plan) and plan.value < best.value):
+                best = plan
+            if isinstance(plan, Plan) and plan.value < AGREES * reached:
+                break
+        return best
 
     def bound(self, duration: float, in_cells: bool) -> BorderBound:
         """Lower bound of all routes along borders; up to `duration` of a plan `in_cells`."""

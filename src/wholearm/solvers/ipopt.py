@@ -176,9 +176,9 @@ _PHASE: ContextVar[int] = ContextVar("phase", default=0)
 
 
 @contextmanager
-def open_ledger(apart: bool = False) -> Iterator[Ledger]:
-    """Collect what solving costs inside the block; `apart`, in no ledger that was open before."""
-    ledger = Ledger(None if apart else _LEDGER.get())
+def open_ledger() -> Iterator[Ledger]:
+    """Collect what solving costs inside the block."""
+    ledger = Ledger(_LEDGER.get())
     token = _LEDGER.set(ledger)
     try:
         yield ledger

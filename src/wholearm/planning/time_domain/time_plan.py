@@ -253,6 +253,7 @@ def _refine_best(
 
 def finish(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
     """Search modes, choose a free end, refine, and hold torques over control periods."""
+    first = solution
     if search.options.mode_search and not search.has_ample(solution):
         solution = improve(search, solution)
     if search.only_begins:
@@ -260,7 +261,7 @@ def finish(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
     search, coarse = choose_end(search, solution)
     solution = refine(search, coarse)
     if not solution.success and search.options.mode_search:
-        solution = _refine_neighbour(search, coarse) or solution
+        solution = _refine_neighbour(search, coarse, first) or solution
     fewer = drop_gone(search, solution) if solution.success else solution
     if fewer is not solution:
         # Phase 3 of query 57 does not hold in its replay otherwise.
@@ -274,18 +275,25 @@ def finish(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
     return solution
 
 
-def _refine_neighbour(search: TimeSearch, coarse: TimeSolution) -> TimeSolution | None:
-    """A refined solution in neighbouring modes that cost as much on few intervals.
+def _refine_neighbour(
+    search: TimeSearch, coarse: TimeSolution, first: TimeSolution
+) -> TimeSolution | None:
+    """A refined solution in neighbouring modes that cost as much, or in those before the search.
 
-    Phase 2 of the route of query 10 has none in which a contact turns back without resting.
+    Phase 2 of the route of query 10 has none in which a contact turns back without resting, and
+    phase 1 of that of query 91 none in the modes that the search finds.
     """
-    for stages in list_neighbours(search, coarse):
-        other = search.solve(stages, most=PATIENCE)
-        if other.success and other.cost - coarse.cost < WORTH * abs(coarse.cost):
-            refined = refine(search, other)
-            if refined.success:
-                return refined
-    return None
+
+    def list_others() -> Iterator[TimeSolution]:
+        for stages in list_neighbours(search, coarse):
+            other = search.solve(stages, most=PATIENCE)
+            if other.success and other.cost - coarse.cost < WORTH * abs(coarse.cost):
+                yield other
+        if sign_sequence(first.stages) != sign_sequence(coarse.stages):
+            yield first
+
+    found = (refine(search, other) for other in list_others())
+    return next((refined for refined in found if refined.success), None)
 
 
 def choose_end(search: TimeSearch, solution: TimeSolution) -> tuple[TimeSearch, TimeSolution]:
