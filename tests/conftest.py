@@ -11,7 +11,7 @@ import alone  # noqa: F401 -- before NumPy
 import shipped
 from once import STORE
 from shipped import HEPTAGON, plan_of, problem_of
-from wholearm.benchmark.kernels import perturb_scenes
+from wholearm.benchmark.corpus import perturb_scenes
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mapping.formation_map import FormationMap

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import re
+from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -16,13 +17,12 @@ from shipped import FOLDER, HEPTAGON, SQUARE, problem_of, solved
 from tiny_study import allow, misbehave
 from wholearm import Finger, Friction, InputError, Polygon, Scene, TorqueProfile
 from wholearm.benchmark import STUDIES
-from wholearm.benchmark.corpus import compare
+from wholearm.benchmark.corpus import LARGEST, compare, perturb_scenes
+from wholearm.benchmark.corpus import STUDY as CORPUS
 from wholearm.benchmark.corpus_cases import FAMILIES, answer, list_cases
 from wholearm.benchmark.growth import SIZES, WORK, run_work
 from wholearm.benchmark.growth import STUDY as GROWTH
 from wholearm.benchmark.guard import BANDS, count, read_stored
-from wholearm.benchmark.kernels import LARGEST, Environment, perturb_scenes
-from wholearm.benchmark.kernels import STUDY as KERNELS
 from wholearm.benchmark.precision.planners import (
     LEAST_TIME,
     NO_DRAG,
@@ -479,39 +479,48 @@ def test_refusals_agree_in_kind_and_in_what_is_short() -> None:
 GOOD: dict[str, Any] = {"objective": "time", "value": 2.0, "modes": [["+"]], "replay": {"ok": True}}
 
 
-def test_answers_come_from_the_environment() -> None:
-    found = KERNELS.run((*Environment(seed=3), str(SQUARE), "time"))["answer"]
+@pytest.fixture
+def exact(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scenes have the numbers that they are given again at the end."""
+    for kind in (Polygon, Finger, Friction, Scene):
+        monkeypatch.setattr(kind, "__post_init__", kind.__post_init__)
+
+
+@pytest.mark.usefixtures("exact")
+def test_other_roundings_have_the_same_values(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(CORPUS, "rounding", 3)
+    found = CORPUS.run(("plan", "square", "time"))["answer"]
     assert found["value"] == pytest.approx(solved(SQUARE).value, rel=1e-6)
-    absent = KERNELS.run((*Environment(), "absent.toml", "time"))["answer"]
-    assert "absent.toml: cannot be read" in absent["refused"]
 
 
 def test_the_command_fails_where_answers_differ(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def answer_all(_: object, cases: list[Case], *__: object) -> list[tuple[Case, Row]]:
-        return [(case, {"answer": GOOD}) for case in cases]
+    def answer_all(_: object, cases: list[Case], *__: object) -> Iterator[tuple[Case, Row]]:
+        return ((case, {"answer": GOOD | {"durations": [2.0]}, "seconds": 1.0}) for case in cases)
 
     monkeypatch.setattr("wholearm.benchmark.study.run_all", answer_all)
-    stored, table = tmp_path / "answers.json", tmp_path / "table.md"
-    command = ["bench", "kernels", "a.toml", "--answers", str(stored), "--jobs", "1"]
+    stored = tmp_path / "answers.json"
+    command = ["bench", "corpus", "--only", "plan square *", "--answers", str(stored)]
+    command += ["-o", str(tmp_path), "--fresh"]
     assert main(command) == 2
     assert f"{stored}: cannot be read: " in capsys.readouterr().err
-    known = {f"plan a {goal}": GOOD for goal in ("time", "effort", "margin")}
+    known = {f"plan square {goal}": GOOD for goal in ("time", "effort", "margin")}
     stored.write_text(json.dumps(known), encoding="utf-8")
-    assert main([*command, "--seeds", "0", "1", "-o", str(table)]) == 0
-    text = table.read_text(encoding="utf-8")
-    assert text.count("| 3 | 3 | 0.0e+00 |") == 2 and ", seed 1 |" in text
-    stored.write_text(json.dumps(known | {"plan a time": GOOD | {"value": 1.0}}), encoding="utf-8")
-    capsys.readouterr()
     assert main(command) == 1
-    assert "plan a time: value: 2.0, stored 1.0, off by 1" in capsys.readouterr().out
+    assert "plan square time: durations: [2.0], stored null" in capsys.readouterr().out
+    assert main([*command, "--values"]) == 0
+    assert "| plan | 3 | 3 |" in capsys.readouterr().out
+    stored.write_text(
+        json.dumps(known | {"plan square time": GOOD | {"value": 1.0}}), encoding="utf-8"
+    )
+    assert main([*command, "--values"]) == 1
+    assert "plan square time: value: 2.0, stored 1.0, off by 1" in capsys.readouterr().out
 
 
-def test_numbers_change_in_the_last_bits_and_stay_so(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("exact")
+def test_numbers_change_in_the_last_bits_and_stay_so() -> None:
     exact = problem_of(SQUARE)
-    for kind in (Polygon, Finger, Friction, Scene):
-        monkeypatch.setattr(kind, "__post_init__", kind.__post_init__)
     perturb_scenes(2**20)
     once = read_problem(str(SQUARE))
     again = once.with_(name="again")

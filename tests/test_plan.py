@@ -210,7 +210,7 @@ def test_unknown_option(heptagon: Problem) -> None:
 FILES = sorted(FOLDER.glob("*.toml"))
 GOALS = ("time", "effort", "margin")
 LONG = ("heptagon_twice", "hexagon", "square", "triangle")
-"""Problems that `kernels` compares with their reference figures."""
+"""Problems whose plans the corpus has."""
 SLOW = [
     (name, objective)
     for name in ("heptagon", *LONG)
@@ -224,7 +224,7 @@ SLOW += [
 ]
 """Those that take long to plan and to look at; landings of the square for effort are left.
 
-`kernels` plans and verifies every problem and objective.
+`bench corpus` plans and verifies every problem and objective.
 """
 CASES = [
     (path, objective) for path in FILES for objective in GOALS if (path.stem, objective) not in SLOW

@@ -3,7 +3,6 @@
 STUDIES = {
     "corpus": (".corpus", "ask everything that is answered, and compare with stored answers"),
     "guard": (".guard", "count what plans take by other measures than time, against stored counts"),
-    "kernels": (".kernels", "plan under other roundings, and compare with stored answers"),
     "queries": (".queries", "ask for routes from pose to pose: how many are solved, and how fast"),
     "skip": (".skip", "measure what each part of the model costs that a scene has or has not"),
     "growth": (".growth", "measure how cost grows with intervals, phases and vertices"),

@@ -2,6 +2,9 @@
 
 Two answers agree if kinds, verdicts and contact modes are the same and numbers are within
 `TOLERANCES`. A better value of the objective is no difference, whatever else it changes.
+
+Numbers may be rounded differently: OpenBLAS has kernels for each processor, of which
+``OPENBLAS_CORETYPE`` chooses one, and `perturb_scenes` changes numbers in the last bits.
 """
 
 from __future__ import annotations
@@ -9,13 +12,21 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
+import random
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields
 from fnmatch import fnmatch
+from functools import cache
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..common.files import read_json, write_text
+from ..scene.model import Finger, Friction, Polygon, Scene
 from .corpus_cases import answer, list_cases
 from .study import Case, Row, Study, format_table, name_case
 
@@ -51,12 +62,22 @@ class Corpus(Study):
     name, title = "corpus", "Answers against stored ones"
     of_code, folder, shipped = True, "build", True
     stored = ("--answers", "results/corpus.json")
-    problems = Path("problems")
-    options = "--only PATTERN ...  cases whose names match, such as 'plan heptagon *' (all)\n"
+    problems, rounding = Path("problems"), 0
+    options = """\
+--only PATTERN ...  cases whose names match, such as 'plan heptagon *' (all)
+--values            compare values, verdicts and contact modes of plans, and nothing else of these,
+    as rounding may change what an optimum leaves open
+--rounding K        change all numbers of scenes in the last bits, drawn from K (0: none) = 0
+    in 0..1000000000
+"""
+
+    def stamp(self, options: argparse.Namespace) -> dict[str, Any]:
+        """How numbers are rounded."""
+        return {"kernel": os.environ.get("OPENBLAS_CORETYPE"), "rounding": options.rounding}
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
         """Those that are asked for."""
-        self.problems = Path(options.problems)
+        self.problems, self.rounding = Path(options.problems), options.rounding
         for case in list_cases():
             if any(fnmatch(" ".join(map(str, case)), own) for own in options.only or "*"):
                 yield case
@@ -71,6 +92,8 @@ class Corpus(Study):
 
     def run(self, case: Case) -> Row:
         """Ask."""
+        if self.rounding:
+            perturb_scenes(self.rounding)
         return {"answer": answer(case, self.problems)}
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
@@ -81,10 +104,11 @@ class Corpus(Study):
             names = {" ".join(map(str, case)) for case in list_cases()}
             _write(options.answers, {k: v for k, v in (known | found).items() if k in names})
         stored = _read(options.answers)
-        verdicts = {
-            name_case(row): compare(row["case"][0], row["answer"], stored.get(name_case(row)))
-            for row in rows
-        }
+        verdicts = {}
+        for row in rows:
+            pair = row["answer"], stored.get(name_case(row))
+            one, other = map(_reduce, pair) if options.values else pair
+            verdicts[name_case(row)] = compare(row["case"][0], one, other)
         kinds = ("same", "better", "other words", "differs")
         table = []
         for family in [*dict.fromkeys(row["case"][0] for row in rows), "all"]:
@@ -122,6 +146,14 @@ def compare(family: str, found: Any, stored: Any) -> tuple[str, list[str]]:
         return "same", []
     strong = [text for weak, text in texts if not weak]
     return ("differs", strong) if strong else ("other words", [text for _, text in texts])
+
+
+def _reduce(answer: Any) -> Any:
+    """Verdict, value and contact modes of a plan, or its refusal; other answers as they are."""
+    if not answer or not {"replay", "refused"} & answer.keys():
+        return answer
+    own = {key: answer[key] for key in ("refused", "objective", "value", "modes") if key in answer}
+    return own | {"replay": {"ok": answer.get("replay", {}).get("ok", False)}}
 
 
 def _allowed(family: str, key: str) -> float:
@@ -177,3 +209,54 @@ def _read(path: str) -> dict[str, Any]:
 def _write(path: str, answers: Mapping[str, Any]) -> None:
     lines = [f"{json.dumps(name)}: {json.dumps(own)}" for name, own in sorted(answers.items())]
     write_text(path, "{\n" + ",\n".join(lines) + "\n}\n")
+
+
+LARGEST = 4  # largest change of a number, in units of 2^-52 of it
+
+
+def perturb_scenes(seed: int) -> None:
+    """Multiply every number of each scene that is made from now on by 1 + k 2^-52, |k| <= 4.
+
+    k follows from the seed, the name of the number and its first 14 digits, to which the number
+    is rounded first. So a scene that is made again from its own numbers keeps them.
+    """
+    for kind in (Polygon, Finger, Friction, Scene):
+        _perturb(kind, seed)
+
+
+def _perturb(kind: Any, seed: int) -> None:
+    check = getattr(kind.__post_init__, "exact", kind.__post_init__)
+    names = [field.name for field in fields(kind) if field.init and field.name != "name"]
+
+    def check_and_perturb(self: Any) -> None:
+        # First as they were given: messages about bad numbers quote them.
+        given = [name for name in names if getattr(self, name) is not None]
+        left_out = set(names) - set(given)
+        check(self)
+        for name in left_out:
+            object.__setattr__(self, name, None)
+        for name in given:
+            label = f"{seed} {kind.__name__}.{getattr(self, 'name', '')}.{name}"
+            object.__setattr__(self, name, _change(getattr(self, name), label))
+        check(self)
+
+    check_and_perturb.exact = check  # type: ignore[attr-defined]
+    kind.__post_init__ = check_and_perturb
+
+
+def _change(value: Any, label: str) -> Any:
+    if isinstance(value, np.ndarray):
+        changed = [_change_number(float(v), f"{label}{i}") for i, v in np.ndenumerate(value)]
+        return np.array(changed).reshape(value.shape)
+    if isinstance(value, Real) and not isinstance(value, bool):
+        return _change_number(float(value), label)
+    return value
+
+
+@cache
+def _change_number(value: float, label: str) -> float:
+    if value == 0.0 or not np.isfinite(value):
+        return value
+    rounded = float(f"{value:.13e}")
+    k = random.Random(f"{label} {rounded!r}").randint(-LARGEST, LARGEST)
+    return rounded * (1 + k * 2.0**-52)
