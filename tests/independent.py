@@ -12,7 +12,7 @@ from scipy.optimize import linprog
 
 from plane import stack_rows
 from wholearm import Problem, TorqueProfile
-from wholearm.benchmark.precision.reference import evaluate_piece, find_piece, solve_motion
+from wholearm.benchmark.precision.simulators import solve_motion
 from wholearm.common.arrays import Array
 from wholearm.contacts.formation import Formation
 from wholearm.mechanics.dynamics import Directions
@@ -188,10 +188,10 @@ def integrate_phase(
     accuracy : float
         Relative and absolute, of each step.
     """
-    contacts, piece = problem.phases[index].formation.contacts, 0
+    contacts, own = problem.phases[index].formation.contacts, torque
 
     def forces(t: float, y: Array) -> tuple[Array, Array]:
-        tau = evaluate_piece(torque, piece, t)
+        tau = own.at(np.array([t]))[0]
         return solve_motion(problem.scene, contacts, y[:5], y[5:], tau, *directions)
 
     def derivative(t: float, y: Array) -> Array:
@@ -207,7 +207,7 @@ def integrate_phase(
     events, lost = [falls(k) for k in range(len(contacts))], None
     inner = torque.breaks[(torque.breaks > span[0]) & (torque.breaks < span[1])]
     for start, stop in pairwise([span[0], *inner.tolist(), span[1]]):
-        piece = find_piece(torque, (start + stop) / 2)
+        own = torque.cut(start, stop)
         run = solve_ivp(
             derivative, (start, stop), state, "DOP853", rtol=accuracy, atol=accuracy, events=events
         )

@@ -30,15 +30,16 @@ from wholearm.benchmark.precision.planners import (
     find_least_time,
     run_planner,
 )
-from wholearm.benchmark.precision.reference import Course, measure_error
 from wholearm.benchmark.precision.simulators import (
     FEW,
     SIMULATORS,
     SOLVED,
+    Course,
     Instance,
     check_plan,
     list_instances,
     make_course,
+    measure_error,
 )
 from wholearm.benchmark.skip import STUDY as SKIP
 from wholearm.benchmark.skip import SkipPair, list_pairs, spend

@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from itertools import pairwise
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from ...common.arrays import Array, Expression
 from ...contacts.formation import Formation
-from ...geometry.curve import Curve, Segment, directions_of
+from ...geometry.curve import directions_of
 from ...mechanics.dynamics import ONE, A, B, PathForces, build_force_rows, inverse
 from ...mechanics.limits import make_limits
 from ...mechanics.path_limits import PathLimits
@@ -27,10 +28,8 @@ from ...planning.path_domain.path_data import prepare
 from ...planning.path_domain.path_mesh import make_grid
 from ...planning.path_domain.path_nlp import LimitShape, build_path_nlp
 from ...planning.path_domain.path_plan import plan_path
-from ...planning.phase_plan import PhasePlan
 from ...planning.time_domain.time_plan import plan_phases
 from ...results.torque import TorqueProfile
-from ...results.trajectory import Samples
 from .simulators import (
     NO_PLAN,
     OPTIMUM,
@@ -49,15 +48,6 @@ LEAST_TIME, NO_DRAG = "least time", "least time without viscous friction"
 """Studies: all phases, and the same without viscous friction."""
 
 
-class PhaseStretch(NamedTuple):
-    """A stretch of a phase without a reversal, as peers plan it."""
-
-    part: Segment
-    share: float  # of the curve's length
-    target: float  # coordinate `progress` at its end
-    progress: int  # coordinate of the object that runs along the phase: x, or phi where it turns
-
-
 def build_plant(formation: Formation) -> Expression:
     """CasADi function (z, z', tau, c_n, Xi, sigma) -> (z'', A z'' + A' z')."""
     scene, n_c = formation.scene, formation.n_contacts
@@ -70,31 +60,6 @@ def build_plant(formation: Formation) -> Expression:
     acceleration = (applied + G.T @ c_n) / ca.DM(scene.mass_diagonal)
     missed = P @ acceleration + P_dot_v
     return ca.Function("plant", [z, v, tau, c_n, Xi, sigma], [acceleration, missed])
-
-
-def list_stretches(curve: Curve) -> list[PhaseStretch]:
-    """The stretches of a phase."""
-    ends = curve.evaluate(np.array([0.0, *(part.stop for part in curve.segments)])).z
-    progress = 2 if abs(ends[-1] - ends[0])[2] > 1e-6 else 0
-    return [
-        PhaseStretch(part, (part.stop - part.start) / curve.length, float(end[progress]), progress)
-        for part, end in zip(curve.segments, ends[1:], strict=True)
-    ]
-
-
-def sample_slow_motion(instance: Instance, counts: list[int]) -> list[tuple[Array, Samples]]:
-    """Times from its start and samples of each stretch of a slow motion, at so many instants.
-
-    It keeps all limits, with its internal force amid its range.
-    """
-    motion = make_slow_motion(instance, 5)
-    marks, stretches = find_reversals(motion), []
-    for start, stop, count in zip(marks, marks[1:], counts, strict=False):
-        # The ends of a stretch are evaluated within it.
-        t = np.linspace(start, stop, count)
-        inside = np.clip(t, start + 1e-9 * (stop - start), stop - 1e-9 * (stop - start))
-        stretches.append((t - start, motion.evaluate(inside)))
-    return stretches
 
 
 def run_planner(study: str, name: str, method: str, setting: str, files: tuple[str, ...]) -> Median:
@@ -133,7 +98,12 @@ def _build_on_curve(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
     build_path_nlp.cache_clear()
     data = prepare(curve, epsilon, make_grid(curve, np.zeros(0), 10), 1)
     build_path_nlp(LimitShape.of(data.limits), len(data.grid.steps), Objective.TIME)
-    return lambda: _convert(plan_path(curve, epsilon, options, 1))
+
+    def run() -> PeerPlan:
+        plan = plan_path(curve, epsilon, options, 1)
+        return PeerPlan(OPTIMUM, plan.motion.duration, plan.torque)
+
+    return run
 
 
 def _build_over_time(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
@@ -144,14 +114,9 @@ def _build_over_time(instance: Instance, setting: str) -> Callable[[], PeerPlan]
 
     def run() -> PeerPlan:
         (plan,) = plan_phases(problem, problem.phases, problem.start, options)
-        return _convert(plan)
+        return PeerPlan(OPTIMUM, plan.motion.duration, plan.torque)
 
     return run
-
-
-def _convert(plan: PhasePlan[Any]) -> PeerPlan:
-    """Our plan as those of peers are given."""
-    return PeerPlan(OPTIMUM, plan.motion.duration, plan.torque)
 
 
 def _limit(instance: Instance, s: Array, owner: NDArray[np.int64]) -> tuple[PathForces, PathLimits]:
@@ -255,35 +220,39 @@ def build_yapss(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
     """
     import yapss
 
-    curve, stretches = instance.curve, list_stretches(instance.curve)
-    counts = [max(4, round(int(setting) * stretch.share)) for stretch in stretches]
-    guesses = sample_slow_motion(instance, [2 * count + 1 for count in counts])
-    n_c, k = curve.formation.n_contacts, len(stretches)
+    curve, slow = instance.curve, make_slow_motion(instance, 5)
+    n_c, k = curve.formation.n_contacts, len(curve.segments)
+    s = np.array([0.0, *(part.stop for part in curve.segments)])
+    counts = [max(4, round(int(setting) * share)) for share in np.diff(s) / curve.length]
+    ends = curve.evaluate(s).z
+    # The coordinate that runs along the phase: x, or phi where the object turns.
+    progress = 2 if abs(ends[-1] - ends[0])[2] > 1e-6 else 0
     ocp = yapss.Problem(
         name="phase", nx=k * [10], nu=k * [2 + n_c], nh=k * [n_c], nq=k * [0], nd=11 * (k - 1)
     )
     _write_functions(ocp, instance)
     limit = curve.formation.scene.torque_limit
-    for index, (stretch, count) in enumerate(zip(stretches, counts, strict=True)):
+    marks = pairwise(find_reversals(slow))
+    for index, (count, (start, stop)) in enumerate(zip(counts, marks, strict=True)):
         bounds, guess = ocp.bounds.phase[index], ocp.guess.phase[index]
         bounds.control.lower[:] = [*-limit, *n_c * [instance.problem.epsilon]]
         bounds.control.upper[:2] = limit
         bounds.path.lower[:] = bounds.path.upper[:] = 0.0
         bounds.duration.lower = 1e-3
-        ends = bounds.final_state
-        ends.lower[stretch.progress] = ends.upper[stretch.progress] = stretch.target
-        t, slow = guesses[index]
-        before = sum(float(times[-1]) for times, _ in guesses[:index])
-        guess.time = t + before
-        guess.state = np.hstack([slow.z, slow.z_dot]).T
-        guess.control = np.hstack([slow.tau, slow.c_n]).T
+        last = bounds.final_state
+        last.lower[progress] = last.upper[progress] = ends[index + 1, progress]
+        guess.time = np.linspace(start, stop, 2 * count + 1)
+        # The ends of a stretch are evaluated within it.
+        inset = 1e-9 * (stop - start)
+        samples = slow.evaluate(np.clip(guess.time, start + inset, stop - inset))
+        guess.state = np.hstack([samples.z, samples.z_dot]).T
+        guess.control = np.hstack([samples.tau, samples.c_n]).T
         ocp.mesh.phase[index].collocation_points = count * [2]
         ocp.mesh.phase[index].fraction = count * [1 / count]
-    first, last = ocp.bounds.phase[0], ocp.bounds.phase[k - 1]
+    first, last = ocp.bounds.phase[0], ocp.bounds.phase[k - 1].final_state
     first.initial_time.lower = first.initial_time.upper = 0.0
     first.initial_state.lower[:] = first.initial_state.upper[:] = [*curve.start, *5 * [0.0]]
-    still = 5 + stretches[-1].progress
-    last.final_state.lower[still] = last.final_state.upper[still] = 0.0
+    last.lower[5 + progress] = last.upper[5 + progress] = 0.0
     ocp.bounds.discrete.lower[:] = ocp.bounds.discrete.upper[:] = 0.0
     ocp.derivatives.method, ocp.derivatives.order = "auto", "second"
     ocp.spectral_method = "lg"

@@ -1,8 +1,14 @@
-"""Phases that methods run on, their timing, simulators, and the replay that checks plans.
+"""Phases that methods run on, their timing, simulators, their reference, and the check of plans.
 
 Phases have one freedom, on four sliding contacts. All simulators but ours are told when directions
 reverse, from the reference, and are restarted there and where the torques step. Plans are replayed
 open loop from rest by the equations of the reference; lost contacts pull by what is measured.
+
+The reference solves the Newton-Euler equations of object and fingers, with contacts that are points
+with normals of rigid bodies (`verification.newton_euler`), together with the contact conditions as
+one linear system. Nothing is shared with the package's own contacts and dynamics; friction keeps
+the directions that it is given. They are integrated by SciPy's DOP853 from step to step of the
+torques, in double precision. Directions reverse where the sliding velocity vanishes.
 """
 
 from __future__ import annotations
@@ -15,14 +21,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from importlib.util import find_spec
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import casadi as ca
 import numpy as np
+from scipy.integrate import solve_ivp
 
-from ...common.arrays import Array, Expression
-from ...geometry.curve import Curve
+from ...common.arrays import Array
+from ...contacts.elemental import Contact
+from ...contacts.formation import Formation
+from ...geometry.curve import Curve, Segment
 from ...geometry.tracing import trace_phases
 from ...mechanics.dynamics import build_forward
 from ...planning.options import PlanOptions
@@ -34,8 +44,9 @@ from ...planning.path_domain.path_plan import plan_path
 from ...problem.definition import End, Problem
 from ...problem.read import read_problem
 from ...results.torque import TorqueProfile
+from ...scene.model import Scene
 from ...simulation.simulate import simulate
-from .reference import Course, Span, find_course, integrate, measure_error
+from ...verification.newton_euler import locate
 
 REPEATS = 3  # largest number of runs that a median is of
 BUDGET = 0.3  # time after which a run is not repeated any more [s]
@@ -192,6 +203,118 @@ def find_mean(seconds: Sequence[float]) -> float:
     return math.exp(math.fsum(logs) / len(logs)) - SHIFT
 
 
+def solve_motion(
+    scene: Scene,
+    contacts: Sequence[Contact],
+    z: Array,
+    z_dot: Array,
+    tau: Array,
+    Xi: Array,
+    sigma: Array,
+) -> tuple[Array, Array]:
+    """Accelerations z'', shape (5,), and c_n, shape (n_c,) [N], from one linear system.
+
+    The unknowns are those of Eqs. (1) and (2) with the friction of Eq. (3) put in, together with
+    the contact conditions differentiated twice: rates of their rows by complex steps.
+    """
+    tiny = 1e-30  # [s]
+    ahead = (z + 1j * tiny * z_dot)[None]
+    touches = [locate(scene, contact.name, ahead) for contact in contacts]
+    rows = np.array([touch.normal[0] for touch in touches])
+    slide = np.array([touch.friction * touch.tangent[0].real for touch in touches])
+    friction = scene.viscous * z_dot + scene.dry * np.append(np.zeros(3), sigma)
+    force = scene.applied_force + np.append(np.zeros(3), tau) - friction
+    count = len(rows)
+    matrix = np.zeros((5 + count, 5 + count))
+    matrix[range(5), range(5)] = scene.mass_diagonal
+    matrix[:5, 5:], matrix[5:, :5] = (Xi[:, None] * slide - rows.real).T, rows.real
+    solution = np.linalg.solve(matrix, np.append(force, -rows.imag @ z_dot / tiny))
+    return np.asarray(solution[:5]), np.asarray(solution[5:])
+
+
+class Span(NamedTuple):
+    """A stretch of time within one piece of the torques, without a reversal."""
+
+    start: float  # start, stop [s]:
+    stop: float
+    piece: int  # of the torques
+    Xi: Array  # Xi, sigma (n_c,) and (2,): directions of sliding and of the joints
+    sigma: Array
+
+
+class Course(NamedTuple):
+    """One phase with torques, and where it gets to."""
+
+    problem: Problem  # of that phase alone
+    torque: TorqueProfile
+    spans: tuple[Span, ...]
+    end: Array  # (10,): state (z, z') when the torques end
+    own_error: float  # of that state, relative to the scene
+
+
+def find_course(problem: Problem, torque: TorqueProfile, curve: Curve, reversals: int) -> Course:
+    """Integrate torques along a phase whose directions reverse so often."""
+    # The smallest tolerance that SciPy takes, and a larger one.
+    end, spans, _ = integrate(problem, torque, curve, reversals, 2.3e-14)
+    rough, *_ = integrate(problem, torque, curve, reversals, 2.3e-12)
+    return Course(problem, torque, spans, end, measure_error(problem, rough, end))
+
+
+def measure_error(problem: Problem, state: Array, exact: Array) -> float:
+    """Largest difference of two states (z, z'), relative to length and time of the scene."""
+    scales = problem.scene.scales
+    unit = np.array([scales.length, scales.length, 1.0, 1.0, 1.0])
+    return float(np.abs((state - exact) / np.append(unit, unit / scales.time)).max())
+
+
+def integrate(
+    problem: Problem, torque: TorqueProfile, curve: Curve, reversals: int, tolerance: float
+) -> tuple[Array, tuple[Span, ...], float]:
+    """State at the end of torques, the stretches on the way there, and the least c_n of all steps.
+
+    Contacts stay closed: those that are lost pull.
+    """
+    contacts, parts = problem.phases[0].formation.contacts, [*curve.segments[: reversals + 1]]
+    y, spans, least = np.append(problem.start, np.zeros(5)), list[Span](), np.inf
+    for piece, (t, stop) in enumerate(pairwise(torque.breaks)):
+        own = torque.cut(t, stop)
+        while t < stop:
+            part = parts[0]
+
+            def solve(
+                t: float, y: Array, part: Segment = part, own: TorqueProfile = own
+            ) -> tuple[Array, Array]:
+                tau = own.at(np.array([t]))[0]
+                return solve_motion(problem.scene, contacts, y[:5], y[5:], tau, part.Xi, part.sigma)
+
+            def rates(t: float, y: Array, solve: Any = solve) -> Array:
+                return np.concatenate([y[5:], solve(t, y)[0]])
+
+            events = [_find_reversal(curve.formation, *parts[:2])] if len(parts) > 1 else []
+            options: dict[str, Any] = {"rtol": tolerance, "atol": tolerance, "events": events}
+            run = solve_ivp(rates, (t, stop), y, "DOP853", **options)
+            least = min([least, *(solve(*at)[1].min() for at in zip(run.t, run.y.T, strict=True))])
+            start, t, y = t, float(run.t[-1]), run.y[:, -1]
+            spans.append(Span(start, t, piece, part.Xi, part.sigma))
+            parts = parts[1:] if run.status == 1 else parts
+    return y, tuple(spans), float(least)
+
+
+def _find_reversal(formation: Formation, before: Segment, after: Segment) -> Any:
+    """Event at which the rate vanishes whose direction differs in two segments."""
+    directions = np.append(before.Xi, before.sigma)
+    row = int(np.flatnonzero(directions * np.append(after.Xi, after.sigma) < 0)[0])
+
+    def rate(_: float, y: Array) -> float:
+        if row >= len(before.Xi):
+            return float(y[8 + row - len(before.Xi)])
+        touch = locate(formation.scene, formation.contacts[row].name, y[None, :5])
+        return float(touch.tangent[0] @ y[5:])
+
+    rate.terminal, rate.direction = True, -directions[row]  # type: ignore[attr-defined]
+    return rate
+
+
 FEW, MANY = "simulation, few pieces", "simulation, many pieces"
 """Studies: torques in a few long pieces, and planned torques in eighty."""
 TOLERANCES = {
@@ -216,46 +339,29 @@ def build_own(course: Course, setting: str) -> Runner:
     return run
 
 
-def write_rates(course: Course) -> tuple[Any, ...]:
-    """Symbols t, y and p, the numbers of `pack_span`, and the right-hand side."""
-    formation = course.problem.phases[0].formation
-    n_c, terms = formation.n_contacts, course.torque.coefficients.shape[2]
-    t, y = ca.SX.sym("t"), ca.SX.sym("y", 10)
-    Xi, sigma = ca.SX.sym("Xi", n_c), ca.SX.sym("sigma", 2)
-    flat, piece = ca.SX.sym("flat", 2 * terms), ca.SX.sym("piece", 2)
-    p = ca.vertcat(Xi, sigma, flat, piece)
-    x = (2 * t - piece[0] - piece[1]) / (piece[1] - piece[0])
-    # Coefficients come column by column.
-    powers = ca.reshape(flat, 2, -1)[:, ::-1]
-    tau = ca.vertcat(*(ca.polyval(powers[k, :].T, x) for k in range(2)))
-    found = build_forward(formation)(y[:5], y[5:], tau, Xi, sigma)
-    return t, y, p, ca.vertcat(y[5:], found[0])
-
-
-def pack_span(course: Course, span: Span) -> Array:
-    """Parameters of the right-hand side on a stretch."""
-    coefficients = course.torque.coefficients[span.piece]
-    ends = course.torque.breaks[span.piece : span.piece + 2]
-    return np.concatenate([span.Xi, span.sigma, coefficients.ravel("F"), ends])
-
-
-def pack_course(course: Course) -> tuple[Expression, Expression]:
-    """State at the start, and a column of parameters, with both ends, for each stretch."""
-    columns = [[*pack_span(course, span), span.start, span.stop] for span in course.spans]
-    return ca.DM(np.append(course.problem.start, np.zeros(5))), ca.DM(np.array(columns).T)
-
-
 def build_cvodes(course: Course, setting: str) -> Runner:
     """CasADi's interface to cvodes; all stretches are one call, by `mapaccum`."""
-    tolerance, (t, y, p, ode) = float(setting), write_rates(course)
-    ends, x = ca.SX.sym("ends", 2), ca.SX.sym("x")
-    half, now = (ends[1] - ends[0]) / 2, (ends[0] + ends[1] + x * (ends[1] - ends[0])) / 2
-    system = {"x": y, "t": x, "p": ca.vertcat(p, ends), "ode": half * ca.substitute(ode, t, now)}
+    tolerance, torque = float(setting), course.torque
+    formation = course.problem.phases[0].formation
+    n_c, terms = formation.n_contacts, torque.coefficients.shape[2]
+    x, y, Xi, sigma = (ca.SX.sym(name, n) for name, n in zip("xyXs", (1, 10, n_c, 2), strict=True))
+    flat, piece, ends = ca.SX.sym("flat", 2 * terms), ca.SX.sym("piece", 2), ca.SX.sym("ends", 2)
+    half, t = (ends[1] - ends[0]) / 2, (ends[0] + ends[1] + x * (ends[1] - ends[0])) / 2
+    place = (2 * t - piece[0] - piece[1]) / (piece[1] - piece[0])
+    # Coefficients come column by column.
+    powers = ca.reshape(flat, 2, -1)[:, ::-1]
+    tau = ca.vertcat(*(ca.polyval(powers[k, :].T, place) for k in range(2)))
+    rates = ca.vertcat(y[5:], build_forward(formation)(y[:5], y[5:], tau, Xi, sigma)[0])
+    system = {"x": y, "t": x, "p": ca.vertcat(Xi, sigma, flat, piece, ends), "ode": half * rates}
     options: dict[str, Any] = {"abstol": tolerance, "reltol": tolerance, "max_num_steps": 100000}
     options |= {"linear_multistep_method": "adams", "nonlinear_solver_iteration": "functional"}
     step = ca.integrator("step", "cvodes", system, -1.0, 1.0, options)
     chain = step.mapaccum(len(course.spans))
-    start, parameters = pack_course(course)
+    columns = []
+    for own in course.spans:
+        known = torque.coefficients[own.piece].ravel("F"), torque.breaks[own.piece : own.piece + 2]
+        columns.append(np.concatenate([own.Xi, own.sigma, *known, [own.start, own.stop]]))
+    start, parameters = np.append(course.problem.start, np.zeros(5)), np.array(columns).T
 
     def run() -> Array:
         states = chain(x0=start, p=parameters)["xf"]
