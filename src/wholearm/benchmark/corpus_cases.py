@@ -264,7 +264,7 @@ def _read_table(table: Any) -> Problem:
 
 def _leg(folder: Path, number: int, objective: str) -> Row:
     leg = draw_leg(SEED, number, folder)
-    return {"refused": "no route"} if leg is None else _solve(leg.problem, objective=objective)
+    return {"refused": "no route"} if leg is None else _solve(leg[0], objective=objective)
 
 
 def _simulate_free(folder: Path, name: str) -> Row:
@@ -445,8 +445,8 @@ def _list(folder: Path, number: int) -> Row:
     if leg is None:
         return {"refused": "no route"}
     return {
-        "route": [" ".join(own["contacts"]) for own in leg.problem.table["phases"]],
-        "places": [list(stop) for stop in leg.stops],
+        "route": [" ".join(own["contacts"]) for own in leg[0].table["phases"]],
+        "places": [list(stop) for stop in leg[1]],
     }
 
 

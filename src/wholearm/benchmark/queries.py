@@ -16,7 +16,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -190,26 +190,15 @@ def _draw_pose(rng: np.random.Generator, table: Table) -> dict[str, float]:
         return {"flush": edge, "x": x}
 
 
-Stops = list[tuple[float, float]]
+def draw_leg(
+    seed: int, number: int, folder: Path
+) -> tuple[Problem, list[tuple[float, float]]] | None:
+    """Draw a leg of a shipped scene: a slide, and one to three cells; and where its phases stop.
 
-
-class QueryLeg(NamedTuple):
-    """A leg as a problem."""
-
-    name: str  # of the scene
-    problem: Problem
-    stops: Stops  # where its phases stop, (x, phi) [m, rad]
-
-
-def draw_leg(seed: int, number: int, folder: Path) -> QueryLeg | None:
-    """Draw a leg of a shipped scene: a slide, and one to three cells.
-
-    None if no route of 200 can be listed.
+    Stops are (x, phi) [m, rad]. None if no route of 200 can be listed.
     """
     rng = np.random.default_rng([seed, number])
-    name = SHIPPED[number % len(SHIPPED)]
-    table: Table = dict(read_problem(str(folder / f"{name}.toml")).table)
-    base = build_problem(table)
+    base = read_problem(str(folder / f"{SHIPPED[number % len(SHIPPED)]}.toml"))
     size, (x0, phi0) = base.scene.scales.length, base.start[[0, 2]].tolist()
     for _ in range(200):
         x, phi = x0 - size * rng.uniform(0.1, 2.5), phi0
@@ -220,13 +209,12 @@ def draw_leg(seed: int, number: int, folder: Path) -> QueryLeg | None:
         try:
             route = list_formations(base, *poses)
             phases = tomllib.loads(format_route(route))["phases"]
-            problem = build_problem({**table, "phases": phases})
+            problem = build_problem({**base.table, "phases": phases})
         except InputError:
             continue
         # Ends are the planner's to choose: what a refusal says holds for all places.
         open_ends = (replace(own, until=replace(own.until, pins=())) for own in problem.phases)
         problem = replace(problem, phases=tuple(open_ends))
         if any(phase.formation.n_constraints == 3 for phase in problem.phases):
-            stops = [(float(part.stop[0]), float(part.stop[1])) for part in route]
-            return QueryLeg(name, problem, stops)
+            return problem, [(float(part.stop[0]), float(part.stop[1])) for part in route]
     return None

@@ -17,12 +17,12 @@ import tempfile
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, NamedTuple
+from typing import IO, TYPE_CHECKING, Any
 
 from .. import __version__
 from ..common.crowd import Processes, run_all
@@ -42,14 +42,6 @@ Added are `case`, the `seconds` of processor time, and `memory`, by which it has
 its process [MB].
 """
 PACKAGES = ("casadi", "numpy", "scipy")
-
-
-class StudyReport(NamedTuple):
-    """What a study has found: its text, what must not be, and the files it has written."""
-
-    text: str
-    findings: list[str]
-    written: list[str]
 
 
 class Study:
@@ -140,8 +132,11 @@ def name_case(row: Row) -> str:
 
 def run_study(
     study: Study, options: argparse.Namespace, progress: Callable[[str], None] = lambda text: None
-) -> StudyReport:
-    """Run a study, or what is left of it, and write its table."""
+) -> tuple[str, list[str], list[str]]:
+    """Run a study, or what is left of it, and write its table.
+
+    Returns its text, what must not be, and the files it has written.
+    """
     cases = list(dict.fromkeys(study.list_cases(options)))
     stem, path, stamp, fresh, again = "", os.devnull, dict[str, Any](), False, False
     if study.keeps:
@@ -158,7 +153,14 @@ def run_study(
         done = {_key(row["case"]): row for row in journal.records}
         left = [case for case in cases if case not in done]
         begun, wrong = time.monotonic(), 0
-        for count, (case, row) in enumerate(_run(study, left, options), start=1):
+        # Each process has one thread of OpenBLAS.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+        jobs = min(1 if study.timed else options.jobs or os.cpu_count() or 1, len(left) or 1)
+        pool = Processes(jobs, study.limit, study.alone)
+        answers = run_all(partial(measure_case, study), left, pool, jobs)
+        for count, (case, answer) in enumerate(answers, start=1):
+            row = _fail(str(answer)) if isinstance(answer, Exception) else answer
+            row = {"case": list(case), **row}
             journal.add(row)
             done[case] = row
             wrong += bool(row.get("findings"))
@@ -174,7 +176,7 @@ def run_study(
         parts.append("\n".join(["## Findings", "", *(f"* {text}" for text in findings)]))
     text = "\n\n".join(parts) + "\n"
     if not study.keeps:
-        return StudyReport(text, findings, [])
+        return text, findings, []
     written = [f"{stem}.md"]
     with together():
         write_text(written[0], text)
@@ -193,7 +195,7 @@ def run_study(
 
             written.append(f"{stem}.png")
             save(figure, written[-1])
-    return StudyReport(text, findings, written)
+    return text, findings, written
 
 
 def describe_machine(packages: Sequence[str] = ()) -> str:
@@ -233,20 +235,6 @@ def digest_source(inputs: Iterable[Path] = ()) -> str:
     for path in inputs:
         found.update(path.name.encode() + path.read_bytes())
     return found.hexdigest()[:16]
-
-
-def _run(
-    study: Study, cases: Sequence[Case], options: argparse.Namespace
-) -> Iterator[tuple[Case, Row]]:
-    """Cases with their rows, as they end."""
-    # Each process has one thread of OpenBLAS.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    jobs = 1 if study.timed else options.jobs or os.cpu_count() or 1
-    jobs = min(jobs, len(cases) or 1)
-    run = partial(measure_case, study)
-    for case, answer in run_all(run, cases, Processes(jobs, study.limit, study.alone), jobs):
-        row = _fail(str(answer)) if isinstance(answer, Exception) else answer
-        yield case, {"case": list(case), **row}
 
 
 def measure_case(study: Study, case: Case) -> Row:

@@ -931,9 +931,9 @@ def _list_studies(options: argparse.Namespace) -> int:
 def _run_study(study: Study, options: argparse.Namespace) -> int:
     from ..benchmark.study import run_study
 
-    found = run_study(study, options, show_progress())
+    text, findings, written = run_study(study, options, show_progress())
     clear_progress()
-    print(found.text, end="")
-    for path in found.written:
+    print(text, end="")
+    for path in written:
         print(f"wrote {path}")
-    return 1 if found.findings else 0
+    return 1 if findings else 0

@@ -130,9 +130,13 @@ def _judge_cell(problem: Problem, phase: Phase, z: Array, stop: tuple[float, flo
     ends = list_ends(scene, phase, z, stop)
     if not len(ends):
         return Verdict("open", f"{at}: no place of its end was found")
-    stopped = best_end(scene, phase, epsilon, ends)
-    if stopped < -CLEAR:
-        reason = f"{at}: no motion comes to rest at any of {len(ends)} places, {stopped:.3g}"
+    stopped = [-np.inf]
+    for end in ends:
+        stopped.append(rest_margin(scene, phase, epsilon, end, ends=True))
+        if stopped[-1] > 0:
+            break
+    if max(stopped) < -CLEAR:
+        reason = f"{at}: no motion comes to rest at any of {len(ends)} places, {max(stopped):.3g}"
         return Verdict("confirmed", reason)
     best = find_best(scene, phase, epsilon, z, ends)
     text = f"{at}: of {best.curves} curves to {best.ends} places the best has {best.margin:.3g}"
@@ -237,16 +241,6 @@ def find_best(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: Array)
         return Best(-np.inf, -np.inf, z[None], 0, len(ends))
     best.sort(key=lambda one: -one[0])
     return Best(best[0][0], max(one[1] for one in best), best[0][3], count, len(ends))
-
-
-def best_end(scene: Scene, phase: Phase, epsilon: float, ends: Array) -> float:
-    """Best margin of a motion that comes to rest at one of `ends`; the first one that may."""
-    best = -np.inf
-    for z in ends:
-        best = max(best, rest_margin(scene, phase, epsilon, z, ends=True))
-        if best > 0:
-            break
-    return best
 
 
 def bend(scene: Scene, phase: Phase, z: Array, controls: Array) -> Array:
