@@ -209,6 +209,16 @@ def takes_over(contact: Contact, scene: Scene, held: Sequence[Contact]) -> bool:
     return any(limit.gained == contact for own in held for limit in build_limits(own, scene))
 
 
+def list_renamed(
+    scene: Scene, before: Sequence[Contact], after: Sequence[Contact]
+) -> dict[Contact, Contact]:
+    """Contacts that go on as those of a neighbouring feature, which their normals agree with."""
+    lost, new = (
+        [c for c in own if c not in other] for own, other in ((before, after), (after, before))
+    )
+    return {old: c for old in lost for c in new if takes_over(c, scene, [old])}
+
+
 def build_clearance(contact: Contact, scene: Scene, touching: bool) -> GapLimit:
     """Limit at which `contact`, not in the formation, is gained; gaps beyond ends do not count.
 

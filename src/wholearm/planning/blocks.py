@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
@@ -34,6 +34,7 @@ from ..solvers.ipopt import charge
 from .lower_bound import look_along
 from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence, make_sequence, plan_sequence, plan_slowly
+from .path_domain.path_motion import PathMotion
 from .phase_plan import PhasePlan, Settled, add_up
 from .stops import Plans, end_of, runs_along_curves, split_blocks
 
@@ -284,10 +285,12 @@ def plan_block(
     if not runs_along_curves(block, options):
         from .time_domain.time_plan import plan_with_impacts
 
+        along = partial(plan_along, planning, block, z, options, allowed)
+
         def plan(duration: float | None) -> Plans:
             pinned = block[-1].index + 1 < len(problem.phases)
             return plan_with_impacts(
-                problem, block, z, options, duration, pinned=pinned, **over_time
+                problem, block, z, options, duration, pinned=pinned, along=along, **over_time
             )
 
         def plan_other(other: Planning, phases: Sequence[Phase], own: PlanOptions) -> Plans:
@@ -319,6 +322,27 @@ def plan_block(
         with charge(part.phases[0].number):
             plans += plan_sequence(part, problem.epsilon, options, add_up(part.phases, allowed))
     return plans, chain
+
+
+def plan_along(
+    planning: Planning,
+    block: Sequence[Phase],
+    z: Array,
+    options: PlanOptions,
+    allowed: Sequence[float | None],
+) -> list[PathMotion]:
+    """Motions of a block along its curves with free torques, if it has some: an initial guess."""
+    problem, own = free_torques(planning.problem, replace(options, transcription="auto"))
+    phases = [problem.phases[phase.index] for phase in block]
+    if not runs_along_curves(phases, own):
+        return []
+    own = replace(own, accuracy=max(own.accuracy, ROUGH))
+    try:
+        free = replace(planning, problem=problem, curves=())
+        plans, _ = plan_block(free, phases, z, own, allowed)
+    except WholearmError:
+        return []
+    return [plan.motion for plan in plans if isinstance(plan.motion, PathMotion)]
 
 
 def _require_margin(planning: Planning) -> Planning:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ...common.arrays import Array
 from ...common.errors import SolverError
 from ...geometry.curve import Curve, directions_of
-from ...mechanics.dynamics import inverse, split_forces
+from ...mechanics.dynamics import Directions, inverse, split_forces
 from ...results.torque import TorqueProfile
 from ...results.trajectory import Samples
 from .elements import DEGREE, Elements, Grid, Profile
@@ -148,6 +148,19 @@ class PathMotion:
         here, _ = self.elements.evaluate(k, y)
         s = self.grid.s[k] + done * self.grid.steps[k]
         return s, self.grid.segment[k], here
+
+    @property
+    def spans(self) -> list[tuple[float, float, Directions]]:
+        """Start and end [s] of each part with the same sliding directions, and these."""
+        k = self.grid.nonempty
+        changes = np.flatnonzero(np.diff(self.grid.segment[k], prepend=-1))
+        edges = [*self.times[k[changes]].tolist(), self.duration]
+        segments = self.grid.segment[k[changes]]
+        signs = (
+            Directions(*(part[0] for part in directions_of(self.curve, segments[j : j + 1])))
+            for j in range(len(segments))
+        )
+        return list(zip(edges, edges[1:], signs, strict=False))
 
     def evaluate(self, t: Array) -> Samples:
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""

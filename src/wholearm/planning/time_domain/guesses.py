@@ -18,6 +18,7 @@ import numpy as np
 
 from ...common.arrays import Array
 from ...common.errors import InputError
+from ...contacts.contact_limits import list_renamed
 from ...contacts.elemental import Contact
 from ...contacts.formation import Formation
 from ...geometry.arcs import CostToGo
@@ -27,14 +28,17 @@ from ...geometry.path_guess import PathGuess, connect, find_end, guess_phase, li
 from ...mechanics.dynamics import Directions, force_rows, metric_weights
 from ...mechanics.limits import SPEED, make_limits
 from ...problem.definition import End, Phase, Problem
+from ...results.trajectory import Samples
+from ..path_domain.path_motion import PathMotion
 from .collocation import Scheme
 from .mode_search import LEAST_INTERVALS, StageMode, can_roll, divide, in_mode, link, merge, mode_of
 from .search import TimeSearch, TimeSolution
-from .stage import Stage, StagePoints, in_own_units, resample, scale_state
+from .stage import Stage, StagePoints, in_own_units, resample, scale_state, unit_lengths
 
 NEAREST = "a motion to the nearest end of the phase"
 STRAIGHT = "a motion straight to the end"
 GIVEN = "the contact modes that the problem gives"
+ALONG = "the plan along curves"
 OTHER = "a motion straight to another end"
 GRADUAL = " with friction that sets in gradually"  # suffix of names where modes are found so
 LONGER = "{}, {:g} times as long as a fall over that height"
@@ -144,6 +148,49 @@ class Guesses:
                 t.append(start + mode.t)
                 z.append(closed)
         return np.array(t), np.array(z)
+
+    def along(self, motions: Sequence[PathMotion]) -> Guess:
+        """Along known motions of the phases on their curves."""
+        scales, scheme = self.problem.scene.scales, self.search.scheme
+        lengths, unit = unit_lengths(scales), scales.time
+        stages = list[Stage]()
+        for stage, motion in zip(join_modes(self.nearest.stages), motions, strict=True):
+            parts = list[tuple[StagePoints, StageMode]]()
+            for start, stop, directions in motion.spans:
+                count = round((stop - start) / motion.duration * stage.intervals)
+                count = max(LEAST_INTERVALS, count)
+                breaks = np.linspace(0.0, 1.0, count + 1)
+                at = breaks[:-1, None] + scheme.points / count
+
+                def sample(
+                    share: Array,
+                    motion: PathMotion = motion,
+                    start: float = start,
+                    span: float = stop - start,
+                ) -> Samples:
+                    return motion.evaluate(start + share.ravel() * span)
+
+                points, ends = sample(at), sample(breaks)
+                shape = (count, len(scheme.points), -1)
+                controls = breaks[:-1, None] + np.linspace(0.0, 1.0, scheme.controls) / count
+                rolling = list(stage.formation.rolling_rows)
+                c = np.hstack([points.c_n, points.c_t[:, rolling]])
+                part = StagePoints(
+                    (stop - start) / unit,
+                    np.full(count, 1 / count),
+                    np.stack([ends.z / lengths, ends.z_dot * (unit / lengths)], axis=1),
+                    (points.z / lengths).reshape(shape),
+                    (points.z_dot * (unit / lengths)).reshape(shape),
+                    (points.z_ddot * (unit**2 / lengths)).reshape(shape),
+                    (c / scales.force).reshape(shape),
+                    (sample(controls).tau / scales.torque).reshape(count, -1, 2),
+                    stage.guess.impulses,
+                )
+                signs = np.concatenate(directions)
+                signs[rolling] = 0.0
+                parts.append((part, StageMode(tuple(signs.tolist()))))
+            stages += divide(stage, parts)
+        return Guess(ALONG, self._leave_room(link(stages)))
 
     def straight(self, goal: Array) -> Guess | None:
         """Straight to an end of a single phase with two freedoms, in the modes of that path."""
@@ -576,7 +623,13 @@ def guess_stages(
         opens = k > 0 and parts[k - 1][0] is not phase
         if opens:
             touching = np.abs(phase.formation.evaluate_limits(outline.z[:1])[0]) < _TOUCHES
-            released = tuple(np.flatnonzero(touching).tolist())
+            before = parts[k - 1][1].formation.contacts
+            renamed = list_renamed(problem.scene, before, phase.formation.contacts)
+            released = tuple(
+                row
+                for row in np.flatnonzero(touching).tolist()
+                if phase.formation.limits[row].gained not in renamed
+            )
         stages.append(
             Stage(
                 phase.index,

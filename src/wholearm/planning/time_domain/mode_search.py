@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
+from ...contacts.contact_limits import list_renamed
 from ...contacts.elemental import Contact
 from ...contacts.formation import Formation
 from ...geometry.curve import find_tied
@@ -109,7 +110,10 @@ def find_turns(stage: Stage, coming: Stage) -> tuple[int, ...]:
 def find_passing(stage: Stage, coming: Stage) -> tuple[tuple[int, float], ...]:
     """`Stage.fading`: contacts that the next stage releases, with 0, or lets slide, with a sign."""
     formation, passing = stage.formation, list[tuple[int, float]]()
+    renamed = list_renamed(formation.scene, formation.contacts, coming.formation.contacts)
     for k, contact in enumerate(formation.contacts):
+        if contact in renamed:
+            continue
         if contact not in coming.formation.contacts:
             passing.append((k, 0.0))
         elif contact in formation.rolling and contact not in coming.formation.rolling:
@@ -120,8 +124,9 @@ def find_passing(stage: Stage, coming: Stage) -> tuple[tuple[int, float], ...]:
 
 def find_fresh(stage: Stage, coming: Stage) -> tuple[int, ...]:
     """Contacts of the coming stage that a stage does not have."""
-    known = stage.formation.contacts
-    return tuple(k for k, c in enumerate(coming.formation.contacts) if c not in known)
+    known, fresh = stage.formation.contacts, coming.formation.contacts
+    renamed = list_renamed(stage.formation.scene, known, fresh).values()
+    return tuple(k for k, c in enumerate(fresh) if c not in known and c not in renamed)
 
 
 def divide(stage: Stage, parts: Sequence[tuple[StagePoints, StageMode]]) -> list[Stage]:

@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 
 from ...common.arrays import Array, Expression
 from ...common.errors import Parameter
-from ...contacts.contact_limits import build_limits
+from ...contacts.contact_limits import build_limits, list_renamed
 from ...contacts.elemental import Contact, build_features, build_gap
 from ...contacts.formation import Formation
 from ...geometry.curve import find_tied, tangent_basis
@@ -972,8 +972,13 @@ def goal_kernel(
 
 
 def new_rows(formation: Formation, following: Formation) -> list[int]:
-    """Constraint rows of a formation that the one before does not have."""
-    fresh = [i for i, c in enumerate(following.contacts) if c not in formation.contacts]
+    """Constraint rows of a formation that the one before does not have.
+
+    A contact that goes on as that of a neighbouring feature has the same row.
+    """
+    renamed = list_renamed(formation.scene, formation.contacts, following.contacts).values()
+    known = {*formation.contacts, *renamed}
+    fresh = [i for i, c in enumerate(following.contacts) if c not in known]
     rolling = [following.contacts[row] for row in following.rolling_rows]
     n_c = following.n_contacts
     return fresh + [n_c + i for i, c in enumerate(rolling) if c not in formation.rolling]

@@ -27,6 +27,7 @@ from ...problem.definition import ROWS, End, Phase, Problem
 from ...results.trajectory import Motion
 from ..options import Objective, PlanOptions
 from ..path_domain.impact_sequence import PER_SPEED, BlockImpact
+from ..path_domain.path_motion import PathMotion
 from ..phase_plan import PhasePlan
 from ..stops import PlanPart, Plans, end_of, plan_stops
 from .guesses import GIVEN, NEAREST, Guess, Guesses, find_modes
@@ -76,6 +77,7 @@ def plan_phases(
     fastest: Sequence[PhasePlan[Motion]] = (),
     pinned: bool = False,
     begun: Sequence[PhasePlan[Motion]] = (),
+    along: Callable[[], list[PathMotion]] = list,
     only_begin: bool = False,
     explained: bool = True,
     patient: bool = True,
@@ -91,6 +93,7 @@ def plan_phases(
     fastest           time-optimal plans from `z`, as guess and fallback for `margin`
     pinned            whether the motion ends where these do
     begun             coarse plans (`only_begin`) from nearly the same `z`, to start from
+    along             gives motions along the curves of the phases, if there are some
     only_begin        whether to find modes on few intervals alone, without limits between points
     explained         whether to look for a change of the problem that makes a plan possible
     patient           whether to try other guesses than the first one
@@ -115,6 +118,8 @@ def plan_phases(
     explanation = replan if explained else None
     if found is None and guesses.given:
         found = solve_guesses(search, [guesses.given])
+    if found is None and (motions := along()):
+        found = solve_guesses(search, [guesses.along(motions)])
     if found is None:
         listed = iter([guesses.nearest])
         if patient:
@@ -455,6 +460,7 @@ def plan_with_impacts(
     fastest: Plans | None = None,
     pinned: bool = False,
     begun: Plans | None = None,
+    along: Callable[[], list[PathMotion]] = list,
     only_begin: bool = False,
 ) -> Plans:
     """Plan a block with the impacts that are possible, or else with stops.
@@ -464,7 +470,7 @@ def plan_with_impacts(
     ends = _find_impacts(block)
     if not ends:
         plan = partial(plan_phases, to_go=to_go, ample=ample, pinned=pinned, only_begin=only_begin)
-        plan = partial(plan, fastest=fastest or (), begun=begun or ())
+        plan = partial(plan, fastest=fastest or (), begun=begun or (), along=along)
         return [*plan(problem, block, z, options, duration)]
     explained = plan_parts_of(problem, block, ample, explained=True)
     if duration is not None and fastest and all(_is_stop(problem, fastest[k - 1]) for k in ends):
