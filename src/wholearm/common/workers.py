@@ -22,7 +22,7 @@ from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext, SpawnProcess
 from multiprocessing.process import BaseProcess
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from .signals import WATCHER
 
@@ -74,11 +74,6 @@ def can_fork() -> bool:
     )
 
 
-class _Child(NamedTuple):
-    process: BaseProcess
-    answers: Connection
-
-
 def _share(
     tasks: Sequence[Task[_T]], count: int, numbers: dict[int, int], known: Sequence[object]
 ) -> list[_T]:
@@ -86,28 +81,30 @@ def _share(
     source, sink = os.pipe()
     os.write(sink, b"".join(k.to_bytes(2, "big") for k in range(len(tasks))))
     os.close(sink)
-    children = list[_Child]()
+    children = list[tuple[BaseProcess, Connection]]()
     try:
         for _ in range(count):
             children.append(_start(tasks, source, numbers))
         results = _take(tasks, source)
-        for child in children:
+        for _, answers in children:
             # A child that was ended, or met an error, sends nothing.
             with suppress(EOFError, OSError):
-                answer = io.BytesIO(child.answers.recv_bytes())
+                answer = io.BytesIO(answers.recv_bytes())
                 results |= _Unpickler(answer, known).load()
         return [results[k] if k in results else task() for k, task in enumerate(tasks)]
     finally:
         os.close(source)
-        for child in children:
-            child.process.kill()
-            child.process.join()
-            child.process.close()
-            child.answers.close()
+        for process, answers in children:
+            process.kill()
+            process.join()
+            process.close()
+            answers.close()
 
 
-def _start(tasks: Sequence[Task[Any]], source: int, numbers: dict[int, int]) -> _Child:
-    """Fork a child that takes tasks."""
+def _start(
+    tasks: Sequence[Task[Any]], source: int, numbers: dict[int, int]
+) -> tuple[BaseProcess, Connection]:
+    """Fork a child that takes tasks, and sends its answers."""
     context = mp.get_context("fork")
     answers, far = context.Pipe(duplex=False)
     given = tasks, source, (answers, far), numbers, os.getpid()
@@ -120,7 +117,7 @@ def _start(tasks: Sequence[Task[Any]], source: int, numbers: dict[int, int]) -> 
             process.start()
     finally:
         far.close()
-    return _Child(process, answers)
+    return process, answers
 
 
 @contextmanager

@@ -247,7 +247,10 @@ def replay_in(
     plan = find_between(plan)
     torque, stretches = apply_friction(problem.scene, plan), list_stretches(plan, whole)
     levels = []
-    for level in list_settings(setting, halvings):
+    # Finer settings, and finer steps alone, with contacts as they are at first.
+    finer = [setting._replace(step=setting.step / 2**k) for k in range(halvings + 1)]
+    same = [own._replace(softness=setting.softness * 2**k) for k, own in enumerate(finer) if k]
+    for level in [*finer, *same]:
         found = []
         for stretch in stretches:
             if progress is not None:
@@ -257,22 +260,6 @@ def replay_in(
         levels.append(Level(level, tuple(found)))
     title = f"{info.title} {version(engine)}"
     return EngineReport(problem, title, allowed, tuple(stretches), tuple(levels))
-
-
-def list_settings(setting: Setting, halvings: int) -> list[Setting]:
-    """A setting, finer ones, and finer steps alone, with contacts as they are at first."""
-    finer = [setting._replace(step=setting.step / 2**k) for k in range(halvings + 1)]
-    return finer + [
-        level._replace(softness=setting.softness * 2**k) for k, level in enumerate(finer[1:], 1)
-    ]
-
-
-class _PressChange(NamedTuple):
-    """A deviation of a contact and its interval [s]."""
-
-    start: float
-    stop: float
-    what: str
 
 
 class _Part(NamedTuple):
@@ -303,13 +290,13 @@ def compare(
         return Departure(run.t, position, angle, forces, None, "")
     time = float(run.t[beyond[0]])
     changes = [c for part in parts for c in _list_changes(problem, part, run, allowed * length)]
-    before = [change for change in changes if change.start <= time]
+    before = [change for change in changes if change[0] <= time]
     # The first one that lasts until then, or else the last one before.
-    lasting = [change for change in before if change.stop >= time]
+    lasting = [change for change in before if change[1] >= time]
     reason = "every contact is as planned"
     if before:
-        cause = min(lasting) if lasting else max(before, key=lambda change: change.stop)
-        reason = f"{cause.what} at t = {cause.start:.5g} s"
+        start, _, what = min(lasting) if lasting else max(before, key=lambda change: change[1])
+        reason = f"{what} at t = {start:.5g} s"
     return Departure(run.t, position, angle, forces, time, reason)
 
 
@@ -349,8 +336,8 @@ def _average(plan: Trajectory, part: _Part, run: EngineRun) -> list[Force]:
 
 def _list_changes(
     problem: Problem, part: _Part, run: EngineRun, reach: float
-) -> Iterator[_PressChange]:
-    """Deviations of contacts from the plan in a phase."""
+) -> Iterator[tuple[float, float, str]]:
+    """Deviations of contacts from the plan in a phase: their intervals [s], and in words."""
     scales, formation, rows = problem.scene.scales, part.phase.formation, part.rows
     actual = formation.evaluate(run.z[rows], run.z_dot[rows])
     planned = formation.evaluate(part.want.z, part.want.z_dot)
@@ -372,10 +359,11 @@ def _list_changes(
         yield from _find_runs(times, hits, f"{run.pairs[column]} presses, which is not planned,")
 
 
-def _find_runs(t: Array, happens: NDArray[np.bool_], what: str) -> Iterator[_PressChange]:
+def _find_runs(
+    t: Array, happens: NDArray[np.bool_], what: str
+) -> Iterator[tuple[float, float, str]]:
     """Intervals in which a flag is set."""
-    for run in find_runs(happens):
-        yield _PressChange(float(t[run.start]), float(t[run.stop - 1]), what)
+    return ((float(t[run.start]), float(t[run.stop - 1]), what) for run in find_runs(happens))
 
 
 class StretchEnd(NamedTuple):

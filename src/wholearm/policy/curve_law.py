@@ -124,7 +124,9 @@ class CurveLaw:
             return
         self.after = after
         tau = self._act(len(self.steps) - 1, 1.0, 0.0, 0.0, self.gain * self.settings.touch, True)
-        a, _ = find_motion(after.torque[0], tau)
+        # Acceleration from these torques at rest.
+        (one, _, _, c, d), (two, _, _, e, f) = after.torque[0]
+        a = ((tau[0] - one) * f - (tau[1] - two) * d) / (c * f - d * e)
         self.beyond = (LAW.far if a < -0.1 * self.settings.most else LAW.soon) * self.settings.touch
 
     def begin(self, at_end: bool = False) -> None:
@@ -568,11 +570,3 @@ def choose_internal_force(
         else:
             u, w = last
     return min(level, flat), internal
-
-
-def find_motion(torque: Sequence[Sequence[float]], tau: Sequence[float]) -> tuple[float, float]:
-    """Acceleration and internal force from torques at rest, by rows of torques."""
-    (one, _, _, c, d), (two, _, _, e, f) = torque
-    first, second = tau[0] - one, tau[1] - two
-    size = c * f - d * e
-    return (first * f - second * d) / size, (second * c - first * e) / size

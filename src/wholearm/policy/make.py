@@ -40,14 +40,13 @@ from .reference import (
     SETTINGS,
     CurveLimitRows,
     ReferencePiece,
-    Reserve,
     find_forces,
     leave_one,
+    scale_ranges,
     trace_pieces,
 )
 from .regulator import RATE, ROOM, end_within, follow
 
-WIDEST_FACTOR = 64.0  # largest factor on ranges
 SAME = 1e-5  # distance from the plan's end that counts as none, over the scene's length and in rad
 STILL = 1e-3  # speed that counts as none, over the scene's
 Planner = Callable[[Problem], Trajectory]  # makes a plan of a problem
@@ -109,7 +108,8 @@ def make_policy(
     if reserve and planner is not None:
         curves = [phase is not None for phase in along]
         plan = replan(planner, problem, blocks, curves, plan)
-    pieces = trace_pieces(problem, along, plan, Reserve(reserve, ranges, delay))
+    widths = None if ranges is None else scale_ranges(ranges, reserve, delay)
+    pieces = trace_pieces(problem, along, plan, reserve, widths)
     tables, about = list[dict[str, Array]](), list[dict[str, Any]]()
     for block, piece in zip(blocks, pieces, strict=True):
         lasts = {phase.number: float(np.diff(starts)[phase.index]) for phase in block}
@@ -193,15 +193,15 @@ def _tabulate_motion(
     inertia = np.diag([finger.inertia for finger in problem.scene.fingers])
     # At the end each joint is critically damped, in contact or not.
     final = np.hstack([RATE**2 * inertia, 2 * RATE * inertia])
-    found = follow(problem, phases, plan, t)
-    speed = np.sqrt(found.b)
+    b, tau, gains = follow(problem, phases, plan, t)
+    speed = np.sqrt(b)
     return {
         "starts": (starts[:-1] - starts[0]) / speed,
         "step": np.array([(t[1] - t[0]) / speed]),
         "theta": samples.z[:, 3:],
         "rates": samples.z_dot[:, 3:] * speed,
-        "tau": found.tau,
-        "gain": np.concatenate([found.gains[:-1], final[None]]),
+        "tau": tau,
+        "gain": np.concatenate([gains[:-1], final[None]]),
         "push": samples.tau[-1] if hold is None else hold,
         "still": np.array([STILL * problem.scene.scales.rate]),
         "ways": _list_free_joints(problem, last, samples.z[-1:]),
@@ -395,16 +395,16 @@ def _pin(phase: Phase, z: Array) -> Phase:
 def find_widest(problem: Problem, plan: Trajectory, delay: float) -> dict[int, float]:
     """The largest factor on the ranges of each phase along a curve, by its number.
 
-    It is at most `WIDEST_FACTOR`, and no relative range exceeds `SETTINGS.widest`. The delay [s] is
+    It is at most 64, and no relative range exceeds `SETTINGS.widest`. The delay [s] is
     that of the torques, as far as known. InputError if neither plan nor problem have ranges.
     """
     ranges = find_ranges(problem, plan)
     if ranges is None:
         raise InputError("", "uncertainty", "is missing; without ranges none is the widest")
     relative = max(ranges.get(p.name, 0.0) for p in PARAMETERS if not p.unit)
-    most = min(SETTINGS.widest / relative, WIDEST_FACTOR) if relative > 0 else WIDEST_FACTOR
+    most = min(SETTINGS.widest / relative, 64.0) if relative > 0 else 64.0
     along = [_find_curve(block) for block in split(problem.phases)]
-    pieces = trace_pieces(problem, along, plan, Reserve(most, ranges, delay))
+    pieces = trace_pieces(problem, along, plan, most, scale_ranges(ranges, most, delay))
     return {
         phase.number: most * piece.share
         for phase, piece in zip(along, pieces, strict=True)

@@ -401,29 +401,30 @@ class ReferencePiece(NamedTuple):
         return dict(zip(names, least[: len(names)].tolist(), strict=True))
 
 
-class Reserve(NamedTuple):
-    """Margins as in `make_policy`, with the known delay of the torques [s]."""
-
-    size: float
-    ranges: Mapping[str, float] | None
-    delay: float
-
-    def scale(self) -> dict[str, float]:
-        """Half widths of the scaled ranges; of the delay its unknown part."""
-        widths = {name: self.size * width for name, width in (self.ranges or {}).items()}
-        late = widths.get("delay", 0.0)
-        # Torques may be early as well: a delay is anything from none to its range.
-        return widths | {"delay": max(late - self.delay, self.delay) if late else 0.0}
+def scale_ranges(ranges: Mapping[str, float], size: float, delay: float) -> dict[str, float]:
+    """Half widths of scaled ranges; of the delay its unknown part, with a known `delay` [s]."""
+    widths = {name: size * width for name, width in ranges.items()}
+    late = widths.get("delay", 0.0)
+    # Torques may be early as well: a delay is anything from none to its range.
+    return widths | {"delay": max(late - delay, delay) if late else 0.0}
 
 
 def trace_pieces(
-    problem: Problem, phases: Sequence[Phase | None], plan: Trajectory, reserve: Reserve
+    problem: Problem,
+    phases: Sequence[Phase | None],
+    plan: Trajectory,
+    size: float,
+    widths: Mapping[str, float] | None,
 ) -> list[ReferencePiece | None]:
-    """References of phases along curves, with margins as large as possible; None for None."""
+    """References of phases along curves, with margins as large as possible; None for None.
+
+    Margins are `size` times those of usual errors or, where there are half `widths` of ranges, such
+    that limits are kept within these.
+    """
     pieces: list[ReferencePiece | None] = []
     for phase in reversed(phases):
         after = pieces[-1] if pieces else None
-        pieces.append(None if phase is None else _trace(problem, phase, plan, reserve, after))
+        pieces.append(None if phase is None else _trace(problem, phase, plan, size, widths, after))
     pieces.reverse()
     before: ReferencePiece | None = None
     for k, piece in enumerate(pieces):
@@ -437,13 +438,21 @@ def trace_pieces(
 
 
 def _trace(
-    problem: Problem, phase: Phase, plan: Trajectory, reserve: Reserve, after: ReferencePiece | None
+    problem: Problem,
+    phase: Phase,
+    plan: Trajectory,
+    size: float,
+    widths: Mapping[str, float] | None,
+    after: ReferencePiece | None,
 ) -> ReferencePiece:
     """A phase's curve, and the controllable motions along it that keep margins."""
     rows_of_phase = np.flatnonzero((plan.phase == phase.index) & ~plan.held)
     curve = trace_phase(phase, plan.z[rows_of_phase[0]], problem.phases[phase.index + 1 :])
     places, *values = _follow(curve, plan, rows_of_phase)
-    s = _place_nodes(curve)
+    # Nodes of the table, with all reversals.
+    s = curve.length * (1 - np.cos(np.pi * np.linspace(0, 1, 121))) / 2
+    s = np.sort(np.concatenate([s, [part.stop for part in curve.segments[:-1]]]))
+    s = s[np.diff(s, prepend=-1.0) > 1e-7 * curve.length]
     a, b, internal = (np.interp(s, places, value) for value in values)
     touch, begins, passes, end = SETTINGS.touch * problem.scene.scales.speed, float(b[0]), 0.0, None
     if phase.end is End.IMPACT and after is not None and b[-1] > touch**2:
@@ -451,9 +460,9 @@ def _trace(
         end = float(after.reach.low[0] / passes), float(after.reach.high[0] / passes)
     else:
         b = np.minimum(b, (touch + (curve.length - s) / SETTINGS.arrival) ** 2)
-    if reserve.ranges is not None and reserve.size:
+    if widths is not None and size:
         planned = a, b, internal
-        within, share = retime_within(curve, s, planned, reserve.scale(), problem.epsilon, end)
+        within, share = retime_within(curve, s, planned, widths, problem.epsilon, end)
         if within is not None:
             return ReferencePiece(curve, *within, share, begins, passes, b)
     best: tuple[CurveLimitRows, ControllableSet, float] | None = None
@@ -462,7 +471,7 @@ def _trace(
         rows = make_rows(curve, s, (*motion, internal))
         for _ in range(2 if factor < 1.0 else 0):
             rows = make_rows(curve, s, (*motion, find_internal_force(rows, *motion)))
-        wanted = reserve.size * rows.unit
+        wanted = size * rows.unit
         wanted[:, rows.presses :] = SETTINGS.authority * rows.unit[:, rows.presses :]
         found = retime(s, rows.slack, wanted, motion[1], end)
         share = float(found.share.min())
@@ -474,7 +483,7 @@ def _trace(
     assert best is not None
     rows, found, share = best
     # Margins without ranges keep no share of ranges.
-    share = share if reserve.ranges is None else 0.0
+    share = share if widths is None else 0.0
     return ReferencePiece(curve, rows, found, share, begins, passes, b)
 
 
@@ -580,10 +589,3 @@ def _follow(
     forces = inverse(formation, *point[:3], directions_of(curve, segment), point.kinematics)
     c_n, c_t = plan.c_n[rows], plan.c_t[rows]
     return s, a, v**2, find_planned_internal_force(formation, forces, plan, c_n, c_t)
-
-
-def _place_nodes(curve: Curve) -> Array:
-    """Nodes of a table, with all reversals."""
-    s = curve.length * (1 - np.cos(np.pi * np.linspace(0, 1, 121))) / 2
-    s = np.sort(np.concatenate([s, [part.stop for part in curve.segments[:-1]]]))
-    return np.asarray(s[np.diff(s, prepend=-1.0) > 1e-7 * curve.length])

@@ -60,24 +60,23 @@ class RegulatedStretch(NamedTuple):
         return self.forces.tau(np.zeros(len(self.z)), np.full(len(self.z), b), self.internal)
 
 
-class Followed(NamedTuple):
-    """A motion to track."""
-
-    b: float  # squared speed over the plan's
-    tau: Array
-    gains: Array  # (n, 2, 4)
-
-
 def end_within(phases: tuple[Phase, ...], plan: Trajectory, t: Array) -> Array:
     """Times in phases, kept below the end, at which the contacts of the next phase hold."""
     end = plan.phase_starts[phases[-1].index + 1]
     return np.asarray(np.minimum(t, np.nextafter(end, 0.0)))
 
 
-def follow(problem: Problem, phases: tuple[Phase, ...], plan: Trajectory, t: Array) -> Followed:
-    """Torques and gains for phases of a plan at even times in them, shape (n,).
+def follow(
+    problem: Problem, phases: tuple[Phase, ...], plan: Trajectory, t: Array
+) -> tuple[float, Array, Array]:
+    """Squared speed over the plan's, torques and gains at even times in phases of a plan, (n,).
 
     The speed is that with the largest least margin of normal forces and torques.
+
+    Returns
+    -------
+    b : float
+    tau, gains : (n, 2) [N m] and (n, 2, 4)
     """
     starts, t = plan.phase_starts, end_within(phases, plan, t)
     owner = np.searchsorted(starts, t, side="right") - 1
@@ -98,7 +97,7 @@ def follow(problem: Problem, phases: tuple[Phase, ...], plan: Trajectory, t: Arr
     b = max((1 - 0.05 * k for k in range(11)), key=find_margin)
     found = [row for part in parts for row in _linearise(problem, part, b)]
     tau = np.concatenate([part.find_torques(b) for part in parts])
-    return Followed(b, tau, regulate(found, float(t[1] - t[0]) / np.sqrt(b)))
+    return b, tau, regulate(found, float(t[1] - t[0]) / np.sqrt(b))
 
 
 def _stretch(formation: Formation, plan: Trajectory, t: Array) -> RegulatedStretch:

@@ -83,10 +83,14 @@ class Until:
     pins: tuple[tuple[str, float], ...] = ()
 
     @property
+    def coordinates(self) -> tuple[tuple[str, float], ...]:
+        """Coordinates that are given where the phase ends, and their values."""
+        return self.pins if self.value is None else ((self.coordinate, self.value), *self.pins)
+
+    @property
     def poses(self) -> tuple[tuple[int, float], ...]:
         """Rows of z that are given where the phase ends, and their values."""
-        own = () if self.value is None else ((self.coordinate, self.value),)
-        return tuple((ROWS[name], value) for name, value in (*own, *self.pins))
+        return tuple((ROWS[name], value) for name, value in self.coordinates)
 
     def measure_pins(self, z: Array, length: float) -> float:
         """How far z, shape (5,), is from the pins at most, x over a `length` and phi in rad."""
@@ -102,10 +106,9 @@ class Until:
     def __str__(self) -> str:
         if self.is_release:
             return "release"
-        poses = self.pins if self.value is None else ((self.coordinate, self.value), *self.pins)
         parts = [
             f"x = {value:g} m" if name == "x" else f"phi = {math.degrees(value):g} deg"
-            for name, value in poses
+            for name, value in self.coordinates
         ]
         if self.contact is not None:
             parts[:1] = [" at ".join([self.contact.name, *parts[:1]])]

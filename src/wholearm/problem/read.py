@@ -505,7 +505,7 @@ def _check_until(scene: Scene, phase: Phase, key: str) -> None:
         raise InputError("", key, "is missing; only a phase with end = 'smooth' has none")
     if until.contact is not None and until.contact in phase.formation.contacts:
         raise InputError("", key, f"{until} is already in the phase's contacts")
-    ends = until.pins if until.value is None else ((until.coordinate, until.value), *until.pins)
+    ends = until.coordinates
     for coordinate, value in ends:
         check_coordinate(scene, coordinate, value, key)
     freedoms = 5 - phase.formation.n_constraints

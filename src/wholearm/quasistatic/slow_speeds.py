@@ -124,6 +124,11 @@ def _predict_phase(
     torques = find_torques(path, problem.epsilon, share)
     if torques is not None:
         motions[OWN] = (evaluate_torques(path, torques.tau), path.length)
+        # Every eighth place, with both ends and both sides of every reversal.
+        same = np.diff(path.s) == 0
+        chosen = np.append(True, same) | np.append(same, True)
+        chosen[::8] = True
+        torques = QuasistaticTorques(*(part[chosen] for part in torques))
     unit = problem.scene.scales.speed
     survivals = tuple(
         _survive(path, name, evaluate, way, problem.epsilon, unit)
@@ -143,7 +148,7 @@ def _predict_phase(
             (_place(path, run.start), _place(path, run.stop - 1)) for run in find_runs(held)
         ),
         survivals=survivals,
-        torques=None if torques is None else _thin_out(path, torques),
+        torques=torques,
         curves=_draw(survivals, motions, unit),
     )
 
@@ -173,14 +178,6 @@ def find_torques(path: PathSamples, epsilon: float, share: float) -> Quasistatic
     c = forces.c(zero, zero, internal)
     c_n, _ = split_forces(path.phase.formation, c, path.directions.Xi)
     return QuasistaticTorques(path.s, path.z, forces.tau(zero, zero, internal), c_n)
-
-
-def _thin_out(path: PathSamples, torques: QuasistaticTorques) -> QuasistaticTorques:
-    """Every eighth place, with both ends and both sides of every reversal."""
-    ends = np.diff(path.s) == 0
-    kept = np.append(True, ends) | np.append(ends, True)
-    kept[::8] = True
-    return QuasistaticTorques(*(part[kept] for part in torques))
 
 
 def _survive(

@@ -43,7 +43,6 @@ APART = 0.01
 contact slides the other way forces step, at another time when numbers are off."""
 Task = tuple[int, tuple[float, ...]]
 """Number and values of a sample."""
-SAMPLES = Range(1, 10**6)  # samples of a study
 
 
 @dataclass(frozen=True)
@@ -504,7 +503,7 @@ def assess_robustness(
                 being written by another run, or cannot be written
     """
     problem, trajectory = adopt_motion(problem, plan)
-    SAMPLES.read(samples, "samples")
+    Range(1, 10**6).read(samples, "samples")
     require_same_phases(problem, trajectory)
     own = uncertainty or Uncertainty(problem.ranges)
     trial = make_trial(problem, trajectory, own, phase, policy)

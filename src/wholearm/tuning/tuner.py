@@ -553,13 +553,6 @@ def _carry(setting: _Setting, z: Array, stops: int) -> tuple[list[PhaseTuning], 
     return [*first, *second], end, reason
 
 
-class _Balance(NamedTuple):
-    """Torques of a quasistatic motion along a passage."""
-
-    tau: Array  # (n, 2) [N m]
-    acting: int  # index of the torque with the most work: the finger behind the motion
-
-
 _Attempt = tuple[PhaseTuning, Array | None, str]
 """The tuned phase, its end at rest if it is reached, and else the reason."""
 
@@ -611,13 +604,13 @@ class _Setting(NamedTuple):
         if found is None:
             text = "no quasistatic motion keeps every contact, where tuning would start"
             return own, None, text
-        bench, acting = Bench(self.problem, self.passage, z), found.acting
+        bench, (balanced, acting) = Bench(self.problem, self.passage, z), found
         title = f"phase {self.passage.title} of {len(self.problem.phases)}, finger {acting + 1}"
         best: _Attempt | None = None
         tell: Callable[[str], None] = lambda text: self.tell(f"{title}: {text}")  # noqa: E731
         # Supporting torques until one serves.
-        for tau in list_starts(found.tau, acting):
-            rule = TuningRule(bench, tau, found.tau[-1], acting, tell)
+        for tau in list_starts(balanced, acting):
+            rule = TuningRule(bench, tau, balanced[-1], acting, tell)
             attempt = self._tune_from(rule, replace(own, acting=acting + 1))
             if attempt[1] is not None:
                 return attempt
@@ -684,7 +677,7 @@ class _Setting(NamedTuple):
             balance = self._balance((after,), trial.z)
             if balance is None:
                 return [None]
-            acting, (first, second) = balance.acting, (float(tau) for tau in balance.tau[0])
+            acting, (first, second) = balance[1], (float(tau) for tau in balance[0][0])
         lowered = [
             (first / FACTOR**n, second) if acting == 0 else (first, second / FACTOR**n)
             for n in range(1, SETTINGS.hold)
@@ -696,8 +689,11 @@ class _Setting(NamedTuple):
             return [None, *lowered, *held]
         return [None, *lowered]
 
-    def _balance(self, phases: Sequence[Phase], z: Array) -> _Balance | None:
-        """What balances a quasistatic motion from `z`, as far as one keeps every contact."""
+    def _balance(self, phases: Sequence[Phase], z: Array) -> tuple[Array, int] | None:
+        """Torques of a quasistatic motion from `z`, (n, 2), as far as one keeps every contact.
+
+        And the index of the torque with the most work: the finger behind the motion.
+        """
         tau: list[Array] = []
         work: list[Array] = []
         for phase in phases:
@@ -712,7 +708,7 @@ class _Setting(NamedTuple):
             z = path.z[-1]
         if not tau:
             return None
-        return _Balance(np.vstack(tau), int(np.vstack(work).mean(axis=0).argmax()))
+        return np.vstack(tau), int(np.vstack(work).mean(axis=0).argmax())
 
     def _sum_up(self, own: PhaseTuning, bench: Bench, trial: TuningTrial) -> PhaseTuning:
         return replace(

@@ -427,13 +427,9 @@ def _check_ends(problem: Problem, phase: Phase, before: Array | None, rows: Samp
         struck = problem.phases[phase.index - 1].end is End.IMPACT
         if not struck and step > 1e-5 * max(speed, fastest):
             texts.append(f"velocity steps by {step:.3g} m/s at the start")
-    pins = [*until.pins]
     if until.contact is not None:
         offs.append(float(np.abs(locate(scene, until.contact.name, rows.z[-1:]).gap[0])) / size)
-    elif until.value is not None:
-        pins.append((until.coordinate, until.value))
-    units = {"x": (0, size), "phi": (2, 1.0)}
-    offs += [abs(z[units[name][0]] - value) / units[name][1] for name, value in pins]
+    offs += [abs(z[row] - value) / (1.0 if row else size) for row, value in until.poses]
     if max(offs) > 1e-5:
         texts.append(f"ends {max(offs):.3g} from {until}")
     if phase.end is End.REST:
