@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 
 from ...common.arrays import Array, Expression
 from ...common.errors import Parameter
-from ...contacts.contact_limits import build_limits, list_renamed
+from ...contacts.contact_limits import build_limits, list_renamed, takes_over
 from ...contacts.elemental import Contact, build_features, build_gap
 from ...contacts.formation import Formation
 from ...geometry.curve import find_tied, tangent_basis
@@ -353,6 +353,10 @@ def add_stage(
     if goal is not None:
         end = layout.nodes[-1]
         rows.add_copies(goal, goal.x.join(z=end[Z], v=end[V]), rows.nonlinear(goal.outputs))
+    landing = landing_kernel(formation, until) if until is not None else None
+    if landing is not None:
+        own = rows.nonlinear(landing.outputs, low=0.0, high=np.inf)
+        rows.add_copies(landing, landing.x.join(z=layout.nodes[-1, Z]), own)
     limits = add_limits(rows, stage, layout, scheme, target)
     if slow:
         add_motors(rows, stage, layout, scheme)
@@ -969,6 +973,19 @@ def goal_kernel(
         P = gained.build_constraints(z, v)[1]
         parts += [P[i, :] @ v for i in new_rows(formation, gained)]
     return build_kernel(x, goals=ca.vertcat(*parts)) if parts else None
+
+
+@share(64)
+def landing_kernel(formation: Formation, until: Until) -> Kernel | None:
+    """Range of the contact with which a phase ends at a place that the planner chooses."""
+    contact, free = until.contact, 5 - formation.n_constraints
+    if contact is None or free - len(until.pins) < 2:
+        return None
+    if takes_over(contact, formation.scene, formation.contacts):
+        return None
+    x = Columns(z=5).make_symbols(z=build_features(formation.scene).z)
+    parts = [limit.value for limit in build_limits(contact, formation.scene)]
+    return build_kernel(x, ranges=ca.vertcat(*parts)) if parts else None
 
 
 def new_rows(formation: Formation, following: Formation) -> list[int]:

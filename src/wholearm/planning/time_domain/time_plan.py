@@ -217,22 +217,7 @@ def solve_coarse(search: TimeSearch, guess: Guess, most: int = ITERATIONS) -> Ti
     if solution.success and solution.margin < -ROUNDING:
         # A motion that presses too little may be far from one that presses enough.
         return solution._replace(success=False, status="the largest c_n is below epsilon")
-    if solution.success and not _is_made(solution.stages[-1], solution.end):
-        # Goal 25 of the corpus: the end that is nearest from another guess is past a fingertip.
-        return solution._replace(success=False, status="the last contact is out of its range")
     return solution
-
-
-def _is_made(stage: Stage, z: Array) -> bool:
-    """Whether the contact that ends a stage is within its range at the end, (5,)."""
-    contact = stage.until and stage.until.contact
-    if not contact:
-        return True
-    formation = stage.formation.add(contact)
-    known = {limit.text for limit in stage.formation.limits}
-    new = [limit.text not in known for limit in formation.limits]
-    values = formation.evaluate_limits(z[None])[0, new]
-    return bool(values.min(initial=0.0) > -formation.scene.touching)
 
 
 def may_gain(search: TimeSearch, solution: TimeSolution) -> bool:
