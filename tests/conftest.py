@@ -81,4 +81,4 @@ def trajectory() -> Trajectory:
 @pytest.fixture
 def unadvised(monkeypatch: pytest.MonkeyPatch) -> None:
     """Why there is no plan, without what would change that, which takes long to find."""
-    monkeypatch.setattr("wholearm.planning.advice.find_changes", lambda *_: [])
+    monkeypatch.setattr("wholearm.planning.explain.find_changes", lambda *_: [])

@@ -15,11 +15,9 @@ from shipped import HEPTAGON, problem_of
 from wholearm import PlanOptions, Problem
 from wholearm.common.errors import InfeasibleError, Parameter
 from wholearm.geometry.tracing import trace_phases
-from wholearm.planning import advice
-from wholearm.planning.path_domain.path_explain import FRICTION
+from wholearm.planning import explain
+from wholearm.planning.explain import FRICTION, change_limit
 from wholearm.planning.path_domain.path_plan import plan_curves
-from wholearm.planning.time_domain import time_explain as explain
-from wholearm.planning.time_domain.time_explain import change_limit
 from wholearm.planning.time_domain.time_plan import plan_phases
 
 INTERVALS = 15
@@ -45,10 +43,10 @@ def plan(problem: Problem, phase: int, explained: bool = True) -> None:
 @contextmanager
 def advising(wanted: Callable[[Parameter], bool]) -> Iterator[None]:
     """Changes of such parameters are looked for, and of no others, which takes long."""
-    find = advice.find_changes
+    find = explain.find_changes
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            advice, "find_changes", lambda every, *rest: find(filter(wanted, every), *rest)
+            explain, "find_changes", lambda every, *rest: find(filter(wanted, every), *rest)
         )
         yield
 

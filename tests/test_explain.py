@@ -28,14 +28,13 @@ from wholearm.common.errors import (
 )
 from wholearm.geometry.curve import Curve
 from wholearm.mechanics.limits import EPSILON
-from wholearm.planning.advice import find_changes
+from wholearm.planning import explain as explanation
+from wholearm.planning.explain import change_limit, explain_stages, find_changes, refuse
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
-from wholearm.planning.time_domain import time_explain
 from wholearm.planning.time_domain.guesses import Guesses
 from wholearm.planning.time_domain.search import TimeSearch
-from wholearm.planning.time_domain.time_explain import change_limit, explain, refuse
 from wholearm.planning.time_domain.time_motion import TimeMotion
 from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.read import build_problem, read_problem
@@ -106,7 +105,7 @@ def test_torques_that_may_not_step_have_to_hold_the_end(tmp_path: Path, rate: fl
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Advice takes the time that it needs, however slow the machine is."""
-    monkeypatch.setattr(time_explain, "ADVICE", np.inf)
+    monkeypatch.setattr(explanation, "ADVICE", np.inf)
 
 
 def test_a_force_that_weight_limits_has_its_closed_form() -> None:
@@ -160,14 +159,16 @@ def test_advice_is_that_along_the_curve(heptagon: Problem, curves: tuple[Curve, 
 
 def test_failures_that_no_limit_explains_are_the_solvers() -> None:
     problem, _ = shove()
-    failed = explain(search(problem), problem, problem.phases, [], "Restoration_Failed", None)
+    failed = explain_stages(
+        search(problem), problem, problem.phases, [], "Restoration_Failed", None
+    )
     assert isinstance(failed, SolverError)
     text = str(failed)
     assert text.startswith("no plan for phases 1 and 2 (") and "Restoration_Failed" in text
     assert all(name in text for name in problem.phases[0].formation.names)
     assert text.endswith("intervals per phase (--time-intervals)") and "\n" not in text
     slide, own = box(), replace(COARSE, transcription="time")
-    failed = explain(TimeSearch.of(slide, own), slide, slide.phases[:1], [], "Failed", None)
+    failed = explain_stages(TimeSearch.of(slide, own), slide, slide.phases[:1], [], "Failed", None)
     assert "leave out --transcription time" in str(failed)
 
 

@@ -34,6 +34,7 @@ from wholearm.mechanics.speed_sweep import (
     make_cosine_grid,
     speed_sweep,
 )
+from wholearm.planning.explain import change_limit, list_shortfalls
 from wholearm.planning.lower_bound import bound_least_time, look_along
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.elements import (
@@ -51,7 +52,6 @@ from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.time_domain.refinement import SETTINGS, check_between, find_misses
 from wholearm.planning.time_domain.search import TimeSearch
 from wholearm.planning.time_domain.stage import Stage
-from wholearm.planning.time_domain.time_explain import change_limit, list_shortfalls
 from wholearm.planning.time_domain.time_motion import TimeMotion
 from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.policy.reference import make_rows

@@ -19,7 +19,8 @@ from shipped import FOLDER, HEPTAGON, IMPACTS, plan_of, problem_of
 from wholearm import Phase, PlanOptions, Problem, verify
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError, SolverError
-from wholearm.planning.blocks import Planning, explain_motors
+from wholearm.planning.blocks import Planning
+from wholearm.planning.explain import explain_motors
 from wholearm.planning.plan import solve
 from wholearm.planning.stops import Plans
 from wholearm.results.trajectory import Samples, Trajectory

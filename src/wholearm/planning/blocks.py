@@ -50,7 +50,6 @@ COARSE = 80  # intervals along a curve that are doubled where none are given
 AMPLE = 1.1  # saturation of the margin, over the least normal force of other phases
 MOVED = 1e-9  # distance of two starts, in radii of gyration or radians
 FREE = {"torque_rate_limit": None, "actuator_lag": None, "control_period": None}  # free torques
-ROUGH = 1e-2  # least accuracy where only the existence of a plan matters
 SHORT = 5e-7  # largest shortfall of a margin below epsilon by rounding, over the scene's force
 
 
@@ -304,6 +303,8 @@ def plan_block(
                     return plan_with_pauses(planning, block, plan, add_up(block, allowed)), None
                 return plan(add_up(block, allowed)), None
             except (InfeasibleError, SolverError) as error:
+                from .explain import explain_motors
+
                 raise explain_motors(planning, block, options, error, plan_other) from None
     curves = []
     for phase in block:
@@ -417,7 +418,7 @@ def share_duration(
     total = 2 * sum(times) if duration is None else duration
     if total <= sum(times):
         # The least-time plan shows it; a little more leaves something to choose.
-        from .advice import describe_changes, round_outwards
+        from .explain import describe_changes, round_outwards
 
         own = Parameter("duration", total, "s", 1, "duration")
         enough = Change(own, round_outwards(1.005 * sum(times), 1))
@@ -459,50 +460,3 @@ def free_torques(problem: Problem, options: PlanOptions) -> tuple[Problem, PlanO
     if scene.has_slow_motors or scene.control_period:
         problem = problem.with_(FREE)
     return problem, options
-
-
-def name_motors(scene: Scene) -> str:
-    """The keys that limit rates or hold torques, with their values."""
-    given = list[str]()
-    if scene.control_period:
-        given.append(f"control_period = {scene.control_period:g} s ({scene.control_hold})")
-    kinds = (("torque_rate_limit", "N m/s", math.inf), ("actuator_lag", "s", 0.0))
-    for key, unit, free in kinds:
-        values = list(dict.fromkeys(getattr(finger, key) for finger in scene.fingers))
-        if values != [free]:
-            texts = dict.fromkeys(f"{value:g}" for value in values)
-            given.append(f"{key} = {' and '.join(texts)} {unit}")
-    return " and ".join(given)
-
-
-def explain_motors(
-    planning: Planning,
-    block: Sequence[Phase],
-    options: PlanOptions,
-    error: InfeasibleError | SolverError,
-    plan_block: Callable[[Planning, Sequence[Phase], PlanOptions], Plans],
-) -> InfeasibleError | SolverError:
-    """The error with whether the phases have a plan with free torques, found by `plan_block`."""
-    keys = name_motors(planning.problem.scene)
-    if not keys:
-        return error
-    from .advice import name_phases
-
-    where = name_phases([phase.number for phase in block])
-    if isinstance(error, InfeasibleError):
-        where += f" ({'; '.join(' '.join(phase.formation.names) for phase in block)})"
-    free, own = free_torques(planning.problem, options)
-    own = replace(own, accuracy=max(own.accuracy, ROUGH))
-    try:
-        phases = [free.phases[phase.index] for phase in block]
-        found = plan_block(replace(planning, problem=free, curves=()), phases, own)
-    except WholearmError as other:
-        text = f"{error}; without {keys} none was found either: {other}"
-    else:
-        lasts = sum(plan.motion.duration for plan in found)
-        text = f"without {keys} there is a plan of {lasts:.4g} s for {where}; with that, {error}"
-    if not isinstance(error, InfeasibleError):
-        return SolverError(text)
-    extended = InfeasibleError(text, error.shortfalls, error.changes)
-    extended.motion = error.motion
-    return extended

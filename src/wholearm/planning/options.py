@@ -111,6 +111,10 @@ class PlanOptions:
                 raise InputError("", "robust", text + "range is below 1")
         return replace(self, ranges=ranges)
 
+    def roughen(self) -> PlanOptions:
+        """The same for plans that only have to exist."""
+        return replace(self, accuracy=max(self.accuracy, 1e-2))
+
     @property
     def goal(self) -> Objective:
         """The objective as an enumeration member."""

@@ -17,7 +17,7 @@ from .blocks import Planning, plan_blocks
 from .options import Objective, PlanOptions
 from .path_domain.path_mesh import Fastest
 from .path_domain.path_motion import PathMotion
-from .path_domain.path_plan import ROUGH, Task, plan_curves
+from .path_domain.path_plan import Task, plan_curves
 from .phase_plan import combine
 from .robust.robust_rows import Guide, list_holds, measure_holds
 
@@ -105,9 +105,8 @@ def find_widest(
             low, guides = middle, _cut(fastest, curves)
         middle = min(2 * low, most) if np.isinf(high) else (low + high) / 2
     for _ in range(_TRIES):
-        options = replace(scale(low), accuracy=ROUGH)
         try:
-            plan_curves(curves, epsilon, options, phases, explained=False)
+            plan_curves(curves, epsilon, scale(low).roughen(), phases, explained=False)
             return low
         except (InfeasibleError, SolverError):
             low *= _LESS

@@ -13,8 +13,7 @@ from typing import NamedTuple
 
 from ..common.errors import Change, Parameter
 from ..mechanics.limits import EPSILON, make_limits
-from ..planning.advice import bracket
-from ..planning.path_domain.path_explain import change_curve, list_frictions
+from ..planning.explain import bracket, change_curve, list_frictions
 from .astar import RoadmapRoute, RouteSearch
 from .edges import Blocked, BorderEdge, Link, cut_curve, link_along
 from .places import measure_along

@@ -21,8 +21,8 @@ from ..common.workers import Task, share
 from ..geometry.curve import Curve
 from ..geometry.path_guess import count_freedoms
 from ..geometry.tracing import trace_phase
-from ..planning.advice import unadvised
 from ..planning.blocks import BEGUN, BlockPlan, Planning, plan_next
+from ..planning.explain import unadvised
 from ..planning.options import PlanOptions
 from ..planning.plan import solve_with
 from ..planning.result import Plan

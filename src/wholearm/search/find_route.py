@@ -38,7 +38,7 @@ from ..common.sharing import exclusive
 from ..common.signals import OutOfTime, Reporter, limited, yielding
 from ..contacts.closing import close_fingers, describe_obstacle, name_reach
 from ..contacts.formation import Formation
-from ..planning.advice import unadvised
+from ..planning.explain import unadvised
 from ..planning.options import Objective, PlanOptions
 from ..planning.plan import solve_with
 from ..problem.definition import Goal, Phase, Problem

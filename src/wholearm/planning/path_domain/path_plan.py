@@ -9,7 +9,7 @@ of the error.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -19,11 +19,8 @@ import numpy as np
 from ...common.arrays import Array
 from ...common.errors import (
     AmbiguityError,
-    InfeasibleError,
     JammingError,
-    Parameter,
     SolverError,
-    WholearmError,
 )
 from ...geometry.curve import Curve, describe_pose, directions_of
 from ...mechanics.dynamics import reduced_inertia
@@ -32,7 +29,7 @@ from ..options import DEFAULT_ACCURACY, Objective, PlanOptions
 from ..phase_plan import PhasePlan
 from ..refine import SOLVES, refine
 from .elements import DEGREE, Elements, Profile, follow
-from .first_guess import center, guess, guess_slowly, start_at
+from .first_guess import center, guess, start_at
 from .path_data import PhaseData, cut, join, prepare
 from .path_mesh import (
     Fastest,
@@ -79,7 +76,6 @@ _LINEARIZATIONS = 3  # most robust plans, each with rows for the speed of the on
 # Violation at nodes by other signs than those of the rows, over the limits' scales, above which a
 # first plan is a reference only; case: two releases of a pentagon, whose plan takes 20 % longer.
 _OTHER_SIGNS = 0.05
-ROUGH = 1e-2  # accuracy of plans that only have to exist
 
 
 def plan_path(
@@ -122,29 +118,24 @@ def plan_curves(
     SolverError      if the solver does not converge
     """
     task = Task(curves, epsilon, options, phases, duration, pins=pins)
-    guides: tuple[Guide, ...] = ()
-
-    def replan(changed: Sequence[Curve], least: float) -> object:
-        changes = replace(task, curves=changed, epsilon=least, options=_roughen(task.options))
-        return plan_task(replace(changes, guides=guides), insist=False)
-
     try:
         if options.ranges:
             # Rows are for the motion of a reference: first of a plan without ranges.
-            nominal = plan_task(replace(task, options=replace(_roughen(options), ranges={})))
-            guides = nominal.guides
-        iterate = _plan_within(replace(task, guides=guides))
+            nominal = plan_task(replace(task, options=replace(options.roughen(), ranges={})))
+            task = replace(task, guides=nominal.guides)
+        iterate = _plan_within(task)
     except JammingError as jam:
         if not explained or len(curves) > 1:
             raise
-        from .path_explain import explain_jam
+        from ..explain import explain_jam
 
-        raise explain_jam(curves[0], epsilon, jam, replan) from None
+        raise explain_jam(task, jam) from None
     except SolverError as stuck:
+        from ..explain import explain_curves
+
         reason = f"{task.name}: {stuck}"
-        within = replace(task, guides=guides)
-        error = explain_stuck(within, reason, replan) if explained else SolverError(reason)
-        if guides and isinstance(error, SolverError):
+        error = explain_curves(task, reason) if explained else SolverError(reason)
+        if task.guides and isinstance(error, SolverError):
             # The reference is a plan without ranges; case: the block of two landings of a pentagon.
             raise SolverError(
                 f"{reason} within the ranges of numbers; without them there is a plan: try "
@@ -153,24 +144,13 @@ def plan_curves(
             ) from None
         raise error from None
     if options.goal is Objective.MARGIN and iterate.plans[0].value < task.lost:
+        from ..explain import explain_duration
+
         least = SolverError(f"{task.name}: the margin found is below epsilon")
-        raise _explain_duration(task) or least
+        raise explain_duration(task) or least
     # Rate-limited torques start at the limit of what friction can hold.
     surely = task.is_held or (options.goal is Objective.TIME and not options.ranges)
     return iterate.plans if surely else _leave_rest(iterate)
-
-
-def explain_stuck(
-    task: Task, reason: str, replan: Callable[[Sequence[Curve], float], object]
-) -> WholearmError:
-    """Why there is no plan: torque rate limits, the duration, or other limits."""
-    from .path_explain import explain, explain_rate_limits
-
-    parts = PathIterate.begin(task, task.elements).parts
-    if task.is_held:
-        return explain_rate_limits(task, parts, reason)
-    late, slow = _explain_duration(task), guess_slowly(join(parts))
-    return late or explain(parts, *slow, task.phases, reason, replan)
 
 
 def plan_task(task: Task, insist: bool = True) -> PathIterate:
@@ -232,44 +212,6 @@ def _leave_rest(iterate: PathIterate) -> Plans:
     return other.plans if ranges or loss <= WORTH * abs(iterate.objective) else plans
 
 
-def _explain_duration(task: Task) -> InfeasibleError | None:
-    """The error if the duration is shorter than the least time, with one that would do."""
-    duration = task.duration
-    if duration is None:
-        return None
-    fastest = replace(task.options, objective=Objective.TIME, duration=None)
-    try:
-        plans = plan_task(replace(task, options=fastest, duration=None)).plans
-    except WholearmError:
-        return None
-    least = sum(plan.value for plan in plans)
-    if least <= duration:
-        return None
-    from ..advice import describe_changes, find_changes, name_phases
-
-    rough = replace(task, options=_roughen(task.options))
-
-    def can_plan(_: Parameter, value: float) -> bool:
-        try:
-            return plan_task(replace(rough, duration=value)).plans[0].value >= task.epsilon
-        except SolverError:
-            return False
-
-    changes = find_changes(
-        [Parameter("duration", duration, "s", 1, "duration")], lambda _: least, can_plan
-    )
-    return InfeasibleError(
-        f"{name_phases(task.phases, 'infeasible')}: duration = {duration:g} s is "
-        f"{least - duration:.3g} s shorter than the least time; {describe_changes(changes)}",
-        changes=changes,
-    )
-
-
-def _roughen(options: PlanOptions) -> PlanOptions:
-    """Options for plans that only have to exist."""
-    return replace(options, accuracy=max(options.accuracy, ROUGH))
-
-
 @dataclass(frozen=True)
 class Task:
     """Arguments of `plan_curves`; with ranges also a reference for each curve."""
@@ -301,7 +243,7 @@ class Task:
     @property
     def name(self) -> str:
         """The phases, for messages."""
-        from ..advice import name_phases
+        from ..explain import name_phases
 
         return name_phases(self.phases)
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...common.arrays import Array
-from ...common.errors import InfeasibleError, SolverError, WholearmError
+from ...common.errors import InfeasibleError, Parameter, SolverError, WholearmError
 from ...geometry.arcs import CostToGo
 from ...mechanics.dynamics import measure_speed
 from ...mechanics.impact import Impact, compute_impact
@@ -47,7 +47,7 @@ from .stage import Stage, halve, in_own_units, resample, to_si, unit_of
 from .time_motion import TimeMotion, make_phase_motions
 
 if TYPE_CHECKING:
-    from .time_explain import Replan
+    from ..explain import Replan
 
 ITERATIONS = 50  # most of the solver from a guess; successes take up to 25
 SPLIT = 80  # the same in modes of the homotopy
@@ -58,7 +58,6 @@ DEARER = 1.2  # cost of a refined plan, over that on few intervals, above which 
 ROUNDING = 5e-7  # largest shortfall of a margin below epsilon by rounding, over the object's weight
 ROUNDS = 4  # most expansions of the cost-to-go
 GAIN = 1e-4  # least relative gain of moving the end
-ROUGH = 1e-2  # least accuracy where only the existence of a plan matters
 AT_REST = 1e-4  # speed below which an impact counts as a stop, in the scene's own units
 SHORTEST = 1 / 16  # shortest step of the continuation to a pinned end
 FREE = "a plan that chooses where it ends"  # name of a guess
@@ -103,17 +102,17 @@ def plan_phases(
     InputError, InfeasibleError, SolverError  if a phase's contacts do not touch, its end cannot be
         reached, or there is no plan
     """
-    from .time_explain import refuse
+    from ..explain import change_limit, refuse
 
     search = TimeSearch.of(problem, options, duration, to_go, ample, only_begin)
     guesses = Guesses(problem, phases, z, search, to_go)
     found = _resume(search, guesses, begun[0]) if begun else None
     stages = [own for plan in fastest for own in plan.stages if isinstance(own, Stage)]
-    rough = replace(options, accuracy=max(options.accuracy, ROUGH))
 
-    def replan(other: Problem) -> object:
+    def replan(parameter: Parameter, value: float) -> object:
+        other = change_limit(problem, parameter.key, value)
         same = [other.phases[phase.index] for phase in phases]
-        return plan_phases(other, same, z, rough, explained=False, patient=False)
+        return plan_phases(other, same, z, options.roughen(), explained=False, patient=False)
 
     explanation = replan if explained else None
     if found is None and guesses.given:
@@ -382,23 +381,27 @@ def _set_free(phase: Phase) -> Phase:
 
 def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) -> _Named:
     """Plan from motions of least violation, or the error that says why there is none."""
-    from .time_explain import explain, list_shortfalls, refuse_paths, solve_elastic
+    from ..explain import explain_stages, list_shortfalls, refuse_paths
+
+    def solve_elastic(stages: list[Stage]) -> list[Stage] | None:
+        solution = search.aiming(Objective.ELASTIC).solve(stages)
+        return solution.stages if solution.success else None
 
     problem, short = guesses.problem, list[list[Stage]]()
     for guess in chain([guesses.nearest], islice(guesses.to_others(), 1)):
-        elastic = solve_elastic(search, guess.stages)
+        elastic = solve_elastic(guess.stages)
         if elastic is not None and not list_shortfalls(problem, elastic, search.scheme):
             found = solve_guesses(search, [guess._replace(stages=elastic)])
             if found is not None:
                 return found
             # Finer intervals may show violations that coarse ones do not.
-            elastic = solve_elastic(search, halve(elastic, search.scheme))
+            elastic = solve_elastic(halve(elastic, search.scheme))
         if elastic is not None and list_shortfalls(problem, elastic, search.scheme):
             short.append(elastic)
     if not short:
         refuse_paths(problem, guesses.phases[0], [margin for margin, _ in guesses.paths])
     reason = "the solver found neither a plan nor a motion that misses limits least"
-    raise explain(search, problem, guesses.phases, short, reason, replan)
+    raise explain_stages(search, problem, guesses.phases, short, reason, replan)
 
 
 def list_plans(

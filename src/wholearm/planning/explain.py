@@ -1,0 +1,723 @@
+"""Diagnosis of phases without a plan: elastic mode, then one relaxation at a time.
+
+All limits are made soft and the shortfalls of the motion of least violation ranked. Then each limit
+alone is relaxed as little as the others allow. Its value is rounded outwards and confirmed by a
+plan: only what was planned is advised.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import replace
+from functools import partial
+from typing import Any, TypeVar
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..common.document import plain
+from ..common.errors import (
+    Change,
+    InfeasibleError,
+    InputError,
+    JammingError,
+    LimitPlace,
+    Parameter,
+    Shortfall,
+    SolverError,
+    WholearmError,
+)
+from ..contacts.formation import Formation
+from ..geometry.curve import Curve, describe_pose
+from ..geometry.path_guess import count_freedoms
+from ..mechanics.limits import EPSILON, PRESS, LimitSet, make_limits
+from ..mechanics.statics import Statics, pushes_one_way
+from ..problem.definition import Phase, Problem
+from ..results.dwell_record import assemble
+from ..results.torque import TorqueProfile
+from ..results.trajectory import Motion, Trajectory
+from ..scene.model import Scales, Scene
+from .blocks import Planning, free_torques
+from .options import Objective, PlanOptions
+from .path_domain.elements import Profile
+from .path_domain.first_guess import guess_slowly
+from .path_domain.junction import require_hold
+from .path_domain.path_data import PhaseData, cut, join
+from .path_domain.path_motion import PathMotion, fit_torque
+from .path_domain.path_nlp import (
+    LimitShape,
+    Relaxation,
+    Tightening,
+    Units,
+    build_path_nlp,
+    make_bounds,
+    pack,
+    parameters,
+    unpack,
+)
+from .path_domain.path_plan import PathIterate, Task, plan_curves, plan_task
+from .stops import Plans, runs_along_curves
+from .time_domain.collocation import Scheme, blend
+from .time_domain.guesses import PathMargin
+from .time_domain.search import TimeSearch
+from .time_domain.stage import Stage, StagePoints, to_si
+from .time_domain.time_motion import make_phase_motions
+
+SHORT = 1e-4  # least violation that counts, over the scale of a limit
+ROWS = 201  # rows of each phase of a motion of least violation
+DIGITS = 3  # significant digits of advised values
+_BEYOND = (0.0, 0.005, 0.015, 0.05, 0.15, 0.5)
+"""Relative distances beyond the least change to try: plans keep limits between nodes too."""
+_CLOSE = 0.02  # relative excess over the least change that is good enough
+ADVICE = 0.6  # processor time [s] after which no change is tried for phases over time
+FRICTION = "friction"  # beginning of the keys of frictions
+_ROUGH = 4.0  # largest factor on the friction of a rolling contact
+_FASTER = (2.0, 10.0, 100.0)  # factors on torque rate limits with which plans are tried
+_TORQUE = 15.0  # unit of shortfalls of torques, over the scene's torque: as bad as one of its force
+_FORCE = 5.0  # largest unit of force when a limit is relaxed, over the scene's
+MISSED = 0.02  # least margin by which limits are missed along an infeasible path
+MET = 0.98  # share of a limit above which it is active
+_unadvised: ContextVar[bool] = ContextVar("_unadvised", default=False)
+Replan = Callable[[Parameter, float], object]  # plans with another value of a parameter, or raises
+E = TypeVar("E", InfeasibleError, JammingError)
+
+
+@contextmanager
+def unadvised() -> Iterator[None]:
+    """Have errors say what is missing without looking for changes that would help."""
+    token = _unadvised.set(True)
+    try:
+        yield
+    finally:
+        _unadvised.reset(token)
+
+
+def advise(
+    error: E,
+    parameters: Iterable[Parameter],
+    find_value: Callable[[Parameter], float | None],
+    replan: Replan | None,
+    seconds: float = math.inf,
+) -> E:
+    """Add to an error the changes of a single parameter that make a plan possible.
+
+    Parameters
+    ----------
+    find_value     as of `find_changes`; NaN where it cannot tell
+    replan         None: no change is looked for
+    seconds : [s]  processor time after which no further change is tried
+    """
+    if replan is None or _unadvised.get():
+        return error
+    stop, undecided = time.thread_time() + seconds, list[Parameter]()
+
+    def find(parameter: Parameter) -> float | None:
+        least = math.nan if time.thread_time() > stop else find_value(parameter)
+        if least is not None and math.isnan(least):
+            undecided.append(parameter)
+            return None
+        return least
+
+    def can_plan(parameter: Parameter, value: float) -> bool:
+        if time.thread_time() > stop:
+            undecided.append(parameter)
+            return False
+        return succeeds(partial(replan, parameter, value))
+
+    error.changes = tuple(find_changes(parameters, find, can_plan))
+    text = describe_changes(error.changes)
+    if undecided and not error.changes:
+        text = "no single limit was found that makes it feasible"
+    error.args = (f"{error}; {text}",)
+    return error
+
+
+def succeeds(plan: Callable[[], object]) -> bool:
+    """Whether there is a plan."""
+    try:
+        plan()
+    except (InfeasibleError, SolverError, JammingError, InputError):
+        return False
+    return True
+
+
+def find_changes(
+    parameters: Iterable[Parameter],
+    find_value: Callable[[Parameter], float | None],
+    can_plan: Callable[[Parameter, float], bool],
+) -> list[Change]:
+    """Changes of a single parameter with which there is a plan, to values rounded outwards.
+
+    Parameters
+    ----------
+    find_value  the value of a parameter at which the other limits can just be kept, if there is one
+    can_plan    whether there is a plan with a value of a parameter
+    """
+    changes = []
+    for parameter in parameters:
+        least = find_value(parameter)
+        if least is not None:
+            value = _find_enough(least, parameter.sign, partial(can_plan, parameter))
+            changes += [] if value is None else [Change(parameter, value)]
+    return changes
+
+
+def _find_enough(least: float, sign: int, can_plan: Callable[[float], bool]) -> float | None:
+    """A feasible rounded value, as little beyond `least` as plans allow, by bisection."""
+    failed: float | None = None
+    tried = (round_outwards(least * (1 + sign * beyond), sign) for beyond in _BEYOND)
+    for value in dict.fromkeys(tried):
+        if value < 0:
+            return None
+        if can_plan(value):
+            break
+        failed = value
+    else:
+        return None
+    while failed is not None and abs(value - failed) > _CLOSE * abs(value):
+        middle = round_outwards((value + failed) / 2, sign)
+        value, failed = (middle, failed) if can_plan(middle) else (value, middle)
+    return value
+
+
+def bracket(
+    own: Parameter, farthest: float, can_plan: Callable[[float], bool], halvings: int = 5
+) -> float | None:
+    """A feasible value between a parameter's and `farthest`, by bisection; None without one."""
+    if farthest == own.value or not can_plan(farthest):
+        return None
+    enough, short = farthest, own.value
+    for _ in range(halvings):
+        middle = round_outwards((enough + short) / 2, own.sign)
+        if middle in (enough, short):
+            break
+        enough, short = (middle, short) if can_plan(middle) else (enough, middle)
+    return enough
+
+
+def round_outwards(value: float, sign: int, digits: int = DIGITS) -> float:
+    """Round to significant digits, up for the sign 1 and down for -1."""
+    if value == 0 or not math.isfinite(value):
+        return value
+    place = digits - 1 - math.floor(math.log10(abs(value)))
+    # Values of so few digits stay, whatever their last bits are.
+    scaled = round(value * 10.0**place, 6)
+    whole = math.ceil(scaled) if sign > 0 else math.floor(scaled)
+    return float(f"{whole}e{-place}")
+
+
+def describe_changes(changes: Sequence[Change]) -> str:
+    """All changes in one line."""
+    if not changes:
+        return "no single limit makes it feasible"
+    return f"feasible with {', or '.join(map(str, changes))}"
+
+
+def name_phases(phases: Sequence[int], what: str = "") -> str:
+    """One phase or several, for messages, and that they are `what`."""
+    first, *others = phases
+    if not others:
+        return f"phase {first} is {what}" if what else f"phase {first}"
+    several = f"phases {first} {'and' if len(others) == 1 else 'to'} {others[-1]}"
+    return f"{several} are {what}" if what else several
+
+
+def change_scene(scene: Scene, key: str, value: float) -> Scene:
+    """The scene with another value of a parameter, such as `fingers.1.torque_limit`."""
+    where, *names = key.split(".")
+    if where == FRICTION:
+        return replace(scene, friction=replace(scene.friction, **{names[0]: value}))
+    change: Any = {names[1]: value}
+    right, left = (
+        replace(link, **change) if f"{k + 1}" == names[0] else link
+        for k, link in enumerate(scene.fingers)
+    )
+    return replace(scene, fingers=(right, left))
+
+
+def change_curve(curve: Curve, key: str, value: float) -> Curve:
+    """The curve with another parameter of the hand."""
+    return _in_scene(curve, change_scene(curve.formation.scene, key, value))
+
+
+def _in_scene(curve: Curve, scene: Scene) -> Curve:
+    return replace(curve, formation=replace(curve.formation, scene=scene))
+
+
+def change_limit(problem: Problem, key: str, value: float) -> Problem:
+    """The problem with another value of a parameter of its limits."""
+    if key == EPSILON:
+        return replace(problem, epsilon=value)
+    return replace(problem, scene=change_scene(problem.scene, key, value))
+
+
+def find_shortfalls(
+    limits: LimitSet, values: Array, places: Sequence[LimitPlace]
+) -> list[Shortfall]:
+    """Violations of limits, each where it is worst, from values of their rows, (n, m)."""
+    violation, shortfalls = limits.fold(-limits.find_slack(values)), []
+    for k, limit in enumerate(limits.limits):
+        of_limit = violation[:, limits.owners == k].max(axis=1)
+        worst = int(of_limit.argmax())
+        amount = float(of_limit[worst])
+        if amount > SHORT * limit.scale:
+            what = (limit.kind, limit.part, limit.text, amount, limit.unit)
+            shortfalls.append(Shortfall(*what, places[worst], amount / limit.scale))
+    return shortfalls
+
+
+def _describe_least(
+    phases: Sequence[int], shortfalls: Iterable[Shortfall], motion: Trajectory | None
+) -> InfeasibleError:
+    """The error for phases with a motion of least violation, the worst shortfall first."""
+    ranked = sorted(shortfalls, key=lambda short: -short.share)
+    text = f"{name_phases(phases, 'infeasible')}: {'; '.join(map(str, ranked))}"
+    return InfeasibleError(text, ranked, (), motion)
+
+
+def _assemble_least(
+    motions: Sequence[Motion], torques: Sequence[TorqueProfile], formations: Sequence[Formation]
+) -> Trajectory:
+    """The trajectory of a motion of least violation."""
+    meta = {
+        "status": "misses limits least",
+        "rolling": [[contact.name for contact in own.rolling] for own in formations],
+        "modes": plain([getattr(own, "modes", ()) for own in motions]),
+    }
+    return assemble(motions, TorqueProfile.chain(torques), meta, ROWS)
+
+
+def explain_curves(task: Task, stopped: str) -> WholearmError:
+    """Why phases along curves have no plan, and what would change that.
+
+    Torque rate limits, the duration, or else limits of which the least violation is found with soft
+    ones. `stopped` says in words how the solver ended.
+    """
+    parts = PathIterate.begin(task, task.elements).parts
+    if task.is_held:
+        return _explain_rate_limits(task, parts, stopped)
+    late = explain_duration(task)
+    if late is not None:
+        return late
+    data, scales = join(parts), task.curves[0].formation.scene.scales
+    profile, units = guess_slowly(data)
+    units = units._replace(torque=np.full(2, _TORQUE * scales.torque))
+    short = np.maximum(data.limits.fold(-data.slack(data.nodes, profile)), 0.0)
+    short += 0.05 * data.limits.scales
+    found = _solve_soft(data, profile, units, short / units.of(data.limits), None)
+    if found is None:
+        return SolverError(stopped)
+    elastic, profiles = found[0], cut(parts, found[0])
+    shortfalls = list[Shortfall]()
+    for part, own, phase in zip(parts, profiles, task.phases, strict=True):
+        times = PathMotion(part.curve, part.grid, own).times.tolist()
+        suffix = f", phase {phase}" if len(parts) > 1 else ""
+        places = [
+            LimitPlace(phase, t, f"t = {t:.4f} s ({describe_pose(z)}){suffix}")
+            for t, z in zip(times, part.curve.evaluate(part.grid.s).z, strict=True)
+        ]
+        shortfalls += find_shortfalls(part.limits, part.evaluate(part.nodes, own), places)
+    if not shortfalls:
+        text = f"{stopped} although limits can be kept; try other --intervals or --accuracy"
+        return SolverError(text)
+    # In units of a slow motion, or of an absurd epsilon, the regularization would outweigh what is
+    # relaxed: units of a fall, and of forces that a hand may have.
+    fall = float(np.sqrt(float(data.grid.s[-1]) / scales.acceleration))
+    largest = _FORCE * scales.force
+    units = units._replace(time=min(units.time, fall), force=min(units.force, largest))
+    may_change = [*data.speeds.parameters, *data.limits.parameters]
+    if len(parts) == 1:
+        # Velocities after impacts between phases would depend on friction too.
+        may_change += list_frictions(data.curve.formation)
+    missed = data.limits.fold(-data.slack(data.nodes, elastic)).max(axis=0)
+
+    def find_value(parameter: Parameter) -> float | None:
+        if parameter.key.startswith(FRICTION):
+            return _search_friction(task, parameter)
+        step = units.force if parameter.unit == "N" else parameter.value
+        relaxation = Relaxation(parameter, step)
+        weights = step * data.limits.weigh(parameter)
+        needed = np.divide(missed, weights, out=np.zeros_like(missed), where=weights > 0)
+        start = max(1.0, 1.5 * float(needed.max()))
+        solution = _solve_soft(data, elastic, units, start, relaxation)
+        return relaxation.move(solution[1]) if solution else None
+
+    error = _describe_least(task.phases, shortfalls, _make_trajectory(parts, profiles))
+    return advise(error, may_change, find_value, partial(_replan_task, task))
+
+
+def _solve_soft(
+    data: PhaseData,
+    profile: Profile,
+    units: Units,
+    extra: float | Array,
+    relaxation: Relaxation | None,
+) -> tuple[Profile, float] | None:
+    """Solve with soft limits, from a profile and the relaxation `extra` there."""
+    goal = Objective.RELAX if relaxation else Objective.ELASTIC
+    nlp = build_path_nlp(LimitShape.of(data.limits), len(data.grid.s) - 1, goal)
+    result = nlp.solver(
+        x0=pack(nlp, profile, units, extra),
+        p=parameters(nlp, data, units, 1.0, relaxation),
+        **make_bounds(nlp, data, units, Tightening.none(data, None), relaxation),
+    )
+    if not nlp.solver.stats()["success"]:
+        return None
+    return unpack(nlp, data.grid, result["x"].full()[:, 0], units)
+
+
+def _make_trajectory(parts: Sequence[PhaseData], profiles: Sequence[Profile]) -> Trajectory | None:
+    """The motion with the least shortfalls; None if it stalls."""
+    pairs = zip(parts, profiles, strict=True)
+    motions = [PathMotion(part.curve, part.grid, profile) for part, profile in pairs]
+    try:
+        torques = [fit_torque(*pair)[0] for pair in zip(parts, motions, strict=True)]
+    except SolverError:
+        return None
+    return _assemble_least(motions, torques, [part.curve.formation for part in parts])
+
+
+def _replan_task(task: Task, parameter: Parameter, value: float) -> object:
+    """Plan along the same curves with another value of a parameter, roughly."""
+    if parameter.key == EPSILON:
+        task = replace(task, epsilon=value)
+    else:
+        task = replace(task, curves=[change_curve(c, parameter.key, value) for c in task.curves])
+    return plan_task(replace(task, options=task.options.roughen()), insist=False)
+
+
+def list_frictions(formation: Formation) -> list[Parameter]:
+    """Friction of what is touched: to be lowered, and where a contact rolls to be raised."""
+    parts = dict.fromkeys(contact.finger for contact in formation.contacts)
+    rolls = {contact.finger for contact in formation.rolling}
+    frictions = []
+    for finger in parts:
+        name = "palm" if finger is None else f"finger {finger + 1}"
+        key, value = f"{FRICTION}.{name.replace(' ', '')}", formation.scene.friction.of(finger)
+        signs = (-1, 1) if finger in rolls else (-1,)
+        frictions += [Parameter(f"friction of {name}", value, "", sign, key) for sign in signs]
+    return frictions
+
+
+def _search_friction(task: Task, parameter: Parameter) -> float | None:
+    """A lower or higher coefficient with which there is a plan."""
+    farthest = 0.0 if parameter.sign < 0 else _ROUGH * parameter.value
+    replan = partial(_replan_task, task, parameter)
+    return bracket(parameter, farthest, lambda value: succeeds(partial(replan, value)))
+
+
+def explain_jam(task: Task, jam: JammingError) -> JammingError:
+    """Add to an error which single lower friction would let a phase be planned."""
+    lower = [own for own in list_frictions(task.curves[0].formation) if own.sign < 0]
+    return advise(jam, lower, partial(_search_friction, task), partial(_replan_task, task))
+
+
+def explain_duration(task: Task) -> InfeasibleError | None:
+    """The error if the duration is shorter than the least time, with one that would do."""
+    duration = task.duration
+    if duration is None:
+        return None
+    fastest = replace(task.options, objective=Objective.TIME, duration=None)
+    try:
+        plans = plan_task(replace(task, options=fastest, duration=None)).plans
+    except WholearmError:
+        return None
+    least = sum(plan.value for plan in plans)
+    if least <= duration:
+        return None
+    rough = replace(task, options=task.options.roughen())
+
+    def can_plan(_: Parameter, value: float) -> bool:
+        try:
+            return plan_task(replace(rough, duration=value)).plans[0].value >= task.epsilon
+        except SolverError:
+            return False
+
+    own = Parameter("duration", duration, "s", 1, "duration")
+    changes = find_changes([own], lambda _: least, can_plan)
+    return InfeasibleError(
+        f"{name_phases(task.phases, 'infeasible')}: duration = {duration:g} s is "
+        f"{least - duration:.3g} s shorter than the least time; {describe_changes(changes)}",
+        changes=changes,
+    )
+
+
+def _explain_rate_limits(task: Task, parts: Sequence[PhaseData], reason: str) -> WholearmError:
+    """The error for phases without a plan under rate limits and lags.
+
+    It is that of unlimited rates if there is no plan with these either. Otherwise larger limits
+    are tried.
+    """
+    rest = task.epsilon, task.options, task.phases, task.duration
+    try:
+        require_hold(parts[0], task.phases[0], 0)
+        require_hold(parts[-1], task.phases[-1], -1)
+        plan_curves([_raise_rate_limits(curve, np.inf) for curve in task.curves], *rest)
+    except WholearmError as error:
+        return error
+    change = "a plan was found for motors without limits"
+    for factor in _FASTER:
+        faster = [_raise_rate_limits(curve, factor) for curve in task.curves]
+        try:
+            plan_curves(faster, *rest, False, task.pins)
+        except WholearmError:
+            continue
+        change = f"feasible with motors {factor:g} times as quick"
+        break
+    text = (
+        "torques may not change as quickly as they would have to (torque_rate_limit, actuator_lag)"
+    )
+    return InfeasibleError(f"{name_phases(task.phases, 'infeasible')}: {text}; {change}; {reason}")
+
+
+def _raise_rate_limits(curve: Curve, factor: float) -> Curve:
+    """The curve in a scene with torque rate limits and 1 / lags times a factor."""
+    scene = curve.formation.scene
+    right, left = (
+        replace(
+            finger,
+            torque_rate_limit=finger.torque_rate_limit * factor,
+            actuator_lag=finger.actuator_lag / factor,
+        )
+        for finger in scene.fingers
+    )
+    return _in_scene(curve, replace(scene, fingers=(right, left)))
+
+
+def refuse(
+    search: TimeSearch,
+    problem: Problem,
+    phases: Sequence[Phase],
+    stages: Sequence[Stage],
+    replan: Replan | None,
+) -> None:
+    """Raise an InfeasibleError if no motion can begin from rest, or come to rest at the end.
+
+    The end counts if it is one point, of a single phase with one degree of freedom. `replan` is as
+    for `explain`.
+    """
+    epsilon, last = search.problem.epsilon, stages[-1]
+    stage, node, phase = stages[0], 0, phases[0]
+    statics = Statics(stage.formation, stage.guess.nodes[0, 0])
+    blocked = statics.find_block(epsilon)
+    say = "from rest at its start, {}, no motion begins in any contact mode"
+    alone = len(phases) == 1 and not phase.until.is_release
+    if blocked is None and alone and count_freedoms(last.formation, last.guess.nodes[-1, 0]) == 1:
+        stage, node = last, -1
+        statics = Statics(last.formation, last.guess.nodes[-1, 0])
+        blocked = statics.find_block(epsilon, ends=True)
+        say = "at its end, {}, no motion comes to rest in any contact mode"
+    if blocked is None:
+        _refuse_pushed(problem, phase, stages if alone else ())
+        if problem.scene.has_slow_motors:
+            _refuse_unheld(problem, phase, stages[0], 0)
+            if alone and (last.formation.n_constraints == 4 or phase.until.pins):
+                _refuse_unheld(problem, phase, last, -1)
+        return
+    where = describe_pose(to_si(stage, problem).guess.nodes[node, 0])
+    text = f"phase {phase.number} is infeasible: {say.format(where)}"
+    shortfalls = list[Shortfall]()
+    if blocked.contact:
+        amount = blocked.short * problem.scene.scales.force
+        limit = f"c_n of {blocked.contact} >= epsilon = {problem.epsilon:g} N"
+        text += f": {limit} is {amount:.3g} N short at best"
+        place = LimitPlace(phase.number, math.nan, where)
+        shortfalls.append(
+            Shortfall(PRESS, blocked.contact, limit, amount, "N", place, blocked.short)
+        )
+    else:
+        text += " within the torque limits"
+
+    def find_value(parameter: Parameter) -> float | None:
+        if parameter.is_speed:
+            return None
+        if parameter.key == EPSILON:
+            value = statics.find_epsilon(node == -1)
+        else:
+            value = statics.find_torque_limit(epsilon, _find_finger(parameter), node == -1)
+        return _unit_of(parameter, problem.scene.scales) * value if value else None
+
+    known = make_limits(phase.formation, problem.epsilon).parameters
+    raise advise(InfeasibleError(text, shortfalls), known, find_value, replan, ADVICE)
+
+
+def _refuse_pushed(problem: Problem, phase: Phase, stages: Sequence[Stage]) -> None:
+    """Raise an error if contacts can push the object only one way, along all of the guess."""
+    if not stages or stages[0].formation.n_constraints > 2:
+        return
+    z = np.concatenate([stage.guess.z.reshape(-1, 5) for stage in stages])
+    if pushes_one_way(stages[0].formation, z):
+        names = " ".join(stages[0].formation.names)
+        where = describe_pose(to_si(stages[-1], problem).guess.nodes[-1, 0])
+        raise InfeasibleError(
+            f"phase {phase.number} is infeasible: {names} can only push the object one way, with "
+            f"whatever friction, so that it does not come to rest at its end, {where}"
+        )
+
+
+def _refuse_unheld(problem: Problem, phase: Phase, stage: Stage, node: int) -> None:
+    """Raise an error if rate-limited torques cannot hold the object at rest at an end."""
+    z, limit = to_si(stage, problem).guess.nodes[node, 0], problem.scene.torque_limit
+    held = Statics(phase.formation, z).torque_polygon()
+    if not held.is_empty(limit):
+        return
+    most = "however large" if held.is_empty(np.full(2, np.inf)) else "within their limits"
+    raise InfeasibleError(
+        f"phase {phase.number} is infeasible: torques may not step (torque_rate_limit, "
+        f"actuator_lag), so that they have to hold the object at rest at its "
+        f"{'end' if node else 'start'}, {describe_pose(z)}; {' '.join(phase.formation.names)} with "
+        f"their friction can be held there by no torques, {most}; end the phase where they can "
+        "(wholearm predict shows where), or leave out torque_rate_limit and actuator_lag"
+    )
+
+
+def refuse_paths(problem: Problem, phase: Phase, margins: Sequence[PathMargin]) -> None:
+    """Raise an InfeasibleError with the critical limit if along every path one is missed."""
+    if not margins or (best := max(margins, key=lambda own: own.value)).value > -MISSED:
+        return
+    limits = make_limits(phase.formation, problem.epsilon).limits
+    limit = next(own for own in limits if (own.kind, own.part) == best[1:3])
+    place, missed = LimitPlace(phase.number, math.nan, "the best of them"), -best.value
+    amount = missed * limit.scale
+    shortfall = Shortfall(*best[1:3], limit.text, amount, limit.unit, place, missed)
+    raise InfeasibleError(
+        f"phase {phase.number} is infeasible along all straight paths to its ends, at any speed: "
+        f"{shortfall}",
+        [shortfall],
+    )
+
+
+def explain_stages(
+    search: TimeSearch,
+    problem: Problem,
+    phases: Sequence[Phase],
+    short: Sequence[list[Stage]],
+    status: str,
+    replan: Replan | None,
+) -> InfeasibleError | SolverError:
+    """Why phases over time have no plan, and what would change that.
+
+    Parameters
+    ----------
+    problem  in SI units
+    short    elastic solutions that violate limits, from different guesses
+    status   how the solver ended, in words
+    replan   None: no change is looked for
+    """
+    numbers = [phase.number for phase in phases]
+    if not short:
+        names = " and ".join(" ".join(phase.formation.names) for phase in phases)
+        text = f"no plan for {name_phases(numbers)} ({names}, until {phases[-1].until}): {status}"
+        usual = search.options.transcription == "time" and not problem.scene.control_period
+        if usual and runs_along_curves(phases, PlanOptions()):
+            return SolverError(f"{text}; leave out --transcription time, which plans along curves")
+        return SolverError(f"{text}; try another number of intervals per phase (--time-intervals)")
+
+    lists = [list_shortfalls(problem, stages, search.scheme) for stages in short]
+    sums = [sum(shortfall.amount for shortfall in shortfalls) for shortfalls in lists]
+    best = sums.index(min(sums))
+    stages = [to_si(stage, problem) for stage in short[best]]
+
+    def find_value(parameter: Parameter) -> float | None:
+        if not is_met(parameter, [stage.guess for stage in stages], lists[best]):
+            return math.nan
+        solution = search.aiming(Objective.RELAX, parameter).solve(short[best])
+        # A limit that may be tighter is not in conflict with the others.
+        if not solution.success or solution.cost < 0.0:
+            return math.nan
+        unit = _unit_of(parameter, problem.scene.scales)
+        return parameter.value + parameter.sign * unit * solution.cost
+
+    motions = make_phase_motions(stages, search.scheme, phases)
+    torques = [motion.torque for motion in motions]
+    motion = _assemble_least(motions, torques, [phase.formation for phase in phases])
+    known = make_limits(phases[0].formation, problem.epsilon).parameters
+    error = _describe_least(numbers, lists[best], motion)
+    return advise(error, known, find_value, replan, ADVICE)
+
+
+def list_shortfalls(problem: Problem, stages: Sequence[Stage], scheme: Scheme) -> list[Shortfall]:
+    """Violations of limits by the motion of stages in the scene's units, each where it is worst.
+
+    They are looked at in SI units, at the collocation points, torques also at ends of intervals.
+    """
+    worst, passed = dict[str, Shortfall](), 0.0
+    pick = np.array([0, *range(scheme.degree), scheme.degree - 1])
+    at = np.concatenate([[0.0], scheme.points, [1.0]])
+    for stage in (to_si(stage, problem) for stage in stages):
+        limits, part = make_limits(stage.formation, problem.epsilon), stage.guess
+        tau = blend(at, part.tau.shape[1]) @ part.tau
+        y = np.concatenate([part.forces[:, pick], tau, part.v[:, pick, 3:]], axis=2)
+        middles = passed + part.duration * (part.breaks[:-1] + part.fractions / 2)
+        places = [
+            LimitPlace(stage.phase + 1, t, f"t = {t:.4f} s, phase {stage.phase + 1}")
+            for t in np.repeat(middles, len(pick)).tolist()
+        ]
+        values = (y @ limits.rows.T).reshape(-1, len(limits.low))
+        for short in find_shortfalls(limits, values, places):
+            worst[short.limit] = max(worst.get(short.limit, short), short, key=lambda s: s.amount)
+        passed += part.duration
+    return list(worst.values())
+
+
+def is_met(
+    parameter: Parameter, motion: Sequence[StagePoints], shortfalls: Sequence[Shortfall]
+) -> bool:
+    """Whether the limit of a parameter is active in the elastic motion.
+
+    That of epsilon is if no normal force is short of more than epsilon.
+    """
+    if parameter.key == EPSILON:
+        return all(each.amount < parameter.value for each in shortfalls if each.kind == PRESS)
+    tables = [part.v[..., 3:] if parameter.is_speed else part.tau for part in motion]
+    most = max(float(np.abs(table[..., _find_finger(parameter)]).max()) for table in tables)
+    return most > MET * parameter.value
+
+
+def _find_finger(parameter: Parameter) -> int:
+    """Index of the finger whose limit a parameter is."""
+    return int(parameter.key.split(".")[1]) - 1
+
+
+def _unit_of(parameter: Parameter, scales: Scales) -> float:
+    """The scene's unit of a parameter in SI units."""
+    return {"N": scales.force, "N m": scales.torque, "rad/s": 1 / scales.time}[parameter.unit]
+
+
+def explain_motors(
+    planning: Planning,
+    block: Sequence[Phase],
+    options: PlanOptions,
+    error: InfeasibleError | SolverError,
+    plan_block: Callable[[Planning, Sequence[Phase], PlanOptions], Plans],
+) -> InfeasibleError | SolverError:
+    """The error with whether the phases have a plan with free torques, found by `plan_block`."""
+    scene, given = planning.problem.scene, list[str]()
+    if scene.control_period:
+        given.append(f"control_period = {scene.control_period:g} s ({scene.control_hold})")
+    kinds = (("torque_rate_limit", "N m/s", math.inf), ("actuator_lag", "s", 0.0))
+    for key, unit, none in kinds:
+        values = list(dict.fromkeys(getattr(finger, key) for finger in scene.fingers))
+        if values != [none]:
+            texts = dict.fromkeys(f"{value:g}" for value in values)
+            given.append(f"{key} = {' and '.join(texts)} {unit}")
+    if not given:
+        return error
+    keys, where = " and ".join(given), name_phases([phase.number for phase in block])
+    if isinstance(error, InfeasibleError):
+        where += f" ({'; '.join(' '.join(phase.formation.names) for phase in block)})"
+    free, own = free_torques(planning.problem, options)
+    try:
+        phases = [free.phases[phase.index] for phase in block]
+        found = plan_block(replace(planning, problem=free, curves=()), phases, own.roughen())
+    except WholearmError as other:
+        text = f"{error}; without {keys} none was found either: {other}"
+    else:
+        lasts = sum(plan.motion.duration for plan in found)
+        text = f"without {keys} there is a plan of {lasts:.4g} s for {where}; with that, {error}"
+    error.args = (text,)
+    return error
