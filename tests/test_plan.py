@@ -21,8 +21,8 @@ from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError, SolverError
 from wholearm.planning.blocks import Planning
 from wholearm.planning.explain import explain_motors
+from wholearm.planning.phase_plan import Plans
 from wholearm.planning.plan import solve
-from wholearm.planning.stops import Plans
 from wholearm.results.trajectory import Samples, Trajectory
 
 OBJECTIVES = ["time", "effort", "margin"]

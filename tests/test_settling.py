@@ -20,8 +20,8 @@ from wholearm import Formation, InputError, Problem, simulate, simulate_free, so
 from wholearm.planning import dwell
 from wholearm.planning.dwell import list_touching, settle_plans
 from wholearm.planning.phase_plan import PhasePlan, Settled
+from wholearm.planning.replay_check import make_table
 from wholearm.planning.result import Plan, describe_plan, load_plan, write_meta
-from wholearm.planning.table_check import make_table
 from wholearm.problem.read import read_own_problem
 from wholearm.problem.table import describe_scene
 from wholearm.results.dwell_record import assemble, change_torques, find_change_times

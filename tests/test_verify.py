@@ -28,9 +28,10 @@ from wholearm.planning.replay_check import (
     ReplayCheck,
     check_plan,
     find_residual,
+    make_table,
     replay_plan,
+    sample_table,
 )
-from wholearm.planning.table_check import make_table, sample_table
 from wholearm.results.torque import TorqueProfile, read_rows
 from wholearm.results.trajectory import Motion, Samples, Trajectory
 from wholearm.verification.newton_euler import BODIES, Balance, balance

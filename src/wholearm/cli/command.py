@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from ..benchmark.study import Study
     from ..common.document import Result
-    from ..planning.table_check import TorqueTable
+    from ..planning.replay_check import TorqueTable
     from ..results.report import Report
     from ..simulation.events import Simulation
     from ..verification.free import FreeReport
@@ -326,7 +326,7 @@ def _check_sampling(options: argparse.Namespace) -> None:
 
 def _make_table(options: argparse.Namespace, plan: wholearm.Plan) -> TorqueTable:
     """The torque table that is asked for, replayed."""
-    from ..planning.table_check import make_table, sample_table
+    from ..planning.replay_check import make_table, sample_table
 
     given = plan.problem, plan.trajectory
     if options.sample_rate is None:

@@ -35,8 +35,7 @@ from .lower_bound import look_along
 from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence, make_sequence, plan_sequence, plan_slowly
 from .path_domain.path_motion import PathMotion
-from .phase_plan import PhasePlan, Settled, add_up
-from .stops import Plans, end_of, runs_along_curves, split_blocks
+from .phase_plan import PhasePlan, Plans, Settled, add_up, end_of, runs_along_curves, split_blocks
 
 if TYPE_CHECKING:
     from ..geometry.arcs import CostToGo

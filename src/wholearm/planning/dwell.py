@@ -25,8 +25,7 @@ from ..simulation.rest import close_contacts
 from ..simulation.simulate import simulate_free
 from ..simulation.tolerances import SLOW, is_slower
 from .path_domain.junction import begin_from
-from .phase_plan import Settled
-from .stops import Plans, end_of
+from .phase_plan import Plans, Settled, end_of
 
 CLOSED = 0.01  # relative gap that counts as closed
 

@@ -60,7 +60,7 @@ from .path_domain.path_nlp import (
     unpack,
 )
 from .path_domain.path_plan import PathIterate, Task, plan_curves, plan_task
-from .stops import Plans, runs_along_curves
+from .phase_plan import Plans, runs_along_curves
 from .time_domain.collocation import Scheme, blend
 from .time_domain.guesses import PathMargin
 from .time_domain.search import TimeSearch

@@ -1,17 +1,23 @@
-"""The plan of one phase in either domain, and objective and duration of several."""
+"""Plans of phases in either domain; blocks of phases, and plans with stops inside a block."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import pairwise
 from typing import Generic, NamedTuple, TypeVar
 
-from ..problem.definition import Phase
+import numpy as np
+
+from ..common.arrays import Array
+from ..common.errors import InfeasibleError
+from ..geometry.tracing import runs_on_curve
+from ..problem.definition import End, Phase, Problem
 from ..results.dwell_record import Settling
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion
-from .options import Objective
+from .options import Objective, PlanOptions
 
 M_co = TypeVar("M_co", bound=Motion, covariant=True)
 
@@ -33,20 +39,17 @@ class PhasePlan(NamedTuple, Generic[M_co]):
     unheld: float = math.nan  # value with free torques, where they are held over control periods
 
 
+Plans = list[PhasePlan[Motion]]
+PlanPart = Callable[[int, int, Array, PlanOptions, float | None], Plans]
+"""Plans phases `start` to `stop` of a block, without the latter, from a configuration and within a
+duration: from rest to rest, with what joins them passed in motion."""
+
+
 class Settled(NamedTuple):
     """Plans of all phases with their dwells; None at ends without one."""
 
     plans: list[PhasePlan[Motion]]
     settlings: tuple[Settling | None, ...]
-
-
-@dataclass
-class Tried:
-    """Statistics of a mode search."""
-
-    sequences: int = 1  # of modes that were tried
-    complete: bool = True  # whether none was left
-    iterations: int = 0  # of the solver
 
 
 def add_up(phases: Sequence[Phase], allowed: Sequence[float | None]) -> float | None:
@@ -58,3 +61,76 @@ def add_up(phases: Sequence[Phase], allowed: Sequence[float | None]) -> float | 
 def combine(goal: Objective, values: Sequence[float]) -> float:
     """Objective value of some phases, given that of each."""
     return min(values) if goal is Objective.MARGIN else sum(values)
+
+
+def plan_stops(
+    plan_part: PlanPart,
+    bounds: Sequence[int],
+    z: Array,
+    options: PlanOptions,
+    duration: float | None = None,
+) -> Plans:
+    """Plan phases of a block with a stop before some of them; raises without a plan.
+
+    Parameters
+    ----------
+    bounds          indices in the block of the phases that start at rest, and the end of the last
+    z : (5,)        start
+    duration : [s]  longest in all, for `margin`: shared in proportion to the parts' least times
+    """
+    parts = list(pairwise(bounds))
+    allowed = [duration] * len(parts)
+    if duration is not None and len(parts) > 1:
+        fastest = replace(options, objective=Objective.TIME, duration=None)
+        least = _plan_parts(plan_part, parts, z, fastest, [None] * len(parts))
+        times = [
+            sum(plan.motion.duration for plan in least[start - bounds[0] : stop - bounds[0]])
+            for start, stop in parts
+        ]
+        if duration <= sum(times):
+            raise InfeasibleError(
+                f"duration = {duration:g} s is not longer than the least time with "
+                f"{'a stop' if len(parts) == 2 else 'stops'}, {sum(times):.6g} s"
+            )
+        allowed = [duration * time / sum(times) for time in times]
+    return _plan_parts(plan_part, parts, z, options, allowed)
+
+
+def _plan_parts(
+    plan_part: PlanPart,
+    parts: Sequence[tuple[int, int]],
+    z: Array,
+    options: PlanOptions,
+    allowed: Sequence[float | None],
+) -> Plans:
+    plans: Plans = []
+    for (start, stop), duration in zip(parts, allowed, strict=True):
+        plans += plan_part(start, stop, z, options, duration)
+        z = end_of(plans[-1])[0]
+    return plans
+
+
+def end_of(plan: PhasePlan[Motion]) -> tuple[Array, Array]:
+    """Configuration z and velocity z' at the end of a phase, shape (5,) each."""
+    samples = plan.motion.evaluate(np.array([plan.motion.duration]))
+    return samples.z[0], samples.z_dot[0]
+
+
+def split_blocks(problem: Problem) -> list[tuple[Phase, ...]]:
+    """Phases that have to be planned together: those joined smoothly or by impacts."""
+    rests = [k + 1 for k, phase in enumerate(problem.phases) if phase.end is End.REST]
+    return [problem.phases[start:stop] for start, stop in pairwise([0, *rests])]
+
+
+def runs_along_curves(block: Sequence[Phase], options: PlanOptions) -> bool:
+    """Whether phases are planned along their curves: a single one, or several that slide."""
+    if options.transcription != "auto":
+        return False
+    if len(block) == 1:
+        return runs_on_curve(block[0])
+    return all(
+        phase.formation.n_constraints == 4
+        and not phase.formation.rolling
+        and not phase.until.is_release
+        for phase in block
+    )

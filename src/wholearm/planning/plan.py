@@ -33,9 +33,8 @@ from .blocks import BlockPlan, Planning, plan_blocks
 from .lower_bound import bound_least_time
 from .options import Objective, PlanOptions
 from .path_domain import impact_sequence
-from .phase_plan import add_up, combine
+from .phase_plan import PlanPart, add_up, combine, plan_stops
 from .result import Plan, PlannedPhase, Status, Timings, write_meta
-from .stops import PlanPart, plan_stops
 
 OVER_TIME = "planned over time"
 NO_MOTION = "the sweep over the phase plane finds no motion"

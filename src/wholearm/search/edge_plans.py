@@ -24,9 +24,9 @@ from ..geometry.tracing import trace_phase
 from ..planning.blocks import BEGUN, BlockPlan, Planning, plan_next
 from ..planning.explain import unadvised
 from ..planning.options import PlanOptions
+from ..planning.phase_plan import end_of, split_blocks
 from ..planning.plan import solve_with
 from ..planning.result import Plan
-from ..planning.stops import end_of, split_blocks
 from ..planning.time_domain.time_motion import TimeMotion
 from ..problem.definition import ROWS, End, ModeGuess, Phase, Problem
 from ..problem.read import read_phase

@@ -1,6 +1,6 @@
 """Finite elements of a curve: s'' and internal force are polynomials, with steps between elements.
 
-An element has `DEGREE` + 1 nodes, the Lobatto points of a local variable y from 0 to 1. Inside a
+An element has `NODES` nodes, the Lobatto points of a local variable y from 0 to 1. Inside a
 motion s is linear in y. Next to rest s is quadratic in y, measured from the place of rest: the
 speed, and viscous friction with it, is the root of s there, and smooth in y. Where torques may not
 step, the motion starts and ends without acceleration and s is cubic in y. Elements after such a
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from ...common.arrays import Array, jacobi_nodes
 
 DEGREE = 4  # degree of the polynomials
+NODES = DEGREE + 1  # of an element
 # Kinds of elements: amid a motion, at its start and end, and there without acceleration.
 INSIDE, FROM_REST, TO_REST, FROM_HOLD, TO_HOLD = range(5)
 POWERS = np.array([1, 2, 2, 3, 3])  # power of y in s, of each kind
@@ -72,17 +73,17 @@ class Grid(NamedTuple):
     def nonempty(self) -> NDArray[np.int64]:
         """The intervals inside elements."""
         k = np.arange(len(self.s) - 1)
-        return k[k % (DEGREE + 1) < DEGREE]
+        return k[k % NODES < DEGREE]
 
     @property
     def edges(self) -> Array:
         """Start and stop of each element, shape (E, 2) [m]."""
-        return self.s.reshape(-1, DEGREE + 1)[:, [0, -1]]
+        return self.s.reshape(-1, NODES)[:, [0, -1]]
 
     @property
     def kinds(self) -> NDArray[np.int64]:
         """Kind of each element, shape (E,)."""
-        kinds = np.full(len(self.s) // (DEGREE + 1), INSIDE)
+        kinds = np.full(len(self.s) // NODES, INSIDE)
         ends = (FROM_HOLD, TO_HOLD) if self.held else (FROM_REST, TO_REST)
         for at in (0, -1):
             kinds[at] = ends[at] if self.rests[at] else kinds[at]
@@ -113,7 +114,7 @@ class Grid(NamedTuple):
 
     def _lean(self, by: float) -> Array:
         """The nodes, those at the ends of elements moved inwards a little."""
-        s = self.s.copy().reshape(-1, DEGREE + 1)
+        s = self.s.copy().reshape(-1, NODES)
         s[:, 0] += by
         s[:, -1] -= by
         return s.ravel()
@@ -121,7 +122,7 @@ class Grid(NamedTuple):
     def integrate(self, a: Array) -> Array:
         """B at the nodes for s'' there, from rest, shape (N + 1,)."""
         lengths = np.diff(self.edges)
-        table = a.reshape(-1, DEGREE + 1, 1)
+        table = a.reshape(-1, NODES, 1)
         links, kinds = find_basis().links, self.kinds
         rises = (links[kinds] @ table)[..., 0]
         if self.bends is not None:
@@ -135,7 +136,7 @@ def lay_out(
     edges: Array, segment: NDArray[np.int64], rests: tuple[bool, bool], held: bool = False
 ) -> Grid:
     """The grid of elements with these edges, shape (E, 2) [m], on segments of shape (E,)."""
-    grid = Grid(np.repeat(edges[:, 0], DEGREE + 1), np.repeat(segment, DEGREE + 1), rests, held)
+    grid = Grid(np.repeat(edges[:, 0], NODES), np.repeat(segment, NODES), rests, held)
     kinds, y = grid.kinds[:, None], find_basis().y[grid.kinds]
     share = y ** POWERS[kinds]
     share = np.where(SIGNS[kinds] > 0, share, 1 - share)
@@ -195,12 +196,12 @@ class Elements:
         self._y = basis.y[kinds].ravel()
         self._rooted, self._power = kinds > 0, POWERS[kinds]
         table = np.stack([profile.a, profile.lam], axis=-1)
-        table = table.reshape(len(kinds), DEGREE + 1, 2)
+        table = table.reshape(len(kinds), NODES, 2)
         self._motion = basis.to_powers[kinds] @ table
-        powers = np.arange(DEGREE + 1)[:, None]
+        powers = np.arange(NODES)[:, None]
         a = np.diff(grid.edges)[:, :, None] * self._motion[..., :1]
         sign = SIGNS[kinds][:, None, None]
-        first = profile.b.reshape(-1, DEGREE + 1)[:, :1, None]
+        first = profile.b.reshape(-1, NODES)[:, :1, None]
         plain = np.concatenate([first, 2 * a / (powers + 1)], axis=1)
         rooted = np.concatenate([4 * sign * a / (powers + 2), np.zeros_like(first)], axis=1)
         # A constant part of s'' in y would be rounding.
@@ -220,14 +221,14 @@ class Elements:
     @property
     def stretch(self) -> Array:
         """Slope ds/dy at the nodes over the element's length, (E, p + 1)."""
-        y = self._y.reshape(-1, DEGREE + 1)
+        y = self._y.reshape(-1, NODES)
         c = 0.0 if self._bends is None else self._bends[:, None]
         power = self._power[:, None]
         return np.asarray(power * y ** (power - 1) * (1 - c + 2 * c * y))
 
     def find_y(self, k: NDArray[np.int64], done: Array, left: Array) -> Array:
         """Local variable where parts of an interval, which add up to 1, are done and left."""
-        element = k // (DEGREE + 1)
+        element = k // NODES
         power = self._power[element]
         y, later = self._y[k], self._y[k + 1]
         squares = np.sqrt(np.maximum(left * y**2 + done * later**2, 0.0))
@@ -245,11 +246,11 @@ class Elements:
     def find_cubic(self, k: NDArray[np.int64], w: Array) -> tuple[NDArray[np.bool_], Array, Array]:
         """Whether s is cubic in y in intervals k, y at a part w of its rise there, and the rise."""
         y, later = self._y[k], self._y[k + 1]
-        return self._power[k // (DEGREE + 1)] == 3, y + w * (later - y), later - y
+        return self._power[k // NODES] == 3, y + w * (later - y), later - y
 
     def evaluate(self, k: NDArray[np.int64], y: Array) -> tuple[Profile, Array]:
         """Profile and speed [m/s] at places y of intervals k."""
-        element = k // (DEGREE + 1)
+        element = k // NODES
         motion = self._motion[element, -1].T
         for power in reversed(range(DEGREE)):
             motion = motion * y + self._motion[element, power].T
@@ -272,7 +273,7 @@ class Elements:
         old = self.grid
         place = old.interpolate(np.arange(len(old.s), dtype=float), grid)
         k = np.clip(np.floor(place).astype(int), 0, len(old.s) - 2)
-        k = np.where(k % (DEGREE + 1) == DEGREE, k + 1, k)
+        k = np.where(k % NODES == DEGREE, k + 1, k)
         k = np.minimum(k, len(old.s) - 2)
         done = np.clip((grid.s - old.s[k]) / np.maximum(old.steps[k], 1e-300), 0.0, 1.0)
         return self.evaluate(k, self.find_y(k, done, 1 - done))[0]

@@ -19,11 +19,10 @@ from ...common.arrays import Array
 from ...mechanics.dynamics import A, V
 from ...mechanics.path_limits import PathLimits
 from ...mechanics.speed_sweep import SweepMode
-from .elements import DEGREE, FROM_REST, INSIDE, TO_REST, Grid, Profile, find_basis
+from .elements import DEGREE, FROM_REST, INSIDE, NODES, TO_REST, Elements, Grid, Profile, find_basis
 from .path_data import PhaseData
 from .path_mesh import Fastest
-from .path_nlp import LEAST_B, PathNLP, Units, pack, parameters
-from .rate_terms import exceeds_rates
+from .path_nlp import LEAST_B, PathNLP, Units, list_slopes, pack, parameters
 
 _SLOW = -12  # height of the slowest guess over that of a fall, as a power of two
 _QUICK = 30.0  # largest b of a guess, over that which the torque limits alone allow
@@ -35,7 +34,6 @@ _CENTRAL, _SLACK = 1e-4, 1e-3
 _MU, _INSIDE = 1e-7, 1e-2
 _DAMPING = 1e-10  # of normal equations with dependent rows, over their mean diagonal
 _WILD = 10.0  # s'' over its median above which a vertex is of nearly parallel limits
-_NODES = DEGREE + 1
 
 
 def guess(data: PhaseData, time_weight: float = 0.0) -> tuple[Profile, Units]:
@@ -51,7 +49,7 @@ def guess(data: PhaseData, time_weight: float = 0.0) -> tuple[Profile, Units]:
         low, high = find_internal_force_range(data, height)
         a, b = _parabola(data, height)
         kept = bool(((low <= high) & (low < np.inf)).all() and (b <= b_max).all())
-        return kept and not exceeds_rates(data, Profile(a, b, find_middle(data, low, high)[1]))
+        return kept and not _exceeds_rates(data, Profile(a, b, find_middle(data, low, high)[1]))
 
     # Bisection over heights from 2^-12 to 2^8 times that of a fall over this length.
     low_power, high_power = float(_SLOW), 8.0
@@ -63,6 +61,19 @@ def guess(data: PhaseData, time_weight: float = 0.0) -> tuple[Profile, Units]:
             high_power = power
     none = low_power == _SLOW
     return _guess_at(data, 0.7 * fall * (1.0 if none else 2**low_power), time_weight)
+
+
+def _exceeds_rates(data: PhaseData, profile: Profile) -> bool:
+    """Whether torque rates or commands are beyond their limits at the nodes of a motion."""
+    grid, lags = data.grid, data.curve.formation.scene.actuator_lag
+    if not grid.held:
+        return False
+    speed = np.sqrt(profile.b).reshape(-1, NODES)
+    y_t = speed / np.maximum(Elements(grid, profile).stretch, 1e-6) / np.diff(grid.edges)
+    tau = data.nodes.forces.tau(*profile).reshape(-1, NODES, 2)
+    rates = np.stack(list_slopes())[grid.kinds] @ tau * y_t[..., None]
+    command = np.abs(tau + lags * rates) * (lags > 0)
+    return bool((np.abs(rates) > data.rate_limit).any() or (command > data.torque_limit).any())
 
 
 def guess_slowly(data: PhaseData) -> tuple[Profile, Units]:
@@ -188,7 +199,7 @@ class _Vertices(NamedTuple):
         Speeds are integrated forwards where s'' is the largest, and backwards where the least.
         """
         modes = fastest.find_modes(grid.edges.mean(axis=1))
-        of_nodes = np.repeat(modes, _NODES)
+        of_nodes = np.repeat(modes, NODES)
         runs = np.split(np.arange(len(of_nodes)), np.flatnonzero(np.diff(of_nodes)) + 1)
         held, pushed = of_nodes == SweepMode.HELD, of_nodes == SweepMode.PUSH
         wanted = np.interp(grid.s, (fastest.s[1:] + fastest.s[:-1]) / 2, fastest.slopes)
@@ -220,7 +231,7 @@ def _find_pairs(sides: PathLimits, rows: PathLimits, b: Array, largest: bool) ->
 
     Other sides may take over at element ends: there those of the next node inside are taken.
     """
-    row = rows.extreme(b, largest).row.reshape(-1, _NODES)
+    row = rows.extreme(b, largest).row.reshape(-1, NODES)
     row[:, 0], row[:, -1] = row[:, 1], row[:, -2]
     return sides.pair(row.ravel())
 
@@ -243,7 +254,7 @@ def _find_multipliers(
     unknowns = table[:, :3][table[:, :3] >= 0].tolist()
     rows, signs, _ = data.limits.sides
     # Where s'' jumps the duration does not depend on the speed.
-    links = np.delete(np.arange(len(grid.steps)), vertices.jumps * _NODES + DEGREE)
+    links = np.delete(np.arange(len(grid.steps)), vertices.jumps * NODES + DEGREE)
     free = np.flatnonzero(~vertices.held)
     limits = g["limits"].start + free[:, None] * nlp.shape.rows + rows[vertices.sides[free]]
     jacobian = nlp.solver.function.get_function("nlp_jac_g")(x, p)[1]
@@ -267,7 +278,7 @@ def _find_slopes(grid: Grid, profile: Profile, units: Units) -> Array:
     b, a = profile.b / units.profile[0], profile.a / units.profile[1]
     weights = basis.weights * np.diff(grid.edges) / units.length
     y = np.where((grid.kinds == INSIDE)[:, None], 0.5, basis.y[grid.kinds])
-    slope = np.zeros((count, 3, _NODES))
+    slope = np.zeros((count, 3, NODES))
     slope[:, 0] = -weights * y * np.maximum(b, LEAST_B).reshape(count, -1) ** -1.5
     for e, node, kind in ((0, 0, FROM_REST), (-1, DEGREE, TO_REST)):
         if grid.kinds[e] == kind:

@@ -25,8 +25,7 @@ from ...problem.definition import End, Phase
 from ...results.trajectory import Motion
 from ...solvers.ipopt import charge
 from ..options import PlanOptions
-from ..phase_plan import PhasePlan
-from ..stops import PlanPart, Plans, end_of
+from ..phase_plan import PhasePlan, PlanPart, Plans, end_of
 from .path_plan import plan_curves
 
 if TYPE_CHECKING:

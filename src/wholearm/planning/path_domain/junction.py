@@ -29,8 +29,7 @@ from ...results.plan_record import ModeSpan
 from ...results.torque import TorqueProfile
 from ...results.trajectory import Motion, Samples
 from ..options import Objective, PlanOptions
-from ..phase_plan import PhasePlan
-from ..stops import Plans, runs_along_curves, split_blocks
+from ..phase_plan import PhasePlan, Plans, runs_along_curves, split_blocks
 from .first_guess import find_internal_force_range
 from .path_data import PhaseData, prepare
 from .path_mesh import make_grid

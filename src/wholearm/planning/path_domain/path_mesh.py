@@ -6,6 +6,7 @@ Where a plan of least time switches is first told by a reachability sweep (`Fast
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -15,8 +16,9 @@ from ...common.arrays import Array, sort_unique
 from ...geometry.curve import Curve
 from ...mechanics.path_limits import PathLimits
 from ...mechanics.speed_sweep import NoMotionError, SweepMode, speed_sweep
-from .elements import DEGREE, Elements, Grid, Profile, lay_out
+from .elements import DEGREE, NODES, Elements, Grid, Profile, lay_out
 from .path_data import PhaseData
+from .path_motion import PathMotion, find_torques
 
 _PICARD = 4  # Picard iterations between speeds and extremes of s''
 _SAMPLES = 320  # places at which vertices are found, at least two in an interval
@@ -327,3 +329,26 @@ def find_fastest(data: PhaseData) -> Fastest | None:
     after = (b[1:] - 2 * braked * s[1:])[index] + 2 * braked[index] * places
     here = np.where(switched, np.where(late, after, before), here)
     return Fastest(s, b, modes, samples.find_switches(here, share, index))
+
+
+def equidistribute(part: PhaseData, motion: PathMotion, elements: int) -> Array:
+    """Breaks between elements that share changes of torque rates evenly [m] (de Boor).
+
+    Half of the density over time is even, half the root of the variation of the rates.
+    """
+    rates = find_torques(part, motion.profile, [motion])[1]
+    most = np.maximum(np.abs(rates).max(axis=(0, 1)), part.torque_limit / motion.duration)
+    changes = np.abs(np.diff((rates / most).reshape(-1, 2), axis=0, prepend=0.0)).sum(axis=1)
+    variation = changes.reshape(len(part.grid.edges), -1).sum(axis=1)
+    ends = motion.times.reshape(-1, NODES)
+    spans = ends[:, -1] - ends[:, 0]
+    density = np.sqrt(variation * spans)
+    shares = density / density.sum() + spans / motion.duration
+    done, t = np.append(0.0, np.cumsum(shares)), np.append(ends[:, 0], ends[-1, -1])
+    stops = part.grid.edges[:, 1]
+    fixed = np.array([0.0, *(done[1:][stops == own.stop][0] for own in part.curve.segments)])
+    inner = [
+        np.linspace(*pair, count + 1)[1:-1]
+        for pair, count in zip(pairwise(fixed), share_out(elements, np.diff(fixed)), strict=True)
+    ]
+    return motion.locate(np.interp(np.concatenate(inner), done, t))[0]

@@ -8,11 +8,12 @@ piecewise polynomials through those (`fit_torque`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.polynomial import legendre
+from numpy.polynomial import chebyshev, legendre
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
@@ -21,7 +22,7 @@ from ...geometry.curve import Curve, directions_of
 from ...mechanics.dynamics import Directions, inverse, split_forces
 from ...results.torque import TorqueProfile
 from ...results.trajectory import Samples
-from .elements import DEGREE, Elements, Grid, Profile
+from .elements import NODES, Elements, Grid, Profile
 from .path_data import PhaseData, Places
 
 _POINTS = 12  # Gauss points for the time in an interval between nodes
@@ -30,6 +31,7 @@ _TINY = 1e-100  # least speed [m/s] that is divided by
 _NEWTON = 5  # iterations from a time to a place
 TORQUE_ERROR = 5e-7  # largest error of the polynomials between knots, over the torque limit
 PLACES = 13  # interpolation points where that is exceeded
+LOOKS = 21  # samples of torque rates in each interval
 
 
 # Gauss points, and the matrix from values there to Legendre coefficients of the integral.
@@ -79,7 +81,7 @@ class PathMotion:
         if self.grid.held:
             cubic, y_cubic, rise = self.elements.find_cubic(every, np.tile(w, len(k)))
             y = np.where(cubic, y_cubic, y)
-            length = np.diff(self.grid.edges)[every // (DEGREE + 1), 0]
+            length = np.diff(self.grid.edges)[every // NODES, 0]
             mean = np.repeat(self.grid.steps[k] / np.maximum(v0 + v1, _TINY)[:, 0], len(w))
             slow = 1.5 * np.abs(rise) * length * y_cubic**2 / mean
             plain = np.where(cubic.reshape(done.shape), slow.reshape(done.shape), plain)
@@ -221,3 +223,39 @@ def _fit(data: PhaseData, motion: PathMotion, places: Places, fractions: Array) 
     coefficients = np.linalg.solve(vandermonde, values.reshape(len(k), len(fractions), 2))
     breaks = np.append(motion.times[k], motion.times[-1])
     return TorqueProfile(breaks, np.asarray(coefficients.transpose(0, 2, 1), dtype=float))
+
+
+def find_torques(
+    data: PhaseData, profile: Profile, motions: Sequence[PathMotion]
+) -> tuple[Array, Array]:
+    """Torques and their rates, (n_solid, LOOKS, 2) [N m, N m/s], at evenly spaced times.
+
+    By Chebyshev interpolation in time through torques within each interval.
+    """
+    checks = data.sampling.checks
+    every = (len(checks) - 1) // (PLACES - 1)
+    picked = np.arange(len(checks)) % every == 0
+    fractions, count = checks[picked], len(data.nonempty)
+    places = data.checks.pick(np.tile(picked, count))
+    values = places.forces.tau(*data.interpolate(profile, fractions)).reshape(count, -1, 2)
+    spans = np.concatenate([motion.durations(fractions) for motion in motions])
+    degree, lasts = len(fractions) - 1, np.maximum(spans[:, -1], np.finfo(float).tiny)
+    through = chebyshev.chebvander(2 * spans / lasts[:, None] - 1, degree)
+    # Where two places fall on one instant no polynomial goes through both.
+    modes = np.linalg.solve(through + 1e-300, values)
+    looks = np.linspace(-1, 1, LOOKS)
+    slopes = chebyshev.chebder(np.eye(degree + 1), axis=0)
+    torques = chebyshev.chebvander(looks, degree) @ modes
+    rates = chebyshev.chebvander(looks, degree - 1) @ slopes @ modes
+    return np.asarray(torques), np.asarray(rates * (2 / lasts)[:, None, None])
+
+
+def find_hurry(data: PhaseData, profile: Profile, motions: Sequence[PathMotion]) -> Array:
+    """Relative violations of rates and commands of each joint in each interval, (n_solid, 2, 2)."""
+    if not data.grid.held:
+        return np.zeros((len(data.nonempty), 2, 2))
+    torques, rates = find_torques(data, profile, motions)
+    rate = np.abs(rates).max(axis=1) / data.rate_limit
+    lags = data.curve.formation.scene.actuator_lag
+    command = np.abs(torques + lags * rates).max(axis=1) / data.torque_limit
+    return np.asarray(np.maximum(np.stack([rate, command * (lags > 0)], axis=1) - 1, 0.0))

@@ -8,9 +8,10 @@ Inside each, a and lambda are polynomials, and b' = 2 a (dash: d/ds) is exact,
     low <= rows (c, tau, theta') <= high at every node (`mechanics.limits`),
     T = sum of h weights_k / sqrt(b_k) (next to rest as in `_find_paces`).
 
-b is continuous where two elements meet; a and lambda may step, unless torques are rate-limited
-(`rate_terms`). The least margin, and the relaxation of a limit, have a copy at every node with
-m_k+1 = m_k: a dense column would make building the Jacobian quadratic in the number of nodes.
+b is continuous where two elements meet; a and lambda may step. Rate-limited torques are continuous:
+d tau / dt = (d tau / dy) (dy / dt) with the local variable y of an element, in which the torques at
+its nodes are a polynomial. The least margin, and the relaxation of a limit, have a copy at every
+node with m_k+1 = m_k: a dense column would make building the Jacobian quadratic in their number.
 Built once for some contacts, intervals and an objective, it serves every phase: grid, coefficients
 and limits are its parameters and bounds.
 """
@@ -30,12 +31,26 @@ from ...common.arrays import Array, Expression
 from ...common.errors import Parameter
 from ...mechanics.dynamics import LAMBDA, ONE, A, B, V
 from ...mechanics.limits import PRESS, TORQUE, LimitSet
+from ...scene.model import Scene
 from ...solvers.ipopt import SolverStatistics, book, build_solver
 from ..columns import Columns, Symbols
 from ..options import Objective
-from .elements import DEGREE, FROM_REST, INSIDE, POWERS, SIGNS, Grid, Profile, find_basis, follow
+from .elements import (
+    DEGREE,
+    FROM_HOLD,
+    FROM_REST,
+    INSIDE,
+    NODES,
+    POWERS,
+    SIGNS,
+    TO_HOLD,
+    TO_REST,
+    Grid,
+    Profile,
+    find_basis,
+    follow,
+)
 from .path_data import PhaseData
-from .rate_terms import UNLIMITED, MotorShape, find_first_slopes, list_kinds, write_motor_rows
 
 if TYPE_CHECKING:
     from .unique_start import SureStart
@@ -47,6 +62,39 @@ _CALM = 1e-6  # regularization by lambda^2: selects among equally good plans
 _ROUGH = 0.1  # regularization by the highest Legendre coefficients: no oscillation within elements
 _EVEN = 1e-4  # regularization by changes of a between nodes, in elastic mode
 _STIFF = 1e3  # `_ROUGH` for nonlinear s'', next to rest nonconstant, in elastic mode, over that
+
+
+class MotorShape(NamedTuple):
+    """Joints with a torque rate limit, and those whose torques lag behind a command."""
+
+    rates: tuple[int, ...] = ()
+    commands: tuple[int, ...] = ()
+
+    @staticmethod
+    def of(scene: Scene) -> MotorShape:
+        """The shape of a scene's motors."""
+        if not scene.has_slow_motors:
+            return UNLIMITED
+        limited, lags = np.isfinite(scene.torque_rate_limit), scene.actuator_lag > 0
+        return MotorShape(*(tuple(np.flatnonzero(mask).tolist()) for mask in (limited, lags)))
+
+    @property
+    def slow(self) -> tuple[int, ...]:
+        """Joints whose torques may not step."""
+        return tuple(sorted({*self.rates, *self.commands}))
+
+    def list_sizes(self, intervals: int) -> dict[str, int]:
+        """Numbers of rows of each kind."""
+        n, joints = intervals + 1, len(self.slow)
+        return {
+            "rates": n * len(self.rates),
+            "commands": n * len(self.commands),
+            "joins": (n // NODES - 1) * joints,
+            "begins": 2 * bool(joints),
+        }
+
+
+UNLIMITED = MotorShape()  # motors whose torques may step
 
 
 class LimitShape(NamedTuple):
@@ -106,7 +154,7 @@ def list_columns(shape: LimitShape, intervals: int, objective: Objective) -> NLP
         p |= {"gives": m + 1, "rates": n}
     if shape.motors.slow:
         p |= {"quick": len(shape.motors.rates), "lags": len(shape.motors.commands)}
-        p |= {"bends": n // (DEGREE + 1), "sizes": n}
+        p |= {"bends": n // NODES, "sizes": n}
     rows = (len(shape.sides) if objective in SOFT else m) + relax
     g = {"links": intervals, "chain": intervals * chained, "limits": n * rows}
     g |= {"duration": int(objective is Objective.MARGIN)} | shape.motors.list_sizes(intervals)
@@ -185,12 +233,12 @@ def write_terms(shape: LimitShape, intervals: int, objective: Objective) -> dict
 
 def _find_lengths(h: Expression) -> Expression:
     """Length of each element, shape (1, E)."""
-    return ca.sum1(ca.reshape(ca.vertcat(h, 0), DEGREE + 1, -1))
+    return ca.sum1(ca.reshape(ca.vertcat(h, 0), NODES, -1))
 
 
 def _write_rises(a: Expression, h: Expression, bends: Expression | None) -> Expression:
     """Rise of b from each node to the next, shape (N,); with `bends` under rate limits."""
-    table, lengths = ca.reshape(a, DEGREE + 1, -1), _find_lengths(h)
+    table, lengths = ca.reshape(a, NODES, -1), _find_lengths(h)
     count = lengths.numel()
     links, kinds = find_basis().links, list_kinds(count, bends is not None)
     rises = ca.horzcat(*(ca.DM(links[kind]) @ table[:, k] for k, kind in enumerate(kinds)))
@@ -208,9 +256,9 @@ def _find_paces(
     basis, held = find_basis(), bends is not None
     lengths = _find_lengths(h)
     count = lengths.numel()
-    paces = ca.reshape(speed, DEGREE + 1, -1)
+    paces = ca.reshape(speed, NODES, -1)
     if bends is not None:
-        c = ca.repmat(bends[1:-1], DEGREE + 1, 1)
+        c = ca.repmat(bends[1:-1], NODES, 1)
         paces[:, 1:-1] /= 1 - c + 2 * c * ca.repmat(ca.DM(basis.y[INSIDE]), 1, count - 2)
     slopes = find_first_slopes(a) if held else (a[0], a[-1])
     # Next to rest the speed is a power of the local variable times a smooth factor.
@@ -225,7 +273,7 @@ def _find_paces(
 
 def _find_bends(values: Expression, degree: int) -> Expression:
     """Sum of the squared Legendre coefficients of each element from a degree on, shape (1, E)."""
-    modes = ca.DM(find_basis().modes[degree:]) @ ca.reshape(values, DEGREE + 1, -1)
+    modes = ca.DM(find_basis().modes[degree:]) @ ca.reshape(values, NODES, -1)
     return ca.sum1(modes**2)
 
 
@@ -249,6 +297,68 @@ def _write_limits(
     if relax:
         rows.append(symbols.rates * b - short[:, shape.rows])
     return ca.horzcat(*rows)
+
+
+def list_kinds(count: int, held: bool) -> list[int]:
+    """Kinds of `count` elements from rest to rest."""
+    start, stop = (FROM_HOLD, TO_HOLD) if held else (FROM_REST, TO_REST)
+    return [start, *[INSIDE] * (count - 2), stop]
+
+
+def find_first_slopes(a: Expression) -> tuple[Expression, Expression]:
+    """Slopes of s'' over y at the start, and at the end backwards."""
+    basis = find_basis()
+    start = ca.DM(basis.to_powers[FROM_HOLD][1]).T @ a[:NODES]
+    return start, ca.DM(basis.to_powers[TO_HOLD][1]).T @ a[-NODES:]
+
+
+def write_motor_rows(
+    shape: MotorShape,
+    symbols: Symbols,
+    torques: Expression,
+    a: Expression,
+    paces: Expression,
+    lengths: Expression,
+) -> dict[str, Expression]:
+    """Rows of each kind of `MotorShape.list_sizes`.
+
+    Parameters
+    ----------
+    symbols                              parameters `quick`, 1 / rate limit, and `lags`
+    torques, a : (n, 2), (n,)
+    paces, lengths : (p + 1, E), (1, E)  dy/dt times the element's length, and that
+    """
+    if not shape.slow:
+        return dict.fromkeys(shape.list_sizes(0), ca.SX(0, 1))
+    rates = {joint: _differentiate(torques[:, joint], paces, lengths) for joint in shape.slow}
+    rows = [symbols.quick[k] * rates[joint] for k, joint in enumerate(shape.rates)]
+    lagged = [
+        torques[:, joint] + symbols.lags[k] * rates[joint] for k, joint in enumerate(shape.commands)
+    ]
+    joins = [torques[NODES::NODES, j] - torques[DEGREE:-1:NODES, j] for j in shape.slow]
+    return {
+        "rates": ca.vertcat(ca.SX(0, 1), *rows),
+        "commands": ca.vertcat(ca.SX(0, 1), *lagged),
+        "joins": ca.vertcat(*joins),
+        "begins": ca.vertcat(*find_first_slopes(a)),
+    }
+
+
+def _differentiate(values: Expression, paces: Expression, lengths: Expression) -> Expression:
+    """Time derivative at the nodes of what has these values there, shape (n,)."""
+    table, count = ca.reshape(values, NODES, -1), lengths.numel()
+    slopes = [ca.DM(slope) for slope in list_slopes()]
+    columns = [slopes[kind] @ table[:, e] for e, kind in enumerate(list_kinds(count, True))]
+    return ca.vec(ca.horzcat(*columns) * paces / ca.repmat(lengths, NODES, 1))
+
+
+def list_slopes() -> list[Array]:
+    """Differentiation matrices at the nodes of each kind of element, over y in forward time."""
+    basis, powers = find_basis(), np.arange(NODES)
+    return [
+        sign * (powers * y[:, None] ** np.maximum(powers - 1, 0)) @ to_powers
+        for sign, y, to_powers in zip(SIGNS, basis.y, basis.to_powers, strict=True)
+    ]
 
 
 class Units(NamedTuple):

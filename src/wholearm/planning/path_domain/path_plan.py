@@ -33,6 +33,7 @@ from .first_guess import center, guess, start_at
 from .path_data import PhaseData, cut, join, prepare
 from .path_mesh import (
     Fastest,
+    equidistribute,
     find_ends,
     find_fastest,
     find_switches,
@@ -42,9 +43,11 @@ from .path_mesh import (
     match,
     place_breaks,
 )
-from .path_motion import PathMotion, fit_torque
+from .path_motion import PathMotion, find_hurry, fit_torque
 from .path_nlp import (
+    UNLIMITED,
     LimitShape,
+    MotorShape,
     PathNLP,
     Tightening,
     Units,
@@ -54,7 +57,6 @@ from .path_nlp import (
     parameters,
     unpack,
 )
-from .rate_terms import UNLIMITED, MotorShape, equidistribute, find_hurry
 
 if TYPE_CHECKING:
     from ..robust.robust_rows import Guide, RobustLimits

@@ -15,7 +15,6 @@ from ...common.errors import Parameter
 from ...geometry.arcs import CostToGo
 from ...problem.definition import Problem
 from ..options import Objective, PlanOptions
-from ..phase_plan import Tried
 from .collocation import Scheme, make_scheme
 from .stage import (
     LimitMisses,
@@ -44,6 +43,15 @@ _ITERATIONS = {Objective.ELASTIC: 90, Objective.RELAX: 50}  # most of one solve,
 _SLOWER = 2  # factor on the most iterations of one solve with rate-limited torques
 _BROKEN = 1e-6  # violation of a formation limit that counts, over the radius of gyration
 _CAP = 1.1  # upper bound of the margin, over the one at which it saturates
+
+
+@dataclass
+class Tried:
+    """Statistics of a mode search."""
+
+    sequences: int = 1  # of modes that were tried
+    complete: bool = True  # whether none was left
+    iterations: int = 0  # of the solver
 
 
 class Price(NamedTuple):
