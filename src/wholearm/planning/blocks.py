@@ -143,38 +143,8 @@ def plan_blocks(
         first = replace(planning, options=_for_time(options), ahead=False)
         least = plan_each(_begin_each(first, report), finer, report).plans
         planning = replace(planning, allowed=share_duration(least, options.duration), least=least)
-        return _require_margin(plan_each(planning, finer, report))
+        return plan_each(planning, finer, report)
     return plan_each(_begin_each(planning, report), finer, report)
-
-
-def plan_alone(planning: Planning, report: Callable[[str], None]) -> Planning | None:
-    """Plan without cost-to-go; None if there was none."""
-    problem, options = planning.problem, planning.options
-    blocks = split_blocks(problem)
-    if not planning.ahead or all(look_ahead(planning, own, options) is None for own in blocks):
-        return None
-    alone = replace(planning, blocks=(), ahead=False)
-    return _require_margin(plan_each(alone, [0] * len(blocks), report))
-
-
-def refine_block(
-    planning: Planning, index: int, report: Callable[[str], None], plain: bool = False
-) -> Planning:
-    """Plan a block on twice the intervals, or if `plain` without mode search; then those after."""
-    finer = [block.finer for block in planning.blocks]
-    finer[index] = PLAIN if plain else finer[index] + 1
-    return _require_margin(plan_each(planning, finer, report))
-
-
-def press_more(
-    planning: Planning, index: int, force: float, report: Callable[[str], None]
-) -> Planning:
-    """Plan a block anew with `force` [N] more normal force, and those after it."""
-    more = planning.more | {index: planning.more.get(index, 0.0) + force}
-    blocks = list(planning.blocks)
-    finer, blocks[index] = [own.finer for own in blocks], replace(blocks[index], finer=BEGUN)
-    planning = replace(planning, more=more, blocks=tuple(blocks))
-    return _require_margin(plan_each(planning, finer, report))
 
 
 def plan_each(planning: Planning, finer: Sequence[int], report: Callable[[str], None]) -> Planning:
@@ -182,7 +152,7 @@ def plan_each(planning: Planning, finer: Sequence[int], report: Callable[[str], 
     made = replace(planning, blocks=())
     for level, block in zip_longest(finer, planning.blocks):
         made = plan_next(made, level, block, report)
-    return made
+    return _require_margin(made)
 
 
 def _begin_each(planning: Planning, report: Callable[[str], None]) -> Planning:

@@ -19,7 +19,6 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.document import plain
 from ..common.errors import (
     Change,
     InfeasibleError,
@@ -37,9 +36,7 @@ from ..geometry.path_guess import count_freedoms
 from ..mechanics.limits import EPSILON, PRESS, LimitSet, make_limits
 from ..mechanics.statics import Statics, pushes_one_way
 from ..problem.definition import Phase, Problem
-from ..results.dwell_record import assemble
-from ..results.torque import TorqueProfile
-from ..results.trajectory import Motion, Trajectory
+from ..results.trajectory import Trajectory
 from ..scene.model import Scales, Scene
 from .blocks import Planning, free_torques
 from .options import Objective, PlanOptions
@@ -60,7 +57,7 @@ from .path_domain.path_nlp import (
     unpack,
 )
 from .path_domain.path_plan import PathIterate, Task, plan_curves, plan_task
-from .phase_plan import Plans, runs_along_curves
+from .phase_plan import Plans, assemble_motions, runs_along_curves
 from .time_domain.collocation import Scheme, blend
 from .time_domain.guesses import PathMargin
 from .time_domain.search import TimeSearch
@@ -68,6 +65,7 @@ from .time_domain.stage import Stage, StagePoints, to_si
 from .time_domain.time_motion import make_phase_motions
 
 SHORT = 1e-4  # least violation that counts, over the scale of a limit
+LEAST = "misses limits least"  # status of motions of least violation
 ROWS = 201  # rows of each phase of a motion of least violation
 DIGITS = 3  # significant digits of advised values
 _BEYOND = (0.0, 0.005, 0.015, 0.05, 0.15, 0.5)
@@ -279,18 +277,6 @@ def _describe_least(
     return InfeasibleError(text, ranked, (), motion)
 
 
-def _assemble_least(
-    motions: Sequence[Motion], torques: Sequence[TorqueProfile], formations: Sequence[Formation]
-) -> Trajectory:
-    """The trajectory of a motion of least violation."""
-    meta = {
-        "status": "misses limits least",
-        "rolling": [[contact.name for contact in own.rolling] for own in formations],
-        "modes": plain([getattr(own, "modes", ()) for own in motions]),
-    }
-    return assemble(motions, TorqueProfile.chain(torques), meta, ROWS)
-
-
 def explain_curves(task: Task, stopped: str) -> WholearmError:
     """Why phases along curves have no plan, and what would change that.
 
@@ -378,7 +364,8 @@ def _make_trajectory(parts: Sequence[PhaseData], profiles: Sequence[Profile]) ->
         torques = [fit_torque(*pair)[0] for pair in zip(parts, motions, strict=True)]
     except SolverError:
         return None
-    return _assemble_least(motions, torques, [part.curve.formation for part in parts])
+    formations = [part.curve.formation for part in parts]
+    return assemble_motions(motions, torques, formations, ROWS, status=LEAST)
 
 
 def _replan_task(task: Task, parameter: Parameter, value: float) -> object:
@@ -634,7 +621,8 @@ def explain_stages(
 
     motions = make_phase_motions(stages, search.scheme, phases)
     torques = [motion.torque for motion in motions]
-    motion = _assemble_least(motions, torques, [phase.formation for phase in phases])
+    formations = [phase.formation for phase in phases]
+    motion = assemble_motions(motions, torques, formations, ROWS, status=LEAST)
     known = make_limits(phases[0].formation, problem.epsilon).parameters
     error = _describe_least(numbers, lists[best], motion)
     return advise(error, known, find_value, replan, ADVICE)

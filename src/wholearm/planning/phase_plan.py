@@ -6,17 +6,19 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
 from ..common.arrays import Array
+from ..common.document import plain
 from ..common.errors import InfeasibleError
+from ..contacts.formation import Formation
 from ..geometry.tracing import runs_on_curve
 from ..problem.definition import End, Phase, Problem
-from ..results.dwell_record import Settling
+from ..results.dwell_record import Settling, assemble
 from ..results.torque import TorqueProfile
-from ..results.trajectory import Motion
+from ..results.trajectory import Motion, Trajectory
 from .options import Objective, PlanOptions
 
 M_co = TypeVar("M_co", bound=Motion, covariant=True)
@@ -61,6 +63,21 @@ def add_up(phases: Sequence[Phase], allowed: Sequence[float | None]) -> float | 
 def combine(goal: Objective, values: Sequence[float]) -> float:
     """Objective value of some phases, given that of each."""
     return min(values) if goal is Objective.MARGIN else sum(values)
+
+
+def assemble_motions(
+    motions: Sequence[Motion],
+    torques: Sequence[TorqueProfile],
+    formations: Sequence[Formation],
+    rows: int,
+    **meta: Any,
+) -> Trajectory:
+    """The trajectory of phases; of its `meta` rolling contacts and modes are added."""
+    own: dict[str, Any] = {
+        "rolling": [[contact.name for contact in formation.rolling] for formation in formations],
+        "modes": plain([getattr(motion, "modes", ()) for motion in motions]),
+    }
+    return assemble(motions, TorqueProfile.chain(torques), own | meta, rows)
 
 
 def plan_stops(

@@ -22,10 +22,8 @@ from ..geometry.tracing import trace_phases
 from ..mechanics.uniqueness import describe_uniqueness
 from ..problem.definition import Problem
 from ..problem.read import require_phases
-from ..results.dwell_record import assemble
 from ..results.plan_record import Certificate, TimeBound, Transition
 from ..results.report import UniquenessMargin
-from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..solvers.ipopt import Ledger, charge, open_ledger
 from ..verification.force_uniqueness import find_uniqueness_margin, find_wedged
@@ -33,7 +31,7 @@ from .blocks import BlockPlan, Planning, plan_blocks
 from .lower_bound import bound_least_time
 from .options import Objective, PlanOptions
 from .path_domain import impact_sequence
-from .phase_plan import PlanPart, add_up, combine, plan_stops
+from .phase_plan import PlanPart, add_up, assemble_motions, combine, plan_stops
 from .result import Plan, PlannedPhase, Status, Timings, write_meta
 
 OVER_TIME = "planned over time"
@@ -100,7 +98,7 @@ def solve_with(
 
 
 def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]) -> Plan:
-    """Plan a problem with phases."""
+    """Plan a problem with phases, verify the plan by simulation and assess it."""
     options = options.scale_ranges(problem.ranges)
     if problem.scene.control_period:
         options = replace(options, transcription="time")
@@ -117,91 +115,71 @@ def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]
                 about = {"name": problem.name, "epsilon": problem.epsilon, "problem": problem.table}
                 error.motion = replace(error.motion, meta=error.motion.meta | about)
             raise
-        return _finish(planning, report, ledger, (started, traced))
+        trajectory, figures = assemble_plan(planning), None
+        unique = check_uniqueness(problem, trajectory, options.uniqueness_margin)
+        planned = time.perf_counter()
+        if options.replay:
+            from .replay_check import replay_plan
 
+            first = trajectory
+            planning, trajectory, figures = replay_plan(planning, trajectory, assemble_plan, report)
+            if trajectory is not first:
+                unique = check_uniqueness(problem, trajectory, options.uniqueness_margin)
+        replayed = time.perf_counter()
+        transitions = _assess(planning, report)
+        assessed = time.perf_counter()
+        ranges = None
+        if options.robust:
+            from .range_cost import assess_ranges
 
-def _finish(
-    planning: Planning,
-    report: Callable[[str], None],
-    ledger: Ledger,
-    begun: tuple[float, float],
-) -> Plan:
-    """Verify the planned blocks by simulation, assess them, and collect the plan.
-
-    Parameters
-    ----------
-    ledger       statistics of the solver
-    begun : [s]  when tracing the phases began and ended, by `time.perf_counter`
-    """
-    problem, options = planning.problem, planning.options
-    trajectory, figures = assemble_plan(planning), None
-    unique = check_uniqueness(problem, trajectory, options.uniqueness_margin)
-    planned = time.perf_counter()
-    if options.replay:
-        from .replay_check import replay_plan
-
-        first = trajectory
-        planning, trajectory, figures = replay_plan(planning, trajectory, assemble_plan, report)
-        if trajectory is not first:
-            unique = check_uniqueness(problem, trajectory, options.uniqueness_margin)
-    replayed = time.perf_counter()
-    transitions = _assess(planning, report)
-    assessed = time.perf_counter()
-    ranges = None
-    if options.robust:
-        from .range_cost import assess_ranges
-
-        ranges = assess_ranges(planning, report)
-    certificate = None
-    if options.certify:
-        report("bounding the least time from below")
-        certificate = certify(planning)
-    phases = _list_phases(planning, ledger, unique)
-    if certificate is not None:
-        gaps = certificate.gaps
-        phases = tuple(own._replace(error=gaps.get(own.number, own.error)) for own in phases)
-    plan = Plan(
-        problem,
-        options,
-        Status.of(phases),
-        combine(options.goal, [phase.value for phase in phases]),
-        trajectory,
-        phases,
-        tuple(transitions),
-        figures,
-        Timings(
-            begun[1] - begun[0],
-            sum(phase.statistics.build_time for phase in phases),
-            sum(phase.statistics.solve_time for phase in phases),
-            planned - begun[0],
-            replayed - planned,
-            assessed - replayed,
-        ),
-        {
-            "wholearm": __version__,
-            "casadi": ca.__version__,
-            "numpy": np.__version__,
-            "python": ".".join(map(str, sys.version_info[:3])),
-        },
-        certificate,
-        ranges,
-    )
-    return replace(plan, trajectory=replace(trajectory, meta=write_meta(plan)))
+            ranges = assess_ranges(planning, report)
+        certificate = None
+        if options.certify:
+            report("bounding the least time from below")
+            certificate = certify(planning)
+        phases = _list_phases(planning, ledger, unique)
+        if certificate is not None:
+            gaps = certificate.gaps
+            phases = tuple(own._replace(error=gaps.get(own.number, own.error)) for own in phases)
+        plan = Plan(
+            problem,
+            options,
+            Status.of(phases),
+            combine(options.goal, [phase.value for phase in phases]),
+            trajectory,
+            phases,
+            tuple(transitions),
+            figures,
+            Timings(
+                traced - started,
+                sum(phase.statistics.build_time for phase in phases),
+                sum(phase.statistics.solve_time for phase in phases),
+                planned - started,
+                replayed - planned,
+                assessed - replayed,
+            ),
+            {
+                "wholearm": __version__,
+                "casadi": ca.__version__,
+                "numpy": np.__version__,
+                "python": ".".join(map(str, sys.version_info[:3])),
+            },
+            certificate,
+            ranges,
+        )
+        return replace(plan, trajectory=replace(trajectory, meta=write_meta(plan)))
 
 
 def assemble_plan(planning: Planning) -> Trajectory:
     """The trajectory of a planning; of its `meta` only rolling contacts and modes."""
-    plans, phases = planning.settled.plans, _list_phases(planning, Ledger(None))
-    meta = {
-        "rolling": [list(phase.rolling) for phase in phases],
-        "modes": plain([phase.modes for phase in phases]),
-    }
-    torque = TorqueProfile.chain([plan.torque for plan in plans])
-    return assemble([plan.motion for plan in plans], torque, meta, planning.options.samples)
+    plans, formations = planning.settled.plans, [own.formation for own in planning.problem.phases]
+    motions, torques = [plan.motion for plan in plans], [plan.torque for plan in plans]
+    modes = plain([getattr(plan.motion, "modes", ()) for plan in planning.plans])
+    return assemble_motions(motions, torques, formations, planning.options.samples, modes=modes)
 
 
 def _list_phases(
-    planning: Planning, ledger: Ledger, unique: Sequence[Uniqueness] = ()
+    planning: Planning, ledger: Ledger, unique: Sequence[Uniqueness]
 ) -> tuple[PlannedPhase, ...]:
     settled = planning.settled
     return tuple(
@@ -216,7 +194,7 @@ def _list_phases(
             plan.attempt,
             plan.error,
             ledger.of(phase.number),
-            *(unique[phase.index] if unique else (None, None)),
+            *unique[phase.index],
             settled.settlings[phase.index],
             None if math.isnan(plan.unheld) else plan.unheld,
         )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -25,7 +26,8 @@ from ..scene.model import Scales
 from ..verification.newton_euler import balance
 from ..verification.verdict import Allowance, find_least_force, measure_departure
 from ..verification.verify import describe_motors, find_commands, judge, observe
-from .blocks import PLAIN, BlockPlan, Planning, plan_alone, press_more, refine_block
+from .blocks import BEGUN, PLAIN, BlockPlan, Planning, look_ahead, plan_each
+from .phase_plan import split_blocks
 
 REFINEMENTS = 3  # most doublings of the intervals of a block
 ROUGH = 2  # the same in the time domain, before the mode search is left out: some modes never hold
@@ -130,24 +132,33 @@ def _improve(
     an instant, with another force.
     """
     index, fails = planning.find_block(number), check.failure is not None
-    block, others = planning.blocks[index], list[Callable[[], Planning | None]]()
-    if fails:
-        others.append(partial(plan_alone, planning, report))
+    block, others = planning.blocks[index], list[Callable[[], Planning]]()
+
+    def replan(changed: Planning, finer: int) -> Planning:
+        levels = [own.finer for own in planning.blocks]
+        return plan_each(changed, [*levels[:index], finer, *levels[index + 1 :]], report)
+
+    every = split_blocks(planning.problem)
+    ahead = (look_ahead(planning, own, planning.options) is not None for own in every)
+    if fails and planning.ahead and any(ahead):
+        alone = replace(planning, blocks=(), ahead=False)
+        others.append(partial(plan_each, alone, [0] * len(every), report))
     most = (REFINEMENTS if block.chain else ROUGH) if fails else 1
     if PLAIN != block.finer < most and not block.is_finest:
-        others.append(partial(refine_block, planning, index, report))
+        others.append(partial(replan, planning, block.finer + 1))
     if fails and block.has_searched and block.finer != PLAIN:
-        others.append(partial(refine_block, planning, index, report, True))
+        others.append(partial(replan, planning, PLAIN))
     short = _find_dip(planning, block, check) if index not in planning.more else 0.0
     if fails and short:
-        others.append(partial(press_more, planning, index, SPARE * short, report))
+        begun = replace(block, finer=BEGUN)
+        blocks = tuple(begun if own is block else own for own in planning.blocks)
+        more = planning.more | {index: SPARE * short}
+        others.append(partial(replan, replace(planning, more=more, blocks=blocks), block.finer))
     for plan in others:
         try:
-            better = plan()
+            return plan()
         except (InfeasibleError, SolverError):
             continue
-        if better is not None:
-            return better
     return None
 
 
