@@ -31,7 +31,7 @@ from ...problem.definition import End, Phase, Problem
 from ...results.trajectory import Samples
 from ..path_domain.path_motion import PathMotion
 from .collocation import Scheme
-from .mode_search import LEAST_INTERVALS, StageMode, can_roll, divide, in_mode, link, merge, mode_of
+from .mode_search import LEAST_INTERVALS, Mode, can_roll, divide, in_mode, link, merge, mode_of
 from .search import TimeSearch, TimeSolution
 from .stage import Stage, StagePoints, in_own_units, resample, scale_state, unit_lengths
 
@@ -113,7 +113,7 @@ class Guesses:
         stages, begin = list[Stage](), 0.0
         finer = 1 if self.search.options.time_intervals else FINER
         for stage, phase in zip(join_modes(self.nearest.stages), self.phases, strict=True):
-            modes, parts = phase.guess or (), list[tuple[StagePoints, StageMode]]()
+            modes, parts = phase.guess or (), list[tuple[StagePoints, Mode]]()
             intervals, span = finer * stage.intervals, modes[-1].t / scales.time
 
             def follow(share: Array, begin: float = begin, span: float = span) -> list[Array]:
@@ -125,7 +125,7 @@ class Guesses:
             for start, stop, mode in zip(edges, edges[1:], modes, strict=False):
                 count = max(LEAST_INTERVALS, round((stop - start) * intervals))
                 part = resample(points, scheme, np.linspace(0.0, 1.0, count + 1), start, stop)
-                parts.append((part, StageMode(mode.signs)))
+                parts.append((part, mode.signs))
             stages += divide(stage, parts)
             begin += span
         return Guess(GIVEN, self._leave_room(link(merge(stages))))
@@ -512,11 +512,11 @@ def split_by_signs(stage: Stage, scheme: Scheme) -> list[Stage]:
     widths = np.diff([0.0, *(place for place, _ in changes), 1.0])
     widths = np.maximum(widths, min(BRIEF / 2, 0.5 / len(widths)))
     edges = [0.0, *np.cumsum(widths / widths.sum())[:-1].tolist(), 1.0]
-    parts = list[tuple[StagePoints, StageMode]]()
+    parts = list[tuple[StagePoints, Mode]]()
     for (begin, stop), (_, new) in zip(pairwise(edges), [*changes, (1.0, {})], strict=True):
         count = max(LEAST_INTERVALS, round((stop - begin) * stage.intervals))
         guess = resample(stage.guess, scheme, np.linspace(0.0, 1.0, count + 1), begin, stop)
-        parts.append((guess, StageMode(tuple(signs))))
+        parts.append((guess, tuple(signs)))
         for row, sign in new.items():
             signs[row] = sign
     return divide(stage, parts)
@@ -532,7 +532,7 @@ def _find_changes(stage: Stage, scheme: Scheme) -> tuple[list[float], list[_Chan
     rates = stage.measure_senses(z, part.v.reshape(-1, 5)) * np.concatenate(stage.directions)
     sizes = np.abs(rates).max(axis=1)
     clear = (np.abs(rates) > SLOW * sizes[:, None]) & (sizes > STILL * sizes.max())[:, None]
-    first, every = np.array(mode_of(stage).signs), list[tuple[float, int, float]]()
+    first, every = np.array(mode_of(stage)), list[tuple[float, int, float]]()
     for row, rate in enumerate(rates.T):
         points = np.flatnonzero(clear[:, row])
         if not len(points) or first[row] == 0:

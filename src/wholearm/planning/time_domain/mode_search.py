@@ -37,27 +37,18 @@ LOST = 3  # most failed sequences since the last gain
 PATIENCE = 50  # most solver iterations for one of them
 
 
-class StageMode(NamedTuple):
-    """Contact mode of a stage."""
-
-    signs: tuple[float, ...]  # of the rates of (contacts, joints); zero for rolling contacts
-
-    def changed(self, rows: Sequence[int], sign: float) -> StageMode:
-        """The mode with another sign of tied rows, given for the first of them."""
-        turn = sign * self.signs[rows[0]]
-        return StageMode(
-            tuple((turn * s or sign) if k in rows else s for k, s in enumerate(self.signs))
-        )
+Mode = tuple[float, ...]
+"""Contact mode of a stage: signs of the rates of (contacts, joints); zero for rolling contacts."""
 
 
-def mode_of(stage: Stage) -> StageMode:
+def mode_of(stage: Stage) -> Mode:
     """The mode of a stage."""
     signs = np.concatenate(stage.directions)
     signs[list(stage.formation.rolling_rows)] = 0.0
-    return StageMode(tuple(signs.tolist()))
+    return tuple(signs.tolist())
 
 
-def sign_sequence(stages: Sequence[Stage]) -> tuple[tuple[int, StageMode], ...]:
+def sign_sequence(stages: Sequence[Stage]) -> tuple[tuple[int, Mode], ...]:
     """Phase and mode of each stage."""
     return tuple((stage.phase, mode_of(stage)) for stage in stages)
 
@@ -68,13 +59,13 @@ def _roll(scene: Scene, contacts: tuple[Contact, ...], rows: tuple[int, ...]) ->
     return Formation(scene, contacts, tuple(contacts[k] for k in rows))
 
 
-def in_mode(stage: Stage, mode: StageMode) -> Stage:
+def in_mode(stage: Stage, mode: Mode) -> Stage:
     """A stage in another mode, with its tangential forces."""
     if mode == mode_of(stage):
         return stage
     formation, part = stage.formation, stage.guess
     n_c = formation.n_contacts
-    signs = np.array(mode.signs)
+    signs = np.array(mode)
     rows = tuple(k for k in range(n_c) if signs[k] == 0)
     directions = Directions(np.where(signs[:n_c] == 0, 1.0, signs[:n_c]), signs[n_c:])
     if rows != formation.rolling_rows:
@@ -102,8 +93,8 @@ def link(stages: Sequence[Stage]) -> list[Stage]:
 def find_turns(stage: Stage, coming: Stage) -> tuple[int, ...]:
     """Rows of (contacts, joints) of a stage that reverse in the next one."""
     joints = ("joint 1", "joint 2")
-    after = dict(zip((*coming.formation.names, *joints), mode_of(coming).signs, strict=True))
-    rows = enumerate(zip((*stage.formation.names, *joints), mode_of(stage).signs, strict=True))
+    after = dict(zip((*coming.formation.names, *joints), mode_of(coming), strict=True))
+    rows = enumerate(zip((*stage.formation.names, *joints), mode_of(stage), strict=True))
     return tuple(k for k, (name, sign) in rows if sign * after.get(name, 0.0) < 0)
 
 
@@ -129,7 +120,7 @@ def find_fresh(stage: Stage, coming: Stage) -> tuple[int, ...]:
     return tuple(k for k, c in enumerate(fresh) if c not in known and c not in renamed)
 
 
-def divide(stage: Stage, parts: Sequence[tuple[StagePoints, StageMode]]) -> list[Stage]:
+def divide(stage: Stage, parts: Sequence[tuple[StagePoints, Mode]]) -> list[Stage]:
     """Pieces of a stage with a guess and a mode each, to be linked."""
     pieces = list[Stage]()
     for guess, mode in parts:
@@ -140,7 +131,7 @@ def divide(stage: Stage, parts: Sequence[tuple[StagePoints, StageMode]]) -> list
     return pieces
 
 
-def split(stage: Stage, scheme: Scheme, begin: int, stop: int, mode: StageMode) -> list[Stage]:
+def split(stage: Stage, scheme: Scheme, begin: int, stop: int, mode: Mode) -> list[Stage]:
     """Pieces of a stage with intervals `begin` to `stop` in another mode, to be linked."""
     edges, modes = [0, begin, stop, stage.intervals], [mode_of(stage), mode, mode_of(stage)]
     parts = [part for part in zip(edges, edges[1:], modes, strict=False) if part[1] > part[0]]
@@ -264,17 +255,6 @@ def drop_gone(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
     return solution
 
 
-def list_neighbours(
-    search: TimeSearch, solution: TimeSolution, leaning: bool = False
-) -> list[list[Stage]]:
-    """Mode sequences one move away from that of a solution."""
-    formations = [search.problem.phases[stage.phase].formation for stage in solution.stages]
-    cost = abs(solution.cost)
-    savings = [solution.price_friction(k) / cost for k in range(len(formations))]
-    epsilon, scheme = search.problem.epsilon, search.scheme
-    return list(list_moves(solution.stages, scheme, formations, epsilon, leaning, savings))
-
-
 def _rolls(stages: list[Stage]) -> int:
     return sum(stage.formation.n_rolling for stage in stages)
 
@@ -289,38 +269,49 @@ class ModeRun(NamedTuple):
     share: float  # [s]: its duration
 
 
-def list_moves(
-    stages: Sequence[Stage],
-    scheme: Scheme,
-    own: Sequence[Formation],
-    epsilon: float,
-    leaning: bool = False,
-    savings: Sequence[Array] = (),
-) -> Iterator[list[Stage]]:
-    """Mode sequences suggested by a solution, the guesses of stages; the most promising first.
+def list_neighbours(
+    search: TimeSearch, solution: TimeSolution, leaning: bool = False
+) -> list[list[Stage]]:
+    """Mode sequences one move away from that of a solution, the most promising first.
 
-    `own` are the formations of the stages' phases, whose rolling contacts have to roll; `leaning`:
-    only contacts at their cones count; `savings` are those of `TimeSolution.price_friction`.
+    `leaning`: only contacts at their cones count. Contacts that a phase has rolling have to roll.
     """
+    stages, scheme, epsilon = solution.stages, search.scheme, search.problem.epsilon
+    own = [search.problem.phases[stage.phase].formation for stage in stages]
     slides = [_find_leaning(stage, scheme, own[k], epsilon) for k, stage in enumerate(stages)]
+
+    def turn(index: int, run: ModeRun) -> list[Stage] | None:
+        """Another mode over a run: rolling if possible, else reversed."""
+        signs = [run.sign] if run.sign else [0.0, -mode_of(stages[index])[run.row]]
+        if _comes_to_rest(stages, index, own, run.row):
+            signs = [sign for sign in signs if sign]
+        pieces = [_change(stages, index, run, sign, scheme) for sign in signs]
+        found = next((piece for piece in pieces if piece is not None), None)
+        return found and link(merge([*stages[:index], *found, *stages[index + 1 :]]))
+
+    def turn_each(runs: list[tuple[int, ModeRun]]) -> list[list[Stage]]:
+        """In whole stages that are mostly one run, then in single runs."""
+        whole = [
+            (k, run._replace(begin=0, stop=stages[k].intervals))
+            for k, run in runs
+            if 2 * run.share > stages[k].guess.duration
+        ]
+        order = (sorted(group, key=lambda pair: -pair[1].share) for group in (whole, runs))
+        return [moved for group in order for pair in group if (moved := turn(*pair))]
+
     if leaning:
-        yield from _apply(
-            stages, scheme, own, [(run, k) for k in range(len(stages)) for run in slides[k]]
-        )
-        return
-    yield from list_dropped(stages)
-    for index in range(len(stages)):
-        left = release_earlier(stages, index)
-        if left is not None:
-            yield link(merge(left))
+        return turn_each([(k, run) for k, found in enumerate(slides) for run in found])
+    earlier = (release_earlier(stages, k) for k in range(len(stages)))
+    moves = [*list_dropped(stages), *(link(merge(left)) for left in earlier if left)]
+    savings = [solution.price_friction(k) / abs(solution.cost) for k in range(len(stages))]
     for slow in (True, False):
-        runs = list[tuple[ModeRun, int]]()
-        for index, stage in enumerate(stages):
+        runs = list[tuple[int, ModeRun]]()
+        for k, stage in enumerate(stages):
             held = _find_held(stage, scheme, slow)
-            if savings:
-                held = [run for run in held if _pays(run, stage, savings[index])]
-            runs += [(run, index) for run in [*held, *slides[index]]]
-        yield from _apply(stages, scheme, own, runs)
+            held = [run for run in held if _pays(run, stage, savings[k])]
+            runs += [(k, run) for run in [*held, *slides[k]]]
+        moves += turn_each(runs)
+    return moves
 
 
 def list_dropped(stages: Sequence[Stage]) -> Iterator[list[Stage]]:
@@ -332,41 +323,6 @@ def list_dropped(stages: Sequence[Stage]) -> Iterator[list[Stage]]:
             left = drop(left, index) if left else None
         if left:
             yield link(merge(left))
-
-
-def _apply(
-    stages: Sequence[Stage],
-    scheme: Scheme,
-    own: Sequence[Formation],
-    runs: list[tuple[ModeRun, int]],
-) -> Iterator[list[Stage]]:
-    """Stages in another mode over a run: whole stages that are mostly one, then single runs."""
-    whole = [
-        (run._replace(begin=0, stop=stages[k].intervals), k)
-        for run, k in runs
-        if 2 * run.share > stages[k].guess.duration
-    ]
-    for group in (whole, runs):
-        for run, index in sorted(group, key=lambda pair: -pair[0].share):
-            pieces = _turn(stages, index, run, own, scheme)
-            if pieces is not None:
-                yield link(merge([*stages[:index], *pieces, *stages[index + 1 :]]))
-
-
-def _sign(stage: Stage, run: ModeRun) -> float:
-    """Direction of a run's row in a stage."""
-    return float(mode_of(stage).signs[run.row])
-
-
-def _turn(
-    stages: Sequence[Stage], index: int, run: ModeRun, own: Sequence[Formation], scheme: Scheme
-) -> list[Stage] | None:
-    """Pieces of a stage in another mode over a run: rolling if possible, else reversed."""
-    signs = [run.sign] if run.sign else [0.0, -_sign(stages[index], run)]
-    if _comes_to_rest(stages, index, own, run.row):
-        signs = [sign for sign in signs if sign]
-    pieces = [_change(stages, index, run, sign, scheme) for sign in signs]
-    return next((piece for piece in pieces if piece is not None), None)
 
 
 def _pays(run: ModeRun, stage: Stage, savings: Array) -> bool:
@@ -403,7 +359,9 @@ def _change(
     middle = stage.guess.z[(run.begin + run.stop) // 2, 0]
     if sign == 0 and not can_roll(stage.formation, middle, run.row):
         return None
-    mode = mode_of(stage).changed(find_tied(stage.formation, middle, run.row), sign)
+    rows, signs = find_tied(stage.formation, middle, run.row), mode_of(stage)
+    turned = sign * signs[rows[0]]
+    mode = tuple((turned * s or sign) if k in rows else s for k, s in enumerate(signs))
     # Where the neighbour has that mode already, the instant between them is optimal.
     at_start, at_end = run.begin == 0, run.stop == stage.intervals
     if not (at_start and at_end):
