@@ -29,7 +29,6 @@ from ..mechanics.dynamics import measure_speed
 from ..mechanics.speed_sweep import NoMotionError
 from ..problem.definition import Phase, Problem
 from ..results.trajectory import Motion
-from ..scene.model import Scene
 from ..solvers.ipopt import charge
 from .lower_bound import look_along
 from .options import Objective, PlanOptions
@@ -140,7 +139,9 @@ def plan_blocks(
     finer, none = [0] * len(split_blocks(problem)), list[float | None]([None] * len(problem.phases))
     planning = Planning(problem, curves, options, (), none)
     if options.goal is Objective.MARGIN:
-        first = replace(planning, options=_for_time(options), ahead=False)
+        first = replace(
+            planning, options=replace(options, objective=Objective.TIME, duration=None), ahead=False
+        )
         least = plan_each(_begin_each(first, report), finer, report).plans
         planning = replace(planning, allowed=share_duration(least, options.duration), least=least)
         return plan_each(planning, finer, report)
@@ -192,7 +193,8 @@ def plan_next(
     z = planning.blocks[-1].end if planning.blocks else problem.start
     if finer == BEGUN and runs_along_curves(phases, options):
         finer = 0
-    moved = known is None or _distance(problem.scene, known.start, z) > MOVED
+    least_move = MOVED * problem.scene.scales.length
+    moved = known is not None and measure_speed(problem.scene, known.start - z) > least_move
     if known is None or moved or known.finer != finer:
         numbers = "-".join(str(phase.number) for phase in phases)
         report(f"phase {numbers} of {len(problem.phases)}: {options.goal.value}")
@@ -205,20 +207,14 @@ def plan_next(
                 phases,
                 z,
                 own,
-                planning.allowed,
                 to_go=look_ahead(planning, phases, own) if planning.ahead else None,
-                ample=find_ample(planning.blocks),
+                ample=AMPLE * min((plan.value for plan in planning.plans), default=math.inf),
                 fastest=[least[phase.index] for phase in phases if least],
                 begun=known.plans if known and known.finer == BEGUN else (),
                 only_begin=finer == BEGUN,
             )
         known = BlockPlan(phases, z, finer, *made)
     return replace(planning, blocks=(*planning.blocks, known))
-
-
-def find_ample(blocks: Sequence[BlockPlan]) -> float:
-    """Saturation of the margin [N], as blocks before have less."""
-    return AMPLE * min((plan.value for block in blocks for plan in block.plans), default=math.inf)
 
 
 def _refine(options: PlanOptions, known: BlockPlan | None, finer: int) -> PlanOptions:
@@ -240,7 +236,6 @@ def plan_block(
     block: Sequence[Phase],
     z: Array,
     options: PlanOptions,
-    allowed: Sequence[float | None] | None = None,
     **over_time: Any,
 ) -> tuple[Plans, ImpactSequence | None]:
     """Plan a block from `z`, along its curves or in the time domain; also its curves.
@@ -248,8 +243,7 @@ def plan_block(
     `over_time` are arguments of `plan_with_impacts`.
     """
     plans: Plans = []
-    problem, known = planning.problem, planning.curves
-    allowed = [None] * len(problem.phases) if allowed is None else allowed
+    problem, known, allowed = planning.problem, planning.curves, planning.allowed
     if not runs_along_curves(block, options):
         from .time_domain.time_plan import plan_with_impacts
 
@@ -262,7 +256,7 @@ def plan_block(
             )
 
         def plan_other(other: Planning, phases: Sequence[Phase], own: PlanOptions) -> Plans:
-            return plan_block(other, phases, z, own, allowed)[0]
+            return plan_block(other, phases, z, own)[0]
 
         with charge(block[0].number):
             try:
@@ -328,15 +322,6 @@ def _require_margin(planning: Planning) -> Planning:
                 f"{plan.value:.4g} N, below epsilon = {epsilon:g} N; allow a longer duration"
             )
     return planning
-
-
-def _for_time(options: PlanOptions) -> PlanOptions:
-    return replace(options, objective=Objective.TIME, duration=None)
-
-
-def _distance(scene: Scene, one: Array, other: Array) -> float:
-    """Distance of two configurations, in radii of gyration or radians."""
-    return measure_speed(scene, one - other) / scene.scales.length
 
 
 def look_ahead(
