@@ -185,6 +185,7 @@ def _list_phases(
     return tuple(
         PlannedPhase(
             phase.number,
+            ledger.of(phase.number),
             plan.value,
             held.motion.duration,
             tuple(contact.name for contact in phase.formation.rolling),
@@ -193,7 +194,6 @@ def _list_phases(
             plan.complete,
             plan.attempt,
             plan.error,
-            ledger.of(phase.number),
             *unique[phase.index],
             settled.settlings[phase.index],
             None if math.isnan(plan.unheld) else plan.unheld,

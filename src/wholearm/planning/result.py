@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import Enum
 from functools import reduce
 from operator import add
-from typing import Any, NamedTuple, get_type_hints
+from typing import Any, NamedTuple
 
 from numpy.typing import ArrayLike
 
@@ -26,26 +26,15 @@ from ..solvers.ipopt import SolverStatistics
 from .options import Objective, PlanOptions
 from .phase_plan import combine
 
-_OPTIONS = (
-    "intervals", "transcription", "time_weight", "duration", "time_intervals", "degree", "scheme",
-    "opening", "clearance", "samples", "mode_search", "certify", "accuracy", "uniqueness_margin",
-    "robust", "largest",
-)  # fmt: skip
-"""Options that stand in `meta` by themselves; `objective` and `replay` do in other ways."""
-_PHASES: Mapping[str, tuple[str, Any]] = {
-    "phase_values": ("value", 0.0), "phase_durations": ("duration", 0.0),
-    "rolling": ("rolling", ()), "modes": ("modes", ()), "sequences": ("sequences", 0),
-    "complete": ("complete", True), "attempts": ("attempt", ""),
-    "phase_errors": ("error", math.nan), "uniqueness_margins": ("uniqueness_margin", None),
-    "wedged": ("wedged", None), "settling": ("settling", None), "unheld": ("unheld", None),
+_KEYS = {
+    "value": "phase_values", "duration": "phase_durations", "attempt": "attempts",
+    "error": "phase_errors", "uniqueness_margin": "uniqueness_margins",
+    "build_time": "build_times", "solve_time": "solve_times",
 }  # fmt: skip
-"""Lists of `meta` with a value for each phase: what that is, and as what it counts where it is
-missing, in files of earlier versions."""
-_STATISTICS = {
-    "iterations": "iterations", "solves": "solves", "build_times": "build_time",
-    "solve_times": "solve_time",
-}  # fmt: skip
-"""Likewise of solving; missing ones are zero."""
+"""What `meta` calls fields of phases and of their statistics; others have the same name there."""
+_OPTIONS = [own.name for own in fields(PlanOptions)]
+_OPTIONS = [name for name in _OPTIONS if name not in ("objective", "replay", "ranges")]
+"""Options that stand in `meta` by themselves."""
 _UNITS = ("m", "rad", "s")  # what files call the fields of deviations
 UNITS = {Objective.TIME: "s", Objective.EFFORT: "(N m)^2 s", Objective.MARGIN: "N"}
 """Units of objectives."""
@@ -70,24 +59,27 @@ class Status(Enum):
 
 
 class PlannedPhase(NamedTuple):
-    """One phase of a plan."""
+    """One phase of a plan; files of earlier versions may not have what has a default."""
 
     number: int  # from 1
-    value: float  # its share of the objective: s, (N m)^2 s or N
-    duration: float  # [s]
-    rolling: tuple[str, ...]  # contacts that the problem lets roll
-    modes: tuple[ModeSpan, ...]  # contact modes in the time domain; none along a curve
-    sequences: int  # of modes that were tried; of phases in one NLP booked to the first
-    complete: bool  # whether every sequence of modes that promised to be better was tried
-    attempt: str  # the guess that it was found from, in the time domain
-    error: float  # estimated relative error of the value, of all phases in one NLP with this one
     statistics: SolverStatistics  # of all solves for this phase, or for a block from this one on
-    # of its contact forces; None in files of earlier versions
-    uniqueness_margin: UniquenessMargin | None = None
+    value: float = 0.0  # its share of the objective: s, (N m)^2 s or N
+    duration: float = 0.0  # [s]
+    rolling: tuple[str, ...] = ()  # contacts that the problem lets roll
+    modes: tuple[ModeSpan, ...] = ()  # contact modes in the time domain; none along a curve
+    sequences: int = 0  # of modes that were tried; of phases in one NLP booked to the first
+    complete: bool = True  # whether every sequence of modes that promised to be better was tried
+    attempt: str = ""  # the guess that it was found from, in the time domain
+    error: float = math.nan  # estimated relative error of the value, of all phases in its NLP
+    uniqueness_margin: UniquenessMargin | None = None  # of its contact forces
     # [s]: for how long friction could hold everything at rest; None if it does not begin so
     wedged: float | None = None
     settling: Settling | None = None  # dwell at its end, included in `duration`
     unheld: float | None = None  # `value` with free torques, if they are held over periods
+
+
+_PHASES = PlannedPhase._fields[2:]
+_STATISTICS = [own.name for own in fields(SolverStatistics)]
 
 
 class Timings(NamedTuple):
@@ -194,10 +186,10 @@ def write_meta(plan: Plan) -> dict[str, Any]:
             "value_unit": plan.unit,
             "error": plan.error,
             "epsilon": plan.problem.epsilon,
-            **{key: [getattr(own, name) for own in phases] for key, (name, _) in _PHASES.items()},
+            **{_KEYS.get(name, name): [getattr(own, name) for own in phases] for name in _PHASES},
             **{
-                key: [getattr(own.statistics, name) for own in phases]
-                for key, name in _STATISTICS.items()
+                _KEYS.get(name, name): [getattr(own.statistics, name) for own in phases]
+                for name in _STATISTICS
             },
             **{name: getattr(options, name) for name in _OPTIONS},
             "versions": plan.versions,
@@ -256,25 +248,20 @@ def _read(trajectory: Trajectory, problem: Problem) -> Plan:
     options = PlanOptions(meta["objective"], **given, replay=meta.get("replay") is not None)
     options = options.scale_ranges(problem.ranges)
 
-    def column(key: str, kind: Any, missing: Any) -> list[Any]:
-        values = meta.get(key)
-        if values is None:
-            return [missing] * count
+    named = {name: meta.get(_KEYS.get(name, name)) for name in (*_PHASES, *_STATISTICS)}
+    known = {name: values for name, values in named.items() if values is not None}
+    for name, values in known.items():
         if len(values) != count:
+            key = _KEYS.get(name, name)
             raise InputError("", key, f"{len(values)} values given, {count} needed")
-        return [restore(kind, value) for value in values]
 
-    kinds, costs = get_type_hints(PlannedPhase), get_type_hints(SolverStatistics)
-    known = {name: column(key, kinds[name], miss) for key, (name, miss) in _PHASES.items()}
-    spent = {name: column(key, costs[name], 0) for key, name in _STATISTICS.items()}
-    phases = tuple(
-        PlannedPhase(
-            number=k + 1,
-            statistics=SolverStatistics(**{name: values[k] for name, values in spent.items()}),
-            **{name: values[k] for name, values in known.items()},
-        )
-        for k in range(count)
-    )
+    def read_phase(k: int) -> PlannedPhase:
+        own = {name: values[k] for name, values in known.items() if name in _PHASES}
+        spent = {name: values[k] for name, values in known.items() if name in _STATISTICS}
+        phase: PlannedPhase = restore(PlannedPhase, {"number": k + 1, "statistics": spent, **own})
+        return phase
+
+    phases = tuple(map(read_phase, range(count)))
     replay, timings = meta.get("replay"), meta.get("timings", {})
     return Plan(
         problem,
