@@ -29,16 +29,15 @@ from wholearm.planning.time_domain.stage import LimitMisses, Stage, StagePoints
 from wholearm.planning.time_domain.time_nlp import (
     Target,
     TimeNLP,
-    bound_unknowns,
     build_time_nlp,
     collocation_kernel,
     end_kernel,
+    find_bounds,
     find_leaving,
     impact_kernel,
     opening_kernel,
     pack,
     point_kernel,
-    raise_bounds,
 )
 from wholearm.results.trajectory import Samples
 from wholearm.solvers.ipopt import build_solver
@@ -330,8 +329,7 @@ def test_a_known_motion_keeps_the_limits(name: str, degree: int) -> None:
     scheme, stage = make_scheme(name, degree), driven(name, degree, 8)
     nlp = build_nlp([stage], scheme)
     x = packed(nlp, [stage])
-    low_x, high_x = bound_unknowns(nlp, [stage], scheme)
-    low, _ = raise_bounds(nlp, [stage], [LimitMisses.none(stage)], (low_x, high_x))
+    (low_x, high_x), (low, _) = find_bounds(nlp, [stage], scheme, [LimitMisses.none(stage)])
     nlp.rows.bounds[0][:] = low
     _, inequalities = misses(nlp, x)
     # Slip and joint speeds start from nothing.
@@ -346,7 +344,7 @@ def test_friction_the_wrong_way_breaks_a_limit(row: int) -> None:
     wrong = replace(stage, directions=Directions(signs[:4], signs[4:]))
     nlp = build_nlp([wrong], scheme)
     x = packed(nlp, [wrong])
-    low, high = bound_unknowns(nlp, [wrong], scheme)
+    (low, high), _ = find_bounds(nlp, [wrong], scheme, [LimitMisses.none(wrong)])
     worst = max(misses(nlp, x)[1].max(), (low - x).max(), (x - high).max())
     assert worst > 0.02
 
@@ -370,8 +368,7 @@ def test_what_is_made_least(objective: Objective) -> None:
 def test_the_margin_raises_what_forces_have_to_exceed(name: str) -> None:
     scheme, stage = make_scheme(name, 3), driven(name, 3, 8)
     nlp = build_nlp([stage], scheme, Objective.MARGIN)
-    low_x, high_x = bound_unknowns(nlp, [stage], scheme)
-    low, _ = raise_bounds(nlp, [stage], [LimitMisses.none(stage)], (low_x, high_x))
+    (low_x, _), (low, _) = find_bounds(nlp, [stage], scheme, [LimitMisses.none(stage)])
     assert not np.isfinite(low_x[nlp.layouts[0].forces]).any()
     # The polynomial through the points may pass a little below them at the ends of an interval.
     room = stage.guess.forces.min() - 0.05

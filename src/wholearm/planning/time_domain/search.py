@@ -30,10 +30,9 @@ from .time_nlp import (
     MARGIN,
     Target,
     TimeNLP,
-    bound_unknowns,
     build_time_nlp,
+    find_bounds,
     pack,
-    raise_bounds,
     unpack,
 )
 
@@ -221,8 +220,7 @@ class TimeSearch:
         margin: float,
     ) -> TimeSolution:
         """Run the solver once."""
-        low, high = bound_unknowns(nlp, stages, self.scheme)
-        low_g, high_g = raise_bounds(nlp, stages, limits, (low, high))
+        (low, high), (low_g, high_g) = find_bounds(nlp, stages, self.scheme, limits)
         if self.duration is not None and nlp.duration_row >= 0:
             high_g[nlp.duration_row] = self.duration
         if self.goal is Objective.MARGIN:
@@ -231,14 +229,20 @@ class TimeSearch:
         if (low > high).any():
             status = "limits that hold between points too leave nothing"
             return TimeSolution(list(stages), np.inf, 0.0, status, False, nlp, {})
-        solver = nlp.first_solver if multipliers is None else nlp.solver
+        solver = nlp.solver
+        if not multipliers:
+            # Of one size for all inequalities.
+            bounded = np.isfinite(high).astype(float) - np.isfinite(low)
+            on_rows = np.where(high_g > low_g, -FIRST_SIZE, 0.0)
+            multipliers = {"lam_x0": FIRST_SIZE * bounded, "lam_g0": on_rows}
+            solver = nlp.first_solver
         result = solver(
             x0=pack([stage.guess for stage in stages], nlp.layouts, margin),
             lbx=low,
             ubx=high,
             lbg=low_g,
             ubg=high_g,
-            **(multipliers or first_multipliers((low, high), (low_g, high_g), FIRST_SIZE)),
+            **multipliers,
         )
         stats = solver.stats()
         self.tried.iterations += stats["iter_count"]
@@ -256,12 +260,3 @@ class TimeSearch:
             nlp,
             {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")},
         )
-
-
-def first_multipliers(
-    bounds: Sequence[Array], row_bounds: Sequence[Array], size: float = FIRST_SIZE
-) -> Multipliers:
-    """Multipliers of one size for all inequalities, by lower and upper bounds."""
-    (low, high), (low_g, high_g) = bounds, row_bounds
-    bounded = np.isfinite(high).astype(float) - np.isfinite(low)
-    return {"lam_x0": size * bounded, "lam_g0": np.where(high_g > low_g, -size, 0.0)}

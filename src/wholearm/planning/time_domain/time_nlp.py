@@ -52,6 +52,7 @@ from ...geometry.curve import find_tied, tangent_basis
 from ...mechanics.dynamics import build_force_rows
 from ...mechanics.limits import CONE, PRESS, SPEED, LimitSet, make_limits
 from ...problem.definition import Until
+from ...scene.model import Scene
 from ...solvers.ipopt import SolverStatistics, book, build_solver
 from ..columns import Columns
 from ..options import Objective
@@ -508,11 +509,8 @@ def join_stages(
         rows.add_copies(kernel, columns, own, kernel.p.join(Xi=coming.directions.Xi))
 
 
-class _Gives(NamedTuple):
-    """Slack of a row: an unknown of each interval, shape (K,), and its weight."""
-
-    unknowns: Indices
-    weight: float
+_Slack = tuple[Indices, float]
+"""Slack of a row: an unknown of each interval, shape (K,), and its weight."""
 
 
 def add_limits(
@@ -549,20 +547,6 @@ def add_limits(
     return LimitRows(limits, pressed, added, others, bounded, alone=not any(soft))
 
 
-def bound_by_limits(
-    rows: LimitRows, bounds: tuple[Array, Array], raised: Array | None = None
-) -> None:
-    """Bound torques and joint speeds, in place, by limits raised by shape (K, n_sides)."""
-    low, high = bounds
-    _, signs, values = rows.limits.sides
-    for side, unknowns in rows.bounded.items():
-        more = 0.0 if raised is None else raised[:, side, None]
-        if signs[side] > 0:
-            low[unknowns] = np.maximum(low[unknowns], values[side] + more)
-        else:
-            high[unknowns] = np.minimum(high[unknowns], values[side] - more)
-
-
 def price_sides(rows: LimitRows, layout: StageLayout, on_x: Array, on_g: Array) -> Array:
     """Multiplier of each side of the limits in each interval, shape (K, n_sides).
 
@@ -577,26 +561,26 @@ def price_sides(rows: LimitRows, layout: StageLayout, on_x: Array, on_g: Array) 
     return price
 
 
-def _list_gives(limits: LimitSet, layout: StageLayout, target: Target) -> list[_Gives | None]:
+def _list_gives(limits: LimitSet, layout: StageLayout, target: Target) -> list[_Slack | None]:
     """Slack of each row, if it has one."""
-    gives: list[_Gives | None] = [None] * len(limits.low)
+    gives: list[_Slack | None] = [None] * len(limits.low)
     chain = layout.nodes[:-1, MARGIN:].ravel()
     if target.objective is Objective.MARGIN:
         for row in limits.of(PRESS):
-            gives[row] = _Gives(chain, -1.0)
+            gives[row] = chain, -1.0
     elif target.objective is Objective.ELASTIC:
         for row in limits.of(*{limit.kind for limit in limits.without(SPEED).limits}):
-            gives[row] = _Gives(layout.short[:, limits.owners[row]], 1.0)
+            gives[row] = layout.short[:, limits.owners[row]], 1.0
     elif target.relaxation is not None:
         weights = limits.weigh(target.relaxation)
         for row in np.flatnonzero(weights):
-            gives[row] = _Gives(chain, float(weights[row]))
+            gives[row] = chain, float(weights[row])
     return gives
 
 
-def _add_gives(rows: NlpRows, own: Indices, gives: _Gives | None) -> None:
+def _add_gives(rows: NlpRows, own: Indices, gives: _Slack | None) -> None:
     if gives is not None:
-        rows.add_entries(own, gives.unknowns[:, None], gives.weight)
+        rows.add_entries(own, gives[0][:, None], gives[1])
 
 
 def _add_presses(
@@ -604,7 +588,7 @@ def _add_presses(
     limits: LimitSet,
     layout: StageLayout,
     scheme: Scheme,
-    gives: list[_Gives | None],
+    gives: list[_Slack | None],
     slow: bool,
 ) -> Indices:
     """Normal forces by the polynomials through the points, shape (K, m, n_c)."""
@@ -778,29 +762,55 @@ def _add_period(
             rows.add_copies(kernel, columns, rows.nonlinear(kernel.outputs))
 
 
-def bound_unknowns(nlp: TimeNLP, stages: Sequence[Stage], scheme: Scheme) -> tuple[Array, Array]:
-    """Bounds of the unknowns but for the least c_n: durations, torques, joint speeds, impulses."""
-    size = nlp.layouts[-1].stop
-    low, high = np.full(size, -np.inf), np.full(size, np.inf)
-    for k, (stage, coming) in enumerate(zip(stages, [*stages[1:], None], strict=True)):
-        layout = nlp.layouts[k]
+def find_bounds(
+    nlp: TimeNLP, stages: Sequence[Stage], scheme: Scheme, limits: Sequence[LimitMisses]
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Bounds of the NLP's unknowns and of its rows, with limits raised."""
+    low, high = np.full((2, nlp.layouts[-1].stop), [[-np.inf], [np.inf]])
+    low_g, high_g = nlp.rows.bounds
+    every = zip(stages, [*stages[1:], None], nlp.layouts, nlp.rows_of, limits, strict=True)
+    for stage, coming, layout, rows, raised in every:
         low[layout.short] = 0.0
         low[layout.h] = SHORTEST
+        if coming is not None and stage.ends_in_impact:
+            low[layout.impulses[: coming.formation.n_contacts]] = 0.0
+        _stay_short(stage, layout, scheme, (low, high))
         still = find_still(stage, stage is stages[-1]) if scheme.ends else set()
         rates = least_senses(stage, stage.guess.places(scheme.points))
         for joint, sigma in enumerate(stage.directions.sigma):
-            own, one_way = layout.v[..., 3 + joint], rates[..., joint - 2].copy()
+            speeds, one_way = layout.v[..., 3 + joint], rates[..., joint - 2].copy()
             if stage.formation.n_contacts + joint in still:
                 one_way[-1, -1] = -np.inf
             if sigma > 0:
-                low[own] = one_way
+                low[speeds] = one_way
             else:
-                high[own] = -one_way
-        bound_by_limits(nlp.rows_of[k].limits, (low, high))
-        _stay_short(stage, layout, scheme, (low, high))
-        if coming is not None and stage.ends_in_impact:
-            low[layout.impulses[: coming.formation.n_contacts]] = 0.0
-    return low, high
+                high[speeds] = -one_way
+        own, n_c = rows.limits, stage.formation.n_contacts
+        sides, signs, values = own.limits.sides
+        more = raised.held * own.limits.scales[sides]
+        # Forces that vanish or set in are only nonnegative.
+        more = np.where(find_relieved(stage, own.limits), -signs * values, more)
+        floor = values[own.pressed] + more[:, own.pressed]
+        # Where rows hold c_n at the points too, its own bounds must not.
+        if own.alone:
+            low[layout.forces[..., :n_c]] = floor[:, None]
+        low_g[own.presses] = floor[:, None]
+        low_g[own.others] = ((signs * values)[own.sides] + more[:, own.sides])[:, None]
+        for held in (layout.begin, layout.finish):
+            low[held[:n_c]] = values[own.pressed][: len(held)]
+        _free_equal(stage, own, layout, (low, low_g))
+        for side, unknowns in own.bounded.items():
+            if signs[side] > 0:
+                low[unknowns] = np.maximum(low[unknowns], values[side] + more[:, side, None])
+            else:
+                high[unknowns] = np.minimum(high[unknowns], values[side] - more[:, side, None])
+        low_g[rows.monitor_rows] += raised.gap[:, None, list(stage.monitored)]
+        low_g[rows.senses] += raised.sense[:, None, list(stage.formation.rubbing_rows)]
+        for joint, sigma in enumerate(stage.directions.sigma):
+            speeds, faster = layout.v[..., 3 + joint], raised.sense[:, -2 + joint, None]
+            low[speeds] += faster * (sigma > 0)
+            high[speeds] -= faster * (sigma < 0)
+    return (low, high), (low_g, high_g)
 
 
 def _stay_short(
@@ -815,43 +825,6 @@ def _stay_short(
     if stage.until is not None and scheme.ends:
         most[-1, -1] = side * np.inf
     bounds[int(side > 0)][layout.z[..., row]] = most
-
-
-def raise_bounds(
-    nlp: TimeNLP,
-    stages: Sequence[Stage],
-    limits: Sequence[LimitMisses],
-    bounds: tuple[Array, Array],
-) -> tuple[Array, Array]:
-    """Bounds of the NLP's rows; raises `bounds`, those of its unknowns, in place."""
-    low, high = nlp.rows.bounds
-    low_x, high_x = bounds
-    for k, (stage, raised) in enumerate(zip(stages, limits, strict=True)):
-        own, layout = nlp.rows_of[k], nlp.layouts[k]
-        kept = own.limits.limits
-        rows, signs, values = kept.sides
-        more = raised.held * kept.scales[rows]
-        # Forces that vanish or set in are only nonnegative.
-        more = np.where(find_relieved(stage, kept), -signs * values, more)
-        pressed = own.limits.pressed
-        floor = values[pressed] + more[:, pressed]
-        # Where rows hold c_n at the points too, its own bounds must not.
-        if own.limits.alone:
-            low_x[layout.forces[..., : stage.formation.n_contacts]] = floor[:, None]
-        low[own.limits.presses] = floor[:, None]
-        others = own.limits.sides
-        low[own.limits.others] = ((signs * values)[others] + more[:, others])[:, None]
-        for held in (layout.begin, layout.finish):
-            low_x[held[: stage.formation.n_contacts]] = values[pressed][: len(held)]
-        _free_equal(stage, own.limits, layout, (low_x, low))
-        bound_by_limits(own.limits, bounds, more)
-        low[own.monitor_rows] += raised.gap[:, None, list(stage.monitored)]
-        low[own.senses] += raised.sense[:, None, list(stage.formation.rubbing_rows)]
-        for joint, sigma in enumerate(stage.directions.sigma):
-            rates, faster = layout.v[..., 3 + joint], raised.sense[:, -2 + joint, None]
-            low_x[rates] += faster * (sigma > 0)
-            high_x[rates] -= faster * (sigma < 0)
-    return low, high
 
 
 def _free_equal(
@@ -872,6 +845,12 @@ def _free_equal(
     low[rows.presses[0, 0, list(stage.growing)]] = -np.inf
 
 
+def build_applied(scene: Scene, tau: Expression, sigma: Expression) -> Expression:
+    """Applied forces, torques, and dry friction of the joints, shape (5,)."""
+    friction = ca.DM(scene.dry) * ca.vertcat(0, 0, 0, sigma)
+    return ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, tau) - friction
+
+
 @share(32)
 def point_kernel(formation: Formation, controls: int, homotopy: bool = False) -> Kernel:
     """Contact constraints, equations of motion, and rates of sliding contacts at a point.
@@ -890,12 +869,8 @@ def point_kernel(formation: Formation, controls: int, homotopy: bool = False) ->
         Xi, sigma = ca.tanh(A_t @ s.v / p.onset), ca.tanh(s.v[3:] / p.onset)
     if rolls:
         gaps[n_c:] -= formation.roll_function(s.first, s.v)[0]
-    applied = (
-        ca.DM(scene.applied_force)
-        + ca.vertcat(0, 0, 0, ca.reshape(s.tau, 2, controls) @ p.shares)
-        - ca.DM(scene.dry) * ca.vertcat(0, 0, 0, sigma)
-        + build_force_rows(formation, P, A_t, Xi).T @ s.forces
-    )
+    push = build_force_rows(formation, P, A_t, Xi).T @ s.forces
+    applied = push + build_applied(scene, ca.reshape(s.tau, 2, controls) @ p.shares, sigma)
     return build_kernel(
         s,
         p,
@@ -1074,13 +1049,8 @@ def hold_kernel(formation: Formation) -> Kernel:
     x = Columns(z=5, forces=formation.n_constraints, tau=2).make_symbols()
     p = Columns(Xi=n_c, sigma=2).make_symbols()
     _, P, _, A_t = formation.build_constraints(x.z, ca.SX.zeros(5))
-    balance = (
-        ca.DM(scene.applied_force)
-        + ca.vertcat(0, 0, 0, x.tau)
-        - ca.DM(scene.dry) * ca.vertcat(0, 0, 0, p.sigma)
-        + build_force_rows(formation, P, A_t, p.Xi).T @ x.forces
-    )
-    return build_kernel(x, p, balance=balance)
+    push = build_force_rows(formation, P, A_t, p.Xi).T @ x.forces
+    return build_kernel(x, p, balance=push + build_applied(scene, x.tau, p.sigma))
 
 
 @lru_cache(maxsize=1)
