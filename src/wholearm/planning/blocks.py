@@ -247,7 +247,7 @@ def plan_block(
     if not runs_along_curves(block, options):
         from .time_domain.time_plan import plan_with_impacts
 
-        along = partial(plan_along, planning, block, z, options, allowed)
+        along = partial(plan_along, planning, block, z, options)
 
         def plan(duration: float | None) -> Plans:
             pinned = block[-1].index + 1 < len(problem.phases)
@@ -293,17 +293,15 @@ def plan_along(
     block: Sequence[Phase],
     z: Array,
     options: PlanOptions,
-    allowed: Sequence[float | None],
 ) -> list[PathMotion]:
     """Motions of a block along its curves with free torques, if it has some: an initial guess."""
     problem, own = free_torques(planning.problem, replace(options, transcription="auto"))
     phases = [problem.phases[phase.index] for phase in block]
     if not runs_along_curves(phases, own):
         return []
-    own = replace(own, accuracy=max(own.accuracy, ROUGH))
     try:
         free = replace(planning, problem=problem, curves=())
-        plans, _ = plan_block(free, phases, z, own, allowed)
+        plans, _ = plan_block(free, phases, z, own.roughen())
     except WholearmError:
         return []
     return [plan.motion for plan in plans if isinstance(plan.motion, PathMotion)]

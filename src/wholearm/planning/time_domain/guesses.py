@@ -155,7 +155,7 @@ class Guesses:
         lengths, unit = unit_lengths(scales), scales.time
         stages = list[Stage]()
         for stage, motion in zip(join_modes(self.nearest.stages), motions, strict=True):
-            parts = list[tuple[StagePoints, StageMode]]()
+            parts = list[tuple[StagePoints, Mode]]()
             for start, stop, directions in motion.spans:
                 count = round((stop - start) / motion.duration * stage.intervals)
                 count = max(LEAST_INTERVALS, count)
@@ -188,7 +188,7 @@ class Guesses:
                 )
                 signs = np.concatenate(directions)
                 signs[rolling] = 0.0
-                parts.append((part, StageMode(tuple(signs.tolist()))))
+                parts.append((part, tuple(signs.tolist())))
             stages += divide(stage, parts)
         return Guess(ALONG, self._leave_room(link(stages)))
 
