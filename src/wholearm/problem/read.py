@@ -125,29 +125,25 @@ def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
     InputError  if anything in it is malformed; names `source`
     """
     with name_source(source):
-        return _build_problem(table, source)
-
-
-def _build_problem(table: Mapping[str, Any], source: str) -> Problem:
-    check_keys(table, "", TOP)
-    scene = _read_scene(table)
-    check_ranges(scene)
-    start = _read_start(scene, _table(table, "start", START))
-    given = table.get("phases", [])
-    if not isinstance(given, list):
-        raise InputError("", "phases", f"{given!r} is not a list of [[phases]]")
-    uncertainty = None
-    if "uncertainty" in table:
-        uncertainty = _table(table, "uncertainty", UNCERTAINTY)
-    return Problem(
-        scene=scene,
-        start=start,
-        phases=tuple(read_phase(scene, i, entry) for i, entry in enumerate(given)),
-        source=source,
-        uncertainty=uncertainty,
-        goals=read_goals(table),
-        **collect_keys(Problem, table),
-    )
+        check_keys(table, "", TOP)
+        scene = _read_scene(table)
+        check_ranges(scene)
+        start = _read_start(scene, _table(table, "start", START))
+        given = table.get("phases", [])
+        if not isinstance(given, list):
+            raise InputError("", "phases", f"{given!r} is not a list of [[phases]]")
+        uncertainty = None
+        if "uncertainty" in table:
+            uncertainty = _table(table, "uncertainty", UNCERTAINTY)
+        return Problem(
+            scene=scene,
+            start=start,
+            phases=tuple(read_phase(scene, i, entry) for i, entry in enumerate(given)),
+            source=source,
+            uncertainty=uncertainty,
+            goals=read_goals(table),
+            **collect_keys(Problem, table),
+        )
 
 
 def read_own_problem(meta: Mapping[str, Any], source: str = "") -> Problem:
@@ -398,20 +394,15 @@ def check_problem(problem: Problem) -> None:
         _check_end(phase, following)
     for index, goal in enumerate(problem.goals):
         key = name_goal(problem.goals, index)
-        check_goal(problem.scene, goal, key)
+        _check_goal(problem.scene, goal, key)
         if problem.phases:
             raise InputError("", key, "given with [[phases]]; allowed is one of the two")
     _check_fingers(problem)
     _check_first_formation(problem)
 
 
-def check_goal(scene: Scene, goal: Goal, key: str) -> None:
-    """Check a goal; `key` is where it stands in a file.
-
-    Raises
-    ------
-    InputError  if it is not one
-    """
+def _check_goal(scene: Scene, goal: Goal, key: str) -> None:
+    """Check a goal; `key` is where it stands in a file."""
     if (goal.flush is None) == (goal.phi is None):
         both = "flush and phi_deg are both" if goal.phi is not None else "neither flush nor phi_deg"
         raise InputError("", key, f"{both} given; allowed is one of the two")
@@ -506,31 +497,21 @@ def _check_until(scene: Scene, phase: Phase, key: str) -> None:
     if until.contact is not None and until.contact in phase.formation.contacts:
         raise InputError("", key, f"{until} is already in the phase's contacts")
     ends = until.coordinates
-    for coordinate, value in ends:
-        check_coordinate(scene, coordinate, value, key)
+    for coordinate, given in ends:
+        if coordinate not in ROWS:
+            raise InputError("", key, f"{coordinate!r} given; allowed are 'x' and 'phi'")
+        value = require_number(given, key)
+        if coordinate == "x":
+            check_place(scene, key, value)
+        else:
+            # Rounding in radians is no matter at the end of the range.
+            TURN.check(key, round(math.degrees(value), 9), "degrees")
     freedoms = 5 - phase.formation.n_constraints
     if len({name for name, _ in ends}) < len(ends):
         raise InputError("", key, f"{until} gives a coordinate twice")
-    if freedoms > 1 and (given := len(ends) + (until.contact is not None)) > freedoms:
-        text = f"{until} gives {given} conditions; allowed are {freedoms}, as the contacts leave"
+    if freedoms > 1 and (count := len(ends) + (until.contact is not None)) > freedoms:
+        text = f"{until} gives {count} conditions; allowed are {freedoms}, as the contacts leave"
         raise InputError("", key, f"{text} {freedoms} freedoms")
-
-
-def check_coordinate(scene: Scene, coordinate: str, given: float, key: str) -> None:
-    """Check a coordinate of the pose where a phase ends, and its value.
-
-    Raises
-    ------
-    InputError  if there is no such coordinate, or its value is out of its range
-    """
-    if coordinate not in ROWS:
-        raise InputError("", key, f"{coordinate!r} given; allowed are 'x' and 'phi'")
-    value = require_number(given, key)
-    if coordinate == "x":
-        check_place(scene, key, value)
-    else:
-        # Rounding in radians is no matter at the end of the range.
-        TURN.check(key, round(math.degrees(value), 9), "degrees")
 
 
 def _check_end(phase: Phase, following: Phase | None) -> None:

@@ -337,7 +337,10 @@ def split_passages(problem: Problem) -> list[Passage]:
     own: list[Phase] = []
     for phase, after in zip(problem.phases, (*problem.phases[1:], None), strict=True):
         own.append(phase)
-        moves = after is not None and bool(_find_predecessor(phase, after))
+        # A contact that goes on as the one which ends the phase is carried on in motion.
+        gained, leaving = phase.until.contact, _list_leaving(phase, after)
+        ending = [own for own in phase.formation.contacts if own.name in leaving]
+        moves = gained is not None and takes_over(gained, problem.scene, ending)
         if after is None or (phase.end is End.REST and not moves):
             passages.append(Passage(tuple(own), after))
             own = []
@@ -361,15 +364,6 @@ def _is_end(phase: Phase, after: Phase | None, event: Event) -> bool:
 def _list_leaving(phase: Phase, after: Phase | None) -> set[str]:
     kept = () if after is None else after.formation.names
     return set(phase.formation.names) - set(kept)
-
-
-def _find_predecessor(phase: Phase, after: Phase | None) -> str:
-    """The contact of a phase that goes on as the one which ends it, empty if none does."""
-    gained, scene = phase.until.contact, phase.formation.scene
-    kept = () if after is None else after.formation.contacts
-    ending = [contact for contact in phase.formation.contacts if contact not in kept]
-    found = (own.name for own in ending if gained and takes_over(gained, scene, [own]))
-    return next(found, "")
 
 
 @dataclass(frozen=True, eq=False)

@@ -237,14 +237,12 @@ def _change_array(rng: Random, array: Any) -> Any:
 
 def _pack(arrays: Mapping[str, Any], others: Mapping[str, bytes] = MappingProxyType({})) -> bytes:
     """The arrays as an archive, with further members as they are."""
-    stream, members = io.BytesIO(), dict(others)
-    for name, array in arrays.items():
-        member = io.BytesIO()
-        np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=True)
-        members[name] = member.getvalue()
-    with warnings.catch_warnings(), zipfile.ZipFile(stream, "w") as archive:
+    stream = io.BytesIO()
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        for name, raw in members.items():
+        np.savez_compressed(stream, **arrays)
+    with zipfile.ZipFile(stream, "a") as archive:
+        for name, raw in others.items():
             archive.writestr(zipfile.ZipInfo(f"{name}.npy"), raw, zipfile.ZIP_DEFLATED)
     return stream.getvalue()
 

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,16 +97,17 @@ def _solve_along(
     upper, most, equal, equal_to = list[Any](), list[Array](), list[Any](), list[Array]()
     for side in (0, 1):
         at, place = slice(side, n - 1 + side), eye_array(n - 1, n, k=side)
-        forces = _limits(scene, phase, epsilon, z[at], z_s[at], z_ss[at], signs, free)
-        for blocks, matrix in ((equal, forces.equal), (upper, -forces.rows)):
+        points = z[at], z_s[at], z_ss[at]
+        laws, laws_to, rows, least, share = _limits(scene, phase, epsilon, *points, signs, free)
+        for blocks, matrix in ((equal, laws), (upper, -rows)):
             every = kron(eye_array(n - 1), np.ones((matrix.shape[1], 1)))
             a, b, v = (diags_array(matrix[:, :, k].ravel()) @ every for k in range(3))
             c: list[Any] = [None, None]
             c[side] = block_diag([coo_array(block) for block in matrix[:, :, 3:]])
             blocks.append([a @ slope + b @ place, v @ place, *c])
-        upper[-1].append(np.tile(forces.share, n - 1)[:, None])
-        most.append(-forces.least.ravel())
-        equal_to.append(forces.equal_to.ravel())
+        upper[-1].append(np.tile(share, n - 1)[:, None])
+        most.append(-least.ravel())
+        equal_to.append(laws_to.ravel())
     moving = np.flatnonzero(top)
     bounds: Bounds = [*zip(np.zeros(n), top, strict=True)]
     bounds += [(0.0, None if limit else 0.0) for limit in top]
@@ -159,20 +160,6 @@ def _push(touches: list[Touch], rolling: tuple[int, ...], signs: Array) -> Array
     return np.stack([*pushes, *(touches[k].tangent for k in rolling)], axis=2)
 
 
-class Forces(NamedTuple):
-    """Limits of a phase at n places, as rows over x = (a, b, v, c) >= least.
-
-    With forces over the scene's weight, torques over their limits and lengths over the radius of
-    gyration. v stands for sqrt(b), c for c_n, c_t(rolling), and all c_t where friction is free.
-    """
-
-    equal: Array  # equal, equal_to (n, 3, k) and (n, 3): Newton's and Euler's laws of the object
-    equal_to: Array
-    rows: Array  # rows, least (n, m, k) and (n, m): limits
-    least: Array
-    share: Array  # (m,): what a margin of 1 takes from each limit
-
-
 def _limits(
     scene: Scene,
     phase: Phase,
@@ -182,8 +169,19 @@ def _limits(
     z_ss: Array,
     signs: Array,
     free: NDArray[np.bool_] | None,
-) -> Forces:
-    """Limits at n places; where `free`, shape (n, n_c), friction of a contact is in its cone."""
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Limits at n places, as rows over x = (a, b, v, c) >= least.
+
+    With forces over the scene's weight, torques over their limits and lengths over the radius of
+    gyration. v stands for sqrt(b), c for c_n, c_t(rolling), and all c_t where friction is free:
+    where `free`, shape (n, n_c), that of a contact is in its cone.
+
+    Returns
+    -------
+    equal, equal_to : (n, 3, k) and (n, 3)  Newton's and Euler's laws of the object
+    rows, least : (n, m, k) and (n, m)      limits
+    share : (m,)                            what a margin of 1 takes from each limit
+    """
     length, force, speed = scene.scales.length, scene.scales.force, scene.scales.speed
     n, n_c, rolling = len(z), phase.formation.n_contacts, phase.formation.rolling_rows
     touches = [locate(scene, name, z) for name in phase.formation.names]
@@ -213,7 +211,7 @@ def _limits(
         share.append(np.zeros(2 * n_c))
     equal_to = np.broadcast_to(scene.applied_force[:3] / scale, (n, 3))
     matrices = np.concatenate(rows, axis=1), np.concatenate(least, axis=1)
-    return Forces(drive[:, :3] / scale[:, None], equal_to, *matrices, np.concatenate(share))
+    return drive[:, :3] / scale[:, None], equal_to, *matrices, np.concatenate(share)
 
 
 def _maximise(A_ub: Any, b_ub: Any, A_eq: Any, b_eq: Any, bounds: Bounds) -> float:
