@@ -7,7 +7,8 @@ import hashlib
 import os
 import pickle
 from collections.abc import Callable
-from functools import cache, wraps
+from functools import wraps
+from inspect import signature
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
@@ -45,14 +46,18 @@ STORE = Store()
 def once(compute: Callable[P, T]) -> Callable[P, T]:
     """Like `functools.cache`, but for all workers of a test run.
 
-    Arguments have to be told apart by their repr, and results have to pickle.
+    Arguments have to be told apart by their repr, and results have to pickle. An argument that is
+    left out is the same as its default.
     """
+    parameters, known = signature(compute), dict[str, T]()
 
-    @cache
     @wraps(compute)
     def get(*args: P.args, **kwargs: P.kwargs) -> T:
-        given = [*map(repr, args), *(f"{key}={kwargs[key]!r}" for key in sorted(kwargs))]
-        name = f"{compute.__module__}.{compute.__qualname__}({', '.join(given)})"
-        return STORE.get(name, lambda: compute(*args, **kwargs))
+        given = parameters.bind(*args, **kwargs)
+        given.apply_defaults()
+        name = f"{compute.__module__}.{compute.__qualname__}({given.arguments})"
+        if name not in known:
+            known[name] = STORE.get(name, lambda: compute(*args, **kwargs))
+        return known[name]
 
-    return get  # type: ignore[return-value]
+    return get

@@ -39,13 +39,9 @@ def read_order() -> list[str]:
 def list_imports(path: Path) -> list[str]:
     """Packages of this project that a module imports from, at any place in it."""
     here = path.relative_to(SOURCE).parts[:-1]
-    found = []
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.ImportFrom) and node.level:
-            base = here[: len(here) - (node.level - 1)]
-            first = (*base, *(node.module or "").split("."))[0]
-            found += [first] if (SOURCE / first).is_dir() else []
-    return found
+    lines = re.findall(r"^ *from (\.+)(\S*) import", path.read_text(encoding="utf-8"), re.M)
+    firsts = [(*here[: len(here) + 1 - len(dots)], *name.split("."))[0] for dots, name in lines]
+    return [first for first in firsts if (SOURCE / first).is_dir()]
 
 
 def test_the_readme_lists_every_package() -> None:

@@ -462,7 +462,7 @@ def test_command_writes_the_figure(
     monkeypatch.chdir(tmp_path)
     trajectory.save("plan.npz")
     with monkeypatch.context() as patch:
-        patch.setattr("wholearm.mapping.formation_map.build_map", lambda *_, **__: chart)
+        patch.setattr("wholearm.build_map", lambda *_, **__: chart)
         assert main(["map", str(HEPTAGON), "--plan", "plan.npz"]) == 0
         assert capsys.readouterr().out == "wrote map_heptagon_four_contacts.png\n"
         data = (tmp_path / "map_heptagon_four_contacts.png").read_bytes()

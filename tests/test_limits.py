@@ -510,7 +510,7 @@ def test_a_margin_that_a_place_limits_does_not_grow_with_the_duration(
     assert bound is not None
     at_once, at_leisure = (
         plan_path(
-            curve, EPSILON, PlanOptions(objective=Objective.MARGIN), 3, ratio * bound.value
+            curve, EPSILON, PlanOptions(Objective.MARGIN, intervals=40), 3, ratio * bound.value
         ).value
         for ratio in (2.0, 3.0)
     )

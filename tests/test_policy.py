@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -227,7 +228,8 @@ def test_a_landing_without_a_reserve_is_planned_anew() -> None:
     problem = replace(whole, start=start, phases=phases)
 
     def planner(own: Problem) -> Trajectory:
-        return wholearm.solve(own, replay=False, time_intervals=8).trajectory
+        options: dict[str, Any] = {"time_intervals": 6, "replay": False}
+        return wholearm.solve(own, **options).trajectory
 
     plan = planner(problem)
     policy = make_policy(problem, plan, planner=planner)

@@ -26,6 +26,7 @@ import pytest
 
 import wholearm
 from shipped import FOLDER, HEPTAGON, LANDING, plan_of, problem_of
+from tiny_study import die_once
 from wholearm.cli.command import hasten
 from wholearm.common import files as archive
 from wholearm.common import signals as interrupts
@@ -160,14 +161,6 @@ def test_tasks_are_given_a_few_at_a_time() -> None:
     for _ in range(5):
         next(answers)
     assert len(given) <= 5 + 4
-
-
-def die_once(path: str) -> str:
-    """Die of the first task at a path."""
-    if not os.path.exists(path):
-        open(path, "x").close()
-        stop()
-    return path
 
 
 def test_a_process_that_is_killed_loses_and_doubles_no_task(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import wholearm
+from refused import advising
 from retelling import Retelling, Units
 from shipped import FOLDER, HEPTAGON, HEXAGON, LANDING, problem_of, solved
 from wholearm import Formation, Goal, Phase, PlanOptions, Problem, load_plan, verify
@@ -258,7 +259,9 @@ def test_what_is_advised_opens_the_way() -> None:
     assert next(
         RouteSearch(Roadmap(eased, 0.1), make_place(eased.scene, eased.start), goal).run()
     ).duration == pytest.approx(float(text.split()[-2]), rel=0.05)
-    said = describe_block(own, [], text, lambda blocked: explain(rough, PlanOptions(), blocked))
+    coarse = PlanOptions(intervals=20)
+    with advising(lambda wanted: wanted.key == "friction.palm"):
+        said = describe_block(own, [], text, lambda at: explain(rough, coarse, at))
     assert "blocked; v0-palm" in said and said.endswith(text) and " N short; " in said
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import casadi as ca
@@ -15,7 +15,7 @@ from plane import make_formation, measure_gaps, measure_slip, unbalance
 from planned import CosineMotion
 from scenes import roll
 from shipped import HEPTAGON
-from timed import drive, landing
+from timed import Sampler, drive, landing
 from wholearm import Formation, Objective, Scene, load
 from wholearm.common.arrays import Array, Expression
 from wholearm.common.sharing import Batch
@@ -251,20 +251,25 @@ over a microsecond."""
 DURATION = 0.06
 
 
-@lru_cache(maxsize=1)
+@cache
 def curve() -> Curve:
     return trace_phases(load(str(HEPTAGON)))[PHASE]
 
 
-@lru_cache(maxsize=32)
-def driven(name: str, degree: int, count: int, contacts: int = 4) -> Stage:
-    """A motion from rest under torques that are linear in time, by plain Newton and Euler."""
+@cache
+def drive_from_rest(contacts: int) -> tuple[Formation, Directions, Sampler]:
+    """A motion under torques that are linear in time, by plain Newton and Euler."""
     formation, segment = curve().formation, curve().segments[0]
     start = CosineMotion(curve(), 0.2, 15.0).evaluate(np.zeros(1))
     formation = Formation(formation.scene, formation.contacts[:contacts])
     directions = Directions(segment.Xi[:contacts], segment.sigma)
     tau = np.stack([start.tau[0], 0.9 * start.tau[0]])
-    sample = drive(formation, start.z[0], tau, directions, DURATION)
+    return formation, directions, drive(formation, start.z[0], tau, directions, DURATION)
+
+
+@cache
+def driven(name: str, degree: int, count: int, contacts: int = 4) -> Stage:
+    formation, directions, sample = drive_from_rest(contacts)
     return Stage(PHASE, formation, directions, sample(make_scheme(name, degree), count))
 
 

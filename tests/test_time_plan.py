@@ -108,7 +108,8 @@ def gentle() -> list[PhasePlan[TimeMotion]]:
 @once
 def in_time() -> Trajectory:
     """The heptagon's last slide and its flip, which curves are for, in the time domain."""
-    return solve(turning(), transcription="time", time_intervals=8, replay=False).trajectory
+    options: dict[str, Any] = {"time_intervals": 8, "replay": False}
+    return solve(turning(), transcription="time", **options).trajectory
 
 
 @cache
@@ -499,7 +500,7 @@ def planned(objective: str) -> Trajectory:
     return solved(objective).trajectory
 
 
-@cache
+@once
 def along(objective: str) -> Trajectory:
     return solve(problem(objective), objective, intervals=80, replay=False).trajectory
 
@@ -550,9 +551,7 @@ def test_transitions_agree_with_those_along_the_curves(objective: str) -> None:
             assert row["saves"] is None and row["reason"] == other["reason"]
 
 
-@pytest.mark.parametrize(
-    "objective, over_time", [*product(("time", "effort"), (True, False)), ("margin", False)]
-)
+@pytest.mark.parametrize("objective, over_time", list(product(("time", "effort"), (True, False))))
 def test_velocities_jump_by_the_impact_law(objective: str, over_time: bool) -> None:
     """Over time impacts are solved for, along curves they are known."""
     plan, own = plan_of(IMPACTS, objective), problem_of(IMPACTS)
@@ -606,7 +605,7 @@ def test_an_impact_that_is_not_possible_next_to_a_landing_is_a_stop() -> None:
     assert sum(got[1:]) == pytest.approx(sum(expected[1:]), rel=1e-3)
 
 
-OBJECTIVES = ["time", "effort", "margin"]
+OBJECTIVES = ["time", "effort"]
 
 
 @pytest.fixture(scope="module")
@@ -779,7 +778,7 @@ def test_a_landing_comes_to_rest_where_it_is_pinned() -> None:
     problem = pin(landing(), 5, ("x", 0.0195))
     start = trace_phases(problem)[-1].end
     # All guesses: what a single one leads to depends on the last bits.
-    options = PlanOptions(time_intervals=6)
+    options = PlanOptions(time_intervals=4)
     plans = plan_phases(problem, problem.phases[4:], start, options)
     motion = plans[-1].motion
     end = motion.evaluate(np.array([motion.duration]))

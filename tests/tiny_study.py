@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import warnings
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from wholearm.benchmark.study import Case, Row, Study
+from wholearm.benchmark.study import Case, Row, Study, measure_case
 
 
 def allow(task: str) -> float:
     """Processor time that a task may take [s]."""
-    return 1.0 if task == "hang" else 20.0
+    return 0.2 if task == "hang" else 20.0
 
 
 def misbehave(how: str) -> str:
@@ -33,6 +34,26 @@ def misbehave(how: str) -> str:
     if how == "large":
         np.ones(6_000_000)
     return how
+
+
+def die_once(path: str) -> str:
+    """Die of the first task at a path."""
+    if not os.path.exists(path):
+        open(path, "x").close()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return path
+
+
+class Misbehaving(Study):
+    strict = True
+
+    def run(self, case: Case) -> Row:
+        return {"how": misbehave(*case)}
+
+
+def measure(how: str) -> Row:
+    """What a case does and takes, measured in the process of the worker."""
+    return measure_case(Misbehaving(), (how,))
 
 
 class Steps(Study):

@@ -199,8 +199,10 @@ class Batch:
         """
         count = len(arguments[0])
         outputs = [np.empty((count, *result.shape[1:])) for result in self._results]
-        size, _, run = self._calls[0 if count <= 5 else 1 if count <= 20 else 2]
-        for start in range(0, count, size):
+        stop = 0
+        while stop < count:
+            start, left = stop, count - stop
+            size, _, run = self._calls[0 if left <= 5 else 1 if left <= 60 else 2]
             stop = min(start + size, count)
             for store, argument in zip(self._arguments, arguments, strict=True):
                 store[: stop - start] = argument[start:stop]

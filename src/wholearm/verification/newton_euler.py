@@ -140,22 +140,26 @@ def place_object(scene: Scene, z: Array) -> Array:
 
 def link_axis(scene: Scene, z: Array, finger: int) -> Array:
     """Unit vectors from joint to tip, shape (n, 2)."""
-    return np.stack([np.cos(z[:, 3 + finger]), np.sin(z[:, 3 + finger])], axis=1)
+    return np.array([np.cos(z[:, 3 + finger]), np.sin(z[:, 3 + finger])]).T
 
 
 def locate(scene: Scene, name: str, z: Array) -> Touch:
     """The contact called `name` at n configurations `z`, shape (n, 5), which may be complex."""
     feature, part = name.split("-")
-    index, corners = int(feature[1:]), place_object(scene, z)
-    point = corner = corners[:, index]
-    normal, low, high = np.tile([0.0, 1.0], (len(z), 1)), *2 * [np.full(len(z), np.inf)]
+    index, vertices = int(feature[1:]), scene.polygon.vertices
+    turn = np.cos(z[:, 2]), np.sin(z[:, 2])
+    point = corner = z[:, :2] + _rotate(vertices[index], *turn)
+    low = high = np.full(len(z), np.inf)
     gap, finger = corner[:, 1], None if part == "palm" else int(part[-1]) - 1
-    if finger is not None:
+    if finger is None:
+        normal = np.zeros((len(z), 2), dtype=z.dtype)
+        normal[:, 1] = 1.0
+    else:
         link, axis = scene.fingers[finger], link_axis(scene, z, finger)
         base = np.asarray(link.base)
         tip = base + link.length * axis
         if part.startswith("finger"):
-            normal = (1 - 2 * finger) * np.stack([-axis[:, 1], axis[:, 0]], axis=1)
+            normal = (1 - 2 * finger) * np.array([-axis[:, 1], axis[:, 0]]).T
             gap, low = dot(normal, corner - base) - link.radius, dot(axis, corner - base)
             high = link.length - low
         elif feature[0] == "v":
@@ -163,19 +167,24 @@ def locate(scene: Scene, name: str, z: Array) -> Touch:
             normal = (corner - tip) / np.where(distance == 0, 1.0, distance)[:, None]
             gap, low = distance - link.radius, dot(axis, corner - tip)
         else:
-            along = corners[:, (index + 1) % corners.shape[1]] - corner
-            length = norm(along)
-            along = along / length[:, None]
-            normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
+            edge = vertices[(index + 1) % len(vertices)] - vertices[index]
+            along = _rotate(edge / norm(edge), *turn)
+            normal = np.array([-along[:, 1], along[:, 0]]).T
             gap, low = -dot(normal, tip - corner) - link.radius, dot(along, tip - corner)
-            high, point = length - low, tip + link.radius * normal
-    tangent = np.stack([normal[:, 1], -normal[:, 0]], axis=1)
+            high, point = norm(edge) - low, tip + link.radius * normal
+    tangent = np.array([normal[:, 1], -normal[:, 0]]).T
     rows = np.zeros((2, len(z), 5), dtype=z.dtype)
     for row, direction in zip(rows, (normal, tangent), strict=True):
         row[:, :2], row[:, 2] = direction, cross_product(point - z[:, :2], direction)
         if finger is not None:
             row[:, 3 + finger] = -cross_product(point - base, direction)
     return Touch(gap, low, high, rows[0], rows[1], scene.friction.of(finger))
+
+
+def _rotate(vector: Array, c: Array, s: Array) -> Array:
+    """A vector, shape (2,), turned by n angles with cosines `c` and sines `s`, shape (n, 2)."""
+    x, y = vector
+    return np.array([x * c - y * s, x * s + y * c]).T
 
 
 def dot(a: Array, b: Array) -> Array:
