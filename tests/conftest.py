@@ -4,19 +4,19 @@ import gc
 import math
 import os
 import signal
+from typing import TYPE_CHECKING
 
 import pytest
 
 import alone  # noqa: F401 -- before NumPy
-import shipped
 from once import STORE
-from shipped import HEPTAGON, plan_of, problem_of
-from wholearm.benchmark.corpus import perturb_scenes
-from wholearm.geometry.curve import Curve
-from wholearm.geometry.tracing import trace_phases
-from wholearm.mapping.formation_map import FormationMap
-from wholearm.problem.definition import Problem
-from wholearm.results.trajectory import Trajectory
+
+# The process that leads the workers has no use for the package.
+if TYPE_CHECKING:
+    from wholearm.geometry.curve import Curve
+    from wholearm.mapping.formation_map import FormationMap
+    from wholearm.problem.definition import Problem
+    from wholearm.results.trajectory import Trajectory
 
 # A shell lets what it starts in the background ignore SIGINT, and so would all that tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -25,13 +25,15 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 def pytest_addoption(parser: pytest.Parser) -> None:
     text = "multiply every number of every scene by 1 + k 2^-52, k from -4 to 4, drawn by SEED"
     parser.addoption("--rounding", type=int, metavar="SEED", help=text)
-    text = "run every command line of the documentation, also those that take seconds to minutes"
+    text = "also run the lines of the documentation and cases of the corpus that take seconds"
     parser.addoption("--slow", action="store_true", help=text)
 
 
 def pytest_configure(config: pytest.Config) -> None:
     seed = config.getoption("--rounding")
     if seed is not None:
+        from wholearm.benchmark.corpus import perturb_scenes
+
         perturb_scenes(seed)
 
 
@@ -59,22 +61,30 @@ def quiet(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def heptagon() -> Problem:
+    from shipped import HEPTAGON, problem_of
+
     return problem_of(HEPTAGON)
 
 
 @pytest.fixture(scope="session")
 def curves(heptagon: Problem) -> tuple[Curve, ...]:
+    from wholearm.geometry.tracing import trace_phases
+
     return trace_phases(heptagon)
 
 
 @pytest.fixture(scope="session")
 def chart() -> FormationMap:
+    import shipped
+
     return shipped.chart()
 
 
 @pytest.fixture(scope="session")
 def trajectory() -> Trajectory:
     """The plan for the heptagon with every option at its default."""
+    from shipped import HEPTAGON, plan_of
+
     return plan_of(HEPTAGON)
 
 

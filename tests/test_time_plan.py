@@ -107,7 +107,7 @@ def gentle() -> list[PhasePlan[TimeMotion]]:
 
 @once
 def in_time() -> Trajectory:
-    """The heptagon's last slide and its flip, which curves are for, in the time domain."""
+    """The heptagon's last slide and a part of its flip, for which curves are, over time."""
     options: dict[str, Any] = {"time_intervals": 8, "replay": False}
     return solve(turning(), transcription="time", **options).trajectory
 
@@ -115,7 +115,7 @@ def in_time() -> Trajectory:
 @cache
 def turning() -> Problem:
     whole = problem_of(HEPTAGON)
-    phases = tuple(replace(phase, index=k) for k, phase in enumerate(whole.phases[2:]))
+    phases = tuple(replace(phase, index=k) for k, phase in enumerate(whole.phases[2:4]))
     return replace(whole, start=trace_phases(whole)[1].end, phases=phases)
 
 
@@ -137,7 +137,7 @@ def statistics(stages: list[StageMotion]) -> float:
     return sum(stage.duration * (1.0 + float(own @ share)) for stage, own, share in parts)
 
 
-@pytest.mark.parametrize("phase", range(2, 5))
+@pytest.mark.parametrize("phase", [2, 3])
 def test_least_times_agree_with_those_along_the_curve(
     curves: tuple[Curve, ...], trajectory: Trajectory, phase: int
 ) -> None:
