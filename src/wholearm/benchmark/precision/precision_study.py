@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,7 +27,6 @@ from .simulators import (
     SHORT,
     SIMULATORS,
     SOLVED,
-    Median,
     find_mean,
     list_instances,
     run_simulator,
@@ -37,9 +36,6 @@ METHODS = SIMULATORS | PLANNERS
 """All methods by name, in the order of the tables."""
 SIMULATION, PLANNING = (FEW, MANY), (LEAST_TIME, NO_DRAG)
 """Studies of each part."""
-Key = tuple[str, str, str, str]
-"""Study, instance, method and setting: what one median is of."""
-Medians = dict[Key, Median]
 MARKERS = "osD^vP*Xdh<>"  # markers of the methods of a panel
 
 
@@ -82,48 +78,38 @@ COMPARISONS = (
 """Tables of times at equal error."""
 
 
-def read_medians(rows: Iterable[Row]) -> Medians:
-    """The medians of a study's rows."""
-    return {
-        (row["study"], row["phase"], row["method"], row["setting"]): Median(
-            row["build"], row["solve"], tuple(row["errors"]), row["outcome"]
-        )
-        for row in rows
-        if "errors" in row
-    }
-
-
 def find_times(
-    medians: Medians, method: str, own: PeerComparison, target: float
+    rows: Sequence[Row], method: str, own: PeerComparison, target: float
 ) -> dict[str, float]:
     """Times in which a method reaches an error on each phase that it has runs on [s].
 
     Infinite where it does not.
     """
     times: dict[str, float] = {}
-    for (study, name, which, _), median in medians.items():
-        if (study, which) == (own.study, method):
-            took = median.solve + own.building * median.build
-            reached = took if median.reaches(target, own.errors) else math.inf
-            times[name] = min(times.get(name, math.inf), reached)
+    for row in rows:
+        if (row["study"], row["method"]) == (own.study, method):
+            error = max(map(abs, row["errors"][: own.errors]))
+            took = row["solve"] + own.building * row["build"]
+            reached = took if row["outcome"] == SOLVED and error <= target else math.inf
+            times[row["phase"]] = min(times.get(row["phase"], math.inf), reached)
     return times
 
 
-def list_methods(medians: Medians, study: str) -> list[str]:
+def list_methods(rows: Sequence[Row], study: str) -> list[str]:
     """Methods that a study has runs of, in their order."""
-    given = {key[2] for key in medians if key[0] == study}
+    given = {row["method"] for row in rows if row["study"] == study}
     return [name for name in METHODS if name in given]
 
 
-def _format_targets(medians: Medians, own: PeerComparison, limit: float) -> list[str]:
+def _format_targets(rows: Sequence[Row], own: PeerComparison, limit: float) -> list[str]:
     """Times to reach errors, and how many times as long as ours that is."""
-    methods, table = list_methods(medians, own.study), []
+    methods, table = list_methods(rows, own.study), []
     if own.ours not in methods:
         return []
     for method in methods:
         cells = [method]
         for target in own.targets:
-            times, ours = (find_times(medians, m, own, target) for m in (method, own.ours))
+            times, ours = (find_times(rows, m, own, target) for m in (method, own.ours))
             names = times.keys() & ours.keys()
             reached = sum(math.isfinite(times[name]) for name in names)
             mean, least = (
@@ -142,23 +128,21 @@ def _format_targets(medians: Medians, own: PeerComparison, limit: float) -> list
     ]
 
 
-def _draw_study(axes: Axes, medians: Medians, study: str) -> None:
+def _draw_study(axes: Axes, rows: Sequence[Row], study: str) -> None:
     """One panel; hollow markers are settings with which some phases are not solved."""
     planning = study in PLANNING
-    for index, method in enumerate(list_methods(medians, study)):
+    for index, method in enumerate(list_methods(rows, study)):
         points, full = [], []
-        settings: dict[str, list[Median]] = {}
-        for (own, _, which, setting), median in medians.items():
-            if (own, which) == (study, method):
-                settings.setdefault(setting, []).append(median)
-        for group in settings.values():
-            found = [own for own in group if np.isfinite(own.errors[0])]
+        mine = [row for row in rows if (row["study"], row["method"]) == (study, method)]
+        for setting in dict.fromkeys(row["setting"] for row in mine):
+            group = [row for row in mine if row["setting"] == setting]
+            found = [row for row in group if np.isfinite(row["errors"][0])]
             if 2 * len(found) < len(group):
                 continue
-            error = float(np.median([abs(own.errors[0]) for own in found]))
-            seconds = find_mean([own.solve + planning * own.build for own in found])
+            error = float(np.median([abs(row["errors"][0]) for row in found]))
+            seconds = find_mean([row["solve"] + planning * row["build"] for row in found])
             points.append((max(error, 1e-16), seconds))
-            full.append(all(own.outcome == SOLVED for own in group))
+            full.append(all(row["outcome"] == SOLVED for row in group))
         if not points:
             continue
         look: Any = {"color": PALETTE[index % len(PALETTE)], "marker": MARKERS[index]}
@@ -220,20 +204,20 @@ class Precision(Study):
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
         """All tables."""
-        medians = read_medians(rows)
-        lines = [INTRODUCTION]
+        lines, measured = [INTRODUCTION], [row for row in rows if "errors" in row]
         for comparison in COMPARISONS:
-            lines += _format_targets(medians, comparison, options.limit)
+            lines += _format_targets(measured, comparison, options.limit)
         table = [(name, own.settings) for name, own in METHODS.items()]
         lines += ["## Settings", "", *format_table(["method", "settings"], table, 2)]
         return "\n".join(lines), []
 
     def draw(self, rows: Sequence[Row]) -> Figure:
         """Mean run time over the error that half of the phases keep, one line for each method."""
-        figure, medians = Figure(figsize=(11.0, 9.0), layout="constrained"), read_medians(rows)
+        figure = Figure(figsize=(11.0, 9.0), layout="constrained")
         FigureCanvasAgg(figure)
+        measured = [row for row in rows if "errors" in row]
         for axes, study in zip(figure.subplots(2, 2).flat, PLANNING + SIMULATION, strict=True):
-            _draw_study(axes, medians, study)
+            _draw_study(axes, measured, study)
         return figure
 
 

@@ -150,10 +150,6 @@ class Median(NamedTuple):
     errors: tuple[float, ...]
     outcome: str = SOLVED  # `SOLVED`, or what failed
 
-    def reaches(self, target: float, count: int | None = None) -> bool:
-        """Whether it is solved and its errors, or the first few of them, are below a target."""
-        return self.outcome == SOLVED and max(map(abs, self.errors[:count])) <= target
-
 
 def measure(
     build: Callable[[], Callable[[], _Answer]],

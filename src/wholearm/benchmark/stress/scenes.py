@@ -200,7 +200,6 @@ def _distance(piece: Piece, here: Array, size: Array) -> float:
 class Case:
     """A problem of the study."""
 
-    number: int  # within its seed
     kind: str  # what is special about it
     table: Table  # the contents of a problem file
     stops: list[tuple[float, float]]  # [m, rad]: where its phases end according to the map
@@ -231,7 +230,7 @@ def draw_case(seed: int, number: int) -> Case:
             route = ROUTES[int(rng.integers(len(ROUTES)))]
             phases, stops, name = route(rng, problem, phases, stops)
             plain = json.loads(json.dumps({**table, "phases": phases}, default=float))
-            last = Case(number, f"{kind}, {name}", plain, stops)
+            last = Case(f"{kind}, {name}", plain, stops)
             if moves or not willing:
                 return last
     if last is None:
