@@ -45,13 +45,13 @@ from wholearm.problem.uncertainty import NAMES, PARAMETERS
 from wholearm.results.trajectory import Motion, Samples
 from wholearm.robustness.sampling import (
     Robustness,
+    Share,
     TimeWindow,
     Trial,
     Uncertainty,
     assess_robustness,
     change_problem,
     change_torques,
-    count_share,
     make_trial,
     measure_sensitivities,
 )
@@ -271,17 +271,17 @@ def test_contacts_have_to_press_while_their_phase_lasts(
 @pytest.mark.parametrize("count, total", [(1, 7), (50, 100), (998, 1000)])
 def test_ends_of_the_interval_are_as_unlikely_as_it_says(count: int, total: int) -> None:
     """Wilson's definition: the share is Z standard deviations off at both ends."""
-    share = count_share(count, total)
-    for p in (share.low, share.high):
+    share = Share(count, total)
+    for p in share.interval:
         assert abs(share.value - p) == pytest.approx(Z * math.sqrt(p * (1 - p) / total), rel=1e-9)
-    assert share.low < share.value < share.high
+    assert share.interval[0] < share.value < share.interval[1]
 
 
 def test_none_and_all_have_one_open_end() -> None:
-    none, every = count_share(0, 20), count_share(20, 20)
+    none, every = Share(0, 20), Share(20, 20)
     # (1 - p)^n = ... is replaced by the normal law: p = Z^2 / (n + Z^2).
-    assert (none.low, none.high) == pytest.approx((0.0, Z**2 / (20 + Z**2)), rel=1e-12)
-    assert (every.low, every.high) == pytest.approx((1 - Z**2 / (20 + Z**2), 1.0), rel=1e-12)
+    assert none.interval == pytest.approx((0.0, Z**2 / (20 + Z**2)), rel=1e-12)
+    assert every.interval == pytest.approx((1 - Z**2 / (20 + Z**2), 1.0), rel=1e-12)
     assert str(every) == "100.0 % (20 of 20, 95 %: 83.9 to 100.0 %)"
 
 

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -167,23 +167,23 @@ class Trial:
     # what the torques are by, instead of the clock; its period is that of the samples
     policy: Policy | None = None
 
-    def run(self, sample: Array) -> dict[str, Any]:
-        """What becomes of one sample, as plain values.
-
-        Parameters
-        ----------
-        sample : (len(varied) + 1,)  a row of `Uncertainty.draw`
+    def run(self, task: Task) -> dict[str, Any]:
+        """What becomes of one sample, by number a row of `Uncertainty.draw`, as plain values.
 
         Returns
         -------
         dict  `distance` [m] and `angle` [rad] from the goal; `reached` and `kept`; the first
               contact that was `lost`, the number of its `phase` and the `time` [s]; the `least` c_n
-              [N] of planned contacts; `path`, poses at even times; `ended`, empty or why the
-              simulation ended early or could not begin
+              [N] of planned contacts; `path`, poses at even times, of the first 200, as many as
+              figures need; `ended`, empty or why the simulation ended early or could not begin
         """
+        number, (*sample, offset) = task
         names = [own.name for own in self.uncertainty.varied]
-        changes = dict(zip(names, sample[:-1].tolist(), strict=True))
-        return self.change(changes, self.uncertainty.sample_rate, float(sample[-1]))
+        changes = dict(zip(names, sample, strict=True))
+        record = self.change(changes, self.uncertainty.sample_rate, offset)
+        if number >= 200:
+            record.pop("path", None)
+        return record
 
     def change(
         self, changes: Mapping[str, float], rate: float | None = None, offset: float = 0.0
@@ -390,20 +390,20 @@ class Robustness(Result):
     @property
     def reached(self) -> Share:
         """How many reach the goal, as near as the uncertainty says."""
-        return count_share(sum(record["reached"] for record in self.records), len(self.records))
+        return Share(sum(record["reached"] for record in self.records), len(self.records))
 
     @property
     def kept(self) -> Share:
         """How many reach it and keep all planned contacts."""
         good = sum(record["reached"] and record["kept"] for record in self.records)
-        return count_share(good, len(self.records))
+        return Share(good, len(self.records))
 
     @property
     def first_lost(self) -> dict[str, Share]:
         """Which contact goes first, by number of the phase and name, the most frequent first."""
         lost = [(own["lost"], own.get("phase")) for own in self.records if own["lost"]]
         names = Counter(f"{name} in phase {k}" if k is not None else name for name, k in lost)
-        return {name: count_share(n, len(self.records)) for name, n in names.most_common()}
+        return {name: Share(n, len(self.records)) for name, n in names.most_common()}
 
     @property
     def document(self) -> Document:
@@ -521,7 +521,7 @@ def assess_robustness(
         drawn = np.vstack(cubes)[:samples]
         tasks = ((k, tuple(drawn[k].tolist())) for k in range(samples) if k not in found)
         good = sum(record["reached"] for record in found.values())
-        for (number, _), answer in run_all(partial(_run, trial), tasks, (start or Processes)()):
+        for (number, _), answer in run_all(trial.run, tasks, (start or Processes)()):
             if isinstance(answer, DiedError):
                 answer = {"ended": str(answer), "reached": False, "kept": False, "lost": "worker"}
             elif isinstance(answer, Exception):
@@ -534,15 +534,6 @@ def assess_robustness(
     records = tuple(found[number] for number in range(samples))
     known_now = 0 if path is None else len({*known, *found})
     return Robustness(trial, drawn, seed, records, known_now)
-
-
-def _run(trial: Trial, task: Task) -> dict[str, Any]:
-    number, sample = task
-    record = trial.run(np.array(sample))
-    # Figures need no more paths.
-    if number >= 200:
-        record.pop("path", None)
-    return record
 
 
 def _stamp(trial: Trial, seed: int) -> dict[str, Any]:
@@ -657,8 +648,19 @@ class Share:
 
     hits: int
     total: int
-    low: float
-    high: float
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Least and largest probability p with |hits/total - p| <= z sigma(p)."""
+        if not self.total:
+            return 0.0, 1.0
+        z = 1.959963984540054  # standard normal quantile of 0.975
+        share, spread = self.value, z**2 / self.total
+        centre = (share + spread / 2) / (1 + spread)
+        half = math.sqrt(share * (1 - share) * spread + spread**2 / 4) / (1 + spread)
+        # At the ends the interval begins and ends exactly there, but for rounding.
+        low = centre - half if self.hits else 0.0
+        return low, centre + half if self.hits < self.total else 1.0
 
     @property
     def value(self) -> float:
@@ -668,23 +670,11 @@ class Share:
     @property
     def table(self) -> dict[str, float]:
         """All of it, as JSON has it."""
-        return {"count": self.hits, "share": self.value, "low": self.low, "high": self.high}
+        low, high = self.interval
+        return {"count": self.hits, "share": self.value, "low": low, "high": high}
 
     def __str__(self) -> str:
         if not self.total:
             return "none"
-        percent = [f"{100 * value:.1f}" for value in (self.value, self.low, self.high)]
+        percent = [f"{100 * value:.1f}" for value in (self.value, *self.interval)]
         return f"{percent[0]} % ({self.hits} of {self.total}, 95 %: {percent[1]} to {percent[2]} %)"
-
-
-def count_share(count: int, total: int) -> Share:
-    """A share with its interval: the probabilities p with |count/total - p| <= z sigma(p)."""
-    if not total:
-        return Share(0, 0, 0.0, 1.0)
-    z = 1.959963984540054  # standard normal quantile of 0.975
-    share, spread = count / total, z**2 / total
-    centre = (share + spread / 2) / (1 + spread)
-    half = math.sqrt(share * (1 - share) * spread + spread**2 / 4) / (1 + spread)
-    # At the ends the interval begins and ends exactly there, but for rounding.
-    low = centre - half if count else 0.0
-    return Share(count, total, low, centre + half if count < total else 1.0)
