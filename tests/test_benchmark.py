@@ -52,7 +52,7 @@ from wholearm.benchmark.precision.simulators import (
     measure_error,
 )
 from wholearm.benchmark.skip import STUDY as SKIP
-from wholearm.benchmark.skip import SkipPair, list_pairs, spend
+from wholearm.benchmark.skip import SkipPlan, list_pairs, spend
 from wholearm.benchmark.study import Case, Row, Study, digest_source
 from wholearm.cli.command import load_study, main
 from wholearm.common.crowd import Processes, run_all
@@ -254,12 +254,13 @@ ABSENT = ("friction of joints", "speed limits that never bind")
 """Parts that are coefficients and bounds, where they are."""
 
 
+Pairs = dict[str, tuple[SkipPlan, SkipPlan]]
+
+
 @pytest.fixture(scope="module")
-def pairs() -> dict[str, SkipPair]:
-    every = list_pairs(
-        str(FOLDER), intervals=INTERVALS, time_intervals=TIME_INTERVALS, mode_search=False
-    )
-    return {pair.part: pair for pair in every}
+def pairs() -> Pairs:
+    options = {"intervals": INTERVALS, "time_intervals": TIME_INTERVALS, "mode_search": False}
+    return list_pairs(str(FOLDER), **options)
 
 
 def assert_bare(cost: Row, contacts: int, rolling: int) -> None:
@@ -276,18 +277,18 @@ def assert_bare(cost: Row, contacts: int, rolling: int) -> None:
 
 
 @pytest.mark.parametrize("part", ["friction of contacts", *ABSENT])
-def test_friction_and_limits_are_free_along_curves(pairs: dict[str, SkipPair], part: str) -> None:
+def test_friction_and_limits_are_free_along_curves(pairs: Pairs, part: str) -> None:
     pair = pairs[f"{part}, along curves"]
-    for case in (pair.without, pair.having):
+    for case in pair:
         assert_bare(spend(case), TOUCHING, 0)
 
 
 def test_over_time_friction_adds_a_sense_for_each_contact_and_point(
-    pairs: dict[str, SkipPair],
+    pairs: Pairs,
 ) -> None:
     own = [pairs[f"{part}, over time"] for part in ("friction of contacts", *ABSENT)]
     full, smooth, free, limited = (
-        spend(case) for case in (own[0].having, own[0].without, own[1].without, own[2].having)
+        spend(case) for case in (own[0][1], own[0][0], own[1][0], own[2][1])
     )
     # What else there is, are coefficients and bounds.
     assert {own["unknowns"] for own in (full, free, limited)} == {smooth["unknowns"]}
@@ -298,19 +299,19 @@ def test_over_time_friction_adds_a_sense_for_each_contact_and_point(
 
 
 def test_a_rolling_contact_has_two_rows_more_than_a_sliding_one_along_a_curve(
-    pairs: dict[str, SkipPair],
+    pairs: Pairs,
 ) -> None:
-    tip = pairs["a second freedom"].without
+    tip = pairs["a second freedom"][0]
     (phase,) = tip.problem.phases
     assert (phase.formation.n_contacts, phase.formation.n_rolling) == (3, 1)
     assert_bare(spend(tip), 3, 1)
 
 
-def test_the_table_has_a_row_for_each_part(pairs: dict[str, SkipPair]) -> None:
+def test_the_table_has_a_row_for_each_part(pairs: Pairs) -> None:
     pair = pairs["a figure"]
     rows = [
-        {"case": ["anywhere", pair.part, having, 0], **spend(plan)}
-        for having, plan in ((False, pair.without), (True, pair.having))
+        {"case": ["anywhere", "a figure", having, 0], **spend(plan)}
+        for having, plan in zip((False, True), pair, strict=True)
     ]
     *_, row = SKIP.report(rows, argparse.Namespace())[0].splitlines()
     name, *cells = [cell.strip() for cell in row.strip("|").split("|")]

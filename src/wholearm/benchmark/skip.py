@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from statistics import median
@@ -34,14 +34,13 @@ class Skip(Study):
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
         """Each part, without and with it, several times."""
-        parts = [pair.part for pair in list_pairs(options.problems)]
+        parts = list_pairs(options.problems)
         return product([options.problems], parts, (False, True), range(3))
 
     def run(self, case: Case) -> Row:
         """Plan once."""
         folder, part, having, _ = case
-        (pair,) = (own for own in list_pairs(folder) if own.part == part)
-        return spend(pair.having if having else pair.without)
+        return spend(list_pairs(folder)[part][having])
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
         """Sizes, and medians of times."""
@@ -75,17 +74,11 @@ class SkipPlan(NamedTuple):
     draw: bool = False  # whether the plan is drawn as well
 
 
-@dataclass(frozen=True)
-class SkipPair:
-    """A part of the model, and the same phases without it and with it."""
+def list_pairs(folder: str, **options: Any) -> dict[str, tuple[SkipPlan, SkipPlan]]:
+    """The same phases without each part of the model and with it, by what the part is called.
 
-    part: str
-    without: SkipPlan
-    having: SkipPlan
-
-
-def list_pairs(folder: str, **options: Any) -> list[SkipPair]:
-    """Every part with two problems made of those in a folder; `options` are those of `solve`."""
+    Problems are made of those in a folder; `options` are those of `solve`.
+    """
     whole, box, joined = (
         load(str(Path(folder) / f"{name}.toml"))
         for name in ("heptagon_four_contacts", "box_rolling", "heptagon_impact")
@@ -93,9 +86,8 @@ def list_pairs(folder: str, **options: Any) -> list[SkipPair]:
     slide = build_problem({**whole.table, "phases": whole.table["phases"][:1]}, whole.source)
     tip = _pick(box, 1, 2)
     path, over_time = options, options | {"transcription": "time"}
-    pairs = [
-        SkipPair(
-            f"{part}, {where}",
+    pairs = {
+        f"{part}, {where}": (
             SkipPlan(slide.with_(absent), own),
             SkipPlan(slide.with_(present), own),
         )
@@ -106,7 +98,7 @@ def list_pairs(folder: str, **options: Any) -> list[SkipPair]:
             ("speed limits that never bind", {}, {"speed_limit": 1e3}),
             ("torque limits that bind", {"torque_limit": 20.0}, {}),
         )
-    ]
+    }
     (phase,) = tip.phases
     sliding = replace(phase, formation=replace(phase.formation, rolling=()))
     slipping = replace(tip, phases=(sliding,))
@@ -117,16 +109,13 @@ def list_pairs(folder: str, **options: Any) -> list[SkipPair]:
     idle = replace(both, start=both.start + np.array([0, 0, 0, 0, 0.6]), phases=(alone,))
     run = _pick(joined, 0, 2)
     stop = replace(run, phases=(replace(run.phases[0], end=End.REST), *run.phases[1:]))
-    return [
-        *pairs,
-        SkipPair(
-            "a rolling contact, over time", SkipPlan(slipping, over_time), SkipPlan(tip, over_time)
-        ),
-        SkipPair("a second freedom", SkipPlan(tip, path), SkipPlan(slipping, path)),
-        SkipPair("a transition at speed", SkipPlan(stop, path), SkipPlan(run, path)),
-        SkipPair("an idle finger, over time", SkipPlan(both, over_time), SkipPlan(idle, over_time)),
-        SkipPair("a figure", SkipPlan(slide, path), SkipPlan(slide, path, draw=True)),
-    ]
+    return pairs | {
+        "a rolling contact, over time": (SkipPlan(slipping, over_time), SkipPlan(tip, over_time)),
+        "a second freedom": (SkipPlan(tip, path), SkipPlan(slipping, path)),
+        "a transition at speed": (SkipPlan(stop, path), SkipPlan(run, path)),
+        "an idle finger, over time": (SkipPlan(both, over_time), SkipPlan(idle, over_time)),
+        "a figure": (SkipPlan(slide, path), SkipPlan(slide, path, draw=True)),
+    }
 
 
 def _pick(problem: Problem, first: int, stop: int) -> Problem:
