@@ -17,7 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..geometry.tracing import load, trace_phases
+from ..planning.options import PlanOptions
 from ..planning.plan import solve
+from ..planning.time_domain.time_plan import plan_phases
 from ..problem.definition import End, Problem, Until
 from ..problem.read import build_problem
 from ..solvers.ipopt import record_runs
@@ -128,9 +130,13 @@ def _pick(problem: Problem, first: int, stop: int) -> Problem:
 
 def spend(plan: SkipPlan) -> Row:
     """Sizes of the first NLP of a plan, and processor time outside and inside the solver [ms]."""
-    started = time.process_time()
+    problem, started = plan.problem, time.process_time()
     with record_runs() as runs:
-        found = solve(plan.problem, replay=False, **plan.options)
+        if plan.options.get("transcription") == "time":
+            # Not from the plan along curves, whose NLPs are others.
+            plan_phases(problem, problem.phases, problem.start, PlanOptions(**plan.options))
+        else:
+            found = solve(problem, replay=False, **plan.options)
     if plan.draw:
         from ..figures.plots import force_margins
 
