@@ -261,6 +261,17 @@ def test_a_contact_passes_from_a_link_over_its_tip_to_an_edge() -> None:
     assert [len(phase.modes) for phase in within.phases] == [1, 1, 2]
 
 
+def test_contacts_that_reverse_at_one_place_do_not_stop_the_motion() -> None:
+    """On the square both fingers reverse halfway, by symmetry."""
+    square = problem_of(FOLDER / "square.toml")
+    middle = replace(square.phases[1], index=0)
+    halfway = replace(square, start=trace_phases(square)[0].end, phases=(middle,))
+    options: dict[str, Any] = {"replay": False, "accuracy": 1e-3}
+    along, within = solve(halfway, **options), solve(halfway, transcription="time", **options)
+    assert within.duration == pytest.approx(along.duration, rel=2e-3)  # errors of both
+    assert len(within.phases[0].modes) == 2
+
+
 @pytest.mark.parametrize(
     "throw, name", [(shove, "radau"), (heave, "radau"), (heave, "legendre"), (lift, "radau")]
 )

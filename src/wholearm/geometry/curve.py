@@ -209,17 +209,23 @@ def tangent_basis(formation: Formation, z: Array) -> Array:
 
 
 def find_tied(formation: Formation, z: Array, row: int) -> tuple[int, ...]:
-    """Rows of (contacts, joints) that reverse with a row: proportional, or of a flush edge."""
+    """Rows of (contacts, joints) that reverse with a row, or are of a flush edge with it.
+
+    With two freedoms these are proportional, with one all that vanish at this place.
+    """
     flush, N = formation.turn_with(row), tangent_basis(formation, z)
-    if N.shape[1] != 2:
+    if N.shape[1] not in (1, 2):
         return flush
     A_t = formation.evaluate(z[None], np.zeros((1, 5))).A_t[0]
     slips = A_t / formation.scene.scales.length
     rates = np.vstack([slips, np.eye(5)[3:]]) @ (N / metric_weights(formation.scene)[:, None])
     rates /= np.linalg.norm(rates, axis=1).max()
     sizes = np.linalg.norm(rates, axis=1)
-    across = np.abs(rates[row, 0] * rates[:, 1] - rates[row, 1] * rates[:, 0])
-    tied = (across < _TIED * sizes * sizes[row]) & (sizes > _TIED) & (sizes[row] > _TIED)
+    if N.shape[1] == 1:
+        tied = (sizes < _TIED) & (sizes[row] < _TIED)
+    else:
+        across = np.abs(rates[row, 0] * rates[:, 1] - rates[row, 1] * rates[:, 0])
+        tied = (across < _TIED * sizes * sizes[row]) & (sizes > _TIED) & (sizes[row] > _TIED)
     return tuple(dict.fromkeys([row, *flush, *np.flatnonzero(tied).tolist()]))
 
 
