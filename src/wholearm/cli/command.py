@@ -218,27 +218,23 @@ def load_plan(options: argparse.Namespace, path: str, silent: bool = False) -> L
     from ..problem.read import adopt_phases
 
     plan, problem, policy = wholearm.load_trajectory(path), read_problem(options), None
-    known, sensor = getattr(options, "policy", None), getattr(options, "sensor", False)
+    known, origins = getattr(options, "policy", None), [("plan", path, plan.meta)]
     if known is not None:
-        policy = wholearm.Policy.load(known).with_sensor(sensor)
+        policy = wholearm.Policy.load(known).with_sensor(getattr(options, "sensor", False))
+        origins.append(("policy", known, policy.about))
     problem = adopt_phases(problem, plan.meta, plan.q[-1], path)
-    named = None if policy is None else (str(known), policy)
-    notes = tell_origin(problem, (path, plan), named, silent)
-    return problem, plan, policy, notes
+    return problem, plan, policy, tell_origin(problem, *origins, silent=silent)
 
 
 def tell_origin(
-    problem: wholearm.Problem,
-    plan: tuple[str, wholearm.Trajectory],
-    policy: tuple[str, wholearm.Policy] | None = None,
-    silent: bool = False,
+    problem: wholearm.Problem, *origins: tuple[str, str, Mapping[str, Any]], silent: bool = False
 ) -> dict[str, list[str]]:
     """Print a line for what was made for another problem.
 
     Parameters
     ----------
-    plan, policy  the file and what is in it
-    silent        leave printing to the caller
+    origins  what it is, its file, and what that says about it
+    silent   leave printing to the caller
 
     Returns
     -------
@@ -250,11 +246,8 @@ def tell_origin(
     """
     from ..results.adopt import describe_origin
 
-    given = [("plan", plan[0], plan[1].meta)]
-    if policy is not None:
-        given.append(("policy", policy[0], policy[1].about))
     notes: list[str] = []
-    for what, source, meta in given:
+    for what, source, meta in origins:
         with name_source(source):
             notes += filter(None, [describe_origin(problem, meta, what)])
     for note in () if silent else notes:
@@ -604,7 +597,7 @@ def draw_map(options: argparse.Namespace) -> int:
     problem = read_problem(options)
     plan = None if options.plan is None else wholearm.load_trajectory(options.plan)
     if plan is not None:
-        tell_origin(problem, (options.plan, plan), silent=bool(poses))
+        tell_origin(problem, ("plan", options.plan, plan.meta), silent=bool(poses))
     margin = options.uniqueness_margin
     limit = {} if margin is None else {"uniqueness_margin": margin}
     _save_map(problem, plan, output, phi, **limit)

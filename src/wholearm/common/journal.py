@@ -44,7 +44,9 @@ class Journal:
             self._stream: BinaryIO = open(path, "ab+", buffering=0)
             try:
                 if stat.S_ISREG(os.fstat(self._stream.fileno()).st_mode):
-                    self._lock()
+                    if fcntl is not None:
+                        # Keeps others from the file until it is closed, or this process ends.
+                        fcntl.flock(self._stream.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
                     if fresh:
                         self._stream.truncate(0)
                     self._stream.seek(0)
@@ -52,6 +54,9 @@ class Journal:
             except BaseException:
                 self.close()
                 raise
+        except BlockingIOError:
+            text = "another run is writing to it; wait for its end, or choose another with -o"
+            raise InputError(path, "", text) from None
         except OSError as error:
             raise self._fail(error) from None
 
@@ -108,15 +113,6 @@ class Journal:
         left = memoryview(line)
         while left:
             left = left[self._stream.write(left) :]
-
-    def _lock(self) -> None:
-        """Keep others from the file until it is closed, or this process ends."""
-        try:
-            if fcntl is not None:
-                fcntl.flock(self._stream.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            text = "another run is writing to it; wait for its end, or choose another with -o"
-            raise InputError(self.path, "", text) from None
 
     def _fail(self, error: OSError) -> InputError:
         return InputError(self.path, "", f"cannot be written: {error.strerror}")
