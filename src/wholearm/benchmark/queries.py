@@ -25,7 +25,7 @@ from ..mapping.formation_list import format_route, list_formations
 from ..planning.options import PlanOptions
 from ..planning.plan import solve
 from ..problem.definition import Problem
-from ..problem.read import build_problem, place_start, read_problem
+from ..problem.read import build_problem, read_problem
 from ..search.find_route import find_route, forget_roadmaps
 from ..verification.verify import verify
 from .stress.scenes import Table
@@ -178,12 +178,10 @@ def _draw_goal(rng: np.random.Generator, table: Table) -> Problem:
 
 def _draw_pose(rng: np.random.Generator, table: Table) -> dict[str, float]:
     count = len(table["object"]["vertices"])
-    scene = build_problem(table).scene
-    size = scene.scales.length
+    size = build_problem(table).scene.scales.length
     while True:
         edge, x = int(rng.integers(count)), round(size * rng.uniform(-3.0, 3.0), 4)
         try:
-            place_start(scene, edge, x)
             build_problem({**table, "start": {"flush": edge, "x": x}})
         except InputError:
             continue

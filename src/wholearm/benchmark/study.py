@@ -12,6 +12,7 @@ import hashlib
 import io
 import os
 import platform
+import re
 import sys
 import tempfile
 import time
@@ -206,7 +207,11 @@ def describe_machine(packages: Sequence[str] = ()) -> str:
             parts.append(f"{name} {version(name)}")
         except PackageNotFoundError:
             continue
-    return ", ".join([*parts, _name_processor(), f"{os.cpu_count()} cores"])
+    processor = platform.processor() or platform.machine()
+    with suppress(OSError):
+        known = re.search(r"^model name\s*:(.*)$", Path("/proc/cpuinfo").read_text("utf-8"), re.M)
+        processor = known[1].strip() if known else processor
+    return ", ".join([*parts, processor, f"{os.cpu_count()} cores"])
 
 
 def format_table(
@@ -290,14 +295,3 @@ def find_peak() -> float:
 def _key(case: Any) -> Any:
     """A case as it was before it was written."""
     return tuple(map(_key, case)) if isinstance(case, list | tuple) else case
-
-
-def _name_processor() -> str:
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as stream:
-            for line in stream:
-                if line.startswith("model name"):
-                    return line.partition(":")[2].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()

@@ -173,8 +173,8 @@ def _plan(table: Mapping[str, Any], objective: str, scene: DrawnScene | None = N
             kind, reason = judge(problem, refusal, scene.stops)
     except Exception as failure:
         kind, reason = "failed", describe_error(failure)[1]
-    row["verdict"], kinds = kind, dict[str, str]()
-    kinds["refuted"], kinds["failed"] = "refusal where a motion exists", "check that failed"
+    row["verdict"] = kind
+    kinds = {"refuted": "refusal where a motion exists", "failed": "check that failed"}
     if not loaded and scene.kind.endswith("from the map"):
         findings.append(("list that does not load", f"{refusal} ({kind}: {reason})"))
     elif kind in kinds:
