@@ -388,23 +388,22 @@ def test_every_problem_has_stored_counts() -> None:
 STORED = json.loads((FOLDER.with_name("results") / "corpus.json").read_text(encoding="utf-8"))
 QUICK: tuple[Case, ...] = (
     *(("plan", "heptagon_four_contacts", goal) for goal in ("time", "effort")),
-    ("variant", "certified"),
     ("goal", 20),
     ("scene", 2, "margin"),
     ("leg", 36, "time"),
-    ("torques", "heptagon", 0.9),
     ("free", "heptagon_four_contacts"),
     ("compare", "heptagon_four_contacts"),
-    ("map", "square"),
     *(("list", number) for number in range(4)),
     ("predict", "square"),
 )
 LONGER: tuple[Case, ...] = (
     ("plan over time", "heptagon_four_contacts", "effort"),
-    *(("variant", name) for name in ("speed", "weak", "rough", "rough, over time")),
+    *(("variant", name) for name in ("speed", "weak", "rough", "certified", "rough, over time")),
     ("goal", 34),
     *(("scene", number, "margin") for number in (17, 44)),
     ("leg", 24, "time"),
+    ("torques", "heptagon", 0.9),
+    ("map", "square"),
     ("policy", "heptagon_four_contacts"),
     ("robustness", "heptagon_four_contacts"),
     ("report", "heptagon_four_contacts"),
