@@ -207,7 +207,9 @@ def integrate_phase(
     events, lost = [falls(k) for k in range(len(contacts))], None
     inner = torque.breaks[(torque.breaks > span[0]) & (torque.breaks < span[1])]
     for start, stop in pairwise([span[0], *inner.tolist(), span[1]]):
-        own = torque.cut(start, stop)
+        # A whole piece, which stays as it is to the last bit.
+        piece = min(np.searchsorted(torque.breaks, (start + stop) / 2), len(torque.breaks) - 1)
+        own = torque.cut(*torque.breaks[piece - 1 : piece + 1].tolist())
         run = solve_ivp(
             derivative, (start, stop), state, "DOP853", rtol=accuracy, atol=accuracy, events=events
         )
