@@ -46,9 +46,9 @@ class RefinementSettings:
     over: tuple[float, float, float] = (1.5, 3.0, 3.0)
     checks: int = 25  # places per interval at which limits are checked
     at_once: int = 2  # most times that an interval is halved at once
-    # most of a phase at the default accuracy, prop. to 1 / sqrt(accuracy); effort of phase 2 of
-    # box_rolling takes 89
-    intervals: int = 120
+    # most of a phase at the default accuracy, prop. to 1 / sqrt(accuracy); phase 2 of box_rolling
+    # takes 155, and with fewer its limits are raised by much
+    intervals: int = 160
     parametric: int = 5  # first iterates in which limits are raised by what ranges change alone
     iterates: int = 24
     refinements: int = 8  # most iterates with finer intervals
