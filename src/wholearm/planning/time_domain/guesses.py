@@ -41,7 +41,6 @@ GIVEN = "the contact modes that the problem gives"
 ALONG = "the plan along curves"
 OTHER = "a motion straight to another end"
 GRADUAL = " with friction that sets in gradually"  # suffix of names where modes are found so
-LONGER = "{}, {:g} times as long as a fall over that height"
 PATHS = 3  # most paths to other ends
 STEP = 0.15  # distance of ends, over the length of the path to the nearest end
 GROWTH = 1.2  # ratio of successive distances
@@ -54,7 +53,7 @@ SURE = 1e-3  # margin above which a motion keeps its limits
 FASTEST = 9.0  # largest squared speed, over gravity times the radius of gyration
 INTERVALS = 10  # of a phase to start with
 FINER = 2  # times as many in modes that are given: phase 19 of query 62 has no solution on 10
-FALLS = (2.0, 4.0, 1.0)  # guessed durations, over that of a fall over the path's length
+FALLS = 2.0  # guessed duration, over that of a fall over the path's length
 ONSETS = (0.1, 0.03)  # rates of the friction homotopy, in the scene's unit
 USED = 0.2  # friction at the last of them, over all there is, below which a contact rests
 RESTS = 0.1  # least duration of that, over that of its stage, that makes it roll
@@ -95,7 +94,7 @@ class Guesses:
     @cached_property
     def nearest(self) -> Guess:
         """To the nearest end of each phase."""
-        return Guess(NEAREST, self._guess(None, FALLS[0]))
+        return Guess(NEAREST, self._guess())
 
     @cached_property
     def given(self) -> Guess | None:
@@ -242,7 +241,7 @@ class Guesses:
         pieces = split_path(outline)
         if len(pieces) > MOST:
             return None
-        return Guess(name, self._guess(pieces, FALLS[0], profile))
+        return Guess(name, self._guess(pieces, profile))
 
     def resume(self, solution: TimeSolution) -> Guess:
         """From a solution with nearly the same start."""
@@ -262,12 +261,8 @@ class Guesses:
             yield straight
         yield self.nearest
         yield self.nearest.by_homotopy()
-        if straight is not None:
-            yield straight.by_homotopy()
         if not given:
             yield from self.to_others()
-            for falls in FALLS[1:]:
-                yield Guess(LONGER.format(NEAREST, falls), self._guess(None, falls))
 
     def _list_goals(self) -> list[Array]:
         """Ends of a phase: the nearest, (5,), and others on both sides of it."""
@@ -307,11 +302,11 @@ class Guesses:
         return goals
 
     def _guess(
-        self, pieces: list[PathGuess] | None, falls: float, profile: PathSpeed | None = None
+        self, pieces: list[PathGuess] | None = None, profile: PathSpeed | None = None
     ) -> list[Stage]:
         options = self.search.options
         count = options.time_intervals or INTERVALS
-        given = self.problem, self.phases, self.z, self.search.scheme, count, falls
+        given = self.problem, self.phases, self.z, self.search.scheme, count
         return self._leave_room(
             [
                 replace(stage, opening=options.opening, clearance=options.clearance)
@@ -585,20 +580,19 @@ def guess_stages(
     z: Array,
     scheme: Scheme,
     intervals: int,
-    falls: float,
     pieces: Sequence[PathGuess] | None = None,
     profile: PathSpeed | None = None,
 ) -> list[Stage]:
     """Stages of phases in one NLP, with an initial guess, in the scene's own units.
 
-    The guessed duration is `falls` times that of a fall over the length of the initial paths. A
+    The guessed duration is `FALLS` times that of a fall over the length of the initial paths. A
     single phase may follow the pieces of a given one, with its speed profile.
     """
     parts = _list_parts(problem, phases, z, pieces)
     lengths = np.array([outline.length for _, outline, _ in parts])
     ends = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()
     # The path parameter of the guess is (1 - cos) / 2 over all stages.
-    total = falls * float(np.sqrt(lengths.sum()))
+    total = FALLS * float(np.sqrt(lengths.sum()))
     clock = np.arccos(1 - 2 * np.clip(ends, 0.0, 1.0)) / np.pi
     if profile is not None:
         total = float(profile.t[-1]) / problem.scene.scales.time

@@ -50,7 +50,6 @@ class Tried:
 
     sequences: int = 1  # of modes that were tried
     complete: bool = True  # whether none was left
-    iterations: int = 0  # of the solver
 
 
 class Price(NamedTuple):
@@ -245,7 +244,6 @@ class TimeSearch:
             **multipliers,
         )
         stats = solver.stats()
-        self.tried.iterations += stats["iter_count"]
         x, cost = result["x"].full()[:, 0], float(result["f"])
         cost -= float(self.price.gradient @ self.price.origin) if self.price else 0.0
         return TimeSolution(

@@ -308,11 +308,6 @@ def bisect_intervals(
     ]
 
 
-def halve(stages: Sequence[Stage], scheme: Scheme) -> list[Stage]:
-    """Stages with all intervals halved."""
-    return bisect_intervals(stages, scheme, [np.ones(own.intervals, dtype=int) for own in stages])
-
-
 def monitor(stages: list[Stage], least: Sequence[Array], depth: float) -> list[Stage]:
     """Stages with the limits added whose least values, (n_limits,), are below -depth.
 

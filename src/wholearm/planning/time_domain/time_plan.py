@@ -42,7 +42,7 @@ from .mode_search import (
 )
 from .refinement import keep_within, refine
 from .search import Price, TimeSearch, TimeSolution
-from .stage import Stage, halve, in_own_units, resample, to_si, unit_of, with_controls
+from .stage import Stage, in_own_units, resample, to_si, unit_of, with_controls
 from .time_motion import TimeMotion, make_phase_motions
 
 if TYPE_CHECKING:
@@ -52,7 +52,6 @@ ITERATIONS = 50  # most of the solver from a guess; successes take up to 25
 SPLIT = 80  # the same in modes of the homotopy
 MODES_GIVEN = 150  # the same in modes that the problem gives; phase 1 of query 29 takes 67
 FEW = 35  # the same where a single guess is tried
-BUDGET = 400  # solver iterations of one block after which no further guess is tried
 DEARER = 1.2  # cost of a refined plan, over that on few intervals, above which others are tried
 ROUNDING = 5e-7  # largest shortfall of a margin below epsilon by rounding, over the object's weight
 ROUNDS = 4  # most expansions of the cost-to-go
@@ -187,7 +186,7 @@ def solve_guesses(
 
     If the first ones fail, `refuse` may raise an error that says why.
     """
-    stop, coarse, best = search.tried.iterations + BUDGET, list[_Named](), None
+    coarse, best = list[_Named](), None
     for guess in guesses:
         if coarse and not guess.homotopy:
             continue
@@ -201,8 +200,6 @@ def solve_guesses(
             best, coarse = _refine_best(search, coarse, best), []
             if best and best[0].cost <= least + (DEARER - 1) * abs(least):
                 return best
-        if search.tried.iterations > stop:
-            break
     return _refine_best(search, coarse, best)
 
 
@@ -467,21 +464,15 @@ def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) 
     """Plan from motions of least violation, or the error that says why there is none."""
     from ..explain import explain_stages, list_shortfalls, refuse_paths
 
-    def solve_elastic(stages: list[Stage]) -> list[Stage] | None:
-        solution = search.aiming(Objective.ELASTIC).solve(stages)
-        return solution.stages if solution.success else None
-
     problem, short = guesses.problem, list[list[Stage]]()
     for guess in chain([guesses.nearest], islice(guesses.to_others(), 1)):
-        elastic = solve_elastic(guess.stages)
-        if elastic is not None and not list_shortfalls(problem, elastic, search.scheme):
-            found = solve_guesses(search, [guess._replace(stages=elastic)])
+        elastic = search.aiming(Objective.ELASTIC).solve(guess.stages)
+        if elastic.success and list_shortfalls(problem, elastic.stages, search.scheme):
+            short.append(elastic.stages)
+        elif elastic.success:
+            found = solve_guesses(search, [guess._replace(stages=elastic.stages)])
             if found is not None:
                 return found
-            # Finer intervals may show violations that coarse ones do not.
-            elastic = solve_elastic(halve(elastic, search.scheme))
-        if elastic is not None and list_shortfalls(problem, elastic, search.scheme):
-            short.append(elastic)
     if not short:
         refuse_paths(problem, guesses.phases[0], [margin for margin, _ in guesses.paths])
     reason = "the solver found neither a plan nor a motion that misses limits least"
