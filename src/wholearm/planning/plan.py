@@ -216,20 +216,18 @@ def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transitio
             impacts = list_impacts(block.phases, block.plans)
             plan_part = plan_parts_of(planning.problem, block.phases)
         else:
-            impacts = impact_sequence.list_impacts(block.chain, block.plans)
+            impacts = impact_sequence.list_impacts(block.phases, block.chain, block.plans)
             plan_part = impact_sequence.plan_parts_of(block.chain, planning.problem.epsilon)
-        ends = [own.before + 1 for own in impacts if not own.passed]
-        stops = [0, *ends, len(block.phases)]
+        first = block.phases[0].index
+        stops = [0, *(own.phase - first for own in impacts if not own.possible), len(block.phases)]
         for own in impacts:
-            phase, at, saves = block.phases[own.before], own.before + 1, math.nan
-            if own.passed:
-                report(f"phase {phase.number}: what its impact saves")
+            if own.possible:
+                report(f"phase {own.phase}: what its impact saves")
+                at = own.phase - first
                 bounds = max(k for k in stops if k < at), at, min(k for k in stops if k > at)
-                with charge(phase.number):
-                    saves = _find_saving(planning, block, bounds, plan_part)
-            contact, impulse = own.impact.least
-            what = phase.number, str(phase.until), own.passed, own.reason, own.ratio
-            found.append(Transition(*what, impulse, contact, own.speed, saves))
+                with charge(own.phase):
+                    own = own._replace(saves=_find_saving(planning, block, bounds, plan_part))
+            found.append(own)
     return found
 
 

@@ -10,6 +10,7 @@ after the other, with pauses between them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -22,6 +23,7 @@ from ...geometry.curve import Curve
 from ...mechanics.dynamics import measure_speed, metric_weights
 from ...mechanics.impact import Impact, compute_impact
 from ...problem.definition import End, Phase
+from ...results.plan_record import Transition
 from ...results.trajectory import Motion
 from ...solvers.ipopt import charge
 from ..options import PlanOptions
@@ -54,22 +56,6 @@ class CurveImpact:
         if self.impact.violations:
             return self.impact.violations[0].describe(PER_SPEED)
         return "" if self.possible else f"phase {self.phase.number + 1} would be run backwards"
-
-
-@dataclass(frozen=True, eq=False)
-class BlockImpact:
-    """An impact between two phases of a block, for unit speed before it."""
-
-    before: int  # index in the block of the phase that it ends
-    impact: Impact  # velocities per m/s, hence without unit and in rad/m; impulses in N s per m/s
-    ratio: float  # speed after over speed before
-    reason: str  # why the motion stops there instead; empty if it passes at speed
-    speed: float  # [m/s]: before the impact; zero at a stop
-
-    @property
-    def passed(self) -> bool:
-        """Whether the motion goes on at speed."""
-        return not self.reason
 
 
 def compute_curve_impact(phase: Phase, before: Curve, after: Curve) -> CurveImpact:
@@ -188,12 +174,22 @@ def plan_parts_of(sequence: ImpactSequence, epsilon: float) -> PlanPart:
     return plan_part
 
 
-def list_impacts(sequence: ImpactSequence, plans: Sequence[PhasePlan[Motion]]) -> list[BlockImpact]:
+def list_impacts(
+    phases: Sequence[Phase], sequence: ImpactSequence, plans: Sequence[PhasePlan[Motion]]
+) -> list[Transition]:
     """The impacts of a sequence, with the speeds that its plans pass them at."""
     impacts = []
-    for k, join in enumerate(sequence.impacts):
+    for phase, plan, join in zip(phases, plans, sequence.impacts, strict=False):
         if join.phase.end is End.IMPACT:
-            scene = join.phase.formation.scene
-            speed = measure_speed(scene, end_of(plans[k])[1]) if join.possible else 0.0
-            impacts.append(BlockImpact(k, join.impact, join.ratio, join.reason, speed))
+            speed = measure_speed(phase.formation.scene, end_of(plan)[1]) if join.possible else 0.0
+            impacts.append(make_transition(phase, join.impact, join.ratio, join.reason, speed))
     return impacts
+
+
+def make_transition(
+    phase: Phase, impact: Impact, ratio: float, reason: str, speed: float
+) -> Transition:
+    """The transition at the end of a phase; what it saves is not known yet."""
+    contact, impulse = impact.least
+    what = phase.number, str(phase.until), not reason, reason, ratio
+    return Transition(*what, impulse, contact, speed, math.nan)

@@ -24,9 +24,10 @@ from ...geometry.arcs import CostToGo
 from ...mechanics.dynamics import measure_speed
 from ...mechanics.impact import Impact, compute_impact
 from ...problem.definition import ROWS, End, Phase, Problem
+from ...results.plan_record import Transition
 from ...results.trajectory import Motion
 from ..options import Objective, PlanOptions
-from ..path_domain.impact_sequence import PER_SPEED, BlockImpact
+from ..path_domain.impact_sequence import PER_SPEED, make_transition
 from ..path_domain.path_motion import PathMotion
 from ..phase_plan import PhasePlan, PlanPart, Plans, end_of, plan_stops
 from .collocation import Scheme, make_scheme
@@ -572,7 +573,7 @@ def plan_parts_of(
     return plan_part
 
 
-def list_impacts(block: Sequence[Phase], plans: Sequence[PhasePlan[Motion]]) -> list[BlockImpact]:
+def list_impacts(block: Sequence[Phase], plans: Sequence[PhasePlan[Motion]]) -> list[Transition]:
     """The impacts of a block, at speed or with a stop."""
     found = []
     for k in _find_impacts(block):
@@ -586,7 +587,7 @@ def list_impacts(block: Sequence[Phase], plans: Sequence[PhasePlan[Motion]]) -> 
         else:
             impact = compute_impact(block[k - 1].formation, block[k].formation, z, v / speed)
         ratio = measure_speed(scene, impact.v)
-        found.append(BlockImpact(k - 1, impact, ratio, reason, speed))
+        found.append(make_transition(block[k - 1], impact, ratio, reason, speed))
     return found
 
 
