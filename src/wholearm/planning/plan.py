@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -17,12 +17,15 @@ from ..common.document import plain
 from ..common.errors import AmbiguityError, InfeasibleError, SolverError
 from ..common.sharing import exclusive
 from ..common.signals import OutOfTime, Reporter, limited
-from ..geometry.curve import describe_pose
+from ..geometry.curve import Curve, describe_pose
 from ..geometry.tracing import trace_phases
+from ..mechanics.dynamics import measure_speed
+from ..mechanics.statics import SURE
 from ..mechanics.uniqueness import describe_uniqueness
 from ..problem.definition import Problem
 from ..problem.read import require_phases
-from ..results.plan_record import Certificate, TimeBound, Transition
+from ..problem.uncertainty import PARAMETERS
+from ..results.plan_record import Certificate, RangeFigures, TimeBound, Transition
 from ..results.report import UniquenessMargin
 from ..results.trajectory import Trajectory
 from ..solvers.ipopt import Ledger, charge, open_ledger
@@ -31,12 +34,25 @@ from .blocks import BlockPlan, Planning, plan_blocks
 from .lower_bound import bound_least_time
 from .options import Objective, PlanOptions
 from .path_domain import impact_sequence
+from .path_domain.impact_sequence import ImpactSequence
+from .path_domain.path_mesh import Fastest
+from .path_domain.path_motion import PathMotion
+from .path_domain.path_plan import Task, plan_curves
 from .phase_plan import PlanPart, add_up, assemble_motions, combine, plan_stops
 from .result import Plan, PlannedPhase, Status, Timings, write_meta
+
+if TYPE_CHECKING:
+    from .robust.robust_rows import Guide
+
 
 OVER_TIME = "planned over time"
 NO_MOTION = "the sweep over the phase plane finds no motion"
 _STILL = 1e-9  # relative speed of rest but for rounding
+WIDEST = 0.95  # largest relative range that is tried
+_MOST = 1e3  # largest factor on ranges that is tried
+_CLOSE = 0.01  # error of the factor, relatively
+_LESS = 0.98  # factor from one tried plan to the next
+_TRIES = 8  # most plans that are tried
 
 
 def solve(
@@ -130,8 +146,6 @@ def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]
         assessed = time.perf_counter()
         ranges = None
         if options.robust:
-            from .range_cost import assess_ranges
-
             ranges = assess_ranges(planning, report)
         certificate = None
         if options.certify:
@@ -288,3 +302,87 @@ def _bound(block: BlockPlan, epsilon: float) -> Iterator[TimeBound]:
             yield TimeBound(phases, duration, None, None, NO_MOTION)
         else:
             yield TimeBound(phases, duration, *found)
+
+
+def assess_ranges(planning: Planning, report: Callable[[str], None]) -> RangeFigures:
+    """Plan without ranges, and if asked for find the widest ranges along curves."""
+    from .robust.robust_rows import Guide, list_holds, measure_holds
+
+    options, problem = planning.options, planning.problem
+    scales = problem.scene.scales
+    report("planning without ranges")
+    bare = plan_blocks(problem, planning.curves, replace(options, ranges={}), report)
+    nominal = combine(options.goal, [plan.value for plan in bare.plans])
+    held = list[int]()  # phases that friction within the ranges may hold at rest at their start
+    for phase, plan in zip(problem.phases, planning.plans, strict=True):
+        first = plan.motion.evaluate(np.zeros(1))
+        if measure_speed(problem.scene, first.z_dot[0]) <= _STILL * scales.speed:
+            holds = list_holds(phase.formation, first.z[0], options.ranges)
+            held += [phase.number] * (measure_holds(holds, first.tau[0]) < SURE * scales.torque)
+    figures = RangeFigures(dict(options.ranges), nominal, held=tuple(held))
+    if not options.largest:
+        return figures
+    unit = options.scale_ranges(problem.ranges, 1.0).ranges
+    relative = [unit[own.name] for own in PARAMETERS if not own.unit]
+    most, found = WIDEST / max(max(relative), WIDEST / _MOST), dict[int, float]()
+    chains = [block.chain for block in planning.blocks if block.chain is not None]
+    for part in (part for chain in chains for part in chain.split()):
+        numbers = [phase.number for phase in part.phases]
+        motions = (planning.plans[number - 1].motion for number in numbers)
+        guides = [Guide(m.grid.s, *m.profile) for m in motions if isinstance(m, PathMotion)]
+        report(f"looking for the widest ranges of phase {numbers[0]}")
+        found |= dict.fromkeys(numbers, _find_widest(planning, part, numbers, guides, most))
+    if not found:
+        return figures
+    each, least = tuple(found.get(phase.number) for phase in problem.phases), min(found.values())
+    return figures._replace(largest=least, phases=each, capped=least >= most)
+
+
+def _find_widest(
+    planning: Planning,
+    part: ImpactSequence,
+    numbers: Sequence[int],
+    guides: Sequence[Guide],
+    most: float,
+) -> float:
+    """The largest factor on ranges, up to `most`, with which phases have a plan; zero for none.
+
+    The minimum-time sweep decides each step of a bisection; then plans are tried with ever smaller
+    factors. `guides` are a motion along each curve.
+    """
+    curves, problem = part.continuous_curves, planning.problem
+
+    def scale(factor: float) -> PlanOptions:
+        wider = planning.options.scale_ranges(problem.ranges, factor)
+        return replace(wider, objective=Objective.TIME, duration=None)
+
+    low, high, middle = 0.0, np.inf, min(1.0, most)
+    while low < most and (np.isinf(high) or high - low > _CLOSE * high):
+        own = scale(middle)
+        task = Task(curves, problem.epsilon, own, numbers, None, guides=tuple(guides))
+        fastest = task.find_fastest()
+        if fastest is None:
+            high = middle
+        else:
+            low, guides = middle, _cut(fastest, curves)
+        middle = min(2 * low, most) if np.isinf(high) else (low + high) / 2
+    for _ in range(_TRIES):
+        try:
+            plan_curves(curves, problem.epsilon, scale(low).roughen(), numbers, explained=False)
+            return low
+        except (InfeasibleError, SolverError):
+            low *= _LESS
+    return 0.0
+
+
+def _cut(fastest: Fastest, curves: Sequence[Curve]) -> list[Guide]:
+    """A minimum-time profile along each curve."""
+    from .robust.robust_rows import Guide
+
+    guides, start = [], 0.0
+    for curve in curves:
+        s = np.linspace(0.0, curve.length, len(fastest.s))
+        b, none = np.interp(s + start, fastest.s, fastest.b), np.zeros_like(s)
+        guides.append(Guide(s, none, b, none))
+        start += curve.length
+    return guides
