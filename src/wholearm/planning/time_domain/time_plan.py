@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain, groupby, islice, pairwise, takewhile
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -519,32 +519,26 @@ def plan_with_impacts(
     z: Array,
     options: PlanOptions,
     duration: float | None,
-    to_go: CostToGo | None = None,
     ample: float = math.inf,
-    fastest: Plans | None = None,
-    pinned: bool = False,
-    begun: Plans | None = None,
-    along: Callable[[], list[PathMotion]] = list,
-    only_begin: bool = False,
+    fastest: Sequence[PhasePlan[Motion]] = (),
+    **others: Any,
 ) -> Plans:
     """Plan a block with the impacts that are possible, or else with stops.
 
-    The arguments are those of `plan_phases`; after `ample` they are for blocks without impacts.
+    The arguments are those of `plan_phases`, and `others` of it for a block without impacts.
     """
-    ends = _find_impacts(block)
+    ends = [k + 1 for k, phase in enumerate(block) if phase.end is End.IMPACT]
     if not ends:
-        plan = partial(plan_phases, to_go=to_go, ample=ample, pinned=pinned, only_begin=only_begin)
-        plan = partial(plan, fastest=fastest or (), begun=begun or (), along=along)
-        return [*plan(problem, block, z, options, duration)]
+        others |= {"ample": ample, "fastest": fastest}
+        return [*plan_phases(problem, block, z, options, duration, **others)]
     explained = plan_parts_of(problem, block, ample, explained=True)
+    with_stops = partial(plan_stops, explained, [0, *ends, len(block)], z)
     if duration is not None and fastest and all(_is_stop(problem, fastest[k - 1]) for k in ends):
         # Without an impact in least time there is none in a longer duration.
-        return plan_stops(explained, [0, *ends, len(block)], z, options, duration)
+        return with_stops(options, duration)
     # A duration that is too short for stops need not be so without them.
-    probe = (
-        options if duration is None else replace(options, objective=Objective.TIME, duration=None)
-    )
-    stopped = plan_stops(explained, [0, *ends, len(block)], z, probe)
+    fast = replace(options, objective=Objective.TIME, duration=None)
+    stopped = with_stops(options if duration is None else fast)
     blocked = [
         k for k in ends if _impact_at_stop(block[k - 1], block[k], stopped[k - 1]).violations
     ]
@@ -554,9 +548,7 @@ def plan_with_impacts(
             return plan_stops(plan_parts_of(problem, block, ample), bounds, z, options, duration)
         except (InfeasibleError, SolverError):
             pass
-    if duration is None:
-        return stopped
-    return plan_stops(explained, [0, *ends, len(block)], z, options, duration)
+    return stopped if duration is None else with_stops(options, duration)
 
 
 def plan_parts_of(
@@ -576,18 +568,20 @@ def plan_parts_of(
 def list_impacts(block: Sequence[Phase], plans: Sequence[PhasePlan[Motion]]) -> list[Transition]:
     """The impacts of a block, at speed or with a stop."""
     found = []
-    for k in _find_impacts(block):
-        (z, v), scene, reason = end_of(plans[k - 1]), block[0].formation.scene, ""
+    for k, (phase, plan) in enumerate(zip(block, plans, strict=True), start=1):
+        if phase.end is not End.IMPACT:
+            continue
+        (z, v), scene, reason = end_of(plan), phase.formation.scene, ""
         speed = measure_speed(scene, v)
         if speed < AT_REST * scene.scales.speed:
-            speed, impact = 0.0, _impact_at_stop(block[k - 1], block[k], plans[k - 1])
+            speed, impact = 0.0, _impact_at_stop(phase, block[k], plan)
             reason = "no plan passes it at speed"
             if impact.violations:
                 reason = impact.violations[0].describe(PER_SPEED)
         else:
-            impact = compute_impact(block[k - 1].formation, block[k].formation, z, v / speed)
+            impact = compute_impact(phase.formation, block[k].formation, z, v / speed)
         ratio = measure_speed(scene, impact.v)
-        found.append(make_transition(block[k - 1], impact, ratio, reason, speed))
+        found.append(make_transition(phase, impact, ratio, reason, speed))
     return found
 
 
@@ -595,11 +589,6 @@ def _is_stop(problem: Problem, plan: PhasePlan[Motion]) -> bool:
     """Whether a plan ends at rest."""
     speed = measure_speed(problem.scene, end_of(plan)[1])
     return speed < AT_REST * problem.scene.scales.speed
-
-
-def _find_impacts(block: Sequence[Phase]) -> list[int]:
-    """Indices in the block of the phases after impacts."""
-    return [k + 1 for k, phase in enumerate(block) if phase.end is End.IMPACT]
 
 
 def _impact_at_stop(phase: Phase, following: Phase, plan: PhasePlan[Motion]) -> Impact:
