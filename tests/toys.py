@@ -21,7 +21,7 @@ from wholearm.geometry.curve import Curve, Segment
 from wholearm.mechanics.dynamics import LAMBDA, A, Directions, PathForces, V
 from wholearm.planning import lower_bound
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.path_domain import path_data, unique_start
+from wholearm.planning.path_domain import path_data, path_plan
 from wholearm.planning.path_domain.path_motion import PathMotion
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
@@ -111,7 +111,7 @@ class Toy:
             patch.setattr(path_data, "inverse", self._inverse)
             patch.setattr(path_data, "reduced_inertia", lambda *_: np.ones(1))
             # A toy has no shape that friction could hold at rest.
-            patch.setattr(unique_start, "find_sure_start", lambda *_: None)
+            patch.setattr(path_plan, "find_sure_start", lambda *_: None)
             yield
 
     def _inverse(

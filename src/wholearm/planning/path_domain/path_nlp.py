@@ -21,7 +21,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -51,9 +51,6 @@ from .elements import (
     follow,
 )
 from .path_data import PhaseData
-
-if TYPE_CHECKING:
-    from .unique_start import SureStart
 
 CHAINED = (Objective.MARGIN, Objective.RELAX)  # with one more unknown, copied at every node
 SOFT = (Objective.ELASTIC, Objective.RELAX)  # with a row for each side of the soft limits
@@ -395,6 +392,14 @@ class Relaxation(NamedTuple):
         if self.parameter.is_speed:
             return float(value * (1 + relaxed) ** 0.5)
         return float(value + sign * self.step * relaxed)
+
+
+class SureStart(NamedTuple):
+    """Bounds of the first node: s'' from `least_a` up, internal force from `low` to `high`."""
+
+    least_a: float
+    low: float
+    high: float
 
 
 class Tightening(NamedTuple):

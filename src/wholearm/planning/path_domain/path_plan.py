@@ -9,7 +9,7 @@ of the error.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -23,7 +23,9 @@ from ...common.errors import (
     SolverError,
 )
 from ...geometry.curve import Curve, describe_pose, directions_of
-from ...mechanics.dynamics import reduced_inertia
+from ...mechanics.dynamics import LAMBDA, ONE, A, reduced_inertia
+from ...mechanics.limits import PRESS
+from ...mechanics.statics import SURE
 from ...mechanics.uniqueness import describe_uniqueness, find_minors
 from ..options import DEFAULT_ACCURACY, Objective, PlanOptions
 from ..phase_plan import PhasePlan
@@ -49,6 +51,7 @@ from .path_nlp import (
     LimitShape,
     MotorShape,
     PathNLP,
+    SureStart,
     Tightening,
     Units,
     build_path_nlp,
@@ -59,8 +62,7 @@ from .path_nlp import (
 )
 
 if TYPE_CHECKING:
-    from ..robust.robust_rows import Guide, RobustLimits
-    from .unique_start import SureStart
+    from ..robust.robust_rows import Guide, RobustHold, RobustLimits
 
 Plans = list[PhasePlan[PathMotion]]
 Pins = tuple[float | None, float | None]  # prescribed internal force at start and end [N]
@@ -74,6 +76,10 @@ _MOST = 80  # most elements of a phase
 _MOVED = 25.0  # distance of a break from its switch that counts, over length and accuracy
 _LONGER = 0.2  # most by which the NLP's duration may be another, relatively
 _MESHES, _RATE_MESHES = 6, 2  # most meshes whose breaks move, and those under rate limits
+BEYOND = 10.0  # distance of a first node beyond what friction holds, over the least sure one
+WORTH = 0.02  # largest relative cost of such a start
+_SHARES = (0.0, 0.002, 0.005, 0.01, WORTH)  # shares of a margin given up for it, in this order
+_KEPT = 1e-9  # violation of a limit that is rounding, over its scale
 _LINEARIZATIONS = 3  # most robust plans, each with rows for the speed of the one before
 # Violation at nodes by other signs than those of the rows, over the limits' scales, above which a
 # first plan is a reference only; case: two releases of a pentagon, whose plan takes 20 % longer.
@@ -197,8 +203,6 @@ def _leave_rest(iterate: PathIterate) -> Plans:
 
     Those of least time start with the largest s'', but not as if friction were larger.
     """
-    from .unique_start import WORTH, find_sure_start
-
     task, plans, margin = iterate.task, iterate.plans, 0.0
     goal, ranges = task.options.goal, task.options.ranges
     if goal is Objective.MARGIN:
@@ -212,6 +216,72 @@ def _leave_rest(iterate: PathIterate) -> Plans:
         return plans
     loss = other.objective - iterate.objective
     return other.plans if ranges or loss <= WORTH * abs(iterate.objective) else plans
+
+
+def find_sure_start(
+    data: PhaseData, profile: Profile, margin: float, ranges: Mapping[str, float]
+) -> SureStart | None:
+    """Bounds with which a motion leaves rest; None if it does anyway, or if nothing helps.
+
+    At rest the torques are affine in s'' and internal force, tau = T0 + Ta s'' + Tl lambda. Those
+    that friction can hold are a polygon (`mechanics.statics`). The first node is put beyond one of
+    its sides: at the nearest place that keeps every limit, or beyond.
+
+    Parameters
+    ----------
+    margin : [N]  of normal forces over epsilon
+    ranges        of parameters, within all of which it has to leave rest
+    """
+    from ..robust.robust_rows import list_holds, measure_holds
+
+    formation, forces = data.curve.formation, data.nodes.forces
+    holds = list_holds(formation, data.curve.start, ranges)
+    here = np.array([profile.a[0], profile.lam[0]])
+    T0, T = forces.of_tau[0, :, ONE], forces.of_tau[0][:, [A, LAMBDA]]
+    unit = formation.scene.scales.torque
+    if measure_holds(holds, T0 + T @ here) > SURE * unit:
+        return None
+    presses = np.isin(data.limits.sides[0], data.limits.of(PRESS))
+    rows = data.find_limits(data.nodes.pick(slice(0, 1))).rows[0] * data.spans[:, None]
+    slopes = rows[:, [A, LAMBDA]]
+    scales = formation.scene.scales
+    units = np.array([scales.acceleration, scales.force])
+    for share in _SHARES if margin > 0 else _SHARES[:1]:
+        offsets = rows[:, ONE] - (1 - share) * margin * presses
+        best, start = np.inf, None
+        for side, bound in _list_sides(holds, BEYOND * SURE * unit):
+            normal = side @ T
+            if normal[0] <= 0:
+                continue
+            level = float(bound - side @ T0)
+            for place in _list_places(normal, level, slopes, offsets, here, units):
+                kept = ((offsets + slopes @ place) / data.spans).min() >= -_KEPT and place[0] > 0
+                kept = kept and measure_holds(holds, T0 + T @ place) > SURE * unit
+                away = float(np.abs(T @ (place - here)).max())
+                if kept and away < best:
+                    ends = (place[1], np.inf) if normal[1] > 0 else (-np.inf, place[1])
+                    best, start = away, SureStart(float(place[0]), *map(float, ends))
+        if start is not None:
+            return start
+    return None
+
+
+def _list_sides(holds: Sequence[RobustHold], beyond: float) -> Iterator[tuple[Array, float]]:
+    """Sides of the torques that can be held, each with its bound and a distance beyond [N m]."""
+    for static, gains in holds:
+        for normal, bound in zip(static.normals, static.bounds, strict=True):
+            yield normal * gains, float(bound) + beyond
+
+
+def _list_places(
+    normal: Array, bound: float, slopes: Array, offsets: Array, here: Array, units: Array
+) -> list[Array]:
+    """Places on the line normal @ x = bound: nearest to `here`, and where limits cross it."""
+    along = np.array([-normal[1], normal[0]])
+    foot = here + units**2 * normal * (bound - normal @ here) / (units**2 @ normal**2)
+    rates, rest = slopes @ along, offsets + slopes @ foot
+    crossings = -rest[rates != 0] / rates[rates != 0]
+    return [foot, *(foot + share * along for share in crossings)]
 
 
 @dataclass(frozen=True)
