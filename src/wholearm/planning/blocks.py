@@ -169,16 +169,11 @@ def _begin_each(planning: Planning, report: Callable[[str], None]) -> Planning:
         try:
             begun = plan_next(begun, BEGUN, None, report)
         except WholearmError as error:
-            if not any(over_time[:index]) or _is_clear(error):
+            short = error.shortfalls if isinstance(error, InfeasibleError) else ()
+            if not any(over_time[:index]) or any(own.share > CLEAR for own in short):
                 raise
             break
     return begun
-
-
-def _is_clear(error: WholearmError) -> bool:
-    """Whether an error is of a large violation."""
-    shortfalls = error.shortfalls if isinstance(error, InfeasibleError) else ()
-    return any(short.share > CLEAR for short in shortfalls)
 
 
 def plan_next(

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...common.arrays import Array
+from ...common.arrays import Array, find_runs
 from ...common.errors import InputError
 from ...contacts.contact_limits import list_renamed
 from ...contacts.elemental import Contact
@@ -29,6 +29,7 @@ from ...mechanics.dynamics import Directions, force_rows, metric_weights
 from ...mechanics.limits import SPEED, make_limits
 from ...problem.definition import End, Phase, Problem
 from ...results.trajectory import Samples
+from ..options import PlanOptions
 from ..path_domain.path_motion import PathMotion
 from .collocation import Scheme
 from .mode_search import LEAST_INTERVALS, Mode, can_roll, divide, in_mode, link, merge, mode_of
@@ -304,15 +305,8 @@ class Guesses:
     def _guess(
         self, pieces: list[PathGuess] | None = None, profile: PathSpeed | None = None
     ) -> list[Stage]:
-        options = self.search.options
-        count = options.time_intervals or INTERVALS
-        given = self.problem, self.phases, self.z, self.search.scheme, count
-        return self._leave_room(
-            [
-                replace(stage, opening=options.opening, clearance=options.clearance)
-                for stage in guess_stages(*given, pieces, profile)
-            ]
-        )
+        given = self.problem, self.phases, self.z, self.search.scheme, self.search.options
+        return self._leave_room(guess_stages(*given, pieces, profile))
 
     def _leave_room(self, stages: list[Stage]) -> list[Stage]:
         """The stages, with an end clear of the contact that ends what follows."""
@@ -535,10 +529,9 @@ def _find_changes(stage: Stage, scheme: Scheme) -> tuple[list[float], list[_Chan
         signs = np.sign(rate)
         if stage.onset and can_roll(formation, z[len(z) // 2], row):
             rests = np.abs(np.tanh(rate / stage.onset)) < USED
-            edges = np.flatnonzero(np.diff(np.concatenate([[0], rests.astype(int), [0]])))
-            for begin, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-                if places[stop - 1] - places[begin] > RESTS:
-                    signs[begin:stop] = 0.0
+            for run in find_runs(rests):
+                if places[run.stop - 1] - places[run.start] > RESTS:
+                    signs[run] = 0.0
         runs = [(0.0, float(signs[points[0]]))]
         for i, j in pairwise(points.tolist()):
             if signs[i] != signs[j]:
@@ -579,7 +572,7 @@ def guess_stages(
     phases: Sequence[Phase],
     z: Array,
     scheme: Scheme,
-    intervals: int,
+    options: PlanOptions,
     pieces: Sequence[PathGuess] | None = None,
     profile: PathSpeed | None = None,
 ) -> list[Stage]:
@@ -606,6 +599,7 @@ def guess_stages(
             begin = next(other.z[0, row] for own, other, _ in parts if own is phase)
             ahead = row, value, 1.0 if value > begin else -1.0
         whole = lengths[[own is phase for own, _, _ in parts]].sum()
+        intervals = options.time_intervals or INTERVALS
         count = max(LEAST_INTERVALS, round(lengths[k] / whole * intervals))
         guess = _guess(outline, scheme, count, clock[k : k + 2], ends[k : k + 2], total, profile)
         ends_in_impact = last and phase.end is End.IMPACT and k + 1 < len(parts)
@@ -635,6 +629,8 @@ def guess_stages(
                 monitored=tuple(sorted({*np.flatnonzero(near).tolist(), *released})),
                 released=released,
                 opens=opens,
+                opening=options.opening,
+                clearance=options.clearance,
                 ahead=ahead,
             )
         )

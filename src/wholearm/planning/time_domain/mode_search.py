@@ -8,22 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...common.arrays import Array
+from ...common.arrays import Array, find_runs
 from ...contacts.contact_limits import list_renamed
-from ...contacts.elemental import Contact
 from ...contacts.formation import Formation
 from ...geometry.curve import find_tied
 from ...mechanics.dynamics import Directions, split_forces
-from ...scene.model import Scene
 from .collocation import Scheme
 from .search import TimeSearch, TimeSolution
-from .stage import Stage, StagePoints, resample
+from .stage import Stage, StagePoints, make_formation, resample
 from .time_nlp import least_senses, new_rows
 
 LEAST_INTERVALS = 3  # fewest intervals of a stage
@@ -53,12 +50,6 @@ def sign_sequence(stages: Sequence[Stage]) -> tuple[tuple[int, Mode], ...]:
     return tuple((stage.phase, mode_of(stage)) for stage in stages)
 
 
-@lru_cache(maxsize=64)
-def _roll(scene: Scene, contacts: tuple[Contact, ...], rows: tuple[int, ...]) -> Formation:
-    """The formation with rolling contacts."""
-    return Formation(scene, contacts, tuple(contacts[k] for k in rows))
-
-
 def in_mode(stage: Stage, mode: Mode) -> Stage:
     """A stage in another mode, with its tangential forces."""
     if mode == mode_of(stage):
@@ -71,7 +62,8 @@ def in_mode(stage: Stage, mode: Mode) -> Stage:
     if rows != formation.rolling_rows:
         c_n, c_t = split_forces(formation, part.forces, stage.directions.Xi)
         part = part._replace(forces=np.concatenate([c_n, c_t[..., list(rows)]], axis=-1))
-        formation = _roll(formation.scene, formation.contacts, rows)
+        rolling = tuple(formation.contacts[k] for k in rows)
+        formation = make_formation(formation.scene, formation.contacts, rolling)
     return replace(stage, formation=formation, directions=directions, guess=part)
 
 
@@ -419,14 +411,11 @@ def _find_runs(
     """Longest run of True in each column, of shape (K d, n), if it is an interval long."""
     longest, breaks = [], stage.guess.breaks
     for row, column in enumerate(flags.T):
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], column.astype(int), [0]])))
-        runs = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+        runs = find_runs(column, scheme.degree)
         if not runs:
             continue
-        first, last = max(runs, key=lambda run: run[1] - run[0])
-        if last - first < scheme.degree:
-            continue
-        begin, stop = first // scheme.degree, -(-last // scheme.degree)
+        run = max(runs, key=lambda run: run.stop - run.start)
+        begin, stop = run.start // scheme.degree, -(-run.stop // scheme.degree)
         share = float(breaks[stop] - breaks[begin]) * stage.guess.duration
         longest.append(ModeRun(row, begin, stop, float(signs[row]), share))
     return longest

@@ -138,6 +138,10 @@ class LimitMisses(NamedTuple):
         return LimitMisses(*(np.repeat(own, 2**times, axis=0) for own in tables))
 
 
+make_formation = lru_cache(maxsize=128)(Formation)
+"""A formation of a scene with contacts, some of which roll; the same object every time."""
+
+
 @lru_cache(maxsize=16)
 def in_own_units(problem: Problem) -> Problem:
     """The problem in its scene's own units; the same object every time."""
@@ -224,14 +228,9 @@ def to_si(stage: Stage, problem: Problem) -> Stage:
     formation = problem.phases[stage.phase].formation
     rolling = stage.formation.rolling
     if set(rolling) != set(formation.rolling):
-        formation = _with_rolling(formation, rolling)
+        rolling = tuple(contact for contact in formation.contacts if contact in rolling)
+        formation = make_formation(formation.scene, formation.contacts, rolling)
     return replace(stage, formation=formation, guess=points, gained=None)
-
-
-@lru_cache(maxsize=64)
-def _with_rolling(formation: Formation, rolling: tuple[object, ...]) -> Formation:
-    contacts = tuple(contact for contact in formation.contacts if contact in rolling)
-    return Formation(formation.scene, formation.contacts, contacts)
 
 
 def resample(
