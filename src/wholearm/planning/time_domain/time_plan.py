@@ -43,7 +43,7 @@ from .mode_search import (
 )
 from .refinement import keep_within, refine
 from .search import Price, TimeSearch, TimeSolution
-from .stage import Stage, in_own_units, resample, to_si, unit_of, with_controls
+from .stage import Stage, bisect_intervals, in_own_units, resample, to_si, unit_of, with_controls
 from .time_motion import TimeMotion, make_phase_motions
 
 if TYPE_CHECKING:
@@ -465,15 +465,19 @@ def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) 
     """Plan from motions of least violation, or the error that says why there is none."""
     from ..explain import explain_stages, list_shortfalls, refuse_paths
 
-    problem, short = guesses.problem, list[list[Stage]]()
+    problem, scheme, short = guesses.problem, search.scheme, list[list[Stage]]()
+    soft = search.aiming(Objective.ELASTIC)
     for guess in chain([guesses.nearest], islice(guesses.to_others(), 1)):
-        elastic = search.aiming(Objective.ELASTIC).solve(guess.stages)
-        if elastic.success and list_shortfalls(problem, elastic.stages, search.scheme):
-            short.append(elastic.stages)
-        elif elastic.success:
+        elastic = soft.solve(guess.stages)
+        if elastic.success and not list_shortfalls(problem, elastic.stages, scheme):
             found = solve_guesses(search, [guess._replace(stages=elastic.stages)])
             if found is not None:
                 return found
+            # Finer intervals may show violations that coarse ones do not.
+            once = [np.ones(stage.intervals, dtype=np.int64) for stage in elastic.stages]
+            elastic = soft.solve(bisect_intervals(elastic.stages, scheme, once))
+        if elastic.success and list_shortfalls(problem, elastic.stages, scheme):
+            short.append(elastic.stages)
     if not short:
         refuse_paths(problem, guesses.phases[0], [margin for margin, _ in guesses.paths])
     reason = "the solver found neither a plan nor a motion that misses limits least"
