@@ -73,16 +73,6 @@ class BlockPlan:
         """Most intervals of a phase in the time domain."""
         return max(len(plan.torque.coefficients) for plan in self.plans)
 
-    @property
-    def has_searched(self) -> bool:
-        """Whether more than one sequence of contact modes was tried."""
-        return any(plan.sequences > 1 for plan in self.plans)
-
-    @property
-    def is_finest(self) -> bool:
-        """Whether it is planned in the time domain on the finest intervals."""
-        return self.chain is None and self.intervals >= FINEST
-
 
 @dataclass(frozen=True, eq=False)
 class Planning:

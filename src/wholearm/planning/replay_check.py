@@ -26,7 +26,7 @@ from ..scene.model import Scales
 from ..verification.newton_euler import balance
 from ..verification.verdict import Allowance, find_least_force, measure_departure
 from ..verification.verify import describe_motors, find_commands, judge, observe
-from .blocks import BEGUN, PLAIN, BlockPlan, Planning, look_ahead, plan_each
+from .blocks import BEGUN, FINEST, PLAIN, BlockPlan, Planning, look_ahead, plan_each
 from .phase_plan import split_blocks
 
 REFINEMENTS = 3  # most doublings of the intervals of a block
@@ -144,9 +144,9 @@ def _improve(
         alone = replace(planning, blocks=(), ahead=False)
         others.append(partial(plan_each, alone, [0] * len(every), report))
     most = (REFINEMENTS if block.chain else ROUGH) if fails else 1
-    if PLAIN != block.finer < most and not block.is_finest:
+    if PLAIN != block.finer < most and (block.chain or block.intervals < FINEST):
         others.append(partial(replan, planning, block.finer + 1))
-    if fails and block.has_searched and block.finer != PLAIN:
+    if fails and any(plan.sequences > 1 for plan in block.plans) and block.finer != PLAIN:
         others.append(partial(replan, planning, PLAIN))
     short = _find_dip(planning, block, check) if index not in planning.more else 0.0
     if fails and short:

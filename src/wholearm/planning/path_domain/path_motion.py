@@ -189,10 +189,6 @@ def _share(v0: Array, v1: Array, w: Array) -> tuple[Array, Array]:
     return done, (1 - w) * (v1 * (1 + w) + v0 * (1 - w)) / total
 
 
-class StalledError(SolverError):
-    """The motion nearly stops, or takes no time, between two nodes: the grid is too coarse."""
-
-
 def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, float]:
     """Torque of a motion, one polynomial in time per interval, and its effort [(N m)^2 s].
 
@@ -217,7 +213,7 @@ def _fit(data: PhaseData, motion: PathMotion, places: Places, fractions: Array) 
     values = places.forces.tau(*data.interpolate(motion.profile, fractions))
     spans = motion.durations(fractions)
     if motion.stalls or not (np.diff(spans, axis=1) > 0).all():
-        raise StalledError("the motion all but stops between two nodes; plan with more intervals")
+        raise SolverError("the motion all but stops between two nodes; plan with more intervals")
     x = 2 * spans / spans[:, -1:] - 1
     vandermonde = x[..., None] ** np.arange(len(fractions))
     coefficients = np.linalg.solve(vandermonde, values.reshape(len(k), len(fractions), 2))

@@ -645,7 +645,7 @@ class PathIterate:
 
     @cached_property
     def plans(self) -> Plans:
-        """The plan of each phase; StalledError if one nearly stops between two nodes."""
+        """The plan of each phase; SolverError if one nearly stops between two nodes."""
         options, plans = self.task.options, []
         for part, motion in zip(self.parts, self.motions, strict=True):
             torque, squares = fit_torque(part, motion)

@@ -73,7 +73,10 @@ def link(stages: Sequence[Stage]) -> list[Stage]:
     for stage, coming in zip(stages, [*stages[1:], None], strict=True):
         turns: tuple[int, ...] = ()
         gained, fading = None, tuple[tuple[int, float], ...]()
-        growing = find_fresh(linked[-1], stage) if linked and not linked[-1].ends_in_impact else ()
+        growing = tuple[int, ...]()
+        if linked and not linked[-1].ends_in_impact:
+            known = linked[-1].formation.contacts
+            growing = tuple(k for k, c in enumerate(stage.formation.contacts) if c not in known)
         if coming is not None and not stage.ends_in_impact:
             turns, fading = find_turns(stage, coming), find_passing(stage, coming)
             fresh = new_rows(stage.formation, coming.formation)
@@ -103,13 +106,6 @@ def find_passing(stage: Stage, coming: Stage) -> tuple[tuple[int, float], ...]:
             row = coming.formation.contacts.index(contact)
             passing.append((k, float(coming.directions.Xi[row])))
     return tuple(passing)
-
-
-def find_fresh(stage: Stage, coming: Stage) -> tuple[int, ...]:
-    """Contacts of the coming stage that a stage does not have."""
-    known, fresh = stage.formation.contacts, coming.formation.contacts
-    renamed = list_renamed(stage.formation.scene, known, fresh).values()
-    return tuple(k for k, c in enumerate(fresh) if c not in known and c not in renamed)
 
 
 def divide(stage: Stage, parts: Sequence[tuple[StagePoints, Mode]]) -> list[Stage]:

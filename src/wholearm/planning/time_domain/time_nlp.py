@@ -110,7 +110,10 @@ def lay_out(
     stop, d, with_margin = 0, scheme.degree, int(target.chained)
     for stage, coming in zip(stages, [*stages[1:], None], strict=True):
         point = Columns(z=5, v=5, a=5, forces=stage.formation.n_constraints)
-        end, short = (0 if scheme.ends else STATE), target.count_shortfalls(stage)
+        # In elastic mode every limit but those of speeds has a shortfall in each interval.
+        soft = make_limits(stage.formation, target.epsilon).without(SPEED).limits
+        short = len(soft) * (target.objective is Objective.ELASTIC)
+        end = 0 if scheme.ends else STATE
         sizes = {"h": 1, "tau": 2 * scheme.controls, "points": d * point.count}
         interval = Columns(**sizes, end=end, short=short, m=with_margin)
         begin = stop + np.arange(point.sizes["forces"] * (held and not layouts))
@@ -184,11 +187,6 @@ class Target(NamedTuple):
     def chained(self) -> bool:
         """Whether nodes have one more unknown, all of them copies: a margin or a relaxation."""
         return self.objective in (Objective.MARGIN, Objective.RELAX)
-
-    def count_shortfalls(self, stage: Stage) -> int:
-        """Number of shortfalls in each interval of a stage: of every limit but those of speeds."""
-        limits = make_limits(stage.formation, self.epsilon).without(SPEED).limits
-        return len(limits) * (self.objective is Objective.ELASTIC)
 
 
 @dataclass(frozen=True, eq=False)
@@ -438,27 +436,20 @@ def _balance(
     return own, own[..., kernel.y["balance"]], own[..., senses]
 
 
-def least_rates(stage: Stage, places: Array) -> Array:
-    """Least rate at `places`, shares of a stage's duration, in their shape.
-
-    Zero at both ends, and with one degree of freedom, where friction cannot hold one contact alone;
-    none in the friction homotopy.
-    """
-    if stage.onset:
-        return np.full(np.shape(places), -np.inf)
-    free = stage.formation.n_constraints < 4
-    return np.asarray(SLIDING * free * np.minimum(1.0, 8 * np.minimum(places, 1 - places)))
-
-
 def least_senses(stage: Stage, places: Array) -> Array:
-    """Least rates of (contacts, joints) at `places`, in their shape and one more axis.
+    """Least rates of (contacts, joints) at `places`, shares of a stage's duration.
 
-    Zero for the second contact of a vertex.
+    In their shape and one more axis. Zero at both ends, for the second contact of a vertex, and
+    with one degree of freedom, where friction cannot hold one contact alone; none in the friction
+    homotopy.
     """
-    contacts, least = stage.formation.contacts, least_rates(stage, places)[..., None]
+    contacts, free = stage.formation.contacts, stage.formation.n_constraints < 4
+    least = SLIDING * free * np.minimum(1.0, 8 * np.minimum(places, 1 - places))[..., None]
+    if stage.onset:
+        least = np.full(least.shape, -np.inf)
     vertices = [contact.index if contact.feature == "v" else None for contact in contacts]
     again = [own is not None and own in vertices[:k] for k, own in enumerate(vertices)]
-    return np.where([*again, False, False], np.minimum(least, 0.0), least)
+    return np.asarray(np.where([*again, False, False], np.minimum(least, 0.0), least))
 
 
 def find_still(stage: Stage, last: bool) -> set[int]:

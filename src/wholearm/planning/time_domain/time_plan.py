@@ -537,7 +537,9 @@ def plan_with_impacts(
         return [*plan_phases(problem, block, z, options, duration, **others)]
     explained = plan_parts_of(problem, block, ample, explained=True)
     with_stops = partial(plan_stops, explained, [0, *ends, len(block)], z)
-    if duration is not None and fastest and all(_is_stop(problem, fastest[k - 1]) for k in ends):
+    slow = AT_REST * problem.scene.scales.speed
+    speeds = [measure_speed(problem.scene, end_of(fastest[k - 1])[1]) for k in ends if fastest]
+    if duration is not None and fastest and max(speeds) < slow:
         # Without an impact in least time there is none in a longer duration.
         return with_stops(options, duration)
     # A duration that is too short for stops need not be so without them.
@@ -587,12 +589,6 @@ def list_impacts(block: Sequence[Phase], plans: Sequence[PhasePlan[Motion]]) -> 
         ratio = measure_speed(scene, impact.v)
         found.append(make_transition(phase, impact, ratio, reason, speed))
     return found
-
-
-def _is_stop(problem: Problem, plan: PhasePlan[Motion]) -> bool:
-    """Whether a plan ends at rest."""
-    speed = measure_speed(problem.scene, end_of(plan)[1])
-    return speed < AT_REST * problem.scene.scales.speed
 
 
 def _impact_at_stop(phase: Phase, following: Phase, plan: PhasePlan[Motion]) -> Impact:
