@@ -76,9 +76,7 @@ FRICTION = "friction"  # beginning of the keys of frictions
 _ROUGH = 4.0  # largest factor on the friction of a rolling contact
 _FASTER = (2.0, 10.0, 100.0)  # factors on torque rate limits with which plans are tried
 _TORQUE = 15.0  # unit of shortfalls of torques, over the scene's torque: as bad as one of its force
-_FORCE = 5.0  # largest unit of force when a limit is relaxed, over the scene's
 MISSED = 0.02  # least margin by which limits are missed along an infeasible path
-MET = 0.98  # share of a limit above which it is active
 _unadvised: ContextVar[bool] = ContextVar("_unadvised", default=False)
 Replan = Callable[[Parameter, float], object]  # plans with another value of a parameter, or raises
 E = TypeVar("E", InfeasibleError, JammingError)
@@ -313,7 +311,7 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
     # In units of a slow motion, or of an absurd epsilon, the regularization would outweigh what is
     # relaxed: units of a fall, and of forces that a hand may have.
     fall = float(np.sqrt(float(data.grid.s[-1]) / scales.acceleration))
-    largest = _FORCE * scales.force
+    largest = 5.0 * scales.force  # largest unit of force when a limit is relaxed, over the scene's
     units = units._replace(time=min(units.time, fall), force=min(units.force, largest))
     may_change = [*data.speeds.parameters, *data.limits.parameters]
     if len(parts) == 1:
@@ -663,7 +661,7 @@ def is_met(
         return all(each.amount < parameter.value for each in shortfalls if each.kind == PRESS)
     tables = [part.v[..., 3:] if parameter.is_speed else part.tau for part in motion]
     most = max(float(np.abs(table[..., _find_finger(parameter)]).max()) for table in tables)
-    return most > MET * parameter.value
+    return most > 0.98 * parameter.value  # share of a limit above which it is active
 
 
 def _find_finger(parameter: Parameter) -> int:

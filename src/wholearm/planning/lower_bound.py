@@ -39,7 +39,6 @@ _ROUNDS = 16  # most grids: losses fall by 64 from one to the next where speeds 
 # Intervals on each side of a blocked one that are split, into how many, and how often; case: the
 # border of an octagon's flip, passed at a tenth of the speed beside it.
 _NARROW, _PARTS, _TRIES = 2, 4, 4
-_MOST = 1500  # most intervals
 _SAFETY = 2.0  # factor on the difference of two quadratures, which err alike at switches
 _RULES = tuple(np.polynomial.legendre.leggauss(count) for count in (2, 3))
 # Left end, middle, right end and the nodes of both rules in an interval.
@@ -163,7 +162,7 @@ def bound_least_time(curves: Sequence[Curve], epsilon: float) -> LowerBound | No
         parts = np.clip(np.ceil(np.cbrt(share * len(share))), 1, 8).astype(np.int64)
         # If not all can be split, those that lose most are.
         order = np.argsort(-share)
-        parts[order[np.cumsum(parts[order] - 1) > _MOST - len(parts)]] = 1
+        parts[order[np.cumsum(parts[order] - 1) > 1500 - len(parts)]] = 1  # most intervals
         if share.sum() < 1 or (parts == 1).all():
             break
         finer = grid.split(parts)

@@ -51,8 +51,6 @@ _STILL = 1e-9  # relative speed of rest but for rounding
 WIDEST = 0.95  # largest relative range that is tried
 _MOST = 1e3  # largest factor on ranges that is tried
 _CLOSE = 0.01  # error of the factor, relatively
-_LESS = 0.98  # factor from one tried plan to the next
-_TRIES = 8  # most plans that are tried
 
 
 def solve(
@@ -366,12 +364,12 @@ def _find_widest(
         else:
             low, guides = middle, _cut(fastest, curves)
         middle = min(2 * low, most) if np.isinf(high) else (low + high) / 2
-    for _ in range(_TRIES):
+    for _ in range(8):  # most plans that are tried
         try:
             plan_curves(curves, problem.epsilon, scale(low).roughen(), numbers, explained=False)
             return low
         except (InfeasibleError, SolverError):
-            low *= _LESS
+            low *= 0.98  # factor from one tried plan to the next
     return 0.0
 
 

@@ -20,7 +20,6 @@ from .elements import DEGREE, NODES, Elements, Grid, Profile, lay_out
 from .path_data import PhaseData
 from .path_motion import PathMotion, find_torques
 
-_PICARD = 4  # Picard iterations between speeds and extremes of s''
 _SAMPLES = 320  # places at which vertices are found, at least two in an interval
 _CAPPED = np.iinfo(np.int64).max  # label of places with an active speed limit
 _AT_CAP = 1e-3  # relative distance of b from its limit at which it is active
@@ -265,7 +264,7 @@ class _Looks(NamedTuple):
         s, b, rows = self.s[k], self.b[k], self.rows.pick(k)
         steps, one, other = np.diff(s), b, b
         largest = rises or bool(along.any()), not rises and not along.any()
-        for _ in range(_PICARD):
+        for _ in range(4):  # Picard iterations between speeds and extremes of s''
             gains = []
             for part, most in zip((one, other), largest, strict=True):
                 rate = rows.extreme(np.maximum(part, 0.0), most).a

@@ -28,7 +28,6 @@ from .path_data import PhaseData, Places
 _POINTS = 12  # Gauss points for the time in an interval between nodes
 _STALLED = 100.0  # speed interpolated from an interval's ends over the one inside when it stalls
 _TINY = 1e-100  # least speed [m/s] that is divided by
-_NEWTON = 5  # iterations from a time to a place
 TORQUE_ERROR = 5e-7  # largest error of the polynomials between knots, over the torque limit
 PLACES = 13  # interpolation points where that is exceeded
 LOOKS = 21  # samples of torque rates in each interval
@@ -134,7 +133,7 @@ class PathMotion:
         local = np.clip(t, 0.0, self.duration) - self.times[k]
         w, clock = local / (self.times[k + 1] - self.times[k]), self._clock[n]
         slope = legendre.legder(clock, axis=1)
-        for _ in range(_NEWTON):
+        for _ in range(5):  # iterations from a time to a place
             x = 2 * w - 1
             late = np.einsum("np,np->n", legendre.legvander(x, _POINTS), clock) - local
             rate = 2 * np.einsum("np,np->n", legendre.legvander(x, _POINTS - 1), slope)

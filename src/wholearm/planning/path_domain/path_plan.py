@@ -72,7 +72,6 @@ _OVER = 1.05  # tightening over the violation
 _GAP = 1.5  # gap to the optimum over the cost of the tightening
 _LOOKS = 17  # places of a segment at which uniqueness is checked
 _START, _SMOOTH, _RATE = 12, 20, 50  # elements of a phase; for effort; under rate limits
-_MOST = 80  # most elements of a phase
 _MOVED = 25.0  # distance of a break from its switch that counts, over length and accuracy
 _LONGER = 0.2  # most by which the NLP's duration may be another, relatively
 _MESHES, _RATE_MESHES = 6, 2  # most meshes whose breaks move, and those under rate limits
@@ -500,7 +499,7 @@ class PathIterate:
             if shift > _MOVED * accuracy and again:
                 return self._move(breaks, self.cuts)
             edges = [part.grid.edges for part in self.parts]
-            count = min(task.elements, _MOST - max(map(len, edges)))
+            count = min(task.elements, 80 - max(map(len, edges)))  # most elements of a phase
             if costly and task.options.intervals is None and 2 * count >= task.elements:
                 shares = np.split(costs, np.cumsum([len(part.grid.s) for part in self.parts])[:-1])
                 pairs = zip(edges, shares, strict=True)

@@ -36,7 +36,6 @@ from ...sensitivity.slopes import find_force_slopes
 
 COPIES = 5  # rows for each force limit: two for each vertex, and one for the reference
 _LOOKS = 97  # places of a segment at which signs are found
-_ROUNDS = 8  # cutting planes
 _LOWER = 0.5  # factor on b where limits leave no polygon
 _SAME = 1e-9  # violation of a row that is rounding, over its scale
 
@@ -181,7 +180,7 @@ def _find_signs(
     wider, signs, b = spread_limits(limits), bare.signs.copy(), motion[1].copy()
     signs[:, :, 4] = np.sign(measure(variations, motion))
     forced = limits.only(PRESS, CONE)
-    for turn in range(_ROUNDS):
+    for turn in range(8):  # cutting planes
         extended = bare.extend(forces, variations, signs)
         sides = PathLimits.of(wider, extended, rates)
         rows = sides.eliminate()

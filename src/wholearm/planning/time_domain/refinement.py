@@ -59,7 +59,6 @@ SETTINGS = RefinementSettings()
 _AMPLE = 1e3  # slack, over what is much for a limit, of what does not count
 _PLACES = 7  # Gauss points of an interval at which torques are compared
 _HELD = 3.0  # rate over the least one below which that bound is active
-_CLOSE = 1e-6  # gap over the radius of gyration below which its limit is active
 _STEP = 1e-6  # step of z for slopes of gaps, over accelerations of a torque of 1
 _ROUNDING = 1e-9  # largest miss of a limit that counts as none, over its scale
 
@@ -345,7 +344,7 @@ def _find_held(stage: Stage, here: MotionResponse, places: Array) -> Array:
     gaps = formation.evaluate_limits(z)[:, monitored]
     moved = [formation.evaluate_limits(z + _STEP * by_torque[..., j]) for j in range(2)]
     slopes = np.stack([(after[:, monitored] - gaps) / _STEP for after in moved], axis=-1)
-    close = gaps < _CLOSE * size
+    close = gaps < 1e-6 * size  # gap over the radius of gyration below which its limit is active
     first = np.repeat(np.arange(len(places)) == 0, places.shape[1])
     close |= first[:, None] & (np.isin(monitored, stage.released) & stage.opens)
     active = np.concatenate([slow, close], axis=1)

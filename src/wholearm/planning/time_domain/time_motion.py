@@ -22,7 +22,6 @@ from .collocation import Scheme, blend
 from .stage import Stage, StagePoints
 
 _NODES = 8  # places per interval at which the equations of motion are solved
-_SWEEPS = 6  # times that accelerations are improved. Each gains one to two digits.
 # Forward dynamics of formations.
 _FORWARDS = Store(
     lambda formation: Batch(build_forward(formation)), lambda formation: formation.equations
@@ -101,7 +100,7 @@ class StageMotion:
         a[..., : len(self.scheme.points)] = _fit(2 * self.scheme.points - 1, self.points.a)
         weights = np.sqrt(metric_weights(self.formation.scene))[:, None]
         kept, least = a, np.full((count, 1, 1), np.inf)
-        for _ in range(_SWEEPS):
+        for _ in range(6):  # times that accelerations are improved. Each gains one to two digits.
             velocity = _integrate(a, half, v[:-1])
             place = _integrate(velocity, half, z[:-1])
             state = (

@@ -60,7 +60,6 @@ from .assembly import Indices, Kernel, NlpRows, build_kernel, share
 from .collocation import Scheme, blend, make_scheme
 from .stage import LimitMisses, Stage, StagePoints
 
-SHORTEST = 1e-6  # least duration of an interval, in the scene's unit
 _BEND = 1e-2  # weight of second differences of torques over their limits, which else may ring
 _HURRY = 3e-4  # weight of time against violations
 CLEAR = 1e-3  # distance of a coordinate from its value at the phase's end; less near the end
@@ -762,7 +761,7 @@ def find_bounds(
     every = zip(stages, [*stages[1:], None], nlp.layouts, nlp.rows_of, limits, strict=True)
     for stage, coming, layout, rows, raised in every:
         low[layout.short] = 0.0
-        low[layout.h] = SHORTEST
+        low[layout.h] = 1e-6  # least duration of an interval, in the scene's unit
         if coming is not None and stage.ends_in_impact:
             low[layout.impulses[: coming.formation.n_contacts]] = 0.0
         _stay_short(stage, layout, scheme, (low, high))

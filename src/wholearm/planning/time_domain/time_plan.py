@@ -50,12 +50,9 @@ if TYPE_CHECKING:
     from ..explain import Replan
 
 ITERATIONS = 50  # most of the solver from a guess; successes take up to 25
-SPLIT = 80  # the same in modes of the homotopy
-MODES_GIVEN = 150  # the same in modes that the problem gives; phase 1 of query 29 takes 67
 FEW = 35  # the same where a single guess is tried
 DEARER = 1.2  # cost of a refined plan, over that on few intervals, above which others are tried
 ROUNDING = 5e-7  # largest shortfall of a margin below epsilon by rounding, over the object's weight
-ROUNDS = 4  # most expansions of the cost-to-go
 GAIN = 1e-4  # least relative gain of moving the end
 AT_REST = 1e-4  # speed below which an impact counts as a stop, in the scene's own units
 SHORTEST = 1 / 16  # shortest step of the continuation to a pinned end
@@ -64,7 +61,6 @@ _STRETCHES = ((1.01, 2), (1.03, 2), (1.07, 3), (1.15, 4), (1.3, 6), (1.6, 8))
 """Durations with held torques to try, over those with free ones, and least numbers of periods."""
 _HELD_PATIENCE = 80  # most solver iterations with held torques
 _BRIEF = 1e-3  # duration, over a period, that counts as zero
-_SHORTER = 4  # most times that a period is left out
 _Named = tuple[TimeSolution, str]  # a solution, and the name of its guess
 
 
@@ -211,9 +207,9 @@ def solve_coarse(search: TimeSearch, guess: Guess, most: int = ITERATIONS) -> Ti
         solution = find_modes(search, stages)
         if not solution.success:
             return solution
-        stages, most = solution.stages, SPLIT
+        stages, most = solution.stages, 80  # most iterations in modes of the homotopy
     if guess.name == GIVEN:
-        most = MODES_GIVEN
+        most = 150  # phase 1 of query 29 takes 67 iterations
     solution = search.solve(stages, guess.before, search.wait(most))
     if solution.success and solution.margin < -ROUNDING:
         # A motion that presses too little may be far from one that presses enough.
@@ -284,7 +280,7 @@ def hold_torques(search: TimeSearch, free: TimeSolution) -> TimeSolution:
 
 def _leave_out(held: TimeSearch, solution: TimeSolution) -> TimeSolution:
     """The solution without last periods of phases whose duration has vanished."""
-    for _ in range(_SHORTER):
+    for _ in range(4):  # most times that a period is left out
         stages, changed = list(solution.stages), False
         for k, (stage, coming) in enumerate(zip(stages, [*stages[1:], None], strict=True)):
             last = coming is None or coming.phase != stage.phase
@@ -375,7 +371,7 @@ def choose_end(search: TimeSearch, solution: TimeSolution) -> tuple[TimeSearch, 
     best, least, to_go = (search, solution), None, search.to_go
     if to_go is None:
         return best
-    for _ in range(ROUNDS):
+    for _ in range(4):  # most expansions of the cost-to-go
         try:
             value, gradient = to_go(solution.end)
         except WholearmError:
