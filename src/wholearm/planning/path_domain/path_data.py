@@ -64,11 +64,6 @@ class PhaseData(NamedTuple):
     spread: RobustLimits | None = None  # robust force limits, if there are ranges
 
     @property
-    def nonempty(self) -> NDArray[np.int64]:
-        """The intervals that have a length."""
-        return self.grid.nonempty
-
-    @property
     def torque_limit(self) -> Array:
         """Torque limits, shape (2,) [N m]."""
         return self.limits.high[self.limits.of(TORQUE)]
@@ -112,14 +107,6 @@ class PhaseData(NamedTuple):
         ]
         return find_speed_cap(LimitSet(tuple(kept)), places.rates)
 
-    def relative_rates(self, places: Places, parameter: Parameter) -> Array:
-        """Rate of a joint over its speed limit, shape (n,) [s/m]; zero for another parameter."""
-        rates = np.zeros(len(places.rates))
-        for limit in self.speeds.limits:
-            if limit.parameter.key == parameter.key:
-                rates = places.rates @ limit.rows[0, -2:] / limit.high[0]
-        return rates
-
     def interpolate(self, profile: Profile, fractions: Array) -> Profile:
         """The profile at `fractions` of every solid interval, interval by interval."""
         return Elements(self.grid, profile).at(fractions)
@@ -129,7 +116,7 @@ class PhaseData(NamedTuple):
         here = self.interpolate(profile, self.sampling.checks)
         speed_slack = 1 - here.b / self.largest_b(self.checks)
         slack = np.column_stack([self.slack(self.checks, here, margin), speed_slack])
-        least = find_minima(slack.reshape(len(self.nonempty), len(self.sampling.checks), -1))
+        least = find_minima(slack.reshape(-1, len(self.sampling.checks), slack.shape[1]))
         short = np.maximum(-least, 0.0)
         return short[:, :-1], short[:, -1]
 
@@ -138,15 +125,15 @@ class PhaseData(NamedTuple):
 
         Zero where nothing is `short` in the interval.
         """
-        slack = self.slack(self.nodes, profile, margin)
-        least = np.minimum(slack[self.nonempty], slack[self.nonempty + 1])
+        slack, k = self.slack(self.nodes, profile, margin), self.grid.nonempty
+        least = np.minimum(slack[k], slack[k + 1])
         return np.where(short > 0, np.maximum(least, 0.0), 0.0)
 
     def spread_to_nodes(self, inside: Array) -> Array:
         """The larger value of the two solid intervals beside each node, shape (N + 1, ...)."""
-        table = np.zeros((len(self.grid.s), *inside.shape[1:]))
-        table[self.nonempty] = inside
-        table[self.nonempty + 1] = np.maximum(table[self.nonempty + 1], inside)
+        table, k = np.zeros((len(self.grid.s), *inside.shape[1:])), self.grid.nonempty
+        table[k] = inside
+        table[k + 1] = np.maximum(table[k + 1], inside)
         return table
 
 

@@ -169,7 +169,7 @@ class LimitSamples(NamedTuple):
     @staticmethod
     def of(data: PhaseData, margin: float) -> LimitSamples:
         """Some of the checks between nodes: an even number in each interval, with its start."""
-        fractions, k = data.sampling.checks, data.nonempty
+        fractions, k = data.sampling.checks, data.grid.nonempty
         wanted = max(_SAMPLES // len(k), 2)
         picked = np.arange(0, len(fractions) - 1, max(1, (len(fractions) - 1) // wanted))
         places = (len(fractions) * np.arange(len(k))[:, None] + picked).ravel()

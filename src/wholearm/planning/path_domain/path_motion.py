@@ -195,20 +195,20 @@ def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, floa
     """
     knots, checks = data.sampling
     torque = _fit(data, motion, data.knots, knots)
-    times = motion.times[data.nonempty, None] + motion.durations(checks)
+    times = motion.times[data.grid.nonempty, None] + motion.durations(checks)
     wanted = data.checks.forces.tau(*data.interpolate(motion.profile, checks))
-    inner = np.tile((checks > 0) & (checks < 1), len(data.nonempty))
+    inner = np.tile((checks > 0) & (checks < 1), len(data.grid.nonempty))
     misfit = torque.at(times.ravel()[inner]) - wanted[inner]
     if np.abs(misfit / data.torque_limit).max() > TORQUE_ERROR:
         every = (len(checks) - 1) // (PLACES - 1)
-        rows = np.tile(np.arange(len(checks)) % every == 0, len(data.nonempty))
+        rows = np.tile(np.arange(len(checks)) % every == 0, len(data.grid.nonempty))
         torque = _fit(data, motion, data.checks.pick(rows), checks[::every])
     return torque, torque.integrate_squares()
 
 
 def _fit(data: PhaseData, motion: PathMotion, places: Places, fractions: Array) -> TorqueProfile:
     """Polynomials through the torques at `fractions` of every solid interval."""
-    k = data.nonempty
+    k = data.grid.nonempty
     values = places.forces.tau(*data.interpolate(motion.profile, fractions))
     spans = motion.durations(fractions)
     if motion.stalls or not (np.diff(spans, axis=1) > 0).all():
@@ -230,7 +230,7 @@ def find_torques(
     checks = data.sampling.checks
     every = (len(checks) - 1) // (PLACES - 1)
     picked = np.arange(len(checks)) % every == 0
-    fractions, count = checks[picked], len(data.nonempty)
+    fractions, count = checks[picked], len(data.grid.nonempty)
     places = data.checks.pick(np.tile(picked, count))
     values = places.forces.tau(*data.interpolate(profile, fractions)).reshape(count, -1, 2)
     spans = np.concatenate([motion.durations(fractions) for motion in motions])
@@ -248,7 +248,7 @@ def find_torques(
 def find_hurry(data: PhaseData, profile: Profile, motions: Sequence[PathMotion]) -> Array:
     """Relative violations of rates and commands of each joint in each interval, (n_solid, 2, 2)."""
     if not data.grid.held:
-        return np.zeros((len(data.nonempty), 2, 2))
+        return np.zeros((len(data.grid.nonempty), 2, 2))
     torques, rates = find_torques(data, profile, motions)
     rate = np.abs(rates).max(axis=1) / data.rate_limit
     lags = data.curve.formation.scene.actuator_lag

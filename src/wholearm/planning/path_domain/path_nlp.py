@@ -483,7 +483,12 @@ def parameters(
         parameter, step = relaxation
         gives = data.limits.weigh(parameter) * step / unit
         blocks["gives"] = np.append(gives, parameter.is_speed)
-        blocks["rates"] = data.relative_rates(data.nodes, parameter) ** 2 * b_unit
+        # Rate of the joint over its speed limit; zero for another parameter.
+        share = np.zeros(len(data.grid.s))
+        for limit in data.speeds.limits:
+            if limit.parameter.key == parameter.key:
+                share = data.nodes.rates @ limit.rows[0, -2:] / limit.high[0]
+        blocks["rates"] = share**2 * b_unit
     return np.asarray(
         nlp.columns.p.join(
             ends=np.zeros(2),

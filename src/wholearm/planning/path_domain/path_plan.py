@@ -150,7 +150,8 @@ def plan_curves(
                 "number as it is"
             ) from None
         raise error from None
-    if options.goal is Objective.MARGIN and iterate.plans[0].value < task.lost:
+    rounding = MISS * curves[0].formation.scene.scales.force
+    if options.goal is Objective.MARGIN and iterate.plans[0].value < epsilon - rounding:
         from ..explain import explain_duration
 
         least = SolverError(f"{task.name}: the margin found is below epsilon")
@@ -317,11 +318,6 @@ class Task:
         from ..explain import name_phases
 
         return name_phases(self.phases)
-
-    @property
-    def lost(self) -> float:
-        """Least acceptable c_n of a plan of largest margin [N]."""
-        return self.epsilon - MISS * self.curves[0].formation.scene.scales.force
 
     @property
     def elements(self) -> int:
@@ -602,14 +598,6 @@ class PathIterate:
         """
         return _GAP * float(self.paid.sum())
 
-    @property
-    def value(self) -> float:
-        """Scale of errors of the cost."""
-        cost = abs(self.solution.cost)
-        if self.task.options.goal is Objective.MARGIN:
-            cost = abs(self.task.epsilon + self.solution.margin) / self.units.force
-        return max(cost, 1e-9)
-
     @cached_property
     def due(self) -> Array:
         """Relative cost at each node of tightening limits by their violations."""
@@ -640,7 +628,10 @@ class PathIterate:
         for kind, (name, joints) in enumerate(nlp.shape.motors._asdict().items()):
             on_rows = np.abs(on_g[nlp.columns.g[name]]).reshape(len(joints), count).T
             costs += (on_rows * motors[:, kind, list(joints)]).sum(axis=1)
-        return np.asarray(costs / self.value)
+        scale = abs(solution.cost)
+        if self.task.options.goal is Objective.MARGIN:
+            scale = abs(self.task.epsilon + solution.margin) / units.force
+        return np.asarray(costs / max(scale, 1e-9))
 
     @cached_property
     def plans(self) -> Plans:
