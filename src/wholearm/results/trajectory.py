@@ -173,7 +173,7 @@ class Trajectory(Drawn):
     def save_torques(self, path: str | os.PathLike[str]) -> None:
         """Write the torques as CSV, ``t,tau1,tau2``, a repeated time being a step.
 
-        Rows are as dense as the torques are bent; `planning.table_check` also replays them.
+        Rows are as dense as the torques are bent; `planning.replay_check` also replays them.
 
         Raises
         ------
