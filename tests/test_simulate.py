@@ -696,7 +696,7 @@ def load_stepper(formation: Formation, grips: Grips, degree: int) -> ModeStepper
     stuck = tuple(tuple(pairs[row] for row in rows) for rows in grips.contacts)
     modes = Modes(tuple(pairs), stuck, tuple(3 + joint for joint in grips.joints))
     s = build_stepper(system.structure, modes, degree)
-    s.load(system, 1e-9)
+    s.load(system, 1e-9, np.zeros(5))
     return s
 
 

@@ -37,10 +37,10 @@ from .contact_problem import (
 )
 from .events import EventKind, describe_change
 from .rest import find_breach
-from .run import Feedback, Run, StuckError, find_root
+from .run import Closing, Feedback, Run, StuckError, find_root
 from .stepper import Modes, ModeStepper
 from .system import ContactRows, Structure, System
-from .tolerances import ROUNDING_FORCE, SETTLING, SHORTEST_STEP, STANDING, STILL
+from .tolerances import ROUNDING_FORCE, SETTLING, STANDING, STILL
 
 CLOSED = 1e-10  # gap that counts as closed at an event, relative to the scene's length
 SUNK = 1e-6  # overlap up to which features touch, over the scene's length; else they are behind
@@ -61,15 +61,6 @@ class ClosedContacts(NamedTuple):
 
     pairs: tuple[int, ...]
     rows: ContactRows
-
-
-class Closing(NamedTuple):
-    """A pair whose gap falls below a level [m] between two instants since a step's start [s]."""
-
-    pair: int
-    level: float
-    left: float
-    right: float
 
 
 class Samples(NamedTuple):
@@ -101,14 +92,11 @@ class FreeRun(Run):
         hint: Modes | None = None,
         wanted: Array | None = None,
     ) -> None:
-        self.feedback = torque if isinstance(torque, Feedback) else None
-        torque = torque.torque if isinstance(torque, Feedback) else torque
         super().__init__(system, torque, z, v, tolerance, wanted)
         self.restitution = restitution
         self.modes = hint or Modes(sigma=(0.0,) * system.n)
         self.watch, self.unit = Watch(system), system.scales.length
         self.resting = self.unique = False
-        self._begin_piece()
 
     def play(self, touching: float, halt: Callable[[FreeRun], bool] | None = None) -> None:
         """Simulate until the torques end or `halt`, called at events.
@@ -161,29 +149,6 @@ class FreeRun(Run):
         # Impacts need no finer steps than these.
         least = max(CHATTER, 1e3 * self.tolerance)
         return least * self.system.scales.speed * 10.0 ** min(recent // MANY, 2)
-
-    def next_piece(self) -> bool:
-        """Go on to the next piece of the torques, if there is one."""
-        if self.piece + 2 >= len(self.breaks):
-            return False
-        self.piece += 1
-        self._begin_piece()
-        return True
-
-    def _begin_piece(self) -> None:
-        """Sample the feedback law, if there is one."""
-        if self.feedback is None:
-            return
-        theta, theta_dot = (part[list(self.system.driven)] for part in (self.z, self.v))
-        forces = {}
-        if self.records:
-            last = self.records[-1]
-            names = (self.system.names[pair] for pair in last.kept)
-            forces = dict(zip(names, last.c_n.tolist(), strict=True))
-        self.feedback.begin(self.piece, theta, theta_dot, forces)
-        if self.piece:
-            pieces = self.torque.coefficients[self.piece - 1 : self.piece + 1]
-            self.steps_at[self.piece] = bool(self.find_torque_steps(pieces)[0])
 
     def note_at(
         self, kind: EventKind, text: str, contact: str = "", value: float = math.nan
@@ -490,7 +455,6 @@ class FreeRun(Run):
         """
         self.load(self.modes)
         s, at, to = self.s, self.s.inputs, self.s.to
-        s.stay(self.system, self.z)
         seen = []
         for tau in np.vstack([np.zeros(2), self.system.scales.torque * np.eye(2)]):
             at[s.at.torque] = 0.0
@@ -514,28 +478,25 @@ class FreeRun(Run):
     def move(self) -> None:
         """Integrate with the present modes until an event, or until the torques step or end."""
         self.load(self.modes)
-        s, modes, rows, watch = self.s, self.modes, self.s.rows, self.watch
-        s.stay(self.system, self.z)
-        self.near = 1e-3 * SHORTEST_STEP * max(self.system.scales.time, abs(self.t))
-        self.kept = list(modes.kept)
+        rows, watch = self.s.rows, self.watch
+        self.kept = list(self.modes.kept)
         watch.watched[:] = 1.0
         watch.watched[self.kept] = 0.0
         counts = [rows.cone.stop, rows.size - rows.cone.stop, len(self.kept)]
         self.slack = np.repeat([ROUNDING_FORCE, 1e-12, CLOSED], counts)
-        self._look()
+        self.look()
         # What touches already may sink by rounding; what is behind something else never closes.
         sunk = np.minimum(watch.gaps, 0.0) - 0.5 * CLOSED * self.unit
         watch.level[:] = np.where(watch.gaps > -SUNK * self.unit, sunk, -np.inf)
         # Values that start below zero may stay there: modes are judged a moment later.
-        self.floor = np.maximum(self.slack, self.slack - self.start)
+        self.floor = np.maximum(self.slack, self.slack - self.values)
         self.h = min(self.h, self._time_to_return())
         self.record()
         super().move()
 
-    def _look(self) -> None:
+    def look(self) -> None:
         """Start from the present state."""
-        self.s.look()
-        self.start = self._list_values()
+        super().look()
         self.watch.advance()
 
     @property
@@ -556,85 +517,40 @@ class FreeRun(Run):
             seen.insert(1, self.system.measure(z))
         return Samples(times, *map(np.concatenate, zip(*seen, strict=True)))
 
-    def happens(self) -> bool:
-        """Whether an event value of the steps, or a range, is negative after the step just made."""
-        return bool((self._list_values() < -self.slack).any())
-
-    def _list_values(self) -> Array:
-        """Event values after the step just made: those of the step, then ranges of kept pairs."""
+    def measure(self) -> Array:
+        """Event values of the steps, then ranges of kept pairs."""
         self.watch.look(self.s)
         values = self.s.outputs[self.s.to.values]
-        self.values = np.concatenate([values, self.watch.spans[self.kept] / self.unit])
-        return self.values
+        return np.concatenate([values, self.watch.spans[self.kept] / self.unit])
 
-    def _find_value(self, h: float, row: int) -> float:
-        """One event value at another end of the step."""
-        self._step_to(h)
-        return float(self._list_values()[row])
+    @property
+    def shift(self) -> Array:
+        """Values that start below zero may stay there: modes are judged a moment later."""
+        return self.floor
 
-    def _find_gap(self, h: float, pair: int) -> float:
-        """A pair's gap at another end of the step [m]."""
-        self._step_to(h)
-        return float(self.system.look(self.s.outputs[: self.system.n])[0][pair])
-
-    def _step_to(self, h: float) -> None:
-        if self.s.inputs[self.s.at.h] != h:
-            self.step_to(h)
-
-    def locate(self, h: float, t: float) -> bool:
-        """Shorten the step just made, of length `h`, to its first event; whether there is one."""
-        values, floor, watch = self._list_values(), self.floor, self.watch
-        if not (watch.alarm or (values < -floor).any() or watch.may_close(REACH / LOOKS)):
-            return False
-        passed: set[int] = set()
-        found, first = False, np.maximum(self.start + floor, 0)
-        while True:
-            self._step_to(h)
-            values = self._list_values() + floor
-            seen = self._sample(h)
-            closing = self._find_closing(seen, passed) or self._find_entering(seen, passed)
-            low = (values < 0).nonzero()[0]
-            if not len(low) and closing is None:
-                return found
-            shares = first[low] / (first[low] - values[low])
-            if closing is not None and (not len(low) or closing.left <= h * shares.min()):
-                root = self._find_contact(h, closing)
-                passed.add(closing.pair)
-                h, found = (h, found) if root is None else (root, True)
-            else:
-                row = int(low[np.argmin(shares)])
-                least = float(floor[row])
-
-                def value(step: float, row: int = row, least: float = least) -> float:
-                    return self._find_value(step, row) + least
-
-                ends = float(first[row]), float(values[row])
-                h = find_root(value, h, *ends, self.near, 1e-3 * least)
-                floor = np.where(np.arange(len(floor)) == row, np.inf, floor)
-                found = True
+    def locate(self, h: float, t: float) -> list[int]:
+        """Shorten the step just made, of length `h` to `t`, to its first event, if there is one."""
+        watch, low = self.watch, (self.values < -self.floor).any()
+        if not (watch.alarm or low or watch.may_close(REACH / LOOKS)):
+            return []
+        return self.find_first(h)
 
     def keep(self, t: float) -> None:
         """Take the step just made, to time `t`, and record its end."""
-        self.t, s = t, self.s
-        self.y = s.outputs[s.to.y].copy()
-        self.record()
-        # `locate` has looked at the end of the step last.
-        self.start = self.values
+        super().keep(t)
         self.watch.advance()
-        self.floor = np.where(self.start > 0, self.slack, self.floor)
-        s.inputs[s.at.y], s.inputs[s.at.t] = self.y, t
+        self.floor = np.where(self.values > 0, self.slack, self.floor)
 
-    def handle(self, found: bool) -> bool:
+    def handle(self, found: list[int]) -> bool:
         """End the motion at an event."""
-        return found
+        return True
 
     def pass_break(self) -> bool | None:
         """Go on to the next piece of the torques; the motion ends if they end or modes change."""
         if not self.next_piece():
             return True
-        self.feed()
         if self.steps_at[self.piece]:
-            self._look()
+            self.look()
             if not self._holds():
                 return True
             self.record()
@@ -652,15 +568,16 @@ class FreeRun(Run):
         clear[rows.slide.start : rows.turn.stop][signs == 0] = -1
         near = CLOSED * self.unit
         touches = (np.abs(watch.gaps) < near) & (watch.ranges > -near) & (watch.watched > 0)
-        return bool((self.start > clear).all()) and not touches.any()
+        return bool((self.values > clear).all()) and not touches.any()
 
-    def _find_contact(self, h: float, closing: Closing) -> float | None:
+    def find_contact(self, h: float, closing: Closing) -> float | None:
         """When a pair closes within a step; None if it does not, or where the two do not face."""
         pair, level, left, right = closing
         n = self.system.n
 
         def value(step: float) -> float:
-            return self._find_gap(step, pair) - level
+            self.step_to(step)
+            return float(self.watch.ahead[pair]) - level
 
         first = value(left) if left > 0 else float(self.watch.gaps[pair]) - level
         last = value(right)
@@ -671,50 +588,50 @@ class FreeRun(Run):
             return None
         # Some ten roundings of the gap count as closed.
         root = find_root(value, right, first, last, self.near, 1e-14 * self.unit, left)
-        self._step_to(root)
+        self.step_to(root)
         out = self.s.outputs
         return root if self._face(out[:n], out[n : 2 * n])[1][pair] else None
 
-    def _find_closing(self, seen: Samples, passed: set[int]) -> Closing | None:
-        """The first pair that closes within the step, and a bracket of when."""
+    def find_closing(self, h: float, done: Sequence[int]) -> Closing | None:
+        """The first pair that closes within the step just made, and a bracket of when."""
+        passed, seen = [pair for pair in done if pair >= 0], self._sample(h)
         # What comes apart within the step may close again within it.
         apart = np.logical_or.accumulate(seen.gaps[:-1] > ARMED * self.unit, axis=0)
         level = np.where(apart, 0.0, self.watch.level)
         crosses = (seen.gaps[1:] < level) & (seen.gaps[:-1] >= level) & (self.watch.watched > 0)
-        crosses[:, list(passed)] = False
+        crosses[:, passed] = False
         crosses &= np.maximum(seen.ranges[1:], seen.ranges[:-1]) > -1e-3 * self.unit
         rows, pairs = crosses.nonzero()
         if not len(rows):
-            return None
+            return self._find_entering(seen, passed)
         row, pair = int(rows[0]), int(pairs[0])
         return Closing(pair, float(level[row, pair]), *seen.times[row : row + 2].tolist())
 
-    def _find_entering(self, seen: Samples, passed: set[int]) -> Closing | None:
+    def _find_entering(self, seen: Samples, passed: Sequence[int]) -> Closing | None:
         """The first pair that comes into range apart or touching, and overlaps after that.
 
         Out of range a gap has no meaning and may be negative throughout.
         """
         turns = (seen.ranges[1:] > 0) & (seen.ranges[:-1] <= 0) & (self.watch.watched > 0)
         turns &= (seen.gaps[1:] < -CLOSED * self.unit) & (seen.gaps[1:] > -REACH * self.unit)
-        turns[:, list(passed)] = False
+        turns[:, passed] = False
         h = float(self.s.inputs[self.s.at.h])
-        try:
-            for row, pair in zip(*(part.tolist() for part in turns.nonzero()), strict=True):
-                left, right = seen.times[row : row + 2].tolist()
-                entry = self._find_entry(pair, left, right, -float(seen.ranges[row, pair]))
-                gap = self._find_gap(entry, pair)
-                if gap > -SUNK * self.unit:
-                    return Closing(pair, min(gap, 0.0) - 0.5 * CLOSED * self.unit, entry, right)
-            return None
-        finally:
-            self._step_to(h)
+        for row, pair in zip(*(part.tolist() for part in turns.nonzero()), strict=True):
+            left, right = seen.times[row : row + 2].tolist()
+            entry = self._find_entry(pair, left, right, -float(seen.ranges[row, pair]))
+            self.step_to(entry)
+            gap = float(self.watch.ahead[pair])
+            if gap > -SUNK * self.unit:
+                return Closing(pair, min(gap, 0.0) - 0.5 * CLOSED * self.unit, entry, right)
+            self.step_to(h)
+        return None
 
     def _find_entry(self, pair: int, left: float, right: float, outside: float) -> float:
         """When a pair comes into range between two instants of a step."""
 
         def value(step: float) -> float:
-            self._step_to(step)
-            return -float(self.system.look(self.s.outputs[: self.system.n])[1][pair])
+            self.step_to(step)
+            return -float(self.watch.spans[pair])
 
         within = value(right)
         if within < 0 <= outside:

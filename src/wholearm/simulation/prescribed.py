@@ -58,7 +58,7 @@ from .modes import (
     share_mode,
 )
 from .rest import Collapse, Rest, StartDeparture, close_contacts, find_rest
-from .run import Run, StuckError, find_root
+from .run import Run, StuckError
 from .stepper import Modes, ModeStepper
 from .tolerances import (
     CREEPING,
@@ -71,7 +71,6 @@ from .tolerances import (
     ROUNDING_LIMIT,
     ROUNDING_SPEED,
     SETTLING,
-    SHORTEST_STEP,
     SLOW,
     STANDING,
     is_slower,
@@ -119,7 +118,7 @@ class ModeSegment(NamedTuple):
     # sets `event_values` from outputs of the steps and the `heading` at their start, (5,)
     measure: Any
     heading: Array
-    # m values, distance to the end [m or rad], its rate, least value plus slack, heading
+    # m values, distance to the end [m or rad], its rate, heading
     event_values: Array
     buffers: Any  # what has to live as long as these
     phase: int = 0  # index of its phase
@@ -176,13 +175,12 @@ def _build_leg(
     every = ca.vertcat(values[: own.slide.stop], values[-2:], *gaps, reached, speed)
     size = ca.sqrt(ca.dot(v, mass * v))
     heading = ca.if_else(size > 0, v / ca.fmax(size, 1e-300), before)
-    least = ca.mmin(every + ca.DM(slack))
-    outputs = ca.vertcat(every, distance, ca.jtimes(distance, z, v), least, heading)
+    outputs = ca.vertcat(every, distance, ca.jtimes(distance, z, v), heading)
     inner = ca.Function("measure", [z, v, values, before], [ca.densify(outputs)])
     packed, start = ca.MX.sym("packed", s.to.size), ca.MX.sym("start", 5)
     measured = inner(packed[:5], packed[5:10], packed[s.to.values], start)
     buffer, measure = ca.Function("measure", [packed, start], [measured]).buffer()
-    start, event_values = np.zeros(5), np.zeros(len(slack) + 8)
+    start, event_values = np.zeros(5), np.zeros(len(slack) + 7)
     buffer.set_arg(0, s.outputs.data)
     buffer.set_arg(1, start.data)
     buffer.set_res(0, event_values.data)
@@ -234,7 +232,7 @@ class Replay(Run):
 
     Attributes
     ----------
-    settling, rest_window, longest_window, shortest_step : [s], rounding : [N]
+    settling, rest_window, longest_window : [s], rounding : [N]
                              see the constants of these names
     slip_signs               signs of contacts, by name, that have just begun to slip
     side                     sign of (coordinate - value) before the end of the phase
@@ -260,7 +258,7 @@ class Replay(Run):
         super().__init__(system, torque, np.asarray(problem.start), np.zeros(5), tolerance, wanted)
         self.problem, time = problem, system.scales.time
         self.settling, self.rest_window = SETTLING * time, REST_WINDOW * time
-        self.longest_window, self.shortest_step = LONGEST_WINDOW * time, SHORTEST_STEP * time
+        self.longest_window = LONGEST_WINDOW * time
         self.rounding = ROUNDING_FORCE * system.scales.force
         self.step_times = [b for b, s in zip(self.breaks, self.steps_at, strict=False) if s]
         self.held_until = self.settled_by = -math.inf
@@ -294,31 +292,31 @@ class Replay(Run):
         stuck = (tuple(pairs[k] for k in rows) for rows in mode.holders if rows[0] < count)
         joints = tuple(3 + joint for joint in grips.joints)
         self.load(Modes(tuple(pairs), tuple(stuck), joints, (0.0,) * count, (0.0,) * 5))
-        self.s.stay(self.system, self.z)
         self.section += 1
         leg = _build_leg(formation, self.phase.until, self.side, self.s, mode)
         self.leg = leg._replace(phase=self.phase.index, section=self.section)
-        self.heading = np.zeros(5)
+        self.slack, self.heading = leg.slack, np.zeros(5)
+        self.urgent = leg.rows.speed
+
+    def measure(self) -> Array:
+        """Event values after the step just made."""
+        self.leg.measure()
+        return self.leg.event_values[:-7].copy()
 
     @property
-    def values(self) -> Array:
-        """Event values at the end of the last step, or at the state looked at."""
-        return self.leg.event_values[:-8].copy()
+    def shift(self) -> Array:
+        """A value that starts within rounding of zero has to fall below that."""
+        return np.where(self.start > self.slack, 0.0, self.slack)
 
     @property
     def distance(self) -> float:
         """Distance to the end of the phase there [m or rad]."""
-        return float(self.leg.event_values[-8])
+        return float(self.leg.event_values[-7])
 
     @property
     def rate(self) -> float:
         """Time derivative of the distance."""
-        return float(self.leg.event_values[-7])
-
-    def happens(self) -> bool:
-        """Whether the step just made ends behind an event."""
-        self.leg.measure()
-        return bool(self.leg.event_values[-6] < 0)
+        return float(self.leg.event_values[-6])
 
     @property
     def heading(self) -> Array:
@@ -329,17 +327,6 @@ class Replay(Run):
     def heading(self, heading: Array) -> None:
         self.leg.heading[:] = heading
 
-    def step_to(self, h: float) -> None:
-        """Repeat the step with another length."""
-        super().step_to(h)
-        self.leg.measure()
-
-    def look(self) -> None:
-        """Evaluate the present state."""
-        self.s.inputs[self.s.at.y], self.s.inputs[self.s.at.t] = self.y, self.t
-        self.s.look()
-        self.leg.measure()
-
     def observe(self) -> None:
         """Evaluate the present state, and record it."""
         self.look()
@@ -347,21 +334,31 @@ class Replay(Run):
 
     def accept(self, t: float) -> None:
         """Take the step just made, to time `t`, and record its end."""
-        s, self.t = self.s, t
-        self.y[:] = s.outputs[s.to.y]
-        self.leg.heading[:] = self.leg.event_values[-5:]
-        if not s.outputs[s.to.ratio] > 0:
-            self.fail_to_step(float(s.outputs[s.to.ratio]))
-        s.inputs[s.at.y], s.inputs[s.at.t] = self.y, t
-        self.record()
+        super().keep(t)
+        self.heading = self.leg.event_values[-5:]
+        self.require_inertia()
 
     def keep(self, t: float) -> None:
         """Accept the step to time `t` as one to look into."""
-        s, begin, heading = self.s, self.t, self.heading.copy()
+        s = self.s
         inputs, forces = s.inputs.copy(), s.outputs[s.to.stage_forces].copy()
+        step = Step(
+            self.leg,
+            self.t,
+            t - self.t,
+            inputs,
+            self.heading.copy(),
+            forces,
+            self.impact,
+            self.arrives,
+        )
         self.accept(t)
-        more = self.impact, self.arrives
-        self.taken.append(Step(self.leg, begin, t - begin, inputs, heading, forces, *more))
+        self.taken.append(step)
+
+    def require_inertia(self) -> None:
+        """Raise a `JammingError` where friction leaves no reduced inertia."""
+        if not self.s.outputs[self.s.to.ratio] > 0:
+            self.fail_to_step(float(self.s.outputs[self.s.to.ratio]))
 
     def fail_to_step(self, ratio: float) -> NoReturn:
         """Raise the error for a step size that underflows."""
@@ -404,14 +401,6 @@ class Replay(Run):
             text = f"the torques end {self.when()}, {distance:.3g} {unit} short of {until}"
         self.note(EventKind.END, text, "", distance)
         return Outcome(OutcomeKind.GOAL_MISSED, text)
-
-    def next_piece(self) -> bool:
-        """Go on to the next piece, if there is one; whether the torques step there."""
-        if self.piece + 2 >= len(self.breaks):
-            return False
-        self.piece += 1
-        self.feed()
-        return self.steps_at[self.piece]
 
     @property
     def coming_step(self) -> float:
@@ -553,7 +542,6 @@ class Replay(Run):
 
     def try_step(self, target: float) -> tuple[float, bool]:
         """As of `Run`; says where it jams or gets nowhere."""
-        self.start = self.values
         try:
             return super().try_step(target)
         except StuckError:
@@ -567,11 +555,11 @@ class Replay(Run):
 
     def locate(self, h: float, t: float) -> list[int]:
         """Shorten the step just made to its first event; rows of its event values."""
-        self.arrives = self.happens()
-        if not self.arrives or self._is_at_end(t):
-            return []
         self.arrives = False
-        return self.find_first(self.start, h)
+        if not (self.values < -self.slack).any():
+            return []
+        self.arrives = self._is_at_end(t)
+        return [] if self.arrives else self.find_first(h)
 
     def _is_at_end(self, t: float) -> bool:
         """Whether the step just tried ends the phase, at a torque break and but for rounding.
@@ -614,12 +602,13 @@ class Replay(Run):
         if self._is_at_end(self.t):
             rate, strikes = -self.rate, self._strikes()
             # Before a step that is still to come, the torques are those of the phase that ends.
-            stepped = self.next_piece()
+            stepped = self.next_piece() and self.steps_at[self.piece]
             window = self.settling if stepped else self.rest_window
             return Arrival(rate, window, strikes)
         if self.t >= self.breaks[-1]:
             return self.run_out()
-        if not self.next_piece():
+        self.next_piece()
+        if not self.steps_at[self.piece]:
             return None
         self.note(EventKind.TORQUE_STEP, f"the torques step {self.when()}")
         return self.restart()
@@ -820,8 +809,7 @@ class Replay(Run):
         if self._bridge():
             return self.come_to_rest()
         s, holders = self.s, self.leg.mode.holders
-        if not s.outputs[s.to.ratio] > 0:
-            self.fail_to_step(float(s.outputs[s.to.ratio]))
+        self.require_inertia()
         if not enters and self.resting and self.resting <= self.stuck:
             return self._hold()
         slipping = {holders[k][0] for k in self.find_slipping()}
@@ -950,7 +938,8 @@ class Replay(Run):
         """Step to where the torques step next, as `coast` does, and go on to the next piece."""
         while True:
             self.coast(self.stop, hide)
-            if self.next_piece():
+            self.next_piece()
+            if self.steps_at[self.piece]:
                 return
             self.records.pop()
 
@@ -967,10 +956,10 @@ class Replay(Run):
         elif self._goes_on():
             return False
         else:
-            start = self.values
+            self.start = self.values
             stretch = min(self.settling, self.stop - self.t)
             self.step_to(stretch)
-            rows = self._find_turning(self.find_first(start, stretch, self.leg.rows.turning))
+            rows = self._find_turning(self.find_first(stretch, self.leg.rows.turning))
             if not rows:
                 self.look()
                 return False
@@ -989,37 +978,6 @@ class Replay(Run):
         # Lever arms are below 100 units of the scene.
         least = 100 * SETTLING * (strongest + fastest**2)
         return bool((self.values[self.leg.rows.turning][self.signs != 0] > least).all())
-
-    def find_first(self, start: Array, h: float, among: slice | None = None) -> list[int]:
-        """Shorten the step just tried, of length h [s], to its first event; its rows.
-
-        `start` are the event values at its start, `among` the rows to look at.
-        """
-        rows, slack = self.leg.rows, self.leg.slack
-        places = range(len(slack))[among] if among else range(len(slack))
-        # A value that starts within rounding of zero has to fall below that.
-        shift = np.where(start > slack, 0.0, slack)
-        before = start + shift
-        seen: list[int] = []
-        done: list[int] = []
-        while True:
-            after = self.values + shift
-            left = [k for k in places if after[k] < 0 and k not in done]
-            if not left:
-                return [k for k in seen if after[k] <= slack[k] or k == done[-1]]
-            seen += [k for k in left if k not in seen]
-            share = {k: max(before[k], 0.0) / (max(before[k], 0.0) - after[k]) for k in left}
-            k = rows.speed if rows.speed in left else min(left, key=share.__getitem__)
-
-            def value(step: float, place: int = k) -> float:
-                self.step_to(step)
-                return float(self.values[place] + shift[place])
-
-            near = 1e-2 * self.shortest_step
-            h = find_root(value, h, float(before[k]), float(after[k]), near, 1e-3 * float(slack[k]))
-            done.append(k)
-            if h != self.s.inputs[self.s.at.h]:
-                self.step_to(h)
 
 
 def project_velocity(formation: Formation, z: Array, v: Array) -> Array:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -66,6 +66,15 @@ def find_root(
     return high
 
 
+class Closing(NamedTuple):
+    """A pair whose gap falls below a level [m] between two instants since a step's start [s]."""
+
+    pair: int
+    level: float
+    left: float
+    right: float
+
+
 class StuckError(ArithmeticError):
     """Steps become too short to get anywhere."""
 
@@ -83,21 +92,31 @@ class Run(ABC):
     impact : [J]         energy lost to impacts so far
     wanted : [s]         instants at which steps have to end; infinity is last
     section              counts changes of modes: records are in order within each section
+    values, start        event values after the step just made and before it, in units of the scene:
+                         an event is where one falls below zero
+    slack                how far below zero each of them counts as rounding
+    urgent               row of the event that is located first, -1 if none
     """
 
     s: ModeStepper
     t: float
     modes: Modes
+    values: Array
+    start: Array
+    slack: Array
+    urgent = -1
 
     def __init__(
         self,
         system: System,
-        torque: TorqueProfile,
+        torque: TorqueProfile | Feedback,
         z: Array,
         v: Array,
         tolerance: float,
         wanted: Array | None = None,
     ) -> None:
+        self.feedback = torque if isinstance(torque, Feedback) else None
+        torque = torque.torque if isinstance(torque, Feedback) else torque
         self.system, self.torque, self.tolerance = system, torque, tolerance
         self.breaks: list[float] = torque.breaks.tolist()
         self.t, self.piece = self.breaks[0], 0
@@ -112,6 +131,7 @@ class Run(ABC):
         within = wanted[(wanted >= self.breaks[0]) & (wanted <= self.breaks[-1])]
         self.wanted, self.next_wanted = [*within.tolist(), math.inf], 0
         self.residual = 0.0
+        self.sample()
         self.decisions, self.decided_at = 0, -math.inf
 
     @property
@@ -130,24 +150,38 @@ class Run(ABC):
         return self.breaks[self.piece + 1]
 
     @property
+    def near(self) -> float:
+        """Width of the bracket of an event that is narrow enough [s]."""
+        return 1e-3 * SHORTEST_STEP * max(self.system.scales.time, abs(self.t))
+
+    @property
     def longest(self) -> float:
         """Longest step from the present state [s]."""
         return math.inf
 
     @abstractmethod
-    def happens(self) -> bool:
-        """Whether an event shows at the end of the step just made."""
+    def measure(self) -> Array:
+        """Event values after the step just made."""
+
+    @property
+    @abstractmethod
+    def shift(self) -> Array:
+        """How far below zero each event value has to fall, by its value before the step."""
 
     @abstractmethod
-    def locate(self, h: float, t: float) -> Any:
-        """Shorten the step just made, of length `h` to `t` [s], to its first events; if any."""
+    def locate(self, h: float, t: float) -> list[int]:
+        """Shorten the step just made, of length `h` to `t` [s], to its first events; their rows."""
+
+    def find_closing(self, h: float, done: Sequence[int]) -> Closing | None:
+        """The first pair that closes within the step just made, of length `h`, but those `done`."""
+        return None
+
+    def find_contact(self, h: float, closing: Closing) -> float | None:
+        """When a pair closes within a step; None if it does not."""
+        return None
 
     @abstractmethod
-    def keep(self, t: float) -> None:
-        """Take the step just made, to time `t` [s], and record its end."""
-
-    @abstractmethod
-    def handle(self, found: Any) -> Any:
+    def handle(self, found: list[int]) -> Any:
         """How events end the motion; None if it goes on."""
 
     @abstractmethod
@@ -204,7 +238,7 @@ class Run(ABC):
         key = modes._replace(Xi=(), sigma=())
         self.s = build_stepper(self.system.structure, key, degree)
         inputs, at = self.s.inputs, self.s.at
-        self.s.load(self.system, self.tolerance)
+        self.s.load(self.system, self.tolerance, self.z)
         if modes.sigma:
             inputs[at.Xi], inputs[at.sigma] = modes.Xi, modes.sigma
         self.feed()
@@ -216,10 +250,86 @@ class Run(ABC):
         inputs[at.piece] = self.torque.breaks[self.piece : self.piece + 2]
         inputs[at.torque] = self.torque.coefficients[self.piece].ravel()
 
+    def next_piece(self) -> bool:
+        """Go on to the next piece of the torques, if there is one."""
+        if self.piece + 2 >= len(self.breaks):
+            return False
+        self.piece += 1
+        self.sample()
+        self.feed()
+        return True
+
+    def sample(self) -> None:
+        """Sample the feedback law, if there is one, at the start of a piece of the torques."""
+        if self.feedback is None:
+            return
+        theta, theta_dot = (part[list(self.system.driven)] for part in (self.z, self.v))
+        forces = {}
+        if self.records:
+            last = self.records[-1]
+            names = (self.system.names[pair] for pair in last.kept)
+            forces = dict(zip(names, last.c_n.tolist(), strict=True))
+        self.feedback.begin(self.piece, theta, theta_dot, forces)
+        if self.piece:
+            pieces = self.torque.coefficients[self.piece - 1 : self.piece + 1]
+            self.steps_at[self.piece] = bool(self.find_torque_steps(pieces)[0])
+
     def step_to(self, h: float) -> None:
         """Repeat the step with another length."""
         self.s.inputs[self.s.at.h] = h
         self.s.step()
+        self.values = self.measure()
+
+    def look(self) -> None:
+        """Evaluate the present state."""
+        self.s.inputs[self.s.at.y], self.s.inputs[self.s.at.t] = self.y, self.t
+        self.s.look()
+        self.values = self.measure()
+
+    def keep(self, t: float) -> None:
+        """Take the step just made, to time `t` [s], and record its end."""
+        s, self.t = self.s, t
+        self.y[:] = s.outputs[s.to.y]
+        s.inputs[s.at.y], s.inputs[s.at.t] = self.y, t
+        self.record()
+
+    def find_first(self, h: float, among: slice = slice(None)) -> list[int]:
+        """Shorten the step just made, of length h [s], to its first event; rows of `values`.
+
+        `among` are the rows to look at. That of a pair that closes is its number after these.
+        """
+        shift = self.shift
+        before, places = np.maximum(self.start + shift, 0.0), np.arange(len(shift))[among]
+        seen, done = list[int](), list[int]()
+        last = -1
+        while True:
+            if h != self.s.inputs[self.s.at.h]:
+                self.step_to(h)
+            after = self.values + shift
+            low = [k for k in places[after[places] < 0].tolist() if k not in done]
+            closing = self.find_closing(h, [k - len(shift) for k in done])
+            if not low and closing is None:
+                shown = (after <= self.slack).nonzero()[0].tolist()
+                return [k for k in seen if k == last or k in shown]
+            seen += [k for k in low if k not in seen]
+            share = {k: before[k] / (before[k] - after[k]) for k in low}
+            row = self.urgent if self.urgent in low else min(low, key=share.__getitem__, default=0)
+            if closing is not None and (not low or closing.left <= h * share[row]):
+                root = self.find_contact(h, closing)
+                done.append(len(shift) + closing.pair)
+                if root is not None:
+                    h, last = root, done[-1]
+                    seen.append(last)
+                continue
+
+            def value(step: float, row: int = row) -> float:
+                self.step_to(step)
+                return float(self.values[row] + shift[row])
+
+            ends = float(before[row]), float(after[row])
+            h = find_root(value, h, *ends, self.near, 1e-3 * float(self.slack[row]))
+            done.append(row)
+            last = row
 
     def move(self) -> Any:
         """Integrate with the present modes until the contact rule ends the motion; how it does."""
@@ -249,6 +359,7 @@ class Run(ABC):
         """
         inputs, outputs, at, to = self.s.inputs, self.s.outputs, self.s.at, self.s.to
         remaining, time = target - self.t, self.system.scales.time
+        self.start = self.values
         least = SHORTEST_STEP * max(time, abs(self.t))
         longest = self.longest
         while True:
@@ -258,8 +369,10 @@ class Run(ABC):
             inputs[at.h] = h
             self.s.step()
             error = float(outputs[to.error])
+            if error <= 1:
+                self.values = self.measure()
             sudden = outputs[to.dip] < -1e-6 and h > SETTLING / 10 * time
-            if error <= 1 and not (sudden and not self.happens()):
+            if error <= 1 and not (sudden and not (self.values < -self.slack).any()):
                 # A growth of 40 at order 8 is that of an error of 1e-13 of the tolerance.
                 grown = h * min(40.0, 0.9 * max(error, 1e-300) ** (-1 / ORDER))
                 self.h = grown if h >= self.h else max(self.h, grown)

@@ -160,8 +160,8 @@ class ModeStepper:
     look: Any
     buffers: Any  # what has to live as long as these
 
-    def load(self, system: System, tolerance: float) -> None:
-        """Set the inputs that do not change along a motion."""
+    def load(self, system: System, tolerance: float, z: Array) -> None:
+        """Set the inputs that do not change along a motion, which keeps what sticks as at z."""
         inputs, at = self.inputs, self.at
         inputs[at.tolerance] = tolerance
         inputs[at.geometry], inputs[at.lift] = system.geometry, 1 / system.mass
@@ -170,13 +170,8 @@ class ModeStepper:
         inputs[at.units] = system.units
         inputs[at.scales] = system.scales.force, system.scales.speed
         inputs[at.friction_units] = system.friction_units
-
-    def stay(self, system: System, z: Array) -> None:
-        """Keep from `z` on what sticks and is held."""
-        stuck, held = self.modes.stuck, self.modes.held
-        if stuck or held:
-            slip = system.evaluate_slip(z, [pairs[0] for pairs in stuck])
-            self.inputs[self.at.stay] = np.concatenate([slip, z[list(held)]])
+        slip = system.evaluate_slip(z, [pairs[0] for pairs in self.modes.stuck])
+        inputs[at.stay] = np.concatenate([slip, z[list(self.modes.held)]])
 
 
 @lru_cache(maxsize=256)
