@@ -48,10 +48,10 @@ from wholearm.scene.model import Finger, Friction, Scene
 from wholearm.simulation import stepper
 from wholearm.simulation.events import Event, EventKind, OutcomeKind, Simulation
 from wholearm.simulation.hand import build_system
-from wholearm.simulation.modes import Grips, Mode, respond
+from wholearm.simulation.modes import Mode, find_mode, respond
 from wholearm.simulation.rest import Collapse, close_contacts, find_rest
 from wholearm.simulation.run import find_root
-from wholearm.simulation.stepper import Modes, ModeStepper, build_stepper
+from wholearm.simulation.stepper import ModeStepper, build_stepper
 from wholearm.simulation.system import ContactRows
 
 
@@ -689,13 +689,10 @@ def test_weights_integrate_polynomials(power: int) -> None:
     assert total == pytest.approx(1 / (power + 1), abs=1e-14)
 
 
-def load_stepper(formation: Formation, grips: Grips, degree: int) -> ModeStepper:
+def load_stepper(mode: Mode, degree: int) -> ModeStepper:
     """Steps of a formation in which friction holds some contacts and joints."""
-    system = build_system(formation.scene)
-    pairs = [system.names.index(name) for name in formation.names]
-    stuck = tuple(tuple(pairs[row] for row in rows) for rows in grips.contacts)
-    modes = Modes(tuple(pairs), stuck, tuple(3 + joint for joint in grips.joints))
-    s = build_stepper(system.structure, modes, degree)
+    system = build_system(mode.formation.scene)
+    s = build_stepper(system.structure, mode.find_modes(), degree)
     s.load(system, 1e-9, np.zeros(5))
     return s
 
@@ -705,7 +702,7 @@ def test_order_on_the_real_dynamics() -> None:
     motion = trajectory.motions[1]
     # One smooth piece for the whole phase, so that only the steps limit the error.
     torque = motion.fit(1, 24)  # type: ignore[attr-defined]
-    s = load_stepper(plan()[0].phases[1].formation, Grips(), 24)
+    s = load_stepper(find_mode(plan()[0].phases[1].formation, np.ones(6)), 24)
     segment = motion.curve.segments[0]  # type: ignore[attr-defined]
 
     def integrate(count: int) -> np.ndarray:
@@ -731,20 +728,21 @@ def test_order_on_the_real_dynamics() -> None:
     assert np.allclose(fine[:10], np.hstack([exact.z[0], exact.z_dot[0]]), atol=1e-7, rtol=0)
 
 
-@pytest.mark.parametrize("grips", [Grips(), Grips(contacts=((1,),)), Grips(joints=(0,))])
-def test_rates_are_those_of_the_formations_own_rows(grips: Grips) -> None:
+@pytest.mark.parametrize("row", [None, 1, 3], ids=["free", "a contact sticks", "a joint is held"])
+def test_rates_are_those_of_the_formations_own_rows(row: int | None) -> None:
     problem = wholearm.load("problems/heptagon.toml")
     free = problem.phases[2].formation
-    formations = [free] if len(grips) else [phase.formation for phase in problem.phases[:2]]
+    formations = [free] if row else [phase.formation for phase in problem.phases[:2]]
     rng = np.random.default_rng(3)
     for formation in formations:
         # On the constraints, where gaps and slip of pairs are those of contacts.
         z = close_contacts(formation, problem.start + 1e-3 * rng.standard_normal(5))
-        mode, s = Mode(formation, grips), load_stepper(formation, grips, 1)
         v = rng.standard_normal(5)
         signs = rng.choice([-1.0, 1.0], formation.n_contacts + 2)
-        signs[[row for rows in grips.contacts for row in rows]] = 0.0
-        signs[[formation.n_contacts + joint for joint in grips.joints]] = 0.0
+        if row:
+            signs[row] = 0.0
+        mode = Mode(formation, ((row,),) if row else ())
+        s = load_stepper(mode, 1)
         tau = rng.standard_normal(2)
         inputs, at, to = s.inputs, s.at, s.to
         inputs[at.y], inputs[at.t] = [*z, *v, *np.zeros(4)], 0.7

@@ -12,7 +12,7 @@ contact flush with a rolling one has no friction of its own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import NamedTuple
 
@@ -21,22 +21,9 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..contacts.formation import Formation
+from .hand import build_system
+from .stepper import Modes
 from .system import ContactRows
-
-
-@dataclass(frozen=True)
-class Grips:
-    """What friction holds although the phase lets it slide or turn."""
-
-    # contacts that stick, those of a flush edge together
-    contacts: tuple[tuple[int, ...], ...] = ()
-    joints: tuple[int, ...] = ()  # joints that are held
-
-    def __len__(self) -> int:
-        return len(self.contacts) + len(self.joints)
-
-
-FREE = Grips()  # nothing is held
 
 
 class Unit(NamedTuple):
@@ -58,45 +45,37 @@ def list_units(formation: Formation) -> tuple[Unit, ...]:
     )
 
 
-def find_grips(formation: Formation, signs: Array) -> Grips:
-    """What sticks where `signs`, shape (n_c + 2,), are zero; nothing with a single freedom."""
-    if formation.n_constraints >= 4:
-        return FREE
-    held = [unit.rows for unit in list_units(formation) if signs[unit.rows[0]] == 0]
-    count = formation.n_contacts
-    return Grips(
-        tuple(rows for rows in held if rows[0] < count),
-        tuple(rows[0] - count for rows in held if rows[0] >= count),
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class Mode:
-    """A formation with some of its contacts stuck and joints held."""
+    """A formation with what rolls or sticks and is held.
+
+    `holders` are the rows, among contacts and then joints, of what each force after c_n holds.
+    """
 
     formation: Formation
-    grips: Grips = FREE
-
-    @cached_property
-    def rolled(self) -> Formation:
-        """The formation in which one contact of each group that sticks rolls."""
-        if not self.grips.contacts:
-            return self.formation
-        stuck = tuple(self.formation.contacts[rows[0]] for rows in self.grips.contacts)
-        return replace(self.formation, rolling=self.formation.rolling + stuck)
+    holders: tuple[tuple[int, ...], ...]
 
     @property
     def n_constraints(self) -> int:
         """Number of constraints, and of independent forces c = [c_n; c_t or T; f]."""
-        return self.formation.n_constraints + len(self.grips)
+        return self.formation.n_contacts + len(self.holders)
 
-    @cached_property
-    def holders(self) -> tuple[tuple[int, ...], ...]:
-        """Rows, among contacts and joints, of what each force after c_n holds."""
-        groups = {rows[0]: rows for rows in self.grips.contacts}
-        held = [groups.get(row, (row,)) for row in self.rolled.rolling_rows]
-        count = self.formation.n_contacts
-        return (*held, *((count + joint,) for joint in self.grips.joints))
+    @property
+    def held(self) -> tuple[list[int], list[int]]:
+        """First row of each contact, or flush edge, that rolls or sticks; joints that are held."""
+        first, count = [rows[0] for rows in self.holders], self.formation.n_contacts
+        return [row for row in first if row < count], [row - count for row in first if row >= count]
+
+    def find_modes(self) -> Modes:
+        """The same of the pairs of features of the scene, without signs."""
+        names, formation = build_system(self.formation.scene).names, self.formation
+        pairs = tuple(names.index(name) for name in formation.names)
+        stuck = [rows for rows in self.holders if rows[0] < len(pairs)]
+        return Modes(
+            pairs,
+            tuple(tuple(pairs[row] for row in rows) for rows in stuck),
+            tuple(3 + joint for joint in self.held[1]),
+        )
 
     def declares(self, holder: int) -> bool:
         """Whether the phase asks for what the `holder`-th force after c_n holds."""
@@ -128,21 +107,21 @@ class Mode:
         return np.array([scales.force] * count + held + held)
 
 
-@lru_cache(maxsize=64)
-def share_mode(formation: Formation, grips: Grips = FREE) -> Mode:
-    """The mode of a formation in which friction holds `grips`, with what is known of it."""
-    return Mode(formation, grips)
+def find_mode(formation: Formation, signs: Array) -> Mode:
+    """What rolls, and what sticks where `signs`, (n_c + 2,), are zero; with one freedom nothing."""
+    held: list[tuple[int, ...]] = [(row,) for row in formation.rolling_rows]
+    if formation.n_constraints < 4:
+        held += [unit.rows for unit in list_units(formation) if signs[unit.rows[0]] == 0]
+    return _share_mode(formation, tuple(sorted(held)))
+
+
+_share_mode = lru_cache(maxsize=64)(Mode)
 
 
 def evaluate_rows(formation: Formation, z: Array, v: Array) -> ContactRows:
-    """Constraint rows of a formation at one state."""
-    at = _roll_all(formation).evaluate(z[None], v[None])
-    return ContactRows(at.A[0], at.A_t[0], *np.split(at.P_dot_v[0], 2))
-
-
-@lru_cache(maxsize=64)
-def _roll_all(formation: Formation) -> Formation:
-    return replace(formation, rolling=formation.contacts)
+    """Constraint rows of a formation at one state, with its contacts closed."""
+    system = build_system(formation.scene)
+    return system.evaluate(z, v, [system.names.index(name) for name in formation.names])
 
 
 class Response(NamedTuple):
@@ -160,19 +139,13 @@ def respond(mode: Mode, signs: Array, rows: ContactRows, v: Array) -> Response |
 
     `signs`, (n_c + 2,), are those of contacts and joints, zero for what is held or rolls.
     """
-    formation, scene = mode.formation, mode.formation.scene
-    count, rolling = formation.n_contacts, list(mode.rolled.rolling_rows)
-    joints = [3 + joint for joint in mode.grips.joints]
-    slip = mode.rolled.sliding_friction * signs[:count]
-    P: Array = rows.A
-    bend: Array = rows.bend
-    G: Array = rows.A - slip[:, None] * rows.A_t
+    scene, count = mode.formation.scene, mode.formation.n_contacts
+    (stuck, held), slip = mode.held, mode.formation.sliding_friction * signs[:count]
+    hold = np.vstack([rows.A_t[stuck], np.eye(5)[3:][held]])
+    P, G = (np.vstack([part, hold]) for part in (rows.A, rows.A - slip[:, None] * rows.A_t))
+    bend = np.concatenate([rows.bend, rows.bend_t[stuck], np.zeros(len(held))])
     inverse_mass = 1 / scene.mass_diagonal
-    if rolling or joints:
-        held = np.vstack([rows.A_t[rolling], np.eye(5)[joints]])
-        P, G = np.vstack([P, held]), np.vstack([G, held])
-        bend = np.concatenate([bend, rows.bend_t[rolling], np.zeros(len(joints))])
-    if mode.grips:
+    if mode.n_constraints > mode.formation.n_constraints:
         lines = P * np.sqrt(inverse_mass)
         lines /= np.linalg.norm(lines, axis=1)[:, None]
         if len(P) > 5 or np.linalg.svd(lines, compute_uv=False)[-1] <= 1e-9:
@@ -202,7 +175,7 @@ def find_fixed(mode: Mode, A: Array, A_t: Array) -> NDArray[np.bool_]:
     """Which contacts, then joints, a mode keeps fixed, (n_c + 2,), from A and A_t, (n_c, 5)."""
     joints = np.eye(5)[3:]
     root = np.sqrt(mode.formation.scene.mass_diagonal)
-    held = [A, A_t[list(mode.rolled.rolling_rows)], joints[list(mode.grips.joints)]]
+    held = [A, A_t[mode.held[0]], joints[mode.held[1]]]
     free = np.vstack([A_t, joints]) / root
     length = np.linalg.norm(free, axis=1)
     P = np.vstack(held) / root

@@ -45,21 +45,10 @@ from ..problem.definition import End, Phase, Problem, Until
 from ..results.torque import TorqueProfile
 from .events import EventKind, Outcome, OutcomeKind, Record, describe_change
 from .hand import build_system
-from .modes import (
-    FREE,
-    Grips,
-    Mode,
-    Unit,
-    evaluate_rows,
-    find_fixed,
-    find_grips,
-    list_units,
-    respond,
-    share_mode,
-)
+from .modes import Mode, Unit, evaluate_rows, find_fixed, find_mode, list_units, respond
 from .rest import Collapse, Rest, StartDeparture, close_contacts, find_rest
 from .run import Run, StuckError
-from .stepper import Modes, ModeStepper
+from .stepper import ModeStepper
 from .tolerances import (
     CREEPING,
     FIRST_STEP,
@@ -284,16 +273,12 @@ class Replay(Run):
         inputs, at = self.s.inputs, self.s.at
         inputs[at.Xi], inputs[at.sigma][3:] = signs[:-2], signs[-2:]
 
-    def take(self, grips: Grips = FREE) -> None:
-        """Go on with the steps of the phase's formation in which friction holds `grips`."""
-        formation, mode = self.formation, share_mode(self.formation, grips)
-        count = formation.n_contacts
-        pairs = [self.system.names.index(name) for name in formation.names]
-        stuck = (tuple(pairs[k] for k in rows) for rows in mode.holders if rows[0] < count)
-        joints = tuple(3 + joint for joint in grips.joints)
-        self.load(Modes(tuple(pairs), tuple(stuck), joints, (0.0,) * count, (0.0,) * 5))
+    def take(self, mode: Mode) -> None:
+        """Go on with the steps of a mode of the phase's formation."""
+        modes = mode.find_modes()
+        self.load(modes._replace(Xi=(0.0,) * len(modes.kept), sigma=(0.0,) * 5))
         self.section += 1
-        leg = _build_leg(formation, self.phase.until, self.side, self.s, mode)
+        leg = _build_leg(self.formation, self.phase.until, self.side, self.s, mode)
         self.leg = leg._replace(phase=self.phase.index, section=self.section)
         self.slack, self.heading = leg.slack, np.zeros(5)
         self.urgent = leg.rows.speed
@@ -699,7 +684,7 @@ class Replay(Run):
             self.side = math.copysign(1.0, place - until.value)
         self.until_unit = measure_until(self.problem.scene, until)
         self.stuck = set()
-        self.take()
+        self.take(find_mode(formation, np.ones(formation.n_contacts + 2)))
         self.releasable, self.resting, self.slipping = (), frozenset(), frozenset()
         if phase.end is End.REST or following is None or not until.is_release:
             return
@@ -741,17 +726,17 @@ class Replay(Run):
 
     def set_off(self, departure: StartDeparture) -> None:
         """Set the friction signs of a motion that starts from rest."""
-        formation = self.formation
-        grips = find_grips(formation, np.concatenate(departure.directions))
+        formation, signs = self.formation, np.concatenate(departure.directions)
+        mode = find_mode(formation, signs)
         if formation.n_constraints < 4:
-            rows = formation.evaluate(self.z[None], self.v[None])
-            fixed = find_fixed(share_mode(formation, grips), rows.A[0], rows.A_t[0])
+            rows = evaluate_rows(formation, self.z, self.v)
+            fixed = find_fixed(mode, rows.A, rows.A_t)
             self.stuck = {
                 row for u in list_units(formation) for row in u.rows if u.grips and fixed[row]
             }
-        if grips != self.leg.mode.grips:
-            self.take(grips)
-        self.signs, self.heading = np.concatenate(departure.directions), departure.heading
+        if mode != self.leg.mode:
+            self.take(mode)
+        self.signs, self.heading = signs, departure.heading
         self.observe()
 
     def go_on(self) -> Ending | None:
@@ -822,17 +807,41 @@ class Replay(Run):
     def _decide(
         self, turned: Sequence[int], *, time: float | None = None, enters: bool = False
     ) -> bool:
-        """Choose the modes of contacts and joints at rest; whether all motion has ended.
+        """Choose the friction signs of all that stands still; whether all motion has ended.
 
         With one freedom whatever slides or turns does so for as long as there is motion.
         """
-        if self.formation.n_constraints < 4:
-            return choose_mode(self, turned, time=time, enters=enters)
-        signs = self.signs
-        for row in turned:
-            signs[row] *= -1
-            note_change(self, row, -signs[row], signs[row], self.t if time is None else time)
-        self.signs = signs
+        formation, signs, time = self.formation, self.signs, self.t if time is None else time
+        if formation.n_constraints >= 4:
+            for row in turned:
+                signs[row] *= -1
+                self.note_change(row, -signs[row], signs[row], time)
+            self.signs = signs
+            return False
+        self.look()
+        slow = np.abs(self.values[self.leg.rows.turning]) < STANDING
+        still = [
+            unit
+            for unit in list_units(formation)
+            if set(unit.rows) & set(turned) or (unit.grips and slow[list(unit.rows)].any())
+        ]
+        if not still:
+            return False
+        if is_slower(self.problem.scene, self.v, STANDING):
+            return True
+        if not self.gets_on():
+            names = " ".join(formation.names)
+            raise SimulationError(f"sticking and slipping of {names} do not end {self.where()}")
+        choice = self._choose(signs, still, [self._list_options(unit, turned) for unit in still])
+        self._take_signs(choice.signs, still)
+        for unit in still:
+            row = unit.rows[0]
+            before = 0.0 if row in self.stuck else float(signs[row])
+            after = float(choice.signs[row]) if not choice.fixed[row] else 0.0
+            changes = before != after and not (enters and after) and unit.grips
+            for row in unit.rows if changes else ():
+                self.note_change(row, before, after, time)
+            self.stuck = (self.stuck - set(unit.rows)) | set(() if after else unit.rows)
         return False
 
     def come_to_rest(self) -> Rested | Switched:
@@ -979,149 +988,116 @@ class Replay(Run):
         least = 100 * SETTLING * (strongest + fastest**2)
         return bool((self.values[self.leg.rows.turning][self.signs != 0] > least).all())
 
+    def note_change(self, row: int, before: float, after: float, time: float) -> None:
+        """Record that a contact or joint sticks, slips or turns back."""
+        names = self.formation.names
+        contact = row < len(names)
+        name = names[row] if contact else f"joint {row - len(names) + 1}"
+        kind, text = describe_change(name, before, after, "slides" if contact else "turns")
+        self.note(kind, f"{text} at t = {time:.5g} s, phase {self.phase.number}", name, time=time)
+
+    def _list_options(self, unit: Unit, turned: Sequence[int]) -> tuple[float, ...]:
+        """Directions to try for one unit, in the order in which the first clear one is taken."""
+        present = float(self.signs[unit.rows[0]])
+        if present != 0:
+            first = -present if set(unit.rows) & set(turned) else present
+            return (first, 0.0, -first) if unit.grips else (first, -first)
+        holder = self.leg.mode.holders.index(unit.rows)
+        low, high = self.values[self.leg.rows.cone].reshape(2, -1)[:, holder]
+        sign = 1.0 if high < low else -1.0
+        # Friction is at the edge of its cone and opposes the slip to come.
+        edge = min(low, high) < ROUNDING_FORCE
+        return (sign, -sign, 0.0) if edge else (0.0, sign, -sign)
+
+    def _choose(
+        self, signs: Array, still: Sequence[Unit], orders: Sequence[tuple[float, ...]]
+    ) -> Choice:
+        """Signs of the first clear combination or of the best; `JammingError` without any."""
+        formation, scales, ahead = self.formation, self.system.scales, self.settling
+        loads = [np.array([1.0, *self.tau(t)]) for t in (self.t, self.t + ahead)]
+        present, count, ratios = (
+            evaluate_rows(formation, self.z, self.v),
+            formation.n_contacts,
+            [1.0],
+        )
+
+        def measure(signs: Array) -> Choice | None:
+            """Margins of one combination; None if it jams or leaves its forces undetermined."""
+            mode = find_mode(formation, signs)
+            if mode.n_constraints > 4:
+                return None
+            acceleration, rates = np.zeros(5), np.zeros(count + 2)
+            for delay, load in zip((0.0, ahead), loads, strict=True):
+                v = self.v + delay * acceleration
+                z = self.z + delay * (self.v + v) / 2
+                rows = evaluate_rows(formation, z, v) if delay else present
+                response = respond(mode, signs, rows, v)
+                if response is None or not response.ratio > 0:
+                    ratios.extend([] if response is None else [response.ratio])
+                    return None
+                acceleration, rates = (
+                    response.acceleration @ load,
+                    rates + response.rates @ load / 2,
+                )
+                held = response.force_limits @ load / mode.force_limit_units
+            gained = signs * rates / (measure_rates(self.problem.scene, count) / scales.time)
+            cones = held[count:].reshape(2, -1).min(axis=0)
+            margins = [np.inf]
+            for unit in still:
+                row = unit.rows[0]
+                if signs[row] == 0:
+                    margins.append(cones[mode.holders.index(unit.rows)])
+                elif abs(gained[row]) > CLEAR:
+                    margins.append(gained[row])
+            fixed = find_fixed(mode, present.A, present.A_t)
+            return Choice(signs, fixed, float(min(margins)), float(held[:count].min()))
+
+        choices: list[Choice] = []
+        for options in product(*orders):
+            tried = signs.copy()
+            for unit, sign in zip(still, options, strict=True):
+                tried[list(unit.rows)] = sign
+            choice = measure(tried)
+            if choice is None:
+                continue
+            if choice.margin > CLEAR and choice.pressing > -CLEAR:
+                return choice
+            choices.append(choice)
+        pressing = [choice for choice in choices if choice.pressing > -CLEAR]
+        best = max(pressing, key=lambda choice: choice.margin, default=None)
+        if best is not None and best.margin > -CLEAR:
+            return best
+        # A contact is about to be lost, and its forces say which.
+        pulling = [choice for choice in choices if choice.pressing <= -CLEAR]
+        if pulling:
+            return max(pulling, key=lambda choice: choice.margin)
+        if min(ratios) <= 0:
+            self.fail_to_step(min(ratios))
+        names = " ".join(formation.names)
+        raise JammingError(
+            f"{names} jams {self.where()}: no combination of sliding and sticking is consistent"
+        )
+
+    def _take_signs(self, signs: Array, still: Sequence[Unit]) -> None:
+        """Go on with the directions chosen; rounding of speeds against them is taken away."""
+        rows = evaluate_rows(self.formation, self.z, self.v)
+        gradients = np.vstack([rows.A_t, np.eye(5)[3:]])
+        wrong = [
+            unit.rows[0]
+            for unit in still
+            if signs[unit.rows[0]] == 0
+            or signs[unit.rows[0]] * (gradients[unit.rows[0]] @ self.v) < 0
+        ]
+        rolling = list(self.formation.rolling_rows)
+        self.project_velocity(np.vstack([rows.A, gradients[rolling + wrong]]))
+        mode = find_mode(self.formation, signs)
+        if mode != self.leg.mode:
+            self.take(mode)
+        self.signs = signs
+        self.heading = self.v / np.sqrt(self.system.mass @ self.v**2)
+
 
 def project_velocity(formation: Formation, z: Array, v: Array) -> Array:
     """Velocity nearest to `v` in the metric M5 that keeps every constraint, shape (5,)."""
     P = formation.evaluate(z[None], v[None]).P[0]
     return solve_impulses(formation.scene.mass_diagonal, P, P, v)[0]
-
-
-def choose_mode(
-    run: Replay, turned: Sequence[int] = (), *, time: float | None = None, enters: bool = False
-) -> bool:
-    """Choose the friction signs of all that stands still; whether the motion has ended.
-
-    Parameters as of `simulate.restart`.
-    """
-    formation, signs = run.formation, run.signs
-    run.look()
-    slow = np.abs(run.values[run.leg.rows.turning]) < STANDING
-    still = [
-        unit
-        for unit in list_units(formation)
-        if set(unit.rows) & set(turned) or (unit.grips and slow[list(unit.rows)].any())
-    ]
-    if not still:
-        return False
-    if is_slower(run.problem.scene, run.v, STANDING):
-        return True
-    if not run.gets_on():
-        names = " ".join(formation.names)
-        raise SimulationError(f"sticking and slipping of {names} do not end {run.where()}")
-    orders = [_list_options(run, unit, float(signs[unit.rows[0]]), turned) for unit in still]
-    choice = _choose(run, signs, still, orders)
-    _take(run, choice.signs, still)
-    for unit in still:
-        row = unit.rows[0]
-        before = 0.0 if row in run.stuck else float(signs[row])
-        after = float(choice.signs[row]) if not choice.fixed[row] else 0.0
-        changes = before != after and not (enters and after) and unit.grips
-        for row in unit.rows if changes else ():
-            note_change(run, row, before, after, run.t if time is None else time)
-        run.stuck = (run.stuck - set(unit.rows)) | set(() if after else unit.rows)
-    return False
-
-
-def note_change(run: Replay, row: int, before: float, after: float, time: float) -> None:
-    """Record that a contact or joint sticks, slips or turns back."""
-    names = run.formation.names
-    contact = row < len(names)
-    name = names[row] if contact else f"joint {row - len(names) + 1}"
-    kind, text = describe_change(name, before, after, "slides" if contact else "turns")
-    run.note(kind, f"{text} at t = {time:.5g} s, phase {run.phase.number}", name, time=time)
-
-
-def _list_options(
-    run: Replay, unit: Unit, present: float, turned: Sequence[int]
-) -> tuple[float, ...]:
-    """Directions to try for one unit, in the order in which the first clear one is taken."""
-    if present != 0:
-        first = -present if set(unit.rows) & set(turned) else present
-        return (first, 0.0, -first) if unit.grips else (first, -first)
-    holder = run.leg.mode.holders.index(unit.rows)
-    low, high = run.values[run.leg.rows.cone].reshape(2, -1)[:, holder]
-    sign = 1.0 if high < low else -1.0
-    # Friction is at the edge of its cone and opposes the slip to come.
-    edge = min(low, high) < ROUNDING_FORCE
-    return (sign, -sign, 0.0) if edge else (0.0, sign, -sign)
-
-
-def _choose(
-    run: Replay, signs: Array, still: Sequence[Unit], orders: Sequence[tuple[float, ...]]
-) -> Choice:
-    """Signs of the first clear combination or of the best; `JammingError` if none is consistent."""
-    formation, scales, ahead = run.formation, run.system.scales, run.settling
-    loads = [np.array([1.0, *run.tau(t)]) for t in (run.t, run.t + ahead)]
-    present, count, ratios = evaluate_rows(formation, run.z, run.v), formation.n_contacts, [1.0]
-
-    def measure(signs: Array) -> Choice | None:
-        """Margins of one combination; None if it jams or leaves its forces undetermined."""
-        mode = Mode(formation, find_grips(formation, signs))
-        if mode.n_constraints > 4:
-            return None
-        acceleration, rates = np.zeros(5), np.zeros(count + 2)
-        for delay, load in zip((0.0, ahead), loads, strict=True):
-            v = run.v + delay * acceleration
-            z = run.z + delay * (run.v + v) / 2
-            rows = evaluate_rows(formation, z, v) if delay else present
-            response = respond(mode, signs, rows, v)
-            if response is None or not response.ratio > 0:
-                ratios.extend([] if response is None else [response.ratio])
-                return None
-            acceleration, rates = response.acceleration @ load, rates + response.rates @ load / 2
-            held = response.force_limits @ load / mode.force_limit_units
-        gained = signs * rates / (measure_rates(run.problem.scene, count) / scales.time)
-        cones = held[count:].reshape(2, -1).min(axis=0)
-        margins = [np.inf]
-        for unit in still:
-            row = unit.rows[0]
-            if signs[row] == 0:
-                margins.append(cones[mode.holders.index(unit.rows)])
-            elif abs(gained[row]) > CLEAR:
-                margins.append(gained[row])
-        fixed = find_fixed(mode, present.A, present.A_t)
-        return Choice(signs, fixed, float(min(margins)), float(held[:count].min()))
-
-    choices: list[Choice] = []
-    for options in product(*orders):
-        tried = signs.copy()
-        for unit, sign in zip(still, options, strict=True):
-            tried[list(unit.rows)] = sign
-        choice = measure(tried)
-        if choice is None:
-            continue
-        if choice.margin > CLEAR and choice.pressing > -CLEAR:
-            return choice
-        choices.append(choice)
-    pressing = [choice for choice in choices if choice.pressing > -CLEAR]
-    best = max(pressing, key=lambda choice: choice.margin, default=None)
-    if best is not None and best.margin > -CLEAR:
-        return best
-    # A contact is about to be lost, and its forces say which.
-    pulling = [choice for choice in choices if choice.pressing <= -CLEAR]
-    if pulling:
-        return max(pulling, key=lambda choice: choice.margin)
-    if min(ratios) <= 0:
-        run.fail_to_step(min(ratios))
-    names = " ".join(formation.names)
-    raise JammingError(
-        f"{names} jams {run.where()}: no combination of sliding and sticking is consistent"
-    )
-
-
-def _take(run: Replay, signs: Array, still: Sequence[Unit]) -> None:
-    """Go on with the directions chosen; rounding of speeds against them is taken away."""
-    formation, v = run.formation, run.v
-    kinematics = formation.evaluate(run.z[None], v[None])
-    gradients = np.vstack([kinematics.A_t[0], np.eye(5)[3:]])
-    wrong = [
-        unit.rows[0]
-        for unit in still
-        if signs[unit.rows[0]] == 0 or signs[unit.rows[0]] * (gradients[unit.rows[0]] @ v) < 0
-    ]
-    run.project_velocity(np.vstack([kinematics.P[0], gradients[wrong]]))
-    grips = find_grips(formation, signs)
-    if grips != run.leg.mode.grips:
-        run.take(grips)
-    run.signs = signs
-    run.heading = run.v / np.sqrt(run.system.mass @ run.v**2)

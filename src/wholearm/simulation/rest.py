@@ -26,7 +26,7 @@ from ..contacts.formation import Formation
 from ..mechanics.dynamics import Directions
 from ..mechanics.statics import GRAZE, Statics, TorquePolygon
 from ..scene.model import Scene
-from .modes import find_grips, list_units, respond, share_mode
+from .modes import find_mode, list_units, respond
 from .system import ContactRows
 from .tolerances import ROUNDING_FORCE, STILL, measure_units
 
@@ -181,7 +181,7 @@ class Rest:
     def _build(self, signs: Array, heading: Array | None = None) -> StartMode | None:
         """The start mode of some signs, (n_c + 2,); None if its forces are not determined."""
         formation, scene, count = self.formation, self.formation.scene, self.formation.n_contacts
-        mode = share_mode(formation, find_grips(formation, signs))
+        mode = find_mode(formation, signs)
         rows = ContactRows(self.statics.A, self.statics.A_t, np.zeros(count), np.zeros(count))
         response = respond(mode, signs, rows, np.zeros(5))
         if response is None:

@@ -21,7 +21,7 @@ from ..mechanics.statics import Statics
 from ..problem.definition import Phase, Problem
 from ..results.report import Approach, ForceAt, Loss, PhaseReport, TorqueAdvice, TuningHelp
 from ..simulation.events import EventKind, Simulation
-from ..simulation.modes import evaluate_rows, find_grips, list_units, respond, share_mode
+from ..simulation.modes import evaluate_rows, find_mode, list_units, respond
 from ..simulation.rest import StartMode, find_rest
 from ..simulation.tolerances import measure_rates
 from .verdict import Allowance
@@ -287,13 +287,13 @@ def answer(formation: Formation, z: Array, v: Array, signs: Array) -> Instant | 
 
     Signs are zero for what rolls or friction holds. None if forces are not determined.
     """
-    mode = share_mode(formation, find_grips(formation, signs))
+    mode = find_mode(formation, signs)
     response = respond(mode, signs, evaluate_rows(formation, z, v), v)
     if response is None:
         return None
     count, held = formation.n_contacts, len(mode.holders)
     c_n, cones = response.force_limits[:count], response.force_limits[count:]
-    c_t = -(mode.rolled.sliding_friction * signs[:count])[:, None] * c_n
+    c_t = -(formation.sliding_friction * signs[:count])[:, None] * c_n
     for k, rows in enumerate(mode.holders):
         if rows[0] < count:
             # The sides of a cone are mu c_n - c_t and mu c_n + c_t.
