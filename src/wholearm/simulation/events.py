@@ -116,14 +116,6 @@ class Energies(NamedTuple):
         return np.asarray(self.work - (self.stored - self.stored[0]) - losses)
 
 
-class Glimpses(NamedTuple):
-    """Normal forces within steps, to the accuracy of Runge-Kutta stages."""
-
-    t: Array  # (k,) [s]
-    phase: NDArray[np.int64]  # (k,)
-    c_n: Array  # (k, m) [N]: naN where a contact is not in the formation
-
-
 class FreeStretch(NamedTuple):
     """Some time in which a contact presses."""
 
@@ -226,7 +218,6 @@ class Record(NamedTuple):
 
     t: float
     phase: int
-    section: int  # counts changes of modes
     kept: tuple[int, ...]  # pairs that press
     y: Array  # z, z' and integrals
     acceleration: Array
@@ -236,11 +227,11 @@ class Record(NamedTuple):
     impact: float  # [J]: energy lost to impacts so far
 
     @staticmethod
-    def of(s: ModeStepper, t: float, phase: int, section: int, impact: float) -> Record:
+    def of(s: ModeStepper, t: float, phase: int, impact: float) -> Record:
         """What the outputs of some steps say."""
         out, to, kept = s.outputs.copy(), s.to, s.modes.kept
         state = out[to.y], out[to.acceleration], out[to.tau]
-        return Record(t, phase, section, kept, *state, out[to.c_n], out[to.c_t], impact)
+        return Record(t, phase, kept, *state, out[to.c_n], out[to.c_t], impact)
 
 
 _NUMBERS = attrgetter("t", "phase", "y", "acceleration", "tau", "impact")

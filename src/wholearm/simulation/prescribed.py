@@ -48,7 +48,7 @@ from .hand import build_system
 from .modes import Mode, Unit, evaluate_rows, find_fixed, find_mode, list_units, respond
 from .rest import Collapse, Rest, StartDeparture, close_contacts, find_rest
 from .run import Run, StuckError
-from .stepper import ModeStepper
+from .stepper import INNER_STAGES, NODES, ModeStepper
 from .tolerances import (
     CREEPING,
     FIRST_STEP,
@@ -69,12 +69,23 @@ from .tolerances import (
 )
 
 CLEAR = 1e-8  # least margin of a clear decision, over the scene's units
+DIP = 1e-7  # how far margins have to dip within a step to be recorded there, over the scene's units
 _OUTCOMES = {
     ViolationKind.PULL: OutcomeKind.CONTACT_LOST,
     ViolationKind.SLIP: OutcomeKind.SLIPS,
     ViolationKind.CLOSING: OutcomeKind.LIMIT_REACHED,
     ViolationKind.HELD: OutcomeKind.HELD,
 }
+
+
+def _interpolate_stages() -> tuple[Array, Array]:
+    """Chebyshev points of a step, and values there from those at `INNER_STAGES` and the ends."""
+    nodes = np.array([0.0, *(NODES[stage] for stage in INNER_STAGES), 1.0])[:, None]
+    places, powers = (1 - np.cos(np.pi * np.arange(17) / 16)) / 2, np.arange(len(nodes))
+    return places, np.asarray(places[:, None] ** powers @ np.linalg.inv(nodes**powers))
+
+
+_PLACES, _INSIDE = _interpolate_stages()
 
 
 class LegRows(NamedTuple):
@@ -110,21 +121,6 @@ class ModeSegment(NamedTuple):
     # m values, distance to the end [m or rad], its rate, heading
     event_values: Array
     buffers: Any  # what has to live as long as these
-    phase: int = 0  # index of its phase
-    section: int = 0  # number of its records
-
-
-class Step(NamedTuple):
-    """A step that has been made, into which may be looked."""
-
-    leg: ModeSegment
-    t: float  # t, h [s]: its start and length
-    h: float
-    inputs: Array  # its packed inputs
-    heading: Array  # direction of the velocity at its start
-    stage_forces: Array
-    impact: float  # [J]: energy lost to impacts so far
-    arrives: bool  # whether it ends where the phase ends, which it has passed by rounding
 
 
 @lru_cache(maxsize=64)
@@ -229,7 +225,8 @@ class Replay(Run):
     passes                   whether the end may be passed at any speed, without an impact
     moving                   whether the motion goes on into the next phase
     stuck                    contacts, then joints, that stick while the rest moves
-    taken                    steps so far, but for those that coast
+    minima                   whether to record where margins are least within steps, too
+    arrives                  whether the step just made ends the phase, which it passes by rounding
     """
 
     leg: ModeSegment
@@ -241,21 +238,25 @@ class Replay(Run):
     slipping: frozenset[int]
 
     def __init__(
-        self, problem: Problem, torque: TorqueProfile, tolerance: float, wanted: Array
+        self,
+        problem: Problem,
+        torque: TorqueProfile,
+        tolerance: float,
+        wanted: Array,
+        minima: bool,
     ) -> None:
         system = build_system(problem.scene)
         super().__init__(system, torque, np.asarray(problem.start), np.zeros(5), tolerance, wanted)
-        self.problem, time = problem, system.scales.time
+        self.problem, self.minima, time = problem, minima, system.scales.time
         self.settling, self.rest_window = SETTLING * time, REST_WINDOW * time
         self.longest_window = LONGEST_WINDOW * time
         self.rounding = ROUNDING_FORCE * system.scales.force
         self.step_times = [b for b, s in zip(self.breaks, self.steps_at, strict=False) if s]
         self.held_until = self.settled_by = -math.inf
         self.until_unit = self.side = 1.0
-        self.passes = self.moving = False
+        self.passes = self.moving = self.arrives = False
         self.stuck: set[int] = set()
         self.slip_signs: dict[str, float] = {}
-        self.taken: list[Step] = []
 
     @property
     def formation(self) -> Formation:
@@ -277,11 +278,9 @@ class Replay(Run):
         """Go on with the steps of a mode of the phase's formation."""
         modes = mode.find_modes()
         self.load(modes._replace(Xi=(0.0,) * len(modes.kept), sigma=(0.0,) * 5))
-        self.section += 1
-        leg = _build_leg(self.formation, self.phase.until, self.side, self.s, mode)
-        self.leg = leg._replace(phase=self.phase.index, section=self.section)
-        self.slack, self.heading = leg.slack, np.zeros(5)
-        self.urgent = leg.rows.speed
+        self.leg = _build_leg(self.formation, self.phase.until, self.side, self.s, mode)
+        self.slack, self.urgent = self.leg.slack, self.leg.rows.speed
+        self.heading = np.zeros(5)
 
     def measure(self) -> Array:
         """Event values after the step just made."""
@@ -317,28 +316,11 @@ class Replay(Run):
         self.look()
         self.record()
 
-    def accept(self, t: float) -> None:
+    def keep(self, t: float) -> None:
         """Take the step just made, to time `t`, and record its end."""
         super().keep(t)
         self.heading = self.leg.event_values[-5:]
         self.require_inertia()
-
-    def keep(self, t: float) -> None:
-        """Accept the step to time `t` as one to look into."""
-        s = self.s
-        inputs, forces = s.inputs.copy(), s.outputs[s.to.stage_forces].copy()
-        step = Step(
-            self.leg,
-            self.t,
-            t - self.t,
-            inputs,
-            self.heading.copy(),
-            forces,
-            self.impact,
-            self.arrives,
-        )
-        self.accept(t)
-        self.taken.append(step)
 
     def require_inertia(self) -> None:
         """Raise a `JammingError` where friction leaves no reduced inertia."""
@@ -540,11 +522,61 @@ class Replay(Run):
 
     def locate(self, h: float, t: float) -> list[int]:
         """Shorten the step just made to its first event; rows of its event values."""
-        self.arrives = False
-        if not (self.values < -self.slack).any():
-            return []
-        self.arrives = self._is_at_end(t)
-        return [] if self.arrives else self.find_first(h)
+        found, records, least = list[int](), list[Record](), math.inf
+        passes = bool((self.values < -self.slack).any())
+        self.arrives = passes and self._is_at_end(t)
+        if passes and not self.arrives:
+            found = self.find_first(h)
+        if self.minima:
+            records, least = self._look_inside(float(self.s.inputs[self.s.at.h]))
+        if least < math.inf:
+            self.step_to(least)
+            found = self.find_first(least)
+        end = self.t + float(self.s.inputs[self.s.at.h])
+        self.records += [record for record in records if record.t < end]
+        return found
+
+    def _look_inside(self, h: float) -> tuple[list[Record], float]:
+        """States where margins are least within the step just made, of length h [s].
+
+        Returns them and the first of these instants at which an event shows, since the start of
+        the step, infinity if there is none.
+        """
+        s, rows, slack = self.s, self.leg.rows, self.slack.copy()
+        margins = s.outputs[s.to.values][: rows.cone.stop]
+        known = np.vstack([s.outputs[s.to.stages].reshape(-1, len(margins)), margins])
+        inside = _INSIDE @ known
+        dips = inside.min(axis=0) < np.minimum(known[0], known[-1]) - DIP
+        if not dips.any():
+            return [], math.inf
+        # Within a step more counts as rounding than at its end.
+        slack[rows.turning] = slack[rows.speed] = STANDING
+        slack[rows.until] = ROUNDING_LIMIT
+        if self.arrives:
+            slack[rows.until] = slack[rows.speed] = slack[rows.turning] = math.inf
+        found: dict[float, tuple[Record, Array, bool]] = {}
+
+        def look(x: float) -> None:
+            if 0 < x < 1 and x not in found:
+                self.step_to(x * h)
+                record = Record.of(s, self.t + x * h, self.phase_index, self.impact)
+                found[x] = record, self.values, bool((self.values + slack < 0).any())
+
+        for row in np.flatnonzero(dips).tolist():
+            middle = min(max(int(inside[:, row].argmin()), 1), len(_PLACES) - 2)
+            around = _PLACES[middle - 1 : middle + 2].tolist()
+            for x in around:
+                look(x)
+            ends = {0.0: known[0], 1.0: known[-1]}
+            values = [(found[x][1] if x in found else ends[x])[row] for x in around]
+            fall, rise = np.diff(values) / np.diff(around)
+            if rise > fall:
+                span = (around[2] - around[0]) / (rise - fall)
+                look(float(around[0] + around[1] - fall * span) / 2)
+        self.step_to(h)
+        states = [found[x] for x in sorted(found)]
+        shown = [x for x in sorted(found) if found[x][2]]
+        return [record for record, _, _ in states], shown[0] * h if shown else math.inf
 
     def _is_at_end(self, t: float) -> bool:
         """Whether the step just tried ends the phase, at a torque break and but for rounding.
@@ -753,34 +785,6 @@ class Replay(Run):
         self.signs = signs
         return self.restart(enters=formation.n_constraints < 4)
 
-    def look_within(self, times: Array) -> list[float]:
-        """Record states at increasing instants, (n,) [s], within steps; those of missed events."""
-        missed: list[float] = []
-        begins = np.array([step.t for step in self.taken])
-        owners = np.searchsorted(begins, times, side="left") - 1
-        for time, owner in zip(times.tolist(), owners.tolist(), strict=True):
-            step = self.taken[max(owner, 0)] if self.taken else None
-            if step is None or owner < 0 or time - step.t >= step.h:
-                continue
-            leg, s = step.leg, step.leg.stepper
-            s.inputs[:] = step.inputs
-            s.inputs[s.at.h] = time - step.t
-            s.step()
-            self.records.append(Record.of(s, time, leg.phase, leg.section, step.impact))
-            # Within a step more counts as rounding than at its end.
-            rows, slack = leg.rows, leg.slack.copy()
-            slack[rows.turning] = slack[rows.speed] = STANDING
-            slack[rows.until] = ROUNDING_LIMIT
-            leg.heading[:] = step.heading
-            leg.measure()
-            short = leg.event_values[: len(slack)] + slack < 0
-            if step.arrives:
-                # The end of the phase may be passed.
-                short[rows.until] = short[rows.speed] = short[rows.turning] = False
-            if short.any():
-                missed.append(time)
-        return missed
-
     def restart(
         self, turned: Sequence[int] = (), *, time: float | None = None, enters: bool = False
     ) -> Ending | None:
@@ -934,14 +938,14 @@ class Replay(Run):
         while self.wanted[self.next_wanted] < stop:
             place = self.wanted[self.next_wanted]
             self.step_to(place - self.t)
-            self.accept(place)
+            self.keep(place)
             if hide:
                 row = self.records[-1]
                 none = np.full(len(row.kept), np.nan)
                 self.records[-1] = row._replace(c_n=none, c_t=none)
             self.next_wanted += 1
         self.step_to(stop - self.t)
-        self.accept(stop)
+        self.keep(stop)
 
     def coast_to_step(self, hide: bool) -> None:
         """Step to where the torques step next, as `coast` does, and go on to the next piece."""

@@ -91,7 +91,6 @@ class Run(ABC):
     steps_at             whether the torques step at the start of each piece
     impact : [J]         energy lost to impacts so far
     wanted : [s]         instants at which steps have to end; infinity is last
-    section              counts changes of modes: records are in order within each section
     values, start        event values after the step just made and before it, in units of the scene:
                          an event is where one falls below zero
     slack                how far below zero each of them counts as rounding
@@ -124,7 +123,7 @@ class Run(ABC):
         self.y = np.concatenate([z, v, np.zeros(LOSSES)])
         self.h = FIRST_STEP * system.scales.time
         self.impact = 0.0
-        self.phase_index = self.section = self.steps = self.rejected = 0
+        self.phase_index = self.steps = self.rejected = 0
         self.records: list[Record] = []
         self.events: list[Event] = []
         wanted = np.zeros(0) if wanted is None else wanted
@@ -411,7 +410,7 @@ class Run(ABC):
 
         At rest accelerations are zero, and forces are NaN, as they are indeterminate.
         """
-        here = self.t, self.phase_index, self.section
+        here = self.t, self.phase_index
         if still:
             kept, n = self.modes.kept, self.system.n
             none, tau = np.full(len(kept), math.nan), self.tau(self.t)

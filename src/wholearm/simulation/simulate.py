@@ -24,7 +24,6 @@ from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from .events import (
     EventKind,
-    Glimpses,
     Outcome,
     OutcomeKind,
     Simulation,
@@ -32,16 +31,13 @@ from .events import (
     list_stretches,
 )
 from .hand import build_system, measure_gaps
-from .prescribed import Replay, Step
+from .prescribed import Replay
 from .run import Feedback, Law, Run
-from .stepper import INNER_STAGES, NODES, Modes
+from .stepper import Modes
 from .tolerances import SLOW, is_slower
 
 if TYPE_CHECKING:
     from .complementarity import FreeRun
-
-Closer = Callable[[Simulation, Glimpses, int], ArrayLike]
-"""Simulation, forces within its steps and number of calls so far -> further instants to check."""
 
 
 class PhaseRun(NamedTuple):
@@ -63,7 +59,7 @@ def simulate(
     restitution: float = 0.0,
     tolerance: float = 1e-9,
     times: ArrayLike | None = None,
-    closer: Closer | None = None,
+    minima: bool = False,
     halt: Callable[[FreeRun], bool] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Simulation:
@@ -90,9 +86,7 @@ def simulate(
 
     With prescribed contacts:
 
-    closer    simulation, forces within its steps and number of calls so far -> instants (n,) [s]
-              within steps to evaluate too, until there are none. Steps change only if an event
-              shows there that their ends miss.
+    minima    whether to record also where normal forces and friction margins are least within steps
     progress  receives a line at the start of each phase
 
     Returns
@@ -118,7 +112,8 @@ def simulate(
             raise InputError("", "contacts", text)
         problem, profile, _ = adopt_torques(problem, what)
         require_phases(problem)
-        return _replay(problem, profile, tolerance, wanted, closer, progress)
+        run = Replay(problem, profile, tolerance, wanted, minima)
+        return _conclude(run, problem, *run.play(progress))
     state = _require_start(problem, start)
     if require_number(restitution, "restitution", nonnegative=True) > 1:
         raise InputError("", "restitution", f"{restitution!r} is not between 0 and 1")
@@ -179,32 +174,6 @@ def simulate_phases(
     return tuple(found)
 
 
-def _replay(
-    problem: Problem,
-    profile: TorqueProfile,
-    tolerance: float,
-    wanted: Array,
-    closer: Closer | None,
-    progress: Callable[[str], None] | None,
-) -> Simulation:
-    for attempts in range(8, 0, -1):
-        run = Replay(problem, profile, tolerance, wanted)
-        outcome, missed_by = run.play(progress)
-        simulation = _conclude(run, problem, outcome, missed_by)
-        missed, calls = list[float](), 0
-        glimpses = list_glimpses(run.problem, run.taken if closer else ())
-        while closer and not missed:
-            times = _sort_times(closer(simulation, glimpses, calls))
-            if not len(times):
-                break
-            missed, calls = run.look_within(times), calls + 1
-            simulation = _conclude(run, problem, outcome, missed_by)
-        if not missed or attempts == 1:
-            break
-        wanted, progress = _sort_times([*wanted, *missed]), None
-    return simulation
-
-
 def _simulate(
     problem: Problem,
     profile: TorqueProfile | Feedback,
@@ -240,8 +209,7 @@ def _conclude(
     clock: Array | None = None,
 ) -> Simulation:
     """The result of a run; `clock`: starts of phases that count by time alone [s]."""
-    # What has been seen within steps comes last in its section.
-    names, records = run.system.names, sorted(run.records, key=lambda row: (row.section, row.t))
+    names, records = run.system.names, run.records
     contacts = [contact.name for contact in problem.contacts]
     events = sorted(run.events, key=lambda event: event.time)
     if clock is not None:
@@ -270,19 +238,6 @@ def _conclude(
         stretches=list_stretches(records, names),
         residual=run.residual,
     )
-
-
-def list_glimpses(problem: Problem, steps: Sequence[Step]) -> Glimpses:
-    """Normal forces at the stages of all steps."""
-    nodes, names = np.array(NODES)[list(INNER_STAGES)], [c.name for c in problem.contacts]
-    columns = [(np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros((0, len(names))))]
-    for step in steps:
-        formation = step.leg.mode.formation
-        c_n = np.full((len(nodes), len(names)), np.nan)
-        at = [names.index(name) for name in formation.names]
-        c_n[:, at] = step.stage_forces.reshape(len(nodes), -1)
-        columns.append((step.t + nodes * step.h, np.full(len(nodes), step.leg.phase), c_n))
-    return Glimpses(*(np.concatenate(column) for column in zip(*columns, strict=True)))
 
 
 def _recall(problem: Problem, plan: Trajectory, row: int) -> Modes:

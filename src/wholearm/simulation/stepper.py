@@ -131,7 +131,7 @@ class Outputs(NamedTuple):
     values: slice
     error: int  # estimated error over the tolerance; accept at 1 and below
     dip: int  # least force or friction margin at stages within the step, at most 1
-    stage_forces: slice  # c_n at the stages of `INNER_STAGES`, one after the other [N]
+    stages: slice  # margins at the start and the stages of `INNER_STAGES`, one after the other
     size: int
 
 
@@ -191,33 +191,32 @@ class _Equations:
         numbers = (g, n, n, n, n, k, 2 * n, 2, n)
         self.at = Inputs(*_lay_out(size, None, None, None, k, n, s, 2, 2 * degree + 2, *numbers))
         self.rows = EventRows(*_lay_out(k, 2 * s, k, n))
-        brief = len(INNER_STAGES) * k
-        outputs = (size, n, k, k, 2, None, self.rows.size, None, None, brief)
+        seen = (1 + len(INNER_STAGES)) * self.rows.cone.stop
+        outputs = (size, n, k, k, 2, None, self.rows.size, None, None, seen)
         self.to = Outputs(*_lay_out(*outputs))
 
     def compile(self) -> ModeStepper:
         """Steps, and looks at a state, as functions of the packed inputs."""
-        at, n, k = self.at, self.n, len(self.modes.kept)
+        at, n = self.at, self.n
         stage, report = self._build_motion()
         packed = ca.MX.sym("packed", at.size)
         y, t, h, geometry = packed[at.y], packed[at.t], packed[at.h], packed[at.geometry]
-        stages: list[tuple[Expression, ...]] = []
+        stages: list[Expression] = []
 
         def rate(state: Expression, time: Expression) -> Expression:
-            rates, *forces = stage(state, time, packed, geometry)
-            stages.append(tuple(forces))
+            rates, margins = stage(state, time, packed, geometry)
+            stages.append(margins)
             return rates
 
         end, fifth, third = build_step(rate, y, t, h, 2 * n)
         error = build_error(fifth, third, y[: 2 * n], packed[at.units], packed[at.tolerance])
-        inner = [stages[row] for row in INNER_STAGES]
-        dip = ca.mmin(ca.vertcat(*(least for _, least in inner)))
-        seen = (error, dip, *(c_n for c_n, _ in inner))
+        inner = ca.vertcat(*(stages[row] for row in INNER_STAGES))
+        seen = (error, ca.mmin(ca.vertcat(1, inner)), stages[0], inner)
         end = ca.vertcat(self._build_projection()(end[: 2 * n], packed), end[2 * n :])
         functions = []
         for state, time, extra in (
             (end, t + h, seen),
-            (y, t, (0, 1, ca.DM.zeros(len(INNER_STAGES) * k))),
+            (y, t, (0, 1, ca.DM.zeros(seen[2].shape[0] + inner.shape[0]))),
         ):
             parts = report(state[: 2 * n], time, packed, geometry)
             outputs = ca.densify(ca.vertcat(state, parts, *extra))
@@ -238,8 +237,8 @@ class _Equations:
     def _build_motion(self) -> tuple[Expression, Expression]:
         """CasADi functions of state, time, packed inputs and geometry.
 
-        The first one returns rates of the state, c_n and the least margin; the second one the
-        outputs from the acceleration to the event values.
+        The first one returns rates of the state and margins; the second one the outputs from the
+        acceleration to the event values.
         """
         structure, n, at, groups = self.structure, self.n, self.at, self.groups
         k, held = len(self.modes.kept), list(self.modes.held)
@@ -278,7 +277,7 @@ class _Equations:
             share = c_n[rows] / ca.fmax(ca.sum1(c_n[rows]), 1e-300) if len(rows) > 1 else 1
             c_t[rows] = friction * share
         inputs = [ca.vertcat(z, v), time, packed, structure.geometry]
-        stage = [ca.vertcat(v, acceleration, *losses), c_n, ca.mmin(ca.vertcat(1.0, margins))]
+        stage = [ca.vertcat(v, acceleration, *losses), margins]
         report = [ca.vertcat(acceleration, c_n, c_t, tau, ratio, margins, *speeds)]
         return (
             ca.Function("stage", inputs, [ca.densify(part) for part in stage]),

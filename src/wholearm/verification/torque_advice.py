@@ -133,7 +133,7 @@ def find_approach(problem: Problem, simulation: Simulation) -> Approach | None:
     is_angle = phase.until.coordinate == "phi"
     gaps, gradient, _ = distance
     rates = -np.einsum("ni,ni->n", gradient, v)
-    least, time = find_lowest(t, gaps, simulation.torque.breaks)
+    least, time = find_lowest(t, gaps)
     unit = scales.rate if is_angle else scales.speed
     going = np.flatnonzero(np.abs(rates) > 1e-6 * unit)
     turns = going[np.flatnonzero(np.diff(np.sign(rates[going])))]

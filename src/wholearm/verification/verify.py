@@ -33,9 +33,9 @@ from ..results.report import (
     SlipMargin,
 )
 from ..results.torque import TorqueProfile
-from ..results.trajectory import Trajectory
-from ..simulation.events import Event, EventKind, Glimpses, Simulation
-from ..simulation.simulate import Closer, simulate
+from ..results.trajectory import Trajectory, interpolate_quintic
+from ..simulation.events import Event, EventKind, Simulation
+from ..simulation.simulate import simulate
 from ..simulation.tolerances import SETTLING
 from .force_uniqueness import find_departure, find_uniqueness_margin, find_wedged
 from .verdict import (
@@ -55,17 +55,10 @@ from .verdict import (
 if TYPE_CHECKING:
     from .free import FreeReport
 
-SHORTEST = 2 * SETTLING
-"""Interval below which forces may jump, and rounding spoils a parabola, relative to the scene's
-time."""
 MISSED = 1e-6  # miss of a limit, over what is much for it, from which on it is reported
 ROWS = 20
 """About how many rows of each phase of a trajectory its replay is compared with; without one, about
 how many even parts of each phase are looked at."""
-_DIP = 1e-7
-"""How far below all that is known a dip has to seem, relative to the scene's force or length."""
-Dips = list[tuple[float, float]]
-"""Where something seems to dip, from start to end [s]."""
 _ENDS = (EventKind.ARRIVAL, EventKind.RELEASE)
 _CHANGES = {EventKind.STICK: "sticks", EventKind.SLIP: "slips", EventKind.REVERSAL: "reverses"}
 
@@ -178,17 +171,27 @@ def observe(
     ------
     JammingError, SimulationError  if the simulation cannot go on
     """
-    times, closer = choose_times(problem, torque, plan), make_closer(problem, torque.breaks)
-    simulation = simulate(problem, torque, tolerance=tolerance, times=times, closer=closer)
+    times = choose_times(problem, torque, plan)
+    simulation = simulate(problem, torque, tolerance=tolerance, times=times, minima=True)
     phases = tuple(
         _report_phase(problem, simulation, torque, plan, index, uniqueness)
         for index in range(int(simulation.phase[-1]) + 1)
     )
-    gap, shortest = None, SHORTEST * problem.scene.scales.time
-    if problem.scene.fingers_collide:
-        gaps = evaluate_finger_gap(problem.scene, simulation.z)
-        gap = FingerGap(*find_lowest(simulation.t, gaps, torque.breaks, shortest))
+    gap = find_finger_gap(simulation) if problem.scene.fingers_collide else None
     return Observation(problem, torque, plan, tolerance, simulation, phases, gap)
+
+
+def find_finger_gap(simulation: Simulation) -> FingerGap:
+    """Least gap of the fingers, on quintics through the recorded states."""
+    t, z, scene = simulation.t, simulation.z, simulation.problem.scene
+    left, share = np.flatnonzero(np.diff(t) > 0), np.arange(1, 8) / 8
+    h, run = np.repeat(np.diff(t)[left], 7), np.outer(np.diff(t)[left], share).ravel()
+    knots = z, simulation.z_dot, simulation.z_ddot
+    inside = interpolate_quintic(h, run, knots, np.repeat(left, 7))[0]
+    times = np.append(t, np.repeat(t[left], 7) + run)
+    order = np.argsort(times, kind="stable")
+    gaps = evaluate_finger_gap(scene, np.concatenate([z, inside]))
+    return FingerGap(*find_lowest(times[order], gaps[order], 2 * SETTLING * scene.scales.time))
 
 
 def judge(seen: Observation, allowance: Allowance, reduced: bool = False) -> Report:
@@ -257,7 +260,7 @@ def _report_phase(
     impacts = [e for e in simulation.find(EventKind.IMPACT) if e.phase == index]
     stops = bool(arrivals) and phase.end is End.REST
     moves = find_departure(simulation, torque, index)
-    part, lost = (phase, simulation, rows, torque.breaks), EventKind.CONTACT_LOST
+    part, lost = (phase, simulation, rows), EventKind.CONTACT_LOST
     pressing = _find_least(*part, list_normal_forces(problem, simulation, phase, rows), lost)
     slips = _find_least(*part, list_slips(simulation, phase, rows), EventKind.SLIP)
     end = worst = held = None
@@ -361,90 +364,6 @@ def choose_times(problem: Problem, torque: TorqueProfile, plan: Trajectory | Non
     return np.concatenate([plan.t[rows] for rows in picked])
 
 
-class Series(NamedTuple):
-    """Recorded values of a force, a margin or a gap in a phase."""
-
-    name: str
-    t: Array  # t, values (n,) [s], [N or m]: at recorded instants
-    values: Array
-    more_t: Array  # more_t, more (k,): by glimpses, in any order
-    more: Array
-    breaks: Array  # [s]: where it may have a kink
-    shortest: float  # [s]: interval below which it may jump
-    depth: float  # [N or m]: how far below the least value a dip has to seem
-
-    def find_dips(self) -> Dips:
-        """Places where it seems to be lower than anywhere recorded, with and without glimpses."""
-        t, values = np.append(self.t, self.more_t), np.append(self.values, self.more)
-        order = np.argsort(t, kind="stable")
-        return [*self._fit(t[order], values[order]), *self._fit(self.t, self.values)]
-
-    def narrow(self, dip: tuple[float, float]) -> Dips:
-        """Places within a dip where it still seems so by what is recorded."""
-        within = slice(*np.searchsorted(self.t, [dip[0], np.nextafter(dip[1], np.inf)]))
-        return self._fit(self.t[within], self.values[within])
-
-    def _fit(self, t: Array, values: Array) -> Dips:
-        parabolas = fit_parabolas(t, values, self.breaks, self.shortest)
-        least = np.nanmin(self.values, initial=np.inf) - self.depth
-        low = np.flatnonzero(parabolas.lowest < least).tolist()
-        return [(float(parabolas.start[k]), float(parabolas.stop[k])) for k in low]
-
-
-def make_closer(problem: Problem, breaks: Array) -> Closer:
-    """Instants to add to a replay, near the minima of forces, slip margins and gaps.
-
-    Parameters
-    ----------
-    breaks : [s]  those of its torques
-    """
-    left: dict[tuple[int, str], Dips] = {}
-
-    def look(simulation: Simulation, glimpses: Glimpses, looks: int) -> Array:
-        before, phases = left.copy(), problem.phases[: int(simulation.phase[-1]) + 1]
-        left.clear()
-        for phase in phases if looks < 3 else ():
-            if looks and not any(index == phase.index for index, _ in before):
-                continue
-            for one in _list_series(problem, simulation, glimpses, phase, breaks):
-                key = phase.index, one.name
-                known = before.get(key, [])
-                dips = [d for dip in known for d in one.narrow(dip)] if looks else one.find_dips()
-                left.update({key: dips} if dips else {})
-        every = [np.linspace(*dip, 10)[1:-1] for dips in left.values() for dip in dips]
-        return np.concatenate([np.zeros(0), *every])
-
-    return look
-
-
-def _list_series(
-    problem: Problem, simulation: Simulation, glimpses: Glimpses, phase: Phase, breaks: Array
-) -> Iterator[Series]:
-    """Forces, slip margins and gaps of a phase; margins and gaps have no jumps."""
-    scales, rows = problem.scene.scales, np.flatnonzero(simulation.phase == phase.index)
-    t, none, shortest = simulation.t[rows], np.zeros(0), SHORTEST * scales.time
-    own = np.flatnonzero(glimpses.phase == phase.index)
-    least = _DIP * scales.force
-    for name, values in list_normal_forces(problem, simulation, phase, rows).items():
-        more = glimpses.c_n[own, simulation.contacts.index(name)]
-        yield Series(name, t, values, glimpses.t[own], more, breaks, shortest, least)
-    for name, values in list_slips(simulation, phase, rows).items():
-        yield Series(f"{name} rolling", t, values, none, none, t[:1], shortest, least)
-    if problem.scene.fingers_collide:
-        gaps = evaluate_finger_gap(problem.scene, simulation.z[rows])
-        yield Series("gap", t, gaps, none, none, t[:1], shortest, _DIP * scales.length)
-
-
-class Parabolas(NamedTuple):
-    """Parabolas through three successive samples each whose vertex lies between the outer ones."""
-
-    start: Array  # start, stop, time (n,) [s]: the outer samples, and the vertex
-    stop: Array
-    time: Array
-    lowest: Array  # (n,): value there
-    dips: NDArray[np.bool_]  # (n,): whether the middle sample is the least of the three
-
-
 def list_normal_forces(
     problem: Problem, simulation: Simulation, phase: Phase, rows: NDArray[np.int64]
 ) -> dict[str, Array]:
@@ -482,15 +401,15 @@ def _find_least(
     phase: Phase,
     simulation: Simulation,
     rows: NDArray[np.int64],
-    breaks: Array,
     series: dict[str, Array],
     kind: EventKind,
 ) -> Iterator[tuple[str, float, float]]:
     """Least value of each contact and its time; that of an event of its loss where it is less."""
     events = {e.contact: e for e in simulation.find(kind) if e.phase == phase.index}
-    shortest = SHORTEST * phase.formation.scene.scales.time
     for name, values in series.items():
-        least, time = find_lowest(simulation.t[rows], values, breaks, shortest)
+        known = not np.isnan(values).all()
+        row = int(np.nanargmin(values)) if known else 0
+        least, time = float(values[row]), float(simulation.t[rows[row]]) if known else math.nan
         if name in events and not least <= events[name].value:
             least, time = events[name].value, events[name].time
         yield name, least, time
@@ -521,57 +440,30 @@ def describe_misses(
     return texts
 
 
-def find_lowest(
-    t: Array, values: Array, breaks: Array, shortest: float = 0.0
-) -> tuple[float, float]:
-    """Least value of a sampled function and where, refined by parabolas inside smooth stretches.
+def find_lowest(t: Array, values: Array, shortest: float = 0.0) -> tuple[float, float]:
+    """Least value of a smooth function and where, refined by parabolas through three samples.
 
     Parameters
     ----------
-    t, values, breaks, shortest  as of `fit_parabolas`
-
-    Returns
-    -------
-    least, time  naN if no value is known
+    t, values : (n,)  times never decrease [s]
+    shortest : [s]    interval below which rounding spoils a parabola
     """
-    if np.isnan(values).all():
-        return math.nan, math.nan
-    first = int(np.nanargmin(values))
+    first = int(values.argmin())
     least, time = float(values[first]), float(t[first])
-    parabolas = fit_parabolas(t, values, breaks, shortest)
-    # Where the middle is not the least of three, a curve that flattens out would seem to dip.
-    lowest = np.where(parabolas.dips, parabolas.lowest, math.inf)
-    if len(lowest) and lowest.min() < least:
-        k = int(lowest.argmin())
-        least, time = float(lowest[k]), float(parabolas.time[k])
-    return least, time
-
-
-def fit_parabolas(t: Array, values: Array, breaks: Array, shortest: float = 0.0) -> Parabolas:
-    """Parabolas with a vertex below their samples, inside smooth stretches of a sampled function.
-
-    Parameters
-    ----------
-    t : (n,) [s]    never decreasing; a jump is there twice
-    values : (n,)   naN where unknown
-    breaks : [s]    where the function may have a kink: no parabola has one inside
-    shortest : [s]  interval below which the function may jump
-    """
     left, right = np.diff(t)[:-1], np.diff(t)[1:]
-    smooth = (left > shortest) & (right > shortest) & ~np.isin(t[1:-1], breaks)
-    smooth &= ~np.isnan(values[:-2] + values[1:-1] + values[2:])
-    left, right, time, middle = left[smooth], right[smooth], t[1:-1][smooth], values[1:-1][smooth]
+    smooth = (left > shortest) & (right > shortest)
+    smooth &= (values[1:-1] <= values[:-2]) & (values[1:-1] <= values[2:])
+    left, right, middle = left[smooth], right[smooth], t[1:-1][smooth]
     fall = (values[1:-1] - values[:-2])[smooth] / left
     rise = (values[2:] - values[1:-1])[smooth] / right
-    bend = (rise - fall) / (left + right)
     slope = (fall * right + rise * left) / (left + right)
     with np.errstate(divide="ignore", invalid="ignore"):
-        shift = -slope / (2 * bend)
-    inside = (bend > 0) & (shift > -left) & (shift < right)
-    left, right, time, shift = left[inside], right[inside], time[inside], shift[inside]
-    lowest = middle[inside] + slope[inside] * shift / 2
-    dips = (fall[inside] <= 0) & (rise[inside] >= 0)
-    return Parabolas(time - left, time + right, time + shift, lowest, dips)
+        shift = np.nan_to_num(-slope * (left + right) / (2 * (rise - fall)))
+    lowest = values[1:-1][smooth] + slope * shift / 2
+    if len(lowest) and lowest.min() < least:
+        k = int(lowest.argmin())
+        least, time = float(lowest[k]), float(middle[k] + shift[k])
+    return least, time
 
 
 def find_commands(torque: TorqueProfile, lag: Array) -> TorqueProfile:
