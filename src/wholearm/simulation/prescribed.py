@@ -226,11 +226,13 @@ class Replay(Run):
     moving                   whether the motion goes on into the next phase
     stuck                    contacts, then joints, that stick while the rest moves
     minima                   whether to record where margins are least within steps, too
+    least                    c_n of contacts up to now in the phase, over the scene's force
     arrives                  whether the step just made ends the phase, which it passes by rounding
     """
 
     leg: ModeSegment
     phase: Phase
+    least: Array
     releasable: tuple[str, ...]  # the contacts whose release ends the phase
     # resting, slipping: the contacts that come to rest, all of them, or slip, one of them, where
     # the phase ends
@@ -546,7 +548,10 @@ class Replay(Run):
         margins = s.outputs[s.to.values][: rows.cone.stop]
         known = np.vstack([s.outputs[s.to.stages].reshape(-1, len(margins)), margins])
         inside = _INSIDE @ known
-        dips = inside.min(axis=0) < np.minimum(known[0], known[-1]) - DIP
+        # Of a normal force, what is less than any of the phase before counts.
+        least, force = np.minimum(known[0], known[-1]), rows.force
+        self.least = least[force] = np.minimum(least[force], self.least)
+        dips = inside.min(axis=0) < least - DIP
         if not dips.any():
             return [], math.inf
         # Within a step more counts as rounding than at its end.
@@ -561,6 +566,7 @@ class Replay(Run):
                 self.step_to(x * h)
                 record = Record.of(s, self.t + x * h, self.phase_index, self.impact)
                 found[x] = record, self.values, bool((self.values + slack < 0).any())
+                self.least = np.minimum(self.least, self.values[force])
 
         for row in np.flatnonzero(dips).tolist():
             middle = min(max(int(inside[:, row].argmin()), 1), len(_PLACES) - 2)
@@ -715,7 +721,7 @@ class Replay(Run):
             place = self.y[0 if until.coordinate == "x" else 2]
             self.side = math.copysign(1.0, place - until.value)
         self.until_unit = measure_until(self.problem.scene, until)
-        self.stuck = set()
+        self.stuck, self.least = set(), np.full(formation.n_contacts, math.inf)
         self.take(find_mode(formation, np.ones(formation.n_contacts + 2)))
         self.releasable, self.resting, self.slipping = (), frozenset(), frozenset()
         if phase.end is End.REST or following is None or not until.is_release:
