@@ -41,6 +41,7 @@ STRAIGHT = "a motion straight to the end"
 GIVEN = "the contact modes that the problem gives"
 ALONG = "the plan along curves"
 OTHER = "a motion straight to another end"
+LONGER = f"{NEAREST}, 4 times as long as a fall over that height"
 GRADUAL = " with friction that sets in gradually"  # suffix of names where modes are found so
 PATHS = 3  # most paths to other ends
 STEP = 0.15  # distance of ends, over the length of the path to the nearest end
@@ -264,6 +265,7 @@ class Guesses:
         yield self.nearest.by_homotopy()
         if not given:
             yield from self.to_others()
+            yield Guess(LONGER, self._guess(falls=2 * FALLS))
 
     def _list_goals(self) -> list[Array]:
         """Ends of a phase: the nearest, (5,), and others on both sides of it."""
@@ -303,10 +305,13 @@ class Guesses:
         return goals
 
     def _guess(
-        self, pieces: list[PathGuess] | None = None, profile: PathSpeed | None = None
+        self,
+        pieces: list[PathGuess] | None = None,
+        profile: PathSpeed | None = None,
+        falls: float = FALLS,
     ) -> list[Stage]:
         given = self.problem, self.phases, self.z, self.search.scheme, self.search.options
-        return self._leave_room(guess_stages(*given, pieces, profile))
+        return self._leave_room(guess_stages(*given, pieces, profile, falls))
 
     def _leave_room(self, stages: list[Stage]) -> list[Stage]:
         """The stages, with an end clear of the contact that ends what follows."""
@@ -575,17 +580,18 @@ def guess_stages(
     options: PlanOptions,
     pieces: Sequence[PathGuess] | None = None,
     profile: PathSpeed | None = None,
+    falls: float = FALLS,
 ) -> list[Stage]:
     """Stages of phases in one NLP, with an initial guess, in the scene's own units.
 
-    The guessed duration is `FALLS` times that of a fall over the length of the initial paths. A
+    The guessed duration is `falls` times that of a fall over the length of the initial paths. A
     single phase may follow the pieces of a given one, with its speed profile.
     """
     parts = _list_parts(problem, phases, z, pieces)
     lengths = np.array([outline.length for _, outline, _ in parts])
     ends = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()
     # The path parameter of the guess is (1 - cos) / 2 over all stages.
-    total = FALLS * float(np.sqrt(lengths.sum()))
+    total = falls * float(np.sqrt(lengths.sum()))
     clock = np.arccos(1 - 2 * np.clip(ends, 0.0, 1.0)) / np.pi
     if profile is not None:
         total = float(profile.t[-1]) / problem.scene.scales.time
