@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from operator import is_not
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -67,6 +68,7 @@ class Stage:
     fading: tuple[tuple[int, float], ...] = ()
     growing: tuple[int, ...] = ()  # contacts that the stage before does not have
     ends_in_impact: bool = False
+    lands: bool = False  # whether the end has to be within the range of the contact gained there
     monitored: tuple[int, ...] = ()  # limits of the formation that are constraints at the points
     released: tuple[int, ...] = ()  # limits of the contacts released where the phase began
     opens: bool = False  # whether they are released at the start of this stage
@@ -310,11 +312,27 @@ def bisect_intervals(
 def monitor(stages: list[Stage], least: Sequence[Array], depth: float) -> list[Stage]:
     """Stages with the limits added whose least values, (n_limits,), are below -depth.
 
-    The same list if there are none.
+    So are those of the range of a contact with which a phase ends. The same list if there are none.
     """
     changed = list[Stage]()
     for stage, values in zip(stages, least, strict=True):
         broken = np.flatnonzero(values < -depth).tolist()
-        changed.append(replace(stage, monitored=tuple(sorted({*stage.monitored, *broken}))))
-    news = [one.monitored != other.monitored for one, other in zip(changed, stages, strict=True)]
-    return changed if any(news) else stages
+        watched = tuple(sorted({*stage.monitored, *broken}))
+        lands = stage.lands or _find_excess(stage) > depth
+        if watched != stage.monitored or lands != stage.lands:
+            stage = replace(stage, monitored=watched, lands=lands)
+        changed.append(stage)
+    return changed if any(map(is_not, changed, stages)) else stages
+
+
+def _find_excess(stage: Stage) -> float:
+    """By how much a stage ends outside of the range of the contact that it gains there, if so."""
+    until, formation = stage.until, stage.formation
+    if until is None or until.contact is None:
+        return 0.0
+    if 5 - formation.n_constraints - len(until.pins) < 2:
+        return 0.0
+    known, gained = {limit.text for limit in formation.limits}, formation.add(until.contact)
+    values = gained.evaluate_limits(stage.guess.nodes[-1:, 0])[0].tolist()
+    pairs = zip(gained.limits, values, strict=True)
+    return max([0.0, *(-float(value) for limit, value in pairs if limit.text not in known)])

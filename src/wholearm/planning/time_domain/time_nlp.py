@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 
 from ...common.arrays import Array, Expression
 from ...common.errors import Parameter
-from ...contacts.contact_limits import build_limits, list_renamed, takes_over
+from ...contacts.contact_limits import build_limits, list_renamed
 from ...contacts.elemental import Contact, build_features, build_gap
 from ...contacts.formation import Formation
 from ...geometry.curve import find_tied, tangent_basis
@@ -351,8 +351,8 @@ def add_stage(
     if goal is not None:
         end = layout.nodes[-1]
         rows.add_copies(goal, goal.x.join(z=end[Z], v=end[V]), rows.nonlinear(goal.outputs))
-    landing = landing_kernel(formation, until) if until is not None else None
-    if landing is not None:
+    if stage.lands and until is not None and until.contact is not None:
+        landing = landing_kernel(formation, until.contact)
         own = rows.nonlinear(landing.outputs, low=0.0, high=np.inf)
         rows.add_copies(landing, landing.x.join(z=layout.nodes[-1, Z]), own)
     limits = add_limits(rows, stage, layout, scheme, target)
@@ -941,16 +941,11 @@ def goal_kernel(
 
 
 @share(64)
-def landing_kernel(formation: Formation, until: Until) -> Kernel | None:
-    """Range of the contact with which a phase ends at a place that the planner chooses."""
-    contact, free = until.contact, 5 - formation.n_constraints
-    if contact is None or free - len(until.pins) < 2:
-        return None
-    if takes_over(contact, formation.scene, formation.contacts):
-        return None
+def landing_kernel(formation: Formation, contact: Contact) -> Kernel:
+    """Limits of the range of a contact with which a phase ends."""
     x = Columns(z=5).make_symbols(z=build_features(formation.scene).z)
-    parts = [limit.value for limit in build_limits(contact, formation.scene)]
-    return build_kernel(x, ranges=ca.vertcat(*parts)) if parts else None
+    ranges = [limit.value for limit in build_limits(contact, formation.scene)]
+    return build_kernel(x, ranges=ca.vertcat(*ranges))
 
 
 def new_rows(formation: Formation, following: Formation) -> list[int]:
