@@ -660,3 +660,10 @@ def test_ranges_follow_the_units(path: Path) -> None:
     problem = load(str(path))
     for units in (Units(1e3, 1e3), Units.of(0.01, 1e-3), Units.of(100.0, 1e4)):
         build_problem(Retelling("", units).apply(problem).table)
+
+
+def test_the_start_of_a_small_object_has_rounding_of_its_angle() -> None:
+    """Angles have no length: rounding of a radian is the same for an object of 0.5 mm."""
+    small = Retelling("", Units.of(0.01, 1e-3)).apply(load(str(PROBLEMS[0])))
+    turned = small.start + np.array([0.0, 0.0, 4e-15, 0.0, 0.0])
+    assert build_problem(replace(small, start=turned).table).epsilon == small.epsilon

@@ -158,6 +158,7 @@ def _list_values(*parts: tuple[str, object]) -> Iterator[tuple[str, Any, Field]]
 def _find_start(problem: Problem) -> dict[str, Any] | None:
     """The table of the start, or None if no edge is flush there or a finger is not closed."""
     q, scene = problem.start[:3], problem.scene
+    units = np.array([scene.scales.length, scene.scales.length, 1.0])
     try:
         closed = [close_finger(scene, q, finger) for finger in (0, 1)]
     except InputError:
@@ -166,7 +167,7 @@ def _find_start(problem: Problem) -> dict[str, Any] | None:
         return None
     for edge in range(scene.polygon.n_vertices):
         flush = place_flush(scene, edge, float(q[0]))
-        if np.abs(flush - q).max() <= 1e-12 * scene.scales.length:
+        if (np.abs(flush - q) <= 1e-12 * units).all():
             return {"flush": edge, "x": float(q[0])}
     return None
 
