@@ -209,24 +209,29 @@ def tangent_basis(formation: Formation, z: Array) -> Array:
 
 
 def find_tied(formation: Formation, z: Array, row: int) -> tuple[int, ...]:
-    """Rows of (contacts, joints) that reverse with a row, or are of a flush edge with it.
-
-    With two freedoms these are proportional, with one all that vanish at this place.
-    """
-    flush, N = formation.turn_with(row), tangent_basis(formation, z)
-    if N.shape[1] not in (1, 2):
+    """Rows of (contacts, joints) that reverse with a row: proportional, or of a flush edge."""
+    flush, rates = formation.turn_with(row), find_rates(formation, z)
+    if rates.shape[1] != 2:
         return flush
+    sizes = np.linalg.norm(rates, axis=1)
+    across = np.abs(rates[row, 0] * rates[:, 1] - rates[row, 1] * rates[:, 0])
+    tied = (across < _TIED * sizes * sizes[row]) & (sizes > _TIED) & (sizes[row] > _TIED)
+    return tuple(dict.fromkeys([row, *flush, *np.flatnonzero(tied).tolist()]))
+
+
+def find_vanishing(formation: Formation, z: Array) -> tuple[int, ...]:
+    """Rows of (contacts, joints) whose rates vanish at a place of a curve, whatever its speed."""
+    rates = find_rates(formation, z)
+    return tuple(np.flatnonzero(np.abs(rates[:, 0]) < _TIED)) if rates.shape[1] == 1 else ()
+
+
+def find_rates(formation: Formation, z: Array) -> Array:
+    """Rates of (contacts, joints) in each free direction, (n_c + 2, n), over the largest one."""
+    N = tangent_basis(formation, z)
     A_t = formation.evaluate(z[None], np.zeros((1, 5))).A_t[0]
     slips = A_t / formation.scene.scales.length
     rates = np.vstack([slips, np.eye(5)[3:]]) @ (N / metric_weights(formation.scene)[:, None])
-    rates /= np.linalg.norm(rates, axis=1).max()
-    sizes = np.linalg.norm(rates, axis=1)
-    if N.shape[1] == 1:
-        tied = (sizes < _TIED) & (sizes[row] < _TIED)
-    else:
-        across = np.abs(rates[row, 0] * rates[:, 1] - rates[row, 1] * rates[:, 0])
-        tied = (across < _TIED * sizes * sizes[row]) & (sizes > _TIED) & (sizes[row] > _TIED)
-    return tuple(dict.fromkeys([row, *flush, *np.flatnonzero(tied).tolist()]))
+    return np.asarray(rates / np.linalg.norm(rates, axis=1).max(initial=1e-300))
 
 
 def refine(s: Array, stop: float) -> Array:

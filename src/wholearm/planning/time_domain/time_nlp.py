@@ -48,7 +48,7 @@ from ...common.errors import Parameter
 from ...contacts.contact_limits import build_limits, list_renamed
 from ...contacts.elemental import Contact, build_features, build_gap
 from ...contacts.formation import Formation
-from ...geometry.curve import find_tied, tangent_basis
+from ...geometry.curve import find_tied, find_vanishing, tangent_basis
 from ...mechanics.dynamics import build_force_rows
 from ...mechanics.limits import CONE, PRESS, SPEED, LimitSet, make_limits
 from ...problem.definition import Until
@@ -362,12 +362,16 @@ def add_stage(
 
 
 def _list_free_turns(stage: Stage) -> tuple[int, ...]:
-    """One of each set of tied rows that reverse: dependent equations spoil the solver's steps."""
-    tied, free = set[int](), list[int]()
+    """One of each set of rows that reverse together: dependent equations spoil the solver's steps.
+
+    Rows are tied, or vanish at the same place of a curve, as on the square by symmetry.
+    """
+    tied, free, end = set[int](), list[int](), stage.guess.nodes[-1, 0]
+    still = find_vanishing(stage.formation, end)
     for row in stage.turns:
         if row not in tied:
             free.append(row)
-            tied.update(find_tied(stage.formation, stage.guess.nodes[-1, 0], row))
+            tied.update(find_tied(stage.formation, end, row), still if row in still else ())
     return tuple(free)
 
 

@@ -240,15 +240,16 @@ def _refine_best(
 
 def finish(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
     """Search modes, choose a free end, refine, and hold torques over control periods."""
-    first = solution
+    searched = solution
     if search.options.mode_search and not search.has_ample(solution):
-        solution = improve(search, solution)
+        searched = improve(search, solution)
     if search.only_begins:
-        return solution
-    search, coarse = choose_end(search, solution)
+        return searched
+    before = [] if searched is solution else [solution]
+    search, coarse = choose_end(search, searched)
     solution = refine(search, coarse)
     if not solution.success and search.options.mode_search:
-        solution = _refine_neighbour(search, coarse, first) or solution
+        solution = _refine_other(search, coarse, before) or solution
     fewer = drop_gone(search, solution) if solution.success else solution
     if fewer is not solution:
         # Phase 3 of query 57 does not hold in its replay otherwise.
@@ -342,13 +343,13 @@ def cut_periods(
     return cut
 
 
-def _refine_neighbour(
-    search: TimeSearch, coarse: TimeSolution, first: TimeSolution
+def _refine_other(
+    search: TimeSearch, coarse: TimeSolution, before: Sequence[TimeSolution]
 ) -> TimeSolution | None:
-    """A refined solution in neighbouring modes that cost as much, or in those before the search.
+    """A refined solution in neighbouring modes that cost as much, or that before the mode search.
 
-    Phase 2 of the route of query 10 has none in which a contact turns back without resting, and
-    phase 1 of that of query 91 none in the modes that the search finds.
+    Phase 2 of the route of query 10 has none in which a contact turns back without resting; phase 1
+    of that of query 91, and phase 5 of that of goal 45, none where the mode search leads.
     """
 
     def list_others() -> Iterator[TimeSolution]:
@@ -356,8 +357,7 @@ def _refine_neighbour(
             other = search.solve(stages, most=PATIENCE)
             if other.success and other.cost - coarse.cost < WORTH * abs(coarse.cost):
                 yield other
-        if sign_sequence(first.stages) != sign_sequence(coarse.stages):
-            yield first
+        yield from before
 
     found = (refine(search, other) for other in list_others())
     return next((refined for refined in found if refined.success), None)
