@@ -272,3 +272,32 @@ def ramp(start: tuple[float, float], rate: tuple[float, float], duration: float)
     return TorqueProfile(
         np.array([0.0, duration]), np.column_stack([np.array(start) + half, half])[None]
     )
+
+
+PENTAGON = """
+epsilon = 0.05
+object = { vertices = [[0, 0], [0.08, 0], [0.08, 0.03], [0.03, 0.09], [0, 0.09]], mass = 0.35 }
+friction = { palm = 0.02, finger1 = 0.02, finger2 = 0.02 }
+start = { flush = 0, x = 0.04 }
+[fingers]
+1 = { base = [0.09, -0.01], length = 0.17, radius = 0.006, inertia = 0.002, viscous = 0.01, dry = 0.01, torque_limit = 4.0 }
+2 = { base = [-0.09, -0.01], length = 0.17, radius = 0.006, inertia = 0.002, viscous = 0.01, dry = 0.01, torque_limit = 4.0 }
+[[phases]]
+contacts = ["v0-palm", "v1-palm", "v1-finger1", "v4-finger2"]
+until = "v2-finger1"
+[[phases]]
+contacts = ["v1-palm", "v1-finger1", "v2-finger1", "v4-finger2"]
+until = "v4-tip2"
+end = "smooth"
+[[phases]]
+contacts = ["v1-palm", "v1-finger1", "v2-finger1", "v4-tip2"]
+until = "e4-tip2"
+end = "smooth"
+[[phases]]
+contacts = ["v1-palm", "v1-finger1", "v2-finger1", "e4-tip2"]
+until = "v0-finger2"
+[[phases]]
+contacts = ["v1-palm", "v2-finger1", "v0-finger2"]
+until = { contact = "v3-finger1", x = 0.08804 }
+"""  # noqa: E501
+"""Five phases of a flip: a contact passes from a link over its tip to an edge; then a landing."""

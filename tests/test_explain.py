@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from refused import advising, ask_shoved
-from scenes import box, shove
+from scenes import PENTAGON, box, shove
 from shipped import HEPTAGON, problem_of, tipping
 from wholearm import PlanOptions, Problem, load_trajectory, plots
 from wholearm.benchmark.stress import refusals
@@ -59,32 +59,6 @@ def search(problem: Problem) -> TimeSearch:
     return TimeSearch.of(problem, COARSE)
 
 
-PENTAGON = """
-epsilon = 0.05
-object = { vertices = [[0, 0], [0.08, 0], [0.08, 0.03], [0.03, 0.09], [0, 0.09]], mass = 0.35 }
-friction = { palm = 0.02, finger1 = 0.02, finger2 = 0.02 }
-start = { flush = 0, x = 0.04 }
-[fingers]
-1 = { base = [0.09, -0.01], length = 0.17, radius = 0.006, inertia = 0.002, viscous = 0.01, dry = 0.01, torque_limit = 4.0 }
-2 = { base = [-0.09, -0.01], length = 0.17, radius = 0.006, inertia = 0.002, viscous = 0.01, dry = 0.01, torque_limit = 4.0 }
-[[phases]]
-contacts = ["v0-palm", "v1-palm", "v1-finger1", "v4-finger2"]
-until = "v2-finger1"
-[[phases]]
-contacts = ["v1-palm", "v1-finger1", "v2-finger1", "v4-finger2"]
-until = "v4-tip2"
-end = "smooth"
-[[phases]]
-contacts = ["v1-palm", "v1-finger1", "v2-finger1", "v4-tip2"]
-until = "e4-tip2"
-end = "smooth"
-[[phases]]
-contacts = ["v1-palm", "v1-finger1", "v2-finger1", "e4-tip2"]
-until = "v0-finger2"
-[[phases]]
-contacts = ["v1-palm", "v2-finger1", "v0-finger2"]
-until = { contact = "v3-finger1", x = 0.08804 }
-"""  # noqa: E501
 TURNED = np.array([0.10451807, 0.05929573, -1.03431931, 0.53647701, 0.53647701])
 """Start of the last phase, at whose end no contact forces balance the weight."""
 
