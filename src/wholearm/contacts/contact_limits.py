@@ -206,7 +206,8 @@ def build_limits(contact: Contact, scene: Scene) -> list[GapLimit]:
 
 def takes_over(contact: Contact, scene: Scene, held: Sequence[Contact]) -> bool:
     """Whether `contact` is the neighbour of one of `held` at the end of its range."""
-    return any(limit.gained == contact for own in held for limit in build_limits(own, scene))
+    limits = (limit for own in held for limit in _build_once(build_limits, own, scene))
+    return any(limit.gained == contact for limit in limits)
 
 
 def list_renamed(

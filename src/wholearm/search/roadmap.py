@@ -152,11 +152,11 @@ class Roadmap:
 
     Attributes
     ----------
-    plans     plans of routes, or why there are none; see `candidates`
+    plans     plans of routes, or why there are none; see `edge_plans`
     measured  plans of single links through cells, or why there are none
     others    slower plans of these
     refined   links whose place on the border has been optimized
-    joined    plans of links from rest to rest; see `edge_plans`
+    joined    plans of links from rest to rest, or why there are none; see `edge_plans`
     """
 
     def __init__(self, problem: Problem, uniqueness_margin: float) -> None:
