@@ -120,6 +120,42 @@ def test_an_interrupt_ends_children() -> None:
     assert not multiprocessing.active_children()
 
 
+LEAVES = """
+import multiprocessing, os, signal, time
+from wholearm.common.crowd import Processes
+from wholearm.common.workers import share
+
+parent = os.getpid()
+BUSY = "import time; print('ready', flush=True); time.sleep(60)"
+barrier = multiprocessing.get_context("fork").Barrier(2)
+
+def task():
+    barrier.wait()
+    if os.getpid() == parent:
+        print("ready", flush=True)
+    time.sleep(60)
+
+{run}
+"""
+
+
+@needs_fork
+@pytest.mark.parametrize(
+    "run",
+    [
+        "share([task] * 2, 2)",
+        "Processes(1).submit(exec, BUSY).result()",
+    ],
+)
+def test_processes_end_with_their_parent_however_it_ends(run: str) -> None:
+    command = [sys.executable, "-c", LEAVES.format(run=run)]
+    with subprocess.Popen(command, text=True, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+        process.kill()
+        # The pipe closes with the last process; the tasks would take a minute.
+        process.communicate(timeout=30)
+
+
 @needs_fork
 def test_other_threads_keep_it_in_one_process() -> None:
     over = threading.Event()

@@ -14,7 +14,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from .errors import InputError
-from .workers import Spawning
+from .workers import Spawning, end_with_parent
 
 _CPU = getattr(signal, "SIGPROF", 27)  # signal that ends a process whose processor time is used up
 
@@ -127,7 +127,7 @@ class _Worker:
 
     def __init__(self, context: Spawning) -> None:
         self.pipe, far = context.Pipe()
-        self.process = context.Process(target=_serve, args=(far,), daemon=True)
+        self.process = context.Process(target=_serve, args=(far, os.getpid()), daemon=True)
         self.process.start()
         far.close()
 
@@ -153,8 +153,9 @@ class _Worker:
         self.pipe.close()
 
 
-def _serve(pipe: Connection) -> None:
+def _serve(pipe: Connection, parent: int) -> None:
     """Compute what comes through the pipe until it closes."""
+    end_with_parent(parent)
     try:
         import resource
 

@@ -8,6 +8,7 @@ a child does not send, as it was ended or met an error, its parent does itself.
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import io
 import multiprocessing as mp
@@ -19,6 +20,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext, SpawnProcess
 from multiprocessing.process import BaseProcess
@@ -137,8 +139,22 @@ class _Spawned(SpawnProcess):
     """A process that a Ctrl-C in its terminal leaves to its parent, from the first moment on."""
 
     def start(self) -> None:
+        # The first process starts this one, too, which would unblock SIGINT.
+        if sys.platform != "win32":
+            resource_tracker.ensure_running()
         with _blocked(signal.SIGINT):
             super().start()
+
+
+def end_with_parent(parent: int) -> None:
+    """Have this process killed when its parent ends, however that comes about (on Linux).
+
+    A signal may end the parent before it knows of a child that it has just started.
+    """
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+        if os.getppid() != parent:
+            os._exit(1)
 
 
 class Spawning(SpawnContext):
@@ -160,27 +176,28 @@ def _serve(
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
+    end_with_parent(parent)
     near, far = ends
     # Nobody would read what is sent if the parent were gone.
     near.close()
     # What there is by now is not looked at for garbage, which would copy its pages.
     gc.freeze()
     try:
-        results = _take(tasks, source, parent)
+        results = _take(tasks, source)
     except KeyboardInterrupt:
         return  # The time is over, as its parent finds out and says.
     with suppress(Exception):
         far.send_bytes(_pickle(results, numbers))
 
 
-def _take(tasks: Sequence[Task[_T]], source: int, parent: int | None = None) -> dict[int, _T]:
+def _take(tasks: Sequence[Task[_T]], source: int) -> dict[int, _T]:
     """Results of tasks by their numbers, which whoever reads them has taken from a pipe.
 
-    A child ends with its `parent`. Tasks that raise an error have none: they are done again in
-    the end, so that the first of them raises it, whoever has met it.
+    Tasks that raise an error have none: they are done again in the end, so that the first of them
+    raises it, whoever has met it.
     """
     results = dict[int, _T]()
-    while parent in (None, os.getppid()) and (number := os.read(source, 2)):
+    while number := os.read(source, 2):
         index = int.from_bytes(number, "big")
         with suppress(Exception):
             results[index] = tasks[index]()
