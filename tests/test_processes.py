@@ -169,6 +169,20 @@ def test_other_threads_keep_it_in_one_process() -> None:
     assert found == [PARENT, PARENT]
 
 
+SCRIPT = """
+from wholearm.common.crowd import Processes
+for base in (2, 3):
+    print(Processes(1).submit(abs, -base).result(), __name__)
+"""
+
+
+def test_a_plain_script_is_not_run_again_by_its_workers(tmp_path: Path) -> None:
+    script = tmp_path / "plain.py"
+    script.write_text(SCRIPT)
+    found = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60)
+    assert (found.stdout, found.stderr) == ("2 __main__\n3 __main__\n", "")
+
+
 def square(number: int) -> int:
     if number == 13:
         raise ValueError("thirteen")

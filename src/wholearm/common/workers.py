@@ -24,6 +24,7 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext, SpawnProcess
 from multiprocessing.process import BaseProcess
+from types import ModuleType
 from typing import Any, TypeVar
 
 from .signals import WATCHER
@@ -33,6 +34,7 @@ Task = Callable[[], _T]
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _sharing = False
+_starting = threading.Lock()
 
 
 def count_cores() -> int:
@@ -136,14 +138,21 @@ def _blocked(*numbers: signal.Signals) -> Iterator[None]:
 
 
 class _Spawned(SpawnProcess):
-    """A process that a Ctrl-C in its terminal leaves to its parent, from the first moment on."""
+    """A process that a Ctrl-C in its terminal leaves to its parent, from the first moment on.
+
+    The script that started this process is not imported in it, which would run it again.
+    """
 
     def start(self) -> None:
         # The first process starts this one, too, which would unblock SIGINT.
         if sys.platform != "win32":
             resource_tracker.ensure_running()
-        with _blocked(signal.SIGINT):
-            super().start()
+        with _starting, _blocked(signal.SIGINT):
+            main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
+            try:
+                super().start()
+            finally:
+                sys.modules["__main__"] = main
 
 
 def end_with_parent(parent: int) -> None:
