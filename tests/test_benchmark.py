@@ -114,6 +114,8 @@ def test_records_of_other_code_do_not_count_where_that_matters(
     )
     main(command)
     assert path.read_text(encoding="utf-8").splitlines()[0] == head
+    path.write_text('{"my": "data"}\n', encoding="utf-8")
+    assert main(command) == 2 and path.read_text(encoding="utf-8") == '{"my": "data"}\n'
 
 
 def test_every_study_is_listed_and_has_its_options(capsys: pytest.CaptureFixture[str]) -> None:

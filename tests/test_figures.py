@@ -36,7 +36,7 @@ from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.common.document import Document, Result, Table
 from wholearm.contacts.closing import contact_table, evaluate_contacts
-from wholearm.figures.curves import draw_torques, find_steps
+from wholearm.figures.curves import draw_torques, find_steps, scale_margins
 from wholearm.figures.map_figure import draw_map
 from wholearm.figures.snapshots import choose_snapshots, draw_snapshot
 from wholearm.figures.style import WIDTH, choose_styles
@@ -159,7 +159,8 @@ def test_strip_has_one_scale_and_its_bar(figure: Figure) -> None:
 
 
 @pytest.mark.parametrize(
-    ("size", "prefix"), [(5e-4, "m"), (2e-6, "\u00b5"), (2.0, ""), (400.0, ""), (1e5, "k")]
+    ("size", "prefix"),
+    [(5e-4, "m"), (2e-6, "\u00b5"), (2.0, ""), (400.0, ""), (16e3, "k"), (1e5, "k")],
 )
 def test_units_suit_the_size(axes: Axes, size: float, prefix: str) -> None:
     torque = TorqueProfile(np.array([0.0, 1.0]), np.full((1, 2, 1), 0.5 * size))
@@ -168,6 +169,15 @@ def test_units_suit_the_size(axes: Axes, size: float, prefix: str) -> None:
     assert f"[{prefix}N m]" in axes.get_ylabel()
     labels = [tick.get_text() for tick in axes.get_yticklabels()]
     assert max(map(len, labels)) <= 5
+
+
+@pytest.mark.parametrize("height", [0.4, 1.0])
+def test_ticks_of_margins_are_apart_in_low_panels(height: float) -> None:
+    axes = Figure((4.0, 4.0)).add_axes((0.2, 0.0, 0.8, height))
+    scale_margins(axes, np.array([-5.0, 300.0]), 5.0)
+    places = axes.transData.transform([[0.0, tick] for tick in axes.get_yticks()])[:, 1]
+    assert np.diff(places).min() >= 8.0 / 72 * axes.figure.dpi
+    assert {0.0, 1.0, 100.0} <= set(axes.get_yticks())
 
 
 def test_margins_are_the_trajectory_with_breaks_at_phases(

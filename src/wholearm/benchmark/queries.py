@@ -41,8 +41,8 @@ class Queries(Study):
     name, title = "queries", "From pose to pose"
     shipped = seeded = True
     options = """\
---queries N   how many = 250 in 0..1000000000
---polygons N  how many more, each about a new polygon in a shipped hand = 0 in 0..1000000000
+--queries N   how many = 250 in 0..100000
+--polygons N  how many more, each about a new polygon in a shipped hand = 0 in 0..100000
 --objective NAME  of the plans: time, effort or margin = time
 --printed     plan the phases that are printed, in place of a second query
 """

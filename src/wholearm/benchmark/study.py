@@ -10,6 +10,7 @@ import argparse
 import csv
 import hashlib
 import io
+import json
 import os
 import platform
 import re
@@ -147,9 +148,11 @@ def run_study(
         path, fresh, again = f"{stem}.jsonl", options.fresh, options.again
         if study.of_code:
             stamp["source"] = digest_source(study.list_inputs(options))
-            # Records of other code are no records.
-            with suppress(OSError, UnicodeDecodeError), open(path, encoding="utf-8") as stream:
-                fresh = fresh or stamp["source"] not in stream.readline()
+            # Records of other code are no records; what is no study of this kind is left alone.
+            with suppress(OSError, ValueError, TypeError), open(path, encoding="utf-8") as stream:
+                known = dict(json.loads(stream.readline()))
+                same = known.get("source") == stamp["source"]
+                fresh = fresh or (known.get("study") == study.name and not same)
     with Journal(path, stamp, fresh, again) as journal:
         done = {_key(row["case"]): row for row in journal.records}
         left = [case for case in cases if case not in done]

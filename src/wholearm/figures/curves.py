@@ -122,10 +122,15 @@ def scale_margins(axes: Axes, margins: Array, epsilon: float) -> None:
     look: Any = {"xycoords": "axes fraction", "ha": "left", "fontsize": 8, "color": "#7a2a12"}
     write(axes, "contact lost, $c_n < 0$", (0, 0), (4, 3), **look)
     decades = linear * 10.0 ** np.arange(math.ceil(math.log10(reach / linear)) + 1)
-    positive = np.outer([1, 2, 5] if len(decades) < 5 else [1], decades)
-    every = np.unique([0.0, linear / 2, *positive.flat])
-    every = np.concatenate([-every[:0:-1], every])
-    axes.yaxis.set_major_locator(FixedLocator(every[(every >= low) & (every <= high)].tolist()))
+    points = 72 / axes.figure.dpi * axes.bbox.height / np.ptp(ends)
+    for digits in ([1, 2, 5], [1]):
+        every = np.unique([0.0, linear / 2, *np.outer(digits, decades).flat])
+        every = np.concatenate([-every[:0:-1], every])
+        every = every[(every >= low) & (every <= high)]
+        # Where labels of 9 points would touch, powers of ten alone have one.
+        if points * np.diff(transform.transform(every)).min() >= 9:
+            break
+    axes.yaxis.set_major_locator(FixedLocator(every.tolist()))
     axes.yaxis.set_minor_locator(NullLocator())
     axes.grid(axis="y", color=GRID, linewidth=0.4)
     _scale_ticks(axes, factor)

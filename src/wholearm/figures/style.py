@@ -80,7 +80,7 @@ def add_line(axes: Axes, points: Array, **look: Any) -> Artist:
 
 def choose_prefix(size: float) -> tuple[str, float]:
     """SI prefix with which values up to `size` have few digits, and the factor to it."""
-    steps = ((3e4, "k", 1e-3), (0.3, "", 1.0), (3e-4, "m", 1e3), (0.0, "\u00b5", 1e6))
+    steps = ((1e4, "k", 1e-3), (0.3, "", 1.0), (3e-4, "m", 1e3), (0.0, "\u00b5", 1e6))
     return next((prefix, factor) for least, prefix, factor in steps if size >= least)
 
 

@@ -251,14 +251,16 @@ def _choose_palette(images: Sequence[Image.Image]) -> Image.Image:
     """
     own = [*PALETTE, BAND, LOW, LOST, INK, GRID, "#ffffff", BODY, TURNS, GHOST]
     own += [colour for pair in FINGERS for colour in pair]
-    exact = [part for colour in own for part in ImageColor.getrgb(colour)]
+    exact = np.array([ImageColor.getrgb(colour) for colour in own])
     some = [images[k] for k in np.linspace(0, len(images) - 1, 4).astype(int)]
     strip = Image.new("RGB", (some[0].width, 4 * some[0].height))
     for k, image in enumerate(some):
         strip.paste(image, (0, k * image.height))
-    tints = strip.quantize(96).getpalette() or []
+    tints = np.reshape(strip.quantize(96).getpalette() or [], (-1, 3))[:96]
+    # Pillow looks up colours in cells of 4 levels: a tint nearby could take the place of an own.
+    apart = np.abs(tints[:, None] - exact).max(axis=2).min(axis=1) >= 12
     palette = Image.new("P", (1, 1))
-    palette.putpalette(exact + tints[: 3 * 96])
+    palette.putpalette(np.vstack([exact, tints[apart]]).ravel().tolist())
     return palette
 
 
