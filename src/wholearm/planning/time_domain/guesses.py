@@ -185,7 +185,7 @@ class Guesses:
                     (points.z_ddot * (unit**2 / lengths)).reshape(shape),
                     (c / scales.force).reshape(shape),
                     (sample(controls).tau / scales.torque).reshape(count, -1, 2),
-                    stage.guess.impulses,
+                    stage.guess.impulses if stop == motion.duration else np.zeros(0),
                 )
                 signs = np.concatenate(directions)
                 signs[rolling] = 0.0
@@ -614,11 +614,13 @@ def guess_stages(
         # Limits near zero along the path, and that of the phase's end.
         near = phase.formation.evaluate_limits(outline.z).min(axis=0) < _NEAR
         near |= [limit.gains(phase.until.contact) for limit in phase.formation.limits]
-        opens = k > 0 and parts[k - 1][0] is not phase
+        before = parts[k - 1][0]
+        opens = k > 0 and before is not phase
         if opens:
             touching = np.abs(phase.formation.evaluate_limits(outline.z[:1])[0]) < _TOUCHES
-            before = parts[k - 1][1].formation.contacts
-            renamed = list_renamed(problem.scene, before, phase.formation.contacts)
+            renamed = list_renamed(
+                problem.scene, before.formation.contacts, phase.formation.contacts
+            )
             released = tuple(
                 row
                 for row in np.flatnonzero(touching).tolist()
@@ -635,7 +637,7 @@ def guess_stages(
                 monitored=tuple(sorted({*np.flatnonzero(near).tolist(), *released})),
                 released=released,
                 opens=opens,
-                opening=options.opening,
+                opening=None if opens and before.end is End.IMPACT else options.opening,
                 clearance=options.clearance,
                 ahead=ahead,
             )

@@ -346,7 +346,8 @@ def _find_held(stage: Stage, here: MotionResponse, places: Array) -> Array:
     slopes = np.stack([(after[:, monitored] - gaps) / _STEP for after in moved], axis=-1)
     close = gaps < 1e-6 * size  # gap over the radius of gyration below which its limit is active
     first = np.repeat(np.arange(len(places)) == 0, places.shape[1])
-    close |= first[:, None] & (np.isin(monitored, stage.released) & stage.opens)
+    opens = stage.opens and stage.opening is not None
+    close |= first[:, None] & (np.isin(monitored, stage.released) & opens)
     active = np.concatenate([slow, close], axis=1)
     held = active[..., None] * np.concatenate([senses, slopes], axis=1)
     return np.asarray(held[:, np.flatnonzero(held.any(axis=(0, 2)))])

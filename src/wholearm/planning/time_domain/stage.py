@@ -72,7 +72,8 @@ class Stage:
     monitored: tuple[int, ...] = ()  # limits of the formation that are constraints at the points
     released: tuple[int, ...] = ()  # limits of the contacts released where the phase began
     opens: bool = False  # whether they are released at the start of this stage
-    opening: float = OPENING  # least acceleration of their gaps, over gravity
+    # least acceleration of their gaps, over gravity; None if an impact gives these a rate
+    opening: float | None = OPENING
     clearance: float = (
         CLEARANCE  # least gap after a third of the stage, over the radius of gyration
     )

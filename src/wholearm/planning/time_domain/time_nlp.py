@@ -328,15 +328,16 @@ def add_stage(
         rows.add_copies(kernel, kernel.x.join(z=ends[:, Z], v=ends[:, V], first=first), own)
         chain = np.hstack([chain, own])
     monitor_rows = _add_monitor_rows(rows, stage, layout, scheme)
-    gained = [formation.limits[k].gained for k in stage.released]
     slow = formation.scene.has_slow_motors
-    # With continuous torques a released contact has no acceleration at first.
-    opening = stage.opening * (scheme.points[:, None] if slow else 1.0)
-    for contact in [c for c in gained if c is not None and stage.opens]:
-        kernel = opening_kernel(formation, contact)
-        columns = kernel.x.join(z=layout.z[0], v=layout.v[0], a=layout.a[0])
-        own = rows.nonlinear(scheme.degree, kernel.outputs, low=opening, high=np.inf)
-        rows.add_copies(kernel, columns, own)
+    if stage.opens and stage.opening is not None:
+        gained = [formation.limits[k].gained for k in stage.released]
+        # With continuous torques a released contact has no acceleration at first.
+        opening = stage.opening * (scheme.points[:, None] if slow else 1.0)
+        for contact in [c for c in gained if c is not None]:
+            kernel = opening_kernel(formation, contact)
+            columns = kernel.x.join(z=layout.z[0], v=layout.v[0], a=layout.a[0])
+            own = rows.nonlinear(scheme.degree, kernel.outputs, low=opening, high=np.inf)
+            rows.add_copies(kernel, columns, own)
     until = stage.until
     if stage.stop is not None:
         until, N = None, tangent_basis(formation, stage.stop)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from itertools import chain, groupby, islice, pairwise, takewhile
 from typing import TYPE_CHECKING, Any
 
@@ -521,6 +521,7 @@ def plan_with_impacts(
     duration: float | None,
     ample: float = math.inf,
     fastest: Sequence[PhasePlan[Motion]] = (),
+    along: Callable[[], list[PathMotion]] = list,
     **others: Any,
 ) -> Plans:
     """Plan a block with the impacts that are possible, or else with stops.
@@ -529,9 +530,10 @@ def plan_with_impacts(
     """
     ends = [k + 1 for k, phase in enumerate(block) if phase.end is End.IMPACT]
     if not ends:
-        others |= {"ample": ample, "fastest": fastest}
+        others |= {"ample": ample, "fastest": fastest, "along": along}
         return [*plan_phases(problem, block, z, options, duration, **others)]
-    explained = plan_parts_of(problem, block, ample, explained=True)
+    along = cache(along)
+    explained = plan_parts_of(problem, block, ample, along, explained=True)
     with_stops = partial(plan_stops, explained, [0, *ends, len(block)], z)
     slow = AT_REST * problem.scene.scales.speed
     speeds = [measure_speed(problem.scene, end_of(fastest[k - 1])[1]) for k in ends if fastest]
@@ -547,14 +549,19 @@ def plan_with_impacts(
     if len(blocked) < len(ends):
         bounds = [0, *blocked, len(block)]
         try:
-            return plan_stops(plan_parts_of(problem, block, ample), bounds, z, options, duration)
+            direct = plan_parts_of(problem, block, ample, along)
+            return plan_stops(direct, bounds, z, options, duration)
         except (InfeasibleError, SolverError):
             pass
     return stopped if duration is None else with_stops(options, duration)
 
 
 def plan_parts_of(
-    problem: Problem, block: Sequence[Phase], ample: float = math.inf, explained: bool = False
+    problem: Problem,
+    block: Sequence[Phase],
+    ample: float = math.inf,
+    along: Callable[[], list[PathMotion]] = list,
+    explained: bool = False,
 ) -> PlanPart:
     """Planner of parts of a block: from all guesses with reasons (`explained`) or the first one."""
 
@@ -562,7 +569,11 @@ def plan_parts_of(
         start: int, stop: int, z: Array, options: PlanOptions, duration: float | None
     ) -> Plans:
         plan = partial(plan_phases, ample=ample, explained=explained, patient=explained)
-        return [*plan(problem, block[start:stop], z, options, duration)]
+        return [
+            *plan(
+                problem, block[start:stop], z, options, duration, along=lambda: along()[start:stop]
+            )
+        ]
 
     return plan_part
 
