@@ -16,7 +16,7 @@ from wholearm.benchmark.stress.event_tracing import clearances, follow, resample
 from wholearm.benchmark.stress.refusals import find_best, list_ends
 from wholearm.benchmark.stress.scenes import draw_case, random_scene
 from wholearm.benchmark.stress.slow_motion import fast_margin, inertia_ratio, slow_margin
-from wholearm.benchmark.stress.stress_study import balance, compare_values
+from wholearm.benchmark.stress.stress_study import check_plan, compare_values
 from wholearm.common.arrays import Array
 from wholearm.contacts.formation import find_touching
 from wholearm.geometry.curve import Curve
@@ -25,7 +25,6 @@ from wholearm.mechanics.dynamics import Directions, reduced_inertia
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.problem.table import write_toml
-from wholearm.verification.newton_euler import locate
 
 
 def test_a_scene_is_drawn_alike_again_and_is_the_same_as_a_file() -> None:
@@ -113,21 +112,16 @@ def test_places_where_a_contact_turns_are_on_the_grid(
     assert (np.abs(rates[s == s[np.abs(s - turns[0]).argmin()]]).min()) < 1e-4
 
 
-def test_what_is_left_of_the_equations_is_the_force_that_is_missing(
+def test_plans_with_other_numbers_than_their_own_are_found(
     heptagon: Problem, trajectory: Trajectory
 ) -> None:
-    scene, motion = heptagon.scene, trajectory.motions[0]
-    rows = motion.evaluate(np.linspace(0.01, 0.05, 5))
-    touches = [locate(scene, name, rows.z) for name in motion.contacts]
-    forces = np.stack([rows.c_n, rows.c_t])
-    rates = (rows.z_dot, rows.z_ddot)
-    assert np.abs(balance(scene, touches, rates, rows.tau, forces)).max() < 1e-9
-    more = rows.tau + np.array([0.0, 0.25])
-    left = balance(scene, touches, rates, more, forces)
-    np.testing.assert_allclose(left[:, 4], -0.25, atol=1e-9)
-    forces[0, :, 0] -= 0.5
-    left = balance(scene, touches, rates, rows.tau, forces)
-    np.testing.assert_allclose(left, 0.5 * touches[0].normal, atol=1e-9)
+    assert check_plan(heptagon, trajectory) == []
+    heavy = check_plan(heptagon.with_(mass=1.02 * heptagon.scene.polygon.mass), trajectory)
+    assert heavy and all("the equation of motion of the object" in text for text in heavy)
+    rough = check_plan(heptagon.with_(friction_palm=0.15), trajectory)
+    assert any("friction of v0-palm is not Coulomb's" in text for text in rough)
+    weak = check_plan(heptagon.with_(torque_limit=1.0), trajectory)
+    assert weak and all("exceeds its limit" in text for text in weak)
 
 
 Course = tuple[Array, Array, Array]

@@ -26,7 +26,7 @@ from ...problem.read import build_problem, read_problem
 from ...problem.table import write_toml
 from ...results.trajectory import Samples, Trajectory
 from ...scene.model import Scene
-from ...verification.newton_euler import Touch, locate
+from ...verification.newton_euler import BODIES, balance, locate
 from ...verification.verify import verify
 from ..study import Case, Row, Study, format_table, name_case
 from .damage import describe_error, run_file
@@ -296,82 +296,36 @@ def check_plan(problem: Problem, plan: Trajectory) -> list[str]:
     return found
 
 
-def balance(
-    scene: Scene, touches: list[Touch], motion: tuple[Array, Array], tau: Array, forces: Array
-) -> Array:
-    """What is left of Newton's and Euler's laws at n instants, shape (n, 5) [N, N m].
-
-    Parameters
-    ----------
-    motion : (n, 5)           z' and z''
-    tau : (n, 2) [N m]
-    forces : (2, n, n_c) [N]  c_n and c_t
-    """
-    z_dot, z_ddot = motion
-    rest = scene.mass_diagonal * z_ddot + scene.viscous * z_dot + scene.dry * np.sign(z_dot)
-    rest = rest - scene.applied_force
-    rest[:, 3:] -= tau
-    for touch, c_n, c_t in zip(touches, forces[0].T, forces[1].T, strict=True):
-        rest -= c_n[:, None] * touch.normal + c_t[:, None] * touch.tangent
-    return np.asarray(rest)
-
-
 def _check_phase(problem: Problem, phase: Phase, rows: Samples) -> list[str]:
-    scene, names = problem.scene, phase.formation.names
-    size, speed = scene.scales.length, scene.scales.speed
-    fastest = max(speed, float(np.abs(rows.z_dot[:, :2]).max()))
-    touches, texts = [locate(scene, name, rows.z) for name in names], []
-    for name, touch in zip(names, touches, strict=True):
-        separation = np.abs((touch.normal * rows.z_dot).sum(axis=1)).max()
+    """Contacts, overlaps, forces and limits of a phase, by `verification.newton_euler`."""
+    scene, formation, texts = problem.scene, phase.formation, list[str]()
+    scales, names = scene.scales, formation.names
+    fastest = max(scales.speed, float(np.abs(rows.z_dot[:, :2]).max()))
+    found = balance(scene, formation.contacts, formation.rolling, rows, STILL)
+    for k, name in enumerate(names):
+        touch = locate(scene, name, rows.z)
         worst = {
-            "gap": np.abs(touch.gap).max() / size / OVERLAP,
-            "beyond its feature": -np.minimum(touch.low, touch.high).min() / size / OVERLAP,
-            "rate of separation": separation / fastest / ROUNDING,
+            "gap": np.abs(found.gaps[:, k]).max() / OVERLAP,
+            "beyond its feature": -min(touch.low.min(), touch.high.min()) / scales.length / OVERLAP,
+            "rate": np.abs(found.rates[:, k]).max() * scales.speed / fastest / ROUNDING,
         }
         texts += [f"{what} of {name} is {v:.2g} of its bound" for what, v in worst.items() if v > 1]
-    for pair, gap in clearances(scene, rows.z).items():
-        if gap.min() < -OVERLAP * size:
-            texts.append(f"{pair} overlap by {-gap.min():.3g} m")
-    texts += _check_forces(problem, phase, rows, touches)
-    motion, forces = (rows.z_dot, rows.z_ddot), np.stack([rows.c_n, rows.c_t])
-    rest = np.abs(balance(scene, touches, motion, rows.tau, forces))
-    # A joint that all but stands still is held by any dry friction up to its own.
-    still = np.abs(rows.z_dot) < STILL * speed / np.append(np.ones(2), np.full(3, size))
-    rest -= np.where(still, 2 * scene.dry, 0.0)
-    arms = scene.scales.force * np.array([1.0, 1.0, size, size, size])
-    biggest = np.maximum(np.abs(scene.mass_diagonal * rows.z_ddot).max(axis=0), arms)
-    biggest[3:] = np.maximum(biggest[3:], np.abs(rows.tau).max(axis=0))
-    excess = rest.max(axis=0) / biggest / ROUNDING
-    for k in np.flatnonzero(excess > 1):
-        row, at = ("x", "y", "phi", "theta_1", "theta_2")[k], int(rest[:, k].argmax())
-        text = f"the equation of {row} misses {rest[at, k]:.3g} ({excess[k]:.2g} of its bound)"
-        texts.append(f"{text} at instant {at}")
-    return texts
-
-
-def _check_forces(problem: Problem, phase: Phase, rows: Samples, touches: list[Touch]) -> list[str]:
-    scene, texts = problem.scene, []
-    force, speed = scene.scales.force, scene.scales.speed
-    names, rolling = phase.formation.names, phase.formation.rolling_rows
-    for k, (name, touch) in enumerate(zip(names, touches, strict=True)):
-        c_n, c_t = rows.c_n[:, k], rows.c_t[:, k]
         # A normal force may lack what `verification.verify` allows.
-        lack = problem.epsilon * (1 - 2e-3) - c_n.min()
-        if lack > ROUNDING * force:
+        lack = problem.epsilon * (1 - 2e-3) - rows.c_n[:, k].min()
+        if lack > ROUNDING * scales.force:
             texts.append(f"c_n of {name} is {lack:.3g} N short of epsilon")
-        slip = (touch.tangent * rows.z_dot).sum(axis=1)
-        scale = max(force, float(np.abs(c_n).max())) * ROUNDING * 10
-        over = (np.abs(c_t) - touch.friction * c_n).max()
-        if over > scale:
-            texts.append(f"c_t of {name} is {over:.3g} N outside its friction cone")
-        if k in rolling:
-            if np.abs(slip).max() > 10 * STILL * speed:
-                texts.append(f"{name} rolls, but slides at {np.abs(slip).max():.3g} m/s")
-            continue
-        moving = np.abs(slip) > STILL * speed
-        wrong = np.where(moving, np.abs(c_t + touch.friction * np.sign(slip) * c_n), 0.0).max()
-        if wrong > scale:
-            texts.append(f"friction at {name} is {wrong:.3g} N off Coulomb's for its sliding")
+    for pair, gap in clearances(scene, rows.z).items():
+        if gap.min() < -OVERLAP * scales.length:
+            texts.append(f"{pair} overlap by {-gap.min():.3g} m")
+    biggest = np.abs(scene.mass_diagonal * rows.z_ddot).max(axis=0)
+    biggest[3:] = np.maximum(biggest[3:], np.abs(rows.tau).max(axis=0))
+    biggest = np.maximum(biggest / np.repeat([scales.force, scales.torque], [2, 3]), 1.0)
+    missed = np.abs(found.forces).max(axis=0) / biggest / ROUNDING
+    for body, share in zip(BODIES, missed, strict=True):
+        if share > 1:
+            texts.append(f"the equation of motion of {body} misses {share:.2g} of its bound")
+    turned = zip((*names, "joint 1", "joint 2"), found.against.any(axis=0), strict=True)
+    texts += [f"friction of {name} is not Coulomb's for its sliding" for name, own in turned if own]
     for text, values, limits in (
         ("tau_{} exceeds its limit by {:.2g} of it", rows.tau, scene.torque_limit),
         ("joint {} exceeds its speed by {:.2g} of it", rows.z_dot[:, 3:], scene.speed_limit),
