@@ -19,13 +19,13 @@ import numpy as np
 
 from ...common.arrays import Array
 from ...common.errors import InputError
-from ...contacts.closing import close_finger, close_fingers, place_flush
+from ...contacts.closing import close_fingers
 from ...contacts.formation import Formation, find_touching
 from ...mapping.borders import NOWHERE, Piece, Window, cut, flush_track, label_cells, palm_track
 from ...mapping.formation_list import Stretch, format_route, list_formations, tolerance
 from ...problem.definition import Phase, Problem
 from ...problem.read import build_problem
-from ...scene.model import Finger, Friction, Polygon, Scene
+from ...scene.model import Scene
 from ...verification.newton_euler import locate
 from .slow_motion import slow_margin
 
@@ -105,13 +105,8 @@ def _draw_hand(rng: Random, body: Table, size: float) -> Table:
 
 def name_first(table: Table) -> list[str]:
     """Names of the contacts that touch at the start."""
-    body, fingers = table["object"], table["fingers"]
-    polygon = Polygon(body["vertices"], body["mass"])
-    right, left = (Finger(**fingers[key]) for key in ("1", "2"))
-    scene = Scene(polygon, (right, left), Friction(**table["friction"]))
-    q = place_flush(scene, table["start"]["flush"], table["start"]["x"])
-    z = np.array([*q, close_finger(scene, q, 0), close_finger(scene, q, 1)])
-    return [contact.name for contact in find_touching(scene, z)]
+    problem = build_problem({key: own for key, own in table.items() if key != "phases"})
+    return [contact.name for contact in find_touching(problem.scene, problem.start)]
 
 
 def random_route(rng: Random, problem: Problem) -> list[tuple[float, float]]:
