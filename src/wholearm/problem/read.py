@@ -198,11 +198,14 @@ def _read_scene(table: Mapping[str, Any]) -> Scene:
 
 
 def _read_start(scene: Scene, start: Mapping[str, Any]) -> Array:
-    edge, count = start["flush"], scene.polygon.n_vertices
+    _check_edge(scene, start["flush"], "start.flush")
+    return place_start(scene, start["flush"], require_number(start["x"], "start.x"))
+
+
+def _check_edge(scene: Scene, edge: object, key: str) -> None:
+    count = scene.polygon.n_vertices
     if not isinstance(edge, int) or isinstance(edge, bool) or not 0 <= edge < count:
-        text = f"{edge!r} is not an edge; allowed are 0 to {count - 1}"
-        raise InputError("", "start.flush", text)
-    return place_start(scene, edge, require_number(start["x"], "start.x"))
+        raise InputError("", key, f"{edge!r} is not an edge; allowed are 0 to {count - 1}")
 
 
 @exclusive
@@ -406,14 +409,10 @@ def _check_goal(scene: Scene, goal: Goal, key: str) -> None:
     if (goal.flush is None) == (goal.phi is None):
         both = "flush and phi_deg are both" if goal.phi is not None else "neither flush nor phi_deg"
         raise InputError("", key, f"{both} given; allowed is one of the two")
-    count = scene.polygon.n_vertices
     if goal.phi is not None:
         TURN.check(f"{key}.phi_deg", round(math.degrees(goal.phi), 9), "degrees")
-    elif not isinstance(goal.flush, int) or isinstance(goal.flush, bool):
-        raise InputError("", f"{key}.flush", f"{goal.flush!r} is not an edge; allowed are integers")
-    elif not 0 <= goal.flush < count:
-        text = f"{goal.flush!r} is not an edge; allowed are 0 to {count - 1}"
-        raise InputError("", f"{key}.flush", text)
+    else:
+        _check_edge(scene, goal.flush, f"{key}.flush")
     if goal.x is not None:
         check_place(scene, f"{key}.x", goal.x)
 

@@ -245,15 +245,6 @@ class Course(NamedTuple):
     torque: TorqueProfile
     spans: tuple[Span, ...]
     end: Array  # (10,): state (z, z') when the torques end
-    own_error: float  # of that state, relative to the scene
-
-
-def find_course(problem: Problem, torque: TorqueProfile, curve: Curve, reversals: int) -> Course:
-    """Integrate torques along a phase whose directions reverse so often."""
-    # The smallest tolerance that SciPy takes, and a larger one.
-    end, spans, _ = integrate(problem, torque, curve, reversals, 2.3e-14)
-    rough, *_ = integrate(problem, torque, curve, reversals, 2.3e-12)
-    return Course(problem, torque, spans, end, measure_error(problem, rough, end))
 
 
 def measure_error(problem: Problem, state: Array, exact: Array) -> float:
@@ -411,7 +402,9 @@ def make_course(instance: Instance, study: str) -> Course | None:
     breaks = motion.times[np.append(motion.grid.steps > 0, True)]
     breaks = np.append(breaks[breaks < stop], stop)
     torque = TorqueProfile.fit(breaks, lambda t: motion.evaluate(t).tau, degree)
-    return find_course(problem, torque, curve, len(marks) - 2)
+    # The smallest tolerance that SciPy takes.
+    end, spans, _ = integrate(problem, torque, curve, len(marks) - 2, 2.3e-14)
+    return Course(problem, torque, spans, end)
 
 
 class ReferenceCheck(NamedTuple):

@@ -25,7 +25,6 @@ from ...mapping.borders import NOWHERE, Piece, Window, cut, flush_track, label_c
 from ...mapping.formation_list import Stretch, format_route, list_formations, tolerance
 from ...problem.definition import Phase, Problem
 from ...problem.read import build_problem
-from ...scene.model import Scene
 from ...verification.newton_euler import locate
 from .slow_motion import slow_margin
 
