@@ -134,7 +134,7 @@ def _draw_phase(axes: Axes, phase: PhasePrediction, epsilon: float) -> None:
         write(axes, text, (0, 1), (0, 29 - 12 * k), color=PALETTE[k], **above)
     if not any(np.isfinite(force).any() for force in curves.force.values()):
         middle: Any = {"transform": axes.transAxes, "ha": "center", "va": "center", "zorder": 7}
-        axes.text(0.5, 0.5, "no slow motion keeps its limits", color=INK, **middle)
+        axes.text(0.5, 0.8, "no slow motion keeps its limits", color=INK, **middle)
     title = f"phase {phase.number}, until {phase.until}"
     above |= {"fontsize": 9, "fontweight": "bold"}
     write(axes, title, (0, 1), (0, 41), color=INK, **above)
