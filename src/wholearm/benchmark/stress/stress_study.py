@@ -324,8 +324,10 @@ def _check_phase(problem: Problem, phase: Phase, rows: Samples) -> list[str]:
     for body, share in zip(BODIES, missed, strict=True):
         if share > 1:
             texts.append(f"the equation of motion of {body} misses {share:.2g} of its bound")
-    turned = zip((*names, "joint 1", "joint 2"), found.against.any(axis=0), strict=True)
-    texts += [f"friction of {name} is not Coulomb's for its sliding" for name, own in turned if own]
+    turned = zip((*names, "joint 1", "joint 2"), found.against.T, strict=True)
+    texts += [
+        f"friction of {name} is not Coulomb's for its sliding" for name, own in turned if own.any()
+    ]
     for text, values, limits in (
         ("tau_{} exceeds its limit by {:.2g} of it", rows.tau, scene.torque_limit),
         ("joint {} exceeds its speed by {:.2g} of it", rows.z_dot[:, 3:], scene.speed_limit),
