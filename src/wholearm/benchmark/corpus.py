@@ -203,7 +203,7 @@ def _show(value: Any) -> str:
 
 
 def _read(path: str) -> dict[str, Any]:
-    return dict(read_json(path, "--update writes it anew"))
+    return dict(read_json(path))
 
 
 def _write(path: str, answers: Mapping[str, Any]) -> None:

@@ -120,7 +120,7 @@ def read_stored(path: str) -> dict[str, Counts]:
     ------
     InputError  if the file cannot be read, or is not a table of whole numbers
     """
-    table = read_json(path, "--update writes it anew")
+    table = read_json(path)
     rows = table.values() if isinstance(table, Mapping) else [None]
     numbers = [n for row in rows for n in (row.values() if isinstance(row, Mapping) else [None])]
     if not all(type(number) is int for number in numbers):

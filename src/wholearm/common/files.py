@@ -103,18 +103,14 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     write_whole(path, lambda stream: stream.write(text.encode()))
 
 
-def read_json(path: str, hint: str = "") -> Any:
-    """Contents of a JSON file.
-
-    Raises
-    ------
-    InputError  if the file cannot be read, with a `hint` at what to do
-    """
+def read_json(path: str) -> Any:
+    """Contents of a JSON file of stored answers; an `InputError` if it cannot be read."""
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "no JSON"
-        raise InputError(path, "", f"cannot be read: {reason}{hint and '; '}{hint}") from None
+        text = f"cannot be read: {reason}; --update writes it anew"
+        raise InputError(path, "", text) from None
 
 
 def make_folder(path: str) -> None:

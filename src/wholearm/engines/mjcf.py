@@ -42,10 +42,6 @@ class Softness(NamedTuple):
     impedance: float = 0.01  # share of the unconstrained motion that a contact takes away
     ratio: float = 100.0  # impedance of friction over that of the gap
 
-    def scale(self, factor: float) -> Softness:
-        """The same with other time constants."""
-        return self._replace(press=factor * self.press, rub=factor * self.rub)
-
 
 def write_mjcf(
     problem: Problem,

@@ -35,7 +35,9 @@ def play(
 
     steps = list_steps(problem, stretch, torque, setting.step)
     drive = EngineDrive(problem.scene, torque, steps.h) if isinstance(torque, ClosedLoop) else None
-    text = write_mjcf(problem, step=steps.h, softness=Softness().scale(setting.softness))
+    own, factor = Softness(), setting.softness
+    own = own._replace(press=factor * own.press, rub=factor * own.rub)
+    text = write_mjcf(problem, step=steps.h, softness=own)
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
     pairs = list_pairs(problem.scene)

@@ -123,7 +123,7 @@ def list_ends(phase: Phase) -> list[Ending]:
     # Where a contact changes its name its gap has no slope, but the end of its range has.
     ends = [Ending(formation, until.poses, (k,)) for k in gaining if k < own]
     if not ends or any(k >= own for k in gaining):
-        ends.append(_close_end(phase))
+        ends.append(Ending(formation.add(until.contact), until.poses))
     return ends
 
 
@@ -144,37 +144,10 @@ def _project(end: Ending, z: Array, slip: Array) -> tuple[Array | None, str]:
     return None, reason
 
 
-def _close_end(phase: Phase) -> Ending:
-    """The end of a phase at which the contact that is gained is closed."""
-    formation, gained = phase.formation, phase.until.contact
-    closed = (*formation.contacts, *(() if gained is None else (gained,)))
-    return Ending(Formation(formation.scene, closed, formation.rolling), phase.until.poses)
-
-
-def connect(
-    formation: Formation,
-    start: Array,
-    goal: Array,
-    bends: tuple[float, float] = (0.0, 0.0),
-    heading: Array | None = None,
-) -> PathGuess:
-    """Straight line projected onto the contacts, with the signs of its mean rates.
-
-    Parameters
-    ----------
-    bends           sideways amplitudes of one arc and of two, over the length; with two freedoms
-    heading : (5,)  initial direction, if not straight to the goal
-    """
+def connect(formation: Formation, start: Array, goal: Array) -> PathGuess:
+    """Straight line projected onto the contacts, with the signs of its mean rates."""
     slip = formation.evaluate_slip(start[None])[0]
-    aside = _find_normal(formation, start, goal) if any(bends) else np.zeros(5)
-    x = np.linspace(0.0, 1.0, POINTS)[1:, None]
-    off = bends[0] * np.sin(np.pi * x) + bends[1] * np.sin(2 * np.pi * x)
-    line = goal - start
-    places = start + x * line + off * aside
-    if heading is not None:
-        metric = np.sqrt(metric_weights(formation.scene))
-        length = np.linalg.norm(line * metric) / np.linalg.norm(heading * metric)
-        places += x * (1 - x) ** 2 * (length * heading - line)
+    places = start + np.linspace(0.0, 1.0, POINTS)[1:, None] * (goal - start)
     z = np.vstack([start, close_all(formation, places, slip)])
     # Where contacts do not close, the path waits.
     last = np.maximum.accumulate(np.where(np.isfinite(z).all(axis=1), np.arange(len(z)), 0))
@@ -184,13 +157,3 @@ def connect(
     rates = np.hstack([slip, speed[:, 3:]]).sum(axis=0)
     signs = np.where(rates < 0, -1.0, 1.0)
     return PathGuess(formation, z, Directions(signs[:-2], signs[-2:]))
-
-
-def _find_normal(formation: Formation, start: Array, goal: Array) -> Array:
-    """Normal of a line in the tangent plane at its start, as long as the line."""
-    metric = np.sqrt(metric_weights(formation.scene))
-    line = (goal - start) * metric
-    plane = np.linalg.qr(tangent_basis(formation, start) / metric[:, None])[0]
-    ahead = plane.T @ line
-    aside = plane @ np.array([-ahead[1], ahead[0]]) / max(np.linalg.norm(ahead), 1e-300)
-    return np.asarray(aside * np.linalg.norm(line) / metric)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise, permutations, product
@@ -600,13 +601,10 @@ def write_template(
     tried = [(few, 1.2 if few else 0.3)]
     # For given vertices the hand and the start of others may do.
     tried += product((True, False), (1.2, 0.8, 0.3, 0.0)) if given else ()
-    for last, (wide, start) in zip([*tried[1:], None], tried, strict=True):
-        try:
+    for wide, start in tried[:-1]:
+        with suppress(InputError):
             return _write(name, vertices, size, weight, wide, start)
-        except InputError:
-            if last is None:
-                raise
-    raise AssertionError
+    return _write(name, vertices, size, weight, *tried[-1])
 
 
 def _write(name: str, vertices: Array, size: float, weight: float, few: bool, start: float) -> str:

@@ -23,6 +23,7 @@ from ..contacts.closing import (
     contact_table,
     evaluate_contacts,
     evaluate_each,
+    find_reach,
     group_alike,
     lower,
 )
@@ -361,11 +362,7 @@ def choose_window(problem: Problem, phi_deg: tuple[float, float] | None = None) 
     """
     scene = problem.scene
     low, high = _cover_phases(problem) if phi_deg is None else np.radians(phi_deg).tolist()
-    size = float(np.hypot(*scene.polygon.vertices.T).max())
-    reach = [size + f.length + f.radius for f in scene.fingers]
-    bases = [float(np.asarray(f.base)[0]) for f in scene.fingers]
-    left = max(base - r for base, r in zip(bases, reach, strict=True))
-    right = min(base + r for base, r in zip(bases, reach, strict=True))
+    left, right = find_reach(scene)
     grid = np.linspace(left, max(left, right), 60)
     _, obstacle = label_grid(scene, grid, np.linspace(low, high, 60))
     reached = grid[(obstacle == 0).any(axis=0)]

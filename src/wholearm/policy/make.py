@@ -173,8 +173,7 @@ def _find_end_torques(
 def hold_end(problem: Problem, phase: Phase, z: Array) -> Array | None:
     """Torques that hold all contacts at the end of a phase at rest, or None."""
     contact = phase.until.contact
-    contacts = phase.formation.contacts if contact is None else (*phase.formation.contacts, contact)
-    touching = Formation(problem.scene, contacts)
+    touching = replace(phase.formation.add(contact), rolling=())
     place = Standstill(z, phase.formation, contact, touching)
     hold = find_hold(place, problem.epsilon, problem.gap, 0.02)
     return None if hold is None else hold.tau

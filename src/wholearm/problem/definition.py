@@ -162,12 +162,6 @@ class Phase:
         """The phase's number for people, from 1."""
         return self.index + 1
 
-    def move_to(self, scene: Scene) -> Phase:
-        """The phase in another scene."""
-        if self.formation.scene is scene:
-            return self
-        return replace(self, formation=replace(self.formation, scene=scene))
-
 
 @declare(
     key("flush", "The edge that shall lie on the palm.", INDEX),
@@ -246,7 +240,12 @@ class Problem:
     goals: tuple[Goal, ...] = ()
 
     def __post_init__(self) -> None:
-        phases = tuple(phase.move_to(self.scene) for phase in self.phases)
+        phases = tuple(
+            phase
+            if phase.formation.scene is self.scene
+            else replace(phase, formation=replace(phase.formation, scene=self.scene))
+            for phase in self.phases
+        )
         object.__setattr__(self, "phases", phases)
         if self.checked:
             return
