@@ -19,12 +19,10 @@ from ..common.sharing import exclusive
 from ..contacts.closing import (
     ClosedFinger,
     Numbers,
-    close_finger,
     close_fingers,
     contact_table,
     describe_obstacle,
     lower,
-    place_flush,
 )
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, find_touching
@@ -34,7 +32,7 @@ from ..geometry.path_guess import find_end, guess_phase
 from ..geometry.tracing import trace_phases
 from ..mechanics.dynamics import metric_weights
 from ..problem.definition import Phase, Problem, Until
-from ..problem.read import build_problem
+from ..problem.read import build_problem, place_start
 from ..problem.table import format_until
 from ..scene.model import TURN, Polygon, Scene, check_place
 from .borders import (
@@ -156,14 +154,13 @@ def _begin(
         return problem.start, None, corners[1:], []
     around = Window((0.0, 0.0), (float(first[1] - near[1]), float(first[1] + near[1])))
     for angle, edge in around.flush_angles(scene):
-        q = place_flush(scene, edge, float(first[0]))
         try:
-            z = np.array([*q, close_finger(scene, q, 0), close_finger(scene, q, 1)])
+            z = place_start(scene, edge, float(first[0]))
         except InputError as error:
             text = f"cannot start at {describe_place(first)}: {error.problem}"
             raise InputError("", "route", text) from None
         # A problem starts with phi in one turn; so does the route.
-        shift = np.array([0.0, float(q[2]) - angle])
+        shift = np.array([0.0, float(z[2]) - angle])
         note = "the [start] below takes the place of the problem's own"
         return z, (edge, float(first[0])), [pose + shift for pose in corners[1:]], [note]
     note = (
