@@ -20,10 +20,11 @@ from ..contacts.formation import Formation
 from ..problem.definition import Phase, Problem
 from ..results.dwell_record import SettledMotion, Settling, change_torques
 from ..results.torque import TorqueProfile
+from ..simulation.hand import build_system
 from ..simulation.holding_torques import Hold, Standstill, find_hold, find_opening
 from ..simulation.rest import close_contacts
 from ..simulation.simulate import simulate_free
-from ..simulation.tolerances import SLOW, is_slower
+from ..simulation.tolerances import SLOW
 from .path_domain.junction import begin_from
 from .phase_plan import Plans, Settled, end_of
 
@@ -64,7 +65,7 @@ def find_places(problem: Problem, plans: Plans) -> list[Standstill | None]:
         z, v = end_of(plan)
         touching = list_touching(problem, phase)
         place = Standstill(z, phase.formation, phase.until.contact, touching)
-        found.append(place if is_slower(problem.scene, v, SLOW) else None)
+        found.append(place if build_system(problem.scene).is_slower(v, SLOW) else None)
     return found
 
 

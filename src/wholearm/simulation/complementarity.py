@@ -158,12 +158,10 @@ class FreeRun(Run):
 
     def stands(self) -> bool:
         """Whether nothing moves."""
-        return bool((np.abs(self.v) < STANDING * self.system.units[self.system.n :]).all())
+        return self.system.is_slower(self.v, STANDING)
 
     def _is_still(self, acceleration: Array) -> bool:
-        system = self.system
-        still = STILL * system.units[system.n :] / system.scales.time
-        return bool((np.abs(acceleration) < still).all())
+        return self.system.is_slower(acceleration * self.system.scales.time, STILL)
 
     def _close(self, touching: float) -> None:
         """Project the start onto what touches, in the metric of masses."""
@@ -287,7 +285,7 @@ class FreeRun(Run):
         for contact, sign in zip(problem.owner, answer.sign, strict=True):
             choice[contact] = MODES[float(sign)] if choice[contact] != APART else APART
         exact = try_modes(problem, choice)
-        if exact is None or (np.abs(exact.change) < STANDING * system.units[system.n :]).all():
+        if exact is None or system.is_slower(exact.change, STANDING):
             return False
         names = " ".join(system.names[pair] for pair in pattern.closed)
         self.note_at(

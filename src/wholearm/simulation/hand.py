@@ -56,6 +56,7 @@ class _Bodies(NamedTuple):
     links: tuple[_Link, _Link]
 
 
+@lru_cache(maxsize=64)
 def build_system(scene: Scene) -> System:
     """The hand and the object as a system with five coordinates."""
     rounded = tuple(finger.radius > 0 for finger in scene.fingers)

@@ -141,8 +141,7 @@ def _find_closing(
     for mode in _list_sliding(place.formation, z):
         rows, closing = rest, -normal @ mode.acceleration
         if mode.heading is None:
-            moving = np.concatenate(mode.directions) != 0
-            rows = np.vstack([rest, (mode.slips / creep[:, None])[moving]])
+            rows = np.vstack([rest, (mode.slips / creep[:, None])[mode.signs != 0]])
         elif normal @ mode.heading >= 0:
             continue
         if ample is None:

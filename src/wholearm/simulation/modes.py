@@ -12,8 +12,10 @@ contact flush with a rolling one has no friction of its own.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -116,6 +118,28 @@ def find_mode(formation: Formation, signs: Array) -> Mode:
 
 
 _share_mode = lru_cache(maxsize=64)(Mode)
+
+
+def list_modes(
+    formation: Formation,
+    signs: Array,
+    units: Sequence[Unit],
+    options: Iterable[Sequence[float]],
+) -> Iterator[tuple[Array, Mode]]:
+    """Each combination of signs of some units, zero where held, that leaves a freedom to move in.
+
+    Parameters
+    ----------
+    signs : (n_c + 2,)  of contacts and joints; those of the units are replaced
+    options             signs to try, for each unit
+    """
+    for choice in product(*options):
+        tried = signs.copy()
+        for unit, sign in zip(units, choice, strict=True):
+            tried[list(unit.rows)] = sign
+        mode = find_mode(formation, tried)
+        if mode.n_constraints <= 4:
+            yield tried, mode
 
 
 def evaluate_rows(formation: Formation, z: Array, v: Array) -> ContactRows:

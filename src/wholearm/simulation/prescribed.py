@@ -28,7 +28,6 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from itertools import product
 from typing import Any, NamedTuple, NoReturn
 
 import casadi as ca
@@ -40,12 +39,13 @@ from ..common.errors import JammingError, SimulationError
 from ..contacts.contact_limits import takes_over
 from ..contacts.elemental import GapLimit, build_features, build_gap
 from ..contacts.formation import Formation
-from ..mechanics.impact import ViolationKind, compute_impact, solve_impulses
+from ..mechanics.impact import ViolationKind, compute_impact
 from ..problem.definition import End, Phase, Problem, Until
 from ..results.torque import TorqueProfile
+from ..scene.model import Scene
 from .events import EventKind, Outcome, OutcomeKind, Record, describe_change
 from .hand import build_system
-from .modes import Mode, Unit, evaluate_rows, find_fixed, find_mode, list_units, respond
+from .modes import Mode, Unit, evaluate_rows, find_fixed, find_mode, list_modes, list_units, respond
 from .rest import Collapse, Rest, StartDeparture, close_contacts, find_rest
 from .run import Run, StuckError
 from .stepper import INNER_STAGES, NODES, ModeStepper
@@ -62,10 +62,6 @@ from .tolerances import (
     SETTLING,
     SLOW,
     STANDING,
-    is_slower,
-    measure_rates,
-    measure_units,
-    measure_until,
 )
 
 CLEAR = 1e-8  # least margin of a clear decision, over the scene's units
@@ -94,18 +90,12 @@ class LegRows(NamedTuple):
     force: slice  # c_n
     # what friction still has to give where it holds (`Mode.holders`): bound - f, then bound + f
     cone: slice
-    slide: slice  # slide, joint: sliding velocities times Xi, joint speeds times sigma
-    joint: slice
+    turning: slice  # sliding velocities times Xi, then joint speeds times sigma
     limit: slice  # the formation's limits; that of the contact to be gained counts as `until`
     until: int  # distance to the end of the phase; one if that is a release
     # speed along the heading, in the metric M5; one with more than one freedom, where contacts and
     # joints come to rest one by one
     speed: int
-
-    @property
-    def turning(self) -> slice:
-        """All that changes sign at a reversal: contacts, then joints."""
-        return slice(self.slide.start, self.joint.stop)
 
 
 class ModeSegment(NamedTuple):
@@ -115,8 +105,9 @@ class ModeSegment(NamedTuple):
     stepper: ModeStepper
     rows: LegRows
     slack: Array  # (m,): how far below zero each event value counts as rounding
-    # sets `event_values` from outputs of the steps and the `heading` at their start, (5,)
+    # sets `event_values` from outputs of the steps and the `heading` at their start
     measure: Any
+    # (5,): velocity at the start of a step, scaled to one in the metric M5, or the impending one
     heading: Array
     # m values, distance to the end [m or rad], its rate, heading
     event_values: Array
@@ -136,9 +127,9 @@ def _build_leg(
     """A segment with the steps of its mode, before it gets a phase and a number."""
     scene, own = formation.scene, s.rows
     limits, last = open_limits(formation, until), own.slide.stop + 2
-    parts = own.force, own.cone, own.slide, slice(own.slide.stop, last)
     until_row = last + len(limits)
-    rows = LegRows(*parts, slice(last, until_row), until_row, until_row + 1)
+    parts = own.force, own.cone, slice(own.slide.start, last), slice(last, until_row)
+    rows = LegRows(*parts, until_row, until_row + 1)
     sizes = [own.cone.stop, last - own.cone.stop, len(limits), 1, 1]
     slack = np.repeat([ROUNDING_FORCE, ROUNDING_SPEED, REACHED, 0.0, ROUNDING_SPEED], sizes)
     z, v, before = build_features(scene).z, ca.SX.sym("v", 5), ca.SX.sym("before", 5)
@@ -156,7 +147,7 @@ def _build_leg(
     mass, unit = ca.DM(scene.mass_diagonal), scene.scales.speed * scene.scales.mass**0.5
     speed = ca.dot(before, mass * v) / unit if mode.n_constraints >= 4 else ca.SX(1)
     gaps = [limit.value / scene.scales.length for limit in limits]
-    reached = distance / measure_until(scene, until)
+    reached = distance / _measure_until(scene, until)
     every = ca.vertcat(values[: own.slide.stop], values[-2:], *gaps, reached, speed)
     size = ca.sqrt(ca.dot(v, mass * v))
     heading = ca.if_else(size > 0, v / ca.fmax(size, 1e-300), before)
@@ -170,6 +161,11 @@ def _build_leg(
     buffer.set_arg(1, start.data)
     buffer.set_res(0, event_values.data)
     return ModeSegment(mode, s, rows, slack, measure, start, event_values, buffer)
+
+
+def _measure_until(scene: Scene, until: Until) -> float:
+    """Unit of the distance to the end of a phase [m or rad]."""
+    return 1.0 if until.coordinate == "phi" else scene.scales.length
 
 
 class Choice(NamedTuple):
@@ -282,7 +278,7 @@ class Replay(Run):
         self.load(modes._replace(Xi=(0.0,) * len(modes.kept), sigma=(0.0,) * 5))
         self.leg = _build_leg(self.formation, self.phase.until, self.side, self.s, mode)
         self.slack, self.urgent = self.leg.slack, self.leg.rows.speed
-        self.heading = np.zeros(5)
+        self.leg.heading[:] = 0.0
 
     def measure(self) -> Array:
         """Event values after the step just made."""
@@ -304,15 +300,6 @@ class Replay(Run):
         """Time derivative of the distance."""
         return float(self.leg.event_values[-6])
 
-    @property
-    def heading(self) -> Array:
-        """Velocity at the start of a step, scaled to one in the metric M5, or the impending one."""
-        return self.leg.heading
-
-    @heading.setter
-    def heading(self, heading: Array) -> None:
-        self.leg.heading[:] = heading
-
     def observe(self) -> None:
         """Evaluate the present state, and record it."""
         self.look()
@@ -321,7 +308,7 @@ class Replay(Run):
     def keep(self, t: float) -> None:
         """Take the step just made, to time `t`, and record its end."""
         super().keep(t)
-        self.heading = self.leg.event_values[-5:]
+        self.leg.heading[:] = self.leg.event_values[-5:]
         self.require_inertia()
 
     def require_inertia(self) -> None:
@@ -605,7 +592,7 @@ class Replay(Run):
             coming = self.piece + 1
             speed = 0.0 if coming >= len(self.steps_at) or self.steps_at[coming] else speed
         elif self.phase.end is not End.SMOOTH and self.formation.n_constraints < 4:
-            units = measure_units(self.problem.scene)[5:]
+            units = self.system.units[5:]
             speed = float(np.abs(self.s.outputs[5:10] / units).max())
         presses = bool(self.values[self.leg.rows.force].min() >= -ROUNDING_FORCE)
         return speed < SLOW and presses and not self.find_slipping()
@@ -704,13 +691,14 @@ class Replay(Run):
         contacts of `resting` come to rest, as they roll in the next phase, or one of `slipping`
         slips.
         """
-        formation, until, moves = phase.formation, phase.until, self.moving
+        formation, until = phase.formation, phase.until
         self.phase, self.phase_index, old = phase, phase.index, self.system.stored(self.z, self.v)
         self.y[:5] = self._close(formation)
-        v = project_velocity(formation, self.z, self.v) if moves else np.zeros(5)
-        self.moving = moves and not is_slower(self.problem.scene, v, STANDING)
-        self.y[5:10] = v if self.moving else 0.0
         self.impact += float(old - self.system.stored(self.z, self.v))
+        self.project_velocity(formation.evaluate(self.z[None], self.v[None]).P[0])
+        self.moving = self.moving and not self.system.is_slower(self.v, STANDING)
+        if not self.moving:
+            self.set_velocity(0.0)
         # At any speed a contact can be gained only where it goes on for another one.
         gained = until.contact
         self.passes = phase.end is End.SMOOTH and (
@@ -720,7 +708,7 @@ class Replay(Run):
         if until.value is not None:
             place = self.y[0 if until.coordinate == "x" else 2]
             self.side = math.copysign(1.0, place - until.value)
-        self.until_unit = measure_until(self.problem.scene, until)
+        self.until_unit = _measure_until(formation.scene, until)
         self.stuck, self.least = set(), np.full(formation.n_contacts, math.inf)
         self.take(find_mode(formation, np.ones(formation.n_contacts + 2)))
         self.releasable, self.resting, self.slipping = (), frozenset(), frozenset()
@@ -764,7 +752,7 @@ class Replay(Run):
 
     def set_off(self, departure: StartDeparture) -> None:
         """Set the friction signs of a motion that starts from rest."""
-        formation, signs = self.formation, np.concatenate(departure.directions)
+        formation, signs = self.formation, departure.signs
         mode = find_mode(formation, signs)
         if formation.n_constraints < 4:
             rows = evaluate_rows(formation, self.z, self.v)
@@ -774,13 +762,14 @@ class Replay(Run):
             }
         if mode != self.leg.mode:
             self.take(mode)
-        self.signs, self.heading = signs, departure.heading
+        self.signs = signs
+        self.leg.heading[:] = departure.heading
         self.observe()
 
     def go_on(self) -> Ending | None:
         """Set the friction signs of the present velocity; what ends the motion at once, if any."""
         formation, v = self.formation, self.v
-        self.heading = v / np.sqrt(self.system.mass @ v**2)
+        self.leg.heading[:] = v / np.sqrt(self.system.mass @ v**2)
         rates = np.concatenate([formation.evaluate(self.z[None], v[None]).A_t[0] @ v, v[3:]])
         signs = np.where(rates < 0, -1.0, 1.0)
         for row, name in enumerate(formation.names):
@@ -837,7 +826,7 @@ class Replay(Run):
         ]
         if not still:
             return False
-        if is_slower(self.problem.scene, self.v, STANDING):
+        if self.system.is_slower(self.v, STANDING):
             return True
         if not self.gets_on():
             names = " ".join(formation.names)
@@ -1025,17 +1014,11 @@ class Replay(Run):
         """Signs of the first clear combination or of the best; `JammingError` without any."""
         formation, scales, ahead = self.formation, self.system.scales, self.settling
         loads = [np.array([1.0, *self.tau(t)]) for t in (self.t, self.t + ahead)]
-        present, count, ratios = (
-            evaluate_rows(formation, self.z, self.v),
-            formation.n_contacts,
-            [1.0],
-        )
+        present, count = evaluate_rows(formation, self.z, self.v), formation.n_contacts
+        speeds, ratios = np.repeat([scales.speed, scales.rate], [count, 2]), [1.0]
 
-        def measure(signs: Array) -> Choice | None:
+        def measure(signs: Array, mode: Mode) -> Choice | None:
             """Margins of one combination; None if it jams or leaves its forces undetermined."""
-            mode = find_mode(formation, signs)
-            if mode.n_constraints > 4:
-                return None
             acceleration, rates = np.zeros(5), np.zeros(count + 2)
             for delay, load in zip((0.0, ahead), loads, strict=True):
                 v = self.v + delay * acceleration
@@ -1050,7 +1033,7 @@ class Replay(Run):
                     rates + response.rates @ load / 2,
                 )
                 held = response.force_limits @ load / mode.force_limit_units
-            gained = signs * rates / (measure_rates(self.problem.scene, count) / scales.time)
+            gained = signs * rates / (speeds / scales.time)
             cones = held[count:].reshape(2, -1).min(axis=0)
             margins = [np.inf]
             for unit in still:
@@ -1063,11 +1046,8 @@ class Replay(Run):
             return Choice(signs, fixed, float(min(margins)), float(held[:count].min()))
 
         choices: list[Choice] = []
-        for options in product(*orders):
-            tried = signs.copy()
-            for unit, sign in zip(still, options, strict=True):
-                tried[list(unit.rows)] = sign
-            choice = measure(tried)
+        for pattern in list_modes(formation, signs, still, orders):
+            choice = measure(*pattern)
             if choice is None:
                 continue
             if choice.margin > CLEAR and choice.pressing > -CLEAR:
@@ -1104,10 +1084,4 @@ class Replay(Run):
         if mode != self.leg.mode:
             self.take(mode)
         self.signs = signs
-        self.heading = self.v / np.sqrt(self.system.mass @ self.v**2)
-
-
-def project_velocity(formation: Formation, z: Array, v: Array) -> Array:
-    """Velocity nearest to `v` in the metric M5 that keeps every constraint, shape (5,)."""
-    P = formation.evaluate(z[None], v[None]).P[0]
-    return solve_impulses(formation.scene.mass_diagonal, P, P, v)[0]
+        self.leg.heading[:] = self.v / np.sqrt(self.system.mass @ self.v**2)

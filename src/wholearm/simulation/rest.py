@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -23,12 +22,12 @@ from ..common.arrays import Array
 from ..common.errors import SimulationError
 from ..contacts.cones import find_weakest
 from ..contacts.formation import Formation
-from ..mechanics.dynamics import Directions
 from ..mechanics.statics import GRAZE, Statics, TorquePolygon
 from ..scene.model import Scene
-from .modes import find_mode, list_units, respond
+from .hand import build_system
+from .modes import Mode, find_mode, list_modes, list_units, respond
 from .system import ContactRows
-from .tolerances import ROUNDING_FORCE, STILL, measure_units
+from .tolerances import ROUNDING_FORCE, STILL
 
 BALANCED = 1e-6  # distance beyond torques that can be held that counts as none, over the scene's
 _AHEAD = 1e-5  # step along the free direction for the signs of what is stationary, in scene units
@@ -39,7 +38,7 @@ class StartDeparture(NamedTuple):
 
     x: float
     heading: Array  # (5,): where to, of length one in the metric M5
-    directions: Directions
+    signs: Array  # (n_c + 2,): of sliding and turning, zero for what friction holds
 
 
 class Collapse(NamedTuple):
@@ -55,8 +54,7 @@ class Collapse(NamedTuple):
 class StartMode(NamedTuple):
     """Start mode; quantities at rest are rows @ (1, tau_1, tau_2)."""
 
-    directions: Directions  # zero for what friction holds
-    mass: Array  # (5,): diagonal of M5
+    signs: Array  # (n_c + 2,): of sliding and turning, zero for what friction holds
     acceleration: Array  # (5, 3): z''
     # (n_c + 2 R, 3) [N]: what has to be positive for the contacts to hold, H c (`contacts.cones`)
     force_limits: Array
@@ -78,7 +76,8 @@ class StartMode(NamedTuple):
 
     def drive(self, tau: Array) -> float:
         """Acceleration in the metric M5."""
-        return float(np.sqrt(self.mass @ (self.acceleration @ [1.0, *tau]) ** 2))
+        mass = self.statics.scene.mass_diagonal
+        return float(np.sqrt(mass @ (self.acceleration @ [1.0, *tau]) ** 2))
 
     def slides(self, tau: Array) -> bool:
         """Whether the formation accelerates in this mode if every contact can press or pull."""
@@ -97,7 +96,7 @@ class StartMode(NamedTuple):
     def depart(self, x: float, tau: Array) -> StartDeparture:
         """Start at `x` of a piece, where the torques are `tau`."""
         heading = self.acceleration @ [1.0, *tau] / self.drive(tau)
-        return StartDeparture(x, heading, self.directions)
+        return StartDeparture(x, heading, self.signs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,14 +112,15 @@ class Rest:
     def sliding(self) -> tuple[StartMode, ...]:
         """Start modes without sticking: two with one freedom, all sign patterns with more."""
         if self.heading is not None:
-            modes = (self._build(self._find_signs(h), h) for h in (self.heading, -self.heading))
+            ways = ((self._find_signs(h), h) for h in (self.heading, -self.heading))
+            modes = (self._build(find_mode(self.formation, signs), signs, h) for signs, h in ways)
             return tuple(mode for mode in modes if mode is not None)
-        return tuple(self._list_patterns(held=False))
+        return self._list_patterns(held=False)
 
     @cached_property
     def sticking(self) -> tuple[StartMode, ...]:
         """Start modes in which friction holds some contact or joint, the least first."""
-        return () if self.heading is not None else tuple(self._list_patterns(held=True))
+        return () if self.heading is not None else self._list_patterns(held=True)
 
     @property
     def modes(self) -> tuple[StartMode, ...]:
@@ -147,25 +147,24 @@ class Rest:
         rounding = BALANCED * self.formation.scene.scales.torque
         return polygon._replace(bounds=polygon.bounds + rounding)
 
-    def _list_patterns(self, held: bool) -> Iterator[StartMode]:
+    def _list_patterns(self, held: bool) -> tuple[StartMode, ...]:
         """Start modes with more freedoms: only those with sticking, or only the others."""
-        units, count = list_units(self.formation), self.formation.n_contacts
-        choices = [(1.0, -1.0, 0.0) if held and unit.grips else (1.0, -1.0) for unit in units]
-        for options in sorted(product(*choices), key=lambda options: options.count(0.0)):
-            grips = options.count(0.0)
-            if (grips > 0) != held or self.formation.n_constraints + grips > 4:
-                continue
-            signs = np.zeros(count + 2)
-            for unit, sign in zip(units, options, strict=True):
-                signs[list(unit.rows)] = sign
-            mode = self._build(signs)
-            if mode is not None:
-                yield mode
+        formation, units = self.formation, list_units(self.formation)
+        options = [(1.0, -1.0, 0.0) if held and unit.grips else (1.0, -1.0) for unit in units]
+        patterns = list_modes(formation, np.zeros(formation.n_contacts + 2), units, options)
+        found = [
+            (mode, signs)
+            for signs, mode in patterns
+            if (len(mode.holders) > formation.n_rolling) == held
+        ]
+        found.sort(key=lambda pattern: len(pattern[0].holders))
+        modes = (self._build(*pattern) for pattern in found)
+        return tuple(mode for mode in modes if mode is not None)
 
     def _find_signs(self, heading: Array) -> Array:
         """Directions of contacts and joints along the only freedom, (n_c + 2,); zero for none."""
         formation, scales = self.formation, self.formation.scene.scales
-        step = _AHEAD / np.abs(heading / measure_units(formation.scene)[:5]).max()
+        step = _AHEAD / np.abs(heading / build_system(formation.scene).units[:5]).max()
         rates = np.concatenate([self.statics.A_t @ heading, heading[3:]])
         rates[list(formation.rolling_rows)] = 0.0
         # How fast each slides or turns over how fast anything moves.
@@ -178,21 +177,20 @@ class Rest:
             rates = np.where(still, np.where(np.abs(ahead) > 1e-12 * scale, ahead, 0.0), rates)
         return np.asarray(np.sign(rates))
 
-    def _build(self, signs: Array, heading: Array | None = None) -> StartMode | None:
+    def _build(self, mode: Mode, signs: Array, heading: Array | None = None) -> StartMode | None:
         """The start mode of some signs, (n_c + 2,); None if its forces are not determined."""
-        formation, scene, count = self.formation, self.formation.scene, self.formation.n_contacts
-        mode = find_mode(formation, signs)
+        scene, count = self.formation.scene, self.formation.n_contacts
         rows = ContactRows(self.statics.A, self.statics.A_t, np.zeros(count), np.zeros(count))
         response = respond(mode, signs, rows, np.zeros(5))
         if response is None:
             return None
-        declared = np.array([mode.declares(k) for k in range(len(mode.holders))] * 2, dtype=bool)
-        kept = np.concatenate([np.ones(count, dtype=bool), declared])
+        declared = [mode.declares(k) for k in range(len(mode.holders))]
+        kept = np.array([True] * count + declared + declared)
         scales, length = scene.scales, scene.scales.length
         slips = signs[:, None] * response.rates
         graze = GRAZE * np.repeat([1.0, length], [count, 2]) @ slips
         openings = self.statics.opening[0] @ response.acceleration + graze
-        still = STILL * np.repeat([scales.acceleration, 1 / scales.time**2], [count, 2])
+        still = STILL * np.repeat([scales.acceleration, scales.rate / scales.time], [count, 2])
         # Difference quotients are as good as 1e-7.
         closing = np.full(len(openings), 1e-7 * scales.acceleration)
         if heading is not None:
@@ -201,8 +199,7 @@ class Rest:
             still, closing = np.array([-_measure_drive(scene)]), np.zeros(len(openings))
         rounding = ROUNDING_FORCE * mode.force_limit_units
         return StartMode(
-            directions=Directions(signs[:count], signs[count:]),
-            mass=scene.mass_diagonal,
+            signs=signs,
             acceleration=response.acceleration,
             force_limits=response.force_limits[kept],
             slips=slips,

@@ -34,7 +34,7 @@ from .hand import build_system, measure_gaps
 from .prescribed import Replay
 from .run import Feedback, Law, Run
 from .stepper import Modes
-from .tolerances import SLOW, is_slower
+from .tolerances import SLOW
 
 if TYPE_CHECKING:
     from .complementarity import FreeRun
@@ -155,7 +155,8 @@ def simulate_phases(
     """
     starts, found = plan.phase_starts, []
     rows = [int(row) for row in np.flatnonzero(np.diff(plan.phase, prepend=-1))]
-    rests = [is_slower(problem.scene, plan.z_dot[row], SLOW) for row in rows] + [True]
+    system = build_system(problem.scene)
+    rests = [system.is_slower(plan.z_dot[row], SLOW) for row in rows] + [True]
     first = 0
     for last in range(len(rows)):
         if not rests[last + 1]:

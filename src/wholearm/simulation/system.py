@@ -131,6 +131,10 @@ class System:
         place = np.where(self.structure.turns, 1.0, self.scales.length)
         return np.concatenate([place, place / self.scales.time])
 
+    def is_slower(self, v: Array, bound: float) -> bool:
+        """Whether no component of z', shape (n,), exceeds `bound` times its unit."""
+        return bool((np.abs(v) < bound * self.units[self.n :]).all())
+
     @cached_property
     def friction_units(self) -> Array:
         """Units of the friction of coordinates, shape (n,) [N, N m]."""

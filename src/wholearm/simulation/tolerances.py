@@ -1,15 +1,5 @@
 """Tolerances of the simulator, each relative to a scale of the scene (`Scene.scales`)."""
 
-from __future__ import annotations
-
-from functools import lru_cache
-
-import numpy as np
-
-from ..common.arrays import Array
-from ..problem.definition import Until
-from ..scene.model import Scene
-
 ROUNDING_FORCE = 1e-9  # shortfall of a force, torque or friction margin that is rounding
 ROUNDING_SPEED = 2e-13  # largest negative speed that counts as rounding
 ROUNDING_LIMIT = 3e-8  # overlap that is rounding: the contact just given up starts at zero
@@ -24,29 +14,3 @@ LONGEST_WINDOW = 2e-2  # longest time between an arrival at speed and its torque
 FIRST_STEP = 2e-2  # length of the first step tried from rest
 SHORTEST_STEP = 1e-13  # underflow of a step, over the scene's time and the elapsed time
 STILL = 1e-10  # acceleration that counts as rounding
-
-
-@lru_cache(maxsize=64)
-def measure_units(scene: Scene) -> Array:
-    """The scene's units of z, then of z', shape (10,): lengths and rad, and both over time."""
-    scales = scene.scales
-    place = np.array([scales.length, scales.length, 1.0, 1.0, 1.0])
-    units = np.concatenate([place, place / scales.time])
-    units.setflags(write=False)
-    return units
-
-
-def measure_until(scene: Scene, until: Until) -> float:
-    """Unit of the distance to the end of a phase [m or rad]."""
-    return 1.0 if until.coordinate == "phi" else scene.scales.length
-
-
-def is_slower(scene: Scene, v: Array, bound: float) -> bool:
-    """Whether no component of z', shape (5,), exceeds `bound` times the scene's unit of it."""
-    return bool((np.abs(v) < bound * measure_units(scene)[5:]).all())
-
-
-def measure_rates(scene: Scene, count: int) -> Array:
-    """The scene's speed for `count` contacts, then that of joints, shape (count + 2,)."""
-    scales = scene.scales
-    return np.repeat([scales.speed, 1 / scales.time], [count, 2])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import combinations, product
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -21,9 +21,8 @@ from ..mechanics.statics import Statics
 from ..problem.definition import Phase, Problem
 from ..results.report import Approach, ForceAt, Loss, PhaseReport, TorqueAdvice, TuningHelp
 from ..simulation.events import EventKind, Simulation
-from ..simulation.modes import evaluate_rows, find_mode, list_units, respond
+from ..simulation.modes import evaluate_rows, find_mode, list_modes, list_units, respond
 from ..simulation.rest import StartMode, find_rest
-from ..simulation.tolerances import measure_rates
 from .verdict import Allowance
 from .verify import find_lowest
 
@@ -176,9 +175,8 @@ def find_worst(
     free = [path for path in paths if path.slides(tau)]
     if not free:
         return None
-    return _answer(
-        formation, z, min(free, key=lambda path: float((path.force_limits @ load).min()))
-    )
+    worst = min(free, key=lambda path: float((path.force_limits @ load).min()))
+    return answer(formation, z, np.zeros(5), worst.signs)
 
 
 def find_resting_changes(
@@ -204,7 +202,7 @@ def find_resting_changes(
     limits, unit = make_limits(formation, epsilon), formation.scene.scales.torque
     starts = list[tuple[StartMode, tuple[Array, Array]]]()
     for path in paths:
-        instant = _answer(formation, z, path)
+        instant = answer(formation, z, np.zeros(5), path.signs)
         if instant is not None:
             towards = [] if gradient is None else [-gradient @ path.acceleration]
             rows = np.vstack([path.margins, *towards])
@@ -227,16 +225,11 @@ def find_resting_changes(
     return tuple(sorted(changes, key=lambda change: (change.holds, np.hypot(*change.change))))
 
 
-def _answer(formation: Formation, z: Array, path: StartMode) -> Instant | None:
-    return answer(formation, z, np.zeros(5), np.concatenate(path.directions))
-
-
 class Instant(NamedTuple):
     """Forces and accelerations at one state; each is rows @ (1, tau_1, tau_2)."""
 
     formation: Formation
-    z: Array  # z, v (5,):
-    v: Array
+    v: Array  # (5,)
     acceleration: Array  # (5, 3)
     # c_n, c_t (n_c, 3) [N]: naN for c_t of a flush edge that friction holds although it may slide:
     # it is not determined
@@ -265,21 +258,23 @@ def find_moving(
     """
     scene, rows = formation.scene, evaluate_rows(formation, z, v)
     speeds = np.concatenate([rows.A_t @ v, v[3:]])
-    slow = np.abs(speeds) < SLOW * measure_rates(scene, formation.n_contacts)
+    slow = np.abs(speeds) < SLOW * np.repeat(
+        [scene.scales.speed, scene.scales.rate], [formation.n_contacts, 2]
+    )
     signs = np.sign(speeds)
     signs[list(formation.rolling_rows)] = 0.0
     still = [unit for unit in list_units(formation) if slow[list(unit.rows)].all()]
     holds = formation.n_constraints < 4
     options = [(1.0, -1.0, 0.0) if holds and unit.grips else (1.0, -1.0) for unit in still]
-    candidates: list[tuple[float, Instant]] = []
-    for choice in product(*options):
-        for unit, sign in zip(still, choice, strict=True):
-            signs[list(unit.rows)] = sign
-        instant = answer(formation, z, v, signs)
-        if instant is not None:
-            misfit = instant.acceleration @ [1.0, *tau] - acceleration
-            candidates.append((float(scene.mass_diagonal @ misfit**2), instant))
-    return min(candidates, key=lambda pair: pair[0])[1] if candidates else None
+    tried = (
+        answer(formation, z, v, own) for own, _ in list_modes(formation, signs, still, options)
+    )
+
+    def misfit(instant: Instant) -> float:
+        off = instant.acceleration @ [1.0, *tau] - acceleration
+        return float(scene.mass_diagonal @ off**2)
+
+    return min((one for one in tried if one is not None), key=misfit, default=None)
 
 
 def answer(formation: Formation, z: Array, v: Array, signs: Array) -> Instant | None:
@@ -298,7 +293,7 @@ def answer(formation: Formation, z: Array, v: Array, signs: Array) -> Instant | 
         if rows[0] < count:
             # The sides of a cone are mu c_n - c_t and mu c_n + c_t.
             c_t[list(rows)] = (cones[held + k] - cones[k]) / 2 if len(rows) == 1 else np.nan
-    return Instant(formation, z, v, response.acceleration, c_n, c_t)
+    return Instant(formation, v, response.acceleration, c_n, c_t)
 
 
 def find_changes(
