@@ -63,14 +63,6 @@ class ClosedContacts(NamedTuple):
     rows: ContactRows
 
 
-class Samples(NamedTuple):
-    """Gaps of all pairs within a step."""
-
-    times: Array  # (m + 1,) [s]: instants since its start, which is the first
-    gaps: Array  # gaps, ranges (m + 1, N) [m]
-    ranges: Array
-
-
 class FreeRun(Run):
     """A running simulation without prescribed contacts.
 
@@ -495,15 +487,10 @@ class FreeRun(Run):
     def look(self) -> None:
         """Start from the present state."""
         super().look()
-        self.watch.advance()
+        self.longest = self.watch.advance()
 
-    @property
-    def longest(self) -> float:
-        """Longest step from the present state: one of `REACH`, in units of the scene."""
-        return self.watch.longest
-
-    def _sample(self, h: float) -> Samples:
-        """Gaps and ranges within the step just made, of length h."""
+    def _sample(self, h: float) -> tuple[Array, Array, Array]:
+        """Instants of the step just made, of length h, both its ends too; gaps and ranges there."""
         watch, n = self.watch, self.system.n
         count = 1 + int(LOOKS * min(1.0, watch.travel / REACH))
         times = h * np.arange(count + 1) / count
@@ -513,7 +500,8 @@ class FreeRun(Run):
             first = np.zeros(count - 1, dtype=np.int64)
             z = interpolate_quintic(np.full(count - 1, h), times[1:-1], tuple(knots), first)[0]
             seen.insert(1, self.system.measure(z))
-        return Samples(times, *map(np.concatenate, zip(*seen, strict=True)))
+        gaps, ranges = map(np.concatenate, zip(*seen, strict=True))
+        return times, gaps, ranges
 
     def measure(self) -> Array:
         """Event values of the steps, then ranges of kept pairs."""
@@ -536,7 +524,7 @@ class FreeRun(Run):
     def keep(self, t: float) -> None:
         """Take the step just made, to time `t`, and record its end."""
         super().keep(t)
-        self.watch.advance()
+        self.longest = self.watch.advance()
         self.floor = np.where(self.values > 0, self.slack, self.floor)
 
     def handle(self, found: list[int]) -> bool:
@@ -592,35 +580,30 @@ class FreeRun(Run):
 
     def find_closing(self, h: float, done: Sequence[int]) -> Closing | None:
         """The first pair that closes within the step just made, and a bracket of when."""
-        passed, seen = [pair for pair in done if pair >= 0], self._sample(h)
+        passed, unit = [pair for pair in done if pair >= 0], self.unit
+        times, gaps, ranges = self._sample(h)
         # What comes apart within the step may close again within it.
-        apart = np.logical_or.accumulate(seen.gaps[:-1] > ARMED * self.unit, axis=0)
+        apart = np.logical_or.accumulate(gaps[:-1] > ARMED * unit, axis=0)
         level = np.where(apart, 0.0, self.watch.level)
-        crosses = (seen.gaps[1:] < level) & (seen.gaps[:-1] >= level) & (self.watch.watched > 0)
+        crosses = (gaps[1:] < level) & (gaps[:-1] >= level) & (self.watch.watched > 0)
         crosses[:, passed] = False
-        crosses &= np.maximum(seen.ranges[1:], seen.ranges[:-1]) > -1e-3 * self.unit
+        crosses &= np.maximum(ranges[1:], ranges[:-1]) > -1e-3 * unit
         rows, pairs = crosses.nonzero()
-        if not len(rows):
-            return self._find_entering(seen, passed)
-        row, pair = int(rows[0]), int(pairs[0])
-        return Closing(pair, float(level[row, pair]), *seen.times[row : row + 2].tolist())
-
-    def _find_entering(self, seen: Samples, passed: Sequence[int]) -> Closing | None:
-        """The first pair that comes into range apart or touching, and overlaps after that.
-
-        Out of range a gap has no meaning and may be negative throughout.
-        """
-        turns = (seen.ranges[1:] > 0) & (seen.ranges[:-1] <= 0) & (self.watch.watched > 0)
-        turns &= (seen.gaps[1:] < -CLOSED * self.unit) & (seen.gaps[1:] > -REACH * self.unit)
+        if len(rows):
+            row, pair = int(rows[0]), int(pairs[0])
+            return Closing(pair, float(level[row, pair]), *times[row : row + 2].tolist())
+        # The first one that comes into range apart or touching, and overlaps after that. Out of
+        # range a gap has no meaning and may be negative throughout.
+        turns = (ranges[1:] > 0) & (ranges[:-1] <= 0) & (self.watch.watched > 0)
+        turns &= (gaps[1:] < -CLOSED * unit) & (gaps[1:] > -REACH * unit)
         turns[:, passed] = False
-        h = float(self.s.inputs[self.s.at.h])
         for row, pair in zip(*(part.tolist() for part in turns.nonzero()), strict=True):
-            left, right = seen.times[row : row + 2].tolist()
-            entry = self._find_entry(pair, left, right, -float(seen.ranges[row, pair]))
+            left, right = times[row : row + 2].tolist()
+            entry = self._find_entry(pair, left, right, -float(ranges[row, pair]))
             self.step_to(entry)
             gap = float(self.watch.ahead[pair])
-            if gap > -SUNK * self.unit:
-                return Closing(pair, min(gap, 0.0) - 0.5 * CLOSED * self.unit, entry, right)
+            if gap > -SUNK * unit:
+                return Closing(pair, min(gap, 0.0) - 0.5 * CLOSED * unit, entry, right)
             self.step_to(h)
         return None
 
@@ -660,7 +643,6 @@ class Watch:
     end, ahead, spans       the same at its end
     level : (N,) [m]        gap at which a pair that touches closes
     watched : (N,)          1 for pairs that do not press
-    longest : [s]           longest step from the start
     """
 
     def __init__(self, system: System) -> None:
@@ -688,10 +670,10 @@ class Watch:
         self._h[0] = s.inputs[s.at.h]
         self._calls[0][0]()
 
-    def advance(self) -> None:
-        """Start the next step from the end of this one."""
+    def advance(self) -> float:
+        """Start the next step from the end of this one; how long it may be, `REACH` at most [s]."""
         self.motion[:], self._start[:] = self.end, self._seen
-        self.longest = float(self._flags[0])
+        return float(self._flags[0])
 
     @property
     def alarm(self) -> bool:

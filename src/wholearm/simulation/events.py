@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from itertools import groupby
-from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.arrays import Array
+from ..common.arrays import Array, find_runs
 from ..common.document import Drawn
 from ..common.errors import SimulationError
 from ..problem.definition import Problem
@@ -234,9 +233,6 @@ class Record(NamedTuple):
         return Record(t, phase, kept, *state, out[to.c_n], out[to.c_t], impact)
 
 
-_NUMBERS = attrgetter("t", "phase", "y", "acceleration", "tau", "impact")
-
-
 def collect(system: System, rows: Sequence[Record], contacts: Sequence[str]) -> dict[str, Any]:
     """Fields of a simulation that its records, in order, have, with the forces of some contacts."""
     n, columns = system.n, {name: column for column, name in enumerate(contacts)}
@@ -249,8 +245,8 @@ def collect(system: System, rows: Sequence[Record], contacts: Sequence[str]) -> 
             if (column := columns.get(system.names[pair])) is not None:
                 forces[:, first:last, column] = values[:, :, k].T
         first = last
-    every = [np.array(column) for column in zip(*map(_NUMBERS, rows), strict=True)]
-    t, phase, y, z_ddot, tau, impact = every
+    numbers = [(row.t, row.phase, row.y, row.acceleration, row.tau, row.impact) for row in rows]
+    t, phase, y, z_ddot, tau, impact = map(np.array, zip(*numbers, strict=True))
     z, z_dot = y[:, :n], y[:, n : 2 * n]
     work, viscous, dry, contact = y[:, 2 * n :].T
     energies = Energies(system.stored(z, z_dot), work, viscous, dry, contact, impact)
@@ -263,25 +259,13 @@ def collect(system: System, rows: Sequence[Record], contacts: Sequence[str]) -> 
 def list_stretches(rows: Sequence[Record], names: Sequence[str]) -> tuple[FreeStretch, ...]:
     """When each pair pressed, without a pause."""
     stretches: list[FreeStretch] = []
-    pressing: dict[int, tuple[list[float], list[Array]]] = {}
-
-    def end(kept: Sequence[int]) -> None:
-        for pair in [pair for pair in pressing if pair not in kept]:
-            times, parts = pressing.pop(pair)
-            c_n = np.concatenate(parts)
+    for pair in {pair for row in rows for pair in row.kept}:
+        for run in find_runs(np.array([pair in row.kept for row in rows])):
+            block = rows[run]
+            c_n = np.array([row.c_n[row.kept.index(pair)] for row in block])
             at = 0 if np.isnan(c_n).all() else int(np.nanargmin(c_n))
-            least = float(c_n[at]), times[at]
-            stretches.append(FreeStretch(names[pair], times[0], times[-1], *least))
-
-    for kept, group in groupby(rows, lambda row: row.kept):
-        end(kept)
-        block = list(group)
-        forces = np.array([row.c_n for row in block])
-        for k, pair in enumerate(kept):
-            times, parts = pressing.setdefault(pair, ([], []))
-            times += [row.t for row in block]
-            parts.append(forces[:, k])
-    end(())
+            least = float(c_n[at]), block[at].t
+            stretches.append(FreeStretch(names[pair], block[0].t, block[-1].t, *least))
     return tuple(sorted(stretches, key=lambda stretch: (stretch.start, stretch.contact)))
 
 

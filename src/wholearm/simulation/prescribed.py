@@ -313,8 +313,9 @@ class Replay(Run):
 
     def require_inertia(self) -> None:
         """Raise a `JammingError` where friction leaves no reduced inertia."""
-        if not self.s.outputs[self.s.to.ratio] > 0:
-            self.fail_to_step(float(self.s.outputs[self.s.to.ratio]))
+        ratio = float(self.s.outputs[self.s.to.ratio])
+        if not ratio > 0:
+            self.fail_to_step(ratio)
 
     def fail_to_step(self, ratio: float) -> NoReturn:
         """Raise the error for a step size that underflows."""
@@ -496,17 +497,13 @@ class Replay(Run):
             return Released(change.c_n)
         return self.lose(change.contact, change.c_n)
 
-    def try_step(self, target: float) -> tuple[float, bool]:
-        """As of `Run`; says where it jams or gets nowhere."""
-        try:
-            return super().try_step(target)
-        except StuckError:
-            self.fail_to_step(float(self.s.outputs[self.s.to.ratio]))
-
     def move(self) -> Ending:
         """Integrate until the motion rests, arrives, releases its contacts or fails."""
         self.h = min(self.h, FIRST_STEP * self.system.scales.time)
-        ending: Ending = super().move()
+        try:
+            ending: Ending = super().move()
+        except StuckError:
+            self.fail_to_step(float(self.s.outputs[self.s.to.ratio]))
         return ending
 
     def locate(self, h: float, t: float) -> list[int]:

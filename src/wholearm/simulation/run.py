@@ -95,6 +95,7 @@ class Run(ABC):
                          an event is where one falls below zero
     slack                how far below zero each of them counts as rounding
     urgent               row of the event that is located first, -1 if none
+    longest : [s]        longest step from the present state
     """
 
     s: ModeStepper
@@ -103,7 +104,7 @@ class Run(ABC):
     values: Array
     start: Array
     slack: Array
-    urgent = -1
+    urgent, longest = -1, math.inf
 
     def __init__(
         self,
@@ -152,11 +153,6 @@ class Run(ABC):
     def near(self) -> float:
         """Width of the bracket of an event that is narrow enough [s]."""
         return 1e-3 * SHORTEST_STEP * max(self.system.scales.time, abs(self.t))
-
-    @property
-    def longest(self) -> float:
-        """Longest step from the present state [s]."""
-        return math.inf
 
     @abstractmethod
     def measure(self) -> Array:
@@ -360,9 +356,8 @@ class Run(ABC):
         remaining, time = target - self.t, self.system.scales.time
         self.start = self.values
         least = SHORTEST_STEP * max(time, abs(self.t))
-        longest = self.longest
         while True:
-            h = min(self.h, longest)
+            h = min(self.h, self.longest)
             whole = h >= 0.999 * remaining
             h = remaining if whole else min(h, remaining / 2)
             inputs[at.h] = h

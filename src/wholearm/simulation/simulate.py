@@ -105,7 +105,10 @@ def simulate(
         raise InputError("", "contacts", f"{contacts!r} given; known: prescribed, free")
     if not 1e-14 <= tolerance <= 1e-2:
         raise InputError("", "tolerance", f"{tolerance!r} is not between 1e-14 and 1e-2")
-    wanted = _sort_times(times)
+    wanted = np.asarray(() if times is None else times, dtype=float)
+    if not np.isfinite(wanted).all():
+        raise InputError("", "times", "holds numbers that are not finite")
+    wanted = sort_unique(wanted)
     if contacts == "prescribed":
         if isinstance(what, Law) or start is not None or until is not None or restitution:
             text = "a law, start, until and restitution need contacts that are free"
@@ -256,13 +259,6 @@ def _recall(problem: Problem, plan: Trajectory, row: int) -> Modes:
     turns = np.sign(v + ahead * a) * (system.dry > 0)
     stuck = tuple((pair,) for pair, one in zip(kept, rolls, strict=True) if one)
     return Modes(tuple(kept), stuck, (), tuple(Xi.tolist()), tuple(turns.tolist()))
-
-
-def _sort_times(instants: ArrayLike | None) -> Array:
-    times = np.asarray(() if instants is None else instants, dtype=float)
-    if not np.isfinite(times).all():
-        raise InputError("", "times", "holds numbers that are not finite")
-    return sort_unique(times)
 
 
 def _require_start(problem: Problem, start: ArrayLike | None) -> Array:
