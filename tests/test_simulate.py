@@ -339,7 +339,7 @@ def test_a_jammed_formation_at_rest() -> None:
     problem, motion = pick(1)
     rough = rebuild(problem, friction=Friction(1.5, 1.5, 1.5))
     rest = find_rest(rough.phases[0].formation, rough.start)
-    assert max(way.ratio for way in rest.sliding) < 0
+    assert max(way.response.ratio for way in rest.sliding) < 0
     simulation = simulate(rough, constant((0.0, 0.0)))
     assert simulation.outcome.kind is OutcomeKind.GOAL_MISSED
     assert np.abs(simulation.z - rough.start).max() < 1e-15

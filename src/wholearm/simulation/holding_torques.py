@@ -101,7 +101,7 @@ def _list_holding(place: Standstill, epsilon: float) -> Array:
 def _list_sliding(formation: Formation, z: Array) -> tuple[StartMode, ...]:
     """Start modes without sticking that do not jam; none if contacts depend on each other."""
     try:
-        return tuple(mode for mode in find_rest(formation, z).sliding if mode.ratio > 0)
+        return tuple(mode for mode in find_rest(formation, z).sliding if mode.response.ratio > 0)
     except SimulationError:
         return ()
 
@@ -139,9 +139,9 @@ def _find_closing(
     )
     best: Hold | None = None
     for mode in _list_sliding(place.formation, z):
-        rows, closing = rest, -normal @ mode.acceleration
+        rows, closing = rest, -normal @ mode.response.acceleration
         if mode.heading is None:
-            rows = np.vstack([rest, (mode.slips / creep[:, None])[mode.signs != 0]])
+            rows = np.vstack([rest, (mode.slips / creep[:, None])[mode.response.signs != 0]])
         elif normal @ mode.heading >= 0:
             continue
         if ample is None:
@@ -156,7 +156,7 @@ def _find_closing(
         if held.measure(tau[None])[0] <= SURE * scales.torque:
             continue
         a = float(closing @ [1.0, *tau])
-        v = mode.acceleration @ [1.0, *tau] * math.sqrt(2 * gap / a)
+        v = mode.response.acceleration @ [1.0, *tau] * math.sqrt(2 * gap / a)
         best = Hold(tau, margin, math.sqrt(2 * a * gap), _find_parting(place, v))
     return best
 

@@ -151,11 +151,31 @@ def evaluate_rows(formation: Formation, z: Array, v: Array) -> ContactRows:
 class Response(NamedTuple):
     """How a mode answers to torques; quantities are rows @ (1, tau_1, tau_2)."""
 
+    mode: Mode
+    signs: Array  # (n_c + 2,): of sliding and turning, zero for what is held or rolls
+    c: Array  # (n_c + K, 3) [N, N m]: normal forces, then those of what is held
     acceleration: Array  # (5, 3)
     rates: Array  # (n_c + 2, 3): accelerations of the contacts' sliding and of the joints
-    # (n_c + 2 K, 3) [N, N m]: what has to be positive for everything to hold, H c + h
-    force_limits: Array
     ratio: float  # reduced inertia over that without friction; jammed at zero and below
+
+    @property
+    def force_limits(self) -> Array:
+        """What has to be positive for everything to hold, H c + h, (n_c + 2 K, 3) [N, N m]."""
+        H, h = self.mode.force_limit_rows
+        force_limits = np.asarray(H @ self.c)
+        force_limits[:, 0] += h
+        return force_limits
+
+    @property
+    def c_t(self) -> Array:
+        """Friction of the contacts, (n_c, 3) [N]; NaN where a flush edge sticks: it is shared."""
+        count = self.mode.formation.n_contacts
+        slip = self.mode.formation.sliding_friction * self.signs[:count]
+        c_t = -slip[:, None] * self.c[:count]
+        for force, rows in zip(self.c[count:], self.mode.holders, strict=True):
+            if rows[0] < count:
+                c_t[list(rows)] = force if len(rows) == 1 else np.nan
+        return c_t
 
 
 def respond(mode: Mode, signs: Array, rows: ContactRows, v: Array) -> Response | None:
@@ -189,10 +209,7 @@ def respond(mode: Mode, signs: Array, rows: ContactRows, v: Array) -> Response |
     acceleration = inverse_mass[:, None] * (applied + G.T @ c)
     rates = np.vstack([rows.A_t @ acceleration, acceleration[3:]])
     rates[:count, 0] += rows.bend_t
-    H, h = mode.force_limit_rows
-    force_limits = H @ c
-    force_limits[:, 0] += h
-    return Response(acceleration, rates, force_limits, ratio)
+    return Response(mode, signs, c, acceleration, rates, ratio)
 
 
 def find_fixed(mode: Mode, A: Array, A_t: Array) -> NDArray[np.bool_]:

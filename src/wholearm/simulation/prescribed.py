@@ -32,7 +32,6 @@ from typing import Any, NamedTuple, NoReturn
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..common.errors import JammingError, SimulationError
@@ -172,7 +171,7 @@ class Choice(NamedTuple):
     """Combination of friction signs, with its margins."""
 
     signs: Array  # (n_c + 2,): directions of contacts and joints, zero for what is held or rolls
-    fixed: NDArray[np.bool_]  # (n_c + 2,): held, or immobile because of what else is held
+    mode: Mode
     margin: float  # least relative acceleration along the signs or friction margin
     pressing: float  # least c_n over the scene's force
 
@@ -757,11 +756,15 @@ class Replay(Run):
             self.stuck = {
                 row for u in list_units(formation) for row in u.rows if u.grips and fixed[row]
             }
+        self.start_with(mode, signs, departure.heading)
+        self.observe()
+
+    def start_with(self, mode: Mode, signs: Array, heading: Array) -> None:
+        """Go on in a mode with its signs, (n_c + 2,), and the direction of the motion, (5,)."""
         if mode != self.leg.mode:
             self.take(mode)
         self.signs = signs
-        self.leg.heading[:] = departure.heading
-        self.observe()
+        self.leg.heading[:] = heading
 
     def go_on(self) -> Ending | None:
         """Set the friction signs of the present velocity; what ends the motion at once, if any."""
@@ -828,12 +831,22 @@ class Replay(Run):
         if not self.gets_on():
             names = " ".join(formation.names)
             raise SimulationError(f"sticking and slipping of {names} do not end {self.where()}")
-        choice = self._choose(signs, still, [self._list_options(unit, turned) for unit in still])
-        self._take_signs(choice.signs, still)
+        options = [self._list_options(unit, turned) for unit in still]
+        chosen, mode, _, _ = self._choose(signs, still, options)
+        rows = evaluate_rows(formation, self.z, self.v)
+        fixed = find_fixed(mode, rows.A, rows.A_t)
+        # Rounding of speeds against the directions chosen is taken away.
+        gradients = np.vstack([rows.A_t, np.eye(5)[3:]])
+        first = np.array([unit.rows[0] for unit in still])
+        ahead = chosen[first] * (gradients[first] @ self.v)
+        wrong = first[(chosen[first] == 0) | (ahead < 0)]
+        rolling = gradients[list(formation.rolling_rows)]
+        self.project_velocity(np.vstack([rows.A, rolling, gradients[wrong]]))
+        self.start_with(mode, chosen, self.v / np.sqrt(self.system.mass @ self.v**2))
         for unit in still:
             row = unit.rows[0]
             before = 0.0 if row in self.stuck else float(signs[row])
-            after = float(choice.signs[row]) if not choice.fixed[row] else 0.0
+            after = float(chosen[row]) if not fixed[row] else 0.0
             changes = before != after and not (enters and after) and unit.grips
             for row in unit.rows if changes else ():
                 self.note_change(row, before, after, time)
@@ -1039,8 +1052,7 @@ class Replay(Run):
                     margins.append(cones[mode.holders.index(unit.rows)])
                 elif abs(gained[row]) > CLEAR:
                     margins.append(gained[row])
-            fixed = find_fixed(mode, present.A, present.A_t)
-            return Choice(signs, fixed, float(min(margins)), float(held[:count].min()))
+            return Choice(signs, mode, float(min(margins)), float(held[:count].min()))
 
         choices: list[Choice] = []
         for pattern in list_modes(formation, signs, still, orders):
@@ -1064,21 +1076,3 @@ class Replay(Run):
         raise JammingError(
             f"{names} jams {self.where()}: no combination of sliding and sticking is consistent"
         )
-
-    def _take_signs(self, signs: Array, still: Sequence[Unit]) -> None:
-        """Go on with the directions chosen; rounding of speeds against them is taken away."""
-        rows = evaluate_rows(self.formation, self.z, self.v)
-        gradients = np.vstack([rows.A_t, np.eye(5)[3:]])
-        wrong = [
-            unit.rows[0]
-            for unit in still
-            if signs[unit.rows[0]] == 0
-            or signs[unit.rows[0]] * (gradients[unit.rows[0]] @ self.v) < 0
-        ]
-        rolling = list(self.formation.rolling_rows)
-        self.project_velocity(np.vstack([rows.A, gradients[rolling + wrong]]))
-        mode = find_mode(self.formation, signs)
-        if mode != self.leg.mode:
-            self.take(mode)
-        self.signs = signs
-        self.leg.heading[:] = self.v / np.sqrt(self.system.mass @ self.v**2)

@@ -25,7 +25,7 @@ from ..contacts.formation import Formation
 from ..mechanics.statics import GRAZE, Statics, TorquePolygon
 from ..scene.model import Scene
 from .hand import build_system
-from .modes import Mode, find_mode, list_modes, list_units, respond
+from .modes import Mode, Response, find_mode, list_modes, list_units, respond
 from .system import ContactRows
 from .tolerances import ROUNDING_FORCE, STILL
 
@@ -54,8 +54,7 @@ class Collapse(NamedTuple):
 class StartMode(NamedTuple):
     """Start mode; quantities at rest are rows @ (1, tau_1, tau_2)."""
 
-    signs: Array  # (n_c + 2,): of sliding and turning, zero for what friction holds
-    acceleration: Array  # (5, 3): z''
+    response: Response
     # (n_c + 2 R, 3) [N]: what has to be positive for the contacts to hold, H c (`contacts.cones`)
     force_limits: Array
     # (k, 3): accelerations of sliding and turning along the signs, or along the only freedom
@@ -63,7 +62,6 @@ class StartMode(NamedTuple):
     grips: Array  # (2 k, 3) [N, N m]: what has to be positive for friction to hold what has no sign
     openings: Array  # (k, 3) [m/s^2]: of closed gaps of other contacts, plus what counts as grazing
     slack: Array  # rounding of force limits, slips, grips and openings
-    ratio: float  # reduced inertia over that without friction; jammed at zero and below
     heading: Array | None  # (5,): with one freedom, the direction
     statics: Statics
 
@@ -77,16 +75,16 @@ class StartMode(NamedTuple):
     def drive(self, tau: Array) -> float:
         """Acceleration in the metric M5."""
         mass = self.statics.scene.mass_diagonal
-        return float(np.sqrt(mass @ (self.acceleration @ [1.0, *tau]) ** 2))
+        return float(np.sqrt(mass @ (self.response.acceleration @ [1.0, *tau]) ** 2))
 
     def slides(self, tau: Array) -> bool:
         """Whether the formation accelerates in this mode if every contact can press or pull."""
         load, least = np.array([1.0, *tau]), _measure_drive(self.statics.scene)
         return (
-            self.ratio > 0
+            self.response.ratio > 0
             and self.drive(tau) > least
             and bool((self.margins[len(self.force_limits) :] @ load >= 0).all())
-            and self.statics.opens(self.acceleration @ load)
+            and self.statics.opens(self.response.acceleration @ load)
         )
 
     def moves(self, tau: Array) -> bool:
@@ -95,8 +93,8 @@ class StartMode(NamedTuple):
 
     def depart(self, x: float, tau: Array) -> StartDeparture:
         """Start at `x` of a piece, where the torques are `tau`."""
-        heading = self.acceleration @ [1.0, *tau] / self.drive(tau)
-        return StartDeparture(x, heading, self.signs)
+        heading = self.response.acceleration @ [1.0, *tau] / self.drive(tau)
+        return StartDeparture(x, heading, self.response.signs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,16 +195,14 @@ class Rest:
             # All accelerations are multiples of this one.
             slips = (heading * scene.mass_diagonal @ response.acceleration)[None]
             still, closing = np.array([-_measure_drive(scene)]), np.zeros(len(openings))
-        rounding = ROUNDING_FORCE * mode.force_limit_units
+        rounding, force_limits = ROUNDING_FORCE * mode.force_limit_units, response.force_limits
         return StartMode(
-            signs=signs,
-            acceleration=response.acceleration,
-            force_limits=response.force_limits[kept],
+            response=response,
+            force_limits=force_limits[kept],
             slips=slips,
-            grips=response.force_limits[~kept],
+            grips=force_limits[~kept],
             openings=openings,
             slack=np.concatenate([rounding[kept], still, rounding[~kept], closing]),
-            ratio=response.ratio,
             heading=heading,
             statics=self.statics,
         )
@@ -247,7 +243,7 @@ class Rest:
     def _collapse(self, coefficients: Array, x: float) -> Collapse:
         """The contact that gives way at `x`."""
         tau = _evaluate(coefficients, x)
-        jammed = [mode.ratio <= 0 for mode in self.sliding]
+        jammed = [mode.response.ratio <= 0 for mode in self.sliding]
         jams = any(jammed) if self.heading is not None else all(jammed)
         free = [mode for mode in self.modes if mode.slides(tau)]
         pulls = self.touching.find_pulls(tau)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import combinations
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from ..mechanics.statics import Statics
 from ..problem.definition import Phase, Problem
 from ..results.report import Approach, ForceAt, Loss, PhaseReport, TorqueAdvice, TuningHelp
 from ..simulation.events import EventKind, Simulation
-from ..simulation.modes import evaluate_rows, find_mode, list_modes, list_units, respond
+from ..simulation.modes import Response, evaluate_rows, list_modes, list_units, respond
 from ..simulation.rest import StartMode, find_rest
 from .verdict import Allowance
 from .verify import find_lowest
@@ -70,46 +69,47 @@ def _examine_loss(
         return None
     row = _find_row(simulation, index, contact, kind, time)
     z, v, tau = simulation.z[row], simulation.z_dot[row], simulation.tau[row]
-    epsilon = max(problem.epsilon, 1e-3 * problem.scene.scales.force)
+    load, epsilon = [1.0, *tau], max(problem.epsilon, 1e-3 * problem.scene.scales.force)
     distance = _measure_distance(phase, z[None], v[None])
     columns = [simulation.contacts.index(name) for name in formation.names]
     rests = bool(np.isnan(simulation.c_n[row, columns]).all())
     if rests:
         paths = find_rest(formation, z).modes
-        instant = find_worst(formation, paths, z, tau)
+        free = [path for path in paths if path.slides(tau)]
+        worst = min(free, key=lambda path: float((path.force_limits @ load).min()), default=None)
+        response = None if worst is None else worst.response
         gradient = None if distance is None else distance[1][0]
         changes = find_resting_changes(formation, paths, epsilon, z, tau, gradient)
     else:
-        instant = find_moving(formation, z, v, tau, simulation.z_ddot[row])
-        changes = () if instant is None else list_changes(instant, epsilon, contact, tau)
-    load = np.array([1.0, *tau])
+        response = find_moving(formation, z, v, tau, simulation.z_ddot[row])
+        changes = () if response is None else list_changes(response, v, epsilon, contact, tau)
     forces: tuple[ForceAt, ...] = ()
     closing: tuple[float, ...] = ()
-    if instant is not None:
+    if response is not None:
         forces = tuple(
             ForceAt(name, float(c_n @ load), float(c_t @ load), (float(c_n[1]), float(c_n[2])))
-            for name, c_n, c_t in zip(formation.names, instant.c_n, instant.c_t, strict=True)
+            for name, c_n, c_t in zip(formation.names, response.c, response.c_t, strict=False)
         )
-    if instant is not None and distance is not None:
-        rows = -distance[1][0] @ instant.acceleration
+    if response is not None and distance is not None:
+        rows = -distance[1][0] @ response.acceleration
         closing = (float(rows @ load - distance[2][0]), float(rows[1]), float(rows[2]))
     when = float(simulation.t[row])
     return Loss(phase.number, contact, kind, when, rests, forces, closing, changes)
 
 
 def list_changes(
-    instant: Instant, epsilon: float, contact: str, tau: Array
+    response: Response, v: Array, epsilon: float, contact: str, tau: Array
 ) -> tuple[TorqueAdvice, ...]:
     """Changes of the torques of a motion that prevent a contact, and what else lets go with it."""
-    formation = instant.formation
+    formation = response.mode.formation
     unit, load = formation.scene.scales.torque, np.array([1.0, *tau])
     limits, bare = make_limits(formation, epsilon), make_limits(formation, 0.0)
     forces = (PRESS, CONE)
     own = [limit.part == contact and limit.kind in forces for limit in limits.limits]
     missed = np.array(own)[limits.owners][limits.sides[0]]
-    gone = instant.find_sides(bare) @ load < -KEPT * limits.scales[limits.sides[0]]
+    gone = find_sides(bare, response, v) @ load < -KEPT * limits.scales[limits.sides[0]]
     missed |= gone & np.isin(limits.sides[0], limits.of(*forces))
-    return find_changes(limits, instant.find_sides(limits), missed, tau, unit)
+    return find_changes(limits, find_sides(limits, response, v), missed, tau, unit)
 
 
 def _find_row(simulation: Simulation, index: int, contact: str, kind: str, time: float) -> int:
@@ -167,18 +167,6 @@ def _measure_distance(phase: Phase, z: Array, v: Array) -> tuple[Array, Array, A
     return side * offset, gradient, np.zeros(len(z))
 
 
-def find_worst(
-    formation: Formation, paths: Sequence[StartMode], z: Array, tau: Array
-) -> Instant | None:
-    """Forces at the start of the motion with the least margin; None if torques begin none."""
-    load = np.array([1.0, *tau])
-    free = [path for path in paths if path.slides(tau)]
-    if not free:
-        return None
-    worst = min(free, key=lambda path: float((path.force_limits @ load).min()))
-    return answer(formation, z, np.zeros(5), worst.signs)
-
-
 def find_resting_changes(
     formation: Formation,
     paths: Sequence[StartMode],
@@ -202,14 +190,12 @@ def find_resting_changes(
     limits, unit = make_limits(formation, epsilon), formation.scene.scales.torque
     starts = list[tuple[StartMode, tuple[Array, Array]]]()
     for path in paths:
-        instant = answer(formation, z, np.zeros(5), path.signs)
-        if instant is not None:
-            towards = [] if gradient is None else [-gradient @ path.acceleration]
-            rows = np.vstack([path.margins, *towards])
-            sizes = np.abs(rows) @ [1.0, unit, unit]
-            scale = [limits.scales[limits.sides[0]], np.where(sizes > 0, sizes, 1.0)]
-            sides = np.vstack([instant.find_sides(limits), rows])
-            starts.append((path, normalise(sides, np.concatenate(scale), tau, unit)))
+        towards = [] if gradient is None else [-gradient @ path.response.acceleration]
+        rows = np.vstack([path.margins, *towards])
+        sizes = np.abs(rows) @ [1.0, unit, unit]
+        scale = [limits.scales[limits.sides[0]], np.where(sizes > 0, sizes, 1.0)]
+        sides = np.vstack([find_sides(limits, path.response, np.zeros(5)), rows])
+        starts.append((path, normalise(sides, np.concatenate(scale), tau, unit)))
     changes: list[TorqueAdvice] = []
     for free in _TORQUES:
         if len(free) == 2 and changes:
@@ -225,34 +211,24 @@ def find_resting_changes(
     return tuple(sorted(changes, key=lambda change: (change.holds, np.hypot(*change.change))))
 
 
-class Instant(NamedTuple):
-    """Forces and accelerations at one state; each is rows @ (1, tau_1, tau_2)."""
-
-    formation: Formation
-    v: Array  # (5,)
-    acceleration: Array  # (5, 3)
-    # c_n, c_t (n_c, 3) [N]: naN for c_t of a flush edge that friction holds although it may slide:
-    # it is not determined
-    c_n: Array
-    c_t: Array
-
-    def find_sides(self, limits: LimitSet) -> Array:
-        """Slack of one-sided limits, rows @ (1, tau_1, tau_2), shape (n_sides, 3)."""
-        c = np.vstack([self.c_n, self.c_t[list(self.formation.rolling_rows)]])
-        of_c, of_tau, of_rates = limits.columns
-        values = of_c @ c
-        values[:, 1:] += of_tau
-        values[:, 0] += of_rates @ self.v[3:]
-        rows, signs, bounds = limits.sides
-        sides = np.asarray(signs[:, None] * values[rows])
-        sides[:, 0] -= signs * bounds
-        return sides
+def find_sides(limits: LimitSet, response: Response, v: Array) -> Array:
+    """Slack of one-sided limits at velocity v, (5,), rows @ (1, tau_1, tau_2), (n_sides, 3)."""
+    formation = response.mode.formation
+    of_c, of_tau, of_rates = limits.columns
+    rolling = response.c_t[list(formation.rolling_rows)]
+    values = of_c @ np.vstack([response.c[: formation.n_contacts], rolling])
+    values[:, 1:] += of_tau
+    values[:, 0] += of_rates @ v[3:]
+    rows, signs, bounds = limits.sides
+    sides = np.asarray(signs[:, None] * values[rows])
+    sides[:, 0] -= signs * bounds
+    return sides
 
 
 def find_moving(
     formation: Formation, z: Array, v: Array, tau: Array, acceleration: Array
-) -> Instant | None:
-    """The instant of a motion; where something stands still, with the friction that it had.
+) -> Response | None:
+    """The mode of a motion; where something stands still, with the friction that it had.
 
     That is the friction with which torques `tau` give the recorded `acceleration`, shape (5,).
     """
@@ -266,34 +242,14 @@ def find_moving(
     still = [unit for unit in list_units(formation) if slow[list(unit.rows)].all()]
     holds = formation.n_constraints < 4
     options = [(1.0, -1.0, 0.0) if holds and unit.grips else (1.0, -1.0) for unit in still]
-    tried = (
-        answer(formation, z, v, own) for own, _ in list_modes(formation, signs, still, options)
-    )
+    modes = list_modes(formation, signs, still, options)
+    tried = (respond(mode, own, rows, v) for own, mode in modes)
 
-    def misfit(instant: Instant) -> float:
-        off = instant.acceleration @ [1.0, *tau] - acceleration
+    def misfit(response: Response) -> float:
+        off = response.acceleration @ [1.0, *tau] - acceleration
         return float(scene.mass_diagonal @ off**2)
 
     return min((one for one in tried if one is not None), key=misfit, default=None)
-
-
-def answer(formation: Formation, z: Array, v: Array, signs: Array) -> Instant | None:
-    """The instant at a state with the friction of `signs`, shape (n_c + 2,).
-
-    Signs are zero for what rolls or friction holds. None if forces are not determined.
-    """
-    mode = find_mode(formation, signs)
-    response = respond(mode, signs, evaluate_rows(formation, z, v), v)
-    if response is None:
-        return None
-    count, held = formation.n_contacts, len(mode.holders)
-    c_n, cones = response.force_limits[:count], response.force_limits[count:]
-    c_t = -(formation.sliding_friction * signs[:count])[:, None] * c_n
-    for k, rows in enumerate(mode.holders):
-        if rows[0] < count:
-            # The sides of a cone are mu c_n - c_t and mu c_n + c_t.
-            c_t[list(rows)] = (cones[held + k] - cones[k]) / 2 if len(rows) == 1 else np.nan
-    return Instant(formation, v, response.acceleration, c_n, c_t)
 
 
 def find_changes(
