@@ -387,21 +387,27 @@ def sample_path(phase: Phase, z: Array, later: Sequence[Phase]) -> PathSamples |
     InputError  if the contacts do not touch at `z`, or the end cannot be reached
     """
     formation = phase.formation
+    curve = None
     if formation.n_constraints == 4 and count_freedoms(formation, z) == 1:
         curve = trace_phase(phase, z, later)
         if phase.until.is_release:
             curve = replace(curve, length=RELEASE_AT * curve.length)
         s, signs = _sample_segments(curve)
         point = curve.evaluate(s)
-        directions = Directions(signs[:, :-2], signs[:, -2:])
-        return _measure(phase, curve, s, point[:3], point.kinematics, directions)
-    if formation.n_constraints != 3 or count_freedoms(formation, z) != 2:
+        (places, z_s, z_ss), kinematics = point[:3], point.kinematics
+    elif formation.n_constraints == 3 and count_freedoms(formation, z) == 2:
+        goal = guess_phase(phase, z, later)[-1].z[-1]
+        s, places, z_s, z_ss, kinematics = _straighten(formation, z, goal)
+        slip = np.einsum("nij,nj->ni", kinematics.A_t, z_s)
+        signs = np.sign(np.hstack([slip, z_s[:, 3:]]))
+    else:
         return None
-    goal = guess_phase(phase, z, later)[-1].z[-1]
-    s, *line, kinematics = _straighten(formation, z, goal)
-    slip = np.einsum("nij,nj->ni", kinematics.A_t, line[1])
-    directions = Directions(np.sign(slip), np.sign(line[1][:, 3:]))
-    return _measure(phase, None, s, line, kinematics, directions)
+    directions = Directions(signs[:, :-2], signs[:, -2:])
+    forces = inverse(formation, places, z_s, z_ss, directions, kinematics)
+    limits = InternalForceLimits.of(formation, forces, z_s[:, 3:])
+    inertia = reduced_inertia(formation, kinematics, directions)
+    line = s, places, z_s, z_ss
+    return PathSamples(phase, curve, *line, directions, forces, limits, kinematics, inertia)
 
 
 def _sample_segments(curve: Curve) -> tuple[Array, Array]:
@@ -414,22 +420,6 @@ def _sample_segments(curve: Curve) -> tuple[Array, Array]:
         places.append(part.start + turn * (part.stop - part.start))
         signs.append(np.tile(np.concatenate([part.Xi, part.sigma]), (count, 1)))
     return np.concatenate(places), np.vstack(signs)
-
-
-def _measure(
-    phase: Phase,
-    curve: Curve | None,
-    s: Array,
-    line: Sequence[Array],
-    kinematics: Kinematics,
-    directions: Directions,
-) -> PathSamples:
-    z, z_s, z_ss = line
-    forces = inverse(phase.formation, z, z_s, z_ss, directions, kinematics)
-    limits = InternalForceLimits.of(phase.formation, forces, z_s[:, 3:])
-    inertia = reduced_inertia(phase.formation, kinematics, directions)
-    line = s, z, z_s, z_ss
-    return PathSamples(phase, curve, *line, directions, forces, limits, kinematics, inertia)
 
 
 def _straighten(

@@ -38,7 +38,7 @@ from .contact_problem import (
 from .events import EventKind, describe_change
 from .rest import find_breach
 from .run import Closing, Feedback, Run, StuckError, find_root
-from .stepper import Modes, ModeStepper
+from .stepper import Modes, ModeStepper, bind
 from .system import ContactRows, Structure, System
 from .tolerances import ROUNDING_FORCE, SETTLING, STANDING, STILL
 
@@ -655,20 +655,15 @@ class Watch:
         self._start, self._seen = given[3 * n : 3 * n + 2 * count], found[: 2 * count]
         self._flags, self._within, self._places = found[-3:], within, 2 * n
         numbers = np.concatenate([system.geometry, system.units, [system.scales.length]])
-        self._calls = []
-        for function, store in zip(_build_watch(system.structure), (found, within), strict=True):
-            buffer, call = function.buffer()
-            buffer.set_arg(0, given.data)
-            buffer.set_arg(1, numbers.data)
-            buffer.set_res(0, store.data)
-            self._calls.append((call, buffer, numbers))
+        functions = zip(_build_watch(system.structure), (found, within), strict=True)
+        self._calls = [bind(function, [given, numbers], store) for function, store in functions]
 
     def look(self, s: ModeStepper) -> None:
         """Evaluate gaps and ranges at the end of the step just made."""
         split, out = self._places, s.outputs
         self.end[:split], self.end[split:] = out[:split], out[s.to.acceleration]
         self._h[0] = s.inputs[s.at.h]
-        self._calls[0][0]()
+        self._calls[0]()
 
     def advance(self) -> float:
         """Start the next step from the end of this one; how long it may be, `REACH` at most [s]."""
@@ -689,7 +684,7 @@ class Watch:
         """Whether some pair may close within the step, if it is at least so long."""
         if self.travel < least:
             return False
-        self._calls[1][0]()
+        self._calls[1]()
         return bool(self._within[0])
 
 

@@ -36,18 +36,17 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.errors import JammingError, SimulationError
 from ..contacts.contact_limits import takes_over
-from ..contacts.elemental import GapLimit, build_features, build_gap
+from ..contacts.elemental import build_features, build_gap
 from ..contacts.formation import Formation
 from ..mechanics.impact import ViolationKind, compute_impact
 from ..problem.definition import End, Phase, Problem, Until
 from ..results.torque import TorqueProfile
-from ..scene.model import Scene
 from .events import EventKind, Outcome, OutcomeKind, Record, describe_change
 from .hand import build_system
 from .modes import Mode, Unit, evaluate_rows, find_fixed, find_mode, list_modes, list_units, respond
-from .rest import Collapse, Rest, StartDeparture, close_contacts, find_rest
+from .rest import Collapse, StartDeparture, close_contacts, find_rest
 from .run import Run, StuckError
-from .stepper import INNER_STAGES, NODES, ModeStepper
+from .stepper import INNER_STAGES, NODES, ModeStepper, bind
 from .tolerances import (
     CREEPING,
     FIRST_STEP,
@@ -101,7 +100,6 @@ class ModeSegment(NamedTuple):
     """A part of a phase with one set of contact modes."""
 
     mode: Mode
-    stepper: ModeStepper
     rows: LegRows
     slack: Array  # (m,): how far below zero each event value counts as rounding
     # sets `event_values` from outputs of the steps and the `heading` at their start
@@ -110,13 +108,8 @@ class ModeSegment(NamedTuple):
     heading: Array
     # m values, distance to the end [m or rad], its rate, heading
     event_values: Array
-    buffers: Any  # what has to live as long as these
-
-
-@lru_cache(maxsize=64)
-def open_limits(formation: Formation, until: Until) -> tuple[GapLimit, ...]:
-    """Limits that end a phase early: all but that of the contact to be gained."""
-    return tuple(limit for limit in formation.limits if not limit.gains(until.contact))
+    until_unit: float  # [m or rad]: of the distance to the end of the phase
+    limits: list[str]  # what has happened where limits that end the phase early are reached
 
 
 @lru_cache(maxsize=64)
@@ -125,7 +118,9 @@ def _build_leg(
 ) -> ModeSegment:
     """A segment with the steps of its mode, before it gets a phase and a number."""
     scene, own = formation.scene, s.rows
-    limits, last = open_limits(formation, until), own.slide.stop + 2
+    gained = [limit for limit in formation.limits if limit.gains(until.contact)]
+    limits = [limit for limit in formation.limits if not limit.gains(until.contact)]
+    last = own.slide.stop + 2
     until_row = last + len(limits)
     parts = own.force, own.cone, slice(own.slide.start, last), slice(last, until_row)
     rows = LegRows(*parts, until_row, until_row + 1)
@@ -133,7 +128,6 @@ def _build_leg(
     slack = np.repeat([ROUNDING_FORCE, ROUNDING_SPEED, REACHED, 0.0, ROUNDING_SPEED], sizes)
     z, v, before = build_features(scene).z, ca.SX.sym("v", 5), ca.SX.sym("before", 5)
     values = ca.SX.sym("values", own.size)
-    gained = [limit for limit in formation.limits if limit.gains(until.contact)]
     if until.is_release:
         distance = ca.SX(1)
     elif until.contact is None:
@@ -146,7 +140,8 @@ def _build_leg(
     mass, unit = ca.DM(scene.mass_diagonal), scene.scales.speed * scene.scales.mass**0.5
     speed = ca.dot(before, mass * v) / unit if mode.n_constraints >= 4 else ca.SX(1)
     gaps = [limit.value / scene.scales.length for limit in limits]
-    reached = distance / _measure_until(scene, until)
+    unit_until = 1.0 if until.coordinate == "phi" else scene.scales.length
+    reached = distance / unit_until
     every = ca.vertcat(values[: own.slide.stop], values[-2:], *gaps, reached, speed)
     size = ca.sqrt(ca.dot(v, mass * v))
     heading = ca.if_else(size > 0, v / ca.fmax(size, 1e-300), before)
@@ -154,17 +149,10 @@ def _build_leg(
     inner = ca.Function("measure", [z, v, values, before], [ca.densify(outputs)])
     packed, start = ca.MX.sym("packed", s.to.size), ca.MX.sym("start", 5)
     measured = inner(packed[:5], packed[5:10], packed[s.to.values], start)
-    buffer, measure = ca.Function("measure", [packed, start], [measured]).buffer()
+    function = ca.Function("measure", [packed, start], [measured])
     start, event_values = np.zeros(5), np.zeros(len(slack) + 7)
-    buffer.set_arg(0, s.outputs.data)
-    buffer.set_arg(1, start.data)
-    buffer.set_res(0, event_values.data)
-    return ModeSegment(mode, s, rows, slack, measure, start, event_values, buffer)
-
-
-def _measure_until(scene: Scene, until: Until) -> float:
-    """Unit of the distance to the end of a phase [m or rad]."""
-    return 1.0 if until.coordinate == "phi" else scene.scales.length
+    measure, texts = bind(function, [s.outputs, start], event_values), [own.text for own in limits]
+    return ModeSegment(mode, rows, slack, measure, start, event_values, unit_until, texts)
 
 
 class Choice(NamedTuple):
@@ -216,7 +204,6 @@ class Replay(Run):
                              see the constants of these names
     slip_signs               signs of contacts, by name, that have just begun to slip
     side                     sign of (coordinate - value) before the end of the phase
-    until_unit : [m or rad]  unit of the distance to the end of the phase
     passes                   whether the end may be passed at any speed, without an impact
     moving                   whether the motion goes on into the next phase
     stuck                    contacts, then joints, that stick while the rest moves
@@ -250,7 +237,7 @@ class Replay(Run):
         self.rounding = ROUNDING_FORCE * system.scales.force
         self.step_times = [b for b, s in zip(self.breaks, self.steps_at, strict=False) if s]
         self.held_until = self.settled_by = -math.inf
-        self.until_unit = self.side = 1.0
+        self.side = 1.0
         self.passes = self.moving = self.arrives = False
         self.stuck: set[int] = set()
         self.slip_signs: dict[str, float] = {}
@@ -472,19 +459,19 @@ class Replay(Run):
                     t = self.time(change.x)
                     soon = self.coming_step - t <= self.rest_window
                     if not (t < self.settled_by or soon):
-                        return self._collapse(rest, change)
+                        return self._collapse(change)
             if self.t < self.settled_by < self.stop:
                 self.wait(self.settled_by)
             else:
                 self.wait(self.stop)
                 self.next_piece()
 
-    def _collapse(self, rest: Rest, change: Collapse) -> Released | Switched | Outcome:
+    def _collapse(self, change: Collapse) -> Released | Switched | Outcome:
         """End because nothing balances at rest."""
         self.wait(max(self.t, self.time(change.x)))
         if change.jammed:
             raise JammingError(
-                f"{' '.join(rest.formation.names)} jams at rest {self.where()}: friction makes "
+                f"{' '.join(self.formation.names)} jams at rest {self.where()}: friction makes "
                 "the reduced inertia vanish or turn negative"
             )
         if change.c_t is not None:
@@ -578,7 +565,7 @@ class Replay(Run):
             return False
         speed = abs(self._measure_rate())
         if self.passes:
-            distance = self.distance / self.until_unit
+            distance = self.distance / self.leg.until_unit
             # Of several breaks as near as that, the nearest is the one at which the phase ends.
             later = self.breaks[self.piece + 2 : self.piece + 3]
             apart = (later[0] - t) / self.problem.scene.scales.time if len(later) else math.inf
@@ -633,15 +620,19 @@ class Replay(Run):
         pulling = [k for k in kinds if k < rows.force.stop]
         if pulling:
             return self.let_go(pulling)
-        if any(rows.cone.start <= k < rows.cone.stop for k in kinds):
-            return self.let_slip(kinds)
-        for k in kinds:
-            if rows.limit.start <= k < rows.limit.stop:
-                limit = open_limits(self.formation, self.phase.until)[k - rows.limit.start]
-                text = f"{limit.text} {self.when()}"
-                self.note(EventKind.LIMIT, text)
-                return Outcome(OutcomeKind.LIMIT_REACHED, text)
-        return self.turn(kinds)
+        cone, limit, mode, now = rows.cone, rows.limit, self.leg.mode, self.t
+        bounds = [k - cone.start for k in kinds if cone.start <= k < cone.stop]
+        if any(mode.declares(k % len(mode.holders)) for k in bounds):
+            return self.slip()
+        reached = [] if bounds else [k for k in kinds if limit.start <= k < limit.stop]
+        if reached:
+            text = f"{self.leg.limits[reached[0] - limit.start]} {self.when()}"
+            self.note(EventKind.LIMIT, text)
+            return Outcome(OutcomeKind.LIMIT_REACHED, text)
+        turned = self._find_turning(kinds)
+        if not bounds and self.steps_within(self.settling):
+            self._finish_piece()
+        return self.restart(turned, time=now)
 
     def _reach(self) -> Arrival:
         """The end of the phase is reached while moving."""
@@ -654,7 +645,7 @@ class Replay(Run):
 
     def _measure_rate(self) -> float:
         """Time derivative of the distance to the end of the phase, in units of the scene."""
-        return self.rate / self.until_unit * self.problem.scene.scales.time
+        return self.rate / self.leg.until_unit * self.problem.scene.scales.time
 
     def _time_to_stop(self) -> float:
         """Time in which the motion would stop at its present deceleration [s]."""
@@ -674,7 +665,7 @@ class Replay(Run):
         rate, strikes = -self.rate, self.phase.end is End.IMPACT
         if self.passes and rate > 0:
             # A motion that is off by rounding comes the earlier the slower it is.
-            early = PASSED * self.until_unit / rate
+            early = PASSED * self.leg.until_unit / rate
             window = min(max(early, settling), self.longest_window)
         if self.steps_within(window):
             self.coast_to_step(hide=False)
@@ -704,7 +695,6 @@ class Replay(Run):
         if until.value is not None:
             place = self.y[0 if until.coordinate == "x" else 2]
             self.side = math.copysign(1.0, place - until.value)
-        self.until_unit = _measure_until(formation.scene, until)
         self.stuck, self.least = set(), np.full(formation.n_contacts, math.inf)
         self.take(find_mode(formation, np.ones(formation.n_contacts + 2)))
         self.releasable, self.resting, self.slipping = (), frozenset(), frozenset()
@@ -896,16 +886,6 @@ class Replay(Run):
             return Switched(name, -math.copysign(1.0, c_t))
         return self.fail_by_slip(row, c_n, c_t)
 
-    def let_slip(self, events: Sequence[int]) -> Ending | None:
-        """Go on after friction has reached its bound; a declared rolling contact must not slip."""
-        mode, cone = self.leg.mode, self.leg.rows.cone
-        bounds = [
-            (k - cone.start) % len(mode.holders) for k in events if cone.start <= k < cone.stop
-        ]
-        if any(map(mode.declares, bounds)):
-            return self.slip()
-        return self.restart(self._find_turning(events))
-
     def _find_turning(self, events: Sequence[int]) -> list[int]:
         """Contacts, then joints, whose sliding or turning is among events."""
         turning = self.leg.rows.turning
@@ -920,13 +900,6 @@ class Replay(Run):
         """Which contacts that the phase lets roll are out of their cones."""
         reserves, mode = self._measure_reserves(), self.leg.mode
         return [k for k, x in enumerate(reserves) if x < -ROUNDING_FORCE and mode.declares(k)]
-
-    def turn(self, events: Sequence[int]) -> Ending | None:
-        """Go on where contacts or joints have come to rest; None if the motion goes on."""
-        now = self.t
-        if self.steps_within(self.settling):
-            self._finish_piece()
-        return self.restart(self._find_turning(events), time=now)
 
     def _finish_piece(self) -> None:
         """Step to the torque step, without a record of the forces on the way."""
@@ -963,7 +936,7 @@ class Replay(Run):
 
     def is_there(self) -> bool:
         """Whether the distance to the end of the phase counts as none, at rest."""
-        return abs(self.distance) < REACHED * self.until_unit
+        return abs(self.distance) < REACHED * self.leg.until_unit
 
     def _bridge(self) -> bool:
         """Integrate from a reversal to its torque step, unrecorded; whether motion has ended."""

@@ -17,7 +17,7 @@ edition, section II.5).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -158,7 +158,6 @@ class ModeStepper:
     rows: EventRows
     step: Any  # step, look: a step of length h; the same outputs at the state given, without a step
     look: Any
-    buffers: Any  # what has to live as long as these
 
     def load(self, system: System, tolerance: float, z: Array) -> None:
         """Set the inputs that do not change along a motion, which keeps what sticks as at z."""
@@ -222,12 +221,8 @@ class _Equations:
             outputs = ca.densify(ca.vertcat(state, parts, *extra))
             functions.append(ca.Function("step", [packed], [outputs]))
         inputs, outputs = np.zeros(at.size), np.zeros(self.to.size)
-        buffers = [function.buffer() for function in functions]
-        for buffer, _ in buffers:
-            buffer.set_arg(0, inputs.data)
-            buffer.set_res(0, outputs.data)
-        step, look = (call for _, call in buffers)
-        return ModeStepper(self.modes, inputs, outputs, at, self.to, self.rows, step, look, buffers)
+        step, look = (bind(function, [inputs], outputs) for function in functions)
+        return ModeStepper(self.modes, inputs, outputs, at, self.to, self.rows, step, look)
 
     def _stack(self, normal: Expression, tangential: Expression) -> Expression:
         """Constraint rows: normal ones, tangential ones that stick, held coordinates."""
@@ -314,6 +309,16 @@ class _Equations:
         P, _ = rows(place, inputs, geometry)
         speed = y[n:] - correct(P, P @ y[n:], lift)
         return ca.Function("project", [y, inputs], [ca.vertcat(place, speed)])
+
+
+def bind(function: Expression, inputs: Sequence[Array], outputs: Array) -> Any:
+    """A call of a CasADi function of dense arrays, which stay in place and live as long."""
+    buffer, call = function.buffer()
+    for k, values in enumerate(inputs):
+        buffer.set_arg(k, values.data)
+    buffer.set_res(0, outputs.data)
+    call.kept = buffer, inputs, outputs
+    return call
 
 
 def _build_torque(time: Expression, piece: Expression, coefficients: Expression) -> Expression:
