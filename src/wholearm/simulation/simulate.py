@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,14 +38,6 @@ from .tolerances import SLOW
 
 if TYPE_CHECKING:
     from .complementarity import FreeRun
-
-
-class PhaseRun(NamedTuple):
-    """Phases that are simulated from a planned start at rest, to the next one."""
-
-    first: int  # first, last: indices of the phases
-    last: int
-    simulation: Simulation
 
 
 @exclusive
@@ -121,16 +113,17 @@ def simulate(
     if require_number(restitution, "restitution", nonnegative=True) > 1:
         raise InputError("", "restitution", f"{restitution!r} is not between 0 and 1")
     end = None if until is None else require_number(until, "until", positive=True)
-    options = {"tolerance": tolerance, "restitution": restitution, "wanted": wanted}
+    options: dict[str, Any] = {"tolerance": tolerance, "restitution": restitution}
+    options |= {"wanted": wanted, "halt": halt}
     if isinstance(what, Law):
         if end is None:
             raise InputError("", "until", "none given; a law of torques needs an end")
-        return _simulate(problem, Feedback(what, end), state, [0.0], None, halt, **options)
+        return _simulate(problem, Feedback(what, end), state, [0.0], **options)
     problem, profile, plan = adopt_torques(problem, what)
     profile = profile if end is None else profile.cut(0.0, end)
     starts = [0.0] if plan is None else plan.phase_starts[:-1].tolist()
     hint = None if plan is None or start is not None else _recall(problem, plan, 0)
-    return _simulate(problem, profile, state, starts, hint, halt, **options)
+    return _simulate(problem, profile, state, starts, hint, **options)
 
 
 def simulate_free(problem: Problem, what: Torques | Law, **options: Any) -> Simulation:
@@ -146,10 +139,11 @@ def simulate_phases(
     restitution: float = 0.0,
     tolerance: float = 1e-9,
     progress: Callable[[str], None] | None = None,
-) -> tuple[PhaseRun, ...]:
+) -> list[tuple[range, Simulation]]:
     """Simulate the phases of a plan one by one, each from its planned start, with free contacts.
 
     Phases that pass into one another in motion, by the plan's velocities, are simulated together.
+    Returns indices of phases with each simulation.
 
     Parameters
     ----------
@@ -171,11 +165,11 @@ def simulate_phases(
         state = np.concatenate([plan.z[row], plan.z_dot[row]])
         hint = _recall(problem, plan, row)
         clock = starts[first : last + 1].tolist()
-        options = {"tolerance": tolerance, "restitution": restitution}
-        simulation = _simulate(problem, profile, state, clock, hint, None, **options)
-        found.append(PhaseRun(first, last, simulation))
+        options: dict[str, Any] = {"tolerance": tolerance, "restitution": restitution}
+        simulation = _simulate(problem, profile, state, clock, hint, **options)
+        found.append((range(first, last + 1), simulation))
         first = last + 1
-    return tuple(found)
+    return found
 
 
 def _simulate(
@@ -183,7 +177,7 @@ def _simulate(
     profile: TorqueProfile | Feedback,
     state: Array,
     starts: Sequence[float],
-    hint: Modes | None,
+    hint: Modes | None = None,
     halt: Callable[[FreeRun], bool] | None = None,
     **options: Any,
 ) -> Simulation:

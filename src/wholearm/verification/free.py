@@ -69,13 +69,12 @@ def verify_free(
         phases, failures = _follow(problem, whole, allowed)
         return FreeReport(problem.name, whole, (), phases, tuple(failures), tuple(warnings))
     failures, alone = [], []
-    for part in simulate_phases(problem, plan, progress=progress, **options):
-        indices = range(part.first, part.last + 1)
-        compared = _compare(problem, plan, part.simulation, indices, allowed)
+    for indices, part in simulate_phases(problem, plan, progress=progress, **options):
+        compared = _compare(problem, plan, part, indices, allowed)
         alone += compared
         title = f"phases {compared[0].number} to {compared[-1].number}" if compared[1:] else ""
-        warnings += warn(f"{title or f'phase {compared[0].number}'} alone", part.simulation)
-        failures += _fail(problem, part.simulation, compared, allowed)
+        warnings += warn(f"{title or f'phase {compared[0].number}'} alone", part)
+        failures += _fail(problem, part, compared, allowed)
     every = range(len(plan.phase_starts) - 1)
     by_clock = _compare(problem, plan, whole, every, allowed)
     return FreeReport(

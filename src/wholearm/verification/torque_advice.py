@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..contacts.formation import Formation
@@ -100,16 +99,39 @@ def _examine_loss(
 def list_changes(
     response: Response, v: Array, epsilon: float, contact: str, tau: Array
 ) -> tuple[TorqueAdvice, ...]:
-    """Changes of the torques of a motion that prevent a contact, and what else lets go with it."""
+    """Least changes of each torque alone that a moving contact is kept with, or of both.
+
+    Both change if one alone misses other limits. What lets go with the contact is kept, too; what
+    other limits miss already they must not miss by more.
+    """
     formation = response.mode.formation
     unit, load = formation.scene.scales.torque, np.array([1.0, *tau])
     limits, bare = make_limits(formation, epsilon), make_limits(formation, 0.0)
-    forces = (PRESS, CONE)
+    rows, forces = limits.sides[0], (PRESS, CONE)
+    owners, scale = limits.owners[rows], limits.scales[rows]
     own = [limit.part == contact and limit.kind in forces for limit in limits.limits]
-    missed = np.array(own)[limits.owners][limits.sides[0]]
-    gone = find_sides(bare, response, v) @ load < -KEPT * limits.scales[limits.sides[0]]
-    missed |= gone & np.isin(limits.sides[0], limits.of(*forces))
-    return find_changes(limits, find_sides(limits, response, v), missed, tau, unit)
+    gone = find_sides(bare, response, v) @ load < -KEPT * scale
+    missed = np.array(own)[owners] | (gone & np.isin(rows, limits.of(*forces)))
+    slack, slope = normalise(find_sides(limits, response, v), scale, tau, unit)
+    slack = np.where(missed, slack, np.maximum(slack, 0.0))
+
+    def describe(change: Array) -> TorqueAdvice:
+        short = -(slack + slope @ change)
+        worst, but = int(short.argmax()), ""
+        if short[worst] > KEPT:
+            limit = limits.limits[owners[worst]]
+            but = f"{limit.text} is {short[worst] * scale[worst]:.3g} {limit.unit} short"
+        return make_advice(unit * change, tau, but)
+
+    short = slack < 0
+    # A change of one torque may miss others, and is then told with them.
+    singles = [find_least_change(slack[short], slope[short], one) for one in _TORQUES[:2]]
+    changes = [describe(one) for one in singles if one is not None]
+    both = None
+    if all(change.but for change in changes):
+        both = find_least_change(slack, slope, _TORQUES[2])
+    changes += [] if both is None else [describe(both)]
+    return tuple(sorted(changes, key=lambda change: (bool(change.but), np.hypot(*change.change))))
 
 
 def _find_row(simulation: Simulation, index: int, contact: str, kind: str, time: float) -> int:
@@ -250,44 +272,6 @@ def find_moving(
         return float(scene.mass_diagonal @ off**2)
 
     return min((one for one in tried if one is not None), key=misfit, default=None)
-
-
-def find_changes(
-    limits: LimitSet, sides: Array, missed: NDArray[np.bool_], tau: Array, unit: float
-) -> tuple[TorqueAdvice, ...]:
-    """Least changes of each torque alone that keep some limits, or of both if that misses others.
-
-    Other limits have to be kept; what they miss already they must not miss by more.
-
-    Parameters
-    ----------
-    sides : (n_sides, 3)  slack of its one-sided limits is sides @ (1, tau_1, tau_2)
-    missed : (n_sides,)   which sides are to be kept
-    tau : (2,) [N m]
-    unit : [N m]          the scale of a torque
-    """
-    owners = limits.owners[limits.sides[0]]
-    scale = limits.scales[limits.sides[0]]
-    slack, slope = normalise(sides, scale, tau, unit)
-    slack = np.where(missed, slack, np.maximum(slack, 0.0))
-
-    def describe(change: Array) -> TorqueAdvice:
-        short = -(slack + slope @ change)
-        worst, but = int(short.argmax()), ""
-        if short[worst] > KEPT:
-            limit = limits.limits[owners[worst]]
-            but = f"{limit.text} is {short[worst] * scale[worst]:.3g} {limit.unit} short"
-        return make_advice(unit * change, tau, but)
-
-    short = slack < 0
-    # A change of one torque may miss others, and is then told with them.
-    singles = [find_least_change(slack[short], slope[short], one) for one in _TORQUES[:2]]
-    changes = [describe(one) for one in singles if one is not None]
-    both = None
-    if all(change.but for change in changes):
-        both = find_least_change(slack, slope, _TORQUES[2])
-    changes += [] if both is None else [describe(both)]
-    return tuple(sorted(changes, key=lambda change: (bool(change.but), np.hypot(*change.change))))
 
 
 def normalise(sides: Array, scale: Array, tau: Array, unit: float) -> tuple[Array, Array]:
