@@ -45,9 +45,7 @@ from .tolerances import ROUNDING_FORCE, SETTLING, STANDING, STILL
 CLOSED = 1e-10  # gap that counts as closed at an event, relative to the scene's length
 SUNK = 1e-6  # overlap up to which features touch, over the scene's length; else they are behind
 CHATTER = 1e-6  # speed of the last impact, over the scene's: separation stays below rounding
-MANY = (
-    20  # impacts in 3e-4 of the scene's time that raise `CHATTER` tenfold; twice as many 100-fold
-)
+MANY = 20  # impacts in 3e-4 of the scene's time that raise `CHATTER` tenfold, each time as many
 DEPENDENT = 1e-7  # share of a row that others leave, below which it is no constraint of its own
 ARMED = 1e-13  # gap from which on a pair has been apart, relative to the scene's length
 LOOKS = 8  # instants of the longest step at which gaps are looked at, its end among them
@@ -132,7 +130,7 @@ class FreeRun(Run):
     @property
     def chatter(self) -> float:
         """Speed of impacts that count as the last one [m/s]."""
-        # Fingers may knock an object to and fro for ever.
+        # Fingers may knock an object to and fro for ever, and be knocked so between two bodies.
         since, recent = self.t - 3e-4 * self.system.scales.time, 0
         for event in reversed(self.events):
             if event.time < since:
@@ -140,7 +138,7 @@ class FreeRun(Run):
             recent += event.kind is EventKind.IMPACT
         # Impacts need no finer steps than these.
         least = max(CHATTER, 1e3 * self.tolerance)
-        return least * self.system.scales.speed * 10.0 ** min(recent // MANY, 2)
+        return least * self.system.scales.speed * 10.0 ** (recent // MANY)
 
     def note_at(
         self, kind: EventKind, text: str, contact: str = "", value: float = math.nan
