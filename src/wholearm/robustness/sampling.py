@@ -264,19 +264,12 @@ class Trial:
         unit = self.problem.scene.scales.time
         began, losses, least = self.windows[0].start, list[tuple[float, int, str]](), math.inf
         for window in self.windows:
-            gains = [
-                stretch.start
-                for stretch in simulation.stretches
-                if stretch.contact == window.gained
-            ]
+            gains = [s.start for s in simulation.stretches if s.contact == window.gained]
             gain = min((time for time in gains if time > began), default=math.inf)
             # A phase ends when its contact is made, even if it bounces then.
-            makes = [
-                event.time
-                for event in simulation.events
-                if event.contact == window.gained and event.kind is EventKind.GAINED
-            ]
-            made = min((time for time in makes if time > began), default=gain)
+            makes = simulation.find(EventKind.GAINED)
+            times = (event.time for event in makes if event.contact == window.gained)
+            made = min((time for time in times if time > began), default=gain)
             planned = window.stop + delay
             for name in window.contacts:
                 time, force = _find_loss(simulation, name, began, min(planned, gain, made), unit)
@@ -600,10 +593,8 @@ def measure_sensitivities(trial: Trial) -> Sensitivities:
         forces = [_find_force(trial, own.name, value, contact, time) for value in ends]
         slope = (forces[1] - forces[0]) / (ends[1] - ends[0])
         found.append(Sensitivity(own.name, own.unit, width, slope))
-    known = [own for own in found if own.slope == own.slope]
-    unknown = [own for own in found if own.slope != own.slope]
-    known.sort(key=lambda own: -abs(own.over_range))
-    return Sensitivities(contact, time, least, (*known, *unknown))
+    found.sort(key=lambda own: math.inf if math.isnan(own.slope) else -abs(own.over_range))
+    return Sensitivities(contact, time, least, tuple(found))
 
 
 def find_least(

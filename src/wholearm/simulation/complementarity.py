@@ -45,7 +45,7 @@ from .tolerances import ROUNDING_FORCE, SETTLING, STANDING, STILL
 CLOSED = 1e-10  # gap that counts as closed at an event, relative to the scene's length
 SUNK = 1e-6  # overlap up to which features touch, over the scene's length; else they are behind
 CHATTER = 1e-6  # speed of the last impact, over the scene's: separation stays below rounding
-MANY = 20  # impacts in 3e-4 of the scene's time that raise `CHATTER` tenfold, each time as many
+MANY = 20  # impacts in 3e-4 of the scene's time that raise `CHATTER` tenfold; see `FreeRun.chatter`
 DEPENDENT = 1e-7  # share of a row that others leave, below which it is no constraint of its own
 ARMED = 1e-13  # gap from which on a pair has been apart, relative to the scene's length
 LOOKS = 8  # instants of the longest step at which gaps are looked at, its end among them
@@ -129,8 +129,11 @@ class FreeRun(Run):
 
     @property
     def chatter(self) -> float:
-        """Speed of impacts that count as the last one [m/s]."""
-        # Fingers may knock an object to and fro for ever, and be knocked so between two bodies.
+        """Speed of impacts that count as the last one [m/s].
+
+        Fingers may knock an object to and fro for ever, or be knocked so between two bodies: it
+        rises tenfold after 20 and after 40 impacts in a short time, and after every 200.
+        """
         since, recent = self.t - 3e-4 * self.system.scales.time, 0
         for event in reversed(self.events):
             if event.time < since:
@@ -138,7 +141,8 @@ class FreeRun(Run):
             recent += event.kind is EventKind.IMPACT
         # Impacts need no finer steps than these.
         least = max(CHATTER, 1e3 * self.tolerance)
-        return least * self.system.scales.speed * 10.0 ** (recent // MANY)
+        raised = min(recent // MANY, 2) + recent // (10 * MANY)
+        return least * self.system.scales.speed * 10.0**raised
 
     def note_at(
         self, kind: EventKind, text: str, contact: str = "", value: float = math.nan
@@ -225,10 +229,8 @@ class FreeRun(Run):
                 note = f"{text or name} at {-rates[k]:.4g} m/s"
                 self.note_at(EventKind.IMPACT, note, name, float(-rates[k]))
                 continue
-            noted = [
-                e.time for e in self.events if (e.kind, e.contact) == (EventKind.CHATTER, name)
-            ]
-            if not noted or self.t - noted[-1] >= pause:
+            chatters = (e for e in self.events if e.kind is EventKind.CHATTER)
+            if all(e.contact != name or self.t - e.time >= pause for e in chatters):
                 note = f"the impacts of {name} come ever closer and are over"
                 self.note_at(EventKind.CHATTER, note, name, float(-rates[k]))
         self.set_velocity(v)
