@@ -38,9 +38,6 @@ from ..simulation.simulate import simulate_free
 
 REACHED = 0.03
 """How far from the planned place a goal counts as reached, over the scene's length: 1 mm of 33."""
-APART = 0.01
-"""How far from events the instant is at which a force is looked at, over the duration: where a
-contact slides the other way forces step, at another time when numbers are off."""
 Task = tuple[int, tuple[float, ...]]
 """Number and values of a sample."""
 
@@ -603,7 +600,8 @@ def find_least(
     """The planned contact that presses least, when, and its c_n; none has no name."""
     t = simulation.t
     events = np.array([0.0, t[-1], *(event.time for event in simulation.events)])
-    apart = np.abs(t[:, None] - events).min(axis=1) > APART * t[-1]
+    # Where a contact slides the other way forces step, at another time when numbers are off.
+    apart = np.abs(t[:, None] - events).min(axis=1) > 0.01 * t[-1]
     least, start = ("", math.nan, math.nan), 0.0
     for window in windows:
         for name in window.contacts:

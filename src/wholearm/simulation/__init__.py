@@ -3,9 +3,9 @@
 Contacts are those of a problem's phases, or found by a complementarity problem at every event.
 
 It shares the data model with the planner (`scene`, `contacts`, `problem`, `results`), and of what
-is computed from it these alone, each with an independent check among the tests: `Directions` of
-`mechanics.dynamics`; `compute_impact`, `solve_impulses` and `ViolationKind` of `mechanics.impact`
-(plastic impacts); `Statics`, `TorquePolygon`, `GRAZE` and `SURE` of `mechanics.statics` (balance
-and closed gaps at rest); and `find_weakest` of `contacts.cones`. Equations of motion, their
-integration, events and the choice of contact modes are its own.
+is computed from it these alone, each with an independent check among the tests: `compute_impact`
+and `ViolationKind` of `mechanics.impact` (plastic impacts); `Statics`, `TorquePolygon`, `GRAZE` and
+`SURE` of `mechanics.statics` (balance and closed gaps at rest); and `find_weakest` of
+`contacts.cones`. Equations of motion, their integration, events and the choice of contact modes are
+its own.
 """

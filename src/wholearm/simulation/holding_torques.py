@@ -32,7 +32,6 @@ from .rest import StartMode, find_rest
 LEAST = 1e-2  # least margin over saturation of torques that hold or close
 AMPLE = 0.1  # saturation of margins of forces, torques, accelerations, over the scene's
 DRIVE = 0.02  # least acceleration towards an open contact, ample sliding, over the scene's
-SLOW = 0.2  # least margin of slowly closing torques, over that of torques that only hold
 _SMALL = 1e-9  # relative rate at which a contact does not part
 
 
@@ -73,7 +72,8 @@ def find_hold(place: Standstill, epsilon: float, gap: float, time: float) -> Hol
     swift = 2 * gap / time**2
     closing = _find_closing(place, rest, opening, gap)
     slow = _find_closing(place, rest, opening, gap, swift) if closing is None else None
-    if slow is not None and slow.margin > SLOW * firm.margin:
+    # Torques that close slowly hold less well than those that only hold, but by not too much.
+    if slow is not None and slow.margin > 0.2 * firm.margin:
         return slow
     return closing or firm
 

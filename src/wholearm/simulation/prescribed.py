@@ -48,14 +48,10 @@ from .rest import Collapse, StartDeparture, close_contacts, find_rest
 from .run import Run, StuckError
 from .stepper import INNER_STAGES, NODES, ModeStepper, bind
 from .tolerances import (
-    CREEPING,
     FIRST_STEP,
-    LONGEST_WINDOW,
-    PASSED,
     REACHED,
     REST_WINDOW,
     ROUNDING_FORCE,
-    ROUNDING_LIMIT,
     ROUNDING_SPEED,
     SETTLING,
     SLOW,
@@ -63,7 +59,6 @@ from .tolerances import (
 )
 
 CLEAR = 1e-8  # least margin of a clear decision, over the scene's units
-DIP = 1e-7  # how far margins have to dip within a step to be recorded there, over the scene's units
 _OUTCOMES = {
     ViolationKind.PULL: OutcomeKind.CONTACT_LOST,
     ViolationKind.SLIP: OutcomeKind.SLIPS,
@@ -200,8 +195,9 @@ class Replay(Run):
 
     Attributes
     ----------
-    settling, rest_window, longest_window : [s], rounding : [N]
+    settling, rest_window : [s], rounding : [N]
                              see the constants of these names
+    longest_window : [s]     longest time between an arrival at speed and its torque break
     slip_signs               signs of contacts, by name, that have just begun to slip
     side                     sign of (coordinate - value) before the end of the phase
     passes                   whether the end may be passed at any speed, without an impact
@@ -233,7 +229,7 @@ class Replay(Run):
         super().__init__(system, torque, np.asarray(problem.start), np.zeros(5), tolerance, wanted)
         self.problem, self.minima, time = problem, minima, system.scales.time
         self.settling, self.rest_window = SETTLING * time, REST_WINDOW * time
-        self.longest_window = LONGEST_WINDOW * time
+        self.longest_window = 2e-2 * time
         self.rounding = ROUNDING_FORCE * system.scales.force
         self.step_times = [b for b, s in zip(self.breaks, self.steps_at, strict=False) if s]
         self.held_until = self.settled_by = -math.inf
@@ -521,12 +517,14 @@ class Replay(Run):
         # Of a normal force, what is less than any of the phase before counts.
         least, force = np.minimum(known[0], known[-1]), rows.force
         self.least = least[force] = np.minimum(least[force], self.least)
-        dips = inside.min(axis=0) < least - DIP
+        # Dips by less, in units of the scene, are no deeper than an error of interpolation.
+        dips = inside.min(axis=0) < least - 1e-7
         if not dips.any():
             return [], math.inf
         # Within a step more counts as rounding than at its end.
         slack[rows.turning] = slack[rows.speed] = STANDING
-        slack[rows.until] = ROUNDING_LIMIT
+        # The contact just given up starts at zero.
+        slack[rows.until] = 3e-8
         if self.arrives:
             slack[rows.until] = slack[rows.speed] = slack[rows.turning] = math.inf
         found: dict[float, tuple[Record, Array, bool]] = {}
@@ -588,7 +586,8 @@ class Replay(Run):
         if coming + 1 >= len(self.breaks) or self.steps_at[coming]:
             return False
         late = 2 * self._time_to_stop() > self.rest_window
-        return late and self._measure_rate() < -CREEPING
+        # Above the error of integration.
+        return late and self._measure_rate() < -1e-7
 
     def pass_break(self) -> Ending | None:
         """Go on to the next piece of the torques."""
@@ -664,8 +663,8 @@ class Replay(Run):
         window = settling = self.settling
         rate, strikes = -self.rate, self.phase.end is End.IMPACT
         if self.passes and rate > 0:
-            # A motion that is off by rounding comes the earlier the slower it is.
-            early = PASSED * self.leg.until_unit / rate
+            # A motion that is off by the error of a long one before comes the earlier the slower.
+            early = 1e-5 * self.leg.until_unit / rate
             window = min(max(early, settling), self.longest_window)
         if self.steps_within(window):
             self.coast_to_step(hide=False)

@@ -29,7 +29,6 @@ from .modes import Mode, Response, find_mode, list_modes, list_units, respond
 from .system import ContactRows
 from .tolerances import ROUNDING_FORCE, STILL
 
-BALANCED = 1e-6  # distance beyond torques that can be held that counts as none, over the scene's
 _AHEAD = 1e-5  # step along the free direction for the signs of what is stationary, in scene units
 
 
@@ -140,9 +139,9 @@ class Rest:
 
     @cached_property
     def held(self) -> TorquePolygon:
-        """Torques that friction can hold, but for `BALANCED`."""
+        """Torques that friction can hold, and those beyond by no more than rounding."""
         polygon = self.touching.torque_polygon()
-        rounding = BALANCED * self.formation.scene.scales.torque
+        rounding = 1e-6 * self.formation.scene.scales.torque
         return polygon._replace(bounds=polygon.bounds + rounding)
 
     def _list_patterns(self, held: bool) -> tuple[StartMode, ...]:

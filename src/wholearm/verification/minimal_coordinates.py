@@ -16,7 +16,6 @@ from ..problem.definition import Problem
 from ..results.report import ReducedState
 from ..simulation.events import Simulation
 
-ROWS = 5  # instants of every phase at which the equation is set up
 _OTHERS = [0, 1, 2, 4]  # degrees of freedom that are eliminated: q and theta_2
 
 
@@ -36,7 +35,7 @@ def list_reduced_states(problem: Problem, simulation: Simulation) -> tuple[Reduc
         scales = problem.scene.scales
         speeds = np.hstack([slip[:, sliding, 0], scales.length * v[:, 3:]])
         moving = rows[np.abs(speeds).min(axis=1) > 1e-4 * scales.speed]
-        chosen = np.unique(np.linspace(0, len(moving) - 1, ROWS).round().astype(int))
+        chosen = np.unique(np.linspace(0, len(moving) - 1, 5).round().astype(int))
         for row in moving[chosen] if len(moving) else ():
             states.append(_reduce_row(formation, simulation, int(row)))
     return tuple(states)

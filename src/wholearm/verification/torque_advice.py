@@ -28,8 +28,6 @@ KEPT = 1e-9  # shortfall of a limit that counts as none, over the scale of it
 FLAT = 1e-9
 """What a limit's slack changes with a torque below which it does not depend on it, in what is unit
 for each."""
-SLOW = 1e-6
-"""Speed below which the direction of friction is looked for, relative to the scene's speed."""
 _TORQUES = ((0,), (1,), (0, 1))  # which torques change: one alone, or both
 _KINDS = {EventKind.CONTACT_LOST: "lost", EventKind.SLIP: "slips"}
 
@@ -256,9 +254,8 @@ def find_moving(
     """
     scene, rows = formation.scene, evaluate_rows(formation, z, v)
     speeds = np.concatenate([rows.A_t @ v, v[3:]])
-    slow = np.abs(speeds) < SLOW * np.repeat(
-        [scene.scales.speed, scene.scales.rate], [formation.n_contacts, 2]
-    )
+    units = np.repeat([scene.scales.speed, scene.scales.rate], [formation.n_contacts, 2])
+    slow = np.abs(speeds) < 1e-6 * units
     signs = np.sign(speeds)
     signs[list(formation.rolling_rows)] = 0.0
     still = [unit for unit in list_units(formation) if slow[list(unit.rows)].all()]
