@@ -16,6 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
+from ..figures.style import PALETTE
 from ..geometry.tracing import load
 from ..mapping.formation_map import build_map
 from ..planning.plan import solve
@@ -37,12 +38,6 @@ WORK = {
 """Kinds of work that are measured for each."""
 FIELDS = {"seconds": ("s", "processor time [s]"), "memory": ("MB", "rise of memory [MB]")}
 """Quantities that are measured, their units and labels."""
-_LOOKS = {
-    "least time": ("#0072B2", "o"),
-    "margin": ("#D55E00", "s"),
-    "reading": ("#009E73", "^"),
-    "map": ("#CC79A7", "D"),
-}
 
 
 class Growth(Study):
@@ -86,9 +81,8 @@ class Growth(Study):
         grid = figure.subplots(2, len(SIZES), squeeze=False)
         for column, grows in zip(grid.T, SIZES, strict=True):
             for axes, (field, (_, label)) in zip(column, FIELDS.items(), strict=True):
-                for work in WORK[grows]:
+                for work, colour, marker in zip(WORK[grows], PALETTE, "os", strict=False):
                     sizes, values = select(rows, grows, work, field)
-                    colour, marker = _LOOKS[work]
                     name = f"{work}, exponent {fit_exponent(sizes, values):.2f}"
                     axes.loglog(sizes, values, color=colour, marker=marker, label=name)
                 axes.set_xticks(SIZES[grows], map(str, SIZES[grows]))

@@ -15,6 +15,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from ...common.arrays import Array
 from ...common.errors import SolverError, WholearmError
@@ -353,22 +354,16 @@ def check_rates(scene: Scene, t: Array, rows: Samples, middles: Samples) -> list
         ("z'", rows.z_dot, rows.z_ddot, middles.z_ddot),
     ):
         miss = np.abs(np.diff(value, axis=0) - h * (rate[1:] + 4 * middle + rate[:-1]) / 6)
-        span = _spread(rate, middle)
+        # How much the rate changes over each interval and those beside it.
+        every = np.insert(rate, range(1, len(rate)), middle, axis=0)
+        every = np.pad(every, ((2, 2), (0, 0)), "edge")
+        span = np.ptp(sliding_window_view(every, 7, axis=0)[::2], axis=2)
         tiny = 1e-7 * unit * float((np.abs(value) / unit).max())
         excess = miss - (h * span + tiny)
         if (excess > 0).any():
             at, k = np.unravel_index(int(excess.argmax()), excess.shape)
             texts.append(f"{what} and its rate differ by {miss[at, k]:.3g} in row {k}")
     return texts
-
-
-def _spread(values: Array, middles: Array) -> Array:
-    """How much values change over each interval and those beside it, shape (n - 1, k)."""
-    every = np.empty((2 * len(values) + 3, values.shape[1]))
-    every[2:-2:2], every[3:-3:2] = values, middles
-    every[:2], every[-2:] = values[0], values[-1]
-    windows = np.stack([every[k : k + 2 * len(middles) : 2] for k in range(7)])
-    return np.asarray(windows.max(axis=0) - windows.min(axis=0))
 
 
 def _check_ends(problem: Problem, phase: Phase, before: Array | None, rows: Samples) -> list[str]:
