@@ -39,7 +39,7 @@ class Columns:
         self._check({name: table.shape[-1] for name, table in tables.items()})
         shape = np.broadcast_shapes(*(table.shape[:-1] for table in tables.values()))
         parts = [np.broadcast_to(tables[name], (*shape, self.sizes[name])) for name in self.sizes]
-        return np.concatenate(parts, axis=-1)
+        return np.concatenate(parts or [np.zeros(0)], axis=-1)
 
     def _check(self, given: dict[str, int]) -> None:
         if given != self.sizes:

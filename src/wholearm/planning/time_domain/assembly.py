@@ -6,7 +6,7 @@ equations. Its copies have other unknowns and parameters.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import wraps
 from typing import Any, NamedTuple, TypeVar
@@ -110,8 +110,7 @@ class NlpRows:
         # Which rows there are, and their bounds: kernels belong to CasADi.
         return self.__dict__ | {"_blocks": [], "_entries": []}
 
-    def nonlinear(self, *shape: int, low: Any = 0.0, high: Any = 0.0) -> Indices:
-        """Rows of a kernel, equal to zero unless bounds are given."""
+    def _add_rows(self, *shape: int, low: Any, high: Any) -> Indices:
         own = self._count + np.arange(int(np.prod(shape))).reshape(shape)
         self._count += own.size
         for bounds, given in ((self._low, low), (self._high, high)):
@@ -120,7 +119,7 @@ class NlpRows:
 
     def linear(self, *shape: int, low: Any = 0.0, high: Any = 0.0) -> Indices:
         """Rows that are sums of unknowns, equal to zero unless bounds are given."""
-        own = self.nonlinear(*shape, low=low, high=high)
+        own = self._add_rows(*shape, low=low, high=high)
         self._linear.append(own.ravel())
         return own
 
@@ -137,17 +136,28 @@ class NlpRows:
         return own
 
     def add_copies(
-        self, kernel: Kernel, columns: Indices, rows: Indices, parameters: Array | None = None
-    ) -> None:
-        """Say which rows are copies of a kernel, one for all but the last axis of `columns`."""
-        table = columns.reshape(-1, columns.shape[-1])
-        given = np.zeros((len(table), 0)) if parameters is None else parameters
-        own = rows.reshape(len(table), -1)
-        self._blocks.append(_Block(kernel, table, own, given.reshape(len(table), -1)))
+        self,
+        kernel: Kernel,
+        x: Mapping[str, Any],
+        p: Mapping[str, Any] | None = None,
+        *,
+        low: Any = 0.0,
+        high: Any = 0.0,
+        cost: bool = False,
+    ) -> Indices:
+        """Add copies of a kernel with blocks of unknowns `x` and parameters `p` as rows or a cost.
 
-    def add_cost(self, kernel: Kernel, columns: Indices, parameters: Array | None = None) -> None:
-        """Add copies of a kernel to the cost."""
-        self.add_copies(kernel, columns, np.zeros((len(columns), 0), dtype=np.int64), parameters)
+        One for all but the last axis of the blocks, which are broadcast. Returns the rows, equal to
+        zero unless bounds are given.
+        """
+        columns = kernel.x.join(**x)
+        shape, count = columns.shape[:-1], columns[..., 0].size
+        own = self._add_rows(*shape, 0 if cost else kernel.outputs, low=low, high=high)
+        given = np.broadcast_to(kernel.p.join(**p or {}), (*shape, kernel.p.count))
+        columns, rows = columns.reshape(count, -1), own.reshape(count, -1)
+        if cost or rows.size:
+            self._blocks.append(_Block(kernel, columns, rows, given.reshape(count, -1)))
+        return own
 
     @property
     def bounds(self) -> tuple[Array, Array]:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from operator import truediv
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,13 +29,12 @@ from ...geometry.path_guess import PathGuess, connect, find_end, guess_phase, li
 from ...mechanics.dynamics import Directions, force_rows, metric_weights
 from ...mechanics.limits import SPEED, make_limits
 from ...problem.definition import End, Phase, Problem
-from ...results.trajectory import Samples
 from ..options import PlanOptions
 from ..path_domain.path_motion import PathMotion
 from .collocation import Scheme
 from .mode_search import LEAST_INTERVALS, Mode, can_roll, divide, in_mode, link, merge, mode_of
 from .search import TimeSearch, TimeSolution
-from .stage import Stage, StagePoints, in_own_units, resample, scale_state, unit_lengths
+from .stage import Stage, StagePoints, in_own_units, resample, scale_state, unit_points
 
 NEAREST = "a motion to the nearest end of the phase"
 STRAIGHT = "a motion straight to the end"
@@ -152,41 +152,34 @@ class Guesses:
 
     def along(self, motions: Sequence[PathMotion]) -> Guess:
         """Along known motions of the phases on their curves."""
-        scales, scheme = self.problem.scene.scales, self.search.scheme
-        lengths, unit = unit_lengths(scales), scales.time
-        stages = list[Stage]()
+        units, scheme, stages = unit_points(self.problem.scene.scales), self.search.scheme, []
         for stage, motion in zip(join_modes(self.nearest.stages), motions, strict=True):
-            parts = list[tuple[StagePoints, Mode]]()
+            parts, rolling = list[tuple[StagePoints, Mode]](), list(stage.formation.rolling_rows)
             for start, stop, directions in motion.spans:
                 count = round((stop - start) / motion.duration * stage.intervals)
                 count = max(LEAST_INTERVALS, count)
-                breaks = np.linspace(0.0, 1.0, count + 1)
-                at = breaks[:-1, None] + scheme.points / count
-
-                def sample(
-                    share: Array,
-                    motion: PathMotion = motion,
-                    start: float = start,
-                    span: float = stop - start,
-                ) -> Samples:
-                    return motion.evaluate(start + share.ravel() * span)
-
-                points, ends = sample(at), sample(breaks)
-                shape = (count, len(scheme.points), -1)
-                controls = breaks[:-1, None] + np.linspace(0.0, 1.0, scheme.controls) / count
-                rolling = list(stage.formation.rolling_rows)
+                breaks, span = np.linspace(0.0, 1.0, count + 1), stop - start
+                inner = (scheme.points, np.linspace(0.0, 1.0, scheme.controls))
+                points, controls, ends = (
+                    motion.evaluate(start + share.ravel() * span)
+                    for share in (*(breaks[:-1, None] + x / count for x in inner), breaks)
+                )
                 c = np.hstack([points.c_n, points.c_t[:, rolling]])
+                z, v, a, forces = (
+                    own.reshape(count, scheme.degree, -1) for own in (*points[:3], c)
+                )
                 part = StagePoints(
-                    (stop - start) / unit,
+                    span,
                     np.full(count, 1 / count),
-                    np.stack([ends.z / lengths, ends.z_dot * (unit / lengths)], axis=1),
-                    (points.z / lengths).reshape(shape),
-                    (points.z_dot * (unit / lengths)).reshape(shape),
-                    (points.z_ddot * (unit**2 / lengths)).reshape(shape),
-                    (c / scales.force).reshape(shape),
-                    (sample(controls).tau / scales.torque).reshape(count, -1, 2),
+                    np.stack([ends.z, ends.z_dot], axis=1),
+                    z,
+                    v,
+                    a,
+                    forces,
+                    controls.tau.reshape(count, -1, 2),
                     stage.guess.impulses if stop == motion.duration else np.zeros(0),
                 )
+                part = StagePoints(*map(truediv, part, units))
                 signs = np.concatenate(directions)
                 signs[rolling] = 0.0
                 parts.append((part, tuple(signs.tolist())))

@@ -29,7 +29,7 @@ from .collocation import Scheme
 from .search import TimeSearch, TimeSolution
 from .stage import LimitMisses, Stage, bisect_intervals, monitor
 from .time_motion import MotionResponse, StageMotion, make_motions
-from .time_nlp import SLIDING, find_relieved, least_senses, price_sides
+from .time_nlp import SLIDING, find_relieved, least_senses
 
 
 @dataclass(frozen=True)
@@ -257,13 +257,19 @@ def _find_gains(
 def price_misses(solution: TimeSolution, misses: Sequence[LimitMisses]) -> list[Array]:
     """Relative cost of raising limits by their misses in each interval, (K,), by multipliers."""
     on_x, on_g = (np.abs(solution.multipliers[key]) for key in ("lam_x0", "lam_g0"))
-    prices = []
-    for k, miss in enumerate(misses):
-        layout, rows = solution.nlp.layouts[k], solution.nlp.rows_of[k].limits
-        scales = rows.limits.scales[rows.limits.sides[0]]
-        cost = (price_sides(rows, layout, on_x, on_g) * miss.held * scales).sum(axis=1)
-        prices.append(np.asarray(cost / max(abs(solution.cost), 1e-300)))
-    return prices
+    costs = []
+    for layout, of_stage, miss in zip(
+        solution.nlp.layouts, solution.nlp.rows_of, misses, strict=True
+    ):
+        rows, price = of_stage.limits, np.zeros_like(miss.held)
+        c_n = layout.forces[..., : rows.presses.shape[2]]
+        price[:, rows.pressed] = on_x[c_n].sum(axis=1) + on_g[rows.presses].sum(axis=1)
+        price[:, rows.sides] = on_g[rows.others].sum(axis=1)
+        for side, unknowns in rows.bounded.items():
+            price[:, side] = on_x[unknowns].sum(axis=1)
+        cost = (price * miss.held * rows.limits.scales[rows.limits.sides[0]]).sum(axis=1)
+        costs.append(np.asarray(cost / max(abs(solution.cost), 1e-300)))
+    return costs
 
 
 def _choose_halvings(

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from operator import is_not
+from operator import is_not, mul
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -214,20 +214,17 @@ def unit_lengths(scales: Scales) -> Array:
     return np.array([scales.length, scales.length, 1.0, 1.0, 1.0])
 
 
+def unit_points(scales: Scales) -> StagePoints:
+    """Units of motion and forces in SI units."""
+    z, unit, force = unit_lengths(scales), scales.time, scales.force
+    nodes, torque, impulse = np.stack([z, z / unit]), scales.torque, force * unit
+    units: Any = (unit, 1.0, nodes, z, z / unit, z / unit**2, force, torque, impulse)
+    return StagePoints(*units)
+
+
 def to_si(stage: Stage, problem: Problem) -> Stage:
     """A stage in SI units, of the same problem in SI units."""
-    scales, part = problem.scene.scales, stage.guess
-    lengths, unit = unit_lengths(scales), scales.time
-    points = part._replace(
-        duration=part.duration * unit,
-        nodes=part.nodes * lengths / np.array([[1.0], [unit]]),
-        z=part.z * lengths,
-        v=part.v * lengths / unit,
-        a=part.a * lengths / unit**2,
-        forces=part.forces * scales.force,
-        tau=part.tau * scales.torque,
-        impulses=part.impulses * scales.force * unit,
-    )
+    points = StagePoints(*map(mul, stage.guess, unit_points(problem.scene.scales)))
     formation = problem.phases[stage.phase].formation
     rolling = stage.formation.rolling
     if set(rolling) != set(formation.rolling):

@@ -192,13 +192,10 @@ class Target(NamedTuple):
 class StageRows:
     """Rows of one stage, interval by interval."""
 
-    # (K, m): constant margin, and contacts at ends of intervals without a point there
-    chain: Indices
     states: Indices  # (K, 2, rungs, f): collocation of z and of z', along the columns of `bases`
     bases: Array  # (K, 5, f): tangent space of each interval
-    points: Indices  # (K, d, m): equations and inequalities at the points
-    balance: Indices  # (K, d, 5): of these, the equations of motion
-    senses: Indices  # (K, d, n_rubbing): and the sliding directions of contacts with friction
+    balance: Indices  # (K, d, 5): equations of motion at the points
+    senses: Indices  # (K, d, n_rubbing): sliding directions of contacts with friction there
     limits: LimitRows
     monitor_rows: Indices  # (K, d, m): limits of the formation
 
@@ -265,12 +262,20 @@ def build_time_nlp(
     rows, cost = NlpRows(), np.zeros(layouts[-1].stop)
     start = stages[0].guess.nodes[0].ravel()
     rows.add_entries(rows.linear(STATE, low=start, high=start), layouts[0].nodes[0, :STATE], 1.0)
-    rows_of = []
+    rows_of, controls = [], scheme.controls
+    of_time = {Objective.TIME: 1.0, Objective.EFFORT: target.time_weight, Objective.ELASTIC: _HURRY}
     for k, (stage, layout) in enumerate(zip(stages, layouts, strict=True)):
         rows_of.append(add_stage(rows, stage, layout, scheme, stage is stages[-1], target))
         if k + 1 < len(stages):
             join_stages(rows, (stage, stages[k + 1]), (layout, layouts[k + 1]), scheme)
-        _add_costs(rows, cost, stage, layout, scheme, target)
+        kernel, columns = effort_kernel(controls), {"tau": layout.tau, "h": layout.h[:, None]}
+        if target.objective is Objective.EFFORT:
+            rows.add_copies(kernel, columns, cost=True)
+        elif controls > 2:
+            given = {"weight": _BEND * stage.formation.scene.torque_limit**-2.0}
+            rows.add_copies(bend_kernel(controls), columns, given, cost=True)
+        cost[layout.h] = of_time.get(target.objective, 0.0)
+        cost[layout.short] = 1 / stage.intervals
     duration_row, last, end = -1, stages[-1], layouts[-1].nodes[-1]
     if stages[0].periods:
         add_periods(rows, stages, layouts)
@@ -291,75 +296,92 @@ def build_time_nlp(
     return TimeNLP(built, max_iter, layouts, rows, rows_of, duration_row)
 
 
-def _add_costs(
-    rows: NlpRows, cost: Array, stage: Stage, layout: StageLayout, scheme: Scheme, target: Target
-) -> None:
-    """Add the cost of a stage."""
-    if target.objective is Objective.EFFORT:
-        kernel = effort_kernel(scheme.controls)
-        rows.add_cost(kernel, kernel.x.join(tau=layout.tau, h=layout.h[:, None]))
-    elif scheme.controls > 2:
-        kernel, weight = bend_kernel(scheme.controls), stage.formation.scene.torque_limit**-2.0
-        given = np.tile(_BEND * weight, (stage.intervals, 1))
-        rows.add_cost(kernel, kernel.x.join(tau=layout.tau, h=layout.h[:, None]), given)
-    of_time = {Objective.TIME: 1.0, Objective.EFFORT: target.time_weight, Objective.ELASTIC: _HURRY}
-    cost[layout.h] = of_time.get(target.objective, 0.0)
-    cost[layout.short] = 1 / stage.intervals
-
-
 def add_stage(
     rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool, target: Target
 ) -> StageRows:
     """Add the constraints of a stage."""
-    formation = stage.formation
-    node, ends = layout.nodes[:-1], layout.nodes[1:]
-    chain = rows.add_equal(ends[:, MARGIN:], node[:, MARGIN:])
-    states, bases = _collocate(rows, stage, layout, scheme)
+    formation, guess, (K, d) = stage.formation, stage.guess, layout.z.shape[:2]
+    places, node, ends = guess.places(scheme.points), layout.nodes[:-1], layout.nodes[1:]
+    rows.add_equal(ends[:, MARGIN:], node[:, MARGIN:])
+
+    # Collocation of z and z' along the tangent space.
+    bases = np.array([tangent_basis(formation, z) for z in guess.z[:, d // 2]])
+    f, parts = bases.shape[2], ((layout.z, layout.v, Z), (layout.v, layout.a, V))
+    states = np.zeros((K, 2, len(scheme.rungs), f), dtype=np.int64)
+    for k, (state, rate, part) in enumerate(parts):
+        columns = {
+            "start": node[:, part],
+            "points": state.reshape(K, -1),
+            "end": ends[:, part][:, : 5 * (not scheme.ends)],
+            "rates": rate.reshape(K, -1),
+            "h": layout.h[:, None],
+        }
+        kernel, N = collocation_kernel(scheme.name, d, f), bases.transpose(0, 2, 1).reshape(K, -1)
+        states[:, k] = rows.add_copies(kernel, columns, {"N": N}).reshape(states[:, k].shape)
     if not stage.periods:
         # Constant ratios of intervals, scaled like other rows.
-        shares, own = stage.intervals * stage.guess.fractions, rows.linear(stage.intervals - 1)
+        shares, own = K * guess.fractions, rows.linear(K - 1)
         rows.add_entries(own, layout.h[:-1], shares[1:])
         rows.add_entries(own, layout.h[1:], -shares[:-1])
-    points, balance, senses = _balance(rows, stage, layout, scheme, last)
-    first = node[:, Z] if formation.rolling else node[:, :0]
+
+    # Equations of motion, contacts and sliding directions at the points.
+    homotopy, first = stage.onset > 0, node[:, Z] if formation.rolling else node[:, :0]
+    kernel, least = point_kernel(formation, scheme.controls, homotopy), least_senses(stage, places)
+    columns = {"z": layout.z, "v": layout.v, "a": layout.a, "forces": layout.forces}
+    columns |= {"tau": layout.tau[:, None], "first": first[:, None]}
+    parameters = stage.directions._asdict() | {
+        "shares": blend(scheme.points, scheme.controls),
+        "least": np.maximum(least[..., : formation.n_contacts], 0.0),
+        "onset": np.full(1 * homotopy, stage.onset),
+    }
+    still, balance, senses = set[int](), kernel.y["balance"], kernel.y["senses"]
+    if scheme.ends:
+        still = find_still(stage, last)
+    low, high = np.zeros((K, d, kernel.outputs)), np.zeros(kernel.outputs)
+    high[senses] = np.inf
+    low[..., senses] = -np.inf if homotopy else 0.0
+    low[-1, -1, senses][[k in still for k in formation.rubbing_rows]] = -np.inf
+    points = rows.add_copies(kernel, columns, parameters, low=low, high=high)
     if not scheme.ends:
-        kernel = end_kernel(formation)
-        own = rows.nonlinear(stage.intervals, kernel.outputs)
-        rows.add_copies(kernel, kernel.x.join(z=ends[:, Z], v=ends[:, V], first=first), own)
-        chain = np.hstack([chain, own])
-    monitor_rows = _add_monitor_rows(rows, stage, layout, scheme)
+        columns = {"z": ends[:, Z], "v": ends[:, V], "first": first}
+        rows.add_copies(end_kernel(formation), columns)
+
+    # Limits of the formation that are not negative; that of the end's contact is zero there.
+    goal = None if stage.until is None else stage.until.contact
+    low = stage.list_clearances(places.ravel(), after=1 / 3).reshape(K, d, -1)
+    if scheme.ends:
+        low[-1, -1, [formation.limits[k].gains(goal) for k in stage.monitored]] = -np.inf
+    kernel = monitor_kernel(formation, stage.monitored)
+    monitor_rows = rows.add_copies(kernel, {"z": layout.z}, low=low, high=np.inf)
     slow = formation.scene.has_slow_motors
     if stage.opens and stage.opening is not None:
         gained = [formation.limits[k].gained for k in stage.released]
         # With continuous torques a released contact has no acceleration at first.
         opening = stage.opening * (scheme.points[:, None] if slow else 1.0)
         for contact in [c for c in gained if c is not None]:
-            kernel = opening_kernel(formation, contact)
-            columns = kernel.x.join(z=layout.z[0], v=layout.v[0], a=layout.a[0])
-            own = rows.nonlinear(scheme.degree, kernel.outputs, low=opening, high=np.inf)
-            rows.add_copies(kernel, columns, own)
-    until = stage.until
+            columns = {"z": layout.z[0], "v": layout.v[0], "a": layout.a[0]}
+            rows.add_copies(opening_kernel(formation, contact), columns, low=opening, high=np.inf)
+
+    # The end.
+    until, end = stage.until, layout.nodes[-1]
     if stage.stop is not None:
         until, N = None, tangent_basis(formation, stage.stop)
         there = rows.linear(N.shape[1], low=N.T @ stage.stop, high=N.T @ stage.stop)
-        rows.add_entries(there[:, None], layout.nodes[-1, Z], N.T)
+        rows.add_entries(there[:, None], end[Z], N.T)
     turns, gained_softly = _list_free_turns(stage), stage.gained
     if _stops(stage):
         turns, gained_softly = (), None
-        N = tangent_basis(formation, stage.guess.nodes[-1, 0])
-        rows.add_entries(rows.linear(N.shape[1])[:, None], layout.nodes[-1, V], N.T)
-    goal = goal_kernel(formation, until, turns, gained_softly)
-    if goal is not None:
-        end = layout.nodes[-1]
-        rows.add_copies(goal, goal.x.join(z=end[Z], v=end[V]), rows.nonlinear(goal.outputs))
+        N = tangent_basis(formation, guess.nodes[-1, 0])
+        rows.add_entries(rows.linear(N.shape[1])[:, None], end[V], N.T)
+    kernel = goal_kernel(formation, until, turns, gained_softly)
+    rows.add_copies(kernel, {"z": end[Z], "v": end[V]})
     if stage.lands and until is not None and until.contact is not None:
         landing = landing_kernel(formation, until.contact)
-        own = rows.nonlinear(landing.outputs, low=0.0, high=np.inf)
-        rows.add_copies(landing, landing.x.join(z=layout.nodes[-1, Z]), own)
+        rows.add_copies(landing, {"z": end[Z]}, high=np.inf)
     limits = add_limits(rows, stage, layout, scheme, target)
     if slow:
         add_motors(rows, stage, layout, scheme)
-    return StageRows(chain, states, bases, points, balance, senses, limits, monitor_rows)
+    return StageRows(states, bases, points[..., balance], points[..., senses], limits, monitor_rows)
 
 
 def _list_free_turns(stage: Stage) -> tuple[int, ...]:
@@ -382,62 +404,6 @@ def _stops(stage: Stage) -> bool:
     With one degree of freedom these are two, as one alone may have a zero.
     """
     return len(_list_free_turns(stage)) >= max(2, 5 - stage.formation.n_constraints)
-
-
-def _collocate(
-    rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme
-) -> tuple[Indices, Array]:
-    """Collocation of z and z' along the tangent space, and its bases."""
-    middles = stage.guess.z[:, scheme.degree // 2]
-    bases = np.array([tangent_basis(stage.formation, z) for z in middles])
-    K, _, f = bases.shape
-    kernel = collocation_kernel(scheme.name, scheme.degree, f)
-    parameters, collected = bases.transpose(0, 2, 1).reshape(K, -1), []
-    if not f:
-        return np.zeros((K, 2, len(scheme.rungs), 0), dtype=np.int64), bases
-    for state, rate, part in ((layout.z, layout.v, Z), (layout.v, layout.a, V)):
-        columns = kernel.x.join(
-            start=layout.nodes[:-1, part],
-            points=state.reshape(K, -1),
-            end=layout.nodes[1:, part][:, : 5 * (not scheme.ends)],
-            rates=rate.reshape(K, -1),
-            h=layout.h[:, None],
-        )
-        own = rows.nonlinear(K, kernel.outputs)
-        rows.add_copies(kernel, columns, own, kernel.p.join(N=parameters))
-        collected.append(own.reshape(K, -1, f))
-    return np.stack(collected, axis=1), bases
-
-
-def _balance(
-    rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool
-) -> tuple[Indices, Indices, Indices]:
-    """Equations of motion, contacts and sliding directions at the points, (K, d, n).
-
-    Also those of the equations of motion and of the sliding directions alone.
-    """
-    formation, shape = stage.formation, layout.z.shape[:2]
-    homotopy, node = stage.onset > 0, layout.nodes[:-1, None]
-    kernel = point_kernel(formation, scheme.controls, homotopy)
-    first = node[..., Z] if formation.rolling else node[..., :0]
-    state = {"z": layout.z, "v": layout.v, "a": layout.a}
-    columns = kernel.x.join(**state, forces=layout.forces, tau=layout.tau[:, None], first=first)
-    least = least_senses(stage, stage.guess.places(scheme.points))[..., : formation.n_contacts]
-    parameters = kernel.p.join(
-        Xi=stage.directions.Xi,
-        sigma=stage.directions.sigma,
-        shares=blend(scheme.points, scheme.controls),
-        least=np.maximum(least, 0.0),
-        onset=np.full(1 * homotopy, stage.onset),
-    )
-    still, senses = find_still(stage, last) if scheme.ends else set(), kernel.y["senses"]
-    low, high = np.zeros((*shape, kernel.outputs)), np.zeros(kernel.outputs)
-    high[senses] = np.inf
-    low[..., senses] = -np.inf if homotopy else 0.0
-    low[-1, -1, senses][[k in still for k in formation.rubbing_rows]] = -np.inf
-    own = rows.nonlinear(*shape, kernel.outputs, low=low, high=high)
-    rows.add_copies(kernel, columns, own, parameters)
-    return own, own[..., kernel.y["balance"]], own[..., senses]
 
 
 def least_senses(stage: Stage, places: Array) -> Array:
@@ -465,23 +431,6 @@ def find_still(stage: Stage, last: bool) -> set[int]:
     return {*stage.turns, *rolls}
 
 
-def _add_monitor_rows(rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:
-    """Nonnegative limits of the formation, but for the end's there, shape (K, d, m)."""
-    formation, (K, d) = stage.formation, layout.z.shape[:2]
-    if not stage.monitored:
-        return np.zeros((K, d, 0), dtype=np.int64)
-    places = stage.guess.places(scheme.points).ravel()
-    low = stage.list_clearances(places, after=1 / 3).reshape(K, d, -1)
-    goal = None if stage.until is None else stage.until.contact
-    reached = [formation.limits[k].gains(goal) for k in stage.monitored]
-    if scheme.ends:
-        low[-1, -1, reached] = -np.inf
-    own = rows.nonlinear(K, d, len(stage.monitored), low=low, high=np.inf)
-    kernel = monitor_kernel(formation, stage.monitored)
-    rows.add_copies(kernel, kernel.x.join(z=layout.z), own)
-    return own
-
-
 def join_stages(
     rows: NlpRows,
     pair: tuple[Stage, Stage],
@@ -499,9 +448,8 @@ def join_stages(
         kernel = impact_kernel(stage.formation, coming.formation)
         high = np.zeros(kernel.outputs)
         high[kernel.y["leaving"]] = high[kernel.y["cones"]] = np.inf
-        columns = kernel.x.join(after=first[V], before=last[V], z=last[Z], impulses=layout.impulses)
-        own = rows.nonlinear(kernel.outputs, high=high)
-        rows.add_copies(kernel, columns, own, kernel.p.join(Xi=coming.directions.Xi))
+        x = {"after": first[V], "before": last[V], "z": last[Z], "impulses": layout.impulses}
+        rows.add_copies(kernel, x, {"Xi": coming.directions.Xi}, high=high)
 
 
 _Slack = tuple[Indices, float]
@@ -540,20 +488,6 @@ def add_limits(
         rows.add_entries(added_row, unknowns, signs[side])
         _add_gives(rows, added_row, gives[own[side]])
     return LimitRows(limits, pressed, added, others, bounded, alone=not any(soft))
-
-
-def price_sides(rows: LimitRows, layout: StageLayout, on_x: Array, on_g: Array) -> Array:
-    """Multiplier of each side of the limits in each interval, shape (K, n_sides).
-
-    `on_x` and `on_g` are absolute multipliers of the unknowns' bounds and of the rows.
-    """
-    price = np.zeros((len(layout.h), len(rows.limits.sides[0])))
-    c_n = layout.forces[..., : rows.presses.shape[2]]
-    price[:, rows.pressed] = on_x[c_n].sum(axis=1) + on_g[rows.presses].sum(axis=1)
-    price[:, rows.sides] = on_g[rows.others].sum(axis=1)
-    for side, unknowns in rows.bounded.items():
-        price[:, side] = on_x[unknowns].sum(axis=1)
-    return price
 
 
 def _list_gives(limits: LimitSet, layout: StageLayout, target: Target) -> list[_Slack | None]:
@@ -633,11 +567,9 @@ def add_motors(rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme)
             rows.add_entries(own, tau[:, :-1, joint], sign * n / limit)
     lagging = tuple(np.flatnonzero(scene.actuator_lag).tolist())
     if lagging:
+        given = {"lag": scene.actuator_lag, "limit": scene.torque_limit}
         kernel = command_kernel(scheme.controls, lagging)
-        commands = rows.nonlinear(K, kernel.outputs, high=np.inf)
-        given = kernel.p.join(lag=scene.actuator_lag, limit=scene.torque_limit)
-        columns = kernel.x.join(tau=layout.tau, h=layout.h[:, None])
-        rows.add_copies(kernel, columns, commands, np.tile(given, (K, 1)))
+        rows.add_copies(kernel, {"tau": layout.tau, "h": layout.h[:, None]}, given, high=np.inf)
 
 
 def join_motors(
@@ -658,10 +590,8 @@ def join_motors(
     if scheme.ends and stage.gained is not None:
         for contact in stage.gained.contacts:
             if contact not in formation.contacts:
-                kernel = opening_kernel(stage.gained, contact)
-                at = (layout.z, layout.v, layout.a)
-                columns = kernel.x.join(**{k: v[-1, -1] for k, v in zip("zva", at, strict=True)})
-                rows.add_copies(kernel, columns, rows.nonlinear(kernel.outputs))
+                z, v, a = (part[-1, -1] for part in (layout.z, layout.v, layout.a))
+                rows.add_copies(opening_kernel(stage.gained, contact), {"z": z, "v": v, "a": a})
 
 
 def hold_ends(
@@ -671,11 +601,9 @@ def hold_ends(
     for k, (place, tau) in ((0, (0, slice(None, 2))), (-1, (-1, slice(-2, None)))):
         stage, layout = stages[k], layouts[k]
         forces = layout.finish if k else layout.begin
-        kernel = hold_kernel(stage.formation)
-        columns = kernel.x.join(z=layout.nodes[place, Z], forces=forces, tau=layout.tau[place, tau])
-        given = kernel.p.join(Xi=stage.directions.Xi, sigma=stage.directions.sigma)
-        rows.add_copies(kernel, columns, rows.nonlinear(kernel.outputs), given)
-        formation = stage.formation
+        z, formation = layout.nodes[place, Z], stage.formation
+        held = {"z": z, "forces": forces, "tau": layout.tau[place, tau]}
+        rows.add_copies(hold_kernel(formation), held, stage.directions._asdict())
         if not k and stage.phase:
             # A command approaches a torque limit only asymptotically in the pause before.
             scene, first = formation.scene, layout.tau[0, :2]
@@ -750,11 +678,8 @@ def _add_period(
             rows.add_entries(even, np.array([one.h]), other.share / size)
             rows.add_entries(even, np.array([other.h]), -one.share / size)
         if linear:
-            kernel = slope_kernel()
-            columns = kernel.x.join(
-                before=one.tau, after=other.tau, h=np.array([one.h]), coming=np.array([other.h])
-            )
-            rows.add_copies(kernel, columns, rows.nonlinear(kernel.outputs))
+            spans = {"h": np.array([one.h]), "coming": np.array([other.h])}
+            rows.add_copies(slope_kernel(), {"before": one.tau, "after": other.tau} | spans)
 
 
 def find_bounds(
@@ -769,11 +694,19 @@ def find_bounds(
         low[layout.h] = 1e-6  # least duration of an interval, in the scene's unit
         if coming is not None and stage.ends_in_impact:
             low[layout.impulses[: coming.formation.n_contacts]] = 0.0
-        _stay_short(stage, layout, scheme, (low, high))
+        if stage.ahead is not None:
+            # A coordinate stays before the value at which the phase ends.
+            row, value, side = stage.ahead
+            left = 1.0 - stage.guess.places(scheme.points) * (stage.until is not None)
+            most = value - side * CLEAR * np.minimum(1.0, (2 * left) ** 2)
+            if stage.until is not None and scheme.ends:
+                most[-1, -1] = side * np.inf
+            (low, high)[int(side > 0)][layout.z[..., row]] = most
         still = find_still(stage, stage is stages[-1]) if scheme.ends else set()
         rates = least_senses(stage, stage.guess.places(scheme.points))
         for joint, sigma in enumerate(stage.directions.sigma):
-            speeds, one_way = layout.v[..., 3 + joint], rates[..., joint - 2].copy()
+            speeds = layout.v[..., 3 + joint]
+            one_way = rates[..., joint - 2] + raised.sense[:, joint - 2, None]
             if stage.formation.n_contacts + joint in still:
                 one_way[-1, -1] = -np.inf
             if sigma > 0:
@@ -801,25 +734,7 @@ def find_bounds(
                 high[unknowns] = np.minimum(high[unknowns], values[side] - more[:, side, None])
         low_g[rows.monitor_rows] += raised.gap[:, None, list(stage.monitored)]
         low_g[rows.senses] += raised.sense[:, None, list(stage.formation.rubbing_rows)]
-        for joint, sigma in enumerate(stage.directions.sigma):
-            speeds, faster = layout.v[..., 3 + joint], raised.sense[:, -2 + joint, None]
-            low[speeds] += faster * (sigma > 0)
-            high[speeds] -= faster * (sigma < 0)
     return (low, high), (low_g, high_g)
-
-
-def _stay_short(
-    stage: Stage, layout: StageLayout, scheme: Scheme, bounds: tuple[Array, Array]
-) -> None:
-    """Bound a coordinate, in place, before the value at which the phase ends."""
-    if stage.ahead is None:
-        return
-    row, value, side = stage.ahead
-    left = 1.0 - stage.guess.places(scheme.points) * (stage.until is not None)
-    most = value - side * CLEAR * np.minimum(1.0, (2 * left) ** 2)
-    if stage.until is not None and scheme.ends:
-        most[-1, -1] = side * np.inf
-    bounds[int(side > 0)][layout.z[..., row]] = most
 
 
 def _free_equal(
@@ -908,7 +823,7 @@ def collocation_kernel(name: str, degree: int, freedoms: int) -> Kernel:
 def monitor_kernel(formation: Formation, monitored: tuple[int, ...]) -> Kernel:
     """Limits of a formation."""
     x = Columns(z=5).make_symbols(z=build_features(formation.scene).z)
-    values = ca.vertcat(*(formation.limits[k].value for k in monitored))
+    values = ca.vertcat(ca.SX(0, 1), *(formation.limits[k].value for k in monitored))
     return build_kernel(x, values=values)
 
 
@@ -923,12 +838,12 @@ def opening_kernel(formation: Formation, contact: Contact) -> Kernel:
 @share(64)
 def goal_kernel(
     formation: Formation, until: Until | None, turns: tuple[int, ...], gained: Formation | None
-) -> Kernel | None:
-    """End of a phase, zero rates of reversals, and zero speeds of contacts gained; None if none."""
+) -> Kernel:
+    """End of a phase, zero rates of reversals, and zero speeds of contacts gained."""
     scene = formation.scene
     x = Columns(z=5, v=5).make_symbols(z=build_features(scene).z)
     z, v = x.z, x.v
-    parts: list[Expression] = []
+    parts: list[Expression] = [ca.SX(0, 1)]
     if until is not None and until.contact is not None:
         # Where a contact changes its name its gap has no gradient, but the end of its range has.
         ranges = [limit for c in formation.contacts for limit in build_limits(c, scene)]
@@ -942,7 +857,7 @@ def goal_kernel(
     if gained is not None:
         P = gained.build_constraints(z, v)[1]
         parts += [P[i, :] @ v for i in new_rows(formation, gained)]
-    return build_kernel(x, goals=ca.vertcat(*parts)) if parts else None
+    return build_kernel(x, goals=ca.vertcat(*parts))
 
 
 @share(64)
