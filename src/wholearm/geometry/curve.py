@@ -210,9 +210,10 @@ def tangent_basis(formation: Formation, z: Array) -> Array:
 
 def find_tied(formation: Formation, z: Array, row: int) -> tuple[int, ...]:
     """Rows of (contacts, joints) that reverse with a row: proportional, or of a flush edge."""
-    flush, rates = formation.turn_with(row), find_rates(formation, z)
-    if rates.shape[1] != 2:
+    flush = formation.turn_with(row)
+    if formation.n_constraints != 3:
         return flush
+    rates = find_rates(formation, z)
     sizes = np.linalg.norm(rates, axis=1)
     across = np.abs(rates[row, 0] * rates[:, 1] - rates[row, 1] * rates[:, 0])
     tied = (across < _TIED * sizes * sizes[row]) & (sizes > _TIED) & (sizes[row] > _TIED)

@@ -20,7 +20,6 @@ import numpy as np
 from ...common.arrays import Array, find_runs
 from ...common.errors import InputError
 from ...contacts.contact_limits import list_renamed
-from ...contacts.elemental import Contact
 from ...contacts.formation import Formation
 from ...geometry.arcs import CostToGo
 from ...geometry.curve import describe_pose, find_tied, tangent_basis
@@ -108,9 +107,24 @@ class Guesses:
 
         if not all(phase.guess for phase in self.phases):
             return None
-        scales, scheme = self.problem.scene.scales, self.search.scheme
-        t, z = self._close_poses()
-        path = CubicSpline(t / scales.time, scale_state(z, scales), bc_type="clamped")
+        scales, scheme, t, z = self.problem.scene.scales, self.search.scheme, [0.0], [self.z]
+        for phase in self.phases:
+            start, slip = t[-1], phase.formation.evaluate_slip(z[-1][None])[0]
+            for mode in phase.guess or ():
+                place = z[-1].copy()
+                place[[0, 2]] = mode.x, mode.phi
+                # With one freedom both may not agree to the last digit.
+                free = phase.formation.n_constraints <= 3
+                pins = ((0, mode.x), (2, mode.phi)) if free else ()
+                closed = close_contacts(phase.formation, place, slip, pins)
+                if closed is None:
+                    text = f"the contacts do not close at {describe_pose(place)}"
+                    raise InputError("", f"phases[{phase.number}].guess", text)
+                t.append(start + mode.t)
+                z.append(closed)
+        path = CubicSpline(
+            np.array(t) / scales.time, scale_state(np.array(z), scales), bc_type="clamped"
+        )
         stages, begin = list[Stage](), 0.0
         finer = 1 if self.search.options.time_intervals else FINER
         for stage, phase in zip(join_modes(self.nearest.stages), self.phases, strict=True):
@@ -130,25 +144,6 @@ class Guesses:
             stages += divide(stage, parts)
             begin += span
         return Guess(GIVEN, self._leave_room(link(merge(stages))))
-
-    def _close_poses(self) -> tuple[Array, Array]:
-        """Times of the poses that the phases give, (n,) [s], and configurations there, (n, 5)."""
-        t, z = [0.0], [self.z]
-        for phase in self.phases:
-            start, slip = t[-1], phase.formation.evaluate_slip(z[-1][None])[0]
-            for mode in phase.guess or ():
-                place = z[-1].copy()
-                place[[0, 2]] = mode.x, mode.phi
-                # With one freedom both may not agree to the last digit.
-                free = phase.formation.n_constraints <= 3
-                pins = ((0, mode.x), (2, mode.phi)) if free else ()
-                closed = close_contacts(phase.formation, place, slip, pins)
-                if closed is None:
-                    text = f"the contacts do not close at {describe_pose(place)}"
-                    raise InputError("", f"phases[{phase.number}].guess", text)
-                t.append(start + mode.t)
-                z.append(closed)
-        return np.array(t), np.array(z)
 
     def along(self, motions: Sequence[PathMotion]) -> Guess:
         """Along known motions of the phases on their curves."""
@@ -310,7 +305,10 @@ class Guesses:
         """The stages, with an end clear of the contact that ends what follows."""
         if self.to_go is None:
             return stages
-        return [*stages[:-1], keep_apart(stages[-1], self.to_go.phase.until.contact)]
+        last, contact = stages[-1], self.to_go.phase.until.contact
+        rows = [k for k, limit in enumerate(last.formation.limits) if limit.gains(contact)]
+        monitored = tuple(sorted({*last.monitored, *rows}))
+        return [*stages[:-1], replace(last, apart=tuple(rows), monitored=monitored)]
 
 
 class PathSpeed(NamedTuple):
@@ -426,7 +424,14 @@ def split_path(outline: PathGuess) -> list[PathGuess]:
         own, part = signs[begin].copy(), np.concatenate([part, z[begin + 1 : stop]])
         turning = list[tuple[int, ...]]()
         if stop < len(signs):
-            turning = _order_turns(formation, z[stop], own, signs[stop], rates[stop - 1 : stop + 1])
+            # Tied rows together, in order of time.
+            turns = np.flatnonzero(own != signs[stop]).tolist()
+            tied = (find_tied(formation, z[stop], row) for row in turns)
+            before, after = rates[stop - 1 : stop + 1]
+            share = np.full(len(before), 0.5)
+            np.divide(before, before - after, out=share, where=before * after < 0)
+            groups = {tuple(sorted({*rows} & {*turns})) for rows in tied}
+            turning = sorted(groups, key=lambda group: (share[group[0]], group))
         # The reversals are within the steps before and after the cut.
         places = stop - 0.5 + (np.arange(len(turning)) + 1) / (len(turning) + 1)
         for rows, place in zip(turning, places, strict=True):
@@ -444,26 +449,6 @@ def split_path(outline: PathGuess) -> list[PathGuess]:
 def _make_stretch(formation: Formation, z: Array, signs: Array, rows: Sequence[int]) -> PathGuess:
     Xi, sigma = np.split(signs.copy(), [formation.n_contacts])
     return PathGuess(formation, z, Directions(Xi, sigma), tuple(rows))
-
-
-def _order_turns(
-    formation: Formation, z: Array, before: Array, after: Array, rates: Array
-) -> list[tuple[int, ...]]:
-    """Rows that reverse between two pieces, tied ones together, in order of time."""
-    rows = np.flatnonzero(before != after).tolist()
-    groups = {tuple(sorted(i for i in find_tied(formation, z, k) if i in rows)) for k in rows}
-
-    def cross(group: tuple[int, ...]) -> float:
-        first, last = rates[:, group[0]]
-        return float(first / (first - last)) if first * last < 0 else 0.5
-
-    return sorted(groups, key=lambda group: (cross(group), group))
-
-
-def keep_apart(stage: Stage, contact: Contact | None) -> Stage:
-    """The stage, with its end clear of the contact that ends the next one."""
-    rows = [k for k, limit in enumerate(stage.formation.limits) if limit.gains(contact)]
-    return replace(stage, apart=tuple(rows), monitored=tuple(sorted({*stage.monitored, *rows})))
 
 
 def find_modes(search: TimeSearch, stages: Sequence[Stage]) -> TimeSolution:

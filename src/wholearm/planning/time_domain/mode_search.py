@@ -69,28 +69,23 @@ def in_mode(stage: Stage, mode: Mode) -> Stage:
 
 def link(stages: Sequence[Stage]) -> list[Stage]:
     """Stages with ends that follow from their modes."""
-    linked = list[Stage]()
+    linked, joints = list[Stage](), ("joint 1", "joint 2")
     for stage, coming in zip(stages, [*stages[1:], None], strict=True):
-        turns: tuple[int, ...] = ()
-        gained, fading = None, tuple[tuple[int, float], ...]()
-        growing = tuple[int, ...]()
+        turns, growing, gained = tuple[int, ...](), tuple[int, ...](), None
+        fading = tuple[tuple[int, float], ...]()
         if linked and not linked[-1].ends_in_impact:
             known = linked[-1].formation.contacts
             growing = tuple(k for k, c in enumerate(stage.formation.contacts) if c not in known)
         if coming is not None and not stage.ends_in_impact:
-            turns, fading = find_turns(stage, coming), find_passing(stage, coming)
+            names = (*stage.formation.names, *joints)
+            after = dict(zip((*coming.formation.names, *joints), mode_of(coming), strict=True))
+            rows = enumerate(zip(names, mode_of(stage), strict=True))
+            turns = tuple(k for k, (name, sign) in rows if sign * after.get(name, 0.0) < 0)
+            fading = find_passing(stage, coming)
             fresh = new_rows(stage.formation, coming.formation)
             gained = coming.formation if fresh else None
         linked.append(replace(stage, gained=gained, growing=growing, fading=fading, turns=turns))
     return linked
-
-
-def find_turns(stage: Stage, coming: Stage) -> tuple[int, ...]:
-    """Rows of (contacts, joints) of a stage that reverse in the next one."""
-    joints = ("joint 1", "joint 2")
-    after = dict(zip((*coming.formation.names, *joints), mode_of(coming), strict=True))
-    rows = enumerate(zip((*stage.formation.names, *joints), mode_of(stage), strict=True))
-    return tuple(k for k, (name, sign) in rows if sign * after.get(name, 0.0) < 0)
 
 
 def find_passing(stage: Stage, coming: Stage) -> tuple[tuple[int, float], ...]:
@@ -295,9 +290,14 @@ def list_neighbours(
     for slow in (True, False):
         runs = list[tuple[int, ModeRun]]()
         for k, stage in enumerate(stages):
-            held = _find_held(stage, scheme, slow)
-            held = [run for run in held if _pays(run, stage, savings[k])]
-            runs += [(k, run) for run in [*held, *slides[k]]]
+            for run in _find_held(stage, scheme, slow):
+                # Rolling, if the contact can, has to promise a gain.
+                places, row = slice(run.begin, run.stop), run.row
+                middle = stage.guess.z[(run.begin + run.stop) // 2, 0]
+                rolls = can_roll(stage.formation, middle, row)
+                if not rolls or savings[k][places, :, row].clip(min=0.0).sum() > WORTH:
+                    runs.append((k, run))
+            runs += [(k, run) for run in slides[k]]
         moves += turn_each(runs)
     return moves
 
@@ -311,16 +311,6 @@ def list_dropped(stages: Sequence[Stage]) -> Iterator[list[Stage]]:
             left = drop(left, index) if left else None
         if left:
             yield link(merge(left))
-
-
-def _pays(run: ModeRun, stage: Stage, savings: Array) -> bool:
-    """Whether rolling over a run might gain, if the contact can roll."""
-    own = (slice(run.begin, run.stop), slice(None), run.row)
-    middle = stage.guess.z[(run.begin + run.stop) // 2, 0]
-    return (
-        not can_roll(stage.formation, middle, run.row)
-        or float(savings[own].clip(min=0.0).sum()) > WORTH
-    )
 
 
 def can_roll(formation: Formation, z: Array, row: int) -> bool:

@@ -21,7 +21,7 @@ from ...mechanics.dynamics import Directions
 from ...mechanics.limits import make_limits
 from ...problem.definition import Phase, Problem, Until
 from ...problem.uncertainty import PARAMETERS
-from ...scene.model import Polygon, Scales, Scene
+from ...scene.model import Polygon, Scales
 from ..options import CLEARANCE, OPENING, Objective, PlanOptions
 from .collocation import Scheme, blend, fit_controls
 
@@ -148,44 +148,34 @@ make_formation = lru_cache(maxsize=128)(Formation)
 @lru_cache(maxsize=16)
 def in_own_units(problem: Problem) -> Problem:
     """The problem in its scene's own units; the same object every time."""
-    scales = problem.scene.scales
-    scene = _scale_scene(problem.scene, scales)
-    phases = tuple(_scale_phase(phase, scene, scales) for phase in problem.phases)
-    return replace(
-        problem,
-        scene=scene,
-        epsilon=problem.epsilon / scales.force,
-        start=scale_state(problem.start, scales),
-        phases=phases,
-    )
-
-
-def _scale_scene(scene: Scene, scales: Scales) -> Scene:
-    body = scene.polygon
+    scales, scene = problem.scene.scales, problem.scene
+    body, units = scene.polygon, {"x": scales.length, "phi": 1.0}
     assert body.inertia is not None
-    polygon = Polygon(
-        body.vertices / scales.length, body.mass / scales.mass, body.inertia / scales.inertia
-    )
 
     def scale(owner: Any) -> dict[str, Any]:
         known = keys_of(owner).items()
         units = {name: getattr(scales, own.scale) for name, own in known if own.scale}
         return {name: getattr(owner, name) / unit for name, unit in units.items()}
 
+    sizes = body.vertices / scales.length, body.mass / scales.mass, body.inertia / scales.inertia
     right, left = (replace(finger, **scale(finger)) for finger in scene.fingers)
-    return replace(scene, polygon=polygon, fingers=(right, left), **scale(scene))
-
-
-def _scale_phase(phase: Phase, scene: Scene, scales: Scales) -> Phase:
-    until = phase.until
-    if until.coordinate == "x" and until.value is not None:
-        until = replace(until, value=until.value / scales.length)
-    formation = Formation(scene, phase.formation.contacts, phase.formation.rolling)
-    units = {"x": scales.length, "phi": 1.0}
-    # With one freedom nothing is left for pins to say.
-    pins = () if formation.n_constraints >= 4 else until.pins
-    until = replace(until, pins=tuple((name, own / units[name]) for name, own in pins))
-    return replace(phase, formation=formation, until=until)
+    scene = replace(scene, polygon=Polygon(*sizes), fingers=(right, left), **scale(scene))
+    phases = list[Phase]()
+    for phase in problem.phases:
+        until, formation = phase.until, replace(phase.formation, scene=scene)
+        if until.coordinate == "x" and until.value is not None:
+            until = replace(until, value=until.value / scales.length)
+        # With one freedom nothing is left for pins to say.
+        pins = () if formation.n_constraints >= 4 else until.pins
+        until = replace(until, pins=tuple((name, own / units[name]) for name, own in pins))
+        phases.append(replace(phase, formation=formation, until=until))
+    return replace(
+        problem,
+        scene=scene,
+        epsilon=problem.epsilon / scales.force,
+        start=scale_state(problem.start, scales),
+        phases=tuple(phases),
+    )
 
 
 def scale_state(z: Array, scales: Scales) -> Array:
@@ -244,16 +234,16 @@ def resample(
     points = _interpolate(part, scheme, (begin + span * inner).ravel())
     nodes = np.stack(_interpolate(part, scheme, begin + span * breaks)[:2], axis=1)
     z, v, a, forces = (table.reshape(shape) for table in points)
-    tau = _torques(part, begin + span * breaks)
+    # Torques of each new interval are those of the old one at its middle.
+    edges, count, controls = begin + span * breaks, *part.tau.shape[:2]
+    middles = (edges[1:] + edges[:-1]) / 2
+    k = np.clip(np.searchsorted(part.breaks, middles, side="right") - 1, 0, count - 1)
+    at = np.linspace(0.0, 1.0, controls)
+    places = edges[:-1, None] + np.diff(edges)[:, None] * at
+    x = np.clip((places - part.breaks[k, None]) / part.fractions[k, None], 0.0, 1.0)
+    tau = fit_controls(at, blend(x, controls) @ part.tau[k], controls)
     impulses = part.impulses if stop == 1.0 else part.impulses[:0]
     return StagePoints(part.duration * span, fractions, nodes, z, v, a, forces, tau, impulses)
-
-
-def bisect(part: StagePoints, scheme: Scheme, times: NDArray[np.int64]) -> StagePoints:
-    """Halve each interval and its parts so many times, shape (K,)."""
-    pairs = zip(part.breaks[:-1], part.breaks[1:], 2**times, strict=True)
-    pieces = [np.linspace(start, stop, count, endpoint=False) for start, stop, count in pairs]
-    return resample(part, scheme, np.append(np.concatenate(pieces), part.breaks[-1]))
 
 
 def _interpolate(part: StagePoints, scheme: Scheme, places: Array) -> tuple[Array, ...]:
@@ -280,31 +270,21 @@ def with_controls(part: StagePoints, count: int) -> StagePoints:
     return part._replace(tau=fit_controls(at, blend(at, old) @ part.tau, count))
 
 
-def _torques(part: StagePoints, breaks: Array) -> Array:
-    """Control points of torques in new intervals, each inside one old interval at its middle."""
-    middles = (breaks[1:] + breaks[:-1]) / 2
-    count, controls = part.tau.shape[:2]
-    k = np.clip(np.searchsorted(part.breaks, middles, side="right") - 1, 0, count - 1)
-    at = np.linspace(0.0, 1.0, controls)
-    places = breaks[:-1, None] + np.diff(breaks)[:, None] * at
-    x = np.clip((places - part.breaks[k, None]) / part.fractions[k, None], 0.0, 1.0)
-    return fit_controls(at, blend(x, controls) @ part.tau[k], controls)
-
-
 def bisect_intervals(
     stages: Sequence[Stage], scheme: Scheme, times: Sequence[NDArray[np.int64]]
 ) -> list[Stage]:
     """Stages with intervals halved so many times, each of shape (K,)."""
-    return [
-        replace(
-            stage,
-            guess=bisect(stage.guess, scheme, mine),
-            periods=tuple(np.repeat(stage.periods, 2**mine).tolist()) if stage.periods else (),
-        )
-        if mine.any()
-        else stage
-        for stage, mine in zip(stages, times, strict=True)
-    ]
+    halved = list[Stage]()
+    for stage, mine in zip(stages, times, strict=True):
+        if mine.any():
+            breaks, periods = stage.guess.breaks, stage.periods
+            parts = zip(breaks[:-1], breaks[1:], 2**mine, strict=True)
+            pieces = [np.linspace(a, b, count, endpoint=False) for a, b, count in parts]
+            guess = resample(stage.guess, scheme, np.append(np.concatenate(pieces), 1.0))
+            periods = tuple(np.repeat(periods, 2 ** mine[: len(periods)]).tolist())
+            stage = replace(stage, guess=guess, periods=periods)
+        halved.append(stage)
+    return halved
 
 
 def monitor(stages: list[Stage], least: Sequence[Array], depth: float) -> list[Stage]:

@@ -288,7 +288,15 @@ def _leave_out(held: TimeSearch, solution: TimeSolution) -> TimeSolution:
             part, period = stage.guess, stage.formation.scene.control_period
             brief = part.duration * part.fractions[-1] < _BRIEF * period
             if last and brief and stage.intervals > 1 and stage.periods[-1] != stage.periods[-2]:
-                stages[k], changed = _drop_last(stage), True
+                # The end of the interval before is that of the last.
+                left = 1 - part.fractions[-1]
+                guess = part._replace(
+                    **{name: getattr(part, name)[:-1] for name in ("z", "v", "a", "forces", "tau")},
+                    duration=part.duration * left,
+                    fractions=part.fractions[:-1] / left,
+                    nodes=np.delete(part.nodes, -2, axis=0),
+                )
+                stages[k], changed = replace(stage, guess=guess, periods=stage.periods[:-1]), True
         if not changed:
             return solution
         fewer = held.solve(stages, most=held.wait(_HELD_PATIENCE))
@@ -296,19 +304,6 @@ def _leave_out(held: TimeSearch, solution: TimeSolution) -> TimeSolution:
             return solution
         solution = fewer
     return solution
-
-
-def _drop_last(stage: Stage) -> Stage:
-    """A stage without its last interval, whose end is that of the one before."""
-    part = stage.guess
-    left = 1 - part.fractions[-1]
-    guess = part._replace(
-        **{name: getattr(part, name)[:-1] for name in ("z", "v", "a", "forces", "tau")},
-        duration=part.duration * left,
-        fractions=part.fractions[:-1] / left,
-        nodes=np.delete(part.nodes, -2, axis=0),
-    )
-    return replace(stage, guess=guess, periods=stage.periods[:-1])
 
 
 def cut_periods(
