@@ -42,14 +42,23 @@ def guess(data: PhaseData, time_weight: float = 0.0) -> tuple[Profile, Units]:
     Where limits forbid even the slowest one, it is as quick as a fall: in units of a slow one the
     regularization would weigh too much.
     """
-    b_max = data.largest_b(data.nodes)
-    fall = _fall(data)
+    b_max, fall, grid = data.largest_b(data.nodes), _fall(data), data.grid
+    scene, most = data.curve.formation.scene, data.torque_limit
 
     def possible(height: float) -> bool:
         low, high = find_internal_force_range(data, height)
         a, b = _parabola(data, height)
         kept = bool(((low <= high) & (low < np.inf)).all() and (b <= b_max).all())
-        return kept and not _exceeds_rates(data, Profile(a, b, find_middle(data, low, high)[1]))
+        if not (kept and grid.held):
+            return kept
+        # Torque rates and commands at the nodes.
+        profile, lags = Profile(a, b, find_middle(data, low, high)[1]), scene.actuator_lag
+        stretch = np.maximum(Elements(grid, profile).stretch, 1e-6)
+        y_t = np.sqrt(b).reshape(-1, NODES) / stretch / np.diff(grid.edges)
+        tau = data.nodes.forces.tau(*profile).reshape(-1, NODES, 2)
+        rates = np.stack(list_slopes())[grid.kinds] @ tau * y_t[..., None]
+        command = np.abs(tau + lags * rates) * (lags > 0)
+        return bool((np.abs(rates) <= data.rate_limit).all() and (command <= most).all())
 
     # Bisection over heights from 2^-12 to 2^8 times that of a fall over this length.
     low_power, high_power = float(_SLOW), 8.0
@@ -61,19 +70,6 @@ def guess(data: PhaseData, time_weight: float = 0.0) -> tuple[Profile, Units]:
             high_power = power
     none = low_power == _SLOW
     return _guess_at(data, 0.7 * fall * (1.0 if none else 2**low_power), time_weight)
-
-
-def _exceeds_rates(data: PhaseData, profile: Profile) -> bool:
-    """Whether torque rates or commands are beyond their limits at the nodes of a motion."""
-    grid, lags = data.grid, data.curve.formation.scene.actuator_lag
-    if not grid.held:
-        return False
-    speed = np.sqrt(profile.b).reshape(-1, NODES)
-    y_t = speed / np.maximum(Elements(grid, profile).stretch, 1e-6) / np.diff(grid.edges)
-    tau = data.nodes.forces.tau(*profile).reshape(-1, NODES, 2)
-    rates = np.stack(list_slopes())[grid.kinds] @ tau * y_t[..., None]
-    command = np.abs(tau + lags * rates) * (lags > 0)
-    return bool((np.abs(rates) > data.rate_limit).any() or (command > data.torque_limit).any())
 
 
 def guess_slowly(data: PhaseData) -> tuple[Profile, Units]:
@@ -204,7 +200,13 @@ class _Vertices(NamedTuple):
         held, pushed = of_nodes == SweepMode.HELD, of_nodes == SweepMode.PUSH
         wanted = np.interp(grid.s, (fastest.s[1:] + fastest.s[:-1]) / 2, fastest.slopes)
         b, rows = np.interp(grid.s, fastest.s, fastest.b), sides.eliminate()
-        most, least = (_find_pairs(sides, rows, b, largest) for largest in (True, False))
+        pairs = []
+        for largest in (True, False):
+            # Other sides may take over at the ends of elements: there those of the next node.
+            row = rows.extreme(b, largest).row.reshape(-1, NODES)
+            row[:, 0], row[:, -1] = row[:, 1], row[:, -2]
+            pairs.append(sides.pair(row.ravel()))
+        most, least = pairs
         (high, press), (low, other) = (sides.meet(b, pair) for pair in (most, least))
         with np.errstate(divide="ignore", invalid="ignore"):
             share = np.nan_to_num(np.clip((wanted - low) / (high - low), 0.0, 1.0))
@@ -224,16 +226,6 @@ class _Vertices(NamedTuple):
         jumps = np.flatnonzero((modes[:-1] == SweepMode.PUSH) & (modes[1:] == SweepMode.BRAKE))
         pair = np.where(pushed[:, None], most, least)
         return _Vertices(Profile(a, b, lam), pair, held, jumps)
-
-
-def _find_pairs(sides: PathLimits, rows: PathLimits, b: Array, largest: bool) -> NDArray[np.int64]:
-    """The sides that meet at the largest or least s'' of each node, shape (n, 2).
-
-    Other sides may take over at element ends: there those of the next node inside are taken.
-    """
-    row = rows.extreme(b, largest).row.reshape(-1, NODES)
-    row[:, 0], row[:, -1] = row[:, 1], row[:, -2]
-    return sides.pair(row.ravel())
 
 
 def _find_multipliers(

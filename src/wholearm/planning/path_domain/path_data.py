@@ -120,15 +120,6 @@ class PhaseData(NamedTuple):
         short = np.maximum(-least, 0.0)
         return short[:, :-1], short[:, -1]
 
-    def slack_at_neighbours(self, profile: Profile, margin: float, short: Array) -> Array:
-        """The lesser slack of the two nodes of each solid interval, shape (n_solid, n_sides).
-
-        Zero where nothing is `short` in the interval.
-        """
-        slack, k = self.slack(self.nodes, profile, margin), self.grid.nonempty
-        least = np.minimum(slack[k], slack[k + 1])
-        return np.where(short > 0, np.maximum(least, 0.0), 0.0)
-
     def spread_to_nodes(self, inside: Array) -> Array:
         """The larger value of the two solid intervals beside each node, shape (N + 1, ...)."""
         table, k = np.zeros((len(self.grid.s), *inside.shape[1:])), self.grid.nonempty

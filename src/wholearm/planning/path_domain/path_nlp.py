@@ -33,7 +33,7 @@ from ...mechanics.dynamics import LAMBDA, ONE, A, B, V
 from ...mechanics.limits import PRESS, TORQUE, LimitSet
 from ...scene.model import Scene
 from ...solvers.ipopt import SolverStatistics, book, build_solver
-from ..columns import Columns, Symbols
+from ..columns import Columns
 from ..options import Objective
 from .elements import (
     DEGREE,
@@ -70,8 +70,6 @@ class MotorShape(NamedTuple):
     @staticmethod
     def of(scene: Scene) -> MotorShape:
         """The shape of a scene's motors."""
-        if not scene.has_slow_motors:
-            return UNLIMITED
         limited, lags = np.isfinite(scene.torque_rate_limit), scene.actuator_lag > 0
         return MotorShape(*(tuple(np.flatnonzero(mask).tolist()) for mask in (limited, lags)))
 
@@ -79,19 +77,6 @@ class MotorShape(NamedTuple):
     def slow(self) -> tuple[int, ...]:
         """Joints whose torques may not step."""
         return tuple(sorted({*self.rates, *self.commands}))
-
-    def list_sizes(self, intervals: int) -> dict[str, int]:
-        """Numbers of rows of each kind."""
-        n, joints = intervals + 1, len(self.slow)
-        return {
-            "rates": n * len(self.rates),
-            "commands": n * len(self.commands),
-            "joins": (n // NODES - 1) * joints,
-            "begins": 2 * bool(joints),
-        }
-
-
-UNLIMITED = MotorShape()  # motors whose torques may step
 
 
 class LimitShape(NamedTuple):
@@ -102,10 +87,10 @@ class LimitShape(NamedTuple):
     presses: tuple[int, ...]  # rows of the least normal forces
     torques: tuple[int, ...]  # rows of the torques
     fast: tuple[int, ...]  # rows that depend on s'
-    motors: MotorShape = UNLIMITED
+    motors: MotorShape = MotorShape()
 
     @staticmethod
-    def of(limits: LimitSet, motors: MotorShape = UNLIMITED) -> LimitShape:
+    def of(limits: LimitSet, motors: MotorShape | None = None) -> LimitShape:
         """The shape of a set of limits."""
         rows, signs, _ = limits.sides
         of_tau, of_rates = (part.any(axis=1) for part in limits.columns[1:])
@@ -116,7 +101,7 @@ class LimitShape(NamedTuple):
             tuple(limits.of(PRESS).tolist()),
             tuple(limits.of(TORQUE).tolist()),
             tuple(np.flatnonzero(of_tau | of_rates | drags).tolist()),
-            motors,
+            motors or MotorShape(),
         )
 
 
@@ -134,98 +119,6 @@ class NLPColumns(NamedTuple):
     # b' = 2 a; the `chain` of the margin or the relaxation; node by node the `limits`, side by side
     # where they are soft, and the speed for `relax`; the `duration` for `margin`; rate limits
     g: Columns
-
-
-def list_columns(shape: LimitShape, intervals: int, objective: Objective) -> NLPColumns:
-    """The blocks of the vectors of an NLP."""
-    n, m, relax = intervals + 1, shape.rows, objective is Objective.RELAX
-    chained = objective in CHAINED
-    extra = m if objective is Objective.ELASTIC else int(chained)
-    p = {"ends": 2, "steps": intervals, "weight": 1, "calm": 1, "a": n * m, "b": n * m}
-    p |= {"lam": n * m, "speed": n * len(shape.fast)}
-    if objective is Objective.EFFORT or shape.motors.slow:
-        p |= {"torque": n * 2}
-    if objective is Objective.EFFORT:
-        p |= {"joints": 2}
-    elif relax:
-        p |= {"gives": m + 1, "rates": n}
-    if shape.motors.slow:
-        p |= {"quick": len(shape.motors.rates), "lags": len(shape.motors.commands)}
-        p |= {"bends": n // NODES, "sizes": n}
-    rows = (len(shape.sides) if objective in SOFT else m) + relax
-    g = {"links": intervals, "chain": intervals * chained, "limits": n * rows}
-    g |= {"duration": int(objective is Objective.MARGIN)} | shape.motors.list_sizes(intervals)
-    return NLPColumns(Columns(b=1, a=1, lam=1, extra=extra), Columns(**p), Columns(**g))
-
-
-def write_terms(shape: LimitShape, intervals: int, objective: Objective) -> dict[str, Expression]:
-    """Write the NLP for every phase with limits of a shape; see `NLPColumns` for its vectors.
-
-    Returns
-    -------
-    dict  expressions of x, p, f and g
-    """
-    n, columns = intervals + 1, list_columns(shape, intervals, objective)
-    symbols = columns.p.make_symbols()
-    b_inner, a, lam = ca.SX.sym("b", n - 2), ca.SX.sym("a", n), ca.SX.sym("lam", n)
-    extra = ca.SX.sym("extra", n, columns.node.sizes["extra"])
-    h, ends, fast = symbols.steps, symbols.ends, list(shape.fast)
-    # Under rate limits b is scaled: next to rest it is many orders of magnitude smaller.
-    bends, sizes = (symbols.bends.T, symbols.sizes) if shape.motors.slow else (None, ca.DM.ones(n))
-    b = ca.vertcat(ends[0] ** 2, b_inner * sizes[1:-1], ends[1] ** 2)
-    speed = ca.vertcat(ends[0], ca.sqrt(b[1:-1]), ends[1])
-    largest = ca.fmax(sizes[1:], sizes[:-1])
-    lengths, paces = _find_lengths(h), _find_paces(a, speed, h, bends)
-    times = ca.vec(ca.DM(find_basis().weights) @ lengths / paces)
-
-    def scale(name: str, column: Expression) -> Expression:
-        table = ca.reshape(getattr(symbols, name), n, -1)
-        return table * ca.repmat(column, 1, table.shape[1])
-
-    # Limits but for their constant part, which is in the bounds.
-    values = scale("a", a) + scale("b", b) + scale("lam", lam)
-    values[:, fast] += scale("speed", speed)
-    torques = values[:, list(shape.torques)]
-    if objective is Objective.EFFORT or shape.motors.slow:
-        torques += ca.reshape(symbols.torque, n, 2)
-    # The relaxation has to outweigh the regularization.
-    share = 1e-3 if objective is Objective.RELAX else 1.0
-    scaled_lam, node_weights = symbols.calm * lam, ca.vertcat(0, h) + ca.vertcat(h, 0)
-    node_costs = share * _CALM * node_weights * scaled_lam**2
-    rough = _find_bends(a, DEGREE) + _find_bends(scaled_lam, DEGREE)
-    if objective is Objective.ELASTIC:
-        # Soft limits would otherwise be avoided by motions that reverse between nodes.
-        slopes, bends = _find_bends(a, 1), _find_bends(a, 2)
-        rough += _STIFF * ca.horzcat(slopes[0], bends[1:-1], slopes[-1])
-        node_costs[:-1] += _EVEN * (a[1:] - a[:-1]) ** 2
-    node_costs[0] += share * _ROUGH * ca.sum2(lengths * rough)
-    if objective is Objective.TIME:
-        node_costs += times
-    elif objective is Objective.EFFORT:
-        node_costs += times * (torques**2 @ symbols.joints + symbols.weight)
-    elif objective is Objective.MARGIN:
-        node_costs[0] -= extra[0]
-    elif objective is Objective.ELASTIC:
-        # Not weighted by lengths, or shortfalls at short intervals would be cheap.
-        node_costs += ca.sum2(extra) / n + 1e-4 * times
-    else:
-        node_costs[0] += extra[0]
-        node_costs += 1e-5 * times
-    nodes = ca.horzcat(ca.vertcat(0, b_inner, 0), a, lam, extra).T
-    chained, late = objective in CHAINED, objective is Objective.MARGIN
-    rows = _write_limits(shape, objective, symbols, values, extra, b)
-    return {
-        "x": ca.vertcat(nodes[1:, 0], ca.vec(nodes[:, 1:-1]), nodes[1:, -1]),
-        "p": symbols.every,
-        "f": ca.sum1(node_costs),
-        "g": columns.g.write(
-            links=(b[1:] - b[:-1] - _write_rises(a, h, bends)) / largest,
-            chain=extra[1:] - extra[:-1] if chained else ca.SX(0, 1),
-            limits=rows.T,
-            duration=ca.sum1(times) if late else ca.SX(0, 1),
-            **write_motor_rows(shape.motors, symbols, torques, a, paces, lengths),
-        ),
-    }
 
 
 def _find_lengths(h: Expression) -> Expression:
@@ -274,28 +167,6 @@ def _find_bends(values: Expression, degree: int) -> Expression:
     return ca.sum1(modes**2)
 
 
-def _write_limits(
-    shape: LimitShape,
-    objective: Objective,
-    symbols: Symbols,
-    values: Expression,
-    extra: Expression,
-    b: Expression,
-) -> Expression:
-    """The rows of the limits at the nodes, shape (n, m) or (n, n_sides), and one for the speed."""
-    if objective is Objective.MARGIN:
-        raised = np.isin(np.arange(shape.rows), shape.presses).astype(float)
-        return values - extra @ ca.DM(raised).T
-    if objective not in SOFT:
-        return values
-    relax = objective is Objective.RELAX
-    short = extra @ symbols.gives.T if relax else extra
-    rows = [values[:, row] + sign * short[:, row] for row, sign in shape.sides]
-    if relax:
-        rows.append(symbols.rates * b - short[:, shape.rows])
-    return ca.horzcat(*rows)
-
-
 def list_kinds(count: int, held: bool) -> list[int]:
     """Kinds of `count` elements from rest to rest."""
     start, stop = (FROM_HOLD, TO_HOLD) if held else (FROM_REST, TO_REST)
@@ -307,46 +178,6 @@ def find_first_slopes(a: Expression) -> tuple[Expression, Expression]:
     basis = find_basis()
     start = ca.DM(basis.to_powers[FROM_HOLD][1]).T @ a[:NODES]
     return start, ca.DM(basis.to_powers[TO_HOLD][1]).T @ a[-NODES:]
-
-
-def write_motor_rows(
-    shape: MotorShape,
-    symbols: Symbols,
-    torques: Expression,
-    a: Expression,
-    paces: Expression,
-    lengths: Expression,
-) -> dict[str, Expression]:
-    """Rows of each kind of `MotorShape.list_sizes`.
-
-    Parameters
-    ----------
-    symbols                              parameters `quick`, 1 / rate limit, and `lags`
-    torques, a : (n, 2), (n,)
-    paces, lengths : (p + 1, E), (1, E)  dy/dt times the element's length, and that
-    """
-    if not shape.slow:
-        return dict.fromkeys(shape.list_sizes(0), ca.SX(0, 1))
-    rates = {joint: _differentiate(torques[:, joint], paces, lengths) for joint in shape.slow}
-    rows = [symbols.quick[k] * rates[joint] for k, joint in enumerate(shape.rates)]
-    lagged = [
-        torques[:, joint] + symbols.lags[k] * rates[joint] for k, joint in enumerate(shape.commands)
-    ]
-    joins = [torques[NODES::NODES, j] - torques[DEGREE:-1:NODES, j] for j in shape.slow]
-    return {
-        "rates": ca.vertcat(ca.SX(0, 1), *rows),
-        "commands": ca.vertcat(ca.SX(0, 1), *lagged),
-        "joins": ca.vertcat(*joins),
-        "begins": ca.vertcat(*find_first_slopes(a)),
-    }
-
-
-def _differentiate(values: Expression, paces: Expression, lengths: Expression) -> Expression:
-    """Time derivative at the nodes of what has these values there, shape (n,)."""
-    table, count = ca.reshape(values, NODES, -1), lengths.numel()
-    slopes = [ca.DM(slope) for slope in list_slopes()]
-    columns = [slopes[kind] @ table[:, e] for e, kind in enumerate(list_kinds(count, True))]
-    return ca.vec(ca.horzcat(*columns) * paces / ca.repmat(lengths, NODES, 1))
 
 
 def list_slopes() -> list[Array]:
@@ -441,16 +272,112 @@ class PathNLP:
 def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> PathNLP:
     """Build the NLP for every phase with limits of a shape."""
     started = time.perf_counter()
-    nlp = write_terms(shape, intervals, objective)
+    n, m, motors, slow = intervals + 1, shape.rows, shape.motors, shape.motors.slow
+    effort, relax = objective is Objective.EFFORT, objective is Objective.RELAX
+    chained, late = objective in CHAINED, objective is Objective.MARGIN
+    sizes = {"ends": 2, "steps": intervals, "weight": 1, "calm": 1, "a": n * m, "b": n * m}
+    sizes |= {"lam": n * m, "speed": n * len(shape.fast)}
+    if effort or slow:
+        sizes |= {"torque": n * 2}
+    if effort:
+        sizes |= {"joints": 2}
+    elif relax:
+        sizes |= {"gives": m + 1, "rates": n}
+    if slow:
+        sizes |= {"quick": len(motors.rates), "lags": len(motors.commands)}
+        sizes |= {"bends": n // NODES, "sizes": n}
+    p = Columns(**sizes)
+    symbols = p.make_symbols()
+    b_inner, a, lam = ca.SX.sym("b", n - 2), ca.SX.sym("a", n), ca.SX.sym("lam", n)
+    extra = ca.SX.sym("extra", n, m if objective is Objective.ELASTIC else int(chained))
+    h, ends, fast = symbols.steps, symbols.ends, list(shape.fast)
+    # Under rate limits b is scaled: next to rest it is many orders of magnitude smaller.
+    bends, scales = (symbols.bends.T, symbols.sizes) if slow else (None, ca.DM.ones(n))
+    b = ca.vertcat(ends[0] ** 2, b_inner * scales[1:-1], ends[1] ** 2)
+    speed = ca.vertcat(ends[0], ca.sqrt(b[1:-1]), ends[1])
+    largest = ca.fmax(scales[1:], scales[:-1])
+    lengths, paces = _find_lengths(h), _find_paces(a, speed, h, bends)
+    times = ca.vec(ca.DM(find_basis().weights) @ lengths / paces)
+
+    def scale(name: str, column: Expression) -> Expression:
+        table = ca.reshape(getattr(symbols, name), n, -1)
+        return table * ca.repmat(column, 1, table.shape[1])
+
+    # Limits but for their constant part, which is in the bounds.
+    values = scale("a", a) + scale("b", b) + scale("lam", lam)
+    values[:, fast] += scale("speed", speed)
+    torques = values[:, list(shape.torques)]
+    if effort or slow:
+        torques += ca.reshape(symbols.torque, n, 2)
+    # The relaxation has to outweigh the regularization.
+    share = 1e-3 if relax else 1.0
+    scaled_lam, node_weights = symbols.calm * lam, ca.vertcat(0, h) + ca.vertcat(h, 0)
+    node_costs = share * _CALM * node_weights * scaled_lam**2
+    rough = _find_bends(a, DEGREE) + _find_bends(scaled_lam, DEGREE)
+    if objective is Objective.ELASTIC:
+        # Soft limits would otherwise be avoided by motions that reverse between nodes.
+        first, second = _find_bends(a, 1), _find_bends(a, 2)
+        rough += _STIFF * ca.horzcat(first[0], second[1:-1], first[-1])
+        node_costs[:-1] += _EVEN * (a[1:] - a[:-1]) ** 2
+    node_costs[0] += share * _ROUGH * ca.sum2(lengths * rough)
+    if objective is Objective.TIME:
+        node_costs += times
+    elif effort:
+        node_costs += times * (torques**2 @ symbols.joints + symbols.weight)
+    elif late:
+        node_costs[0] -= extra[0]
+    elif objective is Objective.ELASTIC:
+        # Not weighted by lengths, or shortfalls at short intervals would be cheap.
+        node_costs += ca.sum2(extra) / n + 1e-4 * times
+    else:
+        node_costs[0] += extra[0]
+        node_costs += 1e-5 * times
+
+    # Limits at the nodes, side by side where they are soft, and one of the speed to relax.
+    limits = values
+    if late:
+        raised = np.isin(np.arange(m), shape.presses).astype(float)
+        limits = values - extra @ ca.DM(raised).T
+    elif objective in SOFT:
+        short = extra @ symbols.gives.T if relax else extra
+        sides = [values[:, row] + sign * short[:, row] for row, sign in shape.sides]
+        limits = ca.horzcat(*sides, *([symbols.rates * b - short[:, m]] if relax else []))
+    none = ca.SX(0, 1)
+    rows = {
+        "links": (b[1:] - b[:-1] - _write_rises(a, h, bends)) / largest,
+        "chain": extra[1:] - extra[:-1] if chained else none,
+        "limits": ca.vec(limits.T),
+        "duration": ca.sum1(times) if late else none,
+    }
+    rates, kinds = dict[int, Expression](), list_kinds(n // NODES, True)
+    for joint in slow:
+        # The derivative of the polynomials of y through the torques at the nodes.
+        table = ca.reshape(torques[:, joint], NODES, -1)
+        parts = [ca.DM(list_slopes()[kind]) @ table[:, e] for e, kind in enumerate(kinds)]
+        rates[joint] = ca.vec(ca.horzcat(*parts) * paces / ca.repmat(lengths, NODES, 1))
+    quick = [symbols.quick[k] * rates[joint] for k, joint in enumerate(motors.rates)]
+    lagged = [torques[:, j] + symbols.lags[k] * rates[j] for k, j in enumerate(motors.commands)]
+    joins = [torques[NODES::NODES, j] - torques[DEGREE:-1:NODES, j] for j in slow]
+    motor_rows = {"rates": quick, "commands": lagged, "joins": joins}
+    rows |= {name: ca.vertcat(none, *own) for name, own in motor_rows.items()}
+    rows["begins"] = ca.vertcat(*find_first_slopes(a)) if slow else none
+    g = Columns(**{name: int(block.numel()) for name, block in rows.items()})
+    nodes = ca.horzcat(ca.vertcat(0, b_inner, 0), a, lam, extra).T
+    nlp = {
+        "x": ca.vertcat(nodes[1:, 0], ca.vec(nodes[:, 1:-1]), nodes[1:, -1]),
+        "p": symbols.every,
+        "f": ca.sum1(node_costs),
+        "g": g.write(**rows),
+    }
     book(SolverStatistics(build_time=time.perf_counter() - started))
     # Soft NLPs start far from their optimum, and need the more robust strategy.
     strategy: dict[str, Any]
     strategy = {"mu_strategy": "monotone"} if objective in SOFT else {"mu_oracle": "probing"}
-    if shape.motors.slow:
+    if slow:
         # Large gradients of the time next to rest would scale the objective down.
         strategy |= {"nlp_scaling_method": "none"}
     solver = build_solver("path_nlp", nlp, 1e-9, max_iter=300, **strategy)
-    columns = list_columns(shape, intervals, objective)
+    columns = NLPColumns(Columns(b=1, a=1, lam=1, extra=extra.shape[1]), p, g)
     return PathNLP(solver, shape, intervals, columns, objective)
 
 

@@ -9,7 +9,7 @@ of the error.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -47,7 +47,6 @@ from .path_mesh import (
 )
 from .path_motion import PathMotion, find_hurry, fit_torque
 from .path_nlp import (
-    UNLIMITED,
     LimitShape,
     MotorShape,
     PathNLP,
@@ -62,7 +61,7 @@ from .path_nlp import (
 )
 
 if TYPE_CHECKING:
-    from ..robust.robust_rows import Guide, RobustHold, RobustLimits
+    from ..robust.robust_rows import Guide, RobustLimits
 
 Plans = list[PhasePlan[PathMotion]]
 Pins = tuple[float | None, float | None]  # prescribed internal force at start and end [N]
@@ -246,15 +245,25 @@ def find_sure_start(
     slopes = rows[:, [A, LAMBDA]]
     scales = formation.scene.scales
     units = np.array([scales.acceleration, scales.force])
+    # Sides of the torques that can be held, and a distance beyond [N m].
+    sides = [
+        (normal * gains, bound + BEYOND * SURE * unit)
+        for static, gains in holds
+        for normal, bound in zip(static.normals, static.bounds, strict=True)
+    ]
     for share in _SHARES if margin > 0 else _SHARES[:1]:
         offsets = rows[:, ONE] - (1 - share) * margin * presses
         best, start = np.inf, None
-        for side, bound in _list_sides(holds, BEYOND * SURE * unit):
+        for side, bound in sides:
             normal = side @ T
             if normal[0] <= 0:
                 continue
-            level = float(bound - side @ T0)
-            for place in _list_places(normal, level, slopes, offsets, here, units):
+            # The nearest place on the line normal @ x = level, and where limits cross it.
+            level, along = float(bound - side @ T0), np.array([-normal[1], normal[0]])
+            foot = here + units**2 * normal * (level - normal @ here) / (units**2 @ normal**2)
+            rates, rest = slopes @ along, offsets + slopes @ foot
+            crossings = -rest[rates != 0] / rates[rates != 0]
+            for place in (foot, *(foot + share * along for share in crossings)):
                 kept = ((offsets + slopes @ place) / data.spans).min() >= -_KEPT and place[0] > 0
                 kept = kept and measure_holds(holds, T0 + T @ place) > SURE * unit
                 away = float(np.abs(T @ (place - here)).max())
@@ -264,24 +273,6 @@ def find_sure_start(
         if start is not None:
             return start
     return None
-
-
-def _list_sides(holds: Sequence[RobustHold], beyond: float) -> Iterator[tuple[Array, float]]:
-    """Sides of the torques that can be held, each with its bound and a distance beyond [N m]."""
-    for static, gains in holds:
-        for normal, bound in zip(static.normals, static.bounds, strict=True):
-            yield normal * gains, float(bound) + beyond
-
-
-def _list_places(
-    normal: Array, bound: float, slopes: Array, offsets: Array, here: Array, units: Array
-) -> list[Array]:
-    """Places on the line normal @ x = bound: nearest to `here`, and where limits cross it."""
-    along = np.array([-normal[1], normal[0]])
-    foot = here + units**2 * normal * (bound - normal @ here) / (units**2 @ normal**2)
-    rates, rest = slopes @ along, offsets + slopes @ foot
-    crossings = -rest[rates != 0] / rates[rates != 0]
-    return [foot, *(foot + share * along for share in crossings)]
 
 
 @dataclass(frozen=True)
@@ -432,8 +423,7 @@ class PathIterate:
     ) -> PathIterate:
         """The NLP on elements with these breaks and cuts, without a point to start from."""
         data, (breaks, cuts) = join(parts), map(tuple, edges)
-        motors = MotorShape.of(task.curves[0].formation.scene) if task.is_held else UNLIMITED
-        shape = LimitShape.of(data.limits, motors)
+        shape = LimitShape.of(data.limits, MotorShape.of(task.curves[0].formation.scene))
         nlp = build_path_nlp(shape, len(data.grid.steps), task.options.goal)
         zero = np.zeros_like(data.grid.s)
         first = PathSolution(Profile(zero, zero, zero), 0.0, {})
@@ -477,7 +467,7 @@ class PathIterate:
 
     def adapt(self) -> PathIterate | None:
         """The next one to solve: with rows or breaks for this motion, halved, or tightened."""
-        task, accuracy = self.task, self.task.options.accuracy
+        task, accuracy, margin = self.task, self.task.options.accuracy, self.solution.margin
         again = self.meshes < _MESHES
         if task.guides and again and self.violation_at_nodes > _OTHER_SIGNS:
             other = PathIterate.begin(replace(task, guides=self.guides), task.elements)
@@ -491,7 +481,16 @@ class PathIterate:
         tight = bool(self.tightening.missed.any())
         fixed = bool(task.guides) and (tight or self.violation_at_nodes > MISS)
         if (self.meshes == 0 or costly) and self.meshes < SOLVES and not fixed:
-            breaks, shift = self.find_switches()
+            # Neither least effort nor tightened limits show where the switches are.
+            breaks, shift = self.breaks, 0.0
+            if not (task.is_held or task.options.goal is Objective.EFFORT or tight):
+                every = zip(self.parts, self.motions, self.breaks, strict=True)
+                found = [
+                    match(before, find_switches(part, motion.profile, margin), part.curve)
+                    for part, motion, before in every
+                ]
+                breaks = tuple(own for own, _ in found)
+                shift = max(own for _, own in found)  # over the curve's length
             if shift > _MOVED * accuracy and again:
                 return self._move(breaks, self.cuts)
             edges = [part.grid.edges for part in self.parts]
@@ -501,21 +500,6 @@ class PathIterate:
                 pairs = zip(edges, shares, strict=True)
                 return self._move(breaks, [halve(*pair, count) for pair in pairs])
         return self.tighten() if self.violation > 1 else None
-
-    def find_switches(self) -> tuple[Sequence[Array], float]:
-        """Breaks at the switches of this motion, and how far they are from the present ones.
-
-        Over the curve's length. Neither least effort nor tightened limits show where they are.
-        """
-        smooth = self.task.is_held or self.task.options.goal is Objective.EFFORT
-        if smooth or self.tightening.missed.any():
-            return self.breaks, 0.0
-        pairs = zip(self.parts, self.motions, self.breaks, strict=True)
-        found = [
-            match(before, find_switches(part, motion.profile, self.solution.margin), part.curve)
-            for part, motion, before in pairs
-        ]
-        return [breaks for breaks, _ in found], max(shift for _, shift in found)
 
     def _move(self, breaks: Sequence[Array], cuts: Sequence[Array]) -> PathIterate:
         """Start on other elements from this motion."""
@@ -539,8 +523,10 @@ class PathIterate:
             # The quadrature of the NLP is not that of the motion.
             off = solution.duration / sum(motion.duration for motion in self.motions)
             duration *= float(np.clip(off, 1 - _LONGER, 1 + _LONGER))
-        # Slack at nodes would absorb the rest.
-        reach = data.slack_at_neighbours(solution.profile, solution.margin, short)
+        # Slack at nodes would absorb the rest: the lesser one of the two beside what is short.
+        slack, k = data.slack(data.nodes, solution.profile, solution.margin), data.grid.nonempty
+        least = np.maximum(np.minimum(slack[k], slack[k + 1]), 0.0)
+        reach = np.where(short > 0, least, 0.0)
         added = _OVER * data.spread_to_nodes(short)
         tighter = Tightening(
             np.maximum(tight.limits, data.spread_to_nodes(reach)) + added,
