@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import replace
 from functools import partial
@@ -36,6 +36,7 @@ from ..geometry.path_guess import count_freedoms
 from ..mechanics.limits import EPSILON, PRESS, LimitSet, make_limits
 from ..mechanics.statics import Statics, pushes_one_way
 from ..problem.definition import Phase, Problem
+from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..scene.model import Scales, Scene
 from .blocks import Planning, free_torques
@@ -61,7 +62,7 @@ from .phase_plan import Plans, assemble_motions, runs_along_curves
 from .time_domain.collocation import Scheme, blend
 from .time_domain.guesses import PathMargin
 from .time_domain.search import TimeSearch
-from .time_domain.stage import Stage, StagePoints, to_si
+from .time_domain.stage import Stage, to_si
 from .time_domain.time_motion import make_phase_motions
 
 SHORT = 1e-4  # least violation that counts, over the scale of a limit
@@ -155,29 +156,22 @@ def find_changes(
     """
     changes = []
     for parameter in parameters:
-        least = find_value(parameter)
-        if least is not None:
-            value = _find_enough(least, parameter.sign, partial(can_plan, parameter))
-            changes += [] if value is None else [Change(parameter, value)]
-    return changes
-
-
-def _find_enough(least: float, sign: int, can_plan: Callable[[float], bool]) -> float | None:
-    """A feasible rounded value, as little beyond `least` as plans allow, by bisection."""
-    failed: float | None = None
-    tried = (round_outwards(least * (1 + sign * beyond), sign) for beyond in _BEYOND)
-    for value in dict.fromkeys(tried):
-        if value < 0:
-            return None
-        if can_plan(value):
+        sign, least, failed = parameter.sign, find_value(parameter), math.nan
+        beyond = [] if least is None else [least * (1 + sign * share) for share in _BEYOND]
+        for value in dict.fromkeys(round_outwards(own, sign) for own in beyond):
+            if value < 0:
+                break
+            if not can_plan(parameter, value):
+                failed = value
+                continue
+            # As little beyond as plans allow, by bisection.
+            while abs(value - failed) > _CLOSE * abs(value):
+                middle = round_outwards((value + failed) / 2, sign)
+                enough = can_plan(parameter, middle)
+                value, failed = (middle, failed) if enough else (value, middle)
+            changes.append(Change(parameter, value))
             break
-        failed = value
-    else:
-        return None
-    while failed is not None and abs(value - failed) > _CLOSE * abs(value):
-        middle = round_outwards((value + failed) / 2, sign)
-        value, failed = (middle, failed) if can_plan(middle) else (value, middle)
-    return value
+    return changes
 
 
 def bracket(
@@ -295,14 +289,16 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
     found = _solve_soft(data, profile, units, short / units.of(data.limits), None)
     if found is None:
         return SolverError(stopped)
-    elastic, profiles = found[0], cut(parts, found[0])
-    shortfalls = list[Shortfall]()
-    for part, own, phase in zip(parts, profiles, task.phases, strict=True):
-        times = PathMotion(part.curve, part.grid, own).times.tolist()
+    elastic, motions, torques = found[0], list[PathMotion](), list[TorqueProfile]()
+    shortfalls, missing = list[Shortfall](), None
+    for part, own, phase in zip(parts, cut(parts, elastic), task.phases, strict=True):
+        motions.append(PathMotion(part.curve, part.grid, own))
         suffix = f", phase {phase}" if len(parts) > 1 else ""
         places = [
             LimitPlace(phase, t, f"t = {t:.4f} s ({describe_pose(z)}){suffix}")
-            for t, z in zip(times, part.curve.evaluate(part.grid.s).z, strict=True)
+            for t, z in zip(
+                motions[-1].times.tolist(), part.curve.evaluate(part.grid.s).z, strict=True
+            )
         ]
         shortfalls += find_shortfalls(part.limits, part.evaluate(part.nodes, own), places)
     if not shortfalls:
@@ -330,7 +326,11 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
         solution = _solve_soft(data, elastic, units, start, relaxation)
         return relaxation.move(solution[1]) if solution else None
 
-    error = _describe_least(task.phases, shortfalls, _make_trajectory(parts, profiles))
+    with suppress(SolverError):  # it stalls
+        torques = [fit_torque(*pair)[0] for pair in zip(parts, motions, strict=True)]
+        formations = [part.curve.formation for part in parts]
+        missing = assemble_motions(motions, torques, formations, ROWS, status=LEAST)
+    error = _describe_least(task.phases, shortfalls, missing)
     return advise(error, may_change, find_value, partial(_replan_task, task))
 
 
@@ -352,18 +352,6 @@ def _solve_soft(
     if not nlp.solver.stats()["success"]:
         return None
     return unpack(nlp, data.grid, result["x"].full()[:, 0], units)
-
-
-def _make_trajectory(parts: Sequence[PhaseData], profiles: Sequence[Profile]) -> Trajectory | None:
-    """The motion with the least shortfalls; None if it stalls."""
-    pairs = zip(parts, profiles, strict=True)
-    motions = [PathMotion(part.curve, part.grid, profile) for part, profile in pairs]
-    try:
-        torques = [fit_torque(*pair)[0] for pair in zip(parts, motions, strict=True)]
-    except SolverError:
-        return None
-    formations = [part.curve.formation for part in parts]
-    return assemble_motions(motions, torques, formations, ROWS, status=LEAST)
 
 
 def _replan_task(task: Task, parameter: Parameter, value: float) -> object:
@@ -497,7 +485,15 @@ def refuse(
         blocked = statics.find_block(epsilon, ends=True)
         say = "at its end, {}, no motion comes to rest in any contact mode"
     if blocked is None:
-        _refuse_pushed(problem, phase, stages if alone else ())
+        z = np.concatenate([stage.guess.z.reshape(-1, 5) for stage in stages])
+        first = stages[0].formation
+        if alone and first.n_constraints <= 2 and pushes_one_way(first, z):
+            where = describe_pose(to_si(last, problem).guess.nodes[-1, 0])
+            raise InfeasibleError(
+                f"phase {phase.number} is infeasible: {' '.join(first.names)} can only push the "
+                "object one way, with whatever friction, so that it does not come to rest at its "
+                f"end, {where}"
+            )
         if problem.scene.has_slow_motors:
             _refuse_unheld(problem, phase, stages[0], 0)
             if alone and (last.formation.n_constraints == 4 or phase.until.pins):
@@ -528,20 +524,6 @@ def refuse(
 
     known = make_limits(phase.formation, problem.epsilon).parameters
     raise advise(InfeasibleError(text, shortfalls), known, find_value, replan, ADVICE)
-
-
-def _refuse_pushed(problem: Problem, phase: Phase, stages: Sequence[Stage]) -> None:
-    """Raise an error if contacts can push the object only one way, along all of the guess."""
-    if not stages or stages[0].formation.n_constraints > 2:
-        return
-    z = np.concatenate([stage.guess.z.reshape(-1, 5) for stage in stages])
-    if pushes_one_way(stages[0].formation, z):
-        names = " ".join(stages[0].formation.names)
-        where = describe_pose(to_si(stages[-1], problem).guess.nodes[-1, 0])
-        raise InfeasibleError(
-            f"phase {phase.number} is infeasible: {names} can only push the object one way, with "
-            f"whatever friction, so that it does not come to rest at its end, {where}"
-        )
 
 
 def _refuse_unheld(problem: Problem, phase: Phase, stage: Stage, node: int) -> None:
@@ -608,7 +590,15 @@ def explain_stages(
     stages = [to_si(stage, problem) for stage in short[best]]
 
     def find_value(parameter: Parameter) -> float | None:
-        if not is_met(parameter, [stage.guess for stage in stages], lists[best]):
+        # The limit has to be active; epsilon if no normal force is short of more than that.
+        if parameter.key == EPSILON:
+            active = all(own.amount < parameter.value for own in lists[best] if own.kind == PRESS)
+        else:
+            parts = [stage.guess for stage in stages]
+            tables = (part.v[..., 3:] if parameter.is_speed else part.tau for part in parts)
+            most = max(float(np.abs(own[..., _find_finger(parameter)]).max()) for own in tables)
+            active = most > 0.98 * parameter.value  # share of a limit above which it is active
+        if not active:
             return math.nan
         solution = search.aiming(Objective.RELAX, parameter).solve(short[best])
         # A limit that may be tighter is not in conflict with the others.
@@ -648,20 +638,6 @@ def list_shortfalls(problem: Problem, stages: Sequence[Stage], scheme: Scheme) -
             worst[short.limit] = max(worst.get(short.limit, short), short, key=lambda s: s.amount)
         passed += part.duration
     return list(worst.values())
-
-
-def is_met(
-    parameter: Parameter, motion: Sequence[StagePoints], shortfalls: Sequence[Shortfall]
-) -> bool:
-    """Whether the limit of a parameter is active in the elastic motion.
-
-    That of epsilon is if no normal force is short of more than epsilon.
-    """
-    if parameter.key == EPSILON:
-        return all(each.amount < parameter.value for each in shortfalls if each.kind == PRESS)
-    tables = [part.v[..., 3:] if parameter.is_speed else part.tau for part in motion]
-    most = max(float(np.abs(table[..., _find_finger(parameter)]).max()) for table in tables)
-    return most > 0.98 * parameter.value  # share of a limit above which it is active
 
 
 def _find_finger(parameter: Parameter) -> int:
