@@ -28,8 +28,6 @@ from ..simulation.tolerances import SLOW
 from .path_domain.junction import begin_from
 from .phase_plan import Plans, Settled, end_of
 
-CLOSED = 0.01  # relative gap that counts as closed
-
 
 class DwellEnd(NamedTuple):
     """A dwell at an end at rest."""
@@ -140,7 +138,7 @@ def _close(problem: Problem, place: Standstill, hold: Hold, time: float) -> _Tri
     except (SimulationError, ArithmeticError):
         return _Trial(None, problem.gap)
     gaps = np.abs(place.touching.evaluate(run.z, run.z_dot).C).max(axis=1)
-    still = np.flatnonzero(gaps > CLOSED * problem.gap)
+    still = np.flatnonzero(gaps > 0.01 * problem.gap)  # relative gap that counts as closed
     last = int(still[-1]) + 1 if len(still) else 0
     return _Trial(float(run.t[last]) if last < len(run.t) else None, float(gaps[-1]))
 
@@ -174,7 +172,6 @@ WAYS = (
 )
 """Allocations in the order in which they are tried."""
 STOP = 0.06  # relative dwell time of an end that gains no contact
-BETTER = 0.8  # largest final error of a later allocation, over the best one before
 
 
 def share_time(problem: Problem, plans: Plans) -> list[DwellEnd | None]:
@@ -186,7 +183,7 @@ def share_time(problem: Problem, plans: Plans) -> list[DwellEnd | None]:
     for way in WAYS:
         ends = find_ends(problem, plans, _share(problem, plans, way), way.firm)
         off = measure_off(problem, plans, ends) if any(ends) else 0.0
-        if not best or off < BETTER * least:
+        if not best or off < 0.8 * least:  # a later one has to be better by a fifth
             best, least = ends, off
         if least <= problem.gap:
             break

@@ -65,18 +65,14 @@ from .time_domain.search import TimeSearch
 from .time_domain.stage import Stage, to_si
 from .time_domain.time_motion import make_phase_motions
 
-SHORT = 1e-4  # least violation that counts, over the scale of a limit
 LEAST = "misses limits least"  # status of motions of least violation
 ROWS = 201  # rows of each phase of a motion of least violation
 DIGITS = 3  # significant digits of advised values
 _BEYOND = (0.0, 0.005, 0.015, 0.05, 0.15, 0.5)
 """Relative distances beyond the least change to try: plans keep limits between nodes too."""
-_CLOSE = 0.02  # relative excess over the least change that is good enough
 ADVICE = 0.6  # processor time [s] after which no change is tried for phases over time
 FRICTION = "friction"  # beginning of the keys of frictions
-_ROUGH = 4.0  # largest factor on the friction of a rolling contact
 _FASTER = (2.0, 10.0, 100.0)  # factors on torque rate limits with which plans are tried
-_TORQUE = 15.0  # unit of shortfalls of torques, over the scene's torque: as bad as one of its force
 MISSED = 0.02  # least margin by which limits are missed along an infeasible path
 _unadvised: ContextVar[bool] = ContextVar("_unadvised", default=False)
 Replan = Callable[[Parameter, float], object]  # plans with another value of a parameter, or raises
@@ -165,7 +161,7 @@ def find_changes(
                 failed = value
                 continue
             # As little beyond as plans allow, by bisection.
-            while abs(value - failed) > _CLOSE * abs(value):
+            while abs(value - failed) > 0.02 * abs(value):  # near enough
                 middle = round_outwards((value + failed) / 2, sign)
                 enough = can_plan(parameter, middle)
                 value, failed = (middle, failed) if enough else (value, middle)
@@ -254,7 +250,7 @@ def find_shortfalls(
         of_limit = violation[:, limits.owners == k].max(axis=1)
         worst = int(of_limit.argmax())
         amount = float(of_limit[worst])
-        if amount > SHORT * limit.scale:
+        if amount > 1e-4 * limit.scale:  # least violation that counts, over the scale of a limit
             what = (limit.kind, limit.part, limit.text, amount, limit.unit)
             shortfalls.append(Shortfall(*what, places[worst], amount / limit.scale))
     return shortfalls
@@ -283,7 +279,7 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
         return late
     data, scales = join(parts), task.curves[0].formation.scene.scales
     profile, units = guess_slowly(data)
-    units = units._replace(torque=np.full(2, _TORQUE * scales.torque))
+    units = units._replace(torque=np.full(2, 15.0 * scales.torque))  # as bad as one of force
     short = np.maximum(data.limits.fold(-data.slack(data.nodes, profile)), 0.0)
     short += 0.05 * data.limits.scales
     found = _solve_soft(data, profile, units, short / units.of(data.limits), None)
@@ -378,7 +374,7 @@ def list_frictions(formation: Formation) -> list[Parameter]:
 
 def _search_friction(task: Task, parameter: Parameter) -> float | None:
     """A lower or higher coefficient with which there is a plan."""
-    farthest = 0.0 if parameter.sign < 0 else _ROUGH * parameter.value
+    farthest = 0.0 if parameter.sign < 0 else 4.0 * parameter.value  # the farthest to try
     replan = partial(_replan_task, task, parameter)
     return bracket(parameter, farthest, lambda value: succeeds(partial(replan, value)))
 

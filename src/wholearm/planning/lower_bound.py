@@ -33,13 +33,10 @@ from ..mechanics.speed_sweep import (
 )
 
 GIVE = 2.5e-7  # relaxation of limits over their scales: a plan may violate them as much
-_TOLERANCE = 3e-8  # loss of the bound, and its error, relative to the time
 GRID_INTERVALS = 100  # of the first grid
-_ROUNDS = 16  # most grids: losses fall by 64 from one to the next where speeds are very low
 # Intervals on each side of a blocked one that are split, into how many, and how often; case: the
 # border of an octagon's flip, passed at a tenth of the speed beside it.
 _NARROW, _PARTS, _TRIES = 2, 4, 4
-_SAFETY = 2.0  # factor on the difference of two quadratures, which err alike at switches
 _RULES = tuple(np.polynomial.legendre.leggauss(count) for count in (2, 3))
 # Left end, middle, right end and the nodes of both rules in an interval.
 _PLACES = np.concatenate([[0.0, 0.5, 1.0], *((1 + nodes) / 2 for nodes, _ in _RULES)])
@@ -146,7 +143,7 @@ def bound_least_time(curves: Sequence[Curve], epsilon: float) -> LowerBound | No
     """
     path = PathTerms(curves, epsilon)
     grid, b_guess, result, tries = path.make_grid(GRID_INTERVALS), None, None, 0
-    for _ in range(_ROUNDS):
+    for _ in range(16):  # most grids; losses fall by 64 a grid where speeds are very low
         try:
             result = _bound(path, grid, b_guess)
         except NoMotionError as error:
@@ -157,7 +154,7 @@ def bound_least_time(curves: Sequence[Curve], epsilon: float) -> LowerBound | No
             parts[max(error.interval - _NARROW, 0) : error.interval + _NARROW + 1] = _PARTS
             grid, b_guess = grid.split(parts), None
             continue
-        share = result.losses / (_TOLERANCE * result.time)
+        share = result.losses / (3e-8 * result.time)  # relative tolerance
         # Losses at switches and kinks fall with the square or the third power of the interval.
         parts = np.clip(np.ceil(np.cbrt(share * len(share))), 1, 8).astype(np.int64)
         # If not all can be split, those that lose most are.
@@ -239,7 +236,7 @@ def _bound(path: PathTerms, grid: PathGrid, b_guess: Array | None) -> _Round:
     losses[:-1] += lost
     losses[1:] += lost
     total = float(fine.sum() + jumps @ taken)
-    estimate = _SAFETY * float(error.sum())
+    estimate = 2.0 * float(error.sum())  # both quadratures err alike at switches
     value = max(0.0, total - estimate) if np.isfinite(total) else 0.0
     return _Round(
         LowerBound(value, estimate), losses, motion, float(find_duration(motion.b, np.diff(s)))

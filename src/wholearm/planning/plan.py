@@ -50,7 +50,6 @@ NO_MOTION = "the sweep over the phase plane finds no motion"
 _STILL = 1e-9  # relative speed of rest but for rounding
 WIDEST = 0.95  # largest relative range that is tried
 _MOST = 1e3  # largest factor on ranges that is tried
-_CLOSE = 0.01  # error of the factor, relatively
 
 
 def solve(
@@ -355,7 +354,7 @@ def _find_widest(
         return replace(wider, objective=Objective.TIME, duration=None)
 
     low, high, middle = 0.0, np.inf, min(1.0, most)
-    while low < most and (np.isinf(high) or high - low > _CLOSE * high):
+    while low < most and (np.isinf(high) or high - low > 0.01 * high):  # relatively
         own = scale(middle)
         task = Task(curves, problem.epsilon, own, numbers, None, guides=tuple(guides))
         fastest = task.find_fastest()

@@ -31,9 +31,7 @@ from .phase_plan import split_blocks
 
 REFINEMENTS = 3  # most doublings of the intervals of a block
 ROUGH = 2  # the same in the time domain, before the mode search is left out: some modes never hold
-STRICT = 0.5  # share of the tolerances of `verify` that a plan may use, if there is another
-DIP = 2e-3  # largest shortfall of c_n, over the scene's force, that more normal force is to mend
-SPARE = 2.0  # additional normal force over that shortfall
+SPARE = 2.0  # additional normal force over a small shortfall
 RESIDUAL = 1e-8  # largest relative residual of the equations of motion; rounding leaves 1e-13
 DENSE = 201  # rows per phase for the equations of motion, if the trajectory has not half as many
 _FINER = 8.0  # divisor of the error of the rows of a table when its replay does not hold
@@ -98,7 +96,7 @@ def replay_plan(
     the tolerances of `verify` only.
     """
     problem, usual = planning.problem, Allowance()
-    strict = usual.scale(STRICT)
+    strict = usual.scale(0.5)  # share of the tolerances for a plan, if there is another
     simulations, known = 0, None
     while True:
         simulations += 1
@@ -173,7 +171,7 @@ def _find_dip(planning: Planning, block: BlockPlan, check: ReplayCheck) -> float
         for contact in phase.contacts
     ]
     short = -min(margins, default=0.0)
-    return short if 0.0 < short < DIP * problem.scene.scales.force else 0.0
+    return short if 0.0 < short < 2e-3 * problem.scene.scales.force else 0.0
 
 
 def check_plan(

@@ -38,7 +38,6 @@ _OPTIONS = [name for name in _OPTIONS if name not in ("objective", "replay", "ra
 _UNITS = ("m", "rad", "s")  # what files call the fields of deviations
 UNITS = {Objective.TIME: "s", Objective.EFFORT: "(N m)^2 s", Objective.MARGIN: "N"}
 """Units of objectives."""
-_LEAST_ERROR = 1e-9  # least relative error that is printed: limits are kept to more than that
 
 
 class Status(Enum):
@@ -285,7 +284,7 @@ def describe_plan(plan: Plan, output: str = "", table: Mapping[str, Any] | None 
     value = f"{plan.status.value}: {plan.options.goal.value} = {figure} {plan.unit}"
     if not math.isnan(plan.error):
         # Compared as printed, with one digit.
-        error = f"{max(plan.error, _LEAST_ERROR):.0e}"
+        error = f"{max(plan.error, 1e-9):.0e}"  # limits are kept to about that
         missed = float(error) > plan.options.accuracy
         text = f"; accuracy {plan.options.accuracy:g} not reached" if missed else ""
         value += f" (to {error}{text})"

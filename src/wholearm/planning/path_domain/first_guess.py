@@ -25,14 +25,11 @@ from .path_mesh import Fastest
 from .path_nlp import LEAST_B, PathNLP, Units, list_slopes, pack, parameters
 
 _SLOW = -12  # height of the slowest guess over that of a fall, as a power of two
-_QUICK = 30.0  # largest b of a guess, over that which the torque limits alone allow
 _FIRM = 40.0  # largest range of lambda in a guess, over the scene's force or its least value
-_LIGHT = 0.5  # least unit of force, over the scene's
 # Complementarity of multipliers, and slacks that larger ones count as or that are the least, in
 # units of the NLP: near the central path, and at a vertex.
 _CENTRAL, _SLACK = 1e-4, 1e-3
 _MU, _INSIDE = 1e-7, 1e-2
-_DAMPING = 1e-10  # of normal equations with dependent rows, over their mean diagonal
 _WILD = 10.0  # s'' over its median above which a vertex is of nearly parallel limits
 
 
@@ -90,7 +87,7 @@ def _fall(data: PhaseData) -> float:
     b_max, middle = data.largest_b(data.nodes), len(data.grid.s) // 2
     median = float(np.partition(b_max, middle)[middle])
     inertia, drag = 2 * length * usual(forces.of_tau[..., A]), usual(forces.of_tau[..., V]) ** 2
-    return min(fall, _QUICK * min(inertia, drag, median))
+    return min(fall, 30.0 * min(inertia, drag, median))  # above what torques alone allow
 
 
 def _parabola(data: PhaseData, height: float) -> tuple[Array, Array]:
@@ -121,7 +118,7 @@ def _guess_at(data: PhaseData, height: float, time_weight: float = 0.0) -> tuple
     whole, middle = find_middle(data, *find_internal_force_range(data, height))
     length, weight = float(data.grid.s[-1]), data.curve.formation.scene.scales.force
     duration = np.pi / 2 * length / np.sqrt(height)
-    force = max(_LIGHT * weight, data.epsilon, float(np.abs(middle).mean()))
+    force = max(0.5 * weight, data.epsilon, float(np.abs(middle).mean()))  # the least unit
     profile, torque = Profile(*_parabola(data, height), middle), data.torque_limit
     squares = np.minimum(np.abs(data.nodes.forces.tau(*profile)), torque) ** 2
     power = time_weight + float(squares.sum(axis=1).mean())
@@ -255,7 +252,7 @@ def _find_multipliers(
     slope = _find_slopes(grid, vertices.profile, units)[table[:, :3] >= 0]
     active = active[:, unknowns]
     squares = active @ active.T
-    damping = _DAMPING * float(ca.trace(squares)) / squares.shape[0]
+    damping = 1e-10 * float(ca.trace(squares)) / squares.shape[0]  # rows may be dependent
     solved = ca.solve(squares + damping * ca.DM.eye(squares.shape[0]), active @ slope, "ldl")
     on_links, on_limits, on_b = np.split(-solved.full()[:, 0], np.cumsum([len(links), limits.size]))
     every_link, kept = np.zeros(len(grid.steps)), np.zeros((len(b), 2))

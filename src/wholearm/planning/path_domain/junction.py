@@ -37,11 +37,7 @@ from .path_mesh import make_grid
 if TYPE_CHECKING:
     from ..blocks import Planning
 
-_PLACES = 129  # internal forces tried on each side of a junction
-_WIDEST = 40.0  # largest range of them, over the scene's force
 _INSIDE = 0.01  # part of the range left out at both ends
-_ELEMENTS = 3  # elements of a grid of which only the ends count
-_VERGE = 1e-6  # distance beyond what friction can hold that is rounding, over the scene's torque
 
 
 class Joint(NamedTuple):
@@ -84,7 +80,7 @@ def choose_joint(
     formation = beginning.formation if isinstance(beginning, Curve) else beginning
     scene, static = formation.scene, Statics(formation, z).torque_polygon()
     beyond = static.measure(before)
-    held = beyond <= _VERGE * scene.scales.torque
+    held = beyond <= 1e-6 * scene.scales.torque  # rounding
     if not held.any():
         held = beyond <= beyond.min()
     if not isinstance(beginning, Curve):
@@ -100,10 +96,10 @@ def choose_joint(
 
 def _list_torques(curve: Curve, epsilon: float, phase: int, place: int) -> tuple[Array, Array]:
     """Torques at an end of a curve at the limit of rest, (n, 2) [N m], and internal forces [N]."""
-    data = prepare(curve, epsilon, make_grid(curve, np.zeros(0), _ELEMENTS, held=True), phase)
+    data = prepare(curve, epsilon, make_grid(curve, np.zeros(0), 3, held=True), phase)  # ends count
     low, high = require_hold(data, phase, place)
-    high = min(high, low + _WIDEST * curve.formation.scene.scales.force)
-    share = np.linspace(_INSIDE, 1 - _INSIDE, _PLACES)
+    high = min(high, low + 40.0 * curve.formation.scene.scales.force)  # the widest range
+    share = np.linspace(_INSIDE, 1 - _INSIDE, 129)  # internal forces to try
     lams = low + share * (high - low)
     forces = data.nodes.forces
     T0, by_lambda = forces.of_tau[place, :, ONE], forces.of_tau[place, :, LAMBDA]

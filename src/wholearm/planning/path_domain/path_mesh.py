@@ -20,15 +20,8 @@ from .elements import DEGREE, NODES, Elements, Grid, Profile, lay_out
 from .path_data import PhaseData
 from .path_motion import PathMotion, find_torques
 
-_SAMPLES = 320  # places at which vertices are found, at least two in an interval
 _CAPPED = np.iinfo(np.int64).max  # label of places with an active speed limit
-_AT_CAP = 1e-3  # relative distance of b from its limit at which it is active
-_AT_EXTREME = 0.03  # distance of s'' from an extreme that counts as none, over its range
-_FLICKER = 4e-3  # distance of changes that count as one, over the curve's length
-_THIN = 1e-3  # range of s'', over its largest, below which limits leave no choice
-_ORDER = 6  # power of an element's length that its cost falls with
 _APART = 1e-5  # least length of an element that switches lead to, over the curve's
-_NEAR = 0.02  # distance at which a switch belongs to a break, over the curve's length
 # Distance of s'' from its largest, over the range that limits allow, in intervals of a sweep.
 _SHARES = {SweepMode.PUSH: 0.0, SweepMode.SWITCH: 0.0, SweepMode.BRAKE: 1.0, SweepMode.HELD: 0.5}
 
@@ -98,7 +91,7 @@ def halve(edges: Array, costs: Array, count: int) -> Array:
         middle = (starts[k] + stops[k]) / 2
         starts.insert(k + 1, middle)
         stops.insert(k, middle)
-        price[k : k + 1] = [price[k] / 2**_ORDER] * 2
+        price[k : k + 1] = [price[k] / 2**6] * 2
     return np.array(starts[1:])
 
 
@@ -112,7 +105,7 @@ def match(breaks: Array, switches: Sequence[Switch], curve: Curve) -> tuple[Arra
     for place, jumps in switches:
         far = np.abs(breaks - place)
         far[list(moved)] = np.inf
-        if far.min(initial=np.inf) < _NEAR * curve.length:
+        if far.min(initial=np.inf) < 0.02 * curve.length:  # it belongs to that break
             moved[int(far.argmin())] = place
             shift = max(shift, float(far.min()) / curve.length)
         elif np.abs(np.concatenate([fixed, breaks, fresh]) - place).min() > least:
@@ -170,7 +163,7 @@ class LimitSamples(NamedTuple):
     def of(data: PhaseData, margin: float) -> LimitSamples:
         """Some of the checks between nodes: an even number in each interval, with its start."""
         fractions, k = data.sampling.checks, data.grid.nonempty
-        wanted = max(_SAMPLES // len(k), 2)
+        wanted = max(320 // len(k), 2)  # places, at least two in an interval
         picked = np.arange(0, len(fractions) - 1, max(1, (len(fractions) - 1) // wanted))
         places = (len(fractions) * np.arange(len(k))[:, None] + picked).ravel()
         sides = data.find_limits(data.checks.pick(places), margin)
@@ -182,13 +175,13 @@ class LimitSamples(NamedTuple):
         """Switches of a motion; see `_Looks` for its arguments."""
         high, low = (self.rows.extreme(b, largest) for largest in (True, False))
         span, switches = high.a - low.a, list[Switch]()
-        choice = np.isfinite(span) & (span > _THIN * np.abs(high.a))
+        choice = np.isfinite(span) & (span > 1e-3 * np.abs(high.a))  # else there is no choice
         # Across a reversal limits are others, and an element ends there anyway.
         for segment in sorted(set(self.segment.tolist())):
             k = np.flatnonzero(choice & (self.segment == segment))
             limits = self.sides.pick(k), self.rows.pick(k), high.row[k], low.row[k]
             looks = _Looks(self.s[k], b[k], *limits, share[k], element[k])
-            switches += looks.find_switches(_FLICKER * self.length)
+            switches += looks.find_switches(4e-3 * self.length)  # nearer ones are one change
         return switches
 
 
@@ -213,7 +206,7 @@ class _Looks(NamedTuple):
     def label(self) -> NDArray[np.int64]:
         """The active or nearest row; negative for the least s'', `_CAPPED` for a speed limit."""
         row = np.where(self.rises, self.at_high, -1 - self.at_low)
-        return np.where(self.b > (1 - _AT_CAP) * self.rows.cap, _CAPPED, row)
+        return np.where(self.b > (1 - 1e-3) * self.rows.cap, _CAPPED, row)  # active
 
     def find_switches(self, flicker: float) -> list[Switch]:
         """Switches of rows; changes nearer to each other than `flicker` [m] are one."""
@@ -252,7 +245,7 @@ class _Looks(NamedTuple):
         takes the place of either.
         """
         capped = self.label == _CAPPED
-        off = (np.minimum(self.share, 1 - self.share) > _AT_EXTREME) & ~capped
+        off = (np.minimum(self.share, 1 - self.share) > 0.03) & ~capped  # at neither extreme
         along = capped[[first, last]]
         first = int(np.flatnonzero(~off[: first + 1]).max(initial=0))
         last = last + int(np.argmin(off[last:]))

@@ -28,7 +28,6 @@ from .path_data import PhaseData, Places
 _POINTS = 12  # Gauss points for the time in an interval between nodes
 _STALLED = 100.0  # speed interpolated from an interval's ends over the one inside when it stalls
 _TINY = 1e-100  # least speed [m/s] that is divided by
-TORQUE_ERROR = 5e-7  # largest error of the polynomials between knots, over the torque limit
 PLACES = 13  # interpolation points where that is exceeded
 LOOKS = 21  # samples of torque rates in each interval
 
@@ -199,7 +198,7 @@ def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, floa
     wanted = data.checks.forces.tau(*data.interpolate(motion.profile, checks))
     inner = np.tile((checks > 0) & (checks < 1), len(data.grid.nonempty))
     misfit = torque.at(times.ravel()[inner]) - wanted[inner]
-    if np.abs(misfit / data.torque_limit).max() > TORQUE_ERROR:
+    if np.abs(misfit / data.torque_limit).max() > 5e-7:  # largest relative error
         every = (len(checks) - 1) // (PLACES - 1)
         rows = np.tile(np.arange(len(checks)) % every == 0, len(data.grid.nonempty))
         torque = _fit(data, motion, data.checks.pick(rows), checks[::every])

@@ -55,10 +55,7 @@ from .path_data import PhaseData
 CHAINED = (Objective.MARGIN, Objective.RELAX)  # with one more unknown, copied at every node
 SOFT = (Objective.ELASTIC, Objective.RELAX)  # with a row for each side of the soft limits
 LEAST_B = 1e-8  # least |s''| at rest and b elsewhere, over typical ones: sqrt(b) is differentiable
-_CALM = 1e-6  # regularization by lambda^2: selects among equally good plans
 _ROUGH = 0.1  # regularization by the highest Legendre coefficients: no oscillation within elements
-_EVEN = 1e-4  # regularization by changes of a between nodes, in elastic mode
-_STIFF = 1e3  # `_ROUGH` for nonlinear s'', next to rest nonconstant, in elastic mode, over that
 
 
 class MotorShape(NamedTuple):
@@ -312,13 +309,13 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     # The relaxation has to outweigh the regularization.
     share = 1e-3 if relax else 1.0
     scaled_lam, node_weights = symbols.calm * lam, ca.vertcat(0, h) + ca.vertcat(h, 0)
-    node_costs = share * _CALM * node_weights * scaled_lam**2
+    node_costs = share * 1e-6 * node_weights * scaled_lam**2  # among equal plans
     rough = _find_bends(a, DEGREE) + _find_bends(scaled_lam, DEGREE)
     if objective is Objective.ELASTIC:
         # Soft limits would otherwise be avoided by motions that reverse between nodes.
         first, second = _find_bends(a, 1), _find_bends(a, 2)
-        rough += _STIFF * ca.horzcat(first[0], second[1:-1], first[-1])
-        node_costs[:-1] += _EVEN * (a[1:] - a[:-1]) ** 2
+        rough += 1e3 * ca.horzcat(first[0], second[1:-1], first[-1])
+        node_costs[:-1] += 1e-4 * (a[1:] - a[:-1]) ** 2
     node_costs[0] += share * _ROUGH * ca.sum2(lengths * rough)
     if objective is Objective.TIME:
         node_costs += times

@@ -66,19 +66,14 @@ if TYPE_CHECKING:
 Plans = list[PhasePlan[PathMotion]]
 Pins = tuple[float | None, float | None]  # prescribed internal force at start and end [N]
 MISS = 2.5e-7  # largest violation between nodes, over the limits' scales; relative for b and time
-_RATE_MISS = 1e-4  # the same, relative, for torque rates and commands
 _OVER = 1.05  # tightening over the violation
 _GAP = 1.5  # gap to the optimum over the cost of the tightening
 _LOOKS = 17  # places of a segment at which uniqueness is checked
 _START, _SMOOTH, _RATE = 12, 20, 50  # elements of a phase; for effort; under rate limits
-_MOVED = 25.0  # distance of a break from its switch that counts, over length and accuracy
 _LONGER = 0.2  # most by which the NLP's duration may be another, relatively
-_MESHES, _RATE_MESHES = 6, 2  # most meshes whose breaks move, and those under rate limits
-BEYOND = 10.0  # distance of a first node beyond what friction holds, over the least sure one
 WORTH = 0.02  # largest relative cost of such a start
 _SHARES = (0.0, 0.002, 0.005, 0.01, WORTH)  # shares of a margin given up for it, in this order
 _KEPT = 1e-9  # violation of a limit that is rounding, over its scale
-_LINEARIZATIONS = 3  # most robust plans, each with rows for the speed of the one before
 # Violation at nodes by other signs than those of the rows, over the limits' scales, above which a
 # first plan is a reference only; case: two releases of a pentagon, whose plan takes 20 % longer.
 _OTHER_SIGNS = 0.05
@@ -184,7 +179,7 @@ def _plan_within(task: Task) -> PathIterate:
     Violations by other signs than those of the rows are tightened; if that costs too much, again.
     """
     iterate = plan_task(task)
-    for _ in range(_LINEARIZATIONS - 1 if task.guides else 0):
+    for _ in range(2 if task.guides else 0):  # most further ones
         if iterate.error <= task.options.accuracy:
             break
         try:
@@ -247,7 +242,7 @@ def find_sure_start(
     units = np.array([scales.acceleration, scales.force])
     # Sides of the torques that can be held, and a distance beyond [N m].
     sides = [
-        (normal * gains, bound + BEYOND * SURE * unit)
+        (normal * gains, bound + 10.0 * SURE * unit)
         for static, gains in holds
         for normal, bound in zip(static.normals, static.bounds, strict=True)
     ]
@@ -468,11 +463,11 @@ class PathIterate:
     def adapt(self) -> PathIterate | None:
         """The next one to solve: with rows or breaks for this motion, halved, or tightened."""
         task, accuracy, margin = self.task, self.task.options.accuracy, self.solution.margin
-        again = self.meshes < _MESHES
+        again = self.meshes < 6  # most meshes whose breaks move
         if task.guides and again and self.violation_at_nodes > _OTHER_SIGNS:
             other = PathIterate.begin(replace(task, guides=self.guides), task.elements)
             return replace(other, meshes=self.meshes + 1)
-        if task.is_held and self.meshes < _RATE_MESHES:
+        if task.is_held and self.meshes < 2:
             each = zip(self.parts, self.motions, strict=True)
             return self._move([equidistribute(*own, task.elements) for own in each], self.cuts)
         costs = self.due + self.paid
@@ -491,7 +486,7 @@ class PathIterate:
                 ]
                 breaks = tuple(own for own, _ in found)
                 shift = max(own for _, own in found)  # over the curve's length
-            if shift > _MOVED * accuracy and again:
+            if shift > 25.0 * accuracy and again:  # over length and accuracy
                 return self._move(breaks, self.cuts)
             edges = [part.grid.edges for part in self.parts]
             count = min(task.elements, 80 - max(map(len, edges)))  # most elements of a phase
@@ -566,7 +561,7 @@ class PathIterate:
             return np.inf
         (short, speeding), hurry, late = self.misses
         over = (short / self.data.spans).max(), speeding.max(), late
-        return float(max(max(over) / MISS, hurry.max() / _RATE_MISS))
+        return float(max(max(over) / MISS, hurry.max() / 1e-4))  # rates relatively
 
     @property
     def violation_at_nodes(self) -> float:

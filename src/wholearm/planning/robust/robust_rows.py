@@ -36,8 +36,6 @@ from ...sensitivity.slopes import find_force_slopes
 
 COPIES = 5  # rows for each force limit: two for each vertex, and one for the reference
 _LOOKS = 97  # places of a segment at which signs are found
-_LOWER = 0.5  # factor on b where limits leave no polygon
-_SAME = 1e-9  # violation of a row that is rounding, over its scale
 
 
 class Guide(NamedTuple):
@@ -187,12 +185,12 @@ def _find_signs(
         extremes = (rows.extreme(b, largest).row for largest in (True, False))
         ends = [sides.meet(b, sides.pair(row)) for row in extremes]
         with np.errstate(invalid="ignore"):
-            b = np.where(ends[0][0] < ends[1][0], _LOWER * b, b)
+            b = np.where(ends[0][0] < ends[1][0], 0.5 * b, b)  # no polygon there
         for end, (a, lam) in enumerate(ends):
             here = np.nan_to_num(a), b, np.nan_to_num(lam)
             slack = bare.evaluate(forces, variations, here) - forced.low
             rowed = extended.c(*here)[:, bare.rows.shape[1] :].reshape(*slack.shape, -1)
-            missed = slack < rowed.min(axis=2) - forced.low - _SAME * forced.scales
+            missed = slack < rowed.min(axis=2) - forced.low - 1e-9 * forced.scales  # rounding
             better = np.sign(measure(variations, here)).astype(np.int8)
             slots = (2 * end, 2 * end + 1) if turn == 0 else (2 * end + turn % 2,)
             for slot in slots:

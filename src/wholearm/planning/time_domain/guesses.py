@@ -42,30 +42,13 @@ ALONG = "the plan along curves"
 OTHER = "a motion straight to another end"
 LONGER = f"{NEAREST}, 4 times as long as a fall over that height"
 GRADUAL = " with friction that sets in gradually"  # suffix of names where modes are found so
-PATHS = 3  # most paths to other ends
-STEP = 0.15  # distance of ends, over the length of the path to the nearest end
-GROWTH = 1.2  # ratio of successive distances
-STEPS = 12  # most ends on either side of the nearest one
-NEAR = -0.3  # margin of a path above which a motion near it may keep its limits
-BRISK = 0.5  # share of a positive margin that the speed profile keeps
-GIVES = 0.02  # what it may lose of a negative margin
-SLOWEST = 0.02  # least sum of speeds at both ends of a piece, over the scene's, for its duration
 SURE = 1e-3  # margin above which a motion keeps its limits
-FASTEST = 9.0  # largest squared speed, over gravity times the radius of gyration
-INTERVALS = 10  # of a phase to start with
-FINER = 2  # times as many in modes that are given: phase 19 of query 62 has no solution on 10
 FALLS = 2.0  # guessed duration, over that of a fall over the path's length
 ONSETS = (0.1, 0.03)  # rates of the friction homotopy, in the scene's unit
-USED = 0.2  # friction at the last of them, over all there is, below which a contact rests
-RESTS = 0.1  # least duration of that, over that of its stage, that makes it roll
-SLOW = 1e-5  # rate over the largest at the same instant below which its sign is undetermined
-STILL = 1e-4  # largest rate at an instant, over that of all, below which all signs are undetermined
 BRIEF = 0.05  # least duration of a piece over that of its stage
 LEAST_STEPS = 2  # fewest steps of a piece of a path that is not merged into another
 MOST = 8  # most pieces of a stage
 _LIGHT = 0.5  # normal forces of an initial guess, over the weight of the object
-_NEAR = 0.02  # distance over the radius of gyration at which a limit is monitored from the start
-_TOUCHES = 1e-5  # gap over the radius of gyration below which a released contact is closed
 _Change = tuple[float, dict[int, float]]  # place, share of a stage, and new signs of rows
 
 
@@ -126,7 +109,7 @@ class Guesses:
             np.array(t) / scales.time, scale_state(np.array(z), scales), bc_type="clamped"
         )
         stages, begin = list[Stage](), 0.0
-        finer = 1 if self.search.options.time_intervals else FINER
+        finer = 1 if self.search.options.time_intervals else 2  # a mode may need more
         for stage, phase in zip(join_modes(self.nearest.stages), self.phases, strict=True):
             modes, parts = phase.guess or (), list[tuple[StagePoints, Mode]]()
             intervals, span = finer * stage.intervals, modes[-1].t / scales.time
@@ -185,7 +168,7 @@ class Guesses:
         """Straight to an end of a single phase with two freedoms, in the modes of that path."""
         outline = self._connect(goal)
         margin = find_margin(outline, self.problem.epsilon, paced=True) if outline else None
-        if outline is None or margin is None or margin.value <= NEAR:
+        if outline is None or margin is None or margin.value <= -0.3:  # not near a motion
             return None
         return self._follow(STRAIGHT, outline, margin.profile)
 
@@ -205,7 +188,7 @@ class Guesses:
 
     def to_others(self) -> Iterator[Guess]:
         """Along the first of these paths."""
-        found = (self._follow(OTHER, outline) for _, outline in self.paths[:PATHS])
+        found = (self._follow(OTHER, outline) for _, outline in self.paths[:3])
         return (guess for guess in found if guess is not None)
 
     def _is_planar(self) -> bool:
@@ -260,7 +243,7 @@ class Guesses:
         (phase,) = self.phases
         formation, nearest = phase.formation, find_end(phase, self.z)
         metric = np.sqrt(metric_weights(formation.scene))
-        step = STEP * float(np.linalg.norm((nearest - self.z) * metric))
+        step = 0.15 * float(np.linalg.norm((nearest - self.z) * metric))  # over that path
         slip, ends = formation.evaluate_slip(self.z[None])[0], list_ends(phase)
         N = tangent_basis(formation, nearest) * metric[2] / metric[:, None] ** 2
 
@@ -281,10 +264,10 @@ class Guesses:
                 sides.append(goal)
         for side in sides:
             goal, last, length = side, nearest, step
-            for _ in range(STEPS):
+            for _ in range(12):  # most ends on either side of the nearest one
                 goals.append(goal)
                 secant = (goal - last) * metric
-                length *= GROWTH
+                length *= 1.2  # ratio of successive distances
                 secant = length * secant / np.linalg.norm(secant) / metric
                 following = project(goal + secant, goal, length)
                 if following is None:
@@ -377,7 +360,7 @@ def find_margin(outline: PathGuess, epsilon: float, paced: bool = False) -> Path
     equal = (drive[:, :3] / units[:, None]).reshape(-1, size)
     equal_to = np.tile(scene.applied_force[:3] / units, m)
     free: list[tuple[float | None, float | None]] = [(None, None)] * (m * width)
-    inside = [(0.0, 0.0), *[(0.0, FASTEST)] * (m - 1), (0.0, 0.0), *free]
+    inside = [(0.0, 0.0), *[(0.0, 9.0)] * (m - 1), (0.0, 0.0), *free]  # the largest b
 
     def maximise(gain: Array, least: float | None) -> Any:
         every = [*inside, (least, 1.0)]
@@ -390,11 +373,12 @@ def find_margin(outline: PathGuess, epsilon: float, paced: bool = False) -> Path
     totals = np.bincount(limits.owners[sides], shares)
     critical = limits.limits[int(totals.argmax())]
     margin, profile = float(answer.x[-1]), None
-    speeds, least = np.where(np.arange(size) <= m, 1.0, 0.0), min(BRISK * margin, margin - GIVES)
+    # A fast one may lose half of a positive margin, and a little of a negative one.
+    speeds, least = np.where(np.arange(size) <= m, 1.0, 0.0), min(0.5 * margin, margin - 0.02)
     fast = maximise(speeds, least) if paced else None
     if fast is not None and fast.status == 0:
         v = scene.scales.speed * np.sqrt(np.maximum(fast.x[: m + 1], 0.0))
-        slow = SLOWEST * scene.scales.speed
+        slow = 0.02 * scene.scales.speed  # least sum of speeds at both ends of a piece
         t = np.append(0.0, np.cumsum(2 * runs[:, 0] / np.maximum(v[1:] + v[:-1], slow)))
         length = np.append(0.0, np.cumsum(runs))
         forces = fast.x[m + 1 : -1].reshape(m, width)
@@ -503,7 +487,8 @@ def _find_changes(stage: Stage, scheme: Scheme) -> tuple[list[float], list[_Chan
     places, z = part.places(scheme.points).ravel(), part.z.reshape(-1, 5)
     rates = stage.measure_senses(z, part.v.reshape(-1, 5)) * np.concatenate(stage.directions)
     sizes = np.abs(rates).max(axis=1)
-    clear = (np.abs(rates) > SLOW * sizes[:, None]) & (sizes > STILL * sizes.max())[:, None]
+    # Signs of other rates, and all where nothing moves, are undetermined.
+    clear = (np.abs(rates) > 1e-5 * sizes[:, None]) & (sizes > 1e-4 * sizes.max())[:, None]
     first, every = np.array(mode_of(stage)), list[tuple[float, int, float]]()
     for row, rate in enumerate(rates.T):
         points = np.flatnonzero(clear[:, row])
@@ -511,9 +496,9 @@ def _find_changes(stage: Stage, scheme: Scheme) -> tuple[list[float], list[_Chan
             continue
         signs = np.sign(rate)
         if stage.onset and can_roll(formation, z[len(z) // 2], row):
-            rests = np.abs(np.tanh(rate / stage.onset)) < USED
+            rests = np.abs(np.tanh(rate / stage.onset)) < 0.2  # little friction is used
             for run in find_runs(rests):
-                if places[run.stop - 1] - places[run.start] > RESTS:
+                if places[run.stop - 1] - places[run.start] > 0.1:  # long enough to roll
                     signs[run] = 0.0
         runs = [(0.0, float(signs[points[0]]))]
         for i, j in pairwise(points.tolist()):
@@ -583,22 +568,21 @@ def guess_stages(
             begin = next(other.z[0, row] for own, other, _ in parts if own is phase)
             ahead = row, value, 1.0 if value > begin else -1.0
         whole = lengths[[own is phase for own, _, _ in parts]].sum()
-        intervals = options.time_intervals or INTERVALS
+        intervals = options.time_intervals or 10  # of a phase to start with
         count = max(LEAST_INTERVALS, round(lengths[k] / whole * intervals))
         guess = _guess(outline, scheme, count, clock[k : k + 2], ends[k : k + 2], total, profile)
         ends_in_impact = last and phase.end is End.IMPACT and k + 1 < len(parts)
         if ends_in_impact:
             guess = guess._replace(impulses=np.zeros(parts[k + 1][0].formation.n_constraints))
         # Limits near zero along the path, and that of the phase's end.
-        near = phase.formation.evaluate_limits(outline.z).min(axis=0) < _NEAR
+        near = phase.formation.evaluate_limits(outline.z).min(axis=0) < 0.02
         near |= [limit.gains(phase.until.contact) for limit in phase.formation.limits]
         before = parts[k - 1][0]
         opens = k > 0 and before is not phase
         if opens:
-            touching = np.abs(phase.formation.evaluate_limits(outline.z[:1])[0]) < _TOUCHES
-            renamed = list_renamed(
-                problem.scene, before.formation.contacts, phase.formation.contacts
-            )
+            touching = np.abs(phase.formation.evaluate_limits(outline.z[:1])[0]) < 1e-5  # closed
+            contacts = before.formation.contacts, phase.formation.contacts
+            renamed = list_renamed(problem.scene, *contacts)
             released = tuple(
                 row
                 for row in np.flatnonzero(touching).tolist()

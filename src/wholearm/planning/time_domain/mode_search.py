@@ -24,13 +24,8 @@ from .stage import Stage, StagePoints, make_formation, resample
 from .time_nlp import least_senses, new_rows
 
 LEAST_INTERVALS = 3  # fewest intervals of a stage
-_STALLED = 1e-6  # rate over the largest at which a sliding direction counts as held
-_SLOW = 1e-2  # rate over the largest below which it is held in all of an interval
-_LEANS = 1e-4  # margin to the cone, over mu c_n, at which a rolling contact is about to slide
 WORTH = 1e-4  # least relative gain of a move; dropping a vanished stage may cost as much
 _GONE = 2e-4  # mean duration of intervals, in the scene's unit, below which a stage has vanished
-MOST = 12  # most sequences of modes to try from one start
-LOST = 3  # most failed sequences since the last gain
 PATIENCE = 50  # most solver iterations for one of them
 
 
@@ -204,7 +199,7 @@ def improve(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
     seen = {sign_sequence(solution.stages)}
     waiting, tried, lost = list_neighbours(search, solution), 1, 0
     recent = set[tuple[object, ...]]()
-    while waiting and tried < MOST and lost < LOST:
+    while waiting and tried < 12 and lost < 3:  # sequences, and failures since the last gain
         moved = waiting.pop(0)
         signs = sign_sequence(moved)
         # A vanished stage may have gained by the intervals of its neighbours alone.
@@ -362,11 +357,11 @@ def _find_held(stage: Stage, scheme: Scheme, slow: bool) -> list[ModeRun]:
     fast = np.abs(v[:, 2:]).max()
     least = least_senses(stage, stage.guess.places(scheme.points))
     least = 1.01 * least.reshape(-1, least.shape[-1])
-    touches = senses < least + _STALLED * fast
+    touches = senses < least + 1e-6 * fast  # of the largest rate
     touches &= (np.abs(senses).max(axis=1) > 1e-3 * fast)[:, None]
     shape = (stage.intervals, scheme.degree, -1)
     count = touches.reshape(shape).sum(axis=1)
-    near = (senses < least + _SLOW * fast).reshape(shape).all(axis=1)
+    near = (senses < least + 1e-2 * fast).reshape(shape).all(axis=1)
     held = np.repeat(near & (count > 0) if slow else count > 1, scheme.degree, axis=0)
     held[:, np.delete(np.arange(formation.n_contacts), formation.rubbing_rows)] = False
     return _find_runs(held, stage, scheme, np.zeros(held.shape[1]))
@@ -382,7 +377,7 @@ def _find_leaning(stage: Stage, scheme: Scheme, own: Formation, epsilon: float) 
         c_n = stage.guess.forces[..., row].ravel()
         c_t = stage.guess.forces[..., n_c + k].ravel()
         mu = formation.friction[row]
-        near = mu * (c_n - epsilon) - np.abs(c_t) < _LEANS * mu * c_n
+        near = mu * (c_n - epsilon) - np.abs(c_t) < 1e-4 * mu * c_n  # about to slide
         for sign in (1.0, -1.0):
             leaning = np.zeros((len(c_n), n_c + 2), dtype=bool)
             # Friction pushes against sliding.

@@ -56,11 +56,7 @@ class RefinementSettings:
 
 
 SETTINGS = RefinementSettings()
-_AMPLE = 1e3  # slack, over what is much for a limit, of what does not count
-_PLACES = 7  # Gauss points of an interval at which torques are compared
-_HELD = 3.0  # rate over the least one below which that bound is active
 _STEP = 1e-6  # step of z for slopes of gaps, over accelerations of a torque of 1
-_ROUNDING = 1e-9  # largest miss of a limit that counts as none, over its scale
 
 
 class CheckPlaces(NamedTuple):
@@ -198,7 +194,7 @@ def find_misses(
     senses = stage.measure_senses(samples.z, samples.z_dot)
     senses -= 0.5 * least_senses(stage, check.places)
     senses[:, np.delete(np.arange(formation.n_contacts), formation.rubbing_rows)] = 1.0
-    tables = (slack - deviations + _AMPLE * relieved, gaps, senses)
+    tables = (slack - deviations + 1e3 * relieved, gaps, senses)  # does not count
     return LimitMisses(*(np.maximum(-find_minima(_by_interval(own)), 0.0) for own in tables))
 
 
@@ -318,7 +314,7 @@ def find_gains(
     margin               of c_n, but not of friction cones
     square               weight of tau^T tau in the cost
     """
-    x, weights = np.polynomial.legendre.leggauss(_PLACES)
+    x, weights = np.polynomial.legendre.leggauss(7)
     x, lengths = (x + 1) / 2, np.diff(motion.breaks)
     t = motion.breaks[:-1, None] + lengths[:, None] * x
     response, n = motion.respond(np.append(t, motion.breaks[:-1])), t.size
@@ -345,7 +341,7 @@ def _find_held(stage: Stage, here: MotionResponse, places: Array) -> Array:
     least = least_senses(stage, places).reshape(len(z), -1)
     least[:, np.delete(np.arange(formation.n_contacts), formation.rubbing_rows)] = -np.inf
     senses = np.concatenate([formation.evaluate(z, v).A_t @ by_torque, by_torque[:, 3:]], axis=1)
-    slow = (stage.measure_senses(z, v) < _HELD * least) & (least > 0)
+    slow = (stage.measure_senses(z, v) < 3.0 * least) & (least > 0)  # active
     monitored, size = list(stage.monitored), formation.scene.scales.length
     gaps = formation.evaluate_limits(z)[:, monitored]
     moved = [formation.evaluate_limits(z + _STEP * by_torque[..., j]) for j in range(2)]
@@ -397,7 +393,7 @@ def find_least(slope: Array, square: float, rows: Array, slack: Array) -> Array:
             u = np.concatenate([u, edges, free], axis=1)
         over = np.einsum("nmj,nuj->num", rows, u) + slack[:, None]
         value = np.einsum("nj,nuj->nu", slope, u) + square * (u**2).sum(axis=2)
-    allowed = (over >= -_ROUNDING).all(axis=2) & np.isfinite(value)
+    allowed = (over >= -1e-9).all(axis=2) & np.isfinite(value)  # rounding
     return np.asarray(np.where(allowed, value, 0.0).min(axis=1, initial=0.0))
 
 

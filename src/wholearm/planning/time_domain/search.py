@@ -39,9 +39,6 @@ from .time_nlp import (
 FIRST_SIZE = 1e-2  # multipliers of a first guess
 Multipliers = dict[str, Array]  # of the unknowns' bounds, `lam_x0`, and of the rows, `lam_g0`
 _ITERATIONS = {Objective.ELASTIC: 90, Objective.RELAX: 50}  # most of one solve, else 150
-_SLOWER = 2  # factor on the most iterations of one solve with rate-limited torques
-_BROKEN = 1e-6  # violation of a formation limit that counts, over the radius of gyration
-_CAP = 1.1  # upper bound of the margin, over the one at which it saturates
 
 
 @dataclass
@@ -156,7 +153,7 @@ class TimeSearch:
 
     def wait(self, iterations: int) -> int:
         """Most solver iterations: more with rate-limited torques."""
-        return iterations * (_SLOWER if self.problem.scene.has_slow_motors else 1)
+        return iterations * (2 if self.problem.scene.has_slow_motors else 1)
 
     def charge(self, z: Array) -> float:
         """Price of an end at `z`, shape (5,)."""
@@ -189,7 +186,7 @@ class TimeSearch:
         margin = before.margin if before else 0.0
         if raised and before and all(map(operator.is_, stages, before.stages)):
             return self.run(before.nlp, stages, raised, before.multipliers, margin)
-        depth = _BROKEN * self.problem.scene.polygon.gyration_radius
+        depth = 1e-6 * self.problem.scene.polygon.gyration_radius  # least violation that counts
         while True:
             limits = raised or [LimitMisses.none(stage) for stage in stages]
             solution = self.run(self.build(stages, most), stages, limits, None, margin)
@@ -224,7 +221,7 @@ class TimeSearch:
             high_g[nlp.duration_row] = self.duration
         if self.goal is Objective.MARGIN:
             # Solving for more than the saturated margin takes long.
-            high[nlp.layouts[-1].nodes[-1, MARGIN]] = _CAP * self.most_margin
+            high[nlp.layouts[-1].nodes[-1, MARGIN]] = 1.1 * self.most_margin
         if (low > high).any():
             status = "limits that hold between points too leave nothing"
             return TimeSolution(list(stages), np.inf, 0.0, status, False, nlp, {})

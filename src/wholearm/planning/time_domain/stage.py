@@ -25,8 +25,6 @@ from ...scene.model import Polygon, Scales
 from ..options import CLEARANCE, OPENING, Objective, PlanOptions
 from .collocation import Scheme, blend, fit_controls
 
-_HAIR = 1e-12  # rounding of a place, as share of the duration
-
 
 class StagePoints(NamedTuple):
     """Motion and forces of a stage in K intervals with d points each."""
@@ -250,7 +248,7 @@ def _interpolate(part: StagePoints, scheme: Scheme, places: Array) -> tuple[Arra
     """z, z', z'' and forces at shares of the duration, by the polynomials of the intervals."""
     count, degree = len(part.fractions), scheme.degree
     # z'' and forces may step after the last point of an interval.
-    k = np.clip(np.searchsorted(part.breaks, places - _HAIR) - 1, 0, count - 1)
+    k = np.clip(np.searchsorted(part.breaks, places - 1e-12) - 1, 0, count - 1)
     x = (places - part.breaks[k]) / part.fractions[k]
     powers = np.arange(degree + 1)
     wide = x[:, None] ** powers @ np.linalg.inv(np.append(0.0, scheme.points)[:, None] ** powers)

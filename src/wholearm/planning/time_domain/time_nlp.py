@@ -60,15 +60,10 @@ from .assembly import Indices, Kernel, NlpRows, build_kernel, share
 from .collocation import Scheme, blend, make_scheme
 from .stage import LimitMisses, Stage, StagePoints
 
-_BEND = 1e-2  # weight of second differences of torques over their limits, which else may ring
 _HURRY = 3e-4  # weight of time against violations
-CLEAR = 1e-3  # distance of a coordinate from its value at the phase's end; less near the end
-LONGEST = 120.0  # most processor time of one solve [s]
-NEAR, FAR = 1e-6, 1e-2  # distance of a start from its bounds: a solution, and a first guess
 SLIDING = 1e-5  # least rate of sliding contacts, over the radius of gyration, and of joints
 _WITHIN = np.array([0.3, 0.4, 0.5, 0.75, 0.85, 0.93])
 """Places at which c_n is also bounded with rate-limited torques: minima are inside intervals."""
-_ROOM = 0.05  # most relative distance of a lagging motor's torque at rest from its limit
 Z, V = slice(0, 5), slice(5, 10)
 """Slices of a node's unknowns: z and z'. With a margin, that follows."""
 STATE, MARGIN = 10, 10
@@ -237,17 +232,17 @@ class TimeNLP:
     @cached_property
     def solver(self) -> Expression:
         """Ipopt, to start from a solution."""
-        return self._build(NEAR)
+        return self._build(1e-6)
 
     @cached_property
     def first_solver(self) -> Expression:
         """Ipopt, to start from a guess."""
-        return self._build(FAR)
+        return self._build(1e-2)
 
     def _build(self, push: float) -> Expression:
         assert self.assembled is not None
         nlp, derivatives = self.assembled
-        most = {"max_iter": self.max_iter, "max_cpu_time": LONGEST}
+        most = {"max_iter": self.max_iter, "max_cpu_time": 120.0}  # [s]
         return build_solver("time_nlp", nlp, push, derivatives, **most)
 
 
@@ -272,7 +267,7 @@ def build_time_nlp(
         if target.objective is Objective.EFFORT:
             rows.add_copies(kernel, columns, cost=True)
         elif controls > 2:
-            given = {"weight": _BEND * stage.formation.scene.torque_limit**-2.0}
+            given = {"weight": 1e-2 * stage.formation.scene.torque_limit**-2.0}  # else they ring
             rows.add_copies(bend_kernel(controls), columns, given, cost=True)
         cost[layout.h] = of_time.get(target.objective, 0.0)
         cost[layout.short] = 1 / stage.intervals
@@ -610,7 +605,7 @@ def hold_ends(
             for joint in np.flatnonzero(scene.actuator_lag):
                 limit = scene.torque_limit[joint]
                 fastest = scene.torque_rate_limit[joint] * scene.actuator_lag[joint] / limit
-                most = 1 - min(_ROOM, float(fastest))
+                most = 1 - min(0.05, float(fastest))
                 rows.add_entries(rows.linear(1, low=-most, high=most), first[joint], 1 / limit)
         for r, row in enumerate(formation.rolling_rows):
             mu = float(formation.friction[row])
@@ -698,7 +693,7 @@ def find_bounds(
             # A coordinate stays before the value at which the phase ends.
             row, value, side = stage.ahead
             left = 1.0 - stage.guess.places(scheme.points) * (stage.until is not None)
-            most = value - side * CLEAR * np.minimum(1.0, (2 * left) ** 2)
+            most = value - side * 1e-3 * np.minimum(1.0, (2 * left) ** 2)
             if stage.until is not None and scheme.ends:
                 most[-1, -1] = side * np.inf
             (low, high)[int(side > 0)][layout.z[..., row]] = most

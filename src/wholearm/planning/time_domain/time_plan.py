@@ -50,10 +50,6 @@ if TYPE_CHECKING:
     from ..explain import Replan
 
 ITERATIONS = 50  # most of the solver from a guess; successes take up to 25
-FEW = 35  # the same where a single guess is tried
-DEARER = 1.2  # cost of a refined plan, over that on few intervals, above which others are tried
-ROUNDING = 5e-7  # largest shortfall of a margin below epsilon by rounding, over the object's weight
-GAIN = 1e-4  # least relative gain of moving the end
 AT_REST = 1e-4  # speed below which an impact counts as a stop, in the scene's own units
 SHORTEST = 1 / 16  # shortest step of the continuation to a pinned end
 FREE = "a plan that chooses where it ends"  # name of a guess
@@ -169,7 +165,7 @@ def try_phases(
             listed = takewhile(lambda guess: not guess.homotopy, listed)
         listed = chain(listed, _free_ends(search, guesses))
     for guess in listed:
-        solution = solve_coarse(search, guess, FEW if single_guess else ITERATIONS)
+        solution = solve_coarse(search, guess, 35 if single_guess else ITERATIONS)
         if solution.success:
             first, *others = list_plans(problem, search, phases, solution, guess.name)
             return [first._replace(complete=not options.mode_search), *others]
@@ -195,7 +191,7 @@ def solve_guesses(
         if coarse and (len(coarse) > 1 or guess.homotopy or not may_gain(search, solution)):
             least = min(own.cost for own, _ in coarse)
             best, coarse = _refine_best(search, coarse, best), []
-            if best and best[0].cost <= least + (DEARER - 1) * abs(least):
+            if best and best[0].cost <= least + 0.2 * abs(least):  # not much dearer
                 return best
     return _refine_best(search, coarse, best)
 
@@ -211,7 +207,7 @@ def solve_coarse(search: TimeSearch, guess: Guess, most: int = ITERATIONS) -> Ti
     if guess.name == GIVEN:
         most = 150  # phase 1 of query 29 takes 67 iterations
     solution = search.solve(stages, guess.before, search.wait(most))
-    if solution.success and solution.margin < -ROUNDING:
+    if solution.success and solution.margin < -5e-7:  # rounding
         # A motion that presses too little may be far from one that presses enough.
         return solution._replace(success=False, status="the largest c_n is below epsilon")
     return solution
@@ -372,7 +368,7 @@ def choose_end(search: TimeSearch, solution: TimeSolution) -> tuple[TimeSearch, 
         except WholearmError:
             break
         total = solution.cost - search.charge(solution.end) + value
-        if least is not None and total > least - GAIN * abs(least):
+        if least is not None and total > least - 1e-4 * abs(least):
             break
         least, best = total, (search, solution)
         search = replace(search, price=Price(gradient, solution.end))
