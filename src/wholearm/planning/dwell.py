@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -36,13 +37,6 @@ class DwellEnd(NamedTuple):
     time: float  # [s]
     hold: Hold | None  # None if no torques hold it
     firm: bool  # whether torques are of the largest margin, also if they do not close gaps
-
-
-class _Trial(NamedTuple):
-    """Simulation of a dwell from where the contact is still open."""
-
-    closes: float | None  # [s]: when all contacts are closed; None if one is open at the end
-    left: float  # [m]: largest gap at the end
 
 
 def settle_plans(problem: Problem, plans: Plans) -> Settled:
@@ -109,38 +103,30 @@ def _describe(problem: Problem, phase: Phase, end: DwellEnd) -> Settling:
         text = f"no torques hold {' '.join(place.touching.names)} at the end of phase"
         warning = f"{text} {phase.number} with c_n >= epsilon"
         return Settling(phase.number, 0.0, (0.0, 0.0), 0.0, warning=warning)
-    first, second = hold.tau.tolist()
+    (first, second), tau = hold.tau.tolist(), hold.tau[None, :, None]
     settling = Settling(phase.number, time, (first, second), hold.margin)
-    trial = _close(problem, place, hold, time)
-    if trial is None or place.gained is None:
+    opening = find_opening(place)
+    if opening is None or place.gained is None:
         return settling
+    # From rest where the contact is still open.
+    closes, left, torque = None, problem.gap, TorqueProfile(np.array([0.0, time]), tau)
+    with suppress(SimulationError, ArithmeticError):
+        z = close_contacts(place.formation, place.z + problem.gap * opening)
+        run = simulate_free(problem, torque, start=z)
+        gaps = np.abs(place.touching.evaluate(run.z, run.z_dot).C).max(axis=1)
+        still = np.flatnonzero(gaps > 0.01 * problem.gap)  # relative gap that counts as closed
+        last, left = int(still[-1]) + 1 if len(still) else 0, float(gaps[-1])
+        closes = float(run.t[last]) if last < len(run.t) else None
     name, text = place.gained.name, f"that hold the end of phase {phase.number}"
     return settling._replace(
         contact=name,
         gap=problem.gap,
-        closes=trial.closes,
-        left=trial.left,
+        closes=closes,
+        left=left,
         speed=hold.speed,
         parts=hold.parts,
         warning="" if hold.speed or firm else f"no torques {text} would drive it on to {name}",
     )
-
-
-def _close(problem: Problem, place: Standstill, hold: Hold, time: float) -> _Trial | None:
-    """Simulate a dwell from rest where the contact is still open; None if all are closed."""
-    opening = find_opening(place)
-    if opening is None:
-        return None
-    torque = TorqueProfile(np.array([0.0, time]), hold.tau[None, :, None])
-    try:
-        z = close_contacts(place.formation, place.z + problem.gap * opening)
-        run = simulate_free(problem, torque, start=z)
-    except (SimulationError, ArithmeticError):
-        return _Trial(None, problem.gap)
-    gaps = np.abs(place.touching.evaluate(run.z, run.z_dot).C).max(axis=1)
-    still = np.flatnonzero(gaps > 0.01 * problem.gap)  # relative gap that counts as closed
-    last = int(still[-1]) + 1 if len(still) else 0
-    return _Trial(float(run.t[last]) if last < len(run.t) else None, float(gaps[-1]))
 
 
 def list_touching(problem: Problem, phase: Phase) -> Formation:

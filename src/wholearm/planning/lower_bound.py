@@ -22,7 +22,7 @@ from ..common.arrays import Array
 from ..geometry.curve import Curve, CurvePoint, directions_of
 from ..mechanics.dynamics import ONE, A, B, V, inverse
 from ..mechanics.limits import make_limits
-from ..mechanics.path_limits import Extreme, PathLimits
+from ..mechanics.path_limits import PathLimits
 from ..mechanics.speed_sweep import (
     NoMotionError,
     SpeedProfile,
@@ -276,42 +276,14 @@ def find_costate(
         (left.extreme(b[:-1], largest), right.extreme(b[1:], largest)) for largest in (True, False)
     )
     y = np.zeros((len(modes), 2))
+    # In an interval with a switch it is zero where a changes.
     k = np.flatnonzero(modes == SweepMode.SWITCH)
-    y[k] = _switch(path, grid, b, pushes[0].a[k], brakes[1].a[k], k)
-    rates, forces = _linearise(path, grid, b, modes, pushes, brakes)
-    ends = float(pushes[0].a[0]), float(brakes[1].a[-1])
-    _integrate(path, grid, modes, rates, forces, ends, y)
-    slopes = np.where((modes == SweepMode.HELD)[:, None], 0.0, forces + rates * y)
-    # At rest only the value is known.
-    secant = np.diff(y, axis=1)[:, 0] / np.diff(grid.angles)
-    slopes[0, 0] = 2 * secant[0] - slopes[0, 1]
-    slopes[-1, 1] = 2 * secant[-1] - slopes[-1, 0]
-    return Costate(y, slopes)
-
-
-def _switch(
-    path: PathTerms, grid: PathGrid, b: Array, pushed: Array, braked: Array, k: NDArray[np.int64]
-) -> Array:
-    """The costate, y, at both ends of the intervals `k` with a switch, shape (n, 2).
-
-    It is zero where a changes from `pushed`, at the first end, to `braked`, at the second.
-    """
-    angles = grid.angles[k[:, None] + [0, 1]]
+    pushed, braked, angles = pushes[0].a[k], brakes[1].a[k], grid.angles[k[:, None] + [0, 1]]
     h = np.diff(path.place(angles))[:, 0]
     x = np.clip((b[k + 1] - b[k] - 2 * braked * h) / (2 * (pushed - braked)), 0.0, h)
     rate = 0.5 * np.maximum(b[k] + 2 * pushed * x, np.maximum(b[k], b[k + 1])) ** -1.5
-    return np.asarray(rate[:, None] * np.column_stack([x, x - h]) * np.sin(angles))
-
-
-def _linearise(
-    path: PathTerms,
-    grid: PathGrid,
-    b: Array,
-    modes: NDArray[np.int64],
-    pushes: tuple[Extreme, Extreme],
-    brakes: tuple[Extreme, Extreme],
-) -> tuple[Array, Array]:
-    """Rates and forces of dy/dangle = force + rate y at both ends of the intervals, (N, 2) each."""
+    y[k] = rate[:, None] * np.column_stack([x, x - h]) * np.sin(angles)
+    # dy/dangle = force + rate y at both ends of the intervals.
     slope, switches = np.zeros((len(modes), 2)), modes == SweepMode.SWITCH
     for mode, extremes, switched in ((SweepMode.PUSH, pushes, 0), (SweepMode.BRAKE, brakes, 1)):
         for end in range(2):
@@ -319,45 +291,38 @@ def _linearise(
             slope[used, end] = extremes[end].slope[used]
     angles = np.column_stack([grid.angles[:-1], grid.angles[1:]])
     speed = np.sqrt(np.column_stack([b[:-1], b[1:]]))
-    inner = speed > 0
+    inner, forces, rates = speed > 0, np.zeros(slope.shape), np.zeros(slope.shape)
     sine, stretch = np.sin(angles), path.length / 2 * np.sin(angles)
-    force = np.zeros(slope.shape)
-    force[inner] = -(stretch * sine)[inner] / (2 * speed[inner] ** 3)
-    rate = np.zeros(slope.shape)
-    rate[inner] = 1 / np.tan(angles[inner]) - 2 * slope[inner] * stretch[inner]
-    return rate, force
-
-
-def _integrate(
-    path: PathTerms,
-    grid: PathGrid,
-    modes: NDArray[np.int64],
-    rates: Array,
-    forces: Array,
-    ends: tuple[float, float],
-    y: Array,
-) -> None:
-    """Integrate y from switches and speed limits, back where accelerating, forth where braking."""
-    h, last = np.diff(grid.angles), len(modes) - 1
+    forces[inner] = -(stretch * sine)[inner] / (2 * speed[inner] ** 3)
+    rates[inner] = 1 / np.tan(angles[inner]) - 2 * slope[inner] * stretch[inner]
+    # From switches and speed limits, back where accelerating, forth where braking.
+    steps, last = np.diff(grid.angles), len(modes) - 1
+    ends = float(pushes[0].a[0]), float(brakes[1].a[-1])
     at_rest = [np.sign(a) / (2 * abs(a) * np.sqrt(abs(a) * path.length / 2)) for a in ends]
     for mode, order, near, far in (
         (SweepMode.PUSH, range(last, -1, -1), 1, 0),
         (SweepMode.BRAKE, range(last + 1), 0, 1),
     ):
         step = far - near
-        for k in order:
-            if modes[k] != mode:
+        for n in order:
+            if modes[n] != mode:
                 continue
-            previous = k - step
+            previous = n - step
             goes_on = 0 <= previous <= last and modes[previous] in (mode, SweepMode.SWITCH)
-            y[k, near] = y[previous, far] if goes_on else 0.0
-            if k == (last if far else 0):
-                y[k, far] = at_rest[far]
+            y[n, near] = y[previous, far] if goes_on else 0.0
+            if n == (last if far else 0):
+                y[n, far] = at_rest[far]
             else:
                 # Trapezoidal rule.
-                half, rate = step * h[k] / 2, rates[k]
-                start = y[k, near] * (1 + half * rate[near]) + half * forces[k].sum()
-                y[k, far] = start / (1 - half * rate[far])
+                half, of_y = step * steps[n] / 2, rates[n]
+                start = y[n, near] * (1 + half * of_y[near]) + half * forces[n].sum()
+                y[n, far] = start / (1 - half * of_y[far])
+    slopes = np.where((modes == SweepMode.HELD)[:, None], 0.0, forces + rates * y)
+    # At rest only the value is known.
+    secant = np.diff(y, axis=1)[:, 0] / steps
+    slopes[0, 0] = 2 * secant[0] - slopes[0, 1]
+    slopes[-1, 1] = 2 * secant[-1] - slopes[-1, 0]
+    return Costate(y, slopes)
 
 
 def find_least(limits: PathLimits, p: Array, slope: Array) -> Array:

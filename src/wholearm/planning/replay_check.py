@@ -114,9 +114,30 @@ def replay_plan(
             break
         if better is None:
             block = planning.blocks[planning.find_block(number)]
-            raise ReplayError(_describe(block, number, accepted))
+            finer = f", with {2**block.finer} times the intervals" if block.finer > 0 else ""
+            reason = accepted.failure[1] if accepted.failure else ""
+            raise ReplayError(
+                f"the plan of phase {number} does not hold in its replay{finer}: "
+                f"{reason}; other intervals or another objective may do, and "
+                "--no-replay (replay=False) leaves the check out"
+            )
         planning, trajectory = better, build(better)
-    return planning, trajectory, _collect_figures(planning, check, simulations)
+    assert isinstance(check.report, Report)
+    found = [(find_least_force(phase), phase.number) for phase in check.report.phases]
+    forces = [(own, number) for own, number in found if own is not None]
+    least, number = min(forces, key=lambda pair: pair[0].least)
+    figures = ReplayFigures(
+        LeastForce(least.least, least.contact, number, least.time),
+        tuple(
+            ReplayedPhase(own.arrival, own.end_speed, own.end_deviation, own.deviation)
+            for own in check.report.phases
+        ),
+        check.residual.size,
+        tuple(block.finer for block in planning.blocks for _ in block.phases),
+        check.report.steps,
+        simulations,
+    )
+    return planning, trajectory, figures
 
 
 def _improve(
@@ -212,36 +233,6 @@ def find_residual(problem: Problem, trajectory: Trajectory) -> Residual:
             when = f"at t = {trajectory.t[rows][row]:.5g} s, phase {phase.number}"
             worst = Residual(size, phase.number, f"{text} {when}")
     return worst
-
-
-def _describe(block: BlockPlan, number: int, check: ReplayCheck) -> str:
-    """Message on a plan that fails in phase `number`."""
-    assert check.failure is not None
-    reason = check.failure[1]
-    finer = f", with {2**block.finer} times the intervals" if block.finer > 0 else ""
-    return (
-        f"the plan of phase {number} does not hold in its replay{finer}: {reason}; other intervals "
-        "or another objective may do, and --no-replay (replay=False) leaves the check out"
-    )
-
-
-def _collect_figures(planning: Planning, check: ReplayCheck, simulations: int) -> ReplayFigures:
-    """Figures of a replay for the plan."""
-    assert isinstance(check.report, Report)
-    found = [(find_least_force(phase), phase.number) for phase in check.report.phases]
-    known = [(least, number) for least, number in found if least is not None]
-    least, number = min(known, key=lambda pair: pair[0].least)
-    return ReplayFigures(
-        LeastForce(least.least, least.contact, number, least.time),
-        tuple(
-            ReplayedPhase(own.arrival, own.end_speed, own.end_deviation, own.deviation)
-            for own in check.report.phases
-        ),
-        check.residual.size,
-        tuple(block.finer for block in planning.blocks for _ in block.phases),
-        check.report.steps,
-        simulations,
-    )
 
 
 class TorqueTable(NamedTuple):

@@ -113,7 +113,15 @@ def split(stage: Stage, scheme: Scheme, begin: int, stop: int, mode: Mode) -> li
     """Pieces of a stage with intervals `begin` to `stop` in another mode, to be linked."""
     edges, modes = [0, begin, stop, stage.intervals], [mode_of(stage), mode, mode_of(stage)]
     parts = [part for part in zip(edges, edges[1:], modes, strict=False) if part[1] > part[0]]
-    return divide(stage, [(_cut(stage.guess, scheme, k, n), signs) for k, n, signs in parts])
+    pieces = list[tuple[StagePoints, Mode]]()
+    for first, last, signs in parts:
+        breaks = stage.guess.breaks[first : last + 1]
+        shares = (breaks - breaks[0]) / (breaks[-1] - breaks[0])
+        while len(shares) - 1 < LEAST_INTERVALS:
+            shares = np.sort(np.append(shares, (shares[1:] + shares[:-1]) / 2))
+        guess = resample(stage.guess, scheme, shares, float(breaks[0]), float(breaks[-1]))
+        pieces.append((guess, signs))
+    return divide(stage, pieces)
 
 
 def merge(stages: Sequence[Stage]) -> list[Stage]:
@@ -183,15 +191,6 @@ def _join(first: StagePoints, second: StagePoints) -> StagePoints:
     z, v, a, forces, tau = (np.concatenate(pair) for pair in pairs)
     shares = np.concatenate(fractions)
     return StagePoints(total, shares, nodes, z, v, a, forces, tau, second.impulses)
-
-
-def _cut(part: StagePoints, scheme: Scheme, begin: int, stop: int) -> StagePoints:
-    """Intervals `begin` to `stop`, on at least the least number of them."""
-    breaks = part.breaks[begin : stop + 1]
-    shares = (breaks - breaks[0]) / (breaks[-1] - breaks[0])
-    while len(shares) - 1 < LEAST_INTERVALS:
-        shares = np.sort(np.append(shares, (shares[1:] + shares[:-1]) / 2))
-    return resample(part, scheme, shares, float(breaks[0]), float(breaks[-1]))
 
 
 def improve(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
