@@ -30,9 +30,7 @@ class PhasePlan(NamedTuple, Generic[M_co]):
     motion: M_co
     torque: TorqueProfile  # from the start of the phase
     value: float  # the phase's share of the objective: s, (N m)^2 s or N
-    sequences: int = (
-        0  # sequences of contact modes tried, of the first phase in one NLP; 0 on curves
-    )
+    sequences: int = 0  # of contact modes tried, in the first phase of an NLP; 0 on curves
     complete: bool = True  # whether the mode search has tried all neighbours
     attempt: str = ""  # name of its initial guess; none along curves
     stages: Sequence[object] = ()  # of the NLP, in the scene's units; none along curves

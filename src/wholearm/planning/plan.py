@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,7 @@ from ..common.document import plain
 from ..common.errors import AmbiguityError, InfeasibleError, SolverError
 from ..common.sharing import exclusive
 from ..common.signals import OutOfTime, Reporter, limited
-from ..geometry.curve import Curve, describe_pose
+from ..geometry.curve import describe_pose
 from ..geometry.tracing import trace_phases
 from ..mechanics.dynamics import measure_speed
 from ..mechanics.statics import SURE
@@ -35,7 +35,6 @@ from .lower_bound import bound_least_time
 from .options import Objective, PlanOptions
 from .path_domain import impact_sequence
 from .path_domain.impact_sequence import ImpactSequence
-from .path_domain.path_mesh import Fastest
 from .path_domain.path_motion import PathMotion
 from .path_domain.path_plan import Task, plan_curves
 from .phase_plan import PlanPart, add_up, assemble_motions, combine, plan_stops
@@ -279,26 +278,19 @@ def check_uniqueness(problem: Problem, trajectory: Trajectory, least: float) -> 
 
 def certify(planning: Planning) -> Certificate:
     """Bound the least time of every part of a planning that is run through from rest to rest."""
-    parts = (part for block in planning.blocks for part in _bound(block, planning.problem.epsilon))
-    return Certificate(tuple(parts))
-
-
-def _bound(block: BlockPlan, epsilon: float) -> Iterator[TimeBound]:
-    times = {
-        phase.number: plan.motion.duration
-        for phase, plan in zip(block.phases, block.plans, strict=True)
-    }
-    if block.chain is None:
-        yield TimeBound(tuple(times), sum(times.values()), None, None, OVER_TIME)
-        return
-    for part in block.chain.split():
-        phases = tuple(phase.number for phase in part.phases)
-        duration = sum(times[number] for number in phases)
-        found = bound_least_time(part.continuous_curves, epsilon)
-        if found is None:
-            yield TimeBound(phases, duration, None, None, NO_MOTION)
-        else:
-            yield TimeBound(phases, duration, *found)
+    bounds = list[TimeBound]()
+    for block in planning.blocks:
+        times = [plan.motion.duration for plan in block.plans]
+        numbers = tuple(phase.number for phase in block.phases)
+        if block.chain is None:
+            bounds.append(TimeBound(numbers, sum(times), None, None, OVER_TIME))
+        for part in block.chain.split() if block.chain else ():
+            phases = tuple(phase.number for phase in part.phases)
+            duration = sum(times[number - numbers[0]] for number in phases)
+            found = bound_least_time(part.continuous_curves, planning.problem.epsilon)
+            figures = (None, None, NO_MOTION) if found is None else found
+            bounds.append(TimeBound(phases, duration, *figures))
+    return Certificate(tuple(bounds))
 
 
 def assess_ranges(planning: Planning, report: Callable[[str], None]) -> RangeFigures:
@@ -339,7 +331,7 @@ def _find_widest(
     planning: Planning,
     part: ImpactSequence,
     numbers: Sequence[int],
-    guides: Sequence[Guide],
+    guides: list[Guide],
     most: float,
 ) -> float:
     """The largest factor on ranges, up to `most`, with which phases have a plan; zero for none.
@@ -347,6 +339,8 @@ def _find_widest(
     The minimum-time sweep decides each step of a bisection; then plans are tried with ever smaller
     factors. `guides` are a motion along each curve.
     """
+    from .robust.robust_rows import Guide
+
     curves, problem = part.continuous_curves, planning.problem
 
     def scale(factor: float) -> PlanOptions:
@@ -361,7 +355,13 @@ def _find_widest(
         if fastest is None:
             high = middle
         else:
-            low, guides = middle, _cut(fastest, curves)
+            # The minimum-time profile along each curve.
+            low, start, guides = middle, 0.0, []
+            for curve in curves:
+                s = np.linspace(0.0, curve.length, len(fastest.s))
+                b, none = np.interp(s + start, fastest.s, fastest.b), np.zeros_like(s)
+                guides.append(Guide(s, none, b, none))
+                start += curve.length
         middle = min(2 * low, most) if np.isinf(high) else (low + high) / 2
     for _ in range(8):  # most plans that are tried
         try:
@@ -370,16 +370,3 @@ def _find_widest(
         except (InfeasibleError, SolverError):
             low *= 0.98  # factor from one tried plan to the next
     return 0.0
-
-
-def _cut(fastest: Fastest, curves: Sequence[Curve]) -> list[Guide]:
-    """A minimum-time profile along each curve."""
-    from .robust.robust_rows import Guide
-
-    guides, start = [], 0.0
-    for curve in curves:
-        s = np.linspace(0.0, curve.length, len(fastest.s))
-        b, none = np.interp(s + start, fastest.s, fastest.b), np.zeros_like(s)
-        guides.append(Guide(s, none, b, none))
-        start += curve.length
-    return guides

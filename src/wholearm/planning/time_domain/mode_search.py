@@ -260,8 +260,13 @@ def list_neighbours(
     def turn(index: int, run: ModeRun) -> list[Stage] | None:
         """Another mode over a run: rolling if possible, else reversed."""
         signs = [run.sign] if run.sign else [0.0, -mode_of(stages[index])[run.row]]
-        if _comes_to_rest(stages, index, own, run.row):
-            signs = [sign for sign in signs if sign]
+        stage, n_c = stages[index], stages[index].formation.n_contacts
+        following = [k for k, other in enumerate(stages) if other.phase > stage.phase][:1]
+        for k in following if run.row < n_c else ():
+            # A contact that rolls from the next phase on slides until this one ends.
+            rolls = set(own[k].rolling) - set(own[index].rolling)
+            if stage.formation.contacts[run.row] in rolls:
+                signs = [sign for sign in signs if sign]
         pieces = [_change(stages, index, run, sign, scheme) for sign in signs]
         found = next((piece for piece in pieces if piece is not None), None)
         return found and link(merge([*stages[:index], *found, *stages[index + 1 :]]))
@@ -312,15 +317,6 @@ def can_roll(formation: Formation, z: Array, row: int) -> bool:
     if row >= formation.n_contacts or formation.n_constraints >= 4:
         return False
     return bool(len(find_tied(formation, z, row)) == 1 and formation.friction[row] > 0)
-
-
-def _comes_to_rest(stages: Sequence[Stage], index: int, own: Sequence[Formation], row: int) -> bool:
-    """Whether a contact slides until its phase ends, since it rolls in the next one."""
-    stage = stages[index]
-    last = max(k for k, other in enumerate(stages) if other.phase == stage.phase)
-    if row >= stage.formation.n_contacts or last + 1 == len(stages):
-        return False
-    return stage.formation.contacts[row] in set(own[last + 1].rolling) - set(own[index].rolling)
 
 
 def _change(

@@ -25,7 +25,6 @@ from ...results.trajectory import Samples
 from ...sensitivity.slopes import find_slopes_at
 from ..options import DEFAULT_ACCURACY, Objective
 from ..robust.robust_rows import find_edges
-from .collocation import Scheme
 from .search import TimeSearch, TimeSolution
 from .stage import LimitMisses, Stage, bisect_intervals, monitor
 from .time_motion import MotionResponse, StageMotion, make_motions
@@ -250,24 +249,6 @@ def _find_gains(
     return gains
 
 
-def price_misses(solution: TimeSolution, misses: Sequence[LimitMisses]) -> list[Array]:
-    """Relative cost of raising limits by their misses in each interval, (K,), by multipliers."""
-    on_x, on_g = (np.abs(solution.multipliers[key]) for key in ("lam_x0", "lam_g0"))
-    costs = []
-    for layout, of_stage, miss in zip(
-        solution.nlp.layouts, solution.nlp.rows_of, misses, strict=True
-    ):
-        rows, price = of_stage.limits, np.zeros_like(miss.held)
-        c_n = layout.forces[..., : rows.presses.shape[2]]
-        price[:, rows.pressed] = on_x[c_n].sum(axis=1) + on_g[rows.presses].sum(axis=1)
-        price[:, rows.sides] = on_g[rows.others].sum(axis=1)
-        for side, unknowns in rows.bounded.items():
-            price[:, side] = on_x[unknowns].sum(axis=1)
-        cost = (price * miss.held * rows.limits.scales[rows.limits.sides[0]]).sum(axis=1)
-        costs.append(np.asarray(cost / max(abs(solution.cost), 1e-300)))
-    return costs
-
-
 def _choose_halvings(
     search: TimeSearch,
     solution: TimeSolution,
@@ -281,11 +262,24 @@ def _choose_halvings(
     most = math.ceil(SETTINGS.intervals * share) * phases
     if sum(stage.intervals for stage in solution.stages) >= most:
         return []
-    prices = price_misses(solution, misses)
-    times = [
-        count_halvings(price, motion.defects, search.scheme)
-        for price, motion in zip(prices, motions, strict=True)
-    ]
+    on_x, on_g = (np.abs(solution.multipliers[key]) for key in ("lam_x0", "lam_g0"))
+    nlp, prices, times = solution.nlp, list[Array](), list[NDArray[np.int64]]()
+    each = zip(nlp.layouts, nlp.rows_of, misses, motions, strict=True)
+    for layout, of_stage, miss, motion in each:
+        # Relative cost of raising limits by their misses, by multipliers.
+        rows, price = of_stage.limits, np.zeros_like(miss.held)
+        c_n = layout.forces[..., : rows.presses.shape[2]]
+        price[:, rows.pressed] = on_x[c_n].sum(axis=1) + on_g[rows.presses].sum(axis=1)
+        price[:, rows.sides] = on_g[rows.others].sum(axis=1)
+        for side, unknowns in rows.bounded.items():
+            price[:, side] = on_x[unknowns].sum(axis=1)
+        cost = (price * miss.held * rows.limits.scales[rows.limits.sides[0]]).sum(axis=1)
+        prices.append(np.asarray(cost / max(abs(solution.cost), 1e-300)))
+        # Errors of collocation decrease with the scheme's order, costs with the third one.
+        dear = np.maximum(prices[-1] / SETTINGS.dear, 1.0)
+        error = np.maximum(np.abs(motion.defects).max(axis=(1, 2)) / SETTINGS.defect, 1.0)
+        wanted = np.ceil(np.maximum(np.log2(dear) / 3, np.log2(error) / search.scheme.order))
+        times.append(np.clip(wanted, 0, SETTINGS.at_once).astype(np.int64))
     shares = [gain + price for gain, price in zip(gains, prices, strict=True)]
     if options.time_intervals is None and _sum(shares) > options.accuracy:
         left = SETTINGS.spare * options.accuracy
@@ -294,8 +288,8 @@ def _choose_halvings(
             left = max(left, 0.5 * _sum(shares))
         more = spread_halvings(shares, left)
         times = [np.maximum(*pair) for pair in zip(times, more, strict=True)]
-    wanted = sum(int((2**mine).sum()) for mine in times)
-    return times if wanted <= most else [np.minimum(mine, 1) for mine in times]
+    count = sum(int((2**mine).sum()) for mine in times)
+    return times if count <= most else [np.minimum(mine, 1) for mine in times]
 
 
 def find_gains(
@@ -395,17 +389,6 @@ def find_least(slope: Array, square: float, rows: Array, slack: Array) -> Array:
         value = np.einsum("nj,nuj->nu", slope, u) + square * (u**2).sum(axis=2)
     allowed = (over >= -1e-9).all(axis=2) & np.isfinite(value)  # rounding
     return np.asarray(np.where(allowed, value, 0.0).min(axis=1, initial=0.0))
-
-
-def count_halvings(prices: Array, defects: Array, scheme: Scheme) -> NDArray[np.int64]:
-    """How often to halve each interval, by its relative cost of misses and collocation error, (K,).
-
-    Errors of collocation decrease with the scheme's order, costs with the third one.
-    """
-    price = np.maximum(prices / SETTINGS.dear, 1.0)
-    error = np.maximum(np.abs(defects).max(axis=(1, 2)) / SETTINGS.defect, 1.0)
-    times = np.maximum(np.log2(price) / 3, np.log2(error) / scheme.order)
-    return np.asarray(np.clip(np.ceil(times), 0, SETTINGS.at_once), dtype=np.int64)
 
 
 def spread_halvings(shares: Sequence[Array], most: float) -> list[NDArray[np.int64]]:

@@ -72,19 +72,13 @@ class Stage:
     opens: bool = False  # whether they are released at the start of this stage
     # least acceleration of their gaps, over gravity; None if an impact gives these a rate
     opening: float | None = OPENING
-    clearance: float = (
-        CLEARANCE  # least gap after a third of the stage, over the radius of gyration
-    )
-    apart: tuple[
-        int, ...
-    ] = ()  # limits that are as clear at the end, as the next phase closes them
+    clearance: float = CLEARANCE  # their least gap after a third of it, over the gyration radius
+    apart: tuple[int, ...] = ()  # limits as clear at the end, as the next phase closes them
     # row of z, its value where the phase ends, and the side from which it comes there
     ahead: tuple[int, float, float] | None = None
     stop: Array | None = None  # (5,): the given end of the last stage
     periods: tuple[int, ...] = ()  # control period of each interval, if torques are held
-    onset: float = (
-        0.0  # rate of the friction homotopy, tanh(rate / onset), in the scene's unit; or 0
-    )
+    onset: float = 0.0  # of the friction homotopy, tanh(rate / onset), if not 0
 
     @property
     def intervals(self) -> int:

@@ -82,9 +82,7 @@ class StageLayout:
     forces: Indices  # (K, d, n_f)
     short: Indices  # (K, n) or (K, 0): shortfalls of limits in each interval
     impulses: Indices  # of the impact that leads to the next stage, if one does
-    begin: (
-        Indices  # begin, finish: forces at rest at both ends of the motion, of continuous torques
-    )
+    begin: Indices  # begin, finish: forces at rest at both ends, of continuous torques
     finish: Indices
 
     @property
