@@ -289,10 +289,15 @@ def describe_plan(plan: Plan, output: str = "", table: Mapping[str, Any] | None 
         text = f"; accuracy {plan.options.accuracy:g} not reached" if missed else ""
         value += f" (to {error}{text})"
     wrote = f"; wrote {output}" if output else ""
+    transitions = {
+        "phase": "after phase:d", "velocity_ratio": "velocity ratio:.6f",
+        "least_impulse": "least impulse [N s per m/s]:.6f", "least_impulse_contact": "of",
+        "speed": "speed [m/s]:.6f", "saves": f"saves [{plan.unit}]:.6f", "stop": "",
+    }  # fmt: skip
     parts = [
         _list_phases(plan),
         _list_modes(plan),
-        _list_transitions(plan),
+        Table.of(plan.transitions, transitions),
         *_list_settlings(plan),
         *_describe_held(plan),
         _describe_replay(plan),
@@ -331,16 +336,6 @@ def _list_modes(plan: Plan) -> Table:
             rows.append((phase.number, mode.start, mode.stop, text))
     heads = ["phase:d", "from [s]:.4f", "to [s]:.4f", "contact modes"]
     return Table(heads, rows, "modes, from the start of each phase")
-
-
-def _list_transitions(plan: Plan) -> Table:
-    """The impacts that a problem asks for."""
-    columns = {
-        "phase": "after phase:d", "velocity_ratio": "velocity ratio:.6f",
-        "least_impulse": "least impulse [N s per m/s]:.6f", "least_impulse_contact": "of",
-        "speed": "speed [m/s]:.6f", "saves": f"saves [{plan.unit}]:.6f", "stop": "",
-    }  # fmt: skip
-    return Table.of(plan.transitions, columns)
 
 
 def _list_settlings(plan: Plan) -> Iterator[str | Table]:

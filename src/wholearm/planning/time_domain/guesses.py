@@ -550,7 +550,16 @@ def guess_stages(
     The guessed duration is `falls` times that of a fall over the length of the initial paths. A
     single phase may follow the pieces of a given one, with its speed profile.
     """
-    parts = _list_parts(problem, phases, z, pieces)
+    parts = list[tuple[Phase, PathGuess, bool]]()  # in own units; whether the last of its phase
+    for k, phase in enumerate(phases):
+        outlines = list(pieces or guess_phase(phase, z, phases[k + 1 :]))
+        if parts and parts[-1][0].end is End.SMOOTH:
+            outlines = [*_turn_first(outlines[0], parts[-1][1]), *outlines[1:]]
+        z, scaled = outlines[-1].z[-1], in_own_units(problem).phases[phase.index]
+        for own in outlines:
+            own_z = scale_state(own.z, problem.scene.scales)
+            path = replace(own, formation=scaled.formation, z=own_z)
+            parts.append((scaled, path, own is outlines[-1]))
     lengths = np.array([outline.length for _, outline, _ in parts])
     ends = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()
     # The path parameter of the guess is (1 - cos) / 2 over all stages.
@@ -605,24 +614,6 @@ def guess_stages(
             )
         )
     return link(stages)
-
-
-def _list_parts(
-    problem: Problem, phases: Sequence[Phase], z: Array, pieces: Sequence[PathGuess] | None
-) -> list[tuple[Phase, PathGuess, bool]]:
-    """Phases with their initial paths, in own units, and whether each is the last of its phase."""
-    parts: list[tuple[Phase, PathGuess, bool]] = []
-    for k, phase in enumerate(phases):
-        outlines = list(pieces or guess_phase(phase, z, phases[k + 1 :]))
-        if parts and parts[-1][0].end is End.SMOOTH:
-            outlines = [*_turn_first(outlines[0], parts[-1][1]), *outlines[1:]]
-        z = outlines[-1].z[-1]
-        for own in outlines:
-            scaled = in_own_units(problem).phases[phase.index]
-            own_z = scale_state(own.z, problem.scene.scales)
-            path = replace(own, formation=scaled.formation, z=own_z)
-            parts.append((scaled, path, own is outlines[-1]))
-    return parts
 
 
 def _guess(

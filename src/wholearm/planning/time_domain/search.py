@@ -141,15 +141,8 @@ class TimeSearch:
         name, degree = self.scheme.name, self.scheme.degree
         linear = goal in (Objective.ELASTIC, Objective.RELAX)
         scheme = make_scheme(name, degree, 2 if linear else degree)
-        return replace(
-            self,
-            goal=goal,
-            relaxation=relaxation,
-            scheme=scheme,
-            duration=None,
-            to_go=None,
-            price=None,
-        )
+        other = replace(self, duration=None, to_go=None, price=None)
+        return replace(other, goal=goal, relaxation=relaxation, scheme=scheme)
 
     def wait(self, iterations: int) -> int:
         """Most solver iterations: more with rate-limited torques."""

@@ -445,101 +445,70 @@ def join_stages(
         rows.add_copies(kernel, x, {"Xi": coming.directions.Xi}, high=high)
 
 
-_Slack = tuple[Indices, float]
-"""Slack of a row: an unknown of each interval, shape (K,), and its weight."""
-
-
 def add_limits(
     rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme, target: Target
 ) -> LimitRows:
     """Add rows for the limits of a stage."""
-    limits = make_limits(stage.formation, target.epsilon)
-    gives = _list_gives(limits, layout, target)
-    presses = limits.of(PRESS)
+    limits, goal = make_limits(stage.formation, target.epsilon), target.objective
+    presses, weights = limits.of(PRESS), np.zeros(len(limits.low))
+    if goal is Objective.MARGIN:
+        weights[presses] = -1.0
+    elif goal is Objective.ELASTIC:
+        weights[limits.of(*{limit.kind for limit in limits.without(SPEED).limits})] = 1.0
+    elif target.relaxation is not None:
+        weights = limits.weigh(target.relaxation)
+
+    def give(added: Indices, row: int) -> None:
+        """Add the slack of a limit's row, if it has one."""
+        if weights[row]:
+            short = goal is Objective.ELASTIC
+            slack = layout.short[:, limits.owners[row]] if short else layout.nodes[:-1, MARGIN]
+            rows.add_entries(added, slack[:, None], weights[row])
+
+    # Normal forces by the polynomials through the points.
+    soft = bool(weights[presses].any())
+    places = np.zeros(1) if scheme.ends else np.array([0.0, 1.0])
+    if stage.formation.scene.has_slow_motors:
+        places = np.append(places, _WITHIN)
+    if soft:
+        places = np.append(places, scheme.points)
+    c_n = layout.forces[:, :, limits.rows[presses].argmax(axis=1)]
+    pressed = rows.linear(len(c_n), len(places), c_n.shape[2], high=np.inf)
+    for i, shares in enumerate(scheme.interpolate(places)):
+        for j in np.flatnonzero(np.abs(shares) > 1e-12):
+            rows.add_entries(pressed[:, i], c_n[:, j], shares[j])
+    for k, row in enumerate(presses):
+        give(pressed[..., k], row)
+
+    # Rows of y at the points, and bounds of one torque or joint speed alone.
     own, signs, bounds = limits.sides
-    # Column of y of each side that is of one torque or joint speed alone; else -1.
     column, n_forces = np.abs(limits.rows).argmax(axis=1), stage.formation.n_constraints
     alone = ((limits.rows != 0).sum(axis=1) == 1) & (column >= n_forces)
     single = np.where(alone, column - n_forces, -1)[own]
     others = np.flatnonzero(~np.isin(own, presses) & (single < 0))
-    soft, slow = [gives[row] for row in presses], stage.formation.scene.has_slow_motors
-    pressed = _add_presses(rows, limits, layout, scheme, soft, slow)
     added = rows.linear(*layout.z.shape[:2], len(others), high=np.inf)
     for k, side in enumerate(others):
-        row = own[side]
-        _add_point_row(rows, added[..., k], signs[side] * limits.rows[row], layout, scheme)
-        _add_gives(rows, added[..., k], gives[row])
+        of_y = np.split(signs[side] * limits.rows[own[side]], [n_forces, n_forces + 2])
+        for unknowns, of_them in ((layout.forces, of_y[0]), (layout.v[..., 3:], of_y[2])):
+            for n in np.flatnonzero(of_them):
+                rows.add_entries(added[..., k], unknowns[..., n], of_them[n])
+        for n in np.flatnonzero(of_y[1]):
+            for i, shares in enumerate(blend(scheme.points, scheme.controls).T):
+                torques = layout.tau[:, None, 2 * i + n]
+                rows.add_entries(added[..., k], torques, of_y[1][n] * shares)
+        give(added[..., k], own[side])
     bounded = dict[int, Indices]()
     for side in np.flatnonzero(single >= 0):
-        j = int(single[side])
+        k = int(single[side])
         # Control points of a torque, or speeds at the points.
-        unknowns = layout.tau[:, j::2] if j < 2 else layout.v[..., 1 + j]
-        if gives[own[side]] is None:
+        unknowns = layout.tau[:, k::2] if k < 2 else layout.v[..., 1 + k]
+        if not weights[own[side]]:
             bounded[int(side)] = unknowns
             continue
         added_row = rows.linear(*unknowns.shape, low=signs[side] * bounds[side], high=np.inf)
         rows.add_entries(added_row, unknowns, signs[side])
-        _add_gives(rows, added_row, gives[own[side]])
-    return LimitRows(limits, pressed, added, others, bounded, alone=not any(soft))
-
-
-def _list_gives(limits: LimitSet, layout: StageLayout, target: Target) -> list[_Slack | None]:
-    """Slack of each row, if it has one."""
-    gives: list[_Slack | None] = [None] * len(limits.low)
-    chain = layout.nodes[:-1, MARGIN:].ravel()
-    if target.objective is Objective.MARGIN:
-        for row in limits.of(PRESS):
-            gives[row] = chain, -1.0
-    elif target.objective is Objective.ELASTIC:
-        for row in limits.of(*{limit.kind for limit in limits.without(SPEED).limits}):
-            gives[row] = layout.short[:, limits.owners[row]], 1.0
-    elif target.relaxation is not None:
-        weights = limits.weigh(target.relaxation)
-        for row in np.flatnonzero(weights):
-            gives[row] = chain, float(weights[row])
-    return gives
-
-
-def _add_gives(rows: NlpRows, own: Indices, gives: _Slack | None) -> None:
-    if gives is not None:
-        rows.add_entries(own, gives[0][:, None], gives[1])
-
-
-def _add_presses(
-    rows: NlpRows,
-    limits: LimitSet,
-    layout: StageLayout,
-    scheme: Scheme,
-    gives: list[_Slack | None],
-    slow: bool,
-) -> Indices:
-    """Normal forces by the polynomials through the points, shape (K, m, n_c)."""
-    places = np.zeros(1) if scheme.ends else np.array([0.0, 1.0])
-    if slow:
-        places = np.append(places, _WITHIN)
-    if any(gives):
-        places = np.append(places, scheme.points)
-    c_n = layout.forces[:, :, limits.rows[limits.of(PRESS)].argmax(axis=1)]
-    presses = rows.linear(len(c_n), len(places), c_n.shape[2], high=np.inf)
-    for i, row in enumerate(scheme.interpolate(places)):
-        for j in np.flatnonzero(np.abs(row) > 1e-12):
-            rows.add_entries(presses[:, i], c_n[:, j], row[j])
-    for k, own in enumerate(gives):
-        _add_gives(rows, presses[..., k], own)
-    return presses
-
-
-def _add_point_row(
-    rows: NlpRows, own: Indices, row: Array, layout: StageLayout, scheme: Scheme
-) -> None:
-    """A row of y at every point, shape (K, d)."""
-    of_c, of_tau, of_rates = np.split(row, [layout.forces.shape[2], layout.forces.shape[2] + 2])
-    for unknowns, of_them in ((layout.forces, of_c), (layout.v[..., 3:], of_rates)):
-        for k in np.flatnonzero(of_them):
-            rows.add_entries(own, unknowns[..., k], of_them[k])
-    for k in np.flatnonzero(of_tau):
-        for i, shares in enumerate(blend(scheme.points, scheme.controls).T):
-            rows.add_entries(own, layout.tau[:, None, 2 * i + k], of_tau[k] * shares)
+        give(added_row, own[side])
+    return LimitRows(limits, pressed, added, others, bounded, alone=not soft)
 
 
 def add_motors(rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme) -> None:
@@ -653,26 +622,21 @@ def add_periods(rows: NlpRows, stages: Sequence[Stage], layouts: Sequence[StageL
         phase = [piece for _, piece in found]
         last = phase[-1].period
         for period, own in groupby(phase, key=lambda piece: piece.period):
-            _add_period(rows, list(own), scene.control_period, period == last, linear)
+            parts, least = list(own), 0.0 if period == last else scene.control_period
+            whole = rows.linear(1, low=least, high=scene.control_period)
+            rows.add_entries(whole, np.array([piece.h for piece in parts]), 1.0)
+            for one, other in pairwise(parts):
+                if one.stage == other.stage:
+                    even, size = rows.linear(1), one.share + other.share
+                    rows.add_entries(even, np.array([one.h]), other.share / size)
+                    rows.add_entries(even, np.array([other.h]), -one.share / size)
+                if linear:
+                    spans = {"h": np.array([one.h]), "coming": np.array([other.h])}
+                    slopes = {"before": one.tau, "after": other.tau} | spans
+                    rows.add_copies(slope_kernel(), slopes)
         for before, after in pairwise(phase):
             if not goes_on and (linear or before.period == after.period):
                 rows.add_equal(after.tau[:2], before.tau[-2:], 1 / scene.torque_limit)
-
-
-def _add_period(
-    rows: NlpRows, pieces: Sequence[_Piece], period: float, last: bool, linear: bool
-) -> None:
-    whole = rows.linear(1, low=0.0 if last else period, high=period)
-    rows.add_entries(whole, np.array([piece.h for piece in pieces]), 1.0)
-    for one, other in pairwise(pieces):
-        if one.stage == other.stage:
-            even = rows.linear(1)
-            size = one.share + other.share
-            rows.add_entries(even, np.array([one.h]), other.share / size)
-            rows.add_entries(even, np.array([other.h]), -one.share / size)
-        if linear:
-            spans = {"h": np.array([one.h]), "coming": np.array([other.h])}
-            rows.add_copies(slope_kernel(), {"before": one.tau, "after": other.tau} | spans)
 
 
 def find_bounds(
