@@ -249,7 +249,20 @@ def _find_multipliers(
     jacobian = nlp.solver.function.get_function("nlp_jac_g")(x, p)[1]
     bounds = ca.DM.eye(len(x))[table[vertices.held, 0].tolist(), :]
     active = ca.vertcat(jacobian[[*links.tolist(), *limits.ravel().tolist()], :], bounds)
-    slope = _find_slopes(grid, vertices.profile, units)[table[:, :3] >= 0]
+    # Gradient of the duration over b, s'' and internal force, element by element.
+    basis, count = find_basis(), len(grid.kinds)
+    b_own, a_own = vertices.profile.b / units.profile[0], vertices.profile.a / units.profile[1]
+    weights = basis.weights * np.diff(grid.edges) / units.length
+    y = np.where((grid.kinds == INSIDE)[:, None], 0.5, basis.y[grid.kinds])
+    slopes = np.zeros((count, 3, NODES))
+    slopes[:, 0] = -weights * y * np.maximum(b_own, LEAST_B).reshape(count, -1) ** -1.5
+    for e, node, kind in ((0, 0, FROM_REST), (-1, DEGREE, TO_REST)):
+        if grid.kinds[e] == kind:
+            end = a_own[node if e == 0 else -1]
+            per_weight = (2 * (grid.edges[e, 1] - grid.edges[e, 0]) / units.length) ** -0.5
+            slopes[e, 0, node] = 0.0
+            slopes[e, 1, node] = -np.sign(end) * weights[e, node] * per_weight * abs(end) ** -1.5
+    slope = slopes.transpose(0, 2, 1).reshape(-1, 3)[table[:, :3] >= 0]
     active = active[:, unknowns]
     squares = active @ active.T
     damping = 1e-10 * float(ca.trace(squares)) / squares.shape[0]  # rows may be dependent
@@ -259,20 +272,3 @@ def _find_multipliers(
     every_link[links], kept[vertices.held, 0] = on_links, on_b
     kept[free] = -signs[vertices.sides[free]] * on_limits.reshape(-1, 2)
     return every_link, kept
-
-
-def _find_slopes(grid: Grid, profile: Profile, units: Units) -> Array:
-    """Gradient of the NLP's duration at each node over b, s'' and internal force, (n, 3)."""
-    basis, count = find_basis(), len(grid.kinds)
-    b, a = profile.b / units.profile[0], profile.a / units.profile[1]
-    weights = basis.weights * np.diff(grid.edges) / units.length
-    y = np.where((grid.kinds == INSIDE)[:, None], 0.5, basis.y[grid.kinds])
-    slope = np.zeros((count, 3, NODES))
-    slope[:, 0] = -weights * y * np.maximum(b, LEAST_B).reshape(count, -1) ** -1.5
-    for e, node, kind in ((0, 0, FROM_REST), (-1, DEGREE, TO_REST)):
-        if grid.kinds[e] == kind:
-            end = a[node if e == 0 else -1]
-            per_weight = (2 * (grid.edges[e, 1] - grid.edges[e, 0]) / units.length) ** -0.5
-            slope[e, 0, node] = 0.0
-            slope[e, 1, node] = -np.sign(end) * weights[e, node] * per_weight * abs(end) ** -1.5
-    return slope.transpose(0, 2, 1).reshape(-1, 3)

@@ -62,23 +62,6 @@ def find_ends(curve: Curve, breaks: Array) -> Array:
     return sort_unique(np.array([0.0, *(segment.stop for segment in curve.segments), *breaks]))
 
 
-def place_breaks(
-    curves: Sequence[Curve], switches: Sequence[Switch], few: int | None
-) -> list[Array]:
-    """Breaks of each curve at switches, which are at places along all curves.
-
-    None on a curve where a fixed number of elements is too `few` for them.
-    """
-    starts = np.cumsum([0.0, *(curve.length for curve in curves)])
-    places = np.array([switch.place for switch in switches])
-    owner, found = np.searchsorted(starts[1:-1], places), list[Array]()
-    for k, curve in enumerate(curves):
-        local = [Switch(place, True) for place in (places[owner == k] - starts[k]).tolist()]
-        breaks = match(np.zeros(0), local, curve)[0]
-        found.append(breaks[:0] if few and len(find_ends(curve, breaks)) > few else breaks)
-    return found
-
-
 def halve(edges: Array, costs: Array, count: int) -> Array:
     """Inner ends of elements (E, 2) [m], of which the dearest are halved, `count` times.
 

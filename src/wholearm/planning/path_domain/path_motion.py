@@ -242,14 +242,3 @@ def find_torques(
     torques = chebyshev.chebvander(looks, degree) @ modes
     rates = chebyshev.chebvander(looks, degree - 1) @ slopes @ modes
     return np.asarray(torques), np.asarray(rates * (2 / lasts)[:, None, None])
-
-
-def find_hurry(data: PhaseData, profile: Profile, motions: Sequence[PathMotion]) -> Array:
-    """Relative violations of rates and commands of each joint in each interval, (n_solid, 2, 2)."""
-    if not data.grid.held:
-        return np.zeros((len(data.grid.nonempty), 2, 2))
-    torques, rates = find_torques(data, profile, motions)
-    rate = np.abs(rates).max(axis=1) / data.rate_limit
-    lags = data.curve.formation.scene.actuator_lag
-    command = np.abs(torques + lags * rates).max(axis=1) / data.torque_limit
-    return np.asarray(np.maximum(np.stack([rate, command * (lags > 0)], axis=1) - 1, 0.0))

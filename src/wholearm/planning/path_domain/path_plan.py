@@ -35,6 +35,7 @@ from .first_guess import center, guess, start_at
 from .path_data import PhaseData, cut, join, prepare
 from .path_mesh import (
     Fastest,
+    Switch,
     equidistribute,
     find_ends,
     find_fastest,
@@ -43,9 +44,8 @@ from .path_mesh import (
     keep_apart,
     make_grid,
     match,
-    place_breaks,
 )
-from .path_motion import PathMotion, find_hurry, fit_torque
+from .path_motion import PathMotion, find_torques, fit_torque
 from .path_nlp import (
     LimitShape,
     MotorShape,
@@ -401,8 +401,15 @@ class PathIterate:
             kept = goal is Objective.MARGIN or bool(data.slack(data.nodes, profile).min() >= 0)
             first = PathIterate.on(task, (none, none), parts, units, kept)
             return first.start(profile, 0.0)
-        few = task.options.intervals and elements
-        breaks = place_breaks(task.curves, fastest.switches, few)
+        # Breaks at the switches, but on a curve where a fixed number of elements is too few.
+        starts = np.cumsum([0.0, *(curve.length for curve in task.curves)])
+        places = np.array([switch.place for switch in fastest.switches])
+        owner, breaks = np.searchsorted(starts[1:-1], places), list[Array]()
+        for k, curve in enumerate(task.curves):
+            local = [Switch(place, True) for place in (places[owner == k] - starts[k]).tolist()]
+            own = match(np.zeros(0), local, curve)[0]
+            few = task.options.intervals and len(find_ends(curve, own)) > elements
+            breaks.append(own[:0] if few else own)
         parts = task.lay_out(breaks, elements)
         first = PathIterate.on(task, (breaks, none), parts, units, True)
         profile, multipliers = start_at(first.nlp, first.data, units, fastest)
@@ -551,8 +558,16 @@ class PathIterate:
         duration, late = self.task.duration, 0.0
         if duration:
             late = sum(motion.duration for motion in self.motions) / duration - 1
-        hurry = find_hurry(self.data, self.solution.profile, self.motions)
-        return self.data.misses(self.solution.profile, self.solution.margin), hurry, late
+        data, profile = self.data, self.solution.profile
+        hurry = np.zeros((len(data.grid.nonempty), 2, 2))
+        if data.grid.held:
+            # Relative violations of rates and commands of each joint in each interval.
+            torques, rates = find_torques(data, profile, self.motions)
+            rate = np.abs(rates).max(axis=1) / data.rate_limit
+            lags = data.curve.formation.scene.actuator_lag
+            command = np.abs(torques + lags * rates).max(axis=1) / data.torque_limit
+            hurry = np.maximum(np.stack([rate, command * (lags > 0)], axis=1) - 1, 0.0)
+        return data.misses(profile, self.solution.margin), hurry, late
 
     @property
     def violation(self) -> float:

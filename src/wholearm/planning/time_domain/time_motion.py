@@ -72,10 +72,6 @@ class StageMotion:
         return TorqueProfile(self.breaks, _fit(2 * at - 1, values))
 
     @property
-    def _forward(self) -> Batch:
-        return _FORWARDS(self.formation)
-
-    @property
     def defects(self) -> Array:
         """Collocation error of z and z' at the end of each interval, shape (K, 2, 5)."""
         return self._integrated[1]
@@ -107,7 +103,7 @@ class StageMotion:
                 np.einsum("kjd,nd->knj", part, powers[:, : part.shape[2]]).reshape(-1, 5)
                 for part in (place, velocity)
             )
-            forces = self._forward(*state, tau.reshape(-1, 2), *signs)
+            forces = _FORWARDS(self.formation)(*state, tau.reshape(-1, 2), *signs)
             found = _fit(x, forces[0][..., 0].reshape(count, _NODES, 5))
             residual = np.abs(weights * (found - a)).max(axis=(1, 2), keepdims=True)
             nearer = residual < least
@@ -145,7 +141,7 @@ class StageMotion:
         v = v - _lift(kinematics.P, metric, np.einsum("nij,nj->ni", kinematics.P, v))
         tau = self.torque.at(t)
         Xi, sigma = (np.broadcast_to(part, (len(t), len(part))) for part in self.directions)
-        a, c, _ = self._forward(z, v, tau, Xi, sigma)
+        a, c, _ = _FORWARDS(self.formation)(z, v, tau, Xi, sigma)
         c_n, c_t = split_forces(formation, c[..., 0], Xi)
         return Samples(z, v, a[..., 0], tau, c_n, c_t)
 
@@ -154,7 +150,7 @@ class StageMotion:
         at = self.evaluate(t)
         signs = [np.broadcast_to(part, (len(t), len(part))) for part in self.directions]
         found = [
-            self._forward(at.z, at.z_dot, at.tau + step, *signs)[:2]
+            _FORWARDS(self.formation)(at.z, at.z_dot, at.tau + step, *signs)[:2]
             for step in (np.zeros(2), *np.eye(2))
         ]
         a, c = (np.stack([own[k][..., 0] for own in found], axis=-1) for k in range(2))
