@@ -38,11 +38,19 @@ from wholearm.planning.lower_bound import (
 )
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain import path_plan
+from wholearm.planning.path_domain.first_guess import guess
 from wholearm.planning.path_domain.impact_sequence import make_sequence, plan_sequence
 from wholearm.planning.path_domain.path_data import prepare
 from wholearm.planning.path_domain.path_mesh import make_grid
 from wholearm.planning.path_domain.path_motion import PathMotion
-from wholearm.planning.path_domain.path_nlp import LimitShape, PathNLP, build_path_nlp
+from wholearm.planning.path_domain.path_nlp import (
+    LimitShape,
+    PathNLP,
+    Relaxation,
+    build_path_nlp,
+    pack,
+    parameters,
+)
 from wholearm.planning.path_domain.path_plan import plan_curves, plan_path
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
@@ -336,6 +344,19 @@ def test_a_stuck_solver_does_not_blame_the_limits(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(path_plan, "build_path_nlp", build)
     with pytest.raises(SolverError, match=r"Ipopt stopped with Max.* although limits can be kept"):
         Toy(constant(1.0, 0.0, 3.0)).plan(intervals=20)
+
+
+@pytest.mark.parametrize("goal", Objective)
+def test_the_slope_of_b_is_twice_a_whatever_is_minimised(goal: Objective) -> None:
+    curve = trace_phases(problem_of(HEPTAGON))[0]
+    data = prepare(curve, EPSILON, make_grid(curve, np.zeros(0), 6), 1)
+    nlp = build_path_nlp(LimitShape.of(data.limits), len(data.grid.steps), goal)
+    profile, units = guess(data)
+    relaxed = Relaxation(data.limits.parameters[0], 1.0) if goal is Objective.RELAX else None
+    given = parameters(nlp, data, units, 1.0, relaxed)
+    g = nlp.solver.function.get_function("nlp_g")(pack(nlp, profile, units, 0.1), given)
+    # The parabola of the guess is one of the polynomials of b.
+    assert np.abs(g.full()[nlp.columns.g["links"]]).max() < 1e-12
 
 
 BOX_LIMIT = float(box().scene.torque_limit.max())
