@@ -58,18 +58,11 @@ class StartMode(NamedTuple):
     force_limits: Array
     # (k, 3): accelerations of sliding and turning along the signs, or along the only freedom
     slips: Array
-    grips: Array  # (2 k, 3) [N, N m]: what has to be positive for friction to hold what has no sign
-    openings: Array  # (k, 3) [m/s^2]: of closed gaps of other contacts, plus what counts as grazing
-    slack: Array  # rounding of force limits, slips, grips and openings
+    # not negative, but for rounding, where the mode is consistent: force limits, slips, limits of
+    # friction that holds what has no sign, and accelerations that open closed gaps
+    margins: Array
     heading: Array | None  # (5,): with one freedom, the direction
     statics: Statics
-
-    @property
-    def margins(self) -> Array:
-        """Rows that are not negative where the mode is consistent, those of force limits first."""
-        rows = np.vstack([self.force_limits, self.slips, self.grips, self.openings])
-        rows[:, 0] += self.slack
-        return rows
 
     def drive(self, tau: Array) -> float:
         """Acceleration in the metric M5."""
@@ -185,6 +178,7 @@ class Rest:
         kept = np.array([True] * count + declared + declared)
         scales, length = scene.scales, scene.scales.length
         slips = signs[:, None] * response.rates
+        # What opens, or closes by no more than counts as grazing.
         graze = GRAZE * np.repeat([1.0, length], [count, 2]) @ slips
         openings = self.statics.opening[0] @ response.acceleration + graze
         still = STILL * np.repeat([scales.acceleration, scales.rate / scales.time], [count, 2])
@@ -194,17 +188,10 @@ class Rest:
             # All accelerations are multiples of this one.
             slips = (heading * scene.mass_diagonal @ response.acceleration)[None]
             still, closing = np.array([-_measure_drive(scene)]), np.zeros(len(openings))
-        rounding, force_limits = ROUNDING_FORCE * mode.force_limit_units, response.force_limits
-        return StartMode(
-            response=response,
-            force_limits=force_limits[kept],
-            slips=slips,
-            grips=force_limits[~kept],
-            openings=openings,
-            slack=np.concatenate([rounding[kept], still, rounding[~kept], closing]),
-            heading=heading,
-            statics=self.statics,
-        )
+        rounding, limits = ROUNDING_FORCE * mode.force_limit_units, response.force_limits
+        margins = np.vstack([limits[kept], slips, limits[~kept], openings])
+        margins[:, 0] += np.concatenate([rounding[kept], still, rounding[~kept], closing])
+        return StartMode(response, limits[kept], slips, margins, heading, self.statics)
 
     def wait(self, coefficients: Array, x: float) -> StartDeparture | Collapse | None:
         """End of the rest on a piece of torques, (2, d + 1) [N m] in powers of x, or None."""
