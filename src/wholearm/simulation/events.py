@@ -166,8 +166,34 @@ class Simulation(Drawn):
 
     @property
     def trajectory(self) -> Trajectory:
-        """The simulated motion as a trajectory, as of a plan."""
-        return make_trajectory(self)
+        """The simulated motion as a trajectory, as of a plan, without phases of one instant.
+
+        Raises
+        ------
+        SimulationError  if there is no motion
+        """
+        rows, problem = _choose_rows(self), self.problem
+        if not len(rows):
+            raise SimulationError(f"there is no motion to keep: {self.outcome.text}")
+        names = ("t", "tau", "c_n", "c_t", "phase")
+        arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in names}
+        for suffix in ("", "_dot", "_ddot"):
+            z = getattr(self, f"z{suffix}")[rows]
+            arrays |= {f"q{suffix}": z[:, :3], f"theta{suffix}": z[:, 3:]}
+        motions = sample_phases(arrays, self.contacts)
+        rolling = [phase.formation.rolling for phase in problem.phases[: len(motions)]]
+        meta = {
+            "status": REPLAYED,
+            "outcome": self.outcome.text,
+            "name": problem.name,
+            "epsilon": problem.epsilon,
+            "rolling": [[contact.name for contact in own] for own in rolling],
+            "phase_durations": [motion.duration for motion in motions],
+            "problem": problem.table,
+        }
+        return Trajectory(
+            **arrays, contacts=self.contacts, torque=self.torque, motions=motions, meta=meta
+        )
 
     def find(self, kind: EventKind) -> tuple[Event, ...]:
         """Events of one kind, in the order of time."""
@@ -267,32 +293,6 @@ def list_stretches(rows: Sequence[Record], names: Sequence[str]) -> tuple[FreeSt
             least = float(c_n[at]), block[at].t
             stretches.append(FreeStretch(names[pair], block[0].t, block[-1].t, *least))
     return tuple(sorted(stretches, key=lambda stretch: (stretch.start, stretch.contact)))
-
-
-def make_trajectory(simulation: Simulation) -> Trajectory:
-    """Trajectory without phases of one instant; `SimulationError` if there is no motion."""
-    rows, problem = _choose_rows(simulation), simulation.problem
-    if not len(rows):
-        raise SimulationError(f"there is no motion to keep: {simulation.outcome.text}")
-    names = ("t", "tau", "c_n", "c_t", "phase")
-    arrays: dict[str, Any] = {name: getattr(simulation, name)[rows] for name in names}
-    for suffix in ("", "_dot", "_ddot"):
-        z = getattr(simulation, f"z{suffix}")[rows]
-        arrays |= {f"q{suffix}": z[:, :3], f"theta{suffix}": z[:, 3:]}
-    motions = sample_phases(arrays, simulation.contacts)
-    rolling = [phase.formation.rolling for phase in problem.phases[: len(motions)]]
-    meta = {
-        "status": REPLAYED,
-        "outcome": simulation.outcome.text,
-        "name": problem.name,
-        "epsilon": problem.epsilon,
-        "rolling": [[contact.name for contact in own] for own in rolling],
-        "phase_durations": [motion.duration for motion in motions],
-        "problem": problem.table,
-    }
-    return Trajectory(
-        **arrays, contacts=simulation.contacts, torque=simulation.torque, motions=motions, meta=meta
-    )
 
 
 def _choose_rows(simulation: Simulation) -> NDArray[np.int64]:

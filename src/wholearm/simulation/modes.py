@@ -212,9 +212,9 @@ def respond(mode: Mode, signs: Array, rows: ContactRows, v: Array) -> Response |
     return Response(mode, signs, c, acceleration, rates, ratio)
 
 
-def find_fixed(mode: Mode, A: Array, A_t: Array) -> NDArray[np.bool_]:
-    """Which contacts, then joints, a mode keeps fixed, (n_c + 2,), from A and A_t, (n_c, 5)."""
-    joints = np.eye(5)[3:]
+def find_fixed(mode: Mode, rows: ContactRows) -> NDArray[np.bool_]:
+    """Which contacts, then joints, a mode keeps fixed, (n_c + 2,)."""
+    A, A_t, joints = rows.A, rows.A_t, np.eye(5)[3:]
     root = np.sqrt(mode.formation.scene.mass_diagonal)
     held = [A, A_t[mode.held[0]], joints[mode.held[1]]]
     free = np.vstack([A_t, joints]) / root

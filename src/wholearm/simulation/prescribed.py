@@ -741,7 +741,7 @@ class Replay(Run):
         mode = find_mode(formation, signs)
         if formation.n_constraints < 4:
             rows = evaluate_rows(formation, self.z, self.v)
-            fixed = find_fixed(mode, rows.A, rows.A_t)
+            fixed = find_fixed(mode, rows)
             self.stuck = {
                 row for u in list_units(formation) for row in u.rows if u.grips and fixed[row]
             }
@@ -823,7 +823,7 @@ class Replay(Run):
         options = [self._list_options(unit, turned) for unit in still]
         chosen, mode, _, _ = self._choose(signs, still, options)
         rows = evaluate_rows(formation, self.z, self.v)
-        fixed = find_fixed(mode, rows.A, rows.A_t)
+        fixed = find_fixed(mode, rows)
         # Rounding of speeds against the directions chosen is taken away.
         gradients = np.vstack([rows.A_t, np.eye(5)[3:]])
         first = np.array([unit.rows[0] for unit in still])
