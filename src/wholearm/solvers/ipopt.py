@@ -90,7 +90,8 @@ def record_runs() -> Iterator[list[IpoptRun]]:
     try:
         yield runs
     finally:
-        _RECORDS.remove(runs)
+        # `list.remove` would take any record with the same runs.
+        _RECORDS[:] = [own for own in _RECORDS if own is not runs]
 
 
 class Solver:
