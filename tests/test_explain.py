@@ -6,6 +6,7 @@ import pickle
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import pytest
 
 from refused import advising, ask_shoved
 from scenes import PENTAGON, box, shove
-from shipped import HEPTAGON, problem_of, tipping
+from shipped import FOLDER, HEPTAGON, problem_of, tipping
 from wholearm import PlanOptions, Problem, load_trajectory, plots
 from wholearm.benchmark.stress import refusals
 from wholearm.benchmark.stress.refusals import judge
@@ -57,6 +58,13 @@ def why_not(plan: Callable[[], object]) -> str:
 
 def search(problem: Problem) -> TimeSearch:
     return TimeSearch.of(problem, COARSE)
+
+
+def test_an_object_on_the_palm_alone_stays_at_rest() -> None:
+    table = dict(read_problem(str(FOLDER / "square.toml")).table)
+    phase = {"contacts": ["v0-palm", "v1-palm"], "until": {"x": table["start"]["x"] - 0.01}}
+    text = why_not(partial(plan_all, build_problem({**table, "phases": [phase]})))
+    assert text.startswith("phase 1 is infeasible: no finger drives the object on v0-palm v1-palm")
 
 
 TURNED = np.array([0.10451807, 0.05929573, -1.03431931, 0.53647701, 0.53647701])

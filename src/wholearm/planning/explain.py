@@ -483,10 +483,16 @@ def refuse(
     if blocked is None:
         z = np.concatenate([stage.guess.z.reshape(-1, 5) for stage in stages])
         first = stages[0].formation
+        names = " ".join(first.names)
+        if alone and [contact.finger for contact in first.contacts] == [None, None]:
+            raise InfeasibleError(
+                f"phase {phase.number} is infeasible: no finger drives the object on {names}, and "
+                "it stays at rest; add a contact with a finger"
+            )
         if alone and first.n_constraints <= 2 and pushes_one_way(first, z):
             where = describe_pose(to_si(last, problem).guess.nodes[-1, 0])
             raise InfeasibleError(
-                f"phase {phase.number} is infeasible: {' '.join(first.names)} can only push the "
+                f"phase {phase.number} is infeasible: {names} can only push the "
                 "object one way, with whatever friction, so that it does not come to rest at its "
                 f"end, {where}"
             )
