@@ -25,6 +25,7 @@ from wholearm.common.arrays import Array
 from wholearm.common.errors import Change, InfeasibleError, InputError, SolverError
 from wholearm.common.signals import OutOfTime
 from wholearm.contacts.closing import close_fingers, contact_table
+from wholearm.contacts.closing import place as place_at
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.path_guess import guess_phase
 from wholearm.geometry.tracing import trace_phase
@@ -59,7 +60,7 @@ from wholearm.search.find_route import (
 )
 from wholearm.search.places import make_place
 from wholearm.search.result import bound_borders, describe_block, format_phases
-from wholearm.search.roadmap import Roadmap
+from wholearm.search.roadmap import Roadmap, can_start
 from wholearm.search.route_choice import FINEST, Found, RefinedPath, ReleaseSearch
 
 TABLE = {k: v for k, v in tomllib.loads(HEPTAGON.read_text()).items() if k != "phases"}
@@ -626,3 +627,21 @@ def test_a_contact_that_a_leg_begins_with_has_been_gained(tmp_path: Path) -> Non
         assert min(np.abs((own.stop - turn) / unit).max() for own in route) < 1e-5
     assert sum(len(own.until.poses) == 2 for own in route) == len(turns)
     load_pasted(dict(square.table), route, tmp_path)
+
+
+def test_a_place_out_of_reach_changes_nothing_at_others() -> None:
+    scene, rng = problem_of(HEPTAGON).scene, np.random.default_rng(1)
+    poses = np.column_stack([rng.uniform(-0.1, 0.1, 300), rng.uniform(-4, 4, 300)])
+    labels, runs = label_cells(scene, *poses.T)[:, [0, 2, 4]], rng.normal(size=poses.shape)
+    inside = (labels >= 0).all(axis=1)
+    labels, poses, runs = labels[inside], poses[inside], runs[inside] * [0.03, 1.0]
+    far = poses + np.array([1.0, 0.0])
+    # A tip does not reach an edge that is 1 m away.
+    lost = np.flatnonzero(np.isnan(place_at(scene, labels, far)).any(axis=1))[:1]
+    assert len(lost)
+    alone = can_start(scene, 0.05, labels, poses, runs)
+    assert 0.2 < alone.mean() < 0.8
+    pairs = (labels, labels), (poses, far), (runs, runs)
+    some, places, ways = (np.concatenate([part, own[lost]]) for part, own in pairs)
+    both = can_start(scene, 0.05, some, places, ways)
+    np.testing.assert_array_equal(both, [*alone, False])

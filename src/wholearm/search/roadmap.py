@@ -118,11 +118,11 @@ def _evaluate(
         unheld = np.equal(np.linalg.det(wrenches), 0.0).reshape(-1, 1, 1)
         kinematics = kinematics._replace(A=np.where(unheld, np.nan, kinematics.A))
         forces = inverse(formation, at.z, at.z_u, at.z_uu, directions, kinematics)
-    rows, cap = PathLimits.of(limits, forces, at.z_u[:, 3:], GIVE).eliminate()
-    # No motion where three contacts cannot balance the object.
+    rows, cap = PathLimits.of(limits, forces, at.z_u[:, 3:], GIVE)
+    # No motion where three contacts cannot balance the object, or a finger cannot reach it.
     held = np.asarray(np.isfinite(rows).all(axis=(1, 2)))
     rows = np.where(held[:, None, None], rows, -np.eye(rows.shape[-1])[ONE])
-    return PathLimits(rows, np.where(held, cap, 0.0))
+    return PathLimits(rows, np.where(held, cap, 0.0)).eliminate()
 
 
 @lru_cache(maxsize=8)
