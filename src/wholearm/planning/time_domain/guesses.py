@@ -403,7 +403,7 @@ def split_path(outline: PathGuess) -> list[PathGuess]:
                 cuts.append(k)
     if len(signs) - cuts[-1] < LEAST_STEPS and len(cuts) > 1:
         signs[cuts.pop() :] = signs[cuts[-1]]
-    way, part = list[PathGuess](), z[:1]
+    stretches, part = list[PathGuess](), z[:1]
     for begin, stop in pairwise([*cuts, len(signs)]):
         own, part = signs[begin].copy(), np.concatenate([part, z[begin + 1 : stop]])
         turning = list[tuple[int, ...]]()
@@ -423,11 +423,11 @@ def split_path(outline: PathGuess) -> list[PathGuess]:
             end = z[k] + (place - k) * (z[k + 1] - z[k]) if len(turning) > 1 else z[stop]
             if len(part) == 1:
                 part = np.stack([part[0], (part[0] + end) / 2])
-            way.append(_make_stretch(formation, np.vstack([part, end]), own, rows))
+            stretches.append(_make_stretch(formation, np.vstack([part, end]), own, rows))
             own[list(rows)] *= -1
             part = end[None]
-    way.append(_make_stretch(formation, np.vstack([part, z[-1:]]), own, ()))
-    return way
+    stretches.append(_make_stretch(formation, np.vstack([part, z[-1:]]), own, ()))
+    return stretches
 
 
 def _make_stretch(formation: Formation, z: Array, signs: Array, rows: Sequence[int]) -> PathGuess:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ...common.arrays import Array, find_minima
 from ...mechanics.dynamics import Directions
-from ...mechanics.limits import CONE, PRESS, LimitSet, make_limits
+from ...mechanics.limits import CONE, PRESS, make_limits
 from ...results.trajectory import Samples
 from ...sensitivity.slopes import find_slopes_at
 from ..options import DEFAULT_ACCURACY, Objective
@@ -223,7 +223,7 @@ def find_deviations(search: TimeSearch, stage: Stage, check: CheckPlaces) -> Arr
 def _find_gains(
     search: TimeSearch, solution: TimeSolution, motions: Sequence[StageMotion], coarse: float
 ) -> list[Array]:
-    """Relative gain of better torques in each interval, shape (K,) each.
+    """Relative gain of torques of any shape in each interval, shape (K,) each.
 
     Zero for held torques. For rate-limited ones it is the gain of the last iterate, from the cost
     `coarse`, distributed by the second differences of the control points.
@@ -240,12 +240,34 @@ def _find_gains(
         gain = 0.01 if math.isnan(coarse) else abs(coarse - solution.cost) / size
         return [share * (gain / max(_sum(shares), 1e-300)) for share in shares]
     square, gains = float(search.goal is Objective.EFFORT), list[Array]()
-    for k, (stage, motion) in enumerate(zip(stages, motions, strict=True)):
-        rows = solution.nlp.rows_of[k]
+    x, weights = np.polynomial.legendre.leggauss(7)
+    x = (x + 1) / 2
+    for rows, stage, motion in zip(solution.nlp.rows_of, stages, motions, strict=True):
+        # Costates of z and z' at the start of each interval.
         lam = solution.multipliers["lam_g0"][rows.states].sum(axis=2)
         costate = np.einsum("kdf,ksf->ksd", rows.bases, lam)
+        # The Hamiltonian at the Gauss points of the intervals is minimised over the torques.
+        lengths = np.diff(motion.breaks)
+        t = motion.breaks[:-1, None] + lengths[:, None] * x
+        response, n = motion.respond(np.append(t, motion.breaks[:-1])), t.size
+        here = MotionResponse(*(part[:n] for part in response))
+        switching = np.einsum("kd,kdj->kj", costate[:, 1], response.a_by_torque[n:])
+        switching = _interpolate(motion.breaks, switching, int(stage.opens), x)
+        slope = 2 * square * here.y[:, -4:-2] - switching
         limits = make_limits(stage.formation, epsilon)
-        gains.append(find_gains(stage, motion, costate, limits, solution.margin, square) / size)
+        values = here.y @ limits.rows.T
+        values[:, limits.of(PRESS)] -= solution.margin
+        own, signs, _ = limits.sides
+        scales = limits.scales[own]
+        slack = np.maximum(limits.find_slack(values) / scales, 0.0)
+        by_torque = np.einsum("mi,nij->nmj", limits.rows, here.y_by_torque)
+        sides = by_torque[:, own] * (signs / scales)[:, None]
+        held = _find_held(stage, here, stage.guess.places(x))
+        sides = np.concatenate([sides, held, -held], axis=1)
+        slack = np.hstack([slack, np.zeros((n, 2 * held.shape[1]))])
+        least = find_least(slope, square, sides, slack).reshape(t.shape)
+        defects = np.abs(np.einsum("ksd,ksd->k", costate, motion.defects))
+        gains.append((defects - least @ weights / 2 * lengths) / size)
     return gains
 
 
@@ -290,43 +312,6 @@ def _choose_halvings(
         times = [np.maximum(*pair) for pair in zip(times, more, strict=True)]
     count = sum(int((2**mine).sum()) for mine in times)
     return times if count <= most else [np.minimum(mine, 1) for mine in times]
-
-
-def find_gains(
-    stage: Stage,
-    motion: StageMotion,
-    costate: Array,
-    limits: LimitSet,
-    margin: float,
-    square: float,
-) -> Array:
-    """Gain of free torques in each interval by minimising the Hamiltonian, in units of cost, (K,).
-
-    Parameters
-    ----------
-    costate : (K, 2, 5)  of z and z' at the start of each interval
-    margin               of c_n, but not of friction cones
-    square               weight of tau^T tau in the cost
-    """
-    x, weights = np.polynomial.legendre.leggauss(7)
-    x, lengths = (x + 1) / 2, np.diff(motion.breaks)
-    t = motion.breaks[:-1, None] + lengths[:, None] * x
-    response, n = motion.respond(np.append(t, motion.breaks[:-1])), t.size
-    here = MotionResponse(*(part[:n] for part in response))
-    switching = np.einsum("kd,kdj->kj", costate[:, 1], response.a_by_torque[n:])
-    switching = _interpolate(motion.breaks, switching, int(stage.opens), x)
-    slope = 2 * square * here.y[:, -4:-2] - switching
-    values = here.y @ limits.rows.T
-    values[:, limits.of(PRESS)] -= margin
-    own, signs, _ = limits.sides
-    size = limits.scales[own]
-    slack = np.maximum(limits.find_slack(values) / size, 0.0)
-    rows = np.einsum("mi,nij->nmj", limits.rows, here.y_by_torque)[:, own] * (signs / size)[:, None]
-    held = _find_held(stage, here, stage.guess.places(x))
-    rows = np.concatenate([rows, held, -held], axis=1)
-    slack = np.hstack([slack, np.zeros((n, 2 * held.shape[1]))])
-    gains = -find_least(slope, square, rows, slack).reshape(t.shape) @ weights / 2 * lengths
-    return np.asarray(gains + np.abs(np.einsum("ksd,ksd->k", costate, motion.defects)))
 
 
 def _find_held(stage: Stage, here: MotionResponse, places: Array) -> Array:
