@@ -194,10 +194,10 @@ def test_a_good_plan_obeys_newton_and_euler(heptagon: Problem, trajectory: Traje
 @pytest.mark.parametrize(
     ("field", "change", "words"),
     [
-        ("tau", np.array([0.01, 0.0]), "equation of theta_1 misses"),
-        ("c_n", np.array([0.01, 0.0, 0.0, 0.0]), "equation of y misses"),
-        ("c_t", np.array([0.0, 0.0, 1e-3, 0.0]), "off Coulomb's"),
-        ("c_t", np.array([0.0, 0.0, 10.0, 0.0]), "outside its friction cone"),
+        ("tau", np.array([0.01, 0.0]), "equation of motion of finger 1 misses"),
+        ("c_n", np.array([0.01, 0.0, 0.0, 0.0]), "equation of motion of the object along y misses"),
+        ("c_t", np.array([0.0, 0.0, 1e-3, 0.0]), "v6-finger2 is not Coulomb's for its sliding"),
+        ("c_t", np.array([0.0, 0.0, 10.0, 0.0]), "v6-finger2 is not Coulomb's for its sliding"),
         ("z", np.array([0.0, -1e-5, 0.0, 0.0, 0.0]), "object and palm overlap"),
         ("z", np.array([0.0, 1e-5, 0.0, 0.0, 0.0]), "gap of v1-palm"),
         ("z_dot", np.array([0.01, 0.0, 0.0, 0.0, 0.0]), "z and its rate differ"),
