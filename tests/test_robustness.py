@@ -218,6 +218,9 @@ def follow(
     scene: Any = SimpleNamespace(scene=SimpleNamespace(scales=scales))
     trial = Trial(scene, None, np.zeros(5), windows, np.zeros(3), FEW)  # type: ignore[arg-type]
     t = np.linspace(0, 1, 11)
+    # "c" is made at 0.45 and bounces, if it presses from 0.46 on.
+    events = [SimpleNamespace(contact="c", kind=EventKind.GAINED, time=0.45)]
+    events *= ("c", 0.46, 1) in stretches
     simulation: Any = SimpleNamespace(
         t=t,
         z=np.zeros((11, 5)),
@@ -226,9 +229,7 @@ def follow(
         stretches=[
             SimpleNamespace(contact=name, start=start, stop=stop) for name, start, stop in stretches
         ],
-        # "c" is made at 0.45 and bounces, if it presses from 0.46 on.
-        events=[SimpleNamespace(contact="c", kind=EventKind.GAINED, time=0.45)]
-        * (("c", 0.46, 1) in stretches),
+        find=lambda kind: [event for event in events if event.kind is kind],
         outcome=SimpleNamespace(kind=None, text=""),
     )
     return trial.judge(simulation)

@@ -52,11 +52,6 @@ class RoadmapRoute:
         return sum(link.duration for link in self.links)
 
     @property
-    def bound(self) -> float:
-        """Lower bound of the duration [s], with a stop where links meet."""
-        return sum(link.bound for link in self.links)
-
-    @property
     def in_cells(self) -> bool:
         """Whether it leads through cells, for which there is no lower bound."""
         return any(link.in_cell for link in self.links)
