@@ -22,7 +22,7 @@ from wholearm.common.errors import InfeasibleError, Parameter
 from wholearm.contacts.closing import contact_table
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve, Segment, directions_of
-from wholearm.geometry.tracing import trace_phases
+from wholearm.geometry.tracing import trace_phase, trace_phases
 from wholearm.mechanics import limits as limits_module
 from wholearm.mechanics.dynamics import LAMBDA, ONE, A, B, V, build_forward, inverse, stack_motion
 from wholearm.mechanics.limits import CONE, PRESS, LimitSet, MotionLimit, make_limits
@@ -55,7 +55,8 @@ from wholearm.planning.time_domain.stage import Stage
 from wholearm.planning.time_domain.time_motion import TimeMotion
 from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.policy.reference import make_rows
-from wholearm.problem.definition import Problem
+from wholearm.problem.definition import End, Phase, Problem, Until
+from wholearm.problem.read import build_problem
 from wholearm.scene.model import Friction
 from wholearm.search.border_limits import estimate_duration
 from wholearm.search.edges import BorderEdge, Terms, time_parts
@@ -486,6 +487,36 @@ def test_a_motion_has_to_be_as_fast_as_the_end_asks_for(cap: float) -> None:
             speed_sweep(*sweep)
     else:
         assert speed_sweep(*sweep).b == pytest.approx([0.0, 4.0, 0.0], abs=1e-12)
+
+
+def test_a_costate_that_falls_where_nothing_bounds_the_speed_ends_the_refinement() -> None:
+    """There is no bound then, on any grid: intervals there were split until they had no length."""
+    link = {"length": 0.1522, "radius": 0.005435, "inertia": 0.00886, "viscous": 0.017}
+    link |= {"dry": 0.0163, "torque_limit": 3.261}
+    corners = [[0.0, 0.0], [0.06, 0.0], [0.085, 0.05], [0.03, 0.095], [-0.015, 0.05]]
+    table: dict[str, Any] = {
+        "epsilon": 0.075,
+        "object": {"vertices": corners, "mass": 0.3},
+        "friction": dict.fromkeys(("palm", "finger1", "finger2"), 0.05),
+        "fingers": {"1": {"base": [0.08695, -0.01087]}, "2": {"base": [-0.08695, -0.01087]}},
+        "start": {"flush": 0, "x": 0.0163},
+        "goal": {"flush": 1},
+    }
+    table["fingers"] = {key: own | link for key, own in table["fingers"].items()}
+    problem = build_problem(table)
+    held, scene = "v1-palm v2-finger1 v3-finger1", problem.scene
+    formations = [
+        make_formation(scene, f"{held} {c}") for c in ("v4-finger2", "v4-tip2", "e4-tip2")
+    ]
+    gained = make_formation(scene, "v4-tip2 e4-tip2 v2-palm").contacts
+    pose = [-0.02434246073883495, 0.044327913995052655, -0.15034739666181246]
+    z = np.array([*pose, 2.305515746021695, 1.4168260217798154])
+    path = list[Curve]()
+    for formation, contact in zip(formations, gained, strict=True):
+        path.append(trace_phase(Phase(0, formation, Until(contact=contact), End.SMOOTH), z))
+        z = path[-1].end
+    bound = bound_least_time(path, problem.epsilon)
+    assert bound is not None and 0.0 <= bound.value < 1.0
 
 
 def test_a_margin_takes_the_duration_that_is_allowed(curves: tuple[Curve, ...]) -> None:

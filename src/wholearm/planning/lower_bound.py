@@ -160,6 +160,8 @@ def bound_least_time(curves: Sequence[Curve], epsilon: float) -> LowerBound | No
         # If not all can be split, those that lose most are.
         order = np.argsort(-share)
         parts[order[np.cumsum(parts[order] - 1) > 1500 - len(parts)]] = 1  # most intervals
+        # Where p falls although b has no bound nothing is bounded, on any grid.
+        parts[np.isinf(share) & (np.diff(grid.angles) < 1e-6)] = 1
         if share.sum() < 1 or (parts == 1).all():
             break
         finer = grid.split(parts)
