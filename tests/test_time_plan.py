@@ -220,8 +220,8 @@ def test_a_contact_passes_from_a_link_over_its_tip_to_an_edge() -> None:
         z = trace_phase(phase, z, whole.phases).end
     phases = tuple(replace(own, index=own.index - 3) for own in whole.phases[3:])
     passing = replace(whole, start=z, phases=phases)
-    along = solve(passing, replay=False, accuracy=1e-3)
-    within = solve(passing, transcription="time", accuracy=1e-3)
+    options: dict[str, Any] = {"replay": False, "accuracy": 1e-3}
+    along, within = solve(passing, **options), solve(passing, transcription="time", **options)
     # Either is good to the accuracy that is asked for.
     assert within.duration == pytest.approx(along.duration, rel=1e-3)
     speeds = [plan.meta["transitions"][-1]["speed"] for plan in (within, along)]
