@@ -109,7 +109,8 @@ class Guesses:
             np.array(t) / scales.time, scale_state(np.array(z), scales), bc_type="clamped"
         )
         stages, begin = list[Stage](), 0.0
-        finer = 1 if self.search.options.time_intervals else 2  # a mode may need more
+        # Phase 19 of query 62 has no solution in given modes on the usual intervals.
+        finer = 1 if self.search.options.time_intervals else 2
         for stage, phase in zip(join_modes(self.nearest.stages), self.phases, strict=True):
             modes, parts = phase.guess or (), list[tuple[StagePoints, Mode]]()
             intervals, span = finer * stage.intervals, modes[-1].t / scales.time
