@@ -12,7 +12,7 @@ from scipy.optimize import linprog
 
 from plane import stack_rows
 from wholearm import Problem, TorqueProfile
-from wholearm.benchmark.precision.simulators import solve_motion
+from wholearm.benchmark.precision import solve_motion
 from wholearm.common.arrays import Array
 from wholearm.contacts.formation import Formation
 from wholearm.mechanics.dynamics import Directions

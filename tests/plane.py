@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from wholearm import Finger, Formation, Friction, Polygon, Scene
-from wholearm.benchmark.precision.simulators import solve_motion
-from wholearm.benchmark.stress.event_tracing import separate
+from wholearm.benchmark.precision import solve_motion
+from wholearm.benchmark.refusals import separate
 from wholearm.common.arrays import Array
 from wholearm.contacts.elemental import parse_contact
 from wholearm.geometry.curve import Curve

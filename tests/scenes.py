@@ -14,7 +14,7 @@ from once import once
 from plane import make_formation, make_scene, rotate
 from shipped import BOX, HEXAGON, plan_of, problem_of
 from wholearm import End, Friction, Phase, Plan, Problem, Scene, TorqueProfile, Trajectory, Until
-from wholearm.benchmark.stress.event_tracing import separate
+from wholearm.benchmark.refusals import separate
 from wholearm.common.arrays import Array
 from wholearm.contacts.closing import close_finger, place_flush
 from wholearm.contacts.elemental import parse_contact

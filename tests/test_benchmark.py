@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import re
+import sys
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import tiny_study
 import wholearm
 from shipped import FOLDER, HEPTAGON, SQUARE, problem_of, solved
 from tiny_study import allow, measure, misbehave
@@ -27,30 +29,27 @@ from wholearm import (
     TorqueProfile,
 )
 from wholearm.benchmark import STUDIES
-from wholearm.benchmark.corpus import LARGEST, compare, perturb_scenes
+from wholearm.benchmark.corpus import FAMILIES, LARGEST, answer, compare, list_cases, perturb_scenes
 from wholearm.benchmark.corpus import STUDY as CORPUS
-from wholearm.benchmark.corpus_cases import FAMILIES, answer, list_cases
 from wholearm.benchmark.growth import SIZES, WORK, run_work
 from wholearm.benchmark.growth import STUDY as GROWTH
 from wholearm.benchmark.guard import BANDS, count, read_stored
-from wholearm.benchmark.precision.planners import (
+from wholearm.benchmark.precision import (
+    FEW,
     LEAST_TIME,
     NO_DRAG,
     PLANNERS,
-    find_least_time,
-    run_planner,
-)
-from wholearm.benchmark.precision.simulators import (
-    FEW,
     SIMULATORS,
     SOLVED,
     Course,
     Instance,
     check_plan,
+    find_least_time,
     integrate,
     list_instances,
     make_course,
     measure_error,
+    run_planner,
 )
 from wholearm.benchmark.skip import STUDY as SKIP
 from wholearm.benchmark.skip import SkipPlan, list_pairs, spend
@@ -65,7 +64,8 @@ from wholearm.solvers.ipopt import record_runs
 @pytest.fixture
 def steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """The tiny study is one of those that there are."""
-    monkeypatch.setitem(STUDIES, "steps", ("tiny_study", "count steps to one"))
+    monkeypatch.setitem(STUDIES, "steps", "count steps to one")
+    monkeypatch.setitem(sys.modules, "wholearm.benchmark.steps", tiny_study)
 
 
 @pytest.mark.usefixtures("steps")
@@ -122,7 +122,7 @@ def test_records_of_other_code_do_not_count_where_that_matters(
 def test_every_study_is_listed_and_has_its_options(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench"]) == 0
     text = capsys.readouterr().out
-    for name, (_, about) in STUDIES.items():
+    for name, about in STUDIES.items():
         assert re.search(rf"^{name} +{re.escape(about)}$", text, re.M)
         study = load_study(name)
         assert isinstance(study, Study) and study.name == name and study.title

@@ -21,8 +21,7 @@ import wholearm
 from once import once
 from shipped import FOLDER, HEPTAGON, HEXAGON, LANDING, chart, problem_of, solved
 from wholearm import Plan, Problem
-from wholearm.cli.arguments import TOPICS, prepare
-from wholearm.cli.command import build_parser, main, read_page
+from wholearm.cli.command import TOPICS, build_parser, main, prepare, read_page
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "wholearm"

@@ -27,7 +27,7 @@ from shipped import BOX, FOLDER, HEPTAGON, IMPACTS, plan_of, problem_of
 from timed import landing, plan_landing
 from wholearm import Formation, InputError, PlanOptions, TorqueProfile, load, verify
 from wholearm import solve as plan
-from wholearm.benchmark.stress.slow_motion import list_others, rest_margin
+from wholearm.benchmark.refusals import list_others, rest_margin
 from wholearm.common.arrays import Array
 from wholearm.common.errors import AmbiguityError, InfeasibleError
 from wholearm.contacts.closing import close_finger

@@ -17,8 +17,8 @@ from refused import advising, ask_shoved
 from scenes import PENTAGON, box, shove
 from shipped import FOLDER, HEPTAGON, problem_of, tipping
 from wholearm import PlanOptions, Problem, load_trajectory, plots
-from wholearm.benchmark.stress import refusals
-from wholearm.benchmark.stress.refusals import judge
+from wholearm.benchmark import refusals
+from wholearm.benchmark.refusals import judge
 from wholearm.common.errors import (
     Change,
     InfeasibleError,

@@ -36,7 +36,7 @@ from retelling import RETELLINGS, Retelling
 from scenes import constant, hexagon, measure_fingers, shorten, slid
 from shipped import HEPTAGON, IMPACTS, plan_of, problem_of
 from wholearm import Formation, Phase, Problem, TorqueProfile, Trajectory, Until, simulate, verify
-from wholearm.benchmark.precision.simulators import solve_motion
+from wholearm.benchmark.precision import solve_motion
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, JammingError, SimulationError
 from wholearm.contacts.elemental import parse_contact

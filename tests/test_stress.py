@@ -11,12 +11,21 @@ import pytest
 
 from shipped import HEPTAGON, tipping
 from wholearm import Friction, Phase, PlanOptions, Problem, Scene, Trajectory, load
-from wholearm.benchmark.stress.damage import look, run_file
-from wholearm.benchmark.stress.event_tracing import clearances, follow, resample, separate, slides
-from wholearm.benchmark.stress.refusals import find_best, list_ends
-from wholearm.benchmark.stress.scenes import draw_case, random_scene
-from wholearm.benchmark.stress.slow_motion import fast_margin, inertia_ratio, slow_margin
-from wholearm.benchmark.stress.stress_study import check_plan, compare_values
+from wholearm.benchmark.damage import look, run_file
+from wholearm.benchmark.refusals import (
+    clearances,
+    fast_margin,
+    find_best,
+    follow,
+    inertia_ratio,
+    list_ends,
+    resample,
+    separate,
+    slides,
+    slow_margin,
+)
+from wholearm.benchmark.scenes import draw_case, random_scene
+from wholearm.benchmark.stress import check_plan, compare_values
 from wholearm.common.arrays import Array
 from wholearm.contacts.formation import find_touching
 from wholearm.geometry.curve import Curve

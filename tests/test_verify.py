@@ -16,7 +16,7 @@ from planned import brake_less, change, plan, plan_landing
 from scenes import PALM, box, measure_fingers, scale, slid, tipped
 from shipped import BOX, HEPTAGON, plan_of, problem_of
 from wholearm import Formation, Friction, PlanOptions, Problem, Report, Scene, simulate
-from wholearm.benchmark.stress.stress_study import check_plan as check_again
+from wholearm.benchmark.stress import check_plan as check_again
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, JammingError, ReplayError
 from wholearm.geometry.tracing import trace_phases

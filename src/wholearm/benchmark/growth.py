@@ -21,7 +21,7 @@ from ..geometry.tracing import load
 from ..mapping.formation_map import build_map
 from ..planning.plan import solve
 from ..problem.read import build_problem, read_problem
-from .stress.scenes import name_first
+from .scenes import name_first
 from .study import Case, Row, Study, finish_axes, format_table
 
 SIZES = {

@@ -28,7 +28,7 @@ from ..problem.definition import Problem
 from ..problem.read import build_problem, read_problem
 from ..search.find_route import find_route, forget_roadmaps
 from ..verification.verify import verify
-from .stress.scenes import Table
+from .scenes import Table
 from .study import Case, Row, Study, format_table
 
 SHIPPED = ("heptagon", "hexagon", "square", "triangle")

@@ -17,16 +17,16 @@ from typing import Any
 
 import numpy as np
 
-from ...common.arrays import Array
-from ...common.errors import InputError
-from ...contacts.closing import close_fingers
-from ...contacts.formation import Formation, find_touching
-from ...mapping.borders import NOWHERE, Piece, Window, cut, flush_track, label_cells, palm_track
-from ...mapping.formation_list import Stretch, format_route, list_formations, tolerance
-from ...problem.definition import Phase, Problem
-from ...problem.read import build_problem
-from ...verification.newton_euler import locate
-from .slow_motion import slow_margin
+from ..common.arrays import Array
+from ..common.errors import InputError
+from ..contacts.closing import close_fingers
+from ..contacts.formation import Formation, find_touching
+from ..mapping.borders import NOWHERE, Piece, Window, cut, flush_track, label_cells, palm_track
+from ..mapping.formation_list import Stretch, format_route, list_formations, tolerance
+from ..problem.definition import Phase, Problem
+from ..problem.read import build_problem
+from ..verification.newton_euler import locate
+from .refusals import slow_margin
 
 Table = dict[str, Any]
 Random = np.random.Generator

@@ -25,9 +25,9 @@ from typing import Any
 
 import numpy as np
 
-from ...planning.plan import solve
-from ...problem.read import build_problem
-from ...problem.table import write_toml
+from ..planning.plan import solve
+from ..problem.read import build_problem
+from ..problem.table import write_toml
 
 Random = np.random.Generator
 BASE: dict[str, Any] = {
@@ -249,7 +249,7 @@ def _pack(arrays: Mapping[str, Any], others: Mapping[str, bytes] = MappingProxyT
 
 def run_file(seed: int, number: int) -> dict[str, Any]:
     """Run the command line on a file of a seed in this process, and look at what it leaves."""
-    from ...__main__ import start
+    from ..__main__ import start
 
     rng, k = np.random.default_rng([seed, number, 1]), (0, 0, 1, 2, 2)[number % 5]
     kind, ending = ("problem", "torque", "trajectory")[k], (".toml", ".csv", ".npz")[k]

@@ -17,24 +17,23 @@ from typing import Any
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from ...common.arrays import Array
-from ...common.errors import SolverError, WholearmError
-from ...common.files import make_folder, write_text
-from ...geometry.tracing import check_phases, load
-from ...planning.plan import solve
-from ...problem.definition import End, Phase, Problem
-from ...problem.read import build_problem, read_problem
-from ...problem.table import write_toml
-from ...results.trajectory import Samples, Trajectory
-from ...scene.model import Scene
-from ...verification.newton_euler import BODIES, balance, locate
-from ...verification.verify import verify
-from ..study import Case, Row, Study, format_table, name_case
+from ..common.arrays import Array
+from ..common.errors import SolverError, WholearmError
+from ..common.files import make_folder, write_text
+from ..geometry.tracing import check_phases, load
+from ..planning.plan import solve
+from ..problem.definition import End, Phase, Problem
+from ..problem.read import build_problem, read_problem
+from ..problem.table import write_toml
+from ..results.trajectory import Samples, Trajectory
+from ..scene.model import Scene
+from ..verification.newton_euler import BODIES, balance, locate
+from ..verification.verify import verify
 from .damage import describe_error, run_file
-from .event_tracing import OVERLAP, clearances
-from .refusals import judge
+from .refusals import OVERLAP, clearances, judge
 from .scenes import Case as DrawnScene
 from .scenes import draw_case
+from .study import Case, Row, Study, format_table, name_case
 
 OBJECTIVES = ("time", "effort", "margin")
 SAME = 1e-6  # relative difference of two values that rounding may make

@@ -1,0 +1,946 @@
+"""Run time against error, of planners and simulators, with public tools beside them.
+
+Methods run on phases of one freedom, on four sliding contacts. Planners are ours in both domains,
+toppra (minimum-time parametrisation, with the internal force eliminated from the limits) and yapss
+(pseudospectral collocation). All simulators but ours are told when directions reverse, from the
+reference, and are restarted there and where the torques step. Plans are replayed open loop from
+rest by the equations of the reference; lost contacts pull by what is measured.
+
+The reference solves the Newton-Euler equations of object and fingers, with contacts that are points
+with normals of rigid bodies (`verification.newton_euler`), together with the contact conditions as
+one linear system. Nothing is shared with the package's own contacts and dynamics; friction keeps
+the directions that it is given. They are integrated by SciPy's DOP853 from step to step of the
+torques, in double precision. Directions reverse where the sliding velocity vanishes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import statistics
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import lru_cache, partial
+from importlib.util import find_spec
+from itertools import pairwise, product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+
+from ..common.arrays import Array, Expression
+from ..common.errors import InputError
+from ..contacts.elemental import Contact
+from ..contacts.formation import Formation
+from ..figures.style import PALETTE
+from ..geometry.curve import Curve, Segment, directions_of
+from ..geometry.tracing import trace_phases
+from ..mechanics.dynamics import ONE, A, B, PathForces, build_force_rows, build_forward, inverse
+from ..mechanics.limits import make_limits
+from ..mechanics.path_limits import PathLimits
+from ..planning.lower_bound import bound_least_time
+from ..planning.options import Objective, PlanOptions
+from ..planning.path_domain.first_guess import guess
+from ..planning.path_domain.path_data import prepare
+from ..planning.path_domain.path_mesh import make_grid
+from ..planning.path_domain.path_motion import PathMotion
+from ..planning.path_domain.path_nlp import LimitShape, build_path_nlp
+from ..planning.path_domain.path_plan import plan_path
+from ..planning.time_domain.time_plan import plan_phases
+from ..problem.definition import End, Problem
+from ..problem.read import read_problem
+from ..results.torque import TorqueProfile
+from ..scene.model import Scene
+from ..simulation.simulate import simulate
+from ..verification.newton_euler import locate
+from .study import Case, Row, Study, finish_axes, format_table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+REPEATS = 3  # largest number of runs that a median is of
+BUDGET = 0.3  # time after which a run is not repeated any more [s]
+SHIFT = 0.01  # shift of the geometric means [s]
+SHORT = 0.05  # time up to which something is done several times over, in about this time [s]
+SOLVED = "solved"
+SIMULATION = FEW, MANY = "simulation, few pieces", "simulation, many pieces"
+"""Studies of simulators: torques in a few long pieces, and planned torques in eighty."""
+PLANNING = LEAST_TIME, NO_DRAG = "least time", "least time without viscous friction"
+"""Studies of planners: all phases, and the same without viscous friction."""
+
+_Answer = TypeVar("_Answer")
+
+
+class Instance(NamedTuple):
+    """One phase from rest to rest."""
+
+    name: str  # of the file, and the number of the phase
+    problem: Problem  # of that phase alone
+    curve: Curve
+
+
+@lru_cache(maxsize=4)
+def list_instances(paths: tuple[str, ...], drag: bool = True) -> tuple[Instance, ...]:
+    """First phases of problem files that are curves of four sliding contacts: what peers know.
+
+    Those that files share are there once. Without `drag` joints have no viscous friction.
+    """
+    instances: dict[object, Instance] = {}
+    for path in paths:
+        problem = read_problem(path)
+        problem = problem if drag else problem.with_(viscous=0.0)
+        scene = problem.scene
+        for phase, curve in zip(problem.phases, trace_phases(problem), strict=False):
+            if phase.formation.rolling:
+                break
+            single = replace(phase, index=0, end=End.REST)
+            alone = replace(problem, start=curve.start, phases=(single,))
+            places = np.round(np.append(curve.start, curve.end), 9) + 0.0
+            limits = (problem.epsilon, *scene.torque_limit, *scene.speed_limit)
+            same = scene.equations, limits, phase.formation.names, tuple(places)
+            name = f"{Path(path).stem} {phase.number}"
+            instances.setdefault(same, Instance(name, alone, curve))
+    return tuple(instances.values())
+
+
+def pick(name: str, paths: tuple[str, ...], drag: bool = True) -> Instance:
+    """The phase of a name, of problem files."""
+    return next(instance for instance in list_instances(paths, drag) if instance.name == name)
+
+
+class PeerPlan(NamedTuple):
+    """What a planner has found for one phase."""
+
+    status: str  # `SOLVED`, or why there is no plan
+    duration: float  # [s]
+    torque: TorqueProfile
+
+
+NO_PLAN = PeerPlan("", 1.0, TorqueProfile(np.array([0.0, 1.0]), np.zeros((1, 2, 1))))
+"""What there is where nothing was found."""
+
+
+def make_slow_motion(instance: Instance, intervals: int, share: float = 1.0) -> PathMotion:
+    """The motion that the planner guesses first, with a share of its squared speed."""
+    curve = instance.curve
+    grid = make_grid(curve, np.zeros(0), intervals + len(curve.segments))
+    data = prepare(curve, instance.problem.epsilon, grid, 0)
+    profile, _ = guess(data)
+    slow = profile._replace(a=share * profile.a, b=share * profile.b)
+    return PathMotion(curve, data.grid, slow)
+
+
+def find_reversals(motion: PathMotion) -> Array:
+    """Times at which the stretches of a motion begin and the last one ends [s]."""
+    last = np.flatnonzero(np.diff(motion.grid.segment, append=-1))
+    return np.append(0.0, motion.times[last])
+
+
+class Method(NamedTuple):
+    """A planner or a simulator."""
+
+    settings: str  # what it is told besides the setting
+    # takes a phase or a course, and a setting; gives what solves it
+    build: Callable[[Any, str], Callable[[], Any]]
+    choices: dict[str, tuple[str, ...]]  # settings that are measured, by study
+    module: str = ""  # what has to be installed, if anything
+
+    @property
+    def is_installed(self) -> bool:
+        """Whether there is what it needs."""
+        return not self.module or find_spec(self.module) is not None
+
+
+class Median(NamedTuple):
+    """The runs of one setting: medians of their times [s], and the worst of the rest."""
+
+    build: float  # build, solve [s]: time to build, and to simulate or solve
+    solve: float
+    # of the state, relative to the scene; of plans those of the phase time, of the replayed end
+    # state, and the worst violation of a limit between nodes
+    errors: tuple[float, ...]
+    outcome: str = SOLVED  # `SOLVED`, or what failed
+
+
+def measure(
+    build: Callable[[], Callable[[], _Answer]],
+    judge: Callable[[_Answer], tuple[tuple[float, ...], str]],
+) -> Median:
+    """Build and run as often as the time allows; `judge` gives the errors and the outcome."""
+    builds, solves, answers = [], [], []
+    with warnings.catch_warnings():
+        # Warnings of peers are not ours.
+        warnings.simplefilter("ignore")
+        began = time.process_time()
+        for _ in range(REPEATS):
+            built, run = _time(build)
+            took, answer = _time(run)
+            builds.append(built)
+            solves.append(took)
+            answers.append(answer)
+            if time.process_time() - began > BUDGET:
+                break
+    errors, outcomes = zip(*map(judge, answers), strict=True)
+    worst = tuple(max(column, key=abs) for column in zip(*errors, strict=True))
+    outcome = next((outcome for outcome in outcomes if outcome != SOLVED), SOLVED)
+    return Median(statistics.median(builds), statistics.median(solves), worst, outcome)
+
+
+def _time(work: Callable[[], _Answer]) -> tuple[float, _Answer]:
+    """Processor time that something takes [s], and its answer.
+
+    Other work on the machine hardly changes it. What is too short for its clock is done several
+    times over.
+    """
+    wall, processor = time.perf_counter(), time.process_time()
+    answer = work()
+    wall, processor = time.perf_counter() - wall, time.process_time() - processor
+    if wall > SHORT:
+        return processor, answer
+    count = math.ceil(SHORT / max(wall, SHORT / 200))
+    processor = time.process_time()
+    for _ in range(count):
+        work()
+    return (time.process_time() - processor) / count, answer
+
+
+def find_mean(seconds: Sequence[float]) -> float:
+    """Shifted geometric mean [s]."""
+    logs = [math.log(value + SHIFT) for value in seconds]
+    return math.exp(math.fsum(logs) / len(logs)) - SHIFT
+
+
+def solve_motion(
+    scene: Scene,
+    contacts: Sequence[Contact],
+    z: Array,
+    z_dot: Array,
+    tau: Array,
+    Xi: Array,
+    sigma: Array,
+) -> tuple[Array, Array]:
+    """Accelerations z'', shape (5,), and c_n, shape (n_c,) [N], from one linear system.
+
+    The unknowns are those of Eqs. (1) and (2) with the friction of Eq. (3) put in, together with
+    the contact conditions differentiated twice: rates of their rows by complex steps.
+    """
+    tiny = 1e-30  # [s]
+    ahead = (z + 1j * tiny * z_dot)[None]
+    touches = [locate(scene, contact.name, ahead) for contact in contacts]
+    rows = np.array([touch.normal[0] for touch in touches])
+    slide = np.array([touch.friction * touch.tangent[0].real for touch in touches])
+    friction = scene.viscous * z_dot + scene.dry * np.append(np.zeros(3), sigma)
+    force = scene.applied_force + np.append(np.zeros(3), tau) - friction
+    count = len(rows)
+    matrix = np.zeros((5 + count, 5 + count))
+    matrix[range(5), range(5)] = scene.mass_diagonal
+    matrix[:5, 5:], matrix[5:, :5] = (Xi[:, None] * slide - rows.real).T, rows.real
+    solution = np.linalg.solve(matrix, np.append(force, -rows.imag @ z_dot / tiny))
+    return np.asarray(solution[:5]), np.asarray(solution[5:])
+
+
+class Span(NamedTuple):
+    """A stretch of time within one piece of the torques, without a reversal."""
+
+    start: float  # start, stop [s]:
+    stop: float
+    piece: int  # of the torques
+    Xi: Array  # Xi, sigma (n_c,) and (2,): directions of sliding and of the joints
+    sigma: Array
+
+
+class Course(NamedTuple):
+    """One phase with torques, and where it gets to."""
+
+    problem: Problem  # of that phase alone
+    torque: TorqueProfile
+    spans: tuple[Span, ...]
+    end: Array  # (10,): state (z, z') when the torques end
+
+
+def measure_error(problem: Problem, state: Array, exact: Array) -> float:
+    """Largest difference of two states (z, z'), relative to length and time of the scene."""
+    scales = problem.scene.scales
+    unit = np.array([scales.length, scales.length, 1.0, 1.0, 1.0])
+    return float(np.abs((state - exact) / np.append(unit, unit / scales.time)).max())
+
+
+def integrate(
+    problem: Problem, torque: TorqueProfile, curve: Curve, reversals: int, tolerance: float
+) -> tuple[Array, tuple[Span, ...], float]:
+    """State at the end of torques, the stretches on the way there, and the least c_n of all steps.
+
+    Contacts stay closed: those that are lost pull.
+    """
+    contacts, parts = problem.phases[0].formation.contacts, [*curve.segments[: reversals + 1]]
+    y, spans, least = np.append(problem.start, np.zeros(5)), list[Span](), np.inf
+    for piece, (t, stop) in enumerate(pairwise(torque.breaks)):
+        own = torque.cut(t, stop)
+        while t < stop:
+            part = parts[0]
+
+            def solve(
+                t: float, y: Array, part: Segment = part, own: TorqueProfile = own
+            ) -> tuple[Array, Array]:
+                tau = own.at(np.array([t]))[0]
+                return solve_motion(problem.scene, contacts, y[:5], y[5:], tau, part.Xi, part.sigma)
+
+            def rates(t: float, y: Array, solve: Any = solve) -> Array:
+                return np.concatenate([y[5:], solve(t, y)[0]])
+
+            events = [_find_reversal(curve.formation, *parts[:2])] if len(parts) > 1 else []
+            options: dict[str, Any] = {"rtol": tolerance, "atol": tolerance, "events": events}
+            run = solve_ivp(rates, (t, stop), y, "DOP853", **options)
+            least = min([least, *(solve(*at)[1].min() for at in zip(run.t, run.y.T, strict=True))])
+            start, t, y = t, float(run.t[-1]), run.y[:, -1]
+            spans.append(Span(start, t, piece, part.Xi, part.sigma))
+            parts = parts[1:] if run.status == 1 else parts
+    return y, tuple(spans), float(least)
+
+
+def _find_reversal(formation: Formation, before: Segment, after: Segment) -> Any:
+    """Event at which the rate vanishes whose direction differs in two segments."""
+    directions = np.append(before.Xi, before.sigma)
+    row = int(np.flatnonzero(directions * np.append(after.Xi, after.sigma) < 0)[0])
+
+    def rate(_: float, y: Array) -> float:
+        if row >= len(before.Xi):
+            return float(y[8 + row - len(before.Xi)])
+        touch = locate(formation.scene, formation.contacts[row].name, y[None, :5])
+        return float(touch.tangent[0] @ y[5:])
+
+    rate.terminal, rate.direction = True, -directions[row]  # type: ignore[attr-defined]
+    return rate
+
+
+TOLERANCES = {
+    FEW: ("0.0001", *(f"1e-{k:02}" for k in range(6, 14))),
+    MANY: ("1e-06", "1e-09", "1e-12"),
+}
+"""Tolerances of each study."""
+
+
+def build_own(course: Course, setting: str) -> Callable[[], Array]:
+    """Our simulator, for the state (z, z') at the end of a course, shape (10,).
+
+    What it keeps of a formation is built by a first run.
+    """
+    tolerance = float(setting)
+
+    def run() -> Array:
+        simulation = simulate(course.problem, course.torque, tolerance=tolerance)
+        return np.append(simulation.z[-1], simulation.z_dot[-1])
+
+    run()
+    return run
+
+
+def build_cvodes(course: Course, setting: str) -> Callable[[], Array]:
+    """CasADi's interface to cvodes; all stretches are one call, by `mapaccum`."""
+    tolerance, torque = float(setting), course.torque
+    formation = course.problem.phases[0].formation
+    n_c, terms = formation.n_contacts, torque.coefficients.shape[2]
+    x, y, Xi, sigma = (ca.SX.sym(name, n) for name, n in zip("xyXs", (1, 10, n_c, 2), strict=True))
+    flat, piece, ends = ca.SX.sym("flat", 2 * terms), ca.SX.sym("piece", 2), ca.SX.sym("ends", 2)
+    half, t = (ends[1] - ends[0]) / 2, (ends[0] + ends[1] + x * (ends[1] - ends[0])) / 2
+    place = (2 * t - piece[0] - piece[1]) / (piece[1] - piece[0])
+    # Coefficients come column by column.
+    powers = ca.reshape(flat, 2, -1)[:, ::-1]
+    tau = ca.vertcat(*(ca.polyval(powers[k, :].T, place) for k in range(2)))
+    rates = ca.vertcat(y[5:], build_forward(formation)(y[:5], y[5:], tau, Xi, sigma)[0])
+    system = {"x": y, "t": x, "p": ca.vertcat(Xi, sigma, flat, piece, ends), "ode": half * rates}
+    options: dict[str, Any] = {"abstol": tolerance, "reltol": tolerance, "max_num_steps": 100000}
+    options |= {"linear_multistep_method": "adams", "nonlinear_solver_iteration": "functional"}
+    step = ca.integrator("step", "cvodes", system, -1.0, 1.0, options)
+    chain = step.mapaccum(len(course.spans))
+    columns = []
+    for own in course.spans:
+        known = torque.coefficients[own.piece].ravel("F"), torque.breaks[own.piece : own.piece + 2]
+        columns.append(np.concatenate([own.Xi, own.sigma, *known, [own.start, own.stop]]))
+    start, parameters = np.append(course.problem.start, np.zeros(5)), np.array(columns).T
+
+    def run() -> Array:
+        states = chain(x0=start, p=parameters)["xf"]
+        return np.asarray(states[:, -1].full()[:, 0])
+
+    return run
+
+
+SIMULATORS = {
+    "wholearm": Method("events, contact forces and energies included", build_own, TOLERANCES),
+    "cvodes": Method(
+        "abstol = reltol = tolerance; Adams, functional iteration; all stretches in one call",
+        build_cvodes,
+        TOLERANCES,
+    ),
+}
+"""Simulators by name."""
+
+
+def run_simulator(
+    study: str, name: str, method: str, setting: str, files: tuple[str, ...]
+) -> Median | None:
+    """Run one setting of one simulator on one phase; None if the phase has no course."""
+    course = make_course(pick(name, files), study)
+    if course is None:
+        return None
+
+    def judge(state: Array) -> tuple[tuple[float, ...], str]:
+        error = measure_error(course.problem, state, course.end)
+        return (error,), SOLVED if np.isfinite(error) else "no finite state"
+
+    return measure(partial(SIMULATORS[method].build, course, setting), judge)
+
+
+@lru_cache(maxsize=64)
+def make_course(instance: Instance, study: str) -> Course | None:
+    """The course of a phase: of 95 % of its last stretch, as just before a stop all is ill-posed.
+
+    None if the slow motion would lose a contact.
+    """
+    problem, curve = instance.problem, instance.curve
+    if study == FEW:
+        motion, degree = make_slow_motion(instance, 2, 0.3), 14
+    else:
+        motion, degree = plan_path(curve, problem.epsilon, PlanOptions(), 1).motion, 6
+    looks = np.linspace(0.0, motion.duration, 201)
+    if motion.evaluate(looks).c_n.min() <= 0:
+        return None
+    marks = find_reversals(motion)
+    stop = marks[-2] + 0.95 * (marks[-1] - marks[-2])
+    breaks = motion.times[np.append(motion.grid.steps > 0, True)]
+    breaks = np.append(breaks[breaks < stop], stop)
+    torque = TorqueProfile.fit(breaks, lambda t: motion.evaluate(t).tau, degree)
+    # The smallest tolerance that SciPy takes.
+    end, spans, _ = integrate(problem, torque, curve, len(marks) - 2, 2.3e-14)
+    return Course(problem, torque, spans, end)
+
+
+class ReferenceCheck(NamedTuple):
+    """What a replay has shown."""
+
+    end: float  # error of the end state, relative to the scene
+    # worst violation of c_n >= epsilon, over the scene's force, or of a torque limit, over it
+    violation: float
+    outcome: str  # `SOLVED`, or why the plan is none
+
+
+def check_plan(instance: Instance, plan: PeerPlan) -> ReferenceCheck:
+    """Replay a plan."""
+    if plan.status != SOLVED:
+        return ReferenceCheck(math.nan, math.nan, plan.status)
+    problem, curve = instance.problem, instance.curve
+    reversals = len(curve.segments) - 1
+    state, _, least = integrate(problem, plan.torque, curve, reversals, 1e-10)
+    end = measure_error(problem, state, np.append(curve.end, np.zeros(5)))
+    limit = problem.scene.torque_limit
+    places = np.cos(np.linspace(0.0, np.pi, 9))
+    excess = float((np.abs(plan.torque.at_places(places)) / limit[:, None] - 1).max())
+    missing = (problem.epsilon - least) / problem.scene.scales.force
+    violation = max(0.0, excess, missing)
+    tests = (
+        (least > 0, "a contact is lost between nodes"),
+        (end <= 1e-2, "the replay ends elsewhere"),
+        (excess <= 1e-2, "a torque limit is missed between nodes"),
+    )
+    outcome = next((text for holds, text in tests if not holds), SOLVED)
+    return ReferenceCheck(end, violation, outcome)
+
+
+def build_plant(formation: Formation) -> Expression:
+    """CasADi function (z, z', tau, c_n, Xi, sigma) -> (z'', A z'' + A' z')."""
+    scene, n_c = formation.scene, formation.n_contacts
+    z, v, c_n = ca.SX.sym("z", 5), ca.SX.sym("v", 5), ca.SX.sym("c_n", n_c)
+    tau, Xi, sigma = ca.SX.sym("tau", 2), ca.SX.sym("Xi", n_c), ca.SX.sym("sigma", 2)
+    _, P, P_dot_v, A_t = formation.build_constraints(z, v)
+    friction = ca.DM(scene.viscous) * v + ca.DM(scene.dry) * ca.vertcat(0, 0, 0, sigma)
+    applied = ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, tau) - friction
+    G = build_force_rows(formation, P, A_t, Xi)
+    acceleration = (applied + G.T @ c_n) / ca.DM(scene.mass_diagonal)
+    missed = P @ acceleration + P_dot_v
+    return ca.Function("plant", [z, v, tau, c_n, Xi, sigma], [acceleration, missed])
+
+
+def run_planner(study: str, name: str, method: str, setting: str, files: tuple[str, ...]) -> Median:
+    """Run one setting of one planner on one phase, and check its plans."""
+    instance = pick(name, files, study != NO_DRAG)
+    if module := PLANNERS[method].module:
+        # No timing is to include the import.
+        __import__(module)
+    least = find_least_time(instance)
+
+    def judge(plan: PeerPlan) -> tuple[tuple[float, ...], str]:
+        end, violation, outcome = check_plan(instance, plan)
+        error = plan.duration / least - 1 if plan.status == SOLVED else math.nan
+        return (error, end, violation), outcome
+
+    return measure(partial(PLANNERS[method].build, instance, setting), judge)
+
+
+@lru_cache(maxsize=64)
+def find_least_time(instance: Instance) -> float:
+    """Lower bound of the least time by a sweep over speeds, which shares nothing with the NLP [s].
+
+    That of a fine plan where there is none.
+    """
+    curve, epsilon = instance.curve, instance.problem.epsilon
+    bound = bound_least_time((curve,), epsilon)
+    if bound is not None:
+        return bound.value
+    return plan_path(curve, epsilon, PlanOptions(accuracy=1e-7), 1).motion.duration
+
+
+def _build_on_curve(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
+    """Ours along the curve; its NLP is built anew."""
+    curve, epsilon = instance.curve, instance.problem.epsilon
+    options = PlanOptions(accuracy=float(setting))
+    build_path_nlp.cache_clear()
+    data = prepare(curve, epsilon, make_grid(curve, np.zeros(0), 10), 1)
+    build_path_nlp(LimitShape.of(data.limits), len(data.grid.steps), Objective.TIME)
+
+    def run() -> PeerPlan:
+        plan = plan_path(curve, epsilon, options, 1)
+        return PeerPlan(SOLVED, plan.motion.duration, plan.torque)
+
+    return run
+
+
+def _build_over_time(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
+    """Ours over time; a setting is the number of intervals, and the degree."""
+    intervals, degree = map(int, setting.split(" x "))
+    options = PlanOptions(time_intervals=intervals, degree=degree, transcription="time")
+    problem = instance.problem
+
+    def run() -> PeerPlan:
+        (plan,) = plan_phases(problem, problem.phases, problem.start, options)
+        return PeerPlan(SOLVED, plan.motion.duration, plan.torque)
+
+    return run
+
+
+def _limit(instance: Instance, s: Array, owner: NDArray[np.int64]) -> tuple[PathForces, PathLimits]:
+    """Forces and limits at places of a curve, whose segments are `owner`."""
+    curve, point = instance.curve, instance.curve.evaluate(s)
+    forces = inverse(curve.formation, *point[:3], directions_of(curve, owner))
+    limits = make_limits(curve.formation, instance.problem.epsilon)
+    return forces, PathLimits.of(limits, forces, point.z_s[:, 3:])
+
+
+def build_toppra(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
+    """Limits on a grid that is fine towards the ends, kept at both ends of every interval."""
+    import toppra
+    from toppra.constraint import DiscretizationType, LinearConstraint
+    from toppra.constraint.linear_constraint import canlinear_colloc_to_interpolate
+
+    toppra.setup_logging("ERROR")
+    length = instance.curve.length
+    apart = 1e-7 * length  # of grid points from a reversal between them
+    grid = length * (1 - np.cos(np.linspace(0.0, np.pi, int(setting) + 1))) / 2
+    for part in instance.curve.segments[:-1]:
+        near = np.abs(grid - part.stop) > 4 * apart
+        grid = np.append(grid[near], part.stop + apart * np.array([-1.0, 1.0]))
+        grid.sort()
+    stops = [part.stop for part in instance.curve.segments[:-1]]
+    _, limits = _limit(instance, grid, np.searchsorted(stops, grid))
+    rows = limits.eliminate().rows
+    constant, a, b = (rows[:, rows[..., A].any(axis=0), column] for column in (ONE, A, B))
+    below, zero = -np.eye(a.shape[1]), np.zeros(a.shape[1])
+
+    class Limits(LinearConstraint):  # type: ignore[misc]
+        """Limits with the internal force eliminated."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.identical = True
+            self.set_discretization_type(DiscretizationType.Interpolation)
+
+        def compute_constraint_params(self, *_: Any) -> Any:
+            return canlinear_colloc_to_interpolate(
+                a, b, constant, below, zero, None, None, grid, identical=True
+            )
+
+    path = toppra.SplineInterpolator(grid, grid[:, None])
+    planner = toppra.algorithm.TOPPRA(
+        [Limits()],
+        path,
+        gridpoints=grid,
+        solver_wrapper="seidel",
+        parametrizer="ParametrizeConstAccel",
+    )
+
+    def run() -> PeerPlan:
+        _, speeds, _ = planner.compute_parameterization(0.0, 0.0)
+        if speeds is None or not np.isfinite(speeds).all():
+            return NO_PLAN._replace(status="no feasible parametrisation")
+        return _make_plan(instance, grid, np.asarray(speeds))
+
+    return run
+
+
+def _make_plan(instance: Instance, grid: Array, speeds: Array) -> PeerPlan:
+    """Torques by inverse dynamics, with the internal force linear between grid points.
+
+    The two points beside a reversal become one, with a step of the torques.
+    """
+    stops = np.array([part.stop for part in instance.curve.segments[:-1]])
+    for stop in stops:
+        k = int(np.searchsorted(grid, stop)) - 1
+        speed = (speeds[k] + speeds[k + 1]) / 2
+        grid, speeds = (
+            np.concatenate([part[:k], [middle], part[k + 2 :]])
+            for part, middle in ((grid, stop), (speeds, speed))
+        )
+    steps, b = np.diff(grid), speeds**2
+    a = np.diff(b) / (2 * steps)
+    times = np.append(0.0, np.cumsum(2 * steps / (speeds[1:] + speeds[:-1])))
+    owner = np.searchsorted(stops, (grid[1:] + grid[:-1]) / 2)
+    ends = [
+        np.mean(_limit(instance, grid[p], owner)[1].find_internal_force_range(a, b[p]), axis=0)
+        for p in (slice(-1), slice(1, None))
+    ]
+
+    def torque(t: Array) -> Array:
+        k = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(a) - 1)
+        local = t - times[k]
+        run = np.clip(local * (speeds[k] + a[k] * local / 2), 0.0, steps[k])
+        part = run / steps[k]
+        internal = ends[0][k] * (1 - part) + ends[1][k] * part
+        forces, _ = _limit(instance, grid[k] + run, owner[k])
+        return forces.tau(a[k], (speeds[k] + a[k] * local) ** 2, internal)
+
+    profile = TorqueProfile.fit(times, torque, 4)
+    return PeerPlan(SOLVED, float(times[-1]), profile)
+
+
+def build_yapss(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
+    """A phase for every stretch, with contact forces among the controls, on Legendre-Gauss points.
+
+    The slow motion is the first guess.
+    """
+    import yapss
+
+    curve, slow = instance.curve, make_slow_motion(instance, 5)
+    n_c, k = curve.formation.n_contacts, len(curve.segments)
+    s = np.array([0.0, *(part.stop for part in curve.segments)])
+    counts = [max(4, round(int(setting) * share)) for share in np.diff(s) / curve.length]
+    ends = curve.evaluate(s).z
+    # The coordinate that runs along the phase: x, or phi where the object turns.
+    progress = 2 if abs(ends[-1] - ends[0])[2] > 1e-6 else 0
+    ocp = yapss.Problem(
+        name="phase", nx=k * [10], nu=k * [2 + n_c], nh=k * [n_c], nq=k * [0], nd=11 * (k - 1)
+    )
+    _write_functions(ocp, instance)
+    limit = curve.formation.scene.torque_limit
+    marks = pairwise(find_reversals(slow))
+    for index, (count, (start, stop)) in enumerate(zip(counts, marks, strict=True)):
+        bounds, guess = ocp.bounds.phase[index], ocp.guess.phase[index]
+        bounds.control.lower[:] = [*-limit, *n_c * [instance.problem.epsilon]]
+        bounds.control.upper[:2] = limit
+        bounds.path.lower[:] = bounds.path.upper[:] = 0.0
+        bounds.duration.lower = 1e-3
+        last = bounds.final_state
+        last.lower[progress] = last.upper[progress] = ends[index + 1, progress]
+        guess.time = np.linspace(start, stop, 2 * count + 1)
+        # The ends of a stretch are evaluated within it.
+        inset = 1e-9 * (stop - start)
+        samples = slow.evaluate(np.clip(guess.time, start + inset, stop - inset))
+        guess.state = np.hstack([samples.z, samples.z_dot]).T
+        guess.control = np.hstack([samples.tau, samples.c_n]).T
+        ocp.mesh.phase[index].collocation_points = count * [2]
+        ocp.mesh.phase[index].fraction = count * [1 / count]
+    first, last = ocp.bounds.phase[0], ocp.bounds.phase[k - 1].final_state
+    first.initial_time.lower = first.initial_time.upper = 0.0
+    first.initial_state.lower[:] = first.initial_state.upper[:] = [*curve.start, *5 * [0.0]]
+    last.lower[5 + progress] = last.upper[5 + progress] = 0.0
+    ocp.bounds.discrete.lower[:] = ocp.bounds.discrete.upper[:] = 0.0
+    ocp.derivatives.method, ocp.derivatives.order = "auto", "second"
+    ocp.spectral_method = "lg"
+    for name, value in {
+        "print_level": 0, "sb": "yes", "tol": 1e-8, "bound_relax_factor": 0.0, "max_iter": 1000,
+        "mu_strategy": "adaptive",
+    }.items():  # fmt: skip
+        setattr(ocp.ipopt_options, name, value)
+
+    def run() -> PeerPlan:
+        return _read(ocp.solve())
+
+    return run
+
+
+def _write_functions(ocp: Any, instance: Instance) -> None:
+    """Objective, dynamics and the links of phases, traced by yapss with CasADi's symbols."""
+    from yapss.math.wrapper import SXW
+
+    curve, plant = instance.curve, build_plant(instance.curve.formation)
+
+    def objective(arg: Any) -> None:
+        arg.objective = arg.phase[len(curve.segments) - 1].final_time
+
+    def continuous(arg: Any) -> None:
+        for index in arg.phase_list:
+            phase, part = arg.phase[index], curve.segments[index]
+            state, control = ([_strip(x) for x in own] for own in (phase.state, phase.control))
+            z, v = ca.vertcat(*state[:5]), ca.vertcat(*state[5:])
+            tau, c_n = ca.vertcat(*control[:2]), ca.vertcat(*control[2:])
+            acceleration, missed = plant(z, v, tau, c_n, part.Xi, part.sigma)
+            rates = [*phase.state[5:], *(SXW(x) for x in ca.vertsplit(acceleration))]
+            phase.dynamics[:] = tuple(rates)
+            phase.path[:] = tuple(SXW(x) for x in ca.vertsplit(missed))
+
+    def discrete(arg: Any) -> None:
+        links = []
+        for before, after in zip(arg.phase, arg.phase[1:], strict=False):
+            links += [after.initial_time - before.final_time]
+            links += [*(after.initial_state - before.final_state)]
+        arg.discrete = links
+
+    ocp.functions.objective, ocp.functions.continuous = objective, continuous
+    if len(curve.segments) > 1:
+        ocp.functions.discrete = discrete
+
+
+def _strip(symbol: Any) -> Any:
+    """The CasADi symbol in a wrapper."""
+    return symbol._value if hasattr(symbol, "_value") else symbol.item()._value
+
+
+def _read(solution: Any) -> PeerPlan:
+    """The torques linear between collocation points: their polynomials swing wide in between."""
+    status = solution.nlp_info.ipopt_status
+    if status != 0:
+        return NO_PLAN._replace(status=str(solution.nlp_info.ipopt_status_message))
+    times, rows = [], []
+    for phase in solution.phase:
+        tau = np.asarray(phase.control)[:2].T
+        times.append([phase.initial_time, *np.ravel(phase.time_c), phase.final_time])
+        rows.append(np.vstack([tau[:1], tau, tau[-1:]]))
+    torque = TorqueProfile.join_rows(np.concatenate(times), np.concatenate(rows))
+    return PeerPlan(SOLVED, float(times[-1][-1]), torque)
+
+
+_CURVE = ("1e-2", "1e-3", "1e-4", "1e-5", "1e-6")
+PLANNERS = {
+    "wholearm, curve": Method(
+        "accuracy; limits tightened between nodes included",
+        _build_on_curve,
+        {LEAST_TIME: _CURVE, NO_DRAG: _CURVE},
+    ),
+    "wholearm, time": Method(
+        "Radau, intervals x degree; linear torques, refinement included",
+        _build_over_time,
+        {LEAST_TIME: ("8 x 3", "16 x 3", "32 x 3", "16 x 2", "16 x 4")},
+    ),
+    "yapss": Method(
+        "two Legendre-Gauss points a segment, automatic second derivatives; adaptive barrier, the "
+        "slow motion",
+        build_yapss,
+        {LEAST_TIME: ("20", "40", "80", "160")},
+        "yapss",
+    ),
+    "toppra": Method(
+        "Seidel, limits at both ends of intervals, squeeze eliminated after Fourier and Motzkin",
+        build_toppra,
+        {NO_DRAG: ("50", "100", "200", "400", "800", "1600", "3200")},
+        "toppra",
+    ),
+}
+"""Planners by name."""
+
+
+METHODS = SIMULATORS | PLANNERS
+"""All methods by name, in the order of the tables."""
+MARKERS = "osD^vP*Xdh<>"  # markers of the methods of a panel
+
+
+INTRODUCTION = f"""\
+Times are medians of processor time over up to {REPEATS} runs (one where that takes over {BUDGET:g}
+s) in one thread; what takes less than {SHORT:g} s is averaged over that time. Means are geometric
+ones, shifted by {1e3 * SHIFT:g} ms, over the phases of all problems, each with the setting that
+reaches the error soonest; what does not reach it counts with the time limit.
+
+Phases whose slow motion would lose a contact have no few pieces of torque, and where a method was
+not run on a phase, ours does not count there either.
+
+Errors of states are relative to the scene's length and time. A plan counts as solved if its
+torques, replayed open loop by other equations than its own, keep every contact and end within 1e-2
+of the end. Its three errors are those of the phase time, against the lower bound of `solve
+--certify`, of the replayed end state, and the worst violation between nodes, over the object's
+weight or the torque limit.
+"""
+
+
+class PeerComparison(NamedTuple):
+    """What one table compares."""
+
+    study: str
+    title: str
+    ours: str  # method that others are compared with
+    targets: tuple[float, ...]  # errors that run times are compared at
+    building: bool  # whether the time to build counts
+    errors: int | None  # how many of the errors have to be below a target; None for all
+
+
+COMPARISONS = (
+    *(PeerComparison(own, own, "wholearm", (1e-6, 1e-9, 1e-11), False, None) for own in SIMULATION),
+    *(
+        PeerComparison(own, f"{own}, {which}", "wholearm, curve", (1e-2, 1e-3, 1e-4), True, count)
+        for own in PLANNING
+        for count, which in ((1, "by the error of the phase time"), (None, "by all three errors"))
+    ),
+)
+"""Tables of times at equal error."""
+
+
+def find_times(
+    rows: Sequence[Row], method: str, own: PeerComparison, target: float
+) -> dict[str, float]:
+    """Times in which a method reaches an error on each phase that it has runs on [s].
+
+    Infinite where it does not.
+    """
+    times: dict[str, float] = {}
+    for row in rows:
+        if (row["study"], row["method"]) == (own.study, method):
+            error = max(map(abs, row["errors"][: own.errors]))
+            took = row["solve"] + own.building * row["build"]
+            reached = took if row["outcome"] == SOLVED and error <= target else math.inf
+            times[row["phase"]] = min(times.get(row["phase"], math.inf), reached)
+    return times
+
+
+def list_methods(rows: Sequence[Row], study: str) -> list[str]:
+    """Methods that a study has runs of, in their order."""
+    given = {row["method"] for row in rows if row["study"] == study}
+    return [name for name in METHODS if name in given]
+
+
+def _format_targets(rows: Sequence[Row], own: PeerComparison, limit: float) -> list[str]:
+    """Times to reach errors, and how many times as long as ours that is."""
+    methods, table = list_methods(rows, own.study), []
+    if own.ours not in methods:
+        return []
+    for method in methods:
+        cells = [method]
+        for target in own.targets:
+            times, ours = (find_times(rows, m, own, target) for m in (method, own.ours))
+            names = times.keys() & ours.keys()
+            reached = sum(math.isfinite(times[name]) for name in names)
+            mean, least = (
+                find_mean([min(part[name], limit) for name in names] or [math.nan])
+                for part in (times, ours)
+            )
+            shown = (f"{mean:.4f}", f"{mean / least:.2g}") if reached else ("-", "-")
+            cells += [shown[0], f"{reached} of {len(names)}", shown[1]]
+        table.append(cells)
+    heads = [head for t in own.targets for head in (f"{t:g} [s]", "reached", "times ours")]
+    return [
+        f"## {own.title[0].upper()}{own.title[1:]}",
+        "",
+        *format_table(["method", *heads], table),
+        "",
+    ]
+
+
+def _draw_study(axes: Axes, rows: Sequence[Row], study: str) -> None:
+    """One panel; hollow markers are settings with which some phases are not solved."""
+    planning = study in PLANNING
+    for index, method in enumerate(list_methods(rows, study)):
+        points, full = [], []
+        mine = [row for row in rows if (row["study"], row["method"]) == (study, method)]
+        for setting in dict.fromkeys(row["setting"] for row in mine):
+            group = [row for row in mine if row["setting"] == setting]
+            found = [row for row in group if np.isfinite(row["errors"][0])]
+            if 2 * len(found) < len(group):
+                continue
+            error = float(np.median([abs(row["errors"][0]) for row in found]))
+            seconds = find_mean([row["solve"] + planning * row["build"] for row in found])
+            points.append((max(error, 1e-16), seconds))
+            full.append(all(row["outcome"] == SOLVED for row in group))
+        if not points:
+            continue
+        look: Any = {"color": PALETTE[index % len(PALETTE)], "marker": MARKERS[index]}
+        look |= {"linestyle": "-" if index < len(PALETTE) else "--", "markersize": 5}
+        axes.plot(*zip(*points, strict=True), label=method, **look)
+        hollow = [point for point, whole in zip(points, full, strict=True) if not whole]
+        if hollow:
+            look |= {"markerfacecolor": "white", "linestyle": "", "zorder": 3}
+            axes.plot(*zip(*hollow, strict=True), **look)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_title(f"{study[0].upper()}{study[1:]}")
+    what = "relative error of the phase time" if planning else "error of z and z' in scene units"
+    axes.set_xlabel(f"{what}, median over phases [-]")
+    axes.set_ylabel(f"{'build and solve' if planning else 'run'} time, mean over phases [s]")
+    if axes.lines:
+        finish_axes(axes, fontsize=8, ncols=2)
+
+
+class Precision(Study):
+    """Every setting of every method on every phase of four sliding contacts."""
+
+    name, title, timed = "precision", "Run time against error, with peers", True
+    columns = ("study", "phase", "method", "setting", "build", "solve", "errors", "outcome")
+    packages, shipped = ("toppra", "yapss"), True
+    allowed = 60.0
+    options = """\
+--peers NAME ...  measure these methods only, by the names that the table has (all)
+--limit S         processor time that one setting may take on one phase [s] = 60.0 in 1e-3..1e6
+"""
+
+    def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
+        """Study, phase, method, setting, and the files that phases are from."""
+        self.allowed = options.limit
+        files = tuple(map(str, sorted(Path(options.problems).glob("*.toml"))))
+        if not files:
+            text = f"{options.problems} has no problem files (*.toml)"
+            raise InputError("", "--problems", text)
+        for method in options.peers:
+            if method not in METHODS:
+                text = f"{method!r} given; allowed are {'; '.join(METHODS)}"
+                raise InputError("", "--peers", text)
+        for study, (method, own) in product(SIMULATION + PLANNING, METHODS.items()):
+            asked = method in (options.peers or METHODS)
+            if asked and study in own.choices and own.is_installed:
+                phases = [instance.name for instance in list_instances(files, study != NO_DRAG)]
+                yield from product([study], phases, [method], own.choices[study], [files])
+
+    def limit(self, case: Case) -> float:
+        """The time allowed, and that of the reference."""
+        return self.allowed + 120.0
+
+    def run(self, case: Case) -> Row:
+        """Measure one setting."""
+        run = run_simulator if case[0] in SIMULATION else run_planner
+        median = run(*case)
+        row = dict(zip(self.columns[:4], case, strict=False))
+        return row if median is None else row | median._asdict()
+
+    def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
+        """All tables."""
+        lines, measured = [INTRODUCTION], [row for row in rows if "errors" in row]
+        for comparison in COMPARISONS:
+            lines += _format_targets(measured, comparison, options.limit)
+        table = [(name, own.settings) for name, own in METHODS.items()]
+        lines += ["## Settings", "", *format_table(["method", "settings"], table, 2)]
+        return "\n".join(lines), []
+
+    def draw(self, rows: Sequence[Row]) -> Figure:
+        """Mean run time over the error that half of the phases keep, one line for each method."""
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(11.0, 9.0), layout="constrained")
+        FigureCanvasAgg(figure)
+        measured = [row for row in rows if "errors" in row]
+        for axes, study in zip(figure.subplots(2, 2).flat, PLANNING + SIMULATION, strict=True):
+            _draw_study(axes, measured, study)
+        return figure
+
+
+STUDY = Precision()

@@ -1,0 +1,815 @@
+"""Second opinions on refusals, by arguments that share nothing with the planner.
+
+Contacts and forces are those of bodies and points (`verification.newton_euler`), distances are by
+separating axes; nothing is known of C-functions or limits of formations.
+
+A phase of one freedom is followed as an ordinary differential equation (`follow`) up to its `until`
+or to where a contact leaves its feature or bodies run into each other. Along a curve z(s) the speed
+squared b = s'^2 and the acceleration a = s'' enter every force linearly, and so do the contact
+forces: whether any motion keeps all limits is a linear programme, discretised in s. Two questions
+are asked of it, each for the largest share `margin` by which all limits can be kept at once
+(negative where they cannot):
+
+* `slow_margin`: at b = a = 0. Positive, a slow enough motion exists.
+* `fast_margin`: with b >= 0 free along the curve, at rest at its ends. Negative, none exists.
+  Viscous friction is not linear in b; what stands in for sqrt(b) may be anything between its chord
+  and its tangents, which can only allow more.
+
+`rest_margin` asks whether a motion can begin from rest, or come to rest, at a place. There every
+force is linear in the accelerations, once it is known which contacts and joints these set in motion
+and which way. With one or two freedoms the ways are few: rays along which something stands still,
+and the sectors between them. Accelerations may vanish, and what stands still may be held by any
+friction in its cone, so that only more is allowed than any motion needs: where even the best margin
+is negative, nothing moves.
+
+A motion with two freedoms from rest to the end of its phase follows some curve x(u), phi(u).
+Cubic curves to many places of the end are drawn at random, and those with the largest `fast_margin`
+are bent further as long as these grow: a search for a plan that shares neither transcription nor
+guesses with the planner.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import product
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+from scipy.linalg import null_space
+from scipy.optimize import brentq, linprog
+from scipy.sparse import block_array, block_diag, coo_array, diags_array, eye_array, kron
+
+from ..common.arrays import Array
+from ..common.errors import InputError, WholearmError
+from ..planning.plan import solve
+from ..problem.definition import End, Phase, Problem
+from ..scene.model import Scene
+from ..verification.newton_euler import Touch, dot, link_axis, locate, norm, place_object
+
+OVERLAP = 1e-6
+"""Overlap over the radius of gyration from which on two bodies count as running into each other."""
+
+
+class Trace(NamedTuple):
+    """A curve of configurations that keep a phase's contacts closed."""
+
+    place: Callable[[Array], Array]  # configurations, shape (5, n), at arc lengths
+    length: float  # [m]
+    end: Array  # (5,)
+    tangents: Callable[[Array], Array]  # unit tangents along the way, shape (n, 5), from (n, 5)
+    ending: str  # what ends it
+    reached: bool  # whether that is the phase's `until`
+
+
+def follow(scene: Scene, phase: Phase, z: Array) -> tuple[Trace, Trace]:
+    """Follow a phase's contacts from `z`, shape (5,), both ways."""
+
+    def equations(z: Array) -> tuple[Array, Array]:
+        gaps, rows = constrain(scene, phase, z[None])
+        return gaps[0], rows[0, : gaps.shape[1]]
+
+    closed = project(scene, z, equations)
+    z = z if closed is None else closed
+    return _march(scene, phase, z, 1.0), _march(scene, phase, z, -1.0)
+
+
+def weights(scene: Scene) -> Array:
+    """Diagonal of the metric, shape (5,): an angle counts as it moves the object's rim [1, m^2]."""
+    return np.array([1.0, 1.0, *[scene.scales.length**2] * 3])
+
+
+def project(
+    scene: Scene, z: Array, equations: Callable[[Array], tuple[Array, Array]]
+) -> Array | None:
+    """Nearest zero of equations to `z`, by Newton's method; None if none.
+
+    Parameters
+    ----------
+    equations  their values, shape (m,), and rows of their Jacobian, (m, 5)
+    """
+    scale, size = np.sqrt(weights(scene)), scene.scales.length
+    for _ in range(20):
+        miss, rows = equations(z)
+        step = -np.linalg.pinv(rows / scale, rcond=1e-10) @ miss / scale
+        z = z + step
+        if np.abs(step * scale).max() < 1e-13 * size:
+            break
+    return z if np.abs(equations(z)[0]).max() < 1e-9 * size else None
+
+
+def constrain(scene: Scene, phase: Phase, z: Array) -> tuple[Array, Array]:
+    """Gaps, shape (n, n_c), and rows of the constraints, (n, n_c + R, 5), at configurations."""
+    touches = [locate(scene, name, z) for name in phase.formation.names]
+    rows = [t.normal for t in touches] + [touches[k].tangent for k in phase.formation.rolling_rows]
+    return np.stack([touch.gap for touch in touches], axis=1), np.stack(rows, axis=1)
+
+
+def _march(scene: Scene, phase: Phase, z: Array, way: float) -> Trace:
+    """Integrate the unit tangent up to the first event."""
+    size, until, scale = scene.scales.length, phase.until, np.sqrt(weights(scene))
+
+    def tangents(z: Array) -> Array:
+        # Cofactors of the four rows: unlike null vectors of an SVD they keep their sense.
+        rows = constrain(scene, phase, z)[1] / scale
+        minors = [way * (-1) ** k * np.linalg.det(np.delete(rows, k, axis=2)) for k in range(5)]
+        found = np.stack(minors, axis=1)
+        size = np.maximum(np.linalg.norm(found, axis=1), 1e-300)[:, None]
+        return np.asarray(found / size / scale)
+
+    def find_room(z: Array) -> dict[str, float]:
+        touches = {f"{n} leaves": locate(scene, n, z[None]) for n in phase.formation.names}
+        room = {name: float(gap[0]) for name, gap in clearances(scene, z[None]).items()}
+        return room | {name: float(min(t.low[0], t.high[0])) for name, t in touches.items()}
+
+    def overlap(_: float, z: Array) -> float:
+        return min(find_room(z).values()) + OVERLAP * size
+
+    def end(_: float, z: Array) -> float:
+        if until.contact is not None or until.value is None:
+            return 1.0
+        return float(z[0 if until.coordinate == "x" else 2] - until.value)
+
+    overlap.terminal, overlap.direction, end.terminal = True, -1.0, True  # type: ignore[attr-defined]
+    run: Any = solve_ivp(
+        lambda _, z: tangents(z[None])[0],
+        (0.0, 60.0 * size),  # several turns of the object
+        z,
+        rtol=1e-9,
+        atol=1e-10 * size / scale,
+        max_step=0.02 * size,
+        dense_output=True,
+        events=(overlap, end),
+    )
+    last = run.y[:, -1]
+    text = "nothing happens" if run.status == 0 else "the contacts become dependent"
+    met = run.status == 1 and len(run.t_events[1]) > 0
+    if run.status == 1 and not met:
+        text = ", ".join(k for k, room in find_room(last).items() if room < -OVERLAP * size / 2)
+        if until.contact is not None:
+            touch, near = locate(scene, until.contact.name, last[None]), 1e-5 * size
+            met = bool(max(abs(touch.gap[0]), -touch.low[0], -touch.high[0]) <= near)
+    return Trace(run.sol, float(run.t[-1]), last, tangents, str(until) if met else text, met)
+
+
+def resample(scene: Scene, phase: Phase, trace: Trace, count: int) -> tuple[Array, Array, Array]:
+    """The curve at even places, and also where a contact or a joint turns.
+
+    Returns
+    -------
+    s : (n,) [m]     arc length
+    z, z_s : (n, 5)  configurations, and unit tangents along the way
+    """
+
+    def slide(s: Array) -> Array:
+        z = trace.place(s).T
+        return slides(scene, phase, z, trace.tangents(z))
+
+    s = np.linspace(0.0, trace.length, count)
+    rates = slide(s)
+    rates[np.abs(rates) < 1e-9 * np.abs(rates).max()] = 0.0
+    turns = [
+        brentq(lambda x, row=row: slide(np.array([x]))[0, row], s[k], s[k + 1])
+        for k, row in zip(*np.nonzero(rates[1:] * rates[:-1] < 0), strict=True)
+    ]
+    s = np.unique([*s, *turns])
+    s = s[np.append(True, np.diff(s) > 1e-9 * scene.scales.length)]
+    z = trace.place(s).T
+    return s, z, trace.tangents(z)
+
+
+def slides(scene: Scene, phase: Phase, z: Array, z_s: Array) -> Array:
+    """Rates of sliding of the contacts and of the joints along z_s, shape (n, n_c + 2)."""
+    rows = [(locate(scene, n, z).tangent * z_s).sum(axis=1) for n in phase.formation.names]
+    return np.column_stack([*rows, z_s[:, 3:]])
+
+
+def clearances(scene: Scene, z: Array) -> dict[str, Array]:
+    """Signed distances [m] of every solid pair at n configurations, each of shape (n,).
+
+    Exact where a pair overlaps by a little or faces flat to vertex; elsewhere a lower bound of the
+    distance, with the right sign. The palm does not stop a link.
+    """
+    corners, bones = place_object(scene, z), list[Array]()
+    apart = {"object and palm": corners[..., 1].min(axis=1)}
+    for finger, link in enumerate(scene.fingers):
+        base = np.broadcast_to(np.asarray(link.base), (len(z), 2))
+        bones.append(np.stack([base, base + link.length * link_axis(scene, z, finger)], axis=1))
+        gap = separate(corners, bones[finger]) - link.radius
+        apart[f"object and finger {finger + 1}"] = gap
+    if scene.fingers_collide:
+        thick = sum(link.radius for link in scene.fingers)
+        apart["finger 1 and finger 2"] = separate(*bones) - thick
+    return apart
+
+
+def separate(first: Array, second: Array) -> Array:
+    """Signed distance of convex polygons or segments, shape (n, k, 2) and (n, m, 2), as (n,).
+
+    Positive: the distance. Negative: minus the depth of the overlap.
+    """
+    depth = np.maximum(_reach(first, second), _reach(second, first))
+    distance = np.minimum(_nearest(first, second), _nearest(second, first))
+    return np.where(depth > 0, distance, depth)
+
+
+def _reach(first: Array, second: Array) -> Array:
+    """Largest gap along the normals of the first body's edges, both ways for a segment."""
+    along = np.roll(first, -1, axis=1) - first
+    along = along / np.maximum(norm(along), 1e-300)[..., None]
+    outward = np.stack([along[..., 1], -along[..., 0]], axis=-1)
+    other = np.einsum("nkd,nmd->nkm", outward, second).min(axis=2)
+    return np.asarray((other - dot(outward, first)).max(axis=1))
+
+
+def _nearest(points: Array, body: Array) -> Array:
+    """Least distance of the points of one body to the edges of another, shape (n,)."""
+    along = np.roll(body, -1, axis=1) - body
+    apart = points[:, :, None] - body[:, None]
+    square = np.maximum(dot(along, along), 1e-300)
+    share = np.clip(dot(apart, along[:, None]) / square[:, None], 0.0, 1.0)
+    return np.asarray(norm(apart - share[..., None] * along[:, None]).min(axis=(1, 2)))
+
+
+Bounds = list[tuple[float | None, float | None]]
+
+
+def slow_margin(scene: Scene, phase: Phase, epsilon: float, z: Array, z_s: Array) -> float:
+    """Least margin of all places, each at its best, for vanishing speed."""
+    curve = np.arange(1.0 * len(z)), z, z_s, np.zeros_like(z)
+    margin = _solve_along(scene, phase, epsilon, curve, np.zeros(len(z)), 0.0)
+    return float(np.nan_to_num(margin, nan=-np.inf))
+
+
+def fast_margin(
+    scene: Scene,
+    phase: Phase,
+    epsilon: float,
+    curve: tuple[Array, Array, Array],
+    rests: tuple[bool, bool] = (True, True),
+    loose: float = 0.0,
+) -> float:
+    """Margin of the best motion along a curve.
+
+    Parameters
+    ----------
+    curve  as of `event_tracing.resample`
+    rests  whether the motion is at rest at the start and at the end of the curve
+    loose  rate of sliding over that of the whole motion below which a contact may also roll, or
+           slide the other way, on a curve nearby: its friction may then be any in its cone
+    """
+    s, z, z_s = curve
+    with np.errstate(divide="ignore"):
+        joints = ((scene.speed_limit / np.abs(z_s[:, 3:])) ** 2).min(axis=1)
+    top = np.minimum(1e6, joints / scene.scales.speed**2)
+    top[[0, -1]] *= ~np.array(rests)
+    z_ss = np.gradient(z_s, s, axis=0, edge_order=1)
+    return _solve_along(scene, phase, epsilon, (s, z, z_s, z_ss), top, loose)
+
+
+def _solve_along(
+    scene: Scene,
+    phase: Phase,
+    epsilon: float,
+    curve: tuple[Array, Array, Array, Array],
+    top: Array,
+    loose: float,
+) -> float:
+    """Largest margin along a curve (s, z, z_s, z_ss), b being at most `top` at its n places.
+
+    Unknowns: b and v, which stands for sqrt(b), at the places, contact forces at both ends of every
+    interval, and the margin.
+    """
+    s, z, z_s, z_ss = curve
+    n, n_c = len(s), phase.formation.n_contacts
+    slow = np.abs(slides(scene, phase, z, z_s)[:, :n_c]) < loose
+    signs, free = _signs(scene, phase, z, z_s), slow[1:] | slow[:-1] if loose else None
+    slope = diags_array(scene.scales.length / (2 * np.diff(s))) @ (
+        eye_array(n - 1, n, k=1) - eye_array(n - 1, n)
+    )
+    upper, most, equal, equal_to = list[Any](), list[Array](), list[Any](), list[Array]()
+    for side in (0, 1):
+        at, place = slice(side, n - 1 + side), eye_array(n - 1, n, k=side)
+        points = z[at], z_s[at], z_ss[at]
+        laws, laws_to, rows, least, share = _limits(scene, phase, epsilon, *points, signs, free)
+        for blocks, matrix in ((equal, laws), (upper, -rows)):
+            every = kron(eye_array(n - 1), np.ones((matrix.shape[1], 1)))
+            a, b, v = (diags_array(matrix[:, :, k].ravel()) @ every for k in range(3))
+            c: list[Any] = [None, None]
+            c[side] = block_diag([coo_array(block) for block in matrix[:, :, 3:]])
+            blocks.append([a @ slope + b @ place, v @ place, *c])
+        upper[-1].append(np.tile(share, n - 1)[:, None])
+        most.append(-least.ravel())
+        equal_to.append(laws_to.ravel())
+    moving = np.flatnonzero(top)
+    bounds: Bounds = [*zip(np.zeros(n), top, strict=True)]
+    bounds += [(0.0, None if limit else 0.0) for limit in top]
+    if len(moving):
+        # v is below the tangents of sqrt(b), and above its chord.
+        some, root = eye_array(n, format="csr")[moving], np.sqrt(top[moving])
+        for share in np.geomspace(1e-3, 1.0, 13):
+            upper.append([-diags_array(0.5 / (share * root)) @ some, some, None, None, None])
+            most.append(share * root / 2)
+        upper.append([diags_array(1 / root) @ some, -some, None, None, None])
+        most.append(np.zeros(len(moving)))
+    A_ub, A_eq = block_array(upper, format="csr"), block_array(equal, format="csr")
+    bounds += [(None, None)] * (A_ub.shape[1] - 2 * n - 1) + [(None, 1.0)]
+    A_eq.resize(A_eq.shape[0], A_ub.shape[1])
+    return _maximise(A_ub, np.concatenate(most), A_eq, np.concatenate(equal_to), bounds)
+
+
+def inertia_ratio(scene: Scene, phase: Phase, z: Array, z_s: Array) -> Array:
+    """Reduced inertia over that without friction, least of both sides, shape (n,): jams below 0."""
+    names, rolling = phase.formation.names, phase.formation.rolling_rows
+    touches = [locate(scene, name, z) for name in names]
+    signs = _signs(scene, phase, z, z_s)
+    rows = np.concatenate(
+        [
+            np.stack([touch.normal for touch in touches], axis=1),
+            *(touches[k].tangent[:, None] for k in rolling),
+        ],
+        axis=1,
+    )
+    light = rows / scene.mass_diagonal
+    without = np.linalg.det(light @ rows.transpose(0, 2, 1))
+    ratios = []
+    for sign in (np.vstack([signs[:1], signs]), np.vstack([signs, signs[-1:]])):
+        ratios.append(np.linalg.det(light @ _push(touches, rolling, sign)) / without)
+    return np.asarray(np.minimum(*ratios))
+
+
+def _signs(scene: Scene, phase: Phase, z: Array, z_s: Array) -> Array:
+    """Signs of sliding of contacts and joints on each interval, shape (n - 1, n_c + 2)."""
+    rates = slides(scene, phase, z, z_s)
+    return np.asarray(np.sign(rates[1:] + rates[:-1]))
+
+
+def _push(touches: list[Touch], rolling: tuple[int, ...], signs: Array) -> Array:
+    """What the forces c_n and c_t(rolling) push with, shape (n, 5, n_c + R)."""
+    pushes = [
+        touch.normal - (0.0 if k in rolling else touch.friction) * signs[:, [k]] * touch.tangent
+        for k, touch in enumerate(touches)
+    ]
+    return np.stack([*pushes, *(touches[k].tangent for k in rolling)], axis=2)
+
+
+def _limits(
+    scene: Scene,
+    phase: Phase,
+    epsilon: float,
+    z: Array,
+    z_s: Array,
+    z_ss: Array,
+    signs: Array,
+    free: NDArray[np.bool_] | None,
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Limits at n places, as rows over x = (a, b, v, c) >= least.
+
+    With forces over the scene's weight, torques over their limits and lengths over the radius of
+    gyration. v stands for sqrt(b), c for c_n, c_t(rolling), and all c_t where friction is free:
+    where `free`, shape (n, n_c), that of a contact is in its cone.
+
+    Returns
+    -------
+    equal, equal_to : (n, 3, k) and (n, 3)  Newton's and Euler's laws of the object
+    rows, least : (n, m, k) and (n, m)      limits
+    share : (m,)                            what a margin of 1 takes from each limit
+    """
+    length, force, speed = scene.scales.length, scene.scales.force, scene.scales.speed
+    n, n_c, rolling = len(z), phase.formation.n_contacts, phase.formation.rolling_rows
+    touches = [locate(scene, name, z) for name in phase.formation.names]
+    mu, held = np.array([touch.friction for touch in touches]), list(rolling)
+    push = [_push(touches, rolling, signs)]
+    if free is not None:
+        push.append(np.stack([touch.tangent for touch in touches], axis=2))
+    mass = scene.mass_diagonal * speed**2
+    inertia = [mass * z_s / length, mass * z_ss, scene.viscous * z_s * speed]
+    drive = np.concatenate([np.stack(inertia, axis=2), *(-force * part for part in push)], axis=2)
+    scale, limit = force * np.array([1.0, 1.0, length]), scene.torque_limit
+    unit = np.eye(drive.shape[2])
+    press, grip = unit[3 : 3 + n_c], unit[3 + n_c : 3 + n_c + len(held)]
+    cone = mu[held, None] * press[held]
+    fixed = np.concatenate([press, cone + grip, cone - grip])
+    torque = drive[:, 3:] / limit[:, None]
+    dry = scene.dry[3:] * signs[:, n_c:] / limit
+    rows = [np.broadcast_to(fixed, (n, *fixed.shape)), -torque, torque]
+    least = [np.tile(epsilon / force * np.concatenate([np.ones(n_c), *[mu[held]] * 2]), (n, 1))]
+    least += [dry - 1.0, -dry - 1.0]
+    share = [np.ones(len(fixed) + 4)]
+    if free is not None:
+        # What is left of friction against the sliding, between nothing and twice its amount.
+        left = signs[:, :n_c, None] * unit[-n_c:]
+        rows += [left, 2 * (mu * free)[:, :, None] * press - left]
+        least.append(np.zeros((n, 2 * n_c)))
+        share.append(np.zeros(2 * n_c))
+    equal_to = np.broadcast_to(scene.applied_force[:3] / scale, (n, 3))
+    matrices = np.concatenate(rows, axis=1), np.concatenate(least, axis=1)
+    return drive[:, :3] / scale[:, None], equal_to, *matrices, np.concatenate(share)
+
+
+def _maximise(A_ub: Any, b_ub: Any, A_eq: Any, b_eq: Any, bounds: Bounds) -> float:
+    """Largest value of the last unknown; -inf where infeasible, NaN where nothing is known."""
+    cost = -np.eye(1, len(bounds), len(bounds) - 1)[0]
+    options = {"time_limit": 20.0}
+    answer = linprog(cost, A_ub, b_ub, A_eq, b_eq, bounds, method="highs", options=options)
+    return float(-answer.fun) if answer.status == 0 else -np.inf if answer.status == 2 else np.nan
+
+
+STILL = 1e-9  # rate over the largest one below which something stands still
+
+
+def rest_margin(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: bool = False) -> float:
+    """Best margin of any motion that leaves rest at `z`, shape (5,), or comes to rest there.
+
+    Parameters
+    ----------
+    ends  whether the motion ends there: then things moved against their accelerations
+
+    Returns
+    -------
+    float  of normal forces over the weight and of torques over their limits, at most 1; NaN with
+           other than one or two freedoms
+    """
+    touches = [locate(scene, name, z[None]) for name in phase.formation.names]
+    rolling = phase.formation.rolling_rows
+    closed = np.array([t.normal[0] for t in touches] + [touches[k].tangent[0] for k in rolling])
+    size = np.array([1.0, 1.0, *[1 / scene.scales.length] * 3])
+    N = size[:, None] * null_space(closed * size, rcond=STILL)
+    if N.shape[1] not in (1, 2):
+        return np.nan
+    slip = np.array([t.tangent[0] for t in touches] + list(np.eye(5)[3:])) @ N
+    slip[list(rolling)] = 0.0
+    apart = np.array([t.normal[0] for t in list_others(scene, phase, z)]).reshape(-1, 5) @ N
+    largest = np.abs(slip).max()
+    margins = [-np.inf]
+    for way in _ways(np.vstack([slip, apart])):
+        rate = slip @ way
+        signs = np.where(np.abs(rate) > STILL * largest, np.sign(rate), 0.0)
+        if (apart @ way >= -STILL * largest).all():
+            margins.append(_solve_at_rest(scene, epsilon, touches, N, (slip, signs, apart), ends))
+    return max(margins)
+
+
+def list_others(scene: Scene, phase: Phase, z: Array) -> list[Touch]:
+    """Contacts that touch at `z` but are none of the phase's: they may only open."""
+    near, count = 1e-6 * scene.scales.length, len(scene.polygon.vertices)
+    names = [f"v{k}-{part}" for k, part in product(range(count), ("palm", "finger1", "finger2"))]
+    names += [f"e{k}-tip{finger}" for k, finger in product(range(count), (1, 2))]
+    touches = [locate(scene, n, z[None]) for n in sorted({*names} - {*phase.formation.names})]
+    return [t for t in touches if abs(t.gap[0]) < near and min(t.low[0], t.high[0]) > near]
+
+
+def _ways(slip: Array) -> Iterator[Array]:
+    """Unit vectors, shape (f,): one for each ray on which something stands still, and between."""
+    if slip.shape[1] == 1:
+        yield from (np.ones(1), -np.ones(1))
+        return
+    moving = slip[np.abs(slip).max(axis=1) > STILL * np.abs(slip).max()]
+    angles = np.arctan2(-moving[:, 0], moving[:, 1])
+    rays = np.sort(np.concatenate([angles, angles + np.pi]) % (2 * np.pi))
+    between = (rays + np.append(rays[1:], rays[0] + 2 * np.pi)) / 2
+    for angle in (*rays, *between):
+        yield np.array([np.cos(angle), np.sin(angle)])
+
+
+def _solve_at_rest(
+    scene: Scene,
+    epsilon: float,
+    touches: list[Touch],
+    N: Array,
+    rates: tuple[Array, Array, Array],
+    ends: bool,
+) -> float:
+    """Margin in one way.
+
+    Unknowns: the acceleration over the scene's, c_n and c_t over the weight, dry friction of the
+    joints over its bound, and the margin.
+
+    Parameters
+    ----------
+    N : (5, f)  accelerations that keep the contacts
+    rates       rates of contacts and joints, shape (n_c + 2, f), their signs, and rates of other
+                gaps
+    """
+    slip, signs, apart = rates
+    scales, f, n_c = scene.scales, N.shape[1], len(touches)
+    unit = np.eye(f + 2 * n_c + 3)
+    move, press, grip = unit[:f], unit[f : f + n_c], unit[f + n_c : f + 2 * n_c]
+    drive = scene.mass_diagonal[:, None] * N @ move * scales.acceleration * scales.length
+    for k, touch in enumerate(touches):
+        drive -= scales.force * (
+            np.outer(touch.normal, press[k]) + np.outer(touch.tangent, grip[k])
+        )
+    drive[3:] += scene.dry[3:, None] * unit[f + 2 * n_c : -1]
+    scale = scales.force * np.array([1.0, 1.0, scales.length])
+    torque = drive[3:] / scene.torque_limit[:, None]
+    way = -signs if ends else signs
+    gone, still = way[:n_c] != 0, (signs == 0) & (np.abs(slip).max(axis=1) > 0)
+    mu = np.array([touch.friction for touch in touches])[:, None]
+    cone = mu * press
+    equal = [drive[:3] / scale[:, None], slip[still] @ move]
+    equal.append((grip + way[:n_c, None] * cone)[gone])
+    equal_to = np.append(scene.applied_force[:3] / scale, np.zeros(still.sum() + gone.sum()))
+    # Limits: rows, what they are at least, and what a margin of 1 takes from them.
+    limits = [
+        ((signs[:, None] * slip) @ move, 0.0, 0.0),
+        (press, epsilon / scales.force, 1.0),
+        ((cone - grip)[~gone], 0.0, 0.0),
+        ((cone + grip)[~gone], 0.0, 0.0),
+        (torque, -1.0, 1.0),
+        (-torque, -1.0, 1.0),
+        (apart @ move, 0.0, 0.0),
+    ]
+    upper = np.concatenate([share * unit[-1] - rows for rows, _, share in limits])
+    most = np.concatenate([np.full(len(rows), -least) for rows, least, _ in limits])
+    bounds: Bounds = [(None, None)] * (f + 2 * n_c)
+    bounds += [(sign, sign) if sign else (-1.0, 1.0) for sign in way[n_c:]]
+    return _maximise(upper, most, np.concatenate(equal), equal_to, [*bounds, (None, 1.0)])
+
+
+PLACES = 60  # places along a curve at which limits are looked at
+CLEAR = 1e-3  # margin over the scene's weight, or a torque limit, from which a motion surely exists
+Flags = NDArray[np.bool_]
+
+
+class Verdict(NamedTuple):
+    """What a second look says about a refusal."""
+
+    # {"confirmed", "refuted", "close", "open"}: no motion exists; one does; it depends on rounding
+    # or on the discretisation; or there is no second argument
+    kind: str
+    reason: str
+
+
+def judge(problem: Problem, error: WholearmError, stops: list[tuple[float, float]]) -> Verdict:
+    """Judge a refusal to plan a problem whose phases stop at the poses `stops` (x, phi).
+
+    Phases after one with two freedoms begin where the least-time plan of the phases before ends.
+    """
+    match = re.search(r"phases? (\d+)|phases\[(\d+)\]", str(error))
+    number = int(match[1] or match[2]) if match else None
+    z = problem.start
+    open_end = Verdict("open", "")
+    planned = False
+    for phase in problem.phases:
+        concerned = number in (None, phase.number)
+        if planned and not concerned:
+            continue
+        if phase.formation.n_constraints == 4 and not phase.until.is_release:
+            # The shortest curve that reaches the phase's end, or the longer one if none does.
+            trace = max(
+                follow(problem.scene, phase, z),
+                key=lambda own: (own.reached, -own.length if own.reached else own.length),
+            )
+            if trace.length < 0.001 * problem.scene.scales.length:
+                return Verdict("close", f"phase {phase.number} has nothing to do")
+            if not trace.reached:
+                return Verdict("confirmed", f"phase {phase.number}: {trace.ending}")
+            if concerned:
+                verdict = _judge_curve(problem, phase, trace)
+                if verdict.kind != "refuted" or number is not None:
+                    return verdict
+                open_end = verdict
+            z = trace.end
+            continue
+        if concerned and phase.index < len(stops):
+            return _judge_cell(problem, phase, z, stops[phase.index])
+        before = None if concerned or number is None else _find_start(problem, number)
+        if before is None:
+            return Verdict("open", f"phase {phase.number} ends where the planner chooses")
+        z, planned = before, True
+    if isinstance(error, InputError) and not open_end.reason:
+        return Verdict("refuted", "every phase reaches its until")
+    return open_end
+
+
+def _find_start(problem: Problem, number: int) -> Array | None:
+    """Where the least-time plan of the phases before one ends at rest; None if there is none."""
+    before = problem.phases[: number - 1]
+    if not before or before[-1].end is not End.REST:
+        return None
+    try:
+        plan = solve(replace(problem, phases=before), replay=False)
+    except WholearmError:
+        return None
+    motion = plan.trajectory.motions[-1]
+    return np.asarray(motion.evaluate(np.array([motion.duration])).z[0])
+
+
+def _judge_curve(problem: Problem, phase: Phase, trace: Trace) -> Verdict:
+    scene, epsilon = problem.scene, problem.epsilon
+    s, z, z_s = resample(scene, phase, trace, PLACES)
+    slow = slow_margin(scene, phase, epsilon, z, z_s)
+    free = float(inertia_ratio(scene, phase, z, z_s).min())
+    at = f"phase {phase.number}"
+    # Of the reduced inertia without friction.
+    if free < 0.02:
+        return Verdict("confirmed" if free < 0.0 else "close", f"{at}: inertia ratio {free:.3g}")
+    if slow > CLEAR:
+        return Verdict("refuted", f"{at}: a slow motion keeps all limits by {slow:.3g}")
+    rests = (_stops_before(problem, phase), phase.end is End.REST)
+    fast = fast_margin(scene, phase, epsilon, (s, z, z_s), rests)
+    if fast < -1e-7:
+        return Verdict("confirmed", f"{at}: no motion keeps all limits, {fast:.3g} short")
+    if np.isnan(fast):
+        return Verdict("open", f"{at}: the linear programme has no answer")
+    if fast > CLEAR and not scene.viscous.any():
+        return Verdict("refuted", f"{at}: a motion keeps all limits by {fast:.3g}")
+    return Verdict("close", f"{at}: slow {slow:.3g}, fast {fast:.3g}")
+
+
+def _stops_before(problem: Problem, phase: Phase) -> bool:
+    return phase.index == 0 or problem.phases[phase.index - 1].end is End.REST
+
+
+def _judge_cell(problem: Problem, phase: Phase, z: Array, stop: tuple[float, float]) -> Verdict:
+    scene, epsilon, at = problem.scene, problem.epsilon, f"phase {phase.number}"
+    if not _stops_before(problem, phase) or phase.end is not End.REST or phase.until.is_release:
+        return Verdict("open", f"{at} does not go from rest to rest")
+    begins = rest_margin(scene, phase, epsilon, z)
+    if begins < -CLEAR:
+        return Verdict("confirmed", f"{at}: no motion from rest at the start, {begins:.3g}")
+    ends = list_ends(scene, phase, z, stop)
+    if not len(ends):
+        return Verdict("open", f"{at}: no place of its end was found")
+    stopped = [-np.inf]
+    for end in ends:
+        stopped.append(rest_margin(scene, phase, epsilon, end, ends=True))
+        if stopped[-1] > 0:
+            break
+    if max(stopped) < -CLEAR:
+        reason = f"{at}: no motion comes to rest at any of {len(ends)} places, {max(stopped):.3g}"
+        return Verdict("confirmed", reason)
+    best = find_best(scene, phase, epsilon, z, ends)
+    text = f"{at}: of {best.curves} curves to {best.ends} places the best has {best.margin:.3g}"
+    if best.margin > CLEAR:
+        return Verdict("refuted", text)
+    text += f", {best.loose:.3g} if slow contacts may stick"
+    least = max(best.margin, best.loose)
+    # Where the best of many curves misses limits by so much, surely none keeps them.
+    return Verdict("confirmed" if best.curves and least < -0.02 else "close", text)
+
+
+class Best(NamedTuple):
+    """The best of many curves."""
+
+    margin: float  # as of `fast_margin`, without and with friction of slow contacts in their cones
+    loose: float
+    z: Array  # (n, 5): the curve that has the margin `margin`
+    curves: int  # curves that were looked at
+    ends: int  # places of the end that were looked at
+
+
+def list_ends(scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]) -> Array:
+    """Places at which a phase with two freedoms ends, those near the pose `stop`, shape (n, 5)."""
+
+    def project_end(z: Array) -> Array | None:
+        return project(scene, z, lambda z: _end_equations(scene, phase, z))
+
+    # A joint may turn far on the way there, so that contacts are followed step by step.
+    line = z[[0, 2]] + np.linspace(0.0, 1.0, 4)[:, None] * (np.array(stop) - z[[0, 2]])
+    first = project_end(bend(scene, phase, z, line[None])[0, -1])
+    first = project_end(z) if first is None else first
+    if first is None:
+        return np.zeros((0, 5))
+    scale = np.sqrt(weights(scene))
+    found = [first]
+    for way in (1.0, -1.0):
+        here, ahead = first, None
+        for step in 0.08 * scene.scales.length * 1.12 ** np.arange(16):
+            rows = _end_equations(scene, phase, here)[1] / scale
+            tangent = np.linalg.svd(rows)[2][-1] / scale
+            if ahead is None:
+                tangent = way * tangent
+            elif (tangent * scale) @ (ahead * scale) < 0:
+                tangent = -tangent
+            after = project_end(here + step * tangent)
+            if after is None or np.linalg.norm((after - here) * scale) > 3 * step:
+                break
+            here, ahead = after, tangent
+            found.append(here)
+    points = np.array(found)
+    return points[inside(scene, phase, points)]
+
+
+def find_best(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: Array) -> Best:
+    """Look for the curve from `z` to one of `ends` along which a motion keeps limits best.
+
+    The search stops at a curve with the margin `CLEAR`.
+    """
+    rng = np.random.default_rng(0)
+    start, size = z[[0, 2]], np.array([scene.scales.length, 1.0])
+    goals = ends[:, [0, 2]]
+
+    def draw(count: int, spread: float) -> Array:
+        """Control points of cubic curves, shape (count, 4, 2), the first of them straight."""
+        last = goals[rng.integers(len(goals), size=count)]
+        points = start + np.linspace(0, 1, 4)[:, None] * (last - start)[:, None]
+        width = spread * rng.uniform(size=(count, 1, 1)) * size
+        points[:, 1:3] += width * rng.normal(size=(count, 2, 2))
+        return points
+
+    best: list[tuple[float, float, Array, Array]] = []
+    count = 0
+
+    def look(controls: Array, most: int) -> bool:
+        nonlocal count, best
+        curves = bend(scene, phase, z, controls)
+        stays = inside(scene, phase, curves.reshape(-1, 5)).reshape(len(curves), -1)
+        kept = np.flatnonzero(stays.all(axis=1))[:most]
+        for k in kept:
+            margins = _find_margins(scene, phase, epsilon, curves[k])
+            best.append((*margins, controls[k], curves[k]))
+        count += len(kept)
+        best = sorted(best, key=lambda one: -max(one[0], one[1]))[:3]
+        return any(one[0] > CLEAR for one in best)
+
+    straight = np.linspace(0, 1, 4)[:, None] * (goals - start)[:, None] + start
+    if not look(straight, len(straight)) and not look(draw(400, 0.5), 40):
+        # The best curves are bent in six rounds, ten of them in each.
+        for turn in range(6):
+            if not best:
+                break
+            spread = 0.3 * 0.7**turn
+            parents = np.array([best[k % len(best)][2] for k in range(40)])
+            moves = spread * size * rng.normal(size=(len(parents), 3, 2))
+            children = parents.copy()
+            children[:, 1:3] += moves[:, :2]
+            nearest = goals - (parents[:, 3] + moves[:, 2])[:, None]
+            children[:, 3] = goals[(np.abs(nearest) / size).sum(axis=2).argmin(axis=1)]
+            if look(children, 10):
+                break
+    if not best:
+        return Best(-np.inf, -np.inf, z[None], 0, len(ends))
+    best.sort(key=lambda one: -one[0])
+    return Best(best[0][0], max(one[1] for one in best), best[0][3], count, len(ends))
+
+
+def bend(scene: Scene, phase: Phase, z: Array, controls: Array) -> Array:
+    """Configurations of cubic curves from `z`, forty along each, shape (n, 40, 5)."""
+    u = np.linspace(0.0, 1.0, 40)[:, None]
+    shares = np.hstack([(1 - u) ** 3, 3 * u * (1 - u) ** 2, 3 * u**2 * (1 - u), u**3])
+    poses = np.einsum("uk,nkd->nud", shares, controls)
+    curves = np.repeat(z[None], len(controls), axis=0)[:, None].repeat(len(u), axis=1)
+    for k in range(1, len(u)):
+        guess = curves[:, k - 1].copy()
+        guess[:, [0, 2]] = poses[:, k]
+        curves[:, k] = place(scene, phase, guess, curves[:, k - 1])
+    return curves
+
+
+def place(scene: Scene, phase: Phase, z: Array, before: Array) -> Array:
+    """Configurations with the x and phi of `z` that keep the contacts, coming from `before`."""
+    z = z.copy()
+    z[:, [1, 3, 4]] = before[:, [1, 3, 4]]
+    for _ in range(6):
+        gaps, rows = constrain(scene, phase, z)
+        rows = rows[:, :, [1, 3, 4]]
+        flat = np.abs(np.linalg.det(rows)) < 1e-12 * scene.scales.length**2
+        rows[flat] = np.eye(3)
+        step = -np.linalg.solve(rows, gaps[..., None])[..., 0]
+        z[:, [1, 3, 4]] += np.clip(step, -0.5, 0.5)
+    return z
+
+
+def inside(scene: Scene, phase: Phase, z: Array) -> Flags:
+    """Whether contacts touch within their features at n configurations, and nothing overlaps.
+
+    Up to 1e-4 of the radius of gyration.
+    """
+    least = 1e-4 * scene.scales.length
+    good = np.isfinite(z).all(axis=1)
+    for name in phase.formation.names:
+        touch = locate(scene, name, z)
+        good &= (np.abs(touch.gap) < 1e-8 * scene.scales.length) & (touch.low > -least)
+        good &= touch.high > -least
+    for gap in clearances(scene, z).values():
+        good &= gap > -least
+    return np.asarray(good)
+
+
+def _find_margins(scene: Scene, phase: Phase, epsilon: float, z: Array) -> tuple[float, float]:
+    runs = np.sqrt(np.diff(z, axis=0) ** 2 @ weights(scene))
+    if runs.min() < 1e-6 * scene.scales.length:
+        return -np.inf, -np.inf
+    s = np.append(0.0, np.cumsum(runs))
+    curve = s, z, np.gradient(z, s, axis=0, edge_order=2)
+    plain = fast_margin(scene, phase, epsilon, curve)
+    # What slides slowly may stick: nearby curves roll.
+    loose = plain if plain > 0 else fast_margin(scene, phase, epsilon, curve, loose=0.01)
+    return np.nan_to_num(plain, nan=-np.inf), np.nan_to_num(loose, nan=-np.inf)
+
+
+def _end_equations(scene: Scene, phase: Phase, z: Array) -> tuple[Array, Array]:
+    """What is missing to contacts and end at one configuration, and its rows."""
+    (gaps,), (rows,) = constrain(scene, phase, z[None])
+    until = phase.until
+    if until.contact is not None:
+        touch = locate(scene, until.contact.name, z[None])
+        return np.append(gaps, touch.gap[0]), np.vstack([rows, touch.normal[0]])
+    k = 2 if until.coordinate == "phi" else 0
+    value = z[k] if until.value is None else until.value
+    return np.append(gaps, z[k] - value), np.vstack([rows, np.eye(5)[k]])

@@ -1,1 +1,0 @@
-"""The stress study: generated scenes, damaged files, and checks of its own."""
