@@ -57,8 +57,8 @@ from wholearm.benchmark.study import Case, Row, Study, digest_source
 from wholearm.cli.command import load_study, main
 from wholearm.common.crowd import Processes, run_all
 from wholearm.common.journal import Journal
+from wholearm.planning.nlp import record_runs
 from wholearm.problem.read import build_problem, read_problem
-from wholearm.solvers.ipopt import record_runs
 
 
 @pytest.fixture

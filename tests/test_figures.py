@@ -43,10 +43,10 @@ from wholearm.figures.style import WIDTH, choose_styles
 from wholearm.mapping.borders import Window
 from wholearm.mapping.formation_list import write_template
 from wholearm.mapping.formation_map import FormationMap, build_map
+from wholearm.planning.nlp import Solver
 from wholearm.planning.plan import solve
 from wholearm.planning.result import Plan, Status, describe_plan, load_plan, write_meta
 from wholearm.results.dwell_record import assemble
-from wholearm.solvers.ipopt import Solver
 from wholearm.viewer import page
 from wholearm.viewer.movie import FRAMES, Movie, write_movie
 from wholearm.viewer.page import describe_motion, place_pushes

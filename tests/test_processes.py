@@ -35,8 +35,8 @@ from wholearm.common.errors import InputError
 from wholearm.common.files import read_arrays, together, write_whole
 from wholearm.common.signals import check, guard, held
 from wholearm.common.workers import can_fork, count_cores, share
+from wholearm.planning.nlp import STOPPED, Solver
 from wholearm.simulation.simulate import simulate
-from wholearm.solvers.ipopt import STOPPED, Solver
 
 PARENT = os.getpid()
 needs_fork = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux")

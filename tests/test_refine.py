@@ -1,11 +1,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import pytest
 
 from wholearm import SolverError
-from wholearm.planning.refine import SOLVES, refine
+from wholearm.planning.path_domain.path_plan import SOLVES, PathIterate, refine
 
 
 @dataclass(frozen=True)
@@ -38,21 +39,26 @@ class Halving:
         return replace(self, mesh=self.mesh + 1, solves=0) if self.mesh < 2 else None
 
 
+def refined(accuracy: float, **changes: int) -> Halving:
+    first: Any = Halving(**changes)
+    return cast(Halving, refine(cast(PathIterate, first), accuracy))
+
+
 def test_refinement_ends_below_the_accuracy_without_violations() -> None:
-    assert refine(Halving(), 0.1).solves == 4
+    assert refined(0.1).solves == 4
     # Below the accuracy at once, but not without violations.
-    assert refine(Halving(), 1.0).solves == 3
-    assert refine(Halving(least=5), 1e-9).solves == 5
-    assert refine(Halving(), 0.0).solves == SOLVES
+    assert refined(1.0).solves == 3
+    assert refined(1e-9, least=5).solves == 5
+    assert refined(0.0).solves == SOLVES
 
 
 def test_what_was_found_is_kept_where_the_next_one_has_no_solution() -> None:
-    assert refine(Halving(gone=6), 0.0).solves == 6
+    assert refined(0.0, gone=6).solves == 6
 
 
 def test_finer_meshes_are_tried_until_there_is_a_solution() -> None:
-    assert refine(Halving(unsolved=2), 0.1).mesh == 2
+    assert refined(0.1, unsolved=2).mesh == 2
     with pytest.raises(SolverError, match="no solution on mesh 0"):
-        refine(Halving(unsolved=3), 0.1)
+        refined(0.1, unsolved=3)
     with pytest.raises(SolverError, match="still missed between nodes"):
-        refine(Halving(least=2), 0.1)
+        refined(0.1, least=2)

@@ -22,10 +22,16 @@ from wholearm.common.sharing import Batch
 from wholearm.geometry.curve import Curve, tangent_basis
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions, metric_weights, split_forces
-from wholearm.planning.columns import Columns
-from wholearm.planning.time_domain.assembly import Kernel, NlpRows, build_kernel
-from wholearm.planning.time_domain.collocation import Scheme, blend, fit_controls, make_scheme
-from wholearm.planning.time_domain.stage import LimitMisses, Stage, StagePoints
+from wholearm.planning.nlp import Columns, Kernel, NlpRows, build_kernel, build_solver
+from wholearm.planning.time_domain.stage import (
+    LimitMisses,
+    Scheme,
+    Stage,
+    StagePoints,
+    blend,
+    fit_controls,
+    make_scheme,
+)
 from wholearm.planning.time_domain.time_nlp import (
     Target,
     TimeNLP,
@@ -40,7 +46,6 @@ from wholearm.planning.time_domain.time_nlp import (
     point_kernel,
 )
 from wholearm.results.trajectory import Samples
-from wholearm.solvers.ipopt import build_solver
 
 
 def test_bounds_are_kept_exactly() -> None:

@@ -19,8 +19,7 @@ from wholearm.common.arrays import Array
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions
 from wholearm.planning.phase_plan import PhasePlan
-from wholearm.planning.time_domain.collocation import Scheme
-from wholearm.planning.time_domain.stage import StagePoints
+from wholearm.planning.time_domain.stage import Scheme, StagePoints
 from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion
 from wholearm.planning.time_domain.time_plan import plan_phases
 

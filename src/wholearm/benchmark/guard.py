@@ -16,11 +16,11 @@ from pathlib import Path
 from ..common.errors import InputError
 from ..common.files import read_json, require_writable, write_text
 from ..geometry.tracing import load, trace_phases
+from ..planning.nlp import IpoptRun, record_runs
 from ..planning.plan import solve
 from ..problem.definition import Problem
 from ..simulation.simulate import simulate
 from ..simulation.stepper import NODES
-from ..solvers.ipopt import IpoptRun, record_runs
 from .study import Case, Row, Study
 
 BANDS = {"iterations": 1.25, "evaluations of the replay": 1.1, "panels of curves": 1.25}

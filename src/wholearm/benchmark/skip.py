@@ -17,12 +17,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..geometry.tracing import load, trace_phases
+from ..planning.nlp import record_runs
 from ..planning.options import PlanOptions
 from ..planning.plan import solve
 from ..planning.time_domain.time_plan import plan_phases
 from ..problem.definition import End, Problem, Until
 from ..problem.read import build_problem
-from ..solvers.ipopt import record_runs
 from .study import Case, Row, Study, format_table
 
 COLUMNS = ("unknowns", "rows", "building", "solving")

@@ -29,8 +29,8 @@ from ..mechanics.dynamics import measure_speed
 from ..mechanics.speed_sweep import NoMotionError
 from ..problem.definition import Phase, Problem
 from ..results.trajectory import Motion
-from ..solvers.ipopt import charge
 from .lower_bound import look_along
+from .nlp import charge
 from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence, make_sequence, plan_sequence, plan_slowly
 from .path_domain.path_motion import PathMotion

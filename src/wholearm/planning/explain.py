@@ -59,10 +59,9 @@ from .path_domain.path_nlp import (
 )
 from .path_domain.path_plan import PathIterate, Task, plan_curves, plan_task
 from .phase_plan import Plans, assemble_motions, runs_along_curves
-from .time_domain.collocation import Scheme, blend
 from .time_domain.guesses import PathMargin
 from .time_domain.search import TimeSearch
-from .time_domain.stage import Stage, to_si
+from .time_domain.stage import Scheme, Stage, blend, to_si
 from .time_domain.time_motion import make_phase_motions
 
 LEAST = "misses limits least"  # status of motions of least violation

@@ -22,7 +22,7 @@ from ..results.dwell_record import Settling
 from ..results.plan_record import Certificate, ModeSpan, RangeFigures, ReplayFigures, Transition
 from ..results.report import UniquenessMargin
 from ..results.trajectory import Samples, Trajectory, load_trajectory
-from ..solvers.ipopt import SolverStatistics
+from .nlp import SolverStatistics
 from .options import Objective, PlanOptions
 from .phase_plan import combine
 

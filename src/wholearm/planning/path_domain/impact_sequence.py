@@ -25,7 +25,7 @@ from ...mechanics.impact import Impact, compute_impact
 from ...problem.definition import End, Phase
 from ...results.plan_record import Transition
 from ...results.trajectory import Motion
-from ...solvers.ipopt import charge
+from ..nlp import charge
 from ..options import PlanOptions
 from ..phase_plan import PhasePlan, PlanPart, Plans, end_of
 from .path_plan import plan_curves

@@ -32,8 +32,7 @@ from ...common.errors import Parameter
 from ...mechanics.dynamics import LAMBDA, ONE, A, B, V
 from ...mechanics.limits import PRESS, TORQUE, LimitSet
 from ...scene.model import Scene
-from ...solvers.ipopt import SolverStatistics, book, build_solver
-from ..columns import Columns
+from ..nlp import Columns, SolverStatistics, book, build_solver
 from ..options import Objective
 from .elements import (
     DEGREE,

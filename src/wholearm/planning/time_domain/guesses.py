@@ -30,10 +30,9 @@ from ...mechanics.limits import SPEED, make_limits
 from ...problem.definition import End, Phase, Problem
 from ..options import PlanOptions
 from ..path_domain.path_motion import PathMotion
-from .collocation import Scheme
 from .mode_search import LEAST_INTERVALS, Mode, can_roll, divide, in_mode, link, merge, mode_of
 from .search import TimeSearch, TimeSolution
-from .stage import Stage, StagePoints, in_own_units, resample, scale_state, unit_points
+from .stage import Scheme, Stage, StagePoints, in_own_units, resample, scale_state, unit_points
 
 NEAREST = "a motion to the nearest end of the phase"
 STRAIGHT = "a motion straight to the end"

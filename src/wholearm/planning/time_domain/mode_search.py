@@ -18,9 +18,8 @@ from ...contacts.contact_limits import list_renamed
 from ...contacts.formation import Formation
 from ...geometry.curve import find_tied
 from ...mechanics.dynamics import Directions, split_forces
-from .collocation import Scheme
 from .search import TimeSearch, TimeSolution
-from .stage import Stage, StagePoints, make_formation, resample
+from .stage import Scheme, Stage, StagePoints, make_formation, resample
 from .time_nlp import least_senses, new_rows
 
 LEAST_INTERVALS = 3  # fewest intervals of a stage

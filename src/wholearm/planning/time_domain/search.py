@@ -15,11 +15,12 @@ from ...common.errors import Parameter
 from ...geometry.arcs import CostToGo
 from ...problem.definition import Problem
 from ..options import Objective, PlanOptions
-from .collocation import Scheme, make_scheme
 from .stage import (
     LimitMisses,
+    Scheme,
     Stage,
     in_own_units,
+    make_scheme,
     monitor,
     scale_options,
     unit_lengths,

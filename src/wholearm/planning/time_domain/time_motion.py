@@ -18,8 +18,7 @@ from ...problem.definition import Phase
 from ...results.plan_record import ROLLS, ModeSpan
 from ...results.torque import TorqueProfile
 from ...results.trajectory import Samples
-from .collocation import Scheme, blend
-from .stage import Stage, StagePoints
+from .stage import Scheme, Stage, StagePoints, blend
 
 _NODES = 8  # places per interval at which the equations of motion are solved
 # Forward dynamics of formations.

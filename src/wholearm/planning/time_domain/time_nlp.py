@@ -53,12 +53,19 @@ from ...mechanics.dynamics import build_force_rows
 from ...mechanics.limits import CONE, PRESS, SPEED, LimitSet, make_limits
 from ...problem.definition import Until
 from ...scene.model import Scene
-from ...solvers.ipopt import SolverStatistics, book, build_solver
-from ..columns import Columns
+from ..nlp import (
+    Columns,
+    Indices,
+    Kernel,
+    NlpRows,
+    SolverStatistics,
+    book,
+    build_kernel,
+    build_solver,
+    share,
+)
 from ..options import Objective
-from .assembly import Indices, Kernel, NlpRows, build_kernel, share
-from .collocation import Scheme, blend, make_scheme
-from .stage import LimitMisses, Stage, StagePoints
+from .stage import LimitMisses, Scheme, Stage, StagePoints, blend, make_scheme
 
 _HURRY = 3e-4  # weight of time against violations
 SLIDING = 1e-5  # least rate of sliding contacts, over the radius of gyration, and of joints

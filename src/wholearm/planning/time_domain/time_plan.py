@@ -30,7 +30,6 @@ from ..options import Objective, PlanOptions
 from ..path_domain.impact_sequence import PER_SPEED, make_transition
 from ..path_domain.path_motion import PathMotion
 from ..phase_plan import PhasePlan, PlanPart, Plans, end_of, plan_stops
-from .collocation import Scheme, make_scheme
 from .guesses import GIVEN, NEAREST, Guess, Guesses, find_modes
 from .mode_search import (
     LEAST_INTERVALS,
@@ -43,7 +42,17 @@ from .mode_search import (
 )
 from .refinement import keep_within, refine
 from .search import Price, TimeSearch, TimeSolution
-from .stage import Stage, bisect_intervals, in_own_units, resample, to_si, unit_of, with_controls
+from .stage import (
+    Scheme,
+    Stage,
+    bisect_intervals,
+    in_own_units,
+    make_scheme,
+    resample,
+    to_si,
+    unit_of,
+    with_controls,
+)
 from .time_motion import TimeMotion, make_phase_motions
 
 if TYPE_CHECKING:

@@ -1,26 +1,92 @@
-"""An NLP assembled from linear rows and from copies of kernels, with its derivatives.
+"""Nonlinear programmes: named blocks, assembly from kernels, Ipopt, and what solving costs.
 
-A kernel is an expression with derivatives that is built once, for all formations with the same
-equations. Its copies have other unknowns and parameters.
+An NLP over time is assembled from linear rows and from copies of kernels, with its derivatives. A
+kernel is an expression with derivatives that is built once, for all formations with the same
+equations. Its copies have other unknowns and parameters. Ipopt has the same options for all NLPs;
+it stops on signals, and its runs are recorded.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import astuple, dataclass
 from functools import wraps
+from operator import add
+from types import SimpleNamespace
 from typing import Any, NamedTuple, TypeVar
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from ...common.arrays import Array, Expression
-from ...contacts.formation import Formation
-from ..columns import Columns, Symbols
+from ..common.arrays import Array, Expression
+from ..common.signals import beat, check
+from ..contacts.formation import Formation
 
 Indices = NDArray[np.int64]
 _K = TypeVar("_K")
+STOPPED = "User_Requested_Stop"  # status of a solver after an interrupt, and of no other
+_OPTIONS = {
+    "print_level": 0,
+    "sb": "yes",
+    "tol": 1e-8,
+    # The default relaxes every bound by 1e-8, so that limits would be missed with success.
+    "bound_relax_factor": 0.0,
+    "fast_step_computation": "yes",
+    # A fixed ordering: the automatic one can differ between machines, and is slow on long grids.
+    "mumps_permuting_scaling": 0,
+    "mumps_pivot_order": 0,
+    # Starting from a solution then takes few iterations.
+    "mu_strategy": "adaptive",
+    "warm_start_init_point": "yes",
+}
+
+
+class Columns:
+    """Named blocks of a vector, one after the other, by their sizes."""
+
+    def __init__(self, **sizes: int) -> None:
+        self.sizes = sizes
+        ends = np.cumsum([0, *sizes.values()]).tolist()
+        self.slices = dict(zip(sizes, map(slice, ends[:-1], ends[1:]), strict=True))
+        self.count: int = ends[-1]
+
+    def __getitem__(self, name: str) -> slice:
+        return self.slices[name]
+
+    def make_symbols(self, **known: Expression) -> Symbols:
+        """A column of symbols for each block that is not `known`."""
+        symbols = {name: ca.SX.sym(name, size) for name, size in self.sizes.items()} | known
+        return Symbols(self, symbols)
+
+    def write(self, **blocks: Expression) -> Expression:
+        """One column of expressions, block by block."""
+        self._check({name: int(block.numel()) for name, block in blocks.items()})
+        return ca.vertcat(ca.SX(0, 1), *(ca.vec(blocks[name]) for name in self.sizes))
+
+    def join(self, **blocks: Any) -> Any:
+        """One array of shape (..., count) from those of all blocks, broadcast in other axes."""
+        tables = {name: np.asarray(block) for name, block in blocks.items()}
+        self._check({name: table.shape[-1] for name, table in tables.items()})
+        shape = np.broadcast_shapes(*(table.shape[:-1] for table in tables.values()))
+        parts = [np.broadcast_to(tables[name], (*shape, self.sizes[name])) for name in self.sizes]
+        return np.concatenate(parts or [np.zeros(0)], axis=-1)
+
+    def _check(self, given: dict[str, int]) -> None:
+        if given != self.sizes:
+            raise ValueError(f"columns {given} are given where {self.sizes} are declared")
+
+
+class Symbols(SimpleNamespace):
+    """Columns of symbols as attributes, by the names of `columns`; `every` is all in one."""
+
+    def __init__(self, columns: Columns, symbols: dict[str, Expression]) -> None:
+        super().__init__(**symbols)
+        self.columns = columns
+        self.every = columns.write(**symbols)
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,3 +291,174 @@ class NlpRows:
 
 def _select(x: Expression, columns: Indices) -> Expression:
     return ca.reshape(x[columns.ravel().tolist()], columns.shape[1], columns.shape[0])
+
+
+def build_solver(
+    name: str,
+    nlp: dict[str, Expression],
+    push: float,
+    derivatives: dict[str, Expression] | None = None,
+    **options: Any,
+) -> Solver:
+    """An Ipopt solver of an NLP.
+
+    Parameters
+    ----------
+    nlp          expressions of x, p, f and g
+    push         distance of an initial point from its bounds; small to start at a solution
+    derivatives  functions that CasADi would derive otherwise: `jac_g` and `hess_lag`
+    **options    of Ipopt, over those that all NLPs share
+    """
+    kinds = ("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac", "mult_bound_push")
+    pushes = {f"warm_start_{kind}": push for kind in kinds}
+    casadi_options = {
+        "ipopt": _OPTIONS | pushes | options,
+        "print_time": False,
+        "record_time": True,
+        # Neither multipliers of parameters nor their gradient are used, and both cost.
+        "calc_lam_p": False,
+        "no_nlp_grad": True,
+        "show_eval_warnings": False,
+        "error_on_fail": False,
+        **(derivatives or {}),
+    }
+    started = time.perf_counter()
+    solver = Solver(ca.nlpsol(name, "ipopt", nlp, casadi_options))
+    book(SolverStatistics(build_time=time.perf_counter() - started))
+    return solver
+
+
+class IpoptRun(NamedTuple):
+    """One run of a solver."""
+
+    unknowns: int
+    rows: int
+    jacobian_nonzeros: int  # of the rows
+    hessian_nonzeros: int  # of the upper triangle of the Lagrangian's Hessian
+    iterations: int
+    seconds: float  # [s]: processor time
+
+
+_RECORDS: list[list[IpoptRun]] = []
+
+
+@contextmanager
+def record_runs() -> Iterator[list[IpoptRun]]:
+    """Collect the runs of all solvers until the end of a `with` statement."""
+    runs: list[IpoptRun] = []
+    _RECORDS.append(runs)
+    try:
+        yield runs
+    finally:
+        # `list.remove` would take any record with the same runs.
+        _RECORDS[:] = [own for own in _RECORDS if own is not runs]
+
+
+class Solver:
+    """An NLP solver that an interrupt ends: CasADi would stop it and go on as if it had failed."""
+
+    def __init__(self, function: Expression) -> None:
+        self.function = function
+
+    def __call__(self, **arguments: Any) -> dict[str, Expression]:
+        """Solve; inputs and outputs are those of a CasADi NLP solver.
+
+        Raises
+        ------
+        KeyboardInterrupt  if a signal stopped the solver, or the time is over (`OutOfTime`)
+        """
+        beat()
+        # CasADi takes lists in three times as fast as arrays.
+        lists = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in arguments.items()}
+        result: dict[str, Expression] = self.function(**lists)
+        stats = self.function.stats()
+        # A solver that was stopped does not always say what it has done.
+        cost = stats.get("iter_count", 0), stats.get("t_wall_total", 0.0)
+        book(SolverStatistics(solves=1, iterations=cost[0], solve_time=cost[1]))
+        for runs in _RECORDS:
+            runs.append(self._describe_run(stats))
+        check()
+        if stats["return_status"] == STOPPED:
+            raise KeyboardInterrupt
+        return result
+
+    def stats(self) -> dict[str, Any]:
+        """Statistics of the last call."""
+        statistics: dict[str, Any] = self.function.stats()
+        return statistics
+
+    def _describe_run(self, stats: dict[str, Any]) -> IpoptRun:
+        jacobian, hessian = map(self.function.get_function, ("nlp_jac_g", "nlp_hess_l"))
+        return IpoptRun(
+            self.function.size1_in("x0"),
+            self.function.size1_in("lbg"),
+            jacobian.nnz_out(jacobian.n_out() - 1),
+            hessian.nnz_out(0),
+            stats["iter_count"],
+            stats["t_proc_total"],
+        )
+
+
+@dataclass(frozen=True)
+class SolverStatistics:
+    """Cost of solving."""
+
+    iterations: int = 0  # of Ipopt
+    solves: int = 0  # how often it ran
+    build_time: float = 0.0  # [s]: of NLPs that were not cached
+    solve_time: float = 0.0  # [s]: of Ipopt
+
+    def __add__(self, other: SolverStatistics) -> SolverStatistics:
+        return SolverStatistics(*map(add, astuple(self), astuple(other)))
+
+
+class Ledger:
+    """Costs by the number of the phase that they were for; 0 stands for none in particular."""
+
+    def __init__(self, outer: Ledger | None) -> None:
+        self._outer = outer
+        self._entries: dict[int, SolverStatistics] = {}
+
+    def of(self, phase: int) -> SolverStatistics:
+        """Cost of a phase."""
+        return self._entries.get(phase, SolverStatistics())
+
+    def add(self, phase: int, cost: SolverStatistics) -> None:
+        """Book a cost here, and in the ledger that was open before."""
+        self._entries[phase] = self.of(phase) + cost
+        if self._outer is not None:
+            self._outer.add(phase, cost)
+
+
+_LEDGER: ContextVar[Ledger | None] = ContextVar("ledger", default=None)
+
+
+_PHASE: ContextVar[int] = ContextVar("phase", default=0)
+
+
+@contextmanager
+def open_ledger() -> Iterator[Ledger]:
+    """Collect what solving costs inside the block."""
+    ledger = Ledger(_LEDGER.get())
+    token = _LEDGER.set(ledger)
+    try:
+        yield ledger
+    finally:
+        _LEDGER.reset(token)
+
+
+@contextmanager
+def charge(phase: int) -> Iterator[None]:
+    """Book what solving costs inside the block to a phase, by its number."""
+    token = _PHASE.set(phase)
+    try:
+        yield
+    finally:
+        _PHASE.reset(token)
+
+
+def book(cost: SolverStatistics) -> None:
+    """Add a cost to the ledger that is open, if one is."""
+    ledger = _LEDGER.get()
+    if ledger is not None:
+        ledger.add(_PHASE.get(), cost)

@@ -1,1 +1,0 @@
-"""Ipopt as every NLP uses it."""
