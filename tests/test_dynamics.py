@@ -44,7 +44,7 @@ from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.results.trajectory import Samples
 from wholearm.scene.model import Friction, Scene
-from wholearm.simulation.contact_problem import (
+from wholearm.simulation.complementarity import (
     APART,
     BACK,
     FORTH,
@@ -52,12 +52,12 @@ from wholearm.simulation.contact_problem import (
     ContactAnswer,
     ContactProblem,
     list_answers,
-    solve,
     solve_lcp,
+    solve_problem,
     try_modes,
 )
-from wholearm.verification.force_uniqueness import find_wedged
-from wholearm.verification.minimal_coordinates import reduce_to_first_joint
+from wholearm.verification.verdict import find_wedged
+from wholearm.verification.verify import reduce_to_first_joint
 
 
 def states(curves: tuple[Curve, ...], count: int = 4) -> Iterator[tuple[Curve, float, Directions]]:
@@ -634,7 +634,7 @@ def test_lemke_finds_one_of_all_answers() -> None:
     rng = np.random.default_rng(5)
     for _ in range(40):
         problem = draw(rng, 0.15)
-        found, every = solve(problem), list_answers(problem)
+        found, every = solve_problem(problem), list_answers(problem)
         assert found is not None and every
         check(problem, found)
         for answer in every:
@@ -661,7 +661,7 @@ def make_mass(b_n: float, b_t: float, mu: float = 0.5) -> ContactProblem:
 )
 def test_a_mass_on_a_floor(b_n: float, b_t: float, mode: int, c_n: float, f: float) -> None:
     problem = make_mass(b_n, b_t)
-    for answer in (solve(problem), try_modes(problem, [mode])):
+    for answer in (solve_problem(problem), try_modes(problem, [mode])):
         assert answer is not None
         assert (*answer.c_n, *answer.f) == pytest.approx((c_n, f))
     for other in {APART, STICKS, FORTH, BACK} - {mode}:

@@ -27,8 +27,7 @@ from wholearm.results.dwell_record import assemble
 from wholearm.scene.model import Finger, Friction, Polygon, Scales, Scene
 from wholearm.simulation.complementarity import FreeRun
 from wholearm.simulation.events import EventKind, OutcomeKind
-from wholearm.simulation.hand import build_system, measure_gaps
-from wholearm.simulation.system import ContactPair, Structure, System
+from wholearm.simulation.system import ContactPair, Structure, System, build_system, measure_gaps
 from wholearm.verification.free import FreeReport, verify_free
 
 DURATION = 0.4

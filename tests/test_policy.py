@@ -16,6 +16,7 @@ from scipy.optimize import linprog
 import wholearm
 from shipped import HEPTAGON, IMPACTS, LANDING, plan_of, problem_of
 from wholearm import InputError, Plan, Policy, Problem, TorqueProfile, Trajectory, Uncertainty
+from wholearm.analysis.robustness import make_trial
 from wholearm.cli.command import main
 from wholearm.geometry.tracing import trace_phase
 from wholearm.mechanics.dynamics import build_forward
@@ -23,9 +24,8 @@ from wholearm.policy.curve_law import CurveLaw, MotionLaw, choose_internal_force
 from wholearm.policy.make import SAME, find_widest, hold_end, make_policy
 from wholearm.policy.reference import find_within, list_scenes, retime, retime_within
 from wholearm.policy.regulator import RATE, Linear, regulate
-from wholearm.robustness.sampling import make_trial
 from wholearm.simulation.simulate import simulate_free
-from wholearm.verification.policy_check import verify_policy
+from wholearm.verification.free import verify_policy
 
 
 @pytest.fixture(scope="module")

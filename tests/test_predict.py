@@ -19,15 +19,7 @@ from planned import change, plan
 from scenes import box, constant, tipped
 from shipped import BOX, FOLDER, HEPTAGON, HEXAGON, LANDING, problem_of
 from wholearm import InputError, Problem, Trajectory, compare, load_trajectory, simulate, verify
-from wholearm.cli.command import main
-from wholearm.common.arrays import Array
-from wholearm.contacts.cones import force_limit_rows
-from wholearm.figures import plots
-from wholearm.figures.analysis_figures import draw_comparison
-from wholearm.mechanics.dynamics import force_rows
-from wholearm.problem.read import name_keys
-from wholearm.problem.table import change_table
-from wholearm.quasistatic.slow_speeds import (
+from wholearm.analysis.slow_speeds import (
     OWN,
     PathSamples,
     Prediction,
@@ -38,12 +30,20 @@ from wholearm.quasistatic.slow_speeds import (
     predict,
     sample_path,
 )
+from wholearm.analysis.tuning import FACTOR, TrialOutcome, split_passages
+from wholearm.cli.command import main
+from wholearm.common.arrays import Array
+from wholearm.contacts.cones import force_limit_rows
+from wholearm.figures import plots
+from wholearm.figures.analysis_figures import draw_comparison
+from wholearm.mechanics.dynamics import force_rows
+from wholearm.problem.read import name_keys
+from wholearm.problem.table import change_table
 from wholearm.results.adopt import describe_origin, save
 from wholearm.results.report import Loss, Report
 from wholearm.results.torque import TorqueProfile, read_notes, read_torque_csv
 from wholearm.simulation.events import EventKind, Simulation
-from wholearm.tuning.tuner import FACTOR, TrialOutcome, split_passages
-from wholearm.verification.torque_advice import find_approach
+from wholearm.verification.verify import find_approach
 
 
 @cache

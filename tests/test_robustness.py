@@ -23,6 +23,18 @@ import pytest
 import wholearm
 from retelling import Retelling, Units
 from wholearm import Formation, InputError, Plan, PlanOptions, Problem, TorqueProfile, load
+from wholearm.analysis.robustness import (
+    Robustness,
+    Share,
+    TimeWindow,
+    Trial,
+    Uncertainty,
+    assess_robustness,
+    change_problem,
+    change_torques,
+    make_trial,
+    measure_sensitivities,
+)
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.common.crowd import connect, run_all
@@ -43,18 +55,6 @@ from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.problem.uncertainty import NAMES, PARAMETERS
 from wholearm.results.trajectory import Motion, Samples
-from wholearm.robustness.sampling import (
-    Robustness,
-    Share,
-    TimeWindow,
-    Trial,
-    Uncertainty,
-    assess_robustness,
-    change_problem,
-    change_torques,
-    make_trial,
-    measure_sensitivities,
-)
 from wholearm.sensitivity.slopes import find_force_slopes, find_slopes_at
 from wholearm.simulation.events import EventKind
 

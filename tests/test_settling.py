@@ -27,9 +27,8 @@ from wholearm.problem.table import describe_scene
 from wholearm.results.dwell_record import assemble, change_torques, find_change_times
 from wholearm.results.torque import TorqueProfile, read_torque_csv
 from wholearm.simulation.events import EventKind, OutcomeKind
-from wholearm.simulation.holding_torques import DRIVE, maximise_margin
-from wholearm.simulation.rest import close_contacts, find_rest
-from wholearm.simulation.tolerances import REST_WINDOW
+from wholearm.simulation.modes import DRIVE, close_contacts, find_rest, maximise_margin
+from wholearm.simulation.system import REST_WINDOW
 from wholearm.verification.verify import describe_motors, find_commands, verify
 
 HELD = (0.019, 0.01, 0.01, 0.01, 0.0)

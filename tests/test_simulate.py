@@ -47,12 +47,10 @@ from wholearm.problem.read import build_problem
 from wholearm.scene.model import Finger, Friction, Scene
 from wholearm.simulation import stepper
 from wholearm.simulation.events import Event, EventKind, OutcomeKind, Simulation
-from wholearm.simulation.hand import build_system
-from wholearm.simulation.modes import Mode, find_mode, respond
-from wholearm.simulation.rest import Collapse, close_contacts, find_rest
+from wholearm.simulation.modes import Collapse, Mode, close_contacts, find_mode, find_rest, respond
 from wholearm.simulation.run import find_root
 from wholearm.simulation.stepper import ModeStepper, build_stepper
-from wholearm.simulation.system import ContactRows
+from wholearm.simulation.system import ContactRows, build_system
 
 
 def pick(index: int) -> tuple[Problem, CosineMotion]:

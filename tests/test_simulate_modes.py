@@ -28,7 +28,7 @@ from wholearm.mechanics.impact import solve_impulses
 from wholearm.planning.plan import solve
 from wholearm.problem.read import build_problem
 from wholearm.simulation.events import EventKind, OutcomeKind, Simulation
-from wholearm.simulation.rest import StartDeparture, find_rest
+from wholearm.simulation.modes import StartDeparture, find_rest
 
 
 def test_replay_keeps_the_vertex_where_it_is() -> None:

@@ -14,6 +14,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .analysis.comparison import Comparison, compare
+    from .analysis.robustness import Robustness, Uncertainty, assess_robustness
+    from .analysis.slow_speeds import Prediction, predict
+    from .analysis.tuning import Tuning, tune
     from .common.errors import (
         AmbiguityError,
         Change,
@@ -26,7 +30,6 @@ if TYPE_CHECKING:
         SolverError,
         WholearmError,
     )
-    from .comparison.metrics import Comparison, compare
     from .contacts.elemental import Contact
     from .contacts.formation import Formation
     from .engines.engine_replay import EngineReport, PolicyReport, play_policy, replay_in
@@ -42,21 +45,17 @@ if TYPE_CHECKING:
     from .policy.playback import Policy
     from .problem.definition import End, Goal, Phase, Problem, Until
     from .problem.read import place_start, read_formation, read_until
-    from .quasistatic.slow_speeds import Prediction, predict
     from .results.adopt import save
     from .results.report import Report
     from .results.torque import TorqueProfile, read_torque_csv
     from .results.trajectory import Trajectory, load_trajectory
-    from .robustness.sampling import Robustness, Uncertainty, assess_robustness
     from .scene.model import Finger, Friction, Polygon, Scene
     from .search.find_route import find_route
     from .search.result import Answer
     from .search.solve import solve
     from .simulation.events import FreeSimulation, Simulation
     from .simulation.simulate import simulate, simulate_free
-    from .tuning.tuner import Tuning, tune
-    from .verification.free import FreeReport, verify_free
-    from .verification.policy_check import verify_policy
+    from .verification.free import FreeReport, verify_free, verify_policy
     from .verification.verify import verify
 
 __version__ = "0.1.0"
@@ -64,7 +63,7 @@ __version__ = "0.1.0"
 _NAMES = {
     "common.errors": "AmbiguityError Change InfeasibleError InputError JammingError ReplayError "
     "Shortfall SimulationError SolverError WholearmError",
-    "comparison.metrics": "Comparison compare",
+    "analysis.comparison": "Comparison compare",
     "contacts.elemental": "Contact",
     "contacts.formation": "Formation",
     "engines.engine_replay": "EngineReport PolicyReport play_policy replay_in",
@@ -79,21 +78,20 @@ _NAMES = {
     "policy.playback": "Policy",
     "problem.definition": "End Goal Phase Problem Until",
     "problem.read": "place_start read_formation read_until",
-    "quasistatic.slow_speeds": "Prediction predict",
+    "analysis.slow_speeds": "Prediction predict",
     "results.adopt": "save",
     "results.report": "Report",
     "results.torque": "TorqueProfile read_torque_csv",
     "results.trajectory": "Trajectory load_trajectory",
-    "robustness.sampling": "Robustness Uncertainty assess_robustness",
+    "analysis.robustness": "Robustness Uncertainty assess_robustness",
     "scene.model": "Finger Friction Polygon Scene",
     "search.find_route": "find_route",
     "search.result": "Answer",
     "search.solve": "solve",
     "simulation.events": "FreeSimulation Simulation",
     "simulation.simulate": "simulate simulate_free",
-    "tuning.tuner": "Tuning tune",
-    "verification.free": "FreeReport verify_free",
-    "verification.policy_check": "verify_policy",
+    "analysis.tuning": "Tuning tune",
+    "verification.free": "FreeReport verify_free verify_policy",
     "verification.verify": "verify",
 }
 """Public names by their modules."""

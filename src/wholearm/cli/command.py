@@ -58,11 +58,11 @@ TOPICS = {
     "search": "search",
     "map": "mapping",
     "policy": "policy",
-    "robustness": "robustness",
+    "robustness": "analysis",
     "engines": "engines",
-    "slow-motions": "quasistatic",
-    "tuning": "tuning",
-    "comparison": "comparison",
+    "slow-motions": "analysis",
+    "tuning": "analysis",
+    "comparison": "analysis",
     "simulation": "simulation",
     "free-simulation": "simulation",
     "output-files": "results",
@@ -695,7 +695,7 @@ def overlay(simulator: str | None, trajectory: wholearm.Trajectory) -> Simulatio
 
 def predict(options: argparse.Namespace) -> int:
     """Predict up to which speed quasistatic motions keep contacts, and write what is asked for."""
-    from ..quasistatic.slow_speeds import make_torques
+    from ..analysis.slow_speeds import make_torques
 
     require_output(options.output)
     require_output(options.torques, ".csv")
@@ -1083,14 +1083,16 @@ def show_page(options: argparse.Namespace) -> int:
 def read_page(folder: str) -> str:
     """The page of a folder, with topics in place of links to other pages."""
     page = resources.files("wholearm").joinpath(*folder.split("/"), "README.md")
-    topics = {posixpath.join(own, "README.md"): topic for topic, own in TOPICS.items()}
 
     def name(link: re.Match[str]) -> str:
         target = posixpath.normpath(posixpath.join(folder, link[2]))
-        return f"{link[1]} (wholearm help {topics[target]})" if target in topics else link[1]
+        topics = [topic for topic, own in TOPICS.items() if target == f"{own}/README.md"]
+        if not topics:
+            return link[1]
+        return f"{link[1]} (wholearm help {link[3] if link[3] in topics else topics[-1]})"
 
     text = page.read_text(encoding="utf-8")
-    return re.sub(r"\[([^\]]+)\]\(([^)#]*)(?:#[^)]*)?\)", name, text)
+    return re.sub(r"\[([^\]]+)\]\(([^)#]*)#?([^)]*)\)", name, text)
 
 
 def complete(options: argparse.Namespace) -> int:

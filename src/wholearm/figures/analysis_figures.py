@@ -35,10 +35,10 @@ from .style import (
 )
 
 if TYPE_CHECKING:
-    from ..comparison.metrics import Comparison, Contender
-    from ..quasistatic.slow_speeds import PhasePrediction, Prediction, Survival
+    from ..analysis.comparison import Comparison, Contender
+    from ..analysis.robustness import Robustness
+    from ..analysis.slow_speeds import PhasePrediction, Prediction, Survival
     from ..results.trajectory import Trajectory
-    from ..robustness.sampling import Robustness
 
 _DOT = "  \u00b7  "  # between the parts of a title
 _KINDS = (

@@ -13,7 +13,7 @@ Xi A_t a > 0, or sticks with A_t a = 0; closed gaps of other contacts can only o
 degrees of freedom the modes are the sectors and rays between a few lines. Whether a motion can
 begin is one linear programme for each of them. For a motion that comes to rest the acceleration is
 against its direction. Forces may be indeterminate here, as where only a finger starts; the start
-modes of `simulation.rest` are those with forces that torques determine.
+modes of `simulation.modes` are those with forces that torques determine.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Dwells: constant torques that hold the ends of phases until contacts are closed.
 
 A phase that stops short of the contact to be gained leaves the next one in another formation.
-Torques that press all contacts together (`simulation.holding_torques`) close it first; how soon
+Torques that press all contacts together (`simulation.modes`) close it first; how soon
 depends on impacts, which are simulated without assumptions on contacts.
 """
 
@@ -21,11 +21,9 @@ from ..contacts.formation import Formation
 from ..problem.definition import Phase, Problem
 from ..results.dwell_record import SettledMotion, Settling, change_torques
 from ..results.torque import TorqueProfile
-from ..simulation.hand import build_system
-from ..simulation.holding_torques import Hold, Standstill, find_hold, find_opening
-from ..simulation.rest import close_contacts
+from ..simulation.modes import Hold, Standstill, close_contacts, find_hold, find_opening
 from ..simulation.simulate import simulate_free
-from ..simulation.tolerances import SLOW
+from ..simulation.system import SLOW, build_system
 from .path_domain.junction import begin_from
 from .phase_plan import Plans, Settled, end_of
 

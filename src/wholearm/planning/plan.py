@@ -28,7 +28,7 @@ from ..problem.uncertainty import PARAMETERS
 from ..results.plan_record import Certificate, RangeFigures, TimeBound, Transition
 from ..results.report import UniquenessMargin
 from ..results.trajectory import Trajectory
-from ..verification.force_uniqueness import find_uniqueness_margin, find_wedged
+from ..verification.verdict import find_uniqueness_margin, find_wedged
 from .blocks import BlockPlan, Planning, plan_blocks
 from .lower_bound import bound_least_time
 from .nlp import Ledger, charge, open_ledger

@@ -33,7 +33,7 @@ from ..results.adopt import Moved, adopt_motion
 from ..results.dwell_record import assemble
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion, Trajectory
-from ..simulation.holding_torques import Standstill, find_hold
+from ..simulation.modes import Standstill, find_hold
 from .curve_law import LoopSettings, choose_internal_force
 from .playback import Policy
 from .reference import (

@@ -1,31 +1,57 @@
-"""Contact modes of a moving formation: what slides, what sticks, and the equations of motion.
+"""Contact modes of a formation: in motion, at the start from rest, and held at rest.
 
-A stuck contact is integrated like a rolling one, v_t = 0 with c_t free, and a held joint with
-theta_i' = 0 and a free friction torque f:
+**In motion.** A stuck contact is integrated like a rolling one, v_t = 0 with c_t free, and a held
+joint with theta_i' = 0 and a free friction torque f:
 
     P = [A; A_t(rolling); A_t(stuck); e(held)],    |c_t| <= mu c_n,    |f| <= D.
 
 Vertices of a flush edge slide and stick as one. Only the sum T of their c_t is determined, with
 |T| <= sum mu c_n; it is distributed in proportion to c_n, which does not affect the motion. A
 contact flush with a rolling one has no friction of its own.
+
+**At rest.** Each choice of signs of sliding and turning, and of what sticks, makes accelerations
+and contact forces affine in the torques. Such a start mode is consistent if contacts and joints
+accelerate with its signs, friction can hold the others, every contact presses and nothing that
+touches closes further. With one freedom these are both directions along it. If none is consistent
+the formation sticks; contact forces are then indeterminate, and the torque polygon
+(`mechanics.statics`) says whether any inside the friction cones balance. On a polynomial piece of
+the torques both change at roots of polynomials.
+
+**Held.** A motion that is to stop at a contact may end a little short of it. Constant torques that
+close the contact and then hold still with everything that touches have to
+
+* be in static balance with all that touches at the contact, every c_n at least epsilon and
+  |c_t| <= mu (c_n - epsilon), and start no motion that gives up one of these contacts;
+* from rest, with the contact still open by a gap, accelerate the formation towards it, beyond what
+  friction can hold.
+
+All of this is affine in the torques. Those with the largest least margin, each over its saturation
+value, solve a linear programme in three unknowns. Contacts of the formation may open on the way:
+torques that keep them closed are so weak that impacts on arrival last longer than the motion.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from itertools import product
-from typing import NamedTuple
+from itertools import combinations, product
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
+from ..common.errors import SimulationError
+from ..contacts.cones import find_weakest
+from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
-from .hand import build_system
+from ..mechanics.impact import ViolationKind, compute_impact
+from ..mechanics.statics import GRAZE, SURE, Statics, TorquePolygon
+from ..scene.model import Scene
 from .stepper import Modes
-from .system import ContactRows
+from .system import ROUNDING_FORCE, STILL, ContactRows, build_system
 
 
 class Unit(NamedTuple):
@@ -223,3 +249,479 @@ def find_fixed(mode: Mode, rows: ContactRows) -> NDArray[np.bool_]:
     basis = np.linalg.svd(P / np.linalg.norm(P, axis=1)[:, None], full_matrices=False)[2]
     rest = free - (free @ basis.T) @ basis
     return np.asarray(np.linalg.norm(rest, axis=1) < 1e-7 * length)
+
+
+_AHEAD = 1e-5  # step along the free direction for the signs of what is stationary, in scene units
+
+
+class StartDeparture(NamedTuple):
+    """The formation starts to move, or goes on, at `x` in [-1, 1] of a piece of the torques."""
+
+    x: float
+    heading: Array  # (5,): where to, of length one in the metric M5
+    signs: Array  # (n_c + 2,): of sliding and turning, zero for what friction holds
+
+
+class Collapse(NamedTuple):
+    """Loss of balance at `x` of a piece without a consistent start mode."""
+
+    x: float
+    contact: str  # the contact that would have to pull most, or that slips
+    c_n: float  # [N]
+    jammed: bool  # whether friction jams one of the directions
+    c_t: float | None = None  # [N]: of a rolling contact that slips, although it presses with `c_n`
+
+
+class StartMode(NamedTuple):
+    """Start mode; quantities at rest are rows @ (1, tau_1, tau_2)."""
+
+    response: Response
+    # (n_c + 2 R, 3) [N]: what has to be positive for the contacts to hold, H c (`contacts.cones`)
+    force_limits: Array
+    # (k, 3): accelerations of sliding and turning along the signs, or along the only freedom
+    slips: Array
+    # not negative, but for rounding, where the mode is consistent: force limits, slips, limits of
+    # friction that holds what has no sign, and accelerations that open closed gaps
+    margins: Array
+    heading: Array | None  # (5,): with one freedom, the direction
+    statics: Statics
+
+    def drive(self, tau: Array) -> float:
+        """Acceleration in the metric M5."""
+        mass = self.statics.scene.mass_diagonal
+        return float(np.sqrt(mass @ (self.response.acceleration @ [1.0, *tau]) ** 2))
+
+    def slides(self, tau: Array) -> bool:
+        """Whether the formation accelerates in this mode if every contact can press or pull."""
+        load, least = np.array([1.0, *tau]), _measure_drive(self.statics.scene)
+        return (
+            self.response.ratio > 0
+            and self.drive(tau) > least
+            and bool((self.margins[len(self.force_limits) :] @ load >= 0).all())
+            and self.statics.opens(self.response.acceleration @ load)
+        )
+
+    def moves(self, tau: Array) -> bool:
+        """Whether the formation starts in this mode under torques `tau`, shape (2,)."""
+        return bool((self.margins @ [1.0, *tau] >= 0).all()) and self.slides(tau)
+
+    def depart(self, x: float, tau: Array) -> StartDeparture:
+        """Start at `x` of a piece, where the torques are `tau`."""
+        heading = self.response.acceleration @ [1.0, *tau] / self.drive(tau)
+        return StartDeparture(x, heading, self.response.signs)
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """A formation at rest at a configuration."""
+
+    formation: Formation
+    z: Array  # (5,)
+    statics: Statics  # of the formation
+    heading: Array | None  # (5,): with one freedom the direction, of length one in the metric M5
+
+    @cached_property
+    def sliding(self) -> tuple[StartMode, ...]:
+        """Start modes without sticking: two with one freedom, all sign patterns with more."""
+        if self.heading is not None:
+            ways = ((self._find_signs(h), h) for h in (self.heading, -self.heading))
+            modes = (self._build(find_mode(self.formation, signs), signs, h) for signs, h in ways)
+            return tuple(mode for mode in modes if mode is not None)
+        return self._list_patterns(held=False)
+
+    @cached_property
+    def sticking(self) -> tuple[StartMode, ...]:
+        """Start modes in which friction holds some contact or joint, the least first."""
+        return () if self.heading is not None else self._list_patterns(held=True)
+
+    @property
+    def modes(self) -> tuple[StartMode, ...]:
+        """All start modes."""
+        return self.sliding + self.sticking
+
+    def _list_modes(self) -> Iterator[StartMode]:
+        # Those with sticking are built when first needed: most never are.
+        yield from self.sliding
+        yield from self.sticking
+
+    @cached_property
+    def touching(self) -> Statics:
+        """That of every contact that touches, in the formation or not."""
+        gained = [self.formation.limits[k].gained for k in np.flatnonzero(self.statics.near)]
+        others = (contact for contact in gained if contact is not None)
+        contacts = *self.formation.contacts, *others
+        return Statics(Formation(self.formation.scene, contacts), self.z)
+
+    @cached_property
+    def held(self) -> TorquePolygon:
+        """Torques that friction can hold, and those beyond by no more than rounding."""
+        polygon = self.touching.torque_polygon()
+        rounding = 1e-6 * self.formation.scene.scales.torque
+        return polygon._replace(bounds=polygon.bounds + rounding)
+
+    def _list_patterns(self, held: bool) -> tuple[StartMode, ...]:
+        """Start modes with more freedoms: only those with sticking, or only the others."""
+        formation, units = self.formation, list_units(self.formation)
+        options = [(1.0, -1.0, 0.0) if held and unit.grips else (1.0, -1.0) for unit in units]
+        patterns = list_modes(formation, np.zeros(formation.n_contacts + 2), units, options)
+        found = [
+            (mode, signs)
+            for signs, mode in patterns
+            if (len(mode.holders) > formation.n_rolling) == held
+        ]
+        found.sort(key=lambda pattern: len(pattern[0].holders))
+        modes = (self._build(*pattern) for pattern in found)
+        return tuple(mode for mode in modes if mode is not None)
+
+    def _find_signs(self, heading: Array) -> Array:
+        """Directions of contacts and joints along the only freedom, (n_c + 2,); zero for none."""
+        formation, scales = self.formation, self.formation.scene.scales
+        step = _AHEAD / np.abs(heading / build_system(formation.scene).units[:5]).max()
+        rates = np.concatenate([self.statics.A_t @ heading, heading[3:]])
+        rates[list(formation.rolling_rows)] = 0.0
+        # How fast each slides or turns over how fast anything moves.
+        scale = _AHEAD / step * np.repeat([scales.length, 1.0], [formation.n_contacts, 2])
+        still = np.abs(rates) < 1e-9 * scale
+        still[list(formation.rolling_rows)] = False
+        if still.any():
+            # What is stationary here has the direction that it has just after.
+            ahead = _find_rates(formation, self.z, step, heading)
+            rates = np.where(still, np.where(np.abs(ahead) > 1e-12 * scale, ahead, 0.0), rates)
+        return np.asarray(np.sign(rates))
+
+    def _build(self, mode: Mode, signs: Array, heading: Array | None = None) -> StartMode | None:
+        """The start mode of some signs, (n_c + 2,); None if its forces are not determined."""
+        scene, count = self.formation.scene, self.formation.n_contacts
+        rows = ContactRows(self.statics.A, self.statics.A_t, np.zeros(count), np.zeros(count))
+        response = respond(mode, signs, rows, np.zeros(5))
+        if response is None:
+            return None
+        declared = [mode.declares(k) for k in range(len(mode.holders))]
+        kept = np.array([True] * count + declared + declared)
+        scales, length = scene.scales, scene.scales.length
+        slips = signs[:, None] * response.rates
+        # What opens, or closes by no more than counts as grazing.
+        graze = GRAZE * np.repeat([1.0, length], [count, 2]) @ slips
+        openings = self.statics.opening[0] @ response.acceleration + graze
+        still = STILL * np.repeat([scales.acceleration, scales.rate / scales.time], [count, 2])
+        # Difference quotients are as good as 1e-7.
+        closing = np.full(len(openings), 1e-7 * scales.acceleration)
+        if heading is not None:
+            # All accelerations are multiples of this one.
+            slips = (heading * scene.mass_diagonal @ response.acceleration)[None]
+            still, closing = np.array([-_measure_drive(scene)]), np.zeros(len(openings))
+        rounding, limits = ROUNDING_FORCE * mode.force_limit_units, response.force_limits
+        margins = np.vstack([limits[kept], slips, limits[~kept], openings])
+        margins[:, 0] += np.concatenate([rounding[kept], still, rounding[~kept], closing])
+        return StartMode(response, limits[kept], slips, margins, heading, self.statics)
+
+    def wait(self, coefficients: Array, x: float) -> StartDeparture | Collapse | None:
+        """End of the rest on a piece of torques, (2, d + 1) [N m] in powers of x, or None."""
+        tau = _evaluate(coefficients, x)
+        for mode in self._list_modes():
+            if mode.moves(tau):
+                return mode.depart(x, tau)
+        loss = self._find_loss(coefficients, x)
+        least = 1e3 * _measure_drive(self.formation.scene)
+        margins = [mode.margins for mode in self.modes]
+        rows = np.vstack(margins)
+        first = np.cumsum([0, *(len(part) for part in margins[:-1])])
+        # Where a margin changes sign; in between, no mode changes.
+        polynomials = rows[:, 1:] @ coefficients + _constant(rows[:, 0], coefficients)
+        starts, middles = _split(polynomials, x)
+        torques = _evaluate(coefficients, middles)
+        values = rows[:, :1] + rows[:, 1:] @ torques
+        consistent = np.logical_and.reduceat(values >= 0, first, axis=0).T
+        for start, tau, chosen in zip(starts.tolist(), torques.T, consistent, strict=True):
+            if start > loss:
+                break
+            modes = [self.modes[k] for k in np.flatnonzero(chosen)]
+            for mode in sorted(modes, key=lambda mode: -mode.drive(tau)):
+                if mode.drive(tau) > least and mode.moves(tau):
+                    return mode.depart(start, tau)
+        return self._collapse(coefficients, loss) if loss <= 1 else None
+
+    def _find_loss(self, coefficients: Array, x: float) -> float:
+        """Where torques cannot be held any more, from `x` on; infinite if they can all along."""
+        normals, bounds = self.held
+        if not np.isfinite(bounds).all():
+            return x
+        return find_breach(_constant(bounds, coefficients) - normals @ coefficients, x)
+
+    def _collapse(self, coefficients: Array, x: float) -> Collapse:
+        """The contact that gives way at `x`."""
+        tau = _evaluate(coefficients, x)
+        jammed = [mode.response.ratio <= 0 for mode in self.sliding]
+        jams = any(jammed) if self.heading is not None else all(jammed)
+        free = [mode for mode in self.modes if mode.slides(tau)]
+        pulls = self.touching.find_pulls(tau)
+        if free or np.isinf(pulls).all():
+            load = np.array([1.0, *tau])
+            weakest = min((mode.force_limits @ load for mode in free or self.sliding), key=np.min)
+            row, least, c_t = find_weakest(self.formation, weakest)
+            return Collapse(x, self.formation.names[row], least, jams, c_t)
+        return Collapse(
+            x, self.touching.formation.names[int(pulls.argmax())], -float(pulls.max()), jams
+        )
+
+
+def find_rest(formation: Formation, z: Array) -> Rest:
+    """Formation at rest at `z`, (5,); `SimulationError` for dependent contacts or no freedom."""
+    statics = Statics(formation, z)
+    freedoms = statics.freedoms.shape[1]
+    if freedoms > 5 - formation.n_constraints or not freedoms:
+        raise SimulationError(
+            f"{' '.join(formation.names)} leaves {freedoms} freedoms, and no forces that are "
+            "determined; it cannot start from rest"
+        )
+    return Rest(formation, z, statics, statics.freedoms[:, 0] if freedoms == 1 else None)
+
+
+def _find_rates(formation: Formation, z: Array, step: float, heading: Array) -> Array:
+    """Sliding and joint rates a `step` from `z` along the free direction, shape (n_c + 2,)."""
+    slip = formation.evaluate_slip(z[None])[0]
+    ahead = close_contacts(formation, z + step * heading, slip=slip)
+    kinematics = formation.evaluate(ahead[None], heading[None])
+    P, inverse_mass = kinematics.P[0], 1 / formation.scene.mass_diagonal
+    lift = inverse_mass[:, None] * P.T
+    tangent = heading - lift @ np.linalg.solve(P @ lift, P @ heading)
+    return np.concatenate([kinematics.A_t[0] @ tangent, tangent[3:]])
+
+
+def _measure_drive(scene: Scene) -> float:
+    """Acceleration in the metric M5 that counts as rounding [kg^(1/2) m/s^2]."""
+    return STILL * float(scene.scales.mass**0.5) * scene.scales.acceleration
+
+
+def _evaluate(coefficients: Array, x: float | Array) -> Array:
+    """Torques at one place of a piece, shape (2,), or at n places, shape (2, n)."""
+    powers = np.power.outer(np.asarray(x), np.arange(coefficients.shape[1]))
+    return np.asarray(coefficients @ powers.T)
+
+
+def _constant(values: Array, coefficients: Array) -> Array:
+    """Values, shape (m,), as polynomials of as many coefficients as those of a piece."""
+    return np.pad(values[:, None], ((0, 0), (0, coefficients.shape[1] - 1)))
+
+
+def _split(polynomials: Array, x: float) -> tuple[Array, Array]:
+    """Starts and middles of the parts of [x, 1] in which none of the rows changes its sign."""
+    if polynomials.shape[1] == 2:
+        level, slope = polynomials[polynomials[:, 1] != 0].T
+        roots = -level / slope
+    else:
+        roots = np.array([r for row in np.unique(polynomials, axis=0) for r in find_roots(row)])
+    starts = np.array([x, *np.unique(roots[(x < roots) & (roots < 1)])])
+    return starts, (starts + np.append(starts[1:], 1.0)) / 2
+
+
+def find_breach(polynomials: Array, x: float) -> float:
+    """First place in [x, 1] at which a polynomial of some, (n, d + 1), turns negative; infinity."""
+    starts, middles = _split(polynomials, x)
+    low = (_evaluate(polynomials, middles) < 0).any(axis=0)
+    return float(starts[low.argmax()]) if low.any() else np.inf
+
+
+def find_roots(polynomial: Array) -> list[float]:
+    """Real roots of a polynomial given by ascending coefficients."""
+    significant = np.flatnonzero(np.abs(polynomial) > 1e-14 * np.abs(polynomial).max())
+    if not len(significant) or significant[-1] == 0:
+        return []
+    roots = np.roots(polynomial[significant[-1] :: -1])
+    return [float(root.real) for root in roots if abs(root.imag) < 1e-9]
+
+
+def close_contacts(
+    formation: Formation, z: Array, within: float = np.inf, slip: Array | None = None
+) -> Array:
+    """Nearest configuration, in the metric M5, with every contact of the formation closed.
+
+    Gaps up to `within` [m] are closed; rolling contacts take coordinates `slip`, (R,) [m], if any.
+    A `SimulationError` says which contact cannot be closed.
+    """
+    inverse_mass = 1 / formation.scene.mass_diagonal
+    closed = 3e-15 * formation.scene.scales.length
+    for _ in range(8):
+        kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
+        gaps, rows = kinematics.C[0], kinematics.A[0]
+        worst = int(np.abs(gaps).argmax())
+        if np.abs(gaps[worst]) > within:
+            raise SimulationError(
+                f"{formation.names[worst]}, with a gap of {gaps[worst]:.3g} m, does not touch"
+            )
+        slid = np.zeros(0) if slip is None else formation.evaluate_slip(z[None])[0] - slip
+        if np.abs(gaps[worst]) < closed and (np.abs(slid) < closed).all():
+            break
+        rows = rows if slip is None else kinematics.P[0]
+        lift = inverse_mass[:, None] * rows.T
+        try:
+            z = z - lift @ np.linalg.solve(rows @ lift, np.concatenate([gaps, slid]))
+        except np.linalg.LinAlgError:
+            raise SimulationError(f"{' '.join(formation.names)} depend on one another") from None
+    if not np.abs(gaps[worst]) < formation.scene.touching * 1e-3:
+        raise SimulationError(
+            f"{formation.names[worst]}, with a gap of {gaps[worst]:.3g} m, cannot be closed"
+        )
+    return z
+
+
+LEAST = 1e-2  # least margin over saturation of torques that hold or close
+AMPLE = 0.1  # saturation of margins of forces, torques, accelerations, over the scene's
+DRIVE = 0.02  # least acceleration towards an open contact, ample sliding, over the scene's
+_SMALL = 1e-9  # relative rate at which a contact does not part
+
+
+class Standstill(NamedTuple):
+    """Where a motion stops."""
+
+    z: Array  # (5,)
+    formation: Formation  # that it stops in
+    gained: Contact | None  # what it stops at
+    touching: Formation  # all that touches
+
+
+class Hold(NamedTuple):
+    """Constant torques for a standstill."""
+
+    tau: Array  # (2,) [N m]
+    margin: float  # the least of the margins, over what is ample
+    # [m/s]: at most, with which the contact is reached from rest, if all others stay closed till
+    # then; zero where nothing has to close, or no torques would drive the formation on
+    speed: float = 0.0
+    # contacts that would have to pull in the impact of that arrival: they part for a moment
+    parts: tuple[str, ...] = ()
+
+
+def find_hold(place: Standstill, epsilon: float, gap: float, time: float) -> Hold | None:
+    """Torques with the largest margin for a standstill; None if none hold c_n >= `epsilon` [N].
+
+    A gained contact, open by up to `gap` [m], is closed with the least acceleration `DRIVE` if any
+    torques do, or else with that which closes it in `time` [s].
+    """
+    rest = _list_holding(place, epsilon)
+    best = maximise_margin(place.formation.scene.torque_limit, rest)
+    if best is None or best[1] < LEAST:
+        return None
+    opening, firm = find_opening(place), Hold(*best)
+    if opening is None:
+        return firm
+    swift = 2 * gap / time**2
+    closing = _find_closing(place, rest, opening, gap)
+    slow = _find_closing(place, rest, opening, gap, swift) if closing is None else None
+    # Torques that close slowly hold less well than those that only hold, but by not too much.
+    if slow is not None and slow.margin > 0.2 * firm.margin:
+        return slow
+    return closing or firm
+
+
+def _list_holding(place: Standstill, epsilon: float) -> Array:
+    """Rows that have to be positive at rest, over their saturation values, shape (k, 3)."""
+    touching, z = place.touching, place.z
+    scene = touching.scene
+    static = Statics(touching, z).torque_polygon(epsilon)
+    rows = [np.column_stack([static.bounds, -static.normals]) / (AMPLE * scene.scales.torque)]
+    A = touching.evaluate(z[None], np.zeros((1, 5))).A[0]
+    count = np.linalg.matrix_rank(A / np.sqrt(scene.mass_diagonal), tol=_SMALL)
+    ample = AMPLE * math.sqrt(scene.scales.mass) * scene.scales.acceleration
+    for kept in combinations(touching.contacts, 4) if count == 5 else ():
+        others = [k for k, contact in enumerate(touching.contacts) if contact not in kept]
+        # Motions that give up the other contacts.
+        rows += [
+            -mode.slips / ample
+            for mode in _list_sliding(Formation(scene, kept), z)
+            if mode.heading is not None and (A[others] @ mode.heading >= -_SMALL).all()
+        ]
+    return np.vstack(rows)
+
+
+def _list_sliding(formation: Formation, z: Array) -> tuple[StartMode, ...]:
+    """Start modes without sticking that do not jam; none if contacts depend on each other."""
+    try:
+        return tuple(mode for mode in find_rest(formation, z).sliding if mode.response.ratio > 0)
+    except SimulationError:
+        return ()
+
+
+def find_opening(place: Standstill) -> Array | None:
+    """Rate of z per metre of the gained contact's gap, shape (5,); None if nothing opens it."""
+    if place.gained is None:
+        return None
+    scene = place.formation.scene
+    at = place.z[None], np.zeros((1, 5))
+    normal = Formation(scene, (place.gained,)).evaluate(*at).A[0][0]
+    root = np.sqrt(scene.mass_diagonal)
+    P, along = place.formation.evaluate(*at).P[0] / root, normal / root
+    free = along - P.T @ np.linalg.lstsq(P.T, along, rcond=_SMALL)[0]
+    rate = float(free @ along)
+    if rate <= 3e-5 * float(along @ along):
+        return None
+    return np.asarray(free / root / rate)
+
+
+def _find_closing(
+    place: Standstill, rest: Array, opening: Array, gap: float, ample: float | None = None
+) -> Hold | None:
+    """Torques of largest margin that accelerate the formation towards a contact open by `gap`.
+
+    With a saturation value `ample` [m/s^2] that acceleration is one more margin, not a bound.
+    """
+    assert place.gained is not None
+    scene, z = place.formation.scene, place.z + gap * opening
+    scales, limits = scene.scales, scene.torque_limit
+    normal = Formation(scene, (place.gained,)).evaluate(z[None], np.zeros((1, 5))).A[0][0]
+    held = Statics(place.formation, z).torque_polygon()
+    creep = DRIVE * np.repeat(
+        [scales.acceleration, 1 / scales.time**2], [place.formation.n_contacts, 2]
+    )
+    best: Hold | None = None
+    for mode in _list_sliding(place.formation, z):
+        rows, closing = rest, -normal @ mode.response.acceleration
+        if mode.heading is None:
+            rows = np.vstack([rest, (mode.slips / creep[:, None])[mode.response.signs != 0]])
+        elif normal @ mode.heading >= 0:
+            continue
+        if ample is None:
+            bound = closing - [DRIVE * scales.acceleration, 0.0, 0.0]
+            solution = maximise_margin(limits, rows, bound[None])
+        else:
+            solution = maximise_margin(limits, np.vstack([rows, closing / ample]))
+        if solution is None or solution[1] < max(LEAST, best.margin if best else 0.0):
+            continue
+        tau, margin = solution
+        # Friction must not be able to hold the formation at rest before it is there.
+        if held.measure(tau[None])[0] <= SURE * scales.torque:
+            continue
+        a = float(closing @ [1.0, *tau])
+        v = mode.response.acceleration @ [1.0, *tau] * math.sqrt(2 * gap / a)
+        best = Hold(tau, margin, math.sqrt(2 * a * gap), _find_parting(place, v))
+    return best
+
+
+def _find_parting(place: Standstill, v: Array) -> tuple[str, ...]:
+    """Contacts that would have to pull in a plastic impact at velocity `v`, shape (5,)."""
+    try:
+        impact = compute_impact(place.formation, place.touching, place.z, v)
+    except np.linalg.LinAlgError:
+        return ()
+    return tuple(h.name for h in impact.violations if h.kind is ViolationKind.PULL)
+
+
+def maximise_margin(
+    limits: Array, rows: Array, bounds: Array | None = None
+) -> tuple[Array, float] | None:
+    """Torques up to `limits`, (2,), with the largest margin m <= 1000, and m; None without any.
+
+    They keep rows @ (1, tau) >= m and bounds @ (1, tau) >= 0, of shapes (k, 3) and (l, 3).
+    """
+    from scipy.optimize import linprog
+
+    sides = np.vstack([rows, np.zeros((0, 3)) if bounds is None else bounds])
+    sides = np.column_stack([sides, np.arange(len(sides)) < len(rows)])
+    sides /= np.abs(sides).max(axis=1)[:, None]
+    answer: Any = linprog(
+        [0.0, 0.0, -1.0],
+        A_ub=sides[:, 1:] * [-1.0, -1.0, 1.0],
+        b_ub=sides[:, 0],
+        bounds=[*((-most, most) for most in limits.tolist()), (None, 1e3)],
+    )
+    return (answer.x[:2], float(answer.x[2])) if answer.status == 0 else None

@@ -42,12 +42,23 @@ from ..mechanics.impact import ViolationKind, compute_impact
 from ..problem.definition import End, Phase, Problem, Until
 from ..results.torque import TorqueProfile
 from .events import EventKind, Outcome, OutcomeKind, Record, describe_change
-from .hand import build_system
-from .modes import Mode, Unit, evaluate_rows, find_fixed, find_mode, list_modes, list_units, respond
-from .rest import Collapse, StartDeparture, close_contacts, find_rest
+from .modes import (
+    Collapse,
+    Mode,
+    StartDeparture,
+    Unit,
+    close_contacts,
+    evaluate_rows,
+    find_fixed,
+    find_mode,
+    find_rest,
+    list_modes,
+    list_units,
+    respond,
+)
 from .run import Run, StuckError
 from .stepper import INNER_STAGES, NODES, ModeStepper, bind
-from .tolerances import (
+from .system import (
     FIRST_STEP,
     REACHED,
     REST_WINDOW,
@@ -56,6 +67,7 @@ from .tolerances import (
     SETTLING,
     SLOW,
     STANDING,
+    build_system,
 )
 
 CLEAR = 1e-8  # least margin of a clear decision, over the scene's units

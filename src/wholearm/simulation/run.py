@@ -15,8 +15,7 @@ from ..common.errors import SimulationError, require_number
 from ..results.torque import TorqueProfile
 from .events import Event, EventKind, Record
 from .stepper import LOSSES, ORDER, Modes, ModeStepper, build_stepper
-from .system import System
-from .tolerances import FIRST_STEP, SETTLING, SHORTEST_STEP
+from .system import FIRST_STEP, SETTLING, SHORTEST_STEP, System
 
 SAME = 1e-9  # distance of two instants that counts as none, relative to the period
 

@@ -30,11 +30,10 @@ from .events import (
     collect,
     list_stretches,
 )
-from .hand import build_system, measure_gaps
 from .prescribed import Replay
 from .run import Feedback, Law, Run
 from .stepper import Modes
-from .tolerances import SLOW
+from .system import SLOW, build_system, measure_gaps
 
 if TYPE_CHECKING:
     from .complementarity import FreeRun

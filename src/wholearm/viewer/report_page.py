@@ -13,11 +13,11 @@ from typing import Any
 import matplotlib
 import numpy as np
 
+from ..analysis.comparison import Contender, compare
 from ..common.arrays import Array
 from ..common.document import Document, Table, fixed, show
 from ..common.errors import SimulationError
 from ..common.sharing import exclusive
-from ..comparison.metrics import Contender, compare
 from ..contacts.closing import close_fingers
 from ..contacts.elemental import Contact
 from ..figures.map_figure import BOX, PLACE, SIZE, draw_map, find_room, split

@@ -23,15 +23,14 @@ from ..contacts.contact_limits import takes_over
 from ..geometry.curve import find_root
 from ..problem.definition import End, Phase, Problem, Until
 from ..problem.read import require_phases
-from ..quasistatic.slow_speeds import SQUEEZE, find_torques, sample_path
 from ..results.torque import TorqueProfile, format_rows, read_rows
 from ..simulation.complementarity import FreeRun
 from ..simulation.events import Event, EventKind, FreeSimulation, list_pauses
-from ..simulation.hand import build_system
 from ..simulation.simulate import simulate_free
-from ..simulation.tolerances import REST_WINDOW
+from ..simulation.system import REST_WINDOW, build_system
 from ..verification.free import FreeReport, find_losses, verify_free
 from ..verification.verdict import DEPARTURE
+from .slow_speeds import SQUEEZE, find_torques, sample_path
 
 _GAINS = (EventKind.GAINED, EventKind.IMPACT, EventKind.PASS)
 FACTOR = 1.1

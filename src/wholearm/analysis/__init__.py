@@ -1,0 +1,1 @@
+"""Slow motions, comparison, robustness and tuning of plans and torques."""

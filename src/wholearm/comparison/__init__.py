@@ -1,1 +1,0 @@
-"""Plans and torques for one problem, side by side."""

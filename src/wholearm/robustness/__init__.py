@@ -1,1 +1,0 @@
-"""How much error a plan bears: samples of scenes and torques, replayed free of assumptions."""

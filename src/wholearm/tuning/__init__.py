@@ -1,1 +1,0 @@
-"""Torques found by trial and error, in steps of 10 %, as Yeap and Trinkle tuned theirs by hand."""
