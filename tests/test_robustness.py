@@ -47,6 +47,7 @@ from wholearm.mechanics.dynamics import (
     metric_weights,
     stack_motion,
 )
+from wholearm.mechanics.sensitivity import find_force_slopes, find_slopes_at
 from wholearm.mechanics.statics import Statics
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
@@ -55,7 +56,6 @@ from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.problem.uncertainty import NAMES, PARAMETERS
 from wholearm.results.trajectory import Motion, Samples
-from wholearm.sensitivity.slopes import find_force_slopes, find_slopes_at
 from wholearm.simulation.events import EventKind
 
 Z = NormalDist().inv_cdf(0.975)

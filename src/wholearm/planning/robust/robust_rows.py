@@ -6,7 +6,7 @@ the same torques,
     h c - sum over p of |d(h c - low)/dp| r_p >= low.
 
 The derivatives times r_p, the parametric bounds, are affine in 1, a = s'', b = s'^2, the internal
-force lambda and s' (`sensitivity.slopes`). So the left side is the least of affine rows, one for
+force lambda and s' (`mechanics.sensitivity`). So the left side is the least of affine rows, one for
 each choice of signs. At a place with a known b they allow a polygon of a and lambda; a minimum-time
 motion is at its vertex of largest or least a. The rows that meet at these two are found by cutting
 planes: the most violated row is added. These `COPIES` rows for each limit are taken like any other
@@ -29,10 +29,10 @@ from ...geometry.curve import Curve, CurvePoint, directions_of
 from ...mechanics.dynamics import Directions, PathForces, inverse, stack_motion
 from ...mechanics.limits import CONE, PRESS, LimitSet, make_limits
 from ...mechanics.path_limits import PathLimits
+from ...mechanics.sensitivity import find_force_slopes
 from ...mechanics.statics import Statics, TorquePolygon
 from ...problem.uncertainty import PARAMETERS
 from ...scene.model import Friction
-from ...sensitivity.slopes import find_force_slopes
 
 COPIES = 5  # rows for each force limit: two for each vertex, and one for the reference
 _LOOKS = 97  # places of a segment at which signs are found

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from ...common.arrays import Array, find_minima
 from ...mechanics.dynamics import Directions
 from ...mechanics.limits import CONE, PRESS, make_limits
+from ...mechanics.sensitivity import find_slopes_at
 from ...results.trajectory import Samples
-from ...sensitivity.slopes import find_slopes_at
 from ..options import DEFAULT_ACCURACY, Objective
 from ..robust.robust_rows import find_edges
 from .search import TimeSearch, TimeSolution

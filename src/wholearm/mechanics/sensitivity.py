@@ -23,23 +23,16 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..contacts.formation import Formation, Kinematics
-from ..geometry.curve import CurvePoint
-from ..mechanics.dynamics import A, B, Directions, PathForces, V, force_rows, metric_weights
-from ..results.trajectory import Samples
+from .dynamics import A, B, Directions, PathForces, V, force_rows, metric_weights
 
 COUNT = 5  # number of coefficients: of 1, a, b, s' and the internal force
-
-
-class _Change(NamedTuple):
-    """Right sides of the derivative: of Newton's and Euler's laws, and of the constraints."""
-
-    load: Array  # (n, 5, COUNT)
-    bend: Array  # (n, n_c + R, COUNT)
+CurvePlaces = tuple[Array, Array, Array, Kinematics]
+"""z, tangent z_s and curvature z_ss at n places of a curve, (n, 5) each, and kinematics there."""
 
 
 def find_force_slopes(
     formation: Formation,
-    point: CurvePoint,
+    point: CurvePlaces,
     directions: Directions,
     forces: PathForces,
     names: Sequence[str],
@@ -53,39 +46,42 @@ def find_force_slopes(
 
 
 def find_shifts(
-    formation: Formation, point: CurvePoint, directions: Directions, forces: PathForces, name: str
+    formation: Formation, point: CurvePlaces, directions: Directions, forces: PathForces, name: str
 ) -> Array:
     """Apparent progress along a curve by joint angles, per unit of a length error, (n,)."""
-    dz, rates = _along(formation, point, directions, forces).displace(name), point.z_s[:, 3:]
+    dz, rates = _along(formation, point, directions, forces).displace(name), point[1][:, 3:]
     square = np.maximum((rates**2).sum(axis=1), 1e-30)
     return np.asarray((dz[:, 3:] * rates).sum(axis=1) / square)
 
 
 def _along(
-    formation: Formation, point: CurvePoint, directions: Directions, forces: PathForces
+    formation: Formation, point: CurvePlaces, directions: Directions, forces: PathForces
 ) -> _State:
     """The state of a formation at n places of a curve."""
-    acceleration = np.zeros((*point.z.shape, COUNT))
-    acceleration[..., A], acceleration[..., B] = point.z_s, point.z_ss
-    size = np.sqrt(point.z_s[:, :3] ** 2 @ metric_weights(formation.scene)[:3])[:, None]
-    along = point.z_s / size, point.z_ss / size
-    places = point.z, point.z_s, point.kinematics
-    return _State(formation, *places, directions, forces.of_c, forces.of_tau, acceleration, along)
+    z, z_s, z_ss, kinematics = point
+    acceleration = np.zeros((*z.shape, COUNT))
+    acceleration[..., A], acceleration[..., B] = z_s, z_ss
+    size = np.sqrt(z_s[:, :3] ** 2 @ metric_weights(formation.scene)[:3])[:, None]
+    along = z_s / size, z_ss / size
+    given = formation, z, z_s, kinematics, directions, *forces[:2]
+    return _State(*given, acceleration, along)
 
 
 def find_slopes_at(
-    formation: Formation, samples: Samples, directions: Directions, names: Sequence[str]
+    formation: Formation,
+    samples: tuple[Array, Array, Array, Array, Array, Array],
+    directions: Directions,
+    names: Sequence[str],
 ) -> Array:
     """The same at n instants of a motion, shape (n, n_c + R, len(names)) [N per unit].
 
-    `start_x` is how far the object is along x, or as far as the contacts let it.
+    `samples` are z, z', z'', tau, c_n and c_t. `start_x` is how far the object is along x, or as
+    far as the contacts let it.
     """
-    z, v = samples.z, samples.z_dot
+    z, v, a, tau, c_n, c_t = samples
     kinematics = formation.evaluate(z, v)
-    c_t = samples.c_t[:, list(formation.rolling_rows)]
-    c = np.hstack([samples.c_n, c_t])[..., None] * np.eye(COUNT)[0]
-    tau = samples.tau[..., None] * np.eye(COUNT)[0]
-    acceleration = samples.z_ddot[..., None] * np.eye(COUNT)[0]
+    c = np.hstack([c_n, c_t[:, list(formation.rolling_rows)]])
+    c, tau, acceleration = (each[..., None] * np.eye(COUNT)[0] for each in (c, tau, a))
     # Fingers follow the object, however far.
     metric = metric_weights(formation.scene) * np.array([1, 1, 1, 1e-6, 1e-6])
     unit = np.broadcast_to(np.eye(5)[0], z.shape)
@@ -114,16 +110,18 @@ class _State(NamedTuple):
     def find_slopes(self, names: Sequence[str]) -> Array:
         """Derivatives of the contact forces, shape (n, n_c + R, len(names), COUNT)."""
         changes = [self.change(name) for name in names]
-        load = np.stack([own.load for own in changes], axis=2)
-        bend = np.stack([own.bend for own in changes], axis=2)
+        load, bend = (np.stack(own, axis=2) for own in zip(*changes, strict=True))
         over = self.kinematics.P / self.formation.scene.mass_diagonal
         G = force_rows(self.formation, self.kinematics, self.directions)
         right = bend - np.einsum("nij,njpq->nipq", over, load)
         flat = np.linalg.solve(over @ G.transpose(0, 2, 1), right.reshape(*right.shape[:2], -1))
         return np.asarray(flat.reshape(right.shape))
 
-    def change(self, name: str) -> _Change:
-        """What one number changes of the equations."""
+    def change(self, name: str) -> tuple[Array, Array]:
+        """Right sides of the derivative by one number.
+
+        Those of Newton's and Euler's laws, (n, 5, COUNT), and of constraints, (n, n_c + R, COUNT).
+        """
         scene, load = self.formation.scene, np.zeros_like(self.acceleration)
         bend = np.zeros_like(self.c)
         if name in ("mass", "inertia"):
@@ -144,7 +142,7 @@ class _State(NamedTuple):
         elif name.startswith(("base", "length")):
             dz = self.displace(name)
             return self._move(name, dz, self.turn(name, dz))
-        return _Change(load, bend)
+        return load, bend
 
     def displace(self, name: str) -> Array:
         """The nearest place where a joint is moved or a link is longer: dz/dp, shape (n, 5)."""
@@ -173,7 +171,7 @@ class _State(NamedTuple):
         turned = np.einsum("nij,nj->ni", self._difference(name, dz).P, self.z_s)
         return _move_least(self.kinematics.P, -turned, metric_weights(self.formation.scene))
 
-    def _move(self, name: str, dz: Array, dz_s: Array) -> _Change:
+    def _move(self, name: str, dz: Array, dz_s: Array) -> tuple[Array, Array]:
         """What another place and tangent change, with geometry that is off by as much."""
         slopes = self._difference(name, dz)
         # P' z' is a quadratic form of the velocity.
@@ -183,7 +181,7 @@ class _State(NamedTuple):
         dG = force_rows(self.formation, slopes, self.directions)
         load = np.einsum("nij,niq->njq", dG, self.c)
         load[..., V] -= self.formation.scene.viscous * dz_s
-        return _Change(load, bend)
+        return load, bend
 
     def _rows_of(self, name: str) -> Array:
         """Which constraint rows are of the finger that a name ends in, shape (n_c + R,)."""

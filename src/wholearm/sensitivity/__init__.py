@@ -1,1 +1,0 @@
-"""How forces change with numbers that are off."""
