@@ -37,7 +37,7 @@ from wholearm.mechanics.dynamics import LAMBDA, Directions, build_forward, inver
 from wholearm.mechanics.impact import Impact, ViolationKind, compute_impact, solve_impulses
 from wholearm.mechanics.statics import Statics, pushes_one_way
 from wholearm.mechanics.uniqueness import find_minors
-from wholearm.planning.path_domain.impact_sequence import ImpactSequence, make_sequence
+from wholearm.planning.blocks import ImpactSequence, make_sequence
 from wholearm.planning.path_domain.path_plan import plan_curves
 from wholearm.planning.time_domain.stage import in_own_units, scale_state
 from wholearm.planning.time_domain.time_plan import plan_phases

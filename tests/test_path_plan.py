@@ -29,6 +29,7 @@ from wholearm.geometry.tracing import trace_phase, trace_phases
 from wholearm.mechanics.dynamics import LAMBDA, ONE, A, B, Directions, V, inverse
 from wholearm.mechanics.limits import make_limits
 from wholearm.planning import lower_bound
+from wholearm.planning.blocks import make_sequence
 from wholearm.planning.lower_bound import (
     LowerBound,
     bound_least_time,
@@ -39,7 +40,6 @@ from wholearm.planning.lower_bound import (
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain import path_plan
 from wholearm.planning.path_domain.first_guess import guess
-from wholearm.planning.path_domain.impact_sequence import make_sequence, plan_sequence
 from wholearm.planning.path_domain.path_data import prepare
 from wholearm.planning.path_domain.path_mesh import make_grid
 from wholearm.planning.path_domain.path_motion import PathMotion
@@ -572,7 +572,7 @@ def test_phases_that_impacts_join_are_advised_together() -> None:
     problem = problem_of(IMPACTS)
     chain = make_sequence(problem.phases, trace_phases(problem)).split()[0]
     with pytest.raises(InfeasibleError) as caught:
-        plan_sequence(chain, 1.0, OPTIONS)
+        chain.plan(1.0, OPTIONS)
     found = re.match(
         r"phases 1 to 3 are infeasible: c_n of (\S+) >= epsilon = 1 N is \S+ N short at "
         r"t = \d\.\d{4} s \(x = .*? mm, phi = .*? deg\), phase ([123])",
@@ -581,10 +581,10 @@ def test_phases_that_impacts_join_are_advised_together() -> None:
     assert found is not None, str(caught.value)
     assert found[1] in chain.phases[int(found[2]) - 1].formation.names
     (value,) = read_advice(str(caught.value)).values()
-    assert all(plan.motion.duration > 0 for plan in plan_sequence(chain, value, OPTIONS))
+    assert all(plan.motion.duration > 0 for plan in chain.plan(value, OPTIONS))
     # Where only the fact counts, no time is spent on advice.
     with pytest.raises(SolverError, match=r"^phases 1 to 3: Ipopt stopped with "):
-        plan_sequence(chain, 1.03 * value, OPTIONS, explained=False)
+        chain.plan(1.03 * value, OPTIONS, explained=False)
 
 
 def test_too_short_a_duration_is_named(curves: tuple[Curve, ...]) -> None:
@@ -691,7 +691,7 @@ def test_plans_of_a_chain_come_near_the_bound() -> None:
     chain = make_sequence(problem.phases, trace_phases(problem)).split()[0]
     found = bound_least_time(chain.continuous_curves, EPSILON)
     assert found is not None
-    plans = plan_sequence(chain, EPSILON, PlanOptions(intervals=80))
+    plans = chain.plan(EPSILON, PlanOptions(intervals=80))
     assert -1e-7 < sum(plan.value for plan in plans) / found.value - 1 < 5e-4
 
 

@@ -2,6 +2,13 @@
 
 Phases joined smoothly or by impacts are one block. Blocks of phases with one degree of freedom are
 planned along their curves, all others in the time domain.
+
+Along curves the velocity at the end of a phase is z_s s'. An impact makes it a multiple of the next
+curve's tangent at any speed: v+ = ratio s' z_s. So whether it is possible is known before planning,
+and with a parameter that runs `ratio` times as fast on the next curve the speed is continuous: the
+curves are planned as one. Otherwise the motion has to stop, and the sequence is split. A smooth end
+is passed at speed where the tangents are the same. Under torque rate limits parts are planned one
+after the other, with pauses between them.
 """
 
 from __future__ import annotations
@@ -13,6 +20,8 @@ from functools import cached_property, partial
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ..common.arrays import Array
 from ..common.errors import (
     Change,
@@ -23,18 +32,32 @@ from ..common.errors import (
     WholearmError,
     name_source,
 )
+from ..contacts.formation import Formation
 from ..geometry.curve import Curve
 from ..geometry.tracing import trace_phase
-from ..mechanics.dynamics import measure_speed
+from ..mechanics.dynamics import measure_speed, metric_weights
+from ..mechanics.impact import Impact, compute_impact
 from ..mechanics.speed_sweep import NoMotionError
-from ..problem.definition import Phase, Problem
+from ..problem.definition import End, Phase, Problem
+from ..results.dwell_record import TorqueChange, change_torques
+from ..results.plan_record import Transition
 from ..results.trajectory import Motion
 from .lower_bound import look_along
 from .nlp import charge
 from .options import Objective, PlanOptions
-from .path_domain.impact_sequence import ImpactSequence, make_sequence, plan_sequence, plan_slowly
 from .path_domain.path_motion import PathMotion
-from .phase_plan import PhasePlan, Plans, Settled, add_up, end_of, runs_along_curves, split_blocks
+from .path_domain.path_plan import plan_curves
+from .phase_plan import (
+    PER_SPEED,
+    PhasePlan,
+    Plans,
+    Settled,
+    add_up,
+    end_of,
+    make_transition,
+    runs_along_curves,
+    split_blocks,
+)
 
 if TYPE_CHECKING:
     from ..geometry.arcs import CostToGo
@@ -48,6 +71,7 @@ COARSE = 80  # intervals along a curve that are doubled where none are given
 AMPLE = 1.1  # saturation of the margin, over the least normal force of other phases
 MOVED = 1e-9  # distance of two starts, in radii of gyration or radians
 FREE = {"torque_rate_limit": None, "actuator_lag": None, "control_period": None}  # free torques
+BEND = 1e-6  # largest 1 - cosine between tangents that count as the same
 SHORT = 5e-7  # largest shortfall of a margin below epsilon by rounding, over the scene's force
 
 
@@ -227,7 +251,6 @@ def plan_block(
 
     `over_time` are arguments of `plan_with_impacts`.
     """
-    plans: Plans = []
     problem, known, allowed = planning.problem, planning.curves, planning.allowed
     if not runs_along_curves(block, options):
         from .time_domain.time_plan import plan_with_impacts
@@ -246,8 +269,6 @@ def plan_block(
         with charge(block[0].number):
             try:
                 if problem.scene.has_slow_motors:
-                    from .path_domain.junction import plan_with_pauses
-
                     return plan_with_pauses(planning, block, plan, add_up(block, allowed)), None
                 return plan(add_up(block, allowed)), None
             except (InfeasibleError, SolverError) as error:
@@ -260,17 +281,48 @@ def plan_block(
         curves.append(known[phase.index] if traced else trace_phase(phase, z, later))
         z = curves[-1].end
     chain = make_sequence(block, curves)
-    parts = chain.split()
     if problem.scene.has_slow_motors:
-        from .path_domain.junction import find_beside
-
-        beside = find_beside(planning, block, chain.curves[-1].end, options)
-        longest = [add_up(part.phases, allowed) for part in parts]
-        return plan_slowly(parts, beside, problem.epsilon, options, longest), chain
-    for part in parts:
+        return plan_slowly(planning, chain, options), chain
+    plans: Plans = []
+    for part in chain.split():
         with charge(part.phases[0].number):
-            plans += plan_sequence(part, problem.epsilon, options, add_up(part.phases, allowed))
+            plans += part.plan(problem.epsilon, options, add_up(part.phases, allowed))
     return plans, chain
+
+
+def plan_with_pauses(
+    planning: Planning,
+    block: Sequence[Phase],
+    plan: Callable[[float | None], Plans],
+    duration: float | None,
+) -> Plans:
+    """Plans of a block in the time domain by `plan` for a longest duration [s], with pauses."""
+    from .dwell import add_pause
+
+    known, scene = planning.find_before(block), planning.problem.scene
+
+    def list_changes(plans: Plans) -> list[TorqueChange]:
+        """From the torques before each phase to its first ones."""
+        firsts = [plan.torque.at(np.zeros(1))[0] for plan in plans]
+        start = find_last_torque(known.plans[-1]) if known else firsts[0]
+        lasts = [start, *map(find_last_torque, plans[:-1])]
+        return [change_torques(scene, *pair) for pair in zip(lasts, firsts, strict=True)]
+
+    plans = plan(duration)
+    changes = list_changes(plans)
+    pause = sum(change.duration for change in changes)
+    if duration is not None and pause:
+        plans = plan(duration - pause)
+        changes = list_changes(plans)
+    return [
+        add_pause(own, change, phase.formation, planning.options)
+        for own, change, phase in zip(plans, changes, block, strict=True)
+    ]
+
+
+def find_last_torque(plan: PhasePlan[Motion]) -> Array:
+    """The torques at the end of a phase, shape (2,) [N m]."""
+    return np.asarray(plan.torque.at(plan.torque.breaks[-1:])[0])
 
 
 def plan_along(
@@ -397,3 +449,157 @@ def free_torques(problem: Problem, options: PlanOptions) -> tuple[Problem, PlanO
     if scene.has_slow_motors or scene.control_period:
         problem = problem.with_(FREE)
     return problem, options
+
+
+@dataclass(frozen=True, eq=False)
+class CurveImpact:
+    """Impact between two curves for unit speed along the first; none if they join smoothly."""
+
+    phase: Phase  # the one that it ends
+    impact: Impact  # velocities per m/s, hence without unit and in rad/m; impulses in N s per m/s
+    ratio: float  # speed along the second curve; negative if the motion would turn back
+
+    @property
+    def possible(self) -> bool:
+        """Whether the motion can go on at speed."""
+        return self.impact.possible and self.ratio > 0
+
+    @property
+    def reason(self) -> str:
+        """Why it cannot, empty if it can."""
+        if self.impact.violations:
+            return self.impact.violations[0].describe(PER_SPEED)
+        return "" if self.possible else f"phase {self.phase.number + 1} would be run backwards"
+
+
+def compute_curve_impact(phase: Phase, before: Curve, after: Curve) -> CurveImpact:
+    """The impact at the end of a phase, from its curve to the next one's."""
+    v = before.evaluate(np.array([before.length])).z_s[0] / before.speed_ratio
+    heading = after.evaluate(np.zeros(1)).z_s[0] / after.speed_ratio
+    metric = metric_weights(after.formation.scene)
+    if phase.end is End.SMOOTH:
+        none = np.zeros(after.formation.n_contacts)
+        impact = Impact(after.formation, v, none, none, ())
+        return CurveImpact(phase, impact, float(v * metric @ heading > 1 - BEND))
+    impact = compute_impact(before.formation, after.formation, after.start, v)
+    return CurveImpact(phase, impact, float(impact.v * metric @ heading))
+
+
+@dataclass(frozen=True, eq=False)
+class ImpactSequence:
+    """One-freedom phases, each but the last ended by an impact or smoothly."""
+
+    phases: tuple[Phase, ...]
+    curves: tuple[Curve, ...]  # parametrised by arc length
+    impacts: tuple[CurveImpact, ...]  # between one curve and the next
+
+    def part(self, start: int, stop: int) -> ImpactSequence:
+        """Phases `start` to `stop`, without the latter."""
+        impacts = self.impacts[start : stop - 1]
+        return ImpactSequence(self.phases[start:stop], self.curves[start:stop], impacts)
+
+    def split(self) -> list[ImpactSequence]:
+        """Split where an impact is not possible."""
+        ends = [k + 1 for k, join in enumerate(self.impacts) if not join.possible]
+        bounds = zip([0, *ends], [*ends, len(self.phases)], strict=True)
+        return [self.part(start, stop) for start, stop in bounds]
+
+    @property
+    def continuous_curves(self) -> tuple[Curve, ...]:
+        """The curves with such speed ratios that the speed is the same on both sides of a join."""
+        ratios = np.cumprod([1.0, *(join.ratio for join in self.impacts)])
+        return tuple(
+            curve.with_speed_ratio(float(ratio)) if ratio != 1 else curve
+            for curve, ratio in zip(self.curves, ratios, strict=True)
+        )
+
+    def plan(
+        self,
+        epsilon: float,
+        options: PlanOptions,
+        duration: float | None = None,
+        **others: Any,
+    ) -> Plans:
+        """Plan phases that possible impacts join, from rest to rest; see `plan_curves`."""
+        numbers = [phase.number for phase in self.phases]
+        curves = self.continuous_curves
+        return [*plan_curves(curves, epsilon, options, numbers, duration, **others)]
+
+    def plan_part(
+        self,
+        epsilon: float,
+        start: int,
+        stop: int,
+        z: Array,
+        options: PlanOptions,
+        duration: float | None,
+    ) -> Plans:
+        """Plan phases `start` to `stop`, from rest at their curve's start `z`: a `PlanPart`."""
+        return self.part(start, stop).plan(epsilon, options, duration, explained=False)
+
+    def list_impacts(self, plans: Plans) -> list[Transition]:
+        """The impacts, with the speeds that plans of the phases pass them at."""
+        impacts = []
+        for plan, join in zip(plans, self.impacts, strict=False):
+            phase = join.phase
+            if phase.end is End.IMPACT:
+                v = end_of(plan)[1] * join.possible
+                speed = measure_speed(phase.formation.scene, v)
+                impacts.append(make_transition(phase, join.impact, join.ratio, join.reason, speed))
+        return impacts
+
+
+def make_sequence(phases: Sequence[Phase], curves: Sequence[Curve]) -> ImpactSequence:
+    """Chain phases along their curves."""
+    impacts = map(compute_curve_impact, phases[:-1], curves[:-1], curves[1:])
+    return ImpactSequence(tuple(phases), tuple(curves), tuple(impacts))
+
+
+def plan_slowly(planning: Planning, sequence: ImpactSequence, options: PlanOptions) -> Plans:
+    """Plan the parts of a block along curves under rate limits, with pauses between them.
+
+    Torques change in pauses from those of the block before, and to those of the next one.
+    """
+    from .dwell import Junction, add_pause, choose_junction
+
+    epsilon, parts = planning.problem.epsilon, sequence.split()
+    known = planning.find_before(sequence.phases)
+    before: Curve | Array | None = None
+    if known is not None:
+        before = known.chain.curves[-1] if known.chain else find_last_torque(known.plans[-1])
+    firsts = [*(part.curves[0] for part in parts[1:]), _find_following(planning, sequence, options)]
+    plans: Plans = []
+    junction: Junction | None = None
+    for part, after in zip(parts, firsts, strict=True):
+        number, first, last = part.phases[0].number, part.curves[0], part.curves[-1]
+        if before is not None and junction is None:
+            junction = choose_junction(before, first, first.start, epsilon, number)
+        coming = None
+        if after is not None:
+            coming = choose_junction(last, after, last.end, epsilon, part.phases[-1].number + 1)
+        pins = junction.begins if junction else None, coming.ends if coming else None
+        duration = add_up(part.phases, planning.allowed)
+        if duration is not None and junction is not None:
+            duration -= junction.change.duration
+        with charge(number):
+            plan = part.plan(epsilon, options, duration, pins=pins)
+        if junction is not None:
+            plan[0] = add_pause(plan[0], junction.change, first.formation, options)
+        plans += plan
+        junction, before = coming, last
+    return plans
+
+
+def _find_following(
+    planning: Planning, sequence: ImpactSequence, options: PlanOptions
+) -> Curve | Formation | None:
+    """The curve after a block along curves, or its formation in the time domain, if any."""
+    index, phases = sequence.phases[-1].index + 1, planning.problem.phases
+    if index == len(phases):
+        return None
+    following = next(own for own in split_blocks(planning.problem) if own[0] is phases[index])
+    if not runs_along_curves(following, options):
+        return phases[index].formation
+    if index < len(planning.curves):
+        return planning.curves[index]
+    return trace_phase(phases[index], sequence.curves[-1].end, phases[index + 1 :])

@@ -40,10 +40,10 @@ from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..scene.model import Scales, Scene
 from .blocks import Planning, free_torques
+from .dwell import require_hold
 from .options import Objective, PlanOptions
 from .path_domain.elements import Profile
 from .path_domain.first_guess import guess_slowly
-from .path_domain.junction import require_hold
 from .path_domain.path_data import PhaseData, cut, join
 from .path_domain.path_motion import PathMotion, fit_torque
 from .path_domain.path_nlp import (

@@ -15,13 +15,16 @@ from ..common.document import plain
 from ..common.errors import InfeasibleError
 from ..contacts.formation import Formation
 from ..geometry.tracing import runs_on_curve
+from ..mechanics.impact import Impact
 from ..problem.definition import End, Phase, Problem
 from ..results.dwell_record import Settling, assemble
+from ..results.plan_record import Transition
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion, Trajectory
 from .options import Objective, PlanOptions
 
 M_co = TypeVar("M_co", bound=Motion, covariant=True)
+PER_SPEED = " per m/s"  # unit after impulses and rates, which are for unit speed before an impact
 
 
 class PhasePlan(NamedTuple, Generic[M_co]):
@@ -149,3 +152,12 @@ def runs_along_curves(block: Sequence[Phase], options: PlanOptions) -> bool:
         and not phase.until.is_release
         for phase in block
     )
+
+
+def make_transition(
+    phase: Phase, impact: Impact, ratio: float, reason: str, speed: float
+) -> Transition:
+    """The transition at the end of a phase; what it saves is not known yet."""
+    contact, impulse = impact.least
+    what = phase.number, str(phase.until), not reason, reason, ratio
+    return Transition(*what, impulse, contact, speed, math.nan)

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -29,12 +30,10 @@ from ..results.plan_record import Certificate, RangeFigures, TimeBound, Transiti
 from ..results.report import UniquenessMargin
 from ..results.trajectory import Trajectory
 from ..verification.verdict import find_uniqueness_margin, find_wedged
-from .blocks import BlockPlan, Planning, plan_blocks
+from .blocks import BlockPlan, ImpactSequence, Planning, plan_blocks
 from .lower_bound import bound_least_time
 from .nlp import Ledger, charge, open_ledger
 from .options import Objective, PlanOptions
-from .path_domain import impact_sequence
-from .path_domain.impact_sequence import ImpactSequence
 from .path_domain.path_motion import PathMotion
 from .path_domain.path_plan import Task, plan_curves
 from .phase_plan import PlanPart, add_up, assemble_motions, combine, plan_stops
@@ -226,8 +225,8 @@ def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transitio
             impacts = list_impacts(block.phases, block.plans)
             plan_part = plan_parts_of(planning.problem, block.phases)
         else:
-            impacts = impact_sequence.list_impacts(block.phases, block.chain, block.plans)
-            plan_part = impact_sequence.plan_parts_of(block.chain, planning.problem.epsilon)
+            impacts = block.chain.list_impacts(block.plans)
+            plan_part = partial(block.chain.plan_part, planning.problem.epsilon)
         first = block.phases[0].index
         stops = [0, *(own.phase - first for own in impacts if not own.possible), len(block.phases)]
         for own in impacts:

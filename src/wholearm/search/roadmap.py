@@ -34,8 +34,8 @@ from ..mechanics.dynamics import ONE, Directions, force_rows, inverse, metric_we
 from ..mechanics.limits import LimitSet, make_limits
 from ..mechanics.path_limits import PathLimits
 from ..mechanics.speed_sweep import make_cosine_grid, speed_sweep
+from ..planning.blocks import BEND, compute_curve_impact
 from ..planning.lower_bound import GIVE
-from ..planning.path_domain.impact_sequence import BEND, compute_curve_impact
 from ..planning.result import Plan
 from ..problem.definition import End, Goal, Phase, Problem, Until
 from ..scene.model import Scene

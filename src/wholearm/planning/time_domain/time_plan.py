@@ -27,9 +27,8 @@ from ...problem.definition import ROWS, End, Phase, Problem
 from ...results.plan_record import Transition
 from ...results.trajectory import Motion
 from ..options import Objective, PlanOptions
-from ..path_domain.impact_sequence import PER_SPEED, make_transition
 from ..path_domain.path_motion import PathMotion
-from ..phase_plan import PhasePlan, PlanPart, Plans, end_of, plan_stops
+from ..phase_plan import PER_SPEED, PhasePlan, PlanPart, Plans, end_of, make_transition, plan_stops
 from .guesses import GIVEN, NEAREST, Guess, Guesses, find_modes
 from .mode_search import (
     LEAST_INTERVALS,
