@@ -24,8 +24,14 @@ from wholearm.engines.engine_replay import (
     play_policy,
     replay_in,
 )
-from wholearm.engines.shapes import list_pairs
-from wholearm.engines.stretch import EngineRun, Setting, find_between, list_steps, list_stretches
+from wholearm.engines.stretch import (
+    EngineRun,
+    Setting,
+    find_between,
+    list_pairs,
+    list_steps,
+    list_stretches,
+)
 from wholearm.planning.plan import solve
 from wholearm.problem.read import build_problem
 from wholearm.results.adopt import require_same_phases

@@ -30,11 +30,10 @@ from tiny_study import die_once
 from wholearm.cli.command import hasten
 from wholearm.common import files as archive
 from wholearm.common import signals as interrupts
-from wholearm.common.crowd import Processes, run_all
 from wholearm.common.errors import InputError
 from wholearm.common.files import read_arrays, together, write_whole
+from wholearm.common.parallel import Processes, can_fork, count_cores, run_all, share
 from wholearm.common.signals import check, guard, held
-from wholearm.common.workers import can_fork, count_cores, share
 from wholearm.planning.nlp import STOPPED, Solver
 from wholearm.simulation.simulate import simulate
 
@@ -122,8 +121,8 @@ def test_an_interrupt_ends_children() -> None:
 
 LEAVES = """
 import multiprocessing, os, signal, time
-from wholearm.common.crowd import Processes
-from wholearm.common.workers import share
+from wholearm.common.parallel import Processes
+from wholearm.common.parallel import share
 
 parent = os.getpid()
 BUSY = "import time; print('ready', flush=True); time.sleep(60)"
@@ -170,7 +169,7 @@ def test_other_threads_keep_it_in_one_process() -> None:
 
 
 SCRIPT = """
-from wholearm.common.crowd import Processes
+from wholearm.common.parallel import Processes
 for base in (2, 3):
     print(Processes(1).submit(abs, -base).result(), __name__)
 """
@@ -400,7 +399,7 @@ def test_planning_is_interrupted(delay: float, tmp_path: Path) -> None:
 WORKS = """
 import time
 import wholearm.__main__ as m
-from wholearm.common.crowd import Processes, run_all
+from wholearm.common.parallel import Processes, run_all
 
 def work():
     for _ in run_all(time.sleep, [0, 60, 60, 60, 60], Processes(2)):

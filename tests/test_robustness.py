@@ -37,7 +37,7 @@ from wholearm.analysis.robustness import (
 )
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
-from wholearm.common.crowd import connect, run_all
+from wholearm.common.parallel import connect, run_all
 from wholearm.geometry.curve import Curve, directions_of
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import (

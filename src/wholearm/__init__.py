@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from .contacts.elemental import Contact
     from .contacts.formation import Formation
     from .engines.engine_replay import EngineReport, PolicyReport, play_policy, replay_in
-    from .engines.mjcf import write_mjcf
+    from .engines.mujoco import write_mjcf
     from .figures import plots
     from .figures.map_figure import draw_map
     from .geometry.tracing import load
@@ -67,7 +67,7 @@ _NAMES = {
     "contacts.elemental": "Contact",
     "contacts.formation": "Formation",
     "engines.engine_replay": "EngineReport PolicyReport play_policy replay_in",
-    "engines.mjcf": "write_mjcf",
+    "engines.mujoco": "write_mjcf",
     "figures.map_figure": "draw_map",
     "geometry.tracing": "load",
     "mapping.formation_list": "format_route list_formations",

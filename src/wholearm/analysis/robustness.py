@@ -20,11 +20,11 @@ import numpy as np
 
 from .. import __version__
 from ..common.arrays import Array
-from ..common.crowd import DiedError, Processes, run_all
 from ..common.document import Document, Result, Table
 from ..common.errors import InputError, SimulationError, require_number
 from ..common.fields import Field, Range
 from ..common.journal import Journal
+from ..common.parallel import DiedError, Processes, run_all
 from ..contacts.closing import close_fingers, describe_obstacle
 from ..policy.playback import ROOM, ClosedLoop, Policy
 from ..problem.definition import Problem

@@ -27,9 +27,9 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from .. import __version__
-from ..common.crowd import Processes, run_all
 from ..common.files import make_folder, together, write_text
 from ..common.journal import Journal
+from ..common.parallel import Processes, run_all
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

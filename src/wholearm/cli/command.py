@@ -741,7 +741,7 @@ def compare(options: argparse.Namespace) -> int:
 
 def robustness(options: argparse.Namespace) -> int:
     """Replay samples, and print what becomes of them."""
-    from ..common.crowd import Processes, connect
+    from ..common.parallel import Processes, connect
     from ..problem.uncertainty import spread_widths
 
     # A file for each study that differs by more than numbers: its problem, phase and policy.
@@ -812,7 +812,7 @@ def find_route(
     alternatives: int = 0,
 ) -> wholearm.Answer:
     """Find a route, with a progress line, in two processes if nothing else is asked for."""
-    from ..common.workers import count_cores
+    from ..common.parallel import count_cores
     from ..search.find_route import find_route_with
 
     with warnings.catch_warnings():

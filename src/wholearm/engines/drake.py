@@ -14,13 +14,20 @@ from ..policy.playback import ClosedLoop
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from ..scene.model import Scene
-from .shapes import LINKS, OBJECT, PALM, Shape, find_pairs, find_rounding, list_pairs, list_shapes
 from .stretch import (
+    LINKS,
+    OBJECT,
+    PALM,
     EngineDrive,
     EngineRun,
     EngineStretch,
     Setting,
+    Shape,
     Steps,
+    find_pairs,
+    find_rounding,
+    list_pairs,
+    list_shapes,
     list_steps,
     press_in,
     record,

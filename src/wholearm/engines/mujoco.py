@@ -1,27 +1,248 @@
-"""Replays in MuJoCo."""
+"""MuJoCo: a scene and a plan's torques as an MJCF file, written without MuJoCo, and replays in it.
+
+Positions are z = (x, y, phi, theta_1, theta_2), with the start of the motion as the model's own
+position and as the keyframe ``home``. What else a plan adds is described in `add_clock`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from ..common.arrays import Array
 from ..policy.playback import ClosedLoop
 from ..problem.definition import Problem
-from ..results.torque import TorqueProfile
-from .mjcf import Softness, write_mjcf
-from .shapes import find_pairs, list_pairs
+from ..results.adopt import Moved, adopt_motion
+from ..results.torque import TorqueProfile, place_rows
+from ..results.trajectory import Trajectory
+from ..scene.model import Scene
 from .stretch import (
+    LINKS,
+    OBJECT,
+    PALM,
     EngineDrive,
     EngineRun,
     EngineStretch,
     Setting,
+    apply_friction,
+    find_pairs,
+    find_rounding,
+    list_pairs,
+    list_shapes,
     list_steps,
     press_in,
     record,
 )
+
+SHARE = 1e-6
+"""Weight of a joint's angle in its tendon, over the scene's time; that of the clock is 1."""
+BEND = 1e-3  # Largest error of the ramps, relative to the largest torque
+CLOCK = "clock"
+HIDDEN = {"group": 3}
+"""Group of joints and actuators for which MuJoCo's viewer has no sliders, unless asked for."""
+STEP = 1.6e-4  # Time step, over the scene's time: 1e-5 s in the scenes of `problems/`
+
+
+class Softness(NamedTuple):
+    """Softness of contacts.
+
+    In a convex contact model sliding separates the surfaces at a rate that falls with the time
+    constant of friction and with the impedance.
+    """
+
+    press: float = 7.5  # time constant of the gap (critically damped), in time steps
+    rub: float = 300.0  # time constant of the sliding speed, in time steps
+    impedance: float = 0.01  # share of the unconstrained motion that a contact takes away
+    ratio: float = 100.0  # impedance of friction over that of the gap
+
+
+def write_mjcf(
+    problem: Problem,
+    plan: Trajectory | Moved | None = None,
+    *,
+    step: float | None = None,
+    softness: Softness | None = None,
+) -> str:
+    """The scene as the text of an MJCF file.
+
+    Parameters
+    ----------
+    plan        its torques are part of the model, and each of its phases has a keyframe at its
+                start
+    step : [s]  `STEP` of the scene's time when left out
+
+    Raises
+    ------
+    InputError  if a link has no thickness
+    """
+    scene, home = problem.scene, problem.start
+    if plan is not None:
+        problem, plan = adopt_motion(problem, plan)
+        home = plan.z[0]
+    root = Element("mujoco", model=problem.name)
+    step = STEP * scene.scales.time if step is None else step
+    softness = Softness() if softness is None else softness
+    _add_options(root, scene, step, softness)
+    world = add(root, "worldbody")
+    reach = 10 * max(scene.polygon.size, *(link.length for link in scene.fingers))
+    place, size = [0.0, -find_rounding(scene), 0.0], [reach, reach, reach / 100]
+    _add_geom(world, PALM, "plane", pos=place, zaxis=[0, 1, 0], size=size, rgba=".6 .6 .6 .3")
+    _add_object(world, scene, home[:3])
+    _add_links(world, scene, home[3:])
+    contact, impedance = add(root, "contact"), softness.impedance
+    for pair in list_pairs(scene):
+        rough = pair.friction > 0
+        add(
+            contact,
+            "pair",
+            name=pair.name,
+            geom1=pair.first,
+            geom2=pair.second,
+            condim="3" if rough else "1",
+            friction=[pair.friction, pair.friction, 0, 0, 0] if rough else [1, 1, 0, 0, 0],
+            solref=[softness.press * step, 1.0],
+            solreffriction=[softness.rub * step, 1.0],
+            solimp=[impedance, impedance, 1.0],
+        )
+    motors = add(root, "actuator")
+    for number, link in enumerate(scene.fingers, 1):
+        # Controls contain the dry friction of the joint.
+        limit = np.array([-1, 1]) * (link.torque_limit + link.dry)
+        add(motors, "motor", name=f"motor{number}", joint=f"theta{number}", ctrlrange=limit)
+    keys = add(root, "keyframe")
+    if plan is None:
+        add(keys, "key", name="home", qpos=home)
+    else:
+        add_clock(root, scene, plan, step)
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _add_options(root: Element, scene: Scene, step: float, softness: Softness) -> None:
+    """Units and solver, and how a viewer shows the scene."""
+    size, depth = scene.polygon.size, scene.polygon.size / 20
+    add(root, "compiler", angle="radian", autolimits="true")
+    # MuJoCo 4.0.0 factorises sparse Hessians wrongly; its midphase drops shapes this thin.
+    known = {"solver": "Newton", "jacobian": "dense", "integrator": "implicitfast"}
+    gravity = [0.0, -scene.gravity, 0.0]
+    tight = {"tolerance": 1e-12, "cone": "elliptic", "impratio": softness.ratio}
+    option = add(root, "option", timestep=step, gravity=gravity, **tight, **known)
+    add(option, "flag", midphase="disable")
+    add(root, "statistic", center=[0.0, size / 2, 0.0], extent=2 * size)
+    visual = add(root, "visual")
+    add(visual, "global", azimuth="90", elevation="-89.9")
+    add(visual, "headlight", ambient=".5 .5 .5", diffuse=".4 .4 .4")
+    points = [(*corner, side) for side in (-depth, depth) for corner in scene.polygon.vertices]
+    add(add(root, "asset"), "mesh", name=OBJECT, inertia="convex", vertex=points)
+
+
+def _add_geom(body: Element, name: str, kind: str, **attributes: object) -> None:
+    """A shape that touches only what pairs say."""
+    add(body, "geom", name=name, type=kind, contype="0", conaffinity="0", **attributes)
+
+
+def _add_object(world: Element, scene: Scene, q: Array) -> None:
+    polygon = scene.polygon
+    body = add(world, "body", name=OBJECT, pos=[*q[:2], 0.0])
+    add(body, "inertial", pos=[0, 0, 0], mass=polygon.mass, diaginertia=[polygon.inertia] * 3)
+    for axis, (name, kind) in enumerate((("x", "slide"), ("y", "slide"), ("phi", "hinge"))):
+        add(body, "joint", name=name, type=kind, axis=np.eye(3)[axis], ref=q[axis])
+    turned = [0.0, 0.0, q[2]]
+    _add_geom(body, OBJECT, "mesh", mesh=OBJECT, euler=turned, rgba=".9 .7 .3 1")
+    _add_shapes(body, scene, q[2])
+
+
+def _add_links(world: Element, scene: Scene, theta: Array) -> None:
+    for k, link in enumerate(scene.fingers):
+        place = [*np.asarray(link.base), 0.0]
+        # The weight of links is no part of the model.
+        body = add(world, "body", name=LINKS[k], pos=place, gravcomp="1")
+        # A uniform rod. MuJoCo makes the stiffness of a contact of how bodies move at their centres
+        # of mass: at the joint that is not at all, and contacts of light links are too stiff.
+        middle = link.length / 2 * np.array([np.cos(theta[k]), np.sin(theta[k]), 0.0])
+        rod = {"mass": 3 * link.inertia / link.length**2, "diaginertia": [link.inertia / 4] * 3}
+        add(body, "inertial", pos=middle, **rod)
+        turn = {"axis": [0, 0, 1], "ref": theta[k], "damping": link.viscous}
+        add(body, "joint", name=f"theta{k + 1}", type="hinge", **turn)
+        _add_shapes(body, scene, theta[k])
+
+
+def _add_shapes(body: Element, scene: Scene, angle: float) -> None:
+    """Balls and capsules, turned so that they are in place at the model's own position."""
+    c, s = np.cos(angle), np.sin(angle)
+    for shape in list_shapes(scene):
+        if shape.body == body.get("name"):
+            ends = np.pad(shape.points @ np.array([[c, s], [-s, c]]), ((0, 0), (0, 1)))
+            kind, key = ("sphere", "pos") if len(ends) == 1 else ("capsule", "fromto")
+            _add_geom(body, shape.name, kind, size=shape.radius, **{key: ends})
+
+
+def list_ramps(scene: Scene, plan: Trajectory, step: float) -> tuple[Array, Array]:
+    """Rows of applied torque in increasing time: shape (n,) [s] and (n, 2) [N m].
+
+    At the start of a time step the lines between rows are at the average over that step, so that
+    torques that jump within one have the right effect.
+    """
+    rows = place_rows(apply_friction(scene, plan), BEND)
+    t, again = rows[:, 0] - step / 2, np.flatnonzero(np.diff(rows[:, 0]) <= 0)
+    t[again] -= step / 2
+    t[again + 1] += step / 2
+    # Rows that are nearer to a step than that keep their order, a millionth of a step apart.
+    t = np.maximum.accumulate(t) + 1e-6 * step * np.arange(len(t))
+    return t, rows[:, 1:]
+
+
+def add_clock(root: Element, scene: Scene, plan: Trajectory, step: float) -> None:
+    """Add clock, tendons, springs, and a keyframe for the start and for each phase."""
+    t, tau = list_ramps(scene, plan, step)
+    share = SHARE * scene.scales.time
+    rises = np.diff(tau, axis=0) / share
+    # The clock is driven by much more force than all springs exert.
+    drive = 1e9 * (np.abs(rises).sum() + np.abs(tau[0]).sum() / share + scene.scales.force)
+    body = add(_find(root, "worldbody"), "body", name=CLOCK)
+    add(body, "inertial", pos=[0, 0, 0], mass=scene.scales.mass, diaginertia=[1, 1, 1])
+    add(body, "joint", name=CLOCK, type="slide", axis=[0, 0, 1], damping=drive, **HIDDEN)
+    tendons, springs = add(root, "tendon"), _find(root, "actuator")
+    spring = {"gainprm": [0], "biastype": "affine", **HIDDEN}
+    add(springs, "general", name=CLOCK, joint=CLOCK, biasprm=[drive, 0, 0], **spring)
+    for k, name in enumerate(("torque1", "torque2")):
+        tendon = add(tendons, "fixed", name=name)
+        add(tendon, "joint", joint=CLOCK, coef=1)
+        add(tendon, "joint", joint=f"theta{k + 1}", coef=share)
+        first = [tau[0, k] / share, 0, 0]
+        add(springs, "general", name=f"{name}-start", tendon=name, biasprm=first, **spring)
+        for row in np.flatnonzero(rises[:, k]):
+            rise, slope = rises[row, k], rises[row, k] / (t[row + 1] - t[row])
+            ramp = {"biasprm": [-slope * t[row], slope, 0], "forcerange": sorted((0.0, rise))}
+            add(springs, "general", name=f"{name}-{row}", tendon=name, **ramp, **spring)
+    # Keyframes with positions, velocities and the clock.
+    starts, keys = plan.phase_starts[:-1], _find(root, "keyframe")
+    firsts = [int(np.flatnonzero(plan.phase == index)[0]) for index in range(len(starts))]
+    names = ["home", *(f"phase{number}" for number in range(1, len(starts) + 1))]
+    for name, k in zip(names, [0, *firsts], strict=True):
+        at = plan.t[k]
+        add(keys, "key", name=name, time=at, qpos=[*plan.z[k], at], qvel=[*plan.z_dot[k], 1.0])
+
+
+def _find(root: Element, tag: str) -> Element:
+    found = root.find(tag)
+    assert found is not None
+    return found
+
+
+def add(parent: Element, tag: str, **attributes: object) -> Element:
+    """Add an element to another; numbers are written with all their digits."""
+    texts = {
+        key: value
+        if isinstance(value, str)
+        else " ".join(format(x, ".17g") for x in np.ravel(np.array(value, dtype=float)))
+        for key, value in attributes.items()
+    }
+    return ElementTree.SubElement(parent, tag, texts)
 
 
 def play(
@@ -47,7 +268,7 @@ def play(
         first, second = (model.geom(name).id for name in (pair.first, pair.second))
         numbers[first, second] = numbers[second, first] = number
 
-    def add(total: Array, find: Callable[[Any], Array]) -> None:
+    def collect(total: Array, find: Callable[[Any], Array]) -> None:
         """Add to totals of pairs what `find` has for the rows of their constraints."""
         contact, held = data.contact, data.contact.efc_address >= 0
         pair = numbers[contact.geom1[held], contact.geom2[held]]
@@ -62,7 +283,7 @@ def play(
             data.ctrl[:] = tau
             mujoco.mj_step(model, data)
             if data.ncon:
-                add(total, lambda rows: data.efc_force[rows])
+                collect(total, lambda rows: data.efc_force[rows])
         return total / (end - start)
 
     # MuJoCo computes stiffnesses from time constants and inertias; they are read at a small depth.
@@ -72,7 +293,7 @@ def play(
     data.qpos[:] = press_in(problem, stretch, {**nowhere, **touching})
     mujoco.mj_forward(model, data)
     found = np.zeros(len(pairs))
-    add(found, lambda k: data.efc_KBIP[k, 0] * data.efc_KBIP[k, 2] / data.efc_R[k])
+    collect(found, lambda k: data.efc_KBIP[k, 0] * data.efc_KBIP[k, 2] / data.efc_R[k])
     names, corners = [pair.name for pair in pairs], problem.scene.polygon.n_vertices
     shares = {
         name: sum(found[names.index(own)] for own in find_pairs(name, corners)) or np.inf

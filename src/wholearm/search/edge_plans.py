@@ -16,8 +16,8 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import InputError, WholearmError, name_source
+from ..common.parallel import Task, share
 from ..common.sharing import exclusive
-from ..common.workers import Task, share
 from ..geometry.curve import Curve
 from ..geometry.path_guess import count_freedoms
 from ..geometry.tracing import trace_phase

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import NamedTuple, TypeVar
 
-from ..common.workers import Task, share
+from ..common.parallel import Task, share
 from ..planning.blocks import free_torques
 from ..planning.options import Objective, PlanOptions
 from ..planning.result import Plan
