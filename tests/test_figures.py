@@ -36,8 +36,8 @@ from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.common.document import Document, Result, Table
 from wholearm.contacts.closing import contact_table, evaluate_contacts
-from wholearm.figures.curves import draw_torques, find_steps, scale_margins
 from wholearm.figures.map_figure import draw_map
+from wholearm.figures.plots import draw_torques, scale_margins
 from wholearm.figures.snapshots import choose_snapshots, draw_snapshot
 from wholearm.figures.style import WIDTH, choose_styles
 from wholearm.mapping.borders import Window
@@ -47,9 +47,14 @@ from wholearm.planning.nlp import Solver
 from wholearm.planning.plan import solve
 from wholearm.planning.result import Plan, Status, describe_plan, load_plan, write_meta
 from wholearm.results.dwell_record import assemble
-from wholearm.viewer import page
 from wholearm.viewer.movie import FRAMES, Movie, write_movie
-from wholearm.viewer.page import describe_motion, place_pushes
+from wholearm.viewer.page import (
+    build_page,
+    describe_motion,
+    place_pushes,
+    write_chart,
+    write_player,
+)
 from wholearm.viewer.report_page import build_report, describe_map, list_joints, list_phases
 
 
@@ -183,7 +188,7 @@ def test_ticks_of_margins_are_apart_in_low_panels(height: float) -> None:
 def test_margins_are_the_trajectory_with_breaks_at_phases(
     figure: Figure, trajectory: Trajectory
 ) -> None:
-    margins, steps = figure.axes[-2], find_steps(trajectory)
+    margins, steps = figure.axes[-2], trajectory.find_steps()
     assert set(np.flatnonzero(np.diff(trajectory.phase)) + 1) <= set(steps)
     added = np.insert(np.zeros(len(trajectory.t), dtype=bool), np.repeat(steps, 2), True)
     for index, name in enumerate(trajectory.contacts):
@@ -523,7 +528,7 @@ def test_pushes_and_weight_are_what_accelerates_the_object() -> None:
 
 def test_a_motion_survives_its_page() -> None:
     problem, plan = problem_of(HEPTAGON), plan_of(HEPTAGON)
-    text = page.build_page("a <title>", [page.write_player(describe_motion(plan, problem))])
+    text = build_page("a <title>", [write_player(describe_motion(plan, problem))])
     assert "a &lt;title&gt;" in text
     # Nothing is fetched: the only address is the name of SVG's namespace.
     assert set(re.findall(r"https?://[^\"]+", text)) == {"http://www.w3.org/2000/svg"}
@@ -543,7 +548,7 @@ def test_a_motion_survives_its_page() -> None:
 def test_names_cannot_end_a_script() -> None:
     name = "</script><script>alert(1)"
     motion = describe_motion(plan_of(HEPTAGON), problem_of(HEPTAGON)) | {"name": name}
-    assert "</script><script>alert" not in page.write_player(motion)
+    assert "</script><script>alert" not in write_player(motion)
 
 
 def test_tables_say_what_the_joints_of_phases_are() -> None:
@@ -621,7 +626,7 @@ def test_slider_plots_and_map_respond_in_a_browser(tmp_path: Path) -> None:
     texts = [place["text"] for place in places]
     firsts = [next(k for k, text in enumerate(texts) if text.startswith(kind)) for kind in kinds]
     motion = describe_motion(plan, problem, plan) | {"speed": 0.25}
-    parts = [page.write_player(motion), page.write_chart(drawing, told)]
+    parts = [write_player(motion), write_chart(drawing, told)]
     acts = """<script>
       const said = {}, output = document.querySelector("output");
       const read = () => [output.textContent, document.querySelector(".cursor").getAttribute("x1")];
@@ -641,7 +646,7 @@ def test_slider_plots_and_map_respond_in_a_browser(tmp_path: Path) -> None:
       });
       document.body.append(JSON.stringify(said));
     </script></body>""".replace("FIRSTS", str(firsts))
-    text = page.build_page("heptagon", parts).replace("</body>", acts)
+    text = build_page("heptagon", parts).replace("</body>", acts)
     found = re.findall(r'\{"first".*\}', open_in_browser(text, tmp_path, "#t=0.1"))
     said = json.loads(found[-1])
     cursor = [58 + 932 * share for share in (0.1 / plan.duration, 0.5, 0.25)]

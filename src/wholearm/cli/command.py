@@ -1020,7 +1020,7 @@ def policy(options: argparse.Namespace) -> int:
 
 def gallery(options: argparse.Namespace) -> int:
     """Plan problems, and write their page."""
-    from ..viewer.gallery import write_gallery
+    from ..viewer.report_page import write_gallery
 
     require_output(options.output, ".md")
     write_gallery(options.files, options.output, show_progress())
@@ -1039,10 +1039,10 @@ def animate(options: argparse.Namespace) -> int:
         ghost = None if simulation is None else simulation.trajectory
         if options.output.lower().endswith(".html"):
             from ..common.files import write_text
-            from ..viewer import page
+            from ..viewer.page import build_page, describe_motion, write_player
 
-            motion = page.describe_motion(trajectory, problem, ghost) | {"speed": options.speed}
-            write_text(options.output, page.build_page(problem.name, [page.write_player(motion)]))
+            motion = describe_motion(trajectory, problem, ghost) | {"speed": options.speed}
+            write_text(options.output, build_page(problem.name, [write_player(motion)]))
         else:
             from ..viewer.movie import Movie, write_movie
 

@@ -14,7 +14,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 
 from ..common.errors import SimulationError
 from ..common.sharing import exclusive
-from .curves import draw_margins, draw_phases
+from .plots import draw_margins, draw_phases
 from .snapshots import place_vertices, trace_link
 from .style import (
     FINGERS,

@@ -8,37 +8,261 @@ from __future__ import annotations
 import math
 import os
 import textwrap
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import matplotlib
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.scale import SymmetricalLogTransform
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
+from ..common.arrays import Array
 from ..common.errors import InputError, require_number
 from ..common.files import write_whole
 from ..common.sharing import exclusive
 from ..contacts.contact_limits import evaluate_finger_gap
+from ..contacts.elemental import parse_contact
 from ..problem.read import read_own_problem
 from ..results.adopt import Torques, narrow
-from .curves import (
-    draw_cones,
-    draw_margins,
-    draw_motion,
-    draw_phases,
-    draw_simulation,
-    draw_torques,
-)
+from ..results.torque import TorqueProfile
+from ..results.trajectory import Trajectory
+from ..scene.model import Scene
 from .snapshots import draw_strip, lay_out_strip
 from .style import (
+    BAND,
+    FINGERS,
+    GRID,
+    INK,
+    LOST,
+    LOW,
     STYLE,
     WIDTH,
     WIDTHS,
+    Styles,
+    choose_prefix,
     choose_styles,
     inset,
     list_contacts,
     open_figure,
     unit_of,
+    write,
     write_title,
 )
+
+if TYPE_CHECKING:
+    from ..simulation.events import Simulation
+
+
+# What is simulated; the torque of finger 2 has longer gaps, to be told from that of finger 1.
+SIMULATED: Any = {"color": "black", "linestyle": (0, (1, 2)), "linewidth": 1.0, "zorder": 5}
+
+
+def sample_torques(torque: TorqueProfile) -> tuple[Array, Array]:
+    """Times, shape (n,) [s], and torques, (n, 2) [N m], with both ends of every piece."""
+    pieces, _, order = torque.coefficients.shape
+    count = 2 if order <= 2 else max(order, math.ceil(2000 / pieces))
+    x = np.linspace(-1.0, 1.0, count)
+    middle, half = (torque.breaks[1:] + torque.breaks[:-1]) / 2, np.diff(torque.breaks) / 2
+    coefficients = np.ascontiguousarray(torque.coefficients)  # einsum's rounding depends on it
+    tau = np.einsum("kjd,xd->kxj", coefficients, np.vander(x, order, increasing=True))
+    return (middle[:, None] + half[:, None] * x).ravel(), tau.reshape(-1, 2)
+
+
+def draw_margins(
+    axes: Axes, trajectory: Trajectory, epsilon: float, styles: Styles, covered: Array | None = None
+) -> list[Line2D]:
+    """Draw c_n - epsilon [N] of every contact over time, on a scale that is linear near zero.
+
+    Returns one line per contact, labelled with its name and broken where forces step. The scale
+    covers further margins `covered` [N], of any shape, too.
+    """
+    steps, margins = trajectory.find_steps(), trajectory.c_n - epsilon
+    t = np.insert(trajectory.t, np.repeat(steps, 2), np.repeat(trajectory.t[steps], 2))
+    lines = []
+    for index, name in enumerate(trajectory.contacts):
+        # Where margins coincide the earlier, wider line stays visible beside the later one.
+        rank = index / max(1, len(trajectory.contacts) - 1)
+        colour, line, _ = styles[name]
+        look: Any = {"color": colour, "linestyle": line, "linewidth": 3.4 - 2.0 * rank}
+        # Up to a step the line keeps its last value.
+        ends = np.column_stack([margins[steps - 1, index], np.full(len(steps), np.nan)]).ravel()
+        values = np.insert(margins[:, index], np.repeat(steps, 2), ends)
+        lines += axes.plot(t, values, zorder=3 + rank, label=name, **look)
+    axes.axhline(0.0, color="black", linewidth=1.3, zorder=2.5)
+    every = margins.ravel() if covered is None else np.append(margins, covered)
+    scale_margins(axes, every, epsilon)
+    return lines
+
+
+def scale_margins(axes: Axes, margins: Array, epsilon: float) -> None:
+    """Set a scale that is linear within a hundredth of the largest margin, ticks and limits."""
+    # Where everything is at rest no force is known.
+    largest, smallest = (float(f.reduce(margins, None, initial=0.0)) for f in (np.fmax, np.fmin))
+    reach = max(largest, -smallest, 2 * epsilon) or 1.0
+    linear = 10.0 ** (round(math.log10(reach)) - 2)
+    transform = SymmetricalLogTransform(10, linear, 1.0)
+    ends = transform.transform(np.array([min(smallest, -epsilon), max(largest, 2 * linear)]))
+    pad = np.ptp(ends) * np.array([-0.1, 0.05])
+    low, high = (float(end) for end in transform.inverted().transform(ends + pad))
+    axes.set_yscale("symlog", linthresh=linear, linscale=1.0)
+    axes.set_ylim(low, high)
+    prefix, factor = choose_prefix(reach)
+    unit, bound = f"[{prefix}N]", f"linear to {factor * linear:g}"
+    axes.set_ylabel(f"force margin $c_n - \\varepsilon$ {unit}, {bound}")
+    axes.axhspan(-epsilon, 0.0, color=LOW, linewidth=0, zorder=1.5)
+    axes.axhspan(low, -epsilon, color=LOST, linewidth=0, zorder=1.5)
+    look: Any = {"xycoords": "axes fraction", "ha": "left", "fontsize": 8, "color": "#7a2a12"}
+    write(axes, "contact lost, $c_n < 0$", (0, 0), (4, 3), **look)
+    decades = linear * 10.0 ** np.arange(math.ceil(math.log10(reach / linear)) + 1)
+    points = 72 / axes.figure.dpi * axes.bbox.height / np.ptp(ends)
+    for digits in ([1, 2, 5], [1]):
+        every = np.unique([0.0, linear / 2, *np.outer(digits, decades).flat])
+        every = np.concatenate([-every[:0:-1], every])
+        every = every[(every >= low) & (every <= high)]
+        # Where labels of 9 points would touch, powers of ten alone have one.
+        if points * np.diff(transform.transform(every)).min() >= 9:
+            break
+    axes.yaxis.set_major_locator(FixedLocator(every.tolist()))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.grid(axis="y", color=GRID, linewidth=0.4)
+    _scale_ticks(axes, factor)
+
+
+def _scale_ticks(axes: Axes, factor: float) -> None:
+    """Have the values at the ticks written times a factor."""
+
+    def show(y: float, _: object) -> str:
+        return f"{factor * y:.6g}".replace("-", "\u2212")
+
+    axes.yaxis.set_major_formatter(FuncFormatter(show))
+
+
+def draw_cones(
+    axes: Axes,
+    trajectory: Trajectory,
+    scene: Scene,
+    styles: Styles,
+    simulation: Simulation | None = None,
+) -> list[Line2D]:
+    """Draw c_t / (mu c_n) of every contact while it rolls; at +1 and -1 it would slip.
+
+    Returns one line per contact that rolls, labelled with its name.
+    """
+    fingers = [parse_contact(name, scene).finger for name in trajectory.contacts]
+    mu = np.array([scene.friction.of(finger) for finger in fingers])
+    shares = trajectory.c_t / np.where(trajectory.rolling, mu * trajectory.c_n, np.nan)
+    steps = trajectory.find_steps()
+    t, lines = np.insert(trajectory.t, steps, np.nan), []
+    for index in np.flatnonzero(trajectory.rolling.any(axis=0)):
+        name = trajectory.contacts[index]
+        look: Any = {"color": styles[name].colour, "linestyle": styles[name].line, "zorder": 3}
+        values = np.insert(shares[:, index], steps, np.nan)
+        lines += axes.plot(t, values, linewidth=1.8, label=name, **look)
+    for edge in (-1.0, 1.0):
+        axes.axhline(edge, color="black", linewidth=1.0, zorder=2)
+        axes.axhspan(edge, 1.25 * edge, color=LOST, linewidth=0, zorder=1.5)
+    axes.axhline(0.0, color=GRID, linewidth=0.5, zorder=1.6)
+    axes.set(ylim=(-1.25, 1.25), yticks=[-1, 0, 1], ylabel="rolling\n$c_t / (\\mu c_n)$")
+    if simulation is not None:
+        first = np.flatnonzero(np.diff(trajectory.phase, prepend=-1))
+        rolls = trajectory.rolling[first][simulation.phase]
+        values = simulation.c_t / np.where(rolls, mu * simulation.c_n, np.nan)
+        axes.plot(simulation.t, values, **SIMULATED)
+    return lines
+
+
+def draw_torques(axes: Axes, torque: TorqueProfile, limits: Array) -> list[Line2D]:
+    """Draw the torques of both joints, with every step upright, and `limits`, shape (2,) [N m].
+
+    Returns the lines of finger 1 and finger 2.
+    """
+    t, tau = sample_torques(torque)
+    lines = []
+    for index, (colour, _) in enumerate(FINGERS):
+        look: Any = {"color": colour, "linewidth": 2.2 - 0.8 * index, "zorder": 3 + index}
+        lines += axes.plot(t, tau[:, index], label=f"finger {index + 1}", **look)
+    for index, (colour, _) in enumerate(FINGERS):
+        # Dashes that alternate keep both limits visible where they are equal.
+        look = {"color": colour, "linewidth": 1.0, "linestyle": (6 * index, (5, 7)), "zorder": 2}
+        axes.axhline(limits[index], label=None if index else "limits", **look)
+        axes.axhline(-limits[index], **look)
+    axes.axhline(0.0, color=GRID, linewidth=0.5, zorder=1.6)
+    reach = 1.12 * max(float(limits.max()), float(np.abs(tau).max()))
+    prefix, factor = choose_prefix(reach)
+    axes.set(ylim=(-reach, reach), ylabel=f"joint torque $\\tau$ [{prefix}N m]")
+    _scale_ticks(axes, factor)
+    return lines
+
+
+def draw_motion(panels: Sequence[Axes], trajectory: Trajectory) -> None:
+    """Draw the object's pose, and the joints' angles and speeds, over time on three axes."""
+    t = trajectory.t
+    pose = np.column_stack([1e3 * trajectory.q[:, :2], np.degrees(trajectory.q[:, 2])])
+    looks: Any = (("x [mm]", "#0072B2", "-"), ("y [mm]", "#E69F00", (0, (5, 1.5))))
+    for column, (name, colour, line) in enumerate((*looks, ("phi [deg]", INK, "-."))):
+        panels[0].plot(t, pose[:, column], color=colour, linestyle=line, label=name)
+    panels[0].set_ylabel("pose")
+    panels[1].set_ylabel("joint angle\n[deg]")
+    panels[2].set_ylabel("joint speed\n[rad/s]")
+    for index, (colour, _) in enumerate(FINGERS):
+        look: Any = {"color": colour, "linewidth": 2.2 - 0.8 * index}
+        look["label"] = f"finger {index + 1}"
+        panels[1].plot(t, np.degrees(trajectory.theta[:, index]), **look)
+        panels[2].plot(t, trajectory.theta_dot[:, index], **look)
+    for axes in panels:
+        axes.grid(axis="y", color=GRID, linewidth=0.4)
+
+
+def draw_simulation(
+    margins: Axes, torques: Axes, simulation: Simulation, epsilon: float
+) -> list[Line2D]:
+    """Draw simulated margins and torques over the planned ones; returns the lines."""
+    t = simulation.t
+    gaps = np.flatnonzero((np.diff(t) <= 0) | (np.diff(simulation.phase) != 0)) + 1
+    c_n = np.insert(simulation.c_n, gaps, np.nan, axis=0)
+    lines = margins.plot(np.insert(t, gaps, np.nan), c_n - epsilon, **SIMULATED)
+    lines[0].set_label("simulated")
+    other = {"linestyle": (0, (3, 5)), "linewidth": 0.9}
+    for index, look in enumerate((SIMULATED, SIMULATED | other)):
+        label = f"simulated {index + 1}"
+        lines += torques.plot(t, simulation.tau[:, index], label=label, **look)
+    return lines
+
+
+def draw_phases(
+    axes: Axes, starts: Array, *, labels: bool = True, span: float | None = None
+) -> list[Artist]:
+    """Shade every other phase and write each one's number above it, where there is room.
+
+    Numbers of phases too short for them stand above the axes in two rows.
+
+    `starts` holds when each phase starts and the last one ends, shape (n_phases + 1,) [s]. The axes
+    must be at their final place, which decides what there is room for; they cover `span` [s], or
+    just the phases.
+    """
+    artists: list[Artist] = []
+    points = axes.bbox.width / axes.figure.dpi * 72 / (span or starts[-1] - starts[0])
+    taken = [-math.inf, -math.inf]  # where each row of numbers ends [points]
+    for index, (start, end) in enumerate(pairwise(starts)):
+        colour = "white" if index % 2 else BAND
+        artists.append(axes.axvspan(start, end, facecolor=colour, linewidth=0, zorder=0.5))
+        middle, text = points * (start + end) / 2, f"phase {index + 1}"
+        if 6.5 * len(text) >= points * (end - start):
+            text = str(index + 1)
+        half = 3.2 * len(text)
+        row = next((k for k, stop in enumerate(taken) if stop < middle - half), None)
+        if not labels or row is None:
+            continue
+        taken[row] = middle + half
+        place, units = ((start + end) / 2, 1.0), ("data", "axes fraction")
+        artists.append(write(axes, text, place, (0, 4 + 10 * row), xycoords=units))
+    return artists
+
 
 if TYPE_CHECKING:
     from ..simulation.events import Simulation

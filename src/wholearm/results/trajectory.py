@@ -155,6 +155,33 @@ class Trajectory(Drawn):
                 whole[rows[:, None], np.arange(whole.shape[1])[columns]] = values
         return fields
 
+    def find_steps(self) -> NDArray[np.int64]:
+        """Rows before which forces step, shape (k,).
+
+        At a new phase, a step of the torques, and where a sliding direction is reversed. Steps of
+        torques below a tenth of the largest cannot be seen.
+        """
+        profile = self.torque
+        before = profile.coefficients[:-1].sum(axis=2)
+        signs = (-1.0) ** np.arange(profile.coefficients.shape[2])
+        after = (profile.coefficients[1:] * signs).sum(axis=2)
+        stepping = np.abs(after - before).max(axis=1) > 0.1 * np.abs(profile.coefficients).max()
+        breaks, starts = profile.breaks[1:-1], self.phase_starts
+        inner = np.abs(breaks[:, None] - starts).min(axis=1) > 1e-9 * self.duration
+        t = self.t
+        # Where a time is there twice, in a replay, the step is between the two rows.
+        repeated = np.flatnonzero(np.diff(t) == 0) + 1
+        steps = np.searchsorted(
+            t, np.setdiff1d(breaks[stepping & inner], t[repeated]), side="right"
+        )
+        phases = np.append(np.flatnonzero(np.diff(self.phase)) + 1, repeated)
+        # The friction of a contact that rolls passes zero without a step.
+        slid = np.where(self.rolling, 0.0, self.c_t)
+        turns = np.flatnonzero((slid[1:] * slid[:-1] < 0).any(axis=1)) + 1
+        every = np.unique(np.concatenate([steps, phases, turns]))
+        # Torques may go on after a motion that has failed.
+        return every[every < len(t)]
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the trajectory to a ``.npz`` file.
 

@@ -21,7 +21,7 @@ from ..common.errors import InputError, require_number
 from ..common.files import write_whole
 from ..common.sharing import exclusive
 from ..contacts.elemental import parse_contact
-from ..figures.curves import draw_margins, draw_phases, draw_torques
+from ..figures.plots import draw_margins, draw_phases, draw_torques
 from ..figures.snapshots import (
     NUMBER,
     choose_numbers,

@@ -16,7 +16,6 @@ from ..common.arrays import Array, find_runs
 from ..common.sharing import exclusive
 from ..contacts.closing import Numbers
 from ..contacts.elemental import build_features, build_geometry, parse_contact
-from ..figures.curves import find_steps
 from ..figures.style import FINGERS, choose_styles
 from ..problem.definition import Problem
 from ..results.trajectory import Trajectory
@@ -97,7 +96,7 @@ def describe_motion(
     most     about as many samples are taken at most
     """
     scene, pushes = problem.scene, place_pushes(problem.scene, trajectory)
-    styles, every = choose_styles(trajectory.contacts), find_steps(trajectory)
+    styles, every = choose_styles(trajectory.contacts), trajectory.find_steps()
     rows = _choose_rows(trajectory, every, most)
     contacts = [
         {

@@ -1,9 +1,10 @@
-"""A report of a problem and its plans in one page."""
+"""A report of a problem and its plans in one page, and a gallery of problems."""
 
 from __future__ import annotations
 
 import io
 import math
+import os
 import platform
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
@@ -17,17 +18,30 @@ from ..analysis.comparison import Contender, compare
 from ..common.arrays import Array
 from ..common.document import Document, Table, fixed, show
 from ..common.errors import SimulationError
+from ..common.files import make_folder, write_text
 from ..common.sharing import exclusive
 from ..contacts.closing import close_fingers
 from ..contacts.elemental import Contact
+from ..figures import plots
 from ..figures.map_figure import BOX, PLACE, SIZE, draw_map, find_room, split
 from ..figures.style import STYLE
+from ..geometry.tracing import load
 from ..mapping.formation_map import Border, FormationMap, build_map, choose_window
 from ..problem.definition import Problem
 from ..results.trajectory import Trajectory
+from ..search.solve import solve
 from ..search.times import time_borders
-from . import page
-from .page import count_places, describe_hand, describe_motion
+from ..verification.verify import verify
+from .movie import Movie, write_movie
+from .page import (
+    build_page,
+    count_places,
+    describe_hand,
+    describe_motion,
+    fold,
+    write_chart,
+    write_player,
+)
 
 
 def build_report(
@@ -64,12 +78,12 @@ def build_report(
     machine = f"Python {platform.python_version()}, {platform.machine()}"
     parts += [
         "<h2>Contact formations</h2>",
-        page.write_chart(*describe_map(chart, first)),
+        write_chart(*describe_map(chart, first)),
         "<h2>Problem</h2>",
-        page.fold(f"<pre>{escape(text or str(problem))}</pre>", "the problem file"),
+        fold(f"<pre>{escape(text or str(problem))}</pre>", "the problem file"),
         Document(f"wholearm {__version__}, {machine}").to_html(),
     ]
-    return page.build_page(problem.name, parts)
+    return build_page(problem.name, parts)
 
 
 def _describe(contender: Contender, most: int) -> list[str]:
@@ -88,7 +102,7 @@ def _describe(contender: Contender, most: int) -> list[str]:
     shown = planned or replayed
     if shown is not None and problem is not None:
         ghost = replayed if planned is not None else None
-        parts.append(page.write_player(describe_motion(shown, problem, ghost, most)))
+        parts.append(write_player(describe_motion(shown, problem, ghost, most)))
         timings = shown.meta.get("timings")
         # Routes are planned from parts that are replayed before: then nothing is left of a step.
         known = timings.items() if isinstance(timings, dict) else ()
@@ -97,7 +111,7 @@ def _describe(contender: Contender, most: int) -> list[str]:
         tables.append(Table(["planning took", "[s]:.4g"], took))
         parts.append(Document("", parts=tables).to_html())
     if report is not None:
-        parts.append(page.fold(report.document.to_html(), "what verify says"))
+        parts.append(fold(report.document.to_html(), "what verify says"))
     return parts
 
 
@@ -206,3 +220,44 @@ def _describe_border(border: Border, times: Array) -> str:
         f"a border, one freedom, x {1e3 * x:.1f} to {1e3 * x_end:.1f} mm, phi "
         f"{math.degrees(phi):.1f} to {math.degrees(phi_end):.1f} deg; {'; '.join(possible)}"
     )
+
+
+def write_gallery(
+    paths: Sequence[str], path: str, progress: Callable[[str], None] = lambda text: None
+) -> None:
+    """Plan the least time of problems and write them to a page of Markdown.
+
+    Figures and movies, which last 2 s, go to a folder beside the page that has its name.
+
+    Raises
+    ------
+    WholearmError  if a problem cannot be read or planned; the page is written only if all are
+    """
+    folder = os.path.splitext(path)[0]
+    make_folder(folder)
+    rows, pictures = list[tuple[object, ...]](), list[str]()
+    for source in paths:
+        name = os.path.splitext(os.path.basename(source))[0]
+        progress(name)
+        plan = solve(load(source), progress=lambda text, name=name: progress(f"{name}: {text}"))
+        progress(f"{name}: figure and movie")
+        stem = os.path.join(folder, name)
+        plots.save(plots.force_margins(plan, width=8.0), f"{stem}.png", resolution=110)
+        movie = Movie(plan.problem, plan.trajectory, speed=plan.duration / 2.0, resolution=50)
+        write_movie(movie, f"{stem}.gif")
+        report = verify(plan.problem, plan)
+        gap = "" if report.finger_gap is None else report.finger_gap.least
+        forces = (contact.least for phase in report.phases for contact in phase.contacts)
+        least = min(force for force in forces if force == force)
+        verdict = "ok" if report.ok else "FAILED"
+        rows.append((name, len(plan.phases), plan.value, least, gap, verdict))
+        place = f"{os.path.basename(folder)}/{name}"
+        links = f"![{name} in motion]({place}.gif)\n\n![{name}]({place}.png)"
+        pictures.append(f"## {plan.problem.name}\n\n{links}")
+    text = (
+        "Least-time plans, each slowed down to 2 s: contact forces in their friction cones, and "
+        "torques as arcs at the joints."
+    )
+    heads = ["problem", "phases:d", "least time [s]:.6f", "least c_n [N]:.4f"]
+    table = Table([*heads, "finger gap [mm]:.1f", "replayed"], rows).to_markdown()
+    write_text(path, "\n\n".join(["# Gallery", text, table, *pictures]) + "\n")
