@@ -35,7 +35,7 @@ from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain.guesses import Guesses
-from wholearm.planning.time_domain.search import TimeSearch
+from wholearm.planning.time_domain.solution import TimeSearch
 from wholearm.planning.time_domain.time_motion import TimeMotion
 from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.read import build_problem, read_problem

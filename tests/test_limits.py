@@ -37,20 +37,19 @@ from wholearm.mechanics.speed_sweep import (
 from wholearm.planning.explain import change_limit, list_shortfalls
 from wholearm.planning.lower_bound import bound_least_time, look_along
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.path_domain.elements import (
+from wholearm.planning.path_domain.path_data import choose_sampling, fit_torque, prepare
+from wholearm.planning.path_domain.path_mesh import make_grid
+from wholearm.planning.path_domain.path_motion import (
     DEGREE,
     FROM_REST,
     INSIDE,
     TO_REST,
+    PathMotion,
     Profile,
     find_basis,
 )
-from wholearm.planning.path_domain.path_data import choose_sampling, prepare
-from wholearm.planning.path_domain.path_mesh import make_grid
-from wholearm.planning.path_domain.path_motion import PathMotion, fit_torque
 from wholearm.planning.path_domain.path_plan import plan_path
-from wholearm.planning.time_domain.refinement import SETTINGS, check_between, find_misses
-from wholearm.planning.time_domain.search import TimeSearch
+from wholearm.planning.time_domain.solution import SETTINGS, TimeSearch, check_between, find_misses
 from wholearm.planning.time_domain.stage import Stage
 from wholearm.planning.time_domain.time_motion import TimeMotion
 from wholearm.planning.time_domain.time_plan import plan_phases

@@ -39,7 +39,6 @@ from wholearm.planning.lower_bound import (
 )
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain import path_plan
-from wholearm.planning.path_domain.first_guess import guess
 from wholearm.planning.path_domain.path_data import prepare
 from wholearm.planning.path_domain.path_mesh import make_grid
 from wholearm.planning.path_domain.path_motion import PathMotion
@@ -48,6 +47,7 @@ from wholearm.planning.path_domain.path_nlp import (
     PathNLP,
     Relaxation,
     build_path_nlp,
+    guess,
     pack,
     parameters,
 )

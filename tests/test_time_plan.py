@@ -67,8 +67,7 @@ from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain.guesses import guess_stages
 from wholearm.planning.time_domain.mode_search import link
-from wholearm.planning.time_domain.refinement import SETTINGS, find_least
-from wholearm.planning.time_domain.search import TimeSearch, TimeSolution
+from wholearm.planning.time_domain.solution import SETTINGS, TimeSearch, TimeSolution, find_least
 from wholearm.planning.time_domain.stage import Stage, in_own_units
 from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion
 from wholearm.planning.time_domain.time_nlp import pack

@@ -45,11 +45,10 @@ from ..mechanics.limits import make_limits
 from ..mechanics.path_limits import PathLimits
 from ..planning.lower_bound import bound_least_time
 from ..planning.options import Objective, PlanOptions
-from ..planning.path_domain.first_guess import guess
 from ..planning.path_domain.path_data import prepare
 from ..planning.path_domain.path_mesh import make_grid
 from ..planning.path_domain.path_motion import PathMotion
-from ..planning.path_domain.path_nlp import LimitShape, build_path_nlp
+from ..planning.path_domain.path_nlp import LimitShape, build_path_nlp, guess
 from ..planning.path_domain.path_plan import plan_path
 from ..planning.time_domain.time_plan import plan_phases
 from ..problem.definition import End, Problem

@@ -46,9 +46,9 @@ from ..simulation.modes import Hold, Standstill, close_contacts, find_hold, find
 from ..simulation.simulate import simulate_free
 from ..simulation.system import SLOW, build_system
 from .options import Objective, PlanOptions
-from .path_domain.first_guess import find_internal_force_range
 from .path_domain.path_data import PhaseData, prepare
 from .path_domain.path_mesh import make_grid
+from .path_domain.path_nlp import find_internal_force_range
 from .phase_plan import PhasePlan, Plans, Settled, end_of
 
 _INSIDE = 0.01  # part of the range left out at both ends

@@ -42,16 +42,15 @@ from ..scene.model import Scales, Scene
 from .blocks import Planning, free_torques
 from .dwell import require_hold
 from .options import Objective, PlanOptions
-from .path_domain.elements import Profile
-from .path_domain.first_guess import guess_slowly
-from .path_domain.path_data import PhaseData, cut, join
-from .path_domain.path_motion import PathMotion, fit_torque
+from .path_domain.path_data import PhaseData, cut, fit_torque, join
+from .path_domain.path_motion import PathMotion, Profile
 from .path_domain.path_nlp import (
     LimitShape,
     Relaxation,
     Tightening,
     Units,
     build_path_nlp,
+    guess_slowly,
     make_bounds,
     pack,
     parameters,
@@ -60,7 +59,7 @@ from .path_domain.path_nlp import (
 from .path_domain.path_plan import PathIterate, Task, plan_curves, plan_task
 from .phase_plan import Plans, assemble_motions, runs_along_curves
 from .time_domain.guesses import PathMargin
-from .time_domain.search import TimeSearch
+from .time_domain.solution import TimeSearch
 from .time_domain.stage import Scheme, Stage, blend, to_si
 from .time_domain.time_motion import make_phase_motions
 

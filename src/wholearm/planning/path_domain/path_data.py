@@ -10,18 +10,23 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from ...common.arrays import Array, find_minima
-from ...common.errors import InputError, JammingError, Parameter
+from ...common.errors import InputError, JammingError, Parameter, SolverError
 from ...geometry.curve import Curve, describe_pose, directions_of
 from ...mechanics.dynamics import PathForces, inverse, reduced_inertia
 from ...mechanics.limits import CONE, PRESS, TORQUE, LimitSet, make_limits
 from ...mechanics.path_limits import PathLimits, find_slack_rows, find_speed_cap, find_value_rows
-from .elements import Elements, Grid, Profile
+from ...results.torque import TorqueProfile
+from .path_motion import Elements, Grid, PathMotion, Profile
 
 if TYPE_CHECKING:
     from ..robust.robust_rows import RobustLimits
+
+PLACES = 13  # interpolation points where torques of a motion are not those through the knots
+LOOKS = 21  # samples of torque rates in each interval
 
 
 class Sampling(NamedTuple):
@@ -252,3 +257,60 @@ def choose_sampling(nodes: int) -> Sampling:
     knots, checks = (5, 25) if nodes > 64 else (9, 33)
     angles = np.linspace(0.0, np.pi, checks)
     return Sampling(np.linspace(0.0, 1.0, knots), (1 - np.cos(angles)) / 2)
+
+
+def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, float]:
+    """Torque of a motion, one polynomial in time per interval, and its effort [(N m)^2 s].
+
+    Through the knots, or through `PLACES` points if that misses the torque between them.
+    """
+    knots, checks = data.sampling
+    torque = _fit(data, motion, data.knots, knots)
+    times = motion.times[data.grid.nonempty, None] + motion.durations(checks)
+    wanted = data.checks.forces.tau(*data.interpolate(motion.profile, checks))
+    inner = np.tile((checks > 0) & (checks < 1), len(data.grid.nonempty))
+    misfit = torque.at(times.ravel()[inner]) - wanted[inner]
+    if np.abs(misfit / data.torque_limit).max() > 5e-7:  # largest relative error
+        every = (len(checks) - 1) // (PLACES - 1)
+        rows = np.tile(np.arange(len(checks)) % every == 0, len(data.grid.nonempty))
+        torque = _fit(data, motion, data.checks.pick(rows), checks[::every])
+    return torque, torque.integrate_squares()
+
+
+def _fit(data: PhaseData, motion: PathMotion, places: Places, fractions: Array) -> TorqueProfile:
+    """Polynomials through the torques at `fractions` of every solid interval."""
+    k = data.grid.nonempty
+    values = places.forces.tau(*data.interpolate(motion.profile, fractions))
+    spans = motion.durations(fractions)
+    if motion.stalls or not (np.diff(spans, axis=1) > 0).all():
+        raise SolverError("the motion all but stops between two nodes; plan with more intervals")
+    x = 2 * spans / spans[:, -1:] - 1
+    vandermonde = x[..., None] ** np.arange(len(fractions))
+    coefficients = np.linalg.solve(vandermonde, values.reshape(len(k), len(fractions), 2))
+    breaks = np.append(motion.times[k], motion.times[-1])
+    return TorqueProfile(breaks, np.asarray(coefficients.transpose(0, 2, 1), dtype=float))
+
+
+def find_torques(
+    data: PhaseData, profile: Profile, motions: Sequence[PathMotion]
+) -> tuple[Array, Array]:
+    """Torques and their rates, (n_solid, LOOKS, 2) [N m, N m/s], at evenly spaced times.
+
+    By Chebyshev interpolation in time through torques within each interval.
+    """
+    checks = data.sampling.checks
+    every = (len(checks) - 1) // (PLACES - 1)
+    picked = np.arange(len(checks)) % every == 0
+    fractions, count = checks[picked], len(data.grid.nonempty)
+    places = data.checks.pick(np.tile(picked, count))
+    values = places.forces.tau(*data.interpolate(profile, fractions)).reshape(count, -1, 2)
+    spans = np.concatenate([motion.durations(fractions) for motion in motions])
+    degree, lasts = len(fractions) - 1, np.maximum(spans[:, -1], np.finfo(float).tiny)
+    through = chebyshev.chebvander(2 * spans / lasts[:, None] - 1, degree)
+    # Where two places fall on one instant no polynomial goes through both.
+    modes = np.linalg.solve(through + 1e-300, values)
+    looks = np.linspace(-1, 1, LOOKS)
+    slopes = chebyshev.chebder(np.eye(degree + 1), axis=0)
+    torques = chebyshev.chebvander(looks, degree) @ modes
+    rates = chebyshev.chebvander(looks, degree - 1) @ slopes @ modes
+    return np.asarray(torques), np.asarray(rates * (2 / lasts)[:, None, None])

@@ -16,9 +16,8 @@ from ...common.arrays import Array, sort_unique
 from ...geometry.curve import Curve
 from ...mechanics.path_limits import PathLimits
 from ...mechanics.speed_sweep import NoMotionError, SweepMode, speed_sweep
-from .elements import DEGREE, NODES, Elements, Grid, Profile, lay_out
-from .path_data import PhaseData
-from .path_motion import PathMotion, find_torques
+from .path_data import PhaseData, find_torques
+from .path_motion import DEGREE, NODES, Elements, Grid, PathMotion, Profile, lay_out
 
 _CAPPED = np.iinfo(np.int64).max  # label of places with an active speed limit
 _APART = 1e-5  # least length of an element that switches lead to, over the curve's

@@ -1,35 +1,294 @@
-"""Motion along a curve as a function of time, from the profile at the nodes of a grid.
+"""Motion along a curve: elements with polynomials of s'' and internal force, and s(t).
 
-Inside an element a = s'' and the internal force are polynomials, and so is b = s'^2; s(t) follows
-by Gauss quadrature of 1 / s'. z, tau and the contact forces follow from s, s' and s'' by inverse
-dynamics: the equations of motion hold at every instant. Torques as a function of time are
-piecewise polynomials through those (`fit_torque`).
+An element has `NODES` nodes, the Lobatto points of a local variable y from 0 to 1. Inside a
+motion s is linear in y. Next to rest s is quadratic in y, measured from the place of rest: the
+speed, and viscous friction with it, is the root of s there, and smooth in y. Where torques may not
+step, the motion starts and ends without acceleration and s is cubic in y. Elements after such a
+start are bent: s is (1 - c) y + c y^2 of the length, with c such that the root of the distance from
+a virtual start with acceleration is linear in y; c is negative before such an end. With b = s'^2
+and b' = 2 s'' (dash: d/ds), b is a polynomial in y too.
+
+Inside an element s(t) follows by Gauss quadrature of 1 / s'. z, tau and the contact forces follow
+from s, s' and s'' by inverse dynamics: the equations of motion hold at every instant.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
-from numpy.polynomial import chebyshev, legendre
+from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
-from ...common.arrays import Array
-from ...common.errors import SolverError
+from ...common.arrays import Array, jacobi_nodes
 from ...geometry.curve import Curve, directions_of
 from ...mechanics.dynamics import Directions, inverse, split_forces
-from ...results.torque import TorqueProfile
 from ...results.trajectory import Samples
-from .elements import NODES, Elements, Grid, Profile
-from .path_data import PhaseData, Places
+
+DEGREE = 4  # degree of the polynomials
+NODES = DEGREE + 1  # of an element
+# Kinds of elements: amid a motion, at its start and end, and there without acceleration.
+INSIDE, FROM_REST, TO_REST, FROM_HOLD, TO_HOLD = range(5)
+POWERS = np.array([1, 2, 2, 3, 3])  # power of y in s, of each kind
+SIGNS = np.array([1.0, 1.0, -1.0, 1.0, -1.0])  # sign of dy/dt in each kind
+
+
+class Basis(NamedTuple):
+    """Polynomial basis of each kind of element, from values at its nodes."""
+
+    y: Array  # (5, p + 1): the nodes, from 0 to 1; for `TO_REST` and `TO_HOLD` from 1 to 0
+    to_powers: Array  # (5, p + 1, p + 1): coefficients of powers of y
+    links: Array  # (5, p, p + 1): rise of b between nodes, over the element's length, from s''
+    weights: Array  # (p + 1,): of Lobatto's quadrature over y
+    modes: Array  # (p + 1, p + 1): Legendre coefficients in an element amid a motion
+
+
+@lru_cache(maxsize=8)
+def find_basis(degree: int = DEGREE) -> Basis:
+    """The basis of elements of a degree."""
+    x = (np.concatenate([[-1.0], jacobi_nodes(degree - 1, 1, 1), [1.0]]) + 1) / 2
+    y = np.stack([x, x, 1 - x, x, 1 - x])
+    powers = np.arange(degree + 1)
+    to_powers = np.asarray(np.linalg.inv(y[..., None] ** powers), dtype=float)
+    plain = 2 * np.diff(y[0][:, None] ** (powers + 1), axis=0) / (powers + 1)
+    rooted = 4 * np.diff(y[1:3, :, None] ** (powers + 2), axis=1) / (powers + 2)
+    cubic = 6 * np.diff(y[3:, :, None] ** (powers + 3), axis=1) / (powers + 3)
+    rises = np.stack([plain, rooted[0], -rooted[1], cubic[0], -cubic[1]])
+    weights = (1 / (powers + 1)) @ to_powers[0]
+    vandermonde = legendre.legvander(2 * x - 1, degree)
+    modes = np.asarray(np.linalg.inv(vandermonde), dtype=float)
+    return Basis(y, to_powers, rises @ to_powers, weights, modes)
+
+
+class Grid(NamedTuple):
+    """Nodes on a curve."""
+
+    s: Array  # (N + 1,) [m]: element by element, equal where two elements meet
+    segment: NDArray[np.int64]  # (N + 1,): of the curve, for each node's forces
+    rests: tuple[bool, bool] = (True, True)  # whether the motion starts and ends at rest
+    held: bool = False  # whether it does so without acceleration
+    bends: Array | None = None  # (E,): c of the elements of the kind `INSIDE`; None for zeros
+
+    @property
+    def steps(self) -> Array:
+        """Lengths of the intervals between nodes, shape (N,) [m]."""
+        return np.diff(self.s)
+
+    @property
+    def nonempty(self) -> NDArray[np.int64]:
+        """The intervals inside elements."""
+        k = np.arange(len(self.s) - 1)
+        return k[k % NODES < DEGREE]
+
+    @property
+    def edges(self) -> Array:
+        """Start and stop of each element, shape (E, 2) [m]."""
+        return self.s.reshape(-1, NODES)[:, [0, -1]]
+
+    @property
+    def kinds(self) -> NDArray[np.int64]:
+        """Kind of each element, shape (E,)."""
+        kinds = np.full(len(self.s) // NODES, INSIDE)
+        ends = (FROM_HOLD, TO_HOLD) if self.held else (FROM_REST, TO_REST)
+        for at in (0, -1):
+            kinds[at] = ends[at] if self.rests[at] else kinds[at]
+        return kinds
+
+    @property
+    def sizes(self) -> Array:
+        """Scale of b at the nodes over the largest, shape (N + 1,): 1 unless motions are `held`.
+
+        Proportional to the distance from rest, and to y^4 in elements next to rest.
+        """
+        sizes = np.ones_like(self.s)
+        if not self.held:
+            return sizes
+        for rest, at, far in ((0, 0, self.s - self.s[0]), (1, -1, self.s[-1] - self.s)):
+            if self.rests[rest]:
+                first = np.diff(self.edges)[at, 0]
+                b = np.where(far < first, first * (far / first) ** (4 / 3), far)
+                sizes = np.minimum(sizes, 2 * b / (self.s[-1] - self.s[0]))
+        # The two ends are no unknowns.
+        return np.maximum(sizes, np.finfo(float).tiny)
+
+    def interpolate(self, values: Array, other: Grid) -> Array:
+        """Values at the nodes of another grid of the same curves, linear between those here."""
+        # Of two nodes at one place, each belongs to the side of its element.
+        hair = 1e-9 * (self.s[-1] - self.s[0])
+        return np.interp(other._lean(2 * hair), self._lean(hair), values)
+
+    def _lean(self, by: float) -> Array:
+        """The nodes, those at the ends of elements moved inwards a little."""
+        s = self.s.copy().reshape(-1, NODES)
+        s[:, 0] += by
+        s[:, -1] -= by
+        return s.ravel()
+
+    def integrate(self, a: Array) -> Array:
+        """B at the nodes for s'' there, from rest, shape (N + 1,)."""
+        lengths = np.diff(self.edges)
+        table = a.reshape(-1, NODES, 1)
+        links, kinds = find_basis().links, self.kinds
+        rises = (links[kinds] @ table)[..., 0]
+        if self.bends is not None:
+            bends = (self.bends * (kinds == INSIDE))[:, None]
+            rises += bends * ((links[FROM_REST] - links[INSIDE]) @ table)[..., 0]
+        rises *= lengths
+        return np.cumsum(np.hstack([np.zeros_like(lengths), rises]).ravel())
+
+
+def lay_out(
+    edges: Array, segment: NDArray[np.int64], rests: tuple[bool, bool], held: bool = False
+) -> Grid:
+    """The grid of elements with these edges, shape (E, 2) [m], on segments of shape (E,)."""
+    grid = Grid(np.repeat(edges[:, 0], NODES), np.repeat(segment, NODES), rests, held)
+    kinds, y = grid.kinds[:, None], find_basis().y[grid.kinds]
+    share = y ** POWERS[kinds]
+    share = np.where(SIGNS[kinds] > 0, share, 1 - share)
+    if held:
+        grid = grid._replace(bends=_find_bends(edges, rests))
+        c = np.asarray(grid.bends)[:, None]
+        share = np.where(kinds == INSIDE, (1 - c) * y + c * y**2, share)
+    s = edges[:, :1] + share * np.diff(edges)
+    s[:, -1] = edges[:, 1]
+    return grid._replace(s=s.ravel())
+
+
+def _find_bends(edges: Array, rests: tuple[bool, bool]) -> Array:
+    """Bends of elements with these edges, each for the nearer one of the ends at rest."""
+    length, bends = edges[-1, 1] - edges[0, 0], np.zeros(len(edges))
+    early = edges.mean(axis=1) - edges[0, 0] < length / 2
+    for sign, at, half in ((1, 0, early), (-1, -1, ~early)):
+        if rests[at]:
+            # A ramp of s'' takes 4/3 of the distance of constant s'' to the same speed.
+            distance = np.abs(edges[half] - edges[at, at]) - np.diff(edges)[at, 0] / 4
+            near, far = np.sqrt(np.maximum(distance, 0.0))[:, ::sign].T
+            bends[half] = sign * (far - near) / (far + near)
+    return bends
+
+
+class Profile(NamedTuple):
+    """Motion at n places of a curve: a = s'' [m/s^2], b = s'^2 [m^2/s^2], internal force [N]."""
+
+    a: Array
+    b: Array
+    lam: Array
+
+
+def follow(grid: Grid, a: Array, lam: Array) -> Profile:
+    """The motion with these s'' and internal forces, s'' corrected so that it ends at rest."""
+    spread = np.ones_like(a)
+    if grid.held:
+        spread = np.cbrt(np.maximum(grid.s * (grid.s[-1] - grid.s), 0.0))
+    a = a - grid.integrate(a)[-1] / grid.integrate(spread)[-1] * spread
+    # At junctions with nearly no speed b may round to less than zero.
+    b = np.maximum(grid.integrate(a), 0.0)
+    b[-1] = 0.0
+    return Profile(a, b, lam)
+
+
+class Elements:
+    """The polynomials of a profile on a grid.
+
+    Parameters
+    ----------
+    profile  at its nodes
+    """
+
+    def __init__(self, grid: Grid, profile: Profile) -> None:
+        self.grid = grid
+        basis, kinds = find_basis(), grid.kinds
+        self._y = basis.y[kinds].ravel()
+        self._rooted, self._power = kinds > 0, POWERS[kinds]
+        table = np.stack([profile.a, profile.lam], axis=-1)
+        table = table.reshape(len(kinds), NODES, 2)
+        self._motion = basis.to_powers[kinds] @ table
+        powers = np.arange(NODES)[:, None]
+        a = np.diff(grid.edges)[:, :, None] * self._motion[..., :1]
+        sign = SIGNS[kinds][:, None, None]
+        first = profile.b.reshape(-1, NODES)[:, :1, None]
+        plain = np.concatenate([first, 2 * a / (powers + 1)], axis=1)
+        rooted = np.concatenate([4 * sign * a / (powers + 2), np.zeros_like(first)], axis=1)
+        # A constant part of s'' in y would be rounding.
+        later = 6 * sign * a[:, 1:] / (powers[:-1] + 4)
+        cubic = np.concatenate([later, np.zeros_like(a[:, :2])], axis=1)
+        rooted = np.where(self._power[:, None, None] == 3, cubic, rooted)
+        b = np.where(self._rooted[:, None, None], rooted, plain)[..., 0]
+        self._bends = None if grid.bends is None else grid.bends * (kinds == INSIDE)
+        if self._bends is not None:
+            c = self._bends[:, None]
+            further = c * np.hstack([0 * first[..., 0], (4 * a / (powers + 2))[..., 0]])
+            b[:, 1:] *= 1 - c
+            b = np.hstack([b, np.zeros_like(c)])
+            b[:, 1:] += further
+        self._b = b
+
+    @property
+    def stretch(self) -> Array:
+        """Slope ds/dy at the nodes over the element's length, (E, p + 1)."""
+        y = self._y.reshape(-1, NODES)
+        c = 0.0 if self._bends is None else self._bends[:, None]
+        power = self._power[:, None]
+        return np.asarray(power * y ** (power - 1) * (1 - c + 2 * c * y))
+
+    def find_y(self, k: NDArray[np.int64], done: Array, left: Array) -> Array:
+        """Local variable where parts of an interval, which add up to 1, are done and left."""
+        element = k // NODES
+        power = self._power[element]
+        y, later = self._y[k], self._y[k + 1]
+        squares = np.sqrt(np.maximum(left * y**2 + done * later**2, 0.0))
+        here = np.where(power == 2, squares, left * y + done * later)
+        if self._bends is not None:
+            c = self._bends[element]
+            part = left * ((1 - c) * y + c * y**2) + done * ((1 - c) * later + c * later**2)
+            root = np.sqrt(np.maximum((1 - c) ** 2 + 4 * c * part, 0.0))
+            bent = 2 * part / np.maximum(1 - c + root, np.finfo(float).tiny)
+            here = np.where(c != 0, bent, here)
+        if self.grid.held:
+            here = np.where(power == 3, np.cbrt(left * y**3 + done * later**3), here)
+        return here
+
+    def find_cubic(self, k: NDArray[np.int64], w: Array) -> tuple[NDArray[np.bool_], Array, Array]:
+        """Whether s is cubic in y in intervals k, y at a part w of its rise there, and the rise."""
+        y, later = self._y[k], self._y[k + 1]
+        return self._power[k // NODES] == 3, y + w * (later - y), later - y
+
+    def evaluate(self, k: NDArray[np.int64], y: Array) -> tuple[Profile, Array]:
+        """Profile and speed [m/s] at places y of intervals k."""
+        element = k // NODES
+        motion = self._motion[element, -1].T
+        for power in reversed(range(DEGREE)):
+            motion = motion * y + self._motion[element, power].T
+        b = self._b[element, -1]
+        for power in reversed(range(self._b.shape[1] - 1)):
+            b = b * y + self._b[element, power]
+        speed = np.sqrt(np.maximum(b, 0.0)) * np.where(self._rooted[element], y, 1.0)
+        if self.grid.held:
+            speed = speed * np.where(self._power[element] == 3, y, 1.0)
+        return Profile(motion[0], speed**2, motion[1]), speed
+
+    def at(self, fractions: Array) -> Profile:
+        """Profile at `fractions` of every interval inside elements, interval by interval."""
+        k = np.repeat(self.grid.nonempty, len(fractions))
+        x = np.tile(fractions, len(self.grid.nonempty))
+        return self.evaluate(k, self.find_y(k, x, 1 - x))[0]
+
+    def move(self, grid: Grid) -> Profile:
+        """The profile at the nodes of another grid of the same curves."""
+        old = self.grid
+        place = old.interpolate(np.arange(len(old.s), dtype=float), grid)
+        k = np.clip(np.floor(place).astype(int), 0, len(old.s) - 2)
+        k = np.where(k % NODES == DEGREE, k + 1, k)
+        k = np.minimum(k, len(old.s) - 2)
+        done = np.clip((grid.s - old.s[k]) / np.maximum(old.steps[k], 1e-300), 0.0, 1.0)
+        return self.evaluate(k, self.find_y(k, done, 1 - done))[0]
+
 
 _POINTS = 12  # Gauss points for the time in an interval between nodes
 _STALLED = 100.0  # speed interpolated from an interval's ends over the one inside when it stalls
 _TINY = 1e-100  # least speed [m/s] that is divided by
-PLACES = 13  # interpolation points where that is exceeded
-LOOKS = 21  # samples of torque rates in each interval
 
 
 # Gauss points, and the matrix from values there to Legendre coefficients of the integral.
@@ -185,60 +444,3 @@ def _share(v0: Array, v1: Array, w: Array) -> tuple[Array, Array]:
     total = np.maximum(v0 + v1, _TINY)
     done = w * (v0 * (2 - w) + v1 * w) / total
     return done, (1 - w) * (v1 * (1 + w) + v0 * (1 - w)) / total
-
-
-def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, float]:
-    """Torque of a motion, one polynomial in time per interval, and its effort [(N m)^2 s].
-
-    Through the knots, or through `PLACES` points if that misses the torque between them.
-    """
-    knots, checks = data.sampling
-    torque = _fit(data, motion, data.knots, knots)
-    times = motion.times[data.grid.nonempty, None] + motion.durations(checks)
-    wanted = data.checks.forces.tau(*data.interpolate(motion.profile, checks))
-    inner = np.tile((checks > 0) & (checks < 1), len(data.grid.nonempty))
-    misfit = torque.at(times.ravel()[inner]) - wanted[inner]
-    if np.abs(misfit / data.torque_limit).max() > 5e-7:  # largest relative error
-        every = (len(checks) - 1) // (PLACES - 1)
-        rows = np.tile(np.arange(len(checks)) % every == 0, len(data.grid.nonempty))
-        torque = _fit(data, motion, data.checks.pick(rows), checks[::every])
-    return torque, torque.integrate_squares()
-
-
-def _fit(data: PhaseData, motion: PathMotion, places: Places, fractions: Array) -> TorqueProfile:
-    """Polynomials through the torques at `fractions` of every solid interval."""
-    k = data.grid.nonempty
-    values = places.forces.tau(*data.interpolate(motion.profile, fractions))
-    spans = motion.durations(fractions)
-    if motion.stalls or not (np.diff(spans, axis=1) > 0).all():
-        raise SolverError("the motion all but stops between two nodes; plan with more intervals")
-    x = 2 * spans / spans[:, -1:] - 1
-    vandermonde = x[..., None] ** np.arange(len(fractions))
-    coefficients = np.linalg.solve(vandermonde, values.reshape(len(k), len(fractions), 2))
-    breaks = np.append(motion.times[k], motion.times[-1])
-    return TorqueProfile(breaks, np.asarray(coefficients.transpose(0, 2, 1), dtype=float))
-
-
-def find_torques(
-    data: PhaseData, profile: Profile, motions: Sequence[PathMotion]
-) -> tuple[Array, Array]:
-    """Torques and their rates, (n_solid, LOOKS, 2) [N m, N m/s], at evenly spaced times.
-
-    By Chebyshev interpolation in time through torques within each interval.
-    """
-    checks = data.sampling.checks
-    every = (len(checks) - 1) // (PLACES - 1)
-    picked = np.arange(len(checks)) % every == 0
-    fractions, count = checks[picked], len(data.grid.nonempty)
-    places = data.checks.pick(np.tile(picked, count))
-    values = places.forces.tau(*data.interpolate(profile, fractions)).reshape(count, -1, 2)
-    spans = np.concatenate([motion.durations(fractions) for motion in motions])
-    degree, lasts = len(fractions) - 1, np.maximum(spans[:, -1], np.finfo(float).tiny)
-    through = chebyshev.chebvander(2 * spans / lasts[:, None] - 1, degree)
-    # Where two places fall on one instant no polynomial goes through both.
-    modes = np.linalg.solve(through + 1e-300, values)
-    looks = np.linspace(-1, 1, LOOKS)
-    slopes = chebyshev.chebder(np.eye(degree + 1), axis=0)
-    torques = chebyshev.chebvander(looks, degree) @ modes
-    rates = chebyshev.chebvander(looks, degree - 1) @ slopes @ modes
-    return np.asarray(torques), np.asarray(rates * (2 / lasts)[:, None, None])

@@ -29,9 +29,7 @@ from ...mechanics.statics import SURE
 from ...mechanics.uniqueness import describe_uniqueness, find_minors
 from ..options import DEFAULT_ACCURACY, Objective, PlanOptions
 from ..phase_plan import PhasePlan
-from .elements import DEGREE, Elements, Profile, follow
-from .first_guess import center, guess, start_at
-from .path_data import PhaseData, cut, join, prepare
+from .path_data import PhaseData, cut, find_torques, fit_torque, join, prepare
 from .path_mesh import (
     Fastest,
     Switch,
@@ -44,7 +42,7 @@ from .path_mesh import (
     make_grid,
     match,
 )
-from .path_motion import PathMotion, find_torques, fit_torque
+from .path_motion import DEGREE, Elements, PathMotion, Profile, follow
 from .path_nlp import (
     LimitShape,
     MotorShape,
@@ -53,9 +51,12 @@ from .path_nlp import (
     Tightening,
     Units,
     build_path_nlp,
+    center,
+    guess,
     make_bounds,
     pack,
     parameters,
+    start_at,
     unpack,
 )
 

@@ -31,7 +31,7 @@ from ...problem.definition import End, Phase, Problem
 from ..options import PlanOptions
 from ..path_domain.path_motion import PathMotion
 from .mode_search import LEAST_INTERVALS, Mode, can_roll, divide, in_mode, link, merge, mode_of
-from .search import TimeSearch, TimeSolution
+from .solution import TimeSearch, TimeSolution
 from .stage import Scheme, Stage, StagePoints, in_own_units, resample, scale_state, unit_points
 
 NEAREST = "a motion to the nearest end of the phase"

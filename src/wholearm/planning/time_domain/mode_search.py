@@ -18,7 +18,7 @@ from ...contacts.contact_limits import list_renamed
 from ...contacts.formation import Formation
 from ...geometry.curve import find_tied
 from ...mechanics.dynamics import Directions, split_forces
-from .search import TimeSearch, TimeSolution
+from .solution import TimeSearch, TimeSolution
 from .stage import Scheme, Stage, StagePoints, make_formation, resample
 from .time_nlp import least_senses, new_rows
 

@@ -39,8 +39,7 @@ from .mode_search import (
     list_neighbours,
     sign_sequence,
 )
-from .refinement import keep_within, refine
-from .search import Price, TimeSearch, TimeSolution
+from .solution import Price, TimeSearch, TimeSolution, keep_within, refine
 from .stage import (
     Scheme,
     Stage,
