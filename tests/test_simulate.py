@@ -327,7 +327,7 @@ def test_jamming_is_an_error_that_names_phase_and_time() -> None:
     rough = rebuild(problem, friction=Friction(0.4, 0.1, 2.0))
     curve = dataclasses.replace(motion.curve, formation=rough.phases[0].formation)
     torque = CosineMotion(curve, motion.duration, 0.3).fit(40, 7)
-    place = r"v6-finger2 jams in phase 1 at t = 0\.1\d+ s: friction"
+    place = r"v6-finger2 jams at t = 0\.1\d+ s, phase 1: friction"
     with pytest.raises(JammingError, match=place) as caught:
         simulate(rough, torque)
     assert caught.value.phase == 1
@@ -343,14 +343,14 @@ def test_a_jammed_formation_at_rest() -> None:
     assert np.abs(simulation.z - rough.start).max() < 1e-15
     # Torques that nothing balances have no motion to go with either.
     tau = motion.evaluate(np.array([0.0])).tau[0]
-    with pytest.raises(JammingError, match="jams at rest in phase 1 at t = 0 s"):
+    with pytest.raises(JammingError, match="jams at rest at t = 0 s, phase 1"):
         simulate(rough, constant(tau))
 
 
 def test_formation_that_does_not_close_is_an_error() -> None:
     problem, _ = plan()
     wrong = dataclasses.replace(problem, start=problem.start + np.eye(5)[1])
-    with pytest.raises(SimulationError, match="does not touch in phase 1 at t = 0 s"):
+    with pytest.raises(SimulationError, match="does not touch at t = 0 s, phase 1"):
         simulate(wrong, constant((0.0, 0.0)))
 
 

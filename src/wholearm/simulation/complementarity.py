@@ -49,13 +49,10 @@ MODES = {0.0: STICKS, 1.0: FORTH, -1.0: BACK}  # by sliding sign
 CLOSED = 1e-10  # gap that counts as closed at an event, relative to the scene's length
 SUNK = 1e-6  # overlap up to which features touch, over the scene's length; else they are behind
 CHATTER = 1e-6  # speed of the last impact, over the scene's: separation stays below rounding
-MANY = 20  # impacts in 3e-4 of the scene's time that raise `CHATTER` tenfold; see `FreeRun.chatter`
 DEPENDENT = 1e-7  # share of a row that others leave, below which it is no constraint of its own
 ARMED = 1e-13  # gap from which on a pair has been apart, relative to the scene's length
 LOOKS = 8  # instants of the longest step at which gaps are looked at, its end among them
 REACH = 0.3  # longest step, in units of the scene: gaps are sampled every `REACH` / `LOOKS`
-ROUNDS = 30  # most impacts at one instant; what is left after them is plastic
-_NONE = np.zeros(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,9 +87,7 @@ class ContactProblem:
         if len(self.b_t):
             return False
         K = self.scaled[2]
-        if len(K) < 2:
-            return not len(K) or float(2 * K[0, 0]) > SINGULAR
-        return bool(np.linalg.eigvalsh(K + K.T)[0] > SINGULAR)
+        return not len(K) or bool(np.linalg.eigvalsh(K + K.T)[0] > SINGULAR)
 
 
 class ContactAnswer(NamedTuple):
@@ -153,36 +148,22 @@ def is_clear(problem: ContactProblem, answer: ContactAnswer, least: float) -> bo
     return bool((np.maximum(answer.c_n / s_n, answer.r_n * s_n) > most).all())
 
 
-def list_answers(problem: ContactProblem) -> list[ContactAnswer] | None:
-    """All solutions with distinct rates, by enumeration of modes; None if these are too many."""
-    combinations = _combine(len(problem.b_n), len(problem.lift), tuple(problem.owner.tolist()))
-    return None if combinations is None else _try(problem, *combinations)
-
-
-def try_modes(problem: ContactProblem, choice: Sequence[int]) -> ContactAnswer | None:
-    """Solution with the modes `choice` of contacts, then joints, if they are consistent."""
-    sizes = len(problem.b_n), len(problem.lift), tuple(problem.owner.tolist())
-    combinations = _combine(*sizes, tuple(choice))
-    answers = [] if combinations is None else _try(problem, *combinations)
-    return answers[0] if answers else None
-
-
 @lru_cache(maxsize=256)
 def _combine(
-    k: int, n: int, owner: tuple[int, ...], choice: tuple[int, ...] | None = None
-) -> tuple[Array, NDArray[np.bool_]] | None:
+    k: int, n: int, owner: tuple[int, ...], choice: tuple[int, ...] | None
+) -> tuple[Array, NDArray[np.bool_]]:
     """One choice of modes of k contacts and n coordinates, or all, with up to n conditions.
 
     Returns which way what may stick gives way, 0 where it does not, (m, s), and which forces are
-    for a condition, (m, k + s).
+    for a condition, (m, k + s). All choices are none if they are too many.
     """
     own = np.array(owner, dtype=int)
     options: list[tuple[int, ...]]
     options = [(APART, STICKS, FORTH, BACK) if i in owner else (APART, STICKS) for i in range(k)]
     options += [(STICKS, FORTH, BACK) for _ in range(owner.count(-1))]
-    if choice is None and math.prod(len(option) for option in options) > 4000:
-        return None
-    every = list(product(*options)) if choice is None else [choice]
+    every = [] if choice is None else [choice]
+    if choice is None and math.prod(len(option) for option in options) <= 4000:
+        every = list(product(*options))
     choices = np.array(every, dtype=int).reshape(len(every), len(options))
     modes = np.empty((len(choices), len(own)), dtype=int)
     modes[:, own >= 0], modes[:, own < 0] = choices[:, own[own >= 0]], choices[:, k:]
@@ -192,8 +173,13 @@ def _combine(
     return ways[sound], active[sound]
 
 
-def _try(p: ContactProblem, ways: Array, active: NDArray[np.bool_]) -> list[ContactAnswer]:
-    """Solve for each combination of modes; the consistent solutions with distinct rates."""
+def list_answers(p: ContactProblem, choice: Sequence[int] | None = None) -> list[ContactAnswer]:
+    """All solutions with distinct rates, or that with the modes `choice` of contacts, then joints.
+
+    Enumerates modes; none are listed where these are more than 4000.
+    """
+    modes = None if choice is None else tuple(choice)
+    ways, active = _combine(len(p.b_n), len(p.lift), tuple(p.owner.tolist()), modes)
     s_n, s_t, K, q = p.scaled
     k, own = len(s_n), K
     if len(s_t):
@@ -201,10 +187,8 @@ def _try(p: ContactProblem, ways: Array, active: NDArray[np.bool_]) -> list[Cont
         held = (p.owner >= 0).nonzero()[0]
         owner, bound = p.owner[held], ways * (p.bound / s_t)
         rubs, partner = np.zeros((len(ways), len(q))), np.arange(len(q))
-        rubs[:, owner], partner[owner] = (
-            p.mu[held] * s_n[owner] / s_t[held] * ways[:, held],
-            k + held,
-        )
+        rubs[:, owner] = p.mu[held] * s_n[owner] / s_t[held] * ways[:, held]
+        partner[owner] = k + held
         own = K - rubs[:, None, :] * K[:, partner]
         right = bound @ K[:, k:].T - q
     else:
@@ -366,7 +350,7 @@ class Pattern:
         )
 
     def recall(self, modes: Modes) -> list[int]:
-        """Modes as `try_modes` has them."""
+        """Modes as `list_answers` has them."""
         known = dict(zip(modes.kept, modes.Xi, strict=True))
         standing = set(self.standing.tolist())
         choice = [
@@ -376,7 +360,7 @@ class Pattern:
         return choice + [MODES[modes.sigma[joint]] for joint in self.joints]
 
     def describe(self, answer: ContactAnswer) -> list[int]:
-        """Modes of an answer as `try_modes` has them."""
+        """Modes of an answer as `list_answers` has them."""
         choice = [STICKS if c > 0 else APART for c in answer.c_n]
         signs = [MODES[sign] for sign in answer.sign.tolist()]
         for k, mode in zip(self.standing, signs, strict=False):
@@ -520,7 +504,7 @@ class FreeRun(Run):
             recent += event.kind is EventKind.IMPACT
         # Impacts need no finer steps than these.
         least = max(CHATTER, 1e3 * self.tolerance)
-        raised = min(recent // MANY, 2) + recent // (10 * MANY)
+        raised = min(recent // 20, 2) + recent // 200
         return least * self.system.scales.speed * 10.0**raised
 
     def note_at(
@@ -583,12 +567,13 @@ class FreeRun(Run):
     def _collide(self) -> ClosedContacts:
         """Resolve impacts until no closed gap closes further; what is closed then."""
         limit = STANDING * self.system.scales.speed
-        for count in range(ROUNDS + 1):
+        # After 30 impacts at one instant the last one is plastic.
+        for count in range(31):
             closed = self._find_closed()
             rates = closed.rows.A @ self.v
             if not (rates < -limit).any():
                 return closed
-            self._strike(closed, rates, -rates.min() > self.chatter and count < ROUNDS)
+            self._strike(closed, rates, -rates.min() > self.chatter and count < 30)
         return self._find_closed()
 
     def _strike(self, closed: ClosedContacts, rates: Array, bouncing: bool) -> None:
@@ -655,8 +640,8 @@ class FreeRun(Run):
         choice = [STICKS if c > 0 else APART for c in answer.c_n]
         for contact, sign in zip(problem.owner, answer.sign, strict=True):
             choice[contact] = MODES[float(sign)] if choice[contact] != APART else APART
-        exact = try_modes(problem, choice)
-        if exact is None or system.is_slower(exact.change, STANDING):
+        exact = list_answers(problem, choice)
+        if not exact or system.is_slower(exact[0].change, STANDING):
             return False
         names = " ".join(system.names[pair] for pair in pattern.closed)
         self.note_at(
@@ -664,7 +649,7 @@ class FreeRun(Run):
             f"no finite forces keep {names} closed: an impact without a collision",
             names,
         )
-        self.set_velocity(self.v + exact.change)
+        self.set_velocity(self.v + exact[0].change)
         return True
 
     def _decide(self, closed: ClosedContacts) -> bool | None:
@@ -712,11 +697,11 @@ class FreeRun(Run):
         if problem.is_unique and (answers := list_answers(problem)):
             return answers[0]
         for modes in likely:
-            if (answer := try_modes(problem, modes)) is not None:
-                return answer
+            if answers := list_answers(problem, modes):
+                return answers[0]
         answer = solve_problem(problem)
         if answer is None:
-            return next(iter(list_answers(problem) or ()), None)
+            return next(iter(list_answers(problem)), None)
         self.residual = max(self.residual, answer.residual)
         return answer
 
@@ -730,7 +715,7 @@ class FreeRun(Run):
         """
         last = pattern.recall(self.modes)
         self.unique = problem.is_unique
-        answers = [] if self.unique else list_answers(problem) or []
+        answers = [] if self.unique else list_answers(problem)
         if len(answers) > 1:
             modes = [pattern.describe(answer) for answer in answers]
             if self.modes.kept or len(problem.b_n):
@@ -752,9 +737,9 @@ class FreeRun(Run):
         names = system.names
         gone = [pair for pair in before.kept if pair not in modes.kept]
         new = [pair for pair in modes.kept if pair not in before.kept]
-        gaps, ranges = system.look(self.z) if gone else (_NONE, _NONE)
         near = CLOSED * system.scales.length
         for pair in gone:
+            gaps, ranges = system.look(self.z)
             # What still touches, at the end of its range, is a neighbour's from there on.
             heirs = [p for p in new if names[p][-1:] == names[pair][-1:]]
             if heirs and abs(gaps[pair]) < near and ranges[pair] < near:

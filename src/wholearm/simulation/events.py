@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +17,6 @@ from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory, sample_phases
 from .stepper import ModeStepper
-from .system import System
 
 REPLAYED = "replayed"  # status in the `meta` of such a trajectory
 
@@ -257,29 +255,6 @@ class Record(NamedTuple):
         out, to, kept = s.outputs.copy(), s.to, s.modes.kept
         state = out[to.y], out[to.acceleration], out[to.tau]
         return Record(t, phase, kept, *state, out[to.c_n], out[to.c_t], impact)
-
-
-def collect(system: System, rows: Sequence[Record], contacts: Sequence[str]) -> dict[str, Any]:
-    """Fields of a simulation that its records, in order, have, with the forces of some contacts."""
-    n, columns = system.n, {name: column for column, name in enumerate(contacts)}
-    forces = np.full((2, len(rows), len(columns)), np.nan)
-    first = 0
-    for kept, group in groupby(rows, lambda row: row.kept):
-        values = np.array([(row.c_n, row.c_t) for row in group])
-        last = first + len(values)
-        for k, pair in enumerate(kept):
-            if (column := columns.get(system.names[pair])) is not None:
-                forces[:, first:last, column] = values[:, :, k].T
-        first = last
-    numbers = [(row.t, row.phase, row.y, row.acceleration, row.tau, row.impact) for row in rows]
-    t, phase, y, z_ddot, tau, impact = map(np.array, zip(*numbers, strict=True))
-    z, z_dot = y[:, :n], y[:, n : 2 * n]
-    work, viscous, dry, contact = y[:, 2 * n :].T
-    energies = Energies(system.stored(z, z_dot), work, viscous, dry, contact, impact)
-    return {
-        **dict(t=t, z=z, z_dot=z_dot, z_ddot=z_ddot, tau=tau, phase=phase),
-        **dict(contacts=tuple(contacts), c_n=forces[0], c_t=forces[1], energies=energies),
-    }
 
 
 def list_stretches(rows: Sequence[Record], names: Sequence[str]) -> tuple[FreeStretch, ...]:

@@ -316,10 +316,10 @@ class Replay(Run):
         names = " ".join(self.formation.names)
         if not ratio > 1e-3:
             raise JammingError(
-                f"{names} jams {self.where()}: friction makes the reduced inertia {ratio:.3g} of "
+                f"{names} jams {self.when()}: friction makes the reduced inertia {ratio:.3g} of "
                 "its frictionless value"
             )
-        raise SimulationError(f"the step size of {names} underflows {self.where()}")
+        raise SimulationError(f"the step size of {names} underflows {self.when()}")
 
     def lose(self, contact: str, c_n: float) -> Outcome:
         """End because `contact` would have to pull."""
@@ -360,12 +360,8 @@ class Replay(Run):
         return self.step_times[k] if k < len(self.step_times) else math.inf
 
     def when(self) -> str:
-        """Present time and phase, to end a sentence."""
+        """Present time and phase, in a sentence."""
         return f"at t = {self.t:.5g} s, phase {self.phase.number}"
-
-    def where(self) -> str:
-        """Present phase and time, for errors."""
-        return f"in phase {self.phase.number} at t = {self.t:.5g} s"
 
     def play(self, progress: Callable[[str], None] | None) -> tuple[Outcome, float]:
         """Simulate phase after phase; how that ends, and how far from the end of the last one."""
@@ -395,7 +391,7 @@ class Replay(Run):
                 ending = self._rest()
             if isinstance(ending, StartDeparture):
                 if not self.gets_on():
-                    raise SimulationError(f"starting and stopping do not end {self.where()}")
+                    raise SimulationError(f"starting and stopping do not end {self.when()}")
                 self.note(EventKind.START, f"the object starts to move {self.when()}")
                 self.set_off(ending)
                 ending = self.move()
@@ -479,7 +475,7 @@ class Replay(Run):
         self.wait(max(self.t, self.time(change.x)))
         if change.jammed:
             raise JammingError(
-                f"{' '.join(self.formation.names)} jams at rest {self.where()}: friction makes "
+                f"{' '.join(self.formation.names)} jams at rest {self.when()}: friction makes "
                 "the reduced inertia vanish or turn negative"
             )
         if change.c_t is not None:
@@ -727,7 +723,7 @@ class Replay(Run):
                 formation, self.z, 10 * REACHED * self.problem.scene.scales.length
             )
         except SimulationError as error:
-            raise SimulationError(f"{error} {self.where()}") from None
+            raise SimulationError(f"{error} {self.when()}") from None
 
     def collide(self, following: Phase) -> Outcome | None:
         """Plastic impact onto the next formation; the outcome if it is not possible."""
@@ -831,7 +827,7 @@ class Replay(Run):
             return True
         if not self.gets_on():
             names = " ".join(formation.names)
-            raise SimulationError(f"sticking and slipping of {names} do not end {self.where()}")
+            raise SimulationError(f"sticking and slipping of {names} do not end {self.when()}")
         options = [self._list_options(unit, turned) for unit in still]
         chosen, mode, _, _ = self._choose(signs, still, options)
         rows = evaluate_rows(formation, self.z, self.v)
@@ -1058,5 +1054,5 @@ class Replay(Run):
             self.fail_to_step(min(ratios))
         names = " ".join(formation.names)
         raise JammingError(
-            f"{names} jams {self.where()}: no combination of sliding and sticking is consistent"
+            f"{names} jams {self.when()}: no combination of sliding and sticking is consistent"
         )

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Sequence
+from itertools import groupby
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -23,11 +24,11 @@ from ..results.adopt import Torques, adopt_torques
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from .events import (
+    Energies,
     EventKind,
     Outcome,
     OutcomeKind,
     Simulation,
-    collect,
     list_stretches,
 )
 from .prescribed import Replay
@@ -206,25 +207,44 @@ def _conclude(
     clock: Array | None = None,
 ) -> Simulation:
     """The result of a run; `clock`: starts of phases that count by time alone [s]."""
-    names, records = run.system.names, run.records
+    system, records = run.system, run.records
+    names, n = system.names, system.n
     contacts = [contact.name for contact in problem.contacts]
     events = sorted(run.events, key=lambda event: event.time)
+    numbers = [(row.t, row.phase, row.y, row.acceleration, row.tau, row.impact) for row in records]
+    t, phase, y, z_ddot, tau, impact = map(np.array, zip(*numbers, strict=True))
     if clock is not None:
         used = dict.fromkeys(names[pair] for row in records for pair in row.kept)
         # Contacts that problem files have no name for are among the stretches alone.
         unnamed = re.compile("tip|joint|.*-(back|joint)")
         contacts += [n for n in used if n not in contacts and not unnamed.match(n)]
-    fields = collect(run.system, records, contacts)
-    if clock is not None:
-        t = fields["t"]
         owners = np.searchsorted(clock, [event.time for event in events], side="right") - 1
         owned = zip(events, owners.tolist(), strict=True)
         events = [event._replace(phase=max(owner, 0)) for event, owner in owned]
         # Of two rows at a boundary the first one ends the phase before.
         twice = np.append(np.diff(t) == 0, False) & np.isin(t, clock[1:])
-        fields["phase"] = np.maximum(np.searchsorted(clock, t, side="right") - 1 - twice, 0)
+        phase = np.maximum(np.searchsorted(clock, t, side="right") - 1 - twice, 0)
+    forces, first = np.full((2, len(records), len(contacts)), np.nan), 0
+    for kept, group in groupby(records, lambda row: row.kept):
+        values = np.array([(row.c_n, row.c_t) for row in group])
+        for k, pair in enumerate(kept):
+            if names[pair] in contacts:
+                column = contacts.index(names[pair])
+                forces[:, first : first + len(values), column] = values[:, :, k].T
+        first += len(values)
+    z, z_dot = y[:, :n], y[:, n : 2 * n]
+    work, viscous, dry, contact = y[:, 2 * n :].T
     return Simulation(
-        **fields,
+        t=t,
+        z=z,
+        z_dot=z_dot,
+        z_ddot=z_ddot,
+        tau=tau,
+        phase=phase,
+        contacts=tuple(contacts),
+        c_n=forces[0],
+        c_t=forces[1],
+        energies=Energies(system.stored(z, z_dot), work, viscous, dry, contact, impact),
         problem=problem,
         torque=run.torque,
         events=tuple(events),
