@@ -44,14 +44,20 @@ from wholearm.geometry.arcs import join, take
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_curve, trace_phases
 from wholearm.mapping.borders import NOWHERE, Window, label_cells
-from wholearm.mapping.formation_map import CROSSED, Border, FormationMap, build_map, choose_window
+from wholearm.mapping.formation_map import (
+    CROSSED,
+    Border,
+    FormationMap,
+    build_map,
+    choose_window,
+    time_borders,
+)
 from wholearm.mechanics.speed_sweep import NoMotionError
 from wholearm.planning.lower_bound import look_along
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.search.edges import Link, cut_curve
 from wholearm.search.places import is_at, make_place
 from wholearm.search.roadmap import Roadmap
-from wholearm.search.times import time_borders
 
 TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
 WINDOW = Window((-0.16, 0.16), (np.radians(-75.0), np.radians(30.0)))

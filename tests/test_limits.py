@@ -57,8 +57,7 @@ from wholearm.policy.reference import make_rows
 from wholearm.problem.definition import End, Phase, Problem, Until
 from wholearm.problem.read import build_problem
 from wholearm.scene.model import Friction
-from wholearm.search.border_limits import estimate_duration
-from wholearm.search.edges import BorderEdge, Terms, time_parts
+from wholearm.search.edges import BorderEdge, Terms, estimate_duration, time_parts
 from wholearm.search.places import make_place
 from wholearm.search.roadmap import time_paths
 

@@ -56,8 +56,7 @@ from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
 from wholearm.problem.read import build_problem
 from wholearm.results.trajectory import Samples
-from wholearm.search.border_limits import estimate_duration
-from wholearm.search.edges import BorderEdge, Terms
+from wholearm.search.edges import BorderEdge, Terms, estimate_duration
 from wholearm.search.places import make_place
 
 EPSILON = 0.05

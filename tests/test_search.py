@@ -43,25 +43,43 @@ from wholearm.planning.lower_bound import bound_least_time
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.time_domain.guesses import GIVEN
 from wholearm.problem.read import build_problem
-from wholearm.search.astar import RoadmapRoute, RouteSearch
-from wholearm.search.cuts import link_changed, list_cut, list_cut_borders, list_openings
-from wholearm.search.edge_plans import BackgroundTask, Cache, PlannedLink, list_printed, plan_links
-from wholearm.search.edges import Link
-from wholearm.search.feasibility import Measured
-from wholearm.search.find_route import (
-    explain,
+from wholearm.search.astar import (
+    FINEST,
+    Found,
+    RefinedPath,
+    ReleaseSearch,
+    RoadmapRoute,
+    RouteSearch,
+    bound_borders,
+)
+from wholearm.search.cuts import (
+    describe_block,
+    explain_block,
     find_hand,
     find_opening,
+    link_changed,
+    list_cut,
+    list_cut_borders,
+    list_openings,
+)
+from wholearm.search.edge_plans import (
+    BackgroundTask,
+    Cache,
+    Measured,
+    PlannedLink,
+    list_printed,
+    plan_links,
+)
+from wholearm.search.edges import Link
+from wholearm.search.find_route import (
     find_route,
+    format_phases,
     load_roadmap,
     require_folder,
-    require_reach,
     store_roadmap,
 )
-from wholearm.search.places import make_place
-from wholearm.search.result import bound_borders, describe_block, format_phases
+from wholearm.search.places import make_place, require_reach
 from wholearm.search.roadmap import Roadmap, can_start
-from wholearm.search.route_choice import FINEST, Found, RefinedPath, ReleaseSearch
 
 TABLE = {k: v for k, v in tomllib.loads(HEPTAGON.read_text()).items() if k != "phases"}
 
@@ -181,7 +199,7 @@ def test_python_and_time_limits_end_a_search(monkeypatch: pytest.MonkeyPatch) ->
 
     with pytest.raises(SolverError, match="time limit is over, and there is no plan yet"):
         find_route(read({"flush": 6}), time_limit=1e-9)
-    monkeypatch.setattr("wholearm.search.route_choice.plan_links", interrupt)
+    monkeypatch.setattr("wholearm.search.astar.plan_links", interrupt)
     with pytest.raises(KeyboardInterrupt):
         find_route(read({"flush": 6}))
 
@@ -262,7 +280,7 @@ def test_what_is_advised_opens_the_way() -> None:
     ).duration == pytest.approx(float(text.split()[-2]), rel=0.05)
     coarse = PlanOptions(intervals=20)
     with advising(lambda wanted: wanted.key == "friction.palm"):
-        said = describe_block(own, [], text, lambda at: explain(rough, coarse, at))
+        said = describe_block(own, [], text, lambda at: explain_block(rough, coarse, at))
     assert "blocked; v0-palm" in said and said.endswith(text) and " N short; " in said
 
 
@@ -274,7 +292,7 @@ def test_fingers_that_cross_on_the_way_are_mounted_elsewhere(
     crossing = build_problem({**table, "goal": {"flush": 0, "x": -0.01}}).with_(length=0.18)
     (goal,), place = crossing.goals, make_place(crossing.scene, crossing.start)
     own, told = RouteSearch(Roadmap(crossing, 0.1), place, goal), list[str]()
-    monkeypatch.setattr("wholearm.search.find_route.HANDS", (0.95,))
+    monkeypatch.setattr("wholearm.search.cuts.HANDS", (0.95,))
     text, (change,) = find_hand(own, crossing, PlanOptions(), 0.0, told.append)
     assert text.startswith(f"with {change} the goal is reached") and f"{change}" in told[0]
     assert change.values == {"fingers.1.base[1]": 0.076, "fingers.2.base[1]": -0.076}

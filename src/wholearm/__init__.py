@@ -50,9 +50,8 @@ if TYPE_CHECKING:
     from .results.torque import TorqueProfile, read_torque_csv
     from .results.trajectory import Trajectory, load_trajectory
     from .scene.model import Finger, Friction, Polygon, Scene
-    from .search.find_route import find_route
-    from .search.result import Answer
-    from .search.solve import solve
+    from .search import solve
+    from .search.find_route import Answer, find_route
     from .simulation.events import FreeSimulation, Simulation
     from .simulation.simulate import simulate, simulate_free
     from .verification.free import FreeReport, verify_free, verify_policy
@@ -85,9 +84,8 @@ _NAMES = {
     "results.trajectory": "Trajectory load_trajectory",
     "analysis.robustness": "Robustness Uncertainty assess_robustness",
     "scene.model": "Finger Friction Polygon Scene",
-    "search.find_route": "find_route",
-    "search.result": "Answer",
-    "search.solve": "solve",
+    "search.find_route": "Answer find_route",
+    "search": "solve",
     "simulation.events": "FreeSimulation Simulation",
     "simulation.simulate": "simulate simulate_free",
     "analysis.tuning": "Tuning tune",

@@ -1,26 +1,57 @@
 """Cut of the roadmap between reached places and goal, and changes of single numbers that open it.
 
 Limits of the hand, friction and epsilon do not change the geometry: the curve of a border is kept.
-The smallest opening change is bracketed by bisection.
+The smallest opening change is bracketed by bisection. If no such number leads to the goal, other
+lengths and bases of the fingers are tried by new searches.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
-from ..common.errors import Change, Parameter
+import numpy as np
+
+from ..common.arrays import Array
+from ..common.errors import Change, InfeasibleError, InputError, Parameter, WholearmError
+from ..common.signals import OutOfTime
+from ..contacts.closing import close_fingers
+from ..contacts.formation import Formation, describe
 from ..mechanics.limits import EPSILON, make_limits
-from ..planning.explain import bracket, change_curve, list_frictions
-from .astar import RoadmapRoute, RouteSearch
-from .edges import Blocked, BorderEdge, Link, cut_curve, link_along
-from .places import measure_along
+from ..planning.explain import bracket, change_curve, list_frictions, unadvised
+from ..planning.options import Objective, PlanOptions
+from ..planning.plan import solve_with
+from ..problem.definition import Goal, Phase, Problem
+from ..scene.model import Scene
+from .astar import EAGER, NEARBY, Chooser, RoadmapRoute, RouteSearch
+from .edge_plans import ROUGH
+from .edges import (
+    DEPENDENT,
+    Blocked,
+    BorderEdge,
+    Link,
+    cut_curve,
+    describe_steps,
+    link_along,
+    point_out,
+)
+from .places import make_place, measure_along, require_reach
+from .roadmap import Roadmap
 
 CUT = 16  # Most borders that are looked at with other numbers, those nearest to the goal
 FARTHEST = 10.0  # Most times that a number is made larger or smaller; friction may go to zero
 HALVINGS = 6  # How often what is between such a number and the given one is halved
+TRIED = 3  # Most numbers with which the goal is looked for
+SYMMETRIC = 1e-9  # Relative difference of lengths and bases up to which the hand is symmetric
+HANDS = (1.05, 0.95, 1.1, 0.9, 1.2, 0.8)
+"""Lengths of fingers and distances of their bases that are tried, relative to the problem's."""
+TIMES, AT_LEAST = 4.0, 20.0
+"""Limit of processor time for other hands: over that of the search, and at least [s]."""
+LISTED, FAILED = 2, 1  # most reasons in a message, and most of routes without a plan
 
 
 class CutBorder(NamedTuple):
@@ -131,3 +162,211 @@ def pass_cut(search: RouteSearch, cut: CutBorder, change: Change) -> RoadmapRout
     if before is None or not isinstance(link, Link):
         return None
     return RoadmapRoute((*before.links, link))
+
+
+Try = Callable[[Change, Sequence[int], bool], tuple[float, Sequence[int]] | None]
+"""Looks for the goal with a change, beyond some borders: about how long the route takes [s], which
+is planned if that is asked for, and over which of the borders it leads."""
+
+
+def find_opening(
+    search: RouteSearch,
+    problem: Problem,
+    options: PlanOptions,
+    seconds: float,
+    report: Callable[[str], None],
+) -> tuple[str, tuple[Change, ...]]:
+    """The change of a single number with which the goal is reached, in words and as such.
+
+    It is looked for on the borders that are shut, and tried by a search beyond those that it opens;
+    then among other lengths and places of the fingers.
+
+    Parameters
+    ----------
+    search         which did not reach the goal
+    seconds : [s]  processor time that this has taken
+    """
+    report("looking for a number that opens the way")
+    cuts = list_cut_borders(search)
+
+    def find(
+        change: Change, beyond: Sequence[int], planned: bool
+    ) -> tuple[float, Sequence[int]] | None:
+        try:
+            changed = problem.with_(change.values)
+        except InputError:
+            return None
+        routes = {k: pass_cut(search, cuts[k], change) for k in beyond}
+        sources = [route for route in routes.values() if route is not None]
+        if not sources:
+            return None
+        found = _search_changed(changed, search.start.z, search.goal, options, planned, sources)
+        if found is None:
+            return None
+        last = {k: route.links[-1] for k, route in routes.items() if route}
+        return found[1], [k for k, link in last.items() if link in found[0].links]
+
+    text, changes = choose_opening(list_openings(cuts), find)
+    if changes:
+        return text, changes
+    hands, changes = find_hand(search, problem, options, seconds, report)
+    return hands if changes or not text else f"{text}; {hands}", changes
+
+
+def choose_opening(openings: Sequence[Opening], find: Try) -> tuple[str, tuple[Change, ...]]:
+    """The first number with which the goal is reached, and the least change of it that does."""
+    tried = list[str]()
+    for opening in openings[:TRIED]:
+        most = opening.open_all()
+        route = find(most, opening.list_open(most), False)
+        # Borders beyond those that the route crosses may need the larger change.
+        least = most if route is None else opening.open_all(route[1])
+        for change in dict.fromkeys((least, most)) if route else ():
+            found = find(change, opening.list_open(change), True)
+            if found is not None:
+                return _describe_reached(change, found[0]), (change,)
+        tried.append(str(most))
+    return f"the goal is not reached with {', nor with '.join(tried)}" if tried else "", ()
+
+
+def _describe_reached(change: Change, duration: float) -> str:
+    return f"with {change} the goal is reached, in about {duration:.3g} s"
+
+
+def _search_changed(
+    changed: Problem,
+    z: Array,
+    goal: Goal,
+    options: PlanOptions,
+    planned: bool,
+    sources: Sequence[RoadmapRoute] = (),
+    most: int = NEARBY,
+) -> tuple[RoadmapRoute, float] | None:
+    """Look for any route from `z` in a changed scene, and about how long it takes [s]."""
+    changed = replace(changed, start=z)
+    roadmap = Roadmap(changed, options.uniqueness_margin)
+    search = RouteSearch(roadmap, make_place(changed.scene, z), goal, sources=sources)
+    rough = replace(options, objective=Objective.TIME, duration=None, accuracy=ROUGH, robust=0.0)
+    rough = replace(rough, mode_search=False, certify=False, replay=False)
+    chooser = Chooser(changed, [], search, rough, first_only=True)
+    try:
+        route = chooser.find_first(lambda _: None, most)
+        if route is None:
+            return None
+        if not planned:
+            return route, route.duration
+        chooser.plan(1, lambda _: None)
+    except np.linalg.LinAlgError:
+        return None
+    return (chooser.made[0][1], chooser.made[0][0].duration) if chooser.made else None
+
+
+def find_hand(
+    search: RouteSearch,
+    problem: Problem,
+    options: PlanOptions,
+    seconds: float,
+    report: Callable[[str], None],
+) -> tuple[str, tuple[Change, ...]]:
+    """The least change of `list_hands` with which the goal is reached from the same pose."""
+    tried, stop = 0, time.process_time() + max(TIMES * seconds, AT_LEAST)
+    with suppress(OutOfTime):
+        for change in list_hands(problem.scene):
+            if time.process_time() > stop:
+                break
+            report(f"looking for routes with {change}")
+            tried += 1
+            try:
+                changed = problem.with_(change.values)
+                require_reach(changed.scene, search.goal, float(search.start.z[2]))
+            except (InputError, InfeasibleError):
+                continue
+            closed = close_fingers(changed.scene, *search.start.z[[0, 2], None])
+            if closed.obstacle.any():
+                continue
+            z, goal = closed.z[0], search.goal
+            found = _search_changed(changed, z, goal, options, True, most=EAGER.most)
+            if found is not None:
+                return _describe_reached(change, found[1]), (change,)
+    most = f"{100 * (max(HANDS) - 1):.0f} %"
+    text = f"the goal is not reached with {tried} other lengths or bases of the fingers"
+    return f"{text}, up to {most} off", ()
+
+
+def list_hands(scene: Scene) -> list[Change]:
+    """Lengths and bases of the fingers that are tried: of both alike where they are, by size."""
+    right, left = scene.fingers
+    (first, _), (second, _) = np.asarray(right.base).tolist(), np.asarray(left.base).tolist()
+    half, base = (first - second) / 2, "fingers.{}.base[1]"
+    given: list[tuple[str, float, float, tuple[str, ...]]]
+    # Bases first: they have decided more often than lengths.
+    if math.isclose(first, -second, rel_tol=SYMMETRIC):
+        keys = base.format(1), base.format(2)
+        given = [("x of base 1, mirrored for base 2,", first, half, keys)]
+    else:
+        given = [
+            ("x of base 1", first, half, (base.format(1),)),
+            ("x of base 2", second, -half, (base.format(2),)),
+        ]
+    if math.isclose(right.length, left.length, rel_tol=SYMMETRIC):
+        given.append(("length of both fingers", right.length, right.length, ("length",)))
+    else:
+        given.append(("length of finger 1", right.length, right.length, ("fingers.1.length",)))
+        given.append(("length of finger 2", left.length, left.length, ("fingers.2.length",)))
+    return [
+        Change(Parameter(name, value, "m", 1 if scale > 1 else -1, *keys), float(f"{moved:.3g}"))
+        for scale in HANDS
+        for name, value, size, keys in given
+        for moved in (value + (scale - 1) * size,)
+    ]
+
+
+def explain_block(problem: Problem, options: PlanOptions, blocked: Blocked) -> str:
+    """The violated limit of a motion along a border of the cut, in words."""
+    (step,) = blocked.steps
+    # A contact may touch at the start already, or be gained both ways; a coordinate is unique.
+    for until in (step.until, point_out(step.contacts, blocked.stop.z)):
+        phase = Phase(0, Formation(problem.scene, step.contacts), until)
+        single = replace(problem, start=blocked.start.z, phases=(phase,), goals=())
+        try:
+            with unadvised():
+                solve_with(single, replace(options, replay=False))
+        except InputError:
+            continue
+        except InfeasibleError as error:
+            if error.shortfalls:
+                short = error.shortfalls[0]
+                return f"{short.limit} is {short.amount:.3g} {short.unit} short"
+        except WholearmError:
+            break
+        except np.linalg.LinAlgError:
+            return DEPENDENT
+        break
+    return blocked.reason
+
+
+def describe_block(
+    search: RouteSearch,
+    failures: Sequence[str],
+    opening: str = "",
+    explain: Callable[[Blocked], str] = lambda blocked: blocked.reason,
+) -> str:
+    """Why nothing leads to a goal: the cut, its violated limits, and the change that opens it."""
+    cut, count = list_cut(search), search.settled
+    text = f"nothing leads from {search.start} to {search.goal}: {count} place{'s'[: count != 1]}"
+    text += f" reached, touching {describe(search.start.contacts)} at the start; "
+    if not cut:
+        text += "no border leads on from there, and no way through a cell"
+    else:
+        many = len(cut) != 1
+        text += f"{len(cut)} border{'s'[:many]} lead{'s'[many:]} on from there, "
+        text += "all of them blocked" if many else "and is blocked"
+    # After the first part, reasons give advice on the plan.
+    reasons = list(dict.fromkeys(reason.split("; ")[0] for reason in failures))[:FAILED]
+    reasons += [f"{describe_border(b)}: {explain(b)}" for b in cut[: LISTED - len(reasons)]]
+    return "; ".join([text, *reasons, *([opening] if opening else [])])
+
+
+def describe_border(blocked: Blocked) -> str:
+    """A blocked border in words."""
+    return f"{describe_steps(blocked.steps)} from {blocked.start}"

@@ -1,5 +1,6 @@
 """Plans of the links of routes, each from rest to rest, and of the phases that are printed.
 
+Links through cells are first planned alone, on few intervals, for their times and initial guesses.
 The plan of a link depends on the others only by the configurations at its ends. Where a link
 through a cell lands on a border is optimized together with the first phase of the next link.
 """
@@ -10,7 +11,7 @@ import math
 from collections.abc import Callable, MutableMapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -18,25 +19,111 @@ from ..common.arrays import Array
 from ..common.errors import InputError, WholearmError, name_source
 from ..common.parallel import Task, share
 from ..common.sharing import exclusive
+from ..contacts.formation import Formation
 from ..geometry.curve import Curve
-from ..geometry.path_guess import count_freedoms
+from ..geometry.explore import STILL
+from ..geometry.path_guess import count_freedoms, find_end
 from ..geometry.tracing import trace_phase
+from ..mechanics.dynamics import metric_weights
+from ..mechanics.speed_sweep import NoMotionError
 from ..planning.blocks import BEGUN, BlockPlan, Planning, plan_next
 from ..planning.explain import unadvised
-from ..planning.options import PlanOptions
-from ..planning.phase_plan import end_of, split_blocks
+from ..planning.lower_bound import look_along
+from ..planning.options import Objective, PlanOptions
+from ..planning.phase_plan import PhasePlan, end_of, split_blocks
 from ..planning.plan import solve_with
 from ..planning.result import Plan
 from ..planning.time_domain.time_motion import TimeMotion
-from ..problem.definition import ROWS, End, ModeGuess, Phase, Problem
+from ..problem.definition import ROWS, End, ModeGuess, Phase, Problem, Until
 from ..problem.read import read_phase
 from ..problem.table import SAME as PRINTED_ANGLE
 from ..problem.table import describe_phase
 from ..results.plan_record import ROLLS
 from ..scene.model import Scene
-from .edges import EdgeStep, Link, describe_steps, find_headings, point_out
-from .feasibility import SINGULAR, Measured, make_phases
-from .places import measure_apart
+from .edges import DEPENDENT, INTERVALS, EdgeStep, Link, describe_steps, find_headings, point_out
+from .places import close_place, measure_apart
+
+ROUGH = 1e-2  # accuracy of plans that only estimate durations
+# Distances are in radii of gyration and radians.
+OFF = 1e-4  # distance of a traced end from a border's end that makes it another one
+GUESSED = 1e-6  # guesses are rounded to this, in the same unit, or over the duration
+SIGNS = {"+": 1.0, "-": -1.0, ROLLS: 0.0}
+PINNED = 1e-9  # pinned coordinates of landings are rounded to this, in the same unit
+SAME = 9  # decimals of configurations that count as equal, in the same unit
+MET = 1e-8  # distance of planned from traced ends of borders that count as equal, in the same unit
+Key = tuple[object, ...]
+T = TypeVar("T")
+
+
+class Measured(NamedTuple):
+    """The plan of one link through a cell."""
+
+    duration: float  # [s]
+    steps: tuple[EdgeStep, ...]  # its phases as planned
+    # initial guesses: plans in the cell and of a border that is left in motion, on few intervals
+    begun: list[PhasePlan[TimeMotion]]
+
+
+def make_phases(problem: Problem, steps: Sequence[EdgeStep]) -> list[Phase]:
+    """Steps as phases."""
+    return [
+        Phase(k, Formation(problem.scene, step.contacts), step.until, step.end)
+        for k, step in enumerate(steps)
+    ]
+
+
+def measure_link(
+    problem: Problem,
+    link: Link,
+    steps: tuple[EdgeStep, ...],
+    options: PlanOptions,
+    further: bool = False,
+    straight: bool = True,
+    first_only: bool = False,
+) -> Measured | str:
+    """Plan a link through a cell alone, on few intervals; the plan, or why there is none.
+
+    Parameters
+    ----------
+    steps       the link's, or others between the same places
+    further     whether other guesses are tried if the first ones fail
+    straight    first guess: straight through the cell; otherwise to the nearest end of the phase
+    first_only  whether only the first guess is tried
+    """
+    from ..planning.time_domain.time_plan import try_phases
+
+    rough = replace(options, objective=Objective.TIME, duration=None, accuracy=ROUGH)
+    phases, z, spent = make_phases(problem, steps), link.start.z, 0.0
+    try:
+        single = replace(problem, goals=(), phases=tuple(phases))
+        if len(phases) > 1 and phases[0].end is End.REST:
+            curve = trace_phase(phases[0], z)
+            spent = look_along((curve,), problem.epsilon, INTERVALS)
+            z, phases = curve.end, phases[1:]
+        goal = close_place(link.stop) if len(phases) == 1 else None
+        if goal is None:
+            goal = replace(link.stop, z=find_end(phases[0], z, phases[1:]))
+        moved = metric_weights(problem.scene) @ (goal.z - z) ** 2
+        if moved < (STILL * problem.scene.scales.length) ** 2:
+            return f"{phases[0].until} holds already where it starts"
+        alone = len(phases) == 1
+        towards = goal.z if straight and alone else None
+        plans = try_phases(single, phases, z, rough, towards, further and alone, first_only)
+    except NoMotionError:
+        return "no motion keeps its limits along the border"
+    except WholearmError as error:
+        return str(error)
+    except np.linalg.LinAlgError:
+        return DEPENDENT
+    if plans is None:
+        return "no guess leads to a plan"
+    return Measured(spent + sum(plan.motion.duration for plan in plans), steps, plans)
+
+
+def leave_in_motion(steps: tuple[EdgeStep, ...]) -> tuple[EdgeStep, ...]:
+    """Phases that leave a border in motion, where the planner chooses."""
+    first, *rest = steps
+    return (EdgeStep(first.contacts, Until(), End.SMOOTH), *rest)
 
 
 class Lost(str):
@@ -69,7 +156,7 @@ def plan_phases(
         except WholearmError as error:
             cache[key] = str(error)
         except np.linalg.LinAlgError:
-            cache[key] = SINGULAR
+            cache[key] = DEPENDENT
     return cache[key]
 
 
@@ -106,15 +193,6 @@ def _round(value: float, unit: float) -> float:
     return round(value, math.ceil(-math.log10(unit)))
 
 
-# Distances are in radii of gyration and radians.
-OFF = 1e-4  # distance of a traced end from a border's end that makes it another one
-GUESSED = 1e-6  # guesses are rounded to this, in the same unit, or over the duration
-SIGNS = {"+": 1.0, "-": -1.0, ROLLS: 0.0}
-PINNED = 1e-9  # pinned coordinates of landings are rounded to this, in the same unit
-SAME = 9  # decimals of configurations that count as equal, in the same unit
-MET = 1e-8  # distance of planned from traced ends of borders that count as equal, in the same unit
-Key = tuple[object, ...]
-T = TypeVar("T")
 Links = Sequence[tuple[Link, Sequence[Measured]]]
 """Links of a route, each with the plans of it that are known, the fastest first."""
 Chosen = tuple[Link, Measured | None]  # a link, and a plan of it as initial guess
@@ -252,7 +330,7 @@ class _LinkPlanner:
             except WholearmError as error:
                 self.cache[key] = str(error)
             except np.linalg.LinAlgError:
-                self.cache[key] = SINGULAR
+                self.cache[key] = DEPENDENT
         return self.cache[key]
 
     def _plan_link(

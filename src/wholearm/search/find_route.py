@@ -7,15 +7,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import pickle
 import sys
 import time
 import warnings
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,48 +22,24 @@ import casadi as ca
 import numpy as np
 
 from .. import __version__
-from ..common.arrays import Array
-from ..common.errors import (
-    Change,
-    InfeasibleError,
-    InputError,
-    Parameter,
-    SolverError,
-    WholearmError,
-)
+from ..common.document import Document, Result, Table
+from ..common.errors import Change, InfeasibleError, InputError, SolverError
 from ..common.files import write_whole
 from ..common.sharing import exclusive
 from ..common.signals import OutOfTime, Reporter, limited, yielding
-from ..contacts.closing import close_fingers, describe_obstacle, name_reach
-from ..contacts.formation import Formation
-from ..planning.explain import unadvised
 from ..planning.options import Objective, PlanOptions
-from ..planning.plan import solve_with
-from ..problem.definition import Goal, Phase, Problem
+from ..planning.result import Plan
+from ..problem.definition import Problem
 from ..problem.read import name_goal
-from ..problem.table import describe_scene
-from ..scene.model import Scene
-from .astar import EAGER, RoadmapRoute, RouteSearch
-from .cuts import Opening, list_cut_borders, list_openings, pass_cut
-from .edges import Blocked, point_out
-from .feasibility import ROUGH, SINGULAR
-from .places import is_at, make_place
-from .result import Alternative, Answer, describe_block
-from .roadmap import Roadmap
-from .route_choice import NEARBY, Chooser
+from ..problem.table import SAME, describe_phase, describe_scene, write_toml
+from .astar import EAGER, BorderBound, Chooser, RoadmapRoute, RouteSearch
+from .cuts import describe_block, describe_border, explain_block, find_opening
+from .edges import Blocked
+from .places import is_at, make_place, require_reach
+from .roadmap import LONGEST, Roadmap
 
 LARGEST = 200_000_000  # Most bytes of a stored roadmap
 _RECURSION = 20_000  # Depth of recursion that pickling a roadmap
-NEAR = 1e-4  # How far beside a goal the hand may close instead, in radii of gyration
-TRIED = 3  # Most numbers with which the goal is looked for
-SYMMETRIC = 1e-9  # Relative difference of lengths and bases up to which the hand is symmetric
-HANDS = (1.05, 0.95, 1.1, 0.9, 1.2, 0.8)
-"""Lengths of fingers and distances of their bases that are tried, relative to the problem's."""
-TIMES, AT_LEAST = 4.0, 20.0
-"""Limit of processor time for other hands: over that of the search, and at least [s]."""
-Try = Callable[[Change, Sequence[int], bool], tuple[float, Sequence[int]] | None]
-"""Looks for the goal with a change, beyond some borders: about how long the route takes [s], which
-is planned if that is asked for, and over which of the borders it leads."""
 ROADMAPS = 4  # scenes whose roadmaps are kept in memory
 _roadmaps: OrderedDict[object, Roadmap] = OrderedDict()
 
@@ -225,7 +199,11 @@ def _plan_to_goal(
     made = chooser.made
     if not made:
         spent, failed = time.process_time() - start, chooser.failures
-        opening, changes, reason = "", tuple[Change, ...](), partial(explain, problem, options)
+        opening, changes, reason = (
+            "",
+            tuple[Change, ...](),
+            partial(explain_block, problem, options),
+        )
         try:
             with yielding():
                 opening, changes = find_opening(search, problem, options, spent, report)
@@ -261,203 +239,6 @@ def _describe_missing(chooser: Chooser, doing: str) -> str:
         count = sum(len(link.steps) for link in best.links)
         text += f", a route of {count} phases found, of about {chooser.estimate(best):.3g} s"
     return f"{text}; what it was at: {doing}"
-
-
-def find_opening(
-    search: RouteSearch,
-    problem: Problem,
-    options: PlanOptions,
-    seconds: float,
-    report: Callable[[str], None],
-) -> tuple[str, tuple[Change, ...]]:
-    """The change of a single number with which the goal is reached, in words and as such.
-
-    It is looked for on the borders that are shut, and tried by a search beyond those that it opens;
-    then among other lengths and places of the fingers.
-
-    Parameters
-    ----------
-    search         which did not reach the goal
-    seconds : [s]  processor time that this has taken
-    """
-    report("looking for a number that opens the way")
-    cuts = list_cut_borders(search)
-
-    def find(
-        change: Change, beyond: Sequence[int], planned: bool
-    ) -> tuple[float, Sequence[int]] | None:
-        try:
-            changed = problem.with_(change.values)
-        except InputError:
-            return None
-        routes = {k: pass_cut(search, cuts[k], change) for k in beyond}
-        sources = [route for route in routes.values() if route is not None]
-        if not sources:
-            return None
-        found = _search_changed(changed, search.start.z, search.goal, options, planned, sources)
-        if found is None:
-            return None
-        last = {k: route.links[-1] for k, route in routes.items() if route}
-        return found[1], [k for k, link in last.items() if link in found[0].links]
-
-    text, changes = choose_opening(list_openings(cuts), find)
-    if changes:
-        return text, changes
-    hands, changes = find_hand(search, problem, options, seconds, report)
-    return hands if changes or not text else f"{text}; {hands}", changes
-
-
-def choose_opening(openings: Sequence[Opening], find: Try) -> tuple[str, tuple[Change, ...]]:
-    """The first number with which the goal is reached, and the least change of it that does."""
-    tried = list[str]()
-    for opening in openings[:TRIED]:
-        most = opening.open_all()
-        route = find(most, opening.list_open(most), False)
-        # Borders beyond those that the route crosses may need the larger change.
-        least = most if route is None else opening.open_all(route[1])
-        for change in dict.fromkeys((least, most)) if route else ():
-            found = find(change, opening.list_open(change), True)
-            if found is not None:
-                return _describe_reached(change, found[0]), (change,)
-        tried.append(str(most))
-    return f"the goal is not reached with {', nor with '.join(tried)}" if tried else "", ()
-
-
-def _describe_reached(change: Change, duration: float) -> str:
-    return f"with {change} the goal is reached, in about {duration:.3g} s"
-
-
-def _search_changed(
-    changed: Problem,
-    z: Array,
-    goal: Goal,
-    options: PlanOptions,
-    planned: bool,
-    sources: Sequence[RoadmapRoute] = (),
-    most: int = NEARBY,
-) -> tuple[RoadmapRoute, float] | None:
-    """Look for any route from `z` in a changed scene, and about how long it takes [s]."""
-    changed = replace(changed, start=z)
-    roadmap = Roadmap(changed, options.uniqueness_margin)
-    search = RouteSearch(roadmap, make_place(changed.scene, z), goal, sources=sources)
-    rough = replace(options, objective=Objective.TIME, duration=None, accuracy=ROUGH, robust=0.0)
-    rough = replace(rough, mode_search=False, certify=False, replay=False)
-    chooser = Chooser(changed, [], search, rough, first_only=True)
-    try:
-        route = chooser.find_first(lambda _: None, most)
-        if route is None:
-            return None
-        if not planned:
-            return route, route.duration
-        chooser.plan(1, lambda _: None)
-    except np.linalg.LinAlgError:
-        return None
-    return (chooser.made[0][1], chooser.made[0][0].duration) if chooser.made else None
-
-
-def find_hand(
-    search: RouteSearch,
-    problem: Problem,
-    options: PlanOptions,
-    seconds: float,
-    report: Callable[[str], None],
-) -> tuple[str, tuple[Change, ...]]:
-    """The least change of `list_hands` with which the goal is reached from the same pose."""
-    tried, stop = 0, time.process_time() + max(TIMES * seconds, AT_LEAST)
-    with suppress(OutOfTime):
-        for change in list_hands(problem.scene):
-            if time.process_time() > stop:
-                break
-            report(f"looking for routes with {change}")
-            tried += 1
-            try:
-                changed = problem.with_(change.values)
-                require_reach(changed.scene, search.goal, float(search.start.z[2]))
-            except (InputError, InfeasibleError):
-                continue
-            closed = close_fingers(changed.scene, *search.start.z[[0, 2], None])
-            if closed.obstacle.any():
-                continue
-            z, goal = closed.z[0], search.goal
-            found = _search_changed(changed, z, goal, options, True, most=EAGER.most)
-            if found is not None:
-                return _describe_reached(change, found[1]), (change,)
-    most = f"{100 * (max(HANDS) - 1):.0f} %"
-    text = f"the goal is not reached with {tried} other lengths or bases of the fingers"
-    return f"{text}, up to {most} off", ()
-
-
-def list_hands(scene: Scene) -> list[Change]:
-    """Lengths and bases of the fingers that are tried: of both alike where they are, by size."""
-    right, left = scene.fingers
-    (first, _), (second, _) = np.asarray(right.base).tolist(), np.asarray(left.base).tolist()
-    half, base = (first - second) / 2, "fingers.{}.base[1]"
-    given: list[tuple[str, float, float, tuple[str, ...]]]
-    # Bases first: they have decided more often than lengths.
-    if math.isclose(first, -second, rel_tol=SYMMETRIC):
-        keys = base.format(1), base.format(2)
-        given = [("x of base 1, mirrored for base 2,", first, half, keys)]
-    else:
-        given = [
-            ("x of base 1", first, half, (base.format(1),)),
-            ("x of base 2", second, -half, (base.format(2),)),
-        ]
-    if math.isclose(right.length, left.length, rel_tol=SYMMETRIC):
-        given.append(("length of both fingers", right.length, right.length, ("length",)))
-    else:
-        given.append(("length of finger 1", right.length, right.length, ("fingers.1.length",)))
-        given.append(("length of finger 2", left.length, left.length, ("fingers.2.length",)))
-    return [
-        Change(Parameter(name, value, "m", 1 if scale > 1 else -1, *keys), float(f"{moved:.3g}"))
-        for scale in HANDS
-        for name, value, size, keys in given
-        for moved in (value + (scale - 1) * size,)
-    ]
-
-
-def explain(problem: Problem, options: PlanOptions, blocked: Blocked) -> str:
-    """The violated limit of a motion along a border of the cut, in words."""
-    (step,) = blocked.steps
-    # A contact may touch at the start already, or be gained both ways; a coordinate is unique.
-    for until in (step.until, point_out(step.contacts, blocked.stop.z)):
-        phase = Phase(0, Formation(problem.scene, step.contacts), until)
-        single = replace(problem, start=blocked.start.z, phases=(phase,), goals=())
-        try:
-            with unadvised():
-                solve_with(single, replace(options, replay=False))
-        except InputError:
-            continue
-        except InfeasibleError as error:
-            if error.shortfalls:
-                short = error.shortfalls[0]
-                return f"{short.limit} is {short.amount:.3g} {short.unit} short"
-        except WholearmError:
-            break
-        except np.linalg.LinAlgError:
-            return SINGULAR
-        break
-    return blocked.reason
-
-
-def require_reach(scene: Scene, goal: Goal, near: float) -> None:
-    """Check that both fingers close on an object that lies at a goal.
-
-    Parameters
-    ----------
-    near : [rad]  angle of the object before
-
-    Raises
-    ------
-    InfeasibleError  if they do not; says where they would
-    """
-    if goal.x is None:
-        return
-    phi = goal.find_angle(scene, near)
-    x = goal.x + NEAR * scene.scales.length * np.array([0.0, -1.0, 1.0])
-    closed = close_fingers(scene, x, np.full(3, phi))
-    if (closed.obstacle > 0).any(axis=1).all():
-        why, where = describe_obstacle(closed), name_reach(scene, phi)
-        raise InfeasibleError(f"nothing leads to {goal}: {why} there; {where}")
 
 
 def require_folder(folder: Path) -> None:
@@ -499,3 +280,129 @@ def _name_file(folder: Path, key: str) -> Path:
     """The file of a scene: another one for other versions."""
     versions = f"{__version__} {ca.__version__} {np.__version__} {sys.version}"
     return folder / f"{hashlib.sha256(f'{versions} {key}'.encode()).hexdigest()[:32]}.chart"
+
+
+NOT_CONSIDERED = (
+    "not considered: rolling contacts, formations without the palm or without one of the fingers, "
+    f"more than {LONGEST} borders passed without a stop, impacts out of or into cells, motions "
+    "through cells that no straight way from rest shows to be possible, and what is further than "
+    f"{EAGER.most} places; phases may be as many as it takes"
+)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Alternative(Result):
+    """A route with its plan."""
+
+    plan: Plan
+
+    @property
+    def problem(self) -> Problem:
+        """The problem with phases, the route, in place of its goals."""
+        return self.plan.problem
+
+    @property
+    def headline(self) -> str:
+        """Value, duration and number of phases, in a line."""
+        return f"{self.plan.headline}, phases: {len(self.problem.phases)}"
+
+    @property
+    def document(self) -> Document:
+        """The lines of `describe`, and the phases of the route."""
+        rows = [
+            (phase.number, ", ".join(phase.formation.names), str(phase.until), phase.end.value)
+            for phase in self.problem.phases
+        ]
+        route = Table(["phase:d", "contacts", "until", "end"], rows)
+        return Document("", parts=[*self.describe(), route])
+
+    def describe(self) -> list[str]:
+        """Value and duration, in lines."""
+        return [f"{self.plan.value:.6f} {self.plan.unit}, {self.plan.duration:.6f} s"]
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The content of JSON files."""
+        phases = list(self.problem.table.get("phases", []))
+        return {"value": self.plan.value, "duration": self.plan.duration, "phases": phases}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Answer(Alternative):
+    """The best route that was found, with its plan."""
+
+    route: RoadmapRoute  # to the last goal
+    # lower bound of routes along borders; None with several goals or an interrupted search
+    bound: BorderBound | None
+    alternatives: tuple[Alternative, ...]
+    failures: tuple[str, ...]  # why routes have no plan
+    blocked: tuple[Blocked, ...]  # borders that no motion can follow
+    settled: int  # places that were looked at
+    complete: bool  # whether the search ended by itself
+
+    @property
+    def gap(self) -> float | None:
+        """Relative gap of the duration to the bound.
+
+        None without a bound, for routes through cells, and for other objectives.
+        """
+        timed = self.plan.options.goal is Objective.TIME
+        if self.bound is None or self.bound.value <= 0 or self.route.in_cells or not timed:
+            return None
+        return max(0.0, self.plan.duration / self.bound.value - 1.0)
+
+    def to_text(self) -> str:
+        """The route as ``[[phases]]``, and how good it is, as comments."""
+        lines = [f"# {line}" for line in self.describe()]
+        lines += ["", format_phases(self.problem).rstrip()]
+        for number, other in enumerate(self.alternatives, start=2):
+            lines += [
+                "",
+                f"# alternative {number}: {other.describe()[0]}",
+                *(f"# {line}".rstrip() for line in format_phases(other.problem).splitlines()),
+            ]
+        return "\n".join(lines).rstrip() + "\n"
+
+    def describe(self) -> list[str]:
+        """Value, bound and statistics of the search, in lines."""
+        plan, count = self.plan, len(self.problem.phases)
+        lines = [
+            f"{count} phase{'s'[: count != 1]}, {plan.options.goal.value} = {plan.value:.6f} "
+            f"{plan.unit}, {plan.duration:.6f} s in all"
+        ]
+        if not self.complete:
+            lines.append("the search ended early: the best route so far")
+        if self.bound is not None:
+            text = "no route along borders, with stops or impacts, "
+            # The bound is at most the duration of the plan.
+            none = self.route.in_cells and self.bound.value >= plan.duration
+            text += "is faster" if none else f"takes less than {self.bound.value:.6f} s"
+            text += "" if self.gap is None else f": gap {100 * self.gap:.2g} %"
+            ended = "" if self.bound.complete else " (the search for such routes ended early)"
+            lines.append(text + ended)
+        if self.route.in_cells:
+            lines.append("this one leads through cells, where nothing bounds times from below")
+        tried = f"{self.settled} places looked at, {len(self.blocked)} ways blocked"
+        lines.append(f"{tried}, {len(self.failures)} routes without a plan")
+        return [*lines, NOT_CONSIDERED]
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The content of JSON files."""
+        return {
+            **super().values,
+            "unit": self.plan.unit,
+            "bound": None if self.bound is None else self.bound.value,
+            "gap": self.gap,
+            "complete": self.complete,
+            "in_cells": self.route.in_cells,
+            "alternatives": [other.values for other in self.alternatives],
+            "failures": list(self.failures),
+            "blocked": [f"{describe_border(b)}: {b.reason}" for b in self.blocked],
+            "not_considered": NOT_CONSIDERED,
+        }
+
+
+def format_phases(problem: Problem) -> str:
+    """The phases of a problem as `[[phases]]` of a problem file."""
+    return write_toml({"phases": [describe_phase(phase, SAME) for phase in problem.phases]})[1:]

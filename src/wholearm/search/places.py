@@ -9,6 +9,8 @@ from itertools import combinations, product
 import numpy as np
 
 from ..common.arrays import Array
+from ..common.errors import InfeasibleError
+from ..contacts.closing import close_fingers, describe_obstacle, name_reach
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, find_touching
 from ..geometry.curve import Curve, describe_pose, find_root, refine
@@ -177,3 +179,27 @@ def measure_turn(place: RoadmapPlace, goal: Goal) -> float:
     """Least angle that the object has to turn to the goal [rad]."""
     phi = float(place.z[2])
     return abs(goal.find_angle(place.scene, phi) - phi)
+
+
+NEAR = 1e-4  # How far beside a goal the hand may close instead, in radii of gyration
+
+
+def require_reach(scene: Scene, goal: Goal, near: float) -> None:
+    """Check that both fingers close on an object that lies at a goal.
+
+    Parameters
+    ----------
+    near : [rad]  angle of the object before
+
+    Raises
+    ------
+    InfeasibleError  if they do not; says where they would
+    """
+    if goal.x is None:
+        return
+    phi = goal.find_angle(scene, near)
+    x = goal.x + NEAR * scene.scales.length * np.array([0.0, -1.0, 1.0])
+    closed = close_fingers(scene, x, np.full(3, phi))
+    if (closed.obstacle > 0).any(axis=1).all():
+        why, where = describe_obstacle(closed), name_reach(scene, phi)
+        raise InfeasibleError(f"nothing leads to {goal}: {why} there; {where}")

@@ -12,18 +12,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ..common.arrays import Array
-from ..contacts.closing import (
-    Flags,
-    Numbers,
-    contact_table,
-    first_contact,
-    move,
-)
+from ..contacts.closing import Flags, Numbers, contact_table, first_contact, move
 from ..contacts.closing import place as place_at
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
@@ -39,20 +33,20 @@ from ..planning.lower_bound import GIVE
 from ..planning.result import Plan
 from ..problem.definition import End, Goal, Phase, Problem, Until
 from ..scene.model import Scene
-from .border_limits import Unstopped
+from .edge_plans import Measured, PlannedLink
 from .edges import (
     Blocked,
     BorderEdge,
     EdgeStep,
     Link,
     Terms,
+    Unstopped,
     cut_curve,
     follow_borders,
     link_along,
     point_out,
     time_parts,
 )
-from .feasibility import Measured
 from .places import (
     Key,
     RoadmapPlace,
@@ -65,10 +59,6 @@ from .places import (
     measure_along,
     unit_steps,
 )
-
-if TYPE_CHECKING:
-    from .edge_plans import PlannedLink
-
 
 NODES = 12  # intervals of a path
 

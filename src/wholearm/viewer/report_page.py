@@ -26,11 +26,10 @@ from ..figures import plots
 from ..figures.map_figure import BOX, PLACE, SIZE, draw_map, find_room, split
 from ..figures.style import STYLE
 from ..geometry.tracing import load
-from ..mapping.formation_map import Border, FormationMap, build_map, choose_window
+from ..mapping.formation_map import Border, FormationMap, build_map, choose_window, time_borders
 from ..problem.definition import Problem
 from ..results.trajectory import Trajectory
-from ..search.solve import solve
-from ..search.times import time_borders
+from ..search import solve
 from ..verification.verify import verify
 from .movie import Movie, write_movie
 from .page import (
