@@ -355,7 +355,7 @@ def test_the_slope_of_b_is_twice_a_whatever_is_minimised(goal: Objective) -> Non
     given = parameters(nlp, data, units, 1.0, relaxed)
     g = nlp.solver.function.get_function("nlp_g")(pack(nlp, profile, units, 0.1), given)
     # The parabola of the guess is one of the polynomials of b.
-    assert np.abs(g.full()[nlp.columns.g["links"]]).max() < 1e-12
+    assert np.abs(g.full()[nlp.g["links"]]).max() < 1e-12
 
 
 BOX_LIMIT = float(box().scene.torque_limit.max())

@@ -20,9 +20,9 @@ from shipped import FOLDER, HEPTAGON, IMPACTS, plan_of, problem_of
 from wholearm import Phase, PlanOptions, Problem, verify
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError, SolverError
+from wholearm.planning import explain
 from wholearm.planning.blocks import Planning
 from wholearm.planning.explain import explain_motors
-from wholearm.planning.phase_plan import Plans
 from wholearm.planning.plan import solve
 from wholearm.results.trajectory import Samples, Trajectory
 
@@ -295,23 +295,27 @@ def test_a_flip_lands_on_the_next_edge() -> None:
     assert max(np.abs(plan.q_dot[-1]).max(), np.abs(plan.theta_dot[-1]).max()) < 1e-9
 
 
-def test_the_keys_that_keep_a_phase_from_a_plan_are_named(heptagon: Problem) -> None:
+def test_the_keys_that_keep_a_phase_from_a_plan_are_named(
+    heptagon: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
     problem = heptagon.with_(torque_rate_limit1=80.0, actuator_lag=0.002)
     error = SolverError("no plan for phase 1 (...): none was found")
     none = [None] * len(problem.phases)
     planning = Planning(problem, (), PlanOptions(), (), [*none])
-    own = planning, problem.phases[:1], planning.options, error
+    own = planning, problem.phases[:1], problem.start, planning.options, error
 
-    def replan(other: Planning, phases: Sequence[Phase], options: PlanOptions) -> Any:
+    def replan(other: Planning, phases: Sequence[Phase], z: Array, options: PlanOptions) -> Any:
         scene = phases[0].formation.scene
         assert not scene.has_slow_motors and scene is other.problem.scene and options
-        return [SimpleNamespace(motion=SimpleNamespace(duration=0.125))]
+        return [SimpleNamespace(motion=SimpleNamespace(duration=0.125))], None
 
-    def fail(*_: object) -> Plans:
+    def fail(*_: object) -> Any:
         raise InfeasibleError("phase 1 is infeasible")
 
+    monkeypatch.setattr(explain, "plan_block", replan)
     keys = "without torque_rate_limit = 80 and inf N m/s and actuator_lag = 0.002 s"
-    assert f"{keys} there is a plan of 0.125 s for phase 1" in str(explain_motors(*own, replan))
-    neither = str(explain_motors(*own, fail))
+    assert f"{keys} there is a plan of 0.125 s for phase 1" in str(explain_motors(*own))
+    monkeypatch.setattr(explain, "plan_block", fail)
+    neither = str(explain_motors(*own))
     assert f"{keys} none was found either: phase 1 is infeasible" in neither
-    assert explain_motors(replace(planning, problem=heptagon), *own[1:], fail) is error
+    assert explain_motors(replace(planning, problem=heptagon), *own[1:]) is error

@@ -22,7 +22,7 @@ from wholearm.common.errors import InputError, JammingError, ReplayError
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning import replay_check as self_check
 from wholearm.planning.blocks import plan_blocks
-from wholearm.planning.plan import assemble_plan, solve
+from wholearm.planning.plan import solve
 from wholearm.planning.replay_check import (
     RESIDUAL,
     ReplayCheck,
@@ -639,12 +639,10 @@ def test_a_contact_that_falls_a_little_short_is_pressed_more(slide: Problem) -> 
     planning = plan_blocks(easy, trace_phases(easy), options, lambda _: None)
     finest = tuple(replace(own, finer=self_check.REFINEMENTS) for own in planning.blocks)
     planning = replace(planning, problem=slide, blocks=finest)
-    held, trajectory, figures = replay_plan(
-        planning, assemble_plan(planning), assemble_plan, lambda _: None
-    )
+    held, figures = replay_plan(planning, lambda _: None)
     assert figures.least_c_n.value > slide.epsilon
     assert held.more == {0: pytest.approx(self_check.SPARE * short, rel=0.05)}
-    assert np.nanmin(trajectory.c_n) == pytest.approx(slide.epsilon + held.more[0], abs=1e-5)
+    assert np.nanmin(held.trajectory.c_n) == pytest.approx(slide.epsilon + held.more[0], abs=1e-5)
 
 
 @pytest.mark.parametrize("jams", [1, 99])

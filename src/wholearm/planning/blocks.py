@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..common.arrays import Array
+from ..common.document import plain
 from ..common.errors import (
     Change,
     InfeasibleError,
@@ -41,7 +42,7 @@ from ..mechanics.speed_sweep import NoMotionError
 from ..problem.definition import End, Phase, Problem
 from ..results.dwell_record import TorqueChange, change_torques
 from ..results.plan_record import Transition
-from ..results.trajectory import Motion
+from ..results.trajectory import Motion, Trajectory
 from .lower_bound import look_along
 from .nlp import charge
 from .options import Objective, PlanOptions
@@ -53,6 +54,7 @@ from .phase_plan import (
     Plans,
     Settled,
     add_up,
+    assemble_motions,
     end_of,
     make_transition,
     runs_along_curves,
@@ -65,14 +67,7 @@ if TYPE_CHECKING:
 PLAIN = -1  # refinement level: first number of intervals, no search for modes
 BEGUN = -2  # refinement level: coarse plans, which may miss limits between points
 FINEST = 64  # most intervals of a phase in the time domain after refinement
-SKETCH = 24  # intervals of the speed sweep for a least time-to-go
-CLEAR = 0.05  # relative violation above which no better plan of earlier phases helps
-COARSE = 80  # intervals along a curve that are doubled where none are given
-AMPLE = 1.1  # saturation of the margin, over the least normal force of other phases
-MOVED = 1e-9  # distance of two starts, in radii of gyration or radians
-FREE = {"torque_rate_limit": None, "actuator_lag": None, "control_period": None}  # free torques
 BEND = 1e-6  # largest 1 - cosine between tangents that count as the same
-SHORT = 5e-7  # largest shortfall of a margin below epsilon by rounding, over the scene's force
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +125,14 @@ class Planning:
 
         return settle_plans(self.problem, plans)
 
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """The motion with dwells; of its `meta` only rolling contacts and modes."""
+        plans, formations = self.settled.plans, [own.formation for own in self.problem.phases]
+        motions, torques = [plan.motion for plan in plans], [plan.torque for plan in plans]
+        modes = plain([getattr(plan.motion, "modes", ()) for plan in self.plans])
+        return assemble_motions(motions, torques, formations, self.options.samples, modes=modes)
+
     def find_block(self, number: int) -> int:
         """Index of the block with the phase of a number, counted from 1."""
         ends = [block.phases[-1].number for block in self.blocks]
@@ -184,7 +187,8 @@ def _begin_each(planning: Planning, report: Callable[[str], None]) -> Planning:
             begun = plan_next(begun, BEGUN, None, report)
         except WholearmError as error:
             short = error.shortfalls if isinstance(error, InfeasibleError) else ()
-            if not any(over_time[:index]) or any(own.share > CLEAR for own in short):
+            # A better plan of earlier phases does not help against large violations.
+            if not any(over_time[:index]) or any(own.share > 0.05 for own in short):
                 raise
             break
     return begun
@@ -202,8 +206,8 @@ def plan_next(
     z = planning.blocks[-1].end if planning.blocks else problem.start
     if finer == BEGUN and runs_along_curves(phases, options):
         finer = 0
-    least_move = MOVED * problem.scene.scales.length
-    moved = known is not None and measure_speed(problem.scene, known.start - z) > least_move
+    rounding = 1e-9 * problem.scene.scales.length
+    moved = known is not None and measure_speed(problem.scene, known.start - z) > rounding
     if known is None or moved or known.finer != finer:
         numbers = "-".join(str(phase.number) for phase in phases)
         report(f"phase {numbers} of {len(problem.phases)}: {options.goal.value}")
@@ -217,7 +221,7 @@ def plan_next(
                 z,
                 own,
                 to_go=look_ahead(planning, phases, own) if planning.ahead else None,
-                ample=AMPLE * min((plan.value for plan in planning.plans), default=math.inf),
+                ample=1.1 * min((plan.value for plan in planning.plans), default=math.inf),
                 fastest=[least[phase.index] for phase in phases if least],
                 begun=known.plans if known and known.finer == BEGUN else (),
                 only_begin=finer == BEGUN,
@@ -236,7 +240,7 @@ def _refine(options: PlanOptions, known: BlockPlan | None, finer: int) -> PlanOp
     if known is not None and known.chain is None:
         doublings = 0 if known.finer == BEGUN else finer - known.finer
         wanted = min(known.intervals * 2**doublings, FINEST)
-    along = (options.intervals or COARSE) * 2**finer
+    along = (options.intervals or 80) * 2**finer  # doubled where none are given
     return replace(options, intervals=along, time_intervals=wanted)
 
 
@@ -263,9 +267,6 @@ def plan_block(
                 problem, block, z, options, duration, pinned=pinned, along=along, **over_time
             )
 
-        def plan_other(other: Planning, phases: Sequence[Phase], own: PlanOptions) -> Plans:
-            return plan_block(other, phases, z, own)[0]
-
         with charge(block[0].number):
             try:
                 if problem.scene.has_slow_motors:
@@ -274,7 +275,7 @@ def plan_block(
             except (InfeasibleError, SolverError) as error:
                 from .explain import explain_motors
 
-                raise explain_motors(planning, block, options, error, plan_other) from None
+                raise explain_motors(planning, block, z, options, error) from None
     curves = []
     for phase in block:
         traced, later = phase.index < len(known), problem.phases[phase.index + 1 :]
@@ -349,8 +350,9 @@ def _require_margin(planning: Planning) -> Planning:
     if planning.options.goal is not Objective.MARGIN:
         return planning
     epsilon = planning.problem.epsilon
+    rounding = 5e-7 * planning.problem.scene.scales.force
     for phase, plan in zip(planning.problem.phases, planning.plans, strict=True):
-        if plan.value < epsilon - SHORT * planning.problem.scene.scales.force:
+        if plan.value < epsilon - rounding:
             raise InfeasibleError(
                 f"phase {phase.number}: in its share of the duration, "
                 f"{planning.allowed[phase.index]:.5g} s, the largest least c_n is "
@@ -388,7 +390,7 @@ def look_ahead(
     def value(z: Array) -> float:
         if planning.sketches and options.goal is Objective.TIME:
             try:
-                return look_along((trace_phase(phase, z),), problem.epsilon, SKETCH)
+                return look_along((trace_phase(phase, z),), problem.epsilon, intervals=24)
             except NoMotionError:
                 text = f"phase {phase.number}: no motion keeps the limits"
                 raise SolverError(text) from None
@@ -447,7 +449,8 @@ def free_torques(problem: Problem, options: PlanOptions) -> tuple[Problem, PlanO
     if scene.control_period:
         options = replace(options, transcription="auto")
     if scene.has_slow_motors or scene.control_period:
-        problem = problem.with_(FREE)
+        keys = ("torque_rate_limit", "actuator_lag", "control_period")
+        problem = problem.with_(dict.fromkeys(keys))
     return problem, options
 
 

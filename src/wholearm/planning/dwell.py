@@ -51,8 +51,6 @@ from .path_domain.path_mesh import make_grid
 from .path_domain.path_nlp import find_internal_force_range
 from .phase_plan import PhasePlan, Plans, Settled, end_of
 
-_INSIDE = 0.01  # part of the range left out at both ends
-
 
 class Junction(NamedTuple):
     """Torques between two phases, and internal forces [N] on both sides.
@@ -111,8 +109,7 @@ def _list_torques(curve: Curve, epsilon: float, phase: int, place: int) -> tuple
     data = prepare(curve, epsilon, make_grid(curve, np.zeros(0), 3, held=True), phase)  # ends count
     low, high = require_hold(data, phase, place)
     high = min(high, low + 40.0 * curve.formation.scene.scales.force)  # the widest range
-    share = np.linspace(_INSIDE, 1 - _INSIDE, 129)  # internal forces to try
-    lams = low + share * (high - low)
+    lams = low + np.linspace(0.01, 0.99, 129) * (high - low)  # those to try
     forces = data.nodes.forces
     T0, by_lambda = forces.of_tau[place, :, ONE], forces.of_tau[place, :, LAMBDA]
     return T0 + np.outer(lams, by_lambda), lams
@@ -226,10 +223,11 @@ class DwellEnd(NamedTuple):
 
 def settle_plans(problem: Problem, plans: Plans) -> Settled:
     """Add the dwells that the problem asks for to phases that come to rest."""
+    places = find_places(problem, plans)
     if problem.settle_share:
-        ends = share_time(problem, plans)
+        ends = share_time(problem, plans, places)
     else:
-        ends = find_ends(problem, plans, [problem.settles(own) or 0.0 for own in problem.phases])
+        ends = find_ends(problem, places, [problem.settles(own) or 0.0 for own in problem.phases])
     numbered = zip(problem.phases, ends, strict=True)
     settlings = [None if end is None else _describe(problem, phase, end) for phase, end in numbered]
     return Settled(hold_plans(problem, plans, ends), tuple(settlings))
@@ -247,11 +245,14 @@ def find_places(problem: Problem, plans: Plans) -> list[Standstill | None]:
 
 
 def find_ends(
-    problem: Problem, plans: Plans, times: Sequence[float], firm: bool = False
+    problem: Problem,
+    places: Sequence[Standstill | None],
+    times: Sequence[float],
+    firm: bool = False,
 ) -> list[DwellEnd | None]:
     """Dwells of given times [s] at ends at rest; None for all others."""
     ends = list[DwellEnd | None]()
-    for place, time in zip(find_places(problem, plans), times, strict=True):
+    for place, time in zip(places, times, strict=True):
         if place is None or time <= 0:
             ends.append(None)
             continue
@@ -345,37 +346,36 @@ WAYS = (
 STOP = 0.06  # relative dwell time of an end that gains no contact
 
 
-def share_time(problem: Problem, plans: Plans) -> list[DwellEnd | None]:
+def share_time(
+    problem: Problem, plans: Plans, places: Sequence[Standstill | None]
+) -> list[DwellEnd | None]:
     """Dwells by the first allocation with a final error within `problem.gap`, or the best one.
 
     Simulated with the plan's torques from the exact start and from it moved by the gap either way.
     """
+    times = [problem.settles(phase) for phase in problem.phases]
+    whole = problem.settle_share * sum(plan.motion.duration for plan in plans)
     best, least = list[DwellEnd | None](), math.inf
     for way in WAYS:
-        ends = find_ends(problem, plans, _share(problem, plans, way), way.firm)
+        weights, gained = np.zeros(len(times)), 0
+        for k, place in enumerate(places):
+            if place is None or times[k] is not None:
+                continue
+            closes = find_opening(place) is not None
+            weights[k] = (way.more if gained < way.first else 1.0) if closes else STOP
+            gained += closes
+        if gained > way.first:
+            weights[-1] *= way.last
+        shares = whole * weights / max(float(weights.sum()), STOP**2)
+        pairs = zip(shares.tolist(), times, strict=True)
+        allotted = [own if time is None else time for own, time in pairs]
+        ends = find_ends(problem, places, allotted, way.firm)
         off = measure_off(problem, plans, ends) if any(ends) else 0.0
         if not best or off < 0.8 * least:  # a later one has to be better by a fifth
             best, least = ends, off
         if least <= problem.gap:
             break
     return best
-
-
-def _share(problem: Problem, plans: Plans, way: DwellAllocation) -> list[float]:
-    """Dwell time of each end by an allocation [s]."""
-    times = [problem.settles(phase) for phase in problem.phases]
-    weights, gained = np.zeros(len(times)), 0
-    for k, place in enumerate(find_places(problem, plans)):
-        if place is None or times[k] is not None:
-            continue
-        closes = find_opening(place) is not None
-        weights[k] = (way.more if gained < way.first else 1.0) if closes else STOP
-        gained += closes
-    if gained > way.first:
-        weights[-1] *= way.last
-    whole = problem.settle_share * sum(plan.motion.duration for plan in plans)
-    shares = whole * weights / max(float(weights.sum()), STOP**2)
-    return [own if time is None else time for own, time in zip(shares.tolist(), times, strict=True)]
 
 
 def measure_off(problem: Problem, plans: Plans, ends: Sequence[DwellEnd | None]) -> float:

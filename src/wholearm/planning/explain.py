@@ -39,7 +39,7 @@ from ..problem.definition import Phase, Problem
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..scene.model import Scales, Scene
-from .blocks import Planning, free_torques
+from .blocks import Planning, free_torques, plan_block
 from .dwell import require_hold
 from .options import Objective, PlanOptions
 from .path_domain.path_data import PhaseData, cut, fit_torque, join
@@ -57,21 +57,14 @@ from .path_domain.path_nlp import (
     unpack,
 )
 from .path_domain.path_plan import PathIterate, Task, plan_curves, plan_task
-from .phase_plan import Plans, assemble_motions, runs_along_curves
+from .phase_plan import assemble_motions, runs_along_curves
 from .time_domain.guesses import PathMargin
 from .time_domain.solution import TimeSearch
 from .time_domain.stage import Scheme, Stage, blend, to_si
 from .time_domain.time_motion import make_phase_motions
 
-LEAST = "misses limits least"  # status of motions of least violation
-ROWS = 201  # rows of each phase of a motion of least violation
-DIGITS = 3  # significant digits of advised values
-_BEYOND = (0.0, 0.005, 0.015, 0.05, 0.15, 0.5)
-"""Relative distances beyond the least change to try: plans keep limits between nodes too."""
 ADVICE = 0.6  # processor time [s] after which no change is tried for phases over time
 FRICTION = "friction"  # beginning of the keys of frictions
-_FASTER = (2.0, 10.0, 100.0)  # factors on torque rate limits with which plans are tried
-MISSED = 0.02  # least margin by which limits are missed along an infeasible path
 _unadvised: ContextVar[bool] = ContextVar("_unadvised", default=False)
 Replan = Callable[[Parameter, float], object]  # plans with another value of a parameter, or raises
 E = TypeVar("E", InfeasibleError, JammingError)
@@ -151,7 +144,9 @@ def find_changes(
     changes = []
     for parameter in parameters:
         sign, least, failed = parameter.sign, find_value(parameter), math.nan
-        beyond = [] if least is None else [least * (1 + sign * share) for share in _BEYOND]
+        # Plans keep limits between nodes too, which the least change does not.
+        shares = (0.0, 0.005, 0.015, 0.05, 0.15, 0.5)
+        beyond = [] if least is None else [least * (1 + sign * share) for share in shares]
         for value in dict.fromkeys(round_outwards(own, sign) for own in beyond):
             if value < 0:
                 break
@@ -183,11 +178,11 @@ def bracket(
     return enough
 
 
-def round_outwards(value: float, sign: int, digits: int = DIGITS) -> float:
-    """Round to significant digits, up for the sign 1 and down for -1."""
+def round_outwards(value: float, sign: int) -> float:
+    """Round to three significant digits, up for the sign 1 and down for -1."""
     if value == 0 or not math.isfinite(value):
         return value
-    place = digits - 1 - math.floor(math.log10(abs(value)))
+    place = 2 - math.floor(math.log10(abs(value)))
     # Values of so few digits stay, whatever their last bits are.
     scaled = round(value * 10.0**place, 6)
     whole = math.ceil(scaled) if sign > 0 else math.floor(scaled)
@@ -323,7 +318,7 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
     with suppress(SolverError):  # it stalls
         torques = [fit_torque(*pair)[0] for pair in zip(parts, motions, strict=True)]
         formations = [part.curve.formation for part in parts]
-        missing = assemble_motions(motions, torques, formations, ROWS, status=LEAST)
+        missing = assemble_motions(motions, torques, formations, 201, status="misses limits least")
     error = _describe_least(task.phases, shortfalls, missing)
     return advise(error, may_change, find_value, partial(_replan_task, task))
 
@@ -427,7 +422,7 @@ def _explain_rate_limits(task: Task, parts: Sequence[PhaseData], reason: str) ->
     except WholearmError as error:
         return error
     change = "a plan was found for motors without limits"
-    for factor in _FASTER:
+    for factor in (2.0, 10.0, 100.0):
         faster = [_raise_rate_limits(curve, factor) for curve in task.curves]
         try:
             plan_curves(faster, *rest, False, task.pins)
@@ -479,9 +474,9 @@ def refuse(
         blocked = statics.find_block(epsilon, ends=True)
         say = "at its end, {}, no motion comes to rest in any contact mode"
     if blocked is None:
-        z = np.concatenate([stage.guess.z.reshape(-1, 5) for stage in stages])
         first = stages[0].formation
         names = " ".join(first.names)
+        z = np.concatenate([own.guess.z.reshape(-1, 5) for own in stages])
         if alone and [contact.finger for contact in first.contacts] == [None, None]:
             raise InfeasibleError(
                 f"phase {phase.number} is infeasible: no finger drives the object on {names}, and "
@@ -544,7 +539,7 @@ def _refuse_unheld(problem: Problem, phase: Phase, stage: Stage, node: int) -> N
 
 def refuse_paths(problem: Problem, phase: Phase, margins: Sequence[PathMargin]) -> None:
     """Raise an InfeasibleError with the critical limit if along every path one is missed."""
-    if not margins or (best := max(margins, key=lambda own: own.value)).value > -MISSED:
+    if not margins or (best := max(margins, key=lambda own: own.value)).value > -0.02:
         return
     limits = make_limits(phase.formation, problem.epsilon).limits
     limit = next(own for own in limits if (own.kind, own.part) == best[1:3])
@@ -610,7 +605,7 @@ def explain_stages(
     motions = make_phase_motions(stages, search.scheme, phases)
     torques = [motion.torque for motion in motions]
     formations = [phase.formation for phase in phases]
-    motion = assemble_motions(motions, torques, formations, ROWS, status=LEAST)
+    motion = assemble_motions(motions, torques, formations, 201, status="misses limits least")
     known = make_limits(phases[0].formation, problem.epsilon).parameters
     error = _describe_least(numbers, lists[best], motion)
     return advise(error, known, find_value, replan, ADVICE)
@@ -653,11 +648,11 @@ def _unit_of(parameter: Parameter, scales: Scales) -> float:
 def explain_motors(
     planning: Planning,
     block: Sequence[Phase],
+    z: Array,
     options: PlanOptions,
     error: InfeasibleError | SolverError,
-    plan_block: Callable[[Planning, Sequence[Phase], PlanOptions], Plans],
 ) -> InfeasibleError | SolverError:
-    """The error with whether the phases have a plan with free torques, found by `plan_block`."""
+    """The error with whether the phases have a plan from `z` with free torques."""
     scene, given = planning.problem.scene, list[str]()
     if scene.control_period:
         given.append(f"control_period = {scene.control_period:g} s ({scene.control_hold})")
@@ -675,9 +670,10 @@ def explain_motors(
     free, own = free_torques(planning.problem, options)
     try:
         phases = [free.phases[phase.index] for phase in block]
-        found = plan_block(replace(planning, problem=free, curves=()), phases, own.roughen())
-    except WholearmError as other:
-        text = f"{error}; without {keys} none was found either: {other}"
+        other = replace(planning, problem=free, curves=())
+        found, _ = plan_block(other, phases, z, own.roughen())
+    except WholearmError as without:
+        text = f"{error}; without {keys} none was found either: {without}"
     else:
         lasts = sum(plan.motion.duration for plan in found)
         text = f"without {keys} there is a plan of {lasts:.4g} s for {where}; with that, {error}"

@@ -9,6 +9,7 @@ it stops on signals, and its runs are recorded.
 from __future__ import annotations
 
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -132,24 +133,20 @@ def build_kernel(x: Symbols, p: Symbols | None = None, **y: Expression) -> Kerne
     )
 
 
-def share(size: int) -> Callable[[Callable[..., _K]], Callable[..., _K]]:
-    """Keep the last `size` kernels, each for all formations with the same equations."""
+def share(build: Callable[..., _K]) -> Callable[..., _K]:
+    """Keep the last 64 kernels, each for all formations with the same equations."""
+    kept = dict[tuple[Any, ...], _K]()
 
-    def decorate(build: Callable[..., _K]) -> Callable[..., _K]:
-        kept = dict[tuple[Any, ...], _K]()
+    @wraps(build)
+    def find(*args: Any) -> _K:
+        key = tuple(arg.equations if isinstance(arg, Formation) else arg for arg in args)
+        # The latest are last.
+        kept[key] = kept.pop(key) if key in kept else build(*args)
+        if len(kept) > 64:
+            del kept[next(iter(kept))]
+        return kept[key]
 
-        @wraps(build)
-        def find(*args: Any) -> _K:
-            key = tuple(arg.equations if isinstance(arg, Formation) else arg for arg in args)
-            # The latest are last.
-            kept[key] = kept.pop(key) if key in kept else build(*args)
-            if len(kept) > size:
-                del kept[next(iter(kept))]
-            return kept[key]
-
-        return find
-
-    return decorate
+    return find
 
 
 class _Block(NamedTuple):
@@ -412,39 +409,21 @@ class SolverStatistics:
         return SolverStatistics(*map(add, astuple(self), astuple(other)))
 
 
-class Ledger:
-    """Costs by the number of the phase that they were for; 0 stands for none in particular."""
-
-    def __init__(self, outer: Ledger | None) -> None:
-        self._outer = outer
-        self._entries: dict[int, SolverStatistics] = {}
-
-    def of(self, phase: int) -> SolverStatistics:
-        """Cost of a phase."""
-        return self._entries.get(phase, SolverStatistics())
-
-    def add(self, phase: int, cost: SolverStatistics) -> None:
-        """Book a cost here, and in the ledger that was open before."""
-        self._entries[phase] = self.of(phase) + cost
-        if self._outer is not None:
-            self._outer.add(phase, cost)
-
-
-_LEDGER: ContextVar[Ledger | None] = ContextVar("ledger", default=None)
-
-
+Ledger = defaultdict[int, SolverStatistics]
+"""Costs by the number of the phase that they were for; 0 stands for none in particular."""
+_LEDGERS: ContextVar[tuple[Ledger, ...]] = ContextVar("ledgers", default=())  # those that are open
 _PHASE: ContextVar[int] = ContextVar("phase", default=0)
 
 
 @contextmanager
 def open_ledger() -> Iterator[Ledger]:
     """Collect what solving costs inside the block."""
-    ledger = Ledger(_LEDGER.get())
-    token = _LEDGER.set(ledger)
+    ledger = Ledger(SolverStatistics)
+    token = _LEDGERS.set((*_LEDGERS.get(), ledger))
     try:
         yield ledger
     finally:
-        _LEDGER.reset(token)
+        _LEDGERS.reset(token)
 
 
 @contextmanager
@@ -458,7 +437,6 @@ def charge(phase: int) -> Iterator[None]:
 
 
 def book(cost: SolverStatistics) -> None:
-    """Add a cost to the ledger that is open, if one is."""
-    ledger = _LEDGER.get()
-    if ledger is not None:
-        ledger.add(_PHASE.get(), cost)
+    """Add a cost to all ledgers that are open."""
+    for ledger in _LEDGERS.get():
+        ledger[_PHASE.get()] += cost

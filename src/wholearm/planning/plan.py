@@ -14,7 +14,6 @@ import casadi as ca
 import numpy as np
 
 from .. import __version__
-from ..common.document import plain
 from ..common.errors import AmbiguityError, InfeasibleError, SolverError
 from ..common.sharing import exclusive
 from ..common.signals import OutOfTime, Reporter, limited
@@ -36,18 +35,14 @@ from .nlp import Ledger, charge, open_ledger
 from .options import Objective, PlanOptions
 from .path_domain.path_motion import PathMotion
 from .path_domain.path_plan import Task, plan_curves
-from .phase_plan import PlanPart, add_up, assemble_motions, combine, plan_stops
+from .phase_plan import PlanPart, add_up, combine, plan_stops
 from .result import Plan, PlannedPhase, Status, Timings, write_meta
 
 if TYPE_CHECKING:
     from .robust.robust_rows import Guide
 
 
-OVER_TIME = "planned over time"
-NO_MOTION = "the sweep over the phase plane finds no motion"
 _STILL = 1e-9  # relative speed of rest but for rounding
-WIDEST = 0.95  # largest relative range that is tried
-_MOST = 1e3  # largest factor on ranges that is tried
 
 
 def solve(
@@ -126,16 +121,15 @@ def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]
                 about = {"name": problem.name, "epsilon": problem.epsilon, "problem": problem.table}
                 error.motion = replace(error.motion, meta=error.motion.meta | about)
             raise
-        trajectory, figures = assemble_plan(planning), None
-        unique = check_uniqueness(problem, trajectory, options.uniqueness_margin)
-        planned = time.perf_counter()
+        unique = check_uniqueness(problem, planning.trajectory, options.uniqueness_margin)
+        planned, figures = time.perf_counter(), None
         if options.replay:
             from .replay_check import replay_plan
 
-            first = trajectory
-            planning, trajectory, figures = replay_plan(planning, trajectory, assemble_plan, report)
-            if trajectory is not first:
-                unique = check_uniqueness(problem, trajectory, options.uniqueness_margin)
+            first = planning
+            planning, figures = replay_plan(planning, report)
+            if planning is not first:
+                unique = check_uniqueness(problem, planning.trajectory, options.uniqueness_margin)
         replayed = time.perf_counter()
         transitions = _assess(planning, report)
         assessed = time.perf_counter()
@@ -155,7 +149,7 @@ def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]
             options,
             Status.of(phases),
             combine(options.goal, [phase.value for phase in phases]),
-            trajectory,
+            planning.trajectory,
             phases,
             tuple(transitions),
             figures,
@@ -176,15 +170,7 @@ def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]
             certificate,
             ranges,
         )
-        return replace(plan, trajectory=replace(trajectory, meta=write_meta(plan)))
-
-
-def assemble_plan(planning: Planning) -> Trajectory:
-    """The trajectory of a planning; of its `meta` only rolling contacts and modes."""
-    plans, formations = planning.settled.plans, [own.formation for own in planning.problem.phases]
-    motions, torques = [plan.motion for plan in plans], [plan.torque for plan in plans]
-    modes = plain([getattr(plan.motion, "modes", ()) for plan in planning.plans])
-    return assemble_motions(motions, torques, formations, planning.options.samples, modes=modes)
+        return replace(plan, trajectory=replace(plan.trajectory, meta=write_meta(plan)))
 
 
 def _list_phases(
@@ -194,7 +180,7 @@ def _list_phases(
     return tuple(
         PlannedPhase(
             phase.number,
-            ledger.of(phase.number),
+            ledger[phase.number],
             plan.value,
             held.motion.duration,
             tuple(contact.name for contact in phase.formation.rolling),
@@ -282,13 +268,13 @@ def certify(planning: Planning) -> Certificate:
         times = [plan.motion.duration for plan in block.plans]
         numbers = tuple(phase.number for phase in block.phases)
         if block.chain is None:
-            bounds.append(TimeBound(numbers, sum(times), None, None, OVER_TIME))
+            bounds.append(TimeBound(numbers, sum(times), None, None, "planned over time"))
         for part in block.chain.split() if block.chain else ():
             phases = tuple(phase.number for phase in part.phases)
             duration = sum(times[number - numbers[0]] for number in phases)
             found = bound_least_time(part.continuous_curves, planning.problem.epsilon)
-            figures = (None, None, NO_MOTION) if found is None else found
-            bounds.append(TimeBound(phases, duration, *figures))
+            reason = "the sweep over the phase plane finds no motion"
+            bounds.append(TimeBound(phases, duration, *(found or (None, None, reason))))
     return Certificate(tuple(bounds))
 
 
@@ -312,7 +298,8 @@ def assess_ranges(planning: Planning, report: Callable[[str], None]) -> RangeFig
         return figures
     unit = options.scale_ranges(problem.ranges, 1.0).ranges
     relative = [unit[own.name] for own in PARAMETERS if not own.unit]
-    most, found = WIDEST / max(max(relative), WIDEST / _MOST), dict[int, float]()
+    # Relative ranges up to 0.95, and up to a thousand times the problem's own.
+    most, found = min(0.95 / max(*relative, 1e-300), 1e3), dict[int, float]()
     chains = [block.chain for block in planning.blocks if block.chain is not None]
     for part in (part for chain in chains for part in chain.split()):
         numbers = [phase.number for phase in part.phases]

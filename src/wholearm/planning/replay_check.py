@@ -33,7 +33,6 @@ REFINEMENTS = 3  # most doublings of the intervals of a block
 ROUGH = 2  # the same in the time domain, before the mode search is left out: some modes never hold
 SPARE = 2.0  # additional normal force over a small shortfall
 RESIDUAL = 1e-8  # largest relative residual of the equations of motion; rounding leaves 1e-13
-DENSE = 201  # rows per phase for the equations of motion, if the trajectory has not half as many
 _FINER = 8.0  # divisor of the error of the rows of a table when its replay does not hold
 _ATTEMPTS = 3  # most tables that are tried
 
@@ -85,15 +84,11 @@ class ReplayCheck(NamedTuple):
 
 
 def replay_plan(
-    planning: Planning,
-    trajectory: Trajectory,
-    build: Callable[[Planning], Trajectory],
-    report: Callable[[str], None],
-) -> tuple[Planning, Trajectory, ReplayFigures]:
+    planning: Planning, report: Callable[[str], None]
+) -> tuple[Planning, ReplayFigures]:
     """Replay a plan and refine blocks until it holds; ReplayError if it does not.
 
-    `build` gives the trajectory of another planning. Blocks are refined, too, if the plan holds by
-    the tolerances of `verify` only.
+    Blocks are refined, too, if the plan holds by the tolerances of `verify` only.
     """
     problem, usual = planning.problem, Allowance()
     strict = usual.scale(0.5)  # share of the tolerances for a plan, if there is another
@@ -101,16 +96,16 @@ def replay_plan(
     while True:
         simulations += 1
         report("replaying the plan")
-        check, accepted = check_plan(problem, trajectory, strict, usual)
+        check, accepted = check_plan(problem, planning.trajectory, strict, usual)
         if check.failure is None:
             break
         if accepted.failure is None:
-            known = planning, trajectory, accepted
-        durations = np.diff(trajectory.phase_starts)
+            known = planning, accepted
+        durations = np.diff(planning.trajectory.phase_starts)
         number = check.find_culprit(problem.scene.scales, strict, durations)
         better = _improve(planning, number, accepted, report)
         if better is None and known is not None:
-            planning, trajectory, check = known
+            planning, check = known
             break
         if better is None:
             block = planning.blocks[planning.find_block(number)]
@@ -121,7 +116,7 @@ def replay_plan(
                 f"{reason}; other intervals or another objective may do, and "
                 "--no-replay (replay=False) leaves the check out"
             )
-        planning, trajectory = better, build(better)
+        planning = better
     assert isinstance(check.report, Report)
     found = [(find_least_force(phase), phase.number) for phase in check.report.phases]
     forces = [(own, number) for own, number in found if own is not None]
@@ -137,7 +132,7 @@ def replay_plan(
         check.report.steps,
         simulations,
     )
-    return planning, trajectory, figures
+    return planning, figures
 
 
 def _improve(
@@ -209,8 +204,8 @@ def check_plan(
 
 def find_residual(problem: Problem, trajectory: Trajectory) -> Residual:
     """Largest residual of the equations of motion at the samples of a trajectory."""
-    if len(trajectory.t) < DENSE / 2 * len(trajectory.motions):
-        trajectory = assemble(trajectory.motions, trajectory.torque, {}, DENSE)
+    if len(trajectory.t) < 100 * len(trajectory.motions):
+        trajectory = assemble(trajectory.motions, trajectory.torque, {}, 201)  # rows per phase
     worst = Residual(0.0, 1, "")
     for phase in problem.phases:
         # Forces are not determined in a dwell.

@@ -35,9 +35,6 @@ _KEYS = {
 _OPTIONS = [own.name for own in fields(PlanOptions)]
 _OPTIONS = [name for name in _OPTIONS if name not in ("objective", "replay", "ranges")]
 """Options that stand in `meta` by themselves."""
-_UNITS = ("m", "rad", "s")  # what files call the fields of deviations
-UNITS = {Objective.TIME: "s", Objective.EFFORT: "(N m)^2 s", Objective.MARGIN: "N"}
-"""Units of objectives."""
 
 
 class Status(Enum):
@@ -121,7 +118,8 @@ class Plan(Drawn, Result):
     @property
     def unit(self) -> str:
         """Unit of the objective."""
-        return UNITS[self.options.goal]
+        units = {Objective.TIME: "s", Objective.EFFORT: "(N m)^2 s", Objective.MARGIN: "N"}
+        return units[self.options.goal]
 
     @property
     def error(self) -> float:
@@ -202,7 +200,7 @@ def write_meta(plan: Plan) -> dict[str, Any]:
     # Deviations have the names of their units in files.
     for own in values["replay"]["phases"] if plan.replay else ():
         for key in ("end_deviation", "deviation"):
-            own[key] = own[key] and dict(zip(_UNITS, own[key].values(), strict=True))
+            own[key] = own[key] and dict(zip(("m", "rad", "s"), own[key].values(), strict=True))
     return values | {"problem": plan.problem.table}
 
 

@@ -64,7 +64,6 @@ from .path_motion import (
 CHAINED = (Objective.MARGIN, Objective.RELAX)  # with one more unknown, copied at every node
 SOFT = (Objective.ELASTIC, Objective.RELAX)  # with a row for each side of the soft limits
 LEAST_B = 1e-8  # least |s''| at rest and b elsewhere, over typical ones: sqrt(b) is differentiable
-_ROUGH = 0.1  # regularization by the highest Legendre coefficients: no oscillation within elements
 
 
 class MotorShape(NamedTuple):
@@ -109,22 +108,6 @@ class LimitShape(NamedTuple):
             tuple(np.flatnonzero(of_tau | of_rates | drags).tolist()),
             motors or MotorShape(),
         )
-
-
-class NLPColumns(NamedTuple):
-    """Blocks of the vectors of an NLP."""
-
-    # unknowns of each node: b over its size (none at the two ends), a, internal force, and `extra`:
-    # shortfalls for `elastic`, the least margin, or the relaxation for `relax`
-    node: Columns
-    # speeds at the `ends`, `steps`, `weight` of time, unit of internal force in the regularization;
-    # coefficients of the limits at the nodes, column by column (the constant ones are part of the
-    # bounds); constant torques and weights of joints for `effort`; how limits and b's one give way
-    # for `relax`; 1 / rate limits, lags, bends of elements and `sizes` of b for rate limits
-    p: Columns
-    # b' = 2 a; the `chain` of the margin or the relaxation; node by node the `limits`, side by side
-    # where they are soft, and the speed for `relax`; the `duration` for `margin`; rate limits
-    g: Columns
 
 
 def _find_lengths(h: Expression) -> Expression:
@@ -263,14 +246,24 @@ class PathNLP:
     solver: Expression  # takes x0, p, bounds and multipliers; see `build_path_nlp` for their order
     shape: LimitShape
     intervals: int
-    columns: NLPColumns
     objective: Objective
+    # unknowns of each node: b over its size (none at the two ends), a, internal force, and `extra`:
+    # shortfalls for `elastic`, the least margin, or the relaxation for `relax`
+    node: Columns
+    # speeds at the `ends`, `steps`, `weight` of time, unit of internal force in the regularization;
+    # coefficients of the limits at the nodes, column by column (the constant ones are part of the
+    # bounds); constant torques and weights of joints for `effort`; how limits and b's one give way
+    # for `relax`; 1 / rate limits, lags, bends of elements and `sizes` of b for rate limits
+    p: Columns
+    # b' = 2 a; the `chain` of the margin or the relaxation; node by node the `limits`, side by side
+    # where they are soft, and the speed for `relax`; the `duration` for `margin`; rate limits
+    g: Columns
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:
         """Which entries of the (N + 1, columns) array of unknowns are not b at an end."""
-        mask = np.ones((self.intervals + 1, self.columns.node.count), dtype=bool)
-        mask[[0, -1], self.columns.node["b"]] = False
+        mask = np.ones((self.intervals + 1, self.node.count), dtype=bool)
+        mask[[0, -1], self.node["b"]] = False
         return mask
 
 
@@ -325,7 +318,7 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
         first, second = _find_bends(a, 1), _find_bends(a, 2)
         rough += 1e3 * ca.horzcat(first[0], second[1:-1], first[-1])
         node_costs[:-1] += 1e-4 * (a[1:] - a[:-1]) ** 2
-    node_costs[0] += share * _ROUGH * ca.sum2(lengths * rough)
+    node_costs[0] += share * 0.1 * ca.sum2(lengths * rough)  # no oscillation within elements
     if objective is Objective.TIME:
         node_costs += times
     elif effort:
@@ -383,8 +376,8 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
         # Large gradients of the time next to rest would scale the objective down.
         strategy |= {"nlp_scaling_method": "none"}
     solver = build_solver("path_nlp", nlp, 1e-9, max_iter=300, **strategy)
-    columns = NLPColumns(Columns(b=1, a=1, lam=1, extra=extra.shape[1]), p, g)
-    return PathNLP(solver, shape, intervals, columns, objective)
+    node = Columns(b=1, a=1, lam=1, extra=extra.shape[1])
+    return PathNLP(solver, shape, intervals, objective, node, p, g)
 
 
 def parameters(
@@ -423,7 +416,7 @@ def parameters(
                 share = data.nodes.rates @ limit.rows[0, -2:] / limit.high[0]
         blocks["rates"] = share**2 * b_unit
     return np.asarray(
-        nlp.columns.p.join(
+        nlp.p.join(
             ends=np.zeros(2),
             steps=data.grid.steps / units.length,
             weight=[time_weight / units.power],
@@ -444,7 +437,7 @@ def make_bounds(
 ) -> dict[str, Array]:
     """Bounds of the NLP, with every limit tightened."""
     tight, speed_share, duration, *_ = tightening
-    n, node = len(data.grid.s), nlp.columns.node
+    n, node = len(data.grid.s), nlp.node
     low, high = np.full((n, node.count), -np.inf), np.full((n, node.count), np.inf)
     b_max = data.largest_b(data.nodes, relaxation.parameter if relaxation else None)
     # Next to rest b is 2 s times the least s''.
@@ -470,17 +463,17 @@ def make_bounds(
     sides = bounds + signs * tight - data.find_terms()[:, rows, ONE]
     sides /= units.of(data.limits)[rows]
     side = np.arange(len(rows)) if nlp.objective in SOFT else rows
-    width = nlp.columns.g.sizes["limits"] // n
+    width = nlp.g.sizes["limits"] // n
     rows_low, rows_high = np.full((n, width), -np.inf), np.full((n, width), np.inf)
     rows_low[:, side[signs > 0]] = sides[:, signs > 0]
     rows_high[:, side[signs < 0]] = sides[:, signs < 0]
     if nlp.objective is Objective.RELAX:
         rows_high[:, -1] = 1.0
-    late = nlp.columns.g.sizes["duration"]
-    equal = np.zeros(nlp.columns.g["limits"].start)
+    late = nlp.g.sizes["duration"]
+    equal = np.zeros(nlp.g["limits"].start)
     longest = np.full(late, (duration or np.inf) / units.time)
     rates, commands = map(list, nlp.shape.motors)
-    torque, sizes = units.of(data.limits)[list(nlp.shape.torques)], nlp.columns.g.sizes
+    torque, sizes = units.of(data.limits)[list(nlp.shape.torques)], nlp.g.sizes
     quickest, most = tightening.motors[:, 0], tightening.motors[:, 1] * data.torque_limit / torque
     joins, begins = np.zeros(sizes["joins"]), np.full(sizes["begins"] // 2, LEAST_B)
     within = np.concatenate([quickest[:, rates].ravel("F"), most[:, commands].ravel("F")])
@@ -506,7 +499,7 @@ def pack(
     `extra` is the least margin [N], the relaxation, or shortfalls in the units of the limits.
     """
     table = np.empty(nlp.free.shape)
-    table[:, nlp.columns.node["extra"]] = extra / _margin_unit(nlp, units)
+    table[:, nlp.node["extra"]] = extra / _margin_unit(nlp, units)
     table[:, :3] = np.column_stack([profile.b, profile.a, profile.lam]) / units.profile
     table[:, 0] /= sizes
     return np.asarray(table[nlp.free])
@@ -529,12 +522,10 @@ def unpack(nlp: PathNLP, grid: Grid, x: Array, units: Units) -> tuple[Profile, f
 
 
 _SLOW = -12  # height of the slowest guess over that of a fall, as a power of two
-_FIRM = 40.0  # largest range of lambda in a guess, over the scene's force or its least value
 # Complementarity of multipliers, and slacks that larger ones count as or that are the least, in
 # units of the NLP: near the central path, and at a vertex.
 _CENTRAL, _SLACK = 1e-4, 1e-3
 _MU, _INSIDE = 1e-7, 1e-2
-_WILD = 10.0  # s'' over its median above which a vertex is of nearly parallel limits
 
 
 def guess(data: PhaseData, time_weight: float = 0.0) -> tuple[Profile, Units]:
@@ -611,9 +602,9 @@ def find_internal_force_range(data: PhaseData, height: float) -> tuple[Array, Ar
 
 
 def find_middle(data: PhaseData, low: Array, high: Array) -> tuple[Array, Array]:
-    """The internal force amid its range, and amid at most `_FIRM` of it; zero without a range."""
+    """The internal force amid its range, and amid a part of it; zero without a range."""
     finite, force = np.isfinite(low + high) & (low <= high), data.curve.formation.scene.scales.force
-    near = np.minimum(high, low + _FIRM * np.maximum(force, np.abs(low)))
+    near = np.minimum(high, low + 40.0 * np.maximum(force, np.abs(low)))
     whole, part = (np.where(finite, (low + end) / 2, 0.0) for end in (high, near))
     return whole, part
 
@@ -636,7 +627,7 @@ def center(
     """Multipliers with which a motion is near the central path."""
     slack = data.slack(data.nodes, profile, margin) / units.of(data.limits)[data.limits.sides[0]]
     on_b = -_CENTRAL / np.maximum(profile.b / units.profile[0], _SLACK)
-    links = np.zeros(nlp.columns.g.sizes["links"])
+    links = np.zeros(nlp.g.sizes["links"])
     return _join(nlp, data, _CENTRAL / np.maximum(slack, _SLACK), on_b, links)
 
 
@@ -668,7 +659,7 @@ def _join(
     nlp: PathNLP, data: PhaseData, on_sides: Array, on_b: Array, on_links: Array
 ) -> dict[str, Array]:
     """Multipliers of the NLP from those of sides, (n, n_sides), b and links; others are zero."""
-    (rows, signs, _), sizes = data.limits.sides, nlp.columns.g.sizes
+    (rows, signs, _), sizes = data.limits.sides, nlp.g.sizes
     on_rows = np.zeros((len(on_sides), nlp.shape.rows))
     for side, row in enumerate(rows.tolist()):
         on_rows[:, row] -= signs[side] * on_sides[:, side]
@@ -677,7 +668,7 @@ def _join(
     # The chain's multiplier at a node is the sum of those of normal forces from there on.
     chain = -1 - np.cumsum(on_rows[:, list(nlp.shape.presses)].sum(axis=1))[:-1]
     known = {"links": on_links, "chain": chain[: sizes["chain"]], "limits": on_rows.ravel()}
-    on_g = nlp.columns.g.join(**{name: np.zeros(sizes[name]) for name in sizes} | known)
+    on_g = nlp.g.join(**{name: np.zeros(sizes[name]) for name in sizes} | known)
     return {"lam_x0": on_x[nlp.free], "lam_g0": on_g}
 
 
@@ -715,7 +706,7 @@ class _Vertices(NamedTuple):
         between = share * press + (1 - share) * other
         lam = np.where(held, between, np.where(pushed, press, other))
         # Parallel rows, as those within ranges may be, meet nowhere or far off: no vertex.
-        wild = ~(np.abs(a) <= _WILD * np.median(np.abs(fastest.slopes))) | ~np.isfinite(lam)
+        wild = ~(np.abs(a) <= 10.0 * np.median(np.abs(fastest.slopes))) | ~np.isfinite(lam)
         if wild.any() and not wild.all():
             a = np.where(wild, wanted, a)
             lam[wild] = np.interp(grid.s[wild], grid.s[~wild], lam[~wild])
@@ -737,7 +728,7 @@ def _find_multipliers(
     From stationarity of the duration, with the Jacobian of the NLP. Where a speed limit is active,
     its multiplier is in the first column.
     """
-    (a, b, lam), grid, g = vertices.profile, data.grid, nlp.columns.g
+    (a, b, lam), grid, g = vertices.profile, data.grid, nlp.g
     # The duration has no slope at rest, nor without acceleration there.
     a, b = a.copy(), np.maximum(b, LEAST_B * units.profile[0])
     a[[0, -1]] = np.maximum(np.abs(a[[0, -1]]), LEAST_B * units.profile[1]) * [1.0, -1.0]

@@ -67,17 +67,10 @@ Plans = list[PhasePlan[PathMotion]]
 Pins = tuple[float | None, float | None]  # prescribed internal force at start and end [N]
 SOLVES = 40  # most of one refinement
 MISS = 2.5e-7  # largest violation between nodes, over the limits' scales; relative for b and time
-_OVER = 1.05  # tightening over the violation
 _GAP = 1.5  # gap to the optimum over the cost of the tightening
 _LOOKS = 17  # places of a segment at which uniqueness is checked
 _START, _SMOOTH, _RATE = 12, 20, 50  # elements of a phase; for effort; under rate limits
-_LONGER = 0.2  # most by which the NLP's duration may be another, relatively
 WORTH = 0.02  # largest relative cost of such a start
-_SHARES = (0.0, 0.002, 0.005, 0.01, WORTH)  # shares of a margin given up for it, in this order
-_KEPT = 1e-9  # violation of a limit that is rounding, over its scale
-# Violation at nodes by other signs than those of the rows, over the limits' scales, above which a
-# first plan is a reference only; case: two releases of a pentagon, whose plan takes 20 % longer.
-_OTHER_SIGNS = 0.05
 
 
 def plan_path(
@@ -282,7 +275,8 @@ def find_sure_start(
         for static, gains in holds
         for normal, bound in zip(static.normals, static.bounds, strict=True)
     ]
-    for share in _SHARES if margin > 0 else _SHARES[:1]:
+    # Shares of a margin to give up.
+    for share in (0.0, 0.002, 0.005, 0.01, WORTH) if margin > 0 else (0.0,):
         offsets = rows[:, ONE] - (1 - share) * margin * presses
         best, start = np.inf, None
         for side, bound in sides:
@@ -295,7 +289,7 @@ def find_sure_start(
             rates, rest = slopes @ along, offsets + slopes @ foot
             crossings = -rest[rates != 0] / rates[rates != 0]
             for place in (foot, *(foot + share * along for share in crossings)):
-                kept = ((offsets + slopes @ place) / data.spans).min() >= -_KEPT and place[0] > 0
+                kept = ((offsets + slopes @ place) / data.spans).min() >= -1e-9 and place[0] > 0
                 kept = kept and measure_holds(holds, T0 + T @ place) > SURE * unit
                 away = float(np.abs(T @ (place - here)).max())
                 if kept and away < best:
@@ -507,7 +501,9 @@ class PathIterate:
         """The next one to solve: with rows or breaks for this motion, halved, or tightened."""
         task, accuracy, margin = self.task, self.task.options.accuracy, self.solution.margin
         again = self.meshes < 6  # most meshes whose breaks move
-        if task.guides and again and self.violation_at_nodes > _OTHER_SIGNS:
+        # A first plan that misses much by signs of no row is a reference only; case: two releases
+        # of a pentagon, whose plan takes 20 % longer.
+        if task.guides and again and self.violation_at_nodes > 0.05:
             other = PathIterate.begin(replace(task, guides=self.guides), task.elements)
             return replace(other, meshes=self.meshes + 1)
         if task.is_held and self.meshes < 2:
@@ -560,18 +556,19 @@ class PathIterate:
         if duration is not None:
             # The quadrature of the NLP is not that of the motion.
             off = solution.duration / sum(motion.duration for motion in self.motions)
-            duration *= float(np.clip(off, 1 - _LONGER, 1 + _LONGER))
+            duration *= float(np.clip(off, 0.8, 1.2))
         # Slack at nodes would absorb the rest: the lesser one of the two beside what is short.
         slack, k = data.slack(data.nodes, solution.profile, solution.margin), data.grid.nonempty
         least = np.maximum(np.minimum(slack[k], slack[k + 1]), 0.0)
         reach = np.where(short > 0, least, 0.0)
-        added = _OVER * data.spread_to_nodes(short)
+        over = 1.05  # tightening over the violation
+        added = over * data.spread_to_nodes(short)
         tighter = Tightening(
             np.maximum(tight.limits, data.spread_to_nodes(reach)) + added,
-            tight.speed_share * (1 - _OVER * data.spread_to_nodes(speeding)),
+            tight.speed_share * (1 - over * data.spread_to_nodes(speeding)),
             duration,
             tight.missed + added,
-            tight.motors * (1 - _OVER * data.spread_to_nodes(hurry)),
+            tight.motors * (1 - over * data.spread_to_nodes(hurry)),
         )
         return replace(self, tightening=tighter)
 
@@ -651,14 +648,14 @@ class PathIterate:
         nlp, data, units, solution = self.nlp, self.data, self.units, self.solution
         rows, signs, _ = data.limits.sides
         on_g, count = solution.multipliers["lam_g0"], len(data.grid.s)
-        on_limits = on_g[nlp.columns.g["limits"]].reshape(count, -1)
+        on_limits = on_g[nlp.g["limits"]].reshape(count, -1)
         on_sides = np.maximum(-signs * on_limits[:, rows], 0.0) / units.of(data.limits)[rows]
         on_b = np.zeros(nlp.free.shape)
         on_b[nlp.free] = solution.multipliers["lam_x0"]
         on_b = np.maximum(on_b[:, 0], 0.0) * solution.profile.b / data.grid.sizes
         costs = (on_sides * limits).sum(axis=1) + on_b / units.profile[0] * speed_share
         for kind, (name, joints) in enumerate(nlp.shape.motors._asdict().items()):
-            on_rows = np.abs(on_g[nlp.columns.g[name]]).reshape(len(joints), count).T
+            on_rows = np.abs(on_g[nlp.g[name]]).reshape(len(joints), count).T
             costs += (on_rows * motors[:, kind, list(joints)]).sum(axis=1)
         scale = abs(solution.cost)
         if self.task.options.goal is Objective.MARGIN:

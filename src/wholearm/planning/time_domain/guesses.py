@@ -35,17 +35,11 @@ from .solution import TimeSearch, TimeSolution
 from .stage import Scheme, Stage, StagePoints, in_own_units, resample, scale_state, unit_points
 
 NEAREST = "a motion to the nearest end of the phase"
-STRAIGHT = "a motion straight to the end"
 GIVEN = "the contact modes that the problem gives"
-ALONG = "the plan along curves"
-OTHER = "a motion straight to another end"
 LONGER = f"{NEAREST}, 4 times as long as a fall over that height"
-GRADUAL = " with friction that sets in gradually"  # suffix of names where modes are found so
 SURE = 1e-3  # margin above which a motion keeps its limits
 FALLS = 2.0  # guessed duration, over that of a fall over the path's length
-ONSETS = (0.1, 0.03)  # rates of the friction homotopy, in the scene's unit
 BRIEF = 0.05  # least duration of a piece over that of its stage
-LEAST_STEPS = 2  # fewest steps of a piece of a path that is not merged into another
 MOST = 8  # most pieces of a stage
 _LIGHT = 0.5  # normal forces of an initial guess, over the weight of the object
 _Change = tuple[float, dict[int, float]]  # place, share of a stage, and new signs of rows
@@ -61,7 +55,8 @@ class Guess(NamedTuple):
 
     def by_homotopy(self) -> Guess:
         """The same path, in the modes of the friction homotopy."""
-        return self._replace(name=self.name + GRADUAL, homotopy=True)
+        name = f"{self.name} with friction that sets in gradually"
+        return self._replace(name=name, homotopy=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,31 +125,29 @@ class Guesses:
 
     def along(self, motions: Sequence[PathMotion]) -> Guess:
         """Along known motions of the phases on their curves."""
-        units, scheme, stages = unit_points(self.problem.scene.scales), self.search.scheme, []
+        units, scheme = unit_points(self.problem.scene.scales), self.search.scheme
+        controls, stages = np.linspace(0.0, 1.0, scheme.controls), list[Stage]()
         for stage, motion in zip(join_modes(self.nearest.stages), motions, strict=True):
             parts, rolling = list[tuple[StagePoints, Mode]](), list(stage.formation.rolling_rows)
             for start, stop, directions in motion.spans:
-                count = round((stop - start) / motion.duration * stage.intervals)
-                count = max(LEAST_INTERVALS, count)
-                breaks, span = np.linspace(0.0, 1.0, count + 1), stop - start
-                inner = (scheme.points, np.linspace(0.0, 1.0, scheme.controls))
-                points, controls, ends = (
-                    motion.evaluate(start + share.ravel() * span)
-                    for share in (*(breaks[:-1, None] + x / count for x in inner), breaks)
+                span = stop - start
+                count = max(LEAST_INTERVALS, round(span / motion.duration * stage.intervals))
+                breaks = np.linspace(0.0, 1.0, count + 1)
+                inner = (breaks[:-1, None] + x / count for x in (scheme.points, controls))
+                points, between, ends = (
+                    [own.reshape(*x.shape, -1) for own in motion.evaluate(start + span * x.ravel())]
+                    for x in (*inner, breaks)
                 )
-                c = np.hstack([points.c_n, points.c_t[:, rolling]])
-                z, v, a, forces = (
-                    own.reshape(count, scheme.degree, -1) for own in (*points[:3], c)
-                )
+                z, v, a, _, c_n, c_t = points
                 part = StagePoints(
                     span,
                     np.full(count, 1 / count),
-                    np.stack([ends.z, ends.z_dot], axis=1),
+                    np.stack(ends[:2], axis=1),
                     z,
                     v,
                     a,
-                    forces,
-                    controls.tau.reshape(count, -1, 2),
+                    np.concatenate([c_n, c_t[..., rolling]], axis=2),
+                    between[3],
                     stage.guess.impulses if stop == motion.duration else np.zeros(0),
                 )
                 part = StagePoints(*map(truediv, part, units))
@@ -162,7 +155,7 @@ class Guesses:
                 signs[rolling] = 0.0
                 parts.append((part, tuple(signs.tolist())))
             stages += divide(stage, parts)
-        return Guess(ALONG, self._leave_room(link(stages)))
+        return Guess("the plan along curves", self._leave_room(link(stages)))
 
     def straight(self, goal: Array) -> Guess | None:
         """Straight to an end of a single phase with two freedoms, in the modes of that path."""
@@ -170,7 +163,7 @@ class Guesses:
         margin = find_margin(outline, self.problem.epsilon, paced=True) if outline else None
         if outline is None or margin is None or margin.value <= -0.3:  # not near a motion
             return None
-        return self._follow(STRAIGHT, outline, margin.profile)
+        return self._follow("a motion straight to the end", outline, margin.profile)
 
     @cached_property
     def paths(self) -> list[tuple[PathMargin, PathGuess]]:
@@ -188,7 +181,8 @@ class Guesses:
 
     def to_others(self) -> Iterator[Guess]:
         """Along the first of these paths."""
-        found = (self._follow(OTHER, outline) for _, outline in self.paths[:3])
+        name = "a motion straight to another end"
+        found = (self._follow(name, outline) for _, outline in self.paths[:3])
         return (guess for guess in found if guess is not None)
 
     def _is_planar(self) -> bool:
@@ -397,11 +391,11 @@ def split_path(outline: PathGuess) -> list[PathGuess]:
     cuts = [0]
     for k in range(1, len(signs)):
         if (signs[k] != signs[cuts[-1]]).any():
-            if k - cuts[-1] < LEAST_STEPS:
+            if k - cuts[-1] < 2:  # fewest steps of a piece
                 signs[cuts[-1] : k] = signs[k]
             else:
                 cuts.append(k)
-    if len(signs) - cuts[-1] < LEAST_STEPS and len(cuts) > 1:
+    if len(signs) - cuts[-1] < 2 and len(cuts) > 1:
         signs[cuts.pop() :] = signs[cuts[-1]]
     stretches, part = list[PathGuess](), z[:1]
     for begin, stop in pairwise([*cuts, len(signs)]):
@@ -439,7 +433,7 @@ def find_modes(search: TimeSearch, stages: Sequence[Stage]) -> TimeSolution:
     """Solution by friction homotopy, with stages in its modes."""
     stages = link(join_modes(stages))
     solution: TimeSolution | None = None
-    for onset in ONSETS:
+    for onset in (0.1, 0.03):  # in the scene's unit
         solution = search.solve([replace(stage, onset=onset) for stage in stages], solution, 50)
         if not solution.success:
             return solution

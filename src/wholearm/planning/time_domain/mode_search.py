@@ -24,7 +24,6 @@ from .time_nlp import least_senses, new_rows
 
 LEAST_INTERVALS = 3  # fewest intervals of a stage
 WORTH = 1e-4  # least relative gain of a move; dropping a vanished stage may cost as much
-_GONE = 2e-4  # mean duration of intervals, in the scene's unit, below which a stage has vanished
 PATIENCE = 50  # most solver iterations for one of them
 
 
@@ -303,7 +302,8 @@ def list_neighbours(
 
 def list_dropped(stages: Sequence[Stage]) -> Iterator[list[Stage]]:
     """The stages without all vanished ones, and without each of these."""
-    gone = [k for k, stage in enumerate(stages) if stage.guess.duration < _GONE * stage.intervals]
+    # By the mean duration of intervals, in the scene's unit.
+    gone = [k for k, stage in enumerate(stages) if stage.guess.duration < 2e-4 * stage.intervals]
     for group in [gone, *([k] for k in gone)] if len(gone) > 1 else [[k] for k in gone]:
         left: list[Stage] | None = list(stages)
         for index in reversed(group):

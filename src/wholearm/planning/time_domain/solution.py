@@ -56,9 +56,7 @@ from .time_nlp import (
     unpack,
 )
 
-FIRST_SIZE = 1e-2  # multipliers of a first guess
 Multipliers = dict[str, Array]  # of the unknowns' bounds, `lam_x0`, and of the rows, `lam_g0`
-_ITERATIONS = {Objective.ELASTIC: 90, Objective.RELAX: 50}  # most of one solve, else 150
 
 
 @dataclass
@@ -218,7 +216,8 @@ class TimeSearch:
         target = Target(
             self.goal, self.problem.epsilon, self.options.time_weight, self.relaxation, gradient
         )
-        return build_time_nlp(stages, self.scheme, target, _ITERATIONS.get(self.goal, most))
+        most = {Objective.ELASTIC: 90, Objective.RELAX: 50}.get(self.goal, most)
+        return build_time_nlp(stages, self.scheme, target, most)
 
     def run(
         self,
@@ -240,10 +239,10 @@ class TimeSearch:
             return TimeSolution(list(stages), np.inf, 0.0, status, False, nlp, {})
         solver = nlp.solver
         if not multipliers:
-            # Of one size for all inequalities.
+            size = 1e-2  # of all inequalities
             bounded = np.isfinite(high).astype(float) - np.isfinite(low)
-            on_rows = np.where(high_g > low_g, -FIRST_SIZE, 0.0)
-            multipliers = {"lam_x0": FIRST_SIZE * bounded, "lam_g0": on_rows}
+            on_rows = np.where(high_g > low_g, -size, 0.0)
+            multipliers = {"lam_x0": size * bounded, "lam_g0": on_rows}
             solver = nlp.first_solver
         result = solver(
             x0=pack([stage.guess for stage in stages], nlp.layouts, margin),

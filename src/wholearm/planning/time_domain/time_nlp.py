@@ -34,7 +34,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from functools import cached_property, lru_cache
+from functools import cached_property
 from itertools import groupby, pairwise
 from math import comb
 from typing import Any, NamedTuple
@@ -67,10 +67,7 @@ from ..nlp import (
 from ..options import Objective
 from .stage import LimitMisses, Scheme, Stage, StagePoints, blend, make_scheme
 
-_HURRY = 3e-4  # weight of time against violations
 SLIDING = 1e-5  # least rate of sliding contacts, over the radius of gyration, and of joints
-_WITHIN = np.array([0.3, 0.4, 0.5, 0.75, 0.85, 0.93])
-"""Places at which c_n is also bounded with rate-limited torques: minima are inside intervals."""
 Z, V = slice(0, 5), slice(5, 10)
 """Slices of a node's unknowns: z and z'. With a margin, that follows."""
 STATE, MARGIN = 10, 10
@@ -263,7 +260,8 @@ def build_time_nlp(
     start = stages[0].guess.nodes[0].ravel()
     rows.add_entries(rows.linear(STATE, low=start, high=start), layouts[0].nodes[0, :STATE], 1.0)
     rows_of, controls = [], scheme.controls
-    of_time = {Objective.TIME: 1.0, Objective.EFFORT: target.time_weight, Objective.ELASTIC: _HURRY}
+    # Weight of time: a little, against violations.
+    of_time = {Objective.TIME: 1.0, Objective.EFFORT: target.time_weight, Objective.ELASTIC: 3e-4}
     for k, (stage, layout) in enumerate(zip(stages, layouts, strict=True)):
         rows_of.append(add_stage(rows, stage, layout, scheme, stage is stages[-1], target))
         if k + 1 < len(stages):
@@ -476,7 +474,8 @@ def add_limits(
     soft = bool(weights[presses].any())
     places = np.zeros(1) if scheme.ends else np.array([0.0, 1.0])
     if stage.formation.scene.has_slow_motors:
-        places = np.append(places, _WITHIN)
+        # Their minima are inside intervals.
+        places = np.append(places, [0.3, 0.4, 0.5, 0.75, 0.85, 0.93])
     if soft:
         places = np.append(places, scheme.points)
     c_n = layout.forces[:, :, limits.rows[presses].argmax(axis=1)]
@@ -725,7 +724,7 @@ def build_applied(scene: Scene, tau: Expression, sigma: Expression) -> Expressio
     return ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, tau) - friction
 
 
-@share(32)
+@share
 def point_kernel(formation: Formation, controls: int, homotopy: bool = False) -> Kernel:
     """Contact constraints, equations of motion, and rates of sliding contacts at a point.
 
@@ -757,7 +756,7 @@ def point_kernel(formation: Formation, controls: int, homotopy: bool = False) ->
     )
 
 
-@share(32)
+@share
 def end_kernel(formation: Formation) -> Kernel:
     """Contacts at the end of an interval without a point there; `first` is z at its start."""
     x = Columns(z=5, v=5, first=5 * bool(formation.rolling)).make_symbols()
@@ -767,7 +766,7 @@ def end_kernel(formation: Formation) -> Kernel:
     return build_kernel(x, gaps=gaps, rates=P @ x.v)
 
 
-@lru_cache(maxsize=32)
+@share
 def collocation_kernel(name: str, degree: int, freedoms: int) -> Kernel:
     """Collocation along the tangent space: N^T (s_j - s_0 - h sum_l a_jl r_l).
 
@@ -783,7 +782,7 @@ def collocation_kernel(name: str, degree: int, freedoms: int) -> Kernel:
     return build_kernel(s, p, steps=N.T @ steps)
 
 
-@share(64)
+@share
 def monitor_kernel(formation: Formation, monitored: tuple[int, ...]) -> Kernel:
     """Limits of a formation."""
     x = Columns(z=5).make_symbols(z=build_features(formation.scene).z)
@@ -791,7 +790,7 @@ def monitor_kernel(formation: Formation, monitored: tuple[int, ...]) -> Kernel:
     return build_kernel(x, values=values)
 
 
-@share(64)
+@share
 def opening_kernel(formation: Formation, contact: Contact) -> Kernel:
     """Second derivative of a contact's gap."""
     x = Columns(z=5, v=5, a=5).make_symbols()
@@ -799,7 +798,7 @@ def opening_kernel(formation: Formation, contact: Contact) -> Kernel:
     return build_kernel(x, opening=A @ x.a + A_dot_v)
 
 
-@share(64)
+@share
 def goal_kernel(
     formation: Formation, until: Until | None, turns: tuple[int, ...], gained: Formation | None
 ) -> Kernel:
@@ -824,7 +823,7 @@ def goal_kernel(
     return build_kernel(x, goals=ca.vertcat(*parts))
 
 
-@share(64)
+@share
 def landing_kernel(formation: Formation, contact: Contact) -> Kernel:
     """Limits of the range of a contact with which a phase ends."""
     x = Columns(z=5).make_symbols(z=build_features(formation.scene).z)
@@ -845,7 +844,7 @@ def new_rows(formation: Formation, following: Formation) -> list[int]:
     return fresh + [n_c + i for i, c in enumerate(rolling) if c not in formation.rolling]
 
 
-@lru_cache(maxsize=8)
+@share
 def effort_kernel(controls: int) -> Kernel:
     """Integral of tau^T tau over an interval, by the control points of tau."""
     x, n = Columns(tau=2 * controls, h=1).make_symbols(), controls - 1
@@ -857,7 +856,7 @@ def effort_kernel(controls: int) -> Kernel:
     return build_kernel(x, effort=x.h * ca.trace(tau @ ca.DM(products) @ tau.T))
 
 
-@lru_cache(maxsize=8)
+@share
 def bend_kernel(controls: int) -> Kernel:
     """Cost of second differences of the control points of torques."""
     x, p = Columns(tau=2 * controls, h=1).make_symbols(), Columns(weight=2).make_symbols()
@@ -871,7 +870,7 @@ def find_leaving(formation: Formation, following: Formation) -> list[int]:
     return [i for i, c in enumerate(formation.contacts) if c not in following.contacts]
 
 
-@share(32)
+@share
 def impact_kernel(formation: Formation, following: Formation) -> Kernel:
     """A plastic impact M5 (v+ - v-) = G+^T p, P+ v+ = 0 onto the next formation, `Xi` after it.
 
@@ -895,7 +894,7 @@ def impact_kernel(formation: Formation, following: Formation) -> Kernel:
     )
 
 
-@lru_cache(maxsize=8)
+@share
 def command_kernel(controls: int, joints: tuple[int, ...]) -> Kernel:
     """Slack of the commands' control points to torque limits, over these and times h."""
     x, n = Columns(tau=2 * controls, h=1).make_symbols(), controls - 1
@@ -911,7 +910,7 @@ def command_kernel(controls: int, joints: tuple[int, ...]) -> Kernel:
     return build_kernel(x, p, left=ca.vertcat(*left))
 
 
-@share(32)
+@share
 def hold_kernel(formation: Formation) -> Kernel:
     """The equations of motion at rest, without acceleration."""
     scene, n_c = formation.scene, formation.n_contacts
@@ -922,7 +921,7 @@ def hold_kernel(formation: Formation) -> Kernel:
     return build_kernel(x, p, balance=push + build_applied(scene, x.tau, p.sigma))
 
 
-@lru_cache(maxsize=1)
+@share
 def slope_kernel() -> Kernel:
     """Difference of the slopes of linear torques in two intervals, times both durations."""
     x = Columns(before=4, after=4, h=1, coming=1).make_symbols()

@@ -58,10 +58,6 @@ if TYPE_CHECKING:
 
 ITERATIONS = 50  # most of the solver from a guess; successes take up to 25
 AT_REST = 1e-4  # speed below which an impact counts as a stop, in the scene's own units
-SHORTEST = 1 / 16  # shortest step of the continuation to a pinned end
-FREE = "a plan that chooses where it ends"  # name of a guess
-_STRETCHES = ((1.01, 2), (1.03, 2), (1.07, 3), (1.15, 4), (1.3, 6), (1.6, 8))
-"""Durations with held torques to try, over those with free ones, and least numbers of periods."""
 _HELD_PATIENCE = 80  # most solver iterations with held torques
 _BRIEF = 1e-3  # duration, over a period, that counts as zero
 _Named = tuple[TimeSolution, str]  # a solution, and the name of its guess
@@ -248,11 +244,16 @@ def finish(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
         searched = improve(search, solution)
     if search.only_begins:
         return searched
-    before = [] if searched is solution else [solution]
     search, coarse = choose_end(search, searched)
-    solution = refine(search, coarse)
-    if not solution.success and search.options.mode_search:
-        solution = _refine_other(search, coarse, before) or solution
+    refined = refine(search, coarse)
+    if not refined.success and search.options.mode_search:
+        # Phase 2 of the route of query 10 has no solution in which a contact turns back without
+        # resting; phase 1 of that of query 91, and phase 5 of that of goal 45, none where the mode
+        # search leads.
+        others = chain(_list_as_good(search, coarse), [solution] * (searched is not solution))
+        found = (refine(search, other) for other in others)
+        refined = next((own for own in found if own.success), refined)
+    solution = refined
     fewer = drop_gone(search, solution) if solution.success else solution
     if fewer is not solution:
         # Phase 3 of query 57 does not hold in its replay otherwise.
@@ -271,7 +272,8 @@ def hold_torques(search: TimeSearch, free: TimeSolution) -> TimeSolution:
     scene, options = search.problem.scene, search.options
     controls = 2 if scene.control_hold == "linear" else 1
     held = replace(search, scheme=make_scheme(options.scheme, options.degree, controls))
-    for stretch, least in _STRETCHES:
+    # Durations over those with free torques, and least numbers of periods.
+    for stretch, least in ((1.01, 2), (1.03, 2), (1.07, 3), (1.15, 4), (1.3, 6), (1.6, 8)):
         periods = cut_periods(free.stages, held.scheme, stretch, least)
         solution = held.solve(periods, most=search.wait(_HELD_PATIENCE))
         if solution.success:
@@ -341,24 +343,12 @@ def cut_periods(
     return cut
 
 
-def _refine_other(
-    search: TimeSearch, coarse: TimeSolution, before: Sequence[TimeSolution]
-) -> TimeSolution | None:
-    """A refined solution in neighbouring modes that cost as much, or that before the mode search.
-
-    Phase 2 of the route of query 10 has none in which a contact turns back without resting; phase 1
-    of that of query 91, and phase 5 of that of goal 45, none where the mode search leads.
-    """
-
-    def list_others() -> Iterator[TimeSolution]:
-        for stages in list_neighbours(search, coarse):
-            other = search.solve(stages, most=PATIENCE)
-            if other.success and other.cost - coarse.cost < WORTH * abs(coarse.cost):
-                yield other
-        yield from before
-
-    found = (refine(search, other) for other in list_others())
-    return next((refined for refined in found if refined.success), None)
+def _list_as_good(search: TimeSearch, coarse: TimeSolution) -> Iterator[TimeSolution]:
+    """Solutions in neighbouring modes that cost no more."""
+    for stages in list_neighbours(search, coarse):
+        other = search.solve(stages, most=PATIENCE)
+        if other.success and other.cost - coarse.cost < WORTH * abs(coarse.cost):
+            yield other
 
 
 def choose_end(search: TimeSearch, solution: TimeSolution) -> tuple[TimeSearch, TimeSolution]:
@@ -443,9 +433,9 @@ def _free_ends(search: TimeSearch, guesses: Guesses) -> Iterator[Guess]:
         moved = search.solve(stages, solution, search.wait(ITERATIONS))
         if moved.success:
             solution, reached = moved, share
-        elif (step := step / 4) < SHORTEST:
+        elif (step := step / 4) < 1 / 16:
             return
-    yield Guess(FREE, solution.stages, before=solution)
+    yield Guess("a plan that chooses where it ends", solution.stages, before=solution)
 
 
 def _set_free(phase: Phase) -> Phase:
