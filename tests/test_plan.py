@@ -300,8 +300,7 @@ def test_the_keys_that_keep_a_phase_from_a_plan_are_named(
 ) -> None:
     problem = heptagon.with_(torque_rate_limit1=80.0, actuator_lag=0.002)
     error = SolverError("no plan for phase 1 (...): none was found")
-    none = [None] * len(problem.phases)
-    planning = Planning(problem, (), PlanOptions(), (), [*none])
+    planning = Planning(problem, (), PlanOptions(), ())
     own = planning, problem.phases[:1], problem.start, planning.options, error
 
     def replan(other: Planning, phases: Sequence[Phase], z: Array, options: PlanOptions) -> Any:

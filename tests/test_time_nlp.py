@@ -531,11 +531,11 @@ def test_kernels_have_the_derivatives_of_their_expression(which: int) -> None:
     kernel = make_kernels()[which]
     rng = np.random.default_rng(which)
     n_x, n_p = (kernel.function.size1_in(i) for i in range(2))
-    x, p, lam = rng.normal(size=n_x), rng.normal(size=n_p), rng.normal(size=kernel.outputs)
+    x, p, lam = rng.normal(size=n_x), rng.normal(size=n_p), rng.normal(size=kernel.y.count)
     steps = 1e-5 * np.eye(n_x)
 
     def dense(x: Array) -> Array:
-        J = np.zeros((kernel.outputs, n_x))
+        J = np.zeros((kernel.y.count, n_x))
         J[tuple(kernel.jacobian_at)] = kernel.jacobian(x, p).full()[:, 0]
         return J
 

@@ -187,6 +187,13 @@ def metric_weights(scene: Scene) -> Array:
     return np.array([1.0, 1.0, rho**2, rho**2, rho**2])
 
 
+def move_least(P: Array, right: Array, metric: Array) -> Array:
+    """The least displacements with P dz = right, (n, n_p), in a diagonal metric, shape (n, 5)."""
+    over = P / metric
+    amounts = np.linalg.solve(over @ P.transpose(0, 2, 1), right[..., None])[..., 0]
+    return np.asarray(np.einsum("nij,ni->nj", over, amounts))
+
+
 def measure_speed(scene: Scene, v: Array) -> float:
     """Speed of a velocity, shape (5,), in the metric of curves [m/s]."""
     return float(np.sqrt(metric_weights(scene) @ v**2))

@@ -23,7 +23,7 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..contacts.formation import Formation, Kinematics
-from .dynamics import A, B, Directions, PathForces, V, force_rows, metric_weights
+from .dynamics import A, B, Directions, PathForces, V, force_rows, metric_weights, move_least
 
 COUNT = 5  # number of coefficients: of 1, a, b, s' and the internal force
 CurvePlaces = tuple[Array, Array, Array, Kinematics]
@@ -85,7 +85,7 @@ def find_slopes_at(
     # Fingers follow the object, however far.
     metric = metric_weights(formation.scene) * np.array([1, 1, 1, 1e-6, 1e-6])
     unit = np.broadcast_to(np.eye(5)[0], z.shape)
-    dz = unit + _move_least(kinematics.P, -kinematics.P[..., 0], metric)
+    dz = unit + move_least(kinematics.P, -kinematics.P[..., 0], metric)
     along = dz, np.zeros_like(dz)
     state = _State(formation, z, v, kinematics, directions, c, tau, acceleration, along)
     state = state._replace(along=(dz, state.turn("", dz)))
@@ -153,7 +153,7 @@ class _State(NamedTuple):
         if self.formation.rolling and name.startswith("base"):
             axis = "xy".index(name[-1])
             gap[:, count:] = -(self._rows_of(name) * self.kinematics.P[..., axis])[:, count:]
-        return _move_least(self.kinematics.P, -gap, metric_weights(self.formation.scene))
+        return move_least(self.kinematics.P, -gap, metric_weights(self.formation.scene))
 
     @property
     def _step(self) -> float:
@@ -169,7 +169,7 @@ class _State(NamedTuple):
     def turn(self, name: str, dz: Array) -> Array:
         """By how much the tangent changes."""
         turned = np.einsum("nij,nj->ni", self._difference(name, dz).P, self.z_s)
-        return _move_least(self.kinematics.P, -turned, metric_weights(self.formation.scene))
+        return move_least(self.kinematics.P, -turned, metric_weights(self.formation.scene))
 
     def _move(self, name: str, dz: Array, dz_s: Array) -> tuple[Array, Array]:
         """What another place and tangent change, with geometry that is off by as much."""
@@ -218,10 +218,3 @@ def _lengthen(formation: Formation, finger: int, change: float) -> Formation:
     fingers[finger] = replace(fingers[finger], length=fingers[finger].length + change)
     scene = replace(formation.scene, fingers=(fingers[0], fingers[1]))
     return replace(formation, scene=scene)
-
-
-def _move_least(P: Array, right: Array, metric: Array) -> Array:
-    """The least displacement with P dz = right, shape (n, 5)."""
-    over = P / metric
-    amounts = np.linalg.solve(over @ P.transpose(0, 2, 1), right[..., None])[..., 0]
-    return np.asarray(np.einsum("nij,ni->nj", over, amounts))

@@ -53,7 +53,6 @@ from .phase_plan import (
     PhasePlan,
     Plans,
     Settled,
-    add_up,
     assemble_motions,
     end_of,
     make_transition,
@@ -103,7 +102,7 @@ class Planning:
     blocks: tuple[BlockPlan, ...]
     # [s]: longest duration of each phase for the objective `margin`, in proportion to time-optimal
     # plans
-    allowed: list[float | None]
+    allowed: Sequence[float] = ()
     least: Plans = field(default_factory=list)  # these plans; blocks end where they do
     ahead: bool = True  # whether blocks end by the cost-to-go, which `margin` and `least` do not
     sketches: bool = False  # whether least times-to-go are those of a speed sweep
@@ -133,6 +132,10 @@ class Planning:
         modes = plain([getattr(plan.motion, "modes", ()) for plan in self.plans])
         return assemble_motions(motions, torques, formations, self.options.samples, modes=modes)
 
+    def allow(self, phases: Sequence[Phase]) -> float | None:
+        """Longest duration of some phases in all [s], for the objective `margin`."""
+        return sum(self.allowed[phase.index] for phase in phases) if self.allowed else None
+
     def find_block(self, number: int) -> int:
         """Index of the block with the phase of a number, counted from 1."""
         ends = [block.phases[-1].number for block in self.blocks]
@@ -153,8 +156,7 @@ def plan_blocks(
     """
     with name_source(problem.source):
         require_steps(problem, options)
-    finer, none = [0] * len(split_blocks(problem)), list[float | None]([None] * len(problem.phases))
-    planning = Planning(problem, curves, options, (), none)
+    finer, planning = [0] * len(split_blocks(problem)), Planning(problem, curves, options, ())
     if options.goal is Objective.MARGIN:
         first = replace(
             planning, options=replace(options, objective=Objective.TIME, duration=None), ahead=False
@@ -255,7 +257,7 @@ def plan_block(
 
     `over_time` are arguments of `plan_with_impacts`.
     """
-    problem, known, allowed = planning.problem, planning.curves, planning.allowed
+    problem, known = planning.problem, planning.curves
     if not runs_along_curves(block, options):
         from .time_domain.time_plan import plan_with_impacts
 
@@ -270,8 +272,8 @@ def plan_block(
         with charge(block[0].number):
             try:
                 if problem.scene.has_slow_motors:
-                    return plan_with_pauses(planning, block, plan, add_up(block, allowed)), None
-                return plan(add_up(block, allowed)), None
+                    return plan_with_pauses(planning, block, plan, planning.allow(block)), None
+                return plan(planning.allow(block)), None
             except (InfeasibleError, SolverError) as error:
                 from .explain import explain_motors
 
@@ -287,7 +289,7 @@ def plan_block(
     plans: Plans = []
     for part in chain.split():
         with charge(part.phases[0].number):
-            plans += part.plan(problem.epsilon, options, add_up(part.phases, allowed))
+            plans += part.plan(problem.epsilon, options, planning.allow(part.phases))
     return plans, chain
 
 
@@ -401,9 +403,7 @@ def look_ahead(
     return CostToGo(phase, value)
 
 
-def share_duration(
-    least: Sequence[PhasePlan[Motion]], duration: float | None
-) -> list[float | None]:
+def share_duration(least: Sequence[PhasePlan[Motion]], duration: float | None) -> list[float]:
     """Longest duration of each phase [s], in proportion to the least times."""
     times = [plan.motion.duration for plan in least]
     total = 2 * sum(times) if duration is None else duration
@@ -581,7 +581,7 @@ def plan_slowly(planning: Planning, sequence: ImpactSequence, options: PlanOptio
         if after is not None:
             coming = choose_junction(last, after, last.end, epsilon, part.phases[-1].number + 1)
         pins = junction.begins if junction else None, coming.ends if coming else None
-        duration = add_up(part.phases, planning.allowed)
+        duration = planning.allow(part.phases)
         if duration is not None and junction is not None:
             duration -= junction.change.duration
         with charge(number):

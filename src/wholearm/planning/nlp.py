@@ -103,11 +103,6 @@ class Kernel:
     p: Columns
     y: Columns
 
-    @property
-    def outputs(self) -> int:
-        """Number of rows of y."""
-        return self.y.count
-
 
 def build_kernel(x: Symbols, p: Symbols | None = None, **y: Expression) -> Kernel:
     """Build the kernel of named SX expressions `y` of symbols."""
@@ -215,7 +210,7 @@ class NlpRows:
         """
         columns = kernel.x.join(**x)
         shape, count = columns.shape[:-1], columns[..., 0].size
-        own = self._add_rows(*shape, 0 if cost else kernel.outputs, low=low, high=high)
+        own = self._add_rows(*shape, 0 if cost else kernel.y.count, low=low, high=high)
         given = np.broadcast_to(kernel.p.join(**p or {}), (*shape, kernel.p.count))
         columns, rows = columns.reshape(count, -1), own.reshape(count, -1)
         if cost or rows.size:

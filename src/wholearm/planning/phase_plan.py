@@ -55,12 +55,6 @@ class Settled(NamedTuple):
     settlings: tuple[Settling | None, ...]
 
 
-def add_up(phases: Sequence[Phase], allowed: Sequence[float | None]) -> float | None:
-    """Longest duration of some phases in all [s]; `allowed` is of all phases."""
-    own = [allowed[phase.index] for phase in phases]
-    return sum(time for time in own if time is not None) if None not in own else None
-
-
 def combine(goal: Objective, values: Sequence[float]) -> float:
     """Objective value of some phases, given that of each."""
     return min(values) if goal is Objective.MARGIN else sum(values)

@@ -35,7 +35,7 @@ from .nlp import Ledger, charge, open_ledger
 from .options import Objective, PlanOptions
 from .path_domain.path_motion import PathMotion
 from .path_domain.path_plan import Task, plan_curves
-from .phase_plan import PlanPart, add_up, combine, plan_stops
+from .phase_plan import PlanPart, combine, plan_stops
 from .result import Plan, PlannedPhase, Status, Timings, write_meta
 
 if TYPE_CHECKING:
@@ -232,7 +232,7 @@ def _find_saving(
     """Cost of a stop at the middle one of `bounds` in phases in motion; NaN without a plan."""
     inside, options = slice(bounds[0], bounds[-1]), planning.options
     moving = block.plans[inside]
-    duration = add_up(block.phases[inside], planning.allowed)
+    duration = planning.allow(block.phases[inside])
     z = moving[0].motion.evaluate(np.zeros(1)).z[0]
     try:
         stopped = plan_stops(plan_part, bounds, z, options, duration)

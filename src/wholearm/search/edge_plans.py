@@ -344,8 +344,7 @@ class _LinkPlanner:
             curves.append(curve)
         single = replace(self.problem, start=z, phases=tuple(phases), goals=())
         count = len(phases) - len(follows)
-        none = list[float | None]([None] * len(phases))
-        planning = Planning(single, tuple(curves), self.options, (), none, sketches=True)
+        planning = Planning(single, tuple(curves), self.options, (), sketches=True)
         with name_source(self.problem.source):
             for part in split_blocks(single):
                 first, guess = part[0], None

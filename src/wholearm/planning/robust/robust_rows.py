@@ -198,11 +198,8 @@ def _find_signs(
     return signs
 
 
-class RobustHold(NamedTuple):
-    """Torques that friction can hold at rest: times `gains`, shape (2,), within a polygon."""
-
-    static: TorquePolygon
-    gains: Array
+RobustHold = tuple[TorquePolygon, Array]
+"""Torques that friction can hold at rest: times gains, shape (2,), within a polygon."""
 
 
 def list_holds(formation: Formation, z: Array, ranges: Mapping[str, float]) -> list[RobustHold]:
@@ -220,7 +217,7 @@ def list_holds(formation: Formation, z: Array, ranges: Mapping[str, float]) -> l
         polygon = replace(scene.polygon, mass=scene.polygon.mass * mass)
         corner = replace(formation, scene=replace(scene, polygon=polygon, friction=friction))
         static = Statics(corner, z).torque_polygon()
-        holds += [RobustHold(static, np.array(gain)) for gain in gains]
+        holds += [(static, np.array(gain)) for gain in gains]
     return holds
 
 

@@ -159,7 +159,7 @@ class Guesses:
 
     def straight(self, goal: Array) -> Guess | None:
         """Straight to an end of a single phase with two freedoms, in the modes of that path."""
-        outline = self._connect(goal)
+        outline = self._connect(goal) if self._is_planar() else None
         margin = find_margin(outline, self.problem.epsilon, paced=True) if outline else None
         if outline is None or margin is None or margin.value <= -0.3:  # not near a motion
             return None
@@ -193,8 +193,6 @@ class Guesses:
 
     def _connect(self, goal: Array) -> PathGuess | None:
         """The straight path to an end; None if it is obstructed."""
-        if not self._is_planar():
-            return None
         formation = self.phases[0].formation
         outline = connect(formation, self.z, goal)
         moves = np.diff(outline.z, axis=0).any(axis=1).all()

@@ -237,13 +237,12 @@ class TimeSearch:
         if (low > high).any():
             status = "limits that hold between points too leave nothing"
             return TimeSolution(list(stages), np.inf, 0.0, status, False, nlp, {})
-        solver = nlp.solver
+        solver = nlp.solver if multipliers else nlp.make_solver(1e-2)
         if not multipliers:
             size = 1e-2  # of all inequalities
             bounded = np.isfinite(high).astype(float) - np.isfinite(low)
             on_rows = np.where(high_g > low_g, -size, 0.0)
             multipliers = {"lam_x0": size * bounded, "lam_g0": on_rows}
-            solver = nlp.first_solver
         result = solver(
             x0=pack([stage.guess for stage in stages], nlp.layouts, margin),
             lbx=low,

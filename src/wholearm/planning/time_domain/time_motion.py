@@ -13,7 +13,13 @@ from ...common.arrays import Array
 from ...common.sharing import Batch, Store
 from ...contacts.elemental import Contact
 from ...contacts.formation import Formation
-from ...mechanics.dynamics import Directions, build_forward, metric_weights, split_forces
+from ...mechanics.dynamics import (
+    Directions,
+    build_forward,
+    metric_weights,
+    move_least,
+    split_forces,
+)
 from ...problem.definition import Phase
 from ...results.plan_record import ROLLS, ModeSpan
 from ...results.torque import TorqueProfile
@@ -135,9 +141,9 @@ class StageMotion:
         for _ in range(3):
             kinematics = formation.evaluate(z, v)
             gaps = np.hstack([kinematics.C, formation.evaluate_slip(z) - self.slip])
-            z = z - _lift(kinematics.P, metric, gaps)
+            z = z - move_least(kinematics.P, gaps, metric)
         kinematics = formation.evaluate(z, v)
-        v = v - _lift(kinematics.P, metric, np.einsum("nij,nj->ni", kinematics.P, v))
+        v = v - move_least(kinematics.P, np.einsum("nij,nj->ni", kinematics.P, v), metric)
         tau = self.torque.at(t)
         Xi, sigma = (np.broadcast_to(part, (len(t), len(part))) for part in self.directions)
         a, c, _ = _FORWARDS(self.formation)(z, v, tau, Xi, sigma)
@@ -171,12 +177,6 @@ def _integrate(powers: Array, scale: Array, start: Array) -> Array:
     integral = scale * np.polynomial.polynomial.polyint(powers, lbnd=-1, axis=2)
     integral[..., 0] += start
     return np.asarray(integral)
-
-
-def _lift(P: Array, metric: Array, residual: Array) -> Array:
-    """Shortest changes of z, shape (n, 5), that change the constraints by `residual`, (n, n_p)."""
-    weighted = (P / metric).transpose(0, 2, 1)
-    return np.asarray((weighted @ np.linalg.solve(P @ weighted, residual[..., None]))[..., 0])
 
 
 @dataclass(frozen=True, eq=False)

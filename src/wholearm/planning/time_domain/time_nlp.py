@@ -234,14 +234,10 @@ class TimeNLP:
     @cached_property
     def solver(self) -> Expression:
         """Ipopt, to start from a solution."""
-        return self._build(1e-6)
+        return self.make_solver(1e-6)
 
-    @cached_property
-    def first_solver(self) -> Expression:
-        """Ipopt, to start from a guess."""
-        return self._build(1e-2)
-
-    def _build(self, push: float) -> Expression:
+    def make_solver(self, push: float) -> Expression:
+        """Ipopt, with this distance of the first point from its bounds."""
         assert self.assembled is not None
         nlp, derivatives = self.assembled
         most = {"max_iter": self.max_iter, "max_cpu_time": 120.0}  # [s]
@@ -335,7 +331,7 @@ def add_stage(
     still, balance, senses = set[int](), kernel.y["balance"], kernel.y["senses"]
     if scheme.ends:
         still = find_still(stage, last)
-    low, high = np.zeros((K, d, kernel.outputs)), np.zeros(kernel.outputs)
+    low, high = np.zeros((K, d, kernel.y.count)), np.zeros(kernel.y.count)
     high[senses] = np.inf
     low[..., senses] = -np.inf if homotopy else 0.0
     low[-1, -1, senses][[k in still for k in formation.rubbing_rows]] = -np.inf
@@ -444,7 +440,7 @@ def join_stages(
     rows.add_equal(first[same], last[same])
     if stage.ends_in_impact:
         kernel = impact_kernel(stage.formation, coming.formation)
-        high = np.zeros(kernel.outputs)
+        high = np.zeros(kernel.y.count)
         high[kernel.y["leaving"]] = high[kernel.y["cones"]] = np.inf
         x = {"after": first[V], "before": last[V], "z": last[Z], "impulses": layout.impulses}
         rows.add_copies(kernel, x, {"Xi": coming.directions.Xi}, high=high)
