@@ -18,16 +18,7 @@ import tiny_study
 import wholearm
 from shipped import FOLDER, HEPTAGON, SQUARE, problem_of, solved
 from tiny_study import allow, measure, misbehave
-from wholearm import (
-    Finger,
-    Friction,
-    InputError,
-    Plan,
-    Polygon,
-    Problem,
-    Scene,
-    TorqueProfile,
-)
+from wholearm import Finger, Friction, InputError, Plan, Polygon, Problem, Scene, TorqueProfile
 from wholearm.benchmark import STUDIES
 from wholearm.benchmark.corpus import FAMILIES, LARGEST, answer, compare, list_cases, perturb_scenes
 from wholearm.benchmark.corpus import STUDY as CORPUS

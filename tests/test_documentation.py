@@ -341,7 +341,7 @@ def test_the_simulator_shares_with_the_planner_what_it_says() -> None:
             if isinstance(node, ast.ImportFrom) and node.level == 2:
                 module = node.module or ""
                 assert module.split(".")[0] in {*re.findall(r"`(\w+)`", doc), "common", "mechanics"}
-                if module.startswith("mechanics.") or module == "contacts.cones":
+                if module.startswith("mechanics."):
                     assert f"`{module}`" in doc
                     shared |= {alias.name for alias in node.names}
     said = set(re.findall(r"`(\w+)`", doc)) - {"scene", "contacts", "problem", "results"}

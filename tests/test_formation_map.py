@@ -40,8 +40,7 @@ from wholearm.contacts.contact_limits import (
     evaluate_finger_gap,
 )
 from wholearm.contacts.elemental import build_features, parse_contact
-from wholearm.geometry.arcs import join, take
-from wholearm.geometry.curve import Curve
+from wholearm.geometry.curve import Curve, join, take
 from wholearm.geometry.tracing import trace_curve, trace_phases
 from wholearm.mapping.borders import NOWHERE, Window, label_cells
 from wholearm.mapping.formation_map import (

@@ -33,10 +33,10 @@ from wholearm.analysis.slow_speeds import (
 from wholearm.analysis.tuning import FACTOR, TrialOutcome, split_passages
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
-from wholearm.contacts.cones import force_limit_rows
 from wholearm.figures import plots
 from wholearm.figures.analysis_figures import draw_comparison
 from wholearm.mechanics.dynamics import force_rows
+from wholearm.mechanics.limits import force_limit_rows
 from wholearm.problem.read import name_keys
 from wholearm.problem.table import change_table
 from wholearm.results.adopt import describe_origin, save

@@ -53,8 +53,8 @@ from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.robust.robust_rows import list_holds, measure_holds
 from wholearm.planning.time_domain.time_plan import plan_phases
+from wholearm.problem.definition import NAMES, PARAMETERS
 from wholearm.problem.read import build_problem, read_problem
-from wholearm.problem.uncertainty import NAMES, PARAMETERS
 from wholearm.results.trajectory import Motion, Samples
 from wholearm.simulation.events import EventKind
 

@@ -59,7 +59,7 @@ from wholearm import (
 )
 from wholearm.common.arrays import Array
 from wholearm.geometry.curve import Curve
-from wholearm.geometry.explore import close_contacts
+from wholearm.geometry.path_guess import close_contacts
 from wholearm.geometry.tracing import trace_phase, trace_phases
 from wholearm.mechanics.dynamics import Directions, metric_weights
 from wholearm.mechanics.impact import compute_impact

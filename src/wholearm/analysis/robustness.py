@@ -27,8 +27,7 @@ from ..common.journal import Journal
 from ..common.parallel import DiedError, Processes, run_all
 from ..contacts.closing import close_fingers, describe_obstacle
 from ..policy.playback import ROOM, ClosedLoop, Policy
-from ..problem.definition import Problem
-from ..problem.uncertainty import PARAMETERS, change_scene, read_widths
+from ..problem.definition import PARAMETERS, Problem, change_scene, read_widths
 from ..results.adopt import Torques, adopt_motion, require_same_phases
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory

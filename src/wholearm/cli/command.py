@@ -30,7 +30,7 @@ import wholearm
 from ..common.errors import InputError, ReplayError, WholearmError, name_source
 from ..common.fields import read_options
 from ..common.signals import check, guard, listen
-from ..mechanics.margin_key import MARGIN
+from ..mechanics import MARGIN
 from ..planning.options import PLANNER
 
 if TYPE_CHECKING:
@@ -742,7 +742,7 @@ def compare(options: argparse.Namespace) -> int:
 def robustness(options: argparse.Namespace) -> int:
     """Replay samples, and print what becomes of them."""
     from ..common.parallel import Processes, connect
-    from ..problem.uncertainty import spread_widths
+    from ..problem.definition import spread_widths
 
     # A file for each study that differs by more than numbers: its problem, phase and policy.
     parts = [stem_of(options.problem), "robustness"]

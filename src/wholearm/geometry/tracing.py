@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -334,3 +335,22 @@ def _chebyshev() -> tuple[Array, Array, Array]:
         term = (above - below) / 2
         integral[:, k] = term - term[0]
     return unit, integral @ analyse / 2, analyse
+
+
+@dataclass(frozen=True, eq=False)
+class CostToGo:
+    """The cost of the phases that follow, the first of them with one freedom."""
+
+    phase: Phase  # the first of them. Its curve is where the motion before it may end.
+    # their least cost from a configuration z, shape (5,). Raises a `WholearmError` without a plan
+    # from there.
+    value: Callable[[Array], float]
+
+    def expand(self, z: Array) -> tuple[float, Array]:
+        """The cost from `z`, shape (5,), and its gradient along the curve, shape (5,)."""
+        curve = trace_phase(self.phase, z)
+        step = 1e-2 * curve.length
+        point = curve.evaluate(np.array([0.0, step]))
+        here, ahead = (self.value(place) for place in point.z)
+        slope = (ahead - here) / step
+        return here, slope * metric_weights(self.phase.formation.scene) * point.z_s[0]

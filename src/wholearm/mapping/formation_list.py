@@ -27,8 +27,7 @@ from ..contacts.closing import (
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, find_touching
 from ..geometry.curve import describe_pose
-from ..geometry.explore import STILL, is_inside
-from ..geometry.path_guess import find_end, guess_phase
+from ..geometry.path_guess import STILL, find_end, guess_phase, is_inside
 from ..geometry.tracing import trace_phases
 from ..mechanics.dynamics import metric_weights
 from ..problem.definition import Phase, Problem, Until

@@ -30,9 +30,9 @@ from ..contacts.closing import (
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, Kinematics
 from ..geometry.curve import solve_tangent
+from ..mechanics import UNIQUENESS
 from ..mechanics.dynamics import Directions, force_rows, inverse, metric_weights, reduced_inertia
 from ..mechanics.limits import make_limits
-from ..mechanics.margin_key import UNIQUENESS
 from ..mechanics.path_limits import InternalForceLimits, PathLimits
 from ..mechanics.speed_sweep import make_cosine_grid, speed_sweep
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN, find_minors

@@ -20,9 +20,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ..common.arrays import Array
-from ..contacts.cones import force_limit_rows
 from ..contacts.formation import Formation
 from .dynamics import Directions, force_rows, measure_speed, metric_weights, reduced_inertia
+from .limits import force_limit_rows
 
 ROUNDING = 1e-6  # momentum or speed, in the metric of curves, that counts as rounding
 

@@ -39,7 +39,7 @@ def find_force_slopes(
 ) -> Array:
     """Derivatives of contact forces by uncertain numbers, (n, n_c + R, len(names), COUNT).
 
-    They are coefficients of (1, a, b, s', lambda) [N per unit]. Names are of `problem.uncertainty`:
+    They are coefficients of (1, a, b, s', lambda) [N per unit]. Names are of `PARAMETERS`:
     relative numbers, or lengths in m; `start_x` is the place along the curve.
     """
     return _along(formation, point, directions, forces).find_slopes(names)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..contacts.formation import Formation, Kinematics
-from .margin_key import UNIQUENESS
+from . import UNIQUENESS
 
 UNIQUENESS_MARGIN: float = UNIQUENESS.default
 _SLIDES, _STICKS, _SLIPS = " ", " sticking", (" slipping +", " slipping -")

@@ -61,7 +61,7 @@ from .phase_plan import (
 )
 
 if TYPE_CHECKING:
-    from ..geometry.arcs import CostToGo
+    from ..geometry.tracing import CostToGo
 
 PLAIN = -1  # refinement level: first number of intervals, no search for modes
 BEGUN = -2  # refinement level: coarse plans, which may miss limits between points
@@ -398,7 +398,7 @@ def look_ahead(
                 raise SolverError(text) from None
         return sum(plan.value for plan in plan_block(planning, following, z, options)[0])
 
-    from ..geometry.arcs import CostToGo
+    from ..geometry.tracing import CostToGo
 
     return CostToGo(phase, value)
 

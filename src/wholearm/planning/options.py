@@ -9,7 +9,7 @@ from typing import Any
 
 from ..common.errors import InputError
 from ..common.fields import declare, read_keys, read_options
-from ..mechanics.margin_key import UNIQUENESS
+from ..mechanics import UNIQUENESS
 
 
 class Objective(Enum):
@@ -99,7 +99,7 @@ class PlanOptions:
 
     def scale_ranges(self, given: Mapping[str, float], factor: float | None = None) -> PlanOptions:
         """The same with ranges of so many times a problem's own, or as many as `robust` says."""
-        from ..problem.uncertainty import PARAMETERS, read_widths
+        from ..problem.definition import PARAMETERS, read_widths
 
         factor = self.robust if factor is None else factor
         ranges = (

@@ -22,9 +22,8 @@ from ..geometry.tracing import trace_phases
 from ..mechanics.dynamics import measure_speed
 from ..mechanics.statics import SURE
 from ..mechanics.uniqueness import describe_uniqueness
-from ..problem.definition import Problem
+from ..problem.definition import PARAMETERS, Problem
 from ..problem.read import require_phases
-from ..problem.uncertainty import PARAMETERS
 from ..results.plan_record import Certificate, RangeFigures, TimeBound, Transition
 from ..results.report import UniquenessMargin
 from ..results.trajectory import Trajectory

@@ -15,9 +15,8 @@ from numpy.typing import ArrayLike
 
 from ..common.document import Document, Drawn, Result, Table, fixed, plain, restore
 from ..common.errors import InputError
-from ..problem.definition import Problem
+from ..problem.definition import PARAMETERS, Problem
 from ..problem.read import read_own_problem
-from ..problem.uncertainty import PARAMETERS
 from ..results.dwell_record import Settling
 from ..results.plan_record import Certificate, ModeSpan, RangeFigures, ReplayFigures, Transition
 from ..results.report import UniquenessMargin

@@ -27,8 +27,7 @@ from ..mechanics.dynamics import (
 )
 from ..mechanics.limits import PRESS, TORQUE, make_limits
 from ..mechanics.path_limits import PathLimits
-from ..problem.definition import ROWS, End, Phase, Problem
-from ..problem.uncertainty import PARAMETERS
+from ..problem.definition import PARAMETERS, ROWS, End, Phase, Problem
 from ..results.adopt import Moved, adopt_motion
 from ..results.dwell_record import assemble
 from ..results.torque import TorqueProfile

@@ -37,8 +37,7 @@ from ..mechanics.limits import LimitSet, make_limits
 from ..mechanics.path_limits import PathLimits, find_slack_rows
 from ..mechanics.sensitivity import find_force_slopes, find_shifts
 from ..mechanics.speed_sweep import ControllableSet, find_controllable, find_duration
-from ..problem.definition import End, Phase, Problem
-from ..problem.uncertainty import GROUPS, change_scene
+from ..problem.definition import GROUPS, End, Phase, Problem, change_scene
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
 from .curve_law import choose_internal_force

@@ -37,18 +37,22 @@ from ..contacts.contact_limits import evaluate_finger_gap
 from ..contacts.elemental import Contact, parse_contact
 from ..contacts.formation import Formation, describe, find_touching
 from ..scene.model import FRICTION as COEFFICIENTS
-from ..scene.model import (
-    PLACE,
-    TURN,
-    Finger,
-    Friction,
-    Polygon,
-    Scene,
-    check_place,
-    check_ranges,
+from ..scene.model import PLACE, TURN, Finger, Friction, Polygon, Scene, check_place, check_ranges
+from .definition import (
+    CONTACT,
+    GROUPS,
+    INDEX,
+    LENGTH,
+    PARAMETERS,
+    ROWS,
+    End,
+    Goal,
+    ModeGuess,
+    Phase,
+    Problem,
+    Until,
+    spread_widths,
 )
-from .definition import CONTACT, INDEX, ROWS, End, Goal, ModeGuess, Phase, Problem, Until
-from .uncertainty import GROUPS, LENGTH, PARAMETERS, spread_widths
 
 _T = TypeVar("_T")
 _GOAL = "allowed is a table with flush or phi_deg, and x"

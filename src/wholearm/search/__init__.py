@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import wraps
+from functools import update_wrapper
 from typing import Any
 
 from ..planning import plan as planning
@@ -10,7 +10,6 @@ from ..planning.result import Plan
 from ..problem.definition import Problem
 
 
-@wraps(planning.solve)
 def solve(problem: Problem, objective: str = "time", **options: Any) -> Plan:
     """Plan along the formations that a problem names, or that lead to its goals."""
     if problem.goals:
@@ -18,3 +17,6 @@ def solve(problem: Problem, objective: str = "time", **options: Any) -> Plan:
 
         return find_route(problem, objective, **options).plan
     return planning.solve(problem, objective, **options)
+
+
+update_wrapper(solve, planning.solve)

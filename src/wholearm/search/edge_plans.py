@@ -21,8 +21,7 @@ from ..common.parallel import Task, share
 from ..common.sharing import exclusive
 from ..contacts.formation import Formation
 from ..geometry.curve import Curve
-from ..geometry.explore import STILL
-from ..geometry.path_guess import count_freedoms, find_end
+from ..geometry.path_guess import STILL, count_freedoms, find_end
 from ..geometry.tracing import trace_phase
 from ..mechanics.dynamics import metric_weights
 from ..mechanics.speed_sweep import NoMotionError

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from ..common.arrays import Array
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, Kinematics
-from ..geometry.arcs import find_on, join, take
-from ..geometry.curve import Curve, CurvePoint, describe_pose, directions_of
+from ..geometry.curve import Curve, CurvePoint, describe_pose, directions_of, find_on, join, take
 from ..geometry.tracing import HELD, trace_curve
 from ..mechanics.dynamics import metric_weights, reduced_inertia
 from ..mechanics.path_limits import PathLimits

@@ -14,7 +14,7 @@ from ..contacts.closing import close_fingers, describe_obstacle, name_reach
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, find_touching
 from ..geometry.curve import Curve, describe_pose, find_root, refine
-from ..geometry.explore import close_contacts
+from ..geometry.path_guess import close_contacts
 from ..geometry.tracing import HELD
 from ..problem.definition import Goal, Until
 from ..scene.model import Scene

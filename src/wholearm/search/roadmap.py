@@ -22,7 +22,7 @@ from ..contacts.closing import place as place_at
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..geometry.curve import Curve
-from ..geometry.explore import close_contacts, is_inside
+from ..geometry.path_guess import close_contacts, is_inside
 from ..mapping.borders import NOWHERE, label_cells
 from ..mechanics.dynamics import ONE, Directions, force_rows, inverse, metric_weights
 from ..mechanics.limits import LimitSet, make_limits

@@ -6,6 +6,6 @@ It shares the data model with the planner (`scene`, `contacts`, `problem`, `resu
 is computed from it these alone, each with an independent check among the tests: `compute_impact`
 and `ViolationKind` of `mechanics.impact` (plastic impacts); `Statics`, `TorquePolygon`, `GRAZE` and
 `SURE` of `mechanics.statics` (balance and closed gaps at rest); and `find_weakest` of
-`contacts.cones`. Equations of motion, their integration, events and the choice of contact modes are
-its own.
+`mechanics.limits`. Equations of motion, their integration, events and the choice of contact modes
+are its own.
 """

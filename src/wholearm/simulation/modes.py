@@ -44,10 +44,10 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..common.errors import SimulationError
-from ..contacts.cones import find_weakest
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..mechanics.impact import ViolationKind, compute_impact
+from ..mechanics.limits import find_weakest
 from ..mechanics.statics import GRAZE, SURE, Statics, TorquePolygon
 from ..scene.model import Scene
 from .stepper import Modes
@@ -276,7 +276,7 @@ class StartMode(NamedTuple):
     """Start mode; quantities at rest are rows @ (1, tau_1, tau_2)."""
 
     response: Response
-    # (n_c + 2 R, 3) [N]: what has to be positive for the contacts to hold, H c (`contacts.cones`)
+    # (n_c + 2 R, 3) [N]: what has to be positive for the contacts to hold, H c (`mechanics.limits`)
     force_limits: Array
     # (k, 3): accelerations of sliding and turning along the signs, or along the only freedom
     slips: Array

@@ -23,14 +23,7 @@ from ..problem.read import require_phases
 from ..results.adopt import Torques, adopt_torques
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
-from .events import (
-    Energies,
-    EventKind,
-    Outcome,
-    OutcomeKind,
-    Simulation,
-    list_stretches,
-)
+from .events import Energies, EventKind, Outcome, OutcomeKind, Simulation, list_stretches
 from .prescribed import Replay
 from .run import Feedback, Law, Run
 from .stepper import Modes

@@ -20,13 +20,7 @@ from ..common.sharing import exclusive
 from ..geometry.curve import describe_pose
 from ..policy.playback import ROOM, ClosedLoop, Policy
 from ..problem.definition import Phase, Problem
-from ..results.adopt import (
-    Moved,
-    Torques,
-    adopt_motion,
-    adopt_torques,
-    require_same_contacts,
-)
+from ..results.adopt import Moved, Torques, adopt_motion, adopt_torques, require_same_contacts
 from ..results.plan_record import Deviation
 from ..results.trajectory import Trajectory
 from ..simulation.events import EventKind, FreeSimulation, OutcomeKind, list_pauses

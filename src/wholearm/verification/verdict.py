@@ -14,7 +14,7 @@ from ..common.fields import POSITIVE, declare, key, read_keys
 from ..contacts.contact_limits import FINGERS_TOUCH
 from ..contacts.formation import Formation, Kinematics
 from ..geometry.curve import describe_pose
-from ..mechanics.margin_key import UNIQUENESS
+from ..mechanics import UNIQUENESS
 from ..mechanics.statics import SURE, Statics
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN, describe_uniqueness, find_minors
 from ..problem.definition import End, Phase, Problem

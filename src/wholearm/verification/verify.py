@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 from ..common.arrays import Array
 from ..common.errors import InputError
 from ..common.sharing import exclusive
-from ..contacts.cones import slip_margins
 from ..contacts.contact_limits import evaluate_finger_gap
 from ..contacts.formation import Formation
 from ..mechanics.dynamics import Directions, force_rows
-from ..mechanics.limits import CONE, PRESS, TORQUE, LimitSet, make_limits
+from ..mechanics.limits import CONE, PRESS, TORQUE, LimitSet, make_limits, slip_margins
 from ..mechanics.statics import Statics
 from ..mechanics.uniqueness import UNIQUENESS_MARGIN
 from ..problem.definition import End, Phase, Problem

@@ -17,11 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ...common.arrays import Array
-from ...common.errors import (
-    AmbiguityError,
-    JammingError,
-    SolverError,
-)
+from ...common.errors import AmbiguityError, JammingError, SolverError
 from ...geometry.curve import Curve, describe_pose, directions_of
 from ...mechanics.dynamics import LAMBDA, ONE, A, reduced_inertia
 from ...mechanics.limits import PRESS

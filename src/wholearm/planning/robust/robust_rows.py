@@ -31,7 +31,7 @@ from ...mechanics.limits import CONE, PRESS, LimitSet, make_limits
 from ...mechanics.path_limits import PathLimits
 from ...mechanics.sensitivity import find_force_slopes
 from ...mechanics.statics import Statics, TorquePolygon
-from ...problem.uncertainty import PARAMETERS
+from ...problem.definition import PARAMETERS
 from ...scene.model import Friction
 
 COPIES = 5  # rows for each force limit: two for each vertex, and one for the reference

@@ -21,10 +21,17 @@ from ...common.arrays import Array, find_runs
 from ...common.errors import InputError
 from ...contacts.contact_limits import list_renamed
 from ...contacts.formation import Formation
-from ...geometry.arcs import CostToGo
 from ...geometry.curve import describe_pose, find_tied, tangent_basis
-from ...geometry.explore import close_contacts, is_inside
-from ...geometry.path_guess import PathGuess, connect, find_end, guess_phase, list_ends
+from ...geometry.path_guess import (
+    PathGuess,
+    close_contacts,
+    connect,
+    find_end,
+    guess_phase,
+    is_inside,
+    list_ends,
+)
+from ...geometry.tracing import CostToGo
 from ...mechanics.dynamics import Directions, force_rows, metric_weights
 from ...mechanics.limits import SPEED, make_limits
 from ...problem.definition import End, Phase, Problem

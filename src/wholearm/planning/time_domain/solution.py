@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from ...common.arrays import Array, find_minima
 from ...common.errors import Parameter
-from ...geometry.arcs import CostToGo
+from ...geometry.tracing import CostToGo
 from ...mechanics.dynamics import Directions
 from ...mechanics.limits import CONE, PRESS, make_limits
 from ...mechanics.sensitivity import find_slopes_at

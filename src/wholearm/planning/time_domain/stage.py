@@ -20,8 +20,7 @@ from ...common.fields import keys_of
 from ...contacts.formation import Formation
 from ...mechanics.dynamics import Directions
 from ...mechanics.limits import make_limits
-from ...problem.definition import Phase, Problem, Until
-from ...problem.uncertainty import PARAMETERS
+from ...problem.definition import PARAMETERS, Phase, Problem, Until
 from ...scene.model import Polygon, Scales
 from ..options import CLEARANCE, OPENING, Objective, PlanOptions
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from ...common.arrays import Array
 from ...common.errors import InfeasibleError, Parameter, SolverError, WholearmError
-from ...geometry.arcs import CostToGo
+from ...geometry.tracing import CostToGo
 from ...mechanics.dynamics import measure_speed
 from ...mechanics.impact import Impact, compute_impact
 from ...problem.definition import ROWS, End, Phase, Problem
