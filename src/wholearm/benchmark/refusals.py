@@ -323,21 +323,14 @@ def _solve_along(
 
 def inertia_ratio(scene: Scene, phase: Phase, z: Array, z_s: Array) -> Array:
     """Reduced inertia over that without friction, least of both sides, shape (n,): jams below 0."""
-    names, rolling = phase.formation.names, phase.formation.rolling_rows
-    touches = [locate(scene, name, z) for name in names]
-    signs = _signs(scene, phase, z, z_s)
-    rows = np.concatenate(
-        [
-            np.stack([touch.normal for touch in touches], axis=1),
-            *(touches[k].tangent[:, None] for k in rolling),
-        ],
-        axis=1,
-    )
+    touches = [locate(scene, name, z) for name in phase.formation.names]
+    signs, rows = _signs(scene, phase, z, z_s), constrain(scene, phase, z)[1]
     light = rows / scene.mass_diagonal
     without = np.linalg.det(light @ rows.transpose(0, 2, 1))
-    ratios = []
-    for sign in (np.vstack([signs[:1], signs]), np.vstack([signs, signs[-1:]])):
-        ratios.append(np.linalg.det(light @ _push(touches, rolling, sign)) / without)
+    ratios = [
+        np.linalg.det(light @ _push(touches, phase.formation.rolling_rows, own)) / without
+        for own in (np.vstack([signs[:1], signs]), np.vstack([signs, signs[-1:]]))
+    ]
     return np.asarray(np.minimum(*ratios))
 
 
@@ -435,7 +428,7 @@ def rest_margin(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: bool
     """
     touches = [locate(scene, name, z[None]) for name in phase.formation.names]
     rolling = phase.formation.rolling_rows
-    closed = np.array([t.normal[0] for t in touches] + [touches[k].tangent[0] for k in rolling])
+    closed = constrain(scene, phase, z[None])[1][0]
     size = np.array([1.0, 1.0, *[1 / scene.scales.length] * 3])
     N = size[:, None] * null_space(closed * size, rcond=STILL)
     if N.shape[1] not in (1, 2):

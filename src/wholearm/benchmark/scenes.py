@@ -191,7 +191,7 @@ def _distance(piece: Piece, here: Array, size: Array) -> float:
 
 
 @dataclass(frozen=True)
-class Case:
+class DrawnScene:
     """A problem of the study."""
 
     kind: str  # what is special about it
@@ -200,7 +200,7 @@ class Case:
 
 
 @lru_cache(maxsize=2)
-def draw_case(seed: int, number: int) -> Case:
+def draw_case(seed: int, number: int) -> DrawnScene:
     """Draw case `number` of a seed: always the same one, whichever others are drawn."""
     rng = np.random.default_rng([seed, number])
     kinds = list(TWISTS)
@@ -224,7 +224,7 @@ def draw_case(seed: int, number: int) -> Case:
             route = ROUTES[int(rng.integers(len(ROUTES)))]
             phases, stops, name = route(rng, problem, phases, stops)
             plain = json.loads(json.dumps({**table, "phases": phases}, default=float))
-            last = Case(f"{kind}, {name}", plain, stops)
+            last = DrawnScene(f"{kind}, {name}", plain, stops)
             if moves or not willing:
                 return last
     if last is None:

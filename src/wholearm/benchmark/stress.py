@@ -31,8 +31,7 @@ from ..verification.newton_euler import BODIES, balance, locate
 from ..verification.verify import verify
 from .damage import describe_error, run_file
 from .refusals import OVERLAP, clearances, judge
-from .scenes import Case as DrawnScene
-from .scenes import draw_case
+from .scenes import DrawnScene, draw_case
 from .study import Case, Row, Study, format_table, name_case
 
 OBJECTIVES = ("time", "effort", "margin")

@@ -27,8 +27,9 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import wholearm
 
-from ..common.errors import InputError, ReplayError, WholearmError, name_source
-from ..common.fields import read_options
+from ..common.errors import InputError, ReplayError, WholearmError, name_source, require_number
+from ..common.fields import Range, keys_of, read_options
+from ..common.files import require_ending, require_writable, together, write_text
 from ..common.signals import check, guard, listen
 from ..mechanics import MARGIN
 from ..planning.options import PLANNER
@@ -437,8 +438,6 @@ def require_output(path: str | None, *endings: str) -> None:
     """Check, before long work, that a file can be written; without endings it is a figure."""
     if path is None:
         return
-    from ..common.files import require_ending, require_writable
-
     if not endings:
         from ..figures.plots import require_format
 
@@ -535,8 +534,6 @@ def tell_origin(
 
 def solve(options: argparse.Namespace) -> int:
     """Plan, and write the plan."""
-    from ..common.fields import keys_of
-    from ..common.files import together
     from ..planning.plan import solve_with
     from ..planning.result import describe_plan
     from ..scene.model import find_unit_hint
@@ -652,8 +649,6 @@ def _check_free(options: argparse.Namespace) -> None:
 
 def _is_table(path: str) -> bool:
     """Whether a file is one of torques alone, and no trajectory."""
-    from ..common.files import require_ending
-
     return require_ending(path, ".npz", ".csv") == ".csv"
 
 
@@ -716,8 +711,6 @@ def predict(options: argparse.Namespace) -> int:
 
 def tune(options: argparse.Namespace) -> int:
     """Tune torques in steps of 10 %, print what became of each phase, write them if they hold."""
-    from ..common.files import write_text
-
     require_output(options.output, ".csv")
     given = {key: getattr(options, key) for key in ("brake", "stops", "squeeze", "share")}
     tuning = wholearm.tune(wholearm.load(options.problem), **given, progress=show_progress())
@@ -884,8 +877,6 @@ def draw_map(options: argparse.Namespace) -> int:
 
 
 def _read_pair(text: str, key: str, allowed: str) -> tuple[float, float]:
-    from ..common.errors import require_number
-
     try:
         first, second = (require_number(float(part), key) for part in text.split(","))
     except ValueError:
@@ -895,8 +886,6 @@ def _read_pair(text: str, key: str, allowed: str) -> tuple[float, float]:
 
 def _check_step(options: argparse.Namespace, problem: wholearm.Problem) -> None:
     """Check that an engine gets along with the time step, if one is given."""
-    from ..common.fields import Range
-
     known = Range(1e-6, 1e-1, lambda scene, _: scene.scales.time, "times the scene's time")
     if options.step is not None:
         known.check("--step", options.step, "s", problem.scene)
@@ -917,8 +906,6 @@ def _load_replayed(options: argparse.Namespace, silent: bool) -> LoadedPlan:
 
 def export(options: argparse.Namespace) -> int:
     """Write the scene, with a plan if one is given."""
-    from ..common.files import write_text
-
     require_output(options.mjcf, ".xml")
     problem, plan = read_problem(options), None
     _check_step(options, problem)
@@ -1038,7 +1025,6 @@ def animate(options: argparse.Namespace) -> int:
         simulation = overlay(options.simulate, trajectory)
         ghost = None if simulation is None else simulation.trajectory
         if options.output.lower().endswith(".html"):
-            from ..common.files import write_text
             from ..viewer.page import build_page, describe_motion, write_player
 
             motion = describe_motion(trajectory, problem, ghost) | {"speed": options.speed}
@@ -1053,7 +1039,6 @@ def animate(options: argparse.Namespace) -> int:
 
 def report(options: argparse.Namespace) -> int:
     """Write the page of a problem and its plans."""
-    from ..common.files import write_text
     from ..viewer.report_page import build_report
 
     stem = stem_of(options.problem)
@@ -1129,7 +1114,6 @@ def write_problem(options: argparse.Namespace) -> int:
     """Write a problem file to begin with."""
     import numpy as np
 
-    from ..common.files import require_writable, write_text
     from ..mapping.formation_list import write_template
 
     output, vertices = f"{options.name.removesuffix('.toml')}.toml", None
@@ -1153,7 +1137,6 @@ def write_problem(options: argparse.Namespace) -> int:
 
 def show_schema(options: argparse.Namespace) -> int:
     """Print or write the schema, or the tables of keys."""
-    from ..common.files import require_writable, write_text
     from ..problem.read import build_schema, write_page
 
     text = write_page() if options.table else json.dumps(build_schema(), indent=2) + "\n"

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
 import threading
-import zipfile
-import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, BinaryIO
-
-import numpy as np
 
 from .errors import InputError
 from .signals import held, on_end
@@ -177,6 +174,10 @@ def read_arrays(path: str | os.PathLike[str], names: Iterable[str]) -> dict[str,
     ------
     InputError  if the file cannot be read, is no archive of arrays, or claims what it does not hold
     """
+    # A command that reads none has no use for these, nor for NumPy.
+    import zipfile
+    import zlib
+
     source, arrays = str(path), dict[str, Any]()
     try:
         with open(path, "rb") as stream:
@@ -202,7 +203,7 @@ def read_arrays(path: str | os.PathLike[str], names: Iterable[str]) -> dict[str,
 
 def _read_array(source: str, name: str, content: bytes) -> Any:
     """The array whose ``.npy`` file has the given bytes."""
-    import io
+    import numpy as np
 
     stream = io.BytesIO(content)
     version = np.lib.format.read_magic(stream)

@@ -70,11 +70,28 @@ def share(tasks: Sequence[Task[_T]], jobs: int, known: Sequence[object] = ()) ->
     count = min(jobs, len(tasks)) - 1
     if count < 1 or _sharing or not can_fork():
         return [task() for task in tasks]
-    _sharing = True
+    _sharing, children = True, list[tuple[BaseProcess, Connection]]()
+    source, sink = os.pipe()
     try:
-        return _share(tasks, count, {id(own): k for k, own in enumerate(known)}, known)
+        os.write(sink, b"".join(k.to_bytes(2, "big") for k in range(len(tasks))))
+        os.close(sink)
+        for _ in range(count):
+            children.append(_start(tasks, source, known))
+        results = _take(tasks, source)
+        for _, answers in children:
+            # A child that was ended, or met an error, sends nothing.
+            with suppress(EOFError, OSError):
+                answer = io.BytesIO(answers.recv_bytes())
+                results |= _Unpickler(answer, known).load()
+        return [results[k] if k in results else task() for k, task in enumerate(tasks)]
     finally:
         _sharing = False
+        os.close(source)
+        for process, answers in children:
+            process.kill()
+            process.join()
+            process.close()
+            answers.close()
 
 
 def can_fork() -> bool:
@@ -87,40 +104,13 @@ def can_fork() -> bool:
     )
 
 
-def _share(
-    tasks: Sequence[Task[_T]], count: int, numbers: dict[int, int], known: Sequence[object]
-) -> list[_T]:
-    """Results of tasks, done by this process and `count` others."""
-    source, sink = os.pipe()
-    os.write(sink, b"".join(k.to_bytes(2, "big") for k in range(len(tasks))))
-    os.close(sink)
-    children = list[tuple[BaseProcess, Connection]]()
-    try:
-        for _ in range(count):
-            children.append(_start(tasks, source, numbers))
-        results = _take(tasks, source)
-        for _, answers in children:
-            # A child that was ended, or met an error, sends nothing.
-            with suppress(EOFError, OSError):
-                answer = io.BytesIO(answers.recv_bytes())
-                results |= _Unpickler(answer, known).load()
-        return [results[k] if k in results else task() for k, task in enumerate(tasks)]
-    finally:
-        os.close(source)
-        for process, answers in children:
-            process.kill()
-            process.join()
-            process.close()
-            answers.close()
-
-
 def _start(
-    tasks: Sequence[Task[Any]], source: int, numbers: dict[int, int]
+    tasks: Sequence[Task[Any]], source: int, known: Sequence[object]
 ) -> tuple[BaseProcess, Connection]:
     """Fork a child that takes tasks, and sends its answers."""
     context = mp.get_context("fork")
     answers, far = context.Pipe(duplex=False)
-    given = tasks, source, (answers, far), numbers, os.getpid()
+    given = tasks, source, (answers, far), known, os.getpid()
     process = context.Process(target=_serve, args=given, daemon=True)
     try:
         # No signal may meet the child before it has said what it does about it.
@@ -161,7 +151,7 @@ def _serve(
     tasks: Sequence[Task[Any]],
     source: int,
     ends: tuple[Connection, Connection],
-    numbers: dict[int, int],
+    known: Sequence[object],
     parent: int,
 ) -> None:
     """Take tasks for as long as there are any, and send what has come of them."""
@@ -181,7 +171,7 @@ def _serve(
     except KeyboardInterrupt:
         return  # The time is over, as its parent finds out and says.
     with suppress(Exception):
-        far.send_bytes(_pickle(results, numbers))
+        far.send_bytes(_pickle(results, known))
 
 
 def _take(tasks: Sequence[Task[_T]], source: int) -> dict[int, _T]:
@@ -201,9 +191,9 @@ def _take(tasks: Sequence[Task[_T]], source: int) -> dict[int, _T]:
 class _Pickler(pickle.Pickler):
     """Pickles with numbers in place of objects that both sides know."""
 
-    def __init__(self, stream: io.BytesIO, numbers: dict[int, int]) -> None:
+    def __init__(self, stream: io.BytesIO, known: Sequence[object]) -> None:
         super().__init__(stream, pickle.HIGHEST_PROTOCOL)
-        self._numbers = numbers
+        self._numbers = {id(own): k for k, own in enumerate(known)}
 
     def persistent_id(self, obj: object) -> int | None:
         return self._numbers.get(id(obj))
@@ -218,12 +208,12 @@ class _Unpickler(pickle.Unpickler):
         return self._known[pid]
 
 
-def _pickle(value: object, numbers: dict[int, int]) -> bytes:
+def _pickle(value: object, known: Sequence[object]) -> bytes:
     stream = io.BytesIO()
     deepest = sys.getrecursionlimit()
     sys.setrecursionlimit(max(deepest, 20_000))
     try:
-        _Pickler(stream, numbers).dump(value)
+        _Pickler(stream, known).dump(value)
     finally:
         sys.setrecursionlimit(deepest)
     return stream.getvalue()
