@@ -12,11 +12,10 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from ..figures.style import PALETTE
+from ..figures.style import PALETTE, open_figure
 from ..geometry.tracing import load
 from ..mapping.formation_map import build_map
 from ..planning.plan import solve
@@ -76,23 +75,22 @@ class Growth(Study):
 
     def draw(self, rows: Sequence[Row]) -> Figure:
         """Cost above, memory below, over what grows, on logarithmic axes."""
-        figure = Figure(figsize=(10.0, 6.4), layout="constrained")
-        FigureCanvasAgg(figure)
-        grid = figure.subplots(2, len(SIZES), squeeze=False)
-        for column, grows in zip(grid.T, SIZES, strict=True):
-            for axes, (field, (_, label)) in zip(column, FIELDS.items(), strict=True):
-                for work, colour, marker in zip(WORK[grows], PALETTE, "os", strict=False):
-                    sizes, values = select(rows, grows, work, field)
-                    name = f"{work}, exponent {fit_exponent(sizes, values):.2f}"
-                    axes.loglog(sizes, values, color=colour, marker=marker, label=name)
-                axes.set_xticks(SIZES[grows], map(str, SIZES[grows]))
-                low, high = (np.log10(limit) for limit in axes.get_ylim())
-                axes.set_ylim(10.0 ** np.floor(low), 10.0 ** np.ceil(high))
-                for axis in (axes.xaxis, axes.yaxis):
-                    axis.set_minor_formatter(NullFormatter())
-                axes.set_xlabel(f"{grows} [-]")
-                axes.set_ylabel(label)
-                finish_axes(axes, fontsize=8)
+        with open_figure(10.0, 6.4, layout="constrained") as figure:
+            grid = figure.subplots(2, len(SIZES), squeeze=False)
+            for column, grows in zip(grid.T, SIZES, strict=True):
+                for axes, (field, (_, label)) in zip(column, FIELDS.items(), strict=True):
+                    for work, colour, marker in zip(WORK[grows], PALETTE, "os", strict=False):
+                        sizes, values = select(rows, grows, work, field)
+                        name = f"{work}, exponent {fit_exponent(sizes, values):.2f}"
+                        axes.loglog(sizes, values, color=colour, marker=marker, label=name)
+                    axes.set_xticks(SIZES[grows], map(str, SIZES[grows]))
+                    low, high = (np.log10(limit) for limit in axes.get_ylim())
+                    axes.set_ylim(10.0 ** np.floor(low), 10.0 ** np.ceil(high))
+                    for axis in (axes.xaxis, axes.yaxis):
+                        axis.set_minor_formatter(NullFormatter())
+                    axes.set_xlabel(f"{grows} [-]")
+                    axes.set_ylabel(label)
+                    finish_axes(axes, fontsize=8)
         return figure
 
 

@@ -37,7 +37,7 @@ from ..common.arrays import Array, Expression
 from ..common.errors import InputError
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
-from ..figures.style import PALETTE
+from ..figures.style import PALETTE, open_figure
 from ..geometry.curve import Curve, Segment, directions_of
 from ..geometry.tracing import trace_phases
 from ..mechanics.dynamics import ONE, A, B, PathForces, build_force_rows, build_forward, inverse
@@ -931,14 +931,10 @@ class Precision(Study):
 
     def draw(self, rows: Sequence[Row]) -> Figure:
         """Mean run time over the error that half of the phases keep, one line for each method."""
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(11.0, 9.0), layout="constrained")
-        FigureCanvasAgg(figure)
         measured = [row for row in rows if "errors" in row]
-        for axes, study in zip(figure.subplots(2, 2).flat, PLANNING + SIMULATION, strict=True):
-            _draw_study(axes, measured, study)
+        with open_figure(11.0, 9.0, layout="constrained") as figure:
+            for axes, study in zip(figure.subplots(2, 2).flat, PLANNING + SIMULATION, strict=True):
+                _draw_study(axes, measured, study)
         return figure
 
 

@@ -228,10 +228,9 @@ def format_table(
 
 
 def finish_axes(axes: Axes, **legend: Any) -> None:
-    """Give axes a grid, no frame and a legend."""
+    """Give axes a grid and a legend."""
     axes.grid(True, which="major", color="#c4c9d0", linewidth=0.6)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, **legend)
+    axes.legend(**legend)
 
 
 def digest_source(inputs: Iterable[Path] = ()) -> str:

@@ -122,42 +122,36 @@ class EngineReport(Result):
         worst = max(float(np.max(each.position)) for each in departures) * 1e3
         turned = math.degrees(max(float(np.max(each.angle)) for each in departures))
         says = "departs" if self.converged else "departs with some settings only, here"
-        pairs = list(zip(self.stretches, departures, strict=True))
-        errors, forces, levels = list[list[Any]](), list[tuple[Any, ...]](), list[list[Any]]()
-        for stretch, found in pairs:
+        lines, errors, forces = list[str](), list[list[Any]](), list[tuple[Any, ...]]()
+        for stretch, found in zip(self.stretches, departures, strict=True):
+            if found.time is not None:
+                when = f"at t = {found.time:.5g} s: {found.reason}"
+                lines.append(f"phase {stretch.name} {says} {when}")
             at = np.linspace(stretch.start, stretch.stop, PARTS + 1)[1:]
             sampled = np.interp(at, found.t, found.position)
             largest = np.max(found.position), np.max(found.angle)
             errors.append([stretch.name, stretch.duration, *largest, *sampled])
             for force in found.forces:
-                off = force.off if force.planned > PRESS * scales.force else None
-                forces.append((force.phase, force.contact, force.planned, force.found, off))
+                forces.append((*force, force.off if force.planned > PRESS * scales.force else None))
+        levels = list[list[Any]]()
         for level in self.levels if len(self.levels) > 1 else ():
             farthest = [np.max(found.position) for found in level.departures]
             levels.append([level.setting.step * scales.time, level.setting.softness, *farthest])
+        lines.append(
+            f"steps of up to {setting.step * scales.time:.3g} s, softness {setting.softness:g}; "
+            "torques contain the dry friction of the joints, with its planned signs"
+        )
         shares = [f"{k / PARTS:.0%} [mm]:.4f" for k in range(1, PARTS + 1)]
         names = [f"{stretch.name} [mm]:.4f" for stretch in self.stretches]
         heads = ["phase:d", "duration [s]:.6f", "largest [mm]:.4f", "[deg]:.4f", *shares]
         other = ["phase:d", "contact", "planned mean c_n [N]:.4f", "found [N]:.4f", "off [%]:+.2f"]
-        lost = [
-            f"phase {stretch.name} {says} at t = {found.time:.5g} s: {found.reason}"
-            for stretch, found in pairs
-            if found.time is not None
-        ]
-        settings = f"steps of up to {setting.step * scales.time:.3g} s, softness "
-        settings += f"{setting.softness:g}; torques contain the dry friction of the joints, with "
-        tables = Table(heads, errors), Table(other, forces)
+        finer = ["step [s]:.3g", "softness:g", *names]
         return Document(
             f"{self.problem.name} in {self.title}",
             "ok" if self.ok else "DEPARTS" if self.converged else "NOT CONVERGED",
             f"within {worst:.4f} mm and {turned:.4f} degrees of the plan "
             f"(allowed {millimetres:.4g} mm, {degrees:.3g} degrees)",
-            [
-                *lost,
-                f"{settings}its planned signs",
-                *tables,
-                Table(["step [s]:.3g", "softness:g", *names], levels),
-            ],
+            [*lines, Table(heads, errors), Table(other, forces), Table(finer, levels)],
         )
 
     @property
