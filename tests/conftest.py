@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from wholearm.problem.definition import Problem
     from wholearm.results.trajectory import Trajectory
 
+# Importing the package and collecting tests makes hardly any garbage.
+gc.disable()
 # A shell lets what it starts in the background ignore SIGINT, and so would all that tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -39,9 +41,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_finish() -> None:
     """Spare the collector what is there until the end, modules and tests, and look rarely."""
-    gc.collect()
     gc.freeze()
     gc.set_threshold(200_000, 50, 1000)
+    gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -16,6 +16,7 @@ import pytest
 
 import tiny_study
 import wholearm
+from rows import each
 from shipped import FOLDER, HEPTAGON, SQUARE, problem_of, solved
 from tiny_study import allow, measure, misbehave
 from wholearm import Finger, Friction, InputError, Plan, Polygon, Problem, Scene, TorqueProfile
@@ -458,8 +459,8 @@ PLANNED: dict[str, Any] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("change", "kind"),
+@each(
+    "change, kind",
     [
         ({}, "same"),
         ({"value": 1 + 5e-7, "durations": [0.40002, 0.59998]}, "same"),

@@ -18,6 +18,7 @@ from plane import (
     place_tips,
     rotate,
 )
+from rows import each
 from shipped import HEPTAGON, chart, problem_of
 from wholearm import InputError, Scene
 from wholearm.common.arrays import Array
@@ -95,7 +96,7 @@ def test_names_round_trip(scene: Scene) -> None:
     assert [str(contact) for contact in contacts] == [contact.name for contact in contacts]
 
 
-@pytest.mark.parametrize(
+@each(
     "name",
     [
         *("v5-palm", "e5-tip1", "e0-palm", "e1-finger1", "v1-finger3", "v1-tip0", "v1", "x1-palm"),
@@ -299,7 +300,7 @@ STANDING = np.array([0.045, 0.03, 0.0, UPRIGHT, UPRIGHT])
 LEFT = np.array([-0.045, 0.03, 0.0, UPRIGHT, UPRIGHT])
 
 
-@pytest.mark.parametrize(
+@each(
     "scene, names, z, text",
     [
         (WIDE, "v0-palm v1-finger1", STANDING, "v1 touches the palm"),
@@ -338,7 +339,7 @@ def test_limit_is_the_clearance(
     assert limits_at(scene, names, z)[text] == pytest.approx(clear, abs=ROUNDING)
 
 
-@pytest.mark.parametrize(
+@each(
     "names, text, gained",
     [
         ("v2-finger1", "v2 runs off finger 1 at its tip", "v2-tip1"),

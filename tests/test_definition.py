@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 import wholearm
+from rows import each
 from shipped import BOX, FOLDER, HEPTAGON, plan_of, problem_of
 from wholearm import End, Goal, InputError, Problem, Until, compare, load, save
 from wholearm.cli.command import build_parser, main
@@ -188,7 +189,7 @@ THREE = {
 }
 
 
-@pytest.mark.parametrize(
+@each(
     "edit, key, text",
     [
         (put("epsilonn", 1), "epsilonn", "did you mean 'epsilon'"),
@@ -281,7 +282,7 @@ def test_an_impact_adds_only_the_contact_gained() -> None:
         read_edited(edit)
 
 
-@pytest.mark.parametrize(
+@each(
     "old, new, key, text",
     [
         ("mass = 0.2", "mass = nan", "object.mass", "finite"),
@@ -422,8 +423,7 @@ def thicken(own: Problem) -> Problem:
     return rebuild(own, scene=replace(own.scene, fingers=fingers))
 
 
-@pytest.mark.parametrize(
-    ("make", "file"),
+@each("make, file",
     [
         (lambda own: rebuild(own, epsilon=-0.1), {"epsilon": -0.1}),
         (lambda own: rebuild(own, epsilon=1e9), {"epsilon": 1e9}),
@@ -559,7 +559,7 @@ BAD: dict[str, list[Any]] = {
 }
 
 
-@pytest.mark.parametrize("key, given", [(key, own) for key, every in BAD.items() for own in every])
+@each("key, given", [(key, own) for key, every in BAD.items() for own in every])
 def test_bad_options_are_named(key: str, given: Any) -> None:
     options = {"objective": "margin"} | {key: given}
     with pytest.raises(InputError) as caught:
@@ -631,8 +631,8 @@ def test_keys_are_those_that_the_reader_allows(where: str) -> None:
             build_problem(table)
 
 
-@pytest.mark.parametrize(
-    ("where", "key", "value"),
+@each(
+    "where, key, value",
     [
         ("", "epsilon", -1.0),
         ("", "surely_unknown", 1),
@@ -713,8 +713,8 @@ def test_another_scene_is_the_scene_of_every_phase(heptagon: Problem) -> None:
     assert heptagon.table["friction"]["palm"] == pytest.approx(0.1)
 
 
-@pytest.mark.parametrize(
-    ("changes", "key", "expected"),
+@each(
+    "changes, key, expected",
     [
         ({"name": "other"}, "name", "other"),
         ({"epsilon": 0.01}, "epsilon", 0.01),
@@ -752,8 +752,8 @@ def test_another_shape_closes_the_fingers_anew(heptagon: Problem) -> None:
     check_table(other)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
+@each(
+    "changes, message",
     [
         (
             {"fricton": 0.2},

@@ -77,12 +77,12 @@ def run(code: str) -> list[str]:
     return result.stdout.splitlines()
 
 
-@pytest.mark.parametrize("name", wholearm.__all__)
-def test_every_name_is_there(name: str) -> None:
-    assert getattr(wholearm, name) is not None
-    # And the same object when asked again.
-    assert getattr(wholearm, name) is getattr(wholearm, name)
-    assert name in dir(wholearm)
+def test_every_name_is_there() -> None:
+    for name in wholearm.__all__:
+        assert getattr(wholearm, name) is not None, name
+        # And the same object when asked again.
+        assert getattr(wholearm, name) is getattr(wholearm, name), name
+        assert name in dir(wholearm), name
 
 
 def test_unknown_attribute() -> None:
@@ -195,24 +195,24 @@ def test_python_blocks_run(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert wholearm.load("heavier.toml").table == problem_of(LANDING).with_(mass=0.25).table
 
 
-@pytest.mark.parametrize("text", CALLS)
-def test_python_calls_fit_their_functions(text: str) -> None:
-    call = ast.parse(text, mode="eval").body
-    assert isinstance(call, ast.Call)
-    function = eval(ast.unparse(call.func), {"wholearm": wholearm})
-    inspect.signature(function).bind(*call.args, **{str(key.arg): 0 for key in call.keywords})
+def test_python_calls_fit_their_functions() -> None:
+    for text in CALLS:
+        call = ast.parse(text, mode="eval").body
+        assert isinstance(call, ast.Call), text
+        function = eval(ast.unparse(call.func), {"wholearm": wholearm})
+        inspect.signature(function).bind(*call.args, **{str(key.arg): 0 for key in call.keywords})
 
 
-@pytest.mark.parametrize("line", LINES)
-def test_shell_lines_are_read(line: str, folder: Path) -> None:
-    words = shlex.split(line, comments=True)
-    if words[0] == "wholearm" and "COMMAND" not in words:
-        if len(words) == 2:
-            words.append("--help")
-        try:
-            make_parser().parse_args(prepare(words[1:]))
-        except SystemExit as error:
-            assert error.code == 0
+def test_shell_lines_are_read(folder: Path) -> None:
+    for line in LINES:
+        words = shlex.split(line, comments=True)
+        if words[0] == "wholearm" and "COMMAND" not in words:
+            if len(words) == 2:
+                words.append("--help")
+            try:
+                make_parser().parse_args(prepare(words[1:]))
+            except SystemExit as error:
+                assert error.code == 0, line
 
 
 PLANS: dict[str, Callable[[], Any]] = {
@@ -284,24 +284,24 @@ def name_anchor(heading: str) -> str:
     return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
 
 
-@pytest.mark.parametrize("path", EVERY, ids=lambda path: str(path.relative_to(ROOT)))
-def test_links_lead_somewhere(path: Path) -> None:
-    text = re.sub(r"^```.*?^```", "", read(path), flags=re.M | re.S)
-    for target, anchor in re.findall(r"\]\(([^)#\s]*)#?([^)\s]*)\)", text):
-        if target.startswith("http"):
-            continue
-        found = path if not target else path.parent / target
-        assert found.exists(), target
-        if anchor:
-            headings = re.findall(r"^#+ (.*)$", read(found), re.M)
-            assert anchor in map(name_anchor, headings), f"{target}#{anchor}"
+def test_links_lead_somewhere() -> None:
+    for path in EVERY:
+        text = re.sub(r"^```.*?^```", "", read(path), flags=re.M | re.S)
+        for target, anchor in re.findall(r"\]\(([^)#\s]*)#?([^)\s]*)\)", text):
+            if target.startswith("http"):
+                continue
+            found = path if not target else path.parent / target
+            assert found.exists(), (path, target)
+            if anchor:
+                headings = re.findall(r"^#+ (.*)$", read(found), re.M)
+                assert anchor in map(name_anchor, headings), (path, target, anchor)
 
 
-@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_modules_that_pages_name_are_there(path: Path) -> None:
-    for name in re.findall(r"`([\w./]+\.py)`", read(path)):
-        places = (ROOT, SOURCE, path.parent, SOURCE / "planning")
-        assert any((place / name).exists() for place in places), name
+def test_modules_that_pages_name_are_there() -> None:
+    for path in PAGES:
+        for name in re.findall(r"`([\w./]+\.py)`", read(path)):
+            places = (ROOT, SOURCE, path.parent, SOURCE / "planning")
+            assert any((place / name).exists() for place in places), (path, name)
 
 
 def test_pages_are_short_and_topics_of_help(capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,6 +15,7 @@ import pytest
 
 from plane import SQUARE, convex_polygon, cross, make_finger, make_scene, rotate
 from retelling import RETELLINGS, Answer, Retelling, answer
+from rows import each
 from shipped import HEPTAGON
 from wholearm import Finger, Friction, Polygon, Problem, Scene, load, verify
 from wholearm.common.arrays import Array
@@ -25,10 +26,8 @@ from wholearm.planning.plan import solve
 from wholearm.problem.read import build_problem
 
 
-@pytest.mark.parametrize("value", [-1.0, math.nan, True, "1"])
-@pytest.mark.parametrize(
-    "key", ["length", "radius", "inertia", "viscous", "dry", "torque_limit", "speed_limit"]
-)
+@each("value", [-1.0, math.nan, True, "1"])
+@each("key", ["length", "radius", "inertia", "viscous", "dry", "torque_limit", "speed_limit"])
 def test_bad_finger_number(key: str, value: Any) -> None:
     with pytest.raises(InputError) as caught:
         replace(make_finger([0, 0]), **{key: value}, name="fingers.2")
@@ -50,8 +49,8 @@ def test_bad_base(base: Any) -> None:
     assert caught.value.key == "fingers.base"
 
 
-@pytest.mark.parametrize("key", ["palm", "finger1", "finger2"])
-@pytest.mark.parametrize("value", [-0.1, math.nan, False, "x"])
+@each("key", ["palm", "finger1", "finger2"])
+@each("value", [-0.1, math.nan, False, "x"])
 def test_bad_friction(key: str, value: Any) -> None:
     with pytest.raises(InputError) as caught:
         Friction(**({"palm": 0.1, "finger1": 0.1, "finger2": 0.1} | {key: value}))
@@ -201,7 +200,7 @@ def test_arrays_are_read_only_copies() -> None:
         polygon.vertices[0, 0] = 0.0
 
 
-@pytest.mark.parametrize(
+@each(
     "points, key, text",
     [
         (SQUARE[::-1], "object.vertices", "clockwise"),
@@ -229,8 +228,8 @@ def test_bad_polygon_names_the_corner(points: Any, key: str, text: str) -> None:
     assert caught.value.key == key
 
 
-@pytest.mark.parametrize("value", [-1.0, 0.0, math.nan, math.inf, True, "1", [1.0], 10**400, 1j])
-@pytest.mark.parametrize("key", ["mass", "inertia"])
+@each("value", [-1.0, 0.0, math.nan, math.inf, True, "1", [1.0], 10**400, 1j])
+@each("key", ["mass", "inertia"])
 def test_bad_mass_and_inertia(key: str, value: Any) -> None:
     with pytest.raises(InputError, match="positive") as caught:
         Polygon(SQUARE, **({"mass": 1.0} | {key: value}))
@@ -388,7 +387,7 @@ def test_answers_do_not_depend_on_how_a_problem_is_told(
     np.testing.assert_allclose(other.torques, one.torques, rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize("telling", RETELLINGS, ids=lambda telling: telling.name)
+@each("telling", RETELLINGS)
 def test_a_retelling_changes_what_it_says(problem: Problem, telling: Retelling) -> None:
     """Configurations at the ends of phases are those of the first telling, in other words."""
     other, length = build_problem(telling.apply(problem).table), telling.units.length

@@ -22,6 +22,7 @@ import pytest
 
 import wholearm
 from retelling import Retelling, Units
+from rows import each
 from wholearm import Formation, InputError, Plan, PlanOptions, Problem, TorqueProfile, load
 from wholearm.analysis.robustness import (
     Robustness,
@@ -239,7 +240,7 @@ ONE = (TimeWindow(1, 1.0, ("a", "b"), "c"),)
 TWO = (TimeWindow(1, 0.5, ("a", "b"), "c"), TimeWindow(2, 1.0, ("b", "c"), ""))
 
 
-@pytest.mark.parametrize(
+@each(
     "stretches, windows, lost",
     [
         ([("a", 0, 1), ("b", 0, 1)], ONE, None),
@@ -352,7 +353,7 @@ def test_ranges_that_make_no_sense_are_refused(widths: dict[str, float], text: s
         Uncertainty(widths)
 
 
-@pytest.mark.parametrize("name", [*NAMES[: NAMES.index("start_x")]])
+@each("name", [*NAMES[: NAMES.index("start_x")]])
 def test_each_parameter_changes_its_own_number(whole: Problem, name: str) -> None:
     def list_numbers(own: Problem) -> dict[str, float]:
         scene = own.scene
@@ -611,7 +612,7 @@ def edited(path: str, value: Any) -> dict[str, Any]:
     return table
 
 
-@pytest.mark.parametrize(
+@each(
     "path, value, text",
     [
         ("object.mass", 1e308, r"1e\+308 given; allowed are 1e-06 to 1e\+06 kg"),

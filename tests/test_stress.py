@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rows import each
 from shipped import HEPTAGON, tipping
 from wholearm import Friction, Phase, PlanOptions, Problem, Scene, Trajectory, load
 from wholearm.benchmark.damage import look, run_file
@@ -50,8 +51,8 @@ def test_damaged_files_end_clearly(number: int) -> None:
     assert record["findings"] == [] and record["status"] in (0, 1, 2)
 
 
-@pytest.mark.parametrize(
-    ("status", "out", "err", "written", "count"),
+@each(
+    "status, out, err, written, count",
     [
         (2, "", "wholearm: mutant.toml: x\n", set(), 0),
         (2, "", "wholearm: x\n", set(), 1),

@@ -13,6 +13,7 @@ from scipy.linalg import expm
 
 from plane import make_formation, measure_gaps, measure_slip, unbalance
 from planned import CosineMotion
+from rows import each
 from scenes import roll
 from shipped import HEPTAGON
 from timed import Sampler, drive, landing
@@ -68,7 +69,7 @@ def build_function() -> ca.Function:
     return ca.Function("f", [x, y], [ca.mtimes(x, y.T) + 1, ca.sin(ca.sum1(x)) * y[0]])
 
 
-@pytest.mark.parametrize("count", [0, 1, 5, 6, 20, 21, 63, 64, 65, 197])
+@each("count", [0, 1, 5, 6, 20, 21, 63, 64, 65, 197])
 def test_batches_agree_with_single_calls(count: int) -> None:
     """Also of arrays with strides, and results outlive the next call."""
     rng = np.random.default_rng(count)
@@ -102,8 +103,8 @@ def test_schemes_have_butchers_coefficients() -> None:
     np.testing.assert_allclose(make_scheme("legendre", 2).integrals, gauss, atol=1e-13)
 
 
-@pytest.mark.parametrize("degree", DEGREES)
-@pytest.mark.parametrize("name", NAMES)
+@each("degree", DEGREES)
+@each("name", NAMES)
 def test_the_whole_interval_is_integrated_to_the_order(name: str, degree: int) -> None:
     scheme = make_scheme(name, degree)
     assert scheme.order == {"radau": 2 * degree - 1, "legendre": 2 * degree}[name]
@@ -492,8 +493,8 @@ def make_nlp(seed: int) -> tuple[Any, Expression, Expression, Expression]:
     for column, value in zip(columns[0], values, strict=True):
         g[int(linear[0])] += value * x[int(column)]
     for kernel, table, own, parameters in copies:
-        for k, each in enumerate(table):
-            y = kernel.function(x[each.tolist()], ca.DM(parameters[k]))
+        for k, entry in enumerate(table):
+            y = kernel.function(x[entry.tolist()], ca.DM(parameters[k]))
             if not own.size:
                 f += y
             for i, row in enumerate(own[k]):
@@ -578,8 +579,8 @@ def test_legendre_points_and_weights_are_those_of_gauss(degree: int) -> None:
     np.testing.assert_allclose(scheme.weights, weights / 2, atol=1e-10)
 
 
-@pytest.mark.parametrize("degree", DEGREES)
-@pytest.mark.parametrize("name", NAMES)
+@each("degree", DEGREES)
+@each("name", NAMES)
 def test_integrals_are_exact_up_to_the_degree(name: str, degree: int) -> None:
     scheme = make_scheme(name, degree)
     for power in range(degree):

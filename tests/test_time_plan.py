@@ -189,13 +189,13 @@ def test_rolling_contacts_are_planned_like_along_the_curve() -> None:
     phase = replace(box().phases[1], index=0)
     problem = replace(box(), start=tip().start, phases=(phase,))
     options: dict[str, Any] = {
-        "time_intervals": 6,
+        "time_intervals": 16,
         "mode_search": False,
         "replay": False,
         "accuracy": 1e-2,
     }
     within = solve(problem, transcription="time", **options)
-    # Measured 0.77 % on 32 intervals, half of that on 64.
+    # Torques that are linear in each interval cost less than the accuracy asked for.
     assert -1e-4 < within.duration / tipped().meta["phase_durations"][1] - 1 < 1e-2
     rolls = phase.formation.rolling
     (motion,) = within.trajectory.motions
@@ -220,7 +220,8 @@ def test_a_contact_passes_from_a_link_over_its_tip_to_an_edge() -> None:
     phases = tuple(replace(own, index=own.index - 3) for own in whole.phases[3:])
     passing = replace(whole, start=z, phases=phases)
     options: dict[str, Any] = {"replay": False, "accuracy": 1e-3}
-    along, within = solve(passing, **options), solve(passing, transcription="time", **options)
+    along = solve(passing, **options)
+    within = solve(passing, transcription="time", time_intervals=4, **options)
     # Either is good to the accuracy that is asked for.
     assert within.duration == pytest.approx(along.duration, rel=1e-3)
     speeds = [plan.meta["transitions"][-1]["speed"] for plan in (within, along)]

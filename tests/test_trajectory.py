@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
+from rows import each
 from scenes import tipped
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
@@ -171,7 +172,7 @@ def changed(arrays: dict[str, Any], name: str, change: str) -> Any:
     return value
 
 
-@pytest.mark.parametrize("name", [*ARRAYS, "phase", *TEXT, *TORQUE])
+@each("name", [*ARRAYS, "phase", *TEXT, *TORQUE])
 def test_missing_array_is_named(trajectory: Trajectory, tmp_path: Path, name: str) -> None:
     arrays = read_arrays(trajectory)
     del arrays[name]
@@ -181,7 +182,7 @@ def test_missing_array_is_named(trajectory: Trajectory, tmp_path: Path, name: st
     assert (caught.value.source, caught.value.key) == (str(tmp_path / "a.npz"), name)
 
 
-@pytest.mark.parametrize(
+@each(
     "name, change",
     [(name, change) for name in [*ARRAYS, "phase"] for change in ("0-d", "inf", "text")]
     + [(name, "nan") for name in ARRAYS if name not in ("c_n", "c_t")]
@@ -201,7 +202,7 @@ def test_bad_array_is_named(trajectory: Trajectory, tmp_path: Path, name: str, c
     assert caught.value.key in loose.get(name, {name})
 
 
-@pytest.mark.parametrize(
+@each(
     "name, value, problem",
     [
         ("meta", np.array("{"), "is not JSON"),
@@ -341,7 +342,7 @@ def test_the_same_file_in_other_words(tmp_path: Path, text: str) -> None:
     np.testing.assert_array_equal(profile.coefficients, plain.coefficients)
 
 
-@pytest.mark.parametrize(
+@each(
     "text, key, problem",
     [
         ("", "t", "an empty file"),
