@@ -477,12 +477,13 @@ def test_the_closest_approach_and_a_motion_that_turns_back() -> None:
     # The same there and back.
     back = dataclasses.replace(
         replay,
+        problem=first_phase(),
         t=np.append(replay.t, 2 * replay.t[-1] - replay.t[-2::-1]),
         z=np.vstack([replay.z, replay.z[-2::-1]]),
         z_dot=np.vstack([replay.z_dot, -replay.z_dot[-2::-1]]),
         phase=np.zeros(2 * len(replay.t) - 1, dtype=np.int64),
     )
-    found = find_approach(first_phase(), back)
+    found = find_approach(back)
     assert found is not None and found.distance == pytest.approx(approach.distance, abs=1e-9)
     assert found.time == pytest.approx(replay.t[-1], abs=1e-6)
     assert list(found.turns) == pytest.approx([replay.t[-1]], abs=1e-9)

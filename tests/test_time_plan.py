@@ -787,7 +787,8 @@ def test_another_place_than_the_one_pinned_fails() -> None:
     allowance, length = Allowance(), problem.scene.scales.length
     for off, missed in ((0.0, False), (0.9, False), (1.1, True)):
         x = LANDS + off * allowance.departure * length
-        failures = describe_ends(pin(problem, 1, ("x", x)), simulation, allowance)
+        pinned = replace(simulation, problem=pin(problem, 1, ("x", x)))
+        failures = describe_ends(pinned, allowance)
         assert bool(failures) == missed
         for failure in failures:
             assert failure.text.startswith("phase 2 ends at x = 16 mm, phi = ")

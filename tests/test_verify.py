@@ -511,7 +511,7 @@ def test_a_contact_let_go_softly_counts_until_it_passes_epsilon() -> None:
     c_n[rows, column] = 2 * problem.epsilon
     c_n[rows[[3, -2, -1]], column] = low, low, 0.0
     given = replace(simulation, c_n=c_n)
-    forces = list_normal_forces(problem, given, problem.phases[0], rows)["v3-finger1"]
+    forces = list_normal_forces(given, problem.phases[0])["v3-finger1"]
     assert np.isnan(forces[-2:]).all() and np.nanmin(forces) == forces[3] == low
 
 

@@ -26,7 +26,7 @@ from ..results.trajectory import Trajectory
 from ..simulation.events import EventKind, FreeSimulation, OutcomeKind, list_pauses
 from ..simulation.simulate import simulate_free, simulate_phases
 from ..simulation.system import build_system
-from .verdict import DEPARTURE
+from .verdict import DEPARTURE, measure_departure
 
 MOST = 60  # most events that the text lists; `to_dict` has all
 _TOLD = (EventKind.AMBIGUOUS, EventKind.INCONSISTENT)
@@ -176,7 +176,7 @@ def _fail(
         ]
         end = phase.deviation
         assert end is not None
-        if max(end.position / problem.scene.scales.length, end.angle) > allowed:
+        if measure_departure(end, problem.scene.scales.length) > allowed:
             texts.append(
                 f"phase {phase.number} alone ends {end.position:.3g} m and {end.angle:.3g} rad "
                 "away from the plan"

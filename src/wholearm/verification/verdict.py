@@ -20,7 +20,6 @@ from ..mechanics.uniqueness import UNIQUENESS_MARGIN, describe_uniqueness, find_
 from ..problem.definition import End, Phase, Problem
 from ..results.plan_record import Deviation
 from ..results.report import ContactMargin, Failure, FingerGap, PhaseReport, UniquenessMargin
-from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
 from ..simulation.events import EventKind, OutcomeKind, Simulation
@@ -79,12 +78,13 @@ def describe_overlap(
     return [Failure(number, f"{text}, phase {number}")]
 
 
-def judge_end(problem: Problem, simulation: Simulation, allowance: Allowance) -> tuple[bool, str]:
+def judge_end(simulation: Simulation, allowance: Allowance) -> tuple[bool, str]:
     """Whether the goal is reached, and the sentence that says how the replay ended.
 
     By rounding the torques may end within a hair of the goal.
     """
-    outcome, last = simulation.outcome, problem.phases[-1]
+    problem, outcome = simulation.problem, simulation.outcome
+    last = problem.phases[-1]
     if outcome.reached:
         return True, outcome.text
     missed = abs(simulation.missed_by)
@@ -121,9 +121,10 @@ def describe_speed(scene: Scene, v: Array) -> str:
     return f"{what} turns at {abs(v[2 + fastest]):.3g} rad/s"
 
 
-def describe_ends(problem: Problem, simulation: Simulation, allowance: Allowance) -> list[Failure]:
+def describe_ends(simulation: Simulation, allowance: Allowance) -> list[Failure]:
     """Sentences on phases that end elsewhere than pinned, or at a speed where they are to rest."""
-    scene, failures = problem.scene, []
+    problem, failures = simulation.problem, []
+    scene = problem.scene
     for event in simulation.find(EventKind.ARRIVAL):
         phase = problem.phases[event.phase]
         row = int(np.flatnonzero(simulation.phase == event.phase)[-1])
@@ -169,9 +170,10 @@ def measure_departure(deviation: Deviation, length: float) -> float:
 
 
 def describe_thin_margins(
-    problem: Problem, phases: Sequence[PhaseReport], simulation: Simulation, allowance: Allowance
+    simulation: Simulation, phases: Sequence[PhaseReport], allowance: Allowance
 ) -> list[Failure]:
     """Sentences on the normal forces below epsilon, but for contacts where they were lost."""
+    problem = simulation.problem
     lost = {(e.phase + 1, e.contact) for e in simulation.find(EventKind.CONTACT_LOST)}
     allowed = allowance.measure_stray(problem)
     return [
@@ -187,7 +189,7 @@ def describe_thin_margins(
 
 
 def describe_ambiguity(
-    problem: Problem, simulation: Simulation, phases: Sequence[PhaseReport], allowance: Allowance
+    simulation: Simulation, phases: Sequence[PhaseReport], allowance: Allowance
 ) -> list[Failure]:
     """Sentences on phases whose contact forces are not, or hardly, the only ones."""
     failures = []
@@ -248,13 +250,6 @@ def find_uniqueness_margin(
         ratio, names, row = find_minors(formation, part, Xi[rows_of], sticking).find_least()
         margins.append(UniquenessMargin(ratio, names, float(motion.t[rows[rows_of[row]]])))
     return min(margins)
-
-
-def find_departure(simulation: Simulation, torque: TorqueProfile, index: int) -> float:
-    """Last break of the torques before a phase starts to move, -inf if it does not [s]."""
-    starts = [e.time for e in simulation.find(EventKind.START) if e.phase == index]
-    breaks = [b for b in torque.breaks.tolist() if starts and b <= starts[0]]
-    return max(breaks, default=-math.inf)
 
 
 def find_wedged(

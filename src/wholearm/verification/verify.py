@@ -9,7 +9,6 @@ from itertools import combinations
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, overload
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..common.errors import InputError
@@ -42,7 +41,7 @@ from ..results.report import (
 )
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory, interpolate_quintic
-from ..simulation.events import Event, EventKind, Simulation
+from ..simulation.events import EventKind, Simulation
 from ..simulation.modes import (
     Response,
     StartMode,
@@ -64,7 +63,6 @@ from .verdict import (
     describe_overlap,
     describe_thin_margins,
     describe_wedging,
-    find_departure,
     find_uniqueness_margin,
     find_wedged,
     judge_end,
@@ -85,8 +83,6 @@ _CHANGES = {EventKind.STICK: "sticks", EventKind.SLIP: "slips", EventKind.REVERS
 class Observation(NamedTuple):
     """A replay and its measurements, before tolerances are applied."""
 
-    problem: Problem
-    torque: TorqueProfile
     plan: Trajectory | None  # what it is compared with
     tolerance: float  # of the simulation
     simulation: Simulation
@@ -166,7 +162,7 @@ def verify(
     report = judge(seen, allowance, reduced)
     if report.ok and not report.warnings:
         return report
-    return replace(report, help=find_help(problem, seen.simulation, seen.phases, allowance))
+    return replace(report, help=find_help(seen.simulation, seen.phases, allowance))
 
 
 def observe(
@@ -188,14 +184,19 @@ def observe(
     ------
     JammingError, SimulationError  if the simulation cannot go on
     """
-    times = choose_times(problem, torque, plan)
+    if plan is None:
+        times = np.linspace(torque.breaks[0], torque.breaks[-1], ROWS * len(problem.phases) + 1)
+    else:
+        owned = (np.flatnonzero(plan.phase == index) for index in range(len(plan.motions)))
+        picked = (own[np.linspace(0, len(own) - 1, ROWS + 1).astype(int)] for own in owned)
+        times = np.concatenate([plan.t[rows] for rows in picked])
     simulation = simulate(problem, torque, tolerance=tolerance, times=times, minima=True)
     phases = tuple(
-        _report_phase(problem, simulation, torque, plan, index, uniqueness)
+        _report_phase(simulation, plan, index, uniqueness)
         for index in range(int(simulation.phase[-1]) + 1)
     )
     gap = find_finger_gap(simulation) if problem.scene.fingers_collide else None
-    return Observation(problem, torque, plan, tolerance, simulation, phases, gap)
+    return Observation(plan, tolerance, simulation, phases, gap)
 
 
 def find_finger_gap(simulation: Simulation) -> FingerGap:
@@ -213,18 +214,18 @@ def find_finger_gap(simulation: Simulation) -> FingerGap:
 
 def judge(seen: Observation, allowance: Allowance, reduced: bool = False) -> Report:
     """Apply tolerances to a replay; see `verify`."""
-    problem, simulation, phases, gap = seen.problem, seen.simulation, seen.phases, seen.gap
-    reached, outcome = judge_end(problem, simulation, allowance)
+    simulation, phases, gap = seen.simulation, seen.phases, seen.gap
+    problem, torque = simulation.problem, simulation.torque
+    reached, outcome = judge_end(simulation, allowance)
     failures = [] if reached else [Failure(len(phases), outcome)]
-    failures += describe_ends(problem, simulation, allowance)
+    failures += describe_ends(simulation, allowance)
     failures += describe_overlap(problem.scene, phases, gap) if reached else []
-    failures += describe_ambiguity(problem, simulation, phases, allowance)
-    thin = describe_thin_margins(problem, phases, simulation, allowance)
-    warnings = _describe_torques(problem, seen.torque) + describe_wedging(phases)
+    failures += describe_ambiguity(simulation, phases, allowance)
+    thin = describe_thin_margins(simulation, phases, allowance)
+    warnings = _describe_torques(problem, torque) + describe_wedging(phases)
     for phase in problem.phases[: len(phases)]:
-        rows = np.flatnonzero(simulation.phase == phase.index)
-        warnings += describe_misses(phase, simulation, rows, seen.torque)
-    for time, text in describe_motors(problem, seen.torque):
+        warnings += describe_misses(phase, simulation)
+    for time, text in describe_motors(problem, torque):
         number = sum(phase.start <= time for phase in phases)
         if seen.plan is None:
             warnings.append(text)
@@ -234,9 +235,6 @@ def judge(seen: Observation, allowance: Allowance, reduced: bool = False) -> Rep
         failures += thin + describe_departures(problem, phases, allowance)
     else:
         warnings += [failure.text for failure in thin]
-    states: tuple[ReducedState, ...] = ()
-    if reduced:
-        states = list_reduced_states(problem, simulation)
     return Report(
         name=problem.name,
         epsilon=problem.epsilon,
@@ -247,7 +245,7 @@ def judge(seen: Observation, allowance: Allowance, reduced: bool = False) -> Rep
         failed_phase=failures[0].phase if failures else None,
         warnings=tuple(warnings),
         phases=phases,
-        energy=_balance(problem, simulation),
+        energy=_balance(simulation),
         finger_gap=gap,
         tolerance=seen.tolerance,
         steps=simulation.steps,
@@ -256,38 +254,44 @@ def judge(seen: Observation, allowance: Allowance, reduced: bool = False) -> Rep
             for e in simulation.events
             if e.kind in _CHANGES and e.contact
         ),
-        reduced=states,
+        reduced=list_reduced_states(simulation) if reduced else (),
         replay=simulation,
     )
 
 
 def _report_phase(
-    problem: Problem,
-    simulation: Simulation,
-    torque: TorqueProfile,
-    plan: Trajectory | None,
-    index: int,
-    uniqueness: bool,
+    simulation: Simulation, plan: Trajectory | None, index: int, uniqueness: bool
 ) -> PhaseReport:
-    phase = problem.phases[index]
+    problem, phase = simulation.problem, simulation.problem.phases[index]
     rows = np.flatnonzero(simulation.phase == index)
     arrivals = [e for e in simulation.events if e.phase == index and e.kind in _ENDS]
     impacts = [e for e in simulation.find(EventKind.IMPACT) if e.phase == index]
     stops = bool(arrivals) and phase.end is End.REST
-    moves = find_departure(simulation, torque, index)
-    part, lost = (phase, simulation, rows), EventKind.CONTACT_LOST
-    pressing = _find_least(*part, list_normal_forces(problem, simulation, phase, rows), lost)
-    slips = _find_least(*part, list_slips(simulation, phase, rows), EventKind.SLIP)
+    formation, until = phase.formation, str(phase.until)
+    if arrivals and phase.until.is_release:
+        what = "release" if arrivals[0].kind is EventKind.RELEASE else "change"
+        until = f"{what} of {arrivals[0].contact}"
+    forces = list_normal_forces(simulation, phase)
+    pressing = _find_least(simulation, index, forces, EventKind.CONTACT_LOST)
+    columns = [simulation.contacts.index(name) for name in formation.names]
+    c_n, c_t = (c[rows][:, columns] for c in (simulation.c_n, simulation.c_t))
+    names = [formation.names[row] for row in formation.rolling_rows]
+    margins = dict(zip(names, slip_margins(formation, c_n, c_t).T, strict=True))
+    slips = _find_least(simulation, index, margins, EventKind.SLIP)
     end = worst = held = None
     if uniqueness:
-        held = find_wedged(problem, phase, simulation, rows, REST_SPEED, moves)
+        # Since the last break of the torques before it starts to move, if it does.
+        starts = [e.time for e in simulation.find(EventKind.START) if e.phase == index]
+        breaks = [b for b in simulation.torque.breaks.tolist() if starts and b <= starts[0]]
+        since = max(breaks, default=-math.inf)
+        held = find_wedged(problem, phase, simulation, rows, REST_SPEED, since)
     if plan is not None:
         # A motion that goes on is compared when its phase was planned to end, not when it did.
         passes, length = phase.end is not End.REST, problem.scene.scales.length
         end, worst = _compare(simulation, plan, index, bool(arrivals), passes, length)
     return PhaseReport(
         number=phase.number,
-        until=_describe_end(arrivals, phase),
+        until=until,
         end=phase.end.value,
         start=float(simulation.t[rows[0]]),
         contacts=tuple(ContactMargin(*least, least[1] - problem.epsilon) for least in pressing),
@@ -333,14 +337,6 @@ def _measure(difference: Array, t: Array, length: float) -> Deviation:
     return Deviation(float(position.max()), float(angle.max()), when)
 
 
-def _describe_end(events: list[Event], phase: Phase) -> str:
-    """What ends a phase, with the contacts that are released or change their mode."""
-    if not events or not phase.until.is_release:
-        return str(phase.until)
-    what = "release" if events[0].kind is EventKind.RELEASE else "change"
-    return f"{what} of {events[0].contact}"
-
-
 def _describe_torques(problem: Problem, torque: TorqueProfile) -> list[str]:
     """Sentences on torques beyond their limits."""
     peaks = np.abs(torque.at_places(np.linspace(-1, 1, 9))).max(axis=2)
@@ -355,8 +351,8 @@ def _describe_torques(problem: Problem, torque: TorqueProfile) -> list[str]:
     return texts
 
 
-def _balance(problem: Problem, simulation: Simulation) -> EnergyBalance:
-    scene, energies = problem.scene, simulation.energies
+def _balance(simulation: Simulation) -> EnergyBalance:
+    scene, energies = simulation.problem.scene, simulation.energies
     ends = simulation.z_dot[[0, -1]]
     kinetic = float(np.diff(0.5 * ends**2 @ scene.mass_diagonal)[0])
     weight = scene.polygon.mass * scene.gravity
@@ -370,19 +366,8 @@ def _balance(problem: Problem, simulation: Simulation) -> EnergyBalance:
     return EnergyBalance(work, kinetic, potential, **losses, residual=residual, relative=relative)
 
 
-def choose_times(problem: Problem, torque: TorqueProfile, plan: Trajectory | None) -> Array:
-    """Instants to look at first: rows of a plan, or even ones; steps show what is in between."""
-    if plan is None:
-        return np.linspace(torque.breaks[0], torque.breaks[-1], ROWS * len(problem.phases) + 1)
-    owned = (np.flatnonzero(plan.phase == index) for index in range(len(plan.motions)))
-    picked = (own[np.linspace(0, len(own) - 1, ROWS + 1).astype(int)] for own in owned)
-    return np.concatenate([plan.t[rows] for rows in picked])
-
-
-def list_normal_forces(
-    problem: Problem, simulation: Simulation, phase: Phase, rows: NDArray[np.int64]
-) -> dict[str, Array]:
-    """Normal forces by contact in a phase, which the simulation has at `rows` [N].
+def list_normal_forces(simulation: Simulation, phase: Phase) -> dict[str, Array]:
+    """Normal forces by contact in a phase [N].
 
     A contact that is let go without a jump of the torques passes epsilon on its way to zero: what
     it has below epsilon on that way is NaN.
@@ -395,53 +380,39 @@ def list_normal_forces(
     }
     forces = {}
     for name in phase.formation.names:
-        values = simulation.c_n[rows, simulation.contacts.index(name)]
-        pressed = np.flatnonzero(values >= problem.epsilon)
-        if name in gone and len(pressed) and values[-1] < problem.epsilon / 2:
+        values = simulation.c_n[simulation.phase == phase.index, simulation.contacts.index(name)]
+        pressed = np.flatnonzero(values >= simulation.problem.epsilon)
+        if name in gone and len(pressed) and values[-1] < simulation.problem.epsilon / 2:
             values[pressed[-1] + 1 :] = math.nan
         forces[name] = values
     return forces
 
 
-def list_slips(simulation: Simulation, phase: Phase, rows: NDArray[np.int64]) -> dict[str, Array]:
-    """Margins to slipping by rolling contact in a phase, which the simulation has at `rows` [N]."""
-    formation = phase.formation
-    columns = [simulation.contacts.index(name) for name in formation.names]
-    c_n, c_t = simulation.c_n[rows][:, columns], simulation.c_t[rows][:, columns]
-    names = [formation.names[row] for row in formation.rolling_rows]
-    return dict(zip(names, slip_margins(formation, c_n, c_t).T, strict=True))
-
-
 def _find_least(
-    phase: Phase,
-    simulation: Simulation,
-    rows: NDArray[np.int64],
-    series: dict[str, Array],
-    kind: EventKind,
+    simulation: Simulation, index: int, series: dict[str, Array], kind: EventKind
 ) -> Iterator[tuple[str, float, float]]:
     """Least value of each contact and its time; that of an event of its loss where it is less."""
-    events = {e.contact: e for e in simulation.find(kind) if e.phase == phase.index}
+    t = simulation.t[simulation.phase == index]
+    events = {e.contact: e for e in simulation.find(kind) if e.phase == index}
     for name, values in series.items():
         known = not np.isnan(values).all()
         row = int(np.nanargmin(values)) if known else 0
-        least, time = float(values[row]), float(simulation.t[rows[row]]) if known else math.nan
+        least, time = float(values[row]), float(t[row]) if known else math.nan
         if name in events and not least <= events[name].value:
             least, time = events[name].value, events[name].time
         yield name, least, time
 
 
-def describe_misses(
-    phase: Phase, simulation: Simulation, rows: NDArray[np.int64], torque: TorqueProfile
-) -> list[str]:
+def describe_misses(phase: Phase, simulation: Simulation) -> list[str]:
     """Sentences on limits that a phase exceeds, other than those of forces and torques alone."""
-    formation, t = phase.formation, simulation.t[rows]
-    limits = make_limits(formation, 0.0).without(PRESS, CONE, TORQUE)
+    formation, rows = phase.formation, np.flatnonzero(simulation.phase == phase.index)
+    limits, t = make_limits(formation, 0.0).without(PRESS, CONE, TORQUE), simulation.t[rows]
     if not limits.limits:
         return []
     columns = [simulation.contacts.index(name) for name in formation.names]
     rolling = [columns[row] for row in formation.rolling_rows]
     c = [simulation.c_n[rows][:, columns], simulation.c_t[rows][:, rolling]]
-    y = np.nan_to_num(np.hstack([*c, torque.at(t), simulation.z_dot[rows, 3:]]))
+    y = np.nan_to_num(np.hstack([*c, simulation.torque.at(t), simulation.z_dot[rows, 3:]]))
     short = limits.fold(-limits.find_slack(y @ limits.rows.T))
     texts = []
     for k, limit in enumerate(limits.limits):
@@ -531,35 +502,30 @@ def describe_motors(problem: Problem, torque: TorqueProfile) -> list[tuple[float
 _OTHERS = [0, 1, 2, 4]  # degrees of freedom that are eliminated: q and theta_2
 
 
-def list_reduced_states(problem: Problem, simulation: Simulation) -> tuple[ReducedState, ...]:
+def list_reduced_states(simulation: Simulation) -> tuple[ReducedState, ...]:
     """The scalar equation at a few instants of every phase with four constraints.
 
     At each instant theta_1 turns and every contact that the formation lets slide does so.
     """
-    states = []
+    problem, states = simulation.problem, []
     for index in range(int(simulation.phase[-1]) + 1):
         formation, rows = problem.phases[index].formation, np.flatnonzero(simulation.phase == index)
         if formation.n_constraints != 4:
             continue
-        z, v = simulation.z[rows], simulation.z_dot[rows]
-        slip = formation.evaluate(z, v).A_t @ v[:, :, None]
+        motion = simulation.z, simulation.z_dot, simulation.z_ddot, simulation.tau
+        z, v, a, tau = (part[rows] for part in motion)
+        slip = (formation.evaluate(z, v).A_t @ v[:, :, None])[:, :, 0]
         sliding = [k for k in range(formation.n_contacts) if k not in formation.rolling_rows]
         scales = problem.scene.scales
-        speeds = np.hstack([slip[:, sliding, 0], scales.length * v[:, 3:]])
-        moving = rows[np.abs(speeds).min(axis=1) > 1e-4 * scales.speed]
-        chosen = np.unique(np.linspace(0, len(moving) - 1, 5).round().astype(int))
-        for row in moving[chosen] if len(moving) else ():
-            states.append(_reduce_row(formation, simulation, int(row)))
+        speeds = np.hstack([slip[:, sliding], scales.length * v[:, 3:]])
+        moving = np.flatnonzero(np.abs(speeds).min(axis=1) > 1e-4 * scales.speed)
+        chosen = np.linspace(0, len(moving) - 1, min(5, len(moving))).round().astype(int)
+        for k in moving[chosen].tolist():
+            directions = Directions(np.sign(slip[k]), np.sign(v[k, 3:]))
+            Phi = reduce_to_first_joint(formation, z[k], v[k, 3], tau[k], directions)
+            time, joint = float(simulation.t[rows[k]]), (float(v[k, 3]), float(a[k, 3]))
+            states.append(ReducedState(time, index + 1, *Phi, *joint))
     return tuple(states)
-
-
-def _reduce_row(formation: Formation, simulation: Simulation, row: int) -> ReducedState:
-    z, v = simulation.z[row], simulation.z_dot[row]
-    slip = formation.evaluate(z[None], v[None]).A_t[0] @ v
-    directions = Directions(np.sign(slip), np.sign(v[3:]))
-    Phi = reduce_to_first_joint(formation, z, v[3], simulation.tau[row], directions)
-    time, phase = float(simulation.t[row]), int(simulation.phase[row]) + 1
-    return ReducedState(time, phase, *Phi, float(v[3]), float(simulation.z_ddot[row, 3]))
 
 
 def reduce_to_first_joint(
@@ -612,9 +578,10 @@ _KINDS = {EventKind.CONTACT_LOST: "lost", EventKind.SLIP: "slips"}
 
 
 def find_help(
-    problem: Problem, simulation: Simulation, phases: tuple[PhaseReport, ...], allowance: Allowance
+    simulation: Simulation, phases: tuple[PhaseReport, ...], allowance: Allowance
 ) -> TuningHelp:
     """Losses with changes of the torques that prevent them, and the approach to a missed end."""
+    problem = simulation.problem
     rolling = [{own.name for own in phase.formation.rolling} for phase in problem.phases]
     events = [
         (event.phase, event.contact, _KINDS[event.kind], event.time)
@@ -630,20 +597,24 @@ def find_help(
         for margin in phase.contacts
         if margin.margin < -allowed and (phase.number - 1, margin.contact) not in ended
     ]
-    losses = (_examine_loss(problem, simulation, *event) for event in events)
-    approach = None if simulation.outcome.reached else find_approach(problem, simulation)
+    losses = (_examine_loss(simulation, *event) for event in events)
+    approach = None if simulation.outcome.reached else find_approach(simulation)
     return TuningHelp(tuple(loss for loss in losses if loss is not None), approach)
 
 
 def _examine_loss(
-    problem: Problem, simulation: Simulation, index: int, contact: str, kind: str, time: float
+    simulation: Simulation, index: int, contact: str, kind: str, time: float
 ) -> Loss | None:
     """A loss with changes that prevent it; None if the phase does not have the contact."""
-    phase = problem.phases[index]
-    formation = phase.formation
+    problem, phase = simulation.problem, simulation.problem.phases[index]
+    formation, rows = phase.formation, np.flatnonzero(simulation.phase == index)
     if contact not in formation.names:
         return None
-    row = _find_row(simulation, index, contact, kind, time)
+    # The last row up to its time, or where the least force was seen.
+    if kind == "thin":
+        row = int(rows[np.nanargmin(simulation.c_n[rows, simulation.contacts.index(contact)])])
+    else:
+        row = int(rows[simulation.t[rows] <= time][-1])
     z, v, tau = simulation.z[row], simulation.z_dot[row], simulation.tau[row]
     load, epsilon = [1.0, *tau], max(problem.epsilon, 1e-3 * problem.scene.scales.force)
     distance = _measure_distance(phase, z[None], v[None])
@@ -667,8 +638,8 @@ def _examine_loss(
             for name, c_n, c_t in zip(formation.names, response.c, response.c_t, strict=False)
         )
     if response is not None and distance is not None:
-        rows = -distance[1][0] @ response.acceleration
-        closing = (float(rows @ load - distance[2][0]), float(rows[1]), float(rows[2]))
+        slope = -distance[1][0] @ response.acceleration
+        closing = (float(slope @ load - distance[2][0]), float(slope[1]), float(slope[2]))
     when = float(simulation.t[row])
     return Loss(phase.number, contact, kind, when, rests, forces, closing, changes)
 
@@ -711,17 +682,9 @@ def list_changes(
     return tuple(sorted(changes, key=lambda change: (bool(change.but), np.hypot(*change.change))))
 
 
-def _find_row(simulation: Simulation, index: int, contact: str, kind: str, time: float) -> int:
-    """The row of a loss: the last one up to its time, or where the least force was seen."""
-    rows = np.flatnonzero(simulation.phase == index)
-    if kind == "thin":
-        forces = simulation.c_n[rows, simulation.contacts.index(contact)]
-        return int(rows[np.nanargmin(forces)])
-    return int(rows[simulation.t[rows] <= time][-1])
-
-
-def find_approach(problem: Problem, simulation: Simulation) -> Approach | None:
+def find_approach(simulation: Simulation) -> Approach | None:
     """How near the last phase entered has come to its end; None if it ends by a release."""
+    problem = simulation.problem
     phase, scales = problem.phases[int(simulation.phase[-1])], problem.scene.scales
     rows = np.flatnonzero(simulation.phase == phase.index)
     t, v = simulation.t[rows], simulation.z_dot[rows]
