@@ -57,7 +57,7 @@ from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.definition import NAMES, PARAMETERS
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.results.trajectory import Motion, Samples
-from wholearm.simulation.events import EventKind
+from wholearm.simulation.events import EventKind, Simulation
 
 Z = NormalDist().inv_cdf(0.975)
 PROBLEM = Path(__file__).parents[1] / "problems" / "heptagon_four_contacts.toml"
@@ -233,6 +233,7 @@ def follow(
         find=lambda kind: [event for event in events if event.kind is kind],
         outcome=SimpleNamespace(kind=None, text=""),
     )
+    simulation.list_pauses = partial(Simulation.list_pauses, simulation)
     return trial.judge(simulation)
 
 

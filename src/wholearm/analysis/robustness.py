@@ -32,11 +32,10 @@ from ..results.adopt import Torques, adopt_motion, require_same_phases
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
-from ..simulation.events import EventKind, FreeSimulation, OutcomeKind, list_pauses
+from ..simulation.events import EventKind, FreeSimulation, OutcomeKind
 from ..simulation.simulate import simulate_free
+from ..verification.free import REACHED, TURNED
 
-REACHED = 0.03
-"""How far from the planned place a goal counts as reached, over the scene's length: 1 mm of 33."""
 Task = tuple[int, tuple[float, ...]]
 """Number and values of a sample."""
 
@@ -61,7 +60,7 @@ class Uncertainty:
     # [m]: how far from the planned place a goal counts as reached; `REACHED` of the scene's length
     # if left out
     distance: float | None = None
-    angle: float = math.radians(1.0)  # [rad]: how far from the planned angle
+    angle: float = TURNED  # [rad]: how far from the planned angle
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "widths", read_widths(self.widths, "range of {}"))
@@ -296,7 +295,7 @@ def _find_loss(
     here = (t >= start) & (t < stop)
     known = c_n[here & (c_n == c_n)]
     least = float(known.min()) if len(known) else math.inf
-    pauses = list_pauses(simulation.stretches, name, start, stop)
+    pauses = simulation.list_pauses(name, start, stop)
     if pauses and pauses[0][0] <= start:
         pauses = [pause for pause in pauses if pause[1] > start + 0.1 * unit]
     return next((first for first, after in pauses if after - first > 1e-3 * unit), None), least

@@ -25,7 +25,7 @@ from ..problem.definition import End, Phase, Problem, Until
 from ..problem.read import require_phases
 from ..results.torque import TorqueProfile, format_rows, read_rows
 from ..simulation.complementarity import FreeRun
-from ..simulation.events import Event, EventKind, FreeSimulation, list_pauses
+from ..simulation.events import Event, EventKind, FreeSimulation
 from ..simulation.simulate import simulate_free
 from ..simulation.system import REST_WINDOW, build_system
 from ..verification.free import FreeReport, find_losses, verify_free
@@ -183,7 +183,7 @@ class Bench:
         self.simulations += 1
         simulation = simulate_free(self.problem, read_rows(make_rows(steps, end)), start=self.z)
         names, reason = (self.passage.after or self.passage.phases[-1]).formation.names, ""
-        pauses = {name: list_pauses(simulation.stretches, name, arrival, end) for name in names}
+        pauses = {name: simulation.list_pauses(name, arrival, end) for name in names}
         parted = {name: max((b - a for a, b in own), default=0.0) for name, own in pauses.items()}
         worst = max(parted, key=parted.__getitem__)
         if parted[worst] > REST_WINDOW * self.problem.scene.scales.time:
@@ -213,12 +213,20 @@ class Bench:
             arrival = find_root(lambda t: float(self.measure(motion.at([t]).z)[0]), a, b)
         before = len(self.passage.phases) - 1
         start = [0.0, *ends][before] if len(ends) >= before else math.inf  # of the last phase
-        turn = self._find_turn(simulation, gaps, start)
-        losses = [] if lost is None else [(lost.time, lost.contact)]
+        # When the end, once nearer, is farther away again.
+        rows = np.flatnonzero(simulation.t >= start)
+        risen = gaps[rows] - np.minimum.accumulate(gaps[rows])
+        back = rows[risen > SETTINGS.back * abs(self.way)]
+        turn = float(simulation.t[back].min(initial=math.inf))
         stop = min(arrival, turn, float(simulation.t[-1]))
-        losses = [
-            loss for loss in losses + self._list_losses(simulation, ends, stop) if loss[0] < stop
-        ]
+        # When contacts of its phases part, also those that never press.
+        losses = [] if lost is None else [(lost.time, lost.contact)]
+        starts = [0.0, *ends][: len(self.passage.phases)]
+        spans = zip(self.passage.phases, starts, [*starts[1:], stop], strict=False)
+        for phase, first, last in spans:
+            found = find_losses(simulation, phase, first, last, DEPARTURE)
+            losses += [(loss.time, loss.contact) for loss in found]
+        losses = [loss for loss in losses if loss[0] < stop]
         time, contact = min(losses, default=(stop, ""))
         at = int(np.searchsorted(simulation.t, time))
         # The step in which a coordinate arrives goes on beyond that.
@@ -242,25 +250,6 @@ class Bench:
             outcome = TrialOutcome.RESTS if rests else TrialOutcome.LASTS
         rate, slowing, z = self._close(simulation, time, at)
         return TuningTrial(steps, outcome, time, contact, rate, slowing, short, least, weakest, z)
-
-    def _find_turn(self, simulation: FreeSimulation, gaps: Array, start: float) -> float:
-        """When the end, once nearer, is farther away again [s], infinite if it never is."""
-        rows = np.flatnonzero(simulation.t >= start)
-        risen = gaps[rows] - np.minimum.accumulate(gaps[rows]) if len(rows) else gaps[:0]
-        back = np.flatnonzero(risen > SETTINGS.back * abs(self.way))
-        return float(simulation.t[rows[back[0]]]) if len(back) else math.inf
-
-    def _list_losses(
-        self, simulation: FreeSimulation, ends: Sequence[float], stop: float
-    ) -> list[tuple[float, str]]:
-        """When contacts of its phases part, also those that never press; and which."""
-        starts = [0.0, *ends][: len(self.passage.phases)]
-        stops = [*starts[1:], stop]
-        return [
-            (loss.time, loss.contact)
-            for phase, first, last in zip(self.passage.phases, starts, stops, strict=False)
-            for loss in find_losses(self.problem, simulation, phase, first, last, DEPARTURE)
-        ]
 
     def _find_least(
         self, contacts: Sequence[str], t: Array, forces: Array, ends: Sequence[float]

@@ -206,6 +206,18 @@ class Simulation(Drawn):
                 forces[:, :, column] = self.c_n[:, at], self.c_t[:, at]
         return replace(self, contacts=tuple(contacts), c_n=forces[0], c_t=forces[1])
 
+    def list_pauses(self, contact: str, start: float, stop: float) -> list[tuple[float, float]]:
+        """When a contact does not press between two times [s], in their order."""
+        pauses, at = [], start
+        pressed = sorted((one.start, one.stop) for one in self.stretches if one.contact == contact)
+        for first, last in pressed:
+            if first > at:
+                pauses.append((at, min(first, stop)))
+            at = max(at, last)
+            if at >= stop:
+                return pauses
+        return [*pauses, (at, stop)]
+
     def at(self, t: float) -> Array:
         """State (z, z') at a recorded instant, shape (10,), the later one where there are two.
 
@@ -217,20 +229,6 @@ class Simulation(Drawn):
         if index < 0 or self.t[index] != t:
             raise ValueError(f"t = {t} s was not recorded; ask for it with `times`")
         return np.concatenate([self.z[index], self.z_dot[index]])
-
-
-def list_pauses(
-    stretches: Sequence[FreeStretch], contact: str, start: float, stop: float
-) -> list[tuple[float, float]]:
-    """When a contact does not press between two times [s], in their order."""
-    pauses, at = [], start
-    for first, last in sorted((one.start, one.stop) for one in stretches if one.contact == contact):
-        if first > at:
-            pauses.append((at, min(first, stop)))
-        at = max(at, last)
-        if at >= stop:
-            return pauses
-    return [*pauses, (at, stop)]
 
 
 FreeSimulation = Simulation  # the name of earlier versions for one with free contacts

@@ -23,7 +23,7 @@ from ..problem.definition import Phase, Problem
 from ..results.adopt import Moved, Torques, adopt_motion, adopt_torques, require_same_contacts
 from ..results.plan_record import Deviation
 from ..results.trajectory import Trajectory
-from ..simulation.events import EventKind, FreeSimulation, OutcomeKind, list_pauses
+from ..simulation.events import EventKind, FreeSimulation, OutcomeKind
 from ..simulation.simulate import simulate_free, simulate_phases
 from ..simulation.system import build_system
 from .verdict import DEPARTURE, measure_departure
@@ -70,17 +70,16 @@ def verify_free(
     whole = simulate_free(problem, torque if plan is None else plan, **options)
     warnings = warn("whole", whole)
     if plan is None:
-        phases, failures = _follow(problem, whole, allowed)
+        phases, failures = _follow(whole, allowed)
         return FreeReport(problem.name, whole, (), phases, tuple(failures), tuple(warnings))
     failures, alone = [], []
     for indices, part in simulate_phases(problem, plan, progress=progress, **options):
-        compared = _compare(problem, plan, part, indices, allowed)
+        compared = _compare(plan, part, indices, allowed)
         alone += compared
         title = f"phases {compared[0].number} to {compared[-1].number}" if compared[1:] else ""
         warnings += warn(f"{title or f'phase {compared[0].number}'} alone", part)
-        failures += _fail(problem, part, compared, allowed)
-    every = range(len(plan.phase_starts) - 1)
-    by_clock = _compare(problem, plan, whole, every, allowed)
+        failures += _fail(part, compared, allowed)
+    by_clock = _compare(plan, whole, range(len(plan.phase_starts) - 1), allowed)
     return FreeReport(
         problem.name, whole, tuple(alone), tuple(by_clock), tuple(failures), tuple(warnings)
     )
@@ -121,7 +120,7 @@ def verify_policy(
     until = (1 + ROOM) * loop.find_duration(count)
     whole = simulate_free(problem, loop, until=until, tolerance=tolerance, restitution=restitution)
     phases = tuple(
-        _judge(problem, plan, loop, whole, phase, allowed)
+        _judge(plan, loop, whole, phase, allowed)
         for phase in problem.phases
         if phase.number in loop.began
     )
@@ -141,16 +140,11 @@ def verify_policy(
 
 
 def _judge(
-    problem: Problem,
-    plan: Trajectory,
-    loop: ClosedLoop,
-    whole: FreeSimulation,
-    phase: Phase,
-    allowed: float,
+    plan: Trajectory, loop: ClosedLoop, whole: FreeSimulation, phase: Phase, allowed: float
 ) -> FreePhase:
     """Losses and end of a phase."""
     start, contact = loop.began[phase.number], phase.until.contact
-    last = phase is problem.phases[-1]
+    last = phase.number == len(whole.problem.phases)
     stop = float(whole.t[-1]) if last else loop.began.get(phase.number + 1, float(whole.t[-1]))
     gains = [
         closed.start
@@ -158,14 +152,12 @@ def _judge(
         if contact is not None and closed.contact == contact.name and closed.start > start
     ]
     reached = last or phase.number + 1 in loop.began
-    losses = find_losses(problem, whole, phase, start, min([stop, *gains]), allowed)
+    losses = find_losses(whole, phase, start, min([stop, *gains]), allowed)
     end = measure_end(whole, plan, phase.index, stop)
     return FreePhase(phase.number, start, stop, reached, tuple(losses), end)
 
 
-def _fail(
-    problem: Problem, simulation: FreeSimulation, phases: Sequence[FreePhase], allowed: float
-) -> list[str]:
+def _fail(simulation: FreeSimulation, phases: Sequence[FreePhase], allowed: float) -> list[str]:
     """Why phases from rest are not as planned."""
     texts = [] if simulation.outcome.kind is OutcomeKind.ENDED else [simulation.outcome.text]
     for phase in phases:
@@ -176,7 +168,7 @@ def _fail(
         ]
         end = phase.deviation
         assert end is not None
-        if measure_departure(end, problem.scene.scales.length) > allowed:
+        if measure_departure(end, simulation.problem.scene.scales.length) > allowed:
             texts.append(
                 f"phase {phase.number} alone ends {end.position:.3g} m and {end.angle:.3g} rad "
                 "away from the plan"
@@ -190,13 +182,13 @@ def warn(title: str, simulation: FreeSimulation) -> list[str]:
 
 
 def _compare(
-    problem: Problem, plan: Trajectory, simulation: FreeSimulation, indices: range, allowed: float
+    plan: Trajectory, simulation: FreeSimulation, indices: range, allowed: float
 ) -> list[FreePhase]:
     """Phases by the clock: where each ends, and which of its contacts are lost meanwhile."""
     compared, starts = [], plan.phase_starts
-    for phase in (problem.phases[index] for index in indices):
+    for phase in (simulation.problem.phases[index] for index in indices):
         start, stop = float(starts[phase.index]), float(starts[phase.index + 1])
-        losses = find_losses(problem, simulation, phase, start, stop, allowed)
+        losses = find_losses(simulation, phase, start, stop, allowed)
         end = measure_end(simulation, plan, phase.index, stop)
         reached = end.time == stop
         compared.append(FreePhase(phase.number, start, stop, reached, tuple(losses), end))
@@ -219,18 +211,16 @@ def describe_losses(phase: FreePhase) -> list[str]:
     ]
 
 
-def _follow(
-    problem: Problem, simulation: FreeSimulation, allowed: float
-) -> tuple[tuple[FreePhase, ...], list[str]]:
+def _follow(simulation: FreeSimulation, allowed: float) -> tuple[tuple[FreePhase, ...], list[str]]:
     """Phases of torques alone: each until what ends it has happened."""
-    phases: list[FreePhase] = []
+    problem, phases = simulation.problem, list[FreePhase]()
     failures: list[str] = []
     start = float(simulation.t[0])
     following: Sequence[Phase | None] = [*problem.phases[1:], None]
     for phase, after in zip(problem.phases, following, strict=True):
         stop = _find_end(simulation, phase, after, start)
         last = float(simulation.t[-1]) if stop is None else stop
-        losses = find_losses(problem, simulation, phase, start, last, allowed)
+        losses = find_losses(simulation, phase, start, last, allowed)
         phases.append(FreePhase(phase.number, start, last, stop is not None, tuple(losses), None))
         failures += describe_losses(phases[-1])
         if stop is None:
@@ -269,20 +259,16 @@ def _find_end(
 
 
 def find_losses(
-    problem: Problem,
-    simulation: FreeSimulation,
-    phase: Phase,
-    start: float,
-    stop: float,
-    allowed: float,
+    simulation: FreeSimulation, phase: Phase, start: float, stop: float, allowed: float
 ) -> list[LostContact]:
     """Contacts of a phase that open by more than is allowed, over the scene's length."""
-    system, losses = build_system(problem.scene), []
+    scene, losses = simulation.problem.scene, []
+    system = build_system(scene)
     for name in phase.formation.names:
-        for first, after in list_pauses(simulation.stretches, name, start, stop):
+        for first, after in simulation.list_pauses(name, start, stop):
             rows = np.flatnonzero((simulation.t >= first) & (simulation.t <= after))
             gaps = system.measure(simulation.z[rows])[0][:, system.names.index(name)]
-            if gaps.max(initial=0.0) > allowed * problem.scene.scales.length:
+            if gaps.max(initial=0.0) > allowed * scene.scales.length:
                 losses.append(LostContact(name, first, float(gaps.max())))
                 break
     return sorted(losses, key=lambda loss: loss.time)
