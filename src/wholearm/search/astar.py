@@ -28,14 +28,13 @@ from .edge_plans import (
     Lost,
     Measured,
     are_alike,
-    leave_in_motion,
     list_printed,
     measure_link,
     plan_links,
     plan_phases,
 )
 from .edges import ROUGHLY, Blocked, Link, describe_steps, leave_at
-from .places import Key, RoadmapPlace, is_at, measure_turn
+from .places import Key, RoadmapPlace, is_at
 from .roadmap import Ahead, Chain, Roadmap
 
 CROSSING = 1.0  # heuristic least time of a motion through a cell, over the scene's time
@@ -114,14 +113,10 @@ class RouteSearch:
     limit: float = math.inf  # largest cost of routes [s]
     sources: Sequence[RoadmapRoute] = ()  # routes to start with, if not from the start itself
 
-    @property
-    def settled(self) -> int:
-        """Number of expanded places."""
-        return len(self.reached)
-
     def measure(self, place: RoadmapPlace, turning: float = 1.0) -> float:
-        """Heuristic time from a place to the goal [s]; `turning` is that of a radian."""
-        return turning * self.roadmap.scene.scales.time * measure_turn(place, self.goal)
+        """Heuristic time to turn from a place to the goal [s]; `turning` is that of a radian."""
+        phi, scene = float(place.z[2]), self.roadmap.scene
+        return turning * scene.scales.time * abs(self.goal.find_angle(scene, phi) - phi)
 
     def run(self, rule: SearchRule = EAGER) -> Iterator[RoadmapRoute]:
         """Yield new routes, about in the order of their durations."""
@@ -176,12 +171,11 @@ class RouteSearch:
                     put(route, place, "cells", CROSSING * time)
                 continue
             if isinstance(work, tuple):
-                links = self.roadmap.release(*work)
+                links, ends = self.roadmap.release(*work), list[Link]()
             else:
                 links = self.roadmap.cross_cells(place)
-            moved = self.roadmap.land_at(links, self.goal)
-            ends = () if isinstance(work, tuple) else self.roadmap.end_in_cell(place, self.goal)
-            for link in (*links, *ends, *moved):
+                ends = list(self.roadmap.end_in_cell(place, self.goal))
+            for link in (*links, *ends, *self.roadmap.land_at(links, self.goal)):
                 put(RoadmapRoute((*route.links, link)), link.stop, None)
 
     @staticmethod
@@ -209,15 +203,9 @@ class ReleaseSearch:
 
     plan: Callable[[RefinedPath], Found]
     best: Measured
+    known: dict[RefinedPath, Found] = field(default_factory=dict)  # plans that were made before
     _others: list[Measured] = field(default_factory=list)
-    _prefetched: dict[RefinedPath, Found] = field(default_factory=dict)
     _tried: set[RefinedPath] = field(default_factory=lambda: {RefinedPath(0)})
-
-    def prefetch(self, execute: Callable[[Sequence[Task[Found]]], list[Found]]) -> None:
-        """Plan the first candidates in parallel."""
-        paths = RefinedPath(None), RefinedPath(-STEPS[0]), RefinedPath(STEPS[0])
-        found = execute([partial(self.plan, path) for path in paths])
-        self._prefetched = dict(zip(paths, found, strict=True))
 
     def run(self) -> list[Measured]:
         """The fastest plan, followed by the others."""
@@ -244,7 +232,7 @@ class ReleaseSearch:
         if path in self._tried:
             return False
         self._tried.add(path)
-        found = self._prefetched[path] if path in self._prefetched else self.plan(path)
+        found = self.known[path] if path in self.known else self.plan(path)
         if isinstance(found, str):
             return False
         better = found.duration < GAIN * self.best.duration
@@ -253,40 +241,28 @@ class ReleaseSearch:
         return better
 
 
+@dataclass(eq=False)
 class Chooser:
-    """Routes of a search, and plans of those that seem best.
+    """Routes of a search, and plans of those that seem best."""
 
-    Parameters
-    ----------
-    before      routes to the goals before
-    jobs        most processes at the same time
-    first_only  whether any plan will do: then links are not refined
+    problem: Problem
+    before: list[RoadmapRoute]  # routes to the goals before
+    search: RouteSearch
+    options: PlanOptions
+    jobs: int = 1  # most processes at the same time
+    first_only: bool = False  # whether any plan will do: then links are not refined
+    found: list[RoadmapRoute] = field(default_factory=list)  # their links through cells have plans
+    made: list[tuple[Plan, RoadmapRoute]] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)  # why routes have no plan
+    _prefetched: dict[Link, Found] = field(default_factory=dict)
+    _measurements: int = 0
+    _bound: tuple[float, BackgroundTask[BorderBound]] | None = None
+    _lost: list[tuple[Link, ...]] = field(default_factory=list)
 
-    Attributes
-    ----------
-    found           routes whose links through cells have plans
-    made, failures  plans of routes, and routes without one
-    """
-
-    def __init__(
-        self,
-        problem: Problem,
-        before: list[RoadmapRoute],
-        search: RouteSearch,
-        options: PlanOptions,
-        jobs: int = 1,
-        first_only: bool = False,
-    ) -> None:
-        self.first_only = first_only
-        self.problem, self.before, self.search = problem, before, search
-        self.options, self.roadmap, self.jobs = options, search.roadmap, jobs
-        self.found: list[RoadmapRoute] = []
-        self.made: list[tuple[Plan, RoadmapRoute]] = []
-        self.failures: list[str] = []
-        self._prefetched: dict[Link, Found] = {}
-        self._measurements = 0
-        self._bound: tuple[float, BackgroundTask[BorderBound]] | None = None
-        self._lost: list[tuple[Link, ...]] = []
+    @property
+    def roadmap(self) -> Roadmap:
+        """The roadmap of the search, which keeps plans."""
+        return self.search.roadmap
 
     def run(self, wanted: int, report: Callable[[str], None]) -> None:
         """Search and plan until there are `wanted` plans, or no more routes."""
@@ -438,7 +414,9 @@ class Chooser:
             if isinstance(plan, Measured)
         ]
         if self.jobs > 1 and len(searches) == 1:
-            searches[0].prefetch(self._share)
+            paths = RefinedPath(None), RefinedPath(-STEPS[0]), RefinedPath(STEPS[0])
+            first = self._share([partial(searches[0].plan, path) for path in paths])
+            searches[0].known = dict(zip(paths, first, strict=True))
         found = self._share([search.run for search in searches])
         for link, (best, *others) in zip(links, found, strict=True):
             roadmap.measured[link] = best
@@ -460,12 +438,10 @@ class Chooser:
 
     def _release(self, link: Link, path: RefinedPath) -> Found:
         """Plan a link that leaves its border at another place, or in motion."""
-        steps = leave_in_motion(link.steps)
-        if path.move is not None:
-            place = link.share + FINEST * path.move
-            if not INSIDE < place < 1 - INSIDE:
-                return "it is too near to the end of the border"
-            steps = leave_at(link, place)
+        place = None if path.move is None else link.share + FINEST * path.move
+        if place is not None and not INSIDE < place < 1 - INSIDE:
+            return "it is too near to the end of the border"
+        steps = leave_at(link, place)
         return measure_link(
             self.problem, link, steps, self.options, straight=path.straight, first_only=True
         )
@@ -507,39 +483,36 @@ class BorderBound(NamedTuple):
 
 
 def bound_borders(search: RouteSearch, enough: float = math.inf) -> BorderBound:
-    """Bound every route along borders from below, up to `enough` [s]."""
+    """Bound every route along borders from below, up to `enough` [s].
+
+    Dijkstra's algorithm with coarse bounds of links; those of the shortest route are refined until
+    all of its links are.
+    """
     refined, links_from = set[Link](), dict[Key, list[Link]]()
     while True:
-        bound, links = _find_shortest(search, enough, refined, links_from)
+        order, settled, links = count(), set[Key](), tuple[Link, ...]()
+        bound = BorderBound(enough, True)
+        queue = [(0.0, next(order), search.start, links)]
+        while queue:
+            beat()
+            cost, _, place, route = heapq.heappop(queue)
+            if cost >= enough:
+                break
+            if is_at(place, search.goal):
+                bound, links = BorderBound(cost, True), route
+                break
+            if place.key in settled:
+                continue
+            if len(settled) >= SETTLED:
+                bound = BorderBound(cost, False)
+                break
+            settled.add(place.key)
+            if place.key not in links_from:
+                every = search.roadmap.list_along(place, search.goal)
+                links_from[place.key] = [link for _, link, _ in every if isinstance(link, Link)]
+            for link in links_from[place.key]:
+                least = link.fine_bound if link in refined else ROUGHLY * link.bound
+                heapq.heappush(queue, (cost + least, next(order), link.stop, (*route, link)))
         if refined.issuperset(links):
             return bound
         refined.update(links)
-
-
-def _find_shortest(
-    search: RouteSearch, enough: float, refined: set[Link], links_from: dict[Key, list[Link]]
-) -> tuple[BorderBound, tuple[Link, ...]]:
-    """The shortest route along borders by bounds of its links, and these; none from `enough` on."""
-    order, settled = count(), set[Key]()
-    queue: list[tuple[float, int, RoadmapPlace, tuple[Link, ...]]] = [
-        (0.0, next(order), search.start, ())
-    ]
-    while queue:
-        beat()
-        cost, _, place, links = heapq.heappop(queue)
-        if cost >= enough:
-            return BorderBound(enough, True), ()
-        if is_at(place, search.goal):
-            return BorderBound(cost, True), links
-        if place.key in settled:
-            continue
-        if len(settled) >= SETTLED:
-            return BorderBound(cost, False), ()
-        settled.add(place.key)
-        if place.key not in links_from:
-            every = search.roadmap.list_along(place, search.goal)
-            links_from[place.key] = [link for _, link, _ in every if isinstance(link, Link)]
-        for link in links_from[place.key]:
-            bound = link.fine_bound if link in refined else ROUGHLY * link.bound
-            heapq.heappush(queue, (cost + bound, next(order), link.stop, (*links, link)))
-    return BorderBound(enough, True), ()

@@ -156,19 +156,6 @@ def link_changed(cut: CutBorder, change: Change) -> Link | Blocked:
     return link_along((border,), (1.0,), blocked.steps, stop)
 
 
-def pass_cut(search: RouteSearch, cut: CutBorder, change: Change) -> RoadmapRoute | None:
-    """The route to a cut border and along it in the changed problem; None if it stays blocked."""
-    before, link = search.reached.get(cut.blocked.start.key), link_changed(cut, change)
-    if before is None or not isinstance(link, Link):
-        return None
-    return RoadmapRoute((*before.links, link))
-
-
-Try = Callable[[Change, Sequence[int], bool], tuple[float, Sequence[int]] | None]
-"""Looks for the goal with a change, beyond some borders: about how long the route takes [s], which
-is planned if that is asked for, and over which of the borders it leads."""
-
-
 def find_opening(
     search: RouteSearch,
     problem: Problem,
@@ -187,46 +174,42 @@ def find_opening(
     seconds : [s]  processor time that this has taken
     """
     report("looking for a number that opens the way")
-    cuts = list_cut_borders(search)
+    cuts, tried = list_cut_borders(search), list[str]()
 
     def find(
         change: Change, beyond: Sequence[int], planned: bool
     ) -> tuple[float, Sequence[int]] | None:
+        """About how long a route beyond some borders takes [s], and which of them it crosses."""
         try:
             changed = problem.with_(change.values)
         except InputError:
             return None
-        routes = {k: pass_cut(search, cuts[k], change) for k in beyond}
-        sources = [route for route in routes.values() if route is not None]
+        lasts, sources = dict[int, Link](), list[RoadmapRoute]()
+        for k in beyond:
+            before = search.reached.get(cuts[k].blocked.start.key)
+            link = link_changed(cuts[k], change)
+            if before is not None and isinstance(link, Link):
+                lasts[k] = link
+                sources.append(RoadmapRoute((*before.links, link)))
         if not sources:
             return None
         found = _search_changed(changed, search.start.z, search.goal, options, planned, sources)
-        if found is None:
-            return None
-        last = {k: route.links[-1] for k, route in routes.items() if route}
-        return found[1], [k for k, link in last.items() if link in found[0].links]
+        return found and (found[1], [k for k, link in lasts.items() if link in found[0].links])
 
-    text, changes = choose_opening(list_openings(cuts), find)
-    if changes:
-        return text, changes
-    hands, changes = find_hand(search, problem, options, seconds, report)
-    return hands if changes or not text else f"{text}; {hands}", changes
-
-
-def choose_opening(openings: Sequence[Opening], find: Try) -> tuple[str, tuple[Change, ...]]:
-    """The first number with which the goal is reached, and the least change of it that does."""
-    tried = list[str]()
-    for opening in openings[:TRIED]:
+    for opening in list_openings(cuts)[:TRIED]:
         most = opening.open_all()
         route = find(most, opening.list_open(most), False)
         # Borders beyond those that the route crosses may need the larger change.
         least = most if route is None else opening.open_all(route[1])
         for change in dict.fromkeys((least, most)) if route else ():
-            found = find(change, opening.list_open(change), True)
-            if found is not None:
-                return _describe_reached(change, found[0]), (change,)
+            reached = find(change, opening.list_open(change), True)
+            if reached is not None:
+                return _describe_reached(change, reached[0]), (change,)
         tried.append(str(most))
-    return f"the goal is not reached with {', nor with '.join(tried)}" if tried else "", ()
+    text, changes = find_hand(search, problem, options, seconds, report)
+    if tried and not changes:
+        text = f"the goal is not reached with {', nor with '.join(tried)}; {text}"
+    return text, changes
 
 
 def _describe_reached(change: Change, duration: float) -> str:
@@ -352,7 +335,7 @@ def describe_block(
     explain: Callable[[Blocked], str] = lambda blocked: blocked.reason,
 ) -> str:
     """Why nothing leads to a goal: the cut, its violated limits, and the change that opens it."""
-    cut, count = list_cut(search), search.settled
+    cut, count = list_cut(search), len(search.reached)
     text = f"nothing leads from {search.start} to {search.goal}: {count} place{'s'[: count != 1]}"
     text += f" reached, touching {describe(search.start.contacts)} at the start; "
     if not cut:

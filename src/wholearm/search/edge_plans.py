@@ -33,7 +33,7 @@ from ..planning.phase_plan import PhasePlan, end_of, split_blocks
 from ..planning.plan import solve_with
 from ..planning.result import Plan
 from ..planning.time_domain.time_motion import TimeMotion
-from ..problem.definition import ROWS, End, ModeGuess, Phase, Problem, Until
+from ..problem.definition import ROWS, End, ModeGuess, Phase, Problem
 from ..problem.read import read_phase
 from ..problem.table import SAME as PRINTED_ANGLE
 from ..problem.table import describe_phase
@@ -119,24 +119,11 @@ def measure_link(
     return Measured(spent + sum(plan.motion.duration for plan in plans), steps, plans)
 
 
-def leave_in_motion(steps: tuple[EdgeStep, ...]) -> tuple[EdgeStep, ...]:
-    """Phases that leave a border in motion, where the planner chooses."""
-    first, *rest = steps
-    return (EdgeStep(first.contacts, Until(), End.SMOOTH), *rest)
-
-
 class Lost(str):
     """Why a route has no plan, with the links for which that is so on every route."""
 
     # the one whose planning fails, after the one that lands at its start, if any
     links: tuple[Link, ...] = ()
-
-    @classmethod
-    def at(cls, links: tuple[Link, ...], reason: str) -> Lost:
-        """A reason together with the links that cause it."""
-        lost = cls(reason)
-        lost.links = links
-        return lost
 
 
 def plan_phases(
@@ -249,7 +236,9 @@ def plan_links(
             blamed = range(len(planned), first - 1, -1)
             other = next((k for k in blamed if len(guesses[k]) > 1), None)
             if other is None:
-                return Lost.at(tuple(link for link, _ in links[first : len(planned) + 1]), reason)
+                lost = Lost(reason)
+                lost.links = tuple(link for link, _ in links[first : len(planned) + 1])
+                return lost
             guesses[other].pop(0)
 
 
@@ -318,7 +307,8 @@ class _LinkPlanner:
         # A landing is planned with the border that follows, as if that ended at rest.
         lands = link.in_cell and following is not None and not following.in_cell
         follows = (following.steps[0]._replace(end=End.REST),) if following and lands else ()
-        place = key_configuration(self.problem.scene, z)
+        length = self.problem.scene.scales.length
+        place = tuple(np.round(z / [length, length, 1, 1, 1], SAME).tolist())
         # Neither samples nor checks of whole plans matter to those of links.
         settings = repr(replace(self.options, samples=2, replay=False, certify=False))
         key = (place, key_steps(link.steps), key_steps(follows), guess is None, settings)
@@ -380,12 +370,6 @@ class PlannedLink:
 
 
 Cache = MutableMapping[Key, PlannedLink | str]  # plans of links, or why there are none
-
-
-def key_configuration(scene: Scene, z: Array) -> tuple[float, ...]:
-    """A configuration, rounded."""
-    length = scene.scales.length
-    return tuple(np.round(z / [length, length, 1, 1, 1], SAME).tolist())
 
 
 def key_steps(steps: Sequence[EdgeStep]) -> Key:

@@ -320,11 +320,13 @@ def point_out(contacts: Sequence[Contact], z: Array) -> Until:
     return Until(coordinate="phi", value=float(z[2]))
 
 
-def leave_at(link: Link, share: float) -> tuple[EdgeStep, ...]:
-    """The phases of a link that leaves a border at a share of its length."""
+def leave_at(link: Link, share: float | None) -> tuple[EdgeStep, ...]:
+    """The phases of a link that leaves a border at a share of its length; with None in motion."""
+    first, *rest = link.steps
+    if share is None:
+        return (EdgeStep(first.contacts, Until(), End.SMOOTH), *rest)
     assert link.left is not None
     z = link.left.evaluate(np.array([share * link.left.length])).z[0]
-    first, *rest = link.steps
     return (first._replace(until=point_out(first.contacts, z)), *rest)
 
 

@@ -227,12 +227,12 @@ def _plan_to_goal(
             complete = False
     others = tuple(Alternative(other) for other, _ in made[1 : 1 + alternatives])
     failures, blocked = tuple(chooser.failures), tuple(search.blocked)
-    return Answer(plan, route, bound, others, failures, blocked, search.settled, complete)
+    return Answer(plan, route, bound, others, failures, blocked, len(search.reached), complete)
 
 
 def _describe_missing(chooser: Chooser, doing: str) -> str:
     """What a search that is out of time has found, and its last step."""
-    text = f"the time limit is over, and there is no plan yet: {chooser.search.settled} places"
+    text = f"the time limit is over, and there is no plan yet: {len(chooser.search.reached)} places"
     text += " looked at"
     if chooser.found:
         best = min(chooser.found, key=chooser.estimate)

@@ -19,8 +19,8 @@ from ..geometry.tracing import HELD
 from ..problem.definition import Goal, Until
 from ..scene.model import Scene
 
-ACROSS = np.linspace(-1.5, 1.5, 13)  # sampled x of goals without x, in radii of gyration
 FINE = 1e-4  # Grid on which places with the same contacts are one, in radii of gyration and radians
+NEAR = 1e-4  # how far beside a goal the hand may close instead, in radii of gyration
 COARSE = 0.25  # the same for landings after a cell, which the planner optimizes
 Key = tuple[tuple[str, ...], int, int]
 
@@ -158,30 +158,6 @@ def _find_first(curve: Curve, row: int, value: float) -> float | None:
         float(grid[k]),
         float(grid[k + 1]),
     )
-
-
-def list_pins(goal: Goal) -> tuple[tuple[str, float], ...]:
-    """Terminal constraints of a phase through a cell that ends at a goal."""
-    return () if goal.x is None else (("x", goal.x),)
-
-
-def list_poses(scene: Scene, z: Array, goal: Goal) -> Array:
-    """Candidate poses (x, phi) of a goal inside a cell near a configuration, shape (n, 2)."""
-    if goal.phi is None:
-        return np.zeros((0, 2))
-    if goal.x is not None:
-        return np.array([[goal.x, goal.phi]])
-    x = float(z[0]) + ACROSS * float(unit_steps(scene)[0])
-    return np.column_stack([x, np.full(len(x), goal.phi)])
-
-
-def measure_turn(place: RoadmapPlace, goal: Goal) -> float:
-    """Least angle that the object has to turn to the goal [rad]."""
-    phi = float(place.z[2])
-    return abs(goal.find_angle(place.scene, phi) - phi)
-
-
-NEAR = 1e-4  # How far beside a goal the hand may close instead, in radii of gyration
 
 
 def require_reach(scene: Scene, goal: Goal, near: float) -> None:

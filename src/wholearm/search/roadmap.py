@@ -53,8 +53,6 @@ from .places import (
     close_place,
     is_flush,
     list_formations_at,
-    list_pins,
-    list_poses,
     make_place,
     measure_along,
     unit_steps,
@@ -266,17 +264,22 @@ class Roadmap:
             formation = Formation(self.scene, link.stop.contacts)
             z = close_contacts(formation, link.stop.z, np.zeros(0), ((0, goal.x),))
             if z is not None and is_inside(formation, z):
-                step = last._replace(until=replace(last.until, pins=list_pins(goal)))
+                step = last._replace(until=replace(last.until, pins=(("x", goal.x),)))
                 stop = replace(link.stop, z=z)
                 first = [EdgeStep(b.contacts, Until(), End.SMOOTH) for b in before]
                 found.append(replace(link, stop=stop, steps=(*first, step), left=None))
         return found
 
     def end_in_cell(self, place: RoadmapPlace, goal: Goal) -> Iterator[Link]:
-        """Straight links from a place to a goal inside a cell around it."""
-        poses = list_poses(self.scene, place.z, goal)
-        for formation in list_formations_at(place, 3) if len(poses) else ():
-            until = Until(None, "phi", goal.phi, list_pins(goal))
+        """Straight links from a place to a goal inside a cell around it; x is sampled if free."""
+        if goal.phi is None:
+            return
+        x = place.z[0] + np.linspace(-1.5, 1.5, 13) * self.scene.scales.length
+        x = x if goal.x is None else np.array([goal.x])
+        poses = np.column_stack([x, np.full(len(x), goal.phi)])
+        pins = () if goal.x is None else (("x", goal.x),)
+        for formation in list_formations_at(place, 3):
+            until = Until(None, "phi", goal.phi, pins)
             link = go_to(place, formation, poses, until, self.epsilon)
             if link is not None:
                 yield link
