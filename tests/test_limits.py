@@ -53,7 +53,7 @@ from wholearm.planning.time_domain.solution import SETTINGS, TimeSearch, check_b
 from wholearm.planning.time_domain.stage import Stage
 from wholearm.planning.time_domain.time_motion import TimeMotion
 from wholearm.planning.time_domain.time_plan import plan_phases
-from wholearm.policy.reference import make_rows
+from wholearm.policy.make import make_rows
 from wholearm.problem.definition import End, Phase, Problem, Until
 from wholearm.problem.read import build_problem
 from wholearm.scene.model import Friction

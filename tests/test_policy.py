@@ -21,9 +21,15 @@ from wholearm.cli.command import main
 from wholearm.geometry.tracing import trace_phase
 from wholearm.mechanics.dynamics import build_forward
 from wholearm.policy.curve_law import CurveLaw, MotionLaw, choose_internal_force
-from wholearm.policy.make import SAME, find_widest, hold_end, make_policy
-from wholearm.policy.reference import find_within, list_scenes, retime, retime_within
-from wholearm.policy.regulator import RATE, Linear, regulate
+from wholearm.policy.make import (
+    find_widest,
+    find_within,
+    list_scenes,
+    make_policy,
+    retime,
+    retime_within,
+)
+from wholearm.policy.regulator import RATE, SAME, Linear, hold_end, regulate
 from wholearm.simulation.simulate import simulate_free
 from wholearm.verification.free import verify_policy
 

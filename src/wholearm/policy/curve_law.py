@@ -1,7 +1,7 @@
 """Control laws of a policy: along a curve, over time, and with measured contact forces.
 
 Along a curve a table over the arc length s has joint angles, the reference b = s'^2, torques and
-limits, affine in a, b, s' and the internal force (`reference`). Each period of `CurveLaw`
+limits, affine in a, b, s' and the internal force (`make`). Each period of `CurveLaw`
 
 * projects joint angles and speeds onto the table: s and s';
 * predicts both for the middle of the interval in which its torques are held;

@@ -1,55 +1,718 @@
-"""Policies from plans: control laws of all phases, their references and margins."""
+"""Policies from plans: references along curves with robustness margins, and tables of all phases.
+
+Torques and limits at places along a curve are coefficients of (1, s'', s'^2, s', lambda) of a
+nominal motion. Its torques are applied: with other friction, mass or gains they lead to another s''
+and internal force, and thus to other contact forces. Without ranges the margin of each limit is the
+root sum square of what usual errors take away. Within ranges, limits hold in the worst corner
+(`Corners`), both under nominal torques and with feedback that tracks the reference. The reference
+is the fastest motion of the backward pass of `mechanics.speed_sweep` that keeps the largest least
+share of the margins. Phases over time have a regulator (`regulator`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise, product
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..common.arrays import Array
-from ..common.errors import InputError, WholearmError, require_number
+from ..common.errors import InputError, require_number
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
-from ..geometry.curve import Curve
-from ..geometry.tracing import runs_on_curve
+from ..geometry.curve import Curve, CurvePoint, directions_of
+from ..geometry.tracing import runs_on_curve, trace_phase
 from ..mechanics.dynamics import (
     LAMBDA,
     ONE,
     A,
     B,
     Directions,
+    PathForces,
     V,
     force_rows,
     inverse,
     metric_weights,
+    stack_motion,
 )
-from ..mechanics.limits import PRESS, TORQUE, make_limits
-from ..mechanics.path_limits import PathLimits
-from ..problem.definition import PARAMETERS, ROWS, End, Phase, Problem
+from ..mechanics.limits import PRESS, TORQUE, LimitSet, make_limits
+from ..mechanics.path_limits import PathLimits, find_slack_rows
+from ..mechanics.sensitivity import find_force_slopes, find_shifts
+from ..mechanics.speed_sweep import ControllableSet, find_controllable, find_duration
+from ..problem.definition import GROUPS, PARAMETERS, End, Phase, Problem, change_scene
 from ..results.adopt import Moved, adopt_motion
-from ..results.dwell_record import assemble
-from ..results.torque import TorqueProfile
-from ..results.trajectory import Motion, Trajectory
-from ..simulation.modes import Standstill, find_hold
+from ..results.trajectory import Trajectory
+from ..scene.model import Scene
 from .curve_law import LoopSettings, choose_internal_force
 from .playback import Policy
-from .reference import (
-    SETTINGS,
-    CurveLimitRows,
-    ReferencePiece,
-    find_forces,
-    leave_one,
-    scale_ranges,
-    trace_pieces,
+from .regulator import (
+    STILL,
+    Planner,
+    find_planned_internal_force,
+    hold_end,
+    replan,
+    tabulate_motion,
 )
-from .regulator import RATE, ROOM, end_within, follow
 
-SAME = 1e-5  # distance from the plan's end that counts as none, over the scene's length and in rad
-STILL = 1e-3  # speed that counts as none, over the scene's
-Planner = Callable[[Problem], Trajectory]  # makes a plan of a problem
 COLUMNS = [ONE, B, V, A, LAMBDA]  # order of coefficients in the tables of a policy
+PathMotion = tuple[Array, Array, Array]  # a, b and internal force at n places
+
+
+@dataclass(frozen=True)
+class ReferenceSettings:
+    """Margins and accuracies of references."""
+
+    # Uncertainties without ranges, relative: of masses, frictions, torques; of the delay [s].
+    mass: float = 0.05
+    friction: float = 0.1
+    gain: float = 0.01
+    late: float = 5e-4
+    least: float = 0.02  # least margin of a normal force, over the scene's unit of force
+    spare: float = 0.05  # margin of a torque for feedback, over its limit
+    kept: float = 1.3  # margin of the reference's forces within ranges, over those of the law
+    authority: float = 2.0  # margin of the reference's torques, over those of the law
+    near: float = 1e-3  # time around a reversal in which friction may have either direction [s]
+    touch: float = 3e-3  # speed s' at which contacts are made, over the scene's
+    arrival: float = 3e-3  # time constant of the approach to the end [s]
+    # Squared speeds over the plan's, tried until there is a margin: relative errors of torques
+    # matter less where torques are small. Case: square, phase 2.
+    slower: tuple[float, ...] = (1.0, 0.25)
+    slowest: float = 0.1  # least b over the plan's of a motion with a margin: slow ones can stick
+    # Shares of the margin that are tried, the largest first. Negative ones: limits of a plan hold
+    # between its own nodes, so that at others they may be violated a little.
+    shares: tuple[float, ...] = (*(0.8**k for k in range(12)), 0.04, 0.0, -0.1, -0.2, -0.4, -0.8)
+    # Upper limits of the share of all intervals, if some interval has less, as a large share in one
+    # interval can reduce that of another one. Case: square, 28 % slower without them.
+    parts: tuple[float, ...] = (0.5, 0.2, 0.0)
+    enough: float = 0.4  # least share that needs no smaller upper limit and no slower motion
+    widest: float = 0.9  # largest relative range
+
+
+SETTINGS = ReferenceSettings()
+UNLIMITED = np.array([1e9, 0.0, 0.0, 0.0, 0.0])
+FIXED = np.array([1.0, 0.0, 1.0, 1.0, 0.0])
+"""Columns that torques do not change: all but those of s'' and the internal force."""
+CORNERS = ("mass", "inertia", *GROUPS["friction"])
+"""Numbers whose ranges have corners; those of geometry and gains count to first order. The start is
+measured, and a delay is in torques."""
+
+
+class CurveLimitRows(NamedTuple):
+    """Torques and limits at n places of a curve."""
+
+    s: Array  # (n,) [m]
+    torque: Array  # (n, 2, 5) [N m]
+    # (n, m, 5) [N, N m]: distances from limits: of forces with friction before, then after the
+    # nearest reversal; of torques
+    slack: Array
+    unit: Array  # (n, m) [N, N m]: margin at level 1
+    presses: int  # how many of the m are of forces
+    scenes: tuple[Scene, ...]  # in the corners of the ranges
+
+    @property
+    def levels(self) -> Array:
+        """Limits over their margins, shape (n, m, 5)."""
+        return np.asarray(self.slack / self.unit[..., None])
+
+
+def split_limits(formation: Formation) -> tuple[LimitSet, LimitSet]:
+    """Limits with an epsilon of zero: those of contact forces, and those of torques alone.
+
+    Speed limits are kept by the plan, and no motion of a policy is faster.
+    """
+    limits, _ = make_limits(formation, 0.0).split_speeds()
+    contact = [limit for limit in limits.limits if limit.rows[:, :-4].any()]
+    joint = [limit for limit in limits.limits if not limit.rows[:, :-4].any()]
+    return LimitSet(tuple(contact)), LimitSet(tuple(joint))
+
+
+def find_torques(curve: Curve, s: Array, directions: Directions) -> Array:
+    """Torques at n places, shape (n, 2, 5)."""
+    point = curve.evaluate(np.clip(s, 0.0, curve.length))
+    return inverse(curve.formation, *point[:3], directions, point.kinematics).of_tau
+
+
+def respond(forces: PathForces, torque: Array) -> tuple[Array, Array]:
+    """Contact forces, (n, n_c + R, 5), a and internal force, (n, 2, 5), from torques (n, 2, 5)."""
+    free = [A, LAMBDA]
+    motion = np.linalg.solve(forces.of_tau[..., free], torque - FIXED * forces.of_tau)
+    return np.asarray(forces.of_c[..., free] @ motion + FIXED * forces.of_c), np.asarray(motion)
+
+
+def measure_slack(limits: LimitSet, c: Array, torque: Array, rates: Array) -> Array:
+    """Slack of limits, (n, m, 5) [N, N m], from coefficients of c and torques; `rates` (n, 2)."""
+    rows = find_slack_rows(limits, PathForces(c, torque), rates)
+    return np.asarray(rows * limits.scales[limits.sides[0], None])
+
+
+def make_rows(curve: Curve, s: Array, motion: PathMotion) -> CurveLimitRows:
+    """Rows at places of a curve, with margins for a motion (a, b, lambda)."""
+    formation, point, speed = curve.formation, curve.evaluate(s), np.sqrt(motion[1])
+    mean, *sides = blend_directions(curve, s, speed * SETTINGS.near)
+    torque, late = (
+        find_torques(curve, s, mean),
+        find_torques(curve, s - SETTINGS.late * speed, mean),
+    )
+    tau, delayed = (PathForces(rows, rows).tau(*motion) for rows in (torque, late))
+    (contact, joint), rates = split_limits(formation), point.z_s[:, 3:]
+    slack, unit = [], []
+    for side in sides:
+        forces = inverse(formation, *point[:3], side, point.kinematics)
+        slack.append(measure_slack(contact, respond(forces, torque)[0], torque, rates))
+        error = _estimate_errors(formation, point, side, contact, motion[1], tau, delayed)
+        unit.append(SETTINGS.least * contact.scales[contact.sides[0]] + error)
+    slack[1][have_same_signs(*sides)] = UNLIMITED
+    slack.append(measure_slack(joint, np.zeros_like(forces.of_c), torque, rates))
+    unit.append(np.tile(SETTINGS.spare * joint.scales[joint.sides[0]], (len(s), 1)))
+    table, count = np.concatenate(slack, axis=1), 2 * slack[0].shape[1]
+    units = np.concatenate(unit, axis=1)
+    return CurveLimitRows(s, torque, table, units, count, (formation.scene,))
+
+
+def have_same_signs(before: Directions, after: Directions) -> Array:
+    """Where directions before and after the nearest reversal are equal, shape (n,)."""
+    same = [(one == other).all(axis=1) for one, other in zip(before, after, strict=True)]
+    return np.asarray(same[0] & same[1])
+
+
+def leave_one(levels: Array) -> Array:
+    """Levels of intervals, (n, 2, m, 5), without duplicates."""
+    found = levels.copy()
+    for k in range(1, levels.shape[2]):
+        twice = (found[:, :, :k] == levels[:, :, k : k + 1]).all(axis=(1, 3)).any(axis=1)
+        found[twice, :, k] = UNLIMITED
+    return found
+
+
+def find_internal_force(rows: CurveLimitRows, a: Array, b: Array) -> Array:
+    """The internal force with the largest least level for a motion, shape (n,)."""
+    levels = rows.levels
+    base = np.einsum("nmi,ni->nm", levels, stack_motion(a, b, np.zeros_like(b)))
+    pairs = zip(base.tolist(), levels[..., LAMBDA].tolist(), strict=True)
+    return np.array([choose_internal_force(one, [0.0] * len(one), by, 0.0)[1] for one, by in pairs])
+
+
+def find_forces(curve: Curve, s: Array, speed: Array) -> Array:
+    """Normal forces at both ends of the intervals between places, (n - 1, 2, n_c, 5) [N]."""
+    formation, point = curve.formation, curve.evaluate(s)
+    mean = blend_directions(curve, s, speed * SETTINGS.near)[0]
+    forces = inverse(formation, *point[:3], mean, point.kinematics)
+    c_n = forces.of_c[:, : formation.n_contacts]
+    return np.stack([c_n[:-1], c_n[1:]], axis=1)
+
+
+def blend_directions(curve: Curve, s: Array, width: Array) -> list[Directions]:
+    """Sliding directions blended over reversals of a width (n,) [m], and as before and after."""
+    first = curve.segments[0]
+    found = [[np.tile(part, (len(s), 1)) for part in (first.Xi, first.sigma)] for _ in range(3)]
+    for before, after in pairwise(curve.segments):
+        near = max(float(np.interp(before.stop, s, width)), 1e-3 * curve.length)
+        share = np.clip(0.5 + (s - before.stop) / (2 * near), 0.0, 1.0)[:, None]
+        for directions, part in zip(found, (share, np.floor(share), np.ceil(share)), strict=True):
+            directions[0] += part * (after.Xi - before.Xi)
+            directions[1] += part * (after.sigma - before.sigma)
+    return [Directions(*directions) for directions in found]
+
+
+def _estimate_errors(
+    formation: Formation,
+    point: CurvePoint,
+    side: Directions,
+    limits: LimitSet,
+    b: Array,
+    tau: Array,
+    delayed: Array,
+) -> Array:
+    """Errors of forces from uncertain numbers, torques and delays, root sum square, (n, m)."""
+
+    def measure(scene: Scene, tau: Array) -> Array:
+        changed = replace(formation, scene=scene)
+        forces = inverse(changed, *point[:3], side, point.kinematics)
+        torque = tau[..., None] * np.eye(5)[ONE]
+        rows = measure_slack(limits, respond(forces, torque)[0], torque, point.z_s[:, 3:])
+        return np.asarray(np.einsum("nmi,ni->nm", rows, stack_motion(0 * b, b, 0 * b)))
+
+    scene = formation.scene
+    doubts = dict(zip(CORNERS, [SETTINGS.mass] * 2 + [SETTINGS.friction] * 3, strict=True))
+    cases = [(change_scene(scene, {name: width}), tau) for name, width in doubts.items()]
+    cases += [(scene, tau * (1 + SETTINGS.gain * np.eye(2)[k])) for k in range(2)]
+    cases.append((scene, delayed))
+    base = measure(scene, tau)
+    return np.asarray(np.sqrt(np.sum([(measure(*case) - base) ** 2 for case in cases], axis=0)))
+
+
+class Corners(NamedTuple):
+    """Limits at n places in k corners, of the nominal (1, a, b, s', internal force)."""
+
+    rows: Array  # (k, n, m, 5)
+    moves: Array  # (k, n, 5): actual acceleration s''
+    swings: Array  # (p, n, m, 5): first-order changes by each other range
+
+    def pick(self, motion: PathMotion) -> Array:
+        """The limits in the corner that is worst for a motion, shape (n, m, 5)."""
+        values = stack_motion(*motion)
+        worst = np.einsum("knmq,nq->knm", self.rows, values).argmin(axis=0)
+        rows = np.take_along_axis(self.rows, worst[None, ..., None], axis=0)[0]
+        signs = np.sign(np.einsum("pnmq,nq->pnm", self.swings, values))
+        return np.asarray(rows - np.einsum("pnm,pnmq->nmq", signs, self.swings))
+
+    def close(self, others: Array) -> Corners:
+        """These and other limits, (n, l, 5), with feedback that makes s'' equal to a."""
+        count = len(self.rows)
+        rows = np.concatenate([self.rows, np.tile(others, (count, 1, 1, 1))], axis=2)
+        rate, rest = self.moves[:, :, None, [A]], self.moves[:, :, None].copy()
+        rest[..., A] = 0.0
+        asked = rows[..., [A]] / rate
+        closed = rows - asked * rest
+        closed[..., [A]] = asked
+        wider = ((0, 0), (0, 0), (0, others.shape[1]), (0, 0))
+        return Corners(closed, self.moves, np.pad(self.swings, wider))
+
+
+def find_corners(
+    formation: Formation,
+    point: CurvePoint,
+    side: Directions,
+    torques: tuple[Array, Array, Array],
+    widths: Mapping[str, float],
+) -> Corners:
+    """Limits of forces in the corners of ranges with half `widths`.
+
+    Torques, (n, 2, 5) each, are the nominal ones, delayed ones, and the derivative by s.
+    """
+    rows, moves = list[Array](), list[Array]()
+    torque, late, slope = torques
+    for scene in list_scenes(formation.scene, widths):
+        changed = replace(formation, scene=scene)
+        c, motion = respond(inverse(changed, *point[:3], side, point.kinematics), torque)
+        rows.append(measure_slack(split_limits(changed)[0], c, torque, point.z_s[:, 3:]))
+        moves.append(motion[:, 0])
+    nominal = inverse(formation, *point[:3], side, point.kinematics)
+    swings = [respond(nominal, late)[0] - respond(nominal, torque)[0]]
+    first_order = (*GROUPS["geometry"], *GROUPS["gain"])
+    for name in (other for other in first_order if widths.get(other, 0.0) > 0):
+        slopes = find_force_slopes(formation, point, side, nominal, (name,))[:, :, 0]
+        if name in GROUPS["geometry"]:
+            # Torques depend on the apparent place.
+            shift = find_shifts(formation, point, side, nominal, name)
+            moved = torque + shift[:, None, None] * slope
+            slopes = slopes + respond(nominal, moved)[0] - respond(nominal, torque)[0]
+        swings.append(widths[name] * slopes)
+    limits, _ = split_limits(formation)
+    side_rows, signs, _ = limits.sides
+    of_c = signs[:, None] * limits.columns[0][side_rows]
+    return Corners(np.array(rows), np.array(moves), of_c @ np.array(swings))
+
+
+def list_scenes(scene: Scene, widths: Mapping[str, float]) -> tuple[Scene, ...]:
+    """Scenes in the corners of ranges with half `widths`."""
+    names = [name for name in CORNERS if widths.get(name, 0.0) > 0]
+    return tuple(
+        change_scene(scene, {n: k * widths[n] for n, k in zip(names, signs, strict=True)})
+        for signs in product((-1, 1), repeat=len(names))
+    )
+
+
+class Within(NamedTuple):
+    """Limits along a curve within ranges, at n places."""
+
+    s: Array  # (n,) [m]
+    torque: Array  # (n, 2, 5) [N m]
+    left: Array  # (n, l, 5) [N m]: distances of torques from their limits
+    sides: tuple[Corners, Corners]  # with friction before and after the nearest reversal
+    same: Array  # (n,): where these are equal
+    unit: Array  # (m + l,): margins at level 1, of forces and torques
+    scenes: tuple[Scene, ...]  # in the corners of the ranges
+
+    def at(self, motion: PathMotion) -> tuple[CurveLimitRows, Array, Array]:
+        """The law's limits near a motion; those of the reference, and their margins."""
+        motions = self._spread(motion)
+        forces = self._pick(self.sides, motions)
+        closed = self._pick([side.close(self.left) for side in self.sides], motions)
+        count, n = len(self.unit) - self.left.shape[1], len(self.s)
+        slack = np.concatenate([forces, self.left], axis=1)
+        copies = forces.shape[1] // count
+        unit = np.concatenate([np.tile(self.unit[:count], copies), self.unit[count:]])
+        table, presses = np.tile(unit, (n, 1)), forces.shape[1]
+        rows = CurveLimitRows(self.s, self.torque, slack, table, presses, self.scenes)
+        kept = np.concatenate(
+            [SETTINGS.kept * self.unit[:count], SETTINGS.authority * self.unit[count:]]
+        )
+        again = np.tile(kept, 2 * len(motions))
+        wanted = np.concatenate([np.tile(kept[:count], copies), kept[count:], again])
+        whole = np.concatenate([slack, closed], axis=1)
+        return rows, whole, np.tile(wanted, (n, 1))
+
+    def _pick(self, sides: tuple[Corners, ...] | list[Corners], motions: list[PathMotion]) -> Array:
+        """Limits on both sides of reversals in the worst corners of motions, (n, rows, 5)."""
+        found = [
+            np.concatenate([side.pick(motion) for motion in motions], axis=1) for side in sides
+        ]
+        found[1][self.same] = UNLIMITED
+        return np.concatenate(found, axis=1)
+
+    def _spread(self, motion: PathMotion) -> list[PathMotion]:
+        """A motion with its internal force, and with the least and largest one within torques."""
+        a, b, internal = motion
+        ends = PathLimits(self.left, b).find_internal_force_range(a, b)
+        low, high = (np.where(np.isfinite(end), end, internal) for end in ends)
+        return [motion, (a, b, np.minimum(low, internal)), (a, b, np.maximum(high, internal))]
+
+
+def find_within(
+    curve: Curve, s: Array, speed: Array, widths: Mapping[str, float], least: float
+) -> Within:
+    """Limits along a curve within ranges, with forces of at least so much [N]."""
+    formation, point = curve.formation, curve.evaluate(s)
+    # Limits are interpolated: nodes next to a reversal need both directions.
+    gaps = np.pad(np.diff(s), 1)
+    width = np.maximum(speed * SETTINGS.near, 1.01 * np.maximum(gaps[1:], gaps[:-1]))
+    mean, *sides = blend_directions(curve, s, width)
+    late = s - (SETTINGS.late + widths.get("delay", 0.0)) * speed
+    nominal, step = find_torques(curve, s, mean), 1e-4 * curve.length
+    before, after = (find_torques(curve, s + sign * step, mean) for sign in (-1, 1))
+    torques = nominal, find_torques(curve, late, mean), (after - before) / (2 * step)
+    corners = [find_corners(formation, point, side, torques, widths) for side in sides]
+    contact, joint = split_limits(formation)
+    none = np.zeros((len(s), formation.n_constraints, 5))
+    left = measure_slack(joint, none, nominal, point.z_s[:, 3:])
+    scales, most = (each.scales[each.sides[0]] for each in (contact, joint))
+    unit = np.concatenate([np.maximum(SETTINGS.least * scales, least), SETTINGS.spare * most])
+    scenes = list_scenes(formation.scene, widths)
+    same = have_same_signs(*sides)
+    return Within(s, nominal, left, (corners[0], corners[1]), same, unit, scenes)
+
+
+class ReferencePiece(NamedTuple):
+    """The reference of a phase along a curve."""
+
+    curve: Curve
+    rows: CurveLimitRows
+    reach: ControllableSet
+    share: float  # least share of the margin
+    begins: float  # [m^2/s^2]: the plan's b at the start
+    passes: float  # ratio of b after and before the impact at the end; zero at rest
+    b: Array  # (n,) [m^2/s^2]: the reference
+
+    @property
+    def duration(self) -> float:
+        """Duration of the reference [s]."""
+        return float(find_duration(self.b, np.diff(self.rows.s)))
+
+    @property
+    def reserves(self) -> dict[str, float]:
+        """Least level of each contact's normal force along the reference."""
+        rows, names = self.rows, self.curve.formation.names
+        a = np.diff(self.b) / (2 * np.diff(rows.s))
+        a = np.append(a, a[-1])
+        count = len(split_limits(self.curve.formation)[0].low)
+        motion = stack_motion(a, self.b, find_internal_force(rows, a, self.b))
+        levels = np.einsum("nmi,ni->nm", rows.levels[:, : rows.presses], motion)
+        least = levels.min(axis=0).reshape(-1, count).min(axis=0)
+        return dict(zip(names, least[: len(names)].tolist(), strict=True))
+
+
+def scale_ranges(ranges: Mapping[str, float], size: float, delay: float) -> dict[str, float]:
+    """Half widths of scaled ranges; of the delay its unknown part, with a known `delay` [s]."""
+    widths = {name: size * width for name, width in ranges.items()}
+    late = widths.get("delay", 0.0)
+    # Torques may be early as well: a delay is anything from none to its range.
+    return widths | {"delay": max(late - delay, delay) if late else 0.0}
+
+
+def trace_pieces(
+    problem: Problem,
+    phases: Sequence[Phase | None],
+    plan: Trajectory,
+    size: float,
+    widths: Mapping[str, float] | None,
+) -> list[ReferencePiece | None]:
+    """References of phases along curves, with margins as large as possible; None for None.
+
+    Margins are `size` times those of usual errors or, where there are half `widths` of ranges, such
+    that limits are kept within these.
+    """
+    pieces: list[ReferencePiece | None] = []
+    for phase in reversed(phases):
+        after = pieces[-1] if pieces else None
+        pieces.append(None if phase is None else _trace(problem, phase, plan, size, widths, after))
+    pieces.reverse()
+    before: ReferencePiece | None = None
+    for k, piece in enumerate(pieces):
+        if piece is not None:
+            first = float(piece.reach.high[0])
+            if before is not None and before.passes:
+                first = float(before.b[-1]) * before.passes
+            piece = pieces[k] = piece._replace(b=piece.reach.run(first))
+        before = piece
+    return pieces
+
+
+def _trace(
+    problem: Problem,
+    phase: Phase,
+    plan: Trajectory,
+    size: float,
+    widths: Mapping[str, float] | None,
+    after: ReferencePiece | None,
+) -> ReferencePiece:
+    """A phase's curve, and the controllable motions along it that keep margins."""
+    rows_of_phase = np.flatnonzero((plan.phase == phase.index) & ~plan.held)
+    curve = trace_phase(phase, plan.z[rows_of_phase[0]], problem.phases[phase.index + 1 :])
+    places, *values = _follow(curve, plan, rows_of_phase)
+    # Nodes of the table, with all reversals.
+    s = curve.length * (1 - np.cos(np.pi * np.linspace(0, 1, 121))) / 2
+    s = np.sort(np.concatenate([s, [part.stop for part in curve.segments[:-1]]]))
+    s = s[np.diff(s, prepend=-1.0) > 1e-7 * curve.length]
+    a, b, internal = (np.interp(s, places, value) for value in values)
+    touch, begins, passes, end = SETTINGS.touch * problem.scene.scales.speed, float(b[0]), 0.0, None
+    if phase.end is End.IMPACT and after is not None and b[-1] > touch**2:
+        passes = after.begins / float(b[-1])
+        end = float(after.reach.low[0] / passes), float(after.reach.high[0] / passes)
+    else:
+        b = np.minimum(b, (touch + (curve.length - s) / SETTINGS.arrival) ** 2)
+    if widths is not None and size:
+        planned = a, b, internal
+        within, share = retime_within(curve, s, planned, widths, problem.epsilon, end)
+        if within is not None:
+            return ReferencePiece(curve, *within, share, begins, passes, b)
+    best: tuple[CurveLimitRows, ControllableSet, float] | None = None
+    for factor in SETTINGS.slower:
+        motion = factor * a, factor * b
+        rows = make_rows(curve, s, (*motion, internal))
+        for _ in range(2 if factor < 1.0 else 0):
+            rows = make_rows(curve, s, (*motion, find_internal_force(rows, *motion)))
+        wanted = size * rows.unit
+        wanted[:, rows.presses :] = SETTINGS.authority * rows.unit[:, rows.presses :]
+        found = retime(s, rows.slack, wanted, motion[1], end)
+        share = float(found.share.min())
+        if best is not None and share <= best[2]:
+            break
+        best = rows, found, share
+        if share >= SETTINGS.enough:
+            break
+    assert best is not None
+    rows, found, share = best
+    # Margins without ranges keep no share of ranges.
+    share = share if widths is None else 0.0
+    return ReferencePiece(curve, rows, found, share, begins, passes, b)
+
+
+def retime(
+    s: Array,
+    slack: Array,
+    reserve: Array,
+    cap: Array,
+    end: tuple[float, float] | None = None,
+    parts: Sequence[float] = SETTINGS.parts,
+) -> ControllableSet:
+    """Controllable motions nowhere faster than a plan, with the largest least share of margins.
+
+    Parameters
+    ----------
+    s : (n,) [m]          nodes
+    slack : (n, m, 5)     limits at the nodes, as in `CurveLimitRows`
+    reserve : (n, m)      their margins
+    cap : (n,) [m^2/s^2]  largest b
+    end : [m^2/s^2]       least and largest b at the last node; by default the last of `cap`
+    parts                 upper limits of the share, tried where some interval has less
+    """
+    limits, floor, end = PathLimits(slack, cap), SETTINGS.slowest * cap, end or (cap[-1], cap[-1])
+    best: ControllableSet | None = None
+    for part in (1.0, *parts):
+        shares = [part, *(share for share in SETTINGS.shares if share < part)]
+        found = find_controllable(limits, reserve, np.diff(s), floor, end, shares)
+        if best is None or found.share.min() > best.share.min():
+            best = found
+        if best.share.min() >= min(0.8 * part, SETTINGS.enough):
+            break
+    assert best is not None
+    return best
+
+
+def retime_within(
+    curve: Curve,
+    s: Array,
+    plan: PathMotion,
+    widths: Mapping[str, float],
+    least: float,
+    end: tuple[float, float] | None = None,
+) -> tuple[tuple[CurveLimitRows, ControllableSet] | None, float]:
+    """The fastest motion that keeps its limits within the largest feasible share of ranges.
+
+    Fixed-point iteration between the worst corners of the ranges and the motion.
+
+    Parameters
+    ----------
+    s : (n,) [m]  nodes
+    plan : (n,)   a, b and internal force of a plan there; no motion is faster
+    widths        half widths of the ranges; that of the delay is its unknown part
+    least : [N]   least normal force within them
+    end           as of `retime`
+
+    Returns
+    -------
+    tuple  the law's limits and the motions, None if there are none; and the share of the ranges
+    """
+
+    def find(share: float) -> tuple[CurveLimitRows, ControllableSet] | None:
+        scaled = {name: min(share * width, SETTINGS.widest) for name, width in widths.items()}
+        within, motion = find_within(curve, s, np.sqrt(plan[1]), scaled, least), plan
+        for _ in range(3):
+            rows, whole, wanted = within.at(motion)
+            found = retime(s, whole, wanted, plan[1], end, ())
+            b = found.run(float(found.high[0]))
+            if found.share.min() < 0.5:
+                return None
+            a = np.gradient(b, s) / 2
+            motion = a, b, find_internal_force(rows, a, b)
+        return within.at(motion)[0], found
+
+    low, high, best = 0.0, 1.0, find(1.0)
+    if best is not None:
+        return best, 1.0
+    # Downwards first: most ranges are only a little too wide.
+    while high - low > 0.03 * high and high > 0.02:
+        share = 0.8 * high if best is None else (low + high) / 2
+        found = find(share)
+        if found is None:
+            high = share
+        else:
+            low, best = share, found
+    return best, low
+
+
+def _follow(
+    curve: Curve, plan: Trajectory, rows: NDArray[np.int64]
+) -> tuple[Array, Array, Array, Array]:
+    """Places s, a, b and internal force of a plan's rows along a curve."""
+    formation, metric = curve.formation, metric_weights(curve.formation.scene)
+    z, grid = plan.z[rows], np.linspace(0.0, curve.length, 400)
+    away = (z[:, None] - curve.evaluate(grid).z[None]) ** 2 @ metric
+    s = grid[away.argmin(axis=1)]
+    for _ in range(4):
+        point = curve.evaluate(s)
+        s = np.clip(s + ((z - point.z) * point.z_s) @ metric, 0.0, curve.length)
+    point = curve.evaluate(s)
+    v = (point.z_s * plan.z_dot[rows]) @ metric
+    a = (point.z_s * plan.z_ddot[rows]) @ metric
+    segment = np.searchsorted([part.stop for part in curve.segments[:-1]], s)
+    forces = inverse(formation, *point[:3], directions_of(curve, segment), point.kinematics)
+    c_n, c_t = plan.c_n[rows], plan.c_t[rows]
+    return s, a, v**2, find_planned_internal_force(formation, forces, plan, c_n, c_t)
+
+
+def _tabulate_curve(piece: ReferencePiece, phase: Phase, push: Array) -> dict[str, Array]:
+    """Arrays of `CurveLaw`."""
+    rows, levels, contact = piece.rows, piece.rows.levels, phase.until.contact
+    arrival, dry = np.zeros((0, 5)), phase.formation.scene.dry[3:]
+    if contact is not None and not piece.passes:
+        arrival = find_arrival(piece.curve, contact, rows)
+    return {
+        "s": rows.s,
+        "theta": piece.curve.evaluate(rows.s).z[:, 3:],
+        "b": piece.b,
+        "levels": leave_one(np.stack([levels[:-1], levels[1:]], axis=1))[..., COLUMNS],
+        "torque": np.stack([rows.torque[:-1], rows.torque[1:]], axis=1)[..., COLUMNS],
+        "push": push,
+        "passes": np.array([piece.passes]),
+        "arrival": arrival[..., COLUMNS],
+        # Friction of the joints decides on rest where torques are not much larger.
+        "keeps": np.array([float((np.abs(push) < 10 * dry).all())]),
+        "forces": find_forces(piece.curve, rows.s, np.sqrt(piece.b))[..., COLUMNS],
+    }
+
+
+def _find_end_torques(
+    problem: Problem, phase: Phase, plan: Trajectory, piece: ReferencePiece
+) -> Array:
+    """Torques that hold the end of a curve: the plan's if it has any."""
+    last = int(np.flatnonzero(plan.phase == phase.index)[-1])
+    if np.isnan(plan.c_n[last]).all():
+        return np.asarray(plan.tau[last])
+    gained = phase.until.contact is not None
+    push = hold_end(problem, phase, piece.curve.end) if gained else None
+    return find_still(piece.curve) if push is None else push
+
+
+def find_arrival(curve: Curve, gained: Contact, rows: CurveLimitRows) -> Array:
+    """Levels of all contacts, with the gained one, at rest at the end of a curve, (k, 5).
+
+    Empty where forces at rest are not unique.
+    """
+    both, own = curve.formation.add(gained), curve.formation.scene
+    if both.n_constraints != 5:
+        return np.zeros((0, 5))
+    # Torques have to balance with other friction, too, and in corners of the ranges.
+    cases = [(own, factor) for factor in (0.7, 1.0, 1.2)]
+    cases += [(scene, 1.0) for scene in rows.scenes if scene != own]
+    try:
+        balances = [_balance(curve, replace(both, scene=scene), mu) for scene, mu in cases]
+    except np.linalg.LinAlgError:
+        return np.zeros((0, 5))
+    margins, found = rows.unit[-1, : curve.formation.n_contacts], list[Array]()
+    for balance in balances:
+        forces = balance[: both.n_contacts, 1:] @ rows.torque[-1]
+        forces[:, ONE] += balance[: both.n_contacts, 0]
+        found.append(forces / np.append(margins, margins.max())[:, None])
+    return np.vstack(found)
+
+
+def _balance(curve: Curve, both: Formation, factor: float) -> Array:
+    """Constraint forces of (1, tau) at rest at the end of a curve, shape (5, 3)."""
+    scene, last = both.scene, curve.segments[-1]
+    point = curve.evaluate(np.array([curve.length]))
+    kinematics = both.evaluate(point.z, point.z_s)
+    slides = np.sign(kinematics.A_t[0] @ point.z_s[0])
+    Xi = np.append(last.Xi, slides[-1])[None]
+    G = force_rows(both, kinematics, Directions(factor * Xi, last.sigma[None]))[0]
+    right = np.zeros((5, 3))
+    right[:, 0] = -scene.applied_force
+    right[3:, 0] += scene.dry[3:] * last.sigma
+    right[3:, 1:] = -np.eye(2)
+    return np.asarray(np.linalg.solve(G.T, right))
+
+
+def find_still(curve: Curve) -> Array:
+    """Torques that hold the end of a curve at rest without friction, (2,)."""
+    formation, point = curve.formation, curve.evaluate(np.array([curve.length]))
+    still = Directions(np.zeros((1, formation.n_contacts)), np.zeros((1, 2)))
+    forces = inverse(formation, *point[:3], still, point.kinematics)
+    limits = make_limits(formation, 0.0).only(PRESS, TORQUE)
+    rows = PathLimits.of(limits, forces, point.z_s[:, 3:]).rows[0]
+    base, press = rows[:, ONE].tolist(), rows[:, LAMBDA].tolist()
+    _, internal = choose_internal_force(base, [0.0] * len(base), press, 0.0)
+    return np.asarray(forces.of_tau[0, :, ONE] + internal * forces.of_tau[0, :, LAMBDA])
+
+
+def split(phases: Sequence[Phase]) -> list[tuple[Phase, ...]]:
+    """Blocks of phases that pass into one another in motion, except by impacts along curves."""
+    blocks: list[list[Phase]] = []
+    for phase in phases:
+        before = blocks[-1][-1] if blocks else None
+        impact = before is not None and before.end is End.IMPACT
+        joined = before is not None and before.end is End.SMOOTH
+        if joined or (impact and not (runs_on_curve(phase) and len(blocks[-1]) == 1)):
+            blocks[-1].append(phase)
+        else:
+            blocks.append([phase])
+    return [tuple(block) for block in blocks]
+
+
+def _find_curve(block: Sequence[Phase]) -> Phase | None:
+    """The phase of a block that is one along a curve."""
+    return block[0] if len(block) == 1 and runs_on_curve(block[0]) else None
+
+
+def find_ranges(problem: Problem, plan: Trajectory) -> Mapping[str, float] | None:
+    """Half widths of the ranges of a plan, or else of its problem, or None."""
+    figures = plan.meta.get("ranges")
+    if figures:
+        return dict(figures["radii"])
+    return None if problem.uncertainty is None else problem.ranges
 
 
 def make_policy(
@@ -116,7 +779,7 @@ def make_policy(
             {"number": k, "plan": t, "duration": t, "share": 0.0} for k, t in lasts.items()
         ]
         if piece is None:
-            tables.append(_tabulate_motion(problem, block, plan, period))
+            tables.append(tabulate_motion(problem, block, plan, period))
             ends = [*tables[-1]["starts"], tables[-1]["step"][0] * (len(tables[-1]["theta"]) - 1)]
             for one, span in zip(found, np.diff(ends).tolist(), strict=True):
                 one["duration"] = span
@@ -136,258 +799,6 @@ def make_policy(
     if ranges is not None and reserve:
         whole.update(ranges=dict(ranges), reserve=reserve)
     return Policy(tables, settings, whole)
-
-
-def split(phases: Sequence[Phase]) -> list[tuple[Phase, ...]]:
-    """Blocks of phases that pass into one another in motion, except by impacts along curves."""
-    blocks: list[list[Phase]] = []
-    for phase in phases:
-        before = blocks[-1][-1] if blocks else None
-        impact = before is not None and before.end is End.IMPACT
-        joined = before is not None and before.end is End.SMOOTH
-        if joined or (impact and not (runs_on_curve(phase) and len(blocks[-1]) == 1)):
-            blocks[-1].append(phase)
-        else:
-            blocks.append([phase])
-    return [tuple(block) for block in blocks]
-
-
-def _find_curve(block: Sequence[Phase]) -> Phase | None:
-    """The phase of a block that is one along a curve."""
-    return block[0] if len(block) == 1 and runs_on_curve(block[0]) else None
-
-
-def _find_end_torques(
-    problem: Problem, phase: Phase, plan: Trajectory, piece: ReferencePiece
-) -> Array:
-    """Torques that hold the end of a curve: the plan's if it has any."""
-    last = int(np.flatnonzero(plan.phase == phase.index)[-1])
-    if np.isnan(plan.c_n[last]).all():
-        return np.asarray(plan.tau[last])
-    gained = phase.until.contact is not None
-    push = hold_end(problem, phase, piece.curve.end) if gained else None
-    return find_still(piece.curve) if push is None else push
-
-
-def hold_end(problem: Problem, phase: Phase, z: Array) -> Array | None:
-    """Torques that hold all contacts at the end of a phase at rest, or None."""
-    contact = phase.until.contact
-    touching = replace(phase.formation.add(contact), rolling=())
-    place = Standstill(z, phase.formation, contact, touching)
-    hold = find_hold(place, problem.epsilon, problem.gap, 0.02)
-    return None if hold is None else hold.tau
-
-
-def _tabulate_motion(
-    problem: Problem, phases: tuple[Phase, ...], plan: Trajectory, period: float
-) -> dict[str, Array]:
-    """Arrays of `MotionLaw`."""
-    starts = plan.phase_starts[phases[0].index : phases[-1].index + 2].copy()
-    starts[-1] = plan.t[(plan.phase == phases[-1].index) & ~plan.held][-1]
-    count = max(int(np.ceil((starts[-1] - starts[0]) / period)), 2)
-    t = np.linspace(starts[0], starts[-1], count + 1)
-    samples, last = plan.at(end_within(phases, plan, t)), phases[-1]
-    hold = hold_end(problem, last, samples.z[-1])
-    inertia = np.diag([finger.inertia for finger in problem.scene.fingers])
-    # At the end each joint is critically damped, in contact or not.
-    final = np.hstack([RATE**2 * inertia, 2 * RATE * inertia])
-    b, tau, gains = follow(problem, phases, plan, t)
-    speed = np.sqrt(b)
-    return {
-        "starts": (starts[:-1] - starts[0]) / speed,
-        "step": np.array([(t[1] - t[0]) / speed]),
-        "theta": samples.z[:, 3:],
-        "rates": samples.z_dot[:, 3:] * speed,
-        "tau": tau,
-        "gain": np.concatenate([gains[:-1], final[None]]),
-        "push": samples.tau[-1] if hold is None else hold,
-        "still": np.array([STILL * problem.scene.scales.rate]),
-        "ways": _list_free_joints(problem, last, samples.z[-1:]),
-    }
-
-
-def _list_free_joints(problem: Problem, phase: Phase, z: Array) -> Array:
-    """Orthonormal basis of joint displacements that the contacts at the end leave free, (f, 2)."""
-    both = phase.formation.add(phase.until.contact)
-    units = np.sqrt(metric_weights(problem.scene))
-    P = both.evaluate(z, np.zeros_like(z)).P[0] / units
-    left = np.linalg.svd(P)[2][len(P) :] / units
-    basis, sizes, _ = np.linalg.svd(left[:, 3:].T, full_matrices=False)
-    return np.asarray(basis.T[sizes > 1e-3 / units[3]])
-
-
-def _tabulate_curve(piece: ReferencePiece, phase: Phase, push: Array) -> dict[str, Array]:
-    """Arrays of `CurveLaw`."""
-    rows, levels, contact = piece.rows, piece.rows.levels, phase.until.contact
-    arrival, dry = np.zeros((0, 5)), phase.formation.scene.dry[3:]
-    if contact is not None and not piece.passes:
-        arrival = find_arrival(piece.curve, contact, rows)
-    return {
-        "s": rows.s,
-        "theta": piece.curve.evaluate(rows.s).z[:, 3:],
-        "b": piece.b,
-        "levels": leave_one(np.stack([levels[:-1], levels[1:]], axis=1))[..., COLUMNS],
-        "torque": np.stack([rows.torque[:-1], rows.torque[1:]], axis=1)[..., COLUMNS],
-        "push": push,
-        "passes": np.array([piece.passes]),
-        "arrival": arrival[..., COLUMNS],
-        # Friction of the joints decides on rest where torques are not much larger.
-        "keeps": np.array([float((np.abs(push) < 10 * dry).all())]),
-        "forces": find_forces(piece.curve, rows.s, np.sqrt(piece.b))[..., COLUMNS],
-    }
-
-
-def find_ranges(problem: Problem, plan: Trajectory) -> Mapping[str, float] | None:
-    """Half widths of the ranges of a plan, or else of its problem, or None."""
-    figures = plan.meta.get("ranges")
-    if figures:
-        return dict(figures["radii"])
-    return None if problem.uncertainty is None else problem.ranges
-
-
-def find_arrival(curve: Curve, gained: Contact, rows: CurveLimitRows) -> Array:
-    """Levels of all contacts, with the gained one, at rest at the end of a curve, (k, 5).
-
-    Empty where forces at rest are not unique.
-    """
-    both, own = curve.formation.add(gained), curve.formation.scene
-    if both.n_constraints != 5:
-        return np.zeros((0, 5))
-    # Torques have to balance with other friction, too, and in corners of the ranges.
-    cases = [(own, factor) for factor in (0.7, 1.0, 1.2)]
-    cases += [(scene, 1.0) for scene in rows.scenes if scene != own]
-    try:
-        balances = [_balance(curve, replace(both, scene=scene), mu) for scene, mu in cases]
-    except np.linalg.LinAlgError:
-        return np.zeros((0, 5))
-    margins, found = rows.unit[-1, : curve.formation.n_contacts], list[Array]()
-    for balance in balances:
-        forces = balance[: both.n_contacts, 1:] @ rows.torque[-1]
-        forces[:, ONE] += balance[: both.n_contacts, 0]
-        found.append(forces / np.append(margins, margins.max())[:, None])
-    return np.vstack(found)
-
-
-def _balance(curve: Curve, both: Formation, factor: float) -> Array:
-    """Constraint forces of (1, tau) at rest at the end of a curve, shape (5, 3)."""
-    scene, last = both.scene, curve.segments[-1]
-    point = curve.evaluate(np.array([curve.length]))
-    kinematics = both.evaluate(point.z, point.z_s)
-    slides = np.sign(kinematics.A_t[0] @ point.z_s[0])
-    Xi = np.append(last.Xi, slides[-1])[None]
-    G = force_rows(both, kinematics, Directions(factor * Xi, last.sigma[None]))[0]
-    right = np.zeros((5, 3))
-    right[:, 0] = -scene.applied_force
-    right[3:, 0] += scene.dry[3:] * last.sigma
-    right[3:, 1:] = -np.eye(2)
-    return np.asarray(np.linalg.solve(G.T, right))
-
-
-def find_still(curve: Curve) -> Array:
-    """Torques that hold the end of a curve at rest without friction, (2,)."""
-    formation, point = curve.formation, curve.evaluate(np.array([curve.length]))
-    still = Directions(np.zeros((1, formation.n_contacts)), np.zeros((1, 2)))
-    forces = inverse(formation, *point[:3], still, point.kinematics)
-    limits = make_limits(formation, 0.0).only(PRESS, TORQUE)
-    rows = PathLimits.of(limits, forces, point.z_s[:, 3:]).rows[0]
-    base, press = rows[:, ONE].tolist(), rows[:, LAMBDA].tolist()
-    _, internal = choose_internal_force(base, [0.0] * len(base), press, 0.0)
-    return np.asarray(forces.of_tau[0, :, ONE] + internal * forces.of_tau[0, :, LAMBDA])
-
-
-def replan(
-    planner: Planner,
-    problem: Problem,
-    blocks: Sequence[tuple[Phase, ...]],
-    curves: Sequence[bool],
-    plan: Trajectory,
-) -> Trajectory:
-    """A plan whose blocks off curves are replanned with a margin where possible."""
-    motions, k = list(plan.motions), 0
-    while k < len(blocks):
-        after = k + 1
-        if not curves[k] and _lacks_margin(problem, blocks[k], plan):
-            for share in (1.0, 0.5, 0.25):
-                found = _replan_blocks(planner, problem, blocks[k:], curves[k:], plan, share)
-                if found is not None:
-                    new, after = found[0], k + found[1]
-                    first = blocks[k][0].index
-                    motions[first : first + len(new)] = new
-                    break
-        k = after
-    if all(new is old for new, old in zip(motions, plan.motions, strict=True)):
-        return plan
-    samples = int(np.bincount(plan.phase).max())
-    still = TorqueProfile(np.array([0.0, plan.duration]), np.zeros((1, 2, 1)))
-    rows = assemble(motions, still, plan.meta, samples)
-    return replace(rows, torque=TorqueProfile.join_rows(rows.t, rows.tau))
-
-
-def _lacks_margin(problem: Problem, phases: Sequence[Phase], plan: Trajectory) -> bool:
-    """Whether a normal force or torque in some phases is nearer to its limit than the margin."""
-    rows = (plan.phase >= phases[0].index) & (plan.phase <= phases[-1].index)
-    scene = problem.scene
-    most = (np.abs(plan.tau[rows]) / scene.torque_limit).max()
-    least = np.nanmin(plan.c_n[rows]) / scene.scales.force
-    return bool(min(least, 1 - most) < 0.99 * ROOM)
-
-
-def _replan_blocks(
-    planner: Planner,
-    problem: Problem,
-    blocks: Sequence[tuple[Phase, ...]],
-    curves: Sequence[bool],
-    plan: Trajectory,
-    share: float,
-) -> tuple[list[Motion], int] | None:
-    """Motions with a share of the margin until the plan is reached again, and their blocks."""
-    starts, found = plan.phase_starts, list[Motion]()
-    z = plan.z[np.flatnonzero(plan.phase == blocks[0][0].index)[0]]
-    blocks = [*blocks[:-1], (*blocks[-1][:-1], _pin(blocks[-1][-1], plan.z[-1]))]
-    for count, (block, curve) in enumerate(zip(blocks, curves, strict=True), start=1):
-        part = _solve(planner, problem, block, z, 0.0 if curve else share)
-        lasts = starts[block[-1].index + 1] - starts[block[0].index]
-        if part is None or (not curve and part.duration > 1.5 * lasts):
-            return None
-        found += part.motions
-        z = part.z[-1]
-        away = np.abs(z - plan.z[np.flatnonzero(plan.phase == block[-1].index)[-1]])
-        away[:2] /= problem.scene.scales.length
-        if away.max() < SAME:
-            return found, count
-    return None
-
-
-def _solve(
-    planner: Planner, problem: Problem, phases: Sequence[Phase], z: Array, share: float
-) -> Trajectory | None:
-    """Plan of phases from a configuration at rest, with a share of the margin."""
-    scene, room = problem.scene, share * ROOM
-    one, two = (
-        replace(link, torque_limit=(1 - room) * link.torque_limit) for link in scene.fingers
-    )
-    tightened = replace(
-        problem,
-        start=z,
-        epsilon=max(problem.epsilon, room * scene.scales.force),
-        scene=replace(scene, fingers=(one, two)),
-        phases=tuple(replace(phase, index=k) for k, phase in enumerate(phases)),
-    )
-    try:
-        return planner(tightened)
-    except WholearmError:
-        return None
-
-
-def _pin(phase: Phase, z: Array) -> Phase:
-    """The phase with terminal constraints on the free coordinates of the pose of z, shape (5,)."""
-    until = phase.until
-    fixed = {row for row, _ in until.poses}
-    gained = until.contact is not None
-    freedoms = len(z) - len(phase.formation.contacts) - gained - len(fixed)
-    names = [name for name in ("x", "phi") if ROWS[name] not in fixed][: max(freedoms, 0)]
-    pins = tuple((name, float(z[ROWS[name]])) for name in names)
-    return replace(phase, until=replace(until, pins=until.pins + pins))
 
 
 def find_widest(problem: Problem, plan: Trajectory, delay: float) -> dict[int, float]:

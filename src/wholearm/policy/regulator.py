@@ -3,11 +3,13 @@
 Displacements N xi that the contacts leave free are seen by the joints as theta = Theta xi; N is
 scaled so that xi are the joint angles (two degrees of freedom), or their arc length (one). About
 the plan xi'' = A1 xi + A2 xi' + B tau. Torques are weighted by the accelerations and the relative
-contact forces that they cause; the Riccati equation is integrated backwards.
+contact forces that they cause; the Riccati equation is integrated backwards. Phases that leave the
+feedback no margin of forces and torques are planned anew with one.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -15,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..common.arrays import Array
+from ..common.errors import WholearmError
 from ..common.sharing import Batch
 from ..contacts.formation import Formation
 from ..mechanics.dynamics import (
@@ -25,9 +28,15 @@ from ..mechanics.dynamics import (
     inverse,
     metric_weights,
 )
-from ..problem.definition import Phase, Problem
-from ..results.trajectory import Trajectory
+from ..problem.definition import ROWS, Phase, Problem
+from ..results.dwell_record import assemble
+from ..results.torque import TorqueProfile
+from ..results.trajectory import Motion, Trajectory
+from ..simulation.modes import Standstill, find_hold
 
+SAME = 1e-5  # distance from the plan's end that counts as none, over the scene's length and in rad
+STILL = 1e-3  # speed that counts as none, over the scene's
+Planner = Callable[[Problem], Trajectory]  # makes a plan of a problem
 RATE = 100.0  # rate at which errors decay if torques change no contact force [1/s]
 ROOM = 0.1  # margin for feedback: normal force over the scene's unit, share of a torque limit
 
@@ -222,3 +231,145 @@ def regulate(found: list[Linear], step: float) -> Array:
         P = (P + P.T) / 2
         gains[k] = K @ np.kron(np.eye(2), np.linalg.pinv(linear.joints))
     return gains
+
+
+def tabulate_motion(
+    problem: Problem, phases: tuple[Phase, ...], plan: Trajectory, period: float
+) -> dict[str, Array]:
+    """Arrays of `MotionLaw`."""
+    starts = plan.phase_starts[phases[0].index : phases[-1].index + 2].copy()
+    starts[-1] = plan.t[(plan.phase == phases[-1].index) & ~plan.held][-1]
+    count = max(int(np.ceil((starts[-1] - starts[0]) / period)), 2)
+    t = np.linspace(starts[0], starts[-1], count + 1)
+    samples, last = plan.at(end_within(phases, plan, t)), phases[-1]
+    hold = hold_end(problem, last, samples.z[-1])
+    inertia = np.diag([finger.inertia for finger in problem.scene.fingers])
+    # At the end each joint is critically damped, in contact or not.
+    final = np.hstack([RATE**2 * inertia, 2 * RATE * inertia])
+    b, tau, gains = follow(problem, phases, plan, t)
+    speed = np.sqrt(b)
+    return {
+        "starts": (starts[:-1] - starts[0]) / speed,
+        "step": np.array([(t[1] - t[0]) / speed]),
+        "theta": samples.z[:, 3:],
+        "rates": samples.z_dot[:, 3:] * speed,
+        "tau": tau,
+        "gain": np.concatenate([gains[:-1], final[None]]),
+        "push": samples.tau[-1] if hold is None else hold,
+        "still": np.array([STILL * problem.scene.scales.rate]),
+        "ways": _list_free_joints(problem, last, samples.z[-1:]),
+    }
+
+
+def _list_free_joints(problem: Problem, phase: Phase, z: Array) -> Array:
+    """Orthonormal basis of joint displacements that the contacts at the end leave free, (f, 2)."""
+    both = phase.formation.add(phase.until.contact)
+    units = np.sqrt(metric_weights(problem.scene))
+    P = both.evaluate(z, np.zeros_like(z)).P[0] / units
+    left = np.linalg.svd(P)[2][len(P) :] / units
+    basis, sizes, _ = np.linalg.svd(left[:, 3:].T, full_matrices=False)
+    return np.asarray(basis.T[sizes > 1e-3 / units[3]])
+
+
+def hold_end(problem: Problem, phase: Phase, z: Array) -> Array | None:
+    """Torques that hold all contacts at the end of a phase at rest, or None."""
+    contact = phase.until.contact
+    touching = replace(phase.formation.add(contact), rolling=())
+    place = Standstill(z, phase.formation, contact, touching)
+    hold = find_hold(place, problem.epsilon, problem.gap, 0.02)
+    return None if hold is None else hold.tau
+
+
+def replan(
+    planner: Planner,
+    problem: Problem,
+    blocks: Sequence[tuple[Phase, ...]],
+    curves: Sequence[bool],
+    plan: Trajectory,
+) -> Trajectory:
+    """A plan whose blocks off curves are replanned with a margin where possible."""
+    motions, k = list(plan.motions), 0
+    while k < len(blocks):
+        after = k + 1
+        if not curves[k] and _lacks_margin(problem, blocks[k], plan):
+            for share in (1.0, 0.5, 0.25):
+                found = _replan_blocks(planner, problem, blocks[k:], curves[k:], plan, share)
+                if found is not None:
+                    new, after = found[0], k + found[1]
+                    first = blocks[k][0].index
+                    motions[first : first + len(new)] = new
+                    break
+        k = after
+    if all(new is old for new, old in zip(motions, plan.motions, strict=True)):
+        return plan
+    samples = int(np.bincount(plan.phase).max())
+    still = TorqueProfile(np.array([0.0, plan.duration]), np.zeros((1, 2, 1)))
+    rows = assemble(motions, still, plan.meta, samples)
+    return replace(rows, torque=TorqueProfile.join_rows(rows.t, rows.tau))
+
+
+def _lacks_margin(problem: Problem, phases: Sequence[Phase], plan: Trajectory) -> bool:
+    """Whether a normal force or torque in some phases is nearer to its limit than the margin."""
+    rows = (plan.phase >= phases[0].index) & (plan.phase <= phases[-1].index)
+    scene = problem.scene
+    most = (np.abs(plan.tau[rows]) / scene.torque_limit).max()
+    least = np.nanmin(plan.c_n[rows]) / scene.scales.force
+    return bool(min(least, 1 - most) < 0.99 * ROOM)
+
+
+def _replan_blocks(
+    planner: Planner,
+    problem: Problem,
+    blocks: Sequence[tuple[Phase, ...]],
+    curves: Sequence[bool],
+    plan: Trajectory,
+    share: float,
+) -> tuple[list[Motion], int] | None:
+    """Motions with a share of the margin until the plan is reached again, and their blocks."""
+    starts, found = plan.phase_starts, list[Motion]()
+    z = plan.z[np.flatnonzero(plan.phase == blocks[0][0].index)[0]]
+    blocks = [*blocks[:-1], (*blocks[-1][:-1], _pin(blocks[-1][-1], plan.z[-1]))]
+    for count, (block, curve) in enumerate(zip(blocks, curves, strict=True), start=1):
+        part = _solve(planner, problem, block, z, 0.0 if curve else share)
+        lasts = starts[block[-1].index + 1] - starts[block[0].index]
+        if part is None or (not curve and part.duration > 1.5 * lasts):
+            return None
+        found += part.motions
+        z = part.z[-1]
+        away = np.abs(z - plan.z[np.flatnonzero(plan.phase == block[-1].index)[-1]])
+        away[:2] /= problem.scene.scales.length
+        if away.max() < SAME:
+            return found, count
+    return None
+
+
+def _solve(
+    planner: Planner, problem: Problem, phases: Sequence[Phase], z: Array, share: float
+) -> Trajectory | None:
+    """Plan of phases from a configuration at rest, with a share of the margin."""
+    scene, room = problem.scene, share * ROOM
+    one, two = (
+        replace(link, torque_limit=(1 - room) * link.torque_limit) for link in scene.fingers
+    )
+    tightened = replace(
+        problem,
+        start=z,
+        epsilon=max(problem.epsilon, room * scene.scales.force),
+        scene=replace(scene, fingers=(one, two)),
+        phases=tuple(replace(phase, index=k) for k, phase in enumerate(phases)),
+    )
+    try:
+        return planner(tightened)
+    except WholearmError:
+        return None
+
+
+def _pin(phase: Phase, z: Array) -> Phase:
+    """The phase with terminal constraints on the free coordinates of the pose of z, shape (5,)."""
+    until = phase.until
+    fixed = {row for row, _ in until.poses}
+    gained = until.contact is not None
+    freedoms = len(z) - len(phase.formation.contacts) - gained - len(fixed)
+    names = [name for name in ("x", "phi") if ROWS[name] not in fixed][: max(freedoms, 0)]
+    pins = tuple((name, float(z[ROWS[name]])) for name in names)
+    return replace(phase, until=replace(until, pins=until.pins + pins))
