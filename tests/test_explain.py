@@ -141,16 +141,14 @@ def test_advice_is_that_along_the_curve(heptagon: Problem, curves: tuple[Curve, 
 
 def test_failures_that_no_limit_explains_are_the_solvers() -> None:
     problem, _ = shove()
-    failed = explain_stages(
-        search(problem), problem, problem.phases, [], "Restoration_Failed", None
-    )
+    failed = explain_stages(search(problem), problem, problem.phases, [], None)
     assert isinstance(failed, SolverError)
     text = str(failed)
-    assert text.startswith("no plan for phases 1 and 2 (") and "Restoration_Failed" in text
+    assert text.startswith("no plan for phases 1 and 2 (") and "found neither a plan nor" in text
     assert all(name in text for name in problem.phases[0].formation.names)
     assert text.endswith("intervals per phase (--time-intervals)") and "\n" not in text
     slide, own = box(), replace(COARSE, transcription="time")
-    failed = explain_stages(TimeSearch.of(slide, own), slide, slide.phases[:1], [], "Failed", None)
+    failed = explain_stages(TimeSearch.of(slide, own), slide, slide.phases[:1], [], None)
     assert "leave out --transcription time" in str(failed)
 
 

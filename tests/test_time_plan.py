@@ -67,11 +67,11 @@ from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain.guesses import guess_stages
 from wholearm.planning.time_domain.mode_search import link
-from wholearm.planning.time_domain.solution import SETTINGS, TimeSearch, TimeSolution, find_least
+from wholearm.planning.time_domain.solution import SETTINGS, TimeSearch, find_least
 from wholearm.planning.time_domain.stage import Stage, in_own_units
 from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion
 from wholearm.planning.time_domain.time_nlp import pack
-from wholearm.planning.time_domain.time_plan import plan_phases, try_phases
+from wholearm.planning.time_domain.time_plan import list_stages, plan_phases, try_phases
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.results.trajectory import Samples
 from wholearm.verification.verdict import DEPARTURE, Allowance, describe_ends
@@ -838,8 +838,9 @@ def test_friction_is_worth_what_a_little_less_of_it_saves(contact: str) -> None:
     start = trace_phases(problem)[-1].end
     least = PlanOptions(objective="effort", time_intervals=8)
     begun = try_phases(problem, problem.phases[4:], start, least, further=True)
-    assert begun is not None and isinstance(begun[0].solution, TimeSolution)
-    solution = begun[0].solution
+    assert begun is not None
+    solution = TimeSearch.of(problem, least).solve(list_stages(begun))
+    assert solution.success
     mu = getattr(landing().scene.friction, contact)
     other = landing().with_({f"friction_{contact}": (1 - share) * mu})
     values = list[float]()

@@ -558,7 +558,6 @@ def explain_stages(
     problem: Problem,
     phases: Sequence[Phase],
     short: Sequence[list[Stage]],
-    status: str,
     replan: Replan | None,
 ) -> InfeasibleError | SolverError:
     """Why phases over time have no plan, and what would change that.
@@ -567,13 +566,13 @@ def explain_stages(
     ----------
     problem  in SI units
     short    elastic solutions that violate limits, from different guesses
-    status   how the solver ended, in words
     replan   None: no change is looked for
     """
     numbers = [phase.number for phase in phases]
     if not short:
         names = " and ".join(" ".join(phase.formation.names) for phase in phases)
-        text = f"no plan for {name_phases(numbers)} ({names}, until {phases[-1].until}): {status}"
+        where = f"no plan for {name_phases(numbers)} ({names}, until {phases[-1].until})"
+        text = f"{where}: the solver found neither a plan nor a motion that misses limits least"
         usual = search.options.transcription == "time" and not problem.scene.control_period
         if usual and runs_along_curves(phases, PlanOptions()):
             return SolverError(f"{text}; leave out --transcription time, which plans along curves")

@@ -28,6 +28,7 @@ from ..common.signals import beat, check
 from ..contacts.formation import Formation
 
 Indices = NDArray[np.int64]
+Symbols = SimpleNamespace  # columns of symbols by the names of `columns`
 _K = TypeVar("_K")
 STOPPED = "User_Requested_Stop"  # status of a solver after an interrupt, and of no other
 _OPTIONS = {
@@ -59,9 +60,9 @@ class Columns:
         return self.slices[name]
 
     def make_symbols(self, **known: Expression) -> Symbols:
-        """A column of symbols for each block that is not `known`."""
+        """A column of symbols for each block that is not `known`; `every` is all in one."""
         symbols = {name: ca.SX.sym(name, size) for name, size in self.sizes.items()} | known
-        return Symbols(self, symbols)
+        return SimpleNamespace(**symbols, columns=self, every=self.write(**symbols))
 
     def write(self, **blocks: Expression) -> Expression:
         """One column of expressions, block by block."""
@@ -79,15 +80,6 @@ class Columns:
     def _check(self, given: dict[str, int]) -> None:
         if given != self.sizes:
             raise ValueError(f"columns {given} are given where {self.sizes} are declared")
-
-
-class Symbols(SimpleNamespace):
-    """Columns of symbols as attributes, by the names of `columns`; `every` is all in one."""
-
-    def __init__(self, columns: Columns, symbols: dict[str, Expression]) -> None:
-        super().__init__(**symbols)
-        self.columns = columns
-        self.every = columns.write(**symbols)
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,10 +155,6 @@ class NlpRows:
         self._high: list[Array] = []
         self._linear: list[Indices] = []
         self._entries: list[tuple[Array, Array, Array]] = []
-
-    def __getstate__(self) -> dict[str, Any]:
-        # Which rows there are, and their bounds: kernels belong to CasADi.
-        return self.__dict__ | {"_blocks": [], "_entries": []}
 
     def _add_rows(self, *shape: int, low: Any, high: Any) -> Indices:
         own = self._count + np.arange(int(np.prod(shape))).reshape(shape)
@@ -367,8 +355,14 @@ class Solver:
         # A solver that was stopped does not always say what it has done.
         cost = stats.get("iter_count", 0), stats.get("t_wall_total", 0.0)
         book(SolverStatistics(solves=1, iterations=cost[0], solve_time=cost[1]))
-        for runs in _RECORDS:
-            runs.append(self._describe_run(stats))
+        if _RECORDS:
+            get = self.function.get_function
+            jacobian, hessian = get("nlp_jac_g"), get("nlp_hess_l")
+            sizes = self.function.size1_in("x0"), self.function.size1_in("lbg")
+            nonzeros = jacobian.nnz_out(jacobian.n_out() - 1), hessian.nnz_out(0)
+            run = IpoptRun(*sizes, *nonzeros, stats["iter_count"], stats["t_proc_total"])
+            for runs in _RECORDS:
+                runs.append(run)
         check()
         if stats["return_status"] == STOPPED:
             raise KeyboardInterrupt
@@ -378,17 +372,6 @@ class Solver:
         """Statistics of the last call."""
         statistics: dict[str, Any] = self.function.stats()
         return statistics
-
-    def _describe_run(self, stats: dict[str, Any]) -> IpoptRun:
-        jacobian, hessian = map(self.function.get_function, ("nlp_jac_g", "nlp_hess_l"))
-        return IpoptRun(
-            self.function.size1_in("x0"),
-            self.function.size1_in("lbg"),
-            jacobian.nnz_out(jacobian.n_out() - 1),
-            hessian.nnz_out(0),
-            stats["iter_count"],
-            stats["t_proc_total"],
-        )
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,6 @@ class PhasePlan(NamedTuple, Generic[M_co]):
     attempt: str = ""  # name of its initial guess; none along curves
     stages: Sequence[object] = ()  # of the NLP, in the scene's units; none along curves
     error: float = math.nan  # estimated relative error of the value of all phases in one NLP
-    solution: object = None  # of the NLP, in the first of coarse plans
     unheld: float = math.nan  # value with free torques, where they are held over control periods
 
 

@@ -125,6 +125,12 @@ class PhaseData(NamedTuple):
         short = np.maximum(-least, 0.0)
         return short[:, :-1], short[:, -1]
 
+    def pick_places(self) -> tuple[Places, Array]:
+        """`PLACES` of the checks of every solid interval, and their fractions."""
+        checks = self.sampling.checks
+        picked = np.arange(len(checks)) % ((len(checks) - 1) // (PLACES - 1)) == 0
+        return self.checks.pick(np.tile(picked, len(self.grid.nonempty))), checks[picked]
+
     def spread_to_nodes(self, inside: Array) -> Array:
         """The larger value of the two solid intervals beside each node, shape (N + 1, ...)."""
         table, k = np.zeros((len(self.grid.s), *inside.shape[1:])), self.grid.nonempty
@@ -271,9 +277,7 @@ def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, floa
     inner = np.tile((checks > 0) & (checks < 1), len(data.grid.nonempty))
     misfit = torque.at(times.ravel()[inner]) - wanted[inner]
     if np.abs(misfit / data.torque_limit).max() > 5e-7:  # largest relative error
-        every = (len(checks) - 1) // (PLACES - 1)
-        rows = np.tile(np.arange(len(checks)) % every == 0, len(data.grid.nonempty))
-        torque = _fit(data, motion, data.checks.pick(rows), checks[::every])
+        torque = _fit(data, motion, *data.pick_places())
     return torque, torque.integrate_squares()
 
 
@@ -298,11 +302,8 @@ def find_torques(
 
     By Chebyshev interpolation in time through torques within each interval.
     """
-    checks = data.sampling.checks
-    every = (len(checks) - 1) // (PLACES - 1)
-    picked = np.arange(len(checks)) % every == 0
-    fractions, count = checks[picked], len(data.grid.nonempty)
-    places = data.checks.pick(np.tile(picked, count))
+    places, fractions = data.pick_places()
+    count = len(data.grid.nonempty)
     values = places.forces.tau(*data.interpolate(profile, fractions)).reshape(count, -1, 2)
     spans = np.concatenate([motion.durations(fractions) for motion in motions])
     degree, lasts = len(fractions) - 1, np.maximum(spans[:, -1], np.finfo(float).tiny)

@@ -15,7 +15,7 @@ from s, s' and s'' by inverse dynamics: the equations of motion hold at every in
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cache, cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -45,19 +45,19 @@ class Basis(NamedTuple):
     modes: Array  # (p + 1, p + 1): Legendre coefficients in an element amid a motion
 
 
-@lru_cache(maxsize=8)
-def find_basis(degree: int = DEGREE) -> Basis:
-    """The basis of elements of a degree."""
-    x = (np.concatenate([[-1.0], jacobi_nodes(degree - 1, 1, 1), [1.0]]) + 1) / 2
+@cache
+def find_basis() -> Basis:
+    """The basis of all elements."""
+    x = (np.concatenate([[-1.0], jacobi_nodes(DEGREE - 1, 1, 1), [1.0]]) + 1) / 2
     y = np.stack([x, x, 1 - x, x, 1 - x])
-    powers = np.arange(degree + 1)
+    powers = np.arange(DEGREE + 1)
     to_powers = np.asarray(np.linalg.inv(y[..., None] ** powers), dtype=float)
     plain = 2 * np.diff(y[0][:, None] ** (powers + 1), axis=0) / (powers + 1)
     rooted = 4 * np.diff(y[1:3, :, None] ** (powers + 2), axis=1) / (powers + 2)
     cubic = 6 * np.diff(y[3:, :, None] ** (powers + 3), axis=1) / (powers + 3)
     rises = np.stack([plain, rooted[0], -rooted[1], cubic[0], -cubic[1]])
     weights = (1 / (powers + 1)) @ to_powers[0]
-    vandermonde = legendre.legvander(2 * x - 1, degree)
+    vandermonde = legendre.legvander(2 * x - 1, DEGREE)
     modes = np.asarray(np.linalg.inv(vandermonde), dtype=float)
     return Basis(y, to_powers, rises @ to_powers, weights, modes)
 

@@ -215,13 +215,13 @@ class Guesses:
             return None
         return Guess(name, self._guess(pieces, profile))
 
-    def resume(self, solution: TimeSolution) -> Guess:
+    def resume(self, name: str, stages: Sequence[Stage]) -> Guess:
         """From a solution with nearly the same start."""
-        first, *others = solution.stages
+        first, *others = stages
         nodes = first.guess.nodes.copy()
         nodes[0, 0] = self.nearest.stages[0].guess.nodes[0, 0]
         stages = [replace(first, guess=first.guess._replace(nodes=nodes)), *others]
-        return Guess("", self._leave_room(stages), before=solution)
+        return Guess(name, self._leave_room(stages))
 
     def every(self, goal: Array | None = None) -> Iterator[Guess]:
         """All of them; where the end is given or pinned, straight there comes first."""

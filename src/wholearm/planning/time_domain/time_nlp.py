@@ -33,11 +33,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby, pairwise
 from math import comb
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -219,17 +219,12 @@ class LimitRows:
 class TimeNLP:
     """A built NLP."""
 
-    # expressions and derivatives; None in copies and files: CasADi's objects belong to one process
-    assembled: tuple[dict[str, Expression], dict[str, Expression]] | None
+    assembled: tuple[dict[str, Expression], dict[str, Expression]]  # expressions and derivatives
     max_iter: int  # most iterations of the solver
     layouts: list[StageLayout]
     rows: NlpRows
     rows_of: list[StageRows]
     duration_row: int  # row of the whole duration with a margin or a relaxation; otherwise -1
-
-    def __getstate__(self) -> dict[str, Any]:
-        known = {own.name: getattr(self, own.name) for own in fields(self)}
-        return known | {"assembled": None}
 
     @cached_property
     def solver(self) -> Expression:
@@ -238,7 +233,6 @@ class TimeNLP:
 
     def make_solver(self, push: float) -> Expression:
         """Ipopt, with this distance of the first point from its bounds."""
-        assert self.assembled is not None
         nlp, derivatives = self.assembled
         most = {"max_iter": self.max_iter, "max_cpu_time": 120.0}  # [s]
         return build_solver("time_nlp", nlp, push, derivatives, **most)

@@ -105,8 +105,8 @@ def plan_phases(
 
     search = TimeSearch.of(problem, options, duration, to_go, ample, only_begin)
     guesses = Guesses(problem, phases, z, search, to_go)
-    found = _resume(search, guesses, begun[0]) if begun else None
-    stages = [own for plan in fastest for own in plan.stages if isinstance(own, Stage)]
+    found = _resume(search, guesses, begun) if begun else None
+    stages = list_stages(fastest)
 
     def replan(parameter: Parameter, value: float) -> object:
         other = change_limit(problem, parameter.key, value)
@@ -137,6 +137,11 @@ def plan_phases(
     if found is None:
         found = _solve_elastic(search, guesses, explanation)
     return list_plans(problem, search, phases, *found)
+
+
+def list_stages(plans: Sequence[PhasePlan[Motion]]) -> list[Stage]:
+    """The stages of plans over time, in the scene's own units."""
+    return [own for plan in plans for own in plan.stages if isinstance(own, Stage)]
 
 
 def try_phases(
@@ -375,11 +380,11 @@ def choose_end(search: TimeSearch, solution: TimeSolution) -> tuple[TimeSearch, 
     return best
 
 
-def _resume(search: TimeSearch, guesses: Guesses, coarse: PhasePlan[Motion]) -> _Named | None:
-    """Plan from a coarse plan, in its modes where these have been searched."""
-    if not isinstance(coarse.solution, TimeSolution):
-        return None
-    guess = guesses.resume(coarse.solution)._replace(name=coarse.attempt)
+def _resume(
+    search: TimeSearch, guesses: Guesses, begun: Sequence[PhasePlan[Motion]]
+) -> _Named | None:
+    """Plan from coarse plans of one NLP, in their modes where these have been searched."""
+    coarse, guess = begun[0], guesses.resume(begun[0].attempt, list_stages(begun))
     if not (coarse.complete or coarse.sequences > 1):
         return solve_guesses(search, [guess, guesses.nearest.by_homotopy()])
     search.tried.sequences, search.tried.complete = coarse.sequences, coarse.complete
@@ -464,8 +469,7 @@ def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) 
             short.append(elastic.stages)
     if not short:
         refuse_paths(problem, guesses.phases[0], [margin for margin, _ in guesses.paths])
-    reason = "the solver found neither a plan nor a motion that misses limits least"
-    raise explain_stages(search, problem, guesses.phases, short, reason, replan)
+    raise explain_stages(search, problem, guesses.phases, short, replan)
 
 
 def list_plans(
@@ -496,8 +500,6 @@ def list_plans(
         plan = PhasePlan(motion, motion.torque, value, attempt=attempt, stages=stages)
         plans.append(plan._replace(error=solution.error, unheld=free[k] if free else plan.unheld))
     plans[0] = plans[0]._replace(sequences=tried.sequences, complete=tried.complete)
-    if search.only_begins:
-        plans[0] = plans[0]._replace(solution=solution)
     return plans
 
 
