@@ -306,10 +306,10 @@ def plan_with_pauses(
 
     def list_changes(plans: Plans) -> list[TorqueChange]:
         """From the torques before each phase to its first ones."""
-        firsts = [plan.torque.at(np.zeros(1))[0] for plan in plans]
-        start = find_last_torque(known.plans[-1]) if known else firsts[0]
-        lasts = [start, *map(find_last_torque, plans[:-1])]
-        return [change_torques(scene, *pair) for pair in zip(lasts, firsts, strict=True)]
+        before = known.plans[-1].end_torques[1] if known else plans[0].end_torques[0]
+        lasts = [before, *(plan.end_torques[1] for plan in plans[:-1])]
+        pairs = zip(lasts, plans, strict=True)
+        return [change_torques(scene, last, plan.end_torques[0]) for last, plan in pairs]
 
     plans = plan(duration)
     changes = list_changes(plans)
@@ -321,11 +321,6 @@ def plan_with_pauses(
         add_pause(own, change, phase.formation, planning.options)
         for own, change, phase in zip(plans, changes, block, strict=True)
     ]
-
-
-def find_last_torque(plan: PhasePlan[Motion]) -> Array:
-    """The torques at the end of a phase, shape (2,) [N m]."""
-    return np.asarray(plan.torque.at(plan.torque.breaks[-1:])[0])
 
 
 def plan_along(
@@ -569,7 +564,7 @@ def plan_slowly(planning: Planning, sequence: ImpactSequence, options: PlanOptio
     known = planning.find_before(sequence.phases)
     before: Curve | Array | None = None
     if known is not None:
-        before = known.chain.curves[-1] if known.chain else find_last_torque(known.plans[-1])
+        before = known.chain.curves[-1] if known.chain else known.plans[-1].end_torques[1]
     firsts = [*(part.curves[0] for part in parts[1:]), _find_following(planning, sequence, options)]
     plans: Plans = []
     junction: Junction | None = None

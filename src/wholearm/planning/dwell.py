@@ -206,7 +206,7 @@ def begin_from(plan: PhasePlan[Motion], formation: Formation, before: Array) -> 
     if isinstance(motion := plan.motion, PausedMotion):
         torque = plan.torque.cut(motion.pause, float(plan.torque.breaks[-1]))
         plan = plan._replace(motion=motion.motion, torque=TorqueProfile.chain([torque]))
-    change = change_torques(formation.scene, before, plan.torque.at(np.zeros(1))[0])
+    change = change_torques(formation.scene, before, plan.end_torques[0])
     # Other contacts than the phase's may help to hold the object until it moves.
     forces = np.full((2, formation.n_contacts), np.nan)
     return _pause(plan, change, forces) if change.duration else plan
@@ -273,8 +273,7 @@ def hold_plans(problem: Problem, plans: Plans, ends: Sequence[DwellEnd | None]) 
         if end is not None and before is not None:
             change, ramp = None, 0.0
             if problem.scene.has_slow_motors:
-                last = plan.torque.at(plan.torque.breaks[-1:])[0]
-                change = change_torques(problem.scene, last, before)
+                change = change_torques(problem.scene, plan.end_torques[1], before)
                 ramp = change.duration
             motion = SettledMotion(plan.motion, ramp + end.time, before, change)
             torque = TorqueProfile.chain([plan.torque, motion.torque])

@@ -40,6 +40,11 @@ class PhasePlan(NamedTuple, Generic[M_co]):
     error: float = math.nan  # estimated relative error of the value of all phases in one NLP
     unheld: float = math.nan  # value with free torques, where they are held over control periods
 
+    @property
+    def end_torques(self) -> Array:
+        """The first and the last torques, shape (2, 2) [N m]."""
+        return self.torque.at(self.torque.breaks[[0, -1]])
+
 
 Plans = list[PhasePlan[Motion]]
 PlanPart = Callable[[int, int, Array, PlanOptions, float | None], Plans]
