@@ -607,7 +607,7 @@ class _Piece(NamedTuple):
 
 def add_periods(rows: NlpRows, stages: Sequence[Stage], layouts: Sequence[StageLayout]) -> None:
     """Durations of control periods, and their torques, constant or linear and continuous."""
-    scene = stages[0].formation.scene
+    scene, duration = stages[0].formation.scene, stages[0].period
     linear, goes_on = scene.control_hold == "linear", scene.has_slow_motors
     pieces = [
         (stage.phase, _Piece(k, period, float(stage.guess.fractions[i]), int(layout.h[i]), tau))
@@ -618,8 +618,8 @@ def add_periods(rows: NlpRows, stages: Sequence[Stage], layouts: Sequence[StageL
         phase = [piece for _, piece in found]
         last = phase[-1].period
         for period, own in groupby(phase, key=lambda piece: piece.period):
-            parts, least = list(own), 0.0 if period == last else scene.control_period
-            whole = rows.linear(1, low=least, high=scene.control_period)
+            parts, least = list(own), 0.0 if period == last else duration
+            whole = rows.linear(1, low=least, high=duration)
             rows.add_entries(whole, np.array([piece.h for piece in parts]), 1.0)
             for one, other in pairwise(parts):
                 if one.stage == other.stage:
