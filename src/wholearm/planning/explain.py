@@ -220,10 +220,7 @@ def change_scene(scene: Scene, key: str, value: float) -> Scene:
 
 def change_curve(curve: Curve, key: str, value: float) -> Curve:
     """The curve with another parameter of the hand."""
-    return _in_scene(curve, change_scene(curve.formation.scene, key, value))
-
-
-def _in_scene(curve: Curve, scene: Scene) -> Curve:
+    scene = change_scene(curve.formation.scene, key, value)
     return replace(curve, formation=replace(curve.formation, scene=scene))
 
 
@@ -438,16 +435,11 @@ def _explain_rate_limits(task: Task, parts: Sequence[PhaseData], reason: str) ->
 
 def _raise_rate_limits(curve: Curve, factor: float) -> Curve:
     """The curve in a scene with torque rate limits and 1 / lags times a factor."""
-    scene = curve.formation.scene
-    right, left = (
-        replace(
-            finger,
-            torque_rate_limit=finger.torque_rate_limit * factor,
-            actuator_lag=finger.actuator_lag / factor,
-        )
-        for finger in scene.fingers
-    )
-    return _in_scene(curve, replace(scene, fingers=(right, left)))
+    for k, finger in enumerate(curve.formation.scene.fingers, start=1):
+        limit, lag = finger.torque_rate_limit * factor, finger.actuator_lag / factor
+        curve = change_curve(curve, f"fingers.{k}.torque_rate_limit", limit)
+        curve = change_curve(curve, f"fingers.{k}.actuator_lag", lag)
+    return curve
 
 
 def refuse(

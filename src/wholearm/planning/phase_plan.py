@@ -95,35 +95,28 @@ def plan_stops(
     duration : [s]  longest in all, for `margin`: shared in proportion to the parts' least times
     """
     parts = list(pairwise(bounds))
-    allowed = [duration] * len(parts)
-    if duration is not None and len(parts) > 1:
-        fastest = replace(options, objective=Objective.TIME, duration=None)
-        least = _plan_parts(plan_part, parts, z, fastest, [None] * len(parts))
-        times = [
-            sum(plan.motion.duration for plan in least[start - bounds[0] : stop - bounds[0]])
-            for start, stop in parts
-        ]
-        if duration <= sum(times):
-            raise InfeasibleError(
-                f"duration = {duration:g} s is not longer than the least time with "
-                f"{'a stop' if len(parts) == 2 else 'stops'}, {sum(times):.6g} s"
-            )
-        allowed = [duration * time / sum(times) for time in times]
-    return _plan_parts(plan_part, parts, z, options, allowed)
 
+    def plan_parts(options: PlanOptions, allowed: Sequence[float | None]) -> Plans:
+        plans, begin = list[PhasePlan[Motion]](), z
+        for (start, stop), longest in zip(parts, allowed, strict=True):
+            plans += plan_part(start, stop, begin, options, longest)
+            begin = end_of(plans[-1])[0]
+        return plans
 
-def _plan_parts(
-    plan_part: PlanPart,
-    parts: Sequence[tuple[int, int]],
-    z: Array,
-    options: PlanOptions,
-    allowed: Sequence[float | None],
-) -> Plans:
-    plans: Plans = []
-    for (start, stop), duration in zip(parts, allowed, strict=True):
-        plans += plan_part(start, stop, z, options, duration)
-        z = end_of(plans[-1])[0]
-    return plans
+    if duration is None or len(parts) == 1:
+        return plan_parts(options, [duration] * len(parts))
+    fastest = replace(options, objective=Objective.TIME, duration=None)
+    least = plan_parts(fastest, [None] * len(parts))
+    times = [
+        sum(plan.motion.duration for plan in least[start - bounds[0] : stop - bounds[0]])
+        for start, stop in parts
+    ]
+    if duration <= sum(times):
+        raise InfeasibleError(
+            f"duration = {duration:g} s is not longer than the least time with "
+            f"{'a stop' if len(parts) == 2 else 'stops'}, {sum(times):.6g} s"
+        )
+    return plan_parts(options, [duration * time / sum(times) for time in times])
 
 
 def end_of(plan: PhasePlan[Motion]) -> tuple[Array, Array]:

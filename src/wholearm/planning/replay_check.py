@@ -244,10 +244,17 @@ class TorqueTable(NamedTuple):
         write_text(path, format_rows(self.rows, self.commands))
 
 
-def _list_commands(problem: Problem, trajectory: Trajectory, rows: Array) -> Array | None:
-    """What motors are told at the times of rows, if they lag."""
+def _tabulate(
+    problem: Problem,
+    trajectory: Trajectory,
+    rows: Array,
+    replay: dict[str, Any] | None,
+    **figures: Any,
+) -> TorqueTable:
+    """The table of rows with the commands of motors that lag, and the figures of its replay."""
     lag = problem.scene.actuator_lag
-    return find_commands(trajectory.torque, lag).at(rows[:, 0]) if lag.any() else None
+    commands = find_commands(trajectory.torque, lag).at(rows[:, 0]) if lag.any() else None
+    return TorqueTable(rows, {"rows": len(rows), **figures, "replay": replay}, commands)
 
 
 def make_table(problem: Problem, trajectory: Trajectory, replay: bool = True) -> TorqueTable:
@@ -267,8 +274,7 @@ def make_table(problem: Problem, trajectory: Trajectory, replay: bool = True) ->
         error /= 2
         rows = place_rows(trajectory.torque, error, rate_limit)
     if not replay:
-        commands = _list_commands(problem, trajectory, rows)
-        return TorqueTable(rows, {"rows": len(rows), "replay": None}, commands)
+        return _tabulate(problem, trajectory, rows, None)
     for _ in range(_ATTEMPTS):
         # The table has to keep the limits of the plan, and to stay near it.
         seen = observe(problem, read_rows(rows), trajectory)
@@ -284,8 +290,7 @@ def make_table(problem: Problem, trajectory: Trajectory, replay: bool = True) ->
             f"the torques as a table of {len(rows)} rows do not hold in their replay: "
             f"{report.reason}; --no-replay (replay=False) leaves the check out"
         )
-    figures = {"rows": len(rows), "replay": _compare(trajectory, report)}
-    return TorqueTable(rows, figures, _list_commands(problem, trajectory, rows))
+    return _tabulate(problem, trajectory, rows, _compare(trajectory, report))
 
 
 def sample_table(
@@ -293,21 +298,16 @@ def sample_table(
 ) -> TorqueTable:
     """Samples of a plan's torques at a rate [Hz], and their replay, whose failure is no error."""
     rows = sample_rows(trajectory.torque, rate, interpolation)
-    commands = _list_commands(problem, trajectory, rows)
-    figures: dict[str, Any] = {
-        "rows": len(rows),
-        "sample_rate": rate,
-        "interpolation": interpolation,
-        "replay": None,
-    }
+    compared: dict[str, Any] | None = None
     if replay:
         try:
             seen = observe(problem, read_rows(rows), trajectory)
             report = judge(seen._replace(plan=None), Allowance())
-            figures["replay"] = _compare(trajectory, report)
+            compared = _compare(trajectory, report)
         except (JammingError, SimulationError) as error:
-            figures["replay"] = {"ok": False, "reason": str(error), "phases": []}
-    return TorqueTable(rows, figures, commands)
+            compared = {"ok": False, "reason": str(error), "phases": []}
+    given = {"sample_rate": rate, "interpolation": interpolation}
+    return _tabulate(problem, trajectory, rows, compared, **given)
 
 
 def _compare(trajectory: Trajectory, report: Report) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from ...geometry.curve import Curve
 from ...mechanics.path_limits import PathLimits
 from ...mechanics.speed_sweep import NoMotionError, SweepMode, speed_sweep
 from .path_data import PhaseData, find_torques
-from .path_motion import DEGREE, NODES, Elements, Grid, PathMotion, Profile, lay_out
+from .path_motion import DEGREE, NODES, Grid, PathMotion, Profile, lay_out
 
 _CAPPED = np.iinfo(np.int64).max  # label of places with an active speed limit
 _APART = 1e-5  # least length of an element that switches lead to, over the curve's
@@ -123,7 +123,7 @@ def find_switches(data: PhaseData, profile: Profile, margin: float) -> list[Swit
     margin : [N]  least margin of normal forces over epsilon
     """
     samples = LimitSamples.of(data, margin)
-    here = Elements(data.grid, profile).at(samples.fractions)
+    here = data.interpolate(profile, samples.fractions)
     high, low = (samples.rows.extreme(here.b, largest).a for largest in (True, False))
     with np.errstate(divide="ignore", invalid="ignore"):
         share = (high - here.a) / (high - low)

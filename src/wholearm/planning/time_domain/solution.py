@@ -311,10 +311,11 @@ def refine(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
     for _ in range(SETTINGS.iterates):
         motions = make_motions(solution.stages, search.scheme)
         checks = [check_between(*pair) for pair in zip(solution.stages, motions, strict=True)]
-        misses, over = list[LimitMisses](), list[Array]()
-        for stage, check in zip(solution.stages, checks, strict=True):
-            misses.append(find_misses(stage, check, search.problem.epsilon, solution.margin))
-            over.append(measure_misses(misses[-1]))
+        misses = [
+            find_misses(stage, check, search.problem.epsilon, solution.margin)
+            for stage, check in zip(solution.stages, checks, strict=True)
+        ]
+        over = [measure_misses(miss) for miss in misses]
         lowest = [find_minima(_by_interval(check.limits)).min(axis=0) for check in checks]
         stages = monitor(solution.stages, lowest, depth)
         gains = _find_gains(search, solution, motions, coarse)
