@@ -110,26 +110,8 @@ class Mode:
         return self.holders[holder][0] in self.formation.rolling_rows
 
     @cached_property
-    def force_limit_rows(self) -> tuple[Array, Array]:
-        """H, shape (n_c + 2 K, n_c + K), and h: the contacts hold where H c + h >= 0.
-
-        Every c_n, then both sides of the cones of the K that are held (see `EventRows.cone`).
-        """
-        formation, count = self.formation, self.formation.n_contacts
-        unit = np.eye(self.n_constraints)
-        edge, most = np.zeros((len(self.holders), len(unit))), np.zeros(len(self.holders))
-        for k, rows in enumerate(self.holders):
-            if rows[0] < count:
-                edge[k, list(rows)] = formation.friction[list(rows)]
-            else:
-                most[k] = formation.scene.dry[3 + rows[0] - count]
-        normal, tangential = unit[:count], unit[count:]
-        H = np.vstack([normal, edge - tangential, edge + tangential])
-        return H, np.concatenate([np.zeros(count), most, most])
-
-    @cached_property
     def force_limit_units(self) -> Array:
-        """The scene's units of H c + h, shape (n_c + 2 K,) [N, N m]."""
+        """The scene's units of `Response.force_limits`, shape (n_c + 2 K,) [N, N m]."""
         scales, count = self.formation.scene.scales, self.formation.n_contacts
         held = [scales.force if rows[0] < count else scales.torque for rows in self.holders]
         return np.array([scales.force] * count + held + held)
@@ -186,11 +168,18 @@ class Response(NamedTuple):
 
     @property
     def force_limits(self) -> Array:
-        """What has to be positive for everything to hold, H c + h, (n_c + 2 K, 3) [N, N m]."""
-        H, h = self.mode.force_limit_rows
-        force_limits = np.asarray(H @ self.c)
-        force_limits[:, 0] += h
-        return force_limits
+        """What has to be positive for everything to hold, (n_c + 2 K, 3) [N, N m].
+
+        Every c_n, then both sides of the cones of the K that are held (see `EventRows.cone`).
+        """
+        formation, count = self.mode.formation, self.mode.formation.n_contacts
+        forces, bounds = self.c[count:], np.zeros((len(self.mode.holders), 3))
+        for k, rows in enumerate(self.mode.holders):
+            if rows[0] < count:
+                bounds[k] = formation.friction[list(rows)] @ self.c[list(rows)]
+            else:
+                bounds[k, 0] = formation.scene.dry[3 + rows[0] - count]
+        return np.vstack([self.c[:count], bounds - forces, bounds + forces])
 
     @property
     def c_t(self) -> Array:

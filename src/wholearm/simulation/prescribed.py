@@ -617,11 +617,7 @@ class Replay(Run):
         """End the motion at events, or go on."""
         rows = self.leg.rows
         if rows.until in kinds:
-            return (
-                self._pass_on()
-                if self.phase.end is End.SMOOTH or self._strikes()
-                else self._reach()
-            )
+            return self._reach()
         if rows.speed in kinds:
             return self.come_to_rest()
         pulling = [k for k in kinds if k < rows.force.stop]
@@ -643,12 +639,22 @@ class Replay(Run):
 
     def _reach(self) -> Arrival:
         """The end of the phase is reached while moving."""
+        rate, window = -self.rate, self.settling
+        if self.phase.end is End.SMOOTH or self._strikes():
+            # It is passed; the torques of the next phase may still have to come.
+            if self.passes and rate > 0:
+                # A motion that is off by the error of a long one before comes the earlier the
+                # slower.
+                early = 1e-5 * self.leg.until_unit / rate
+                window = min(max(early, window), self.longest_window)
+            if self.steps_within(window):
+                self.coast_to_step(hide=False)
+            return Arrival(rate, window, self.phase.end is End.IMPACT)
         # A planned motion that comes this early by its error would have stopped v / a later.
         stopping = 2 * self._time_to_stop()
         remaining = min(stopping, self.longest_window) if stopping < math.inf else 0.0
         slow = abs(self._measure_rate()) < SLOW
-        window = max(remaining, self.settling) if slow else remaining
-        return Arrival(-self.rate, window, remaining=remaining)
+        return Arrival(rate, max(remaining, window) if slow else remaining, remaining=remaining)
 
     def _measure_rate(self) -> float:
         """Time derivative of the distance to the end of the phase, in units of the scene."""
@@ -665,18 +671,6 @@ class Replay(Run):
         rate, time = -self._measure_rate(), self._time_to_stop() / self.problem.scene.scales.time
         stops = rate < SLOW or rate * time / 2 < REACHED
         return self.phase.end is End.IMPACT and not stops
-
-    def _pass_on(self) -> Arrival:
-        """The end of a phase is passed; the torques of the next one may still have to come."""
-        window = settling = self.settling
-        rate, strikes = -self.rate, self.phase.end is End.IMPACT
-        if self.passes and rate > 0:
-            # A motion that is off by the error of a long one before comes the earlier the slower.
-            early = 1e-5 * self.leg.until_unit / rate
-            window = min(max(early, settling), self.longest_window)
-        if self.steps_within(window):
-            self.coast_to_step(hide=False)
-        return Arrival(rate, window, strikes)
 
     def enter(self, phase: Phase, following: Phase | None) -> None:
         """Enter the formation of `phase`; the energy that its projection takes is lost to impact.
