@@ -170,9 +170,20 @@ class Simulation(Drawn):
         ------
         SimulationError  if there is no motion
         """
-        rows, problem = _choose_rows(self), self.problem
-        if not len(rows):
+        chosen, problem = list[NDArray[np.int64]](), self.problem
+        # Rows whose times increase in each phase, but for one repetition where forces step.
+        for index in range(int(self.phase[-1]) + 1):
+            rows = np.flatnonzero(self.phase == index)
+            t = self.t[rows]
+            before, after = np.append(True, np.diff(t) > 0), np.append(np.diff(t) > 0, True)
+            # At the end of a phase what comes before the last step stands for its last instant.
+            chosen.append(rows[before | (after & (t < t[-1]))])
+            if len(chosen[-1]) < 2:
+                chosen.pop()
+                break
+        if not chosen:
             raise SimulationError(f"there is no motion to keep: {self.outcome.text}")
+        rows = np.concatenate(chosen)
         names = ("t", "tau", "c_n", "c_t", "phase")
         arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in names}
         for suffix in ("", "_dot", "_ddot"):
@@ -266,18 +277,3 @@ def list_stretches(rows: Sequence[Record], names: Sequence[str]) -> tuple[FreeSt
             least = float(c_n[at]), block[at].t
             stretches.append(FreeStretch(names[pair], block[0].t, block[-1].t, *least))
     return tuple(sorted(stretches, key=lambda stretch: (stretch.start, stretch.contact)))
-
-
-def _choose_rows(simulation: Simulation) -> NDArray[np.int64]:
-    """Rows whose times increase in each phase, but for one repetition where forces step."""
-    chosen = [np.zeros(0, dtype=np.int64)]
-    for index in range(int(simulation.phase[-1]) + 1):
-        rows = np.flatnonzero(simulation.phase == index)
-        t = simulation.t[rows]
-        before, after = np.append(True, np.diff(t) > 0), np.append(np.diff(t) > 0, True)
-        # At the end of a phase what comes before the last step stands for its last instant.
-        kept = rows[before | (after & (t < t[-1]))]
-        if len(kept) < 2:
-            break
-        chosen.append(kept)
-    return np.concatenate(chosen)

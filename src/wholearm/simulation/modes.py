@@ -410,7 +410,11 @@ class Rest:
         for mode in self._list_modes():
             if mode.moves(tau):
                 return mode.depart(x, tau)
-        loss = self._find_loss(coefficients, x)
+        # Where torques cannot be held any more; infinite if they can all along.
+        normals, bounds = self.held
+        loss = x
+        if np.isfinite(bounds).all():
+            loss = find_breach(_constant(bounds, coefficients) - normals @ coefficients, x)
         least = 1e3 * _measure_drive(self.formation.scene)
         margins = [mode.margins for mode in self.modes]
         rows = np.vstack(margins)
@@ -429,13 +433,6 @@ class Rest:
                 if mode.drive(tau) > least and mode.moves(tau):
                     return mode.depart(start, tau)
         return self._collapse(coefficients, loss) if loss <= 1 else None
-
-    def _find_loss(self, coefficients: Array, x: float) -> float:
-        """Where torques cannot be held any more, from `x` on; infinite if they can all along."""
-        normals, bounds = self.held
-        if not np.isfinite(bounds).all():
-            return x
-        return find_breach(_constant(bounds, coefficients) - normals @ coefficients, x)
 
     def _collapse(self, coefficients: Array, x: float) -> Collapse:
         """The contact that gives way at `x`."""
@@ -682,17 +679,13 @@ def _find_closing(
             continue
         a = float(closing @ [1.0, *tau])
         v = mode.response.acceleration @ [1.0, *tau] * math.sqrt(2 * gap / a)
-        best = Hold(tau, margin, math.sqrt(2 * a * gap), _find_parting(place, v))
+        try:
+            violations = compute_impact(place.formation, place.touching, place.z, v).violations
+        except np.linalg.LinAlgError:
+            violations = ()
+        parts = tuple(own.name for own in violations if own.kind is ViolationKind.PULL)
+        best = Hold(tau, margin, math.sqrt(2 * a * gap), parts)
     return best
-
-
-def _find_parting(place: Standstill, v: Array) -> tuple[str, ...]:
-    """Contacts that would have to pull in a plastic impact at velocity `v`, shape (5,)."""
-    try:
-        impact = compute_impact(place.formation, place.touching, place.z, v)
-    except np.linalg.LinAlgError:
-        return ()
-    return tuple(h.name for h in impact.violations if h.kind is ViolationKind.PULL)
 
 
 def maximise_margin(

@@ -119,42 +119,26 @@ def verify_policy(
     loop = ClosedLoop(policy)
     until = (1 + ROOM) * loop.find_duration(count)
     whole = simulate_free(problem, loop, until=until, tolerance=tolerance, restitution=restitution)
-    phases = tuple(
-        _judge(plan, loop, whole, phase, allowed)
-        for phase in problem.phases
-        if phase.number in loop.began
-    )
     failures = [] if whole.outcome.kind is OutcomeKind.ENDED else [whole.outcome.text]
-    for phase in phases:
-        failures += describe_losses(phase)
-        if not phase.reached:
-            failures.append(f"phase {phase.number} does not end within {until:.4g} s")
-    end = phases[-1].deviation
-    assert end is not None
+    phases: list[FreePhase] = []
+    for phase in (own for own in problem.phases if own.number in loop.began):
+        number, start, gained = phase.number, loop.began[phase.number], phase.until.contact
+        stop = loop.began.get(number + 1, float(whole.t[-1]))
+        name = "" if gained is None else gained.name
+        gains = [s.start for s in whole.stretches if s.contact == name and s.start > start]
+        losses = tuple(find_losses(whole, phase, start, min([stop, *gains]), allowed))
+        reached = number == count or number + 1 in loop.began
+        end = measure_end(whole, plan, phase.index, stop)
+        phases.append(FreePhase(number, start, stop, reached, losses, end))
+        failures += describe_losses(phases[-1])
+        if not reached:
+            failures.append(f"phase {number} does not end within {until:.4g} s")
     far = end.position / problem.scene.scales.length > REACHED or end.angle > TURNED
     if len(phases) == count and far:
         text = f"ends {end.position:.3g} m and {end.angle:.3g} rad away from the plan"
         failures.append(f"the policy {text}")
     warnings = tuple(warn("whole", whole))
-    return FreeReport(problem.name, whole, (), phases, tuple(failures), warnings)
-
-
-def _judge(
-    plan: Trajectory, loop: ClosedLoop, whole: FreeSimulation, phase: Phase, allowed: float
-) -> FreePhase:
-    """Losses and end of a phase."""
-    start, contact = loop.began[phase.number], phase.until.contact
-    last = phase.number == len(whole.problem.phases)
-    stop = float(whole.t[-1]) if last else loop.began.get(phase.number + 1, float(whole.t[-1]))
-    gains = [
-        closed.start
-        for closed in whole.stretches
-        if contact is not None and closed.contact == contact.name and closed.start > start
-    ]
-    reached = last or phase.number + 1 in loop.began
-    losses = find_losses(whole, phase, start, min([stop, *gains]), allowed)
-    end = measure_end(whole, plan, phase.index, stop)
-    return FreePhase(phase.number, start, stop, reached, tuple(losses), end)
+    return FreeReport(problem.name, whole, (), tuple(phases), tuple(failures), warnings)
 
 
 def _fail(simulation: FreeSimulation, phases: Sequence[FreePhase], allowed: float) -> list[str]:

@@ -205,16 +205,6 @@ def describe_ambiguity(
     return failures
 
 
-def describe_wedging(phases: Sequence[PhaseReport]) -> list[str]:
-    """Sentences on phases that need not begin as soon as their torques do."""
-    return [
-        f"phase {phase.number} may stay wedged for {1e3 * phase.wedged:.3g} ms: so long friction "
-        "can hold everything at rest under its torques"
-        for phase in phases
-        if phase.wedged
-    ]
-
-
 def find_least_force(phase: PhaseReport) -> ContactMargin | None:
     """The contact with the least normal force in a phase; None if nothing moved."""
     known = [margin for margin in phase.contacts if not math.isnan(margin.least)]

@@ -62,7 +62,6 @@ from .verdict import (
     describe_ends,
     describe_overlap,
     describe_thin_margins,
-    describe_wedging,
     find_uniqueness_margin,
     find_wedged,
     judge_end,
@@ -222,7 +221,13 @@ def judge(seen: Observation, allowance: Allowance, reduced: bool = False) -> Rep
     failures += describe_overlap(problem.scene, phases, gap) if reached else []
     failures += describe_ambiguity(simulation, phases, allowance)
     thin = describe_thin_margins(simulation, phases, allowance)
-    warnings = _describe_torques(problem, torque) + describe_wedging(phases)
+    warnings = _describe_torques(problem, torque)
+    warnings += [
+        f"phase {phase.number} may stay wedged for {1e3 * phase.wedged:.3g} ms: so long friction "
+        "can hold everything at rest under its torques"
+        for phase in phases
+        if phase.wedged
+    ]
     for phase in problem.phases[: len(phases)]:
         warnings += describe_misses(phase, simulation)
     for time, text in describe_motors(problem, torque):
