@@ -32,7 +32,6 @@ from ..verification.free import FreeReport, find_losses, verify_free
 from ..verification.verdict import DEPARTURE
 from .slow_speeds import SQUEEZE, find_torques, sample_path
 
-_GAINS = (EventKind.GAINED, EventKind.IMPACT, EventKind.PASS)
 FACTOR = 1.1
 """What raises a torque by 10 %; lowering divides by it, so that each torque comes again."""
 
@@ -70,7 +69,6 @@ class TuningSettings:
 
 
 SETTINGS = TuningSettings()
-_GOLDEN = (3 - math.sqrt(5)) / 2
 
 
 class TrialOutcome(Enum):
@@ -344,7 +342,8 @@ def _is_end(phase: Phase, after: Phase | None, event: Event) -> bool:
     """Whether an event ends a phase; a coordinate that does is none."""
     until = phase.until
     if until.contact is not None:
-        return event.kind in _GAINS and event.contact == until.contact.name
+        gains = EventKind.GAINED, EventKind.IMPACT, EventKind.PASS
+        return event.kind in gains and event.contact == until.contact.name
     gone = event.kind is EventKind.CONTACT_LOST
     return until.is_release and gone and event.contact in _list_leaving(phase, after)
 
@@ -903,7 +902,7 @@ class TuningRule:
             if count == SETTINGS.grid and rate > 2 * SETTINGS.coarse * self.slow:
                 return None
             left = at - low > high - at
-            other = at - _GOLDEN * (at - low) if left else at + _GOLDEN * (high - at)
+            other = at + (3 - math.sqrt(5)) / 2 * (low - at if left else high - at)
             new, trial = run(other)
             if new < rate:
                 low, high = (low, at) if left else (at, high)

@@ -39,7 +39,6 @@ from .run import Closing, Feedback, Run, StuckError, find_root
 from .stepper import Modes, ModeStepper, bind
 from .system import ROUNDING_FORCE, SETTLING, STANDING, STILL, ContactRows, Structure, System
 
-RESIDUAL = 1e-8  # largest residual of a solution, relative to the largest rate without contacts
 EDGE = 1e-9  # reserve of friction that counts as none, relative to its bound or the largest force
 SAME = 1e-6  # difference of rates that is none, over the largest rate without contacts
 SINGULAR = 1e-9  # determinant of a scaled system that counts as zero
@@ -100,7 +99,7 @@ class ContactAnswer(NamedTuple):
     shares: Array  # (s,): friction over the most that it may be
     sign: Array  # (s,): sliding sign where friction is at its bound, 0 where it holds
     change: Array  # (n,): M^-1 (G^T c_n + T^T f)
-    residual: float  # relative; see `RESIDUAL`
+    residual: float  # over the largest rate without contacts, 1e-8 at most
 
 
 def solve_problem(p: ContactProblem) -> ContactAnswer | None:
@@ -119,7 +118,7 @@ def solve_problem(p: ContactProblem) -> ContactAnswer | None:
     M[minus + held, p.owner[held]] = p.mu[held] * s_n[p.owner[held]] / s_t[held]
     found = solve_lcp(M, np.concatenate([q, -q[k:], p.bound / s_t]))
     size = float(np.abs(q).max(initial=0.0)) or 1.0
-    if not found.residual <= RESIDUAL * max(size, float((p.bound / s_t).max(initial=0.0))):
+    if not found.residual <= 1e-8 * max(size, float((p.bound / s_t).max(initial=0.0))):
         return None
     z = found.z
     return complete(p, s_n * z[:k], s_t * (z[k:plus] - z[plus:minus]), found.residual / size)

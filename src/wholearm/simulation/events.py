@@ -18,8 +18,6 @@ from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory, sample_phases
 from .stepper import ModeStepper
 
-REPLAYED = "replayed"  # status in the `meta` of such a trajectory
-
 
 class EventKind(Enum):
     """What happens at an instant of a simulation."""
@@ -192,7 +190,7 @@ class Simulation(Drawn):
         motions = sample_phases(arrays, self.contacts)
         rolling = [phase.formation.rolling for phase in problem.phases[: len(motions)]]
         meta = {
-            "status": REPLAYED,
+            "status": "replayed",
             "outcome": self.outcome.text,
             "name": problem.name,
             "epsilon": problem.epsilon,

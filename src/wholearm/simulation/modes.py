@@ -240,9 +240,6 @@ def find_fixed(mode: Mode, rows: ContactRows) -> NDArray[np.bool_]:
     return np.asarray(np.linalg.norm(rest, axis=1) < 1e-7 * length)
 
 
-_AHEAD = 1e-5  # step along the free direction for the signs of what is stationary, in scene units
-
-
 class StartDeparture(NamedTuple):
     """The formation starts to move, or goes on, at `x` in [-1, 1] of a piece of the torques."""
 
@@ -365,16 +362,16 @@ class Rest:
     def _find_signs(self, heading: Array) -> Array:
         """Directions of contacts and joints along the only freedom, (n_c + 2,); zero for none."""
         formation, scales = self.formation, self.formation.scene.scales
-        step = _AHEAD / np.abs(heading / build_system(formation.scene).units[:5]).max()
+        fastest = np.abs(heading / build_system(formation.scene).units[:5]).max()
         rates = np.concatenate([self.statics.A_t @ heading, heading[3:]])
         rates[list(formation.rolling_rows)] = 0.0
         # How fast each slides or turns over how fast anything moves.
-        scale = _AHEAD / step * np.repeat([scales.length, 1.0], [formation.n_contacts, 2])
+        scale = fastest * np.repeat([scales.length, 1.0], [formation.n_contacts, 2])
         still = np.abs(rates) < 1e-9 * scale
         still[list(formation.rolling_rows)] = False
         if still.any():
             # What is stationary here has the direction that it has just after.
-            ahead = _find_rates(formation, self.z, step, heading)
+            ahead = _find_rates(formation, self.z, 1e-5 / fastest, heading)
             rates = np.where(still, np.where(np.abs(ahead) > 1e-12 * scale, ahead, 0.0), rates)
         return np.asarray(np.sign(rates))
 

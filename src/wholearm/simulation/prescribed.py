@@ -63,7 +63,6 @@ from .system import (
     REACHED,
     REST_WINDOW,
     ROUNDING_FORCE,
-    ROUNDING_SPEED,
     SETTLING,
     SLOW,
     STANDING,
@@ -132,7 +131,8 @@ def _build_leg(
     parts = own.force, own.cone, slice(own.slide.start, last), slice(last, until_row)
     rows = LegRows(*parts, until_row, until_row + 1)
     sizes = [own.cone.stop, last - own.cone.stop, len(limits), 1, 1]
-    slack = np.repeat([ROUNDING_FORCE, ROUNDING_SPEED, REACHED, 0.0, ROUNDING_SPEED], sizes)
+    # Of speeds 2e-13 is rounding.
+    slack = np.repeat([ROUNDING_FORCE, 2e-13, REACHED, 0.0, 2e-13], sizes)
     z, v, before = build_features(scene).z, ca.SX.sym("v", 5), ca.SX.sym("before", 5)
     values = ca.SX.sym("values", own.size)
     if until.is_release:

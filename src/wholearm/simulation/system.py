@@ -42,7 +42,6 @@ from ..contacts.elemental import build_features, rotate_quarter
 from ..scene.model import Scales, Scene
 
 ROUNDING_FORCE = 1e-9  # shortfall of a force, torque or friction margin that is rounding
-ROUNDING_SPEED = 2e-13  # largest negative speed that counts as rounding
 REACHED = 3e-5  # distance to the end of a phase that counts as there, at rest: the next overlaps
 SLOW = 2e-4  # speed that counts as rest at the end of a phase
 STANDING = 1e-9  # speed that counts as none in friction: either sign by integration error

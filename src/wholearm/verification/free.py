@@ -29,7 +29,6 @@ from ..simulation.system import build_system
 from .verdict import DEPARTURE, measure_departure
 
 MOST = 60  # most events that the text lists; `to_dict` has all
-_TOLD = (EventKind.AMBIGUOUS, EventKind.INCONSISTENT)
 REACHED, TURNED = 0.03, math.radians(1.0)
 """How far from the plan's end a policy may end: over the scene's length, and in rad."""
 
@@ -162,7 +161,8 @@ def _fail(simulation: FreeSimulation, phases: Sequence[FreePhase], allowed: floa
 
 def warn(title: str, simulation: FreeSimulation) -> list[str]:
     """What was not decided by the laws of contact alone."""
-    return [f"{title}: {event.text}" for event in simulation.events if event.kind in _TOLD]
+    told = EventKind.AMBIGUOUS, EventKind.INCONSISTENT
+    return [f"{title}: {event.text}" for event in simulation.events if event.kind in told]
 
 
 def _compare(

@@ -75,7 +75,6 @@ MISSED = 1e-6  # miss of a limit, over what is much for it, from which on it is 
 ROWS = 20
 """About how many rows of each phase of a trajectory its replay is compared with; without one, about
 how many even parts of each phase are looked at."""
-_ENDS = (EventKind.ARRIVAL, EventKind.RELEASE)
 _CHANGES = {EventKind.STICK: "sticks", EventKind.SLIP: "slips", EventKind.REVERSAL: "reverses"}
 
 
@@ -269,7 +268,8 @@ def _report_phase(
 ) -> PhaseReport:
     problem, phase = simulation.problem, simulation.problem.phases[index]
     rows = np.flatnonzero(simulation.phase == index)
-    arrivals = [e for e in simulation.events if e.phase == index and e.kind in _ENDS]
+    ends = EventKind.ARRIVAL, EventKind.RELEASE
+    arrivals = [e for e in simulation.events if e.phase == index and e.kind in ends]
     impacts = [e for e in simulation.find(EventKind.IMPACT) if e.phase == index]
     stops = bool(arrivals) and phase.end is End.REST
     formation, until = phase.formation, str(phase.until)
