@@ -349,7 +349,7 @@ def test_a_stuck_solver_does_not_blame_the_limits(monkeypatch: pytest.MonkeyPatc
 def test_the_slope_of_b_is_twice_a_whatever_is_minimised(goal: Objective) -> None:
     curve = trace_phases(problem_of(HEPTAGON))[0]
     data = prepare(curve, EPSILON, make_grid(curve, np.zeros(0), 6), 1)
-    nlp = build_path_nlp(LimitShape.of(data.limits), len(data.grid.steps), goal)
+    nlp = build_path_nlp(LimitShape.of(data), len(data.grid.steps), goal)
     profile, units = guess(data)
     relaxed = Relaxation(data.limits.parameters[0], 1.0) if goal is Objective.RELAX else None
     given = parameters(nlp, data, units, 1.0, relaxed)

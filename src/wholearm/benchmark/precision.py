@@ -501,7 +501,7 @@ def _build_on_curve(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
     options = PlanOptions(accuracy=float(setting))
     build_path_nlp.cache_clear()
     data = prepare(curve, epsilon, make_grid(curve, np.zeros(0), 10), 1)
-    build_path_nlp(LimitShape.of(data.limits), len(data.grid.steps), Objective.TIME)
+    build_path_nlp(LimitShape.of(data), len(data.grid.steps), Objective.TIME)
 
     def run() -> PeerPlan:
         plan = plan_path(curve, epsilon, options, 1)

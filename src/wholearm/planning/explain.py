@@ -329,7 +329,7 @@ def _solve_soft(
 ) -> tuple[Profile, float] | None:
     """Solve with soft limits, from a profile and the relaxation `extra` there."""
     goal = Objective.RELAX if relaxation else Objective.ELASTIC
-    nlp = build_path_nlp(LimitShape.of(data.limits), len(data.grid.s) - 1, goal)
+    nlp = build_path_nlp(LimitShape.of(data), len(data.grid.s) - 1, goal)
     result = nlp.solver(
         x0=pack(nlp, profile, units, extra),
         p=parameters(nlp, data, units, 1.0, relaxation),

@@ -39,7 +39,6 @@ from ...mechanics.dynamics import LAMBDA, ONE, A, B, V
 from ...mechanics.limits import PRESS, TORQUE, LimitSet
 from ...mechanics.path_limits import PathLimits
 from ...mechanics.speed_sweep import SweepMode
-from ...scene.model import Scene
 from ..nlp import Columns, SolverStatistics, book, build_solver
 from ..options import Objective
 from .path_data import PhaseData
@@ -66,24 +65,6 @@ SOFT = (Objective.ELASTIC, Objective.RELAX)  # with a row for each side of the s
 LEAST_B = 1e-8  # least |s''| at rest and b elsewhere, over typical ones: sqrt(b) is differentiable
 
 
-class MotorShape(NamedTuple):
-    """Joints with a torque rate limit, and those whose torques lag behind a command."""
-
-    rates: tuple[int, ...] = ()
-    commands: tuple[int, ...] = ()
-
-    @staticmethod
-    def of(scene: Scene) -> MotorShape:
-        """The shape of a scene's motors."""
-        limited, lags = np.isfinite(scene.torque_rate_limit), scene.actuator_lag > 0
-        return MotorShape(*(tuple(np.flatnonzero(mask).tolist()) for mask in (limited, lags)))
-
-    @property
-    def slow(self) -> tuple[int, ...]:
-        """Joints whose torques may not step."""
-        return tuple(sorted({*self.rates, *self.commands}))
-
-
 class LimitShape(NamedTuple):
     """Structure of the limits that an NLP is built for."""
 
@@ -92,11 +73,13 @@ class LimitShape(NamedTuple):
     presses: tuple[int, ...]  # rows of the least normal forces
     torques: tuple[int, ...]  # rows of the torques
     fast: tuple[int, ...]  # rows that depend on s'
-    motors: MotorShape = MotorShape()
+    rates: tuple[int, ...]  # joints with a torque rate limit
+    commands: tuple[int, ...]  # joints whose torques lag behind a command
 
     @staticmethod
-    def of(limits: LimitSet, motors: MotorShape | None = None) -> LimitShape:
-        """The shape of a set of limits."""
+    def of(data: PhaseData) -> LimitShape:
+        """The shape of the limits of phases and of their motors."""
+        limits, scene = data.limits, data.curve.formation.scene
         rows, signs, _ = limits.sides
         of_tau, of_rates = (part.any(axis=1) for part in limits.columns[1:])
         drags = np.array([limits.limits[k].drags for k in limits.owners])
@@ -106,8 +89,14 @@ class LimitShape(NamedTuple):
             tuple(limits.of(PRESS).tolist()),
             tuple(limits.of(TORQUE).tolist()),
             tuple(np.flatnonzero(of_tau | of_rates | drags).tolist()),
-            motors or MotorShape(),
+            tuple(np.flatnonzero(np.isfinite(scene.torque_rate_limit)).tolist()),
+            tuple(np.flatnonzero(scene.actuator_lag).tolist()),
         )
+
+    @property
+    def slow(self) -> tuple[int, ...]:
+        """Joints whose torques may not step."""
+        return tuple(sorted({*self.rates, *self.commands}))
 
 
 def _find_lengths(h: Expression) -> Expression:
@@ -271,7 +260,7 @@ class PathNLP:
 def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> PathNLP:
     """Build the NLP for every phase with limits of a shape."""
     started = time.perf_counter()
-    n, m, motors, slow = intervals + 1, shape.rows, shape.motors, shape.motors.slow
+    n, m, slow = intervals + 1, shape.rows, shape.slow
     effort, relax = objective is Objective.EFFORT, objective is Objective.RELAX
     chained, late = objective in CHAINED, objective is Objective.MARGIN
     sizes = {"ends": 2, "steps": intervals, "weight": 1, "calm": 1, "a": n * m, "b": n * m}
@@ -283,7 +272,7 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     elif relax:
         sizes |= {"gives": m + 1, "rates": n}
     if slow:
-        sizes |= {"quick": len(motors.rates), "lags": len(motors.commands)}
+        sizes |= {"quick": len(shape.rates), "lags": len(shape.commands)}
         sizes |= {"bends": n // NODES, "sizes": n}
     p = Columns(**sizes)
     symbols = p.make_symbols()
@@ -354,8 +343,8 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
         table = ca.reshape(torques[:, joint], NODES, -1)
         parts = [ca.DM(list_slopes()[kind]) @ table[:, e] for e, kind in enumerate(kinds)]
         rates[joint] = ca.vec(ca.horzcat(*parts) * paces / ca.repmat(lengths, NODES, 1))
-    quick = [symbols.quick[k] * rates[joint] for k, joint in enumerate(motors.rates)]
-    lagged = [torques[:, j] + symbols.lags[k] * rates[j] for k, j in enumerate(motors.commands)]
+    quick = [symbols.quick[k] * rates[joint] for k, joint in enumerate(shape.rates)]
+    lagged = [torques[:, j] + symbols.lags[k] * rates[j] for k, j in enumerate(shape.commands)]
     joins = [torques[NODES::NODES, j] - torques[DEGREE:-1:NODES, j] for j in slow]
     motor_rows = {"rates": quick, "commands": lagged, "joins": joins}
     rows |= {name: ca.vertcat(none, *own) for name, own in motor_rows.items()}
@@ -395,13 +384,13 @@ def parameters(
         "lam": terms[..., LAMBDA] * force / unit,
         "speed": (terms[..., V] * np.sqrt(b_unit) / unit)[:, nlp.shape.fast],
     }
-    torque, motors = unit[list(nlp.shape.torques)], nlp.shape.motors
-    if nlp.objective is Objective.EFFORT or motors.slow:
+    torque, shape = unit[list(nlp.shape.torques)], nlp.shape
+    if nlp.objective is Objective.EFFORT or shape.slow:
         blocks["torque"] = data.nodes.forces.of_tau[..., ONE] / torque
     if nlp.objective is Objective.EFFORT:
         blocks["joints"] = torque**2 / units.power
-    if motors.slow:
-        scene, (rates, commands) = data.curve.formation.scene, map(list, motors)
+    if shape.slow:
+        scene, rates, commands = data.curve.formation.scene, list(shape.rates), list(shape.commands)
         blocks["quick"] = (torque / units.time / data.rate_limit)[rates]
         blocks["lags"] = scene.actuator_lag[commands] / units.time
         blocks |= {"bends": data.grid.bends, "sizes": data.grid.sizes}
@@ -447,7 +436,7 @@ def make_bounds(
     if data.grid.held:
         low[:, 0], high[:, 0] = LEAST_B, high[:, 0] / data.grid.sizes
     # From rest to rest, without reversal.
-    if nlp.shape.motors.slow:
+    if nlp.shape.slow:
         low[[0, -1], node["a"]] = high[[0, -1], node["a"]] = 0.0
     else:
         low[0, node["a"]], high[-1, node["a"]] = LEAST_B, -LEAST_B
@@ -472,7 +461,7 @@ def make_bounds(
     late = nlp.g.sizes["duration"]
     equal = np.zeros(nlp.g["limits"].start)
     longest = np.full(late, (duration or np.inf) / units.time)
-    rates, commands = map(list, nlp.shape.motors)
+    rates, commands = list(nlp.shape.rates), list(nlp.shape.commands)
     torque, sizes = units.of(data.limits)[list(nlp.shape.torques)], nlp.g.sizes
     quickest, most = tightening.motors[:, 0], tightening.motors[:, 1] * data.torque_limit / torque
     joins, begins = np.zeros(sizes["joins"]), np.full(sizes["begins"] // 2, LEAST_B)

@@ -41,7 +41,6 @@ from .path_mesh import (
 from .path_motion import DEGREE, Elements, PathMotion, Profile, follow
 from .path_nlp import (
     LimitShape,
-    MotorShape,
     PathNLP,
     SureStart,
     Tightening,
@@ -451,8 +450,7 @@ class PathIterate:
     ) -> PathIterate:
         """The NLP on elements with these breaks and cuts, without a point to start from."""
         data, (breaks, cuts) = join(parts), map(tuple, edges)
-        shape = LimitShape.of(data.limits, MotorShape.of(task.curves[0].formation.scene))
-        nlp = build_path_nlp(shape, len(data.grid.steps), task.options.goal)
+        nlp = build_path_nlp(LimitShape.of(data), len(data.grid.steps), task.options.goal)
         zero = np.zeros_like(data.grid.s)
         first = PathSolution(Profile(zero, zero, zero), 0.0, {})
         none = Tightening.none(data, task.duration)
@@ -650,7 +648,8 @@ class PathIterate:
         on_b[nlp.free] = solution.multipliers["lam_x0"]
         on_b = np.maximum(on_b[:, 0], 0.0) * solution.profile.b / data.grid.sizes
         costs = (on_sides * limits).sum(axis=1) + on_b / units.profile[0] * speed_share
-        for kind, (name, joints) in enumerate(nlp.shape.motors._asdict().items()):
+        motor_rows = (("rates", nlp.shape.rates), ("commands", nlp.shape.commands))
+        for kind, (name, joints) in enumerate(motor_rows):
             on_rows = np.abs(on_g[nlp.g[name]]).reshape(len(joints), count).T
             costs += (on_rows * motors[:, kind, list(joints)]).sum(axis=1)
         scale = abs(solution.cost)
