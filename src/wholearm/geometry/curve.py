@@ -297,7 +297,12 @@ def take(curve: Curve, start: float, stop: float) -> Curve:
         # What is missing at an end is extrapolated.
         if last - first < 1e-9 * length:
             continue
-        own = panel if (first, last) == (panel.s[0], panel.s[-1]) else _cut(panel, first, last)
+        own = panel
+        if (first, last) != (panel.s[0], panel.s[-1]):
+            # The same polynomial through other nodes.
+            s = first + (last - first) * (1 - np.cos(np.linspace(0, np.pi, len(panel.s)))) / 2
+            s[-1] = last
+            own = Panel(s, *panel.interpolate(s))
         columns = (high - own.s)[::-1], own.z[::-1], -own.z_s[::-1]
         panels.append(Panel(*columns) if back else Panel(own.s - low, own.z, own.z_s))
     sign = -1.0 if back else 1.0
@@ -331,14 +336,6 @@ def join(back: Curve | None, forth: Curve | None) -> Curve:
         else:
             segments.append(moved)
     return _make(forth, panels, segments, offset + forth.length)
-
-
-def _cut(panel: Panel, first: float, last: float) -> Panel:
-    """The same polynomial through nodes between two places."""
-    nodes = (1 - np.cos(np.linspace(0, np.pi, len(panel.s)))) / 2
-    s = first + (last - first) * nodes
-    s[-1] = last
-    return Panel(s, *panel.interpolate(s))
 
 
 def _make(curve: Curve, panels: list[Panel], segments: list[Segment], length: float) -> Curve:

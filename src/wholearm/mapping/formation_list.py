@@ -66,14 +66,6 @@ class Stretch:
     start: Array  # start, stop (2,) [m, rad]: x and phi at its ends
     stop: Array
 
-    def to_toml(self, number: int) -> str:
-        """The stretch as one ``[[phases]]`` table of a problem file."""
-        names = ", ".join(f'"{contact}"' for contact in self.contacts)
-        return (
-            f"[[phases]]                     # {number}: to {describe_place(self.stop)}\n"
-            f"contacts = [{names}]\nuntil = {format_until(self.until)}\n"
-        )
-
 
 class Route(tuple[Stretch, ...]):
     """The stretches of a route, which are the phases of a problem file."""
@@ -176,7 +168,12 @@ def format_route(route: Route) -> str:
     if route.start is not None:
         edge, x = route.start
         lines.append(f"[start]\nflush = {edge}\nx = {x!r}\n")
-    lines += [stretch.to_toml(number) for number, stretch in enumerate(route, start=1)]
+    for number, stretch in enumerate(route, start=1):
+        names = ", ".join(f'"{contact}"' for contact in stretch.contacts)
+        lines.append(
+            f"{'[[phases]]':<{_COMMENTS}}# {number}: to {describe_place(stretch.stop)}\n"
+            f"contacts = [{names}]\nuntil = {format_until(stretch.until)}\n"
+        )
     return "\n".join(lines)
 
 

@@ -158,7 +158,14 @@ def build_map(
     tracks = list(list_tracks(scene, window, samples))
     borders = _build_borders(problem, cut(scene, tracks, window), limit)
     report("map: crossings and directions")
-    directions = _check_cells(problem, window, limit)
+    # At a lattice of places inside cells.
+    ends = np.linspace(*window.x, 25), np.linspace(*window.phi, 25)
+    middles = np.meshgrid(*((values[1:] + values[:-1]) / 2 for values in ends))
+    places = np.column_stack([part.ravel() for part in middles])
+    inside = label_cells(scene, *places.T)
+    places, inside = places[inside[:, 0] != NOWHERE], inside[inside[:, 0] != NOWHERE]
+    z = close_fingers(scene, *places.T).z
+    directions = check_cell(scene, problem.epsilon, inside[:, [0, 2, 4]], z, limit)
     return FormationMap(
         problem,
         x,
@@ -167,6 +174,7 @@ def build_map(
         tuple(name_contacts(table, row) for row in rows),
         tuple(borders),
         _find_crossings(scene, borders),
+        places,
         *directions,
     )
 
@@ -234,18 +242,6 @@ def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]
             edges = tuple(dict.fromkeys(b.flush for b in meeting if b.flush is not None))
             crossings.append(Crossing(points[k], z, contacts, edges))
     return tuple(crossings)
-
-
-def _check_cells(problem: Problem, window: Window, limit: float) -> tuple[Array, Flags, Flags]:
-    """Feasible directions of motion at a lattice of places inside cells."""
-    scene = problem.scene
-    x, phi = (np.linspace(*ends, 25) for ends in (window.x, window.phi))
-    x, phi = np.meshgrid((x[1:] + x[:-1]) / 2, (phi[1:] + phi[:-1]) / 2)
-    places = np.column_stack([x.ravel(), phi.ravel()])
-    labels = label_cells(scene, *places.T)
-    places, labels = places[labels[:, 0] != NOWHERE], labels[labels[:, 0] != NOWHERE]
-    z, triples = close_fingers(scene, *places.T).z, labels[:, [0, 2, 4]]
-    return places, *check_cell(scene, problem.epsilon, triples, z, limit)
 
 
 def check_border(

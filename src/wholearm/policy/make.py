@@ -626,18 +626,6 @@ def _tabulate_curve(piece: ReferencePiece, phase: Phase, push: Array) -> dict[st
     }
 
 
-def _find_end_torques(
-    problem: Problem, phase: Phase, plan: Trajectory, piece: ReferencePiece
-) -> Array:
-    """Torques that hold the end of a curve: the plan's if it has any."""
-    last = int(np.flatnonzero(plan.phase == phase.index)[-1])
-    if np.isnan(plan.c_n[last]).all():
-        return np.asarray(plan.tau[last])
-    gained = phase.until.contact is not None
-    push = hold_end(problem, phase, piece.curve.end) if gained else None
-    return find_still(piece.curve) if push is None else push
-
-
 def find_arrival(curve: Curve, gained: Contact, rows: CurveLimitRows) -> Array:
     """Levels of all contacts, with the gained one, at rest at the end of a curve, (k, 5).
 
@@ -785,11 +773,15 @@ def make_policy(
                 one["duration"] = span
         else:
             phase = block[0]
-            push = _find_end_torques(problem, phase, plan, piece)
+            last = int(np.flatnonzero(plan.phase == phase.index)[-1])
+            push = plan.tau[last]
+            if not np.isnan(plan.c_n[last]).all():
+                gained = phase.until.contact is not None
+                hold = hold_end(problem, phase, piece.curve.end) if gained else None
+                push = find_still(piece.curve) if hold is None else hold
             tables.append(_tabulate_curve(piece, phase, push))
             found[0].update(duration=piece.duration, share=piece.share, reserves=piece.reserves)
-            gained = phase.until.contact
-            found[0]["gained"] = "" if gained is None else gained.name
+            found[0]["gained"] = "" if phase.until.contact is None else phase.until.contact.name
         if piece is None or not piece.passes:
             found[-1]["duration"] += settings.dwell + delay
         about += found

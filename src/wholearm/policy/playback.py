@@ -83,11 +83,7 @@ class Policy(Result):
         self.last = len(self.laws) - 1 if laws is None else laws - 1
         counts = [law.count for law in self.laws[: self.last + 1]]
         self.firsts = [1 + sum(counts[:k]) for k in range(len(counts))]
-        self.contacts = self._connect_sensors()
-        self.reset()
-
-    def _connect_sensors(self) -> list[str]:
-        """Let laws along curves with known contacts use measured forces; names of the contacts."""
+        # Laws along curves with known contacts use measured forces.
         found = dict[str, None]()
         phases = self.about.get("phases", [])
         for arrays, law, first in zip(self.tables, self.laws, self.firsts, strict=False):
@@ -97,7 +93,8 @@ class Policy(Result):
                 late = self.settings.delay / self.settings.period
                 law.sensing = Sensing(names, gained, table, late)
                 found.update(dict.fromkeys([*names, gained] if gained else names))
-        return list(found)
+        self.contacts = list(found)
+        self.reset()
 
     @property
     def headline(self) -> str:

@@ -130,9 +130,18 @@ def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
     """
     with name_source(source):
         check_keys(table, "", TOP)
-        scene = _read_scene(table)
+        polygon = Polygon(**collect_keys(Polygon, _table(table, "object", OBJECT)))
+        fingers = _table(table, "fingers", FINGERS)
+        friction = Friction(**collect_keys(Friction, _table(table, "friction", FRICTION)))
+        right, left = (
+            Finger(**collect_keys(Finger, _table(fingers, key, FINGER, name)), name=name)
+            for key, name in ((key, f"fingers.{key}") for key in FINGERS)
+        )
+        scene = Scene(polygon, (right, left), friction, **collect_keys(Scene, table))
         check_ranges(scene)
-        start = _read_start(scene, _table(table, "start", START))
+        start = _table(table, "start", START)
+        _check_edge(scene, start["flush"], "start.flush")
+        z = place_start(scene, start["flush"], require_number(start["x"], "start.x"))
         given = table.get("phases", [])
         if not isinstance(given, list):
             raise InputError("", "phases", f"{given!r} is not a list of [[phases]]")
@@ -141,7 +150,7 @@ def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
             uncertainty = _table(table, "uncertainty", UNCERTAINTY)
         return Problem(
             scene=scene,
-            start=start,
+            start=z,
             phases=tuple(read_phase(scene, i, entry) for i, entry in enumerate(given)),
             source=source,
             uncertainty=uncertainty,
@@ -188,22 +197,6 @@ def adopt_phases(problem: Problem, meta: Mapping[str, Any], q: Array, source: st
         place = f"x = {1e3 * x:.4g} mm, phi = {math.degrees(phi):.4g} deg"
         raise InputError(source, "goal", f"the plan ends at {place}, and not with {goal}")
     return replace(problem, phases=read_own_problem(meta, source).phases, goals=())
-
-
-def _read_scene(table: Mapping[str, Any]) -> Scene:
-    polygon = Polygon(**collect_keys(Polygon, _table(table, "object", OBJECT)))
-    fingers = _table(table, "fingers", FINGERS)
-    friction = Friction(**collect_keys(Friction, _table(table, "friction", FRICTION)))
-    right, left = (
-        Finger(**collect_keys(Finger, _table(fingers, key, FINGER, name)), name=name)
-        for key, name in ((key, f"fingers.{key}") for key in FINGERS)
-    )
-    return Scene(polygon, (right, left), friction, **collect_keys(Scene, table))
-
-
-def _read_start(scene: Scene, start: Mapping[str, Any]) -> Array:
-    _check_edge(scene, start["flush"], "start.flush")
-    return place_start(scene, start["flush"], require_number(start["x"], "start.x"))
 
 
 def _check_edge(scene: Scene, edge: object, key: str) -> None:

@@ -20,7 +20,7 @@ from ..contacts.closing import close_finger, place_flush
 from ..scene.model import Polygon, Scene
 
 if TYPE_CHECKING:
-    from .definition import ModeGuess, Phase, Problem, Until
+    from .definition import Phase, Problem, Until
 
 
 SAME = 9  # decimals of an angle in degrees that a printed phase has at most
@@ -180,14 +180,12 @@ def describe_phase(phase: Phase, digits: int = 15) -> dict[str, Any]:
     if phase.settle is not None:
         own["settle"] = phase.settle
     if phase.guess:
-        own["guess"] = [_write_mode(mode, digits) for mode in phase.guess]
+        own["guess"] = []
+        for mode in phase.guess:
+            signs = "".join("-0+"[round(sign) + 1] for sign in mode.signs)
+            place = {"t": mode.t, "x": mode.x, "phi_deg": to_degrees(mode.phi, digits)}
+            own["guess"].append(place | {"signs": f"{signs[:-2]} {signs[-2:]}"})
     return own if phase.end.value == "rest" else own | {"end": phase.end.value}
-
-
-def _write_mode(mode: ModeGuess, digits: int) -> dict[str, Any]:
-    signs = "".join("-0+"[round(sign) + 1] for sign in mode.signs)
-    place = {"t": mode.t, "x": mode.x, "phi_deg": to_degrees(mode.phi, digits)}
-    return place | {"signs": f"{signs[:-2]} {signs[-2:]}"}
 
 
 def write_until(until: Until, digits: int = 15) -> Any:

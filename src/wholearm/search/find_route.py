@@ -181,7 +181,14 @@ def _plan_to_goal(
             chooser.run(1 + alternatives, report)
     except OutOfTime:
         if not chooser.made:
-            raise SolverError(_describe_missing(chooser, report.last)) from None
+            text = f"the time limit is over, and there is no plan yet: {len(search.reached)} places"
+            text += " looked at"
+            if chooser.found:
+                best = min(chooser.found, key=chooser.estimate)
+                count = sum(len(link.steps) for link in best.links)
+                duration = chooser.estimate(best)
+                text += f", a route of {count} phases found, of about {duration:.3g} s"
+            raise SolverError(f"{text}; what it was at: {report.last}") from None
         complete = False
     except KeyboardInterrupt:
         if hurry is None or not (chooser.made or chooser.found):
@@ -228,17 +235,6 @@ def _plan_to_goal(
     others = tuple(Alternative(other) for other, _ in made[1 : 1 + alternatives])
     failures, blocked = tuple(chooser.failures), tuple(search.blocked)
     return Answer(plan, route, bound, others, failures, blocked, len(search.reached), complete)
-
-
-def _describe_missing(chooser: Chooser, doing: str) -> str:
-    """What a search that is out of time has found, and its last step."""
-    text = f"the time limit is over, and there is no plan yet: {len(chooser.search.reached)} places"
-    text += " looked at"
-    if chooser.found:
-        best = min(chooser.found, key=chooser.estimate)
-        count = sum(len(link.steps) for link in best.links)
-        text += f", a route of {count} phases found, of about {chooser.estimate(best):.3g} s"
-    return f"{text}; what it was at: {doing}"
 
 
 def require_folder(folder: Path) -> None:
