@@ -27,7 +27,6 @@ from .edge_plans import (
     BackgroundTask,
     Lost,
     Measured,
-    are_alike,
     list_printed,
     measure_link,
     plan_links,
@@ -310,8 +309,10 @@ class Chooser:
         Their ends are those of plans of the route's links. If these have the torques and the
         objective of the plan, they are the initial guess, too.
         """
-        problem, options = self.problem, self.options
-        alike = are_alike(problem, options)
+        problem, options, scene = self.problem, self.options, self.problem.scene
+        # Plans of links are of least time, with torques that are free to jump.
+        slow = scene.has_slow_motors or scene.control_period > 0
+        alike = options.goal is Objective.TIME and not slow
         if not alike:
             options = replace(options, objective=Objective.TIME, duration=None)
             problem, options = free_torques(problem, options)
@@ -334,7 +335,7 @@ class Chooser:
         best: Plan | str = ""
         # Without guesses: query 61, whose guess leads to worse contact modes.
         for guesses in (True, False) if alike else (False,):
-            phases = list_printed(problem.scene, planned, guesses)
+            phases = list_printed(scene, planned, guesses)
             printed = replace(self.problem, phases=phases, goals=())
             plan = plan_phases(printed, self.options, self.roadmap.plans, report)
             if not isinstance(best, Plan) or (isinstance(plan, Plan) and plan.value < best.value):

@@ -192,12 +192,6 @@ class BackgroundTask(Generic[T]):
     result: T | None = None  # what it has returned
 
 
-def are_alike(problem: Problem, options: PlanOptions) -> bool:
-    """Whether plans of links are as those of a route: of least time with torques free to jump."""
-    scene = problem.scene
-    return options.goal.value == "time" and not (scene.has_slow_motors or scene.control_period)
-
-
 @exclusive
 def plan_links(
     problem: Problem,
