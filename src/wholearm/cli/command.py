@@ -958,9 +958,7 @@ def policy(options: argparse.Namespace) -> int:
     say = show_progress()
 
     def plan_anew(own: wholearm.Problem) -> wholearm.Trajectory:
-        from ..planning.plan import solve
-
-        return solve(own, replay=False, progress=say).trajectory
+        return wholearm.solve(own, replay=False, progress=say).trajectory
 
     def advise() -> str:
         """Whether a faster loop would do: what is lost between two periods is lost by lateness."""

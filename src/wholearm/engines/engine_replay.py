@@ -260,7 +260,6 @@ class _Part(NamedTuple):
     """A phase of a stretch: its rows of the run, and the plan there."""
 
     phase: Phase
-    contacts: tuple[str, ...]
     rows: NDArray[np.int64]
     want: Samples
 
@@ -305,7 +304,7 @@ def _divide(
     for index in stretch.phases:
         rows, motion = np.flatnonzero(owner == index), plan.motions[index]
         want = motion.evaluate(np.clip(run.t[rows] - starts[index], 0.0, motion.duration))
-        parts.append(_Part(problem.phases[index], motion.contacts, rows, want))
+        parts.append(_Part(problem.phases[index], rows, want))
     return parts
 
 
@@ -323,8 +322,8 @@ def _average(plan: Trajectory, part: _Part, run: EngineRun) -> list[Force]:
     planned = np.nanmean(motion.evaluate(middles).c_n, axis=0).tolist()
     share = np.diff(run.t)[ends - 1]
     press = share @ run.press[ends - 1] / share.sum()
-    found = [float(press[run.find_columns(name, scene)].sum()) for name in part.contacts]
-    rows = zip(part.contacts, planned, found, strict=True)
+    found = [float(press[run.find_columns(name, scene)].sum()) for name in motion.contacts]
+    rows = zip(motion.contacts, planned, found, strict=True)
     return [Force(part.phase.number, *row) for row in rows]
 
 

@@ -181,32 +181,26 @@ def _add_shapes(body: Element, scene: Scene, angle: float) -> None:
             _add_geom(body, shape.name, kind, size=shape.radius, **{key: ends})
 
 
-def list_ramps(scene: Scene, plan: Trajectory, step: float) -> tuple[Array, Array]:
-    """Rows of applied torque in increasing time: shape (n,) [s] and (n, 2) [N m].
+def add_clock(root: Element, scene: Scene, plan: Trajectory, step: float) -> None:
+    """Add clock, tendons, springs, and a keyframe for the start and for each phase.
 
-    At the start of a time step the lines between rows are at the average over that step, so that
-    torques that jump within one have the right effect.
+    At the start of a time step the lines between rows of torque are at the average over that step,
+    so that torques that jump within one have the right effect.
     """
-    rows = place_rows(apply_friction(scene, plan), BEND)
+    parts, rows = {part.tag: part for part in root}, place_rows(apply_friction(scene, plan), BEND)
     t, again = rows[:, 0] - step / 2, np.flatnonzero(np.diff(rows[:, 0]) <= 0)
     t[again] -= step / 2
     t[again + 1] += step / 2
     # Rows that are nearer to a step than that keep their order, a millionth of a step apart.
-    t = np.maximum.accumulate(t) + 1e-6 * step * np.arange(len(t))
-    return t, rows[:, 1:]
-
-
-def add_clock(root: Element, scene: Scene, plan: Trajectory, step: float) -> None:
-    """Add clock, tendons, springs, and a keyframe for the start and for each phase."""
-    t, tau = list_ramps(scene, plan, step)
+    t, tau = np.maximum.accumulate(t) + 1e-6 * step * np.arange(len(t)), rows[:, 1:]
     share = SHARE * scene.scales.time
     rises = np.diff(tau, axis=0) / share
     # The clock is driven by much more force than all springs exert.
     drive = 1e9 * (np.abs(rises).sum() + np.abs(tau[0]).sum() / share + scene.scales.force)
-    body = add(_find(root, "worldbody"), "body", name=CLOCK)
+    body = add(parts["worldbody"], "body", name=CLOCK)
     add(body, "inertial", pos=[0, 0, 0], mass=scene.scales.mass, diaginertia=[1, 1, 1])
     add(body, "joint", name=CLOCK, type="slide", axis=[0, 0, 1], damping=drive, **HIDDEN)
-    tendons, springs = add(root, "tendon"), _find(root, "actuator")
+    tendons, springs = add(root, "tendon"), parts["actuator"]
     spring = {"gainprm": [0], "biastype": "affine", **HIDDEN}
     add(springs, "general", name=CLOCK, joint=CLOCK, biasprm=[drive, 0, 0], **spring)
     for k, name in enumerate(("torque1", "torque2")):
@@ -220,18 +214,12 @@ def add_clock(root: Element, scene: Scene, plan: Trajectory, step: float) -> Non
             ramp = {"biasprm": [-slope * t[row], slope, 0], "forcerange": sorted((0.0, rise))}
             add(springs, "general", name=f"{name}-{row}", tendon=name, **ramp, **spring)
     # Keyframes with positions, velocities and the clock.
-    starts, keys = plan.phase_starts[:-1], _find(root, "keyframe")
+    starts = plan.phase_starts[:-1]
     firsts = [int(np.flatnonzero(plan.phase == index)[0]) for index in range(len(starts))]
     names = ["home", *(f"phase{number}" for number in range(1, len(starts) + 1))]
     for name, k in zip(names, [0, *firsts], strict=True):
-        at = plan.t[k]
-        add(keys, "key", name=name, time=at, qpos=[*plan.z[k], at], qvel=[*plan.z_dot[k], 1.0])
-
-
-def _find(root: Element, tag: str) -> Element:
-    found = root.find(tag)
-    assert found is not None
-    return found
+        state = {"qpos": [*plan.z[k], plan.t[k]], "qvel": [*plan.z_dot[k], 1.0]}
+        add(parts["keyframe"], "key", name=name, time=plan.t[k], **state)
 
 
 def add(parent: Element, tag: str, **attributes: object) -> Element:

@@ -62,17 +62,6 @@ if TYPE_CHECKING:
 SIMULATED: Any = {"color": "black", "linestyle": (0, (1, 2)), "linewidth": 1.0, "zorder": 5}
 
 
-def sample_torques(torque: TorqueProfile) -> tuple[Array, Array]:
-    """Times, shape (n,) [s], and torques, (n, 2) [N m], with both ends of every piece."""
-    pieces, _, order = torque.coefficients.shape
-    count = 2 if order <= 2 else max(order, math.ceil(2000 / pieces))
-    x = np.linspace(-1.0, 1.0, count)
-    middle, half = (torque.breaks[1:] + torque.breaks[:-1]) / 2, np.diff(torque.breaks) / 2
-    coefficients = np.ascontiguousarray(torque.coefficients)  # einsum's rounding depends on it
-    tau = np.einsum("kjd,xd->kxj", coefficients, np.vander(x, order, increasing=True))
-    return (middle[:, None] + half[:, None] * x).ravel(), tau.reshape(-1, 2)
-
-
 def draw_margins(
     axes: Axes, trajectory: Trajectory, epsilon: float, styles: Styles, covered: Array | None = None
 ) -> list[Line2D]:
@@ -181,7 +170,13 @@ def draw_torques(axes: Axes, torque: TorqueProfile, limits: Array) -> list[Line2
 
     Returns the lines of finger 1 and finger 2.
     """
-    t, tau = sample_torques(torque)
+    # Both ends of every piece, and between them as many places as show.
+    pieces, _, order = torque.coefficients.shape
+    x = np.linspace(-1.0, 1.0, 2 if order <= 2 else max(order, math.ceil(2000 / pieces)))
+    middle, half = (torque.breaks[1:] + torque.breaks[:-1]) / 2, np.diff(torque.breaks) / 2
+    coefficients = np.ascontiguousarray(torque.coefficients)  # einsum's rounding depends on it
+    tau = np.einsum("kjd,xd->kxj", coefficients, np.vander(x, order, increasing=True))
+    t, tau = (middle[:, None] + half[:, None] * x).ravel(), tau.reshape(-1, 2)
     lines = []
     for index, (colour, _) in enumerate(FINGERS):
         look: Any = {"color": colour, "linewidth": 2.2 - 0.8 * index, "zorder": 3 + index}
