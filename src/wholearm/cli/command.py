@@ -436,15 +436,9 @@ def clear_progress() -> None:
 
 def require_output(path: str | None, *endings: str) -> None:
     """Check, before long work, that a file can be written; without endings it is a figure."""
-    if path is None:
-        return
-    if not endings:
-        from ..figures.plots import require_format
-
-        require_format(path)
-    require_writable(path)
-    if endings:
-        require_ending(path, *endings)
+    if path is not None:
+        require_writable(path)
+        require_ending(path, *(endings or (".png", ".pdf", ".svg")))
 
 
 def finish(

@@ -23,7 +23,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from ..common.arrays import Array
 from ..common.errors import InputError, require_number
-from ..common.files import write_whole
+from ..common.files import require_ending, write_whole
 from ..common.sharing import exclusive
 from ..contacts.contact_limits import evaluate_finger_gap
 from ..contacts.elemental import parse_contact
@@ -367,14 +367,6 @@ def force_margins(
     return figure
 
 
-def require_format(path: str | os.PathLike[str]) -> str:
-    """Return the ending of `path`, or raise `InputError` if it is none of .png, .pdf and .svg."""
-    ending = os.path.splitext(path)[1].lower()
-    if ending not in _FORMATS:
-        raise InputError(str(path), "", f"ending {ending!r} given; allowed: {', '.join(_FORMATS)}")
-    return ending
-
-
 @exclusive
 def save(figure: Figure, path: str | os.PathLike[str], *, resolution: int = 180) -> None:
     """Write a figure as PNG, PDF or SVG, by the ending of `path`; equal figures, equal bytes.
@@ -383,7 +375,9 @@ def save(figure: Figure, path: str | os.PathLike[str], *, resolution: int = 180)
 
     Raises `InputError` if the ending is another one, or the file cannot be written.
     """
-    ending = require_format(path)
-    options: Any = {"format": ending[1:], "metadata": _FORMATS[ending], "dpi": resolution}
+    ending = require_ending(path, *_FORMATS)
+    # What a device or a pipe gets is a PNG.
+    kind = ending if ending in _FORMATS else ".png"
+    options: Any = {"format": kind[1:], "metadata": _FORMATS[kind], "dpi": resolution}
     with matplotlib.rc_context(STYLE):
         write_whole(path, lambda stream: figure.savefig(stream, **options))
