@@ -4,6 +4,7 @@ import gc
 import math
 import os
 import signal
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import pytest
@@ -55,10 +56,12 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> None:
     STORE.folder.mkdir(exist_ok=True)
 
 
-@pytest.fixture(autouse=True)
-def quiet(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope="session", autouse=True)
+def quiet() -> Iterator[None]:
     """No line of progress on stderr, however long a command takes on this machine."""
-    monkeypatch.setattr("wholearm.cli.command.EVERY", math.inf)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("wholearm.cli.command.EVERY", math.inf)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -69,7 +69,7 @@ def test_gaps_and_rows_are_those_of_rigid_bodies(scene: Scene) -> None:
         np.testing.assert_allclose(touch.tangent, rows.A_t[:, k], atol=1e-14)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@each("name", NAMES)
 def test_rows_are_the_derivatives_of_the_gap(scene: Scene, name: str) -> None:
     formation = make_formation(scene, name)
     z = configurations(2)
@@ -79,7 +79,7 @@ def test_rows_are_the_derivatives_of_the_gap(scene: Scene, name: str) -> None:
         np.testing.assert_allclose(A[:, k], rise[:, 0] / (2 * STEP), atol=DIFFERENCE)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@each("name", NAMES)
 def test_second_derivative_term(scene: Scene, name: str) -> None:
     formation = make_formation(scene, name)
     z = configurations(5)
@@ -117,7 +117,7 @@ def test_pointed_tip_has_no_arc() -> None:
         parse_contact("v1-tip1", pointed)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@each("name", NAMES)
 def test_slip_coordinate_integrates_the_sliding_velocity(scene: Scene, name: str) -> None:
     """Where a contact touches, the gradient of its slip is A_t, by derivative and difference."""
     formation = make_formation(scene, name)
@@ -229,7 +229,7 @@ def test_finger_that_is_too_short(finger: int) -> None:
         close_finger(scene, np.array([0.0, 0.03, 0.0]), finger)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@each("seed", range(5))
 def test_flush_edge_lies_on_the_palm(seed: int) -> None:
     rng = np.random.default_rng(seed)
     scene = make_scene(convex_polygon(rng, 6))

@@ -249,7 +249,7 @@ def test_ends_are_read() -> None:
     assert ends == [End.IMPACT, *4 * [End.REST]]
 
 
-@pytest.mark.parametrize(
+@each(
     "index, until, end, key, text",
     [
         (0, "v3-finger1", "bang", "end", "'bang' given; allowed are 'rest', 'smooth', 'impact'"),
@@ -311,9 +311,7 @@ def test_bad_file_names_the_file(tmp_path: Path, old: str, new: str, key: str, t
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    "content", [b"\xff\xfe", b"\x00", b"[[[[", b"a = " + b"9" * 5000, b"a = " + b"[" * 20_000]
-)
+@each("content", [b"\xff\xfe", b"\x00", b"[[[[", b"a = " + b"9" * 5000, b"a = " + b"[" * 20_000])
 def test_not_toml(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "bad.toml"
     path.write_bytes(content)
@@ -869,8 +867,8 @@ def test_goals_are_read_and_written(given: object, goals: tuple[Goal, ...]) -> N
     assert "goal" not in found.table and len(found.table["phases"]) == 5
 
 
-@pytest.mark.parametrize(
-    ("given", "text"),
+@each(
+    "given, text",
     [
         ({"x": 0.0}, "goal: neither flush nor phi_deg given"),
         ({"flush": 1, "phi_deg": 3.0}, "goal: flush and phi_deg are both given"),

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from refused import advising, ask_shoved
+from rows import each
 from scenes import PENTAGON, box, shove
 from shipped import FOLDER, HEPTAGON, problem_of, tipping
 from wholearm import PlanOptions, Problem, load_trajectory, plots
@@ -305,8 +306,8 @@ def test_only_confirmed_changes_are_found() -> None:
     assert find_changes([PRESSING], lambda _: -0.01, lambda *_: True) == []
 
 
-@pytest.mark.parametrize("limit, least", [(STRONGEST, 3.0), (PRESSING, 0.04)])
-@pytest.mark.parametrize("needed", [0.0, 0.013, 0.1, 0.49])
+@each("limit, least", [(STRONGEST, 3.0), (PRESSING, 0.04)])
+@each("needed", [0.0, 0.013, 0.1, 0.49])
 def test_more_than_the_least_is_found_closely(
     limit: Parameter, least: float, needed: float
 ) -> None:

@@ -15,6 +15,7 @@ import pytest
 from scipy.optimize import linprog
 
 from plane import SQUARE, make_formation, make_scene
+from rows import each
 from scenes import roll
 from wholearm import Objective
 from wholearm.common.arrays import Array, find_minima
@@ -584,8 +585,8 @@ def test_effort_is_the_integral_of_squared_torque(curves: tuple[Curve, ...], pha
     assert squares == pytest.approx((h / 2 * weights * power).sum(), rel=1e-7)
 
 
-@pytest.mark.parametrize("nodes", [11, 81])
-@pytest.mark.parametrize("deepest", [3e-3, 0.01, 0.05])
+@each("nodes", [11, 81])
+@each("deepest", [3e-3, 0.01, 0.05])
 def test_dips_next_to_rest_are_found(nodes: int, deepest: float) -> None:
     """Viscous friction goes with the root of the way: x - 2 sqrt(deepest x) is least there."""
     x = choose_sampling(nodes).checks

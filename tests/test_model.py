@@ -42,7 +42,7 @@ def test_zero_is_refused_where_it_means_nothing(key: str) -> None:
         replace(make_finger([0, 0]), **change)
 
 
-@pytest.mark.parametrize("base", [[0.1], [0.1, math.nan], "ab", None, [0.1, 0.2, 0.3]])
+@each("base", [[0.1], [0.1, math.nan], "ab", None, [0.1, 0.2, 0.3]])
 def test_bad_base(base: Any) -> None:
     with pytest.raises(InputError) as caught:
         replace(make_finger([0, 0]), base=base)
@@ -104,7 +104,7 @@ def test_every_number_of_a_finger_has_a_unit_of_the_scene() -> None:
     assert all(getattr(scene.scales, own.scale) > 0 for own in known.values())
 
 
-@pytest.mark.parametrize("given", ["\n" * 3, "\x00" * 5000, "x" * 5000, "\u2028", "\x1b[2J"])
+@each("given", ["\n" * 3, "\x00" * 5000, "x" * 5000, "\u2028", "\x1b[2J"])
 def test_a_message_is_one_line(given: str) -> None:
     text = str(InputError("a.toml", "name", f"{given} is not allowed"))
     assert text.isprintable() and len(text) <= 1000 + 10
@@ -166,7 +166,7 @@ def test_regular_polygon_has_textbook_inertia(count: int) -> None:
     np.testing.assert_allclose(polygon.centroid, [0.5, -0.7], rtol=1e-13)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@each("seed", range(6))
 def test_centroid_and_inertia_equal_quadrature(seed: int) -> None:
     rng = np.random.default_rng(seed)
     corners = convex_polygon(rng, 3 + seed)
@@ -181,7 +181,7 @@ def test_given_inertia_is_kept_and_points_may_be_lists() -> None:
     assert (polygon.mass, polygon.inertia, polygon.n_vertices) == pytest.approx((1.0, 0.25, 4))
 
 
-@pytest.mark.parametrize("edge", range(5))
+@each("edge", range(5))
 def test_flush_edge_lies_below_the_object(edge: int) -> None:
     polygon = Polygon(convex_polygon(np.random.default_rng(edge), 5), 1.0)
     heights = rotate(polygon.flush_angle(edge), polygon.vertices)[:, 1]
@@ -251,7 +251,7 @@ def test_far_from_the_origin_only_the_corners_lose_digits(seed: int) -> None:
     np.testing.assert_allclose(away.vertices, here.vertices, rtol=0, atol=1e-12 * size)
 
 
-@pytest.mark.parametrize(
+@each(
     "points, text",
     [
         (1e-5 * np.array(SQUARE) / np.abs(SQUARE).max(), "allowed are 0.0001 to 1000 m"),

@@ -14,6 +14,7 @@ from scipy.optimize import linprog
 
 from independent import balances
 from once import once
+from rows import each
 from shipped import HEPTAGON, problem_of, solved
 from toys import LIMIT, Toy, constant
 from wholearm import Formation, InputError, Problem, simulate, simulate_free, solve
@@ -189,8 +190,8 @@ def test_keys_are_checked_and_kept() -> None:
     assert again.table["settle"] == 0.02 and again.table["phases"][1]["settle"] == 0
 
 
-@pytest.mark.parametrize(
-    ("changes", "key", "allowed"),
+@each(
+    "changes, key, allowed",
     [
         ({"settle": -1}, "settle", ">= 0"),
         ({"settle": 1e9}, "settle", "allowed are"),
@@ -352,7 +353,7 @@ def test_keys_of_motors_are_checked_and_kept(heptagon: Problem, key: str, value:
     assert other.with_(torque_rate_limit2=None).scene.fingers[1].torque_rate_limit == np.inf
 
 
-@pytest.mark.parametrize("seed", range(8))
+@each("seed", range(8))
 def test_one_motor_is_at_its_rate_or_its_command_throughout(heptagon: Problem, seed: int) -> None:
     rng = np.random.default_rng(seed)
     rates, lags = 10 ** rng.uniform(1, 4, 2), 10 ** rng.uniform(-4, -1, 2) * [seed > 2, seed > 5]

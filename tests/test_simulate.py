@@ -33,6 +33,7 @@ from planned import (
 )
 from pushing import pushed, rocking
 from retelling import RETELLINGS, Retelling
+from rows import each
 from scenes import constant, hexagon, measure_fingers, shorten, slid
 from shipped import HEPTAGON, IMPACTS, plan_of, problem_of
 from wholearm import Formation, Phase, Problem, TorqueProfile, Trajectory, Until, simulate, verify
@@ -391,8 +392,8 @@ def test_error_estimate_bounds_the_error() -> None:
         assert abs(state - np.exp(-length)) < float(estimate) * 2 * tolerance
 
 
-@pytest.mark.parametrize("power", [1, 3, 5])
-@pytest.mark.parametrize("root", [1e-7, 3e-4, 0.7])
+@each("power", [1, 3, 5])
+@each("root", [1e-7, 3e-4, 0.7])
 def test_events_are_located_at_multiple_roots(power: int, root: float) -> None:
     # A joint that starts without acceleration turns back like t^3.
     def fall(x: float) -> float:
@@ -680,7 +681,7 @@ def test_baseline_agrees_with_the_dynamics(names: tuple[str, ...]) -> None:
             assert np.allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max())
 
 
-@pytest.mark.parametrize("power", range(8))
+@each("power", range(8))
 def test_weights_integrate_polynomials(power: int) -> None:
     nodes = np.array(stepper.NODES)
     total = sum(w * nodes[j] ** power for j, w in stepper.WEIGHTS.items())

@@ -234,8 +234,8 @@ def test_scene_starts_with_closed_fingers(seed: int) -> None:
 SQUARE = np.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]])
 
 
-@pytest.mark.parametrize(
-    ("segment", "apart"),
+@each(
+    "segment, apart",
     [
         ([[2.0, 0.5], [3.0, 0.5]], 1.0),
         ([[2.0, 2.0], [3.0, 2.0]], np.sqrt(2.0)),

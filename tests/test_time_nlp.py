@@ -118,8 +118,8 @@ def test_the_whole_interval_is_integrated_to_the_order(name: str, degree: int) -
         np.testing.assert_allclose(scheme.integrals[-1], scheme.weights, atol=1e-10)
 
 
-@pytest.mark.parametrize("degree, counts", [(1, (64, 128)), (2, (8, 16)), (3, (4, 8)), (4, (2, 4))])
-@pytest.mark.parametrize("name", NAMES)
+@each("degree, counts", [(1, (64, 128)), (2, (8, 16)), (3, (4, 8)), (4, (2, 4))])
+@each("name", NAMES)
 def test_a_linear_equation_is_integrated_to_the_order(
     name: str, degree: int, counts: tuple[int, int]
 ) -> None:
@@ -552,7 +552,7 @@ def test_kernels_have_the_derivatives_of_their_expression(which: int) -> None:
     np.testing.assert_allclose(H, np.triu(bend), atol=1e-8)
 
 
-@pytest.mark.parametrize(
+@each(
     "name, degree, points",
     [
         ("radau", 1, [1.0]),
@@ -570,7 +570,7 @@ def test_points_are_the_tabulated_ones(name: str, degree: int, points: list[floa
     np.testing.assert_allclose(got, points, atol=3e-7 if degree > 3 else 1e-14)
 
 
-@pytest.mark.parametrize("degree", DEGREES)
+@each("degree", DEGREES)
 def test_legendre_points_and_weights_are_those_of_gauss(degree: int) -> None:
     x, weights = np.polynomial.legendre.leggauss(degree)
     scheme = make_scheme("legendre", degree)

@@ -324,7 +324,7 @@ def test_linear_rows_with_a_step(tmp_path: Path) -> None:
     assert at(profile, [1.25, 2.0]) == [[2.5, 1.5], [1.0, 3.0]]
 
 
-@pytest.mark.parametrize(
+@each(
     "text",
     [
         "tau2, note ,t,tau1\n-1,a,0,1\n-2,b,0.5,2\n0,c,0.5,4\n3,,2,1\n",
@@ -333,7 +333,6 @@ def test_linear_rows_with_a_step(tmp_path: Path) -> None:
         "\ufeff" + GOOD,
         GOOD.replace("0.5", "5e-1").replace(",", " , "),
     ],
-    ids=["other columns", "CRLF", "blank lines", "byte-order mark", "spaces"],
 )
 def test_the_same_file_in_other_words(tmp_path: Path, text: str) -> None:
     profile = read_torque_csv(write(tmp_path / "a.csv", text))
@@ -508,7 +507,7 @@ def test_samples(rate: float) -> None:
     assert len(hold) == 2 * (count - 1) and hold[-1, 0] == linear[-1, 0]
 
 
-@pytest.mark.parametrize("rate", [0.0, -1.0, math.nan, math.inf, 0.5, 1e8])
+@each("rate", [0.0, -1.0, math.nan, math.inf, 0.5, 1e8])
 def test_rates_out_of_range(rate: float) -> None:
     with pytest.raises(InputError) as caught:
         sample_rows(bent(), rate, "linear")

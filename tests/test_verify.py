@@ -13,6 +13,7 @@ import pytest
 
 from plane import make_formation, make_scene
 from planned import brake_less, change, plan, plan_landing
+from rows import each
 from scenes import PALM, box, measure_fingers, scale, slid, tipped
 from shipped import BOX, HEPTAGON, plan_of, problem_of
 from wholearm import Formation, Friction, PlanOptions, Problem, Report, Scene, simulate
@@ -334,8 +335,8 @@ def test_a_replay_far_from_its_plan_fails() -> None:
     assert verify(problem, dataclasses.replace(trajectory, q=elsewhere), departure=0.02).ok
 
 
-@pytest.mark.parametrize("key", ["departure", "rest_speed"])
-@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
+@each("key", ["departure", "rest_speed"])
+@each("value", [0.0, -1.0, math.nan, math.inf])
 def test_tolerances_are_positive(key: str, value: float) -> None:
     problem, trajectory = plan()
     with pytest.raises(InputError) as caught:
