@@ -421,31 +421,25 @@ def read_goals(table: Mapping[str, Any]) -> tuple[Goal, ...]:
     ------
     InputError  if what is given is neither a table nor a list of tables, or a key is unknown
     """
-    given = table.get("goal", [])
+    given, goals = table.get("goal", []), list[Goal]()
     several = isinstance(given, list)
-    return tuple(
-        _read_goal(entry, f"goal[{index}]" if several else "goal")
-        for index, entry in enumerate(given if several else [given], start=1)
-    )
+    for index, entry in enumerate(given if several else [given], start=1):
+        key = f"goal[{index}]" if several else "goal"
+        if not isinstance(entry, Mapping):
+            raise InputError("", key, f"{entry!r} given; {_GOAL}")
+        for name in entry:
+            if name not in GOAL:
+                raise InputError("", f"{key}.{name}", f"unknown key; {_GOAL}")
+        phi, x = entry.get("phi_deg"), entry.get("x")
+        phi = None if phi is None else math.radians(require_number(phi, f"{key}.phi_deg"))
+        x = None if x is None else require_number(x, f"{key}.x")
+        goals.append(Goal(entry.get("flush"), phi, x))
+    return tuple(goals)
 
 
 def name_goal(goals: Sequence[Goal], index: int) -> str:
     """The key of a goal, by its index from 0."""
     return "goal" if len(goals) == 1 else f"goal[{index + 1}]"
-
-
-def _read_goal(entry: object, key: str) -> Goal:
-    if not isinstance(entry, Mapping):
-        raise InputError("", key, f"{entry!r} given; {_GOAL}")
-    for name in entry:
-        if name not in ("flush", "phi_deg", "x"):
-            raise InputError("", f"{key}.{name}", f"unknown key; {_GOAL}")
-    phi, x = entry.get("phi_deg"), entry.get("x")
-    return Goal(
-        entry.get("flush"),
-        None if phi is None else math.radians(require_number(phi, f"{key}.phi_deg")),
-        None if x is None else require_number(x, f"{key}.x"),
-    )
 
 
 def require_phases(problem: Problem) -> None:

@@ -93,11 +93,6 @@ def measure_apart(scene: Scene, z: Array, other: Array) -> float:
     return float(np.abs((z - other) / [length, length, 1, 1, 1]).max())
 
 
-def unit_steps(scene: Scene) -> Array:
-    """One unit of (x, phi): a radius of gyration and a radian, shape (2,)."""
-    return np.array([scene.scales.length, 1.0])
-
-
 def is_flush(place: RoadmapPlace, edge: int) -> bool:
     """Whether an edge lies on the palm."""
     count = place.scene.polygon.n_vertices

@@ -55,18 +55,12 @@ from .places import (
     list_formations_at,
     make_place,
     measure_along,
-    unit_steps,
 )
 
 NODES = 12  # intervals of a path
 
 STEPS, MIDDLES, PART = make_cosine_grid(NODES)
 """Intervals over the path's length, and the places in them where limits are kept."""
-
-
-def list_middles(starts: Array, ends: Array) -> Array:
-    """Poses at `MIDDLES` of paths between poses (n, 2), shape (n, NODES, 2)."""
-    return np.asarray(starts[:, None] + MIDDLES[:, None] * (ends - starts)[:, None])
 
 
 def can_start(scene: Scene, epsilon: float, labels: Numbers, poses: Array, runs: Array) -> Flags:
@@ -86,7 +80,7 @@ def time_paths(scene: Scene, epsilon: float, labels: Numbers, starts: Array, end
     """
     if not len(ends):
         return np.zeros(0)
-    poses = list_middles(starts, ends).reshape(-1, 2)
+    poses = (starts[:, None] + MIDDLES[:, None] * (ends - starts)[:, None]).reshape(-1, 2)
     labels, runs = np.repeat(labels, NODES, axis=0), np.repeat(ends - starts, NODES, axis=0)
     rows, cap = _evaluate(scene, epsilon, labels, poses, runs)
     limits = PathLimits(rows.reshape(-1, NODES, *rows.shape[1:]), cap.reshape(-1, NODES))
@@ -313,11 +307,11 @@ def go_to(
     scene = start.scene
     label = np.array([contact_table(scene).index(contact) for contact in formation.contacts])
     begin = np.broadcast_to(start.z[[0, 2]], poses.shape)
-    middles = list_middles(begin, poses)
+    middles = begin[:, None] + MIDDLES[:, None] * (poses - begin)[:, None]
     places = np.concatenate([middles, poses[:, None]], axis=1)
     labels = label_cells(scene, *places.reshape(-1, 2).T)[:, [0, 2, 4]]
     inside = (labels == label).all(axis=1).reshape(places.shape[:2]).all(axis=1)
-    inside &= np.abs((poses - begin) / unit_steps(scene)).max(axis=1) > NEAREST
+    inside &= np.abs((poses - begin) / [scene.scales.length, 1.0]).max(axis=1) > NEAREST
     if not inside.any():
         return None
     ends = poses[inside]
@@ -359,7 +353,7 @@ def shoot(places: Sequence[RoadmapPlace], epsilon: float) -> Rays:
     scene = places[0].scene
     cells, held = _list_cells(places)
     angles = 2 * np.pi * (np.arange(HEADINGS) + 0.5) / HEADINGS
-    headings = np.column_stack([np.cos(angles), np.sin(angles)]) * unit_steps(scene)
+    headings = np.column_stack([scene.scales.length * np.cos(angles), np.sin(angles)])
     sources = np.repeat(np.arange(len(places)), HEADINGS)
     starts = np.array([place.z[[0, 2]] for place in places])[sources]
     runs = np.tile(headings, (len(places), 1))
