@@ -233,27 +233,17 @@ class ContactSolution(NamedTuple):
 
 
 def solve_lcp(M: Array, q: Array) -> ContactSolution:
-    """Solve w = M z + q, z >= 0, w >= 0, z w = 0 by Lemke's method; M (n, n) is near one."""
+    """Solve w = M z + q, z >= 0, w >= 0, z w = 0 by Lemke's method; M (n, n) is near one.
+
+    Complementary pivoting until the artificial unknown z_0 leaves the basis.
+    """
     n = len(q)
-    size = float(np.abs(q).max(initial=0.0))
-    if n == 0 or (q >= 0).all():
+    if (q >= 0).all():
         return ContactSolution(np.zeros(n), q.copy(), 0.0)
-    solutions = []
-    # Least pivots above and below the rounding of redundant rows.
-    for least in (1e-8, 1e-11):
-        solutions.append(_pivot(M, q, size, least))
-        if solutions[-1].residual <= 1e-10 * size:
-            break
-    return min(solutions, key=lambda solution: solution.residual)
-
-
-def _pivot(M: Array, q: Array, size: float, least: float) -> ContactSolution:
-    """Complementary pivoting until the artificial unknown leaves the basis."""
-    n = len(q)
-    # Columns: the right-hand side, w, z and the artificial z_0.
+    # Columns: the right-hand side, w, z and z_0.
     table = np.empty((n, 2 * n + 2))
-    table[:, 0], table[:, 1 : n + 1], table[:, n + 1 : -1] = q / size, np.eye(n), -M
-    table[:, -1] = -1.0
+    table[:, 0], table[:, 1 : n + 1] = q / float(np.abs(q).max()), np.eye(n)
+    table[:, n + 1 : -1], table[:, -1] = -M, -1.0
     basis = np.arange(1, n + 1)
     row, entering = _choose(table, np.arange(n), -np.ones(n)), 2 * n + 1
     for _ in range(60 * n):
@@ -267,7 +257,8 @@ def _pivot(M: Array, q: Array, size: float, least: float) -> ContactSolution:
             return _read(M, q, basis)
         entering = leaving + n if leaving <= n else leaving - n
         column = table[:, entering]
-        rising = (column > least).nonzero()[0]
+        # Smaller pivots are rounding of redundant rows.
+        rising = (column > 1e-8).nonzero()[0]
         if not len(rising):
             break
         # The artificial unknown goes as soon as it may: its level is what is missing.
@@ -1006,6 +997,9 @@ class Watch:
     end, ahead, spans       the same at its end
     level : (N,) [m]        gap at which a pair that touches closes
     watched : (N,)          1 for pairs that do not press
+    alarm                   whether some pair has closed, or has come into range and overlaps, by
+                            the end
+    travel                  length of the step in units of the scene
     """
 
     def __init__(self, system: System) -> None:
@@ -1027,21 +1021,12 @@ class Watch:
         self.end[:split], self.end[split:] = out[:split], out[s.to.acceleration]
         self._h[0] = s.inputs[s.at.h]
         self._calls[0]()
+        self.alarm, self.travel = bool(self._flags[1]), float(self._flags[2])
 
     def advance(self) -> float:
         """Start the next step from the end of this one; how long it may be, `REACH` at most [s]."""
         self.motion[:], self._start[:] = self.end, self._seen
         return float(self._flags[0])
-
-    @property
-    def alarm(self) -> bool:
-        """Whether some pair has closed, or has come into range and overlaps, by the end."""
-        return bool(self._flags[1])
-
-    @property
-    def travel(self) -> float:
-        """Length of the step in units of the scene."""
-        return float(self._flags[2])
 
     def may_close(self, least: float) -> bool:
         """Whether some pair may close within the step, if it is at least so long."""
