@@ -28,7 +28,7 @@ from ..simulation.complementarity import FreeRun
 from ..simulation.events import Event, EventKind, FreeSimulation
 from ..simulation.simulate import simulate_free
 from ..simulation.system import REST_WINDOW, build_system
-from ..verification.free import FreeReport, find_losses, verify_free
+from ..verification.free import FreeReport, find_losses, list_leaving, verify_free
 from ..verification.verdict import DEPARTURE
 from .slow_speeds import SQUEEZE, find_torques, sample_path
 
@@ -299,7 +299,7 @@ class Passage:
     def list_pressed(self, index: int) -> list[str]:
         """The contacts of a phase that press to its end: without those that it releases."""
         phase, after = self.phases[index], (*self.phases[1:], self.after)[index]
-        leaving = _list_leaving(phase, after) if phase.until.is_release else set()
+        leaving = list_leaving(phase, after) if phase.until.is_release else set()
         return [name for name in phase.formation.names if name not in leaving]
 
     def follow(self, events: Sequence[Event]) -> tuple[list[float], Event | None]:
@@ -324,7 +324,7 @@ def split_passages(problem: Problem) -> list[Passage]:
     for phase, after in zip(problem.phases, (*problem.phases[1:], None), strict=True):
         own.append(phase)
         # A contact that goes on as the one which ends the phase is carried on in motion.
-        gained, leaving = phase.until.contact, _list_leaving(phase, after)
+        gained, leaving = phase.until.contact, list_leaving(phase, after)
         ending = [own for own in phase.formation.contacts if own.name in leaving]
         moves = gained is not None and takes_over(gained, problem.scene, ending)
         if after is None or (phase.end is End.REST and not moves):
@@ -345,12 +345,7 @@ def _is_end(phase: Phase, after: Phase | None, event: Event) -> bool:
         gains = EventKind.GAINED, EventKind.IMPACT, EventKind.PASS
         return event.kind in gains and event.contact == until.contact.name
     gone = event.kind is EventKind.CONTACT_LOST
-    return until.is_release and gone and event.contact in _list_leaving(phase, after)
-
-
-def _list_leaving(phase: Phase, after: Phase | None) -> set[str]:
-    kept = () if after is None else after.formation.names
-    return set(phase.formation.names) - set(kept)
+    return until.is_release and gone and event.contact in list_leaving(phase, after)
 
 
 @dataclass(frozen=True, eq=False)

@@ -235,11 +235,14 @@ def _find_end(
         passed = rows[values[rows] * values[rows[0]] <= 0]
         times = simulation.t[passed[:1]].tolist()
     else:
-        kept = set() if after is None else set(after.formation.names)
-        leaving = set(phase.formation.names) - kept
         lost = [e for e in later if e.kind is EventKind.CONTACT_LOST]
-        times = [e.time for e in lost if e.contact in leaving]
+        times = [e.time for e in lost if e.contact in list_leaving(phase, after)]
     return min(times, default=None)
+
+
+def list_leaving(phase: Phase, after: Phase | None) -> set[str]:
+    """Contacts of a phase that the next one does not have."""
+    return set(phase.formation.names) - set(() if after is None else after.formation.names)
 
 
 def find_losses(
