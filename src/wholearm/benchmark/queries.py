@@ -60,7 +60,7 @@ class Queries(Study):
 
     def limit(self, case: Case) -> float:
         """Two searches."""
-        return 180.0
+        return 600.0
 
     def run(self, case: Case) -> Row:
         """Ask a query, and a second one or what is planned for the phases that are printed."""

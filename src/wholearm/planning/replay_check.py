@@ -142,11 +142,17 @@ def _improve(
 
     A plan that holds by the tolerances of `verify` is only refined, once. For one that fails:
     without cost-to-go, as short phases after a landing magnify its residual speed; on finer
-    intervals; without mode search; with a larger epsilon, as at a reversal a replay may stick for
-    an instant, with another force.
+    intervals; for the largest margin in less time, as slow motions are less stable in open loop;
+    without mode search; with a larger epsilon, as at a reversal a replay may stick for an instant,
+    with another force.
     """
     index, fails = planning.find_block(number), check.failure is not None
     block, others = planning.blocks[index], list[Callable[[], Planning]]()
+
+    begun = replace(block, finer=BEGUN)
+    again = replace(
+        planning, blocks=tuple(begun if own is block else own for own in planning.blocks)
+    )
 
     def replan(changed: Planning, finer: int) -> Planning:
         levels = [own.finer for own in planning.blocks]
@@ -157,6 +163,14 @@ def _improve(
     if fails and planning.ahead and any(ahead):
         alone = replace(planning, blocks=(), ahead=False)
         others.append(partial(plan_each, alone, [0] * len(every), report))
+    if fails and planning.allowed and block.finer != 0:
+        # Query 37 of `bench queries` has no plan of least margin otherwise.
+        least = {phase.index: planning.least[phase.index].motion.duration for phase in block.phases}
+        allowed = [
+            (own + least[k]) / 2 if k in least else own for k, own in enumerate(planning.allowed)
+        ]
+        if sum(allowed[k] for k in least) > 1.1 * sum(least.values()):
+            others.append(partial(replan, replace(again, allowed=allowed), block.finer))
     most = (REFINEMENTS if block.chain else ROUGH) if fails else 1
     if PLAIN != block.finer < most and (block.chain or block.intervals < FINEST):
         others.append(partial(replan, planning, block.finer + 1))
@@ -164,10 +178,8 @@ def _improve(
         others.append(partial(replan, planning, PLAIN))
     short = _find_dip(planning, block, check) if index not in planning.more else 0.0
     if fails and short:
-        begun = replace(block, finer=BEGUN)
-        blocks = tuple(begun if own is block else own for own in planning.blocks)
         more = planning.more | {index: SPARE * short}
-        others.append(partial(replan, replace(planning, more=more, blocks=blocks), block.finer))
+        others.append(partial(replan, replace(again, more=more), block.finer))
     for plan in others:
         try:
             return plan()

@@ -306,8 +306,9 @@ class Chooser:
     def _plan(self, route: RoadmapRoute, report: Callable[[str], None]) -> Plan | str:
         """The plan of the phases that are printed for a route.
 
-        Their ends are those of plans of the route's links. If these have the torques and the
-        objective of the plan, they are the initial guess, too.
+        Their ends are those of plans of the route's links. These are the initial guess, too, if
+        they have the torques and the objective of the plan; for another objective if there is no
+        plan without (query 19, margin).
         """
         problem, options, scene = self.problem, self.options, self.problem.scene
         # Plans of links are of least time, with torques that are free to jump.
@@ -334,13 +335,13 @@ class Chooser:
         reached = sum(link.duration for link in planned)
         best: Plan | str = ""
         # Without guesses: query 61, whose guess leads to worse contact modes.
-        for guesses in (True, False) if alike else (False,):
+        for guesses in (True, False) if alike else (False,) if slow else (False, True):
             phases = list_printed(scene, planned, guesses)
             printed = replace(self.problem, phases=phases, goals=())
             plan = plan_phases(printed, self.options, self.roadmap.plans, report)
             if not isinstance(best, Plan) or (isinstance(plan, Plan) and plan.value < best.value):
                 best = plan
-            if isinstance(plan, Plan) and plan.value < AGREES * reached:
+            if isinstance(plan, Plan) and not (alike and plan.value >= AGREES * reached):
                 break
         return best
 
