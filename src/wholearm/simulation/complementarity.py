@@ -786,16 +786,19 @@ class FreeRun(Run):
     def _hold(self) -> None:
         """Let time pass at rest until forces leave their bounds, or the torques end."""
         self.record(still=True)
+        decided = True
         while True:
-            breach = find_breach(self._list_margins(), self.fraction(self.t))
+            breach = find_breach(self._list_margins(decided), self.fraction(self.t))
+            decided = False
             self.wait(self.time(breach) if breach < 1 else self.stop)
             if breach < 1 or not self.next_piece():
                 return
 
-    def _list_margins(self) -> Array:
+    def _list_margins(self, decided: bool) -> Array:
         """Margins at rest, polynomials of x in [-1, 1] on the present piece, (m, d + 1), scaled.
 
-        All are affine in the torques: they follow from the steps' forces under three torques.
+        All are affine in the torques: they follow from the steps' forces under three torques. Where
+        it is `decided` that everything rests at present, accelerations there are rounding.
         """
         self.load(self.modes)
         s, at, to = self.s, self.s.inputs, self.s.to
@@ -814,7 +817,9 @@ class FreeRun(Run):
         margins, rates = values[:count], values[count:]
         margins[:, 0] += ROUNDING_FORCE
         creeps = np.vstack([-rates, rates])
-        creeps[:, 0] += 10 * STILL
+        present = np.abs(creeps @ self.fraction(self.t) ** np.arange(creeps.shape[1]))
+        # Contacts are nearly dependent where two fingers come to rest on each other.
+        creeps[:, 0] += np.maximum(10 * STILL, 2 * present * decided)
         return np.vstack([margins, creeps])
 
     # Motion.
