@@ -275,10 +275,10 @@ def finish(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
 def hold_torques(search: TimeSearch, free: TimeSolution) -> TimeSolution:
     """Plan with torques held over control periods, from one with free torques.
 
-    Continuation in the period: torques held over two periods are held over one, too. The motion
-    has a dozen of the longest; each solution is the guess for half the period. Where a finger's tip
-    passes round a corner (pentagon, eight phases), none is found for 1 ms from free torques alone,
-    and one that lasts 1.2 % longer for 2 ms.
+    Where no duration leads to one, continuation in the period: torques held over two periods are
+    held over one, too. The motion has a dozen of the longest; each solution is the guess for half
+    the period. Where a finger's tip passes round a corner (pentagon, eight phases), none is found
+    for 1 ms from free torques alone.
     """
     scene, options = search.problem.scene, search.options
     controls = 2 if scene.control_hold == "linear" else 1
@@ -289,16 +289,13 @@ def hold_torques(search: TimeSearch, free: TimeSolution) -> TimeSolution:
     # Durations over those with free torques, and least numbers of periods.
     stretches = ((1.01, 2), (1.03, 2), (1.07, 3), (1.15, 4), (1.3, 6), (1.6, 8))
     found: TimeSolution | None = None
-    for factor in 2.0 ** np.arange(doublings, -1, -1):
-        cut = partial(cut_periods, scheme=held.scheme, period=factor * period)
-        guesses = chain(
-            [cut(found.stages)] if found else [],
-            (cut(free.stages, stretch=stretch, least=least) for stretch, least in stretches),
-        )
-        tried = (_solve_held(held, stages) for stages in guesses)
+    for doubled in (0, *range(doublings, -1, -1)):
+        cut = partial(cut_periods, scheme=held.scheme, period=2**doubled * period)
+        guesses = (cut(free.stages, stretch=stretch, least=least) for stretch, least in stretches)
+        tried = (_solve_held(held, own) for own in ([cut(found.stages)] if found else guesses))
         found = next((solution for solution in tried if solution.success), None)
-    if found:
-        return found._replace(error=free.error, free=free)
+        if found and found.stages[0].period == period:
+            return found._replace(error=free.error, free=free)
     status = f"no torques held over {scene.control_hold} periods were found"
     return free._replace(status=status, success=False)
 
