@@ -397,13 +397,6 @@ def test_bad_trajectory_files(
     assert not Path("a.png").exists()
 
 
-def test_plot(folder: Path, planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["plot", str(planned / "plan.npz"), "-o", "a.png"]) == 0
-    assert capsys.readouterr().out == "wrote a.png\n"
-    assert Path("a.png").read_bytes().startswith(b"\x89PNG")
-    assert [path.name for path in folder.iterdir()] == ["a.png"]
-
-
 def run(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-W", "error", *arguments]
     return subprocess.run(command, capture_output=True, text=True, **options)
@@ -439,6 +432,9 @@ def test_bad_input_is_told_before_anything_heavy_is_imported() -> None:
     assert run("-c", code).stdout == "2 []\n"
 
 
+NEW = "new out.toml --polygon 4 --size 0.05"
+
+
 def run_in_shell(command: str, redirection: str) -> tuple[int, str]:
     """Exit status and stderr of a command with a redirection."""
     run = subprocess.run(
@@ -452,31 +448,30 @@ def run_in_shell(command: str, redirection: str) -> tuple[int, str]:
 
 @pytest.mark.skipif(os.name != "posix", reason="redirections of a POSIX shell")
 @pytest.mark.parametrize(
-    ("redirection", "status", "message"),
+    ("command", "redirection", "status", "message"),
     [
-        (">&-", 0, ""),
-        ("2>&-", 0, ""),
-        ("> /dev/full", 1, "cannot be written: No space left on device\n"),
+        ("help", ">&-", 0, ""),
+        ("help", "2>&-", 0, ""),
+        (NEW, "> /dev/full", 1, "cannot be written: No space left on device\n"),
     ],
 )
 def test_output_that_cannot_be_written_is_no_traceback(
-    folder: Path, redirection: str, status: int, message: str
+    folder: Path, command: str, redirection: str, status: int, message: str
 ) -> None:
-    got, errors = run_in_shell("new out.toml --polygon 4 --size 0.05", redirection)
+    got, errors = run_in_shell(command, redirection)
     assert (got, errors) == (status, message and f"wholearm: standard output: {message}")
-    assert Path("out.toml").exists()
+    assert Path("out.toml").exists() is (command == NEW)
 
 
 def test_a_closed_pipe_is_no_traceback(folder: Path) -> None:
-    path = write_problem(folder, keep(1))
-    command = [sys.executable, "-m", "wholearm", "solve", path, "-o", "a.npz"]
+    command = [sys.executable, "-m", "wholearm", *NEW.split()]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert process.stdout is not None and process.stderr is not None
     process.stdout.close()
     assert process.stderr.read() == b""
     process.stderr.close()
     assert process.wait() == 1
-    assert Path("a.npz").exists()
+    assert Path("out.toml").exists()
 
 
 def list_parsers(parser: argparse.ArgumentParser) -> list[argparse.ArgumentParser]:

@@ -142,6 +142,17 @@ CALLS = re.findall(r"`(wholearm\.\w[\w.]*\([^`]*\))`", "".join(map(read, PAGES))
 
 
 @pytest.fixture
+def line(request: pytest.FixtureRequest) -> str:
+    """A line that is run."""
+    own: str = request.param
+    words = shlex.split(own)[1:]
+    quick = words[0] in QUICK and not {"--policy", "--free", "free"} & {*words}
+    if not quick and not request.config.getoption("--slow"):
+        pytest.skip("slow: --slow runs it")
+    return own
+
+
+@pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A current folder with the files that the lines name."""
     monkeypatch.chdir(tmp_path)
@@ -226,14 +237,9 @@ RUN = [
 ]
 
 
-@pytest.mark.parametrize("line", RUN)
-def test_shell_lines_run(
-    line: str, folder: Path, request: pytest.FixtureRequest, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.parametrize("line", RUN, indirect=True)
+def test_shell_lines_run(line: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = shlex.split(line)[1:]
-    quick = words[0] in QUICK and not {"--policy", "--free", "free"} & {*words}
-    if not quick and not request.config.getoption("--slow"):
-        pytest.skip("slow: --slow runs it")
     if "mujoco" in words:
         pytest.importorskip("mujoco")
     if "pent.toml" in words:

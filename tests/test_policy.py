@@ -6,7 +6,6 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -30,6 +29,7 @@ from wholearm.policy.make import (
     retime_within,
 )
 from wholearm.policy.regulator import RATE, SAME, Linear, hold_end, regulate
+from wholearm.results.dwell_record import assemble
 from wholearm.simulation.simulate import simulate_free
 from wholearm.verification.free import verify_policy
 
@@ -227,17 +227,18 @@ def test_an_end_without_a_gained_contact_is_held(problem: Problem) -> None:
 
 
 def test_a_landing_without_a_reserve_is_planned_anew() -> None:
-    # The last two phases, from where the other heptagon's fifth one begins, too.
-    whole, other = problem_of(LANDING), plan_of(HEPTAGON)
-    start = other.z[np.flatnonzero(other.phase == 4)[0]]
+    # The last two phases alone.
+    whole, known = problem_of(LANDING), plan_of(LANDING)
     phases = tuple(replace(phase, index=k) for k, phase in enumerate(whole.phases[4:]))
-    problem = replace(whole, start=start, phases=phases)
+    own = known.torque.cut(known.phase_starts[4], known.duration)
+    torque = TorqueProfile(own.breaks - own.breaks[0], own.coefficients)
+    meta = {key: known.meta[key][4:] for key in ("modes", "rolling")}
+    plan = assemble(known.motions[4:], torque, dict(known.meta) | meta, 201)
+    problem = replace(whole, start=plan.z[0], phases=phases)
 
     def planner(own: Problem) -> Trajectory:
-        options: dict[str, Any] = {"time_intervals": 6, "replay": False}
-        return wholearm.solve(own, **options).trajectory
+        return wholearm.solve(own, time_intervals=4, replay=False).trajectory
 
-    plan = planner(problem)
     policy = make_policy(problem, plan, planner=planner)
     law = policy.laws[-1]
     assert isinstance(law, MotionLaw)

@@ -218,7 +218,7 @@ def heptagon() -> Problem:
 @pytest.fixture(scope="module")
 def slow(heptagon: Problem) -> tuple[Problem, Plan]:
     problem = heptagon.with_(torque_rate_limit=500.0, actuator_lag2=1e-3)
-    return problem, solve(problem, replay=False, intervals=60)
+    return problem, solve(problem, replay=False, intervals=40)
 
 
 def fastest(rate: float) -> float:

@@ -34,7 +34,7 @@ from scenes import (
     tip,
     tipped,
 )
-from shipped import FOLDER, HEPTAGON, IMPACTS, LANDING, plan_of, problem_of, tipping
+from shipped import FOLDER, HEPTAGON, IMPACTS, LANDING, plan_of, problem_of
 from timed import (
     fastest_landing,
     instants,
@@ -107,7 +107,7 @@ def gentle() -> list[PhasePlan[TimeMotion]]:
 
 @once
 def in_time() -> Trajectory:
-    """The heptagon's last slide and a part of its flip, for which curves are, over time."""
+    """The heptagon's last slide, for which curves are, over time."""
     options: dict[str, Any] = {"time_intervals": 8, "replay": False}
     return solve(turning(), transcription="time", **options).trajectory
 
@@ -115,8 +115,8 @@ def in_time() -> Trajectory:
 @cache
 def turning() -> Problem:
     whole = problem_of(HEPTAGON)
-    phases = tuple(replace(phase, index=k) for k, phase in enumerate(whole.phases[2:4]))
-    return replace(whole, start=trace_phases(whole)[1].end, phases=phases)
+    phase = replace(whole.phases[2], index=0)
+    return replace(whole, start=trace_phases(whole)[1].end, phases=(phase,))
 
 
 @cache
@@ -125,8 +125,8 @@ def thrown(
 ) -> tuple[Problem, Trajectory, float]:
     """A problem of one and two contacts, its plan, and the time that its second phase takes."""
     problem, expected = throw()
-    plan = solve(problem, objective, time_intervals=8, uniqueness_margin=ANY)
-    return problem, plan.trajectory, expected
+    options: dict[str, Any] = {"time_intervals": 8, "uniqueness_margin": ANY, "replay": False}
+    return problem, solve(problem, objective, **options).trajectory, expected
 
 
 def statistics(stages: list[StageMotion]) -> float:
@@ -137,18 +137,16 @@ def statistics(stages: list[StageMotion]) -> float:
     return sum(stage.duration * (1.0 + float(own @ share)) for stage, own, share in parts)
 
 
-@pytest.mark.parametrize("phase", [2, 3])
 def test_least_times_agree_with_those_along_the_curve(
-    curves: tuple[Curve, ...], trajectory: Trajectory, phase: int
+    curves: tuple[Curve, ...], trajectory: Trajectory
 ) -> None:
-    plan = in_time()
-    motion, expected = plan.motions[phase - 2], trajectory.meta["phase_durations"][phase]
+    (motion,), expected = in_time().motions, trajectory.meta["phase_durations"][2]
     assert isinstance(motion, TimeMotion)
     # Two discretisations of one problem: torques are linear over a 16th of the phase here, or half
     # of that where they switch, so that it takes longer.
     assert -1e-4 < motion.duration / expected - 1 < 1e-3
     end = motion.stages[-1].points.nodes[-1]
-    np.testing.assert_allclose(end[0], curves[phase].end, atol=1e-8)
+    np.testing.assert_allclose(end[0], curves[2].end, atol=1e-8)
     np.testing.assert_allclose(end[1], 0.0, atol=1e-6)
     # Friction is against the motion, which one freedom leaves no choice.
     for stage in motion.stages:
@@ -211,8 +209,11 @@ def test_rolling_contacts_are_planned_like_along_the_curve() -> None:
     assert verify(problem, within).ok
 
 
-def test_a_contact_passes_from_a_link_over_its_tip_to_an_edge() -> None:
+def test_a_contact_passes_from_a_link_over_its_tip_to_an_edge(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Its three features follow in one motion, and an impact that leaves the tip."""
+    monkeypatch.setattr("wholearm.planning.plan._find_saving", lambda *_: np.nan)
     whole = build_problem(tomllib.loads(LYING))
     z = whole.start
     for phase in whole.phases[:3]:
@@ -294,6 +295,8 @@ def test_one_and_two_contacts_are_planned_for_every_objective(
     if objective == "margin":
         # Phases without a choice may limit both.
         assert least[1] > least[0] - SLACK
+        one, other = plan.meta["phase_values"]
+        assert one == other
 
 
 def test_friction_never_pushes_the_wrong_way(stages: list[StageMotion]) -> None:
@@ -365,16 +368,17 @@ def test_values_are_those_of_the_objective(
         value = sum(plan.value for plan in gentle)
         assert value == pytest.approx(statistics(stages_of(gentle)), rel=1e-4)
         return
-    allowed = 2.0 * total(coarse)
-    plans = plan_landing(objective="margin", time_intervals=COARSE, duration=allowed)
-    assert total(plans) < allowed * (1 + 1e-8)
+    problem, allowed = raised(), 0.07
+    given = problem, problem.phases, problem.start
+    plans = plan_phases(*given, PlanOptions("margin", time_intervals=COARSE), allowed)
+    # With more time it would be larger.
+    assert total(plans) == pytest.approx(allowed, rel=1e-8)
     samples = [stage.evaluate(instants(stage, 12)) for stage in stages_of(plans)]
     least = min(part.c_n.min() for part in samples)
-    assert plans[0].value == plans[1].value
     # Forces keep to it between points too, where limits are tightened a little too much.
     assert plans[0].value < least + SLACK
     assert plans[0].value == pytest.approx(least, rel=2e-3)
-    assert plans[0].value > 0.5
+    assert plans[0].value > 5 * problem.epsilon
 
 
 def test_the_effort_of_a_gentle_plan_is_least(
@@ -574,7 +578,7 @@ def test_an_impact_that_is_not_possible_next_to_a_landing_is_a_stop() -> None:
     phases = [replace(phase, index=k) for k, phase in enumerate(whole.phases[3:])]
     phases[0] = replace(phases[0], end=End.IMPACT)
     one = replace(whole, start=trace_phases(whole)[2].end, phases=tuple(phases))
-    struck = solve(one, time_intervals=6, replay=False)
+    struck = solve(one, time_intervals=4, replay=False)
     (row,) = struck.meta["transitions"]
     assert (row["phase"], row["possible"], row["gained"]) == (1, False, "v4-finger1")
     assert row["least_impulse"] < 0 and row["least_impulse_contact"] in row["reason"]
@@ -671,7 +675,7 @@ def test_the_links_are_kept_apart_between_points_too() -> None:
 def test_plans_are_the_same_whichever_way_a_joint_is_guessed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    problem, options = raised(), PlanOptions(time_intervals=10)
+    problem, options = raised(), PlanOptions(time_intervals=6)
 
     def guess_wrong(*given: object, **named: object) -> list[Stage]:
         stages = guess_stages(*given, **named)  # type: ignore[arg-type]
@@ -699,7 +703,7 @@ def test_what_may_slide_or_roll_is_faster_than_what_has_to_roll() -> None:
     (phase,) = problem.phases
     rolls = replace(phase, formation=roll(phase.formation, "v1-palm"))
     bound = solve(replace(problem, phases=(rolls,)), intervals=10, replay=False).trajectory
-    plan = solve(problem, time_intervals=6, replay=False).trajectory
+    plan = solve(problem, time_intervals=4, replay=False).trajectory
     assert plan.duration < 0.95 * bound.duration
     report = verify(problem, plan)
     assert report.ok, report.to_text()
@@ -795,15 +799,6 @@ def test_another_place_than_the_one_pinned_fails() -> None:
             assert failure.text.endswith(f"and not with v2-palm at x = {x:g} m")
 
 
-def test_a_motion_that_slides_while_it_tips_is_planned() -> None:
-    problem = tipping()
-    options = PlanOptions(time_intervals=4, accuracy=1e-2)
-    (plan,) = plan_phases(problem, problem.phases, problem.start, options, explained=False)
-    samples = plan.motion.evaluate(np.linspace(0.0, plan.motion.duration, 50))
-    assert np.degrees(samples.z[-1, 2]) == pytest.approx(9.5, abs=1e-5)
-    assert samples.c_n.min() > problem.epsilon - 1e-6
-
-
 def test_a_vertex_in_a_corner_may_go_back_first() -> None:
     """The triangle turns about a vertex in the corner of palm and link, which first goes back."""
     table = dict(read_problem(str(FOLDER / "triangle.toml")).table)
@@ -814,16 +809,19 @@ def test_a_vertex_in_a_corner_may_go_back_first() -> None:
     z = close_contacts(phase.formation, near, np.zeros(0), ((2, 0.0),))
     assert z is not None
     own = replace(problem, start=z, phases=(replace(phase, index=0),))
-    plan = solve(own, time_intervals=10, replay=False).trajectory
+    plan = solve(own, time_intervals=6, replay=False).trajectory
     report = verify(own, plan)
     assert report.ok, report.to_text()
 
 
-def test_the_estimated_error_is_about_that_of_a_finer_plan() -> None:
-    coarse, fine = plan_landing(time_intervals=6), plan_landing()
-    lost = total(coarse) / total(fine) - 1
-    assert fine[0].error < PlanOptions().accuracy < coarse[0].error == coarse[1].error
-    assert lost == pytest.approx(coarse[0].error - fine[0].error, rel=0.6)
+def test_the_estimated_error_is_about_that_of_a_finer_plan(
+    coarse: list[PhasePlan[TimeMotion]],
+) -> None:
+    fine = plan_of(LANDING).meta
+    lost = total(coarse) / sum(fine["phase_durations"][4:]) - 1
+    error = fine["phase_errors"][4]
+    assert error < PlanOptions().accuracy < coarse[0].error == coarse[1].error
+    assert lost == pytest.approx(coarse[0].error - error, rel=0.6)
 
 
 def replace_scene(stages: list[Stage], problem: Problem) -> list[Stage]:
@@ -831,8 +829,7 @@ def replace_scene(stages: list[Stage], problem: Problem) -> list[Stage]:
     return [replace(stage, formation=problem.phases[stage.phase].formation) for stage in stages]
 
 
-@pytest.mark.parametrize("contact", ["palm", "finger1", "finger2"])
-def test_friction_is_worth_what_a_little_less_of_it_saves(contact: str) -> None:
+def test_friction_is_worth_what_a_little_less_of_it_saves() -> None:
     """By the envelope theorem: as much as the Lagrangian falls, all else as it is."""
     problem, share = landing(), 1e-3
     start = trace_phases(problem)[-1].end
@@ -841,21 +838,26 @@ def test_friction_is_worth_what_a_little_less_of_it_saves(contact: str) -> None:
     assert begun is not None
     solution = TimeSearch.of(problem, least).solve(list_stages(begun))
     assert solution.success
-    mu = getattr(landing().scene.friction, contact)
-    other = landing().with_({f"friction_{contact}": (1 - share) * mu})
-    values = list[float]()
-    for problem in (landing(), other):
-        stages = replace_scene(solution.stages, in_own_units(problem))
-        nlp = TimeSearch.of(problem, least).build(stages)
+
+    def value(other: Problem) -> float:
+        stages = replace_scene(solution.stages, in_own_units(other))
+        nlp = TimeSearch.of(other, least).build(stages)
         x = pack([stage.guess for stage in stages], nlp.layouts, 0.0)
         g = nlp.solver.function.get_function("nlp_g")(x, [])
-        values.append(float(solution.multipliers["lam_g0"] @ g.full()[:, 0]))
-    own = [
-        solution.price_friction(k)[..., [n.endswith(contact) for n in stage.formation.names]].sum()
-        for k, stage in enumerate(solution.stages)
-    ]
-    # The other way is less by twice of all there is.
-    assert values[0] - values[1] == pytest.approx(share / 2 * sum(own), rel=1e-6, abs=1e-12)
+        return float(solution.multipliers["lam_g0"] @ g.full()[:, 0])
+
+    for contact in ("palm", "finger1", "finger2"):
+        mu = getattr(problem.scene.friction, contact)
+        other = problem.with_({f"friction_{contact}": (1 - share) * mu})
+        own = [
+            solution.price_friction(k)[
+                ..., [name.endswith(contact) for name in stage.formation.names]
+            ].sum()
+            for k, stage in enumerate(solution.stages)
+        ]
+        # The other way is less by twice of all there is.
+        saved = pytest.approx(share / 2 * sum(own), rel=1e-6, abs=1e-12)
+        assert value(problem) - value(other) == saved
 
 
 def draw(rng: np.random.Generator, count: int) -> tuple[Array, Array, Array]:
