@@ -241,7 +241,7 @@ def test_printed_phases_have_the_plan_that_they_are_printed_for() -> None:
     planned = [
         PhasePlan(own, plan.trajectory.torque, own.duration) for own in plan.trajectory.motions
     ]
-    block = BlockPlan(plan.problem.phases, plan.problem.start, 0, planned, None)
+    block = BlockPlan(plan.problem.phases, plan.problem.start, planned, None)
     links = [PlannedLink(plan.problem.phases, (block,))]
     phases = list_printed(plan.problem.scene, links, guesses=True)
     printed = replace(plan.problem, phases=phases)

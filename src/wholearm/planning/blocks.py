@@ -63,9 +63,6 @@ from .phase_plan import (
 if TYPE_CHECKING:
     from ..geometry.tracing import CostToGo
 
-PLAIN = -1  # refinement level: first number of intervals, no search for modes
-BEGUN = -2  # refinement level: coarse plans, which may miss limits between points
-FINEST = 64  # most intervals of a phase in the time domain after refinement
 BEND = 1e-6  # largest 1 - cosine between tangents that count as the same
 
 
@@ -75,9 +72,9 @@ class BlockPlan:
 
     phases: tuple[Phase, ...]
     start: Array  # (5,)
-    finer: int  # refinement level: doublings of its intervals, or `PLAIN` or `BEGUN`
     plans: Plans  # one for each of its phases
     chain: ImpactSequence | None  # its curves; None in the time domain
+    coarse: bool = False  # whether its plans may miss limits between points
 
     @property
     def end(self) -> Array:
@@ -85,11 +82,6 @@ class BlockPlan:
         if self.chain is not None:
             return self.chain.curves[-1].end
         return end_of(self.plans[-1])[0]
-
-    @property
-    def intervals(self) -> int:
-        """Most intervals of a phase in the time domain."""
-        return max(len(plan.torque.coefficients) for plan in self.plans)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,22 +148,22 @@ def plan_blocks(
     """
     with name_source(problem.source):
         require_steps(problem, options)
-    finer, planning = [0] * len(split_blocks(problem)), Planning(problem, curves, options, ())
+    planning = Planning(problem, curves, options, ())
     if options.goal is Objective.MARGIN:
         first = replace(
             planning, options=replace(options, objective=Objective.TIME, duration=None), ahead=False
         )
-        least = plan_each(_begin_each(first, report), finer, report).plans
+        least = plan_each(_begin_each(first, report), report).plans
         planning = replace(planning, allowed=share_duration(least, options.duration), least=least)
-        return plan_each(planning, finer, report)
-    return plan_each(_begin_each(planning, report), finer, report)
+        return plan_each(planning, report)
+    return plan_each(_begin_each(planning, report), report)
 
 
-def plan_each(planning: Planning, finer: Sequence[int], report: Callable[[str], None]) -> Planning:
-    """Plan block after block at its refinement level, but for those that are planned so."""
-    made = replace(planning, blocks=())
-    for level, block in zip_longest(finer, planning.blocks):
-        made = plan_next(made, level, block, report)
+def plan_each(planning: Planning, report: Callable[[str], None]) -> Planning:
+    """Plan block after block, but for those that are planned and not coarse."""
+    made, count = replace(planning, blocks=()), len(split_blocks(planning.problem))
+    for _, block in zip_longest(range(count), planning.blocks):
+        made = plan_next(made, block, report)
     return _require_margin(made)
 
 
@@ -186,7 +178,7 @@ def _begin_each(planning: Planning, report: Callable[[str], None]) -> Planning:
         return planning
     for index in range(len(blocks)):
         try:
-            begun = plan_next(begun, BEGUN, None, report)
+            begun = plan_next(begun, None, report, coarse=True)
         except WholearmError as error:
             short = error.shortfalls if isinstance(error, InfeasibleError) else ()
             # A better plan of earlier phases does not help against large violations.
@@ -197,23 +189,24 @@ def _begin_each(planning: Planning, report: Callable[[str], None]) -> Planning:
 
 
 def plan_next(
-    planning: Planning, finer: int, known: BlockPlan | None, report: Callable[[str], None]
+    planning: Planning,
+    known: BlockPlan | None,
+    report: Callable[[str], None],
+    coarse: bool = False,
 ) -> Planning:
-    """Plan the next block at a refinement level, unless `known` is that.
+    """Plan the next block, in the time domain coarsely if asked, unless `known` is its plan.
 
-    A coarse one (`BEGUN`) is the guess.
+    A coarse one is the guess.
     """
     problem, options, least = planning.problem, planning.options, planning.least
     phases = split_blocks(problem)[len(planning.blocks)]
     z = planning.blocks[-1].end if planning.blocks else problem.start
-    if finer == BEGUN and runs_along_curves(phases, options):
-        finer = 0
+    coarse = coarse and not runs_along_curves(phases, options)
     rounding = 1e-9 * problem.scene.scales.length
     moved = known is not None and measure_speed(problem.scene, known.start - z) > rounding
-    if known is None or moved or known.finer != finer:
+    if known is None or moved or known.coarse:
         numbers = "-".join(str(phase.number) for phase in phases)
         report(f"phase {numbers} of {len(problem.phases)}: {options.goal.value}")
-        own = _refine(options, known, finer)
         with name_source(problem.source):
             more = planning.more.get(len(planning.blocks), 0.0)
             pressed = replace(problem, epsilon=problem.epsilon + more) if more else problem
@@ -221,29 +214,15 @@ def plan_next(
                 replace(planning, problem=pressed),
                 phases,
                 z,
-                own,
-                to_go=look_ahead(planning, phases, own) if planning.ahead else None,
+                options,
+                to_go=look_ahead(planning, phases, options) if planning.ahead else None,
                 ample=1.1 * min((plan.value for plan in planning.plans), default=math.inf),
                 fastest=[least[phase.index] for phase in phases if least],
-                begun=known.plans if known and known.finer == BEGUN else (),
-                only_begin=finer == BEGUN,
+                begun=known.plans if known and known.coarse else (),
+                only_begin=coarse,
             )
-        known = BlockPlan(phases, z, finer, *made)
+        known = BlockPlan(phases, z, *made, coarse)
     return replace(planning, blocks=(*planning.blocks, known))
-
-
-def _refine(options: PlanOptions, known: BlockPlan | None, finer: int) -> PlanOptions:
-    """Options for a block at a refinement level."""
-    if finer in (0, BEGUN):
-        return options
-    if finer == PLAIN:
-        return replace(options, mode_search=False)
-    wanted = options.time_intervals
-    if known is not None and known.chain is None:
-        doublings = 0 if known.finer == BEGUN else finer - known.finer
-        wanted = min(known.intervals * 2**doublings, FINEST)
-    along = (options.intervals or 80) * 2**finer  # doubled where none are given
-    return replace(options, intervals=along, time_intervals=wanted)
 
 
 def plan_block(

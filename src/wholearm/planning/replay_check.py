@@ -1,4 +1,4 @@
-"""Verification of a plan by simulation of its torques, and refinement where it fails.
+"""Verification of a plan by simulation of its torques, and other plans where it fails.
 
 The residual of the equations of motion is independent of the planner (`verification.newton_euler`).
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,11 +25,8 @@ from ..scene.model import Scales
 from ..verification.newton_euler import balance
 from ..verification.verdict import Allowance, find_least_force, measure_departure
 from ..verification.verify import describe_motors, find_commands, judge, observe
-from .blocks import BEGUN, FINEST, PLAIN, BlockPlan, Planning, look_ahead, plan_each
-from .phase_plan import split_blocks
+from .blocks import BlockPlan, Planning, plan_each
 
-REFINEMENTS = 3  # most doublings of the intervals of a block
-ROUGH = 2  # the same in the time domain, before the mode search is left out: some modes never hold
 SPARE = 2.0  # additional normal force over a small shortfall
 RESIDUAL = 1e-8  # largest relative residual of the equations of motion; rounding leaves 1e-13
 _FINER = 8.0  # divisor of the error of the rows of a table when its replay does not hold
@@ -86,34 +82,21 @@ class ReplayCheck(NamedTuple):
 def replay_plan(
     planning: Planning, report: Callable[[str], None]
 ) -> tuple[Planning, ReplayFigures]:
-    """Replay a plan and refine blocks until it holds; ReplayError if it does not.
-
-    Blocks are refined, too, if the plan holds by the tolerances of `verify` only.
-    """
-    problem, usual = planning.problem, Allowance()
-    strict = usual.scale(0.5)  # share of the tolerances for a plan, if there is another
-    simulations, known = 0, None
+    """Replay a plan, and other plans of blocks until one holds; ReplayError if none does."""
+    problem, allowance, simulations = planning.problem, Allowance(), 0
     while True:
         simulations += 1
         report("replaying the plan")
-        check, accepted = check_plan(problem, planning.trajectory, strict, usual)
+        check = check_plan(problem, planning.trajectory, allowance)
         if check.failure is None:
             break
-        if accepted.failure is None:
-            known = planning, accepted
         durations = np.diff(planning.trajectory.phase_starts)
-        number = check.find_culprit(problem.scene.scales, strict, durations)
-        better = _improve(planning, number, accepted, report)
-        if better is None and known is not None:
-            planning, check = known
-            break
+        number = check.find_culprit(problem.scene.scales, allowance, durations)
+        better = _improve(planning, number, check, report)
         if better is None:
-            block = planning.blocks[planning.find_block(number)]
-            finer = f", with {2**block.finer} times the intervals" if block.finer > 0 else ""
-            reason = accepted.failure[1] if accepted.failure else ""
             raise ReplayError(
-                f"the plan of phase {number} does not hold in its replay{finer}: "
-                f"{reason}; other intervals or another objective may do, and "
+                f"the plan of phase {number} does not hold in its replay: "
+                f"{check.failure[1]}; other intervals or another objective may do, and "
                 "--no-replay (replay=False) leaves the check out"
             )
         planning = better
@@ -128,7 +111,6 @@ def replay_plan(
             for own in check.report.phases
         ),
         check.residual.size,
-        tuple(block.finer for block in planning.blocks for _ in block.phases),
         check.report.steps,
         simulations,
     )
@@ -140,49 +122,29 @@ def _improve(
 ) -> Planning | None:
     """The first other plan of the block with phase `number` that there is, None without one.
 
-    A plan that holds by the tolerances of `verify` is only refined, once. For one that fails:
-    without cost-to-go, as short phases after a landing magnify its residual speed; on finer
-    intervals; for the largest margin in less time, as slow motions are less stable in open loop;
-    without mode search; with a larger epsilon, as at a reversal a replay may stick for an instant,
-    with another force.
+    For the largest margin in less time, as slow motions are less stable in open loop: query 37 of
+    `bench queries`. Then with a larger epsilon, as at a reversal a replay may stick for an instant,
+    with another force: least effort of leg 22 of seed 7.
     """
-    index, fails = planning.find_block(number), check.failure is not None
-    block, others = planning.blocks[index], list[Callable[[], Planning]]()
-
-    begun = replace(block, finer=BEGUN)
+    index, others = planning.find_block(number), list[Planning]()
+    block = planning.blocks[index]
+    coarse = replace(block, coarse=True)
     again = replace(
-        planning, blocks=tuple(begun if own is block else own for own in planning.blocks)
+        planning, blocks=(*planning.blocks[:index], coarse, *planning.blocks[index + 1 :])
     )
-
-    def replan(changed: Planning, finer: int) -> Planning:
-        levels = [own.finer for own in planning.blocks]
-        return plan_each(changed, [*levels[:index], finer, *levels[index + 1 :]], report)
-
-    every = split_blocks(planning.problem)
-    ahead = (look_ahead(planning, own, planning.options) is not None for own in every)
-    if fails and planning.ahead and any(ahead):
-        alone = replace(planning, blocks=(), ahead=False)
-        others.append(partial(plan_each, alone, [0] * len(every), report))
-    if fails and planning.allowed and block.finer != 0:
-        # Query 37 of `bench queries` has no plan of least margin otherwise.
+    if planning.allowed:
         least = {phase.index: planning.least[phase.index].motion.duration for phase in block.phases}
         allowed = [
             (own + least[k]) / 2 if k in least else own for k, own in enumerate(planning.allowed)
         ]
         if sum(allowed[k] for k in least) > 1.1 * sum(least.values()):
-            others.append(partial(replan, replace(again, allowed=allowed), block.finer))
-    most = (REFINEMENTS if block.chain else ROUGH) if fails else 1
-    if PLAIN != block.finer < most and (block.chain or block.intervals < FINEST):
-        others.append(partial(replan, planning, block.finer + 1))
-    if fails and any(plan.sequences > 1 for plan in block.plans) and block.finer != PLAIN:
-        others.append(partial(replan, planning, PLAIN))
+            others.append(replace(again, allowed=allowed))
     short = _find_dip(planning, block, check) if index not in planning.more else 0.0
-    if fails and short:
-        more = planning.more | {index: SPARE * short}
-        others.append(partial(replan, replace(again, more=more), block.finer))
-    for plan in others:
+    if short:
+        others.append(replace(again, more=planning.more | {index: SPARE * short}))
+    for other in others:
         try:
-            return plan()
+            return plan_each(other, report)
         except (InfeasibleError, SolverError):
             continue
     return None
@@ -202,16 +164,14 @@ def _find_dip(planning: Planning, block: BlockPlan, check: ReplayCheck) -> float
     return short if 0.0 < short < 2e-3 * problem.scene.scales.force else 0.0
 
 
-def check_plan(
-    problem: Problem, trajectory: Trajectory, *allowances: Allowance
-) -> list[ReplayCheck]:
-    """Replay of a plan by each of the tolerances, and residual of the equations of motion."""
+def check_plan(problem: Problem, trajectory: Trajectory, allowance: Allowance) -> ReplayCheck:
+    """Replay of a plan, and residual of the equations of motion."""
     residual = find_residual(problem, trajectory)
     try:
         seen = observe(problem, trajectory.torque, trajectory)
     except (JammingError, SimulationError) as error:
-        return [ReplayCheck(error, residual) for _ in allowances]
-    return [ReplayCheck(judge(seen, allowance), residual) for allowance in allowances]
+        return ReplayCheck(error, residual)
+    return ReplayCheck(judge(seen, allowance), residual)
 
 
 def find_residual(problem: Problem, trajectory: Trajectory) -> Residual:

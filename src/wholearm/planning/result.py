@@ -233,7 +233,9 @@ def _read_replay(given: Mapping[str, Any]) -> ReplayFigures:
         {**own, **{key: own[key] and rename(own[key]) for key in ("end_deviation", "deviation")}}
         for own in given["phases"]
     ]
-    found: ReplayFigures = restore(ReplayFigures, {**given, "phases": phases})
+    # In earlier versions intervals were doubled for a replay to hold.
+    known = {key: value for key, value in given.items() if key != "refinements"}
+    found: ReplayFigures = restore(ReplayFigures, {**known, "phases": phases})
     return found
 
 
@@ -369,16 +371,15 @@ def _describe_replay(plan: Plan) -> str:
     if replay is None:
         return "the plan was not replayed"
     ends = [phase.end_deviation for phase in replay.phases if phase.end_deviation]
-    least, finer = replay.least_c_n, max(replay.refinements)
+    least = replay.least_c_n
     short = epsilon - least.value
     below = f", {short:.1e} N below epsilon between samples" if short > 1e-6 * least.value else ""
-    text = (
+    return (
         f"replayed: least c_n {least.value:{fixed(epsilon or 0.05, 5)}} N on "
         f"{least.contact}{below}, off by at most "
         f"{max((end.position for end in ends), default=0.0):.1e} m and "
         f"{max((end.angle for end in ends), default=0.0):.1e} rad at the ends of phases"
     )
-    return text + (f", with up to {2**finer} times the intervals" if finer > 0 else "")
 
 
 def _list_bounds(plan: Plan) -> Table:

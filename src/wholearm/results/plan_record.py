@@ -138,9 +138,6 @@ class ReplayFigures(NamedTuple):
     least_c_n: LeastForce
     phases: tuple[ReplayedPhase, ...]
     residual: float  # what the samples leave of the equations of motion, in the scene's own units
-    # how often the intervals of each phase were doubled for the replay to hold; -1 for a plan
-    # without a search for contact modes
-    refinements: tuple[int, ...]
     steps: int  # of the simulation
     # how many replays were made before one held, that one included; None where a file of an earlier
     # version does not say

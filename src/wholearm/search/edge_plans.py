@@ -25,7 +25,7 @@ from ..geometry.path_guess import STILL, count_freedoms, find_end
 from ..geometry.tracing import trace_phase
 from ..mechanics.dynamics import metric_weights
 from ..mechanics.speed_sweep import NoMotionError
-from ..planning.blocks import BEGUN, BlockPlan, Planning, plan_next
+from ..planning.blocks import BlockPlan, Planning, plan_next
 from ..planning.explain import unadvised
 from ..planning.lower_bound import look_along
 from ..planning.options import Objective, PlanOptions
@@ -336,8 +336,8 @@ class _LinkPlanner:
                 ends = first.end is not End.REST or first.index == count - 1
                 if measured and measured.begun and ends:
                     start = planning.blocks[-1].end if planning.blocks else z
-                    guess = BlockPlan(part, start, BEGUN, list(measured.begun), None)
-                planning = plan_next(planning, 0, guess, self.report)
+                    guess = BlockPlan(part, start, list(measured.begun), None, coarse=True)
+                planning = plan_next(planning, guess, self.report)
         pinned = [
             pin_landing(phase, end_of(plan)[0])
             for phase, plan in zip(phases[:count], planning.plans, strict=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,10 +57,6 @@ class Allowance:
 
     def __post_init__(self) -> None:
         read_keys(self)
-
-    def scale(self, share: float) -> Allowance:
-        """A share of what is allowed from the plan; the speed that passes for rest stays."""
-        return replace(self, departure=share * self.departure, stray=share * self.stray)
 
     def measure_stray(self, problem: Problem) -> float:
         """How far normal forces of a plan may fall below epsilon, rounding included [N]."""
