@@ -23,9 +23,9 @@ friction in its cone, so that only more is allowed than any motion needs: where 
 is negative, nothing moves.
 
 A motion with two freedoms from rest to the end of its phase follows some curve x(u), phi(u).
-Cubic curves to many places of the end are drawn at random, and those with the largest `fast_margin`
-are bent further as long as these grow: a search for a plan that shares neither transcription nor
-guesses with the planner.
+Cubic curves to many places of the end are straight or drawn at random, and the largest
+`fast_margin` of them counts: a search for a plan that shares neither transcription nor guesses with
+the planner.
 """
 
 from __future__ import annotations
@@ -240,7 +240,7 @@ Bounds = list[tuple[float | None, float | None]]
 def slow_margin(scene: Scene, phase: Phase, epsilon: float, z: Array, z_s: Array) -> float:
     """Least margin of all places, each at its best, for vanishing speed."""
     curve = np.arange(1.0 * len(z)), z, z_s, np.zeros_like(z)
-    margin = _solve_along(scene, phase, epsilon, curve, np.zeros(len(z)), 0.0)
+    margin = _solve_along(scene, phase, epsilon, curve, np.zeros(len(z)))
     return float(np.nan_to_num(margin, nan=-np.inf))
 
 
@@ -250,7 +250,6 @@ def fast_margin(
     epsilon: float,
     curve: tuple[Array, Array, Array],
     rests: tuple[bool, bool] = (True, True),
-    loose: float = 0.0,
 ) -> float:
     """Margin of the best motion along a curve.
 
@@ -258,8 +257,6 @@ def fast_margin(
     ----------
     curve  as of `event_tracing.resample`
     rests  whether the motion is at rest at the start and at the end of the curve
-    loose  rate of sliding over that of the whole motion below which a contact may also roll, or
-           slide the other way, on a curve nearby: its friction may then be any in its cone
     """
     s, z, z_s = curve
     with np.errstate(divide="ignore"):
@@ -267,7 +264,7 @@ def fast_margin(
     top = np.minimum(1e6, joints / scene.scales.speed**2)
     top[[0, -1]] *= ~np.array(rests)
     z_ss = np.gradient(z_s, s, axis=0, edge_order=1)
-    return _solve_along(scene, phase, epsilon, (s, z, z_s, z_ss), top, loose)
+    return _solve_along(scene, phase, epsilon, (s, z, z_s, z_ss), top)
 
 
 def _solve_along(
@@ -276,7 +273,6 @@ def _solve_along(
     epsilon: float,
     curve: tuple[Array, Array, Array, Array],
     top: Array,
-    loose: float,
 ) -> float:
     """Largest margin along a curve (s, z, z_s, z_ss), b being at most `top` at its n places.
 
@@ -284,9 +280,7 @@ def _solve_along(
     interval, and the margin.
     """
     s, z, z_s, z_ss = curve
-    n, n_c = len(s), phase.formation.n_contacts
-    slow = np.abs(slides(scene, phase, z, z_s)[:, :n_c]) < loose
-    signs, free = _signs(scene, phase, z, z_s), slow[1:] | slow[:-1] if loose else None
+    n, signs = len(s), _signs(scene, phase, z, z_s)
     slope = diags_array(scene.scales.length / (2 * np.diff(s))) @ (
         eye_array(n - 1, n, k=1) - eye_array(n - 1, n)
     )
@@ -294,14 +288,14 @@ def _solve_along(
     for side in (0, 1):
         at, place = slice(side, n - 1 + side), eye_array(n - 1, n, k=side)
         points = z[at], z_s[at], z_ss[at]
-        laws, laws_to, rows, least, share = _limits(scene, phase, epsilon, *points, signs, free)
+        laws, laws_to, rows, least = _limits(scene, phase, epsilon, *points, signs)
         for blocks, matrix in ((equal, laws), (upper, -rows)):
             every = kron(eye_array(n - 1), np.ones((matrix.shape[1], 1)))
             a, b, v = (diags_array(matrix[:, :, k].ravel()) @ every for k in range(3))
             c: list[Any] = [None, None]
             c[side] = block_diag([coo_array(block) for block in matrix[:, :, 3:]])
             blocks.append([a @ slope + b @ place, v @ place, *c])
-        upper[-1].append(np.tile(share, n - 1)[:, None])
+        upper[-1].append(np.ones((least.size, 1)))
         most.append(-least.ravel())
         equal_to.append(laws_to.ravel())
     moving = np.flatnonzero(top)
@@ -357,30 +351,25 @@ def _limits(
     z_s: Array,
     z_ss: Array,
     signs: Array,
-    free: NDArray[np.bool_] | None,
-) -> tuple[Array, Array, Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     """Limits at n places, as rows over x = (a, b, v, c) >= least.
 
     With forces over the scene's weight, torques over their limits and lengths over the radius of
-    gyration. v stands for sqrt(b), c for c_n, c_t(rolling), and all c_t where friction is free:
-    where `free`, shape (n, n_c), that of a contact is in its cone.
+    gyration. v stands for sqrt(b), c for c_n and c_t(rolling).
 
     Returns
     -------
     equal, equal_to : (n, 3, k) and (n, 3)  Newton's and Euler's laws of the object
-    rows, least : (n, m, k) and (n, m)      limits
-    share : (m,)                            what a margin of 1 takes from each limit
+    rows, least : (n, m, k) and (n, m)      limits, from each of which a margin of 1 takes 1
     """
     length, force, speed = scene.scales.length, scene.scales.force, scene.scales.speed
     n, n_c, rolling = len(z), phase.formation.n_contacts, phase.formation.rolling_rows
     touches = [locate(scene, name, z) for name in phase.formation.names]
     mu, held = np.array([touch.friction for touch in touches]), list(rolling)
-    push = [_push(touches, rolling, signs)]
-    if free is not None:
-        push.append(np.stack([touch.tangent for touch in touches], axis=2))
+    push = -force * _push(touches, rolling, signs)
     mass = scene.mass_diagonal * speed**2
     inertia = [mass * z_s / length, mass * z_ss, scene.viscous * z_s * speed]
-    drive = np.concatenate([np.stack(inertia, axis=2), *(-force * part for part in push)], axis=2)
+    drive = np.concatenate([np.stack(inertia, axis=2), push], axis=2)
     scale, limit = force * np.array([1.0, 1.0, length]), scene.torque_limit
     unit = np.eye(drive.shape[2])
     press, grip = unit[3 : 3 + n_c], unit[3 + n_c : 3 + n_c + len(held)]
@@ -391,16 +380,9 @@ def _limits(
     rows = [np.broadcast_to(fixed, (n, *fixed.shape)), -torque, torque]
     least = [np.tile(epsilon / force * np.concatenate([np.ones(n_c), *[mu[held]] * 2]), (n, 1))]
     least += [dry - 1.0, -dry - 1.0]
-    share = [np.ones(len(fixed) + 4)]
-    if free is not None:
-        # What is left of friction against the sliding, between nothing and twice its amount.
-        left = signs[:, :n_c, None] * unit[-n_c:]
-        rows += [left, 2 * (mu * free)[:, :, None] * press - left]
-        least.append(np.zeros((n, 2 * n_c)))
-        share.append(np.zeros(2 * n_c))
     equal_to = np.broadcast_to(scene.applied_force[:3] / scale, (n, 3))
     matrices = np.concatenate(rows, axis=1), np.concatenate(least, axis=1)
-    return drive[:, :3] / scale[:, None], equal_to, *matrices, np.concatenate(share)
+    return drive[:, :3] / scale[:, None], equal_to, *matrices
 
 
 def _maximise(A_ub: Any, b_ub: Any, A_eq: Any, b_eq: Any, bounds: Bounds) -> float:
@@ -640,18 +622,15 @@ def _judge_cell(problem: Problem, phase: Phase, z: Array, stop: tuple[float, flo
     text = f"{at}: of {best.curves} curves to {len(ends)} places the best has {best.margin:.3g}"
     if best.margin > CLEAR:
         return Verdict("refuted", text)
-    text += f", {best.loose:.3g} if slow contacts may stick"
-    least = max(best.margin, best.loose)
     # Where the best of many curves misses limits by so much, surely none keeps them.
-    return Verdict("confirmed" if best.curves and least < -0.02 else "close", text)
+    return Verdict("confirmed" if best.curves and best.margin < -0.02 else "close", text)
 
 
 class Best(NamedTuple):
     """The best of many curves."""
 
-    margin: float  # as of `fast_margin`, without and with friction of slow contacts in their cones
-    loose: float
-    z: Array  # (n, 5): the curve that has the margin `margin`
+    margin: float  # as of `fast_margin`
+    z: Array  # (n, 5): the curve
     curves: int  # curves that were looked at
 
 
@@ -702,39 +681,18 @@ def find_best(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: Array)
     drawn = share * (goals[rng.integers(len(goals), size=400)] - start)[:, None] + start
     width = 0.5 * rng.uniform(size=(400, 1, 1)) * size
     drawn[:, 1:3] += width * rng.normal(size=(400, 2, 2))
-    best: list[tuple[float, float, Array, Array]] = []
-    count = 0
-
-    def look(controls: Array, most: int) -> bool:
-        nonlocal count, best
+    best = Best(-np.inf, z[None], 0)
+    for controls, most in ((straight, len(straight)), (drawn, 40)):
         curves = bend(scene, phase, z, controls)
         stays = inside(scene, phase, curves.reshape(-1, 5)).reshape(len(curves), -1)
-        kept = np.flatnonzero(stays.all(axis=1))[:most]
-        for k in kept:
-            margins = _find_margins(scene, phase, epsilon, curves[k])
-            best.append((*margins, controls[k], curves[k]))
-        count += len(kept)
-        best = sorted(best, key=lambda one: -max(one[0], one[1]))[:3]
-        return any(one[0] > CLEAR for one in best)
-
-    if not look(straight, len(straight)) and not look(drawn, 40):
-        # The best curves are bent in six rounds, ten of them in each.
-        for turn in range(6):
-            if not best:
-                break
-            spread = 0.3 * 0.7**turn
-            parents = np.array([best[k % len(best)][2] for k in range(40)])
-            moves = spread * size * rng.normal(size=(len(parents), 3, 2))
-            children = parents.copy()
-            children[:, 1:3] += moves[:, :2]
-            nearest = goals - (parents[:, 3] + moves[:, 2])[:, None]
-            children[:, 3] = goals[(np.abs(nearest) / size).sum(axis=2).argmin(axis=1)]
-            if look(children, 10):
-                break
-    if not best:
-        return Best(-np.inf, -np.inf, z[None], 0)
-    best.sort(key=lambda one: -one[0])
-    return Best(best[0][0], max(one[1] for one in best), best[0][3], count)
+        kept = curves[stays.all(axis=1)][:most]
+        margins = [_find_margin(scene, phase, epsilon, curve) for curve in kept]
+        best = best._replace(curves=best.curves + len(kept))
+        if max(margins, default=-np.inf) > best.margin:
+            best = best._replace(margin=max(margins), z=kept[int(np.argmax(margins))])
+        if best.margin > CLEAR:
+            break
+    return best
 
 
 def bend(scene: Scene, phase: Phase, z: Array, controls: Array) -> Array:
@@ -780,16 +738,13 @@ def inside(scene: Scene, phase: Phase, z: Array) -> Flags:
     return np.asarray(good)
 
 
-def _find_margins(scene: Scene, phase: Phase, epsilon: float, z: Array) -> tuple[float, float]:
+def _find_margin(scene: Scene, phase: Phase, epsilon: float, z: Array) -> float:
     runs = np.sqrt(np.diff(z, axis=0) ** 2 @ weights(scene))
     if runs.min() < 1e-6 * scene.scales.length:
-        return -np.inf, -np.inf
+        return -np.inf
     s = np.append(0.0, np.cumsum(runs))
-    curve = s, z, np.gradient(z, s, axis=0, edge_order=2)
-    plain = fast_margin(scene, phase, epsilon, curve)
-    # What slides slowly may stick: nearby curves roll.
-    loose = plain if plain > 0 else fast_margin(scene, phase, epsilon, curve, loose=0.01)
-    return np.nan_to_num(plain, nan=-np.inf), np.nan_to_num(loose, nan=-np.inf)
+    margin = fast_margin(scene, phase, epsilon, (s, z, np.gradient(z, s, axis=0, edge_order=2)))
+    return float(np.nan_to_num(margin, nan=-np.inf))
 
 
 def _end_equations(scene: Scene, phase: Phase, z: Array) -> tuple[Array, Array]:
