@@ -19,7 +19,7 @@ from ..common.errors import InfeasibleError, name_source, require_number
 from ..common.fields import SHARE
 from ..common.sharing import exclusive
 from ..contacts.formation import Formation, Kinematics
-from ..geometry.curve import Curve
+from ..geometry.curve import Curve, border, describe_pose, solve_tangent
 from ..geometry.path_guess import RELEASE_AT, close_all, count_freedoms, find_end, guess_phase
 from ..geometry.tracing import trace_phase
 from ..mechanics.dynamics import (
@@ -429,18 +429,16 @@ def _straighten(
     way = goal - start
     line, slip = start + u[:, None] * way, formation.evaluate_slip(start[None])[0]
     z = close_all(formation, line, slip, ((0, line[:, 0]), (2, line[:, 2])))
-    metric, count = metric_weights(formation.scene), formation.n_constraints
-    pose = np.broadcast_to(np.eye(5)[[0, 2]], (PLACES, 2, 5))
-    P = formation.evaluate(z, np.zeros_like(z)).P
-    inverse_rows = np.linalg.inv(np.concatenate([P, pose], axis=1))
-    z_u = inverse_rows[..., count:] @ way[[0, 2]]
-    bend = formation.evaluate(z, z_u).P_dot_v
-    z_uu = -np.einsum("nij,nj->ni", inverse_rows[..., :count], bend)
-    speed = np.sqrt(z_u**2 @ metric)[:, None]
-    z_uu -= ((z_u * z_uu) @ metric)[:, None] / speed**2 * z_u
-    steps = np.diff(u) * (speed[1:, 0] + speed[:-1, 0]) / 2
-    s = np.concatenate([[0.0], np.cumsum(steps)])
-    return s, z, z_u / speed, z_uu / speed**2, formation.evaluate(z, z_u / speed)
+    metric, along = metric_weights(formation.scene), way * [1, 0, 1, 0, 0]
+    at, across = formation.evaluate(z, np.zeros_like(z)), np.array([-way[2], 0, way[0], 0, 0])
+    for _ in range(2):
+        # The line is one more constraint; it has no curvature of its own.
+        P, bend = border(at.P, across), np.pad(at.P_dot_v, ((0, 0), (0, 1)))
+        z_s, z_ss = solve_tangent(P, bend, np.tile(along, (PLACES, 1)), metric)
+        at = formation.evaluate(z, z_s)
+    speed = along @ along / (z_s @ along)
+    s = np.append(0.0, np.cumsum(np.diff(u) * (speed[1:] + speed[:-1]) / 2))
+    return s, z, z_s, z_ss, at
 
 
 class Place(NamedTuple):
@@ -452,8 +450,7 @@ class Place(NamedTuple):
 
     def to_text(self) -> str:
         """The pose in mm and degrees."""
-        x, phi = round(1e3 * self.x, 6) + 0.0, round(math.degrees(self.phi), 6) + 0.0
-        return f"x = {x:.4g} mm, phi = {phi:.4g} deg"
+        return describe_pose(np.array(self[1:]))
 
 
 class Weakest(NamedTuple):

@@ -261,8 +261,9 @@ def find_root(function: Callable[[float], float], low: float, high: float) -> fl
 
 
 def describe_pose(z: Array) -> str:
-    """Pose of the object in words."""
-    x, phi = round(1e3 * float(z[0]), 6) + 0.0, round(float(np.degrees(z[2])), 6) + 0.0
+    """Pose of the object in words, from z, q or (x, phi)."""
+    x, phi = 1e3 * float(z[0]), float(np.degrees(z[min(2, len(z) - 1)]))
+    x, phi = round(x, 6) + 0.0, round(phi, 6) + 0.0
     return f"x = {x:.4g} mm, phi = {phi:.4g} deg"
 
 

@@ -101,7 +101,7 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
     near = tolerance(problem.scene)
     for one, two in pairwise(corners):
         if not (np.abs(two - one) > near).any():
-            text = f"two poses at {describe_place(one)} are the same place"
+            text = f"two poses at {describe_pose(one)} are the same place"
             raise InputError("", "route", text)
     z, start, corners, notes = _begin(problem, corners)
     here, stretches, legs = z[[0, 2]], list[Stretch](), list[int]()
@@ -148,14 +148,14 @@ def _begin(
         try:
             z = place_start(scene, edge, float(first[0]))
         except InputError as error:
-            text = f"cannot start at {describe_place(first)}: {error.problem}"
+            text = f"cannot start at {describe_pose(first)}: {error.problem}"
             raise InputError("", "route", text) from None
         # A problem starts with phi in one turn; so does the route.
         shift = np.array([0.0, float(z[2]) - angle])
         note = "the [start] below takes the place of the problem's own"
         return z, (edge, float(first[0])), [pose + shift for pose in corners[1:]], [note]
     note = (
-        f"starts with leg 1 from the problem's start to {describe_place(first)}, "
+        f"starts with leg 1 from the problem's start to {describe_pose(first)}, "
         "where no edge is flush on the palm"
     )
     return problem.start, None, corners, [note]
@@ -163,7 +163,7 @@ def _begin(
 
 def format_route(route: Route) -> str:
     """The route as ``[[phases]]`` with comments, ready to paste into a problem file."""
-    first, last = describe_place(route[0].start), describe_place(route[-1].stop)
+    first, last = describe_pose(route[0].start), describe_pose(route[-1].stop)
     lines = [f"# from {first} to {last}", *(f"# {note}" for note in route.notes)]
     if route.start is not None:
         edge, x = route.start
@@ -171,7 +171,7 @@ def format_route(route: Route) -> str:
     for number, stretch in enumerate(route, start=1):
         names = ", ".join(f'"{contact}"' for contact in stretch.contacts)
         lines.append(
-            f"{'[[phases]]':<{_COMMENTS}}# {number}: to {describe_place(stretch.stop)}\n"
+            f"{'[[phases]]':<{_COMMENTS}}# {number}: to {describe_pose(stretch.stop)}\n"
             f"contacts = [{names}]\nuntil = {format_until(stretch.until)}\n"
         )
     return "\n".join(lines)
@@ -330,11 +330,6 @@ def _form(scene: Scene, contacts: tuple[Contact, ...]) -> Formation:
     return Formation(scene, contacts)
 
 
-def describe_place(pose: Array) -> str:
-    """A pose (x, phi) in words."""
-    return describe_pose(np.array([pose[0], 0.0, pose[1]]))
-
-
 def split_leg(scene: Scene, start: Array, stop: Array) -> list[Part]:
     """Split a leg into parts with one formation each.
 
@@ -393,7 +388,7 @@ def _build_parts(scene: Scene, leg: Leg, spans: list[Span], at_change: bool) -> 
             gained = tuple(c for c in following if c not in mine)
             if len(gained) != 1:
                 names = ", ".join(c.name for c in dict.fromkeys((*mine, *following)))
-                text = f"runs through a crossing of borders at {describe_place(end)}, of {names}"
+                text = f"runs through a crossing of borders at {describe_pose(end)}, of {names}"
                 raise InputError("", "route", f"{text}; go around it, or stop there")
         elif at_change:
             z = close_fingers(scene, end[:1], end[1:]).z[0]
@@ -440,7 +435,7 @@ def _require_reached(scene: Scene, leg: Leg, kept: list[Piece], ends: list[float
             pose = leg.at((before + after) / 2)
             text = describe_obstacle(close_fingers(scene, pose[:1], pose[1:]))
             text = text or "there the border has ended"
-            raise InputError("", "route", f"cannot be followed at {describe_place(pose)}: {text}")
+            raise InputError("", "route", f"cannot be followed at {describe_pose(pose)}: {text}")
 
 
 @dataclass(frozen=True, eq=False)

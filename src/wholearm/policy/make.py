@@ -38,7 +38,7 @@ from ..mechanics.dynamics import (
     metric_weights,
     stack_motion,
 )
-from ..mechanics.limits import PRESS, TORQUE, LimitSet, make_limits
+from ..mechanics.limits import LimitSet, make_limits
 from ..mechanics.path_limits import PathLimits, find_slack_rows
 from ..mechanics.sensitivity import find_force_slopes, find_shifts
 from ..mechanics.speed_sweep import ControllableSet, find_controllable, find_duration
@@ -65,11 +65,7 @@ PathMotion = tuple[Array, Array, Array]  # a, b and internal force at n places
 class ReferenceSettings:
     """Margins and accuracies of references."""
 
-    # Uncertainties without ranges, relative: of masses, frictions, torques; of the delay [s].
-    mass: float = 0.05
-    friction: float = 0.1
-    gain: float = 0.01
-    late: float = 5e-4
+    late: float = 5e-4  # uncertainty of the delay without ranges [s]
     least: float = 0.02  # least margin of a normal force, over the scene's unit of force
     spare: float = 0.05  # margin of a torque for feedback, over its limit
     kept: float = 1.3  # margin of the reference's forces within ranges, over those of the law
@@ -98,6 +94,8 @@ FIXED = np.array([1.0, 0.0, 1.0, 1.0, 0.0])
 CORNERS = ("mass", "inertia", *GROUPS["friction"])
 """Numbers whose ranges have corners; those of geometry and gains count to first order. The start is
 measured, and a delay is in torques."""
+DOUBTS = dict.fromkeys(CORNERS, 0.1) | {"mass": 0.05, "inertia": 0.05, "gain1": 0.01, "gain2": 0.01}
+"""Relative uncertainties without ranges."""
 
 
 class CurveLimitRows(NamedTuple):
@@ -148,21 +146,29 @@ def measure_slack(limits: LimitSet, c: Array, torque: Array, rates: Array) -> Ar
     return np.asarray(rows * limits.scales[limits.sides[0], None])
 
 
+def of_forces(limits: LimitSet) -> Array:
+    """Derivatives of the slack of limits by contact forces, shape (m, n_c + R)."""
+    rows, signs, _ = limits.sides
+    return np.asarray(signs[:, None] * limits.columns[0][rows])
+
+
 def make_rows(curve: Curve, s: Array, motion: PathMotion) -> CurveLimitRows:
     """Rows at places of a curve, with margins for a motion (a, b, lambda)."""
     formation, point, speed = curve.formation, curve.evaluate(s), np.sqrt(motion[1])
     mean, *sides = blend_directions(curve, s, speed * SETTINGS.near)
-    torque, late = (
-        find_torques(curve, s, mean),
-        find_torques(curve, s - SETTINGS.late * speed, mean),
-    )
-    tau, delayed = (PathForces(rows, rows).tau(*motion) for rows in (torque, late))
+    torque, late = (find_torques(curve, s - late * speed, mean) for late in (0.0, SETTINGS.late))
     (contact, joint), rates = split_limits(formation), point.z_s[:, 3:]
     slack, unit = [], []
     for side in sides:
         forces = inverse(formation, *point[:3], side, point.kinematics)
-        slack.append(measure_slack(contact, respond(forces, torque)[0], torque, rates))
-        error = _estimate_errors(formation, point, side, contact, motion[1], tau, delayed)
+        c = respond(forces, torque)[0]
+        slack.append(measure_slack(contact, c, torque, rates))
+        slopes = find_force_slopes(formation, point, side, forces, tuple(DOUBTS))
+        changes = np.array([*DOUBTS.values()])[:, None] * slopes
+        delay = respond(forces, late)[0] - c
+        changes = np.append(changes, delay[:, :, None], axis=2)
+        errors = np.einsum("nckq,nq->nck", changes, stack_motion(*motion))
+        error = np.linalg.norm(of_forces(contact) @ errors, axis=2)
         unit.append(SETTINGS.least * contact.scales[contact.sides[0]] + error)
     slack[1][have_same_signs(*sides)] = UNLIMITED
     slack.append(measure_slack(joint, np.zeros_like(forces.of_c), torque, rates))
@@ -215,33 +221,6 @@ def blend_directions(curve: Curve, s: Array, width: Array) -> list[Directions]:
             directions[0] += part * (after.Xi - before.Xi)
             directions[1] += part * (after.sigma - before.sigma)
     return [Directions(*directions) for directions in found]
-
-
-def _estimate_errors(
-    formation: Formation,
-    point: CurvePoint,
-    side: Directions,
-    limits: LimitSet,
-    b: Array,
-    tau: Array,
-    delayed: Array,
-) -> Array:
-    """Errors of forces from uncertain numbers, torques and delays, root sum square, (n, m)."""
-
-    def measure(scene: Scene, tau: Array) -> Array:
-        changed = replace(formation, scene=scene)
-        forces = inverse(changed, *point[:3], side, point.kinematics)
-        torque = tau[..., None] * np.eye(5)[ONE]
-        rows = measure_slack(limits, respond(forces, torque)[0], torque, point.z_s[:, 3:])
-        return np.asarray(np.einsum("nmi,ni->nm", rows, stack_motion(0 * b, b, 0 * b)))
-
-    scene = formation.scene
-    doubts = dict(zip(CORNERS, [SETTINGS.mass] * 2 + [SETTINGS.friction] * 3, strict=True))
-    cases = [(change_scene(scene, {name: width}), tau) for name, width in doubts.items()]
-    cases += [(scene, tau * (1 + SETTINGS.gain * np.eye(2)[k])) for k in range(2)]
-    cases.append((scene, delayed))
-    base = measure(scene, tau)
-    return np.asarray(np.sqrt(np.sum([(measure(*case) - base) ** 2 for case in cases], axis=0)))
 
 
 class Corners(NamedTuple):
@@ -301,9 +280,7 @@ def find_corners(
             moved = torque + shift[:, None, None] * slope
             slopes = slopes + respond(nominal, moved)[0] - respond(nominal, torque)[0]
         swings.append(widths[name] * slopes)
-    limits, _ = split_limits(formation)
-    side_rows, signs, _ = limits.sides
-    of_c = signs[:, None] * limits.columns[0][side_rows]
+    of_c = of_forces(split_limits(formation)[0])
     return Corners(np.array(rows), np.array(moves), of_c @ np.array(swings))
 
 
@@ -664,18 +641,6 @@ def _balance(curve: Curve, both: Formation, factor: float) -> Array:
     return np.asarray(np.linalg.solve(G.T, right))
 
 
-def find_still(curve: Curve) -> Array:
-    """Torques that hold the end of a curve at rest without friction, (2,)."""
-    formation, point = curve.formation, curve.evaluate(np.array([curve.length]))
-    still = Directions(np.zeros((1, formation.n_contacts)), np.zeros((1, 2)))
-    forces = inverse(formation, *point[:3], still, point.kinematics)
-    limits = make_limits(formation, 0.0).only(PRESS, TORQUE)
-    rows = PathLimits.of(limits, forces, point.z_s[:, 3:]).rows[0]
-    base, press = rows[:, ONE].tolist(), rows[:, LAMBDA].tolist()
-    _, internal = choose_internal_force(base, [0.0] * len(base), press, 0.0)
-    return np.asarray(forces.of_tau[0, :, ONE] + internal * forces.of_tau[0, :, LAMBDA])
-
-
 def split(phases: Sequence[Phase]) -> list[tuple[Phase, ...]]:
     """Blocks of phases that pass into one another in motion, except by impacts along curves."""
     blocks: list[list[Phase]] = []
@@ -776,9 +741,8 @@ def make_policy(
             last = int(np.flatnonzero(plan.phase == phase.index)[-1])
             push = plan.tau[last]
             if not np.isnan(plan.c_n[last]).all():
-                gained = phase.until.contact is not None
-                hold = hold_end(problem, phase, piece.curve.end) if gained else None
-                push = find_still(piece.curve) if hold is None else hold
+                hold = hold_end(problem, phase, piece.curve.end)
+                push = push if hold is None else hold
             tables.append(_tabulate_curve(piece, phase, push))
             found[0].update(duration=piece.duration, share=piece.share, reserves=piece.reserves)
             found[0]["gained"] = "" if phase.until.contact is None else phase.until.contact.name

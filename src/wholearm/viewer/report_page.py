@@ -25,6 +25,7 @@ from ..contacts.elemental import Contact
 from ..figures import plots
 from ..figures.map_figure import BOX, PLACE, SIZE, draw_map, find_room, split
 from ..figures.style import STYLE
+from ..geometry.curve import describe_pose
 from ..geometry.tracing import load
 from ..mapping.formation_map import Border, FormationMap, build_map, choose_window, time_borders
 from ..problem.definition import Problem
@@ -185,7 +186,7 @@ def describe_map(chart: FormationMap, plan: Trajectory | None = None) -> tuple[s
 
     places = []
     for (index, _), point, z in zip(parts, middles, poses, strict=True):
-        text = f"a cell, two freedoms; its middle is at {_name_place(point)}"
+        text = f"a cell, two freedoms; its middle is at {describe_pose(point)}"
         places.append(describe(chart.formations[index], text, z[None]) | {"wide": True})
     flush = [border for border in chart.borders if border.flush is not None]
     for border, times in zip(flush, time_borders(chart.problem, flush), strict=True):
@@ -193,16 +194,11 @@ def describe_map(chart: FormationMap, plan: Trajectory | None = None) -> tuple[s
         rows = np.unique(np.linspace(0, len(border.z) - 1, 40).round().astype(int))
         places.append(describe(border.contacts, _describe_border(border, times), border.z[rows]))
     for crossing in chart.crossings:
-        text = f"a crossing at {_name_place(crossing.point)}"
+        text = f"a crossing at {describe_pose(crossing.point)}"
         places.append(describe(crossing.contacts, text, crossing.z[None]))
     low, high = ([1e3 * float(chart.x[k]), math.degrees(chart.phi[k])] for k in (0, -1))
     axes = {"low": low, "high": high, "box": [72 * v for v in BOX], "tall": 72 * SIZE[1]}
     return drawing, {"id": PLACE, "hand": describe_hand(scene), "places": places, "axes": axes}
-
-
-def _name_place(point: Array) -> str:
-    x, phi = point
-    return f"x = {1e3 * x:.2f} mm, phi = {math.degrees(phi):.2f} deg"
 
 
 def _describe_border(border: Border, times: Array) -> str:
