@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import tomllib
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from once import once
 from wholearm import FormationMap, Plan, Problem, Trajectory, build_map, load
@@ -26,6 +28,16 @@ BOX = FOLDER / "box_rolling.toml"
 @cache
 def problem_of(path: Path) -> Problem:
     return load(str(path))
+
+
+def text_of(path: Path = HEPTAGON, phases: int = 1) -> str:
+    """A problem file with its first phases alone."""
+    return "[[phases]]".join(path.read_text(encoding="utf-8").split("[[phases]]")[: phases + 1])
+
+
+def table_of(path: Path = HEPTAGON) -> dict[str, Any]:
+    """The tables of a problem file without its phases."""
+    return tomllib.loads(text_of(path, 0))
 
 
 @once

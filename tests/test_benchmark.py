@@ -6,6 +6,7 @@ import argparse
 import json
 import re
 import sys
+import tomllib
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -17,7 +18,7 @@ import pytest
 import tiny_study
 import wholearm
 from rows import each
-from shipped import FOLDER, HEPTAGON, SQUARE, problem_of, solved
+from shipped import FOLDER, HEPTAGON, SQUARE, problem_of, solved, text_of
 from tiny_study import allow, measure, misbehave
 from wholearm import Finger, Friction, InputError, Plan, Polygon, Problem, Scene, TorqueProfile
 from wholearm.benchmark import STUDIES
@@ -324,16 +325,8 @@ NODES, CONTACTS = 60, 4
 """Five nodes for each of twelve elements; sliding contacts."""
 
 
-def write_first_phase(folder: Path) -> str:
-    lines = HEPTAGON.read_text(encoding="utf-8").split("[[phases]]")
-    path = folder / "slide.toml"
-    path.write_text("[[phases]]".join(lines[:2]), encoding="utf-8")
-    return str(path)
-
-
 def test_counts_of_one_phase_are_those_of_theory() -> None:
-    table = dict(read_problem(str(HEPTAGON)).table)
-    found = count(build_problem({**table, "phases": table["phases"][:1]}))
+    found = count(build_problem(tomllib.loads(text_of())))
     # Speed, acceleration and squeeze at each node, but for the speed at both ends, where it is 0.
     assert found["phase 1 of 1: unknowns"] == 3 * NODES - 2
     # How the speed goes on, and the forces and torques at each node.
@@ -345,7 +338,8 @@ def test_counts_of_one_phase_are_those_of_theory() -> None:
 def test_the_command_stores_counts_and_fails_where_they_grow(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path, counts = write_first_phase(tmp_path), tmp_path / "counts.json"
+    path, counts = str(tmp_path / "slide.toml"), tmp_path / "counts.json"
+    Path(path).write_text(text_of(), encoding="utf-8")
     command = ["bench", "guard", path, "--counts", str(counts)]
     assert main(command) == 2
     assert f"{counts}: cannot be read: " in capsys.readouterr().err
@@ -559,7 +553,7 @@ def test_numbers_change_in_the_last_bits_and_stay_so() -> None:
         once.with_(mass=-1.0)
 
 
-FILES = (str(Path(__file__).parents[1] / "problems" / "heptagon_four_contacts.toml"),)
+FILES = (str(HEPTAGON),)
 LEAST = {LEAST_TIME: 0.0666298, NO_DRAG: 0.0663431}
 """Least times of the fourth phase, within 1e-5."""
 TRIED = {"wholearm, curve": "1e-3", "wholearm, time": "8 x 3", "yapss": "20", "toppra": "100"}
@@ -597,28 +591,22 @@ def test_what_a_replay_does_not_keep_is_no_solution() -> None:
 
 
 def test_methods_that_nobody_knows_are_named(capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["bench", "precision", "--problems", str(Path(FILES[0]).parent), "-o", "out"]
+    command = ["bench", "precision", "--problems", str(FOLDER), "-o", "out"]
     assert main([*command, "--peers", "fastest"]) == 2
     assert "--peers: 'fastest' given; allowed are wholearm;" in capsys.readouterr().err
-
-
-PROBLEMS = Path(__file__).parents[1] / "problems"
-FLIPS = str(PROBLEMS / "heptagon_four_contacts.toml")
 
 
 @lru_cache
 def course() -> Course:
     """The heptagon's first phase, with a reversal on its way."""
-    (first, *_) = list_instances((FLIPS,))
-    found = make_course(first, FEW)
+    found = make_course(phase(1), FEW)
     assert found is not None
     return found
 
 
 def test_reference_is_exact_and_meets_the_reversal() -> None:
     problem, torque, spans, end = course()
-    (first, *_) = list_instances((FLIPS,))
-    rough, *_ = integrate(problem, torque, first.curve, 1, 2.3e-12)
+    rough, *_ = integrate(problem, torque, phase(1).curve, 1, 2.3e-12)
     assert measure_error(problem, rough, end) < 1e-12
     directions = {tuple(np.append(span.Xi, span.sigma)) for span in spans}
     assert len(directions) == 2

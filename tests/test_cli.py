@@ -164,18 +164,15 @@ def test_bad_sampling(
     assert [entry.name for entry in folder.iterdir()] == ["problem.toml"]
 
 
-def test_solve_without_a_replay(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = write_problem(folder, keep(1))
-    command = ["solve", path, "-o", "a.npz", "--intervals", "20", "--no-replay"]
+def test_solve_without_a_replay_and_a_name_of_its_output(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["solve", write_problem(folder, keep(1)), "--intervals", "20", "--no-replay"]
     assert main([*command, "--torques", "a.csv"]) == 0
     lines = list(filter(None, capsys.readouterr().out.splitlines()))
     assert lines[2] == "the plan was not replayed" and lines[3].endswith(" rows")
-    assert load_trajectory("a.npz").meta["replay"] is None
-
-
-def test_solve_names_its_output_after_the_problem(folder: Path) -> None:
-    assert main(["solve", write_problem(folder, keep(1)), "--intervals", "20"]) == 0
-    assert {path.name for path in folder.iterdir()} == {"problem.npz", "problem.toml"}
+    assert {path.name for path in folder.iterdir()} == {"problem.npz", "problem.toml", "a.csv"}
+    assert load_trajectory("problem.npz").meta["replay"] is None
 
 
 def test_solve_lists_the_impacts(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

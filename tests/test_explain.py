@@ -272,7 +272,7 @@ def test_the_event_that_ends_a_curve(until: str, kind: str) -> None:
 
 @pytest.mark.parametrize(
     ("x", "changes", "kind"),
-    [(-0.01, {}, "refuted"), (0.0, {}, "refuted"), (-0.01, WEAK | {"epsilon": 1.0}, "confirmed")],
+    [(-0.01, {}, "refuted"), (-0.01, WEAK | {"epsilon": 1.0}, "confirmed")],
 )
 def test_a_leg_through_a_cell(x: float, changes: dict[str, float], kind: str) -> None:
     """The object tips over its left vertex while it slides by `x`."""

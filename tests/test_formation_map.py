@@ -28,7 +28,7 @@ from plane import (
 )
 from retelling import Retelling
 from scenes import hexagon, measure_fingers
-from shipped import HEPTAGON, IMPACTS, LANDING, problem_of, solved
+from shipped import HEPTAGON, IMPACTS, LANDING, problem_of, solved, text_of
 from wholearm import End, Formation, Goal, InputError, Problem, Scene, Until, list_formations
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
@@ -435,9 +435,8 @@ def test_map_needs_a_sound_grid_and_some_reach(heptagon: Problem) -> None:
 def test_phases_are_listed_for_a_problem_without_any(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    text = HEPTAGON.read_text(encoding="utf-8")
     path = tmp_path / "bare.toml"
-    path.write_text(text[: text.index("[[phases]]")], encoding="utf-8")
+    path.write_text(text_of(phases=0), encoding="utf-8")
     assert main(["map", str(path), "--list", "0.045,-1.98", "-.0637,-1.98"]) == 0
     assert tomllib.loads(capsys.readouterr().out)["phases"] == TABLE["phases"][:3]
     bare = read_problem(str(path))

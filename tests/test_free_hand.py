@@ -16,7 +16,7 @@ from scipy.integrate import quad
 
 from plane import finger_gap, make_scene, rotate
 from planned import change, plan
-from shipped import HEPTAGON, HEXAGON
+from shipped import HEXAGON, text_of
 from wholearm import Formation, Problem, TorqueProfile, Trajectory, simulate, simulate_free, verify
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
@@ -298,8 +298,7 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     given, written, figure = (str(tmp_path / name) for name in ("a.npz", "b.npz", "c.png"))
     trajectory.save(given)
     path = str(tmp_path / "two.toml")
-    parts = HEPTAGON.read_text(encoding="utf-8").split("[[phases]]")
-    Path(path).write_text("[[phases]]".join(parts[:3]), encoding="utf-8")
+    Path(path).write_text(text_of(phases=2), encoding="utf-8")
     assert main(["verify", path, given, "--free", "-o", written]) == 0
     out = capsys.readouterr().out
     assert out.splitlines()[0].startswith("heptagon, four contacts: ok: ")

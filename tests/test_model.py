@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import re
+import tomllib
 from dataclasses import fields, replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,8 +15,8 @@ import pytest
 from plane import SQUARE, convex_polygon, cross, make_finger, make_scene, rotate
 from retelling import RETELLINGS, Answer, Retelling, answer
 from rows import each
-from shipped import HEPTAGON
-from wholearm import Finger, Friction, Polygon, Problem, Scene, load, verify
+from shipped import BOX, IMPACTS, text_of
+from wholearm import Finger, Friction, Polygon, Problem, Scene, verify
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError, InputError, JammingError, name_source
 from wholearm.common.fields import keys_of
@@ -272,13 +271,9 @@ def test_polygons_beyond_all_reason(points: Any, text: str) -> None:
     assert caught.value.key.startswith("object.vertices")
 
 
-TABLE = dict(load(str(HEPTAGON)).table)
-
-
 def edited(friction: dict[str, float] | None = None, **joints: float) -> Problem:
     """The first phase of the heptagon with other numbers, those of joints or at the top."""
-    table: dict[str, Any] = copy.deepcopy(TABLE)
-    table["phases"] = table["phases"][:1]
+    table: dict[str, Any] = tomllib.loads(text_of())
     table["friction"] |= friction or {}
     for key, value in joints.items():
         for part in (table,) if key == "gravity" else table["fingers"].values():
@@ -343,45 +338,33 @@ def test_jamming_says_which_friction_to_lower() -> None:
     solve(edited(rough | {"palm": float(found[1])}), intervals=10, replay=False)
 
 
-PROBLEMS = Path(__file__).parents[1] / "problems"
-CASES = [("heptagon_impact", 2, 20), ("box_rolling", 1, 20)]
-"""Problems, how many of their phases are planned, the last of them to rest, and intervals."""
+CASES = [(IMPACTS, 2), (BOX, 1)]
+"""Problems, and how many of their phases are planned, the last of them to rest."""
+OPTIONS: dict[str, Any] = {"intervals": 10, "replay": False}
 TELLINGS = [("time", telling) for telling in (RETELLINGS[1], *RETELLINGS[3:])]
 TELLINGS += [("effort", RETELLINGS[4]), ("margin", RETELLINGS[1])]
 """Of other costs, the effort mirrored, which swaps the torques, and the margin in small units."""
 
 
-@pytest.fixture(scope="module", params=CASES, ids=[case[0] for case in CASES])
-def case(request: pytest.FixtureRequest) -> tuple[str, int, int]:
-    found: tuple[str, int, int] = request.param
-    return found
-
-
-@pytest.fixture(scope="module")
-def problem(case: tuple[str, int, int]) -> Problem:
-    name, phases, _ = case
-    table = copy.deepcopy(dict(load(str(PROBLEMS / f"{name}.toml")).table))
-    table["phases"] = table["phases"][:phases]
+@pytest.fixture(scope="module", params=CASES, ids=[case[0].stem for case in CASES])
+def problem(request: pytest.FixtureRequest) -> Problem:
+    table = tomllib.loads(text_of(*request.param))
     table["phases"][-1]["end"] = "rest"
     return build_problem(table)
 
 
 @pytest.fixture(scope="module")
-def answers(case: tuple[str, int, int], problem: Problem) -> dict[str, Answer]:
+def answers(problem: Problem) -> dict[str, Answer]:
     goals, same = ("time", "effort", "margin"), Retelling("the same")
-    return {goal: answer(problem, goal, same, intervals=case[2], replay=False) for goal in goals}
+    return {goal: answer(problem, goal, same, **OPTIONS) for goal in goals}
 
 
 @pytest.mark.parametrize("objective, telling", TELLINGS, ids=lambda p: getattr(p, "name", p))
 def test_answers_do_not_depend_on_how_a_problem_is_told(
-    case: tuple[str, int, int],
-    problem: Problem,
-    answers: dict[str, Answer],
-    telling: Retelling,
-    objective: str,
+    problem: Problem, answers: dict[str, Answer], telling: Retelling, objective: str
 ) -> None:
     one = answers[objective]
-    other = answer(problem, objective, telling, intervals=case[2], replay=False)
+    other = answer(problem, objective, telling, **OPTIONS)
     assert other.value == pytest.approx(one.value, rel=1e-8)
     np.testing.assert_allclose(other.breaks, one.breaks, rtol=0, atol=1e-7)
     np.testing.assert_allclose(other.torques, one.torques, rtol=0, atol=1e-7)

@@ -17,7 +17,7 @@ from scipy.optimize import linprog
 import wholearm
 from planned import change, plan
 from scenes import box, constant, tipped
-from shipped import BOX, FOLDER, HEPTAGON, HEXAGON, LANDING, problem_of
+from shipped import BOX, FOLDER, HEPTAGON, HEXAGON, LANDING, problem_of, text_of
 from wholearm import InputError, Problem, Trajectory, compare, load_trajectory, simulate, verify
 from wholearm.analysis.slow_speeds import (
     OWN,
@@ -194,10 +194,8 @@ def test_what_is_left_out_is_named() -> None:
 
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    text = HEPTAGON.read_text(encoding="utf-8")
     file, table, figure = (tmp_path / name for name in ("one.toml", "slow.csv", "slow.svg"))
-    cut = text.index("[[phases]]", text.index("[[phases]]") + 1)
-    file.write_text(text[:cut], encoding="utf-8")
+    file.write_text(text_of(), encoding="utf-8")
     arguments = ["predict", str(file), "-o", str(figure), "--torques", str(table), "--json"]
     assert main(arguments) == 0
     values = json.loads(capsys.readouterr().out)
@@ -221,9 +219,8 @@ def test_without_quasistatic_torques_the_table_is_printed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # Torques too weak to hold the object; the file begins with a byte order mark.
-    text = "[[phases]]".join(HEPTAGON.read_text(encoding="utf-8").split("[[phases]]")[:2])
     file, table = tmp_path / "weak.toml", tmp_path / "a.csv"
-    weak = re.sub("torque_limit = .*", "torque_limit = 0.02", text)
+    weak = re.sub("torque_limit = .*", "torque_limit = 0.02", text_of())
     file.write_text(weak, encoding="utf-8-sig")
     assert main(["predict", str(file), "--torques", str(table)]) == 1
     out, err = capsys.readouterr()
@@ -575,9 +572,7 @@ def test_what_differs_from_the_problem_of_a_plan_is_said(
     with pytest.raises(InputError, match=r"object\.vertices: 6 entries in the plan, 7 here"):
         describe_origin(problem, {"problem": meta["problem"] | {"object": chipped}})
     own = tmp_path / "own.toml"
-    text = HEPTAGON.read_text(encoding="utf-8")
-    first = "[[phases]]".join(text.split("[[phases]]")[:2])
-    own.write_text(re.sub(r"(?m)^mass = .*", "mass = 0.21", first), encoding="utf-8")
+    own.write_text(re.sub(r"(?m)^mass = .*", "mass = 0.21", text_of()), encoding="utf-8")
     for command in (["verify"], ["verify", "--json"]):
         main([command[0], str(own), moved, *command[1:]])
         out = capsys.readouterr().out

@@ -1,12 +1,12 @@
 from __future__ import annotations
 
-import copy
 import json
 import math
 import os
 import re
 import signal
 import time
+import tomllib
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
@@ -23,7 +23,8 @@ import pytest
 import wholearm
 from retelling import Retelling, Units
 from rows import each
-from wholearm import Formation, InputError, Plan, PlanOptions, Problem, TorqueProfile, load
+from shipped import BOX, FOLDER, HEPTAGON, problem_of, text_of
+from wholearm import Formation, InputError, Plan, PlanOptions, Problem, TorqueProfile
 from wholearm.analysis.robustness import (
     Robustness,
     Share,
@@ -55,12 +56,11 @@ from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.robust.robust_rows import list_holds, measure_holds
 from wholearm.planning.time_domain.time_plan import plan_phases
 from wholearm.problem.definition import NAMES, PARAMETERS
-from wholearm.problem.read import build_problem, read_problem
+from wholearm.problem.read import build_problem
 from wholearm.results.trajectory import Motion, Samples
 from wholearm.simulation.events import EventKind, Simulation
 
 Z = NormalDist().inv_cdf(0.975)
-PROBLEM = Path(__file__).parents[1] / "problems" / "heptagon_four_contacts.toml"
 NONE = dict.fromkeys(("inertia", "friction", "geometry", "start_x", "gain", "delay"), 0.0)
 FEW = Uncertainty({**NONE, "friction_finger1": 0.1}, sample_rate=None)
 """Of mass and of one friction."""
@@ -70,7 +70,7 @@ THREADS: Callable[[], Executor] = partial(ThreadPoolExecutor, 2)
 @pytest.fixture(scope="module")
 def problem() -> Problem:
     """The first slide of the heptagon alone."""
-    whole = wholearm.load(str(PROBLEM))
+    whole = problem_of(HEPTAGON)
     return whole.with_({"phases": [whole.table["phases"][0]], "epsilon": 0.3})
 
 
@@ -204,8 +204,7 @@ def test_bad_options_are_named(
     monkeypatch.chdir(tmp_path)
     plan.save("plan.npz")
     # The file as far as the second phase.
-    text_of_one = "[[phases]]".join(PROBLEM.read_text(encoding="utf-8").split("[[phases]]")[:2])
-    Path("one.toml").write_text(text_of_one, encoding="utf-8")
+    Path("one.toml").write_text(text_of(), encoding="utf-8")
     assert main(["robustness", "one.toml", "plan.npz", *options]) == 2
     assert text in capsys.readouterr().err
 
@@ -310,11 +309,6 @@ def test_no_scheduler_is_bad_input() -> None:
         connect("tcp://127.0.0.1:1", patience=0.5)
 
 
-@pytest.fixture(scope="module")
-def whole() -> Problem:
-    return read_problem(str(PROBLEM))
-
-
 @pytest.fixture
 def torque() -> TorqueProfile:
     """A line and a parabola, with a step at 0.3 s."""
@@ -355,7 +349,7 @@ def test_ranges_that_make_no_sense_are_refused(widths: dict[str, float], text: s
 
 
 @each("name", [*NAMES[: NAMES.index("start_x")]])
-def test_each_parameter_changes_its_own_number(whole: Problem, name: str) -> None:
+def test_each_parameter_changes_its_own_number(heptagon: Problem, name: str) -> None:
     def list_numbers(own: Problem) -> dict[str, float]:
         scene = own.scene
         assert scene.polygon.inertia is not None
@@ -367,7 +361,7 @@ def test_each_parameter_changes_its_own_number(whole: Problem, name: str) -> Non
             found |= {f"length{k}": finger.length, f"base{k}_x": base[0], f"base{k}_y": base[1]}
         return found
 
-    before, after = list_numbers(whole), list_numbers(change_problem(whole, {name: 1e-3}))
+    before, after = list_numbers(heptagon), list_numbers(change_problem(heptagon, {name: 1e-3}))
     relative = not next(own.unit for own in PARAMETERS if own.name == name)
     change = before[name] * 1e-3 if relative else 1e-3
     assert after.pop(name) == pytest.approx(before.pop(name) + change, rel=1e-14)
@@ -396,14 +390,14 @@ def test_torques_are_sampled_and_held(torque: TorqueProfile, offset: float) -> N
         )
 
 
-def test_a_problem_brings_its_own_ranges(whole: Problem) -> None:
-    own = whole.with_(uncertainty={"friction": 0.2, "friction_palm": 0.3, "start_x": 5e-4})
+def test_a_problem_brings_its_own_ranges(heptagon: Problem) -> None:
+    own = heptagon.with_(uncertainty={"friction": 0.2, "friction_palm": 0.3, "start_x": 5e-4})
     assert own.table["uncertainty"] == own.uncertainty
     widths = Uncertainty(own.uncertainty or {}).widths
     expected = {"friction_palm": 0.3, "friction_finger2": 0.2, "start_x": 5e-4, "mass": 0.05}
     assert {key: widths[key] for key in expected} == expected
-    assert replace(own, uncertainty=None).table == whole.table
-    assert replace(whole, uncertainty={"mass": 0.1}).table["uncertainty"] == {"mass": 0.1}
+    assert replace(own, uncertainty=None).table == heptagon.table
+    assert replace(heptagon, uncertainty={"mass": 0.1}).table["uncertainty"] == {"mass": 0.1}
 
 
 @pytest.mark.parametrize(
@@ -415,31 +409,25 @@ def test_a_problem_brings_its_own_ranges(whole: Problem) -> None:
         (0.1, "uncertainty: 0.1 is not a table"),
     ],
 )
-def test_ranges_of_a_problem_are_checked(whole: Problem, ranges: object, text: str) -> None:
+def test_ranges_of_a_problem_are_checked(heptagon: Problem, ranges: object, text: str) -> None:
     with pytest.raises(InputError, match=re.escape(text)):
-        whole.with_(uncertainty=ranges)
+        heptagon.with_(uncertainty=ranges)
 
 
-FOLDER = Path(__file__).parents[1] / "problems"
 EPSILON = 0.05
 RADII = {"mass": 0.02, "friction_palm": 0.02, "friction_finger1": 0.02, "friction_finger2": 0.02}
 
 
 @pytest.fixture(scope="module")
-def hexed() -> Problem:
-    return load(str(FOLDER / "heptagon_four_contacts.toml"))
-
-
-@pytest.fixture(scope="module")
-def curve(hexed: Problem) -> Curve:
-    return trace_phases(hexed)[0]
+def curve(heptagon: Problem) -> Curve:
+    return trace_phases(heptagon)[0]
 
 
 @pytest.fixture(scope="module")
 def rolling() -> tuple[Problem, Curve]:
-    hexed = load(str(FOLDER / "box_rolling.toml"))
-    curves = (own for own in trace_phases(hexed) if own.formation.rolling)
-    return hexed, next(curves)
+    problem = problem_of(BOX)
+    curves = (own for own in trace_phases(problem) if own.formation.rolling)
+    return problem, next(curves)
 
 
 def replace_nearby(formation: Formation, z: Array, v: Array) -> tuple[Array, Array]:
@@ -460,7 +448,7 @@ State = tuple[Array, Array, Array, Directions]
 
 
 def solve_forces(
-    hexed: Problem, formation: Formation, state: State, name: str, change: float
+    heptagon: Problem, formation: Formation, state: State, name: str, change: float
 ) -> Array:
     """Contact forces in the scene whose number is off, at the same place, velocity and torques."""
     z, v, tau, directions = state
@@ -468,20 +456,20 @@ def solve_forces(
     if name.startswith("gain"):
         tau[int(name[-1]) - 1] *= 1 + change
     else:
-        formation = replace(formation, scene=change_problem(hexed, {name: change}).scene)
+        formation = replace(formation, scene=change_problem(heptagon, {name: change}).scene)
         z, v = replace_nearby(formation, z, v)
     found = build_forward(formation)(z, v, tau, directions.Xi, directions.sigma)
     return np.asarray(found[1].full()[:, 0])
 
 
 def require_slopes(
-    hexed: Problem, formation: Formation, state: State, names: list[str], slopes: Array
+    heptagon: Problem, formation: Formation, state: State, names: list[str], slopes: Array
 ) -> None:
     """Require slopes, shape (n_c + R, len(names)), to be those of differences."""
     units = {parameter.name: parameter.unit for parameter in PARAMETERS}
     for k, name in enumerate(names):
         step = 1e-6 if units[name] else 1e-5
-        given = hexed, formation, state, name
+        given = heptagon, formation, state, name
         ends = [solve_forces(*given, sign * step) for sign in (-1, 1)]
         expected = (ends[1] - ends[0]) / (2 * step)
         np.testing.assert_allclose(slopes[:, k], expected, rtol=1e-5, atol=1e-5, err_msg=name)
@@ -492,9 +480,9 @@ OFF = [name for name in NAMES if name not in ("delay", "start_x")]
 
 @pytest.mark.parametrize("which", ["sliding", "rolling"])
 def test_slopes_along_curves_are_those_of_the_whole_solve(
-    which: str, hexed: Problem, curve: Curve, rolling: tuple[Problem, Curve]
+    which: str, heptagon: Problem, curve: Curve, rolling: tuple[Problem, Curve]
 ) -> None:
-    own, way = (hexed, curve) if which == "sliding" else rolling
+    own, way = (heptagon, curve) if which == "sliding" else rolling
     # Slip coordinates count from the joint, which is another question.
     names = [name for name in OFF if which == "sliding" or not name.startswith("base")]
     s, (a, b, squeeze) = 0.4 * way.length, np.array([[2.0], [0.1], [3.0]])
@@ -516,9 +504,9 @@ def test_slopes_along_curves_are_those_of_the_whole_solve(
     np.testing.assert_allclose(slopes[:, -1], (ends[1] - ends[0]) / (2 * step), rtol=1e-5)
 
 
-def test_slopes_with_two_freedoms_are_those_of_the_whole_solve(hexed: Problem) -> None:
-    contacts = [hexed.phases[0].formation.contacts[k] for k in (1, 2, 3)]
-    formation, z = Formation(hexed.scene, tuple(contacts)), hexed.start
+def test_slopes_with_two_freedoms_are_those_of_the_whole_solve(heptagon: Problem) -> None:
+    contacts = [heptagon.phases[0].formation.contacts[k] for k in (1, 2, 3)]
+    formation, z = Formation(heptagon.scene, tuple(contacts)), heptagon.start
     kinematics = formation.evaluate(z[None], z[None])
     v = np.linalg.svd(kinematics.P[0])[2][3:].T @ [0.2, -0.5]
     here = Directions(np.sign(kinematics.A_t[0] @ v), np.sign(v[3:]))
@@ -528,19 +516,19 @@ def test_slopes_with_two_freedoms_are_those_of_the_whole_solve(hexed: Problem) -
     samples = Samples(*(part[None] for part in (z, v, z_ddot, tau, c, -0.1 * here.Xi * c)))
     rows = Directions(here.Xi[None], here.sigma[None])
     slopes = find_slopes_at(formation, samples, rows, OFF)[0]
-    require_slopes(hexed, formation, (z, v, tau, here), OFF, slopes)
+    require_slopes(heptagon, formation, (z, v, tau, here), OFF, slopes)
     along = find_slopes_at(formation, samples, rows, ["start_x"])[0, :, 0]
     assert np.isfinite(along).all() and np.abs(along).max() > 1.0
 
 
-def find_least_in_corners(hexed: Problem, formation: Formation, motion: Motion) -> Array:
+def find_least_in_corners(heptagon: Problem, formation: Formation, motion: Motion) -> Array:
     """The least c_n of each contact over all corners of `RADII`, at instants of a motion."""
     samples = motion.evaluate(np.linspace(0.0, motion.duration, 22)[1:-1])
     least = np.full(samples.c_n.shape, np.inf)
     Xi, sigma = -np.sign(samples.c_t), np.sign(samples.z_dot[:, 3:])
     for signs in product((-1, 1), repeat=len(RADII)):
         changes = {name: sign * RADII[name] for name, sign in zip(RADII, signs, strict=True)}
-        scene = change_problem(hexed, changes).scene
+        scene = change_problem(heptagon, changes).scene
         forward = build_forward(replace(formation, scene=scene)).map(len(Xi))
         given = samples.z.T, samples.z_dot.T, samples.tau.T, Xi.T, sigma.T
         least = np.minimum(least, forward(*given)[1].full().T)
@@ -549,7 +537,7 @@ def find_least_in_corners(hexed: Problem, formation: Formation, motion: Motion) 
 
 @pytest.mark.parametrize("transcription", ["auto", "time"])
 def test_a_robust_plan_keeps_epsilon_in_every_corner(
-    transcription: str, hexed: Problem, curve: Curve
+    transcription: str, heptagon: Problem, curve: Curve
 ) -> None:
     options = PlanOptions(ranges=RADII, accuracy=1e-3)
     own: tuple[PhasePlan[Motion], ...]
@@ -557,10 +545,10 @@ def test_a_robust_plan_keeps_epsilon_in_every_corner(
         own = tuple(plan_path(curve, EPSILON, replace(options, ranges=r), 1) for r in (RADII, {}))
     else:
         timed = replace(options, transcription="time", mode_search=False, time_intervals=4)
-        given = hexed, hexed.phases[:1], hexed.start
+        given = heptagon, heptagon.phases[:1], heptagon.start
         own = tuple(plan_phases(*given, replace(timed, ranges=r))[0] for r in (RADII, {}))
-    formation = hexed.phases[0].formation
-    robust, plain = (find_least_in_corners(hexed, formation, plan.motion).min() for plan in own)
+    formation = heptagon.phases[0].formation
+    robust, plain = (find_least_in_corners(heptagon, formation, plan.motion).min() for plan in own)
     # What two percent change to second order is a hundredth of what they change to first.
     swing = EPSILON - plain
     assert swing > 0.01
@@ -584,27 +572,23 @@ def test_options_that_make_no_sense_are_refused(given: dict[str, float], text: s
         PlanOptions(**given).scale_ranges({})  # type: ignore[arg-type]
 
 
-def test_what_friction_may_hold_grows_with_the_ranges(hexed: Problem) -> None:
-    formation, tau = hexed.phases[0].formation, np.array([0.05, -0.02])
+def test_what_friction_may_hold_grows_with_the_ranges(heptagon: Problem) -> None:
+    formation, tau = heptagon.phases[0].formation, np.array([0.05, -0.02])
     ranges = {"friction_palm": 0.3, "friction_finger1": 0.3, "mass": 0.1, "gain2": 0.05}
-    exact = Statics(formation, hexed.start).torque_polygon().measure(tau[None])[0]
-    assert measure_holds(list_holds(formation, hexed.start, {}), tau) == pytest.approx(exact)
-    rng, within = np.random.default_rng(3), list_holds(formation, hexed.start, ranges)
+    exact = Statics(formation, heptagon.start).torque_polygon().measure(tau[None])[0]
+    assert measure_holds(list_holds(formation, heptagon.start, {}), tau) == pytest.approx(exact)
+    rng, within = np.random.default_rng(3), list_holds(formation, heptagon.start, ranges)
     for tau in rng.uniform(-1.0, 1.0, (20, 2)):
         least = measure_holds(within, tau)
         for _ in range(5):
             own = {name: width * rng.uniform(-1, 1) for name, width in ranges.items()}
-            scene = change_problem(hexed, own).scene
-            static = Statics(replace(formation, scene=scene), hexed.start).torque_polygon()
+            scene = change_problem(heptagon, own).scene
+            static = Statics(replace(formation, scene=scene), heptagon.start).torque_polygon()
             assert static.measure((tau * [1.0, 1 + own["gain2"]])[None])[0] >= least - 1e-9
 
 
-PROBLEMS = sorted((Path(__file__).parents[1] / "problems").glob("*.toml"))
-HEPTAGON = dict(load(str(PROBLEMS[0].with_name("heptagon_four_contacts.toml"))).table)
-
-
 def edited(path: str, value: Any) -> dict[str, Any]:
-    table = copy.deepcopy(HEPTAGON)
+    table = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
     *keys, last = path.split(".")
     part = table
     for key in keys:
@@ -657,16 +641,16 @@ def test_without_gravity_fingers_are_weighed_against_each_other() -> None:
         build_problem(table)
 
 
-@pytest.mark.parametrize("path", PROBLEMS, ids=lambda path: path.stem)
+@each("path", sorted(FOLDER.glob("*.toml")))
 def test_ranges_follow_the_units(path: Path) -> None:
     """Millimetres and grams, and sizes and masses far from those of the shipped problems."""
-    problem = load(str(path))
+    problem = problem_of(path)
     for units in (Units(1e3, 1e3), Units.of(0.01, 1e-3), Units.of(100.0, 1e4)):
         build_problem(Retelling("", units).apply(problem).table)
 
 
 def test_the_start_of_a_small_object_has_rounding_of_its_angle() -> None:
     """Angles have no length: rounding of a radian is the same for an object of 0.5 mm."""
-    small = Retelling("", Units.of(0.01, 1e-3)).apply(load(str(PROBLEMS[0])))
+    small = Retelling("", Units.of(0.01, 1e-3)).apply(problem_of(BOX))
     turned = small.start + np.array([0.0, 0.0, 4e-15, 0.0, 0.0])
     assert build_problem(replace(small, start=turned).table).epsilon == small.epsilon

@@ -18,7 +18,7 @@ import pytest
 import wholearm
 from refused import advising
 from retelling import Retelling, Units
-from shipped import FOLDER, HEPTAGON, HEXAGON, LANDING, problem_of, solved
+from shipped import FOLDER, HEPTAGON, HEXAGON, LANDING, problem_of, solved, table_of, text_of
 from wholearm import Formation, Goal, Phase, PlanOptions, Problem, load_plan, verify
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
@@ -81,7 +81,7 @@ from wholearm.search.find_route import (
 from wholearm.search.places import make_place, require_reach
 from wholearm.search.roadmap import Roadmap, can_start
 
-TABLE = {k: v for k, v in tomllib.loads(HEPTAGON.read_text()).items() if k != "phases"}
+TABLE = table_of()
 
 
 def read(goal: dict[str, Any], **changes: Any) -> Problem:
@@ -209,9 +209,8 @@ def fail(*_: object) -> None:
 
 
 def test_route_prints_phases_that_load(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    text = HEPTAGON.read_text(encoding="utf-8").split("[[phases]]")[0]
     path = tmp_path / "goal.toml"
-    path.write_text(f"{text}[goal]\nflush = 0\nx = 0.03\n", encoding="utf-8")
+    path.write_text(f"{text_of(phases=0)}[goal]\nflush = 0\nx = 0.03\n", encoding="utf-8")
     found = tmp_path / "found"
     assert main(["route", str(path), "--cache", str(found)]) == 0
     (phase,) = tomllib.loads(capsys.readouterr().out)["phases"]
@@ -245,8 +244,7 @@ def test_printed_phases_have_the_plan_that_they_are_printed_for() -> None:
     links = [PlannedLink(plan.problem.phases, (block,))]
     phases = list_printed(plan.problem.scene, links, guesses=True)
     printed = replace(plan.problem, phases=phases)
-    table = {key: own for key, own in plan.problem.table.items() if key != "phases"}
-    again = build_problem(table | tomllib.loads(format_phases(printed)))
+    again = build_problem(table_of(LANDING) | tomllib.loads(format_phases(printed)))
     over_time = [phase.number for phase in plan.phases if phase.modes]
     assert over_time and [p.number for p in again.phases if p.guess] == over_time
     for one, other in zip(printed.phases, again.phases, strict=True):
@@ -288,8 +286,9 @@ def test_fingers_that_cross_on_the_way_are_mounted_elsewhere(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """With links of 0.18 m the fingers touch halfway through the slide; none closes at x = 0."""
-    table = {key: own for key, own in problem_of(HEXAGON).table.items() if key != "phases"}
-    crossing = build_problem({**table, "goal": {"flush": 0, "x": -0.01}}).with_(length=0.18)
+    crossing = build_problem({**table_of(HEXAGON), "goal": {"flush": 0, "x": -0.01}}).with_(
+        length=0.18
+    )
     (goal,), place = crossing.goals, make_place(crossing.scene, crossing.start)
     own, told = RouteSearch(Roadmap(crossing, 0.1), place, goal), list[str]()
     monkeypatch.setattr("wholearm.search.cuts.HANDS", (0.95,))

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
+import shipped
 from plane import (
     SQUARE,
     convex_polygon,
@@ -22,6 +22,7 @@ from plane import (
     rotate,
 )
 from scenes import hexagon, measure_fingers, roll, tip
+from shipped import problem_of
 from wholearm import InputError, Phase, PlanOptions, Problem, Scene, Until
 from wholearm.common.arrays import Array
 from wholearm.contacts.closing import close_finger, place_flush
@@ -29,7 +30,7 @@ from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation, find_touching
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.path_guess import POINTS, PathGuess, close_contacts, guess_phase
-from wholearm.geometry.tracing import load, trace_curve, trace_phases, until_distance
+from wholearm.geometry.tracing import trace_curve, trace_phases, until_distance
 from wholearm.mechanics.dynamics import metric_weights
 from wholearm.planning.path_domain.path_plan import plan_path
 from wholearm.planning.time_domain.time_plan import plan_phases
@@ -372,7 +373,6 @@ def test_fingers_that_graze_are_noticed(least: float) -> None:
     assert curve.reached or curve.ending.startswith("finger 1 touches finger 2 at x = ")
 
 
-HEPTAGON = Path(__file__).parents[1] / "problems" / "heptagon.toml"
 LANDING = "v1-palm v4-finger1 v6-finger2"
 CLOSED = 1e-9
 """Gap [m] that counts as closed: what a trajectory file promises."""
@@ -380,7 +380,7 @@ CLOSED = 1e-9
 
 @pytest.fixture(scope="module")
 def flipping() -> Problem:
-    return load(str(HEPTAGON))
+    return problem_of(shipped.LANDING)
 
 
 @pytest.fixture(scope="module")
@@ -448,25 +448,13 @@ def test_five_contacts_leave_nothing_to_plan(flipping: Problem, curves: tuple[Cu
     assert caught.value.key == "phases[2].contacts"
 
 
-FOLDER = Path(__file__).parents[1] / "problems"
-
-
-@pytest.fixture(scope="module")
-def shipped_hexagon() -> Problem:
-    return load(str(FOLDER / "hexagon.toml"))
-
-
-@pytest.fixture(scope="module")
-def square() -> Problem:
-    return load(str(FOLDER / "square.toml"))
-
-
-def test_an_end_is_found_where_the_nearest_one_breaks_a_limit(shipped_hexagon: Problem) -> None:
+def test_an_end_is_found_where_the_nearest_one_breaks_a_limit() -> None:
     """v0 is lifted until edge 0 is flush on finger 2, while v1 stays on the link's side."""
-    start = trace_phases(shipped_hexagon)[4].end
-    formation = make_formation(shipped_hexagon.scene, "v1-palm v3-finger1 v0-finger2")
-    until = parse_contact("v1-finger2", shipped_hexagon.scene)
-    ending = Formation(shipped_hexagon.scene, (*formation.contacts, until))
+    problem = problem_of(shipped.HEXAGON)
+    start, scene = trace_phases(problem)[4].end, problem.scene
+    formation = make_formation(scene, "v1-palm v3-finger1 v0-finger2")
+    until = parse_contact("v1-finger2", scene)
+    ending = Formation(scene, (*formation.contacts, until))
     nearest = close_contacts(ending, start, np.zeros(0))
     assert nearest is not None and ending.evaluate_limits(nearest[None]).min() < -CLOSED
     (part,) = guess_phase(Phase(5, formation, Until(until)), start)
@@ -476,7 +464,8 @@ def test_an_end_is_found_where_the_nearest_one_breaks_a_limit(shipped_hexagon: P
     np.testing.assert_allclose(part.z[-1, 2], part.z[-1, 4] - np.pi, atol=1e-9)
 
 
-def test_a_flush_edge_that_turns_is_planned_in_the_time_domain_too(square: Problem) -> None:
+def test_a_flush_edge_that_turns_is_planned_in_the_time_domain_too() -> None:
+    square = problem_of(shipped.SQUARE)
     curves, options = trace_phases(square), PlanOptions(time_intervals=6)
     curve = curves[2]
     turning = [part.Xi for part in curve.segments]
