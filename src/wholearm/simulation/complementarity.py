@@ -35,13 +35,14 @@ from ..results.torque import TorqueProfile
 from ..results.trajectory import interpolate_quintic
 from .events import EventKind, describe_change
 from .modes import find_breach
-from .run import Closing, Feedback, Run, StuckError, find_root
+from .run import Feedback, Run, StuckError, find_root
 from .stepper import Modes, ModeStepper, bind
 from .system import ROUNDING_FORCE, SETTLING, STANDING, STILL, ContactRows, Structure, System
 
 EDGE = 1e-9  # reserve of friction that counts as none, relative to its bound or the largest force
 SAME = 1e-6  # difference of rates that is none, over the largest rate without contacts
 SINGULAR = 1e-9  # determinant of a scaled system that counts as zero
+MOST = 600  # most choices of modes that are enumerated: all of one to three contacts and two joints
 APART, STICKS, FORTH, BACK = range(4)
 """Modes of a contact; of a joint all but the first. One without friction that presses sticks."""
 MODES = {0.0: STICKS, 1.0: FORTH, -1.0: BACK}  # by sliding sign
@@ -161,7 +162,7 @@ def _combine(
     options = [(APART, STICKS, FORTH, BACK) if i in owner else (APART, STICKS) for i in range(k)]
     options += [(STICKS, FORTH, BACK) for _ in range(owner.count(-1))]
     every = [] if choice is None else [choice]
-    if choice is None and math.prod(len(option) for option in options) <= 4000:
+    if choice is None and math.prod(len(option) for option in options) <= MOST:
         every = list(product(*options))
     choices = np.array(every, dtype=int).reshape(len(every), len(options))
     modes = np.empty((len(choices), len(own)), dtype=int)
@@ -175,7 +176,7 @@ def _combine(
 def list_answers(p: ContactProblem, choice: Sequence[int] | None = None) -> list[ContactAnswer]:
     """All solutions with distinct rates, or that with the modes `choice` of contacts, then joints.
 
-    Enumerates modes; none are listed where these are more than 4000.
+    Enumerates modes; none are listed where these are more than `MOST`.
     """
     modes = None if choice is None else tuple(choice)
     ways, active = _combine(len(p.b_n), len(p.lift), tuple(p.owner.tolist()), modes)
@@ -517,7 +518,7 @@ class FreeRun(Run):
         for _ in range(5):
             gaps, ranges = system.look(self.z)
             near = np.flatnonzero((np.abs(gaps) < touching) & (ranges > -touching)).tolist()
-            if not near:
+            if np.abs(gaps[near]).max(initial=0.0) < 1e-15 * system.scales.length:
                 break
             rows = system.evaluate(self.z, self.v, near).A / root
             self.y[: system.n] -= np.linalg.lstsq(rows, gaps[near], rcond=1e-9)[0] / root
@@ -760,20 +761,17 @@ class FreeRun(Run):
     def _note_ambiguity(self, pattern: Pattern, answers: Sequence[Sequence[int]]) -> None:
         """Record that there are several answers, once for each set of contacts."""
         names = [self.system.names[pair] for pair in pattern.closed]
-        words = {APART: "parts", STICKS: "presses", FORTH: "slides +", BACK: "slides -"}
+        slides = {APART: "parts", STICKS: "presses", FORTH: "slides +", BACK: "slides -"}
         turns = {STICKS: "is held", FORTH: "turns +", BACK: "turns -"}
-        standing = set(pattern.standing.tolist())
+        told = [(name, slides) for name in names]
+        for k in pattern.standing.tolist():
+            told[k] = names[k], slides | {STICKS: "sticks"}
+        told += [(_name(self.system, joint), turns) for joint in pattern.joints.tolist()]
+        differs = [len(set(modes)) > 1 for modes in zip(*answers, strict=True)]
         texts = []
         for answer in answers:
-            parts = [
-                f"{name} {'sticks' if mode == STICKS and k in standing else words[mode]}"
-                for k, (name, mode) in enumerate(zip(names, answer, strict=False))
-                if any(other[k] != mode for other in answers)
-            ]
-            parts += [
-                f"{_name(self.system, int(joint))} {turns[mode]}"
-                for joint, mode in zip(pattern.joints, answer[len(names) :], strict=True)
-            ]
+            own = zip(told, answer, differs, strict=True)
+            parts = [f"{name} {words[mode]}" for (name, words), mode, other in own if other]
             texts.append(", ".join(parts) or "the rest accelerates otherwise")
         text = f"{len(answers)} motions are possible with {', '.join(names) or 'no contact'} closed"
         text += f" ({'; or '.join(texts)})"
@@ -915,9 +913,20 @@ class FreeRun(Run):
         touches = (np.abs(watch.gaps) < near) & (watch.ranges > -near) & (watch.watched > 0)
         return bool((self.values > clear).all()) and not touches.any()
 
-    def find_contact(self, h: float, closing: Closing) -> float | None:
+    def find_closing(self, h: float, done: Sequence[int]) -> tuple[int, float] | None:
+        """The first pair that closes within the step just made, but those `done`, and when."""
+        passed = [pair for pair in done if pair >= 0]
+        while bracket := self._find_bracket(h, passed):
+            if (root := self._find_contact(h, *bracket)) is not None:
+                return bracket[0], root
+            passed.append(bracket[0])
+            self.step_to(h)
+        return None
+
+    def _find_contact(
+        self, h: float, pair: int, level: float, left: float, right: float
+    ) -> float | None:
         """When a pair closes within a step; None if it does not, or where the two do not face."""
-        pair, level, left, right = closing
         n = self.system.n
 
         def value(step: float) -> float:
@@ -937,9 +946,11 @@ class FreeRun(Run):
         out = self.s.outputs
         return root if self._face(out[:n], out[n : 2 * n])[1][pair] else None
 
-    def find_closing(self, h: float, done: Sequence[int]) -> Closing | None:
-        """The first pair that closes within the step just made, and a bracket of when."""
-        passed, unit = [pair for pair in done if pair >= 0], self.unit
+    def _find_bracket(
+        self, h: float, passed: Sequence[int]
+    ) -> tuple[int, float, float, float] | None:
+        """The first pair whose gap falls below a level [m], that, and a bracket of when [s]."""
+        unit = self.unit
         times, gaps, ranges = self._sample(h)
         # What comes apart within the step may close again within it.
         apart = np.logical_or.accumulate(gaps[:-1] > ARMED * unit, axis=0)
@@ -950,7 +961,7 @@ class FreeRun(Run):
         rows, pairs = crosses.nonzero()
         if len(rows):
             row, pair = int(rows[0]), int(pairs[0])
-            return Closing(pair, float(level[row, pair]), *times[row : row + 2].tolist())
+            return pair, float(level[row, pair]), *times[row : row + 2].tolist()
         # The first one that comes into range apart or touching, and overlaps after that. Out of
         # range a gap has no meaning and may be negative throughout.
         turns = (ranges[1:] > 0) & (ranges[:-1] <= 0) & (self.watch.watched > 0)
@@ -962,7 +973,7 @@ class FreeRun(Run):
             self.step_to(entry)
             gap = float(self.watch.ahead[pair])
             if gap > -SUNK * unit:
-                return Closing(pair, min(gap, 0.0) - 0.5 * CLOSED * unit, entry, right)
+                return pair, min(gap, 0.0) - 0.5 * CLOSED * unit, entry, right
             self.step_to(h)
         return None
 

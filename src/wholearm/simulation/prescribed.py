@@ -12,10 +12,8 @@ that roll there. After an impact every contact of the next formation has to pres
 Where a sliding or joint velocity reaches zero, Coulomb's law decides. A contact at rest may slide
 with a sign if it then accelerates with it, or stick if its c_t stays in the cone; a joint likewise.
 Each combination is one linear system, and every contact has to press. Forces are evaluated a short
-time later, which tells one that leaves its cone from one that returns. The first combination that
-is consistent by more than rounding is taken, or else the one with the largest margin. What has just
-come to rest tries to reverse, then to stick, then to continue; all else tries its present mode, or
-to slip if its cone is just reached.
+time later, which tells one that leaves its cone from one that returns. The combination with the
+largest margin is taken.
 
 What cannot move because something else sticks has no independent constraint. Its friction is
 indeterminate and has either sign: margins elsewhere are monotonic in it, so some sign is consistent
@@ -209,7 +207,6 @@ class Replay(Run):
     ----------
     settling, rest_window : [s], rounding : [N]
                              see the constants of these names
-    longest_window : [s]     longest time between an arrival at speed and its torque break
     slip_signs               signs of contacts, by name, that have just begun to slip
     side                     sign of (coordinate - value) before the end of the phase
     passes                   whether the end may be passed at any speed, without an impact
@@ -241,7 +238,6 @@ class Replay(Run):
         super().__init__(system, torque, np.asarray(problem.start), np.zeros(5), tolerance, wanted)
         self.problem, self.minima, time = problem, minima, system.scales.time
         self.settling, self.rest_window = SETTLING * time, REST_WINDOW * time
-        self.longest_window = 2e-2 * time
         self.rounding = ROUNDING_FORCE * system.scales.force
         self.step_times = [b for b, s in zip(self.breaks, self.steps_at, strict=False) if s]
         self.held_until = self.settled_by = -math.inf
@@ -271,7 +267,7 @@ class Replay(Run):
         modes = mode.find_modes()
         self.load(modes._replace(Xi=(0.0,) * len(modes.kept), sigma=(0.0,) * 5))
         self.leg = _build_leg(self.formation, self.phase.until, self.side, self.s, mode)
-        self.slack, self.urgent = self.leg.slack, self.leg.rows.speed
+        self.slack = self.leg.slack
         self.leg.heading[:] = 0.0
 
     def measure(self) -> Array:
@@ -583,8 +579,7 @@ class Replay(Run):
         elif self.phase.end is not End.SMOOTH and self.formation.n_constraints < 4:
             units = self.system.units[5:]
             speed = float(np.abs(self.s.outputs[5:10] / units).max())
-        presses = bool(self.values[self.leg.rows.force].min() >= -ROUNDING_FORCE)
-        return speed < SLOW and presses and not self.find_slipping()
+        return speed < SLOW
 
     def _comes_later(self) -> bool:
         """Whether a motion with fading deceleration still approaches, at a break before its end."""
@@ -623,7 +618,7 @@ class Replay(Run):
         pulling = [k for k in kinds if k < rows.force.stop]
         if pulling:
             return self.let_go(pulling)
-        cone, limit, mode, now = rows.cone, rows.limit, self.leg.mode, self.t
+        cone, limit, mode = rows.cone, rows.limit, self.leg.mode
         bounds = [k - cone.start for k in kinds if cone.start <= k < cone.stop]
         if any(mode.declares(k % len(mode.holders)) for k in bounds):
             return self.slip()
@@ -632,27 +627,16 @@ class Replay(Run):
             text = f"{self.leg.limits[reached[0] - limit.start]} {self.when()}"
             self.note(EventKind.LIMIT, text)
             return Outcome(OutcomeKind.LIMIT_REACHED, text)
-        turned = self._find_turning(kinds)
-        if not bounds and self.steps_within(self.settling):
-            self._finish_piece()
-        return self.restart(turned, time=now)
+        return self.restart(self._find_turning(kinds))
 
     def _reach(self) -> Arrival:
         """The end of the phase is reached while moving."""
         rate, window = -self.rate, self.settling
         if self.phase.end is End.SMOOTH or self._strikes():
-            # It is passed; the torques of the next phase may still have to come.
-            if self.passes and rate > 0:
-                # A motion that is off by the error of a long one before comes the earlier the
-                # slower.
-                early = 1e-5 * self.leg.until_unit / rate
-                window = min(max(early, window), self.longest_window)
-            if self.steps_within(window):
-                self.coast_to_step(hide=False)
             return Arrival(rate, window, self.phase.end is End.IMPACT)
         # A planned motion that comes this early by its error would have stopped v / a later.
-        stopping = 2 * self._time_to_stop()
-        remaining = min(stopping, self.longest_window) if stopping < math.inf else 0.0
+        stopping, longest = 2 * self._time_to_stop(), 2e-2 * self.system.scales.time
+        remaining = min(stopping, longest) if stopping < math.inf else 0.0
         slow = abs(self._measure_rate()) < SLOW
         return Arrival(rate, max(remaining, window) if slow else remaining, remaining=remaining)
 
@@ -771,14 +755,12 @@ class Replay(Run):
         self.signs = signs
         return self.restart(enters=formation.n_constraints < 4)
 
-    def restart(
-        self, turned: Sequence[int] = (), *, time: float | None = None, enters: bool = False
-    ) -> Ending | None:
+    def restart(self, turned: Sequence[int] = (), enters: bool = False) -> Ending | None:
         """Choose contact modes after forces jump and record them; what ends the motion, if any.
 
-        `turned`: contacts, then joints, that came to rest at `time` [s]; `enters`: a new formation.
+        `turned`: contacts, then joints, that came to rest; `enters`: a new formation.
         """
-        if self._decide(turned, time=time, enters=enters):
+        if self._decide(turned, enters):
             return self.come_to_rest()
         self.observe()
         if self._bridge():
@@ -794,18 +776,16 @@ class Replay(Run):
             return self.let_go(pulling.tolist())
         return self.slip() if slipping else None
 
-    def _decide(
-        self, turned: Sequence[int], *, time: float | None = None, enters: bool = False
-    ) -> bool:
+    def _decide(self, turned: Sequence[int], enters: bool = False) -> bool:
         """Choose the friction signs of all that stands still; whether all motion has ended.
 
         With one freedom whatever slides or turns does so for as long as there is motion.
         """
-        formation, signs, time = self.formation, self.signs, self.t if time is None else time
+        formation, signs = self.formation, self.signs
         if formation.n_constraints >= 4:
             for row in turned:
                 signs[row] *= -1
-                self.note_change(row, -signs[row], signs[row], time)
+                self.note_change(row, -signs[row], signs[row])
             self.signs = signs
             return False
         self.look()
@@ -822,8 +802,7 @@ class Replay(Run):
         if not self.gets_on():
             names = " ".join(formation.names)
             raise SimulationError(f"sticking and slipping of {names} do not end {self.when()}")
-        options = [self._list_options(unit, turned) for unit in still]
-        chosen, mode, _, _ = self._choose(signs, still, options)
+        chosen, mode, _, _ = self._choose(signs, still)
         rows = evaluate_rows(formation, self.z, self.v)
         fixed = find_fixed(mode, rows)
         # Rounding of speeds against the directions chosen is taken away.
@@ -840,7 +819,7 @@ class Replay(Run):
             after = float(chosen[row]) if not fixed[row] else 0.0
             changes = before != after and not (enters and after) and unit.grips
             for row in unit.rows if changes else ():
-                self.note_change(row, before, after, time)
+                self.note_change(row, before, after)
             self.stuck = (self.stuck - set(unit.rows)) | set(() if after else unit.rows)
         return False
 
@@ -902,38 +881,19 @@ class Replay(Run):
         reserves, mode = self._measure_reserves(), self.leg.mode
         return [k for k, x in enumerate(reserves) if x < -ROUNDING_FORCE and mode.declares(k)]
 
-    def _finish_piece(self) -> None:
-        """Step to the torque step, without a record of the forces on the way."""
-        self.coast_to_step(hide=True)
-        self.records.pop()
-        self.note(EventKind.TORQUE_STEP, f"the torques step {self.when()}")
-
-    def steps_within(self, window: float) -> bool:
-        """Whether the torques step soon."""
-        return self.coming_step - self.t <= window
-
-    def coast(self, stop: float, hide: bool) -> None:
-        """Step to `stop`, whatever happens on the way; `hide` leaves out the forces on the way."""
+    def coast(self, stop: float) -> None:
+        """Step to `stop`, whatever happens on the way, without a record of the forces there."""
         while self.wanted[self.next_wanted] < stop:
             place = self.wanted[self.next_wanted]
             self.step_to(place - self.t)
             self.keep(place)
-            if hide:
-                row = self.records[-1]
-                none = np.full(len(row.kept), np.nan)
-                self.records[-1] = row._replace(c_n=none, c_t=none)
+            row = self.records[-1]
+            none = np.full(len(row.kept), np.nan)
+            self.records[-1] = row._replace(c_n=none, c_t=none)
             self.next_wanted += 1
         self.step_to(stop - self.t)
         self.keep(stop)
-
-    def coast_to_step(self, hide: bool) -> None:
-        """Step to where the torques step next, as `coast` does, and go on to the next piece."""
-        while True:
-            self.coast(self.stop, hide)
-            self.next_piece()
-            if self.steps_at[self.piece]:
-                return
-            self.records.pop()
+        self.records.pop()
 
     def is_there(self) -> bool:
         """Whether the distance to the end of the phase counts as none, at rest."""
@@ -942,9 +902,14 @@ class Replay(Run):
     def _bridge(self) -> bool:
         """Integrate from a reversal to its torque step, unrecorded; whether motion has ended."""
         rows: list[int] = []
-        if self.steps_within(self.settling):
+        if self.coming_step - self.t <= self.settling:
             self.records.pop()
-            self._finish_piece()
+            while True:
+                self.coast(self.stop)
+                self.next_piece()
+                if self.steps_at[self.piece]:
+                    break
+            self.note(EventKind.TORQUE_STEP, f"the torques step {self.when()}")
         elif self._goes_on():
             return False
         else:
@@ -956,8 +921,7 @@ class Replay(Run):
                 self.look()
                 return False
             self.records.pop()
-            self.coast(self.t + float(self.s.inputs[self.s.at.h]), hide=True)
-            self.records.pop()
+            self.coast(self.t + float(self.s.inputs[self.s.at.h]))
         ended = self._decide(rows)
         self.observe()
         return ended
@@ -971,31 +935,16 @@ class Replay(Run):
         least = 100 * SETTLING * (strongest + fastest**2)
         return bool((self.values[self.leg.rows.turning][self.signs != 0] > least).all())
 
-    def note_change(self, row: int, before: float, after: float, time: float) -> None:
+    def note_change(self, row: int, before: float, after: float) -> None:
         """Record that a contact or joint sticks, slips or turns back."""
         names = self.formation.names
         contact = row < len(names)
         name = names[row] if contact else f"joint {row - len(names) + 1}"
         kind, text = describe_change(name, before, after, "slides" if contact else "turns")
-        self.note(kind, f"{text} at t = {time:.5g} s, phase {self.phase.number}", name, time=time)
+        self.note(kind, f"{text} {self.when()}", name)
 
-    def _list_options(self, unit: Unit, turned: Sequence[int]) -> tuple[float, ...]:
-        """Directions to try for one unit, in the order in which the first clear one is taken."""
-        present = float(self.signs[unit.rows[0]])
-        if present != 0:
-            first = -present if set(unit.rows) & set(turned) else present
-            return (first, 0.0, -first) if unit.grips else (first, -first)
-        holder = self.leg.mode.holders.index(unit.rows)
-        low, high = self.values[self.leg.rows.cone].reshape(2, -1)[:, holder]
-        sign = 1.0 if high < low else -1.0
-        # Friction is at the edge of its cone and opposes the slip to come.
-        edge = min(low, high) < ROUNDING_FORCE
-        return (sign, -sign, 0.0) if edge else (0.0, sign, -sign)
-
-    def _choose(
-        self, signs: Array, still: Sequence[Unit], orders: Sequence[tuple[float, ...]]
-    ) -> Choice:
-        """Signs of the first clear combination or of the best; `JammingError` without any."""
+    def _choose(self, signs: Array, still: Sequence[Unit]) -> Choice:
+        """The most consistent signs of what stands still; `JammingError` without any."""
         formation, scales, ahead = self.formation, self.system.scales, self.settling
         loads = [np.array([1.0, *self.tau(t)]) for t in (self.t, self.t + ahead)]
         present, count = evaluate_rows(formation, self.z, self.v), formation.n_contacts
@@ -1028,22 +977,14 @@ class Replay(Run):
                     margins.append(gained[row])
             return Choice(signs, mode, float(min(margins)), float(held[:count].min()))
 
-        choices: list[Choice] = []
-        for pattern in list_modes(formation, signs, still, orders):
-            choice = measure(*pattern)
-            if choice is None:
-                continue
-            if choice.margin > CLEAR and choice.pressing > -CLEAR:
-                return choice
-            choices.append(choice)
-        pressing = [choice for choice in choices if choice.pressing > -CLEAR]
-        best = max(pressing, key=lambda choice: choice.margin, default=None)
-        if best is not None and best.margin > -CLEAR:
-            return best
-        # A contact is about to be lost, and its forces say which.
-        pulling = [choice for choice in choices if choice.pressing <= -CLEAR]
-        if pulling:
-            return max(pulling, key=lambda choice: choice.margin)
+        options = [(1.0, -1.0, 0.0) if unit.grips else (1.0, -1.0) for unit in still]
+        patterns = list_modes(formation, signs, still, options)
+        choices = [one for one in (measure(*pattern) for pattern in patterns) if one is not None]
+        pressing = [one for one in choices if one.pressing > -CLEAR and one.margin > -CLEAR]
+        # Where none presses a contact is about to be lost, and its forces say which.
+        pulling = [one for one in choices if one.pressing <= -CLEAR]
+        if pressing or pulling:
+            return max(pressing or pulling, key=lambda one: one.margin)
         if min(ratios) <= 0:
             self.fail_to_step(min(ratios))
         names = " ".join(formation.names)

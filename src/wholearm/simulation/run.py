@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +15,7 @@ from ..common.errors import SimulationError, require_number
 from ..results.torque import TorqueProfile
 from .events import Event, EventKind, Record
 from .stepper import LOSSES, ORDER, Modes, ModeStepper, build_stepper
-from .system import FIRST_STEP, SETTLING, SHORTEST_STEP, System
+from .system import FIRST_STEP, SHORTEST_STEP, System
 
 SAME = 1e-9  # distance of two instants that counts as none, relative to the period
 
@@ -65,15 +65,6 @@ def find_root(
     return high
 
 
-class Closing(NamedTuple):
-    """A pair whose gap falls below a level [m] between two instants since a step's start [s]."""
-
-    pair: int
-    level: float
-    left: float
-    right: float
-
-
 class StuckError(ArithmeticError):
     """Steps become too short to get anywhere."""
 
@@ -93,7 +84,6 @@ class Run(ABC):
     values, start        event values after the step just made and before it, in units of the scene:
                          an event is where one falls below zero
     slack                how far below zero each of them counts as rounding
-    urgent               row of the event that is located first, -1 if none
     longest : [s]        longest step from the present state
     """
 
@@ -103,7 +93,7 @@ class Run(ABC):
     values: Array
     start: Array
     slack: Array
-    urgent, longest = -1, math.inf
+    longest = math.inf
 
     def __init__(
         self,
@@ -166,12 +156,11 @@ class Run(ABC):
     def locate(self, h: float, t: float) -> list[int]:
         """Shorten the step just made, of length `h` to `t` [s], to its first events; their rows."""
 
-    def find_closing(self, h: float, done: Sequence[int]) -> Closing | None:
-        """The first pair that closes within the step just made, of length `h`, but those `done`."""
-        return None
+    def find_closing(self, h: float, done: Sequence[int]) -> tuple[int, float] | None:
+        """The first pair that closes within the step just made, of length `h`, and when [s].
 
-    def find_contact(self, h: float, closing: Closing) -> float | None:
-        """When a pair closes within a step; None if it does not."""
+        Those `done` do not count.
+        """
         return None
 
     @abstractmethod
@@ -307,13 +296,11 @@ class Run(ABC):
                 return [k for k in seen if k == last or k in shown]
             seen += [k for k in low if k not in seen]
             share = {k: before[k] / (before[k] - after[k]) for k in low}
-            row = self.urgent if self.urgent in low else min(low, key=share.__getitem__, default=0)
-            if closing is not None and (not low or closing.left <= h * share[row]):
-                root = self.find_contact(h, closing)
-                done.append(len(shift) + closing.pair)
-                if root is not None:
-                    h, last = root, done[-1]
-                    seen.append(last)
+            row = min(low, key=share.__getitem__, default=0)
+            if closing is not None and (not low or closing[1] <= h * share[row]):
+                last, h = len(shift) + closing[0], closing[1]
+                done.append(last)
+                seen.append(last)
                 continue
 
             def value(step: float, row: int = row) -> float:
@@ -345,8 +332,6 @@ class Run(ABC):
     def try_step(self, target: float) -> tuple[float, bool]:
         """Make a step within the tolerance, to `target` [s] at most.
 
-        Steps are halved where a force dips below zero within one and nothing happens by its end.
-
         Returns
         -------
         h, whole  its length [s] and whether it ends at `target`
@@ -364,8 +349,6 @@ class Run(ABC):
             error = float(outputs[to.error])
             if error <= 1:
                 self.values = self.measure()
-            sudden = outputs[to.dip] < -1e-6 and h > SETTLING / 10 * time
-            if error <= 1 and not (sudden and not (self.values < -self.slack).any()):
                 # A growth of 40 at order 8 is that of an error of 1e-13 of the tolerance.
                 grown = h * min(40.0, 0.9 * max(error, 1e-300) ** (-1 / ORDER))
                 self.h = grown if h >= self.h else max(self.h, grown)
@@ -374,9 +357,7 @@ class Run(ABC):
             self.rejected += 1
             if h < least:
                 raise StuckError
-            self.h = h * (0.5 if error <= 1 else max(0.2, 0.9 * error ** (-1 / ORDER)))
-            if not error < math.inf:
-                self.h = 0.2 * h
+            self.h = h * max(0.2, 0.9 * error ** (-1 / ORDER)) if error < math.inf else 0.2 * h
 
     def wait(self, stop: float) -> None:
         """Let time pass at rest."""
@@ -387,17 +368,9 @@ class Run(ABC):
         self.t = stop
         self.record(still=True)
 
-    def note(
-        self,
-        kind: EventKind,
-        text: str,
-        contact: str = "",
-        value: float = math.nan,
-        time: float | None = None,
-    ) -> None:
-        """Append an event, at present if no time is given."""
-        time = self.t if time is None else time
-        self.events.append(Event(time, self.phase_index, kind, text, contact, value))
+    def note(self, kind: EventKind, text: str, contact: str = "", value: float = math.nan) -> None:
+        """Append an event at present."""
+        self.events.append(Event(self.t, self.phase_index, kind, text, contact, value))
 
     def record(self, still: bool = False) -> None:
         """Record the present instant from the outputs of the steps.

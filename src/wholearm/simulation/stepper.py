@@ -130,7 +130,6 @@ class Outputs(NamedTuple):
     # positive until something happens, in units of the scene: see `EventRows`
     values: slice
     error: int  # estimated error over the tolerance; accept at 1 and below
-    dip: int  # least force or friction margin at stages within the step, at most 1
     stages: slice  # margins at the start and the stages of `INNER_STAGES`, one after the other
     size: int
 
@@ -191,7 +190,7 @@ class _Equations:
         self.at = Inputs(*_lay_out(size, None, None, None, k, n, s, 2, 2 * degree + 2, *numbers))
         self.rows = EventRows(*_lay_out(k, 2 * s, k, n))
         seen = (1 + len(INNER_STAGES)) * self.rows.cone.stop
-        outputs = (size, n, k, k, 2, None, self.rows.size, None, None, seen)
+        outputs = (size, n, k, k, 2, None, self.rows.size, None, seen)
         self.to = Outputs(*_lay_out(*outputs))
 
     def compile(self) -> ModeStepper:
@@ -210,12 +209,12 @@ class _Equations:
         end, fifth, third = build_step(rate, y, t, h, 2 * n)
         error = build_error(fifth, third, y[: 2 * n], packed[at.units], packed[at.tolerance])
         inner = ca.vertcat(*(stages[row] for row in INNER_STAGES))
-        seen = (error, ca.mmin(ca.vertcat(1, inner)), stages[0], inner)
+        seen = (error, stages[0], inner)
         end = ca.vertcat(self._build_projection()(end[: 2 * n], packed), end[2 * n :])
         functions = []
         for state, time, extra in (
             (end, t + h, seen),
-            (y, t, (0, 1, ca.DM.zeros(seen[2].shape[0] + inner.shape[0]))),
+            (y, t, (0, ca.DM.zeros(stages[0].shape[0] + inner.shape[0]))),
         ):
             parts = report(state[: 2 * n], time, packed, geometry)
             outputs = ca.densify(ca.vertcat(state, parts, *extra))
