@@ -359,16 +359,11 @@ class Pattern:
                 choice[k] = mode
         return choice + signs[len(self.standing) :]
 
-    def make_modes(self, answer: ContactAnswer, rows: ContactRows, unique: bool) -> Modes:
-        """Independent constraints that give the answer's motion; `unique`: it is the only one."""
+    def make_modes(self, answer: ContactAnswer, rows: ContactRows) -> Modes:
+        """Independent constraints that give the answer's motion."""
         system, closed = self.system, self.closed
         size = max(float(np.abs(answer.r_n).max(initial=0.0)), system.scales.acceleration)
         still, presses = 1e-3 * SAME * size, answer.c_n > 0
-        if unique and (presses | (answer.r_n > still)).all():
-            # What presses is independent then, and nothing stands.
-            own = np.flatnonzero(presses).tolist()
-            slides, turns = tuple(self.Xi[own].tolist()), tuple(self.sigma.tolist())
-            return Modes(tuple(closed[k] for k in own), (), (), slides, turns)
         order = sorted(range(len(closed)), key=lambda k: -answer.c_n[k])
         root = np.sqrt(system.mass)
         basis: list[Array] = []
@@ -377,9 +372,8 @@ class Pattern:
             """Whether a row is a constraint of its own; it counts from then on."""
             row = row / root
             size, rest = float(np.linalg.norm(row)), row.copy()
-            for _ in range(2):
-                for other in basis:
-                    rest = rest - (other @ rest) * other
+            for other in basis:
+                rest = rest - (other @ rest) * other
             left = float(np.linalg.norm(rest))
             if left <= DEPENDENT * size:
                 return False
@@ -391,7 +385,8 @@ class Pattern:
         stuck, Xi = [], self.Xi.copy()
         held, sigma = [], self.sigma.copy()
         sigma[self.joints] = answer.sign[count:]
-        # Of what sticks as one, as the contacts of a flush edge do, what has to hold comes first.
+        # Of what sticks as one, as the contacts of a flush edge do, what has to hold comes first:
+        # decisions in the least-time policy of the square do not end else.
         for j in np.argsort(-answer.shares, kind="stable").tolist():
             sign = answer.sign[j]
             if j >= count:
@@ -673,7 +668,7 @@ class FreeRun(Run):
         # What rests leaves its last modes by rounding, before it takes others in which it rests.
         still = self.resting or self._is_still(acceleration)
         rests = self.stands() and still and self._is_still(coming + answer.change)
-        modes = pattern.make_modes(answer, rows, self.unique)
+        modes = pattern.make_modes(answer, rows)
         self._note_changes(pattern.closed, modes, rests)
         self.modes = modes
         # Rounding of speeds that are zero.

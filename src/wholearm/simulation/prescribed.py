@@ -214,7 +214,6 @@ class Replay(Run):
     stuck                    contacts, then joints, that stick while the rest moves
     minima                   whether to record where margins are least within steps, too
     least                    c_n of contacts up to now in the phase, over the scene's force
-    arrives                  whether the step just made ends the phase, which it passes by rounding
     """
 
     leg: ModeSegment
@@ -242,7 +241,7 @@ class Replay(Run):
         self.step_times = [b for b, s in zip(self.breaks, self.steps_at, strict=False) if s]
         self.held_until = self.settled_by = -math.inf
         self.side = 1.0
-        self.passes = self.moving = self.arrives = False
+        self.passes = self.moving = False
         self.stuck: set[int] = set()
         self.slip_signs: dict[str, float] = {}
 
@@ -495,9 +494,7 @@ class Replay(Run):
     def locate(self, h: float, t: float) -> list[int]:
         """Shorten the step just made to its first event; rows of its event values."""
         found, records, least = list[int](), list[Record](), math.inf
-        passes = bool((self.values < -self.slack).any())
-        self.arrives = passes and self._is_at_end(t)
-        if passes and not self.arrives:
+        if (self.values < -self.slack).any() and not self._is_at_end(t):
             found = self.find_first(h)
         if self.minima:
             records, least = self._look_inside(float(self.s.inputs[self.s.at.h]))
@@ -514,7 +511,7 @@ class Replay(Run):
         Returns them and the first of these instants at which an event shows, since the start of
         the step, infinity if there is none.
         """
-        s, rows, slack = self.s, self.leg.rows, self.slack.copy()
+        s, rows = self.s, self.leg.rows
         margins = s.outputs[s.to.values][: rows.cone.stop]
         known = np.vstack([s.outputs[s.to.stages].reshape(-1, len(margins)), margins])
         inside = _INSIDE @ known
@@ -525,19 +522,13 @@ class Replay(Run):
         dips = inside.min(axis=0) < least - 1e-7
         if not dips.any():
             return [], math.inf
-        # Within a step more counts as rounding than at its end.
-        slack[rows.turning] = slack[rows.speed] = STANDING
-        # The contact just given up starts at zero.
-        slack[rows.until] = 3e-8
-        if self.arrives:
-            slack[rows.until] = slack[rows.speed] = slack[rows.turning] = math.inf
         found: dict[float, tuple[Record, Array, bool]] = {}
 
         def look(x: float) -> None:
             if 0 < x < 1 and x not in found:
                 self.step_to(x * h)
                 record = Record.of(s, self.t + x * h, self.phase_index, self.impact)
-                found[x] = record, self.values, bool((self.values + slack < 0).any())
+                found[x] = record, self.values, bool((self.values + self.slack < 0).any())
                 self.least = np.minimum(self.least, self.values[force])
 
         for row in np.flatnonzero(dips).tolist():
