@@ -14,13 +14,14 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import count
+from itertools import count, pairwise
 from typing import NamedTuple, TypeVar
 
 from ..common.parallel import Task, share
 from ..common.signals import beat
 from ..planning.blocks import free_torques
 from ..planning.options import Objective, PlanOptions
+from ..planning.phase_plan import end_of
 from ..planning.result import Plan
 from ..problem.definition import Goal, Problem
 from .edge_plans import (
@@ -31,6 +32,7 @@ from .edge_plans import (
     measure_link,
     plan_links,
     plan_phases,
+    time_from,
 )
 from .edges import ROUGHLY, Blocked, Link, describe_steps, leave_at
 from .places import Key, RoadmapPlace, is_at
@@ -201,6 +203,7 @@ class ReleaseSearch:
     """Pattern search for the place where a link leaves a border for a cell."""
 
     plan: Callable[[RefinedPath], Found]
+    time: Callable[[Measured], float]  # [s]: of a plan and the border that follows
     best: Measured
     known: dict[RefinedPath, Found] = field(default_factory=dict)  # plans that were made before
     _others: list[Measured] = field(default_factory=list)
@@ -208,10 +211,9 @@ class ReleaseSearch:
 
     def run(self) -> list[Measured]:
         """The fastest plan, followed by the others."""
-        path = self._move(RefinedPath(0), STEPS[:1])
-        # In motion the planner chooses the place: tried first where no shift has gained anything.
-        if path.move or not self._try(RefinedPath(None)):
-            path = self._move(path, STEPS[1:])
+        # In motion the planner chooses the place.
+        if not self._try(RefinedPath(None)):
+            path = self._move(RefinedPath(0), STEPS)
             if self._try(path._replace(straight=False)):
                 self._move(path._replace(straight=False), STEPS[1:])
         return [self.best, *self._others]
@@ -234,7 +236,7 @@ class ReleaseSearch:
         found = self.known[path] if path in self.known else self.plan(path)
         if isinstance(found, str):
             return False
-        better = found.duration < GAIN * self.best.duration
+        better = self.time(found) < GAIN * self.time(self.best)
         self._others.append(self.best if better else found)
         self.best = found if better else self.best
         return better
@@ -254,6 +256,7 @@ class Chooser:
     made: list[tuple[Plan, RoadmapRoute]] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)  # why routes have no plan
     _prefetched: dict[Link, Found] = field(default_factory=dict)
+    _following: dict[tuple[Link, bytes], float] = field(default_factory=dict)
     _measurements: int = 0
     _bound: tuple[float, BackgroundTask[BorderBound]] | None = None
     _lost: list[tuple[Link, ...]] = field(default_factory=list)
@@ -405,13 +408,14 @@ class Chooser:
     def _refine(self, route: RoadmapRoute, report: Callable[[str], None]) -> None:
         """Optimize the places where a route leaves borders for cells."""
         roadmap = self.roadmap
+        following = dict(pairwise((*route.links, None)))
         links = [link for link in route.links if link.left and link not in roadmap.refined]
         roadmap.refined.update(links)
         for link in links:
             report(f"planning {describe_steps(link.steps)} in other ways")
         plans = {link: roadmap.measured[link] for link in links}
         searches = [
-            ReleaseSearch(partial(self._release, link), plan)
+            ReleaseSearch(partial(self._release, link), partial(self._time, following[link]), plan)
             for link, plan in plans.items()
             if isinstance(plan, Measured)
         ]
@@ -444,9 +448,25 @@ class Chooser:
         if place is not None and not INSIDE < place < 1 - INSIDE:
             return "it is too near to the end of the border"
         steps = leave_at(link, place)
+        # In motion the first guess has no plan in goal 48 of the corpus.
         return measure_link(
-            self.problem, link, steps, self.options, straight=path.straight, first_only=True
+            self.problem,
+            link,
+            steps,
+            self.options,
+            straight=path.straight,
+            first_only=place is not None,
         )
+
+    def _time(self, following: Link | None, plan: Measured) -> float:
+        """Duration [s] of a plan through a cell, and of the border that follows where it lands."""
+        if following is None or following.in_cell:
+            return plan.duration
+        z = end_of(plan.begun[-1])[0]
+        key = following, z.tobytes()
+        if key not in self._following:
+            self._following[key] = time_from(self.problem, following, z)
+        return plan.duration + self._following[key]
 
     def _is_lost(self, route: RoadmapRoute) -> bool:
         """Whether a route contains links that had no plan on another one."""

@@ -39,8 +39,18 @@ from ..problem.table import SAME as PRINTED_ANGLE
 from ..problem.table import describe_phase
 from ..results.plan_record import ROLLS
 from ..scene.model import Scene
-from .edges import DEPENDENT, INTERVALS, EdgeStep, Link, describe_steps, find_headings, point_out
-from .places import close_place, measure_apart
+from .edges import (
+    DEPENDENT,
+    INTERVALS,
+    BorderEdge,
+    EdgeStep,
+    Link,
+    describe_steps,
+    find_headings,
+    link_along,
+    point_out,
+)
+from .places import close_place, make_place, measure_apart
 
 ROUGH = 1e-2  # accuracy of plans that only estimate durations
 # Distances are in radii of gyration and radians.
@@ -323,7 +333,7 @@ class _LinkPlanner:
         steps = (*link.steps, *follows)
         phases, curves = make_phases(self.problem, steps), list[Curve]()
         if not link.in_cell and len(phases) == 1:
-            phases[0], curve = _aim(phases[0], z, link)
+            phases[0], curve = aim(phases[0], z, link)
             curves.append(curve)
         single = replace(self.problem, start=z, phases=tuple(phases), goals=())
         count = len(phases) - len(follows)
@@ -386,16 +396,32 @@ def pin_landing(phase: Phase, z: Array) -> Phase:
     return replace(phase, until=replace(until, pins=((name, value),)))
 
 
-def _aim(phase: Phase, z: Array, link: Link) -> tuple[Phase, Curve]:
-    """The phase of a border's link from `z` and its curve, which ends where the link does.
+def aim(phase: Phase, z: Array, link: Link) -> tuple[Phase, Curve]:
+    """The first phase of a border's link from `z` and its curve, which ends where the border does.
 
     A contact may be gained both ways along a border; then the end is given by x or phi.
     """
+    end = link.borders[0].curve.end
     try:
         curve = trace_phase(phase, z)
-        if measure_apart(link.stop.scene, curve.end, link.stop.z) <= OFF:
+        if measure_apart(link.stop.scene, curve.end, end) <= OFF:
             return phase, curve
     except InputError:
         pass
-    other = replace(phase, until=point_out(phase.formation.contacts, link.stop.z))
+    other = replace(phase, until=point_out(phase.formation.contacts, end))
     return other, trace_phase(other, z)
+
+
+def time_from(problem: Problem, link: Link, z: Array) -> float:
+    """Estimated duration [s] of a border's link from another place `z`, (5,), of its first border.
+
+    Infinite where no motion keeps its limits from there.
+    """
+    first = link.borders[0]
+    try:
+        _, curve = aim(make_phases(problem, link.steps[:1])[0], z, link)
+    except InputError:
+        return math.inf
+    edge = BorderEdge(make_place(problem.scene, z), curve, first.gained, first.terms)
+    found = link_along((edge, *link.borders[1:]), link.ratios, link.steps, link.stop)
+    return found.duration if isinstance(found, Link) else math.inf
