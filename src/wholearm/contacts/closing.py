@@ -168,11 +168,11 @@ def _close_finger(
         vertices = (first[mine, None] + np.arange(size + 1)) % count
         corners = place_corners(scene, x[mine], y[mine], phi[mine], vertices)
         corners -= np.asarray(link.base)
-        least, found = _touch(link, finger, corners)
-        reached = found >= 0
-        kind, place = np.divmod(found, size)
-        own = kind * count + vertices[np.arange(len(place)), place]
-        feature[mine], angle[mine] = np.where(reached, own, -1), least
+        least, touching = _touch(link, finger, corners)
+        reached = touching >= 0
+        kind, place = np.divmod(touching, size)
+        numbers = kind * count + vertices[np.arange(len(place)), place]
+        feature[mine], angle[mine] = np.where(reached, numbers, -1), least
         covered = np.zeros(len(least), dtype=bool)
         if size == count:
             around = corners[:, :-1]
@@ -255,7 +255,7 @@ def _touch(link: Finger, finger: int, corners: Array) -> tuple[Array, Numbers]:
         side = np.where(run <= length + slack, _find_angle(link, sign, SIDE, corners), np.nan)
         beyond = (run > length) & (radius > 0)
         arc = np.where(beyond, _find_angle(link, sign, ARC, corners), np.nan)
-        edges = (_find_angle(link, own, EDGE, corners, outward) for own in (-1.0, 1.0))
+        edges = (_find_angle(link, side_sign, EDGE, corners, outward) for side_sign in (-1.0, 1.0))
         both = np.stack(list(edges), axis=-1)
     tip = length * np.stack([np.cos(both), np.sin(both)], axis=-1)
     place = ((tip - corners[:, :, None]) * along[:, :, None]).sum(axis=-1)
@@ -324,16 +324,18 @@ def evaluate_each(scene: Scene, labels: Numbers, z: Array, v: Array | None = Non
     A, A_t = np.empty((2, *labels.shape, 5))
     for index in np.unique(labels).tolist():
         rows, places = np.nonzero(labels == index)
-        own = evaluate_contacts(scene, [index], z[rows], v[rows])
-        C[rows, places], A_dot_v[rows, places] = own.C[:, 0], own.A_dot_v[:, 0]
-        A[rows, places], A_t[rows, places] = own.A[:, 0], own.A_t[:, 0]
+        contact = evaluate_contacts(scene, [index], z[rows], v[rows])
+        C[rows, places], A_dot_v[rows, places] = contact.C[:, 0], contact.A_dot_v[:, 0]
+        A[rows, places], A_t[rows, places] = contact.A[:, 0], contact.A_t[:, 0]
     return Kinematics(C, A, A_t, A_dot_v, A, A_dot_v)
 
 
 def group_alike(scene: Scene, labels: Numbers) -> Iterator[tuple[Formation, Flags]]:
     """Groups of formations with the same friction at each contact, with one that stands for all."""
     table = contact_table(scene)
-    fingers = np.array([-1 if own.finger is None else own.finger for own in table])[labels]
+    fingers = np.array([-1 if contact.finger is None else contact.finger for contact in table])[
+        labels
+    ]
     for kind in np.unique(fingers, axis=0):
         rows = (fingers == kind).all(axis=1)
         contacts = tuple(table[k] for k in labels[int(rows.argmax())].tolist())
@@ -398,13 +400,13 @@ def place(scene: Scene, labels: Numbers, poses: Array) -> Array:
     z[:, 1] = -_turn(scene.polygon.vertices[labels[:, 0]], poses[:, 1])[:, 1]
     for finger, link in enumerate(scene.fingers):
         sign = 1.0 if finger == 0 else -1.0
-        for own in _list_touches(scene, finger, labels[:, 1 + finger], z):
+        for touch in _list_touches(scene, finger, labels[:, 1 + finger], z):
             with np.errstate(invalid="ignore", divide="ignore"):
-                angle = _find_angle(link, sign, own.kind, own.corner, own.outward)
+                angle = _find_angle(link, sign, touch.kind, touch.corner, touch.outward)
             # Counted from where the finger hangs outside, from which it closes.
             outside = -np.pi / 2 if finger == 0 else 3 * np.pi / 2
             swept = np.mod(sign * (angle - outside), 2 * np.pi)
-            z[own.rows, 3 + finger] = outside + sign * swept
+            z[touch.rows, 3 + finger] = outside + sign * swept
     return z
 
 
@@ -421,18 +423,18 @@ def move(scene: Scene, labels: Numbers, poses: Array, rates: Array) -> ExplicitM
     z_u[:, 1], z_uu[:, 1] = -arm[:, 0] * turn, -bend[:, 0]
     for finger, link in enumerate(scene.fingers):
         sign, joint = (1.0 if finger == 0 else -1.0), 3 + finger
-        for own in _list_touches(scene, finger, labels[:, 1 + finger], z):
-            at, angle = own.rows, z[own.rows, joint]
+        for touch in _list_touches(scene, finger, labels[:, 1 + finger], z):
+            at, angle = touch.rows, z[touch.rows, joint]
             axis = np.column_stack([np.cos(angle), np.sin(angle)])
-            tip, point = link.length * axis, own.corner
-            if own.kind == SIDE:
+            tip, point = link.length * axis, touch.corner
+            if touch.kind == SIDE:
                 normal = sign * _quarter(axis)
-            elif own.kind == EDGE:
-                normal = -own.outward
+            elif touch.kind == EDGE:
+                normal = -touch.outward
                 point = tip + link.radius * normal
             else:
                 normal = (point - tip) / link.radius
-            lever = own.arm + point - own.corner
+            lever = touch.arm + point - touch.corner
             for rows, along in ((A, normal), (A_t, -_quarter(normal))):
                 rows[at, 1 + finger, :2] = along
                 rows[at, 1 + finger, 2] = cross_product(lever, along)
@@ -441,28 +443,28 @@ def move(scene: Scene, labels: Numbers, poses: Array, rates: Array) -> ExplicitM
             with np.errstate(invalid="ignore", divide="ignore"):
                 rate = -(held[:, :3] * z_u[at, :3]).sum(axis=1) / held[:, joint]
                 z_u[at, joint] = rate
-                bent = _bend(own, link.radius, tip, normal, z_u[at], rate)
+                bent = _bend(touch, link.radius, tip, normal, z_u[at], rate)
                 z_uu[at, joint] = -(bent + held[:, 1] * z_uu[at, 1]) / held[:, joint]
             bend[at, 1 + finger] = bent
     return ExplicitMotion(z, z_u, z_uu, Kinematics(0 * bend, A, A_t, bend, A, bend))
 
 
 def _bend(
-    own: _Touch, radius: float, tip: Array, normal: Array, rates: Array, rate: Array
+    touch: _Touch, radius: float, tip: Array, normal: Array, rates: Array, rate: Array
 ) -> Array:
     """The gap's second derivative at constant rates of object, (n, 5), and joint, shape (n,)."""
     turn = rates[:, 2:3]
     rate = rate[:, None]
-    moved, fallen = rates[:, :2] + turn * _quarter(own.arm), -(turn**2) * own.arm
-    if own.kind == SIDE:
-        parts = -(rate**2) * normal * own.corner + normal * fallen
+    moved, fallen = rates[:, :2] + turn * _quarter(touch.arm), -(turn**2) * touch.arm
+    if touch.kind == SIDE:
+        parts = -(rate**2) * normal * touch.corner + normal * fallen
         parts = parts + 2 * rate * _quarter(normal) * moved
         return np.asarray(parts.sum(axis=1))
     # The tip's centre as seen from the vertex.
-    apart, closing = tip - own.corner, rate * _quarter(tip) - moved
+    apart, closing = tip - touch.corner, rate * _quarter(tip) - moved
     bent = -(rate**2) * tip - fallen
-    if own.kind == EDGE:
-        out = own.outward
+    if touch.kind == EDGE:
+        out = touch.outward
         parts = -(turn**2) * out * apart + 2 * turn * _quarter(out) * closing + out * bent
         return np.asarray(parts.sum(axis=1))
     inwards, bends = (normal * closing).sum(axis=1), (normal * bent).sum(axis=1)

@@ -61,8 +61,8 @@ def _separate(one: _Segment, two: _Segment) -> Expression:
     links, lengths = (one, two), (one.length, two.length)
     axes = [(link.tip - link.base) / link.length for link in links]
     parts = []
-    for own, other, axis in ((one, two, axes[0]), (two, one, axes[1])):
-        ends = rotate_quarter(axis).T @ ca.horzcat(other.base - own.base, other.tip - own.base)
+    for part, other, axis in ((one, two, axes[0]), (two, one, axes[1])):
+        ends = rotate_quarter(axis).T @ ca.horzcat(other.base - part.base, other.tip - part.base)
         parts += [ca.fmin(ends[0], ends[1]), -ca.fmax(ends[0], ends[1])]
     # From base and tip of link 1 to base and tip of link 2; each link goes on from there along its
     # axis or against it, and what goes on towards the other link takes from the separation.
@@ -206,7 +206,7 @@ def build_limits(contact: Contact, scene: Scene) -> list[GapLimit]:
 
 def takes_over(contact: Contact, scene: Scene, held: Sequence[Contact]) -> bool:
     """Whether `contact` is the neighbour of one of `held` at the end of its range."""
-    limits = (limit for own in held for limit in _build_once(build_limits, own, scene))
+    limits = (limit for contact in held for limit in _build_once(build_limits, contact, scene))
     return any(limit.gained == contact for limit in limits)
 
 
@@ -215,7 +215,8 @@ def list_renamed(
 ) -> dict[Contact, Contact]:
     """Contacts that go on as those of a neighbouring feature, which their normals agree with."""
     lost, new = (
-        [c for c in own if c not in other] for own, other in ((before, after), (after, before))
+        [c for c in contacts if c not in other]
+        for contacts, other in ((before, after), (after, before))
     )
     return {old: c for old in lost for c in new if takes_over(c, scene, [old])}
 
@@ -225,7 +226,7 @@ def build_clearance(contact: Contact, scene: Scene, touching: bool) -> GapLimit:
 
     With a link that touches a vertex with its side (`touching`) they do, by convexity.
     """
-    gap = own = build_gap(contact, scene)
+    gap = line_gap = build_gap(contact, scene)
     text = f"{contact.corner} touches {contact.part}"
     if contact.finger is None or (touching and contact.surface == "finger"):
         return GapLimit(gap, text, contact)
@@ -234,7 +235,7 @@ def build_clearance(contact: Contact, scene: Scene, touching: bool) -> GapLimit:
         gap = ca.fmax(gap, link.vertex_beyond[contact.index])
     elif contact.feature == "e":
         gap = ca.fmax(gap, link.edge_beyond[contact.index])
-        gap = gap if touching else ca.fmax(gap, link.other_gap[contact.index] - own)
+        gap = gap if touching else ca.fmax(gap, link.other_gap[contact.index] - line_gap)
     else:
         for limit in build_limits(contact, scene):
             gap = ca.fmax(gap, -limit.value)
@@ -329,10 +330,10 @@ def build_apart(scene: Scene, finger: int) -> Expression:
         -ca.mmax(link.vertex_gap) - 2 * part.radius,
         ca.mmax(ca.fmin(at_joint, link.edge_gap)),
     ]
-    for own, other in ((link.base, link.tip), (link.tip, link.base)):
-        rays = features.vertices - ca.repmat(own, 1, features.vertices.shape[1])
+    for end, other in ((link.base, link.tip), (link.tip, link.base)):
+        rays = features.vertices - ca.repmat(end, 1, features.vertices.shape[1])
         distance = ca.sqrt(ca.sum1(rays**2) + ROUNDING * part.length**2)
-        table = rays.T @ ca.horzcat(rays, other - own) / ca.repmat(distance.T, 1, rays.shape[1] + 1)
+        table = rays.T @ ca.horzcat(rays, other - end) / ca.repmat(distance.T, 1, rays.shape[1] + 1)
         nearest = table[:, 0]
         for column in range(1, rays.shape[1]):
             nearest = ca.fmin(nearest, table[:, column])

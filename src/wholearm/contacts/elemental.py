@@ -284,9 +284,9 @@ def build_rows(contacts: Sequence[Contact], scene: Scene) -> tuple[Expression, .
     for along in (normals, ca.horzcat(normals[:, 1], -normals[:, 0])):
         turns = [arms[:, 0] * along[:, 1] - arms[:, 1] * along[:, 0]]
         for finger, link in enumerate(scene.fingers):
-            own = ca.sparsify(ca.DM([float(c.finger == finger) for c in contacts]))
+            on_finger = ca.sparsify(ca.DM([float(c.finger == finger) for c in contacts]))
             levers = points - ca.repmat(ca.DM(link.base).T, len(parts), 1)
-            turns.append((levers[:, 1] * along[:, 0] - levers[:, 0] * along[:, 1]) * own)
+            turns.append((levers[:, 1] * along[:, 0] - levers[:, 0] * along[:, 1]) * on_finger)
         rows.append(ca.horzcat(along, *turns))
     return gaps, *rows
 

@@ -98,8 +98,10 @@ class Formation(Keeper):
         """Rows of (contacts, joints) that turn as one with a row: a flush edge's, or its own."""
         if row >= self.n_contacts or self.contacts[row].surface == "tip":
             return (row,)
-        own = self.contacts[row]
-        on_side = [(c.surface, c.finger) == (own.surface, own.finger) for c in self.contacts]
+        contact = self.contacts[row]
+        on_side = [
+            (c.surface, c.finger) == (contact.surface, contact.finger) for c in self.contacts
+        ]
         return tuple(np.flatnonzero(on_side).tolist())
 
     @cached_property
@@ -227,13 +229,13 @@ _PARTS = Store(_Parts, lambda scene: scene.shape)
 
 
 def _build_function(formation: Formation) -> Expression:
-    scene, own = formation.scene, _PARTS(formation.scene)
-    parts = [own.find(contact, scene) for contact in formation.contacts]
+    scene, features = formation.scene, _PARTS(formation.scene)
+    parts = [features.find(contact, scene) for contact in formation.contacts]
     outputs = [
         ca.densify(ca.vertcat(ca.SX(0, width), *(part[k] for part in parts)))
         for k, width in enumerate((1, 5, 5, 1))
     ]
-    return ca.Function("formation", [own.z, own.v], outputs)
+    return ca.Function("formation", [features.z, features.v], outputs)
 
 
 def _build_roll_function(formation: Formation) -> Expression:

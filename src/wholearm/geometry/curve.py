@@ -298,14 +298,14 @@ def take(curve: Curve, start: float, stop: float) -> Curve:
         # What is missing at an end is extrapolated.
         if last - first < 1e-9 * length:
             continue
-        own = panel
+        piece = panel
         if (first, last) != (panel.s[0], panel.s[-1]):
             # The same polynomial through other nodes.
             s = first + (last - first) * (1 - np.cos(np.linspace(0, np.pi, len(panel.s)))) / 2
             s[-1] = last
-            own = Panel(s, *panel.interpolate(s))
-        columns = (high - own.s)[::-1], own.z[::-1], -own.z_s[::-1]
-        panels.append(Panel(*columns) if back else Panel(own.s - low, own.z, own.z_s))
+            piece = Panel(s, *panel.interpolate(s))
+        columns = (high - piece.s)[::-1], piece.z[::-1], -piece.z_s[::-1]
+        panels.append(Panel(*columns) if back else Panel(piece.s - low, piece.z, piece.z_s))
     sign = -1.0 if back else 1.0
     segments = []
     for part in curve.segments:

@@ -54,14 +54,14 @@ def close_all(
     steps = 1e-5 * np.diag([rho, rho, 1.0, 1.0, 1.0])
     sizes = np.append(sizes, [rho if row < 2 else 1.0 for row, _ in fixed])
     sizes = np.append(sizes, np.full(len(active), rho))
-    found, z, left = np.full(z.shape, np.nan), z.copy(), np.arange(len(z))
+    solutions, z, left = np.full(z.shape, np.nan), z.copy(), np.arange(len(z))
     for _ in range(50):
         kinematics = formation.evaluate(z, np.zeros(z.shape))
         residual = np.hstack([kinematics.C, formation.evaluate_slip(z) - slip])
         rows = kinematics.P
         for row, value in fixed:
-            own = np.broadcast_to(value, len(found))[left]
-            residual = np.column_stack([residual, z[:, row] - own])
+            values = np.broadcast_to(value, len(solutions))[left]
+            residual = np.column_stack([residual, z[:, row] - values])
             one = np.broadcast_to(np.eye(5)[row], (len(z), 1, 5))
             rows = np.concatenate([rows, one], axis=1)
         if active:
@@ -77,11 +77,11 @@ def close_all(
         turned = np.abs(change[:, 2:]).max(axis=1, keepdims=True)
         z = z - change * np.minimum(1.0, 0.1 / np.maximum(turned, 1e-12))
         closed = np.abs(residual).max(axis=1) < 3e-11
-        found[left[closed]] = z[closed]
+        solutions[left[closed]] = z[closed]
         z, left = z[~closed], left[~closed]
         if not len(left):
             break
-    return found
+    return solutions
 
 
 def is_inside(formation: Formation, z: Array) -> bool:
@@ -119,7 +119,7 @@ def explore(formation: Formation, z: Array, slip: Array, ends: list[Ending]) -> 
         return None
     metric = metric_weights(formation.scene)
     places = _list_places(formation, z)
-    found, least = None, np.inf
+    nearest, least = None, np.inf
     for end in ends:
         off = end.measure(places)
         order = np.argsort(off)[:24]
@@ -130,8 +130,8 @@ def explore(formation: Formation, z: Array, slip: Array, ends: list[Ending]) -> 
             distance = float(metric @ (goal - z) ** 2)
             # One that holds at the start is no end to go to.
             if STILL * formation.scene.scales.length < np.sqrt(distance) < least:
-                found, least = goal, np.sqrt(distance)
-    return found
+                nearest, least = goal, np.sqrt(distance)
+    return nearest
 
 
 def _list_places(formation: Formation, z: Array) -> Array:
@@ -213,14 +213,14 @@ def _find_goal(phase: Phase, z: Array, later: Sequence[Phase]) -> Array:
     """Nearest configuration at which the phase ends."""
     key = f"phases[{phase.number}].until"
     if phase.until.is_release:
-        ends = [own.until for own in later if not own.until.is_release]
+        ends = [after.until for after in later if not after.until.is_release]
         if not ends:
             raise InputError("", key, "is missing; only one freedom needs none")
         # On the way to where a phase ends next, as far as this one's contacts lead there.
-        ahead = _find_goal(replace(phase, until=ends[0]), z, later)
+        next_end = _find_goal(replace(phase, until=ends[0]), z, later)
         slip = phase.formation.evaluate_slip(z[None])[0]
-        middle = close_contacts(phase.formation, (z + ahead) / 2, slip)
-        return ahead if middle is None else middle
+        middle = close_contacts(phase.formation, (z + next_end) / 2, slip)
+        return next_end if middle is None else middle
     slip, reasons, goals = phase.formation.evaluate_slip(z[None])[0], [], []
     endings = list_ends(phase)
     for end in endings:
@@ -246,11 +246,11 @@ def list_ends(phase: Phase) -> list[Ending]:
     formation, until = phase.formation, phase.until
     if until.contact is None:
         return [Ending(formation, until.poses)]
-    own = sum(len(build_limits(c, formation.scene)) for c in formation.contacts)
+    count = sum(len(build_limits(c, formation.scene)) for c in formation.contacts)
     gaining = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]
     # Where a contact changes its name its gap has no slope, but the end of its range has.
-    ends = [Ending(formation, until.poses, (k,)) for k in gaining if k < own]
-    if not ends or any(k >= own for k in gaining):
+    ends = [Ending(formation, until.poses, (k,)) for k in gaining if k < count]
+    if not ends or any(k >= count for k in gaining):
         ends.append(Ending(formation.add(until.contact), until.poses))
     return ends
 

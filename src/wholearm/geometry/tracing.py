@@ -351,6 +351,6 @@ class CostToGo:
         curve = trace_phase(self.phase, z)
         step = 1e-2 * curve.length
         point = curve.evaluate(np.array([0.0, step]))
-        here, ahead = (self.value(place) for place in point.z)
-        slope = (ahead - here) / step
+        here, next_value = (self.value(place) for place in point.z)
+        slope = (next_value - here) / step
         return here, slope * metric_weights(self.phase.formation.scene) * point.z_s[0]

@@ -123,13 +123,13 @@ def _compute_impact(before: Formation, after: Formation, z: Array, v: Array, Xi:
     rolls = [after.names[row] for row in after.rolling_rows]
     normal, cones = np.split(force_limit_rows(after) @ p, [after.n_contacts])
     along = Xi * (kinematics.A_t[0] @ v_after)
-    found = [
+    violations = [
         *_list(ViolationKind.HELD, after.names, along, ROUNDING * speed),
         *_list(ViolationKind.PULL, after.names, normal, ROUNDING * momentum),
         *_list(ViolationKind.SLIP, [*rolls, *rolls], cones, ROUNDING * momentum),
         *_list(ViolationKind.CLOSING, *_rates(before, after, z, v_after), ROUNDING * speed),
     ]
-    return Impact(after, v_after, p, Xi, tuple(found))
+    return Impact(after, v_after, p, Xi, tuple(violations))
 
 
 def solve_impulses(mass: Array, rows: Array, force_rows: Array, v: Array) -> tuple[Array, Array]:

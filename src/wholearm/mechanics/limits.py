@@ -129,8 +129,10 @@ class LimitSet:
     @property
     def parameters(self) -> list[Parameter]:
         """What may be changed to let a motion be planned, each once, those of fingers first."""
-        found = {limit.parameter.key: limit.parameter for limit in self.limits}
-        return sorted(found.values(), key=lambda parameter: not parameter.key.startswith("finger"))
+        parameters = {limit.parameter.key: limit.parameter for limit in self.limits}
+        return sorted(
+            parameters.values(), key=lambda parameter: not parameter.key.startswith("finger")
+        )
 
 
 Maker = Callable[[Formation, float], Sequence[MotionLimit]]
@@ -169,7 +171,7 @@ def _make_force_limits(formation: Formation, epsilon: float) -> list[MotionLimit
 def _make_joint_limits(formation: Formation, _: float) -> list[MotionLimit]:
     """Torques and speeds of the joints stay within their limits; infinite ones are none."""
     scene, width = formation.scene, formation.n_contacts + formation.n_rolling + 4
-    found = []
+    joint_limits = []
     for kind, unit, first, limits in (
         (TORQUE, "N m", width - 4, scene.torque_limit),
         (SPEED, "rad/s", width - 2, scene.speed_limit),
@@ -182,10 +184,10 @@ def _make_joint_limits(formation: Formation, _: float) -> list[MotionLimit]:
             parameter = Parameter(name, limit, unit, 1, key)
             rows, most = np.eye(width)[[first + k]], np.array([limit])
             text = f"{name} = {limit:g} {unit}"
-            found.append(
+            joint_limits.append(
                 MotionLimit(kind, part, text, unit, rows, -most, most, limit, parameter, np.ones(1))
             )
-    return found
+    return joint_limits
 
 
 MAKERS: list[Maker] = [_make_force_limits, _make_joint_limits]

@@ -255,11 +255,11 @@ class InternalForceLimits(NamedTuple):
         k, best = np.arange(len(a)), least.argmax(axis=1)
         internal, value = tried[k, best], np.where(feasible, least[k, best], -np.inf)
         slack = offset + slope * internal[:, None]
-        found = np.isfinite(value)
-        slack[:, soft] -= np.where(found, value, 0.0)[:, None] * weights[soft]
+        finite = np.isfinite(value)
+        slack[:, soft] -= np.where(finite, value, 0.0)[:, None] * weights[soft]
         # Where other limits cannot be kept it is these that are to blame.
-        slack[np.ix_(~found, soft)] = np.inf
-        pair = np.argsort(np.where(found[:, None], np.abs(slack), slack), axis=1)[:, :2]
+        slack[np.ix_(~finite, soft)] = np.inf
+        pair = np.argsort(np.where(finite[:, None], np.abs(slack), slack), axis=1)[:, :2]
         # Where it has no effect, only those that are missed.
         bent = np.abs(np.take_along_axis(slope, pair, axis=1)) > FLAT
         free = np.take_along_axis(slack, pair, axis=1)[:, 1] > TIED

@@ -110,7 +110,7 @@ class _State(NamedTuple):
     def find_slopes(self, names: Sequence[str]) -> Array:
         """Derivatives of the contact forces, shape (n, n_c + R, len(names), COUNT)."""
         changes = [self.change(name) for name in names]
-        load, bend = (np.stack(own, axis=2) for own in zip(*changes, strict=True))
+        load, bend = (np.stack(columns, axis=2) for columns in zip(*changes, strict=True))
         over = self.kinematics.P / self.formation.scene.mass_diagonal
         G = force_rows(self.formation, self.kinematics, self.directions)
         right = bend - np.einsum("nij,njpq->nipq", over, load)
@@ -125,9 +125,9 @@ class _State(NamedTuple):
         scene, load = self.formation.scene, np.zeros_like(self.acceleration)
         bend = np.zeros_like(self.c)
         if name in ("mass", "inertia"):
-            own = np.array([1, 1, 0, 0, 0] if name == "mass" else [0, 0, 1, 0, 0])
-            load -= (own * scene.mass_diagonal)[:, None] * self.acceleration
-            load[..., 0] += own * scene.applied_force
+            share = np.array([1, 1, 0, 0, 0] if name == "mass" else [0, 0, 1, 0, 0])
+            load -= (share * scene.mass_diagonal)[:, None] * self.acceleration
+            load[..., 0] += share * scene.applied_force
         elif name.startswith("friction"):
             part = {"palm": None, "finger1": 0, "finger2": 1}[name.partition("_")[2]]
             mine = np.array([contact.finger == part for contact in self.formation.contacts])
@@ -194,19 +194,19 @@ class _State(NamedTuple):
         formation, v = self.formation, self.z_s
         if name.startswith("length"):
             formation = _lengthen(formation, int(name[-1]) - 1, change)
-        found = formation.evaluate(z, v)
+        kinematics = formation.evaluate(z, v)
         if not name.startswith("base"):
-            return found
+            return kinematics
         back = np.zeros(5)
         back["xy".index(name[-1])] = change
         moved = formation.evaluate(z - back, v)
         mine, count = self._rows_of(name), formation.n_contacts
 
         def choose(one: Array, other: Array) -> Array:
-            own = mine[:count] if one.shape[1] == count else mine
-            return np.where(own.reshape(-1, *[1] * (one.ndim - 2)), other, one)
+            rows = mine[:count] if one.shape[1] == count else mine
+            return np.where(rows.reshape(-1, *[1] * (one.ndim - 2)), other, one)
 
-        return Kinematics(*map(choose, found, moved))
+        return Kinematics(*map(choose, kinematics, moved))
 
 
 @lru_cache(maxsize=16)  # compiled functions of a formation cost more than evaluating them

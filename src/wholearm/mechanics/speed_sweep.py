@@ -235,7 +235,7 @@ def find_controllable(
     losses = np.hstack([losses[:-1], losses[1:]])
     low, high, share = floor.copy(), limits.cap.copy(), np.full(len(steps), shares[-1])
     low[-1], high[-1] = end
-    found = list[Array]()
+    intervals = list[Array]()
     for k in range(len(steps) - 1, -1, -1):
         box = np.array([[0.0, -1.0, high[k + 1]], [0.0, 1.0, -low[k + 1]]])
         bounding = (table[k, :, :2] != 0).any(axis=1) | (losses[k] != 0)
@@ -253,9 +253,9 @@ def find_controllable(
                 share[k] = shares[middle]
             else:
                 begin = middle + 1
-        found.append(chosen)
+        intervals.append(chosen)
         low[k], high[k] = least, most
-    return ControllableSet(low, high, share, found[::-1])
+    return ControllableSet(low, high, share, intervals[::-1])
 
 
 def _find_range(rows: Array) -> tuple[float, float]:

@@ -173,14 +173,14 @@ class Statics:
     def find_epsilon(self, ends: bool = False) -> float | None:
         """The largest epsilon with which a motion can begin, or end here [N], or None."""
         answers = [self._start(mode, 0.0, cones=True) for mode in self._list_modes(ends)]
-        found = [float(one.x[-1]) for one in answers if one is not None]
-        return max((value for value in found if value >= 0), default=None)
+        values = [float(one.x[-1]) for one in answers if one is not None]
+        return max((value for value in values if value >= 0), default=None)
 
     def find_torque_limit(self, epsilon: float, finger: int, ends: bool = False) -> float | None:
         """The least torque limit of a finger with which a motion can begin, or end here [N m]."""
         answers = [self._start(mode, epsilon, finger) for mode in self._list_modes(ends)]
-        found = [float(one.x[[finger, 2 + finger]].sum()) for one in answers if one is not None]
-        return min(found, default=None)
+        values = [float(one.x[[finger, 2 + finger]].sum()) for one in answers if one is not None]
+        return min(values, default=None)
 
     @cached_property
     def freedoms(self) -> Array:
@@ -281,8 +281,8 @@ class Statics:
         f, signs, still = mode.N.shape[1], mode.signs, mode.signs == 0
         # Unknowns y, c_n, c_t, friction d of the joints, and x, each in a unit of its own.
         sizes = np.abs(forces / self._units[:, None]).max(axis=0)
-        given = 1 / np.where(sizes > 0, sizes, 1 / force)
-        units = np.concatenate([np.ones(f), np.full(2 * n_c, force), np.full(2, torque), given])
+        unit = 1 / np.where(sizes > 0, sizes, 1 / force)
+        units = np.concatenate([np.ones(f), np.full(2 * n_c, force), np.full(2, torque), unit])
         y, c_n, c_t, d, x = np.split(np.diag(units), np.cumsum([f, n_c, n_c, 2]))
         inertia = (scene.mass_diagonal[:, None] * mode.N) @ y
         pushes = self.A.T @ c_n + self.A_t.T @ c_t - np.eye(5)[:, 3:] @ d + forces @ x - inertia
@@ -308,7 +308,7 @@ class Statics:
             b_ub=-np.concatenate(lows),
             A_eq=equal,
             b_eq=np.concatenate([-load / self._units, np.zeros(len(equal) - 5)]),
-            bounds=np.vstack([unbounded, dry / torque, bounds / given[:, None]]),
+            bounds=np.vstack([unbounded, dry / torque, bounds / unit[:, None]]),
             # Forces that are missing just beyond balance are small.
             options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
         )

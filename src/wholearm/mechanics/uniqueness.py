@@ -73,7 +73,7 @@ def find_minors(
     Signs Xi are (n_c,) or (n, n_c); `sticking` contacts do not slide, besides rolling ones.
     """
     held, friction = {*formation.rolling_rows, *sticking}, formation.friction
-    kinds = tuple((k in held, own > 0) for k, own in enumerate(friction.tolist()))
+    kinds = tuple((k in held, mu > 0) for k, mu in enumerate(friction.tolist()))
     A, A_t = kinematics.A, kinematics.A_t
     slip = friction[:, None] * A_t
     G = A - np.broadcast_to(Xi, A.shape[:2])[..., None] * slip
@@ -86,11 +86,11 @@ def find_minors(
         smooth = K[:, of_rows, choices.rows[:, None, :] + len(kinds)]
         rubbed = K[:, of_rows, choices.forces[:, None, :]]
         below = np.asarray(np.linalg.det(smooth), dtype=float)
-        own: Array = np.ones_like(below)
+        ratio: Array = np.ones_like(below)
         # Least Gram determinant of independent rows.
         least = 1e-12 * np.einsum("...ii->...i", smooth).prod(axis=-1)
-        np.divide(np.linalg.det(rubbed), below, out=own, where=below > least)
-        ratios.append(own)
+        np.divide(np.linalg.det(rubbed), below, out=ratio, where=below > least)
+        ratios.append(ratio)
         modes += choices.modes
     table = np.concatenate(ratios, axis=1)
     return Minors(table.min(axis=1), table.argmin(axis=1), modes, formation.names)

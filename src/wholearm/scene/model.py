@@ -109,10 +109,10 @@ def check_ranges(scene: Scene) -> None:
         [(f"{finger.name}.", finger) for finger in scene.fingers],
     ]
     for owners in parts:
-        for attribute, own in keys_of(owners[0][1]).items():
-            for one, (prefix, owner) in product(own.ranges, owners):
-                key = f"{prefix}{own.name}"
-                one.check(key, getattr(owner, attribute), own.unit, scene, owner)
+        for attribute, entry in keys_of(owners[0][1]).items():
+            for one, (prefix, owner) in product(entry.ranges, owners):
+                key = f"{prefix}{entry.name}"
+                one.check(key, getattr(owner, attribute), entry.unit, scene, owner)
 
 
 def find_unit_hint(scene: Scene) -> str:
@@ -512,9 +512,9 @@ class Scene:
 
         Limits of torques and speeds, and names, are no part of it.
         """
-        known = (self.mass_diagonal, self.viscous, self.dry, self.applied_force)
+        numbers = (self.mass_diagonal, self.viscous, self.dry, self.applied_force)
         solid = self.fingers_collide
-        return (self.shape, *(part.tobytes() for part in known), self.friction, solid)
+        return (self.shape, *(part.tobytes() for part in numbers), self.friction, solid)
 
     @property
     def touching(self) -> float:

@@ -233,12 +233,12 @@ class ReleaseSearch:
         if path in self._tried:
             return False
         self._tried.add(path)
-        found = self.known[path] if path in self.known else self.plan(path)
-        if isinstance(found, str):
+        plan = self.known[path] if path in self.known else self.plan(path)
+        if isinstance(plan, str):
             return False
-        better = self.time(found) < GAIN * self.time(self.best)
-        self._others.append(self.best if better else found)
-        self.best = found if better else self.best
+        better = self.time(plan) < GAIN * self.time(self.best)
+        self._others.append(self.best if better else plan)
+        self.best = plan if better else self.best
         return better
 
 
@@ -351,11 +351,11 @@ class Chooser:
     def bound(self, duration: float, in_cells: bool) -> BorderBound:
         """Lower bound of all routes along borders; up to `duration` of a plan `in_cells`."""
         enough, task = self._bound or (0.0, None)
-        known = task.result if task else None
+        bound = task.result if task else None
         wanted = duration if in_cells else math.inf
-        if known is None or min(enough, wanted) <= known.value < wanted:
+        if bound is None or min(enough, wanted) <= bound.value < wanted:
             return bound_borders(self.search, wanted)
-        return known.up_to(wanted)
+        return bound.up_to(wanted)
 
     def _list_plans(self, link: Link) -> list[Measured]:
         """Plans of a link through a cell, the fastest first."""
@@ -386,22 +386,26 @@ class Chooser:
 
     def _measure(self, route: RoadmapRoute, report: Callable[[str], None]) -> bool:
         """Plan the links of a route that lead through cells; whether all have a plan."""
-        known = self.roadmap.measured
+        measured = self.roadmap.measured
         if self._is_lost(route):
             return False
         kept = self._prefetched
-        new = [own for own in route.links if own.in_cell and own not in known and own not in kept]
+        new = [
+            link
+            for link in route.links
+            if link.in_cell and link not in measured and link not in kept
+        ]
         if self.jobs > 1 and len(new) > 1:
-            found = self._share([partial(self._measure_link, link) for link in new])
-            kept.update(zip(new, found, strict=True))
+            plans = self._share([partial(self._measure_link, link) for link in new])
+            kept.update(zip(new, plans, strict=True))
         for link in route.links:
             if not link.in_cell:
                 continue
-            if link not in known:
+            if link not in measured:
                 self._measurements += 1
                 report(f"planning {describe_steps(link.steps)}")
-                known[link] = kept.pop(link) if link in kept else self._measure_link(link)
-            if isinstance(known[link], str):
+                measured[link] = kept.pop(link) if link in kept else self._measure_link(link)
+            if isinstance(measured[link], str):
                 return False
         return True
 
@@ -423,8 +427,8 @@ class Chooser:
             paths = RefinedPath(None), RefinedPath(-STEPS[0]), RefinedPath(STEPS[0])
             first = self._share([partial(searches[0].plan, path) for path in paths])
             searches[0].known = dict(zip(paths, first, strict=True))
-        found = self._share([search.run for search in searches])
-        for link, (best, *others) in zip(links, found, strict=True):
+        results = self._share([search.run for search in searches])
+        for link, (best, *others) in zip(links, results, strict=True):
             roadmap.measured[link] = best
             roadmap.others.setdefault(link, []).extend(others)
 
@@ -433,14 +437,14 @@ class Chooser:
 
     def _measure_link(self, link: Link) -> Found:
         """Plan a link through a cell, from other places of its border if that fails."""
-        found = measure_link(self.problem, link, link.steps, self.options, further=True)
+        plan = measure_link(self.problem, link, link.steps, self.options, further=True)
         for move in ELSEWHERE if link.left else ():
             place = link.share + move
-            if not isinstance(found, str):
+            if not isinstance(plan, str):
                 break
             if INSIDE < place < 1 - INSIDE:
-                found = measure_link(self.problem, link, leave_at(link, place), self.options)
-        return found
+                plan = measure_link(self.problem, link, leave_at(link, place), self.options)
+        return plan
 
     def _release(self, link: Link, path: RefinedPath) -> Found:
         """Plan a link that leaves its border at another place, or in motion."""
@@ -480,9 +484,9 @@ class Chooser:
         """About the least time that a plan along all routes may take [s]."""
         total = 0.0
         for link in (link for r in (*self.before, route) for link in r.links):
-            known = self.roadmap.measured.get(link)
-            if isinstance(known, Measured):
-                total += known.duration
+            measured = self.roadmap.measured.get(link)
+            if isinstance(measured, Measured):
+                total += measured.duration
             else:
                 total += FASTER * link.duration if link.in_cell else link.duration
         return total

@@ -102,27 +102,27 @@ def list_cut(search: RouteSearch) -> list[Blocked]:
 
 def list_cut_borders(search: RouteSearch) -> list[CutBorder]:
     """At most `CUT` borders of the cut, the nearest to the goal first."""
-    found = list[CutBorder]()
+    borders = list[CutBorder]()
     for blocked in list_cut(search):
         for chain in search.roadmap.follow(blocked.start):
             border = chain.borders[0]
             if chain.link is blocked:
-                found.append(CutBorder(blocked, border))
+                borders.append(CutBorder(blocked, border))
                 break
             if set(border.formation.contacts) == set(blocked.steps[-1].contacts):
                 goal = measure_along(border.curve, search.goal)
                 if goal is not None and goal[1] == blocked.steps[-1].until:
                     part = replace(border, curve=cut_curve(border.curve, goal[0]))
-                    found.append(CutBorder(blocked, part))
+                    borders.append(CutBorder(blocked, part))
                     break
-        if len(found) == CUT:
+        if len(borders) == CUT:
             break
-    return found
+    return borders
 
 
 def list_openings(cuts: Sequence[CutBorder]) -> list[Opening]:
     """Numbers that open some border, ordered by the nearest border that they open."""
-    found: dict[str, tuple[Parameter, list[float]]] = {}
+    by_key: dict[str, tuple[Parameter, list[float]]] = {}
     for index, cut in enumerate(cuts):
         formation, epsilon = cut.border.formation, cut.border.terms.epsilon
         for number in (*make_limits(formation, epsilon).parameters, *list_frictions(formation)):
@@ -134,9 +134,9 @@ def list_openings(cuts: Sequence[CutBorder]) -> list[Opening]:
 
             value = bracket(number, farthest, opens, HALVINGS)
             if value is not None:
-                _, values = found.setdefault(number.key, (number, [math.nan] * len(cuts)))
+                _, values = by_key.setdefault(number.key, (number, [math.nan] * len(cuts)))
                 values[index] = value
-    openings = [Opening(number, tuple(values)) for number, values in found.values()]
+    openings = [Opening(number, tuple(values)) for number, values in by_key.values()]
 
     def rank(opening: Opening) -> tuple[int, float]:
         first = next(k for k, value in enumerate(opening.values) if not math.isnan(value))
@@ -193,8 +193,8 @@ def find_opening(
                 sources.append(RoadmapRoute((*before.links, link)))
         if not sources:
             return None
-        found = _search_changed(changed, search.start.z, search.goal, options, planned, sources)
-        return found and (found[1], [k for k, link in lasts.items() if link in found[0].links])
+        result = _search_changed(changed, search.start.z, search.goal, options, planned, sources)
+        return result and (result[1], [k for k, link in lasts.items() if link in result[0].links])
 
     for opening in list_openings(cuts)[:TRIED]:
         most = opening.open_all()
@@ -268,9 +268,9 @@ def find_hand(
             if closed.obstacle.any():
                 continue
             z, goal = closed.z[0], search.goal
-            found = _search_changed(changed, z, goal, options, True, most=EAGER.most)
-            if found is not None:
-                return _describe_reached(change, found[1]), (change,)
+            result = _search_changed(changed, z, goal, options, True, most=EAGER.most)
+            if result is not None:
+                return _describe_reached(change, result[1]), (change,)
     most = f"{100 * (max(HANDS) - 1):.0f} %"
     text = f"the goal is not reached with {tried} other lengths or bases of the fingers"
     return f"{text}, up to {most} off", ()
@@ -281,25 +281,25 @@ def list_hands(scene: Scene) -> list[Change]:
     right, left = scene.fingers
     (first, _), (second, _) = np.asarray(right.base).tolist(), np.asarray(left.base).tolist()
     half, base = (first - second) / 2, "fingers.{}.base[1]"
-    given: list[tuple[str, float, float, tuple[str, ...]]]
+    numbers: list[tuple[str, float, float, tuple[str, ...]]]
     # Bases first: they have decided more often than lengths.
     if math.isclose(first, -second, rel_tol=SYMMETRIC):
         keys = base.format(1), base.format(2)
-        given = [("x of base 1, mirrored for base 2,", first, half, keys)]
+        numbers = [("x of base 1, mirrored for base 2,", first, half, keys)]
     else:
-        given = [
+        numbers = [
             ("x of base 1", first, half, (base.format(1),)),
             ("x of base 2", second, -half, (base.format(2),)),
         ]
     if math.isclose(right.length, left.length, rel_tol=SYMMETRIC):
-        given.append(("length of both fingers", right.length, right.length, ("length",)))
+        numbers.append(("length of both fingers", right.length, right.length, ("length",)))
     else:
-        given.append(("length of finger 1", right.length, right.length, ("fingers.1.length",)))
-        given.append(("length of finger 2", left.length, left.length, ("fingers.2.length",)))
+        numbers.append(("length of finger 1", right.length, right.length, ("fingers.1.length",)))
+        numbers.append(("length of finger 2", left.length, left.length, ("fingers.2.length",)))
     return [
         Change(Parameter(name, value, "m", 1 if scale > 1 else -1, *keys), float(f"{moved:.3g}"))
         for scale in HANDS
-        for name, value, size, keys in given
+        for name, value, size, keys in numbers
         for moved in (value + (scale - 1) * size,)
     ]
 

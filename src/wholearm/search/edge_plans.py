@@ -179,7 +179,7 @@ def _list_modes(motion: TimeMotion, length: float) -> tuple[ModeGuess, ...]:
         t, x = _round(span.stop, GUESSED * motion.duration), _round(x, GUESSED * length)
         # In degrees, as it is printed.
         phi = math.radians(_round(math.degrees(phi), math.degrees(GUESSED)))
-        signs = tuple(SIGNS[own] for own in (*span.contacts.values(), *span.joints))
+        signs = tuple(SIGNS[sign] for sign in (*span.contacts.values(), *span.joints))
         modes.append(ModeGuess(t, x, phi, signs))
     return tuple(modes)
 
@@ -269,10 +269,10 @@ class _LinkPlanner:
         tasks: list[Task[Any]] = [partial(quiet._plan_part, links, part) for part in parts]
         if background:
             tasks.insert(len(cells), background.task)
-        found = share(tasks, jobs, (self.problem, self.problem.scene))
+        results = share(tasks, jobs, (self.problem, self.problem.scene))
         if background:
-            background.result = found.pop(len(cells))
-        for plans in found:
+            background.result = results.pop(len(cells))
+        for plans in results:
             self.cache.update(plans)
 
     def _plan_part(
@@ -291,17 +291,17 @@ class _LinkPlanner:
 
     def plan(self, links: Sequence[Chosen]) -> tuple[list[PlannedLink], str]:
         """Plans of links one after the other, and why the next one has none, if so."""
-        z, found = self.problem.start, list[PlannedLink]()
+        z, plans = self.problem.start, list[PlannedLink]()
         for k, (link, _) in enumerate(links):
             apart = measure_apart(self.problem.scene, z, link.start.z)
             if k and not links[k - 1][0].in_cell and apart < MET:
                 z = link.start.z  # A border ends at the same place from wherever it starts.
             planned = self._plan_cached(links, k, z)
             if isinstance(planned, str):
-                return found, f"{describe_steps(link.steps)}: {planned}"
-            found.append(planned)
+                return plans, f"{describe_steps(link.steps)}: {planned}"
+            plans.append(planned)
             z = planned.end
-        return found, ""
+        return plans, ""
 
     def _plan_cached(self, links: Sequence[Chosen], k: int, z: Array) -> PlannedLink | str:
         """The plan of link number k from `z`, from the cache if it is there."""
@@ -423,5 +423,5 @@ def time_from(problem: Problem, link: Link, z: Array) -> float:
     except InputError:
         return math.inf
     edge = BorderEdge(make_place(problem.scene, z), curve, first.gained, first.terms)
-    found = link_along((edge, *link.borders[1:]), link.ratios, link.steps, link.stop)
-    return found.duration if isinstance(found, Link) else math.inf
+    changed = link_along((edge, *link.borders[1:]), link.ratios, link.steps, link.stop)
+    return changed.duration if isinstance(changed, Link) else math.inf

@@ -188,8 +188,8 @@ class Link:
     @cached_property
     def fine_bound(self) -> float:
         """Lower bound on a refined grid, up to rounding [s]."""
-        found = bound_least_time(self._curves, self.borders[0].terms.epsilon)
-        return max(ROUGHLY * self.bound, found.value if found else 0.0)
+        bound = bound_least_time(self._curves, self.borders[0].terms.epsilon)
+        return max(ROUGHLY * self.bound, bound.value if bound else 0.0)
 
     @property
     def _curves(self) -> list[Curve]:
@@ -381,7 +381,7 @@ def link_along(
         return Blocked(start, steps, reason, stop)
     pairs = zip(borders, ratios, strict=True)
     limits = [border.limits.with_speed_ratio(ratio) for border, ratio in pairs]
-    found = last.ends or estimate_duration(limits)
-    if isinstance(found, str):
-        return Blocked(start, steps, Unstopped(found), stop)
-    return Link(start, stop, steps, found, borders=borders, ratios=ratios)
+    duration = last.ends or estimate_duration(limits)
+    if isinstance(duration, str):
+        return Blocked(start, steps, Unstopped(duration), stop)
+    return Link(start, stop, steps, duration, borders=borders, ratios=ratios)

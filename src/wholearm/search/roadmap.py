@@ -158,15 +158,15 @@ class Roadmap:
 
     def trace(self, place: RoadmapPlace, chain: Chain | None = None) -> list[BorderEdge]:
         """Borders from a place; with a chain, only those that it may enter."""
-        closed, found = close_place(place) if place.landed else place, list[BorderEdge]()
+        closed, borders = close_place(place) if place.landed else place, list[BorderEdge]()
         for formation in list_formations_at(closed, 4) if closed else ():
             if closed and (chain is None or chain.can_enter(formation)):
                 key = place.key, formation.contacts
                 if key not in self._borders:
                     curves = self._curves.setdefault(frozenset(formation.contacts), [])
                     self._borders[key] = follow_borders(closed, formation, self.terms, curves)
-                found += self._borders[key]
-        return found
+                borders += self._borders[key]
+        return borders
 
     def follow(self, place: RoadmapPlace) -> list[Chain]:
         """Borders from a place."""
@@ -193,7 +193,7 @@ class Roadmap:
     def go_on(self, chain: Chain, goal: Goal) -> Iterator[Ahead]:
         """Feasible links that pass the end of a chain in motion; further ones as in `set_out`."""
         for longer in self.extend(chain):
-            yield from (own for own in self._list_ends(longer, goal) if isinstance(own[1], Link))
+            yield from (link for link in self._list_ends(longer, goal) if isinstance(link[1], Link))
 
     def _list_ends(self, chain: Chain, goal: Goal) -> Iterator[Ahead]:
         if chain.link is not None:
@@ -250,7 +250,7 @@ class Roadmap:
         """
         if goal.flush is None or goal.x is None:
             return []
-        found, near = list[Link](), NEAR * self.scene.scales.length
+        moved, near = list[Link](), NEAR * self.scene.scales.length
         for link in links:
             *before, last = link.steps
             if not is_flush(link.stop, goal.flush) or abs(link.stop.z[0] - goal.x) > near:
@@ -261,8 +261,8 @@ class Roadmap:
                 step = last._replace(until=replace(last.until, pins=(("x", goal.x),)))
                 stop = replace(link.stop, z=z)
                 first = [EdgeStep(b.contacts, Until(), End.SMOOTH) for b in before]
-                found.append(replace(link, stop=stop, steps=(*first, step), left=None))
-        return found
+                moved.append(replace(link, stop=stop, steps=(*first, step), left=None))
+        return moved
 
     def end_in_cell(self, place: RoadmapPlace, goal: Goal) -> Iterator[Link]:
         """Straight links from a place to a goal inside a cell around it; x is sampled if free."""
@@ -291,13 +291,13 @@ def cross(places: Sequence[RoadmapPlace], epsilon: float) -> list[Link]:
             best[key] = k
     chosen = [best[key] for key in sorted(best)]
     z, table = place_at(scene, rays.labels[chosen], rays.ends[chosen]), contact_table(scene)
-    found = list[Link]()
+    links = list[Link]()
     for k, end in zip(chosen, z, strict=True):
         contacts, gained = tuple(table[c] for c in rays.labels[k]), table[rays.gained[k]]
         step, start = EdgeStep(contacts, Until(contact=gained)), places[rays.sources[k]]
         stop = RoadmapPlace(scene, end, (*contacts, gained), landed=True)
-        found.append(Link(start, stop, (step,), float(times[k]), True))
-    return found
+        links.append(Link(start, stop, (step,), float(times[k]), True))
+    return links
 
 
 def go_to(
@@ -459,10 +459,10 @@ class Chain:
     def end_at(self, goal: Goal) -> Link | Blocked | None:
         """The link to a goal on the last border; None if there is none."""
         last = self.borders[-1]
-        found = measure_along(last.curve, goal)
-        if found is None:
+        place = measure_along(last.curve, goal)
+        if place is None:
             return None
-        return self._link(found[1], replace(last, curve=cut_curve(last.curve, found[0])))
+        return self._link(place[1], replace(last, curve=cut_curve(last.curve, place[0])))
 
     def _link(self, until: Until, last: BorderEdge) -> Link | Blocked:
         """The link to rest at the end of the last border, or of a part of it."""

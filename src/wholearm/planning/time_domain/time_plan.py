@@ -289,7 +289,7 @@ def hold_torques(search: TimeSearch, free: TimeSolution) -> TimeSolution:
     # Durations over those with free torques, and least numbers of periods.
     stretches = ((1.01, 2), (1.03, 2), (1.07, 3), (1.15, 4), (1.3, 6), (1.6, 8))
     found: TimeSolution | None = None
-    for doubled in (0, *range(doublings, -1, -1)):
+    for doubled in (0, *(range(doublings, -1, -1) if doublings else ())):
         cut = partial(cut_periods, scheme=held.scheme, period=2**doubled * period)
         guesses = (cut(free.stages, stretch=stretch, least=least) for stretch, least in stretches)
         tried = (_solve_held(held, own) for own in ([cut(found.stages)] if found else guesses))
