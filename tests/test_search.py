@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,7 @@ from wholearm.contacts.closing import close_fingers, contact_table
 from wholearm.contacts.closing import place as place_at
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.path_guess import guess_phase
-from wholearm.geometry.tracing import trace_phase
+from wholearm.geometry.tracing import CostToGo, trace_phase
 from wholearm.mapping.borders import NOWHERE, flush_track, label_cells
 from wholearm.mapping.formation_list import (
     Route,
@@ -350,6 +351,24 @@ def test_a_border_is_left_where_that_is_best(best: int, end: int) -> None:
     found, *others = ReleaseSearch(plan, Measured(1 + FINEST * abs(best), (), [])).run()
     assert found.duration == pytest.approx(1, abs=1e-9)
     assert all(own.duration >= found.duration for own in others)
+
+
+def test_a_border_is_left_with_regard_to_what_follows(heptagon: Problem) -> None:
+    """A link that lasts 1 + |k| with k steps of the place, before one that lasts |k + 3| twice."""
+
+    def plan(path: RefinedPath) -> Found:
+        if path.move is None:
+            return "no guess leads to a plan"
+        z = np.full((1, 5), float(path.move))
+        motion = SimpleNamespace(duration=0.0, evaluate=lambda _: SimpleNamespace(z=z, z_dot=z))
+        begun: Any = [SimpleNamespace(motion=motion)]
+        return Measured(1 + abs(path.move), (), begun)
+
+    to_go = CostToGo(heptagon.phases[0], lambda z: 2 * abs(float(z[0]) + 3))
+    for cost, duration in ((None, 1), (to_go, 4)):
+        start = plan(RefinedPath(0))
+        assert isinstance(start, Measured)
+        assert ReleaseSearch(plan, start, cost).run()[0].duration == duration
 
 
 PHI = np.radians(-35.0)

@@ -19,9 +19,9 @@ from typing import NamedTuple, TypeVar
 
 from ..common.parallel import Task, share
 from ..common.signals import beat
+from ..geometry.tracing import CostToGo
 from ..planning.blocks import free_torques
 from ..planning.options import Objective, PlanOptions
-from ..planning.phase_plan import end_of
 from ..planning.result import Plan
 from ..problem.definition import Goal, Problem
 from .edge_plans import (
@@ -29,10 +29,11 @@ from .edge_plans import (
     Lost,
     Measured,
     list_printed,
+    look_ahead,
     measure_link,
     plan_links,
     plan_phases,
-    time_from,
+    time_with,
 )
 from .edges import ROUGHLY, Blocked, Link, describe_steps, leave_at
 from .places import Key, RoadmapPlace, is_at
@@ -200,17 +201,24 @@ class RefinedPath(NamedTuple):
 
 @dataclass
 class ReleaseSearch:
-    """Pattern search for the place where a link leaves a border for a cell."""
+    """Pattern search for the place where a link leaves a border for a cell.
+
+    Least time of the link and of a border that follows where it lands.
+    """
 
     plan: Callable[[RefinedPath], Found]
-    time: Callable[[Measured], float]  # [s]: of a plan and the border that follows
     best: Measured
+    to_go: CostToGo | None = None  # time of what follows [s]
     known: dict[RefinedPath, Found] = field(default_factory=dict)  # plans that were made before
+    _tried: set[RefinedPath] = field(default_factory=set)
     _others: list[Measured] = field(default_factory=list)
-    _tried: set[RefinedPath] = field(default_factory=lambda: {RefinedPath(0)})
 
     def run(self) -> list[Measured]:
         """The fastest plan, followed by the others."""
+        # The same place again where another end may lead on faster.
+        if self.to_go:
+            self._try(RefinedPath(0))
+        self._tried.add(RefinedPath(0))
         # In motion the planner chooses the place.
         if not self._try(RefinedPath(None)):
             path = self._move(RefinedPath(0), STEPS)
@@ -236,7 +244,7 @@ class ReleaseSearch:
         plan = self.known[path] if path in self.known else self.plan(path)
         if isinstance(plan, str):
             return False
-        better = self.time(plan) < GAIN * self.time(self.best)
+        better = time_with(self.to_go, plan) < GAIN * time_with(self.to_go, self.best)
         self._others.append(self.best if better else plan)
         self.best = plan if better else self.best
         return better
@@ -256,7 +264,6 @@ class Chooser:
     made: list[tuple[Plan, RoadmapRoute]] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)  # why routes have no plan
     _prefetched: dict[Link, Found] = field(default_factory=dict)
-    _following: dict[tuple[Link, bytes], float] = field(default_factory=dict)
     _measurements: int = 0
     _bound: tuple[float, BackgroundTask[BorderBound]] | None = None
     _lost: list[tuple[Link, ...]] = field(default_factory=list)
@@ -412,17 +419,19 @@ class Chooser:
     def _refine(self, route: RoadmapRoute, report: Callable[[str], None]) -> None:
         """Optimize the places where a route leaves borders for cells."""
         roadmap = self.roadmap
-        following = dict(pairwise((*route.links, None)))
-        links = [link for link in route.links if link.left and link not in roadmap.refined]
-        roadmap.refined.update(links)
-        for link in links:
+        links = list[Link]()
+        searches = list[ReleaseSearch]()
+        for link, after in pairwise((*route.links, None)):
+            if link is None or link.left is None or link in roadmap.refined:
+                continue
             report(f"planning {describe_steps(link.steps)} in other ways")
-        plans = {link: roadmap.measured[link] for link in links}
-        searches = [
-            ReleaseSearch(partial(self._release, link), partial(self._time, following[link]), plan)
-            for link, plan in plans.items()
-            if isinstance(plan, Measured)
-        ]
+            single = after is not None and not after.in_cell and len(after.steps) == 1
+            to_go = look_ahead(self.problem, after, link.stop) if after and single else None
+            plan = roadmap.measured[link]
+            assert isinstance(plan, Measured)
+            searches.append(ReleaseSearch(partial(self._release, link, to_go), plan, to_go))
+            links.append(link)
+        roadmap.refined.update(links)
         if self.jobs > 1 and len(searches) == 1:
             paths = RefinedPath(None), RefinedPath(-STEPS[0]), RefinedPath(STEPS[0])
             first = self._share([partial(searches[0].plan, path) for path in paths])
@@ -446,7 +455,7 @@ class Chooser:
                 plan = measure_link(self.problem, link, leave_at(link, place), self.options)
         return plan
 
-    def _release(self, link: Link, path: RefinedPath) -> Found:
+    def _release(self, link: Link, to_go: CostToGo | None, path: RefinedPath) -> Found:
         """Plan a link that leaves its border at another place, or in motion."""
         place = None if path.move is None else link.share + FINEST * path.move
         if place is not None and not INSIDE < place < 1 - INSIDE:
@@ -460,17 +469,8 @@ class Chooser:
             self.options,
             straight=path.straight,
             first_only=place is not None,
+            to_go=to_go,
         )
-
-    def _time(self, following: Link | None, plan: Measured) -> float:
-        """Duration [s] of a plan through a cell, and of the border that follows where it lands."""
-        if following is None or following.in_cell:
-            return plan.duration
-        z = end_of(plan.begun[-1])[0]
-        key = following, z.tobytes()
-        if key not in self._following:
-            self._following[key] = time_from(self.problem, following, z)
-        return plan.duration + self._following[key]
 
     def _is_lost(self, route: RoadmapRoute) -> bool:
         """Whether a route contains links that had no plan on another one."""

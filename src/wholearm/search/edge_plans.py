@@ -16,13 +16,13 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import InputError, WholearmError, name_source
+from ..common.errors import InputError, SolverError, WholearmError, name_source
 from ..common.parallel import Task, share
 from ..common.sharing import exclusive
 from ..contacts.formation import Formation
 from ..geometry.curve import Curve
 from ..geometry.path_guess import STILL, count_freedoms, find_end
-from ..geometry.tracing import trace_phase
+from ..geometry.tracing import CostToGo, trace_phase
 from ..mechanics.dynamics import metric_weights
 from ..mechanics.speed_sweep import NoMotionError
 from ..planning.blocks import BlockPlan, Planning, plan_next
@@ -42,15 +42,13 @@ from ..scene.model import Scene
 from .edges import (
     DEPENDENT,
     INTERVALS,
-    BorderEdge,
     EdgeStep,
     Link,
     describe_steps,
     find_headings,
-    link_along,
     point_out,
 )
-from .places import close_place, make_place, measure_apart
+from .places import RoadmapPlace, close_place, measure_apart
 
 ROUGH = 1e-2  # accuracy of plans that only estimate durations
 # Distances are in radii of gyration and radians.
@@ -89,6 +87,7 @@ def measure_link(
     further: bool = False,
     straight: bool = True,
     first_only: bool = False,
+    to_go: CostToGo | None = None,
 ) -> Measured | str:
     """Plan a link through a cell alone, on few intervals; the plan, or why there is none.
 
@@ -98,6 +97,7 @@ def measure_link(
     further     whether other guesses are tried if the first ones fail
     straight    first guess: straight through the cell; otherwise to the nearest end of the phase
     first_only  whether only the first guess is tried
+    to_go       cost of what follows, with regard to which the end is chosen
     """
     from ..planning.time_domain.time_plan import try_phases
 
@@ -117,7 +117,7 @@ def measure_link(
             return f"{phases[0].until} holds already where it starts"
         alone = len(phases) == 1
         towards = goal.z if straight and alone else None
-        plans = try_phases(single, phases, z, rough, towards, further and alone, first_only)
+        plans = try_phases(single, phases, z, rough, towards, further and alone, first_only, to_go)
     except NoMotionError:
         return "no motion keeps its limits along the border"
     except WholearmError as error:
@@ -333,7 +333,7 @@ class _LinkPlanner:
         steps = (*link.steps, *follows)
         phases, curves = make_phases(self.problem, steps), list[Curve]()
         if not link.in_cell and len(phases) == 1:
-            phases[0], curve = aim(phases[0], z, link)
+            phases[0], curve = _aim(phases[0], z, link)
             curves.append(curve)
         single = replace(self.problem, start=z, phases=tuple(phases), goals=())
         count = len(phases) - len(follows)
@@ -396,32 +396,46 @@ def pin_landing(phase: Phase, z: Array) -> Phase:
     return replace(phase, until=replace(until, pins=((name, value),)))
 
 
-def aim(phase: Phase, z: Array, link: Link) -> tuple[Phase, Curve]:
-    """The first phase of a border's link from `z` and its curve, which ends where the border does.
+def _aim(phase: Phase, z: Array, link: Link) -> tuple[Phase, Curve]:
+    """The phase of a border's link from `z` and its curve, which ends where the link does.
 
     A contact may be gained both ways along a border; then the end is given by x or phi.
     """
-    end = link.borders[0].curve.end
     try:
         curve = trace_phase(phase, z)
-        if measure_apart(link.stop.scene, curve.end, end) <= OFF:
+        if measure_apart(link.stop.scene, curve.end, link.stop.z) <= OFF:
             return phase, curve
     except InputError:
         pass
-    other = replace(phase, until=point_out(phase.formation.contacts, end))
+    other = replace(phase, until=point_out(phase.formation.contacts, link.stop.z))
     return other, trace_phase(other, z)
 
 
-def time_from(problem: Problem, link: Link, z: Array) -> float:
-    """Estimated duration [s] of a border's link from another place `z`, (5,), of its first border.
+def look_ahead(problem: Problem, link: Link, place: RoadmapPlace) -> CostToGo | None:
+    """Least time [s] along a border's link of one phase, as a function of where it begins.
 
-    Infinite where no motion keeps its limits from there.
+    It begins about at `place`; None if that is where the border ends.
     """
-    first = link.borders[0]
+    (phase,) = make_phases(problem, link.steps)
     try:
-        _, curve = aim(make_phases(problem, link.steps[:1])[0], z, link)
+        phase, _ = _aim(phase, (close_place(place) or place).z, link)
     except InputError:
+        return None
+
+    def value(z: Array) -> float:
+        try:
+            return look_along((trace_phase(phase, z),), problem.epsilon, INTERVALS)
+        except NoMotionError:
+            raise SolverError("no motion keeps the limits along the border that follows") from None
+
+    return CostToGo(phase, value)
+
+
+def time_with(to_go: CostToGo | None, plan: Measured) -> float:
+    """Duration [s] of a plan through a cell and of what follows; infinite if nothing does."""
+    try:
+        return plan.duration + (to_go.value(end_of(plan.begun[-1])[0]) if to_go else 0.0)
+    except InputError:
+        return plan.duration  # It lands where the border ends.
+    except SolverError:
         return math.inf
-    edge = BorderEdge(make_place(problem.scene, z), curve, first.gained, first.terms)
-    changed = link_along((edge, *link.borders[1:]), link.ratios, link.steps, link.stop)
-    return changed.duration if isinstance(changed, Link) else math.inf

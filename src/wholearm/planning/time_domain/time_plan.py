@@ -152,6 +152,7 @@ def try_phases(
     goal: Array | None = None,
     further: bool = False,
     single_guess: bool = False,
+    to_go: CostToGo | None = None,
 ) -> list[PhasePlan[TimeMotion]] | None:
     """Coarse plans of phases (`only_begin` of `plan_phases`), without a mode search or reasons.
 
@@ -160,9 +161,11 @@ def try_phases(
     goal : (5,)   end of the first, straight guess of a single phase; otherwise its nearest end
     further       whether guesses after the first ones are tried
     single_guess  whether to solve from one guess alone, for few iterations
+    to_go         cost of what follows, for the choice of the end
     """
-    search = TimeSearch.of(problem, replace(options, mode_search=False), only_begins=True)
-    guesses = Guesses(problem, phases, z, search)
+    rough = replace(options, mode_search=False)
+    search = TimeSearch.of(problem, rough, to_go=to_go, only_begins=True)
+    guesses = Guesses(problem, phases, z, search, to_go)
     listed: Iterable[Guess] = guesses.every(goal)
     if single_guess:
         # The nearest end is another guess than a straight path that limits exclude.
@@ -175,6 +178,7 @@ def try_phases(
     for guess in listed:
         solution = solve_coarse(search, guess, 35 if single_guess else ITERATIONS)
         if solution.success:
+            search, solution = choose_end(search, solution)
             first, *others = list_plans(problem, search, phases, solution, guess.name)
             return [first._replace(complete=not options.mode_search), *others]
     return None
