@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from once import once
-from wholearm import FormationMap, Plan, Problem, Trajectory, build_map, load
+from wholearm import FormationMap, Plan, Problem, Report, Trajectory, build_map, load, verify
 from wholearm.planning.plan import solve
 
 FOLDER = Path(__file__).parents[1] / "problems"
@@ -52,6 +52,12 @@ def chart() -> FormationMap:
 
 def plan_of(path: Path, objective: str = "time") -> Trajectory:
     return solved(path, objective).trajectory
+
+
+@once
+def verified(path: Path, objective: str = "time") -> Report:
+    """The replay of a plan."""
+    return verify(problem_of(path), plan_of(path, objective))
 
 
 @cache

@@ -66,8 +66,8 @@ def test_a_study_is_a_command_with_records_and_a_table(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "out"
-    command = ["bench", "steps", "-o", str(folder), "--jobs", "2"]
-    assert main([*command, "--most", "4"]) == 1
+    command = ["bench", "steps", "-o", str(folder), "--jobs", "1"]
+    assert main([*command, "--most", "4", "--jobs", "2"]) == 1
     text = capsys.readouterr().out
     assert text.startswith("# Steps to one\n\nwholearm ") and "| 3 | 7 |" in text
     assert "* no natural one" in text and f"wrote {folder / 'bench_steps.md'}" in text

@@ -21,7 +21,7 @@ import pytest
 
 import wholearm
 from once import once
-from shipped import FOLDER, HEPTAGON, HEXAGON, LANDING, chart, problem_of, solved
+from shipped import FOLDER, HEPTAGON, HEXAGON, LANDING, chart, problem_of, solved, verified
 from wholearm import Plan, Problem
 from wholearm.cli.command import TOPICS, build_parser, main, prepare, read_page
 
@@ -260,7 +260,7 @@ def test_results_are_one_line_and_motions_a_picture() -> None:
         plan,
         plan.trajectory,
         wholearm.simulate(problem, plan),
-        wholearm.verify(problem, plan),
+        verified(HEPTAGON),
         policy(),
         chart(),
         problem,

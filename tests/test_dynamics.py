@@ -23,7 +23,7 @@ from plane import (
 )
 from planned import forward
 from scenes import box, roll, tipped
-from shipped import BOX, FOLDER, HEPTAGON, IMPACTS, plan_of, problem_of
+from shipped import BOX, FOLDER, HEPTAGON, IMPACTS, plan_of, problem_of, verified
 from timed import landing, plan_landing
 from wholearm import Formation, InputError, PlanOptions, TorqueProfile, load, verify
 from wholearm import solve as plan
@@ -744,7 +744,7 @@ def test_an_ambiguous_scene_is_refused_by_name() -> None:
 
 
 def test_replays_tell_the_uniqueness_margin_of_each_phase() -> None:
-    report = verify(box(), tipped())
+    report = verified(BOX)
     minors = [phase.uniqueness_margin for phase in report.phases]
     assert report.ok and all(minor is not None and 0.1 < minor.value < 1 for minor in minors)
     planned = [own["value"] for own in tipped().meta["uniqueness_margins"]]

@@ -16,8 +16,8 @@ from scipy.integrate import trapezoid
 
 from plane import finger_gap, measure_gaps, measure_slip, unbalance
 from scenes import measure_fingers
-from shipped import FOLDER, HEPTAGON, IMPACTS, plan_of, problem_of
-from wholearm import Phase, PlanOptions, Problem, verify
+from shipped import FOLDER, HEPTAGON, IMPACTS, plan_of, problem_of, verified
+from wholearm import Phase, PlanOptions, Problem
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError, SolverError
 from wholearm.planning import explain
@@ -260,7 +260,7 @@ def test_plans_are_those_of_the_corpus(name: str) -> None:
 @pytest.mark.parametrize("path, objective", CASES, ids=lambda case: getattr(case, "stem", case))
 def test_plans_hold_in_simulation(path: Path, objective: str) -> None:
     problem, plan = problem_of(path), plan_of(path, objective)
-    report = verify(problem, plan)
+    report = verified(path, objective)
     assert report.ok, report.to_text()
     assert abs(report.missed_by) < GOAL
     assert len(report.phases) == len(problem.phases)

@@ -194,6 +194,7 @@ def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str], plan: Pla
 def test_no_policy_is_written_that_does_not_carry_out_its_plan(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
+    problem: Problem,
     plan: Plan,
     policy: Policy,
     monkeypatch: pytest.MonkeyPatch,
@@ -204,6 +205,8 @@ def test_no_policy_is_written_that_does_not_carry_out_its_plan(
     weak = Policy([first, {**last, "torque": 0.2 * last["torque"]}], policy.settings)
     weak.about = policy.about
     monkeypatch.setattr("wholearm.make_policy", lambda *_, **__: weak)
+    report = verify_policy(problem, plan.trajectory, weak)
+    monkeypatch.setattr("wholearm.verify_policy", lambda *_, **__: report)
     output = tmp_path / "policy.npz"
     assert main(["policy", str(tmp_path / "plan.npz"), "-o", str(output)]) == 1
     said = capsys.readouterr().err

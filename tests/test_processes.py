@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 
 import wholearm
-from shipped import FOLDER, HEPTAGON, LANDING, plan_of, problem_of
+from shipped import FOLDER, HEPTAGON, LANDING, plan_of, problem_of, verified
 from tiny_study import die_once
 from wholearm.cli.command import hasten
 from wholearm.common import files as archive
@@ -546,7 +546,7 @@ def planned(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, ...]:
     trajectory.save(path)
     loaded = wholearm.load_trajectory(path)
     simulation = simulate(problem, trajectory.torque, times=[0.1])
-    return problem, trajectory, loaded, simulation, wholearm.verify(problem, trajectory)
+    return problem, trajectory, loaded, simulation, verified(LANDING)
 
 
 def check_same(one: wholearm.Trajectory, other: wholearm.Trajectory) -> None:

