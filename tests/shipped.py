@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,10 @@ BOX = FOLDER / "box_rolling.toml"
 """A box that tips over a vertex that rolls."""
 
 
+Edit = Callable[[dict[str, Any]], object]
+"""A change of the tables of a problem file."""
+
+
 @cache
 def problem_of(path: Path) -> Problem:
     return load(str(path))
@@ -38,6 +43,18 @@ def text_of(path: Path = HEPTAGON, phases: int = 1) -> str:
 def table_of(path: Path = HEPTAGON) -> dict[str, Any]:
     """The tables of a problem file without its phases."""
     return tomllib.loads(text_of(path, 0))
+
+
+def put(path: str, value: object) -> Edit:
+    """An edit that sets a dotted key; numbers index lists."""
+
+    def edit(table: Any) -> None:
+        *parents, last = path.split(".")
+        for key in parents:
+            table = table[int(key)] if isinstance(table, list) else table[key]
+        table[int(last) if isinstance(table, list) else last] = value
+
+    return edit
 
 
 @once

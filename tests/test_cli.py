@@ -9,7 +9,6 @@ import re
 import subprocess
 import sys
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +16,13 @@ import numpy as np
 import pytest
 
 import wholearm
-from shipped import HEPTAGON, IMPACTS, solved
+from shipped import HEPTAGON, IMPACTS, Edit, put, solved
 from wholearm import PlanOptions, Trajectory, load_trajectory
 from wholearm.cli.command import build_parser, main
 from wholearm.planning.result import describe_plan
 from wholearm.problem.table import write_toml
 
 TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
-Edit = Callable[[dict[str, Any]], object]
 
 
 def write_problem(folder: Path, edit: Edit) -> str:
@@ -38,18 +36,6 @@ def write_problem(folder: Path, edit: Edit) -> str:
 def keep(count: int) -> Edit:
     """An edit that leaves the first phases."""
     return lambda table: table["phases"].__delitem__(slice(count, None))
-
-
-def put(*keys: Any) -> Edit:
-    """An edit that sets the last key but one to the last."""
-
-    def edit(table: Any) -> None:
-        *parents, last, value = keys
-        for key in parents:
-            table = table[key]
-        table[last] = value
-
-    return edit
 
 
 @pytest.fixture
@@ -227,14 +213,14 @@ def test_solve_prints_json(
 
 
 BAD_PROBLEMS: dict[str, tuple[Edit, str, str]] = {
-    "nan": (put("object", "vertices", 1, 0, float("nan")), "object.vertices[1]", "nan is not a"),
-    "unknown key": (put("object", "mas", 1.0), "object.mas", "did you mean 'mass'?"),
+    "nan": (put("object.vertices.1.0", float("nan")), "object.vertices[1]", "nan is not a"),
+    "unknown key": (put("object.mas", 1.0), "object.mas", "did you mean 'mass'?"),
     "later formation": (
-        put("phases", 1, "contacts", 3, "v4-finger2"),
+        put("phases.1.contacts.3", "v4-finger2"),
         "phases[2].contacts",
         "v4-finger2 does not touch at the end of phase 1",
     ),
-    "start out of reach": (put("start", "x", 0.5), "start", "finger 1 is too short to reach"),
+    "start out of reach": (put("start.x", 0.5), "start", "finger 1 is too short to reach"),
 }
 """Other values are refused in the tests of the reader."""
 
@@ -257,7 +243,7 @@ def test_bad_problems(folder: Path, capsys: pytest.CaptureFixture[str], case: st
             ["phase 1 is infeasible: c_n of v1-palm >= epsilon = 50 N", " at t"],
         ),
         (
-            put("fingers", "1", "torque_limit", 0.01),
+            put("fingers.1.torque_limit", 0.01),
             ["torque limit of finger 1 = 0.01 N m", "short"],
         ),
         (put("friction", dict.fromkeys(["palm", "finger1", "finger2"], 1.5)), ["jams at x ="]),

@@ -19,7 +19,7 @@ import pytest
 
 import wholearm
 from rows import each
-from shipped import BOX, FOLDER, HEPTAGON, plan_of, problem_of, table_of
+from shipped import BOX, FOLDER, HEPTAGON, Edit, plan_of, problem_of, put, table_of
 from wholearm import End, Goal, InputError, Problem, Until, compare, load, save
 from wholearm.cli.command import build_parser, main
 from wholearm.common.fields import NONNEGATIVE, Range, declare, keys_of
@@ -47,25 +47,12 @@ from wholearm.results.adopt import describe_origin
 from wholearm.scene.model import Finger, Friction, find_unit_hint
 
 TEXT = HEPTAGON.read_text(encoding="utf-8")
-Edit = Callable[[dict[str, Any]], object]
 
 
 def read_edited(edit: Edit) -> Problem:
     table = tomllib.loads(TEXT)
     edit(table)
     return build_problem(table)
-
-
-def put(path: str, value: object) -> Edit:
-    """An edit that sets a dotted key; numbers index lists."""
-
-    def edit(table: Any) -> None:
-        *parents, last = path.split(".")
-        for key in parents:
-            table = table[int(key)] if isinstance(table, list) else table[key]
-        table[int(last) if isinstance(table, list) else last] = value
-
-    return edit
 
 
 def both(*edits: Edit) -> Edit:
