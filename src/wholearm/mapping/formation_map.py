@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -28,7 +29,7 @@ from ..contacts.closing import (
     lower,
 )
 from ..contacts.elemental import Contact
-from ..contacts.formation import Formation, Kinematics
+from ..contacts.formation import Kinematics
 from ..geometry.curve import solve_tangent
 from ..mechanics import UNIQUENESS
 from ..mechanics.dynamics import Directions, force_rows, inverse, metric_weights, reduced_inertia
@@ -165,7 +166,7 @@ def build_map(
     inside = label_cells(scene, *places.T)
     places, inside = places[inside[:, 0] != NOWHERE], inside[inside[:, 0] != NOWHERE]
     z = close_fingers(scene, *places.T).z
-    directions = check_cell(scene, problem.epsilon, inside[:, [0, 2, 4]], z, limit)
+    directions = _check_cells(problem, inside[:, [0, 2, 4]], z, limit)
     return FormationMap(
         problem,
         x,
@@ -199,7 +200,7 @@ def _build_borders(problem: Problem, pieces: Sequence[Piece], limit: float) -> l
     if flush.any():
         rows = np.array([0 if _along(piece) == "x" else 2 for piece in pieces])[owner[flush]]
         chosen = labels[flush][labels[flush] != NOWHERE].reshape(-1, 4)
-        flags[:, flush] = check_border(scene, problem.epsilon, chosen, z[flush], rows, limit)
+        flags[:, flush] = _check_borders(problem, chosen, z[flush], rows, limit)
     table, found = contact_table(scene), []
     for index, piece in enumerate(pieces):
         mine = owner == index
@@ -244,109 +245,73 @@ def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]
     return tuple(crossings)
 
 
-def check_border(
-    scene: Scene,
-    epsilon: float,
-    label: Numbers,
-    z: Array,
-    coordinate: int | Numbers,
-    uniqueness_margin: float = UNIQUENESS_MARGIN,
+def _check_borders(
+    problem: Problem, labels: Numbers, z: Array, rows: Numbers, limit: float
 ) -> tuple[Flags, Flags, Flags]:
-    """Whether a quasistatic motion along a border is feasible, in each direction.
+    """Whether motions along borders are feasible, with rows of z increasing and decreasing, (n,).
 
-    Parameters
-    ----------
-    epsilon : [N]             least normal force
-    label : (4,) or (n, 4)    the contacts, as indices into `closing.contact_table`
-    z : (n, 5)                configurations on borders
-    coordinate : (n,) {0, 2}  x or phi, whichever increases along the border
-    uniqueness_margin         least uniqueness margin, as of `find_minors`
-
-    Returns
-    -------
-    forth, back : (n,)  for travel with the coordinate increasing, and decreasing
-    ambiguous : (n,)    feasible in some direction, but contact forces are not unique
+    And where contact forces of one that would be are not unique.
     """
-    labels = np.broadcast_to(label, (len(z), 4))
+    scene, weights = problem.scene, np.sqrt(metric_weights(problem.scene))
     kinematics = evaluate_each(scene, labels, z)
-    weights = np.sqrt(metric_weights(scene))
     _, sizes, right = np.linalg.svd(kinematics.A / weights)
     z_s = right[:, -1] / weights
-    along = z_s[np.arange(len(z)), coordinate]
-    z_s *= np.where(along < 0, -1.0, 1.0)[:, None]
+    z_s *= np.where(z_s[np.arange(len(z)), rows] < 0, -1.0, 1.0)[:, None]
     regular = sizes[:, -1] > REGULAR * sizes[:, 0]
-    held, unique = (np.zeros((2, len(z)), dtype=bool) for _ in range(2))
-    for formation, mine in group_alike(scene, labels):
-        (rows,) = np.nonzero(mine & regular)
-        part, still = Kinematics(*(array[rows] for array in kinematics)), np.zeros(len(rows))
-        for k, tangent in enumerate((z_s[rows], -z_s[rows])):
-            directions = Directions.of(part, tangent)
-            forces = inverse(formation, z[rows], tangent, np.zeros_like(tangent), directions, part)
-            squeezing = InternalForceLimits.of(formation, forces, tangent[:, 3:])
-            low, high = squeezing.find_span(still, still, epsilon)
-            held[k, rows] = feasible = low <= high
-            sole = _are_unique(formation, part, tangent, feasible, uniqueness_margin)
-            unique[k, rows[feasible]] = sole
-    return held[0] & unique[0], held[1] & unique[1], np.any(held & ~unique, axis=0)
+    tangents = np.stack([z_s, -z_s], axis=1)
+    possible, ambiguous = _check_motions(problem, labels, z, kinematics, regular, tangents, limit)
+    return possible[:, 0], possible[:, 1], ambiguous
 
 
-def check_cell(
-    scene: Scene,
-    epsilon: float,
-    label: Numbers,
-    z: Array,
-    uniqueness_margin: float = UNIQUENESS_MARGIN,
-) -> tuple[Flags, Flags]:
-    """Whether quasistatic motions inside cells are feasible in the directions `WAYS`.
+def _check_cells(problem: Problem, labels: Numbers, z: Array, limit: float) -> tuple[Flags, Flags]:
+    """Whether motions inside cells are feasible in the directions `WAYS`, (n, 4).
 
-    Parameters
-    ----------
-    epsilon : [N]           least normal force
-    label : (3,) or (n, 3)  contacts of palm and fingers, as indices into `closing.contact_table`
-    z : (n, 5)              configurations in cells
-    uniqueness_margin       as of `check_border`
-
-    Returns
-    -------
-    possible : (n, 4)
-    ambiguous : (n,)   one more would be, but contact forces are not unique
+    And where contact forces of one that would be are not unique, (n,).
     """
-    labels = np.broadcast_to(label, (len(z), 3))
+    scene, pose = problem.scene, np.broadcast_to(np.eye(5)[[0, 2]], (len(z), 2, 5))
     kinematics = evaluate_each(scene, labels, z)
-    held, unique = (np.zeros((len(z), len(WAYS)), dtype=bool) for _ in range(2))
-    rows = np.zeros((2, 5))
-    rows[[0, 1], [0, 2]] = 1.0
-    matrix = np.concatenate([kinematics.A, np.broadcast_to(rows, (len(z), 2, 5))], axis=1)
+    matrix = np.concatenate([kinematics.A, pose], axis=1)
     regular = np.abs(np.linalg.det(matrix)) > REGULAR * scene.scales.length**2
-    part = Kinematics(*(array[regular] for array in kinematics))
-    for formation, _ in group_alike(scene, labels):
-        for k, direction in enumerate(_WAYS):
-            right = np.zeros((regular.sum(), 5, 1))
-            right[:, 3:, 0] = direction
-            z_s = np.linalg.solve(matrix[regular], right)[..., 0]
-            # Contact forces and torques at rest, with friction that opposes z_s.
-            directions = Directions.of(part, z_s)
-            G = force_rows(formation, part, directions)
-            wrench = G[:, :, :3].transpose(0, 2, 1)
-            solvable = np.abs(np.linalg.det(wrench)) > REGULAR * scene.scales.length
-            wrench[~solvable] = np.eye(3)
-            right = np.broadcast_to(-scene.applied_force[:3, None], (len(G), 3, 1))
-            c_n = np.linalg.solve(wrench, right)[..., 0]
-            tau = scene.dry[3:] * directions.sigma - np.einsum("nij,ni->nj", G[:, :, 3:], c_n)
-            within = (c_n >= epsilon).all(axis=1) & (np.abs(tau) <= scene.torque_limit).all(axis=1)
-            held[regular, k] = feasible = within & solvable
-            sole = _are_unique(formation, part, z_s, feasible, uniqueness_margin)
-            unique[held[:, k], k] = sole
+    tangents = np.zeros((len(z), len(WAYS), 5))
+    tangents[regular] = (np.linalg.inv(matrix[regular])[..., 3:] @ _WAYS.T).swapaxes(1, 2)
+    return _check_motions(problem, labels, z, kinematics, regular, tangents, limit)
+
+
+def _check_motions(
+    problem: Problem,
+    labels: Numbers,
+    z: Array,
+    kinematics: Kinematics,
+    regular: Flags,
+    tangents: Array,
+    limit: float,
+) -> tuple[Flags, Flags]:
+    """Whether quasistatic motions along `tangents`, (n, k, 5), are feasible, (n, k).
+
+    And whether one more would be, but contact forces are not unique, (n,): their uniqueness margin
+    is below the `limit`. What is not `regular` is left out.
+    """
+    scene = problem.scene
+    held, unique = np.zeros((2, *tangents.shape[:2]), dtype=bool)
+    for (formation, mine), k in product(group_alike(scene, labels), range(tangents.shape[1])):
+
+        def take(rows: Numbers, k: int = k) -> tuple[Kinematics, Array, Directions]:
+            part = Kinematics(*(array[rows] for array in kinematics))
+            return part, tangents[rows, k], Directions.of(part, tangents[rows, k])
+
+        rows = np.flatnonzero(mine & regular)
+        part, tangent, directions = take(rows)
+        if formation.n_constraints == 3:
+            wrench = force_rows(formation, part, directions)[:, :, :3]
+            rows = rows[np.abs(np.linalg.det(wrench)) > REGULAR * scene.scales.length]
+            part, tangent, directions = take(rows)
+        forces = inverse(formation, z[rows], tangent, 0 * tangent, directions, part)
+        limits = InternalForceLimits.of(formation, forces, tangent[:, 3:])
+        still = np.zeros(len(rows))
+        low, high = limits.find_span(still, still, problem.epsilon)
+        held[rows, k] = low <= high
+        unique[rows, k] = find_minors(formation, part, directions.Xi).ratios >= limit
     return held & unique, np.any(held & ~unique, axis=1)
-
-
-def _are_unique(
-    formation: Formation, kinematics: Kinematics, z_s: Array, rows: Flags, uniqueness_margin: float
-) -> Flags:
-    """Whether contact forces of motions along `z_s` are unique, at some of the rows."""
-    part = Kinematics(*(array[rows] for array in kinematics))
-    Xi = Directions.of(part, z_s[rows]).Xi
-    return np.asarray(find_minors(formation, part, Xi).ratios >= uniqueness_margin)
 
 
 @exclusive
