@@ -53,10 +53,9 @@ class LawSettings:
     drive: float = 0.3
     creep: float = 3.0  # dwell times after which joints may creep: with low friction they do
     # Distance beyond the end at which a contact is made, as time at touching speed [s]: if it does
-    # not stop the joints, if it is there at the beginning, if it stops them.
+    # not stop the joints, if it is there at the beginning.
     soon: float = 0.02
     ahead: float = 0.05
-    far: float = 0.3
     # Of measured forces: weight of the last sample in the bias; force of a closed contact and least
     # reference force, over the mean of all.
     smooth: float = 0.3
@@ -109,32 +108,22 @@ class CurveLaw:
         self.memory = LAW.integral * self.gain**2 * settings.period
         self.turn: tuple[float, float] | None = None
         self.after: CurveLaw | None = None
-        self.beyond = 0.0
         self.sensing: Sensing | None = None
         self.begin()
 
     def lead_to(self, after: CurveLaw) -> None:
-        """Set the next law, and the distance beyond the end that shows the contact.
-
-        It is short where the final torques drive the joints on along the next curve.
-        """
+        """Set the next law."""
         if self.passes:
             self.turn = after.chords[0]
-        if self.passes or self.keeps:
-            return
-        self.after = after
-        tau = self._act(len(self.steps) - 1, 1.0, 0.0, 0.0, self.gain * self.settings.touch, True)
-        # Acceleration from these torques at rest.
-        (one, _, _, c, d), (two, _, _, e, f) = after.torque[0]
-        a = ((tau[0] - one) * f - (tau[1] - two) * d) / (c * f - d * e)
-        self.beyond = (LAW.far if a < -0.1 * self.settings.most else LAW.soon) * self.settings.touch
+        elif not self.keeps:
+            self.after = after
 
     def begin(self, at_end: bool = False) -> None:
         """Start anew, at the beginning or just before the end."""
         self.j = len(self.steps) - 1 if at_end else 0
         self.over = self.pushes = False
         self.sum = self.a = self.ran = self.rested = self.drive = self.held = 0.0
-        self.limit = LAW.ahead * self.settings.touch if at_end else self.beyond
+        self.limit = (LAW.ahead if at_end else LAW.soon) * self.settings.touch
         self.s, self.v, self.level = self.nodes[self.j], 0.0, 0.0
         self.off, self.fresh = 0.0, not at_end
         if self.sensing is not None:
@@ -205,7 +194,7 @@ class CurveLaw:
             self.drive += rise / 2
         else:
             self.drive = 0.0
-        limit, self.limit = self.limit, self.beyond
+        limit, self.limit = self.limit, LAW.soon * touch
         return self.drive > rise or self.s > self.length + limit
 
     def _measure(self, one: float, two: float, rate_one: float, rate_two: float) -> None:
