@@ -570,19 +570,14 @@ class FreeRun(Run):
         v = self.v + answer.change
         if bouncing and self.restitution:
             v = self._expand(closed, answer, v)
-        pause = 1e-3 * self.system.scales.time
         for k, pair in enumerate(closed.pairs):
             if rates[k] >= -STANDING * self.system.scales.speed or answer.c_n[k] <= 0:
                 continue
             name, text = self.system.names[pair], self.system.structure.pairs[pair].text
+            kind, note = EventKind.CHATTER, f"the impacts of {name} come ever closer and are over"
             if bouncing:
-                note = f"{text or name} at {-rates[k]:.4g} m/s"
-                self.note_at(EventKind.IMPACT, note, name, float(-rates[k]))
-                continue
-            chatters = (e for e in self.events if e.kind is EventKind.CHATTER)
-            if all(e.contact != name or self.t - e.time >= pause for e in chatters):
-                note = f"the impacts of {name} come ever closer and are over"
-                self.note_at(EventKind.CHATTER, note, name, float(-rates[k]))
+                kind, note = EventKind.IMPACT, f"{text or name} at {-rates[k]:.4g} m/s"
+            self.note_at(kind, note, name, float(-rates[k]))
         self.set_velocity(v)
 
     def _pose(self, closed: ClosedContacts, v: Array) -> ContactProblem:
