@@ -578,7 +578,7 @@ class FreeRun(Run):
             kind, note = EventKind.CHATTER, f"the impacts of {name} come ever closer and are over"
             if bouncing:
                 kind, note = EventKind.IMPACT, f"{text or name} at {-rates[k]:.4g} m/s"
-            # What chatters may do so again at once: `draw_run(139)` of the tests tells it six times.
+            # What chatters may do so again at once: in `draw_run(139)` of the tests six times.
             told = (e for e in self.events if e.kind is kind and e.contact == name)
             if bouncing or all(self.t - e.time >= pause for e in told):
                 self.note_at(kind, note, name, float(-rates[k]))
