@@ -299,17 +299,13 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
     if len(parts) == 1:
         # Velocities after impacts between phases would depend on friction too.
         may_change += list_frictions(data.curve.formation)
-    missed = data.limits.fold(-data.slack(data.nodes, elastic)).max(axis=0)
 
     def find_value(parameter: Parameter) -> float | None:
         if parameter.key.startswith(FRICTION):
             return _search_friction(task, parameter)
         step = units.force if parameter.unit == "N" else parameter.value
         relaxation = Relaxation(parameter, step)
-        weights = step * data.limits.weigh(parameter)
-        needed = np.divide(missed, weights, out=np.zeros_like(missed), where=weights > 0)
-        start = max(1.0, 1.5 * float(needed.max()))
-        solution = _solve_soft(data, elastic, units, start, relaxation)
+        solution = _solve_soft(data, elastic, units, 1.0, relaxation)
         return relaxation.move(solution[1]) if solution else None
 
     with suppress(SolverError):  # it stalls

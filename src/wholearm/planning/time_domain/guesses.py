@@ -189,8 +189,7 @@ class Guesses:
     def to_others(self) -> Iterator[Guess]:
         """Along the first of these paths."""
         name = "a motion straight to another end"
-        found = (self._follow(name, outline) for _, outline in self.paths[:3])
-        return (guess for guess in found if guess is not None)
+        return (self._follow(name, outline) for _, outline in self.paths[:3])
 
     def _is_planar(self) -> bool:
         """Whether there is a single phase, with two freedoms, that does not end by a release."""
@@ -206,14 +205,9 @@ class Guesses:
         free = formation.evaluate_limits(outline.z).min() > -formation.scene.touching
         return outline if moves and free else None
 
-    def _follow(
-        self, name: str, outline: PathGuess, profile: PathSpeed | None = None
-    ) -> Guess | None:
-        """Along a path in its modes; None if these are too many."""
-        pieces = split_path(outline)
-        if len(pieces) > MOST:
-            return None
-        return Guess(name, self._guess(pieces, profile))
+    def _follow(self, name: str, outline: PathGuess, profile: PathSpeed | None = None) -> Guess:
+        """Along a path in its modes."""
+        return Guess(name, self._guess(split_path(outline), profile))
 
     def resume(self, name: str, stages: Sequence[Stage]) -> Guess:
         """From a solution with nearly the same start."""

@@ -23,7 +23,7 @@ from ...common.errors import InfeasibleError, Parameter, SolverError, WholearmEr
 from ...geometry.tracing import CostToGo
 from ...mechanics.dynamics import measure_speed
 from ...mechanics.impact import Impact, compute_impact
-from ...problem.definition import ROWS, End, Phase, Problem
+from ...problem.definition import End, Phase, Problem
 from ...results.plan_record import Transition
 from ...results.trajectory import Motion
 from ..options import Objective, PlanOptions
@@ -43,7 +43,6 @@ from .solution import Price, TimeSearch, TimeSolution, keep_within, refine
 from .stage import (
     Scheme,
     Stage,
-    bisect_intervals,
     in_own_units,
     make_scheme,
     resample,
@@ -88,7 +87,7 @@ def plan_phases(
     duration : [s]    longest duration of all these phases, for `margin`
     to_go             cost-to-go at a free end
     ample : [N]       saturation of the objective `margin`, as other phases keep less anyway
-    fastest           time-optimal plans from `z`, as guess and fallback for `margin`
+    fastest           time-optimal plans from `z`, as guess for `margin`
     pinned            whether the motion ends where these do
     begun             coarse plans (`only_begin`) from nearly the same `z`, to start from
     along             gives motions along the curves of the phases, if there are some
@@ -129,11 +128,6 @@ def plan_phases(
             listed,
             lambda: refuse(search, problem, phases, guesses.nearest.stages, explanation),
         )
-    if found is None and stages and search.goal is Objective.MARGIN:
-        # They keep epsilon within any duration that is no shorter.
-        search.tried.complete = False
-        kept = TimeSolution(stages, 0.0, 0.0, "", True, search.build(stages), {})
-        found = kept, fastest[0].attempt
     if found is None:
         found = _solve_elastic(search, guesses, explanation)
     return list_plans(problem, search, phases, *found)
@@ -191,7 +185,7 @@ def solve_guesses(
 
     If the first ones fail, `refuse` may raise an error that says why.
     """
-    coarse, best = list[_Named](), None
+    coarse = list[_Named]()
     for guess in guesses:
         if coarse and not guess.homotopy:
             continue
@@ -201,11 +195,10 @@ def solve_guesses(
         elif refuse and not coarse and guess.name == NEAREST:
             refuse()
         if coarse and (len(coarse) > 1 or guess.homotopy or not may_gain(search, solution)):
-            least = min(own.cost for own, _ in coarse)
-            best, coarse = _refine_best(search, coarse, best), []
-            if best and best[0].cost <= least + 0.2 * abs(least):  # not much dearer
+            best, coarse = _refine_best(search, coarse), []
+            if best:
                 return best
-    return _refine_best(search, coarse, best)
+    return _refine_best(search, coarse)
 
 
 def solve_coarse(search: TimeSearch, guess: Guess, most: int = ITERATIONS) -> TimeSolution:
@@ -233,10 +226,9 @@ def may_gain(search: TimeSearch, solution: TimeSolution) -> bool:
     return any(sign_sequence(moved) != known for moved in list_neighbours(search, solution))
 
 
-def _refine_best(
-    search: TimeSearch, coarse: Sequence[_Named], best: _Named | None
-) -> _Named | None:
-    """The best of refined solutions, unless coarse ones are dearer, and of one that is known."""
+def _refine_best(search: TimeSearch, coarse: Sequence[_Named]) -> _Named | None:
+    """The best of refined solutions, of which those are left out whose coarse ones cost more."""
+    best: _Named | None = None
     for solution, name in sorted(coarse, key=lambda own: own[0].cost):
         if best and best[0].cost < solution.cost:
             break
@@ -433,7 +425,10 @@ def _list_slow(
 
 
 def _free_ends(search: TimeSearch, guesses: Guesses) -> Iterator[Guess]:
-    """A coarse plan that chooses where phases end, moved to where they are pinned."""
+    """A coarse plan that chooses where phases end, moved to where they are pinned.
+
+    Goal 12 of the corpus takes 1.16 s instead of 0.68 s without it.
+    """
     known, every = search.problem.phases, guesses.problem.phases
     if not any(_set_free(phase) is not phase for phase in guesses.phases):
         return
@@ -443,24 +438,12 @@ def _free_ends(search: TimeSearch, guesses: Guesses) -> Iterator[Guess]:
     found = solve_guesses(own, Guesses(problem, phases, guesses.z, own).every())
     if found is None:
         return
-    solution, reached, step = found[0], 0.0, 1.0
-    ends = {stage.phase: stage.guess.nodes[-1, 0] for stage in solution.stages}
-    while reached < 1.0:
-        share, stages = min(1.0, reached + step), list[Stage]()
-        for stage in solution.stages:
-            until = stage.until and known[stage.phase].until
-            if until:
-                end = ends[stage.phase]
-                places = [(name, float(end[ROWS[name]]), value) for name, value in until.pins]
-                pins = tuple((name, a + share * (b - a)) for name, a, b in places)
-                until = replace(until, pins=pins)
-            stages.append(replace(stage, until=until))
-        moved = search.solve(stages, solution, search.wait(ITERATIONS))
-        if moved.success:
-            solution, reached = moved, share
-        elif (step := step / 4) < 1 / 16:
-            return
-    yield Guess("a plan that chooses where it ends", solution.stages, before=solution)
+    stages = [
+        replace(stage, until=stage.until and known[stage.phase].until) for stage in found[0].stages
+    ]
+    moved = search.solve(stages, found[0], search.wait(ITERATIONS))
+    if moved.success:
+        yield Guess("a plan that chooses where it ends", moved.stages, before=moved)
 
 
 def _set_free(phase: Phase) -> Phase:
@@ -479,13 +462,11 @@ def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) 
     for guess in chain([guesses.nearest], islice(guesses.to_others(), 1)):
         elastic = soft.solve(guess.stages)
         if elastic.success and not list_shortfalls(problem, elastic.stages, scheme):
+            # Phase 3 of leg 21 has a plan from there with the torque limit that is advised.
             found = solve_guesses(search, [guess._replace(stages=elastic.stages)])
             if found is not None:
                 return found
-            # Finer intervals may show violations that coarse ones do not.
-            once = [np.ones(stage.intervals, dtype=np.int64) for stage in elastic.stages]
-            elastic = soft.solve(bisect_intervals(elastic.stages, scheme, once))
-        if elastic.success and list_shortfalls(problem, elastic.stages, scheme):
+        elif elastic.success:
             short.append(elastic.stages)
     if not short:
         refuse_paths(problem, guesses.phases[0], [margin for margin, _ in guesses.paths])
