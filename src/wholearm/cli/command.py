@@ -256,8 +256,8 @@ options as of `read_options`."""
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit status."""
-    given = sys.argv[1:] if arguments is None else arguments
-    return guard(lambda: _run(given), clear_progress)
+    command_line = sys.argv[1:] if arguments is None else arguments
+    return guard(lambda: _run(command_line), clear_progress)
 
 
 def _run(given: Sequence[str]) -> int:
@@ -351,9 +351,9 @@ def build_parser() -> Parser:
     for part in re.split(r"^(?=\[\[)", TABLE, flags=re.M)[1:]:
         head, _, table = part.partition("\n")
         name, run, text = re.split(r" {2,}", head)
-        own = add_parser(commands, name.strip("[]"), text)
-        add_options(own, table)
-        own.set_defaults(run=globals()[run])
+        subparser = add_parser(commands, name.strip("[]"), text)
+        add_options(subparser, table)
+        subparser.set_defaults(run=globals()[run])
     text = "run studies: measure, compare with stored answers, look for what must not be"
     bench = add_parser(commands, "bench", text)
     bench.fill = partial(_fill_bench, bench)
@@ -489,10 +489,10 @@ def load_plan(options: argparse.Namespace, path: str, silent: bool = False) -> L
     from ..problem.read import adopt_phases
 
     plan, problem, policy = wholearm.load_trajectory(path), read_problem(options), None
-    known, origins = getattr(options, "policy", None), [("plan", path, plan.meta)]
-    if known is not None:
-        policy = wholearm.Policy.load(known).with_sensor(getattr(options, "sensor", False))
-        origins.append(("policy", known, policy.about))
+    policy_path, origins = getattr(options, "policy", None), [("plan", path, plan.meta)]
+    if policy_path is not None:
+        policy = wholearm.Policy.load(policy_path).with_sensor(getattr(options, "sensor", False))
+        origins.append(("policy", policy_path, policy.about))
     problem = adopt_phases(problem, plan.meta, plan.q[-1], path)
     return problem, plan, policy, tell_origin(problem, *origins, silent=silent)
 
@@ -533,8 +533,10 @@ def solve(options: argparse.Namespace) -> int:
     from ..scene.model import find_unit_hint
 
     output = options.output or f"{stem_of(options.problem)}.npz"
-    given = {key: getattr(options, key) for key in keys_of(wholearm.PlanOptions)}
-    plan_options = wholearm.PlanOptions(**{k: own for k, own in given.items() if own is not None})
+    values = {key: getattr(options, key) for key in keys_of(wholearm.PlanOptions)}
+    plan_options = wholearm.PlanOptions(
+        **{k: value for k, value in values.items() if value is not None}
+    )
     require_output(output, ".npz")
     require_output(options.torques, ".csv")
     _check_sampling(options)
@@ -544,11 +546,11 @@ def solve(options: argparse.Namespace) -> int:
     for key in ("cache", "jobs"):
         if getattr(options, key) is not None and not problem.goals:
             raise InputError("", f"--{key}", "is for problems with [goal]")
-    found = ""
+    route_text = ""
     try:
         if problem.goals:
             answer = find_route(options, problem, plan_options)
-            plan, found = answer.plan, answer.to_text()
+            plan, route_text = answer.plan, answer.to_text()
         else:
             plan = solve_with(problem, plan_options, show_progress(), options.time_limit)
         table = None if options.torques is None else _make_table(options, plan)
@@ -569,7 +571,7 @@ def solve(options: argparse.Namespace) -> int:
         extra = {} if figures is None else {"torques": figures}
         print(json.dumps(plan.to_dict() | extra, indent=2))
     else:
-        print(found + describe_plan(plan, output, figures).to_text())
+        print(route_text + describe_plan(plan, output, figures).to_text())
     return 0
 
 
@@ -590,18 +592,18 @@ def _make_table(options: argparse.Namespace, plan: wholearm.Plan) -> TorqueTable
     """The torque table that is asked for, replayed."""
     from ..planning.replay_check import make_table, sample_table
 
-    given = plan.problem, plan.trajectory
+    arguments = plan.problem, plan.trajectory
     if options.sample_rate is None:
-        return make_table(*given, options.replay)
+        return make_table(*arguments, options.replay)
     interpolation = options.interpolation or "linear"
-    return sample_table(*given, options.sample_rate, interpolation, options.replay)
+    return sample_table(*arguments, options.sample_rate, interpolation, options.replay)
 
 
 def verify(options: argparse.Namespace) -> int:
     """Replay torques, and print the verdict."""
     require_output(options.output, ".npz")
     keys = ("tolerance", "departure", "rest_speed", "uniqueness_margin", "restitution")
-    given = {key: own for key in keys if (own := getattr(options, key)) is not None}
+    values = {key: value for key in keys if (value := getattr(options, key)) is not None}
     _check_free(options)
     policy, notes = None, dict[str, list[str]]()
     torques: wholearm.Trajectory | wholearm.TorqueProfile
@@ -617,12 +619,12 @@ def verify(options: argparse.Namespace) -> int:
 
         check_phases(problem)
     if policy is not None and isinstance(torques, wholearm.Trajectory):
-        report: Report | FreeReport = wholearm.verify_policy(problem, torques, policy, **given)
+        report: Report | FreeReport = wholearm.verify_policy(problem, torques, policy, **values)
     elif options.free:
-        report = wholearm.verify_free(problem, torques, progress=show_progress(), **given)
+        report = wholearm.verify_free(problem, torques, progress=show_progress(), **values)
     else:
         show_progress()(f"replaying {len(problem.phases)} phases")
-        report = wholearm.verify(problem, torques, reduced=options.reduced, **given)
+        report = wholearm.verify(problem, torques, reduced=options.reduced, **values)
     if options.output is not None:
         report.trajectory.save(options.output)
     return finish(options, report, options.output, notes=notes)
@@ -706,8 +708,8 @@ def predict(options: argparse.Namespace) -> int:
 def tune(options: argparse.Namespace) -> int:
     """Tune torques in steps of 10 %, print what became of each phase, write them if they hold."""
     require_output(options.output, ".csv")
-    given = {key: getattr(options, key) for key in ("brake", "stops", "squeeze", "share")}
-    tuning = wholearm.tune(wholearm.load(options.problem), **given, progress=show_progress())
+    values = {key: getattr(options, key) for key in ("brake", "stops", "squeeze", "share")}
+    tuning = wholearm.tune(wholearm.load(options.problem), **values, progress=show_progress())
     output = options.output if tuning.ok else None
     if output is not None:
         write_text(output, tuning.to_csv())
@@ -748,9 +750,9 @@ def robustness(options: argparse.Namespace) -> int:
         try:
             widths[name] = float(value)
         except ValueError:
-            given = f"{text!r} given; NAME=WIDTH is needed, such as mass=0.1"
-            raise InputError("", "--vary", given) from None
-    known = problem.ranges | spread_widths(widths, "range of {}")
+            fault = f"{text!r} given; NAME=WIDTH is needed, such as mass=0.1"
+            raise InputError("", "--vary", fault) from None
+    ranges = problem.ranges | spread_widths(widths, "range of {}")
     goal = options.goal_distance, math.radians(options.goal_angle)
     start: Callable[[], Executor] = partial(Processes, options.jobs)
     if options.scheduler is not None:
@@ -761,7 +763,7 @@ def robustness(options: argparse.Namespace) -> int:
         samples=options.samples,
         seed=options.seed,
         uncertainty=wholearm.Uncertainty(
-            known, options.sample_rate or None, options.tolerance, *goal
+            ranges, options.sample_rate or None, options.tolerance, *goal
         ),
         phase=options.phase,
         policy=policy,
@@ -880,9 +882,9 @@ def _read_pair(text: str, key: str, allowed: str) -> tuple[float, float]:
 
 def _check_step(options: argparse.Namespace, problem: wholearm.Problem) -> None:
     """Check that an engine gets along with the time step, if one is given."""
-    known = Range(1e-6, 1e-1, lambda scene, _: scene.scales.time, "times the scene's time")
+    step_range = Range(1e-6, 1e-1, lambda scene, _: scene.scales.time, "times the scene's time")
     if options.step is not None:
-        known.check("--step", options.step, "s", problem.scene)
+        step_range.check("--step", options.step, "s", problem.scene)
 
 
 def _load_replayed(options: argparse.Namespace, silent: bool) -> LoadedPlan:
@@ -922,19 +924,19 @@ def replay(options: argparse.Namespace) -> int:
         setting = setting._replace(step=options.step / problem.scene.scales.time)
     if options.softness is not None:
         setting = setting._replace(softness=options.softness)
-    given: dict[str, Any] = {"whole": options.whole, "setting": setting}
-    given["progress"] = show_progress()
+    arguments: dict[str, Any] = {"whole": options.whole, "setting": setting}
+    arguments["progress"] = show_progress()
     if policy is None:
-        given |= {"allowed": options.departure, "halvings": options.refine}
+        arguments |= {"allowed": options.departure, "halvings": options.refine}
         with name_source(options.problem):
             return finish(
-                options, wholearm.replay_in(options.engine, problem, plan, **given), notes=notes
+                options, wholearm.replay_in(options.engine, problem, plan, **arguments), notes=notes
             )
     if options.refine:
         raise InputError("", "--refine", "is for plans by the clock, not with --policy")
-    given["allowed"] = ALLOWED if options.departure is None else options.departure
+    arguments["allowed"] = ALLOWED if options.departure is None else options.departure
     with name_source(options.policy):
-        report = wholearm.play_policy(options.engine, problem, plan, policy, **given)
+        report = wholearm.play_policy(options.engine, problem, plan, policy, **arguments)
     return finish(options, report, notes=notes)
 
 
@@ -947,7 +949,7 @@ def policy(options: argparse.Namespace) -> int:
     require_output(output, ".npz")
     plan = wholearm.load_trajectory(options.plan)
     problem = read_own_problem(plan.meta, options.plan)
-    given = {key: getattr(options, key) for key in ("reserve", "period", "delay", "torque_limit")}
+    values = {key: getattr(options, key) for key in ("reserve", "period", "delay", "torque_limit")}
     allowed = {} if options.departure is None else {"departure": options.departure}
     say = show_progress()
 
@@ -956,17 +958,17 @@ def policy(options: argparse.Namespace) -> int:
 
     def advise() -> str:
         """Whether a faster loop would do: what is lost between two periods is lost by lateness."""
-        quick = {**given, "period": min(2e-4, options.period), "delay": 0.0}
+        quick = {**values, "period": min(2e-4, options.period), "delay": 0.0}
         if (quick["period"], 0.0) == (options.period, options.delay):
             return f"a period below {options.period:g} s may do"
-        own = wholearm.make_policy(problem, plan, **quick, planner=plan_anew)
+        quick_policy = wholearm.make_policy(problem, plan, **quick, planner=plan_anew)
         words = f"--period {quick['period']:g} --delay 0"
-        held = wholearm.verify_policy(problem, plan, own, **allowed).ok
+        held = wholearm.verify_policy(problem, plan, quick_policy, **allowed).ok
         return f"{words} would do" if held else f"{words} would not do either"
 
     with name_source(options.plan):
         say("making the policy")
-        made = wholearm.make_policy(problem, plan, **given, planner=plan_anew)
+        made = wholearm.make_policy(problem, plan, **values, planner=plan_anew)
         say("simulating the policy")
         report = wholearm.verify_policy(problem, plan, made, **allowed)
         if options.largest:
@@ -1063,7 +1065,7 @@ def read_page(folder: str) -> str:
 
     def name(link: re.Match[str]) -> str:
         target = posixpath.normpath(posixpath.join(folder, link[2]))
-        topics = [topic for topic, own in TOPICS.items() if target == f"{own}/README.md"]
+        topics = [topic for topic, path in TOPICS.items() if target == f"{path}/README.md"]
         if not topics:
             return link[1]
         return f"{link[1]} (wholearm help {link[3] if link[3] in topics else topics[-1]})"
@@ -1094,8 +1096,8 @@ def _complete_files(parser: Parser, files: object, folders: object) -> None:
     named = {"problem", "plan", "trajectory", "torques", "files", "output"}
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
-            for own in action.choices.values():
-                _complete_files(own, files, folders)
+            for subparser in action.choices.values():
+                _complete_files(subparser, files, folders)
         elif action.metavar == "DIR":
             action.complete = folders  # type: ignore[attr-defined]
         elif action.metavar in ("FILE", "PLAN") or (action.dest in named and not action.type):
@@ -1114,10 +1116,10 @@ def write_problem(options: argparse.Namespace) -> int:
         raise InputError(output, "", "is there already; choose another name")
     if text := options.vertices:
         try:
-            vertices = np.array([[float(x) for x in own.split(",")] for own in text.split()])
+            vertices = np.array([[float(x) for x in corner.split(",")] for corner in text.split()])
         except ValueError:
-            given = f"{text!r} given; needed are corners as x,y in m, as in '0,0 0.08,0 0.04,0.06'"
-            raise InputError("", "--vertices", given) from None
+            fault = f"{text!r} given; needed are corners as x,y in m, as in '0,0 0.08,0 0.04,0.06'"
+            raise InputError("", "--vertices", fault) from None
     with name_source("--vertices" if vertices is not None else ""):
         content = write_template(
             stem_of(output), options.polygon, options.size, options.mass, vertices
