@@ -61,7 +61,7 @@ class ModeGuess(NamedTuple):
 INDEX = leave({"type": "integer", "minimum": 0})  # number of an edge
 CONTACT = _name_contact()  # JSON Schema of the name of a contact
 DWELL = FieldKind(
-    lambda given, key: (read_share if isinstance(given, str) else NONNEGATIVE.read)(given, key),
+    lambda value, key: (read_share if isinstance(value, str) else NONNEGATIVE.read)(value, key),
     {"anyOf": [NONNEGATIVE.schema, {"type": "string", "pattern": "^[^%]+%\\s*$"}]},
 )
 """A time, or a share of the motion's."""
@@ -375,7 +375,10 @@ def read_widths(
     given, label  as for `spread_widths`
     length : [m]  the scene's, which defaults of lengths are in proportion to
     """
-    defaults = {own.name: own.default * (length if own.unit == "m" else 1) for own in PARAMETERS}
+    defaults = {
+        parameter.name: parameter.default * (length if parameter.unit == "m" else 1)
+        for parameter in PARAMETERS
+    }
     return defaults | spread_widths(given, label)
 
 
@@ -400,7 +403,9 @@ def spread_widths(given: Mapping[str, object], label: str) -> dict[str, float]:
         if name not in (*NAMES, *GROUPS):
             raise InputError("", key, f"is unknown; allowed are {', '.join((*GROUPS, *NAMES))}")
         width, names = require_number(value, key, nonnegative=True), GROUPS.get(name, (name,))
-        if width >= 1 and any(own.name in names and not own.unit for own in PARAMETERS):
+        if width >= 1 and any(
+            parameter.name in names and not parameter.unit for parameter in PARAMETERS
+        ):
             raise InputError("", key, f"{width:g} given; a relative range is below 1")
         widths |= dict.fromkeys(names, width)
     return widths

@@ -142,16 +142,16 @@ def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
         start = _table(table, "start", START)
         _check_edge(scene, start["flush"], "start.flush")
         z = place_start(scene, start["flush"], require_number(start["x"], "start.x"))
-        given = table.get("phases", [])
-        if not isinstance(given, list):
-            raise InputError("", "phases", f"{given!r} is not a list of [[phases]]")
+        entries = table.get("phases", [])
+        if not isinstance(entries, list):
+            raise InputError("", "phases", f"{entries!r} is not a list of [[phases]]")
         uncertainty = None
         if "uncertainty" in table:
             uncertainty = _table(table, "uncertainty", UNCERTAINTY)
         return Problem(
             scene=scene,
             start=z,
-            phases=tuple(read_phase(scene, i, entry) for i, entry in enumerate(given)),
+            phases=tuple(read_phase(scene, i, entry) for i, entry in enumerate(entries)),
             source=source,
             uncertainty=uncertainty,
             goals=read_goals(table),
@@ -258,7 +258,10 @@ def _read_guess(formation: Formation, given: object, key: str) -> tuple[ModeGues
         if not isinstance(entry, Mapping):
             raise InputError("", name, f"{entry!r} is not a table")
         check_keys(entry, name, MODE)
-        t, x, phi = (require_number(entry[own], f"{name}.{own}") for own in ("t", "x", "phi_deg"))
+        t, x, phi = (
+            require_number(entry[quantity], f"{name}.{quantity}")
+            for quantity in ("t", "x", "phi_deg")
+        )
         if t <= (modes[-1].t if modes else 0.0):
             raise InputError("", f"{name}.t", f"{t:g} given; allowed is more than before")
         check_place(scene, f"{name}.x", x)
@@ -291,7 +294,9 @@ def read_formation(scene: Scene, names: Sequence[object]) -> Formation:
     stems = [n.removesuffix(ROLLING) if isinstance(n, str) else n for n in names]
     contacts = tuple(_parse_name(stem, scene) for stem in stems)
     rolls = [stem != name for stem, name in zip(stems, names, strict=True)]
-    rolling = tuple(contact for contact, own in zip(contacts, rolls, strict=True) if own)
+    rolling = tuple(
+        contact for contact, is_rolling in zip(contacts, rolls, strict=True) if is_rolling
+    )
     return Formation(scene, contacts, rolling)
 
 
@@ -357,7 +362,7 @@ def check_keys(table: Mapping[str, Any], where: str, known: Table) -> None:
             hint = f"did you mean {near[0]!r}? " if near else ""
             allowed = ", ".join(sorted(known))
             raise InputError("", f"{prefix}{key}", f"unknown key; {hint}allowed are {allowed}")
-    for key in sorted(name for name, own in known.items() if own.required):
+    for key in sorted(name for name, field in known.items() if field.required):
         if key not in table:
             raise InputError("", f"{prefix}{key}", "is missing")
 
@@ -371,9 +376,9 @@ def check_problem(problem: Problem) -> None:
     InputError  for the first thing that is wrong
     """
     check_ranges(problem.scene)
-    for attribute, own in keys_of(Problem).items():
-        value = own.read(getattr(problem, attribute), own.name)
-        own.check(value, own.name, problem.scene)
+    for attribute, field in keys_of(Problem).items():
+        value = field.read(getattr(problem, attribute), field.name)
+        field.check(value, field.name, problem.scene)
     spread_widths(problem.uncertainty or {}, "uncertainty.{}")
     check_place(problem.scene, "start.x", float(require_vector(problem.start, "start", 5)[0]))
     if problem.scene.actuator_lag.any() and problem.is_settled:
@@ -487,10 +492,10 @@ def _check_until(scene: Scene, phase: Phase, key: str) -> None:
     if until.contact is not None and until.contact in phase.formation.contacts:
         raise InputError("", key, f"{until} is already in the phase's contacts")
     ends = until.coordinates
-    for coordinate, given in ends:
+    for coordinate, target in ends:
         if coordinate not in ROWS:
             raise InputError("", key, f"{coordinate!r} given; allowed are 'x' and 'phi'")
-        value = require_number(given, key)
+        value = require_number(target, key)
         if coordinate == "x":
             check_place(scene, key, value)
         else:
@@ -509,18 +514,18 @@ def _check_end(phase: Phase, following: Phase | None) -> None:
     if phase.end is End.REST:
         return
     key, until = f"phases[{phase.number}].end", phase.until
-    given = f"{phase.end.value!r} given"
+    end_text = f"{phase.end.value!r} given"
     if following is None:
-        raise InputError("", key, f"{given}, but the last phase ends at rest")
+        raise InputError("", key, f"{end_text}, but the last phase ends at rest")
     contacts = following.formation.contacts
     if phase.end is End.IMPACT and until.contact is None:
-        raise InputError("", key, f"{given}, but until is {until}, not a contact that is gained")
+        raise InputError("", key, f"{end_text}, but until is {until}, not a contact that is gained")
     if phase.end is End.IMPACT and until.contact not in contacts:
-        raise InputError("", key, f"{given}, but phase {following.number} does not have {until}")
+        raise InputError("", key, f"{end_text}, but phase {following.number} does not have {until}")
     before = {*phase.formation.contacts, until.contact}
     extra = [c.name for c in contacts if c not in before]
     if extra:
-        text = f"{given}, but phase {following.number} has {', '.join(extra)} too"
+        text = f"{end_text}, but phase {following.number} has {', '.join(extra)} too"
         raise InputError("", key, text)
     same = set(contacts) == set(phase.formation.contacts)
     same = same and set(following.formation.rolling) == set(phase.formation.rolling)

@@ -81,8 +81,8 @@ def _enter(place: Any, step: str | int, key: str) -> Any:
             count = len(place) if isinstance(place, list) else 0
             raise InputError("", key, f"there is no number {step + 1}; the list has {count}")
     elif not isinstance(place, dict) or step not in place:
-        known = ", ".join(place) if isinstance(place, dict) else "no table"
-        raise InputError("", key, f"there is no {step!r}; what is there: {known}")
+        keys = ", ".join(place) if isinstance(place, dict) else "no table"
+        raise InputError("", key, f"there is no {step!r}; what is there: {keys}")
     return place[step]
 
 
@@ -106,24 +106,24 @@ def write_table(problem: Problem) -> Mapping[str, Any]:
         return {}
     table: dict[str, Any] = {
         key: value
-        for key, value, own in _list_values(("", problem))
-        if own.required or value != own.shown_default
+        for key, value, field in _list_values(("", problem))
+        if field.required or value != field.shown_default
     }
     table |= {"object": {}, "fingers": {"1": {}, "2": {}}, "friction": {}, "start": start}
     if problem.uncertainty is not None:
         table["uncertainty"] = _to_plain(problem.uncertainty)
     goals = [
-        {"flush": own.flush, "phi_deg": own.phi and to_degrees(own.phi), "x": own.x}
-        for own in problem.goals
+        {"flush": goal.flush, "phi_deg": goal.phi and to_degrees(goal.phi), "x": goal.x}
+        for goal in problem.goals
     ]
-    goals = [{key: own[key] for key in own if own[key] is not None} for own in goals]
+    goals = [{key: goal[key] for key in goal if goal[key] is not None} for goal in goals]
     if goals:
         table["goal"] = goals[0] if len(goals) == 1 else goals
     elif problem.phases:
         table["phases"] = [describe_phase(phase) for phase in problem.phases]
     for prefix, part in _list_parts(problem.scene):
-        for key, value, own in _list_values((prefix, part)):
-            if own.required or value != own.shown_default:
+        for key, value, field in _list_values((prefix, part)):
+            if field.required or value != field.shown_default:
                 _set(table, key, value)
     return table
 
@@ -148,11 +148,11 @@ def _list_parts(scene: Scene) -> list[tuple[str, object]]:
 def _list_values(*parts: tuple[str, object]) -> Iterator[tuple[str, Any, Field]]:
     """Dotted keys, values and declarations of parts of a problem."""
     for prefix, part in parts:
-        for attribute, own in keys_of(part).items():
+        for attribute, field in keys_of(part).items():
             value = _to_plain(getattr(part, attribute))
             if attribute == "inertia" and isinstance(part, Polygon):
                 value = None if value == part.uniform_inertia else value
-            yield f"{prefix}{own.name}", None if value == math.inf else value, own
+            yield f"{prefix}{field.name}", None if value == math.inf else value, field
 
 
 def _find_start(problem: Problem) -> dict[str, Any] | None:
@@ -174,28 +174,28 @@ def _find_start(problem: Problem) -> dict[str, Any] | None:
 
 def describe_phase(phase: Phase, digits: int = 15) -> dict[str, Any]:
     """A phase as an entry of a file, with angles of at most so many decimals."""
-    own: dict[str, Any] = {"contacts": name_contacts(phase)}
+    entry: dict[str, Any] = {"contacts": name_contacts(phase)}
     if not phase.until.is_release:
-        own["until"] = write_until(phase.until, digits)
+        entry["until"] = write_until(phase.until, digits)
     if phase.settle is not None:
-        own["settle"] = phase.settle
+        entry["settle"] = phase.settle
     if phase.guess:
-        own["guess"] = []
+        entry["guess"] = []
         for mode in phase.guess:
             signs = "".join("-0+"[round(sign) + 1] for sign in mode.signs)
             place = {"t": mode.t, "x": mode.x, "phi_deg": to_degrees(mode.phi, digits)}
-            own["guess"].append(place | {"signs": f"{signs[:-2]} {signs[-2:]}"})
-    return own if phase.end.value == "rest" else own | {"end": phase.end.value}
+            entry["guess"].append(place | {"signs": f"{signs[:-2]} {signs[-2:]}"})
+    return entry if phase.end.value == "rest" else entry | {"end": phase.end.value}
 
 
 def write_until(until: Until, digits: int = 15) -> Any:
     """What ends a phase, as its file has it: a name, or a table."""
     if until.contact is not None and not until.pins:
         return until.contact.name
-    own: dict[str, Any] = {} if until.contact is None else {"contact": until.contact.name}
+    table: dict[str, Any] = {} if until.contact is None else {"contact": until.contact.name}
     for row, value in until.poses:
-        own["phi_deg" if row else "x"] = (to_degrees(value, digits) if row else value) + 0.0
-    return own
+        table["phi_deg" if row else "x"] = (to_degrees(value, digits) if row else value) + 0.0
+    return table
 
 
 def format_until(until: Until) -> str:
