@@ -20,7 +20,7 @@ def plain(value: Any) -> Any:
     Of named tuples and dataclasses the properties that they name as `derived`, and all fields but
     those that a `repr` leaves out.
     """
-    names = [own.name for own in fields(value) if own.repr] if is_dataclass(value) else ()
+    names = [field.name for field in fields(value) if field.repr] if is_dataclass(value) else ()
     if names := [*getattr(value, "derived", ()), *(names or getattr(value, "_fields", ()))]:
         value = {name: getattr(value, name) for name in names}
     elif isinstance(value, np.ndarray | np.generic):
@@ -49,7 +49,7 @@ def restore(kind: Any, value: Any) -> Any:
         return None if value is None else restore(parts[0], value)
     if origin is tuple:
         kinds = parts[:1] * len(value) if Ellipsis in parts else parts
-        return tuple(restore(own, item) for own, item in zip(kinds, value, strict=True))
+        return tuple(restore(item_kind, item) for item_kind, item in zip(kinds, value, strict=True))
     if origin is Mapping:
         return {str(key): restore(parts[1], item) for key, item in value.items()}
     if hasattr(kind, "_fields") or is_dataclass(kind):
@@ -101,7 +101,8 @@ class Table(NamedTuple):
         units = [head.rpartition("[")[2].rstrip("]") for head in self.heads]
         how = [(form, SCALES.get(unit, 1.0)) for form, unit in zip(self.forms, units, strict=True)]
         return [
-            [show(value, *own) for value, own in zip(row, how, strict=True)] for row in self.rows
+            [show(value, *form_and_scale) for value, form_and_scale in zip(row, how, strict=True)]
+            for row in self.rows
         ]
 
     def to_text(self) -> str:
@@ -252,8 +253,8 @@ class Result(Brief):
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON, with None where there is no number."""
-        found: dict[str, Any] = plain(self.values)
-        return found
+        values: dict[str, Any] = plain(self.values)
+        return values
 
     def _repr_html_(self) -> str:
         return self.document.to_html()
@@ -270,7 +271,7 @@ def show(value: Any, form: str, scale: float = 1.0) -> str:
     if isinstance(value, str):
         return value
     if isinstance(value, tuple | list | np.ndarray):
-        return " ".join(show(own, form, scale) for own in value)
+        return " ".join(show(entry, form, scale) for entry in value)
     if value is None or math.isnan(value):
         return "-"
     return format(value if scale == 1.0 else scale * value, form)
@@ -327,5 +328,8 @@ def _write(value: Any) -> str:
 def describe_differences(found: Iterable[Difference], one: str, other: str) -> str:
     """The first differences in words; `one` and `other` say where the values stand."""
     shown, rest = (parts := list(found))[:3], parts[3:]
-    text = ", ".join(f"{own.key} ({own.one} {one}, {own.other} {other})" for own in shown)
+    text = ", ".join(
+        f"{difference.key} ({difference.one} {one}, {difference.other} {other})"
+        for difference in shown
+    )
     return text + (f", and {len(rest)} more" if rest else "")

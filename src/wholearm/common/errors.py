@@ -39,13 +39,15 @@ class Change(NamedTuple):
     @property
     def values(self) -> dict[str, float]:
         """What changes, as `Problem.with_` takes it."""
-        own = self.parameter
-        return {own.key: self.value} | ({own.mirrored: -self.value} if own.mirrored else {})
+        parameter = self.parameter
+        return {parameter.key: self.value} | (
+            {parameter.mirrored: -self.value} if parameter.mirrored else {}
+        )
 
     def __str__(self) -> str:
-        own = self.parameter
-        value = f"{self.value:g} {own.unit}".rstrip()
-        return f"{own.name} = {value} instead of {own.value:g}"
+        parameter = self.parameter
+        value = f"{self.value:g} {parameter.unit}".rstrip()
+        return f"{parameter.name} = {value} instead of {parameter.value:g}"
 
 
 class LimitPlace(NamedTuple):

@@ -63,8 +63,8 @@ class Range:
     def find_fault(self, given: object) -> str:
         """What is wrong with a value; empty if nothing is."""
         kinds = (int,) if self.whole else (int, float)
-        known = isinstance(given, kinds) and not isinstance(given, bool)
-        if known and self.low <= given <= self.high:  # type: ignore[operator]
+        is_number = isinstance(given, kinds) and not isinstance(given, bool)
+        if is_number and self.low <= given <= self.high:  # type: ignore[operator]
             return ""
         return f"{given!r} given; allowed are {self.describe()}"
 
@@ -140,7 +140,7 @@ def refer(name: str) -> Schema:
 
 def leave(schema: Schema) -> FieldKind:
     """What has a reader of its own."""
-    return FieldKind(lambda given, _: given, schema)
+    return FieldKind(lambda value, _: value, schema)
 
 
 SHARE = Range(0.0, 1.0)
@@ -175,8 +175,8 @@ class Field:
     @property
     def unit(self) -> str:
         """The unit; empty where there is none."""
-        found = re.search(r"\[([^\]]*)\]", self.text)
-        return found[1] if found else ""
+        match = re.search(r"\[([^\]]*)\]", self.text)
+        return match[1] if match else ""
 
     @property
     def shown_default(self) -> Any:
@@ -187,8 +187,8 @@ class Field:
     @property
     def schema(self) -> dict[str, Any]:
         """The value's JSON Schema."""
-        given = {"default": self.shown_default, "description": self.text}
-        return {**self.kind.schema} | {k: v for k, v in given.items() if v not in (None, "")}
+        annotations = {"default": self.shown_default, "description": self.text}
+        return {**self.kind.schema} | {k: v for k, v in annotations.items() if v not in (None, "")}
 
     def describe_default(self) -> str:
         """The default as it is shown to a user; empty where there is none."""
@@ -196,7 +196,7 @@ class Field:
         if isinstance(value, bool):
             return str(value).lower()
         if isinstance(value, float):
-            return re.sub(r"e([+-])0*", lambda found: f"e{found[1]}".replace("+", ""), f"{value:g}")
+            return re.sub(r"e([+-])0*", lambda match: f"e{match[1]}".replace("+", ""), f"{value:g}")
         return "" if value is None else str(value)
 
     def explain(self) -> str:
@@ -246,17 +246,17 @@ def declare(*fields: Field) -> Callable[[type[T]], type[T]]:
     """
 
     def describe(owner: type[T]) -> type[T]:
-        known = {field.name: field.default for field in dataclasses.fields(owner)}  # type: ignore[arg-type]
-        found = {}
+        defaults = {field.name: field.default for field in dataclasses.fields(owner)}  # type: ignore[arg-type]
+        keys = {}
         for field in fields:
             attribute = field.attribute or field.name
-            default = known[attribute]
-            found[attribute] = field if default is MISSING else replace(field, default=default)
+            default = defaults[attribute]
+            keys[attribute] = field if default is MISSING else replace(field, default=default)
         lines = [
-            f"    {name}\n        {field.explain()}" for name, field in found.items() if field.text
+            f"    {name}\n        {field.explain()}" for name, field in keys.items() if field.text
         ]
         owner.__doc__ = "\n".join([owner.__doc__ or "", "    Keys", "    ----", *lines, ""])
-        owner.__keys__ = found  # type: ignore[attr-defined]
+        owner.__keys__ = keys  # type: ignore[attr-defined]
         return owner
 
     return describe
@@ -264,8 +264,8 @@ def declare(*fields: Field) -> Callable[[type[T]], type[T]]:
 
 def keys_of(owner: Any) -> dict[str, Field]:
     """The declared fields of a dataclass, or of an object of one, by attribute."""
-    found: dict[str, Field] = owner.__keys__
-    return found
+    fields: dict[str, Field] = owner.__keys__
+    return fields
 
 
 def read_keys(owner: Any, prefix: str = "") -> None:
@@ -277,10 +277,10 @@ def read_keys(owner: Any, prefix: str = "") -> None:
 
 def collect_keys(owner: type, table: Mapping[str, Any]) -> dict[str, Any]:
     """Values of a table, or their defaults, by attribute."""
-    known = keys_of(owner).items()
+    fields = keys_of(owner).items()
     return {
         name: table.get(field.name, field.default)
-        for name, field in known
+        for name, field in fields
         if field.name in table or not field.required
     }
 
@@ -350,25 +350,25 @@ def read_options(table: str) -> list[Option]:
 
 
 def _read_option(usage: str, rest: str) -> Option:
-    found = _TEXT.fullmatch(rest)
-    assert found is not None
-    text, default, low, high, words = found.groups()
+    match = _TEXT.fullmatch(rest)
+    assert match is not None
+    text, default, low, high, words = match.groups()
     optional, several = usage.endswith("]"), usage.rstrip("]").endswith("...")
     parts = usage.removeprefix("[").rstrip("]").removesuffix("...").split()
     flags = [part for part in parts if part.startswith("-")] or parts[:1]
     metavar = " ".join(parts[len(flags) :]).removeprefix("[") or None
     name = flags[-1].lstrip("-").replace("-", "_")
     kind: FieldKind | Range = TEXT
-    given: Any = [] if several else default
+    field_default: Any = [] if several else default
     if low:
         read = float if re.search(r"[.e]", low) else int
         kind = Range(read(low), read(high))
-        given = None if default is None else kind.parse(default)
+        field_default = None if default is None else kind.parse(default)
     elif words:
         kind = choice(*words.split("|"))
     elif metavar is None and flags[0].startswith("-"):
-        kind, given = BOOLEAN, name.startswith("no_")
+        kind, field_default = BOOLEAN, name.startswith("no_")
         name = name.removeprefix("no_")
-        text = f"{_OFF if given else ''}{text}"
+        text = f"{_OFF if field_default else ''}{text}"
     nargs = ("*" if optional else "+") if several else "?" if optional else None
-    return Option(Field(name, text, kind, default=given), flags, metavar, nargs)
+    return Option(Field(name, text, kind, default=field_default), flags, metavar, nargs)

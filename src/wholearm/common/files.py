@@ -184,9 +184,9 @@ def read_arrays(path: str | os.PathLike[str], names: Iterable[str]) -> dict[str,
             if stream.read(6) == b"\x93NUMPY":
                 raise InputError(source, "", "is not a trajectory file: one array, no archive")
             with zipfile.ZipFile(stream) as archive:
-                known = {info.filename: info for info in archive.infolist()}
+                members = {info.filename: info for info in archive.infolist()}
                 for name in names:
-                    info = known.get(f"{name}.npy")
+                    info = members.get(f"{name}.npy")
                     if info is None:
                         continue
                     if info.file_size > LARGEST:
@@ -213,8 +213,8 @@ def _read_array(source: str, name: str, content: bytes) -> Any:
     shape, _, kind = (read if version == (1, 0) else np.lib.format.read_array_header_2_0)(stream)
     if kind.hasobject:
         raise InputError(source, name, "holds Python objects; numbers or text are needed")
-    claimed, given = math.prod(shape) * kind.itemsize, len(content) - stream.tell()
-    if min(shape, default=0) < 0 or claimed != given:
-        raise InputError(source, name, f"claims {claimed} bytes of {shape} and holds {given}")
+    claimed, stored = math.prod(shape) * kind.itemsize, len(content) - stream.tell()
+    if min(shape, default=0) < 0 or claimed != stored:
+        raise InputError(source, name, f"claims {claimed} bytes of {shape} and holds {stored}")
     stream.seek(0)
     return np.lib.format.read_array(stream, allow_pickle=False)

@@ -92,14 +92,14 @@ class Journal:
             other, kind, text = _parse(given.split(b"\n", 1)[0]) or {}, self._stamp["study"], ""
             if other.get("study") != kind:
                 text = f"no {kind} study"
-            elif found := list(find_differences(other, self._stamp)):
-                text = f"another study: {describe_differences(found, 'in the file', 'now')}"
+            elif differences := list(find_differences(other, self._stamp)):
+                text = f"another study: {describe_differences(differences, 'in the file', 'now')}"
             if text:
                 what = f"holds {text}; --fresh begins anew, or choose another with -o"
                 raise InputError(self.path, "", what)
             first, *lines = given[: given.rfind(b"\n") + 1].splitlines(keepends=True)
-            known = [(line, _parse(line)) for line in lines]
-            kept = [own for own in known if not (again and (own[1] or {}).get("findings"))]
+            entries = [(line, _parse(line)) for line in lines]
+            kept = [entry for entry in entries if not (again and (entry[1] or {}).get("findings"))]
             self.records = [record for _, record in kept if record is not None]
             whole = b"".join([first, *(line for line, _ in kept)])
         with held():

@@ -110,8 +110,8 @@ def _start(
     """Fork a child that takes tasks, and sends its answers."""
     context = mp.get_context("fork")
     answers, far = context.Pipe(duplex=False)
-    given = tasks, source, (answers, far), known, os.getpid()
-    process = context.Process(target=_serve, args=given, daemon=True)
+    arguments = tasks, source, (answers, far), known, os.getpid()
+    process = context.Process(target=_serve, args=arguments, daemon=True)
     try:
         # No signal may meet the child before it has said what it does about it.
         with _blocked(*_SIGNALS), warnings.catch_warnings():
@@ -193,7 +193,7 @@ class _Pickler(pickle.Pickler):
 
     def __init__(self, stream: io.BytesIO, known: Sequence[object]) -> None:
         super().__init__(stream, pickle.HIGHEST_PROTOCOL)
-        self._numbers = {id(own): k for k, own in enumerate(known)}
+        self._numbers = {id(shared_object): k for k, shared_object in enumerate(known)}
 
     def persistent_id(self, obj: object) -> int | None:
         return self._numbers.get(id(obj))
@@ -354,7 +354,7 @@ class _Worker:
 
     def ask(self, run: Callable[[Any], Any], task: Any, limit: float) -> tuple[bool, Any]:
         """Whether a task succeeded, and its result or its exception."""
-        begun, late = time.monotonic(), False
+        start_time, late = time.monotonic(), False
         try:
             self.pipe.send((run, task, limit))
             if self.pipe.poll(20.0 * limit if math.isfinite(limit) else None):
@@ -364,7 +364,7 @@ class _Worker:
         except (EOFError, OSError):
             self.process.join()
             late = self.process.exitcode == -_CPU
-        kind, elapsed = "time limit" if late else "crash", time.monotonic() - begun
+        kind, elapsed = "time limit" if late else "crash", time.monotonic() - start_time
         raise DiedError(f"{kind} after {elapsed:.0f} s: exit status {self.process.exitcode}", late)
 
     def end(self) -> None:
