@@ -72,9 +72,9 @@ def play(
                 done = step
             # Half a step late: the step at that time is done then, whatever its rounding.
             simulator.AdvanceTo((step - 0.5) * steps.h)
-            found = results.Eval(context)
-            for k in range(found.num_point_pair_contacts()):
-                info = found.point_pair_contact_info(k)
+            contact_results = results.Eval(context)
+            for k in range(contact_results.num_point_pair_contacts()):
+                info = contact_results.point_pair_contact_info(k)
                 both = info.point_pair()
                 number = pairs[frozenset((both.id_A, both.id_B))]
                 total[number] += abs(info.contact_force() @ both.nhat_BA_W)
@@ -167,24 +167,26 @@ def _add_shapes(plant: Any, graph: Any, scene: Scene, setting: Setting) -> dict[
     from pydrake.math import RigidTransform, RotationMatrix
 
     shapes = {shape.name: shape for shape in list_shapes(scene)}
-    known: dict[tuple[str, float], Any] = {}
+    geometry_ids: dict[tuple[str, float], Any] = {}
 
     def register(name: str, friction: float) -> Any:
         key = (name, friction)
-        if key not in known:
+        if key not in geometry_ids:
             material = _make_material(scene, setting, friction)
             label = f"{name} {friction:g}"
             if name == PALM:
                 low = [0.0, -find_rounding(scene), 0.0]
                 place = RigidTransform(RotationMatrix.MakeXRotation(-np.pi / 2), low)
-                known[key] = plant.RegisterCollisionGeometry(
+                geometry_ids[key] = plant.RegisterCollisionGeometry(
                     plant.world_body(), place, HalfSpace(), label, material
                 )
             else:
                 place, form = _place(shapes[name])
                 body = plant.GetBodyByName(shapes[name].body)
-                known[key] = plant.RegisterCollisionGeometry(body, place, form, label, material)
-        return known[key]
+                geometry_ids[key] = plant.RegisterCollisionGeometry(
+                    body, place, form, label, material
+                )
+        return geometry_ids[key]
 
     numbers = {}
     for number, pair in enumerate(list_pairs(scene)):
@@ -193,7 +195,9 @@ def _add_shapes(plant: Any, graph: Any, scene: Scene, setting: Setting) -> dict[
         ids = [register(pair.first, one), register(pair.second, two)]
         numbers[frozenset(ids)] = number
     manager = graph.collision_filter_manager()
-    manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(list(known.values()))))
+    manager.Apply(
+        CollisionFilterDeclaration().ExcludeWithin(GeometrySet(list(geometry_ids.values())))
+    )
     allowed = CollisionFilterDeclaration()
     for first, second in numbers:
         allowed.AllowBetween(GeometrySet(first), GeometrySet(second))

@@ -123,19 +123,19 @@ class EngineReport(Result):
         turned = math.degrees(max(float(np.max(each.angle)) for each in departures))
         says = "departs" if self.converged else "departs with some settings only, here"
         lines, errors, forces = list[str](), list[list[Any]](), list[tuple[Any, ...]]()
-        for stretch, found in zip(self.stretches, departures, strict=True):
-            if found.time is not None:
-                when = f"at t = {found.time:.5g} s: {found.reason}"
+        for stretch, departure in zip(self.stretches, departures, strict=True):
+            if departure.time is not None:
+                when = f"at t = {departure.time:.5g} s: {departure.reason}"
                 lines.append(f"phase {stretch.name} {says} {when}")
             at = np.linspace(stretch.start, stretch.stop, PARTS + 1)[1:]
-            sampled = np.interp(at, found.t, found.position)
-            largest = np.max(found.position), np.max(found.angle)
+            sampled = np.interp(at, departure.t, departure.position)
+            largest = np.max(departure.position), np.max(departure.angle)
             errors.append([stretch.name, stretch.duration, *largest, *sampled])
-            for force in found.forces:
+            for force in departure.forces:
                 forces.append((*force, force.off if force.planned > PRESS * scales.force else None))
         levels = list[list[Any]]()
         for level in self.levels if len(self.levels) > 1 else ():
-            farthest = [np.max(found.position) for found in level.departures]
+            farthest = [np.max(departure.position) for departure in level.departures]
             levels.append([level.setting.step * scales.time, level.setting.softness, *farthest])
         lines.append(
             f"steps of up to {setting.step * scales.time:.3g} s, softness {setting.softness:g}; "
@@ -243,15 +243,15 @@ def replay_in(
     levels = []
     # Finer settings, and finer steps alone, with contacts as they are at first.
     finer = [setting._replace(step=setting.step / 2**k) for k in range(halvings + 1)]
-    same = [own._replace(softness=setting.softness * 2**k) for k, own in enumerate(finer) if k]
+    same = [level._replace(softness=setting.softness * 2**k) for k, level in enumerate(finer) if k]
     for level in [*finer, *same]:
-        found = []
+        departures = []
         for stretch in stretches:
             if progress is not None:
                 progress(f"phase {stretch.name} in {info.title}, step {level.step:.3g}")
             run = play(problem, stretch, torque, level)
-            found.append(compare(problem, plan, stretch, run, allowed))
-        levels.append(Level(level, tuple(found)))
+            departures.append(compare(problem, plan, stretch, run, allowed))
+        levels.append(Level(level, tuple(departures)))
     title = f"{info.title} {version(engine)}"
     return EngineReport(problem, title, allowed, tuple(stretches), tuple(levels))
 
@@ -322,8 +322,8 @@ def _average(plan: Trajectory, part: _Part, run: EngineRun) -> list[Force]:
     planned = np.nanmean(motion.evaluate(middles).c_n, axis=0).tolist()
     share = np.diff(run.t)[ends - 1]
     press = share @ run.press[ends - 1] / share.sum()
-    found = [float(press[run.find_columns(name, scene)].sum()) for name in motion.contacts]
-    rows = zip(motion.contacts, planned, found, strict=True)
+    mean_forces = [float(press[run.find_columns(name, scene)].sum()) for name in motion.contacts]
+    rows = zip(motion.contacts, planned, mean_forces, strict=True)
     return [Force(part.phase.number, *row) for row in rows]
 
 
@@ -445,8 +445,8 @@ def play_policy(
     problem, plan = adopt_motion(problem, plan)
     play = require_engine(engine)
     if policy.count != len(problem.phases):
-        given = f"{policy.count} given; the problem has {len(problem.phases)}"
-        raise InputError("", "phases of the policy", given)
+        fault = f"{policy.count} given; the problem has {len(problem.phases)}"
+        raise InputError("", "phases of the policy", fault)
     info = ENGINES[engine]
     setting = info.setting if setting is None else setting
     arrivals = []
@@ -465,12 +465,12 @@ def play_policy(
 def _join(parts: list[EngineStretch], policy: Policy, whole: bool) -> list[EngineStretch]:
     """Stretches that begin at rest, or one of all phases."""
     begins = [1] if whole else policy.resting
-    found = []
+    stretches = []
     for first, after in zip(begins, [*begins[1:], len(parts) + 1], strict=True):
         phases, stop, rest = tuple(range(first - 1, after - 1)), parts[after - 2].stop, np.zeros(5)
         start = parts[first - 1]
-        found.append(start._replace(phases=phases, stop=stop, z_dot=rest, z_ddot=rest))
-    return found
+        stretches.append(start._replace(phases=phases, stop=stop, z_dot=rest, z_ddot=rest))
+    return stretches
 
 
 def _judge(

@@ -127,10 +127,10 @@ def _add_options(root: Element, scene: Scene, step: float, softness: Softness) -
     size, depth = scene.polygon.size, scene.polygon.size / 20
     add(root, "compiler", angle="radian", autolimits="true")
     # MuJoCo 4.0.0 factorises sparse Hessians wrongly; its midphase drops shapes this thin.
-    known = {"solver": "Newton", "jacobian": "dense", "integrator": "implicitfast"}
+    solver_options = {"solver": "Newton", "jacobian": "dense", "integrator": "implicitfast"}
     gravity = [0.0, -scene.gravity, 0.0]
     tight = {"tolerance": 1e-12, "cone": "elliptic", "impratio": softness.ratio}
-    option = add(root, "option", timestep=step, gravity=gravity, **tight, **known)
+    option = add(root, "option", timestep=step, gravity=gravity, **tight, **solver_options)
     add(option, "flag", midphase="disable")
     add(root, "statistic", center=[0.0, size / 2, 0.0], extent=2 * size)
     visual = add(root, "visual")
@@ -244,9 +244,9 @@ def play(
 
     steps = list_steps(problem, stretch, torque, setting.step)
     drive = EngineDrive(problem.scene, torque, steps.h) if isinstance(torque, ClosedLoop) else None
-    own, factor = Softness(), setting.softness
-    own = own._replace(press=factor * own.press, rub=factor * own.rub)
-    text = write_mjcf(problem, step=steps.h, softness=own)
+    softness, factor = Softness(), setting.softness
+    softness = softness._replace(press=factor * softness.press, rub=factor * softness.rub)
+    text = write_mjcf(problem, step=steps.h, softness=softness)
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
     pairs = list_pairs(problem.scene)
@@ -280,11 +280,12 @@ def play(
     touching = {name: max(force, 0.0) / little for name, force in stretch.c_n.items()}
     data.qpos[:] = press_in(problem, stretch, {**nowhere, **touching})
     mujoco.mj_forward(model, data)
-    found = np.zeros(len(pairs))
-    collect(found, lambda k: data.efc_KBIP[k, 0] * data.efc_KBIP[k, 2] / data.efc_R[k])
+    stiffnesses = np.zeros(len(pairs))
+    collect(stiffnesses, lambda k: data.efc_KBIP[k, 0] * data.efc_KBIP[k, 2] / data.efc_R[k])
     names, corners = [pair.name for pair in pairs], problem.scene.polygon.n_vertices
     shares = {
-        name: sum(found[names.index(own)] for own in find_pairs(name, corners)) or np.inf
+        name: sum(stiffnesses[names.index(pair_name)] for pair_name in find_pairs(name, corners))
+        or np.inf
         for name in stretch.c_n
     }
     mujoco.mj_resetData(model, data)

@@ -200,7 +200,7 @@ Engine = Callable[[Problem, EngineStretch, TorqueProfile | ClosedLoop, Setting],
 def list_stretches(plan: Trajectory, whole: bool) -> list[EngineStretch]:
     """The whole plan, or its phases, each from its planned start."""
     starts, count = plan.phase_starts, len(plan.motions)
-    found = []
+    stretches = []
     for phases in [tuple(range(count))] if whole else [(index,) for index in range(count)]:
         motion, start, stop = plan.motions[phases[0]], starts[phases[0]], starts[phases[-1] + 1]
         at = motion.evaluate(np.linspace(0.0, motion.duration, ROWS))
@@ -208,8 +208,8 @@ def list_stretches(plan: Trajectory, whole: bool) -> list[EngineStretch]:
         c_n = np.nan_to_num(at.c_n[int(np.argmax(np.isfinite(at.c_n).all(axis=1)))])
         forces = dict(zip(motion.contacts, c_n.tolist(), strict=True))
         state = at.z[0], at.z_dot[0], at.z_ddot[0]
-        found.append(EngineStretch(phases, float(start), float(stop), *state, forces))
-    return found
+        stretches.append(EngineStretch(phases, float(start), float(stop), *state, forces))
+    return stretches
 
 
 def list_steps(
