@@ -56,29 +56,35 @@ def draw_comparison(comparison: Comparison) -> Figure:
     Replays are drawn; where nothing has moved a panel says so.
     """
     shown: list[tuple[Contender, Trajectory | None]] = []
-    for own in comparison.contenders:
+    for contender in comparison.contenders:
         motion = None
         with suppress(SimulationError):
-            motion = None if own.report is None else own.report.trajectory
-        shown.append((own, motion))
+            motion = None if contender.report is None else contender.report.trajectory
+        shown.append((contender, motion))
     motions = [motion for _, motion in shown if motion is not None]
-    styles = choose_styles(tuple(dict.fromkeys(name for own in motions for name in own.contacts)))
+    styles = choose_styles(
+        tuple(dict.fromkeys(name for motion in motions for name in motion.contacts))
+    )
     longest = max((motion.duration for motion in motions), default=1.0)
     # Height of a panel, and of a line of text above it, and room at both sides [in].
     tall, line, left, right = 2.45, 0.25, 0.8, 1.3
     high = 0.5 + len(motions) * (tall + line + 0.4) + len(shown) * line
-    covered = np.concatenate([[0.0], *(own.c_n.ravel() - comparison.epsilon for own in motions)])
+    covered = np.concatenate(
+        [[0.0], *(motion.c_n.ravel() - comparison.epsilon for motion in motions)]
+    )
     with open_figure(10.0, high) as figure:
         title = f"{comparison.name}{_DOT}force margins{_DOT}\u03b5 = {comparison.epsilon:g} N"
         write_title(figure, title)
         look: Any = {"fontsize": 9, "color": INK, "parse_math": False, "va": "bottom"}
         look["transform"] = figure.dpi_scale_trans
         high -= 0.35
-        for own, motion in shown:
+        for contender, motion in shown:
             high -= line
-            what = f"{own.duration:.4g} s" if own.ok else own.reason
-            between = _DOT if own.ok else ": "
-            figure.text(left, high, f"{own.name}{_DOT}{own.verdict}{between}{what}", **look)
+            what = f"{contender.duration:.4g} s" if contender.ok else contender.reason
+            between = _DOT if contender.ok else ": "
+            figure.text(
+                left, high, f"{contender.name}{_DOT}{contender.verdict}{between}{what}", **look
+            )
             if motion is None:
                 continue
             high -= tall + line
@@ -124,13 +130,13 @@ def _draw_phase(axes: Axes, phase: PhasePrediction, epsilon: float) -> None:
     axes.axhspan(low, 0.0, color=LOST, linewidth=0, zorder=1)
     axes.axhline(epsilon, color="black", linewidth=1.0, zorder=2)
     above: Any = {"xycoords": "axes fraction", "ha": "left", "va": "bottom", "fontsize": 7.5}
-    for k, own in enumerate(phase.survivals):
+    for k, survival in enumerate(phase.survivals):
         look: Any = {"color": PALETTE[k], "linestyle": LINES[k % 3][0], "linewidth": 1.9}
-        force = curves.force[own.motion]
+        force = curves.force[survival.motion]
         axes.plot(curves.speed, np.where(np.isfinite(force), force, np.nan), zorder=3 + k, **look)
-        if own.speed:
-            axes.plot(own.speed, epsilon, "o", color=PALETTE[k], markersize=5, zorder=6)
-        text = f"{own.motion}, {_name_failure(own)}"
+        if survival.speed:
+            axes.plot(survival.speed, epsilon, "o", color=PALETTE[k], markersize=5, zorder=6)
+        text = f"{survival.motion}, {_name_failure(survival)}"
         write(axes, text, (0, 1), (0, 29 - 12 * k), color=PALETTE[k], **above)
     if not any(np.isfinite(force).any() for force in curves.force.values()):
         middle: Any = {"transform": axes.transAxes, "ha": "center", "va": "center", "zorder": 7}
@@ -206,23 +212,28 @@ def _draw_motion(axes: Axes, study: Robustness) -> None:
 
 def _draw_ends(axes: Axes, study: Robustness) -> None:
     records = [record for record in study.records if "distance" in record]
-    known = study.trial.uncertainty
-    goal = 1e3 * known.find_distance(study.trial.problem.scene), math.degrees(known.angle)
-    given = [(1e3 * own["distance"], math.degrees(own["angle"])) for own in records]
+    uncertainty = study.trial.uncertainty
+    goal = (
+        1e3 * uncertainty.find_distance(study.trial.problem.scene),
+        math.degrees(uncertainty.angle),
+    )
+    deviations = [(1e3 * record["distance"], math.degrees(record["angle"])) for record in records]
     least = 1e-4  # [mm] and [deg]: lesser ones are drawn so
-    places = np.maximum(np.array(given).reshape(-1, 2), least)
+    places = np.maximum(np.array(deviations).reshape(-1, 2), least)
     kinds = np.array([find_kind(record) for record in records])
     for kind, (label, colour, marker) in enumerate(_KINDS):
-        own = places[kinds == kind]
-        text = f"{label}: {len(own)}"
-        axes.plot(*own.T, marker, ms=3.5, color=colour, alpha=0.7, label=text, mew=0.9)
+        points = places[kinds == kind]
+        text = f"{label}: {len(points)}"
+        axes.plot(*points.T, marker, ms=3.5, color=colour, alpha=0.7, label=text, mew=0.9)
     axes.set(xscale="log", yscale="log")
     around = np.vstack([places, goal])
     # Whole powers of ten, so that both ends of an axis have a number.
     low = 0.8 * 10 ** np.floor(np.log10(around.min(axis=0)))
     high = 1.25 * 10 ** np.ceil(np.log10(around.max(axis=0)))
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    notes = [f" (at least {least:g})" if min(own) <= least else "" for own in around.T.tolist()]
+    notes = [
+        f" (at least {least:g})" if min(column) <= least else "" for column in around.T.tolist()
+    ]
     axes.set_xlabel(f"distance from the goal [mm]{notes[0]}")
     axes.set_ylabel(f"angle from the goal [deg]{notes[1]}")
     axes.axvline(goal[0], color=INK, linewidth=0.8, linestyle=(0, (1, 2)))

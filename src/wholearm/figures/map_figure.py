@@ -141,7 +141,7 @@ class _Drawing:
             upright = (np.subtract.outer(self.phi, path[:, 1]) * self.scale[1]) ** 2
             # 8 points from the plan.
             clear &= (across[None] + upright[:, None]).min(axis=2) > 64.0
-        names = [" | ".join(map(_shorten, own)) for own in self.chart.formations]
+        names = [" | ".join(map(_shorten, formation)) for formation in self.chart.formations]
         boxes = [self._write_inside(names[k], region & clear) for k, region in self.parts]
         look: Any = {"color": "#666666", "style": "italic"}
         look["path_effects"] = [withStroke(linewidth=2.2, foreground="white")]  # over the hatching
@@ -164,8 +164,8 @@ class _Drawing:
             if room >= 1.15:
                 place = np.array([self.x[column], self.phi[row]])
                 size = (half[::-1] + 3) / self.scale
-                own: Any = {"fontsize": 7.6, "color": INK, "zorder": 7, "rotation": turn} | look
-                self._write(place, text, **own)
+                style: Any = {"fontsize": 7.6, "color": INK, "zorder": 7, "rotation": turn} | look
+                self._write(place, text, **style)
                 return np.stack([place - size, place + size])
         return None
 
@@ -184,9 +184,9 @@ class _Drawing:
 
     def draw_borders(self) -> None:
         """Borders, with lines beside them to where motions are possible, and what can be hit."""
-        flush = [own for own in self.chart.borders if own.flush is not None]
-        passing = [_to_axes(own.points) for own in self.chart.borders if own.flush is None]
-        every = [_to_axes(own.points) for own in flush]
+        flush = [border for border in self.chart.borders if border.flush is not None]
+        passing = [_to_axes(border.points) for border in self.chart.borders if border.flush is None]
+        every = [_to_axes(border.points) for border in flush]
         self._add_lines(passing, _LINE, zorder=3, **_PASSING)
         self._add_lines(every, _LINE, lw=0.9, zorder=3)
 
@@ -197,7 +197,7 @@ class _Drawing:
         for colour, way, name in ((_FORTH, 1.0, "forth"), (_BACK, -1.0, "back")):
             # 2.6 points beside the border.
             strips = [shift(run * self.scale, way * 2.6) for run in cut(every, name)]
-            self._add_lines([own / self.scale for own in strips], colour, lw=1.3, zorder=4)
+            self._add_lines([strip / self.scale for strip in strips], colour, lw=1.3, zorder=4)
             heads = np.concatenate([np.empty((0, 3, 2)), *(place_heads(s, way) for s in strips)])
             self._add(heads / self.scale, fc=colour, lw=0, zorder=5)
         self._add_lines(list(cut(every, "ambiguous")), _AMBIGUOUS, zorder=4, **_DOTTED)
@@ -206,11 +206,11 @@ class _Drawing:
 
     def draw_crossings(self) -> None:
         """Dots; those where only a contact changes its name on a border are small."""
-        for own in self.chart.crossings:
+        for crossing in self.chart.crossings:
             look: Any = {"marker": "o", "mfc": INK, "mec": "white", "mew": 0.5, "zorder": 6}
             look |= {"ls": "none", "gid": next(self.gids)}
-            look["ms"] = 3.6 if len(own.flush) >= 2 else 2.4
-            add_line(self.axes, _to_axes(own.point[None]), **look)
+            look["ms"] = 3.6 if len(crossing.flush) >= 2 else 2.4
+            add_line(self.axes, _to_axes(crossing.point[None]), **look)
 
     def draw_paths(self) -> None:
         """The plan, each phase with its number on or beside it."""

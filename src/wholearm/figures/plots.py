@@ -304,8 +304,8 @@ def force_margins(
     epsilon = require_number(meta.get("epsilon", problem.epsilon), "meta.epsilon")
     scene, styles = problem.scene, choose_styles(trajectory.contacts)
     parts = [textwrap.shorten(str(meta.get("name", "")), 36, placeholder="\u2026")]
-    known = meta.get("objective")
-    parts.append(f"objective {known}" if known else str(meta.get("status", "")))
+    objective = meta.get("objective")
+    parts.append(f"objective {objective}" if objective else str(meta.get("status", "")))
     parts += [f"duration {trajectory.duration:.4g} s", f"\u03b5 = {epsilon:g} N"]
     if scene.fingers_collide:
         least = float(evaluate_finger_gap(scene, trajectory.z).min())

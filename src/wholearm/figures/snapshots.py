@@ -81,10 +81,10 @@ def draw_bodies(axes: Axes, scene: Scene, z: Array, **look: Any) -> list[Artist]
     shapes = [trace_link(f, angle) for f, angle in zip(scene.fingers, z[3:].tolist(), strict=True)]
     shapes.append(place_vertices(scene, z))
     artists: list[Artist] = []
-    looks = (*((*own, 0.9, 2) for own in FINGERS), (INK, BODY, 1.1, 4))
+    looks = (*((*colours, 0.9, 2) for colours in FINGERS), (INK, BODY, 1.1, 4))
     for points, (line, face, wide, above) in zip(shapes, looks, strict=True):
-        own: dict[str, Any] = {"fc": face, "ec": line, "lw": wide, "zorder": above} | look
-        artists.append(axes.add_artist(Outline(points, **own)))
+        style: dict[str, Any] = {"fc": face, "ec": line, "lw": wide, "zorder": above} | look
+        artists.append(axes.add_artist(Outline(points, **style)))
     return artists
 
 
@@ -136,9 +136,9 @@ def choose_numbers(
             for shift in (shifts[index], -shifts[index])[: 1 + (count <= 5)]:
                 place = vertices[index] + shift
                 far = [
-                    np.abs(vertices[k] + own - place)
+                    np.abs(vertices[k] + other_shift - place)
                     > NUMBER * np.array([0.34 * (len(str(index)) + len(str(k))), 1.2])
-                    for k, own in numbers.items()
+                    for k, other_shift in numbers.items()
                 ]
                 if all(apart.any() for apart in far) and place[1] > lowest:
                     numbers[index] = shift
@@ -147,7 +147,9 @@ def choose_numbers(
 
     steps = (k * 10**n for n in range(4) for k in (1, 2, 5))
     # None of them where even the first number would stand too low.
-    fitting = (own for step in steps if len(put(own := range(0, count, step))) == len(own))
+    fitting = (
+        indices for step in steps if len(put(indices := range(0, count, step))) == len(indices)
+    )
     every = next(fitting, range(0))
     return dict(sorted(put(dict.fromkeys([*first, *every])).items()))
 
@@ -180,9 +182,9 @@ def choose_snapshots(trajectory: Trajectory) -> NDArray[np.int64]:
         parts[np.argmax(np.diff(starts) / parts)] += 1
     rows = [0, len(trajectory.t) - 1]
     for k, (start, end) in enumerate(pairwise(starts)):
-        own = np.flatnonzero(trajectory.phase == k)
+        phase_rows = np.flatnonzero(trajectory.phase == k)
         for t in np.linspace(start, end, parts[k] + 1)[:-1]:
-            rows.append(own[np.abs(trajectory.t[own] - t).argmin()])
+            rows.append(phase_rows[np.abs(trajectory.t[phase_rows] - t).argmin()])
     return np.unique(rows)
 
 
@@ -249,10 +251,10 @@ def draw_strip(
         for k, width in zip(row, widths, strict=True):
             axes = inset(figure, left, bottom, width, height)
             box = np.column_stack([strip.boxes[k][:, 0], [strip.low, strip.high]])
-            own = trajectory.motions[trajectory.phase[k]].contacts
+            contacts = trajectory.motions[trajectory.phase[k]].contacts
             # What does not press at this instant is left out, unless no force is known.
             presses = dict(zip(trajectory.contacts, np.isfinite(trajectory.c_n[k]), strict=True))
-            names = [name for name in trajectory.contacts if name in own]
+            names = [name for name in trajectory.contacts if name in contacts]
             names = [name for name in names if presses[name]] or names
             draw_snapshot(axes, scene, trajectory.z[k], names, styles, box)
             place = "end" if k == last else f"phase {trajectory.phase[k] + 1}"
