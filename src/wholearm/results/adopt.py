@@ -62,8 +62,8 @@ def adopt_torques(
 
 def require_same_contacts(problem: Problem, plan: Trajectory | None) -> None:
     """Check that a plan, if there is one, has the contacts of a problem."""
-    known = {contact.name for contact in problem.contacts}
-    if plan is not None and (odd := {*plan.contacts} ^ known):
+    contact_names = {contact.name for contact in problem.contacts}
+    if plan is not None and (odd := {*plan.contacts} ^ contact_names):
         text = f"trajectory and problem differ in {', '.join(sorted(odd))}"
         raise InputError("", "contacts", text)
 
@@ -71,8 +71,8 @@ def require_same_contacts(problem: Problem, plan: Trajectory | None) -> None:
 def require_same_phases(problem: Problem, plan: Trajectory) -> None:
     """Check that a plan has the phases of a problem."""
     require_phases(problem)
-    given = [set(motion.contacts) for motion in plan.motions]
-    if given != [set(phase.formation.names) for phase in problem.phases]:
+    contact_sets = [set(motion.contacts) for motion in plan.motions]
+    if contact_sets != [set(phase.formation.names) for phase in problem.phases]:
         raise InputError("", "phases", "the plan's contacts are not those of the problem's phases")
 
 
@@ -111,13 +111,13 @@ def require_made_for(problem: Problem, meta: Mapping[str, Any]) -> None:
     ------
     InputError  if it was not, by the first key that differs, or does not say what it was made for
     """
-    own = meta.get("problem")
-    if not isinstance(own, Mapping):
+    tables = meta.get("problem")
+    if not isinstance(tables, Mapping):
         raise InputError("", "meta.problem", "the trajectory does not hold its problem's tables")
-    found = next(_find(own, problem), None)
-    if found is not None:
-        text = f"{found.one} in the trajectory, {found.other} in the problem"
-        raise InputError("", found.key, f"{text}; it is one of another problem")
+    difference = next(_find(tables, problem), None)
+    if difference is not None:
+        text = f"{difference.one} in the trajectory, {difference.other} in the problem"
+        raise InputError("", difference.key, f"{text}; it is one of another problem")
 
 
 def describe_origin(problem: Problem, meta: Mapping[str, Any], what: str = "plan") -> str:
@@ -138,12 +138,12 @@ def describe_origin(problem: Problem, meta: Mapping[str, Any], what: str = "plan
                 the hand is another one, a base or a length being off by more than a tenth of the
                 link
     """
-    own = meta.get("problem")
-    if not isinstance(own, Mapping):
+    tables = meta.get("problem")
+    if not isinstance(tables, Mapping):
         return ""
-    for found in _find(own, problem):
-        _require_sense(found, problem, what)
-    text = describe_differences(_find(own, problem), f"in the {what}", "here")
+    for difference in _find(tables, problem):
+        _require_sense(difference, problem, what)
+    text = describe_differences(_find(tables, problem), f"in the {what}", "here")
     return f"made for another problem: {text}" if text else ""
 
 

@@ -71,10 +71,10 @@ class TorqueChange:
 def change_torques(scene: Scene, before: Array, after: Array) -> TorqueChange:
     """How torques change from ones to others, both of shape (2,) [N m]."""
     levels, spans, rates, decays = _divide(scene, before, after)
-    own = spans > 0
-    times = np.append(0.0, np.cumsum(spans[own]))
-    levels = np.append(levels[:-1][own], levels[-1])
-    return TorqueChange(before, after, times, levels, rates[own], decays[own])
+    nonempty = spans > 0
+    times = np.append(0.0, np.cumsum(spans[nonempty]))
+    levels = np.append(levels[:-1][nonempty], levels[-1])
+    return TorqueChange(before, after, times, levels, rates[nonempty], decays[nonempty])
 
 
 def find_change_times(scene: Scene, before: Array, after: Array) -> Array:

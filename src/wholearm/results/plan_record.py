@@ -65,14 +65,14 @@ class Certificate:
     @property
     def total(self) -> TimeBound | None:
         """The bound of all phases that have one, together; None without any."""
-        known = [part for part in self.parts if part.bound is not None]
-        if not known:
+        bounded_parts = [part for part in self.parts if part.bound is not None]
+        if not bounded_parts:
             return None
         return TimeBound(
-            tuple(phase for part in known for phase in part.phases),
-            sum(part.duration for part in known),
-            sum(part.bound or 0.0 for part in known),
-            sum(part.error or 0.0 for part in known),
+            tuple(phase for part in bounded_parts for phase in part.phases),
+            sum(part.duration for part in bounded_parts),
+            sum(part.bound or 0.0 for part in bounded_parts),
+            sum(part.error or 0.0 for part in bounded_parts),
         )
 
 

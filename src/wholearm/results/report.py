@@ -301,7 +301,7 @@ class Report(Result):
             lines.append(f"end of the replay: {self.outcome}")
         lines += [f"warning: {text}" for text in self.warnings]
         help, gap = self.help, self.finger_gap
-        lines += [f"help: {own.to_text()}" for own in (*help.losses, help.approach) if own]
+        lines += [f"help: {advice.to_text()}" for advice in (*help.losses, help.approach) if advice]
         if gap is not None:
             lines.append(f"least gap of the fingers: {gap.least:.5g} m at t = {gap.time:.5g} s")
         # Epsilon with three digits, or a thousandth of the largest.
@@ -313,7 +313,7 @@ class Report(Result):
             for p in self.phases
             for c in p.contacts
         ]
-        slips = [(p.number, *own) for p in self.phases for own in p.rolling]
+        slips = [(p.number, *slip_margin) for p in self.phases for slip_margin in p.rolling]
         impacts = any(p.end == "impact" for p in self.phases)
         planned = any(p.deviation is not None for p in self.phases)
         ends = _ENDS | (_IMPACTS if impacts else {}) | (_DEVIATIONS if planned else {})
@@ -338,8 +338,10 @@ class Report(Result):
         for loss in self.help.losses:
             if loss.kind == "thin":
                 continue
-            for own in loss.forces:
-                rows.append((loss.time, f"c_n of {own.contact}", own.c_n, own.c_t, *own.per_tau))
+            for load in loss.forces:
+                rows.append(
+                    (loss.time, f"c_n of {load.contact}", load.c_n, load.c_t, *load.per_tau)
+                )
             if loss.closing:
                 value, *per_tau = loss.closing
                 until = self.phases[loss.phase - 1].until

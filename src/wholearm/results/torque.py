@@ -147,9 +147,9 @@ def read_torque_csv(path: str) -> TorqueProfile:
     header = [cell.strip() for cell in numbered[0][1]] if numbered else []
     for column in COLUMNS:
         if column not in header:
-            given = ",".join(header) or "an empty file"
+            names = ",".join(header) or "an empty file"
             raise InputError(
-                str(path), column, f"column is missing; {given} given, {','.join(COLUMNS)} needed"
+                str(path), column, f"column is missing; {names} given, {','.join(COLUMNS)} needed"
             )
     where = [header.index(column) for column in COLUMNS]
     values = np.array([_read_row(path, line, row, where) for line, row in numbered[1:]])

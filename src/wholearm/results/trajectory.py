@@ -149,9 +149,9 @@ class Trajectory(Drawn):
         for index in sorted(set(owner.tolist())):
             motion, rows = self.motions[index], np.flatnonzero(owner == index)
             part = motion.evaluate(times[rows] - starts[index])
-            own = [self.contacts.index(name) for name in motion.contacts]
+            contact_columns = [self.contacts.index(name) for name in motion.contacts]
             for k, (whole, values) in enumerate(zip(fields, part, strict=True)):
-                columns = slice(None) if k < 4 else own
+                columns = slice(None) if k < 4 else contact_columns
                 whole[rows[:, None], np.arange(whole.shape[1])[columns]] = values
         return fields
 
@@ -225,12 +225,12 @@ class SampledMotion:
 
     def evaluate(self, t: Array) -> Samples:
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""
-        grid, known = self.t - self.t[0], self.samples
+        grid, samples = self.t - self.t[0], self.samples
         k = np.clip(np.searchsorted(grid, t, side="right") - 1, 0, len(grid) - 2)
         h, run = grid[k + 1] - grid[k], np.asarray(t) - grid[k]
-        z, z_dot, z_ddot = interpolate_quintic(h, run, known[:3], k)
+        z, z_dot, z_ddot = interpolate_quintic(h, run, samples[:3], k)
         x = (run / h)[:, None]
-        forces = [(1 - x) * f[k] + x * f[k + 1] for f in (known.tau, known.c_n, known.c_t)]
+        forces = [(1 - x) * f[k] + x * f[k + 1] for f in (samples.tau, samples.c_n, samples.c_t)]
         return Samples(z, z_dot, z_ddot, *forces)
 
 
@@ -272,8 +272,8 @@ def sample_phases(
         names = ("q", "theta"), ("q_dot", "theta_dot"), ("q_ddot", "theta_ddot")
         z, z_dot, z_ddot = (np.hstack([parts[one], parts[other]]) for one, other in names)
         forces = parts["tau"], parts["c_n"][:, held], parts["c_t"][:, held]
-        own = tuple(name for name, here in zip(contacts, held, strict=True) if here)
-        motions.append(SampledMotion(parts["t"], own, Samples(z, z_dot, z_ddot, *forces)))
+        contact_names = tuple(name for name, here in zip(contacts, held, strict=True) if here)
+        motions.append(SampledMotion(parts["t"], contact_names, Samples(z, z_dot, z_ddot, *forces)))
     return tuple(motions)
 
 
@@ -316,10 +316,10 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
         text = "is not a list of spans with start, stop, contacts and joints for each phase"
         raise InputError(source, "meta.modes", text) from None
     contacts = tuple(str(name) for name in arrays["contacts"])
-    known = {name: arrays[name] for name in _ARRAYS}
+    samples = {name: arrays[name] for name in _ARRAYS}
     torque = TorqueProfile(arrays["torque_breaks"], arrays["torque_coefficients"])
-    motions = sample_phases(known, contacts)
-    return Trajectory(**known, contacts=contacts, torque=torque, motions=motions, meta=meta)
+    motions = sample_phases(samples, contacts)
+    return Trajectory(**samples, contacts=contacts, torque=torque, motions=motions, meta=meta)
 
 
 def _check_shape(source: str, name: str, arrays: Mapping[str, Any], tail: tuple[int, ...]) -> None:
@@ -362,5 +362,5 @@ def _check_order(source: str, arrays: Mapping[str, Any]) -> None:
     if len(breaks) < 2 or (np.diff(breaks) <= 0).any():
         raise InputError(source, "torque_breaks", "must be two or more, and increase")
     if len(arrays["torque_coefficients"]) != len(breaks) - 1:
-        given, needed = len(arrays["torque_coefficients"]), len(breaks) - 1
-        raise InputError(source, "torque_coefficients", f"{given} pieces given, {needed} needed")
+        count, needed = len(arrays["torque_coefficients"]), len(breaks) - 1
+        raise InputError(source, "torque_coefficients", f"{count} pieces given, {needed} needed")
