@@ -95,8 +95,11 @@ class _Scene:
 
     def draw(self, t: float) -> list[Artist]:
         """Everything at an instant, in the order of drawing."""
-        axes, own, artists = self._axes, self._trajectory, list[Artist]()
-        row, z = max(0, int(np.searchsorted(own.t, t, side="right")) - 1), _blend(own.t, own.z, t)
+        axes, motion, artists = self._axes, self._trajectory, list[Artist]()
+        row, z = (
+            max(0, int(np.searchsorted(motion.t, t, side="right")) - 1),
+            _blend(motion.t, motion.z, t),
+        )
         if self._ghost is not None:
             behind = _blend(self._ghost.t, self._ghost.z, t)
             artists += draw_bodies(axes, self._scene, behind, ec=GHOST, fc="none")
@@ -115,7 +118,7 @@ class _Scene:
         for k in pressing:
             dot: Any = {"marker": "o", "ms": 5.5, "mfc": self._colours[k], "mec": "white"}
             artists.append(add_line(axes, self._points[row, [k]], **dot))
-        for finger, torque in zip(self._scene.fingers, own.tau[row].tolist(), strict=True):
+        for finger, torque in zip(self._scene.fingers, motion.tau[row].tolist(), strict=True):
             # At the limit an arc of three quarters.
             swept = 1.5 * math.pi * torque / finger.torque_limit
             arc = _trace_arc(np.asarray(finger.base), swept, 0.05 * self._size)
@@ -181,24 +184,24 @@ class Movie:
     @exclusive
     def draw(self) -> Iterator[Array]:
         """Pictures one by one, shape (height, width, 4), uint8."""
-        problem, own = self._problem, self._trajectory
+        problem, motion = self._problem, self._trajectory
         with open_figure(8.0, 7.4, dpi=self._resolution) as figure:
             canvas: Any = figure.canvas
-            scene = _Scene(figure.add_axes((0.02, 0.47, 0.96, 0.49)), problem, own, self._ghost)
+            scene = _Scene(figure.add_axes((0.02, 0.47, 0.96, 0.49)), problem, motion, self._ghost)
             margins = figure.add_axes((0.09, 0.225, 0.74, 0.215))
             torques = figure.add_axes((0.09, 0.06, 0.74, 0.14), sharex=margins)
-            draw_margins(margins, own, problem.epsilon, choose_styles(own.contacts))
-            draw_torques(torques, own.torque, problem.scene.torque_limit)
+            draw_margins(margins, motion, problem.epsilon, choose_styles(motion.contacts))
+            draw_torques(torques, motion.torque, problem.scene.torque_limit)
             for axes, room in ((margins, 0.235), (torques, 0.14)):
-                draw_phases(axes, own.phase_starts, labels=axes is margins)
+                draw_phases(axes, motion.phase_starts, labels=axes is margins)
                 list_contacts(axes, 72 * 7.4 * room, 8.0)
             margins.set_ylabel(f"margin {unit_of(margins)}")
             margins.tick_params(labelbottom=False)
             label = rf"$\tau$ {unit_of(torques)}"
-            torques.set(xlabel="time $t$ [s]", ylabel=label, xlim=(0.0, own.duration))
+            torques.set(xlabel="time $t$ [s]", ylabel=label, xlim=(0.0, motion.duration))
             figure.align_ylabels([margins, torques])
             canvas.draw()
-            still, decimals = canvas.copy_from_bbox(figure.bbox), count_decimals(own.duration)
+            still, decimals = canvas.copy_from_bbox(figure.bbox), count_decimals(motion.duration)
             look: Any = {"va": "top", "fontsize": 10.5, "fontweight": "bold", "parse_math": False}
             for t in self.times:
                 canvas.restore_region(still)
@@ -249,9 +252,9 @@ def _choose_palette(images: Sequence[Image.Image]) -> Image.Image:
 
     The rest are the colours of four pictures, mostly tints of these.
     """
-    own = [*PALETTE, BAND, LOW, LOST, INK, GRID, "#ffffff", BODY, TURNS, GHOST]
-    own += [colour for pair in FINGERS for colour in pair]
-    exact = np.array([ImageColor.getrgb(colour) for colour in own])
+    colours = [*PALETTE, BAND, LOW, LOST, INK, GRID, "#ffffff", BODY, TURNS, GHOST]
+    colours += [colour for pair in FINGERS for colour in pair]
+    exact = np.array([ImageColor.getrgb(colour) for colour in colours])
     some = [images[k] for k in np.linspace(0, len(images) - 1, 4).astype(int)]
     strip = Image.new("RGB", (some[0].width, 4 * some[0].height))
     for k, image in enumerate(some):

@@ -72,7 +72,10 @@ def build_report(
         progress(f"writing {contender.name}")
         # All motions together leave a page at some 3 MB.
         parts += _describe(contender, 8000 // len(comparison.contenders))
-    first = next((own.planned for own in comparison.contenders if own.planned is not None), None)
+    first = next(
+        (contender.planned for contender in comparison.contenders if contender.planned is not None),
+        None,
+    )
     progress("map")
     chart = chart or build_map(problem, 90, choose_window(problem, None))
     machine = f"Python {platform.python_version()}, {platform.machine()}"
@@ -105,8 +108,8 @@ def _describe(contender: Contender, most: int) -> list[str]:
         parts.append(write_player(describe_motion(shown, problem, ghost, most)))
         timings = shown.meta.get("timings")
         # Routes are planned from parts that are replayed before: then nothing is left of a step.
-        known = timings.items() if isinstance(timings, dict) else ()
-        took = [(str(name), value) for name, value in known if value and value >= 1e-3]
+        steps = timings.items() if isinstance(timings, dict) else ()
+        took = [(str(name), value) for name, value in steps if value and value >= 1e-3]
         tables = [list_phases(problem, shown), list_joints(shown)]
         tables.append(Table(["planning took", "[s]:.4g"], took))
         parts.append(Document("", parts=tables).to_html())
@@ -119,8 +122,8 @@ def list_phases(problem: Problem, trajectory: Trajectory) -> Table:
     """A row for each phase that the motion enters."""
     rows = []
     for index in np.unique(trajectory.phase):
-        phase, own = problem.phases[index], trajectory.phase == index
-        t, c_n = trajectory.t[own], trajectory.c_n[own]
+        phase, in_phase = problem.phases[index], trajectory.phase == index
+        t, c_n = trajectory.t[in_phase], trajectory.c_n[in_phase]
         least, name = math.nan, ""
         if np.isfinite(c_n).any():
             least = float(np.nanmin(c_n))
