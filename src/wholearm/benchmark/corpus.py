@@ -101,9 +101,9 @@ SEED = 0
 def list_cases() -> Iterator[Case]:
     """All cases: first those that take long, so that processes end together."""
     yield from (("tune", name) for name in reversed(TUNED))
-    yield from (("plan over time", *own) for own in product(PROBLEMS, OBJECTIVES))
+    yield from (("plan over time", *pair) for pair in product(PROBLEMS, OBJECTIVES))
     yield from (("policy", name) for name in PROBLEMS)
-    yield from (("plan", *own) for own in product(PROBLEMS, OBJECTIVES))
+    yield from (("plan", *pair) for pair in product(PROBLEMS, OBJECTIVES))
     yield from (("variant", name) for name in VARIANTS)
     yield from (("goal", k) for k in range(60))
     yield "robustness", "heptagon_four_contacts"
@@ -122,17 +122,17 @@ def list_cases() -> Iterator[Case]:
 
 def answer(case: Case, folder: Path) -> Row:
     """What the package says to a case; `folder` has the shipped problems."""
-    family, *given = case
-    row: Row = _shorten(FAMILIES[family](folder, *given))
+    family, *arguments = case
+    row: Row = _shorten(FAMILIES[family](folder, *arguments))
     return row
 
 
 def _shorten(value: Any) -> Any:
     """Plain values for JSON: numbers with nine digits, None for NaN and infinity."""
     if isinstance(value, dict):
-        return {key: _shorten(own) for key, own in value.items()}
+        return {key: _shorten(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_shorten(own) for own in value]
+        return [_shorten(entry) for entry in value]
     if isinstance(value, float):
         return float(f"{value:.9g}") if math.isfinite(value) else None
     return value
@@ -152,7 +152,10 @@ def _refuse(error: Exception) -> Row:
     row: Row = {"refused": type(error).__name__, "words": mask(str(error)), "text": str(error)}
     short = getattr(error, "shortfalls", ())
     if short:
-        row["short"] = [own.part for own in short[:1]] + [short[0].kind, short[0].place.phase]
+        row["short"] = [shortfall.part for shortfall in short[:1]] + [
+            short[0].kind,
+            short[0].place.phase,
+        ]
         row["amount"] = short[0].amount
     changes = getattr(error, "changes", ())
     row["advice"] = {change.parameter.key: change.value for change in changes}
@@ -181,8 +184,10 @@ def _describe_plan(plan: Plan) -> Row:
         "modes": list_modes(plan),
         "impacts": len(plan.transitions),
     }
-    if any(own.settling for own in plan.phases):
-        row["dwells"] = [own.settling.duration if own.settling else 0.0 for own in plan.phases]
+    if any(phase.settling for phase in plan.phases):
+        row["dwells"] = [
+            phase.settling.duration if phase.settling else 0.0 for phase in plan.phases
+        ]
     if plan.certificate is not None:
         row["gaps"] = sorted(plan.certificate.gaps)
         row["bound"] = None if plan.certificate.total is None else plan.certificate.total.bound
@@ -194,17 +199,17 @@ def _describe_plan(plan: Plan) -> Row:
 def _verify(problem: Problem, what: Any) -> Row:
     """The verdict about a plan or torques, and what the replay shows."""
     report = wholearm.verify(problem, what)
-    known = filter(None, map(find_least_force, report.phases))
+    margins = filter(None, map(find_least_force, report.phases))
     energy = report.energy
     return {
         "ok": report.ok,
         "reached": report.reached,
         "failed phase": report.failed_phase,
         "failures": [mask(text) for text in report.failures],
-        "arrivals": [own.arrival for own in report.phases],
-        "least": [own.least for own in known],
+        "arrivals": [phase.arrival for phase in report.phases],
+        "least": [margin.least for margin in margins],
         "events": [change.time for change in report.changes],
-        "kinds": [f"{own.phase} {own.what} {own.kind}" for own in report.changes],
+        "kinds": [f"{change.phase} {change.what} {change.kind}" for change in report.changes],
         "energy": [energy.work, energy.kinetic, energy.potential, energy.dry, energy.contact],
         "help": mask(json.dumps(report.to_dict().get("help"))) if not report.ok else "",
     }
@@ -245,15 +250,16 @@ def _reach(folder: Path, number: int) -> Row:
     # What is known of a scene from other goals may lead to another route.
     forget_roadmaps()
     try:
-        found = wholearm.find_route(problem)
+        answer = wholearm.find_route(problem)
     except wholearm.WholearmError as error:
         return _refuse(error)
     phases = [
-        f"{' '.join(own['contacts'])} {own.get('end', '')}" for own in found.problem.table["phases"]
+        f"{' '.join(phase['contacts'])} {phase.get('end', '')}"
+        for phase in answer.problem.table["phases"]
     ]
-    row = _describe_plan(found.plan) | {"route": phases, "in cells": found.route.in_cells}
-    row["bound"] = None if found.bound is None else found.bound.value
-    return row | {"replay": _verify(found.problem, found.plan)}
+    row = _describe_plan(answer.plan) | {"route": phases, "in cells": answer.route.in_cells}
+    row["bound"] = None if answer.bound is None else answer.bound.value
+    return row | {"replay": _verify(answer.problem, answer.plan)}
 
 
 def _scene(folder: Path, number: int, objective: str) -> Row:
@@ -290,9 +296,11 @@ def _simulate_free(folder: Path, name: str) -> Row:
     return {
         "ok": report.ok,
         "failures": [mask(text) for text in report.failures],
-        "phases": [own.number for own in report.alone if own.reached],
-        "stops": [own.stop for own in report.alone],
-        "lost": [f"{own.number} {loss.contact}" for own in report.alone for loss in own.losses],
+        "phases": [phase.number for phase in report.alone if phase.reached],
+        "stops": [phase.stop for phase in report.alone],
+        "lost": [
+            f"{phase.number} {loss.contact}" for phase in report.alone for loss in phase.losses
+        ],
     }
 
 
@@ -310,9 +318,9 @@ def _follow(folder: Path, name: str, share: float) -> Row:
         "ok": report.ok,
         "lost": [f"{number} {loss.contact}" for number, loss in lost[:1]],
         "times": [loss.time for _, loss in lost[:1]],
-        "stops": [own.stop for own in report.phases if not lost or own.number < lost[0][0]],
-        "events": [own.time for own in events],
-        "kinds": [f"{own.kind.value} {own.contact}" for own in events],
+        "stops": [phase.stop for phase in report.phases if not lost or phase.number < lost[0][0]],
+        "events": [event.time for event in events],
+        "kinds": [f"{event.kind.value} {event.contact}" for event in events],
     }
     try:
         told = _verify(problem, torque)
@@ -335,15 +343,15 @@ def _tune(folder: Path, name: str) -> Row:
 def _predict(folder: Path, name: str) -> Row:
     phases = [
         {
-            "path": own.path,
-            "length": own.length,
-            "kept": own.is_kept,
-            "first": "" if own.slow is None else own.slow.name,
-            "least": None if own.slow is None else own.slow.force,
-            "speeds": [one.speed for one in own.survivals],
-            "breaks": [f"{one.motion}: {one.first.name}" for one in own.survivals],
+            "path": phase.path,
+            "length": phase.length,
+            "kept": phase.is_kept,
+            "first": "" if phase.slow is None else phase.slow.name,
+            "least": None if phase.slow is None else phase.slow.force,
+            "speeds": [one.speed for one in phase.survivals],
+            "breaks": [f"{one.motion}: {one.first.name}" for one in phase.survivals],
         }
-        for own in wholearm.predict(_load(folder, name)).phases
+        for phase in wholearm.predict(_load(folder, name)).phases
     ]
     return {"phases": phases}
 
@@ -359,12 +367,14 @@ def _control(folder: Path, name: str) -> Row:
         return _refuse(error)
     return {
         "duration": policy.duration,
-        "durations": [own["duration"] for own in policy.about["phases"]],
-        "shares": [own["share"] for own in policy.about["phases"]],
+        "durations": [phase["duration"] for phase in policy.about["phases"]],
+        "shares": [phase["share"] for phase in policy.about["phases"]],
         "ok": report.ok,
         "reached": [phase.number for phase in report.phases if phase.reached],
-        "stops": [own.stop for own in report.phases],
-        "lost": [f"{own.number} {loss.contact}" for own in report.phases for loss in own.losses],
+        "stops": [phase.stop for phase in report.phases],
+        "lost": [
+            f"{phase.number} {loss.contact}" for phase in report.phases for loss in phase.losses
+        ],
     }
 
 
@@ -397,7 +407,9 @@ def _compare(folder: Path, name: str) -> Row:
         peaks="peaks",
         simulations="simulations",
     )
-    contacts = [f"{own.contact} in phase {own.phase}" for own in comparison.contenders]
+    contacts = [
+        f"{contender.contact} in phase {contender.phase}" for contender in comparison.contenders
+    ]
     return numbers | {"contacts": contacts}
 
 
@@ -417,7 +429,9 @@ def _report(folder: Path, name: str) -> Row:
         torques = str(folder / "torques" / TUNED[name][0])
         status = start(["report", str(folder / f"{name}.toml"), path, torques, "-o", str(page)])
         text = page.read_text(encoding="utf-8")
-    tables = [own for own in re.findall(r"<table>.*?</table>", text) if "planning took" not in own]
+    tables = [
+        table for table in re.findall(r"<table>.*?</table>", text) if "planning took" not in table
+    ]
     cells = re.findall(r"<td[^>]*>(.*?)</td>", "".join(tables))
     numbers = [float(cell) for cell in cells if re.fullmatch(r"[-+]?\d+\.\d+", cell)]
     return {"exit": status, "cells": len(cells), "numbers": numbers}
@@ -429,11 +443,11 @@ def _draw_map(folder: Path, name: str) -> Row:
     return {
         "formations": _count(chart.formations),
         "borders": _count(border.contacts for border in chart.borders),
-        "crossings": _count(own.contacts for own in chart.crossings),
+        "crossings": _count(crossing.contacts for crossing in chart.crossings),
         "x": np.sort(points[:, 0]).tolist(),
         "phi": np.sort(points[:, 1]).tolist(),
-        "forth": sum(int(own.forth.sum()) for own in chart.borders),
-        "back": sum(int(own.back.sum()) for own in chart.borders),
+        "forth": sum(int(border.forth.sum()) for border in chart.borders),
+        "back": sum(int(border.back.sum()) for border in chart.borders),
         "possible": chart.possible.sum(axis=0).tolist(),
     }
 
@@ -451,14 +465,14 @@ def _list(folder: Path, number: int) -> Row:
         places = (0.045, -2.0), (-0.0637, -2.0), (-0.0505, -23.4), (0.0078, -50.0)
         route = wholearm.list_formations(problem, *((x, np.radians(phi)) for x, phi in places))
         return {
-            "route": [" ".join(map(str, own.contacts)) for own in route],
-            "places": [own.stop.tolist() for own in route],
+            "route": [" ".join(map(str, stretch.contacts)) for stretch in route],
+            "places": [stretch.stop.tolist() for stretch in route],
         }
     leg = draw_leg(SEED + 1, number, folder)
     if leg is None:
         return {"refused": "no route"}
     return {
-        "route": [" ".join(own["contacts"]) for own in leg[0].table["phases"]],
+        "route": [" ".join(phase["contacts"]) for phase in leg[0].table["phases"]],
         "places": [list(stop) for stop in leg[1]],
     }
 
@@ -590,7 +604,7 @@ class Corpus(Study):
         """Those that are asked for."""
         self.problems, self.rounding = Path(options.problems), options.rounding
         for case in list_cases():
-            if any(fnmatch(" ".join(map(str, case)), own) for own in options.only or "*"):
+            if any(fnmatch(" ".join(map(str, case)), pattern) for pattern in options.only or "*"):
                 yield case
 
     def list_inputs(self, options: argparse.Namespace) -> list[Path]:
@@ -609,12 +623,12 @@ class Corpus(Study):
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
         """How many answers of each family are the same, and which differ; or they are stored."""
-        found = {name_case(row): row["answer"] for row in rows}
+        answers = {name_case(row): row["answer"] for row in rows}
         if options.update:
-            known = read_json(options.answers) if Path(options.answers).exists() else {}
-            known |= found
-            names = sorted({" ".join(map(str, case)) for case in list_cases()} & known.keys())
-            lines = [f"{json.dumps(name)}: {json.dumps(known[name])}" for name in names]
+            contents = read_json(options.answers) if Path(options.answers).exists() else {}
+            contents |= answers
+            names = sorted({" ".join(map(str, case)) for case in list_cases()} & contents.keys())
+            lines = [f"{json.dumps(name)}: {json.dumps(contents[name])}" for name in names]
             write_text(options.answers, "{\n" + ",\n".join(lines) + "\n}\n")
         stored = read_json(options.answers)
         verdicts = {}
@@ -635,7 +649,7 @@ class Corpus(Study):
                 lines.append(f"* {kind}: {name}: {texts[0]}")
         wrong = {name: texts for name, (kind, texts) in verdicts.items() if kind == "differs"}
         return "\n".join(lines), [
-            f"{name}: {own}" for name, texts in wrong.items() for own in texts[:3]
+            f"{name}: {text}" for name, texts in wrong.items() for text in texts[:3]
         ]
 
 
@@ -665,8 +679,10 @@ def _reduce(answer: Any) -> Any:
     """Verdict, value and contact modes of a plan, or its refusal; other answers as they are."""
     if not answer or not {"replay", "refused"} & answer.keys():
         return answer
-    own = {key: answer[key] for key in ("refused", "objective", "value", "modes") if key in answer}
-    return own | {"replay": {"ok": answer.get("replay", {}).get("ok", False)}}
+    entries = {
+        key: answer[key] for key in ("refused", "objective", "value", "modes") if key in answer
+    }
+    return entries | {"replay": {"ok": answer.get("replay", {}).get("ok", False)}}
 
 
 def _allowed(family: str, key: str) -> float:
@@ -679,8 +695,8 @@ def _differ(family: str, key: str, found: Any, stored: Any) -> Iterator[tuple[bo
     """Whether a difference is one of words, and what it is, for each entry."""
     if isinstance(found, Mapping) and isinstance(stored, Mapping):
         for name in dict.fromkeys([*stored, *found]):
-            own = key if key in WORDS else name
-            for weak, text in _differ(family, own, found.get(name), stored.get(name)):
+            subkey = key if key in WORDS else name
+            for weak, text in _differ(family, subkey, found.get(name), stored.get(name)):
                 yield weak, f"{name}: {text}"
         return
     numbers, others = _flatten(found), _flatten(stored)
@@ -705,9 +721,9 @@ def _flatten(value: Any) -> list[float] | None:
         return [value]
     if not isinstance(value, list) or not value:
         return None
-    parts = [_flatten(own) for own in value]
-    known = [part for part in parts if part is not None]
-    return [own for part in known for own in part] if len(known) == len(parts) else None
+    parts = [_flatten(entry) for entry in value]
+    lists = [part for part in parts if part is not None]
+    return [number for part in lists for number in part] if len(lists) == len(parts) else None
 
 
 def _show(value: Any) -> str:

@@ -66,9 +66,9 @@ class Growth(Study):
             lines += [f"## {grows.capitalize()}", ""]
             table = []
             for work, (field, (unit, _)) in product(WORK[grows], FIELDS.items()):
-                known, values = select(rows, grows, work, field)
+                measured_sizes, values = select(rows, grows, work, field)
                 shown = [f"{value:.3g}" for value in values] + [""] * (len(sizes) - len(values))
-                exponent = fit_exponent(known, values)
+                exponent = fit_exponent(measured_sizes, values)
                 table.append((f"{work} [{unit}]", *shown, f"{exponent:.2f}"))
             lines += [*format_table(["work", *map(str, sizes), "exponent"], table), ""]
         return "\n".join(lines), []

@@ -51,15 +51,15 @@ class Guard(Study):
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
         """What has grown."""
-        found: dict[str, Counts] = {Path(row["case"][0]).stem: row["counts"] for row in rows}
-        known = read_stored(options.counts) if Path(options.counts).exists() else {}
+        new_counts: dict[str, Counts] = {Path(row["case"][0]).stem: row["counts"] for row in rows}
+        stored_counts = read_stored(options.counts) if Path(options.counts).exists() else {}
         if options.update:
-            known |= found
-            write_text(options.counts, json.dumps(known, indent=2, sort_keys=True) + "\n")
+            stored_counts |= new_counts
+            write_text(options.counts, json.dumps(stored_counts, indent=2, sort_keys=True) + "\n")
         grown = []
-        for name, counts in found.items():
-            if name in known:
-                grown += compare(name, counts, known[name])
+        for name, counts in new_counts.items():
+            if name in stored_counts:
+                grown += compare(name, counts, stored_counts[name])
             else:
                 grown.append(f"{name}: no counts are stored; --update stores them")
         return "" if grown else f"{len(rows)} problems: no count has grown", grown
@@ -76,15 +76,15 @@ def count(problem: Problem) -> Counts:
     dict  by names such as "phase 5-6 of 6: rows"; `BANDS` has those that rounding has a part in
     """
     firsts: dict[str, IpoptRun] = {}
-    block, begun = "", 0
+    block, first = "", 0
 
     with record_runs() as runs:
 
         def note(text: str) -> None:
-            nonlocal block, begun
-            if block and len(runs) > begun:
-                firsts.setdefault(block, runs[begun])
-            block, begun = text.removesuffix(": time"), len(runs)
+            nonlocal block, first
+            if block and len(runs) > first:
+                firsts.setdefault(block, runs[first])
+            block, first = text.removesuffix(": time"), len(runs)
 
         plan = solve(problem, replay=False, progress=note).trajectory
         note("")

@@ -280,12 +280,12 @@ def integrate(
     contacts, parts = problem.phases[0].formation.contacts, [*curve.segments[: reversals + 1]]
     y, spans, least = np.append(problem.start, np.zeros(5)), list[Span](), np.inf
     for piece, (t, stop) in enumerate(pairwise(torque.breaks)):
-        own = torque.cut(t, stop)
+        profile = torque.cut(t, stop)
         while t < stop:
             part = parts[0]
 
             def solve(
-                t: float, y: Array, part: Segment = part, own: TorqueProfile = own
+                t: float, y: Array, part: Segment = part, own: TorqueProfile = profile
             ) -> tuple[Array, Array]:
                 tau = own.at(np.array([t]))[0]
                 return solve_motion(problem.scene, contacts, y[:5], y[5:], tau, part.Xi, part.sigma)
@@ -359,9 +359,12 @@ def build_cvodes(course: Course, setting: str) -> Callable[[], Array]:
     step = ca.integrator("step", "cvodes", system, -1.0, 1.0, options)
     chain = step.mapaccum(len(course.spans))
     columns = []
-    for own in course.spans:
-        known = torque.coefficients[own.piece].ravel("F"), torque.breaks[own.piece : own.piece + 2]
-        columns.append(np.concatenate([own.Xi, own.sigma, *known, [own.start, own.stop]]))
+    for span in course.spans:
+        polynomial = (
+            torque.coefficients[span.piece].ravel("F"),
+            torque.breaks[span.piece : span.piece + 2],
+        )
+        columns.append(np.concatenate([span.Xi, span.sigma, *polynomial, [span.start, span.stop]]))
     start, parameters = np.append(course.problem.start, np.zeros(5)), np.array(columns).T
 
     def run() -> Array:
@@ -684,7 +687,9 @@ def _write_functions(ocp: Any, instance: Instance) -> None:
     def continuous(arg: Any) -> None:
         for index in arg.phase_list:
             phase, part = arg.phase[index], curve.segments[index]
-            state, control = ([_strip(x) for x in own] for own in (phase.state, phase.control))
+            state, control = (
+                [_strip(x) for x in symbols] for symbols in (phase.state, phase.control)
+            )
             z, v = ca.vertcat(*state[:5]), ca.vertcat(*state[5:])
             tau, c_n = ca.vertcat(*control[:2]), ca.vertcat(*control[2:])
             acceleration, missed = plant(z, v, tau, c_n, part.Xi, part.sigma)
@@ -786,10 +791,15 @@ class PeerComparison(NamedTuple):
 
 
 COMPARISONS = (
-    *(PeerComparison(own, own, "wholearm", (1e-6, 1e-9, 1e-11), False, None) for own in SIMULATION),
     *(
-        PeerComparison(own, f"{own}, {which}", "wholearm, curve", (1e-2, 1e-3, 1e-4), True, count)
-        for own in PLANNING
+        PeerComparison(study, study, "wholearm", (1e-6, 1e-9, 1e-11), False, None)
+        for study in SIMULATION
+    ),
+    *(
+        PeerComparison(
+            study, f"{study}, {which}", "wholearm, curve", (1e-2, 1e-3, 1e-4), True, count
+        )
+        for study in PLANNING
         for count, which in ((1, "by the error of the phase time"), (None, "by all three errors"))
     ),
 )
@@ -815,8 +825,8 @@ def find_times(
 
 def list_methods(rows: Sequence[Row], study: str) -> list[str]:
     """Methods that a study has runs of, in their order."""
-    given = {row["method"] for row in rows if row["study"] == study}
-    return [name for name in METHODS if name in given]
+    methods = {row["method"] for row in rows if row["study"] == study}
+    return [name for name in METHODS if name in methods]
 
 
 def _format_targets(rows: Sequence[Row], own: PeerComparison, limit: float) -> list[str]:
@@ -854,11 +864,11 @@ def _draw_study(axes: Axes, rows: Sequence[Row], study: str) -> None:
         mine = [row for row in rows if (row["study"], row["method"]) == (study, method)]
         for setting in dict.fromkeys(row["setting"] for row in mine):
             group = [row for row in mine if row["setting"] == setting]
-            found = [row for row in group if np.isfinite(row["errors"][0])]
-            if 2 * len(found) < len(group):
+            finite_rows = [row for row in group if np.isfinite(row["errors"][0])]
+            if 2 * len(finite_rows) < len(group):
                 continue
-            error = float(np.median([abs(row["errors"][0]) for row in found]))
-            seconds = find_mean([row["solve"] + planning * row["build"] for row in found])
+            error = float(np.median([abs(row["errors"][0]) for row in finite_rows]))
+            seconds = find_mean([row["solve"] + planning * row["build"] for row in finite_rows])
             points.append((max(error, 1e-16), seconds))
             full.append(all(row["outcome"] == SOLVED for row in group))
         if not points:
@@ -903,11 +913,11 @@ class Precision(Study):
             if method not in METHODS:
                 text = f"{method!r} given; allowed are {'; '.join(METHODS)}"
                 raise InputError("", "--peers", text)
-        for study, (method, own) in product(SIMULATION + PLANNING, METHODS.items()):
+        for study, (method, peer) in product(SIMULATION + PLANNING, METHODS.items()):
             asked = method in (options.peers or METHODS)
-            if asked and study in own.choices and own.is_installed:
+            if asked and study in peer.choices and peer.is_installed:
                 phases = [instance.name for instance in list_instances(files, study != NO_DRAG)]
-                yield from product([study], phases, [method], own.choices[study], [files])
+                yield from product([study], phases, [method], peer.choices[study], [files])
 
     def limit(self, case: Case) -> float:
         """The time allowed, and that of the reference."""
@@ -925,7 +935,7 @@ class Precision(Study):
         lines, measured = [INTRODUCTION], [row for row in rows if "errors" in row]
         for comparison in COMPARISONS:
             lines += _format_targets(measured, comparison, options.limit)
-        table = [(name, own.settings) for name, own in METHODS.items()]
+        table = [(name, method.settings) for name, method in METHODS.items()]
         lines += ["## Settings", "", *format_table(["method", "settings"], table, 2)]
         return "\n".join(lines), []
 

@@ -83,7 +83,7 @@ class Queries(Study):
         started = time.process_time()
         try:
             if printed:
-                table = {key: own for key, own in problem.table.items() if key != "goal"}
+                table = {key: entry for key, entry in problem.table.items() if key != "goal"}
                 phases = tomllib.loads(answer.to_text())
                 plan = solve(build_problem(table | phases), objective)
             else:
@@ -98,8 +98,8 @@ class Queries(Study):
             if printed:
                 row["off"] = plan.value / answer.plan.value - 1
         if abs(row.get("off", 0.0)) > SAME:
-            found = f"{plan.value:.6g} {plan.unit} as printed, {answer.plan.value:.6g} found"
-            return row | {"kind": "another plan as printed", "findings": [found]}
+            difference = f"{plan.value:.6g} {plan.unit} as printed, {answer.plan.value:.6g} found"
+            return row | {"kind": "another plan as printed", "findings": [difference]}
         return row | {"kind": "solved"}
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
@@ -113,7 +113,7 @@ class Queries(Study):
             ("second query or plan", [row["second"] for row in rows if "second" in row]),
         ):
             if times:
-                shown = (f"{own:.2f}" for own in np.percentile(times, [50, 95, 100]))
+                shown = (f"{seconds:.2f}" for seconds in np.percentile(times, [50, 95, 100]))
                 table.append((name, *shown))
         heads = ["processor time", "median [s]", "95 % [s]", "most [s]"]
         lines += ["", *format_table(heads, table, 4)]
@@ -125,7 +125,7 @@ class Queries(Study):
             text = f"Gap of {len(gaps)} routes along borders alone: at most {100 * max(gaps):.2g} %"
             lines += [f"{text}, median {100 * np.median(gaps):.2g} %."]
         if off := [abs(row["off"]) for row in rows if "off" in row]:
-            same = f"{sum(own <= SAME for own in off)} of {len(off)} plans of printed phases"
+            same = f"{sum(offset <= SAME for offset in off)} of {len(off)} plans of printed phases"
             lines += ["", f"{same} are the same to {SAME:g}; largest difference {max(off):.2g}."]
         wrong = [row for row in rows if "findings" in row]
         return "\n".join(lines), [f"{row['text']}: {row['findings'][0]}" for row in wrong]
@@ -141,8 +141,8 @@ def draw_query(seed: int, number: int, folder: Path) -> Problem:
     table = dict(read_problem(str(folder / f"{name}.toml")).table)
     table.pop("phases")
     if kind >= len(SHIPPED):
-        own = np.random.default_rng([seed, 1000 + kind])
-        table["object"] = {"vertices": _draw_corners(own, int(own.integers(3, 8))), "mass": 0.2}
+        rng = np.random.default_rng([seed, 1000 + kind])
+        table["object"] = {"vertices": _draw_corners(rng, int(rng.integers(3, 8))), "mass": 0.2}
         table["name"] = f"polygon {kind - len(SHIPPED) + 1}"
     else:
         table["name"] = name
@@ -153,7 +153,7 @@ def draw_polygon_query(seed: int, number: int, folder: Path) -> Problem:
     """The problem of a query about a polygon of its own, of 3 to 8 corners, in a shipped hand."""
     rng = np.random.default_rng([seed, number, 2])
     base = read_problem(str(folder / f"{('heptagon', 'hexagon', 'triangle')[number % 3]}.toml"))
-    table = {key: own for key, own in base.table.items() if key != "phases"}
+    table = {key: entry for key, entry in base.table.items() if key != "phases"}
     corners = _draw_corners(rng, int(rng.integers(3, 9)))
     table["object"] = {"vertices": corners, "mass": base.scene.polygon.mass}
     parts = ("palm", "finger1", "finger2")
@@ -211,7 +211,9 @@ def draw_leg(
         except InputError:
             continue
         # Ends are the planner's to choose: what a refusal says holds for all places.
-        open_ends = (replace(own, until=replace(own.until, pins=())) for own in problem.phases)
+        open_ends = (
+            replace(phase, until=replace(phase.until, pins=())) for phase in problem.phases
+        )
         problem = replace(problem, phases=tuple(open_ends))
         if any(phase.formation.n_constraints == 3 for phase in problem.phases):
             return problem, [(float(part.stop[0]), float(part.stop[1])) for part in route]

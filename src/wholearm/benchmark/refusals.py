@@ -116,9 +116,9 @@ def _march(scene: Scene, phase: Phase, z: Array, way: float) -> Trace:
         # Cofactors of the four rows: unlike null vectors of an SVD they keep their sense.
         rows = constrain(scene, phase, z)[1] / scale
         minors = [way * (-1) ** k * np.linalg.det(np.delete(rows, k, axis=2)) for k in range(5)]
-        found = np.stack(minors, axis=1)
-        size = np.maximum(np.linalg.norm(found, axis=1), 1e-300)[:, None]
-        return np.asarray(found / size / scale)
+        tangent = np.stack(minors, axis=1)
+        size = np.maximum(np.linalg.norm(tangent, axis=1), 1e-300)[:, None]
+        return np.asarray(tangent / size / scale)
 
     def find_room(z: Array) -> dict[str, float]:
         touches = {f"{n} leaves": locate(scene, n, z[None]) for n in phase.formation.names}
@@ -322,8 +322,8 @@ def inertia_ratio(scene: Scene, phase: Phase, z: Array, z_s: Array) -> Array:
     light = rows / scene.mass_diagonal
     without = np.linalg.det(light @ rows.transpose(0, 2, 1))
     ratios = [
-        np.linalg.det(light @ _push(touches, phase.formation.rolling_rows, own)) / without
-        for own in (np.vstack([signs[:1], signs]), np.vstack([signs, signs[-1:]]))
+        np.linalg.det(light @ _push(touches, phase.formation.rolling_rows, side)) / without
+        for side in (np.vstack([signs[:1], signs]), np.vstack([signs, signs[-1:]]))
     ]
     return np.asarray(np.minimum(*ratios))
 
@@ -537,7 +537,7 @@ def judge(problem: Problem, error: WholearmError, stops: list[tuple[float, float
             # The shortest curve that reaches the phase's end, or the longer one if none does.
             trace = max(
                 follow(problem.scene, phase, z),
-                key=lambda own: (own.reached, -own.length if own.reached else own.length),
+                key=lambda trace: (trace.reached, -trace.length if trace.reached else trace.length),
             )
             if trace.length < 0.001 * problem.scene.scales.length:
                 return Verdict("close", f"phase {phase.number} has nothing to do")
@@ -647,7 +647,7 @@ def list_ends(scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]) -
     if first is None:
         return np.zeros((0, 5))
     scale = np.sqrt(weights(scene))
-    found = [first]
+    ends = [first]
     for way in (1.0, -1.0):
         here, ahead = first, None
         for step in 0.08 * scene.scales.length * 1.12 ** np.arange(16):
@@ -661,8 +661,8 @@ def list_ends(scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]) -
             if after is None or np.linalg.norm((after - here) * scale) > 3 * step:
                 break
             here, ahead = after, tangent
-            found.append(here)
-    points = np.array(found)
+            ends.append(here)
+    points = np.array(ends)
     return points[inside(scene, phase, points)]
 
 

@@ -104,7 +104,7 @@ def _draw_hand(rng: Random, body: Table, size: float) -> Table:
 
 def name_first(table: Table) -> list[str]:
     """Names of the contacts that touch at the start."""
-    problem = build_problem({key: own for key, own in table.items() if key != "phases"})
+    problem = build_problem({key: entry for key, entry in table.items() if key != "phases"})
     return [contact.name for contact in find_touching(problem.scene, problem.start)]
 
 

@@ -56,8 +56,8 @@ class Skip(Study):
         for part in dict.fromkeys(row["case"][1] for row in rows):
             cells = [part]
             for column, having in product(COLUMNS, (False, True)):
-                own = [row for row in rows if row["case"][1:3] == [part, having]]
-                cells.append(f"{median(row[column] for row in own):.0f}")
+                group = [row for row in rows if row["case"][1:3] == [part, having]]
+                cells.append(f"{median(row[column] for row in group):.0f}")
             table.append(cells)
         firsts = ("unknowns", "rows", "building without [ms]", "solving without [ms]")
         heads = [f"{name} without" if name in COLUMNS else name for name in firsts]
@@ -90,10 +90,10 @@ def list_pairs(folder: str, **options: Any) -> dict[str, tuple[SkipPlan, SkipPla
     path, over_time = options, options | {"transcription": "time"}
     pairs = {
         f"{part}, {where}": (
-            SkipPlan(slide.with_(absent), own),
-            SkipPlan(slide.with_(present), own),
+            SkipPlan(slide.with_(absent), settings),
+            SkipPlan(slide.with_(present), settings),
         )
-        for where, own in (("along curves", path), ("over time", over_time))
+        for where, settings in (("along curves", path), ("over time", over_time))
         for part, absent, present in (
             ("friction of contacts", {"friction": 0.0}, {}),
             ("friction of joints", {"viscous": 0.0, "dry": 0.0}, {}),
@@ -136,11 +136,11 @@ def spend(plan: SkipPlan) -> Row:
             # Not from the plan along curves, whose NLPs are others.
             plan_phases(problem, problem.phases, problem.start, PlanOptions(**plan.options))
         else:
-            found = solve(problem, replay=False, **plan.options)
+            solution = solve(problem, replay=False, **plan.options)
     if plan.draw:
         from ..figures.plots import force_margins
 
-        force_margins(found).canvas.draw()
+        force_margins(solution).canvas.draw()
     whole, solving = time.process_time() - started, sum(run.seconds for run in runs)
     sizes = runs[0].unknowns, runs[0].rows
     return dict(zip(COLUMNS, (*sizes, 1e3 * (whole - solving), 1e3 * solving), strict=True))

@@ -115,13 +115,13 @@ class Stress(Study):
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
         """Tables of each part, and every finding."""
-        found = [(name_case(row), *own) for row in rows for own in row["findings"]]
-        found += [
+        findings = [(name_case(row), *finding) for row in rows for finding in row["findings"]]
+        findings += [
             (name_case(row), "warning", f"printed: {row['printed']}")
             for row in rows
             if "printed" in row
         ]
-        found += compare_values([row for row in rows if row["case"][0] == "problem"])
+        findings += compare_values([row for row in rows if row["case"][0] == "problem"])
         lines = []
         for kind, title, describe in (
             ("scene", "Generated scenes", _describe_scenes),
@@ -131,10 +131,10 @@ class Stress(Study):
             mine = [row for row in rows if row["case"][0] == kind]
             if mine:
                 lines += [f"## {title}", "", *describe(mine), ""]
-        counted = Counter(kind for _, kind, _ in found)
+        counted = Counter(kind for _, kind, _ in findings)
         kinds = dict.fromkeys([*KINDS, *counted])
         lines += format_table(["finding", "number"], [(kind, counted[kind]) for kind in kinds])
-        return "\n".join(lines), [f"{where}: {kind}: {text}" for where, kind, text in found]
+        return "\n".join(lines), [f"{where}: {kind}: {text}" for where, kind, text in findings]
 
 
 STUDY = Stress()
@@ -152,8 +152,8 @@ def _plan(table: Mapping[str, Any], objective: str, scene: DrawnScene | None = N
         plan = solve(problem, objective)
         row |= {"outcome": "planned", "value": plan.value}
         findings += [("plan refuted by replay", t) for t in verify(problem, plan).failures[:1]]
-        if found := check_plan(problem, plan.trajectory):
-            findings.append(("plan refuted by residual", "; ".join(found[:3])))
+        if faults := check_plan(problem, plan.trajectory):
+            findings.append(("plan refuted by residual", "; ".join(faults[:3])))
     except WholearmError as error:
         row["text"] = str(error)
         if row["outcome"] == "planned":
@@ -200,7 +200,7 @@ def change(table: Mapping[str, Any], what: str, rng: np.random.Generator) -> dic
 
     def vary(key: str, value: Any) -> Any:
         if isinstance(value, Mapping):
-            return {name: vary(name, own) for name, own in value.items()}
+            return {name: vary(name, entry) for name, entry in value.items()}
         return value * (1 + share * float(rng.uniform(-1, 1))) if key in keys else value
 
     return dict(vary("", table))
@@ -213,13 +213,13 @@ def compare_values(rows: Iterable[Row]) -> list[tuple[str, str, str]]:
         _, path, objective, what, _ = row["case"]
         if what == "noise" and row["value"] is not None:
             groups.setdefault(f"{path}, {objective}", []).append(row["value"])
-    found = []
+    findings = []
     for name, values in groups.items():
         apart = np.ptp(values) / np.abs(values).max()
         if apart > SAME:
             text = f"{min(values):.9g} to {max(values):.9g}, {apart:.2g} apart"
-            found.append((name, "optimum that differs under noise", text))
-    return found
+            findings.append((name, "optimum that differs under noise", text))
+    return findings
 
 
 def _describe_scenes(rows: Sequence[Row]) -> list[str]:
@@ -270,7 +270,7 @@ def _count(names: Iterable[str]) -> str:
 
 def check_plan(problem: Problem, plan: Trajectory) -> list[str]:
     """Sentences on what is wrong with a plan; none if nothing is."""
-    found: list[str] = []
+    faults: list[str] = []
     before: Array | None = None
     for phase, motion, start in zip(problem.phases, plan.motions, plan.phase_starts, strict=False):
         # Some of the instants are in pieces of the torques that are short.
@@ -291,8 +291,8 @@ def check_plan(problem: Problem, plan: Trajectory) -> list[str]:
         texts += [f"the torque profile is {share:.2g} of the limit off"] if share > 1e-4 else []
         texts += _check_ends(problem, phase, before, rows)
         before = np.array([rows.z[-1], rows.z_dot[-1]])
-        found += [f"phase {phase.number}: {text}" for text in texts]
-    return found
+        faults += [f"phase {phase.number}: {text}" for text in texts]
+    return faults
 
 
 def _check_phase(problem: Problem, phase: Phase, rows: Samples) -> list[str]:
@@ -300,13 +300,13 @@ def _check_phase(problem: Problem, phase: Phase, rows: Samples) -> list[str]:
     scene, formation, texts = problem.scene, phase.formation, list[str]()
     scales, names = scene.scales, formation.names
     fastest = max(scales.speed, float(np.abs(rows.z_dot[:, :2]).max()))
-    found = balance(scene, formation.contacts, formation.rolling, rows, STILL)
+    residuals = balance(scene, formation.contacts, formation.rolling, rows, STILL)
     for k, name in enumerate(names):
         touch = locate(scene, name, rows.z)
         worst = {
-            "gap": np.abs(found.gaps[:, k]).max() / OVERLAP,
+            "gap": np.abs(residuals.gaps[:, k]).max() / OVERLAP,
             "beyond its feature": -min(touch.low.min(), touch.high.min()) / scales.length / OVERLAP,
-            "rate": np.abs(found.rates[:, k]).max() * scales.speed / fastest / ROUNDING,
+            "rate": np.abs(residuals.rates[:, k]).max() * scales.speed / fastest / ROUNDING,
         }
         texts += [f"{what} of {name} is {v:.2g} of its bound" for what, v in worst.items() if v > 1]
         # A normal force may lack what `verification.verify` allows.
@@ -319,13 +319,15 @@ def _check_phase(problem: Problem, phase: Phase, rows: Samples) -> list[str]:
     biggest = np.abs(scene.mass_diagonal * rows.z_ddot).max(axis=0)
     biggest[3:] = np.maximum(biggest[3:], np.abs(rows.tau).max(axis=0))
     biggest = np.maximum(biggest / np.repeat([scales.force, scales.torque], [2, 3]), 1.0)
-    missed = np.abs(found.forces).max(axis=0) / biggest / ROUNDING
+    missed = np.abs(residuals.forces).max(axis=0) / biggest / ROUNDING
     for body, share in zip(BODIES, missed, strict=True):
         if share > 1:
             texts.append(f"the equation of motion of {body} misses {share:.2g} of its bound")
-    turned = zip((*names, "joint 1", "joint 2"), found.against.T, strict=True)
+    turned = zip((*names, "joint 1", "joint 2"), residuals.against.T, strict=True)
     texts += [
-        f"friction of {name} is not Coulomb's for its sliding" for name, own in turned if own.any()
+        f"friction of {name} is not Coulomb's for its sliding"
+        for name, flags in turned
+        if flags.any()
     ]
     for text, values, limits in (
         ("tau_{} exceeds its limit by {:.2g} of it", rows.tau, scene.torque_limit),

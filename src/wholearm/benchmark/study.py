@@ -150,13 +150,13 @@ def run_study(
             stamp["source"] = digest_source(study.list_inputs(options))
             # Records of other code are no records; what is no study of this kind is left alone.
             with suppress(OSError, ValueError, TypeError), open(path, encoding="utf-8") as stream:
-                known = dict(json.loads(stream.readline()))
-                same = known.get("source") == stamp["source"]
-                fresh = fresh or (known.get("study") == study.name and not same)
+                header = dict(json.loads(stream.readline()))
+                same = header.get("source") == stamp["source"]
+                fresh = fresh or (header.get("study") == study.name and not same)
     with Journal(path, stamp, fresh, again) as journal:
         done = {_key(row["case"]): row for row in journal.records}
         left = [case for case in cases if case not in done]
-        begun, wrong = time.monotonic(), 0
+        wall_start, wrong = time.monotonic(), 0
         # Each process has one thread of OpenBLAS.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         jobs = min(1 if study.timed else options.jobs or os.cpu_count() or 1, len(left) or 1)
@@ -168,13 +168,15 @@ def run_study(
             journal.add(row)
             done[case] = row
             wrong += bool(row.get("findings"))
-            ahead = (time.monotonic() - begun) / count * (len(left) - count) / 60
+            ahead = (time.monotonic() - wall_start) / count * (len(left) - count) / 60
             text = f"{study.name}: {len(cases) - len(left) + count} of {len(cases)} cases"
             progress(f"{text}, {wrong} with findings, {ahead:.0f} min left")
     rows = [done[case] for case in cases]
     good = [row for row in rows if "failed" not in row]
-    body, found = study.report(good, options)
-    findings = [f"{name_case(row)}: {row['failed']}" for row in rows if "failed" in row] + found
+    body, violations = study.report(good, options)
+    findings = [
+        f"{name_case(row)}: {row['failed']}" for row in rows if "failed" in row
+    ] + violations
     parts = [f"# {study.title}", describe_machine(study.packages), body.strip()]
     if findings:
         parts.append("\n".join(["## Findings", "", *(f"* {text}" for text in findings)]))
@@ -212,8 +214,8 @@ def describe_machine(packages: Sequence[str] = ()) -> str:
             continue
     processor = platform.processor() or platform.machine()
     with suppress(OSError):
-        known = re.search(r"^model name\s*:(.*)$", Path("/proc/cpuinfo").read_text("utf-8"), re.M)
-        processor = known[1].strip() if known else processor
+        match = re.search(r"^model name\s*:(.*)$", Path("/proc/cpuinfo").read_text("utf-8"), re.M)
+        processor = match[1].strip() if match else processor
     return ", ".join([*parts, processor, f"{os.cpu_count()} cores"])
 
 
@@ -236,18 +238,18 @@ def finish_axes(axes: Axes, **legend: Any) -> None:
 def digest_source(inputs: Iterable[Path] = ()) -> str:
     """A digest of the source code of the package, the machine, its packages and further files."""
     folder = Path(__file__).parents[1]
-    found = hashlib.sha256(describe_machine().encode())
+    digest = hashlib.sha256(describe_machine().encode())
     for path in sorted(folder.rglob("*.py")):
-        found.update(str(path.relative_to(folder)).encode() + path.read_bytes())
+        digest.update(str(path.relative_to(folder)).encode() + path.read_bytes())
     for path in inputs:
-        found.update(path.name.encode() + path.read_bytes())
-    return found.hexdigest()[:16]
+        digest.update(path.name.encode() + path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def measure_case(study: Study, case: Case) -> Row:
     """Run a case in a process of a study, with what that took."""
     printed = _redirect()
-    peak, started, begun = find_peak(), time.process_time(), time.monotonic()
+    peak, started, wall_start = find_peak(), time.process_time(), time.monotonic()
     try:
         with warnings.catch_warnings():
             if study.strict:
@@ -255,7 +257,7 @@ def measure_case(study: Study, case: Case) -> Row:
             row = dict(study.run(case))
     except Exception:
         text = traceback.format_exc().strip()[-1500:]
-        row = _fail(f"traceback after {time.monotonic() - begun:.0f} s: {text}")
+        row = _fail(f"traceback after {time.monotonic() - wall_start:.0f} s: {text}")
     seconds, memory = time.process_time() - started, find_peak() - peak
     sys.stdout.flush()
     sys.stderr.flush()
