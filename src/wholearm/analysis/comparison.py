@@ -101,10 +101,10 @@ class Comparison(Result):
             for contender in self.contenders
             if not contender.ok
         ]
-        names = [own.name for own in self.contenders]
+        names = [contender.name for contender in self.contenders]
         heads = [f"{name}:{form}" for form in (".5f", "+z.4f") for name in names]
-        lasts = zip_longest(*(own.lasts for own in self.contenders))
-        margins = zip_longest(*(own.margins for own in self.contenders))
+        lasts = zip_longest(*(contender.lasts for contender in self.contenders))
+        margins = zip_longest(*(contender.margins for contender in self.contenders))
         pairs = zip(lasts, margins, strict=True)
         rows = [(number, *one, *two) for number, (one, two) in enumerate(pairs, start=1)]
         title = "phases: durations [s], then least margins [N]"
@@ -152,8 +152,8 @@ def _read(problem: Problem, path: str) -> tuple[Problem, Trajectory | TorqueProf
     with name_source(path):
         require_made_for(problem, trajectory.meta)
     replay = trajectory.meta.get("replay")
-    known = (replay or {}).get(SIMULATIONS, trajectory.meta.get(SIMULATIONS))
-    return problem, trajectory, known if isinstance(known, int) else None
+    simulations = (replay or {}).get(SIMULATIONS, trajectory.meta.get(SIMULATIONS))
+    return problem, trajectory, simulations if isinstance(simulations, int) else None
 
 
 def _judge(

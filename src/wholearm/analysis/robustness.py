@@ -77,7 +77,7 @@ class Uncertainty:
     @property
     def varied(self) -> tuple[Field, ...]:
         """The parameters with a range."""
-        return tuple(own for own in PARAMETERS if self.widths[own.name] > 0)
+        return tuple(parameter for parameter in PARAMETERS if self.widths[parameter.name] > 0)
 
     def draw(self, count: int, seed: int | tuple[int, int]) -> Array:
         """Samples of a Latin hypercube, shape (count, len(varied) + 1).
@@ -92,9 +92,9 @@ class Uncertainty:
         )
         shares = (slices + generator.random(slices.shape)) / count
         centred = 2 * shares[:, :-1] - 1
-        delay = [own.name == "delay" for own in self.varied]
+        delay = [parameter.name == "delay" for parameter in self.varied]
         centred[:, delay] = shares[:, :-1][:, delay]
-        widths = np.array([self.widths[own.name] for own in self.varied])
+        widths = np.array([self.widths[parameter.name] for parameter in self.varied])
         return np.column_stack([centred * widths, shares[:, -1]])
 
 
@@ -173,7 +173,7 @@ class Trial:
               figures need; `ended`, empty or why the simulation ended early or could not begin
         """
         number, (*sample, offset) = task
-        names = [own.name for own in self.uncertainty.varied]
+        names = [parameter.name for parameter in self.uncertainty.varied]
         changes = dict(zip(names, sample, strict=True))
         record = self.change(changes, self.uncertainty.sample_rate, offset)
         if number >= 200:
@@ -293,8 +293,8 @@ def _find_loss(
     column = simulation.contacts.index(name)
     t, c_n = simulation.t, simulation.c_n[:, column]
     here = (t >= start) & (t < stop)
-    known = c_n[here & (c_n == c_n)]
-    least = float(known.min()) if len(known) else math.inf
+    forces = c_n[here & (c_n == c_n)]
+    least = float(forces.min()) if len(forces) else math.inf
     pauses = simulation.list_pauses(name, start, stop)
     if pauses and pauses[0][0] <= start:
         pauses = [pause for pause in pauses if pause[1] > start + 0.1 * unit]
@@ -320,24 +320,24 @@ def make_trial(
     if phase is not None and not 1 <= phase <= count:
         raise InputError("", "--phase", f"{phase} given; the plan has phases 1 to {count}")
     if policy is not None and policy.count != count:
-        given = f"{policy.count} given; the plan has {count}"
-        raise InputError("", "phases of the policy", given)
+        text = f"{policy.count} given; the plan has {count}"
+        raise InputError("", "phases of the policy", text)
     first, last = (0, count - 1) if phase is None else (phase - 1, phase - 1)
     rows = np.flatnonzero((plan.phase >= first) & (plan.phase <= last))
     scales = problem.scene.scales
     units = np.array([scales.speed, scales.speed, *[scales.rate] * 3])
     if np.abs(plan.z_dot[rows[0]] / units).max() > 1e-6:
-        given = f"{phase} given; it does not start at rest, so that it is no trial of its own"
-        raise InputError("", "--phase", given)
+        text = f"{phase} given; it does not start at rest, so that it is no trial of its own"
+        raise InputError("", "--phase", text)
     begin = float(starts[first])
     windows = tuple(
         TimeWindow(
-            own.number,
-            float(starts[own.index + 1]) - begin,
-            tuple(own.formation.names),
-            "" if own.until.contact is None else own.until.contact.name,
+            planned_phase.number,
+            float(starts[planned_phase.index + 1]) - begin,
+            tuple(planned_phase.formation.names),
+            "" if planned_phase.until.contact is None else planned_phase.until.contact.name,
         )
-        for own in problem.phases[first : last + 1]
+        for planned_phase in problem.phases[first : last + 1]
     )
     torque = plan.torque.cut(begin, float(starts[last + 1]))
     torque = TorqueProfile(torque.breaks - begin, torque.coefficients)
@@ -389,7 +389,7 @@ class Robustness(Result):
     @property
     def first_lost(self) -> dict[str, Share]:
         """Which contact goes first, by number of the phase and name, the most frequent first."""
-        lost = [(own["lost"], own.get("phase")) for own in self.records if own["lost"]]
+        lost = [(record["lost"], record.get("phase")) for record in self.records if record["lost"]]
         names = Counter(f"{name} in phase {k}" if k is not None else name for name, k in lost)
         return {name: Share(n, len(self.records)) for name, n in names.most_common()}
 
@@ -409,11 +409,15 @@ class Robustness(Result):
         others = [(f"{len(lost) - 8} others", f"{rest} times")] if lost[8:] else []
         ended = Counter(record["ended"] for record in self.records if record["ended"])
         rows = []
-        for own in least.of:
-            width = f"{own.width:g} {own.unit}" if own.unit else f"{100 * own.width:g} %"
-            slope = f"{own.slope:.5g} N{'/' + own.unit if own.unit else ''}"
-            slope = slope if own.slope == own.slope else "a contact is lost at once"
-            rows.append((own.name, width, slope, own.over_range))
+        for sensitivity in least.of:
+            width = (
+                f"{sensitivity.width:g} {sensitivity.unit}"
+                if sensitivity.unit
+                else f"{100 * sensitivity.width:g} %"
+            )
+            slope = f"{sensitivity.slope:.5g} N{'/' + sensitivity.unit if sensitivity.unit else ''}"
+            slope = slope if sensitivity.slope == sensitivity.slope else "a contact is lost at once"
+            rows.append((sensitivity.name, width, slope, sensitivity.over_range))
         heads = ["parameter", "range (+-)", "d(least c_n)/d:.5g", "over the range [N]:.4g"]
         end, missed = self.nominal, ""
         if not end["reached"]:
@@ -450,8 +454,10 @@ class Robustness(Result):
             "kept": self.kept.table,
             "first_lost": {name: share.table for name, share in self.first_lost.items()},
             "least_c_n": {"contact": least.contact, "time": least.time, "c_n": least.c_n},
-            "sensitivities": [dict(zip(keys, own, strict=True)) for own in least.of],
-            "nominal": {key: own for key, own in self.nominal.items() if key != "path"},
+            "sensitivities": [
+                dict(zip(keys, sensitivity, strict=True)) for sensitivity in least.of
+            ],
+            "nominal": {key: entry for key, entry in self.nominal.items() if key != "path"},
         }
 
 
@@ -493,47 +499,47 @@ def assess_robustness(
     problem, trajectory = adopt_motion(problem, plan)
     Range(1, 10**6).read(samples, "samples")
     require_same_phases(problem, trajectory)
-    own = uncertainty or Uncertainty(problem.ranges)
-    trial = make_trial(problem, trajectory, own, phase, policy)
+    trial_uncertainty = uncertainty or Uncertainty(problem.ranges)
+    trial = make_trial(problem, trajectory, trial_uncertainty, phase, policy)
     with Journal(os.fspath(path or os.devnull), _stamp(trial, seed), fresh) as journal:
         sizes = [record["samples"] for record in journal.records if "samples" in record]
-        known = {record["sample"]: record for record in journal.records if "sample" in record}
+        stored = {record["sample"]: record for record in journal.records if "sample" in record}
         if samples > sum(sizes):
             sizes.append(samples - sum(sizes))
             journal.add({"samples": sizes[-1]})
-        found = {k: record for k, record in known.items() if k < samples}
+        outcomes = {k: record for k, record in stored.items() if k < samples}
         # Latin hypercubes one after another: one more each time that the study is enlarged.
         starts = [sum(sizes[:k]) for k in range(len(sizes))]
         parts = zip(starts, sizes, strict=True)
-        cubes = [own.draw(size, (seed, k) if k else seed) for k, size in parts]
+        cubes = [trial_uncertainty.draw(size, (seed, k) if k else seed) for k, size in parts]
         drawn = np.vstack(cubes)[:samples]
-        tasks = ((k, tuple(drawn[k].tolist())) for k in range(samples) if k not in found)
-        good = sum(record["reached"] for record in found.values())
+        tasks = ((k, tuple(drawn[k].tolist())) for k in range(samples) if k not in outcomes)
+        good = sum(record["reached"] for record in outcomes.values())
         for (number, _), answer in run_all(trial.run, tasks, (start or Processes)()):
             if isinstance(answer, DiedError):
                 answer = {"ended": str(answer), "reached": False, "kept": False, "lost": "worker"}
             elif isinstance(answer, Exception):
                 raise answer
-            found[number] = {"sample": number, **answer}
+            outcomes[number] = {"sample": number, **answer}
             good += answer["reached"]
-            journal.add(found[number])
+            journal.add(outcomes[number])
             if progress is not None:
-                progress(f"{len(found)} of {samples} samples, {good} reach the goal")
-    records = tuple(found[number] for number in range(samples))
-    known_now = 0 if path is None else len({*known, *found})
+                progress(f"{len(outcomes)} of {samples} samples, {good} reach the goal")
+    records = tuple(outcomes[number] for number in range(samples))
+    known_now = 0 if path is None else len({*stored, *outcomes})
     return Robustness(trial, drawn, seed, records, known_now)
 
 
 def _stamp(trial: Trial, seed: int) -> dict[str, Any]:
     """What records belong to: another plan, range or version makes them another study's."""
     policy = trial.policy
-    known = [] if policy is None else [own for t in policy.tables for own in t.values()]
+    arrays = [] if policy is None else [array for t in policy.tables for array in t.values()]
     return {
         "study": "robustness",
         "version": __version__,
         "problem": trial.problem.table,
         "plan": _digest([trial.torque.breaks, trial.torque.coefficients, trial.state]),
-        "policy": None if policy is None else _digest(known),
+        "policy": None if policy is None else _digest(arrays),
         "pace": None if policy is None else policy.settings._asdict(),
         "sensor": policy is not None and policy.sensor,
         "phases": [window.phase for window in trial.windows],
@@ -580,16 +586,20 @@ def measure_sensitivities(trial: Trial) -> Sensitivities:
     The least value of a smooth force changes like the force where it is least, whenever that is.
     """
     contact, time, least = find_least(trial.simulate({}, trial.torque), trial.windows)
-    found = []
-    for own in trial.uncertainty.varied if contact else ():
-        width = trial.uncertainty.widths[own.name]
+    sensitivities = []
+    for parameter in trial.uncertainty.varied if contact else ():
+        width = trial.uncertainty.widths[parameter.name]
         step = 1e-3 * width
-        ends = (0.0, step) if own.name == "delay" else (-step, step)
-        forces = [_find_force(trial, own.name, value, contact, time) for value in ends]
+        ends = (0.0, step) if parameter.name == "delay" else (-step, step)
+        forces = [_find_force(trial, parameter.name, value, contact, time) for value in ends]
         slope = (forces[1] - forces[0]) / (ends[1] - ends[0])
-        found.append(Sensitivity(own.name, own.unit, width, slope))
-    found.sort(key=lambda own: math.inf if math.isnan(own.slope) else -abs(own.over_range))
-    return Sensitivities(contact, time, least, tuple(found))
+        sensitivities.append(Sensitivity(parameter.name, parameter.unit, width, slope))
+    sensitivities.sort(
+        key=lambda sensitivity: (
+            math.inf if math.isnan(sensitivity.slope) else -abs(sensitivity.over_range)
+        )
+    )
+    return Sensitivities(contact, time, least, tuple(sensitivities))
 
 
 def find_least(

@@ -200,7 +200,8 @@ def _name(path: PathSamples, least: Least) -> Weakest:
     contacts = dict.fromkeys(limit.part for limit in limits if limit.kind in (PRESS, CONE))
     kinds = dict.fromkeys(limit.kind for limit in limits if limit.kind not in (PRESS, CONE))
     others = (
-        f"{kind} of {' and '.join(dict.fromkeys(own.part for own in limits if own.kind == kind))}"
+        f"{kind} of "
+        f"{' and '.join(dict.fromkeys(limit.part for limit in limits if limit.kind == kind))}"
         for kind in kinds
     )
     force = least.force if math.isfinite(least.force) else None
@@ -331,11 +332,11 @@ def find_break(evaluate: Evaluate, wanted: float, unit: float, above: float = 0.
         return Break(np.inf, start, 0.0) if holds else Break(0.0, start, np.inf)
     for _ in range(24):
         middle = (low + high) / 2
-        found = evaluate(middle)
-        if (found.force >= wanted) == holds:
+        sample = evaluate(middle)
+        if (sample.force >= wanted) == holds:
             low = middle
         else:
-            high, least = middle, found
+            high, least = middle, sample
     return Break(high, least, 0.0) if holds else Break(0.0, start, high)
 
 
@@ -552,8 +553,8 @@ class Prediction(Result):
         return Document(self.name, reason=head, parts=[self._list_slow(), self._list_speeds()])
 
     def _list_slow(self) -> Table:
-        known = [abs(phase.slow.force) for phase in self.phases if phase.slow and phase.slow.force]
-        rows, form = list[tuple[object, ...]](), fixed(self.epsilon or 1e-3 * max(known, default=0))
+        sizes = [abs(phase.slow.force) for phase in self.phases if phase.slow and phase.slow.force]
+        rows, form = list[tuple[object, ...]](), fixed(self.epsilon or 1e-3 * max(sizes, default=0))
         for phase in self.phases:
             row = phase.number, phase.until, phase.path
             if phase.slow is None:
@@ -567,7 +568,7 @@ class Prediction(Result):
 
     def _list_speeds(self) -> Table:
         rows = []
-        for phase, survival in ((p, own) for p in self.phases for own in p.survivals):
+        for phase, survival in ((p, survival) for p in self.phases for survival in p.survivals):
             ends = survival.speed, survival.lost
             speed, lost = ("any speed" if v is None else f"{v:.4g}" for v in ends)
             if survival.again is not None:

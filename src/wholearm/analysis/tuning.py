@@ -182,7 +182,10 @@ class Bench:
         simulation = simulate_free(self.problem, read_rows(make_rows(steps, end)), start=self.z)
         names, reason = (self.passage.after or self.passage.phases[-1]).formation.names, ""
         pauses = {name: simulation.list_pauses(name, arrival, end) for name in names}
-        parted = {name: max((b - a for a, b in own), default=0.0) for name, own in pauses.items()}
+        parted = {
+            name: max((b - a for a, b in intervals), default=0.0)
+            for name, intervals in pauses.items()
+        }
         worst = max(parted, key=parted.__getitem__)
         if parted[worst] > REST_WINDOW * self.problem.scene.scales.time:
             reason = f"{worst} parts for {1e3 * parted[worst]:.3g} ms"
@@ -222,8 +225,8 @@ class Bench:
         starts = [0.0, *ends][: len(self.passage.phases)]
         spans = zip(self.passage.phases, starts, [*starts[1:], stop], strict=False)
         for phase, first, last in spans:
-            found = find_losses(simulation, phase, first, last, DEPARTURE)
-            losses += [(loss.time, loss.contact) for loss in found]
+            phase_losses = find_losses(simulation, phase, first, last, DEPARTURE)
+            losses += [(loss.time, loss.contact) for loss in phase_losses]
         losses = [loss for loss in losses if loss[0] < stop]
         time, contact = min(losses, default=(stop, ""))
         at = int(np.searchsorted(simulation.t, time))
@@ -320,16 +323,16 @@ class Passage:
 def split_passages(problem: Problem) -> list[Passage]:
     """The phases of a problem, those together that are carried in one motion."""
     passages: list[Passage] = []
-    own: list[Phase] = []
+    phases: list[Phase] = []
     for phase, after in zip(problem.phases, (*problem.phases[1:], None), strict=True):
-        own.append(phase)
+        phases.append(phase)
         # A contact that goes on as the one which ends the phase is carried on in motion.
         gained, leaving = phase.until.contact, list_leaving(phase, after)
-        ending = [own for own in phase.formation.contacts if own.name in leaving]
+        ending = [contact for contact in phase.formation.contacts if contact.name in leaving]
         moves = gained is not None and takes_over(gained, problem.scene, ending)
         if after is None or (phase.end is End.REST and not moves):
-            passages.append(Passage(tuple(own), after))
-            own = []
+            passages.append(Passage(tuple(phases), after))
+            phases = []
     return passages
 
 
@@ -505,9 +508,9 @@ def tune(
                 title = parts[-1].title
                 reason = f"phase{'s' if '-' in title else ''} {title}: {reason}"
                 return Tuning(problem.name, tuple(tuned), None, None, reason)
-            for own in parts:
-                steps += [step._replace(time=clock + step.time) for step in own.steps]
-                clock += own.duration + setting.pause
+            for part in parts:
+                steps += [step._replace(time=clock + step.time) for step in part.steps]
+                clock += part.duration + setting.pause
             z = end
     rows = make_rows(steps, clock)
     report = verify_free(problem, read_rows(rows))
@@ -516,12 +519,12 @@ def tune(
 
 def _carry(setting: _Setting, z: Array, stops: int) -> tuple[list[PhaseTuning], Array | None, str]:
     """Tune a passage from rest at `z`, with stops on the way where that does not succeed."""
-    own, end, reason = setting.tune(z)
+    tuning, end, reason = setting.tune(z)
     halves = setting.halve(z) if end is None and stops else None
     if halves is None:
-        return [own], end, reason
+        return [tuning], end, reason
     first, z_middle, why = _carry(halves[0], z, (stops - 1) // 2)
-    spent = own.simulations
+    spent = tuning.simulations
     first[0] = replace(first[0], simulations=first[0].simulations + spent)
     if z_middle is None:
         return first, None, why
@@ -573,21 +576,21 @@ class _Setting(NamedTuple):
     def tune(self, z: Array) -> _Attempt:
         """Tune it from rest at `z`; where it ends at rest, or why it does not."""
         phases = self.passage.phases
-        own = PhaseTuning(phases[0].number, phases[-1].number, str(self.passage.until))
+        tuning = PhaseTuning(phases[0].number, phases[-1].number, str(self.passage.until))
         if any(phase.until.value is not None for phase in phases[:-1]):
-            return own, None, "a coordinate is passed in motion; the rule tunes phases to rest"
-        found = self._balance(phases, z)
-        if found is None:
+            return tuning, None, "a coordinate is passed in motion; the rule tunes phases to rest"
+        balance = self._balance(phases, z)
+        if balance is None:
             text = "no quasistatic motion keeps every contact, where tuning would start"
-            return own, None, text
-        bench, (balanced, acting) = Bench(self.problem, self.passage, z), found
+            return tuning, None, text
+        bench, (balanced, acting) = Bench(self.problem, self.passage, z), balance
         title = f"phase {self.passage.title} of {len(self.problem.phases)}, finger {acting + 1}"
         best: _Attempt | None = None
         tell: Callable[[str], None] = lambda text: self.tell(f"{title}: {text}")  # noqa: E731
         # Supporting torques until one serves.
         for tau in list_starts(balanced, acting):
             rule = TuningRule(bench, tau, balanced[-1], acting, tell)
-            attempt = self._tune_from(rule, replace(own, acting=acting + 1))
+            attempt = self._tune_from(rule, replace(tuning, acting=acting + 1))
             if attempt[1] is not None:
                 return attempt
             if best is None or best[0].raised is None:
@@ -760,17 +763,17 @@ class TuningRule:
 
         The last trial says what was lost, or that the object did not slide.
         """
-        found = []
+        drives = []
         for raised in range(SETTINGS.raises):
             tau = self.scale(raised)
             if self.is_exhausted or abs(tau[self.acting]) > self.limit[self.acting]:
                 break
             trial = self._run([TuningStep(0.0, tau)], f"raised {raised} times")
             if trial.outcome is TrialOutcome.ARRIVES:
-                found.append(TuningDrive(raised, trial))
+                drives.append(TuningDrive(raised, trial))
             elif trial.outcome is TrialOutcome.LOSES:
                 break
-        return found
+        return drives
 
     def brake(self, drives: Sequence[TuningDrive]) -> tuple[TuningDrive, TuningDrive] | None:
         """Stop a drive at the end of the phase, the fastest that lets itself be stopped.
@@ -793,9 +796,9 @@ class TuningRule:
             for drive in chosen:
                 if self.is_exhausted:
                     return None
-                found = self._lower(drive.trial, first, supported)
-                if found is not None:
-                    return drive, found
+                braking = self._lower(drive.trial, first, supported)
+                if braking is not None:
+                    return drive, braking
         return None
 
     def _count_steps(self, finger: int) -> int:
@@ -885,11 +888,11 @@ class TuningRule:
             return trial.rate if trial.outcome is TrialOutcome.ARRIVES else math.inf, trial
 
         grid = [drive.time * (k + 1) / (SETTINGS.grid + 1) for k in range(SETTINGS.grid)]
-        found = [run(at) for at in grid]
-        k = min(range(1, SETTINGS.grid - 1), key=lambda k: found[k][0])
+        runs = [run(at) for at in grid]
+        k = min(range(1, SETTINGS.grid - 1), key=lambda k: runs[k][0])
         low, at, high = grid[k - 1 : k + 2]
-        rate, best = found[k]
-        if rate > min(found[k - 1][0], found[k + 1][0]):
+        rate, best = runs[k]
+        if rate > min(runs[k - 1][0], runs[k + 1][0]):
             return None
         for count in range(SETTINGS.sections):
             if rate < self.slow:
@@ -929,6 +932,6 @@ def list_starts(tau: Array, acting: int) -> list[Array]:
     if start and hard / start > 1:
         count = math.ceil(math.log(hard / start) / math.log(FACTOR) / SETTINGS.support_step)
         values += [start * FACTOR ** (SETTINGS.support_step * n) for n in range(1, count)]
-    found = np.tile(tau[0], (len(values), 1))
-    found[:, other] = values
-    return list(found)
+    torques = np.tile(tau[0], (len(values), 1))
+    torques[:, other] = values
+    return list(torques)
