@@ -240,7 +240,7 @@ class CurveLaw:
 
     def _find_floor(self) -> list[float]:
         """Level on each interval below which feedback is reduced."""
-        found = []
+        floors = []
         for j, h in enumerate(self.steps):
             b, after = self.b[j], self.b[j + 1]
             a, level = (after - b) / (2 * h), 1e30
@@ -248,8 +248,8 @@ class CurveLaw:
                 level = min(
                     level, choose_internal_force(*self._list_levels(j, share, sqrt(b_end)), a)[0]
                 )
-            found.append(min(LAW.level, LAW.part * level))
-        return found
+            floors.append(min(LAW.level, LAW.part * level))
+        return floors
 
     def _list_levels(
         self, j: int, share: float, v: float
@@ -418,7 +418,7 @@ class MotionLaw:
         one = theta[0] - p - share * (u - p) + lead * fast_one
         two = theta[1] - q - share * (w - q) + lead * fast_two
         k, share = self._locate(now + lead)
-        found = []
+        torques = []
         if self.settled:
             one, two = self._add_integral(one, two)
         for row in (0, 1):
@@ -430,8 +430,8 @@ class MotionLaw:
             most = settings.limit[row]
             feedback = min(max(feedback, -LAW.share * most), LAW.share * most)
             tau = first + share * (after - first) - feedback
-            found.append(min(max(tau, -most), most))
-        return found[0], found[1]
+            torques.append(min(max(tau, -most), most))
+        return torques[0], torques[1]
 
     def _add_integral(self, one: float, two: float) -> tuple[float, float]:
         """Angle errors along free displacements, plus their integrals."""
@@ -482,10 +482,10 @@ class Sensing:
         mean = sum(self.expected[0]) / len(self.names)
         presses = forces.get(self.gained, 0.0) > LAW.felt * mean
         self.felt = self.felt + 1 if presses else 0
-        for k, (name, known) in enumerate(zip(self.names, self.expected[0], strict=True)):
+        for k, (name, expected) in enumerate(zip(self.names, self.expected[0], strict=True)):
             force = forces.get(name)
             if force is not None and isfinite(force):
-                self.bias[k] += LAW.smooth * (force - known - self.bias[k])
+                self.bias[k] += LAW.smooth * (force - expected - self.bias[k])
 
     def shift(
         self, place: tuple[int, float, float, float, float], low: float, high: float

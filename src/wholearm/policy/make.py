@@ -186,11 +186,11 @@ def have_same_signs(before: Directions, after: Directions) -> Array:
 
 def leave_one(levels: Array) -> Array:
     """Levels of intervals, (n, 2, m, 5), without duplicates."""
-    found = levels.copy()
+    distinct_levels = levels.copy()
     for k in range(1, levels.shape[2]):
-        twice = (found[:, :, :k] == levels[:, :, k : k + 1]).all(axis=(1, 3)).any(axis=1)
-        found[twice, :, k] = UNLIMITED
-    return found
+        twice = (distinct_levels[:, :, :k] == levels[:, :, k : k + 1]).all(axis=(1, 3)).any(axis=1)
+        distinct_levels[twice, :, k] = UNLIMITED
+    return distinct_levels
 
 
 def find_internal_force(rows: CurveLimitRows, a: Array, b: Array) -> Array:
@@ -213,14 +213,14 @@ def find_forces(curve: Curve, s: Array, speed: Array) -> Array:
 def blend_directions(curve: Curve, s: Array, width: Array) -> list[Directions]:
     """Sliding directions blended over reversals of a width (n,) [m], and as before and after."""
     first = curve.segments[0]
-    found = [[np.tile(part, (len(s), 1)) for part in (first.Xi, first.sigma)] for _ in range(3)]
+    pairs = [[np.tile(part, (len(s), 1)) for part in (first.Xi, first.sigma)] for _ in range(3)]
     for before, after in pairwise(curve.segments):
         near = max(float(np.interp(before.stop, s, width)), 1e-3 * curve.length)
         share = np.clip(0.5 + (s - before.stop) / (2 * near), 0.0, 1.0)[:, None]
-        for directions, part in zip(found, (share, np.floor(share), np.ceil(share)), strict=True):
+        for directions, part in zip(pairs, (share, np.floor(share), np.ceil(share)), strict=True):
             directions[0] += part * (after.Xi - before.Xi)
             directions[1] += part * (after.sigma - before.sigma)
-    return [Directions(*directions) for directions in found]
+    return [Directions(*directions) for directions in pairs]
 
 
 class Corners(NamedTuple):
@@ -325,11 +325,11 @@ class Within(NamedTuple):
 
     def _pick(self, sides: tuple[Corners, ...] | list[Corners], motions: list[PathMotion]) -> Array:
         """Limits on both sides of reversals in the worst corners of motions, (n, rows, 5)."""
-        found = [
+        limits = [
             np.concatenate([side.pick(motion) for motion in motions], axis=1) for side in sides
         ]
-        found[1][self.same] = UNLIMITED
-        return np.concatenate(found, axis=1)
+        limits[1][self.same] = UNLIMITED
+        return np.concatenate(limits, axis=1)
 
     def _spread(self, motion: PathMotion) -> list[PathMotion]:
         """A motion with its internal force, and with the least and largest one within torques."""
@@ -464,18 +464,18 @@ def _trace(
             rows = make_rows(curve, s, (*motion, find_internal_force(rows, *motion)))
         wanted = size * rows.unit
         wanted[:, rows.presses :] = SETTINGS.authority * rows.unit[:, rows.presses :]
-        found = retime(s, rows.slack, wanted, motion[1], end)
-        share = float(found.share.min())
+        controllable_set = retime(s, rows.slack, wanted, motion[1], end)
+        share = float(controllable_set.share.min())
         if best is not None and share <= best[2]:
             break
-        best = rows, found, share
+        best = rows, controllable_set, share
         if share >= SETTINGS.enough:
             break
     assert best is not None
-    rows, found, share = best
+    rows, controllable_set, share = best
     # Margins without ranges keep no share of ranges.
     share = share if widths is None else 0.0
-    return ReferencePiece(curve, rows, found, share, begins, passes, b)
+    return ReferencePiece(curve, rows, controllable_set, share, begins, passes, b)
 
 
 def retime(
@@ -501,9 +501,9 @@ def retime(
     best: ControllableSet | None = None
     for part in (1.0, *parts):
         shares = [part, *(share for share in SETTINGS.shares if share < part)]
-        found = find_controllable(limits, reserve, np.diff(s), floor, end, shares)
-        if best is None or found.share.min() > best.share.min():
-            best = found
+        controllable_set = find_controllable(limits, reserve, np.diff(s), floor, end, shares)
+        if best is None or controllable_set.share.min() > best.share.min():
+            best = controllable_set
         if best.share.min() >= min(0.8 * part, SETTINGS.enough):
             break
     assert best is not None
@@ -540,13 +540,13 @@ def retime_within(
         within, motion = find_within(curve, s, np.sqrt(plan[1]), scaled, least), plan
         for _ in range(3):
             rows, whole, wanted = within.at(motion)
-            found = retime(s, whole, wanted, plan[1], end, ())
-            b = found.run(float(found.high[0]))
-            if found.share.min() < 0.5:
+            controllable_set = retime(s, whole, wanted, plan[1], end, ())
+            b = controllable_set.run(float(controllable_set.high[0]))
+            if controllable_set.share.min() < 0.5:
                 return None
             a = np.gradient(b, s) / 2
             motion = a, b, find_internal_force(rows, a, b)
-        return within.at(motion)[0], found
+        return within.at(motion)[0], controllable_set
 
     low, high, best = 0.0, 1.0, find(1.0)
     if best is not None:
@@ -554,11 +554,11 @@ def retime_within(
     # Downwards first: most ranges are only a little too wide.
     while high - low > 0.03 * high and high > 0.02:
         share = 0.8 * high if best is None else (low + high) / 2
-        found = find(share)
-        if found is None:
+        candidate = find(share)
+        if candidate is None:
             high = share
         else:
-            low, best = share, found
+            low, best = share, candidate
     return best, low
 
 
@@ -608,22 +608,22 @@ def find_arrival(curve: Curve, gained: Contact, rows: CurveLimitRows) -> Array:
 
     Empty where forces at rest are not unique.
     """
-    both, own = curve.formation.add(gained), curve.formation.scene
+    both, nominal_scene = curve.formation.add(gained), curve.formation.scene
     if both.n_constraints != 5:
         return np.zeros((0, 5))
     # Torques have to balance with other friction, too, and in corners of the ranges.
-    cases = [(own, factor) for factor in (0.7, 1.0, 1.2)]
-    cases += [(scene, 1.0) for scene in rows.scenes if scene != own]
+    cases = [(nominal_scene, factor) for factor in (0.7, 1.0, 1.2)]
+    cases += [(scene, 1.0) for scene in rows.scenes if scene != nominal_scene]
     try:
         balances = [_balance(curve, replace(both, scene=scene), mu) for scene, mu in cases]
     except np.linalg.LinAlgError:
         return np.zeros((0, 5))
-    margins, found = rows.unit[-1, : curve.formation.n_contacts], list[Array]()
+    margins, levels = rows.unit[-1, : curve.formation.n_contacts], list[Array]()
     for balance in balances:
         forces = balance[: both.n_contacts, 1:] @ rows.torque[-1]
         forces[:, ONE] += balance[: both.n_contacts, 0]
-        found.append(forces / np.append(margins, margins.max())[:, None])
-    return np.vstack(found)
+        levels.append(forces / np.append(margins, margins.max())[:, None])
+    return np.vstack(levels)
 
 
 def _balance(curve: Curve, both: Formation, factor: float) -> Array:
@@ -703,8 +703,8 @@ def make_policy(
     period = require_number(period, "period", positive=True)
     delay = require_number(delay, "delay", nonnegative=True)
     if len(plan.phase_starts) != len(problem.phases) + 1:
-        given = f"{len(plan.phase_starts) - 1} given; the problem has {len(problem.phases)}"
-        raise InputError("", "phases of the plan", given)
+        text = f"{len(plan.phase_starts) - 1} given; the problem has {len(problem.phases)}"
+        raise InputError("", "phases of the plan", text)
     scales, limit = problem.scene.scales, problem.scene.torque_limit.tolist()
     if torque_limit is not None:
         limit = [require_number(torque_limit, "torque_limit", positive=True)] * 2
@@ -728,13 +728,13 @@ def make_policy(
     tables, about = list[dict[str, Array]](), list[dict[str, Any]]()
     for block, piece in zip(blocks, pieces, strict=True):
         lasts = {phase.number: float(np.diff(starts)[phase.index]) for phase in block}
-        found: list[dict[str, Any]] = [
+        entries: list[dict[str, Any]] = [
             {"number": k, "plan": t, "duration": t, "share": 0.0} for k, t in lasts.items()
         ]
         if piece is None:
             tables.append(tabulate_motion(problem, block, plan, period))
             ends = [*tables[-1]["starts"], tables[-1]["step"][0] * (len(tables[-1]["theta"]) - 1)]
-            for one, span in zip(found, np.diff(ends).tolist(), strict=True):
+            for one, span in zip(entries, np.diff(ends).tolist(), strict=True):
                 one["duration"] = span
         else:
             phase = block[0]
@@ -744,11 +744,11 @@ def make_policy(
                 hold = hold_end(problem, phase, piece.curve.end)
                 push = push if hold is None else hold
             tables.append(_tabulate_curve(piece, phase, push))
-            found[0].update(duration=piece.duration, share=piece.share, reserves=piece.reserves)
-            found[0]["gained"] = "" if phase.until.contact is None else phase.until.contact.name
+            entries[0].update(duration=piece.duration, share=piece.share, reserves=piece.reserves)
+            entries[0]["gained"] = "" if phase.until.contact is None else phase.until.contact.name
         if piece is None or not piece.passes:
-            found[-1]["duration"] += settings.dwell + delay
-        about += found
+            entries[-1]["duration"] += settings.dwell + delay
+        about += entries
     duration = sum(phase["duration"] for phase in about)
     whole: dict[str, Any] = {"name": problem.name, "duration": duration, "phases": about}
     whole["problem"] = problem.table

@@ -84,7 +84,7 @@ class Policy(Result):
         counts = [law.count for law in self.laws[: self.last + 1]]
         self.firsts = [1 + sum(counts[:k]) for k in range(len(counts))]
         # Laws along curves with known contacts use measured forces.
-        found = dict[str, None]()
+        contacts = dict[str, None]()
         phases = self.about.get("phases", [])
         for arrays, law, first in zip(self.tables, self.laws, self.firsts, strict=False):
             table, about = arrays.get("forces"), phases[first - 1] if first <= len(phases) else {}
@@ -92,8 +92,8 @@ class Policy(Result):
             if isinstance(law, CurveLaw) and table is not None and len(names) == table.shape[2]:
                 late = self.settings.delay / self.settings.period
                 law.sensing = Sensing(names, gained, table, late)
-                found.update(dict.fromkeys([*names, gained] if gained else names))
-        self.contacts = list(found)
+                contacts.update(dict.fromkeys([*names, gained] if gained else names))
+        self.contacts = list(contacts)
         self.reset()
 
     @property
@@ -264,11 +264,11 @@ def _read_tables(
     source: str, arrays: Mapping[str, Any], number: int, shapes: Mapping[str, tuple[int, ...]]
 ) -> dict[str, Any]:
     """Checked tables of a law."""
-    found = {}
+    tables = {}
     for name, shape in shapes.items():
         key = f"{name}_{number}"
         if key not in arrays and name in LATER:
-            found[name] = np.zeros([max(n, 0) for n in shape])
+            tables[name] = np.zeros([max(n, 0) for n in shape])
             continue
         if key not in arrays:
             raise InputError(source, key, "array is missing")
@@ -278,20 +278,20 @@ def _read_tables(
             needed = ", ".join("any" if n < 0 else str(n) for n in shape)
             text = f"{array.dtype} of shape {array.shape} given, numbers of shape ({needed}) needed"
             raise InputError(source, key, text)
-        found[name] = array
-    curve = "s" in found
+        tables[name] = array
+    curve = "s" in tables
     axis, spans = ("s", ["levels", "torque"]) if curve else ("starts", [])
-    spans += ["forces"] if curve and len(found["forces"]) else []
+    spans += ["forces"] if curve and len(tables["forces"]) else []
     nodes = ("theta", "b", "s") if curve else ("theta", "rates", "tau", "gain")
-    count = len(found["theta"])
-    lengths = {len(found[name]) for name in nodes} | {len(found[name]) + 1 for name in spans}
+    count = len(tables["theta"])
+    lengths = {len(tables[name]) for name in nodes} | {len(tables[name]) + 1 for name in spans}
     if count < 2 or lengths != {count}:
         raise InputError(source, f"theta_{number}", "has not as many places as other arrays")
-    if not (np.diff(found[axis]) > 0).all() or not len(found[axis]):
+    if not (np.diff(tables[axis]) > 0).all() or not len(tables[axis]):
         raise InputError(source, f"{axis}_{number}", "does not increase")
-    if not curve and found["step"][0] <= 0:
+    if not curve and tables["step"][0] <= 0:
         raise InputError(source, f"step_{number}", "is not positive")
-    return found
+    return tables
 
 
 ROOM = 1.0  # time that a simulation goes on after the policy's own, over that

@@ -104,9 +104,9 @@ def follow(
         return float(min(min(forces) / unit, (1 - max(loads)) / ROOM))
 
     b = max((1 - 0.05 * k for k in range(11)), key=find_margin)
-    found = [row for part in parts for row in _linearise(problem, part, b)]
+    linearizations = [row for part in parts for row in _linearise(problem, part, b)]
     tau = np.concatenate([part.find_torques(b) for part in parts])
-    return b, tau, regulate(found, float(t[1] - t[0]) / np.sqrt(b))
+    return b, tau, regulate(linearizations, float(t[1] - t[0]) / np.sqrt(b))
 
 
 def _stretch(formation: Formation, plan: Trajectory, t: Array) -> RegulatedStretch:
@@ -142,13 +142,13 @@ def _split_modes(phase: Phase, plan: Trajectory, t: Array) -> list[tuple[Formati
     columns = [plan.contacts.index(name) for name in phase.formation.names]
     rolls = plan.rolling[nearest][:, columns]
     edges = [0, *(np.flatnonzero((rolls[1:] != rolls[:-1]).any(axis=1)) + 1).tolist(), len(t)]
-    found = []
+    intervals = []
     for first, after in pairwise(edges):
         if after > first:
             pairs = zip(phase.formation.contacts, rolls[first], strict=True)
             rolling = tuple(contact for contact, rolls_now in pairs if rolls_now)
-            found.append((replace(phase.formation, rolling=rolling), t[first:after]))
-    return found
+            intervals.append((replace(phase.formation, rolling=rolling), t[first:after]))
+    return intervals
 
 
 def _linearise(problem: Problem, part: RegulatedStretch, b: float) -> list[Linear]:
@@ -293,9 +293,9 @@ def replan(
         after = k + 1
         if not curves[k] and _lacks_margin(problem, blocks[k], plan):
             for share in (1.0, 0.5, 0.25):
-                found = _replan_blocks(planner, problem, blocks[k:], curves[k:], plan, share)
-                if found is not None:
-                    new, after = found[0], k + found[1]
+                replacement = _replan_blocks(planner, problem, blocks[k:], curves[k:], plan, share)
+                if replacement is not None:
+                    new, after = replacement[0], k + replacement[1]
                     first = blocks[k][0].index
                     motions[first : first + len(new)] = new
                     break
@@ -326,7 +326,7 @@ def _replan_blocks(
     share: float,
 ) -> tuple[list[Motion], int] | None:
     """Motions with a share of the margin until the plan is reached again, and their blocks."""
-    starts, found = plan.phase_starts, list[Motion]()
+    starts, motions = plan.phase_starts, list[Motion]()
     z = plan.z[np.flatnonzero(plan.phase == blocks[0][0].index)[0]]
     blocks = [*blocks[:-1], (*blocks[-1][:-1], _pin(blocks[-1][-1], plan.z[-1]))]
     for count, (block, curve) in enumerate(zip(blocks, curves, strict=True), start=1):
@@ -334,12 +334,12 @@ def _replan_blocks(
         lasts = starts[block[-1].index + 1] - starts[block[0].index]
         if part is None or (not curve and part.duration > 1.5 * lasts):
             return None
-        found += part.motions
+        motions += part.motions
         z = part.z[-1]
         away = np.abs(z - plan.z[np.flatnonzero(plan.phase == block[-1].index)[-1]])
         away[:2] /= problem.scene.scales.length
         if away.max() < SAME:
-            return found, count
+            return motions, count
     return None
 
 
