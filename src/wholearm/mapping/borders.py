@@ -57,14 +57,14 @@ class Window:
 
     def flush_angles(self, scene: Scene) -> list[tuple[float, int]]:
         """Angles inside the window at which an edge lies on the palm, increasing, and the edge."""
-        found = []
+        angles = []
         for edge in range(scene.polygon.n_vertices):
             angle = scene.polygon.flush_angle(edge)
             turns = np.arange(np.ceil((self.phi[0] - angle) / (2 * np.pi)), 1e3)
             within = angle + 2 * np.pi * turns
             within = within[(within > self.phi[0]) & (within < self.phi[1])]
-            found += [(float(value), edge) for value in within]
-        return sorted(found)
+            angles += [(float(value), edge) for value in within]
+        return sorted(angles)
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,8 +209,8 @@ def _circle_track(
             inwards = sign * np.column_stack([-np.sin(angle), np.cos(angle)])
             # All vertices are on one side of a line through a vertex if its neighbours are.
             neighbours = (index - 1) % count, (index + 1) % count
-            own, *others = _corners_at(scene, phi, vertex, index, *neighbours)
-            away = [((other - own) * inwards).sum(axis=1) for other in others]
+            corner, *others = _corners_at(scene, phi, vertex, index, *neighbours)
+            away = [((other - corner) * inwards).sum(axis=1) for other in others]
             supported = np.minimum(*away) > -3e-11 * scene.scales.length
             pair = np.broadcast_to([side, arc], (len(x), 2))
         else:
@@ -222,8 +222,10 @@ def _circle_track(
             pair = np.broadcast_to([arc, first + count + edge], (len(x), 2))
         if link.radius == 0:
             aside = 3e-8 * scene.scales.length
-            beside = [close_fingers(scene, x + d, phi).touched[:, finger] for d in (-aside, aside)]
-            pair = np.sort(np.column_stack(beside), axis=1)
+            contacts = [
+                close_fingers(scene, x + d, phi).touched[:, finger] for d in (-aside, aside)
+            ]
+            pair = np.sort(np.column_stack(contacts), axis=1)
             about = np.isin(pair, [side, *(first + count + (index - k) % count for k in (0, 1))])
             supported = about.all(axis=1) & (pair[:, 0] != pair[:, 1])
         same = _is_closed(closed, finger, angle, pair)
@@ -327,7 +329,7 @@ def _find_changes(
     changed = np.flatnonzero((labels[1:] != labels[:-1]).any(axis=1) & within)
     low, high, owner = places[changed], places[changed + 1], owners[changed]
     old, last = labels[changed], labels[changed + 1]
-    found: dict[int, list[tuple[float, float, Numbers]]] = {}
+    track_changes: dict[int, list[tuple[float, float, Numbers]]] = {}
     # Eight changes between two neighbouring places at most.
     for _ in range(8):
         if not len(low):
@@ -345,12 +347,14 @@ def _find_changes(
         for k, before, after, label in zip(
             owner.tolist(), low.tolist(), high.tolist(), new, strict=True
         ):
-            found.setdefault(k, []).append((before, after, label))
+            track_changes.setdefault(k, []).append((before, after, label))
         # A second change may hide behind the first.
         more = (new != last).any(axis=1) & (high < stop)
         low, high, old, last = high[more], stop[more], new[more], last[more]
         owner = owner[more]
-    return {k: sorted(changes, key=lambda change: change[0]) for k, changes in found.items()}
+    return {
+        k: sorted(changes, key=lambda change: change[0]) for k, changes in track_changes.items()
+    }
 
 
 def _fill(track: Track, low: float, high: float) -> Array:

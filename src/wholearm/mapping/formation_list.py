@@ -459,7 +459,7 @@ def tolerance(scene: Scene) -> Array:
 
 def choose_leg(scene: Scene, start: Array, stop: Array) -> Leg:
     """The border that both ends are near, or a straight line."""
-    found = []
+    candidates = []
     for leg, off in _list_near(scene, start, stop):
         flush = leg.track.flush
         if off < 1 and (flush is None or flush[0] is None):
@@ -470,9 +470,9 @@ def choose_leg(scene: Scene, start: Array, stop: Array) -> Leg:
             ranges = [piece.places[[0, -1]] + reach for piece in cut(scene, [leg.track])]
             ends = leg.start, leg.stop
             if all(any(low < place < high for low, high in ranges) for place in ends):
-                found.append((off, leg))
-    if found:
-        return min(found, key=lambda entry: entry[0])[1]
+                candidates.append((off, leg))
+    if candidates:
+        return min(candidates, key=lambda entry: entry[0])[1]
     near = tolerance(scene)
 
     def pose(s: Array) -> tuple[Array, Array]:

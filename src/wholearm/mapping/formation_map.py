@@ -201,14 +201,14 @@ def _build_borders(problem: Problem, pieces: Sequence[Piece], limit: float) -> l
         rows = np.array([0 if _along(piece) == "x" else 2 for piece in pieces])[owner[flush]]
         chosen = labels[flush][labels[flush] != NOWHERE].reshape(-1, 4)
         flags[:, flush] = _check_borders(problem, chosen, z[flush], rows, limit)
-    table, found = contact_table(scene), []
+    table, borders = contact_table(scene), []
     for index, piece in enumerate(pieces):
         mine = owner == index
         contacts = name_contacts(table, piece.label[piece.label != NOWHERE])
         points = np.column_stack([x[mine], phi[mine]])
         along, flags_here = _along(piece), flags[:, mine]
-        found.append(Border(contacts, piece.track.flush, along, points, z[mine], *flags_here))
-    return found
+        borders.append(Border(contacts, piece.track.flush, along, points, z[mine], *flags_here))
+    return borders
 
 
 def _along(piece: Piece) -> str:
