@@ -117,12 +117,12 @@ def solve_problem(p: ContactProblem) -> ContactAnswer | None:
     M[k + i, minus + i] = M[plus + i, minus + i] = 1.0
     M[minus + i, k + i] = M[minus + i, plus + i] = -1.0
     M[minus + held, p.owner[held]] = p.mu[held] * s_n[p.owner[held]] / s_t[held]
-    found = solve_lcp(M, np.concatenate([q, -q[k:], p.bound / s_t]))
+    solution = solve_lcp(M, np.concatenate([q, -q[k:], p.bound / s_t]))
     size = float(np.abs(q).max(initial=0.0)) or 1.0
-    if not found.residual <= 1e-8 * max(size, float((p.bound / s_t).max(initial=0.0))):
+    if not solution.residual <= 1e-8 * max(size, float((p.bound / s_t).max(initial=0.0))):
         return None
-    z = found.z
-    return complete(p, s_n * z[:k], s_t * (z[k:plus] - z[plus:minus]), found.residual / size)
+    z = solution.z
+    return complete(p, s_n * z[:k], s_t * (z[k:plus] - z[plus:minus]), solution.residual / size)
 
 
 def complete(problem: ContactProblem, c_n: Array, f: Array, residual: float = 0.0) -> ContactAnswer:
@@ -157,7 +157,7 @@ def _combine(
     Returns which way what may stick gives way, 0 where it does not, (m, s), and which forces are
     for a condition, (m, k + s). All choices are none if they are too many.
     """
-    own = np.array(owner, dtype=int)
+    owners = np.array(owner, dtype=int)
     options: list[tuple[int, ...]]
     options = [(APART, STICKS, FORTH, BACK) if i in owner else (APART, STICKS) for i in range(k)]
     options += [(STICKS, FORTH, BACK) for _ in range(owner.count(-1))]
@@ -165,8 +165,8 @@ def _combine(
     if choice is None and math.prod(len(option) for option in options) <= MOST:
         every = list(product(*options))
     choices = np.array(every, dtype=int).reshape(len(every), len(options))
-    modes = np.empty((len(choices), len(own)), dtype=int)
-    modes[:, own >= 0], modes[:, own < 0] = choices[:, own[own >= 0]], choices[:, k:]
+    modes = np.empty((len(choices), len(owners)), dtype=int)
+    modes[:, owners >= 0], modes[:, owners < 0] = choices[:, owners[owners >= 0]], choices[:, k:]
     active = np.hstack([choices[:, :k] != APART, modes == STICKS])
     sound = active.sum(axis=1) <= n
     ways = np.where(modes == FORTH, 1.0, np.where(modes == BACK, -1.0, 0.0))
@@ -181,7 +181,7 @@ def list_answers(p: ContactProblem, choice: Sequence[int] | None = None) -> list
     modes = None if choice is None else tuple(choice)
     ways, active = _combine(len(p.b_n), len(p.lift), tuple(p.owner.tolist()), modes)
     s_n, s_t, K, q = p.scaled
-    k, own = len(s_n), K
+    k, left = len(s_n), K
     if len(s_t):
         # A contact that slides brings its friction with it, what turns has a given one.
         held = (p.owner >= 0).nonzero()[0]
@@ -189,14 +189,14 @@ def list_answers(p: ContactProblem, choice: Sequence[int] | None = None) -> list
         rubs, partner = np.zeros((len(ways), len(q))), np.arange(len(q))
         rubs[:, owner] = p.mu[held] * s_n[owner] / s_t[held] * ways[:, held]
         partner[owner] = k + held
-        own = K - rubs[:, None, :] * K[:, partner]
+        left = K - rubs[:, None, :] * K[:, partner]
         right = bound @ K[:, k:].T - q
     else:
         right = np.broadcast_to(-q, active.shape)
     # Forces without a condition are zero, by rows of the unit matrix.
-    own = np.where(active[:, :, None] & active[:, None, :], own, np.eye(len(q)))
-    sound = np.abs(np.linalg.det(own)) > SINGULAR
-    forces = np.linalg.solve(own[sound], np.where(active, right, 0.0)[sound][:, :, None])[:, :, 0]
+    left = np.where(active[:, :, None] & active[:, None, :], left, np.eye(len(q)))
+    sound = np.abs(np.linalg.det(left)) > SINGULAR
+    forces = np.linalg.solve(left[sound], np.where(active, right, 0.0)[sound][:, :, None])[:, :, 0]
     if len(s_t):
         forces[:, k:] -= bound[sound]
         forces[:, k + held] -= rubs[sound][:, owner] * forces[:, owner]
@@ -342,10 +342,10 @@ class Pattern:
 
     def recall(self, modes: Modes) -> list[int]:
         """Modes as `list_answers` has them."""
-        known = dict(zip(modes.kept, modes.Xi, strict=True))
+        signs = dict(zip(modes.kept, modes.Xi, strict=True))
         standing = set(self.standing.tolist())
         choice = [
-            MODES[known[pair] if k in standing else 0.0] if pair in known else APART
+            MODES[signs[pair] if k in standing else 0.0] if pair in signs else APART
             for k, pair in enumerate(self.closed)
         ]
         return choice + [MODES[modes.sigma[joint]] for joint in self.joints]
@@ -445,9 +445,9 @@ class FreeRun(Run):
         while self.t < self.breaks[-1] and not (halt is not None and halt(self)):
             if self.t >= self.stop:
                 self.next_piece()
-            found = self._collide()
+            closed = self._collide()
             moved = not self.stands()
-            rests = self._decide(found)
+            rests = self._decide(closed)
             if moved and self.stands():
                 rests = self._decide(self._find_closed())
             if not self.gets_on():
@@ -541,10 +541,10 @@ class FreeRun(Run):
         slow = (rows.A @ self.v < self.chatter).tolist()
         lines = rows.A / np.sqrt(system.mass)
         lines /= np.sqrt((lines**2).sum(axis=1))[:, None]
-        own = (np.abs(lines[:, None] - lines).max(axis=2) > DEPENDENT).tolist()
+        independent = (np.abs(lines[:, None] - lines).max(axis=2) > DEPENDENT).tolist()
         chosen: list[int] = []
         for k in sorted(range(len(touching)), key=lambda k: touching[k] not in self.modes.kept):
-            if slow[k] and all(own[k][j] for j in chosen):
+            if slow[k] and all(independent[k][j] for j in chosen):
                 chosen.append(k)
         chosen.sort()
         pairs = tuple(touching[k] for k in chosen)
@@ -764,8 +764,10 @@ class FreeRun(Run):
         differs = [len(set(modes)) > 1 for modes in zip(*answers, strict=True)]
         texts = []
         for answer in answers:
-            own = zip(told, answer, differs, strict=True)
-            parts = [f"{name} {words[mode]}" for (name, words), mode, other in own if other]
+            labelled_modes = zip(told, answer, differs, strict=True)
+            parts = [
+                f"{name} {words[mode]}" for (name, words), mode, other in labelled_modes if other
+            ]
             texts.append(", ".join(parts) or "the rest accelerates otherwise")
         text = f"{len(answers)} motions are possible with {', '.join(names) or 'no contact'} closed"
         text += f" ({'; or '.join(texts)})"
@@ -1015,15 +1017,15 @@ class Watch:
     def __init__(self, system: System) -> None:
         n, count = system.n, len(system.names)
         sizes = np.cumsum([0, 3 * n, count, count, count, count, 3 * n, 1])
-        given, found, within = np.zeros(sizes[-1]), np.zeros(2 * count + 3), np.zeros(1)
-        parts = [given[first:last] for first, last in pairwise(sizes)]
+        inputs, outputs, within = np.zeros(sizes[-1]), np.zeros(2 * count + 3), np.zeros(1)
+        parts = [inputs[first:last] for first, last in pairwise(sizes)]
         self.motion, self.gaps, self.ranges, self.level, self.watched, self.end, self._h = parts
-        self.ahead, self.spans = found[:count], found[count : 2 * count]
-        self._start, self._seen = given[3 * n : 3 * n + 2 * count], found[: 2 * count]
-        self._flags, self._within, self._places = found[-3:], within, 2 * n
+        self.ahead, self.spans = outputs[:count], outputs[count : 2 * count]
+        self._start, self._seen = inputs[3 * n : 3 * n + 2 * count], outputs[: 2 * count]
+        self._flags, self._within, self._places = outputs[-3:], within, 2 * n
         numbers = np.concatenate([system.geometry, system.units, [system.scales.length]])
-        functions = zip(_build_watch(system.structure), (found, within), strict=True)
-        self._calls = [bind(function, [given, numbers], store) for function, store in functions]
+        functions = zip(_build_watch(system.structure), (outputs, within), strict=True)
+        self._calls = [bind(function, [inputs, numbers], store) for function, store in functions]
 
     def look(self, s: ModeStepper) -> None:
         """Evaluate gaps and ranges at the end of the step just made."""
@@ -1057,8 +1059,10 @@ def _build_watch(structure: Structure) -> tuple[Expression, Expression]:
     """
     n, count = structure.n, len(structure.pairs)
     sizes = [3 * n, count, count, count, count, 3 * n, 1]
-    given = ca.SX.sym("given", sum(sizes))
-    motion, gap, span, level, watched, end, h = ca.vertsplit(given, np.cumsum([0, *sizes]).tolist())
+    inputs = ca.SX.sym("given", sum(sizes))
+    motion, gap, span, level, watched, end, h = ca.vertsplit(
+        inputs, np.cumsum([0, *sizes]).tolist()
+    )
     g = structure.geometry.shape[0]
     numbers = ca.SX.sym("numbers", g + 2 * n + 1)
     geometry, units, unit = numbers[:g], numbers[g : g + n], numbers[-1]
@@ -1075,8 +1079,8 @@ def _build_watch(structure: Structure) -> tuple[Expression, Expression]:
     closes = combine(gaps < least, gap >= least)
     enters = combine(ranges > 0, span <= 0, gaps < -CLOSED * unit, gaps > -REACH * unit)
     alarm = ca.mmax(watched * ca.logic_or(closes, enters))
-    found = ca.vertcat(gaps, ranges, longest, alarm, travel)
-    look = ca.Function("look", [given, numbers], [ca.densify(found)])
+    outputs = ca.vertcat(gaps, ranges, longest, alarm, travel)
+    look = ca.Function("look", [inputs, numbers], [ca.densify(outputs)])
     v = ca.SX.sym("v", n)
     both = structure.gap_function(structure.z, geometry)
     rates = ca.reshape(ca.jtimes(ca.vec(both), structure.z, v), -1, 2)
@@ -1091,9 +1095,9 @@ def _build_watch(structure: Structure) -> tuple[Expression, Expression]:
     closes = combine(gap >= least, low < least, outside > -1e-3 * unit)
     enters = combine(inside <= 0, outside > 0, low < -CLOSED * unit, high > -REACH * unit)
     flag = ca.mmax(watched * ca.logic_or(closes, enters))
-    return look, ca.Function("within", [given, numbers], [ca.densify(flag)])
+    return look, ca.Function("within", [inputs, numbers], [ca.densify(flag)])
 
 
 def _name(system: System, joint: int) -> str:
-    known = joint in system.driven
-    return f"joint {system.driven.index(joint) + 1}" if known else f"coordinate {joint + 1}"
+    driven = joint in system.driven
+    return f"joint {system.driven.index(joint) + 1}" if driven else f"coordinate {joint + 1}"

@@ -194,7 +194,7 @@ class Simulation(Drawn):
             "outcome": self.outcome.text,
             "name": problem.name,
             "epsilon": problem.epsilon,
-            "rolling": [[contact.name for contact in own] for own in rolling],
+            "rolling": [[contact.name for contact in contacts] for contacts in rolling],
             "phase_durations": [motion.duration for motion in motions],
             "problem": problem.table,
         }

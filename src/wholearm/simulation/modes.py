@@ -350,13 +350,13 @@ class Rest:
         formation, units = self.formation, list_units(self.formation)
         options = [(1.0, -1.0, 0.0) if held and unit.grips else (1.0, -1.0) for unit in units]
         patterns = list_modes(formation, np.zeros(formation.n_contacts + 2), units, options)
-        found = [
+        candidates = [
             (mode, signs)
             for signs, mode in patterns
             if (len(mode.holders) > formation.n_rolling) == held
         ]
-        found.sort(key=lambda pattern: len(pattern[0].holders))
-        modes = (self._build(*pattern) for pattern in found)
+        candidates.sort(key=lambda pattern: len(pattern[0].holders))
+        modes = (self._build(*pattern) for pattern in candidates)
         return tuple(mode for mode in modes if mode is not None)
 
     def _find_signs(self, heading: Array) -> Array:
@@ -680,7 +680,9 @@ def _find_closing(
             violations = compute_impact(place.formation, place.touching, place.z, v).violations
         except np.linalg.LinAlgError:
             violations = ()
-        parts = tuple(own.name for own in violations if own.kind is ViolationKind.PULL)
+        parts = tuple(
+            violation.name for violation in violations if violation.kind is ViolationKind.PULL
+        )
         best = Hold(tau, margin, math.sqrt(2 * a * gap), parts)
     return best
 

@@ -121,18 +121,18 @@ def _build_leg(
     formation: Formation, until: Until, side: float, s: ModeStepper, mode: Mode
 ) -> ModeSegment:
     """A segment with the steps of its mode, before it gets a phase and a number."""
-    scene, own = formation.scene, s.rows
+    scene, layout = formation.scene, s.rows
     gained = [limit for limit in formation.limits if limit.gains(until.contact)]
     limits = [limit for limit in formation.limits if not limit.gains(until.contact)]
-    last = own.slide.stop + 2
+    last = layout.slide.stop + 2
     until_row = last + len(limits)
-    parts = own.force, own.cone, slice(own.slide.start, last), slice(last, until_row)
+    parts = layout.force, layout.cone, slice(layout.slide.start, last), slice(last, until_row)
     rows = LegRows(*parts, until_row, until_row + 1)
-    sizes = [own.cone.stop, last - own.cone.stop, len(limits), 1, 1]
+    sizes = [layout.cone.stop, last - layout.cone.stop, len(limits), 1, 1]
     # Of speeds 2e-13 is rounding.
     slack = np.repeat([ROUNDING_FORCE, 2e-13, REACHED, 0.0, 2e-13], sizes)
     z, v, before = build_features(scene).z, ca.SX.sym("v", 5), ca.SX.sym("before", 5)
-    values = ca.SX.sym("values", own.size)
+    values = ca.SX.sym("values", layout.size)
     if until.is_release:
         distance = ca.SX(1)
     elif until.contact is None:
@@ -147,7 +147,7 @@ def _build_leg(
     gaps = [limit.value / scene.scales.length for limit in limits]
     unit_until = 1.0 if until.coordinate == "phi" else scene.scales.length
     reached = distance / unit_until
-    every = ca.vertcat(values[: own.slide.stop], values[-2:], *gaps, reached, speed)
+    every = ca.vertcat(values[: layout.slide.stop], values[-2:], *gaps, reached, speed)
     size = ca.sqrt(ca.dot(v, mass * v))
     heading = ca.if_else(size > 0, v / ca.fmax(size, 1e-300), before)
     outputs = ca.vertcat(every, distance, ca.jtimes(distance, z, v), heading)
@@ -156,7 +156,10 @@ def _build_leg(
     measured = inner(packed[:5], packed[5:10], packed[s.to.values], start)
     function = ca.Function("measure", [packed, start], [measured])
     start, event_values = np.zeros(5), np.zeros(len(slack) + 7)
-    measure, texts = bind(function, [s.outputs, start], event_values), [own.text for own in limits]
+    measure, texts = (
+        bind(function, [s.outputs, start], event_values),
+        [limit.text for limit in limits],
+    )
     return ModeSegment(mode, rows, slack, measure, start, event_values, unit_until, texts)
 
 
@@ -493,17 +496,17 @@ class Replay(Run):
 
     def locate(self, h: float, t: float) -> list[int]:
         """Shorten the step just made to its first event; rows of its event values."""
-        found, records, least = list[int](), list[Record](), math.inf
+        rows, records, least = list[int](), list[Record](), math.inf
         if (self.values < -self.slack).any() and not self._is_at_end(t):
-            found = self.find_first(h)
+            rows = self.find_first(h)
         if self.minima:
             records, least = self._look_inside(float(self.s.inputs[self.s.at.h]))
         if least < math.inf:
             self.step_to(least)
-            found = self.find_first(least)
+            rows = self.find_first(least)
         end = self.t + float(self.s.inputs[self.s.at.h])
         self.records += [record for record in records if record.t < end]
-        return found
+        return rows
 
     def _look_inside(self, h: float) -> tuple[list[Record], float]:
         """States where margins are least within the step just made, of length h [s].
@@ -513,22 +516,22 @@ class Replay(Run):
         """
         s, rows = self.s, self.leg.rows
         margins = s.outputs[s.to.values][: rows.cone.stop]
-        known = np.vstack([s.outputs[s.to.stages].reshape(-1, len(margins)), margins])
-        inside = _INSIDE @ known
+        stage_margins = np.vstack([s.outputs[s.to.stages].reshape(-1, len(margins)), margins])
+        inside = _INSIDE @ stage_margins
         # Of a normal force, what is less than any of the phase before counts.
-        least, force = np.minimum(known[0], known[-1]), rows.force
+        least, force = np.minimum(stage_margins[0], stage_margins[-1]), rows.force
         self.least = least[force] = np.minimum(least[force], self.least)
         # Dips by less, in units of the scene, are no deeper than an error of interpolation.
         dips = inside.min(axis=0) < least - 1e-7
         if not dips.any():
             return [], math.inf
-        found: dict[float, tuple[Record, Array, bool]] = {}
+        samples: dict[float, tuple[Record, Array, bool]] = {}
 
         def look(x: float) -> None:
-            if 0 < x < 1 and x not in found:
+            if 0 < x < 1 and x not in samples:
                 self.step_to(x * h)
                 record = Record.of(s, self.t + x * h, self.phase_index, self.impact)
-                found[x] = record, self.values, bool((self.values + self.slack < 0).any())
+                samples[x] = record, self.values, bool((self.values + self.slack < 0).any())
                 self.least = np.minimum(self.least, self.values[force])
 
         for row in np.flatnonzero(dips).tolist():
@@ -536,15 +539,15 @@ class Replay(Run):
             around = _PLACES[middle - 1 : middle + 2].tolist()
             for x in around:
                 look(x)
-            ends = {0.0: known[0], 1.0: known[-1]}
-            values = [(found[x][1] if x in found else ends[x])[row] for x in around]
+            ends = {0.0: stage_margins[0], 1.0: stage_margins[-1]}
+            values = [(samples[x][1] if x in samples else ends[x])[row] for x in around]
             fall, rise = np.diff(values) / np.diff(around)
             if rise > fall:
                 span = (around[2] - around[0]) / (rise - fall)
                 look(float(around[0] + around[1] - fall * span) / 2)
         self.step_to(h)
-        states = [found[x] for x in sorted(found)]
-        shown = [x for x in sorted(found) if found[x][2]]
+        states = [samples[x] for x in sorted(samples)]
+        shown = [x for x in sorted(samples) if samples[x][2]]
         return [record for record, _, _ in states], shown[0] * h if shown else math.inf
 
     def _is_at_end(self, t: float) -> bool:

@@ -320,9 +320,9 @@ class Run(ABC):
             target = min(self.stop, self.wanted[self.next_wanted])
             h, whole = self.try_step(target)
             t = target if whole else self.t + h
-            if found := self.locate(h, t):
+            if rows := self.locate(h, t):
                 self.keep(self.t + float(self.s.inputs[self.s.at.h]))
-                ending = self.handle(found)
+                ending = self.handle(rows)
             else:
                 self.keep(t)
                 ending = self.pass_break() if t == self.stop else None

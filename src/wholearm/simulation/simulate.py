@@ -143,7 +143,7 @@ def simulate_phases(
     problem, restitution, tolerance  as of `simulate`
     progress  told which phase is simulated
     """
-    starts, found = plan.phase_starts, []
+    starts, simulations = plan.phase_starts, []
     rows = [int(row) for row in np.flatnonzero(np.diff(plan.phase, prepend=-1))]
     system = build_system(problem.scene)
     rests = [system.is_slower(plan.z_dot[row], SLOW) for row in rows] + [True]
@@ -160,9 +160,9 @@ def simulate_phases(
         clock = starts[first : last + 1].tolist()
         options: dict[str, Any] = {"tolerance": tolerance, "restitution": restitution}
         simulation = _simulate(problem, profile, state, clock, hint, **options)
-        found.append((range(first, last + 1), simulation))
+        simulations.append((range(first, last + 1), simulation))
         first = last + 1
-    return found
+    return simulations
 
 
 def _simulate(

@@ -172,8 +172,8 @@ class System:
 
     def evaluate(self, z: Array, v: Array, chosen: Sequence[int]) -> ContactRows:
         """Rows of some pairs at one state."""
-        n, found = self.n, self._evaluate(z, v, chosen)
-        return ContactRows(found[:, :n], found[:, n : 2 * n], found[:, 2 * n], found[:, 2 * n + 1])
+        n, rows = self.n, self._evaluate(z, v, chosen)
+        return ContactRows(rows[:, :n], rows[:, n : 2 * n], rows[:, 2 * n], rows[:, 2 * n + 1])
 
     def evaluate_slip(self, z: Array, chosen: Sequence[int]) -> Array:
         """Slip coordinates of some pairs, shape (m,) [m]."""
@@ -351,14 +351,14 @@ def _list_link_pairs(bodies: _Bodies, rounded: bool) -> list[ContactPair]:
     """Tips and joints of either link against the other link."""
     links, pairs, none = bodies.links, list[ContactPair](), ca.SX(0)
     thick = links[0].radius + links[1].radius
-    for own, other in ((0, 1), (1, 0)):
-        mine, theirs = links[own], links[other]
+    for finger, other in ((0, 1), (1, 0)):
+        mine, theirs = links[finger], links[other]
         for name, point, rest in (("tip", mine.tip, mine.base), ("joint", mine.base, mine.tip)):
             behind = theirs.normal.T @ (rest - theirs.base)
             run = theirs.axis.T @ (point - theirs.base)
             level = theirs.normal.T @ (point - theirs.base)
             for side, way in (("finger", 1.0), ("back", -1.0)):
-                title = f"{name}{own + 1}-{side}{other + 1}"
+                title = f"{name}{finger + 1}-{side}{other + 1}"
                 ranges = (run, theirs.length - run, way * behind)
                 pairs.append(ContactPair(title, way * level - thick, none, ranges, FINGERS_TOUCH))
     if not rounded:
