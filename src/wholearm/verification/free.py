@@ -120,7 +120,7 @@ def verify_policy(
     whole = simulate_free(problem, loop, until=until, tolerance=tolerance, restitution=restitution)
     failures = [] if whole.outcome.kind is OutcomeKind.ENDED else [whole.outcome.text]
     phases: list[FreePhase] = []
-    for phase in (own for own in problem.phases if own.number in loop.began):
+    for phase in (phase for phase in problem.phases if phase.number in loop.began):
         number, start, gained = phase.number, loop.began[phase.number], phase.until.contact
         stop = loop.began.get(number + 1, float(whole.t[-1]))
         name = "" if gained is None else gained.name

@@ -203,8 +203,8 @@ def describe_ambiguity(
 
 def find_least_force(phase: PhaseReport) -> ContactMargin | None:
     """The contact with the least normal force in a phase; None if nothing moved."""
-    known = [margin for margin in phase.contacts if not math.isnan(margin.least)]
-    return min(known, key=lambda margin: margin.least, default=None)
+    margins = [margin for margin in phase.contacts if not math.isnan(margin.least)]
+    return min(margins, key=lambda margin: margin.least, default=None)
 
 
 def find_uniqueness_margin(

@@ -186,7 +186,7 @@ def observe(
         times = np.linspace(torque.breaks[0], torque.breaks[-1], ROWS * len(problem.phases) + 1)
     else:
         owned = (np.flatnonzero(plan.phase == index) for index in range(len(plan.motions)))
-        picked = (own[np.linspace(0, len(own) - 1, ROWS + 1).astype(int)] for own in owned)
+        picked = (rows[np.linspace(0, len(rows) - 1, ROWS + 1).astype(int)] for rows in owned)
         times = np.concatenate([plan.t[rows] for rows in picked])
     simulation = simulate(problem, torque, tolerance=tolerance, times=times, minima=True)
     phases = tuple(
@@ -321,13 +321,13 @@ def _compare(
         return None, None
     at = np.searchsorted(simulation.t, plan.t[planned])
     at = np.minimum(at, len(simulation.t) - 1)
-    known = simulation.t[at] == plan.t[planned]
-    difference = (simulation.z[at] - plan.z[planned])[known]
-    worst = _measure(difference, plan.t[planned][known], length)
+    recorded = simulation.t[at] == plan.t[planned]
+    difference = (simulation.z[at] - plan.z[planned])[recorded]
+    worst = _measure(difference, plan.t[planned][recorded], length)
     if not arrived:
         return None, worst
     last = int(np.flatnonzero(simulation.phase == index)[-1])
-    if passes and known[-1]:
+    if passes and recorded[-1]:
         last = int(at[-1])
     difference = simulation.z[[last]] - plan.z[planned[-1:]]
     return _measure(difference, simulation.t[[last]], length), worst
@@ -400,9 +400,9 @@ def _find_least(
     t = simulation.t[simulation.phase == index]
     events = {e.contact: e for e in simulation.find(kind) if e.phase == index}
     for name, values in series.items():
-        known = not np.isnan(values).all()
-        row = int(np.nanargmin(values)) if known else 0
-        least, time = float(values[row]), float(t[row]) if known else math.nan
+        has_values = not np.isnan(values).all()
+        row = int(np.nanargmin(values)) if has_values else 0
+        least, time = float(values[row]), float(t[row]) if has_values else math.nan
         if name in events and not least <= events[name].value:
             least, time = events[name].value, events[name].time
         yield name, least, time
@@ -587,7 +587,7 @@ def find_help(
 ) -> TuningHelp:
     """Losses with changes of the torques that prevent them, and the approach to a missed end."""
     problem = simulation.problem
-    rolling = [{own.name for own in phase.formation.rolling} for phase in problem.phases]
+    rolling = [{contact.name for contact in phase.formation.rolling} for phase in problem.phases]
     events = [
         (event.phase, event.contact, _KINDS[event.kind], event.time)
         for event in simulation.events
@@ -662,9 +662,9 @@ def list_changes(
     limits, bare = make_limits(formation, epsilon), make_limits(formation, 0.0)
     rows, forces = limits.sides[0], (PRESS, CONE)
     owners, scale = limits.owners[rows], limits.scales[rows]
-    own = [limit.part == contact and limit.kind in forces for limit in limits.limits]
+    contact_limits = [limit.part == contact and limit.kind in forces for limit in limits.limits]
     gone = find_sides(bare, response, v) @ load < -KEPT * scale
-    missed = np.array(own)[owners] | (gone & np.isin(rows, limits.of(*forces)))
+    missed = np.array(contact_limits)[owners] | (gone & np.isin(rows, limits.of(*forces)))
     slack, slope = normalise(find_sides(limits, response, v), scale, tau, unit)
     slack = np.where(missed, slack, np.maximum(slack, 0.0))
 
@@ -767,8 +767,8 @@ def find_resting_changes(
     for free in _TORQUES:
         if len(free) == 2 and changes:
             break
-        found = ((path, find_least_change(*sides, free)) for path, sides in starts)
-        least = [(path, unit * one) for path, one in found if one is not None]
+        solutions = ((path, find_least_change(*sides, free)) for path, sides in starts)
+        least = [(path, unit * one) for path, one in solutions if one is not None]
         moved = [change for path, change in least if path.moves(tau + change)]
         held = None if moved else Statics(formation, z).find_holding_change(tau, epsilon, free)
         if moved:
@@ -809,7 +809,7 @@ def find_moving(
     holds = formation.n_constraints < 4
     options = [(1.0, -1.0, 0.0) if holds and unit.grips else (1.0, -1.0) for unit in still]
     modes = list_modes(formation, signs, still, options)
-    tried = (respond(mode, own, rows, v) for own, mode in modes)
+    tried = (respond(mode, signs, rows, v) for signs, mode in modes)
 
     def misfit(response: Response) -> float:
         off = response.acceleration @ [1.0, *tau] - acceleration
@@ -839,10 +839,10 @@ def find_least_change(slack: Array, slope: Array, free: tuple[int, ...]) -> Arra
     sizes = np.linalg.norm(steep, axis=1)
     used = sizes > FLAT
     normal, reach = steep[used] / sizes[used, None], slack[used] / sizes[used]
-    found = [np.zeros(2), *(-reach[:, None] * normal)]
+    changes = [np.zeros(2), *(-reach[:, None] * normal)]
     for i, j in combinations(range(len(reach)), 2):
         pair = normal[[i, j]]
         if abs(np.linalg.det(pair)) > FLAT:
-            found.append(np.linalg.solve(pair, -reach[[i, j]]))
-    kept = [change for change in found if (slack + steep @ change >= -KEPT).all()]
+            changes.append(np.linalg.solve(pair, -reach[[i, j]]))
+    kept = [change for change in changes if (slack + steep @ change >= -KEPT).all()]
     return min(kept, key=np.linalg.norm, default=None)
