@@ -362,7 +362,10 @@ def monitor(stages: list[Stage], least: Sequence[Array], depth: float) -> list[S
 
 
 def _find_excess(stage: Stage) -> float:
-    """By how much a stage ends outside of the range of the contact that it gains there, if so."""
+    """By how much a stage ends outside of the range of the contact that it gains there, if so.
+
+    Goal 52 of the corpus lands past a fingertip without it, and takes 6 % longer.
+    """
     until, formation = stage.until, stage.formation
     if until is None or until.contact is None:
         return 0.0
