@@ -119,7 +119,7 @@ class Planning:
     @cached_property
     def trajectory(self) -> Trajectory:
         """The motion with dwells; of its `meta` only rolling contacts and modes."""
-        plans, formations = self.settled.plans, [own.formation for own in self.problem.phases]
+        plans, formations = self.settled.plans, [phase.formation for phase in self.problem.phases]
         motions, torques = [plan.motion for plan in plans], [plan.torque for plan in plans]
         modes = plain([getattr(plan.motion, "modes", ()) for plan in self.plans])
         return assemble_motions(motions, torques, formations, self.options.samples, modes=modes)
@@ -136,7 +136,7 @@ class Planning:
     def find_before(self, phases: Sequence[Phase]) -> BlockPlan | None:
         """The planned block that ends where some phases begin."""
         index = phases[0].index
-        return next((own for own in self.blocks if own.phases[-1].index + 1 == index), None)
+        return next((block for block in self.blocks if block.phases[-1].index + 1 == index), None)
 
 
 def plan_blocks(
@@ -172,20 +172,20 @@ def _begin_each(planning: Planning, report: Callable[[str], None]) -> Planning:
 
     An error is raised only if it does not depend on where exactly the block before ends.
     """
-    blocks, begun = split_blocks(planning.problem), planning
-    over_time = [not runs_along_curves(own, planning.options) for own in blocks]
+    blocks, coarse = split_blocks(planning.problem), planning
+    over_time = [not runs_along_curves(block, planning.options) for block in blocks]
     if not any(over_time[:-1]):
         return planning
     for index in range(len(blocks)):
         try:
-            begun = plan_next(begun, None, report, coarse=True)
+            coarse = plan_next(coarse, None, report, coarse=True)
         except WholearmError as error:
             short = error.shortfalls if isinstance(error, InfeasibleError) else ()
             # A better plan of earlier phases does not help against large violations.
-            if not any(over_time[:index]) or any(own.share > 0.05 for own in short):
+            if not any(over_time[:index]) or any(shortfall.share > 0.05 for shortfall in short):
                 raise
             break
-    return begun
+    return coarse
 
 
 def plan_next(
@@ -236,7 +236,7 @@ def plan_block(
 
     `over_time` are arguments of `plan_with_impacts`.
     """
-    problem, known = planning.problem, planning.curves
+    problem, stored = planning.problem, planning.curves
     if not runs_along_curves(block, options):
         from .time_domain.time_plan import plan_with_impacts
 
@@ -259,8 +259,8 @@ def plan_block(
                 raise explain_motors(planning, block, z, options, error) from None
     curves = []
     for phase in block:
-        traced, later = phase.index < len(known), problem.phases[phase.index + 1 :]
-        curves.append(known[phase.index] if traced else trace_phase(phase, z, later))
+        traced, later = phase.index < len(stored), problem.phases[phase.index + 1 :]
+        curves.append(stored[phase.index] if traced else trace_phase(phase, z, later))
         z = curves[-1].end
     chain = make_sequence(block, curves)
     if problem.scene.has_slow_motors:
@@ -281,11 +281,11 @@ def plan_with_pauses(
     """Plans of a block in the time domain by `plan` for a longest duration [s], with pauses."""
     from .dwell import add_pause
 
-    known, scene = planning.find_before(block), planning.problem.scene
+    block_before, scene = planning.find_before(block), planning.problem.scene
 
     def list_changes(plans: Plans) -> list[TorqueChange]:
         """From the torques before each phase to its first ones."""
-        before = known.plans[-1].end_torques[1] if known else plans[0].end_torques[0]
+        before = block_before.plans[-1].end_torques[1] if block_before else plans[0].end_torques[0]
         lasts = [before, *(plan.end_torques[1] for plan in plans[:-1])]
         pairs = zip(lasts, plans, strict=True)
         return [change_torques(scene, last, plan.end_torques[0]) for last, plan in pairs]
@@ -297,8 +297,8 @@ def plan_with_pauses(
         plans = plan(duration - pause)
         changes = list_changes(plans)
     return [
-        add_pause(own, change, phase.formation, planning.options)
-        for own, change, phase in zip(plans, changes, block, strict=True)
+        add_pause(plan, change, phase.formation, planning.options)
+        for plan, change, phase in zip(plans, changes, block, strict=True)
     ]
 
 
@@ -309,13 +309,13 @@ def plan_along(
     options: PlanOptions,
 ) -> list[PathMotion]:
     """Motions of a block along its curves with free torques, if it has some: an initial guess."""
-    problem, own = free_torques(planning.problem, replace(options, transcription="auto"))
+    problem, free_options = free_torques(planning.problem, replace(options, transcription="auto"))
     phases = [problem.phases[phase.index] for phase in block]
-    if not runs_along_curves(phases, own):
+    if not runs_along_curves(phases, free_options):
         return []
     try:
         free = replace(planning, problem=problem, curves=())
-        plans, _ = plan_block(free, phases, z, own.roughen())
+        plans, _ = plan_block(free, phases, z, free_options.roughen())
     except WholearmError:
         return []
     return [plan.motion for plan in plans if isinstance(plan.motion, PathMotion)]
@@ -353,7 +353,7 @@ def look_ahead(
     phase, ending = problem.phases[index], block[-1]
     until = ending.until.contact
     gained = set(phase.formation.contacts) - set(ending.formation.contacts)
-    following = next(own for own in split_blocks(problem) if own[0] is phase)
+    following = next(phases for phases in split_blocks(problem) if phases[0] is phase)
     if (
         options.goal is Objective.MARGIN
         or until is None
@@ -385,19 +385,19 @@ def share_duration(least: Sequence[PhasePlan[Motion]], duration: float | None) -
         # The least-time plan shows it; a little more leaves something to choose.
         from .explain import describe_changes, round_outwards
 
-        own = Parameter("duration", total, "s", 1, "duration")
-        enough = Change(own, round_outwards(1.005 * sum(times), 1))
+        parameter = Parameter("duration", total, "s", 1, "duration")
+        enough = Change(parameter, round_outwards(1.005 * sum(times), 1))
         raise InfeasibleError(
             f"duration = {total:g} s is not longer than the least time, {sum(times):.6g} s; "
             f"{describe_changes([enough])}",
             changes=[enough],
         )
-    return [total / sum(times) * own for own in times]
+    return [total / sum(times) * time for time in times]
 
 
 def require_steps(problem: Problem, options: PlanOptions) -> None:
     """Raise an InputError for combinations with rate-limited or held torques without a planner."""
-    given = [
+    settings = [
         (f"{finger.name}.{key}", getattr(finger, key))
         for finger in problem.scene.fingers
         for key, free in (("torque_rate_limit", math.inf), ("actuator_lag", 0.0))
@@ -407,14 +407,14 @@ def require_steps(problem: Problem, options: PlanOptions) -> None:
     if scene.control_period:
         if options.ranges:
             why = "ranges (--robust) are not kept with it yet"
-        elif given and scene.control_hold == "constant":
-            why = f"torques held constant step, and {given[0][0]} is given; hold them linear"
+        elif settings and scene.control_hold == "constant":
+            why = f"torques held constant step, and {settings[0][0]} is given; hold them linear"
         if why:
             raise InputError("", "control_period", f"{scene.control_period:g} given; {why}")
     along = all(runs_along_curves(block, options) for block in split_blocks(problem))
-    if given and options.ranges and not along:
+    if settings and options.ranges and not along:
         why = "ranges (--robust) are not kept with it in phases over time yet"
-        raise InputError("", given[0][0], f"{given[0][1]:g} given; {why}")
+        raise InputError("", settings[0][0], f"{settings[0][1]:g} given; {why}")
 
 
 def free_torques(problem: Problem, options: PlanOptions) -> tuple[Problem, PlanOptions]:
@@ -540,10 +540,14 @@ def plan_slowly(planning: Planning, sequence: ImpactSequence, options: PlanOptio
     from .dwell import Junction, add_pause, choose_junction
 
     epsilon, parts = planning.problem.epsilon, sequence.split()
-    known = planning.find_before(sequence.phases)
+    block_before = planning.find_before(sequence.phases)
     before: Curve | Array | None = None
-    if known is not None:
-        before = known.chain.curves[-1] if known.chain else known.plans[-1].end_torques[1]
+    if block_before is not None:
+        before = (
+            block_before.chain.curves[-1]
+            if block_before.chain
+            else block_before.plans[-1].end_torques[1]
+        )
     firsts = [*(part.curves[0] for part in parts[1:]), _find_following(planning, sequence, options)]
     plans: Plans = []
     junction: Junction | None = None
@@ -574,7 +578,7 @@ def _find_following(
     index, phases = sequence.phases[-1].index + 1, planning.problem.phases
     if index == len(phases):
         return None
-    following = next(own for own in split_blocks(planning.problem) if own[0] is phases[index])
+    following = next(block for block in split_blocks(planning.problem) if block[0] is phases[index])
     if not runs_along_curves(following, options):
         return phases[index].formation
     if index < len(planning.curves):

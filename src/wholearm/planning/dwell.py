@@ -227,7 +227,9 @@ def settle_plans(problem: Problem, plans: Plans) -> Settled:
     if problem.settle_share:
         ends = share_time(problem, plans, places)
     else:
-        ends = find_ends(problem, places, [problem.settles(own) or 0.0 for own in problem.phases])
+        ends = find_ends(
+            problem, places, [problem.settles(phase) or 0.0 for phase in problem.phases]
+        )
     numbered = zip(problem.phases, ends, strict=True)
     settlings = [None if end is None else _describe(problem, phase, end) for phase, end in numbered]
     return Settled(hold_plans(problem, plans, ends), tuple(settlings))
@@ -235,13 +237,13 @@ def settle_plans(problem: Problem, plans: Plans) -> Settled:
 
 def find_places(problem: Problem, plans: Plans) -> list[Standstill | None]:
     """Where phases come to rest; None for those that do not."""
-    found = list[Standstill | None]()
+    standstills = list[Standstill | None]()
     for phase, plan in zip(problem.phases, plans, strict=True):
         z, v = end_of(plan)
         touching = list_touching(problem, phase)
         place = Standstill(z, phase.formation, phase.until.contact, touching)
-        found.append(place if build_system(problem.scene).is_slower(v, SLOW) else None)
-    return found
+        standstills.append(place if build_system(problem.scene).is_slower(v, SLOW) else None)
+    return standstills
 
 
 def find_ends(
@@ -320,7 +322,7 @@ def list_touching(problem: Problem, phase: Phase) -> Formation:
     if phase.until.contact is not None:
         contacts.append(phase.until.contact)
     following = problem.phases[phase.number : phase.number + 1]
-    contacts += [contact for own in following for contact in own.formation.contacts]
+    contacts += [contact for next_phase in following for contact in next_phase.formation.contacts]
     return Formation(problem.scene, tuple(dict.fromkeys(contacts)))
 
 
@@ -367,7 +369,7 @@ def share_time(
             weights[-1] *= way.last
         shares = whole * weights / max(float(weights.sum()), STOP**2)
         pairs = zip(shares.tolist(), times, strict=True)
-        allotted = [own if time is None else time for own, time in pairs]
+        allotted = [share if time is None else time for share, time in pairs]
         ends = find_ends(problem, places, allotted, way.firm)
         off = measure_off(problem, plans, ends) if any(ends) else 0.0
         if not best or off < 0.8 * least:  # a later one has to be better by a fifth

@@ -147,7 +147,7 @@ def find_changes(
         # Plans keep limits between nodes too, which the least change does not.
         shares = (0.0, 0.005, 0.015, 0.05, 0.15, 0.5)
         beyond = [] if least is None else [least * (1 + sign * share) for share in shares]
-        for value in dict.fromkeys(round_outwards(own, sign) for own in beyond):
+        for value in dict.fromkeys(round_outwards(candidate, sign) for candidate in beyond):
             if value < 0:
                 break
             if not can_plan(parameter, value):
@@ -272,13 +272,13 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
     units = units._replace(torque=np.full(2, 15.0 * scales.torque))  # as bad as one of force
     short = np.maximum(data.limits.fold(-data.slack(data.nodes, profile)), 0.0)
     short += 0.05 * data.limits.scales
-    found = _solve_soft(data, profile, units, short / units.of(data.limits), None)
-    if found is None:
+    soft_solution = _solve_soft(data, profile, units, short / units.of(data.limits), None)
+    if soft_solution is None:
         return SolverError(stopped)
-    elastic, motions, torques = found[0], list[PathMotion](), list[TorqueProfile]()
+    elastic, motions, torques = soft_solution[0], list[PathMotion](), list[TorqueProfile]()
     shortfalls, missing = list[Shortfall](), None
-    for part, own, phase in zip(parts, cut(parts, elastic), task.phases, strict=True):
-        motions.append(PathMotion(part.curve, part.grid, own))
+    for part, part_profile, phase in zip(parts, cut(parts, elastic), task.phases, strict=True):
+        motions.append(PathMotion(part.curve, part.grid, part_profile))
         suffix = f", phase {phase}" if len(parts) > 1 else ""
         places = [
             LimitPlace(phase, t, f"t = {t:.4f} s ({describe_pose(z)}){suffix}")
@@ -286,7 +286,7 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
                 motions[-1].times.tolist(), part.curve.evaluate(part.grid.s).z, strict=True
             )
         ]
-        shortfalls += find_shortfalls(part.limits, part.evaluate(part.nodes, own), places)
+        shortfalls += find_shortfalls(part.limits, part.evaluate(part.nodes, part_profile), places)
     if not shortfalls:
         text = f"{stopped} although limits can be kept; try other --intervals or --accuracy"
         return SolverError(text)
@@ -367,7 +367,9 @@ def _search_friction(task: Task, parameter: Parameter) -> float | None:
 
 def explain_jam(task: Task, jam: JammingError) -> JammingError:
     """Add to an error which single lower friction would let a phase be planned."""
-    lower = [own for own in list_frictions(task.curves[0].formation) if own.sign < 0]
+    lower = [
+        parameter for parameter in list_frictions(task.curves[0].formation) if parameter.sign < 0
+    ]
     return advise(jam, lower, partial(_search_friction, task), partial(_replan_task, task))
 
 
@@ -392,8 +394,8 @@ def explain_duration(task: Task) -> InfeasibleError | None:
         except SolverError:
             return False
 
-    own = Parameter("duration", duration, "s", 1, "duration")
-    changes = find_changes([own], lambda _: least, can_plan)
+    parameter = Parameter("duration", duration, "s", 1, "duration")
+    changes = find_changes([parameter], lambda _: least, can_plan)
     return InfeasibleError(
         f"{name_phases(task.phases, 'infeasible')}: duration = {duration:g} s is "
         f"{least - duration:.3g} s shorter than the least time; {describe_changes(changes)}",
@@ -464,7 +466,7 @@ def refuse(
     if blocked is None:
         first = stages[0].formation
         names = " ".join(first.names)
-        z = np.concatenate([own.guess.z.reshape(-1, 5) for own in stages])
+        z = np.concatenate([stage.guess.z.reshape(-1, 5) for stage in stages])
         if alone and [contact.finger for contact in first.contacts] == [None, None]:
             raise InfeasibleError(
                 f"phase {phase.number} is infeasible: no finger drives the object on {names}, and "
@@ -505,8 +507,8 @@ def refuse(
             value = statics.find_torque_limit(epsilon, _find_finger(parameter), node == -1)
         return _unit_of(parameter, problem.scene.scales) * value if value else None
 
-    known = make_limits(phase.formation, problem.epsilon).parameters
-    raise advise(InfeasibleError(text, shortfalls), known, find_value, replan, ADVICE)
+    parameters = make_limits(phase.formation, problem.epsilon).parameters
+    raise advise(InfeasibleError(text, shortfalls), parameters, find_value, replan, ADVICE)
 
 
 def _refuse_unheld(problem: Problem, phase: Phase, stage: Stage, node: int) -> None:
@@ -527,10 +529,10 @@ def _refuse_unheld(problem: Problem, phase: Phase, stage: Stage, node: int) -> N
 
 def refuse_paths(problem: Problem, phase: Phase, margins: Sequence[PathMargin]) -> None:
     """Raise an InfeasibleError with the critical limit if along every path one is missed."""
-    if not margins or (best := max(margins, key=lambda own: own.value)).value > -0.02:
+    if not margins or (best := max(margins, key=lambda margin: margin.value)).value > -0.02:
         return
     limits = make_limits(phase.formation, problem.epsilon).limits
-    limit = next(own for own in limits if (own.kind, own.part) == best[1:3])
+    limit = next(limit for limit in limits if (limit.kind, limit.part) == best[1:3])
     place, missed = LimitPlace(phase.number, math.nan, "the best of them"), -best.value
     amount = missed * limit.scale
     shortfall = Shortfall(*best[1:3], limit.text, amount, limit.unit, place, missed)
@@ -574,11 +576,15 @@ def explain_stages(
     def find_value(parameter: Parameter) -> float | None:
         # The limit has to be active; epsilon if no normal force is short of more than that.
         if parameter.key == EPSILON:
-            active = all(own.amount < parameter.value for own in lists[best] if own.kind == PRESS)
+            active = all(
+                shortfall.amount < parameter.value
+                for shortfall in lists[best]
+                if shortfall.kind == PRESS
+            )
         else:
             parts = [stage.guess for stage in stages]
             tables = (part.v[..., 3:] if parameter.is_speed else part.tau for part in parts)
-            most = max(float(np.abs(own[..., _find_finger(parameter)]).max()) for own in tables)
+            most = max(float(np.abs(table[..., _find_finger(parameter)]).max()) for table in tables)
             active = most > 0.98 * parameter.value  # share of a limit above which it is active
         if not active:
             return math.nan
@@ -593,9 +599,9 @@ def explain_stages(
     torques = [motion.torque for motion in motions]
     formations = [phase.formation for phase in phases]
     motion = assemble_motions(motions, torques, formations, 201, status="misses limits least")
-    known = make_limits(phases[0].formation, problem.epsilon).parameters
+    parameters = make_limits(phases[0].formation, problem.epsilon).parameters
     error = _describe_least(numbers, lists[best], motion)
-    return advise(error, known, find_value, replan, ADVICE)
+    return advise(error, parameters, find_value, replan, ADVICE)
 
 
 def list_shortfalls(problem: Problem, stages: Sequence[Stage], scheme: Scheme) -> list[Shortfall]:
@@ -640,29 +646,29 @@ def explain_motors(
     error: InfeasibleError | SolverError,
 ) -> InfeasibleError | SolverError:
     """The error with whether the phases have a plan from `z` with free torques."""
-    scene, given = planning.problem.scene, list[str]()
+    scene, settings = planning.problem.scene, list[str]()
     if scene.control_period:
-        given.append(f"control_period = {scene.control_period:g} s ({scene.control_hold})")
+        settings.append(f"control_period = {scene.control_period:g} s ({scene.control_hold})")
     kinds = (("torque_rate_limit", "N m/s", math.inf), ("actuator_lag", "s", 0.0))
     for key, unit, none in kinds:
         values = list(dict.fromkeys(getattr(finger, key) for finger in scene.fingers))
         if values != [none]:
             texts = dict.fromkeys(f"{value:g}" for value in values)
-            given.append(f"{key} = {' and '.join(texts)} {unit}")
-    if not given:
+            settings.append(f"{key} = {' and '.join(texts)} {unit}")
+    if not settings:
         return error
-    keys, where = " and ".join(given), name_phases([phase.number for phase in block])
+    keys, where = " and ".join(settings), name_phases([phase.number for phase in block])
     if isinstance(error, InfeasibleError):
         where += f" ({'; '.join(' '.join(phase.formation.names) for phase in block)})"
-    free, own = free_torques(planning.problem, options)
+    free, free_options = free_torques(planning.problem, options)
     try:
         phases = [free.phases[phase.index] for phase in block]
         other = replace(planning, problem=free, curves=())
-        found, _ = plan_block(other, phases, z, own.roughen())
+        plans, _ = plan_block(other, phases, z, free_options.roughen())
     except WholearmError as without:
         text = f"{error}; without {keys} none was found either: {without}"
     else:
-        lasts = sum(plan.motion.duration for plan in found)
+        lasts = sum(plan.motion.duration for plan in plans)
         text = f"without {keys} there is a plan of {lasts:.4g} s for {where}; with that, {error}"
     error.args = (text,)
     return error

@@ -157,17 +157,17 @@ class NlpRows:
         self._entries: list[tuple[Array, Array, Array]] = []
 
     def _add_rows(self, *shape: int, low: Any, high: Any) -> Indices:
-        own = self._count + np.arange(int(np.prod(shape))).reshape(shape)
-        self._count += own.size
-        for bounds, given in ((self._low, low), (self._high, high)):
-            bounds.append(np.broadcast_to(np.asarray(given, dtype=float), shape).ravel())
-        return own
+        rows = self._count + np.arange(int(np.prod(shape))).reshape(shape)
+        self._count += rows.size
+        for bounds, bound in ((self._low, low), (self._high, high)):
+            bounds.append(np.broadcast_to(np.asarray(bound, dtype=float), shape).ravel())
+        return rows
 
     def linear(self, *shape: int, low: Any = 0.0, high: Any = 0.0) -> Indices:
         """Rows that are sums of unknowns, equal to zero unless bounds are given."""
-        own = self._add_rows(*shape, low=low, high=high)
-        self._linear.append(own.ravel())
-        return own
+        rows = self._add_rows(*shape, low=low, high=high)
+        self._linear.append(rows.ravel())
+        return rows
 
     def add_entries(self, rows: Any, columns: Any, values: Any) -> None:
         """Add entries to linear rows; the three are broadcast against one another."""
@@ -176,10 +176,10 @@ class NlpRows:
 
     def add_equal(self, columns: Any, others: Any, scale: Any = 1.0) -> Indices:
         """Add rows by which unknowns, times a scale, are those of others; shape of `columns`."""
-        own = self.linear(*np.shape(columns))
-        self.add_entries(own, columns, scale)
-        self.add_entries(own, others, -np.asarray(scale))
-        return own
+        rows = self.linear(*np.shape(columns))
+        self.add_entries(rows, columns, scale)
+        self.add_entries(rows, others, -np.asarray(scale))
+        return rows
 
     def add_copies(
         self,
@@ -198,12 +198,12 @@ class NlpRows:
         """
         columns = kernel.x.join(**x)
         shape, count = columns.shape[:-1], columns[..., 0].size
-        own = self._add_rows(*shape, 0 if cost else kernel.y.count, low=low, high=high)
-        given = np.broadcast_to(kernel.p.join(**p or {}), (*shape, kernel.p.count))
-        columns, rows = columns.reshape(count, -1), own.reshape(count, -1)
+        indices = self._add_rows(*shape, 0 if cost else kernel.y.count, low=low, high=high)
+        parameters = np.broadcast_to(kernel.p.join(**p or {}), (*shape, kernel.p.count))
+        columns, rows = columns.reshape(count, -1), indices.reshape(count, -1)
         if cost or rows.size:
-            self._blocks.append(_Block(kernel, columns, rows, given.reshape(count, -1)))
-        return own
+            self._blocks.append(_Block(kernel, columns, rows, parameters.reshape(count, -1)))
+        return indices
 
     @property
     def bounds(self) -> tuple[Array, Array]:
@@ -233,9 +233,9 @@ class NlpRows:
         jac_rows, jac_columns, jac = [row], [column], [ca.MX(ca.DM(value))]
         places, hess = [], []
         for kernel, columns, rows, parameters in blocks:
-            count, given = len(columns), ca.DM(parameters.T)
+            count, values = len(columns), ca.DM(parameters.T)
             here = _select(x, columns)
-            y = kernel.function.map(count)(here, given)
+            y = kernel.function.map(count)(here, values)
             lam = ca.repmat(lam_f, 1, count)
             if rows.size:
                 parts.append(ca.vec(y))
@@ -243,12 +243,12 @@ class NlpRows:
                 i, j = kernel.jacobian_at
                 jac_rows.append(rows[:, i].ravel())
                 jac_columns.append(columns[:, j].ravel())
-                jac.append(ca.vec(kernel.jacobian.map(count)(here, given)))
+                jac.append(ca.vec(kernel.jacobian.map(count)(here, values)))
             else:
                 f += ca.sum2(y)
             ends = columns[:, kernel.hessian_at]
             places.append((ends.max(axis=1) * size + ends.min(axis=1)).ravel())
-            hess.append(ca.vec(kernel.hessian.map(count)(here, given, lam)))
+            hess.append(ca.vec(kernel.hessian.map(count)(here, values, lam)))
         g = ca.vertcat(*parts)[order.tolist()]
         jac_row, jac_column = np.concatenate(jac_rows), np.concatenate(jac_columns)
         sort = np.lexsort((jac_row, jac_column))
@@ -331,7 +331,7 @@ def record_runs() -> Iterator[list[IpoptRun]]:
         yield runs
     finally:
         # `list.remove` would take any record with the same runs.
-        _RECORDS[:] = [own for own in _RECORDS if own is not runs]
+        _RECORDS[:] = [record for record in _RECORDS if record is not runs]
 
 
 class Solver:

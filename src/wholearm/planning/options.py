@@ -47,7 +47,7 @@ PLANNER = """\
 """
 """What takes more than these ranges takes memory or hours for nothing."""
 _FIELDS = [option.field for option in read_options(PLANNER)]
-_DEFAULTS: dict[str, Any] = {own.name: own.default for own in _FIELDS}
+_DEFAULTS: dict[str, Any] = {option.name: option.default for option in _FIELDS}
 DEFAULT_ACCURACY: float = _DEFAULTS["accuracy"]
 OPENING: float = _DEFAULTS["opening"]
 CLEARANCE: float = _DEFAULTS["clearance"]
@@ -105,9 +105,12 @@ class PlanOptions:
         ranges = (
             {key: factor * width for key, width in read_widths(given).items()} if factor else {}
         )
-        for own in PARAMETERS:
-            if not own.unit and ranges.get(own.name, 0.0) >= 1:
-                text = f"{factor:g} makes the range of {own.name} {ranges[own.name]:g}; a relative "
+        for parameter in PARAMETERS:
+            if not parameter.unit and ranges.get(parameter.name, 0.0) >= 1:
+                text = (
+                    f"{factor:g} makes the range of {parameter.name} "
+                    f"{ranges[parameter.name]:g}; a relative "
+                )
                 raise InputError("", "robust", text + "range is below 1")
         return replace(self, ranges=ranges)
 

@@ -72,11 +72,11 @@ def assemble_motions(
     **meta: Any,
 ) -> Trajectory:
     """The trajectory of phases; of its `meta` rolling contacts and modes are added."""
-    own: dict[str, Any] = {
+    entries: dict[str, Any] = {
         "rolling": [[contact.name for contact in formation.rolling] for formation in formations],
         "modes": plain([getattr(motion, "modes", ()) for motion in motions]),
     }
-    return assemble(motions, TorqueProfile.chain(torques), own | meta, rows)
+    return assemble(motions, TorqueProfile.chain(torques), entries | meta, rows)
 
 
 def plan_stops(

@@ -78,8 +78,8 @@ def solve(
         in its replay; names phase, limit, place and time. A SolverError says what was being done
         when the time was over.
     """
-    own = PlanOptions(objective=objective, **options)
-    return solve_with(problem, own, progress, time_limit)
+    plan_options = PlanOptions(objective=objective, **options)
+    return solve_with(problem, plan_options, progress, time_limit)
 
 
 @exclusive
@@ -142,7 +142,9 @@ def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]
         phases = _list_phases(planning, ledger, unique)
         if certificate is not None:
             gaps = certificate.gaps
-            phases = tuple(own._replace(error=gaps.get(own.number, own.error)) for own in phases)
+            phases = tuple(
+                phase._replace(error=gaps.get(phase.number, phase.error)) for phase in phases
+            )
         plan = Plan(
             problem,
             options,
@@ -200,7 +202,7 @@ def _list_phases(
 
 def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transition]:
     """Transitions of all impacts, as the block's domain knows them, and what each saves."""
-    found: list[Transition] = []
+    transitions: list[Transition] = []
     for block in planning.blocks:
         if len(block.phases) == 1:
             continue
@@ -213,16 +215,20 @@ def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transitio
             impacts = block.chain.list_impacts(block.plans)
             plan_part = partial(block.chain.plan_part, planning.problem.epsilon)
         first = block.phases[0].index
-        stops = [0, *(own.phase - first for own in impacts if not own.possible), len(block.phases)]
-        for own in impacts:
-            if own.possible:
-                report(f"phase {own.phase}: what its impact saves")
-                at = own.phase - first
+        stops = [
+            0,
+            *(impact.phase - first for impact in impacts if not impact.possible),
+            len(block.phases),
+        ]
+        for impact in impacts:
+            if impact.possible:
+                report(f"phase {impact.phase}: what its impact saves")
+                at = impact.phase - first
                 bounds = max(k for k in stops if k < at), at, min(k for k in stops if k > at)
-                with charge(own.phase):
-                    own = own._replace(saves=_find_saving(planning, block, bounds, plan_part))
-            found.append(own)
-    return found
+                with charge(impact.phase):
+                    impact = impact._replace(saves=_find_saving(planning, block, bounds, plan_part))
+            transitions.append(impact)
+    return transitions
 
 
 def _find_saving(
@@ -237,7 +243,7 @@ def _find_saving(
         stopped = plan_stops(plan_part, bounds, z, options, duration)
     except (InfeasibleError, SolverError):
         return math.nan
-    values = [combine(options.goal, [plan.value for plan in own]) for own in (stopped, moving)]
+    values = [combine(options.goal, [plan.value for plan in plans]) for plans in (stopped, moving)]
     gain = values[0] - values[1]
     return -gain if options.goal is Objective.MARGIN else gain
 
@@ -248,7 +254,7 @@ Uniqueness = tuple[UniquenessMargin | None, float | None]
 
 def check_uniqueness(problem: Problem, trajectory: Trajectory, least: float) -> list[Uniqueness]:
     """Uniqueness of the contact forces in every phase; AmbiguityError below the `least` margin."""
-    found = list[Uniqueness]()
+    uniqueness = list[Uniqueness]()
     for phase in problem.phases:
         rows = np.flatnonzero(trajectory.phase == phase.index)
         margin = find_uniqueness_margin(phase, trajectory, rows)
@@ -256,8 +262,8 @@ def check_uniqueness(problem: Problem, trajectory: Trajectory, least: float) -> 
             place = describe_pose(trajectory.z[np.searchsorted(trajectory.t, margin.time)])
             text = describe_uniqueness(margin.value, margin.contacts, place, least)
             raise AmbiguityError(f"phase {phase.number}: {text}")
-        found.append((margin, find_wedged(problem, phase, trajectory, rows, _STILL)))
-    return found
+        uniqueness.append((margin, find_wedged(problem, phase, trajectory, rows, _STILL)))
+    return uniqueness
 
 
 def certify(planning: Planning) -> Certificate:
@@ -271,9 +277,9 @@ def certify(planning: Planning) -> Certificate:
         for part in block.chain.split() if block.chain else ():
             phases = tuple(phase.number for phase in part.phases)
             duration = sum(times[number - numbers[0]] for number in phases)
-            found = bound_least_time(part.continuous_curves, planning.problem.epsilon)
+            bound = bound_least_time(part.continuous_curves, planning.problem.epsilon)
             reason = "the sweep over the phase plane finds no motion"
-            bounds.append(TimeBound(phases, duration, *(found or (None, None, reason))))
+            bounds.append(TimeBound(phases, duration, *(bound or (None, None, reason))))
     return Certificate(tuple(bounds))
 
 
@@ -296,19 +302,19 @@ def assess_ranges(planning: Planning, report: Callable[[str], None]) -> RangeFig
     if not options.largest:
         return figures
     unit = options.scale_ranges(problem.ranges, 1.0).ranges
-    relative = [unit[own.name] for own in PARAMETERS if not own.unit]
+    relative = [unit[parameter.name] for parameter in PARAMETERS if not parameter.unit]
     # Relative ranges up to 0.95, and up to a thousand times the problem's own.
-    most, found = min(0.95 / max(*relative, 1e-300), 1e3), dict[int, float]()
+    most, widest = min(0.95 / max(*relative, 1e-300), 1e3), dict[int, float]()
     chains = [block.chain for block in planning.blocks if block.chain is not None]
     for part in (part for chain in chains for part in chain.split()):
         numbers = [phase.number for phase in part.phases]
         motions = (planning.plans[number - 1].motion for number in numbers)
         guides = [Guide(m.grid.s, *m.profile) for m in motions if isinstance(m, PathMotion)]
         report(f"looking for the widest ranges of phase {numbers[0]}")
-        found |= dict.fromkeys(numbers, _find_widest(planning, part, numbers, guides, most))
-    if not found:
+        widest |= dict.fromkeys(numbers, _find_widest(planning, part, numbers, guides, most))
+    if not widest:
         return figures
-    each, least = tuple(found.get(phase.number) for phase in problem.phases), min(found.values())
+    each, least = tuple(widest.get(phase.number) for phase in problem.phases), min(widest.values())
     return figures._replace(largest=least, phases=each, capped=least >= most)
 
 
@@ -334,8 +340,8 @@ def _find_widest(
 
     low, high, middle = 0.0, np.inf, min(1.0, most)
     while low < most and (np.isinf(high) or high - low > 0.01 * high):  # relatively
-        own = scale(middle)
-        task = Task(curves, problem.epsilon, own, numbers, None, guides=tuple(guides))
+        options = scale(middle)
+        task = Task(curves, problem.epsilon, options, numbers, None, guides=tuple(guides))
         fastest = task.find_fastest()
         if fastest is None:
             high = middle

@@ -101,14 +101,14 @@ def replay_plan(
             )
         planning = better
     assert isinstance(check.report, Report)
-    found = [(find_least_force(phase), phase.number) for phase in check.report.phases]
-    forces = [(own, number) for own, number in found if own is not None]
+    pairs = [(find_least_force(phase), phase.number) for phase in check.report.phases]
+    forces = [(force, number) for force, number in pairs if force is not None]
     least, number = min(forces, key=lambda pair: pair[0].least)
     figures = ReplayFigures(
         LeastForce(least.least, least.contact, number, least.time),
         tuple(
-            ReplayedPhase(own.arrival, own.end_speed, own.end_deviation, own.deviation)
-            for own in check.report.phases
+            ReplayedPhase(phase.arrival, phase.end_speed, phase.end_deviation, phase.deviation)
+            for phase in check.report.phases
         ),
         check.residual.size,
         check.report.steps,
@@ -135,7 +135,8 @@ def _improve(
     if planning.allowed:
         least = {phase.index: planning.least[phase.index].motion.duration for phase in block.phases}
         allowed = [
-            (own + least[k]) / 2 if k in least else own for k, own in enumerate(planning.allowed)
+            (duration + least[k]) / 2 if k in least else duration
+            for k, duration in enumerate(planning.allowed)
         ]
         if sum(allowed[k] for k in least) > 1.1 * sum(least.values()):
             others.append(replace(again, allowed=allowed))
@@ -193,8 +194,8 @@ def find_residual(problem: Problem, trajectory: Trajectory) -> Residual:
             trajectory.c_n[rows][:, columns],
             trajectory.c_t[rows][:, columns],
         )
-        own = [contacts[name] for name in motion.contacts]
-        left = balance(problem.scene, own, formation.rolling, samples)
+        motion_contacts = [contacts[name] for name in motion.contacts]
+        left = balance(problem.scene, motion_contacts, formation.rolling, samples)
         size, row, text = left.find_worst()
         if not size <= worst.size:
             when = f"at t = {trajectory.t[rows][row]:.5g} s, phase {phase.number}"
@@ -278,8 +279,8 @@ def sample_table(
             compared = _compare(trajectory, report)
         except (JammingError, SimulationError) as error:
             compared = {"ok": False, "reason": str(error), "phases": []}
-    given = {"sample_rate": rate, "interpolation": interpolation}
-    return _tabulate(problem, trajectory, rows, compared, **given)
+    sampling = {"sample_rate": rate, "interpolation": interpolation}
+    return _tabulate(problem, trajectory, rows, compared, **sampling)
 
 
 def _compare(trajectory: Trajectory, report: Report) -> dict[str, Any]:
