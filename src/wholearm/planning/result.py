@@ -31,7 +31,7 @@ _KEYS = {
     "build_time": "build_times", "solve_time": "solve_times",
 }  # fmt: skip
 """What `meta` calls fields of phases and of their statistics; others have the same name there."""
-_OPTIONS = [own.name for own in fields(PlanOptions)]
+_OPTIONS = [option.name for option in fields(PlanOptions)]
 _OPTIONS = [name for name in _OPTIONS if name not in ("objective", "replay", "ranges")]
 """Options that stand in `meta` by themselves."""
 
@@ -74,7 +74,7 @@ class PlannedPhase(NamedTuple):
 
 
 _PHASES = PlannedPhase._fields[2:]
-_STATISTICS = [own.name for own in fields(SolverStatistics)]
+_STATISTICS = [statistic.name for statistic in fields(SolverStatistics)]
 
 
 class Timings(NamedTuple):
@@ -182,9 +182,12 @@ def write_meta(plan: Plan) -> dict[str, Any]:
             "value_unit": plan.unit,
             "error": plan.error,
             "epsilon": plan.problem.epsilon,
-            **{_KEYS.get(name, name): [getattr(own, name) for own in phases] for name in _PHASES},
             **{
-                _KEYS.get(name, name): [getattr(own.statistics, name) for own in phases]
+                _KEYS.get(name, name): [getattr(phase, name) for phase in phases]
+                for name in _PHASES
+            },
+            **{
+                _KEYS.get(name, name): [getattr(phase.statistics, name) for phase in phases]
                 for name in _STATISTICS
             },
             **{name: getattr(options, name) for name in _OPTIONS},
@@ -197,9 +200,11 @@ def write_meta(plan: Plan) -> dict[str, Any]:
         }
     )
     # Deviations have the names of their units in files.
-    for own in values["replay"]["phases"] if plan.replay else ():
+    for phase in values["replay"]["phases"] if plan.replay else ():
         for key in ("end_deviation", "deviation"):
-            own[key] = own[key] and dict(zip(("m", "rad", "s"), own[key].values(), strict=True))
+            phase[key] = phase[key] and dict(
+                zip(("m", "rad", "s"), phase[key].values(), strict=True)
+            )
     return values | {"problem": plan.problem.table}
 
 
@@ -230,33 +235,38 @@ def _read_replay(given: Mapping[str, Any]) -> ReplayFigures:
         return {"position": own["m"], "angle": own["rad"], "time": own.get("s")}
 
     phases = [
-        {**own, **{key: own[key] and rename(own[key]) for key in ("end_deviation", "deviation")}}
-        for own in given["phases"]
+        {
+            **phase,
+            **{key: phase[key] and rename(phase[key]) for key in ("end_deviation", "deviation")},
+        }
+        for phase in given["phases"]
     ]
     # In earlier versions intervals were doubled for a replay to hold.
-    known = {key: value for key, value in given.items() if key != "refinements"}
-    found: ReplayFigures = restore(ReplayFigures, {**known, "phases": phases})
-    return found
+    entries = {key: value for key, value in given.items() if key != "refinements"}
+    figures: ReplayFigures = restore(ReplayFigures, {**entries, "phases": phases})
+    return figures
 
 
 def _read(trajectory: Trajectory, problem: Problem) -> Plan:
     meta = trajectory.meta
     count = len(trajectory.motions)
-    given = {name: meta[name] for name in _OPTIONS if name in meta}
-    options = PlanOptions(meta["objective"], **given, replay=meta.get("replay") is not None)
+    arguments = {name: meta[name] for name in _OPTIONS if name in meta}
+    options = PlanOptions(meta["objective"], **arguments, replay=meta.get("replay") is not None)
     options = options.scale_ranges(problem.ranges)
 
     named = {name: meta.get(_KEYS.get(name, name)) for name in (*_PHASES, *_STATISTICS)}
-    known = {name: values for name, values in named.items() if values is not None}
-    for name, values in known.items():
+    stored = {name: values for name, values in named.items() if values is not None}
+    for name, values in stored.items():
         if len(values) != count:
             key = _KEYS.get(name, name)
             raise InputError("", key, f"{len(values)} values given, {count} needed")
 
     def read_phase(k: int) -> PlannedPhase:
-        own = {name: values[k] for name, values in known.items() if name in _PHASES}
-        spent = {name: values[k] for name, values in known.items() if name in _STATISTICS}
-        phase: PlannedPhase = restore(PlannedPhase, {"number": k + 1, "statistics": spent, **own})
+        entries = {name: values[k] for name, values in stored.items() if name in _PHASES}
+        spent = {name: values[k] for name, values in stored.items() if name in _STATISTICS}
+        phase: PlannedPhase = restore(
+            PlannedPhase, {"number": k + 1, "statistics": spent, **entries}
+        )
         return phase
 
     phases = tuple(map(read_phase, range(count)))
@@ -314,9 +324,9 @@ def _list_phases(plan: Plan) -> Table:
     torques = fixed(float(plan.problem.scene.torque_limit.max()), 7)
     rows = []
     for index, phase in enumerate(plan.phases):
-        own = plan.trajectory.phase == index
-        c_n = plan.trajectory.c_n[own]
-        torque = abs(plan.trajectory.tau[own]).max()
+        mask = plan.trajectory.phase == index
+        c_n = plan.trajectory.c_n[mask]
+        torque = abs(plan.trajectory.tau[mask]).max()
         rows.append((phase.number, phase.duration, c_n[c_n == c_n].min(), torque))
     heads = ["phase:d", "duration [s]:.6f", f"least c_n [N]:{forces}"]
     return Table([*heads, f"largest |tau| [N m]:{torques}"], rows)
@@ -339,25 +349,28 @@ def _list_modes(plan: Plan) -> Table:
 
 def _list_settlings(plan: Plan) -> Iterator[str | Table]:
     """The dwells of phases, and their duration."""
-    known = [phase.settling for phase in plan.phases if phase.settling is not None]
-    if not known:
+    dwells = [phase.settling for phase in plan.phases if phase.settling is not None]
+    if not dwells:
         return
     rows = []
-    for own in known:
-        closing = (own.gap, own.closes, own.left, own.speed, ", ".join(own.parts) or "-")
-        row = (own.phase, own.duration, own.tau, own.contact or "-")
-        rows.append(row + (closing if own.contact else ("",) * 5))
+    for dwell in dwells:
+        closing = (dwell.gap, dwell.closes, dwell.left, dwell.speed, ", ".join(dwell.parts) or "-")
+        row = (dwell.phase, dwell.duration, dwell.tau, dwell.contact or "-")
+        rows.append(row + (closing if dwell.contact else ("",) * 5))
     heads = ["phase:d", "held [ms]:.3g", "tau [N m]:8.4f", "closes", "from [mm]:.3g"]
     heads += ["in [ms]:.3g", "left [mm]:.2g", "at [mm/s]:.3g", "parts for a moment"]
     yield Table(heads, rows)
-    held = sum(own.duration for own in known)
-    yield from (f"warning: {own.warning}" for own in known if own.warning)
+    held = sum(dwell.duration for dwell in dwells)
+    yield from (f"warning: {dwell.warning}" for dwell in dwells if dwell.warning)
     yield f"held for {held:.6g} s in all, {held / (plan.duration - held):.1%} of the motion"
 
 
 def _describe_held(plan: Plan) -> Iterator[str]:
     """Relative cost of torques held over control periods."""
-    scene, free = plan.problem.scene, [own.unheld for own in plan.phases if own.unheld is not None]
+    scene, free = (
+        plan.problem.scene,
+        [phase.unheld for phase in plan.phases if phase.unheld is not None],
+    )
     if len(free) == len(plan.phases):
         value = combine(plan.options.goal, free)
         text = f"torques {scene.control_hold} over {1e3 * scene.control_period:g} ms each:"
@@ -387,9 +400,9 @@ def _list_bounds(plan: Plan) -> Table:
     rows, certificate = list[tuple[Any, ...]](), plan.certificate
     for part in certificate.parts if certificate else ():
         ends = dict.fromkeys((part.phases[0], part.phases[-1]))
-        known = part.bound, part.error, part.gap
+        figures = part.bound, part.error, part.gap
         text = f"not certified: {part.reason}" if part.bound is None else ""
-        rows.append(("-".join(map(str, ends)), part.duration, *known, text))
+        rows.append(("-".join(map(str, ends)), part.duration, *figures, text))
     if certificate and (total := certificate.total):
         text = "of those with a bound" if any(row[-1] for row in rows) else ""
         rows.append(("all", total.duration, total.bound, total.error, total.gap, text))
@@ -402,7 +415,7 @@ def _describe_ranges(plan: Plan) -> Iterator[str]:
     ranges = plan.ranges
     if ranges is None:
         return
-    units = {own.name: own.unit for own in PARAMETERS}
+    units = {parameter.name: parameter.unit for parameter in PARAMETERS}
     radii = [
         f"{name} {1e3 * radius:g} mm" if units[name] == "m" else f"{name} {100 * radius:g} %"
         for name, radius in ranges.radii.items()
@@ -415,7 +428,7 @@ def _describe_ranges(plan: Plan) -> Iterator[str]:
         numbers = " and ".join(map(str, ranges.held))
         yield f"friction within the ranges may hold the start of phase {numbers}"
     if ranges.largest is not None:
-        each = ", ".join("-" if own is None else f"{own:.3g}" for own in ranges.phases)
+        each = ", ".join("-" if factor is None else f"{factor:.3g}" for factor in ranges.phases)
         text = f"a plan exists for ranges {ranges.largest:.3g} times as wide as the problem's"
         capped = ", as wide as they make sense" if ranges.capped else ""
         yield f"{text}{capped}; phase by phase {each}"
@@ -439,7 +452,9 @@ def _list_table(table: Mapping[str, Any]) -> Iterator[str | Table]:
 
 def _describe_uniqueness(plan: Plan) -> str:
     """Uniqueness margin of contact forces, and for how long phases are possibly stuck."""
-    margins = [(own.uniqueness_margin, own.number) for own in plan.phases if own.uniqueness_margin]
+    margins = [
+        (phase.uniqueness_margin, phase.number) for phase in plan.phases if phase.uniqueness_margin
+    ]
     if not margins:
         return ""
     least, number = min(margins)

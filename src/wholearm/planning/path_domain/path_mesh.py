@@ -314,7 +314,9 @@ def equidistribute(part: PhaseData, motion: PathMotion, elements: int) -> Array:
     shares = density / density.sum() + spans / motion.duration
     done, t = np.append(0.0, np.cumsum(shares)), np.append(ends[:, 0], ends[-1, -1])
     stops = part.grid.edges[:, 1]
-    fixed = np.array([0.0, *(done[1:][stops == own.stop][0] for own in part.curve.segments)])
+    fixed = np.array(
+        [0.0, *(done[1:][stops == segment.stop][0] for segment in part.curve.segments)]
+    )
     inner = [
         np.linspace(*pair, count + 1)[1:-1]
         for pair, count in zip(pairwise(fixed), share_out(elements, np.diff(fixed)), strict=True)

@@ -346,7 +346,7 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     lagged = [torques[:, j] + symbols.lags[k] * rates[j] for k, j in enumerate(shape.commands)]
     joins = [torques[NODES::NODES, j] - torques[DEGREE:-1:NODES, j] for j in slow]
     motor_rows = {"rates": quick, "commands": lagged, "joins": joins}
-    rows |= {name: ca.vertcat(none, *own) for name, own in motor_rows.items()}
+    rows |= {name: ca.vertcat(none, *expressions) for name, expressions in motor_rows.items()}
     rows["begins"] = ca.vertcat(*find_first_slopes(a)) if slow else none
     g = Columns(**{name: int(block.numel()) for name, block in rows.items()})
     nodes = ca.horzcat(ca.vertcat(0, b_inner, 0), a, lam, extra).T
@@ -637,8 +637,8 @@ def _join(
     on_x[:, 0] = on_b
     # The chain's multiplier at a node is the sum of those of normal forces from there on.
     chain = -1 - np.cumsum(on_rows[:, list(nlp.shape.presses)].sum(axis=1))[:-1]
-    known = {"links": on_links, "chain": chain[: sizes["chain"]], "limits": on_rows.ravel()}
-    on_g = nlp.g.join(**{name: np.zeros(sizes[name]) for name in sizes} | known)
+    multipliers = {"links": on_links, "chain": chain[: sizes["chain"]], "limits": on_rows.ravel()}
+    on_g = nlp.g.join(**{name: np.zeros(sizes[name]) for name in sizes} | multipliers)
     return {"lam_x0": on_x[nlp.free], "lam_g0": on_g}
 
 

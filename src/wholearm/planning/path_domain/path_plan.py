@@ -158,7 +158,7 @@ def plan_task(task: Task, insist: bool = True) -> PathIterate:
         accuracy *= 10
         options = replace(task.options, accuracy=accuracy)
         other = refine(replace(first, task=replace(task, options=options)), accuracy)
-        iterate = min(iterate, other, key=lambda own: own.objective)
+        iterate = min(iterate, other, key=lambda candidate: candidate.objective)
     return iterate
 
 
@@ -432,9 +432,9 @@ class PathIterate:
         owner, breaks = np.searchsorted(starts[1:-1], places), list[Array]()
         for k, curve in enumerate(task.curves):
             local = [Switch(place, True) for place in (places[owner == k] - starts[k]).tolist()]
-            own = match(np.zeros(0), local, curve)[0]
-            few = task.options.intervals and len(find_ends(curve, own)) > elements
-            breaks.append(own[:0] if few else own)
+            curve_breaks = match(np.zeros(0), local, curve)[0]
+            few = task.options.intervals and len(find_ends(curve, curve_breaks)) > elements
+            breaks.append(curve_breaks[:0] if few else curve_breaks)
         parts = task.lay_out(breaks, elements)
         first = PathIterate.on(task, (breaks, none), parts, units, True)
         profile, multipliers = start_at(first.nlp, first.data, units, fastest)
@@ -503,7 +503,7 @@ class PathIterate:
             return replace(other, meshes=self.meshes + 1)
         if task.is_held and self.meshes < 2:
             each = zip(self.parts, self.motions, strict=True)
-            return self._move([equidistribute(*own, task.elements) for own in each], self.cuts)
+            return self._move([equidistribute(*pair, task.elements) for pair in each], self.cuts)
         costs = self.due + self.paid
         costly = _GAP * float(costs.sum()) > accuracy
         if self.meshes == 0 or costly:
@@ -512,12 +512,12 @@ class PathIterate:
             tight = bool(self.tightening.limits.any())
             if not (task.is_held or task.options.goal is Objective.EFFORT or tight):
                 every = zip(self.parts, self.motions, self.breaks, strict=True)
-                found = [
+                matches = [
                     match(before, find_switches(part, motion.profile, margin), part.curve)
                     for part, motion, before in every
                 ]
-                breaks = tuple(own for own, _ in found)
-                shift = max(own for _, own in found)  # over the curve's length
+                breaks = tuple(places for places, _ in matches)
+                shift = max(distance for _, distance in matches)  # over the curve's length
             if shift > 25.0 * accuracy and again:  # over length and accuracy
                 return self._move(breaks, self.cuts)
             edges = [part.grid.edges for part in self.parts]
@@ -531,7 +531,7 @@ class PathIterate:
     def _move(self, breaks: Sequence[Array], cuts: Sequence[Array]) -> PathIterate:
         """Start on other elements from this motion."""
         every = zip(self.task.curves, breaks, cuts, strict=True)
-        ends = [keep_apart(curve, np.append(own, more)) for curve, own, more in every]
+        ends = [keep_apart(curve, np.append(places, more)) for curve, places, more in every]
         parts, old = self.task.lay_out(ends, self.task.elements), self.solution
         grid = join(parts).grid
         profile = Elements(self.data.grid, old.profile).move(grid)

@@ -142,7 +142,10 @@ class Guesses:
                 breaks = np.linspace(0.0, 1.0, count + 1)
                 inner = (breaks[:-1, None] + x / count for x in (scheme.points, controls))
                 points, between, ends = (
-                    [own.reshape(*x.shape, -1) for own in motion.evaluate(start + span * x.ravel())]
+                    [
+                        samples.reshape(*x.shape, -1)
+                        for samples in motion.evaluate(start + span * x.ravel())
+                    ]
                     for x in (*inner, breaks)
                 )
                 z, v, a, _, c_n, c_t = points
@@ -176,15 +179,15 @@ class Guesses:
     def paths(self) -> list[tuple[PathMargin, PathGuess]]:
         """Straight paths to the ends of a single phase, those first that keep limits most."""
         goals = self._list_goals() if self._is_planar() else []
-        outlines = [own for goal in goals if (own := self._connect(goal))]
-        found = [(find_margin(own, self.problem.epsilon), own) for own in outlines]
+        outlines = [guess for goal in goals if (guess := self._connect(goal))]
+        paths = [(find_margin(outline, self.problem.epsilon), outline) for outline in outlines]
 
         def rank(path: tuple[PathMargin, PathGuess]) -> tuple[float, float]:
             """Feasible paths by their length, others by their margin."""
             (margin, *_), outline = path
             return (-SURE, outline.length) if margin > SURE else (-margin, 0.0)
 
-        return sorted((own for own in found if own[0].value > -np.inf), key=rank)
+        return sorted((path for path in paths if path[0].value > -np.inf), key=rank)
 
     def to_others(self) -> Iterator[Guess]:
         """Along the first of these paths."""
@@ -274,8 +277,8 @@ class Guesses:
         profile: PathSpeed | None = None,
         falls: float = FALLS,
     ) -> list[Stage]:
-        given = self.problem, self.phases, self.z, self.search.scheme, self.search.options
-        return self._leave_room(guess_stages(*given, pieces, profile, falls))
+        arguments = self.problem, self.phases, self.z, self.search.scheme, self.search.options
+        return self._leave_room(guess_stages(*arguments, pieces, profile, falls))
 
     def _leave_room(self, stages: list[Stage]) -> list[Stage]:
         """The stages, with an end clear of the contact that ends what follows."""
@@ -337,11 +340,11 @@ def find_margin(outline: PathGuess, epsilon: float, paced: bool = False) -> Path
     drive = np.zeros((m, 5, size))
     mass, slope = scene.mass_diagonal * scene.scales.speed**2, z_s / (2 * runs)
     drive[k, :, k], drive[k, :, k + 1] = mass * (z_ss / 2 - slope), mass * (z_ss / 2 + slope)
-    own = m + 1 + k[:, None] * width + np.arange(width)
-    drive[k[:, None], :, own] = -force * G
+    columns = m + 1 + k[:, None] * width + np.arange(width)
+    drive[k[:, None], :, columns] = -force * G
     units = force * np.array([1.0, 1.0, scene.scales.length])
     y, offset = np.zeros((m, width + 2, size)), np.zeros((m, width + 2))
-    y[k[:, None], np.arange(width), own] = force
+    y[k[:, None], np.arange(width), columns] = force
     y[:, width:], offset[:, width:] = drive[:, 3:], scene.dry[3:] * sigma
     limits = make_limits(formation, epsilon).without(SPEED)
     sides, signs, bounds = limits.sides
@@ -349,7 +352,7 @@ def find_margin(outline: PathGuess, epsilon: float, paced: bool = False) -> Path
     slopes = limits.rows[sides, :-2] * scales[:, None]
     rows = -(slopes @ y)
     rows[..., -1] = 1.0
-    given = rows.reshape(-1, size), (offset @ slopes.T - scales * bounds).ravel()
+    inequalities = rows.reshape(-1, size), (offset @ slopes.T - scales * bounds).ravel()
     equal = (drive[:, :3] / units[:, None]).reshape(-1, size)
     equal_to = np.tile(scene.applied_force[:3] / units, m)
     free: list[tuple[float | None, float | None]] = [(None, None)] * (m * width)
@@ -357,7 +360,7 @@ def find_margin(outline: PathGuess, epsilon: float, paced: bool = False) -> Path
 
     def maximise(gain: Array, least: float | None) -> Any:
         every = [*inside, (least, 1.0)]
-        return linprog(-gain, *given, equal, equal_to, every, method="highs")
+        return linprog(-gain, *inequalities, equal, equal_to, every, method="highs")
 
     answer = maximise(np.eye(size)[-1], None)
     if answer.status != 0:
@@ -398,11 +401,11 @@ def split_path(outline: PathGuess) -> list[PathGuess]:
         signs[cuts.pop() :] = signs[cuts[-1]]
     stretches, part = list[PathGuess](), z[:1]
     for begin, stop in pairwise([*cuts, len(signs)]):
-        own, part = signs[begin].copy(), np.concatenate([part, z[begin + 1 : stop]])
+        stretch_signs, part = signs[begin].copy(), np.concatenate([part, z[begin + 1 : stop]])
         turning = list[tuple[int, ...]]()
         if stop < len(signs):
             # Tied rows together, in order of time.
-            turns = np.flatnonzero(own != signs[stop]).tolist()
+            turns = np.flatnonzero(stretch_signs != signs[stop]).tolist()
             tied = (find_tied(formation, z[stop], row) for row in turns)
             before, after = rates[stop - 1 : stop + 1]
             share = np.full(len(before), 0.5)
@@ -416,10 +419,10 @@ def split_path(outline: PathGuess) -> list[PathGuess]:
             end = z[k] + (place - k) * (z[k + 1] - z[k]) if len(turning) > 1 else z[stop]
             if len(part) == 1:
                 part = np.stack([part[0], (part[0] + end) / 2])
-            stretches.append(_make_stretch(formation, np.vstack([part, end]), own, rows))
-            own[list(rows)] *= -1
+            stretches.append(_make_stretch(formation, np.vstack([part, end]), stretch_signs, rows))
+            stretch_signs[list(rows)] *= -1
             part = end[None]
-    stretches.append(_make_stretch(formation, np.vstack([part, z[-1:]]), own, ()))
+    stretches.append(_make_stretch(formation, np.vstack([part, z[-1:]]), stretch_signs, ()))
     return stretches
 
 
@@ -442,7 +445,7 @@ def find_modes(search: TimeSearch, stages: Sequence[Stage]) -> TimeSolution:
     if not all(pieces):
         status = "with friction that sets in gradually things turn too often"
         return solution._replace(status=status, success=False)
-    exact = [replace(piece, onset=0.0) for own in pieces for piece in own]
+    exact = [replace(piece, onset=0.0) for parts in pieces for piece in parts]
     return solution._replace(stages=link(merge(exact)))
 
 
@@ -504,7 +507,7 @@ def _find_changes(stage: Stage, scheme: Scheme) -> tuple[list[float], list[_Chan
                 break
             k = int(lasts.argmin())
             runs = [(0.0, runs[1][1]), *runs[2:]] if k == 0 else runs[:k] + runs[k + 1 :]
-            runs = [own for n, own in enumerate(runs) if not n or own[1] != runs[n - 1][1]]
+            runs = [run for n, run in enumerate(runs) if not n or run[1] != runs[n - 1][1]]
         first[row] = runs[0][1]
         every += [(place, row, sign) for place, sign in runs[1:]]
     changes, near = list[_Change](), 2 * float(np.diff(places).max())
@@ -518,9 +521,9 @@ def _find_changes(stage: Stage, scheme: Scheme) -> tuple[list[float], list[_Chan
     # Where all rates reverse near each other the motion stops: that is one change.
     joined, count = list[_Change](), int(np.count_nonzero(first))
     while changes:
-        close = [own for own in changes if own[0] < changes[0][0] + near]
-        rows = {row: sign for _, own in close for row, sign in own.items()}
-        if len(rows) == sum(len(own) for _, own in close) == count:
+        close = [change for change in changes if change[0] < changes[0][0] + near]
+        rows = {row: sign for _, turns in close for row, sign in turns.items()}
+        if len(rows) == sum(len(turns) for _, turns in close) == count:
             joined.append((close[len(close) // 2][0], rows))
             changes = changes[len(close) :]
         else:
@@ -549,10 +552,10 @@ def guess_stages(
         if parts and parts[-1][0].end is End.SMOOTH:
             outlines = [*_turn_first(outlines[0], parts[-1][1]), *outlines[1:]]
         z, scaled = outlines[-1].z[-1], in_own_units(problem).phases[phase.index]
-        for own in outlines:
-            own_z = scale_state(own.z, problem.scene.scales)
-            path = replace(own, formation=scaled.formation, z=own_z)
-            parts.append((scaled, path, own is outlines[-1]))
+        for piece in outlines:
+            own_z = scale_state(piece.z, problem.scene.scales)
+            path = replace(piece, formation=scaled.formation, z=own_z)
+            parts.append((scaled, path, piece is outlines[-1]))
     lengths = np.array([outline.length for _, outline, _ in parts])
     ends = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()
     # The path parameter of the guess is (1 - cos) / 2 over all stages.
@@ -567,9 +570,9 @@ def guess_stages(
         ahead = None
         if phase.until.value is not None:
             row, value = 0 if phase.until.coordinate == "x" else 2, phase.until.value
-            begin = next(other.z[0, row] for own, other, _ in parts if own is phase)
+            begin = next(other.z[0, row] for owner, other, _ in parts if owner is phase)
             ahead = row, value, 1.0 if value > begin else -1.0
-        whole = lengths[[own is phase for own, _, _ in parts]].sum()
+        whole = lengths[[owner is phase for owner, _, _ in parts]].sum()
         intervals = options.time_intervals or 10  # of a phase to start with
         count = max(LEAST_INTERVALS, round(lengths[k] / whole * intervals))
         guess = _guess(outline, scheme, count, clock[k : k + 2], ends[k : k + 2], total, profile)
@@ -648,8 +651,8 @@ def _guess(
     if profile is not None:
         at = breaks[:-1, None] + scheme.points / count
         passed = clock[0] + at.ravel() * (clock[1] - clock[0])
-        own = np.searchsorted(profile.t / profile.t[-1], passed) - 1
-        c = profile.forces[np.clip(own, 0, len(profile.forces) - 1)]
+        indices = np.searchsorted(profile.t / profile.t[-1], passed) - 1
+        c = profile.forces[np.clip(indices, 0, len(profile.forces) - 1)]
     return _add_forces(formation, outline.directions, scheme, count, duration, follow, c)
 
 
@@ -709,16 +712,16 @@ def _turn_first(outline: PathGuess, before: PathGuess) -> list[PathGuess]:
     """
     # Rolling contacts have no direction to keep.
     slides = np.delete(np.arange(before.formation.n_contacts), before.formation.rolling_rows)
-    known = {before.formation.names[k]: before.directions.Xi[k] for k in slides}
-    own, formation = np.concatenate(outline.directions), outline.formation
+    directions = {before.formation.names[k]: before.directions.Xi[k] for k in slides}
+    outline_signs, formation = np.concatenate(outline.directions), outline.formation
     n_c = formation.n_contacts
-    signs = own.copy()
+    signs = outline_signs.copy()
     signs[n_c:] = before.directions.sigma
     for k in range(n_c):
         if k not in formation.rolling_rows:
             together = [formation.names[i] for i in formation.turn_with(k)]
-            signs[k] = next((known[name] for name in together if name in known), signs[k])
-    differing = np.flatnonzero(signs != own).tolist()
+            signs[k] = next((directions[name] for name in together if name in directions), signs[k])
+    differing = np.flatnonzero(signs != outline_signs).tolist()
     turns = list(dict.fromkeys(formation.turn_with(k) for k in differing))
     pieces = []
     cuts = np.linspace(0, len(outline.z) - 1, len(turns) + 2).astype(int)
@@ -726,5 +729,5 @@ def _turn_first(outline: PathGuess, before: PathGuess) -> list[PathGuess]:
         turn = turns[k] if k < len(turns) else outline.turns
         pieces.append(_make_stretch(formation, outline.z[begin : stop + 1], signs, turn))
         if k < len(turns):
-            signs[list(turns[k])] = own[list(turns[k])]
+            signs[list(turns[k])] = outline_signs[list(turns[k])]
     return pieces
