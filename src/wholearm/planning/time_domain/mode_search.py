@@ -67,8 +67,8 @@ def link(stages: Sequence[Stage]) -> list[Stage]:
         turns, growing, gained = tuple[int, ...](), tuple[int, ...](), None
         fading = tuple[tuple[int, float], ...]()
         if linked and not linked[-1].ends_in_impact:
-            known = linked[-1].formation.contacts
-            growing = tuple(k for k, c in enumerate(stage.formation.contacts) if c not in known)
+            contacts = linked[-1].formation.contacts
+            growing = tuple(k for k, c in enumerate(stage.formation.contacts) if c not in contacts)
         if coming is not None and not stage.ends_in_impact:
             names = (*stage.formation.names, *joints)
             after = dict(zip((*coming.formation.names, *joints), mode_of(coming), strict=True))
@@ -253,8 +253,10 @@ def list_neighbours(
     `leaning`: only contacts at their cones count. Contacts that a phase has rolling have to roll.
     """
     stages, scheme, epsilon = solution.stages, search.scheme, search.problem.epsilon
-    own = [search.problem.phases[stage.phase].formation for stage in stages]
-    slides = [_find_leaning(stage, scheme, own[k], epsilon) for k, stage in enumerate(stages)]
+    formations = [search.problem.phases[stage.phase].formation for stage in stages]
+    slides = [
+        _find_leaning(stage, scheme, formations[k], epsilon) for k, stage in enumerate(stages)
+    ]
 
     def turn(index: int, run: ModeRun) -> list[Stage] | None:
         """Another mode over a run: rolling if possible, else reversed."""
@@ -263,12 +265,12 @@ def list_neighbours(
         following = [k for k, other in enumerate(stages) if other.phase > stage.phase][:1]
         for k in following if run.row < n_c else ():
             # A contact that rolls from the next phase on slides until this one ends.
-            rolls = set(own[k].rolling) - set(own[index].rolling)
+            rolls = set(formations[k].rolling) - set(formations[index].rolling)
             if stage.formation.contacts[run.row] in rolls:
                 signs = [sign for sign in signs if sign]
         pieces = [_change(stages, index, run, sign, scheme) for sign in signs]
-        found = next((piece for piece in pieces if piece is not None), None)
-        return found and link(merge([*stages[:index], *found, *stages[index + 1 :]]))
+        replacement = next((piece for piece in pieces if piece is not None), None)
+        return replacement and link(merge([*stages[:index], *replacement, *stages[index + 1 :]]))
 
     def turn_each(runs: list[tuple[int, ModeRun]]) -> list[list[Stage]]:
         """In whole stages that are mostly one run, then in single runs."""
@@ -281,7 +283,7 @@ def list_neighbours(
         return [moved for group in order for pair in group if (moved := turn(*pair))]
 
     if leaning:
-        return turn_each([(k, run) for k, found in enumerate(slides) for run in found])
+        return turn_each([(k, run) for k, runs in enumerate(slides) for run in runs])
     earlier = (release_earlier(stages, k) for k in range(len(stages)))
     moves = [*list_dropped(stages), *(link(merge(left)) for left in earlier if left)]
     savings = [solution.price_friction(k) / abs(solution.cost) for k in range(len(stages))]

@@ -322,16 +322,19 @@ def refine(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
         times = [np.zeros(stage.intervals, dtype=np.int64) for stage in stages]
         if failed:
             # Raised limits may leave nothing where shorter intervals miss less.
-            times = [(own > 1).astype(np.int64) for own in over]
+            times = [(ratios > 1).astype(np.int64) for ratios in over]
         elif refined < SETTINGS.refinements:
             times = _choose_halvings(search, solution, motions, misses, gains) or times
-        worst, finer = max(own.max() for own in over), any(own.any() for own in times)
+        worst, finer = (
+            max(ratios.max() for ratios in over),
+            any(halvings.any() for halvings in times),
+        )
         if worst <= 1 and not finer and stages is solution.stages:
             return solution._replace(error=_sum(gains))
         refined += finer
         raised = [
-            own.add(miss, SETTINGS.over).halve(mine)
-            for own, miss, mine in zip(raised, misses, times, strict=True)
+            amounts.add(miss, SETTINGS.over).halve(mine)
+            for amounts, miss, mine in zip(raised, misses, times, strict=True)
         ]
         stages = bisect_intervals(stages, search.scheme, times)
         better = search.solve(stages, solution, search.wait(SETTINGS.patience), raised)
@@ -365,10 +368,10 @@ def keep_within(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
         if iterate and max(measure_misses(miss).max() for miss in misses) <= 1:
             return solution._replace(error=error)
         raised = [
-            own._replace(held=table, gap=own.gap + miss.gap)
+            amounts._replace(held=table, gap=amounts.gap + miss.gap)
             if iterate < SETTINGS.parametric
-            else own.add(miss, SETTINGS.over)
-            for own, table, miss in zip(raised, deviations, misses, strict=True)
+            else amounts.add(miss, SETTINGS.over)
+            for amounts, table, miss in zip(raised, deviations, misses, strict=True)
         ]
         solution = search.solve(solution.stages, solution, raised=raised)
         if not solution.success:
@@ -389,7 +392,7 @@ def _sum(tables: Iterable[NDArray[Any]]) -> float:
 def measure_misses(miss: LimitMisses) -> Array:
     """The largest miss of each interval, over its tolerance, shape (K,)."""
     allowed = (SETTINGS.miss, SETTINGS.graze, SETTINGS.falter * SLIDING)
-    parts = (own.max(axis=1, initial=0.0) / a for own, a in zip(miss, allowed, strict=True))
+    parts = (table.max(axis=1, initial=0.0) / a for table, a in zip(miss, allowed, strict=True))
     return np.asarray(np.max(list(parts), axis=0))
 
 
@@ -432,7 +435,7 @@ def find_misses(
     senses -= 0.5 * least_senses(stage, check.places)
     senses[:, np.delete(np.arange(formation.n_contacts), formation.rubbing_rows)] = 1.0
     tables = (slack - deviations + 1e3 * relieved, gaps, senses)  # does not count
-    return LimitMisses(*(np.maximum(-find_minima(_by_interval(own)), 0.0) for own in tables))
+    return LimitMisses(*(np.maximum(-find_minima(_by_interval(table)), 0.0) for table in tables))
 
 
 def find_deviations(search: TimeSearch, stage: Stage, check: CheckPlaces) -> Array:
@@ -495,11 +498,11 @@ def _find_gains(
         limits = make_limits(stage.formation, epsilon)
         values = here.y @ limits.rows.T
         values[:, limits.of(PRESS)] -= solution.margin
-        own, signs, _ = limits.sides
-        scales = limits.scales[own]
+        side_rows, signs, _ = limits.sides
+        scales = limits.scales[side_rows]
         slack = np.maximum(limits.find_slack(values) / scales, 0.0)
         by_torque = np.einsum("mi,nij->nmj", limits.rows, here.y_by_torque)
-        sides = by_torque[:, own] * (signs / scales)[:, None]
+        sides = by_torque[:, side_rows] * (signs / scales)[:, None]
         held = _find_held(stage, here, stage.guess.places(x))
         sides = np.concatenate([sides, held, -held], axis=1)
         slack = np.hstack([slack, np.zeros((n, 2 * held.shape[1]))])
@@ -577,8 +580,8 @@ def _interpolate(breaks: Array, values: Array, first: int, x: Array) -> Array:
 
     The ends, before value number `first` and after the last, are extrapolated by parabolas.
     """
-    known = np.arange(min(first, len(values) - 1), len(values))
-    for end, near in ((0, known[:3]), (len(values), known[-3:])):
+    indices = np.arange(min(first, len(values) - 1), len(values))
+    for end, near in ((0, indices[:3]), (len(values), indices[-3:])):
         powers = np.arange(len(near))
         at = (breaks[near] - breaks[end])[:, None] ** powers
         value = np.linalg.solve(at, values[near])[:1]
@@ -601,8 +604,8 @@ def find_least(slope: Array, square: float, rows: Array, slack: Array) -> Array:
     one, other = rows[:, first], rows[:, second]
     across = one[..., 0] * other[..., 1] - one[..., 1] * other[..., 0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        own = slack[:, first, None] * other - slack[:, second, None] * one
-        u = np.stack([-own[..., 1], own[..., 0]], axis=-1) / across[..., None]
+        numerators = slack[:, first, None] * other - slack[:, second, None] * one
+        u = np.stack([-numerators[..., 1], numerators[..., 0]], axis=-1) / across[..., None]
         if square:
             free = (-slope / (2 * square))[:, None]
             beyond = (np.einsum("nmj,noj->nm", rows, free) + slack)[..., None]
@@ -627,4 +630,4 @@ def spread_halvings(shares: Sequence[Array], most: float) -> list[NDArray[np.int
             break
         left[worst] /= 4.0
         times[worst] += 1
-    return np.split(times, np.cumsum([len(own) for own in shares])[:-1])
+    return np.split(times, np.cumsum([len(part) for part in shares])[:-1])

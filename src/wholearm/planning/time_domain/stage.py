@@ -63,7 +63,7 @@ def blend(places: Array, count: int) -> Array:
     A polynomial lies between its control points, the first and last of which are its ends.
     """
     k, n = np.arange(count), count - 1
-    choices = np.array([comb(n, own) for own in k.tolist()], dtype=float)
+    choices = np.array([comb(n, index) for index in k.tolist()], dtype=float)
     x = np.asarray(places)[..., None]
     return np.asarray(choices * x**k * (1 - x) ** (n - k))
 
@@ -159,7 +159,9 @@ class Stage:
         """
         slow = self.formation.scene.has_slow_motors
         late = (np.minimum(places / after, 1.0) ** 3 if slow else places > after)[:, None]
-        released, apart = (np.isin(self.monitored, own) for own in (self.released, self.apart))
+        released, apart = (
+            np.isin(self.monitored, limits) for limits in (self.released, self.apart)
+        )
         opened = np.where(self.opens, late, 1.0)
         return np.asarray(self.clearance * np.maximum(released * opened, apart * late))
 
@@ -191,12 +193,12 @@ class LimitMisses(NamedTuple):
     def add(self, misses: LimitMisses, factors: Sequence[float]) -> LimitMisses:
         """The sum with other amounts times a factor for each kind."""
         triples = zip(self, misses, factors, strict=True)
-        return LimitMisses(*(own + factor * more for own, more, factor in triples))
+        return LimitMisses(*(amounts + factor * more for amounts, more, factor in triples))
 
     def halve(self, times: NDArray[np.int64]) -> LimitMisses:
         """On intervals halved so many times, (K,); zero on those that are."""
-        tables = (np.where(times[:, None] > 0, 0.0, own) for own in self)
-        return LimitMisses(*(np.repeat(own, 2**times, axis=0) for own in tables))
+        tables = (np.where(times[:, None] > 0, 0.0, amounts) for amounts in self)
+        return LimitMisses(*(np.repeat(table, 2**times, axis=0) for table in tables))
 
 
 make_formation = lru_cache(maxsize=128)(Formation)
@@ -211,8 +213,8 @@ def in_own_units(problem: Problem) -> Problem:
     assert body.inertia is not None
 
     def scale(owner: Any) -> dict[str, Any]:
-        known = keys_of(owner).items()
-        units = {name: getattr(scales, own.scale) for name, own in known if own.scale}
+        keys = keys_of(owner).items()
+        units = {name: getattr(scales, key.scale) for name, key in keys if key.scale}
         return {name: getattr(owner, name) / unit for name, unit in units.items()}
 
     sizes = body.vertices / scales.length, body.mass / scales.mass, body.inertia / scales.inertia
@@ -225,7 +227,7 @@ def in_own_units(problem: Problem) -> Problem:
             until = replace(until, value=until.value / scales.length)
         # With one freedom nothing is left for pins to say.
         pins = () if formation.n_constraints >= 4 else until.pins
-        until = replace(until, pins=tuple((name, own / units[name]) for name, own in pins))
+        until = replace(until, pins=tuple((name, value / units[name]) for name, value in pins))
         phases.append(replace(phase, formation=formation, until=until))
     return replace(
         problem,
@@ -243,7 +245,7 @@ def scale_state(z: Array, scales: Scales) -> Array:
 
 def scale_options(options: PlanOptions, scales: Scales) -> PlanOptions:
     """Options in own units."""
-    lengths = {own.name for own in PARAMETERS if own.unit == "m"}
+    lengths = {parameter.name for parameter in PARAMETERS if parameter.unit == "m"}
     ranges = {
         name: radius / scales.length if name in lengths else radius
         for name, radius in options.ranges.items()
@@ -371,7 +373,7 @@ def _find_excess(stage: Stage) -> float:
         return 0.0
     if 5 - formation.n_constraints - len(until.pins) < 2:
         return 0.0
-    known, gained = {limit.text for limit in formation.limits}, formation.add(until.contact)
+    texts, gained = {limit.text for limit in formation.limits}, formation.add(until.contact)
     values = gained.evaluate_limits(stage.guess.nodes[-1:, 0])[0].tolist()
     pairs = zip(gained.limits, values, strict=True)
-    return max([0.0, *(-float(value) for limit, value in pairs if limit.text not in known)])
+    return max([0.0, *(-float(value) for limit, value in pairs if limit.text not in texts)])

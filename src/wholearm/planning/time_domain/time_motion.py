@@ -109,11 +109,11 @@ class StageMotion:
                 for part in (place, velocity)
             )
             forces = _FORWARDS(self.formation)(*state, tau.reshape(-1, 2), *signs)
-            found = _fit(x, forces[0][..., 0].reshape(count, _NODES, 5))
-            residual = np.abs(weights * (found - a)).max(axis=(1, 2), keepdims=True)
+            accelerations = _fit(x, forces[0][..., 0].reshape(count, _NODES, 5))
+            residual = np.abs(weights * (accelerations - a)).max(axis=(1, 2), keepdims=True)
             nearer = residual < least
             kept, least = np.where(nearer, a, kept), np.where(nearer, residual, 0.0)
-            a = np.where(nearer, found, kept)
+            a = np.where(nearer, accelerations, kept)
         velocity = _integrate(a, half, v[:-1])
         place = _integrate(velocity, half, z[:-1])
         miss = (z[1:] - place.sum(axis=2))[..., None], (v[1:] - velocity.sum(axis=2))[..., None]
@@ -154,11 +154,13 @@ class StageMotion:
         """State, forces and accelerations at times `t`, and how these change with torques."""
         at = self.evaluate(t)
         signs = [np.broadcast_to(part, (len(t), len(part))) for part in self.directions]
-        found = [
+        responses = [
             _FORWARDS(self.formation)(at.z, at.z_dot, at.tau + step, *signs)[:2]
             for step in (np.zeros(2), *np.eye(2))
         ]
-        a, c = (np.stack([own[k][..., 0] for own in found], axis=-1) for k in range(2))
+        a, c = (
+            np.stack([response[k][..., 0] for response in responses], axis=-1) for k in range(2)
+        )
         y = np.hstack([c[..., 0], at.tau, at.z_dot[:, 3:]])
         by_torque = np.zeros((*y.shape, 2))
         by_torque[:, : c.shape[1]] = c[..., 1:] - c[..., :1]
@@ -208,7 +210,7 @@ class TimeMotion:
     @property
     def modes(self) -> tuple[ModeSpan, ...]:
         """Contact modes of the stages with their times."""
-        found = []
+        spans = []
         for stage, start in zip(self.stages, self.starts[:-1].tolist(), strict=True):
             formation, (Xi, sigma) = stage.formation, stage.directions
             rolls = formation.rolling_rows
@@ -217,8 +219,8 @@ class TimeMotion:
                 for k, name in enumerate(formation.names)
             }
             joints = tuple("+" if sign > 0 else "-" for sign in sigma)
-            found.append(ModeSpan(start, start + stage.duration, contacts, joints))
-        return tuple(found)
+            spans.append(ModeSpan(start, start + stage.duration, contacts, joints))
+        return tuple(spans)
 
     def evaluate(self, t: Array) -> Samples:
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""
@@ -238,7 +240,8 @@ def make_phase_motions(
     """The motion of each phase from the stages' guesses."""
     pairs = list(zip(make_motions(stages, scheme), stages, strict=True))
     return [
-        TimeMotion([own for own, stage in pairs if stage.phase == phase.index]) for phase in phases
+        TimeMotion([motion for motion, stage in pairs if stage.phase == phase.index])
+        for phase in phases
     ]
 
 

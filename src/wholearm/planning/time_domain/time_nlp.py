@@ -115,24 +115,24 @@ def lay_out(
         begin = stop + np.arange(point.sizes["forces"] * (held and not layouts))
         first = stop + len(begin) + np.arange(STATE + with_margin)
         starts = first[-1] + 1 + interval.count * np.arange(stage.intervals)
-        own = {
+        columns = {
             name: starts[:, None] + np.arange(part.start, part.stop)
             for name, part in interval.slices.items()
         }
-        points = own["points"].reshape(stage.intervals, d, point.count)
+        points = columns["points"].reshape(stage.intervals, d, point.count)
         at = {name: points[..., part] for name, part in point.slices.items()}
-        ends = points[:, -1, :STATE] if scheme.ends else own["end"]
-        nodes = np.vstack([first, np.hstack([ends, own["m"]])])
+        ends = points[:, -1, :STATE] if scheme.ends else columns["end"]
+        nodes = np.vstack([first, np.hstack([ends, columns["m"]])])
         stop = int(first[-1]) + 1 + interval.count * stage.intervals
         ends_in_impact = coming is not None and stage.ends_in_impact
         extra = coming.formation.n_constraints if coming is not None and ends_in_impact else 0
         layouts.append(
             StageLayout(
                 nodes=nodes,
-                h=own["h"][:, 0],
-                tau=own["tau"],
+                h=columns["h"][:, 0],
+                tau=columns["tau"],
                 **at,
-                short=own["short"],
+                short=columns["short"],
                 impulses=stop + np.arange(extra),
                 begin=begin,
                 finish=stop + np.arange(point.sizes["forces"] * (held and coming is None)),
@@ -160,12 +160,12 @@ def pack(points: Sequence[StagePoints], layouts: Sequence[StageLayout], margin: 
 def unpack(x: Array, layouts: Sequence[StageLayout]) -> list[StagePoints]:
     """What `pack` put together."""
     parts = []
-    for own in layouts:
-        duration = float(x[own.h].sum())
-        nodes = x[own.nodes[:, :STATE]].reshape(-1, 2, 5)
-        z, v, a, forces = (x[part] for part in (own.z, own.v, own.a, own.forces))
-        tau = x[own.tau].reshape(len(own.tau), -1, 2)
-        fractions, impulses = x[own.h] / duration, x[own.impulses]
+    for layout in layouts:
+        duration = float(x[layout.h].sum())
+        nodes = x[layout.nodes[:, :STATE]].reshape(-1, 2, 5)
+        z, v, a, forces = (x[part] for part in (layout.z, layout.v, layout.a, layout.forces))
+        tau = x[layout.tau].reshape(len(layout.tau), -1, 2)
+        fractions, impulses = x[layout.h] / duration, x[layout.impulses]
         parts.append(StagePoints(duration, fractions, nodes, z, v, a, forces, tau, impulses))
     return parts
 
@@ -260,8 +260,8 @@ def build_time_nlp(
         if target.objective is Objective.EFFORT:
             rows.add_copies(kernel, columns, cost=True)
         elif controls > 2:
-            given = {"weight": 1e-2 * stage.formation.scene.torque_limit**-2.0}  # else they ring
-            rows.add_copies(bend_kernel(controls), columns, given, cost=True)
+            weights = {"weight": 1e-2 * stage.formation.scene.torque_limit**-2.0}  # else they ring
+            rows.add_copies(bend_kernel(controls), columns, weights, cost=True)
         cost[layout.h] = of_time.get(target.objective, 0.0)
         cost[layout.short] = 1 / stage.intervals
     duration_row, last, end = -1, stages[-1], layouts[-1].nodes[-1]
@@ -308,9 +308,9 @@ def add_stage(
         states[:, k] = rows.add_copies(kernel, columns, {"N": N}).reshape(states[:, k].shape)
     if not stage.periods:
         # Constant ratios of intervals, scaled like other rows.
-        shares, own = K * guess.fractions, rows.linear(K - 1)
-        rows.add_entries(own, layout.h[:-1], shares[1:])
-        rows.add_entries(own, layout.h[1:], -shares[:-1])
+        shares, ratio_rows = K * guess.fractions, rows.linear(K - 1)
+        rows.add_entries(ratio_rows, layout.h[:-1], shares[1:])
+        rows.add_entries(ratio_rows, layout.h[1:], -shares[:-1])
 
     # Equations of motion, contacts and sliding directions at the points.
     homotopy, first = stage.onset > 0, node[:, Z] if formation.rolling else node[:, :0]
@@ -406,7 +406,7 @@ def least_senses(stage: Stage, places: Array) -> Array:
     if stage.onset:
         least = np.full(least.shape, -np.inf)
     vertices = [contact.index if contact.feature == "v" else None for contact in contacts]
-    again = [own is not None and own in vertices[:k] for k, own in enumerate(vertices)]
+    again = [vertex is not None and vertex in vertices[:k] for k, vertex in enumerate(vertices)]
     return np.asarray(np.where([*again, False, False], np.minimum(least, 0.0), least))
 
 
@@ -477,14 +477,14 @@ def add_limits(
         give(pressed[..., k], row)
 
     # Rows of y at the points, and bounds of one torque or joint speed alone.
-    own, signs, bounds = limits.sides
+    side_rows, signs, bounds = limits.sides
     column, n_forces = np.abs(limits.rows).argmax(axis=1), stage.formation.n_constraints
     alone = ((limits.rows != 0).sum(axis=1) == 1) & (column >= n_forces)
-    single = np.where(alone, column - n_forces, -1)[own]
-    others = np.flatnonzero(~np.isin(own, presses) & (single < 0))
+    single = np.where(alone, column - n_forces, -1)[side_rows]
+    others = np.flatnonzero(~np.isin(side_rows, presses) & (single < 0))
     added = rows.linear(*layout.z.shape[:2], len(others), high=np.inf)
     for k, side in enumerate(others):
-        of_y = np.split(signs[side] * limits.rows[own[side]], [n_forces, n_forces + 2])
+        of_y = np.split(signs[side] * limits.rows[side_rows[side]], [n_forces, n_forces + 2])
         for unknowns, of_them in ((layout.forces, of_y[0]), (layout.v[..., 3:], of_y[2])):
             for n in np.flatnonzero(of_them):
                 rows.add_entries(added[..., k], unknowns[..., n], of_them[n])
@@ -492,18 +492,18 @@ def add_limits(
             for i, shares in enumerate(blend(scheme.points, scheme.controls).T):
                 torques = layout.tau[:, None, 2 * i + n]
                 rows.add_entries(added[..., k], torques, of_y[1][n] * shares)
-        give(added[..., k], own[side])
+        give(added[..., k], side_rows[side])
     bounded = dict[int, Indices]()
     for side in np.flatnonzero(single >= 0):
         k = int(single[side])
         # Control points of a torque, or speeds at the points.
         unknowns = layout.tau[:, k::2] if k < 2 else layout.v[..., 1 + k]
-        if not weights[own[side]]:
+        if not weights[side_rows[side]]:
             bounded[int(side)] = unknowns
             continue
         added_row = rows.linear(*unknowns.shape, low=signs[side] * bounds[side], high=np.inf)
         rows.add_entries(added_row, unknowns, signs[side])
-        give(added_row, own[side])
+        give(added_row, side_rows[side])
     return LimitRows(limits, pressed, added, others, bounded, alone=not soft)
 
 
@@ -520,14 +520,16 @@ def add_motors(rows: NlpRows, stage: Stage, layout: StageLayout, scheme: Scheme)
             rates[:, :, k], layout.h[:, None, None], scene.torque_rate_limit[joint] / limit
         )
         for side, sign in enumerate((1.0, -1.0)):
-            own = rates[:, :, k, side]
-            rows.add_entries(own, tau[:, 1:, joint], -sign * n / limit)
-            rows.add_entries(own, tau[:, :-1, joint], sign * n / limit)
+            rate_rows = rates[:, :, k, side]
+            rows.add_entries(rate_rows, tau[:, 1:, joint], -sign * n / limit)
+            rows.add_entries(rate_rows, tau[:, :-1, joint], sign * n / limit)
     lagging = tuple(np.flatnonzero(scene.actuator_lag).tolist())
     if lagging:
-        given = {"lag": scene.actuator_lag, "limit": scene.torque_limit}
+        parameters = {"lag": scene.actuator_lag, "limit": scene.torque_limit}
         kernel = command_kernel(scheme.controls, lagging)
-        rows.add_copies(kernel, {"tau": layout.tau, "h": layout.h[:, None]}, given, high=np.inf)
+        rows.add_copies(
+            kernel, {"tau": layout.tau, "h": layout.h[:, None]}, parameters, high=np.inf
+        )
 
 
 def join_motors(
@@ -540,11 +542,11 @@ def join_motors(
     rows.add_equal(coming.tau[0, :2], layout.tau[-1, -2:], scale)
     shares = scheme.interpolate(np.ones(1))[0]
     for fading, slips in stage.fading:
-        own, share = rows.linear(1), float(formation.friction[fading]) if slips else 1.0
-        rows.add_entries(own, layout.forces[-1, :, fading], share * shares)
+        equation, share = rows.linear(1), float(formation.friction[fading]) if slips else 1.0
+        rows.add_entries(equation, layout.forces[-1, :, fading], share * shares)
         if slips:
             tangential = formation.n_contacts + formation.rolling_rows.index(fading)
-            rows.add_entries(own, layout.forces[-1, :, tangential], slips * shares)
+            rows.add_entries(equation, layout.forces[-1, :, tangential], slips * shares)
     if scheme.ends and stage.gained is not None:
         for contact in stage.gained.contacts:
             if contact not in formation.contacts:
@@ -572,9 +574,9 @@ def hold_ends(
                 rows.add_entries(rows.linear(1, low=-most, high=most), first[joint], 1 / limit)
         for r, row in enumerate(formation.rolling_rows):
             mu = float(formation.friction[row])
-            own = rows.linear(2, low=mu * epsilon, high=np.inf)
-            rows.add_entries(own, forces[row], mu)
-            rows.add_entries(own, forces[formation.n_contacts + r], np.array([1.0, -1.0]))
+            cone_rows = rows.linear(2, low=mu * epsilon, high=np.inf)
+            rows.add_entries(cone_rows, forces[row], mu)
+            rows.add_entries(cone_rows, forces[formation.n_contacts + r], np.array([1.0, -1.0]))
 
 
 def find_relieved(stage: Stage, limits: LimitSet) -> NDArray[np.bool_]:
@@ -585,8 +587,8 @@ def find_relieved(stage: Stage, limits: LimitSet) -> NDArray[np.bool_]:
     names, owners = stage.formation.names, limits.owners[limits.sides[0]]
 
     def find(contact: int, *kinds: str) -> list[bool]:
-        own = [limits.limits[k] for k in owners]
-        return [limit.kind in kinds and limit.part == names[contact] for limit in own]
+        side_limits = [limits.limits[k] for k in owners]
+        return [limit.kind in kinds and limit.part == names[contact] for limit in side_limits]
 
     for contact, slips in stage.fading:
         relieved[-1] |= find(contact, *((CONE,) if slips else (PRESS, CONE)))
@@ -614,11 +616,11 @@ def add_periods(rows: NlpRows, stages: Sequence[Stage], layouts: Sequence[StageL
         for k, (stage, layout) in enumerate(zip(stages, layouts, strict=True))
         for i, (period, tau) in enumerate(zip(stage.periods, layout.tau, strict=True))
     ]
-    for _, found in groupby(pieces, key=lambda own: own[0]):
-        phase = [piece for _, piece in found]
+    for _, pairs in groupby(pieces, key=lambda pair: pair[0]):
+        phase = [piece for _, piece in pairs]
         last = phase[-1].period
-        for period, own in groupby(phase, key=lambda piece: piece.period):
-            parts, least = list(own), 0.0 if period == last else duration
+        for period, group in groupby(phase, key=lambda piece: piece.period):
+            parts, least = list(group), 0.0 if period == last else duration
             whole = rows.linear(1, low=least, high=duration)
             rows.add_entries(whole, np.array([piece.h for piece in parts]), 1.0)
             for one, other in pairwise(parts):
@@ -666,21 +668,23 @@ def find_bounds(
                 low[speeds] = one_way
             else:
                 high[speeds] = -one_way
-        own, n_c = rows.limits, stage.formation.n_contacts
-        sides, signs, values = own.limits.sides
-        more = raised.held * own.limits.scales[sides]
+        limit_rows, n_c = rows.limits, stage.formation.n_contacts
+        sides, signs, values = limit_rows.limits.sides
+        more = raised.held * limit_rows.limits.scales[sides]
         # Forces that vanish or set in are only nonnegative.
-        more = np.where(find_relieved(stage, own.limits), -signs * values, more)
-        floor = values[own.pressed] + more[:, own.pressed]
+        more = np.where(find_relieved(stage, limit_rows.limits), -signs * values, more)
+        floor = values[limit_rows.pressed] + more[:, limit_rows.pressed]
         # Where rows hold c_n at the points too, its own bounds must not.
-        if own.alone:
+        if limit_rows.alone:
             low[layout.forces[..., :n_c]] = floor[:, None]
-        low_g[own.presses] = floor[:, None]
-        low_g[own.others] = ((signs * values)[own.sides] + more[:, own.sides])[:, None]
+        low_g[limit_rows.presses] = floor[:, None]
+        low_g[limit_rows.others] = ((signs * values)[limit_rows.sides] + more[:, limit_rows.sides])[
+            :, None
+        ]
         for held in (layout.begin, layout.finish):
-            low[held[:n_c]] = values[own.pressed][: len(held)]
-        _free_equal(stage, own, layout, (low, low_g))
-        for side, unknowns in own.bounded.items():
+            low[held[:n_c]] = values[limit_rows.pressed][: len(held)]
+        _free_equal(stage, limit_rows, layout, (low, low_g))
+        for side, unknowns in limit_rows.bounded.items():
             if signs[side] > 0:
                 low[unknowns] = np.maximum(low[unknowns], values[side] + more[:, side, None])
             else:
@@ -700,8 +704,8 @@ def _free_equal(
     for contact, slips in stage.fading:
         if slips:
             names = [rows.limits.limits[k].part for k in rows.limits.owners]
-            own = [names[k] == stage.formation.names[contact] for k in rows.limits.sides[0]]
-            low[rows.others[-1, -1, np.array(own)[rows.sides]]] = -np.inf
+            mask = [names[k] == stage.formation.names[contact] for k in rows.limits.sides[0]]
+            low[rows.others[-1, -1, np.array(mask)[rows.sides]]] = -np.inf
         else:
             low_x[layout.forces[-1, -1, contact]] = -np.inf
             low[rows.presses[-1, 1:2, contact]] = -np.inf
@@ -827,8 +831,8 @@ def new_rows(formation: Formation, following: Formation) -> list[int]:
     A contact that goes on as that of a neighbouring feature has the same row.
     """
     renamed = list_renamed(formation.scene, formation.contacts, following.contacts).values()
-    known = {*formation.contacts, *renamed}
-    fresh = [i for i, c in enumerate(following.contacts) if c not in known]
+    contacts = {*formation.contacts, *renamed}
+    fresh = [i for i, c in enumerate(following.contacts) if c not in contacts]
     rolling = [following.contacts[row] for row in following.rolling_rows]
     n_c = following.n_contacts
     return fresh + [n_c + i for i, c in enumerate(rolling) if c not in formation.rolling]

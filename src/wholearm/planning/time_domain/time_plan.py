@@ -104,7 +104,7 @@ def plan_phases(
 
     search = TimeSearch.of(problem, options, duration, to_go, ample, only_begin)
     guesses = Guesses(problem, phases, z, search, to_go)
-    found = _resume(search, guesses, begun) if begun else None
+    named_solution = _resume(search, guesses, begun) if begun else None
     stages = list_stages(fastest)
 
     def replan(parameter: Parameter, value: float) -> object:
@@ -113,29 +113,29 @@ def plan_phases(
         return plan_phases(other, same, z, options.roughen(), explained=False, patient=False)
 
     explanation = replan if explained else None
-    if found is None and guesses.given:
-        found = solve_guesses(search, [guesses.given])
-    if found is None and (motions := along()):
-        found = solve_guesses(search, [guesses.along(motions)])
-    if found is None:
+    if named_solution is None and guesses.given:
+        named_solution = solve_guesses(search, [guesses.given])
+    if named_solution is None and (motions := along()):
+        named_solution = solve_guesses(search, [guesses.along(motions)])
+    if named_solution is None:
         listed = iter([guesses.nearest])
         if patient:
             listed = chain(guesses.every(), _free_ends(search, guesses))
         if search.goal is Objective.MARGIN:
             listed = _list_slow(search, listed, stages, pinned, guesses.nearest)
-        found = solve_guesses(
+        named_solution = solve_guesses(
             search,
             listed,
             lambda: refuse(search, problem, phases, guesses.nearest.stages, explanation),
         )
-    if found is None:
-        found = _solve_elastic(search, guesses, explanation)
-    return list_plans(problem, search, phases, *found)
+    if named_solution is None:
+        named_solution = _solve_elastic(search, guesses, explanation)
+    return list_plans(problem, search, phases, *named_solution)
 
 
 def list_stages(plans: Sequence[PhasePlan[Motion]]) -> list[Stage]:
     """The stages of plans over time, in the scene's own units."""
-    return [own for plan in plans for own in plan.stages if isinstance(own, Stage)]
+    return [stage for plan in plans for stage in plan.stages if isinstance(stage, Stage)]
 
 
 def try_phases(
@@ -222,14 +222,14 @@ def may_gain(search: TimeSearch, solution: TimeSolution) -> bool:
     """Whether a solution suggests other contact modes."""
     if not search.options.mode_search or search.has_ample(solution):
         return False
-    known = sign_sequence(solution.stages)
-    return any(sign_sequence(moved) != known for moved in list_neighbours(search, solution))
+    sequence = sign_sequence(solution.stages)
+    return any(sign_sequence(moved) != sequence for moved in list_neighbours(search, solution))
 
 
 def _refine_best(search: TimeSearch, coarse: Sequence[_Named]) -> _Named | None:
     """The best of refined solutions, of which those are left out whose coarse ones cost more."""
     best: _Named | None = None
-    for solution, name in sorted(coarse, key=lambda own: own[0].cost):
+    for solution, name in sorted(coarse, key=lambda pair: pair[0].cost):
         if best and best[0].cost < solution.cost:
             break
         solution = finish(search, solution)
@@ -252,8 +252,8 @@ def finish(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
         # resting; phase 1 of that of query 91, and phase 5 of that of goal 45, none where the mode
         # search leads.
         others = chain(_list_as_good(search, coarse), [solution] * (searched is not solution))
-        found = (refine(search, other) for other in others)
-        refined = next((own for own in found if own.success), refined)
+        solutions = (refine(search, other) for other in others)
+        refined = next((solution for solution in solutions if solution.success), refined)
     solution = refined
     fewer = drop_gone(search, solution) if solution.success else solution
     if fewer is not solution:
@@ -284,14 +284,17 @@ def hold_torques(search: TimeSearch, free: TimeSolution) -> TimeSolution:
     doublings = max(0, math.floor(math.log2(lasts / (12 * period))))
     # Durations over those with free torques, and least numbers of periods.
     stretches = ((1.01, 2), (1.03, 2), (1.07, 3), (1.15, 4), (1.3, 6), (1.6, 8))
-    found: TimeSolution | None = None
+    held_solution: TimeSolution | None = None
     for doubled in (0, *(range(doublings, -1, -1) if doublings else ())):
         cut = partial(cut_periods, scheme=held.scheme, period=2**doubled * period)
         guesses = (cut(free.stages, stretch=stretch, least=least) for stretch, least in stretches)
-        tried = (_solve_held(held, own) for own in ([cut(found.stages)] if found else guesses))
-        found = next((solution for solution in tried if solution.success), None)
-        if found and found.stages[0].period == period:
-            return found._replace(error=free.error, free=free)
+        tried = (
+            _solve_held(held, stages)
+            for stages in ([cut(held_solution.stages)] if held_solution else guesses)
+        )
+        held_solution = next((solution for solution in tried if solution.success), None)
+        if held_solution and held_solution.stages[0].period == period:
+            return held_solution._replace(error=free.error, free=free)
     status = f"no torques held over {scene.control_hold} periods were found"
     return free._replace(status=status, success=False)
 
@@ -336,9 +339,9 @@ def cut_periods(
     whole = sum(stage.guess.duration for stage in stages)
     stretch = max(stretch, (least - 0.5) * period / whole)
     near = _BRIEF * period
-    for _, own in groupby(stages, key=lambda stage: stage.phase):
+    for _, group in groupby(stages, key=lambda stage: stage.phase):
         start = 0.0
-        for stage in own:
+        for stage in group:
             stop = start + stretch * stage.guess.duration
             ticks = period * np.arange(math.floor(start / period), math.ceil(stop / period) + 1)
             if stage.periods:
@@ -429,19 +432,22 @@ def _free_ends(search: TimeSearch, guesses: Guesses) -> Iterator[Guess]:
 
     Goal 12 of the corpus takes 1.16 s instead of 0.68 s without it.
     """
-    known, every = search.problem.phases, guesses.problem.phases
+    scaled_phases, every = search.problem.phases, guesses.problem.phases
     if not any(_set_free(phase) is not phase for phase in guesses.phases):
         return
     problem = replace(guesses.problem, phases=tuple(map(_set_free, every)))
     phases = [problem.phases[phase.index] for phase in guesses.phases]
-    own = replace(search, problem=in_own_units(problem), only_begins=True, to_go=None, price=None)
-    found = solve_guesses(own, Guesses(problem, phases, guesses.z, own).every())
-    if found is None:
+    free_search = replace(
+        search, problem=in_own_units(problem), only_begins=True, to_go=None, price=None
+    )
+    coarse = solve_guesses(free_search, Guesses(problem, phases, guesses.z, free_search).every())
+    if coarse is None:
         return
     stages = [
-        replace(stage, until=stage.until and known[stage.phase].until) for stage in found[0].stages
+        replace(stage, until=stage.until and scaled_phases[stage.phase].until)
+        for stage in coarse[0].stages
     ]
-    moved = search.solve(stages, found[0], search.wait(ITERATIONS))
+    moved = search.solve(stages, coarse[0], search.wait(ITERATIONS))
     if moved.success:
         yield Guess("a plan that chooses where it ends", moved.stages, before=moved)
 
@@ -463,9 +469,9 @@ def _solve_elastic(search: TimeSearch, guesses: Guesses, replan: Replan | None) 
         elastic = soft.solve(guess.stages)
         if elastic.success and not list_shortfalls(problem, elastic.stages, scheme):
             # Phase 3 of leg 21 has a plan from there with the torque limit that is advised.
-            found = solve_guesses(search, [guess._replace(stages=elastic.stages)])
-            if found is not None:
-                return found
+            named_solution = solve_guesses(search, [guess._replace(stages=elastic.stages)])
+            if named_solution is not None:
+                return named_solution
         elif elastic.success:
             short.append(elastic.stages)
     if not short:
@@ -571,7 +577,7 @@ def plan_parts_of(
 
 def list_impacts(block: Sequence[Phase], plans: Sequence[PhasePlan[Motion]]) -> list[Transition]:
     """The impacts of a block, at speed or with a stop."""
-    found = []
+    transitions = []
     for k, (phase, plan) in enumerate(zip(block, plans, strict=True), start=1):
         if phase.end is not End.IMPACT:
             continue
@@ -585,8 +591,8 @@ def list_impacts(block: Sequence[Phase], plans: Sequence[PhasePlan[Motion]]) -> 
         else:
             impact = compute_impact(phase.formation, block[k].formation, z, v / speed)
         ratio = measure_speed(scene, impact.v)
-        found.append(make_transition(phase, impact, ratio, reason, speed))
-    return found
+        transitions.append(make_transition(phase, impact, ratio, reason, speed))
+    return transitions
 
 
 def _impact_at_stop(phase: Phase, following: Phase, plan: PhasePlan[Motion]) -> Impact:
