@@ -317,7 +317,10 @@ def test_output_that_is_a_device(folder: Path) -> None:
         ([], "COMMAND"),
         (["slove"], "invalid choice: 'slove'"),
         (["solve"], "problem"),
-        (["solve", str(HEPTAGON), "--speed", "3"], "unrecognized arguments: --speed 3"),
+        (
+            ["solve", str(HEPTAGON), "--speed", "3"],
+            "unrecognized arguments: --speed 3; see wholearm solve --help",
+        ),
         (["solve", str(HEPTAGON), "--intervals", "ten"], "'ten' given; allowed are whole numbers"),
         (["solve", str(HEPTAGON), "--intervals", "5"], "--intervals: 5 given; allowed are whole"),
         (["solve", str(HEPTAGON), "--objective", "fun"], "objective: 'fun' given; allowed are"),

@@ -313,9 +313,12 @@ class Parser(argparse.ArgumentParser):
             fill()
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse, with all options."""
+        """Parse, with all options; a command refuses what it does not know in its own name."""
         self.complete()
-        return super().parse_known_args(args, namespace)
+        parsed, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return parsed, unknown
 
     def format_help(self) -> str:
         """The help, with all options."""
