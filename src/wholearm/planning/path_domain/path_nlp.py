@@ -175,6 +175,7 @@ class Units(NamedTuple):
     force: float  # [N]
     torque: Array  # (2,) [N m]: of each joint
     power: float  # [(N m)^2]: of the effort's integrand
+    press: float  # [N]: typical internal force, in the regularization
 
     @property
     def profile(self) -> Array:
@@ -238,7 +239,7 @@ class PathNLP:
     # unknowns of each node: b over its size (none at the two ends), a, internal force, and `extra`:
     # shortfalls for `elastic`, the least margin, or the relaxation for `relax`
     node: Columns
-    # speeds at the `ends`, `steps`, `weight` of time;
+    # speeds at the `ends`, `steps`, `weight` of time, unit of internal force in the regularization;
     # coefficients of the limits at the nodes, column by column (the constant ones are part of the
     # bounds); constant torques and weights of joints for `effort`; how limits and b's one give way
     # for `relax`; 1 / rate limits, lags, bends of elements and `sizes` of b for rate limits
@@ -262,7 +263,7 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     n, m, slow = intervals + 1, shape.rows, shape.slow
     effort, relax = objective is Objective.EFFORT, objective is Objective.RELAX
     chained, late = objective in CHAINED, objective is Objective.MARGIN
-    sizes = {"ends": 2, "steps": intervals, "weight": 1, "a": n * m, "b": n * m}
+    sizes = {"ends": 2, "steps": intervals, "weight": 1, "calm": 1, "a": n * m, "b": n * m}
     sizes |= {"lam": n * m, "speed": n * len(shape.fast)}
     if effort or slow:
         sizes |= {"torque": n * 2}
@@ -298,9 +299,9 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
         torques += ca.reshape(symbols.torque, n, 2)
     # The relaxation has to outweigh the regularization.
     share = 1e-3 if relax else 1.0
-    node_weights = ca.vertcat(0, h) + ca.vertcat(h, 0)
-    node_costs = share * 1e-6 * node_weights * lam**2  # among equal plans
-    rough = _find_bends(a, DEGREE) + _find_bends(lam, DEGREE)
+    scaled_lam, node_weights = symbols.calm * lam, ca.vertcat(0, h) + ca.vertcat(h, 0)
+    node_costs = share * 1e-6 * node_weights * scaled_lam**2  # among equal plans
+    rough = _find_bends(a, DEGREE) + _find_bends(scaled_lam, DEGREE)
     if objective is Objective.ELASTIC:
         # Soft limits would otherwise be avoided by motions that reverse between nodes.
         first, second = _find_bends(a, 1), _find_bends(a, 2)
@@ -408,6 +409,7 @@ def parameters(
             ends=np.zeros(2),
             steps=data.grid.steps / units.length,
             weight=[time_weight / units.power],
+            calm=[force / units.press],
             **{name: block.ravel("F") for name, block in blocks.items()},
         )
     )
@@ -423,7 +425,7 @@ def make_bounds(
     pins: tuple[float | None, float | None] = (None, None),
 ) -> dict[str, Array]:
     """Bounds of the NLP, with every limit tightened."""
-    tight, speed_share, duration, _, motors = tightening
+    tight, speed_share, duration, *_ = tightening
     n, node = len(data.grid.s), nlp.node
     low, high = np.full((n, node.count), -np.inf), np.full((n, node.count), np.inf)
     b_max = data.largest_b(data.nodes, relaxation.parameter if relaxation else None)
@@ -461,7 +463,7 @@ def make_bounds(
     longest = np.full(late, (duration or np.inf) / units.time)
     rates, commands = list(nlp.shape.rates), list(nlp.shape.commands)
     torque, sizes = units.of(data.limits)[list(nlp.shape.torques)], nlp.g.sizes
-    quickest, most = motors[:, 0], motors[:, 1] * data.torque_limit / torque
+    quickest, most = tightening.motors[:, 0], tightening.motors[:, 1] * data.torque_limit / torque
     joins, begins = np.zeros(sizes["joins"]), np.full(sizes["begins"] // 2, LEAST_B)
     within = np.concatenate([quickest[:, rates].ravel("F"), most[:, commands].ravel("F")])
     motors_low = -within, joins, begins, -np.inf * begins
@@ -519,7 +521,7 @@ def guess(data: PhaseData, time_weight: float = 0.0) -> tuple[Profile, Units]:
     """A guess with b as high as limits allow, by bisection.
 
     Where limits forbid even the slowest one, it is as quick as a fall: in units of a slow one the
-    regularization would weigh too much. Case: 5 N m/s on heptagon_four_contacts.toml.
+    regularization would weigh too much.
     """
     b_max, fall, grid = data.largest_b(data.nodes), _fall(data), data.grid
     scene, most = data.curve.formation.scene, data.torque_limit
@@ -531,7 +533,7 @@ def guess(data: PhaseData, time_weight: float = 0.0) -> tuple[Profile, Units]:
         if not (kept and grid.held):
             return kept
         # Torque rates and commands at the nodes.
-        profile, lags = Profile(a, b, find_middle(data, low, high)), scene.actuator_lag
+        profile, lags = Profile(a, b, find_middle(data, low, high)[1]), scene.actuator_lag
         stretch = np.maximum(Elements(grid, profile).stretch, 1e-6)
         y_t = np.sqrt(b).reshape(-1, NODES) / stretch / np.diff(grid.edges)
         tau = data.nodes.forces.tau(*profile).reshape(-1, NODES, 2)
@@ -557,8 +559,19 @@ def guess_slowly(data: PhaseData) -> tuple[Profile, Units]:
 
 
 def _fall(data: PhaseData) -> float:
-    """The b of a fall over the length of the curve [m^2/s^2]."""
-    return 2 * data.curve.formation.scene.scales.acceleration * float(data.grid.s[-1])
+    """The b of a fall over the length of the curve, or of what joints may do [m^2/s^2]."""
+    length, forces = float(data.grid.s[-1]), data.nodes.forces
+    fall = 2 * data.curve.formation.scene.scales.acceleration * length
+
+    def usual(coefficients: Array) -> float:
+        """Value at which this coefficient alone takes a joint to its torque limit."""
+        return 1 / max(float((np.abs(coefficients) / data.torque_limit).max(axis=1).mean()), 1e-100)
+
+    # The upper median; NumPy's takes 10 ms to import what it needs.
+    b_max, middle = data.largest_b(data.nodes), len(data.grid.s) // 2
+    median = float(np.partition(b_max, middle)[middle])
+    inertia, drag = 2 * length * usual(forces.of_tau[..., A]), usual(forces.of_tau[..., V]) ** 2
+    return min(fall, 30.0 * min(inertia, drag, median))  # above what torques alone allow
 
 
 def _parabola(data: PhaseData, height: float) -> tuple[Array, Array]:
@@ -577,22 +590,24 @@ def find_internal_force_range(data: PhaseData, height: float) -> tuple[Array, Ar
     return data.find_limits(data.nodes).find_internal_force_range(*_parabola(data, height))
 
 
-def find_middle(data: PhaseData, low: Array, high: Array) -> Array:
-    """The internal force amid its range, or amid a part of a wide one; zero without a range."""
+def find_middle(data: PhaseData, low: Array, high: Array) -> tuple[Array, Array]:
+    """The internal force amid its range, and amid a part of it; zero without a range."""
     finite, force = np.isfinite(low + high) & (low <= high), data.curve.formation.scene.scales.force
     near = np.minimum(high, low + 40.0 * np.maximum(force, np.abs(low)))
-    return np.where(finite, (low + near) / 2, 0.0)
+    whole, part = (np.where(finite, (low + end) / 2, 0.0) for end in (high, near))
+    return whole, part
 
 
 def _guess_at(data: PhaseData, height: float, time_weight: float = 0.0) -> tuple[Profile, Units]:
-    middle = find_middle(data, *find_internal_force_range(data, height))
+    whole, middle = find_middle(data, *find_internal_force_range(data, height))
     length, weight = float(data.grid.s[-1]), data.curve.formation.scene.scales.force
     duration = np.pi / 2 * length / np.sqrt(height)
     force = max(0.5 * weight, data.epsilon, float(np.abs(middle).mean()))  # the least unit
     profile, torque = Profile(*_parabola(data, height), middle), data.torque_limit
     squares = np.minimum(np.abs(data.nodes.forces.tau(*profile)), torque) ** 2
     power = time_weight + float(squares.sum(axis=1).mean())
-    return profile, Units(length, 0.6 * duration, force, torque, power)
+    most = max(force, float(np.abs(whole).mean()))
+    return profile, Units(length, 0.6 * duration, force, torque, power, most)
 
 
 def center(
@@ -615,14 +630,18 @@ def start_at(
     sides = data.find_limits(data.nodes)
     vertices = _Vertices.at(data.grid, sides, fastest)
     scale = data.spans / units.of(data.limits)[data.limits.sides[0]]
-    profile, (on_links, kept) = vertices.profile, _find_multipliers(nlp, data, units, vertices)
+    on_links, kept = _find_multipliers(nlp, data, units, vertices)
     kept = np.maximum(kept, _MU / _INSIDE)
-    on_sides = _MU / np.maximum(sides.find_slack(*profile) * scale, _INSIDE)
+    (a, b, lam), slack = vertices.profile, _MU / kept / scale[vertices.sides]
+    inner_a, inner_lam = sides.meet(b, vertices.sides, slack)
+    stay = vertices.held | ~(np.isfinite(inner_a) & np.isfinite(inner_lam))
+    moved = Profile(np.where(stay, a, inner_a), b, np.where(stay, lam, inner_lam))
+    on_sides = _MU / np.maximum(sides.find_slack(*moved) * scale, _INSIDE)
     free = np.flatnonzero(~vertices.held)
     on_sides[free[:, None], vertices.sides[free]] = kept[free]
-    on_b = -_MU / np.maximum(profile.b / units.profile[0], _INSIDE)
+    on_b = -_MU / np.maximum(moved.b / units.profile[0], _INSIDE)
     on_b[vertices.held] += kept[vertices.held, 0]
-    return profile, _join(nlp, data, on_sides, on_b, on_links)
+    return moved, _join(nlp, data, on_sides, on_b, on_links)
 
 
 def _join(

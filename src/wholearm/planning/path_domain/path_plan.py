@@ -201,7 +201,6 @@ def _plan_within(task: Task) -> PathIterate:
     """Plan; with a reference by successive linearization, each about the motion of the one before.
 
     Violations by other signs than those of the rows are tightened; if that costs too much, again.
-    Case: the margin of phase 2 of heptagon_four_contacts.toml within ranges is 0.1 % larger.
     """
     iterate = plan_task(task)
     for _ in range(2 if task.guides else 0):  # most further ones
@@ -412,6 +411,7 @@ class PathIterate:
     tightening: Tightening  # of the limits for that
     is_kept: bool  # whether some motion is known to keep limits, or negative margins would do
     meshes: int = 0  # before this one
+    before: PathIterate | None = None  # the solution on the mesh before
 
     @staticmethod
     def begin(task: Task, elements: int) -> PathIterate:
@@ -462,10 +462,9 @@ class PathIterate:
         return replace(self, solution=PathSolution(profile, margin, multipliers))
 
     def restart(self) -> PathIterate | None:
-        """A first one with twice the elements, once.
-
-        Case: 15 intervals at the largest epsilon that the cone of a rolling tip allows.
-        """
+        """The solution on the mesh before with tightened limits, or twice the elements, once."""
+        if self.before is not None:
+            return replace(self.before.tighten(), meshes=SOLVES)
         elements = 2 * self.task.elements
         if len(self.parts[0].grid.edges) >= elements:
             return None
@@ -506,10 +505,12 @@ class PathIterate:
             return self._move([equidistribute(*pair, task.elements) for pair in each], self.cuts)
         costs = self.due + self.paid
         costly = _GAP * float(costs.sum()) > accuracy
-        if self.meshes == 0 or costly:
+        # No mesh mends rows of ranges for another motion.
+        tight = bool(self.tightening.missed.any())
+        fixed = bool(task.guides) and (tight or self.violation_at_nodes > MISS)
+        if (self.meshes == 0 or costly) and self.meshes < SOLVES and not fixed:
             # Neither least effort nor tightened limits show where the switches are.
             breaks, shift = self.breaks, 0.0
-            tight = bool(self.tightening.limits.any())
             if not (task.is_held or task.options.goal is Objective.EFFORT or tight):
                 every = zip(self.parts, self.motions, self.breaks, strict=True)
                 matches = [
@@ -538,7 +539,8 @@ class PathIterate:
         if grid.held:
             profile = follow(grid, profile.a, profile.lam)
         made = PathIterate.on(self.task, (breaks, cuts), parts, self.units, self.is_kept)
-        return replace(made, meshes=self.meshes + 1).start(profile, old.margin)
+        made = replace(made, meshes=self.meshes + 1, before=replace(self, before=None))
+        return made.start(profile, old.margin)
 
     def tighten(self) -> PathIterate:
         """The same with limits tightened by somewhat more than their violations."""
@@ -546,12 +548,10 @@ class PathIterate:
         (short, speeding), hurry, _ = self.misses
         solution, duration = self.solution, self.task.duration
         if duration is not None:
-            # The quadrature of the NLP is not that of the motion. Case: phase 2 of
-            # heptagon_four_contacts.toml within ranges has no plan of largest margin otherwise.
+            # The quadrature of the NLP is not that of the motion.
             off = solution.duration / sum(motion.duration for motion in self.motions)
             duration *= float(np.clip(off, 0.8, 1.2))
         # Slack at nodes would absorb the rest: the lesser one of the two beside what is short.
-        # Case: the largest margin of phase 3 of the heptagon.
         slack, k = data.slack(data.nodes, solution.profile, solution.margin), data.grid.nonempty
         least = np.maximum(np.minimum(slack[k], slack[k + 1]), 0.0)
         reach = np.where(short > 0, least, 0.0)
