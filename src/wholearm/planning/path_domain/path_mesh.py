@@ -157,13 +157,13 @@ class LimitSamples(NamedTuple):
         """Switches of a motion; see `_Looks` for its arguments."""
         high, low = (self.rows.extreme(b, largest) for largest in (True, False))
         span, switches = high.a - low.a, list[Switch]()
-        choice = np.isfinite(span)
+        choice = np.isfinite(span) & (span > 1e-3 * np.abs(high.a))  # else there is no choice
         # Across a reversal limits are others, and an element ends there anyway.
         for segment in sorted(set(self.segment.tolist())):
             k = np.flatnonzero(choice & (self.segment == segment))
             limits = self.sides.pick(k), self.rows.pick(k), high.row[k], low.row[k]
             looks = _Looks(self.s[k], b[k], *limits, share[k], element[k])
-            switches += looks.find_switches()
+            switches += looks.find_switches(4e-3 * self.length)  # nearer ones are one change
         return switches
 
 
@@ -190,11 +190,17 @@ class _Looks(NamedTuple):
         row = np.where(self.rises, self.at_high, -1 - self.at_low)
         return np.where(self.b > (1 - 1e-3) * self.rows.cap, _CAPPED, row)  # active
 
-    def find_switches(self) -> list[Switch]:
-        """Switches of rows."""
+    def find_switches(self, flicker: float) -> list[Switch]:
+        """Switches of rows; changes nearer to each other than `flicker` [m] are one."""
         label, switches = self.label, list[Switch]()
-        for first in np.flatnonzero(label[1:] != label[:-1]).tolist():
-            last = first + 1
+        changes = np.flatnonzero(label[1:] != label[:-1])
+        if not len(changes):
+            return switches
+        apart = np.diff(self.s[changes]) > flicker
+        for cluster in np.split(changes, np.flatnonzero(apart) + 1):
+            first, last = int(cluster[0]), int(cluster[-1]) + 1
+            if label[first] == label[last]:
+                continue
             capped = _CAPPED in (label[first], label[last])
             if not capped and self.rises[first] == self.rises[last]:
                 switches.append(Switch(self.find_crossing(first, last), False))
