@@ -308,6 +308,8 @@ class Chooser:
                 self._refine(route, report)
             report(f"planning a route of {sum(len(link.steps) for link in route.links)} phases")
             plan = self._plan(route, report)
+            if isinstance(plan, str) and self._take_others(route):
+                plan = self._plan(route, report)
             # An interrupted one is still there, to be planned then.
             self.found.remove(route)
             if isinstance(plan, str):
@@ -316,6 +318,19 @@ class Chooser:
                     self._lost.append(plan.links)
             else:
                 self.made.append((plan, route))
+
+    def _take_others(self, route: RoadmapRoute) -> bool:
+        """Take the other plans of links that last least by themselves; whether there are any.
+
+        The plan of goal 32 of the corpus does not hold in its replay otherwise.
+        """
+        roadmap, changed = self.roadmap, False
+        for link in route.links:
+            if others := roadmap.others.pop(link, []):
+                fastest = min(others, key=lambda plan: plan.duration)
+                changed |= fastest is not roadmap.measured[link]
+                roadmap.measured[link] = fastest
+        return changed
 
     def _plan(self, route: RoadmapRoute, report: Callable[[str], None]) -> Plan | str:
         """The plan of the phases that are printed for a route.
