@@ -505,12 +505,10 @@ class PathIterate:
             return self._move([equidistribute(*pair, task.elements) for pair in each], self.cuts)
         costs = self.due + self.paid
         costly = _GAP * float(costs.sum()) > accuracy
-        # No mesh mends rows of ranges for another motion.
-        tight = bool(self.tightening.missed.any())
-        fixed = bool(task.guides) and (tight or self.violation_at_nodes > MISS)
-        if (self.meshes == 0 or costly) and self.meshes < SOLVES and not fixed:
+        if (self.meshes == 0 or costly) and self.meshes < SOLVES:
             # Neither least effort nor tightened limits show where the switches are.
             breaks, shift = self.breaks, 0.0
+            tight = bool(self.tightening.missed.any())
             if not (task.is_held or task.options.goal is Objective.EFFORT or tight):
                 every = zip(self.parts, self.motions, self.breaks, strict=True)
                 matches = [
