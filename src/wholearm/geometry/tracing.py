@@ -259,7 +259,7 @@ def _refine_dips(grid: Array, values: Array) -> Array:
     return np.setdiff1d(low + (high - low) * inner, grid)
 
 
-class Guess(NamedTuple):
+class PanelGuess(NamedTuple):
     """Chebyshev coefficients, shape (NODES, 5), of a panel that is too long."""
 
     step: float
@@ -278,8 +278,8 @@ def build_panel(
     heading: Array,
     start: float,
     step: float,
-    guess: Guess | None,
-) -> tuple[Panel | None, float, Guess | None]:
+    guess: PanelGuess | None,
+) -> tuple[Panel | None, float, PanelGuess | None]:
     """Panel of about `step` metres, if it converges, factor on the next step, and guess for it.
 
     Rolling contacts keep the slip coordinates `slip`, shape (R,) [m].
@@ -314,7 +314,7 @@ def build_panel(
     # A trailing coefficient of 0.3 of the largest one is aimed at.
     factor = (0.3 * RESOLVED / max(tail, 1e-3 * RESOLVED)) ** (1 / (NODES - 1))
     if speed.max() > 1.5 or tail > RESOLVED:
-        return None, max(min(factor, 0.8), SHORTER**2), Guess(step, analyse @ points)
+        return None, max(min(factor, 0.8), SHORTER**2), PanelGuess(step, analyse @ points)
     return Panel(start + step * (integrate @ speed), points, z_u / speed[:, None]), factor, None
 
 
