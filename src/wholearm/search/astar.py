@@ -216,9 +216,11 @@ class ReleaseSearch:
     known: dict[RefinedPath, Found] = field(default_factory=dict)  # plans that were made before
     _tried: set[RefinedPath] = field(default_factory=set)
     _others: list[Measured] = field(default_factory=list)
+    _least: float = math.inf  # time of the best plan and of what follows [s]
 
     def run(self) -> list[Measured]:
         """The fastest plan, followed by the others."""
+        self._least = time_with(self.to_go, self.best)
         # The same place again where another end may lead on faster.
         if self.to_go:
             self._try(RefinedPath(0))
@@ -248,9 +250,10 @@ class ReleaseSearch:
         plan = self.known[path] if path in self.known else self.plan(path)
         if isinstance(plan, str):
             return False
-        better = time_with(self.to_go, plan) < GAIN * time_with(self.to_go, self.best)
+        time = time_with(self.to_go, plan)
+        better = time < GAIN * self._least
         self._others.append(self.best if better else plan)
-        self.best = plan if better else self.best
+        self.best, self._least = (plan, time) if better else (self.best, self._least)
         return better
 
 
@@ -444,7 +447,7 @@ class Chooser:
             if link is None or link.left is None or link in roadmap.refined:
                 continue
             report(f"planning {describe_steps(link.steps)} in other ways")
-            single = after is not None and not after.in_cell and len(after.steps) == 1
+            single = after and not after.in_cell and len(after.steps) == 1
             to_go = look_ahead(self.problem, after, link.stop) if after and single else None
             plan = roadmap.measured[link]
             assert isinstance(plan, Measured)
