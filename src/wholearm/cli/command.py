@@ -61,6 +61,7 @@ TOPICS = {
     "policy": "policy",
     "robustness": "analysis",
     "engines": "engines",
+    "design": "design",
     "slow-motions": "analysis",
     "tuning": "analysis",
     "comparison": "analysis",

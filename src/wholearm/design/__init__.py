@@ -1,0 +1,1 @@
+"""Values of parameters: sweeps over grids and samples, sensitivities, the best hand."""
