@@ -40,6 +40,17 @@ Task = tuple[int, tuple[float, ...]]
 """Number and values of a sample."""
 
 
+def draw_cube(count: int, size: int, seed: int | tuple[int, int]) -> Array:
+    """Samples of a Latin hypercube, shape (count, size), in [0, 1).
+
+    Each column has one sample in each of `count` slices, so that the effect of a number does not
+    drown in that of the others.
+    """
+    generator = np.random.default_rng(seed)
+    slices = generator.permuted(np.tile(np.arange(count)[:, None], size), axis=0)
+    return np.asarray((slices + generator.random(slices.shape)) / count)
+
+
 @dataclass(frozen=True)
 class Uncertainty:
     """Half widths of the ranges, by name of the parameter, and how torques are carried out.
@@ -82,15 +93,9 @@ class Uncertainty:
     def draw(self, count: int, seed: int | tuple[int, int]) -> Array:
         """Samples of a Latin hypercube, shape (count, len(varied) + 1).
 
-        Each parameter has one sample in each of `count` slices of its range, so that its effect
-        does not drown in that of the others. The last column is where in a period of the
-        sample-and-hold the torques begin, in [0, 1).
+        The last column is where in a period of the sample-and-hold the torques begin, in [0, 1).
         """
-        generator = np.random.default_rng(seed)
-        slices = generator.permuted(
-            np.tile(np.arange(count)[:, None], len(self.varied) + 1), axis=0
-        )
-        shares = (slices + generator.random(slices.shape)) / count
+        shares = draw_cube(count, len(self.varied) + 1, seed)
         centred = 2 * shares[:, :-1] - 1
         delay = [parameter.name == "delay" for parameter in self.varied]
         centred[:, delay] = shares[:, :-1][:, delay]

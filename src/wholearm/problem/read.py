@@ -12,7 +12,7 @@ import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from itertools import zip_longest
+from itertools import product, zip_longest
 from typing import Any, TypeVar
 
 import numpy as np
@@ -576,6 +576,8 @@ def name_keys() -> dict[str, tuple[str, ...]]:
         names |= {f"{name}{number}": (f"fingers.{number}.{finger}",) for number in FINGERS}
         if field.kind is not POINT:
             names[name] = tuple(f"fingers.{number}.{finger}" for number in FINGERS)
+    for number, (place, axis) in product(FINGERS, enumerate("xy", start=1)):
+        names[f"base{number}_{axis}"] = (f"fingers.{number}.base[{place}]",)
     return names
 
 

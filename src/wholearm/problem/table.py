@@ -81,8 +81,10 @@ def _enter(place: Any, step: str | int, key: str) -> Any:
             count = len(place) if isinstance(place, list) else 0
             raise InputError("", key, f"there is no number {step + 1}; the list has {count}")
     elif not isinstance(place, dict) or step not in place:
-        keys = ", ".join(place) if isinstance(place, dict) else "no table"
-        raise InputError("", key, f"there is no {step!r}; what is there: {keys}")
+        keys = list(place) if isinstance(place, dict) else ["no table"]
+        near = get_close_matches(step, keys, 1, 0.5)
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        raise InputError("", key, f"there is no {step!r}; {hint}what is there: {', '.join(keys)}")
     return place[step]
 
 
