@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     )
     from .contacts.elemental import Contact
     from .contacts.formation import Formation
+    from .design.sweep import Sweep, sweep
+    from .design.sweep_figure import draw_sweep
     from .engines.engine_replay import EngineReport, PolicyReport, play_policy, replay_in
     from .engines.mujoco import write_mjcf
     from .figures import plots
@@ -65,6 +67,8 @@ _NAMES = {
     "analysis.comparison": "Comparison compare",
     "contacts.elemental": "Contact",
     "contacts.formation": "Formation",
+    "design.sweep": "Sweep sweep",
+    "design.sweep_figure": "draw_sweep",
     "engines.engine_replay": "EngineReport PolicyReport play_policy replay_in",
     "engines.mujoco": "write_mjcf",
     "figures.map_figure": "draw_map",
@@ -101,12 +105,13 @@ __all__ = [
     "InfeasibleError", "InputError", "JammingError", "Objective", "Phase", "Plan",
     "PlanOptions", "Policy", "PolicyReport", "Polygon", "Prediction", "Problem", "ReplayError",
     "Report", "Robustness", "Scene", "Shortfall", "Simulation", "SimulationError",
-    "SolverError", "Status", "TorqueProfile", "Trajectory", "Tuning", "Uncertainty", "Until",
-    "WholearmError", "__version__", "assess_robustness", "build_map", "compare", "draw_map",
-    "find_route", "format_route", "list_formations", "load", "load_plan", "load_trajectory",
-    "make_policy", "place_start", "play_policy", "plots", "predict", "read_formation",
-    "read_torque_csv", "read_until", "replay_in", "save", "simulate", "simulate_free", "solve",
-    "tune", "verify", "verify_free", "verify_policy", "write_mjcf",
+    "SolverError", "Status", "Sweep", "TorqueProfile", "Trajectory", "Tuning", "Uncertainty",
+    "Until", "WholearmError", "__version__", "assess_robustness", "build_map", "compare",
+    "draw_map", "draw_sweep", "find_route", "format_route", "list_formations", "load",
+    "load_plan", "load_trajectory", "make_policy", "place_start", "play_policy", "plots",
+    "predict", "read_formation", "read_torque_csv", "read_until", "replay_in", "save",
+    "simulate", "simulate_free", "solve", "sweep", "tune", "verify", "verify_free",
+    "verify_policy", "write_mjcf",
 ]  # fmt: skip
 
 

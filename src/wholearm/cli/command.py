@@ -33,6 +33,7 @@ from ..common.files import require_ending, require_writable, together, write_tex
 from ..common.signals import check, guard, listen
 from ..mechanics import MARGIN
 from ..planning.options import PLANNER
+from . import design
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -231,6 +232,7 @@ problem           problem file (TOML) with [goal] in place of [[phases]]
 --jobs                worker processes (default: all cores) in 1..256
 --scheduler ADDRESS   run on the cluster of this Dask scheduler (extra: cluster)
 {JSON}\
+{design.TABLE}\
 [[animate]]  animate  make a movie of a plan, or a page that plays it
 trajectory         trajectory file (.npz)
 -o --output FILE   what to write: .gif, .mp4 (needs ffmpeg), or .html, which plays in any browser
@@ -357,7 +359,7 @@ def build_parser() -> Parser:
         name, run, text = re.split(r" {2,}", head)
         subparser = add_parser(commands, name.strip("[]"), text)
         add_options(subparser, table)
-        subparser.set_defaults(run=globals()[run])
+        subparser.set_defaults(run=globals().get(run) or getattr(design, run))
     text = "run studies: measure, compare with stored answers, look for what must not be"
     bench = add_parser(commands, "bench", text)
     bench.fill = partial(_fill_bench, bench)

@@ -44,6 +44,12 @@ class Change(NamedTuple):
             {parameter.mirrored: -self.value} if parameter.mirrored else {}
         )
 
+    @property
+    def relative(self) -> float:
+        """How large the change is, over the value or what it becomes."""
+        before, after = self.parameter.value, self.value
+        return abs(after - before) / max(abs(before), abs(after), 1e-300)
+
     def __str__(self) -> str:
         parameter = self.parameter
         value = f"{self.value:g} {parameter.unit}".rstrip()

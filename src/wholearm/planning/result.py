@@ -25,6 +25,8 @@ from .nlp import SolverStatistics
 from .options import Objective, PlanOptions
 from .phase_plan import combine
 
+UNITS = {Objective.TIME: "s", Objective.EFFORT: "(N m)^2 s", Objective.MARGIN: "N"}
+"""Units of the objectives."""
 _KEYS = {
     "value": "phase_values", "duration": "phase_durations", "attempt": "attempts",
     "error": "phase_errors", "uniqueness_margin": "uniqueness_margins",
@@ -117,8 +119,7 @@ class Plan(Drawn, Result):
     @property
     def unit(self) -> str:
         """Unit of the objective."""
-        units = {Objective.TIME: "s", Objective.EFFORT: "(N m)^2 s", Objective.MARGIN: "N"}
-        return units[self.options.goal]
+        return UNITS[self.options.goal]
 
     @property
     def error(self) -> float:

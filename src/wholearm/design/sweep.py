@@ -1,0 +1,374 @@
+"""Sweeps: a plan for each point of a grid, or of a Latin hypercube, of parameters of problems.
+
+A row depends on its point alone, not on the process that computes it nor on the order. Rows are
+kept one by one in a `Journal` and go through an executor, like samples of `analysis.robustness`.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import os
+import re
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from itertools import product
+from numbers import Real
+from typing import Any
+
+import numpy as np
+
+from .. import __version__
+from ..analysis.robustness import draw_cube
+from ..common.document import Document, Result, Table, plain
+from ..common.errors import InfeasibleError, InputError, WholearmError
+from ..common.fields import Range, choice
+from ..common.journal import Journal
+from ..common.parallel import Processes, run_all
+from ..mechanics.limits import make_limits
+from ..planning.options import Objective, PlanOptions
+from ..planning.result import UNITS, Plan
+from ..problem.definition import Problem
+from ..problem.read import name_keys
+from ..search import solve
+from .parameters import Parameter, find_parameter, require_allowed
+
+Point = tuple[Any, ...]
+"""Index of a problem, and the value of each parameter."""
+Row = dict[str, Any]
+"""What came of a point, as plain values; see `Sweep`."""
+CHECKS = ("verify", "free", "policy")
+"""What plans can be tried with: the replay with given contacts, without, and as a policy."""
+ACTIVE = 1e-3  # slack below which a limit counts as active, over the unit of its shortfalls
+
+
+@dataclass(frozen=True)
+class Planner:
+    """Plans problems with other values of parameters."""
+
+    problems: tuple[Problem, ...]
+    names: tuple[str, ...]  # of the parameters, as of `Problem.with_`
+    options: Mapping[str, Any]  # of `solve`
+    checks: tuple[str, ...] = ()  # of `CHECKS`
+
+    def run(self, task: tuple[int, Point]) -> Row:
+        """The row of a point, which has a number."""
+        index, *values = task[1]
+        changes = dict(zip(self.names, values, strict=True))
+        try:
+            plan = solve(self.problems[index].with_(changes), **self.options)
+        except WholearmError as error:
+            return describe_failure(error)
+        limit, share = find_limit(plan)
+        margin = float(np.nanmin(plan.trajectory.c_n)) - plan.problem.epsilon
+        row = {"status": "planned", "value": plan.value, "margin": margin}
+        row |= {"limit": limit, "share": share}
+        row |= {f"duration{phase.number}": phase.duration for phase in plan.phases}
+        return row | {check: _try(plan, check) for check in self.checks}
+
+
+def find_limit(plan: Plan) -> tuple[str, float]:
+    """The limit that is active for the longest time, and for which share of the motion.
+
+    Instead of epsilon counts the plan's least normal force, which is more for the objective margin.
+    """
+    motion, spent = plan.trajectory, dict[str, float]()
+    weight = np.gradient(motion.t)  # samples are even in time within a phase
+    for phase in plan.problem.phases:
+        rows, formation = motion.phase == phase.index, phase.formation
+        limits = make_limits(formation, float(np.nanmin(motion.c_n)))
+        columns = [motion.contacts.index(name) for name in formation.names]
+        c_t = motion.c_t[rows][:, columns][:, formation.rolling_rows]
+        forces = [motion.c_n[rows][:, columns], c_t, motion.tau[rows], motion.theta_dot[rows]]
+        slack, sides = limits.find_slack(np.hstack(forces) @ limits.rows.T), limits.sides[0]
+        times = weight[rows] @ (slack <= ACTIVE * limits.scales[sides])
+        for owner, length in zip(limits.owners[sides], times.tolist(), strict=True):
+            name = _name(limits.limits[owner].text)
+            spent[name] = spent.get(name, 0.0) + length
+    limit = max(spent, key=lambda name: spent[name])
+    return limit, spent[limit] / motion.duration
+
+
+def _name(limit: str) -> str:
+    """A limit in words, without its value."""
+    return re.split(r" >?= |, ", limit, maxsplit=1)[0]
+
+
+def _try(plan: Plan, check: str) -> str:
+    """What a check of a plan finds; "ok" if it holds."""
+    from ..policy.make import make_policy
+    from ..verification.free import verify_free, verify_policy
+    from ..verification.verify import verify
+
+    try:
+        if check == "policy":
+            policy = make_policy(plan.problem, plan)
+            report: Any = verify_policy(plan.problem, plan, policy)
+        else:
+            report = (verify_free if check == "free" else verify)(plan.problem, plan)
+    except WholearmError as error:
+        return str(error)
+    return "ok" if report.ok else str(report.reason)
+
+
+def describe_failure(error: Exception) -> Row:
+    """The row of a point without a plan."""
+    impossible, infeasible = isinstance(error, InputError), isinstance(error, InfeasibleError)
+    status = "infeasible" if infeasible else "impossible" if impossible else "failed"
+    text = f"{error.key}: {error.problem}" if isinstance(error, InputError) else str(error)
+    # Without numbers and places, which differ from point to point.
+    reason = re.split(r"; |: going | at [xt] = ", re.sub(r" \(.*?\)", "", text), maxsplit=1)[0]
+    reason = re.sub(r"(?<== )-?\d\S*|-?\d+\.\d\S*", "\u2026", reason)
+    for shortfall in getattr(error, "shortfalls", ())[:1]:
+        reason = f"{_name(shortfall.limit)} in phase {shortfall.place.phase}"
+    changes = sorted(getattr(error, "changes", ()), key=lambda change: change.relative)
+    change = str(changes[0]) if changes else ""
+    return {"status": status, "value": None, "reason": reason, "change": change, "message": text}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Sweep(Result):
+    """Rows of points, in the order of the points.
+
+    A row has `status`. With a plan: the `value` of the objective; `margin`, the least normal force
+    beyond epsilon [N]; the `limit` that is active for the longest time, and its `share` of the
+    motion; `duration1`, ... of the phases [s]; for each check "ok" or what fails. Without one: its
+    `reason` in a few words, alike for neighbouring points; the smallest `change` of one number with
+    which there is a plan, if one was found; the whole `message`.
+    """
+
+    planner: Planner
+    axes: tuple[tuple[Any, ...], ...]  # values of each parameter; of samples the first and last
+    points: tuple[Point, ...]
+    rows: tuple[Row, ...]
+    samples: int = 0  # size of the Latin hypercube; 0 for a grid
+
+    @property
+    def titles(self) -> list[str]:
+        """Names of the parameters, with the units of those that are numbers."""
+        titles, problem = list[str](), self.planner.problems[0]
+        for name in self.planner.names:
+            try:
+                titles.append(find_parameter(problem, name).title)
+            except InputError:
+                titles.append(name)
+        return titles
+
+    @property
+    def sources(self) -> list[str]:
+        """Files of the problems, or their names."""
+        return [problem.source or problem.name for problem in self.planner.problems]
+
+    @property
+    def objective(self) -> Objective:
+        """Of the plans."""
+        return Objective(self.planner.options["objective"])
+
+    @property
+    def label(self) -> str:
+        """Objective and its unit."""
+        return f"{self.objective.value} [{UNITS[self.objective]}]"
+
+    @property
+    def ok(self) -> bool:
+        """Whether any point has a plan."""
+        return self.best is not None
+
+    @property
+    def reasons(self) -> Counter[str]:
+        """How many points have no plan for each reason."""
+        return Counter(row["reason"] for row in self.rows if "reason" in row)
+
+    @property
+    def best(self) -> int | None:
+        """Index of the row with the best value; None without a plan."""
+        sign = -1 if self.objective is Objective.MARGIN else 1
+        values = {k: row["value"] for k, row in enumerate(self.rows) if row["value"] is not None}
+        return min(values, key=lambda k: sign * values[k], default=None)
+
+    @property
+    def entries(self) -> list[Row]:
+        """Rows with their problem and the values of the parameters."""
+        names = ("problem", *self.planner.names)
+        points = [(self.sources[index], *values) for index, *values in self.points]
+        pairs = zip(points, self.rows, strict=True)
+        return [dict(zip(names, point, strict=True)) | row for point, row in pairs]
+
+    @property
+    def document(self) -> Document:
+        """All rows, how many have no plan for which reason, and the best one."""
+        names, checks, count = self.planner.names, self.planner.checks, len(self.rows)
+        columns = {"problem": "problem"} if len(self.sources) > 1 else {}
+        columns |= {k: f"{title}:.6g" for k, title in zip(names, self.titles, strict=True)}
+        columns |= {"status": "status", "value": f"{self.label}:.6g", "phases": "phases [s]:.4g"}
+        columns |= {"margin": "margin [N]:.3g"} | dict(zip(checks, checks, strict=True))
+        columns |= {"reason": "limited by, or reason", "change": "feasible with"}
+        entries = self.entries
+        for entry in entries:
+            entry["phases"] = [entry[key] for key in entry if key.startswith("duration")] or None
+            if "limit" in entry:
+                entry["reason"] = f"{entry['limit']} ({100 * entry['share']:.0f} % of the time)"
+        reasons = self.reasons.most_common()
+        last = f"no point has a plan, most often because of: {reasons[0][0]}" if reasons else ""
+        if self.best is not None:
+            best = entries[self.best]
+            places = [f"{k} = {show_value(best[k])}" for k in columns if k in (*names, "problem")]
+            last = f"best: {self.label} = {best['value']:.6g}, {', '.join(places)}"
+        rows = [[entry.get(key) for key in columns] for entry in entries]
+        parts = [Table([*columns.values()], rows, most=100)]
+        parts += [Table(["without a plan, by reason", "points:d"], reasons)]
+        reason = f"{count - self.reasons.total()} of {count} points planned"
+        return Document(", ".join(self.sources), reason=reason, parts=[*parts, last])
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Everything, as JSON has it."""
+        vary = dict(zip(self.planner.names, self.axes, strict=True))
+        about = {"objective": self.objective, "unit": UNITS[self.objective], "vary": vary}
+        about |= {"samples": self.samples, "reasons": self.reasons, "best": self.best}
+        return about | {"rows": self.entries}
+
+    def to_csv(self) -> str:
+        """All rows as CSV, with all digits."""
+        entries, stream = self.entries, io.StringIO()
+        heads = dict.fromkeys(k for entry in sorted(entries, key=len, reverse=True) for k in entry)
+        writer = csv.DictWriter(stream, heads, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(entries)
+        return stream.getvalue()
+
+
+def show_value(value: Any) -> str:
+    """A number with six digits, or a word."""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def read_vary(texts: Sequence[str], samples: int = 0) -> dict[str, tuple[Any, ...]]:
+    """Values of parameters from ``NAME=LOW:HIGH:COUNT`` or ``NAME=VALUE,VALUE``.
+
+    Samples take ``NAME=LOW:HIGH``. Values that are no numbers are words.
+
+    Raises
+    ------
+    InputError  if a text is none of these, or a name is given twice
+    """
+    vary = dict[str, tuple[Any, ...]]()
+    form = "NAME=LOW:HIGH" if samples else "NAME=LOW:HIGH:COUNT or NAME=VALUE,VALUE"
+    for text in texts:
+        name, _, given = text.partition("=")
+        parts: list[Any] = [_parse(part) for part in re.split("[:,]", given)]
+        several = ":" not in given and not samples
+        if several and name and given and name not in vary:
+            vary[name] = tuple(parts)
+            continue
+        numbers = all(isinstance(part, Real) for part in parts) and "," not in given
+        if several or not numbers or len(parts) != 3 - bool(samples) or parts[0] >= parts[1]:
+            raise InputError("", "--vary", f"{text!r} given; {form} is needed, each name once")
+        count = Range(2, 10**6).read((*parts, 2)[2], f"--vary {name}: COUNT")
+        vary[name] = tuple(np.linspace(parts[0], parts[1], count).tolist())
+    return vary
+
+
+def _parse(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
+
+
+def require_values(problem: Problem, name: str, values: Sequence[Any]) -> None:
+    """Raise an `InputError` if a problem lacks a parameter, or no file may have its values."""
+    parameter = Parameter(name, (name, *name_keys().get(name, ())), math.nan, "")
+    if all(isinstance(value, Real) for value in values):
+        values = min(values), max(values)
+    for value in values:
+        require_allowed(problem, parameter, value, "--vary")
+
+
+def describe_progress(done: int, count: int, before: int, began: float) -> str:
+    """A bar of what is done, and the time that is left at the speed since `began` [s]."""
+    left = (time.monotonic() - began) / max(done - before, 1) * (count - done)
+    time_left = f"{left:.0f} s" if left < 100 else f"{left / 60:.0f} min"
+    return f"[{'#' * (20 * done // count):.<20}] {done} of {count} points, {time_left} left"
+
+
+def sweep(
+    problems: Problem | Sequence[Problem],
+    vary: Mapping[str, Sequence[Any]],
+    objective: str = "time",
+    *,
+    samples: int = 0,
+    seed: int = 0,
+    checks: Sequence[str] = (),
+    time_limit: float | None = None,
+    path: str | os.PathLike[str] | None = None,
+    fresh: bool = False,
+    start: Callable[[], Executor] | None = None,
+    progress: Callable[[str], None] | None = None,
+    **options: Any,
+) -> Sweep:
+    """Plan problems with other values of parameters.
+
+    Parameters
+    ----------
+    problems         one or several, with phases or goals
+    vary             values of parameters by the names of `Problem.with_`: all their combinations
+    objective        of the plans, as of `wholearm.solve`
+    samples          size of a Latin hypercube, from the first to the last of the values, in place
+                     of the grid; 0 for the grid
+    seed             of the samples
+    checks           of "verify", "free" and "policy": what plans are tried with besides the replay
+                     that is part of planning
+    time_limit : [s] for planning one point
+    path             file to which rows are written as they come. A sweep that is there already goes
+                     on where it was stopped, and ends the same to the last bit, unless it is to be
+                     `fresh`.
+    fresh            begin the file anew, whatever it holds
+    start            makes a `concurrent.futures.Executor`; processes on all cores if left out
+    progress         told how many points are done, and the time that is left
+    **options        as `wholearm.solve` takes them
+
+    Raises
+    ------
+    InputError  if a problem lacks a parameter, no file may have one of its values, or the file
+                holds another sweep or anything else
+    """
+    listed = (problems,) if isinstance(problems, Problem) else tuple(problems)
+    for check in checks:
+        choice(*CHECKS).read(check, "--with")
+    chosen = {"objective": objective, **options}
+    PlanOptions(**chosen)
+    axes = tuple(tuple(plain(list(values))) for values in vary.values())
+    for problem, (name, values) in product(listed, zip(vary, axes, strict=True)):
+        require_values(problem, name, values)
+    combinations: Iterable[Point] = product(*axes)
+    if samples:
+        ends = np.array([(values[0], values[-1]) for values in axes], dtype=float).reshape(-1, 2)
+        cube = draw_cube(Range(1, 10**6).read(samples, "samples"), len(axes), seed)
+        combinations = (ends[:, 0] + cube * np.diff(ends)[:, 0]).tolist()
+    points = [(index, *values) for index, values in product(range(len(listed)), combinations)]
+    planner = Planner(listed, tuple(vary), chosen | {"time_limit": time_limit}, tuple(checks))
+    stamp = {
+        "study": "sweep", "version": __version__, "problems": [p.table for p in listed],
+        "vary": dict(zip(vary, axes, strict=True)), "samples": samples, "seed": seed,
+        "options": plain(planner.options), "checks": checks,
+    }  # fmt: skip
+    with Journal(os.fspath(path or os.devnull), stamp, fresh) as journal:
+        rows = {record["point"]: record["row"] for record in journal.records}
+        tasks = [(k, point) for k, point in enumerate(points) if k not in rows]
+        began, before = time.monotonic(), len(rows)
+        for (number, _), answer in run_all(planner.run, tasks, (start or Processes)()):
+            if isinstance(answer, Exception):
+                # Not kept: what a process died of may not be there the next time.
+                rows[number] = describe_failure(answer)
+            else:
+                rows[number] = answer
+                journal.add({"point": number, "row": answer})
+            if progress is not None:
+                progress(describe_progress(len(rows), len(points), before, began))
+    return Sweep(planner, axes, tuple(points), tuple(rows[k] for k in range(len(points))), samples)

@@ -1,0 +1,179 @@
+"""Figure of a sweep: a curve over one parameter, contours over two, small multiples beyond.
+
+Points without a plan have the colour of their reason. Nothing is interpolated but contour lines.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from itertools import groupby
+from textwrap import fill
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
+
+from ..common.arrays import Array
+from ..common.errors import InputError
+from ..figures.style import GRID, INK, LINES, PALETTE, open_figure
+from ..planning.options import Objective
+from .sweep import Sweep, show_value
+
+MOST = 24  # panels, and lines of a panel
+SHARE = 0.08  # of the points of a panel, from which their reason is written there
+Lines = Mapping[str, Sequence[int]]
+"""Indices of rows by what they have in common."""
+
+
+def draw_sweep(sweep: Sweep) -> Figure:
+    """Draw the values over the parameters, and why there are none where there are none.
+
+    Over one parameter, problems and words are lines; over two they are panels. Samples have a panel
+    for each parameter.
+
+    Raises
+    ------
+    InputError  if a grid has more than three parameters, or there are too many panels
+    """
+    several = [k for k, axis in enumerate(sweep.axes, 1) if len(axis) > 1]
+    numeric = [k for k in several if all(isinstance(v, int | float) for v in sweep.axes[k - 1])]
+    if not numeric or (len(numeric) > 3 and not sweep.samples):
+        text = f"drawn are 1 to 3 parameters with several numbers, and not {len(numeric)}"
+        raise InputError("", "--figure", f"{text}; --samples may have any number")
+    shown = numeric if sweep.samples else numeric[:2]
+    lines: dict[str, list[int]] = {}
+    fixed = [] if sweep.samples else [k for k in several if k not in shown]
+    for row, point in enumerate(sweep.points):
+        parts = [os.path.basename(sweep.sources[point[0]])] if len(sweep.sources) > 1 else []
+        parts += [f"{sweep.planner.names[k - 1]} = {show_value(point[k])}" for k in fixed]
+        lines.setdefault(", ".join(parts), []).append(row)
+    contours = len(shown) == 2 and not sweep.samples
+    panels = [{name: rows} for name, rows in lines.items()] if contours else [lines for _ in shown]
+    if max(len(panels), len(lines)) > MOST:
+        raise InputError("", "--figure", f"more than {MOST} panels or lines; vary fewer values")
+    reasons = sweep.reasons.most_common()
+    colours = {reason: PALETTE[k % len(PALETTE)] for k, (reason, _) in enumerate(reasons)}
+    columns = 2 if len(panels) == 4 else min(3, len(panels))
+    height = 1.2 + 3.0 * math.ceil(len(panels) / columns) + 0.17 * min(len(reasons), 8)
+    with open_figure(10.0 if columns > 1 else 7.0, height, layout="constrained") as figure:
+        grid = figure.subplots(math.ceil(len(panels) / columns), columns, squeeze=False)
+        for k, (axes, panel) in enumerate(zip(grid.flat, panels, strict=False)):
+            if contours:
+                ((title, rows),) = panel.items()
+                axes.set_title(title, fontsize=9, parse_math=False)
+                mesh = _draw_plane(axes, sweep, shown, rows, colours)
+            else:
+                _draw_lines(axes, sweep, shown[k], panel, colours)
+        for axes in grid.flat[len(panels) :]:
+            axes.remove()
+        if contours:
+            figure.colorbar(mesh, ax=list(grid.flat[: len(panels)]), label=sweep.label)
+        patches = [
+            Patch(color=_pale(colours[reason]), label=fill(f"{reason}: {count}", 110))
+            for reason, count in reasons[:8]
+        ]
+        if patches:
+            look: Any = {"loc": "outside lower left", "alignment": "left", "fontsize": 8}
+            figure.legend(handles=patches, title="points without a plan, by reason", **look)
+        sources = ", ".join(map(os.path.basename, sweep.sources))
+        figure.suptitle(sources, fontsize=10, parse_math=False)
+    return figure
+
+
+def _pale(colour: str) -> tuple[float, float, float]:
+    red, green, blue = (0.7 + 0.3 * int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5))
+    return red, green, blue
+
+
+def _take(sweep: Sweep, rows: Sequence[int]) -> tuple[Array, list[str]]:
+    """Values of rows, NaN without a plan, and reasons, empty with a plan."""
+    values = np.array([sweep.rows[row]["value"] for row in rows], dtype=float)
+    return values, [sweep.rows[row].get("reason", "") for row in rows]
+
+
+def _border(places: Array) -> Array:
+    """Borders of cells around places, half way between them."""
+    return np.concatenate([places[:1], (places[1:] + places[:-1]) / 2, places[-1:]])
+
+
+def _write(axes: Axes, reason: str, colour: str, x: float, y: float, transform: Any) -> None:
+    box = {"facecolor": _pale(colour), "linewidth": 0, "pad": 1.5}
+    look: Any = {"ha": "center", "va": "center", "fontsize": 7.5, "color": INK, "bbox": box}
+    text = fill(reason if len(reason) <= 60 else f"{reason[:57]}...", 18)
+    axes.text(x, y, text, transform=transform, parse_math=False, **look)
+
+
+def _draw_lines(
+    axes: Axes, sweep: Sweep, index: int, lines: Lines, colours: Mapping[str, str]
+) -> None:
+    """Values over one parameter; where there are none, bands or crosses of the reason.
+
+    A line alone has bands of full height; of several ones each has a strip at the bottom.
+    """
+    axes.set(xlabel=sweep.titles[index - 1], ylabel=sweep.label)
+    axes.grid(color=GRID, linewidth=0.4)
+    single, across = len(lines) == 1 and not sweep.samples, axes.get_xaxis_transform()
+    for number, (name, rows) in enumerate(lines.items()):
+        rows = sorted(rows, key=lambda row: sweep.points[row][index])
+        x = np.array([sweep.points[row][index] for row in rows], dtype=float)
+        (values, reasons), (dash, marker) = _take(sweep, rows), LINES[number % len(LINES)]
+        look: Any = {"color": PALETTE[number % len(PALETTE)], "marker": marker, "markersize": 3.0}
+        axes.plot(x, values, linestyle="" if sweep.samples else dash, label=name, **look)
+        low, high = (0.0, 1.0) if single else (0.05 * number + 0.01, 0.05 * number + 0.04)
+        if len(lines) > 1 and any(reasons):
+            axes.plot(0.0, (low + high) / 2, transform=axes.transAxes, clip_on=False, **look)
+        borders, first = _border(x), 0
+        for reason, group in groupby(reasons):
+            last = first + len(list(group))
+            if reason and sweep.samples:
+                middle = np.full(last - first, (low + high) / 2)
+                axes.plot(x[first:last], middle, "x", color=colours[reason], transform=across)
+            elif reason:
+                left, right, colour = borders[first], borders[last], colours[reason]
+                axes.axvspan(left, right, low, high, color=_pale(colour), linewidth=0, zorder=1)
+                if single and last - first > SHARE * len(rows):
+                    _write(axes, reason, colour, (left + right) / 2, 0.5, across)
+            first = last
+    if not single:
+        bottom, top = axes.get_ylim()
+        axes.set_ylim(top - (top - bottom) / (1 - 0.05 * len(lines)), top)
+    if len(lines) > 1:
+        axes.legend(fontsize=8)
+
+
+def _draw_plane(
+    axes: Axes,
+    sweep: Sweep,
+    shown: Sequence[int],
+    rows: Sequence[int],
+    colours: Mapping[str, str],
+) -> Any:
+    """Values over two parameters as cells, with contour lines, and regions without a plan."""
+    labels = [sweep.titles[k - 1] for k in shown]
+    axes.set(xlabel=labels[0], ylabel=labels[1])
+    x, y = (np.array(sweep.axes[k - 1], dtype=float) for k in shown)
+    values, reasons = _take(sweep, rows)
+    values, every = values.reshape(len(x), len(y)).T, _take(sweep, range(len(sweep.rows)))[0]
+    low, high = (np.nanmin(every), np.nanmax(every)) if sweep.ok else (0.0, 1.0)
+    look = "viridis" if sweep.objective is Objective.MARGIN else "viridis_r"
+    mesh = axes.pcolormesh(_border(x), _border(y), values, vmin=low, vmax=high, cmap=look)
+    if np.isfinite(values).sum() > 3 and np.nanmax(values) > np.nanmin(values):
+        levels = MaxNLocator(8).tick_values(low, high)
+        lines = axes.contour(
+            x, y, np.ma.masked_invalid(values), levels, colors="white", linewidths=0.9
+        )
+        axes.clabel(lines, fontsize=7.5)
+    shades, names = np.zeros((*values.shape, 4)), np.array(reasons).reshape(len(x), len(y)).T
+    for reason, colour in colours.items():
+        here = names == reason
+        shades[here] = *_pale(colour), 1.0
+        if here.mean() > SHARE and here.any(axis=0).mean() > 0.35:  # wide enough
+            below, left = np.nonzero(here)
+            _write(axes, reason, colour, x[left].mean(), y[below].mean(), axes.transData)
+    axes.pcolormesh(_border(x), _border(y), shades)
+    return mesh
