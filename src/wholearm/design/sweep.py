@@ -16,6 +16,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import product
 from numbers import Real
@@ -133,41 +134,24 @@ def describe_failure(error: Exception) -> Row:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Sweep(Result):
-    """Rows of points, in the order of the points.
+    """Rows of all points, in their order.
 
-    A row has `status`. With a plan: the `value` of the objective; `margin`, the least normal force
-    beyond epsilon [N]; the `limit` that is active for the longest time, and its `share` of the
-    motion; `duration1`, ... of the phases [s]; for each check "ok" or what fails. Without one: its
-    `reason` in a few words, alike for neighbouring points; the smallest `change` of one number with
-    which there is a plan, if one was found; the whole `message`.
+    A row has `problem`, the parameters by name, and `status`. With a plan: the `value` of the
+    objective; `margin`, the least normal force beyond epsilon [N]; the `limit` that is active for
+    the longest time, and its `share` of the motion; `duration1`, ... of the phases [s]; for each
+    check "ok" or what fails. Without one: its `reason` in a few words, alike for neighbouring
+    points; the smallest `change` of one number with which there is a plan, if one was found; the
+    whole `message`.
     """
 
-    planner: Planner
-    axes: tuple[tuple[Any, ...], ...]  # values of each parameter; of samples the first and last
-    points: tuple[Point, ...]
+    derived = ("reasons", "best")
+    problems: tuple[str, ...]  # their files, or names
+    objective: Objective
+    vary: Mapping[str, tuple[Any, ...]]  # values of the parameters; of samples the first and last
+    samples: int  # size of the Latin hypercube; 0 for a grid
     rows: tuple[Row, ...]
-    samples: int = 0  # size of the Latin hypercube; 0 for a grid
-
-    @property
-    def titles(self) -> list[str]:
-        """Names of the parameters, with the units of those that are numbers."""
-        titles, problem = list[str](), self.planner.problems[0]
-        for name in self.planner.names:
-            try:
-                titles.append(find_parameter(problem, name).title)
-            except InputError:
-                titles.append(name)
-        return titles
-
-    @property
-    def sources(self) -> list[str]:
-        """Files of the problems, or their names."""
-        return [problem.source or problem.name for problem in self.planner.problems]
-
-    @property
-    def objective(self) -> Objective:
-        """Of the plans."""
-        return Objective(self.planner.options["objective"])
+    titles: Mapping[str, str]  # of the parameters, with units
+    checks: tuple[str, ...] = ()
 
     @property
     def label(self) -> str:
@@ -180,9 +164,9 @@ class Sweep(Result):
         return self.best is not None
 
     @property
-    def reasons(self) -> Counter[str]:
-        """How many points have no plan for each reason."""
-        return Counter(row["reason"] for row in self.rows if "reason" in row)
+    def reasons(self) -> dict[str, int]:
+        """How many points have no plan for each reason, the most frequent first."""
+        return dict(Counter(r["reason"] for r in self.rows if "reason" in r).most_common())
 
     @property
     def best(self) -> int | None:
@@ -192,54 +176,36 @@ class Sweep(Result):
         return min(values, key=lambda k: sign * values[k], default=None)
 
     @property
-    def entries(self) -> list[Row]:
-        """Rows with their problem and the values of the parameters."""
-        names = ("problem", *self.planner.names)
-        points = [(self.sources[index], *values) for index, *values in self.points]
-        pairs = zip(points, self.rows, strict=True)
-        return [dict(zip(names, point, strict=True)) | row for point, row in pairs]
-
-    @property
     def document(self) -> Document:
         """All rows, how many have no plan for which reason, and the best one."""
-        names, checks, count = self.planner.names, self.planner.checks, len(self.rows)
-        columns = {"problem": "problem"} if len(self.sources) > 1 else {}
-        columns |= {k: f"{title}:.6g" for k, title in zip(names, self.titles, strict=True)}
-        columns |= {"status": "status", "value": f"{self.label}:.6g", "phases": "phases [s]:.4g"}
-        columns |= {"margin": "margin [N]:.3g"} | dict(zip(checks, checks, strict=True))
+        names = {"problem": "problem"} if len(self.problems) > 1 else {}
+        names |= {name: f"{title}:.6g" for name, title in self.titles.items()}
+        columns = names | {"status": "status", "value": f"{self.label}:.6g"}
+        columns |= {"phases": "phases [s]:.4g", "margin": "margin [N]:.3g"}
+        columns |= dict(zip(self.checks, self.checks, strict=True))
         columns |= {"reason": "limited by, or reason", "change": "feasible with"}
-        entries = self.entries
-        for entry in entries:
-            entry["phases"] = [entry[key] for key in entry if key.startswith("duration")] or None
-            if "limit" in entry:
-                entry["reason"] = f"{entry['limit']} ({100 * entry['share']:.0f} % of the time)"
-        reasons = self.reasons.most_common()
-        last = f"no point has a plan, most often because of: {reasons[0][0]}" if reasons else ""
-        if self.best is not None:
-            best = entries[self.best]
-            places = [f"{k} = {show_value(best[k])}" for k in columns if k in (*names, "problem")]
-            last = f"best: {self.label} = {best['value']:.6g}, {', '.join(places)}"
-        rows = [[entry.get(key) for key in columns] for entry in entries]
-        parts = [Table([*columns.values()], rows, most=100)]
-        parts += [Table(["without a plan, by reason", "points:d"], reasons)]
-        reason = f"{count - self.reasons.total()} of {count} points planned"
-        return Document(", ".join(self.sources), reason=reason, parts=[*parts, last])
-
-    @property
-    def values(self) -> dict[str, Any]:
-        """Everything, as JSON has it."""
-        vary = dict(zip(self.planner.names, self.axes, strict=True))
-        about = {"objective": self.objective, "unit": UNITS[self.objective], "vary": vary}
-        about |= {"samples": self.samples, "reasons": self.reasons, "best": self.best}
-        return about | {"rows": self.entries}
+        rows, reasons, best = list[list[Any]](), self.reasons, self.best
+        for row in self.rows:
+            cells: Row = {"phases": [row[key] for key in row if key.startswith("duration")] or None}
+            if "limit" in row:
+                cells["reason"] = f"{row['limit']} ({100 * row['share']:.0f} % of the time)"
+            rows.append([(row | cells).get(key) for key in columns])
+        last = f"no point has a plan, most often because of: {next(iter(reasons), '')}"
+        if best is not None:
+            place = ", ".join(f"{name} = {show_value(self.rows[best][name])}" for name in names)
+            last = f"best: {self.label} = {self.rows[best]['value']:.6g}, {place}"
+        table = Table([*columns.values()], rows, most=100)
+        causes = Table(["without a plan, by reason", "points:d"], [*reasons.items()])
+        reason = f"{len(rows) - sum(reasons.values())} of {len(rows)} points planned"
+        return Document(", ".join(self.problems), reason=reason, parts=[table, causes, last])
 
     def to_csv(self) -> str:
         """All rows as CSV, with all digits."""
-        entries, stream = self.entries, io.StringIO()
-        heads = dict.fromkeys(k for entry in sorted(entries, key=len, reverse=True) for k in entry)
+        stream = io.StringIO()
+        heads = dict.fromkeys(key for row in sorted(self.rows, key=len)[::-1] for key in row)
         writer = csv.DictWriter(stream, heads, lineterminator="\n")
         writer.writeheader()
-        writer.writerows(entries)
+        writer.writerows(self.rows)
         return stream.getvalue()
 
 
@@ -281,13 +247,16 @@ def _parse(text: str) -> Any:
         return text
 
 
-def require_values(problem: Problem, name: str, values: Sequence[Any]) -> None:
-    """Raise an `InputError` if a problem lacks a parameter, or no file may have its values."""
+def name_parameter(problem: Problem, name: str, values: Sequence[Any]) -> str:
+    """A parameter with its unit; raises an `InputError` if no file may have one of its values."""
     parameter = Parameter(name, (name, *name_keys().get(name, ())), math.nan, "")
     if all(isinstance(value, Real) for value in values):
         values = min(values), max(values)
     for value in values:
         require_allowed(problem, parameter, value, "--vary")
+    with suppress(InputError):
+        return find_parameter(problem, name).title
+    return name
 
 
 def describe_progress(done: int, count: int, before: int, began: float) -> str:
@@ -342,20 +311,25 @@ def sweep(
     for check in checks:
         choice(*CHECKS).read(check, "--with")
     chosen = {"objective": objective, **options}
-    PlanOptions(**chosen)
-    axes = tuple(tuple(plain(list(values))) for values in vary.values())
-    for problem, (name, values) in product(listed, zip(vary, axes, strict=True)):
-        require_values(problem, name, values)
-    combinations: Iterable[Point] = product(*axes)
+    goal = PlanOptions(**chosen).goal
+    axes = {name: tuple(plain(list(values))) for name, values in vary.items()}
+    for problem in listed[::-1]:
+        titles = {name: name_parameter(problem, name, values) for name, values in axes.items()}
+    names = [problem.source or problem.name for problem in listed]
+    if len({*names}) < len(names):
+        names = [f"{name} ({k})" for k, name in enumerate(names, start=1)]
+    combinations: Iterable[Point] = product(*axes.values())
     if samples:
-        ends = np.array([(values[0], values[-1]) for values in axes], dtype=float).reshape(-1, 2)
+        ends = np.array([(values[0], values[-1]) for values in axes.values()], dtype=float).reshape(
+            -1, 2
+        )
         cube = draw_cube(Range(1, 10**6).read(samples, "samples"), len(axes), seed)
         combinations = (ends[:, 0] + cube * np.diff(ends)[:, 0]).tolist()
     points = [(index, *values) for index, values in product(range(len(listed)), combinations)]
     planner = Planner(listed, tuple(vary), chosen | {"time_limit": time_limit}, tuple(checks))
     stamp = {
         "study": "sweep", "version": __version__, "problems": [p.table for p in listed],
-        "vary": dict(zip(vary, axes, strict=True)), "samples": samples, "seed": seed,
+        "vary": axes, "samples": samples, "seed": seed,
         "options": plain(planner.options), "checks": checks,
     }  # fmt: skip
     with Journal(os.fspath(path or os.devnull), stamp, fresh) as journal:
@@ -371,4 +345,8 @@ def sweep(
                 journal.add({"point": number, "row": answer})
             if progress is not None:
                 progress(describe_progress(len(rows), len(points), before, began))
-    return Sweep(planner, axes, tuple(points), tuple(rows[k] for k in range(len(points))), samples)
+    whole = (
+        {"problem": names[index], **dict(zip(axes, values, strict=True)), **rows[k]}
+        for k, (index, *values) in enumerate(points)
+    )
+    return Sweep(tuple(names), goal, axes, samples, tuple(whole), titles, tuple(checks))

@@ -22,12 +22,12 @@ from ..common.arrays import Array
 from ..common.errors import InputError
 from ..figures.style import GRID, INK, LINES, PALETTE, open_figure
 from ..planning.options import Objective
-from .sweep import Sweep, show_value
+from .sweep import Row, Sweep, show_value
 
 MOST = 24  # panels, and lines of a panel
 SHARE = 0.08  # of the points of a panel, from which their reason is written there
-Lines = Mapping[str, Sequence[int]]
-"""Indices of rows by what they have in common."""
+Lines = Mapping[str, Sequence[Row]]
+"""Rows by what they have in common."""
 
 
 def draw_sweep(sweep: Sweep) -> Figure:
@@ -40,24 +40,24 @@ def draw_sweep(sweep: Sweep) -> Figure:
     ------
     InputError  if a grid has more than three parameters, or there are too many panels
     """
-    several = [k for k, axis in enumerate(sweep.axes, 1) if len(axis) > 1]
-    numeric = [k for k in several if all(isinstance(v, int | float) for v in sweep.axes[k - 1])]
+    several = [name for name, values in sweep.vary.items() if len(values) > 1]
+    numeric = [k for k in several if all(isinstance(v, int | float) for v in sweep.vary[k])]
     if not numeric or (len(numeric) > 3 and not sweep.samples):
         text = f"drawn are 1 to 3 parameters with several numbers, and not {len(numeric)}"
         raise InputError("", "--figure", f"{text}; --samples may have any number")
     shown = numeric if sweep.samples else numeric[:2]
-    lines: dict[str, list[int]] = {}
-    fixed = [] if sweep.samples else [k for k in several if k not in shown]
-    for row, point in enumerate(sweep.points):
-        parts = [os.path.basename(sweep.sources[point[0]])] if len(sweep.sources) > 1 else []
-        parts += [f"{sweep.planner.names[k - 1]} = {show_value(point[k])}" for k in fixed]
+    fixed = [] if sweep.samples else [name for name in several if name not in shown]
+    lines = dict[str, list[Row]]()
+    for row in sweep.rows:
+        parts = [os.path.basename(row["problem"])] if len(sweep.problems) > 1 else []
+        parts += [f"{name} = {show_value(row[name])}" for name in fixed]
         lines.setdefault(", ".join(parts), []).append(row)
     contours = len(shown) == 2 and not sweep.samples
     panels = [{name: rows} for name, rows in lines.items()] if contours else [lines for _ in shown]
     if max(len(panels), len(lines)) > MOST:
         raise InputError("", "--figure", f"more than {MOST} panels or lines; vary fewer values")
-    reasons = sweep.reasons.most_common()
-    colours = {reason: PALETTE[k % len(PALETTE)] for k, (reason, _) in enumerate(reasons)}
+    reasons = sweep.reasons
+    colours = {reason: PALETTE[k % len(PALETTE)] for k, reason in enumerate(reasons)}
     columns = 2 if len(panels) == 4 else min(3, len(panels))
     height = 1.2 + 3.0 * math.ceil(len(panels) / columns) + 0.17 * min(len(reasons), 8)
     with open_figure(10.0 if columns > 1 else 7.0, height, layout="constrained") as figure:
@@ -75,12 +75,12 @@ def draw_sweep(sweep: Sweep) -> Figure:
             figure.colorbar(mesh, ax=list(grid.flat[: len(panels)]), label=sweep.label)
         patches = [
             Patch(color=_pale(colours[reason]), label=fill(f"{reason}: {count}", 110))
-            for reason, count in reasons[:8]
+            for reason, count in [*reasons.items()][:8]
         ]
         if patches:
             look: Any = {"loc": "outside lower left", "alignment": "left", "fontsize": 8}
             figure.legend(handles=patches, title="points without a plan, by reason", **look)
-        sources = ", ".join(map(os.path.basename, sweep.sources))
+        sources = ", ".join(map(os.path.basename, sweep.problems))
         figure.suptitle(sources, fontsize=10, parse_math=False)
     return figure
 
@@ -90,10 +90,10 @@ def _pale(colour: str) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def _take(sweep: Sweep, rows: Sequence[int]) -> tuple[Array, list[str]]:
+def _take(rows: Sequence[Row]) -> tuple[Array, list[str]]:
     """Values of rows, NaN without a plan, and reasons, empty with a plan."""
-    values = np.array([sweep.rows[row]["value"] for row in rows], dtype=float)
-    return values, [sweep.rows[row].get("reason", "") for row in rows]
+    values = np.array([row["value"] for row in rows], dtype=float)
+    return values, [row.get("reason", "") for row in rows]
 
 
 def _border(places: Array) -> Array:
@@ -109,21 +109,21 @@ def _write(axes: Axes, reason: str, colour: str, x: float, y: float, transform: 
 
 
 def _draw_lines(
-    axes: Axes, sweep: Sweep, index: int, lines: Lines, colours: Mapping[str, str]
+    axes: Axes, sweep: Sweep, name: str, lines: Lines, colours: Mapping[str, str]
 ) -> None:
     """Values over one parameter; where there are none, bands or crosses of the reason.
 
     A line alone has bands of full height; of several ones each has a strip at the bottom.
     """
-    axes.set(xlabel=sweep.titles[index - 1], ylabel=sweep.label)
+    axes.set(xlabel=sweep.titles[name], ylabel=sweep.label)
     axes.grid(color=GRID, linewidth=0.4)
     single, across = len(lines) == 1 and not sweep.samples, axes.get_xaxis_transform()
-    for number, (name, rows) in enumerate(lines.items()):
-        rows = sorted(rows, key=lambda row: sweep.points[row][index])
-        x = np.array([sweep.points[row][index] for row in rows], dtype=float)
-        (values, reasons), (dash, marker) = _take(sweep, rows), LINES[number % len(LINES)]
+    for number, (label, rows) in enumerate(lines.items()):
+        rows = sorted(rows, key=lambda row: row[name])
+        x = np.array([row[name] for row in rows], dtype=float)
+        (values, reasons), (dash, marker) = _take(rows), LINES[number % len(LINES)]
         look: Any = {"color": PALETTE[number % len(PALETTE)], "marker": marker, "markersize": 3.0}
-        axes.plot(x, values, linestyle="" if sweep.samples else dash, label=name, **look)
+        axes.plot(x, values, linestyle="" if sweep.samples else dash, label=label, **look)
         low, high = (0.0, 1.0) if single else (0.05 * number + 0.01, 0.05 * number + 0.04)
         if len(lines) > 1 and any(reasons):
             axes.plot(0.0, (low + high) / 2, transform=axes.transAxes, clip_on=False, **look)
@@ -149,16 +149,15 @@ def _draw_lines(
 def _draw_plane(
     axes: Axes,
     sweep: Sweep,
-    shown: Sequence[int],
-    rows: Sequence[int],
+    shown: Sequence[str],
+    rows: Sequence[Row],
     colours: Mapping[str, str],
 ) -> Any:
     """Values over two parameters as cells, with contour lines, and regions without a plan."""
-    labels = [sweep.titles[k - 1] for k in shown]
-    axes.set(xlabel=labels[0], ylabel=labels[1])
-    x, y = (np.array(sweep.axes[k - 1], dtype=float) for k in shown)
-    values, reasons = _take(sweep, rows)
-    values, every = values.reshape(len(x), len(y)).T, _take(sweep, range(len(sweep.rows)))[0]
+    axes.set(xlabel=sweep.titles[shown[0]], ylabel=sweep.titles[shown[1]])
+    x, y = (np.array(sweep.vary[name], dtype=float) for name in shown)
+    values, reasons = _take(rows)
+    values, every = values.reshape(len(x), len(y)).T, _take(sweep.rows)[0]
     low, high = (np.nanmin(every), np.nanmax(every)) if sweep.ok else (0.0, 1.0)
     look = "viridis" if sweep.objective is Objective.MARGIN else "viridis_r"
     mesh = axes.pcolormesh(_border(x), _border(y), values, vmin=low, vmax=high, cmap=look)
