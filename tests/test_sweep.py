@@ -189,7 +189,7 @@ def test_reasons_of_neighbours_are_alike() -> None:
     assert rows[0]["status"] == "impossible"
 
 
-def make(vary: dict[str, Any], problem: Problem, samples: int = 0) -> Sweep:
+def make(vary: dict[str, Any], problem: Problem | list[Problem], samples: int = 0) -> Sweep:
     """A sweep that is made up: no plan where the first parameter is largest."""
 
     def run(_: Planner, task: tuple[int, tuple[Any, ...]]) -> dict[str, Any]:
@@ -216,7 +216,16 @@ def test_figures(box: Problem) -> None:
     assert legend is not None
     names = [text.get_text() for text in legend.get_texts()]
     assert names == ["control_hold = constant", "control_hold = linear"]
-    plane = wholearm.draw_sweep(make({"mass": mass, "epsilon": [0.0, 0.1]}, box))
+    twice = make({"mass": mass}, [box, box.with_(epsilon=0.1)])
+    assert twice.problems == (f"{box.source} (1)", f"{box.source} (2)")
+    assert len(wholearm.draw_sweep(twice).axes[0].get_legend_handles_labels()[1]) == 2
+    plane = wholearm.draw_sweep(make({"mass": mass[::-1], "epsilon": [0.0, 0.1]}, box))
+    cells = plane.axes[0].collections[0].get_array()
+    # Rows are numbered in the order of the grid: the largest mass, which has no plan, comes first.
+    assert cells is not None and np.ma.filled(cells, 9.0).tolist() == [
+        [pytest.approx(value) for value in line]
+        for line in ([1.8, 1.6, 1.4, 1.2, 9.0], [1.9, 1.7, 1.5, 1.3, 9.0])
+    ]
     assert [axes.get_xlabel() for axes in plane.axes] == ["mass [kg]", ""]
     assert plane.legends[0].get_texts()[0].get_text() == "too heavy: 2"
     vary = {"mass": mass, "epsilon": [0.0, 0.1], "x": [0.0, 0.001, 0.002]}

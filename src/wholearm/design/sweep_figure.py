@@ -6,7 +6,6 @@ Points without a plan have the colour of their reason. Nothing is interpolated b
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from itertools import groupby
 from textwrap import fill
@@ -49,7 +48,7 @@ def draw_sweep(sweep: Sweep) -> Figure:
     fixed = [] if sweep.samples else [name for name in several if name not in shown]
     lines = dict[str, list[Row]]()
     for row in sweep.rows:
-        parts = [os.path.basename(row["problem"])] if len(sweep.problems) > 1 else []
+        parts = [row["problem"]] if len(sweep.problems) > 1 else []
         parts += [f"{name} = {show_value(row[name])}" for name in fixed]
         lines.setdefault(", ".join(parts), []).append(row)
     contours = len(shown) == 2 and not sweep.samples
@@ -80,8 +79,7 @@ def draw_sweep(sweep: Sweep) -> Figure:
         if patches:
             look: Any = {"loc": "outside lower left", "alignment": "left", "fontsize": 8}
             figure.legend(handles=patches, title="points without a plan, by reason", **look)
-        sources = ", ".join(map(os.path.basename, sweep.problems))
-        figure.suptitle(sources, fontsize=10, parse_math=False)
+        figure.suptitle(", ".join(sweep.problems), fontsize=10, parse_math=False)
     return figure
 
 
@@ -155,8 +153,8 @@ def _draw_plane(
 ) -> Any:
     """Values over two parameters as cells, with contour lines, and regions without a plan."""
     axes.set(xlabel=sweep.titles[shown[0]], ylabel=sweep.titles[shown[1]])
-    x, y = (np.array(sweep.vary[name], dtype=float) for name in shown)
-    values, reasons = _take(rows)
+    x, y = (np.sort(np.array(sweep.vary[name], dtype=float)) for name in shown)
+    values, reasons = _take(sorted(rows, key=lambda row: [row[name] for name in shown]))
     values, every = values.reshape(len(x), len(y)).T, _take(sweep.rows)[0]
     low, high = (np.nanmin(every), np.nanmax(every)) if sweep.ok else (0.0, 1.0)
     look = "viridis" if sweep.objective is Objective.MARGIN else "viridis_r"
