@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import re
 from functools import partial
 
@@ -63,7 +64,7 @@ def sweep(options: argparse.Namespace) -> int:
         seed=options.seed,
         checks=tuple(filter(None, (getattr(options, "with") or "").split(","))),
         time_limit=options.time_limit,
-        path=output.removesuffix(require_ending(output, ".csv")) + ".jsonl",
+        path=f"{os.path.splitext(output)[0]}.jsonl" if require_ending(output, ".csv") else None,
         fresh=options.fresh,
         start=partial(connect, options.scheduler) if options.scheduler else start,
         progress=show_progress(),

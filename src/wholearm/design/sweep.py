@@ -27,7 +27,7 @@ import numpy as np
 from .. import __version__
 from ..analysis.robustness import draw_cube
 from ..common.document import Document, Result, Table, plain
-from ..common.errors import InfeasibleError, InputError, WholearmError
+from ..common.errors import InfeasibleError, InputError, WholearmError, require_number
 from ..common.fields import Range, choice
 from ..common.journal import Journal
 from ..common.parallel import Processes, run_all
@@ -119,9 +119,10 @@ def _try(plan: Plan, check: str) -> str:
 
 def describe_failure(error: Exception) -> Row:
     """The row of a point without a plan."""
-    impossible, infeasible = isinstance(error, InputError), isinstance(error, InfeasibleError)
-    status = "infeasible" if infeasible else "impossible" if impossible else "failed"
-    text = f"{error.key}: {error.problem}" if isinstance(error, InputError) else str(error)
+    status, text = "infeasible" if isinstance(error, InfeasibleError) else "failed", str(error)
+    if isinstance(error, InputError):
+        status = "impossible"
+        text = ": ".join(filter(None, (error.key, error.problem)))
     # Without numbers and places, which differ from point to point.
     reason = re.split(r"; |: going | at [xt] = ", re.sub(r" \(.*?\)", "", text), maxsplit=1)[0]
     reason = re.sub(r"(?<== )-?\d\S*|-?\d+\.\d\S*", "\u2026", reason)
@@ -313,6 +314,7 @@ def sweep(
     chosen = {"objective": objective, **options}
     goal = PlanOptions(**chosen).goal
     axes = {name: tuple(plain(list(values))) for name, values in vary.items()}
+    titles = dict[str, str]()
     for problem in listed[::-1]:
         titles = {name: name_parameter(problem, name, values) for name, values in axes.items()}
     names = [problem.source or problem.name for problem in listed]
@@ -320,11 +322,12 @@ def sweep(
         names = [f"{name} ({k})" for k, name in enumerate(names, start=1)]
     combinations: Iterable[Point] = product(*axes.values())
     if samples:
-        ends = np.array([(values[0], values[-1]) for values in axes.values()], dtype=float).reshape(
-            -1, 2
+        low, high = (
+            np.array([require_number(values[k], f"--vary {name}") for name, values in axes.items()])
+            for k in (0, -1)
         )
         cube = draw_cube(Range(1, 10**6).read(samples, "samples"), len(axes), seed)
-        combinations = (ends[:, 0] + cube * np.diff(ends)[:, 0]).tolist()
+        combinations = (low + cube * (high - low)).tolist()
     points = [(index, *values) for index, values in product(range(len(listed)), combinations)]
     planner = Planner(listed, tuple(vary), chosen | {"time_limit": time_limit}, tuple(checks))
     stamp = {
