@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     )
     from .contacts.elemental import Contact
     from .contacts.formation import Formation
+    from .design.hand import Design, design_hand
+    from .design.sensitivities import Sensitivities, find_sensitivities
     from .design.sweep import Sweep, sweep
     from .design.sweep_figure import draw_sweep
     from .engines.engine_replay import EngineReport, PolicyReport, play_policy, replay_in
@@ -67,6 +69,8 @@ _NAMES = {
     "analysis.comparison": "Comparison compare",
     "contacts.elemental": "Contact",
     "contacts.formation": "Formation",
+    "design.hand": "Design design_hand",
+    "design.sensitivities": "Sensitivities find_sensitivities",
     "design.sweep": "Sweep sweep",
     "design.sweep_figure": "draw_sweep",
     "engines.engine_replay": "EngineReport PolicyReport play_policy replay_in",
@@ -100,14 +104,15 @@ _NAMES = {
 _HOMES = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 __all__ = [
-    "AmbiguityError", "Answer", "Change", "Comparison", "Contact", "End", "EngineReport",
-    "Finger", "Formation", "FormationMap", "FreeReport", "FreeSimulation", "Friction", "Goal",
-    "InfeasibleError", "InputError", "JammingError", "Objective", "Phase", "Plan",
-    "PlanOptions", "Policy", "PolicyReport", "Polygon", "Prediction", "Problem", "ReplayError",
-    "Report", "Robustness", "Scene", "Shortfall", "Simulation", "SimulationError",
-    "SolverError", "Status", "Sweep", "TorqueProfile", "Trajectory", "Tuning", "Uncertainty",
-    "Until", "WholearmError", "__version__", "assess_robustness", "build_map", "compare",
-    "draw_map", "draw_sweep", "find_route", "format_route", "list_formations", "load",
+    "AmbiguityError", "Answer", "Change", "Comparison", "Contact", "Design", "End",
+    "EngineReport", "Finger", "Formation", "FormationMap", "FreeReport", "FreeSimulation",
+    "Friction", "Goal", "InfeasibleError", "InputError", "JammingError", "Objective",
+    "Phase", "Plan", "PlanOptions", "Policy", "PolicyReport", "Polygon", "Prediction",
+    "Problem", "ReplayError", "Report", "Robustness", "Scene", "Sensitivities", "Shortfall",
+    "Simulation", "SimulationError", "SolverError", "Status", "Sweep", "TorqueProfile",
+    "Trajectory", "Tuning", "Uncertainty", "Until", "WholearmError", "__version__",
+    "assess_robustness", "build_map", "compare", "design_hand", "draw_map", "draw_sweep",
+    "find_route", "find_sensitivities", "format_route", "list_formations", "load",
     "load_plan", "load_trajectory", "make_policy", "place_start", "play_policy", "plots",
     "predict", "read_formation", "read_torque_csv", "read_until", "replay_in", "save",
     "simulate", "simulate_free", "solve", "sweep", "tune", "verify", "verify_free",

@@ -244,6 +244,7 @@ trajectory         trajectory file (.npz)
 {PROBLEM}\
 [files PLAN ...]  trajectory files (.npz) or torques (.csv); none: plan the least time
 -o --output FILE  page to write (default: NAME.html)
+--sensitivities   also show what 1 percent more of each number of the problem is worth
 [[gallery]]  gallery  plan problems and show them all on one page
 files PROBLEM ...  problem files (TOML)
 -o --output FILE   page to write (.md); figures and movies go to a folder beside it
@@ -1050,7 +1051,7 @@ def report(options: argparse.Namespace) -> int:
         if not options.files:
             wholearm.solve(problem, progress=say).save(paths[0])
         text = Path(options.problem).read_text(encoding="utf-8")
-        content = build_report(problem, paths, text, say)
+        content = build_report(problem, paths, text, say, sensitivities=options.sensitivities)
     write_text(output, content)
     return finish(options, None, output)
 

@@ -22,6 +22,8 @@ from ..common.files import make_folder, write_text
 from ..common.sharing import exclusive
 from ..contacts.closing import close_fingers
 from ..contacts.elemental import Contact
+from ..design.figures import draw_sensitivities
+from ..design.sensitivities import find_sensitivities
 from ..figures import plots
 from ..figures.map_figure import BOX, PLACE, SIZE, draw_map, find_room, split
 from ..figures.style import STYLE
@@ -50,6 +52,7 @@ def build_report(
     text: str = "",
     progress: Callable[[str], None] = lambda text: None,
     chart: FormationMap | None = None,
+    sensitivities: bool = False,
 ) -> str:
     """Put plans and torques for a problem, replayed, into one page of HTML.
 
@@ -59,6 +62,7 @@ def build_report(
     text      the problem file as it stands
     progress  called with what is being done
     chart     the map of the problem, if it is there already
+    sensitivities  whether to add what 1 % more of each number is worth
 
     Raises
     ------
@@ -76,6 +80,13 @@ def build_report(
         (contender.planned for contender in comparison.contenders if contender.planned is not None),
         None,
     )
+    if sensitivities:
+        stream = io.StringIO()
+        result = find_sensitivities(comparison.contenders[0].problem or problem, progress=progress)
+        draw_sensitivities(result).savefig(stream, format="svg", metadata={"Date": None})
+        picture = stream.getvalue()
+        parts += ["<h2>What 1 % more of each number is worth</h2>"]
+        parts += [picture[picture.index("<svg") :], result.document.to_html()]
     progress("map")
     chart = chart or build_map(problem, 90, choose_window(problem, None))
     machine = f"Python {platform.python_version()}, {platform.machine()}"

@@ -1,0 +1,283 @@
+"""The hand that does a job best: numbers within ranges, by COBYQA from several starts.
+
+Every hand that is tried is planned and replayed by `solve`; one without a plan is infeasible, for a
+reason. COBYQA (SciPy) models the value by quadratics in a trust region, and goes on where there is
+no value, as behind the edge of what a hand can reach. The first start is the present hand, others
+are the first feasible hands of Latin hypercubes. Of several problems the values over those with the
+present hand are added with weights, or the worst one counts.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..analysis.robustness import draw_cube
+from ..common.arrays import Array
+from ..common.document import Document, Result, Table
+from ..common.errors import InfeasibleError, InputError
+from ..common.parallel import count_cores, share
+from ..common.sharing import exclusive
+from ..planning.options import Objective, PlanOptions
+from ..planning.result import UNITS, Plan
+from ..problem.definition import Problem
+from ..search import solve
+from .parameters import Parameter, find_parameter, require_allowed
+from .sweep import Planner
+
+RADII = (0.3, 0.1)  # of the first trust region of each run of COBYQA, over half a range
+FINE = 1e-2  # radius at which a run ends
+SAME = 1e-3  # relative difference of the values of one optimum
+
+
+class Choice(NamedTuple):
+    """A number that is chosen from a range, and the dotted keys that follow it, by a factor."""
+
+    parameter: Parameter
+    low: float
+    high: float
+    factors: Mapping[str, float]
+
+    def at(self, share: float) -> float:
+        """The value at a share of the range, from -1 to 1, with six digits."""
+        value = (self.low + self.high + share * (self.high - self.low)) / 2
+        return float(f"{min(max(value, self.low), self.high):.6g}")
+
+
+def read_choices(
+    problem: Problem, texts: Sequence[str], symmetric: bool = False, label: str = "--over"
+) -> list[Choice]:
+    """Numbers and their ranges from texts ``NAME=LOW:HIGH``.
+
+    In a symmetric hand what is said of one finger holds for the other, mirrored at x = 0.
+
+    Raises
+    ------
+    InputError  if the problem has no such number, a file may not have LOW or HIGH, these are in the
+                wrong order, or a number is chosen twice
+    """
+    choices, taken = list[Choice](), set[str]()
+    for text in texts:
+        name, _, numbers = text.partition("=")
+        try:
+            low, high = map(float, numbers.split(":"))
+        except ValueError:
+            raise InputError("", label, f"{text!r} given; NAME=LOW:HIGH is needed") from None
+        parameter = find_parameter(problem, name, label)
+        if not -math.inf < low < high < math.inf:
+            raise InputError("", f"{label} {name}", f"{numbers} given; LOW has to be below HIGH")
+        for end in (low, high):
+            require_allowed(problem, parameter, end, label)
+        factors = dict.fromkeys(parameter.keys, 1.0)
+        for key in parameter.keys if symmetric else ():
+            other = re.sub(r"(finger(?:s\.)?)([12])", lambda m: m[1] + "21"[int(m[2]) - 1], key)
+            factors.setdefault(other, -1.0 if key.endswith("base[1]") else 1.0)
+        if taken & {*factors}:
+            raise InputError("", f"{label} {name}", "is chosen by what stands before, too")
+        taken |= {*factors}
+        choices.append(Choice(parameter, low, high, factors))
+    return choices
+
+
+class Hand(NamedTuple):
+    """A hand that was tried."""
+
+    start: int  # number of the search, from 1
+    shares: tuple[float, ...]  # of the ranges, from -1 to 1
+    cost: float  # what is minimised; NaN without a plan
+    reason: str = ""  # why there is none
+
+
+@dataclass(frozen=True, eq=False)
+class Aim:
+    """What hands are judged by."""
+
+    choices: tuple[Choice, ...]
+    planner: Planner
+    today: tuple[float, ...]  # values of the problems with the present hand; NaN without a plan
+    weights: Array
+    worst: bool  # whether the worst problem counts, and not the weighted sum
+
+    def find(self, hand: Hand) -> list[float]:
+        """The numbers of a hand."""
+        return [choice.at(share) for choice, share in zip(self.choices, hand.shares, strict=True)]
+
+    def rate(self, start: int, shares: Sequence[float]) -> Hand:
+        """Plan and judge a hand."""
+        hand, values = Hand(start, tuple(shares), math.nan), list[float]()
+        sign = -1.0 if self.planner.options["objective"] == "margin" else 1.0
+        for index, today in enumerate(self.today):
+            row = self.planner.run((0, (index, *self.set(hand).values())))
+            if row["value"] is None:
+                return hand._replace(reason=row["reason"])
+            one = len(self.today) == 1 or math.isnan(today)
+            values.append(sign * row["value"] / (1.0 if one else abs(today)))
+        return hand._replace(cost=max(values) if self.worst else float(values @ self.weights))
+
+    def set(self, hand: Hand) -> dict[str, float]:
+        """Values by dotted keys."""
+        pairs = zip(self.choices, self.find(hand), strict=True)
+        return {
+            k: factor * value for choice, value in pairs for k, factor in choice.factors.items()
+        }
+
+    def search(self, start: int, budget: int, report: Callable[[str], None]) -> list[Hand]:
+        """The hands of one search."""
+        from scipy.optimize import minimize
+
+        tried = list[Hand]()
+
+        def judge(shares: Array) -> float:
+            tried.append(self.rate(start, shares.tolist()))
+            best = min((hand.cost for hand in tried if not hand.reason), default=math.nan)
+            report(f"start {start}: {len(tried)} hands, best {best:.6g}")
+            return tried[-1].cost
+
+        points = 2 * draw_cube(budget, len(self.choices), start) - 1
+        if start == 1:
+            present = [c.parameter.value for c in self.choices]
+            ends = np.array([(c.low, c.high) for c in self.choices])
+            shares = (2 * np.array(present) - ends.sum(axis=1)) / np.ptp(ends, axis=1)
+            points = np.vstack([np.clip(np.nan_to_num(shares), -1, 1), points])
+        first = next((point for point in points if math.isfinite(judge(point))), None)
+        most = len(tried) + budget
+        for radius in RADII if first is not None else ():
+            # Again from the best: models that were made far from an edge mislead along it.
+            best = min((hand for hand in tried if not hand.reason), key=lambda hand: hand.cost)
+            options = {"initial_tr_radius": radius, "final_tr_radius": FINE}
+            options |= {"maxfev": max(most - len(tried), 1)}
+            bounds = [(-1.0, 1.0)] * len(self.choices)
+            minimize(judge, best.shares, method="COBYQA", bounds=bounds, options=options)
+        return tried
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Design(Result):
+    """The best hand, and what was tried on the way to it."""
+
+    aim: Aim
+    plans: tuple[Plan, ...]  # of the problems, with the best hand
+    hands: tuple[Hand, ...]
+
+    @property
+    def optima(self) -> list[Hand]:
+        """The best hand of each start that has a feasible one, the best of all first."""
+        ranked = sorted((hand for hand in self.hands if not hand.reason), key=lambda h: -h.cost)
+        return sorted({hand.start: hand for hand in ranked}.values(), key=lambda h: h.cost)
+
+    @property
+    def label(self) -> str:
+        """What is minimised, with its unit."""
+        goal = Objective(self.aim.planner.options["objective"])
+        text = f"{'-' * (goal is Objective.MARGIN)}{goal.value}"
+        return f"{text} [{UNITS[goal]}]" if len(self.plans) == 1 else f"{text} over today's"
+
+    @property
+    def reasons(self) -> Counter[str]:
+        """How many hands have no plan for each reason."""
+        return Counter(hand.reason for hand in self.hands if hand.reason)
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Everything, as JSON has it."""
+        names = [choice.parameter.name for choice in self.aim.choices]
+        hands = {
+            key: [
+                {"start": hand.start, "cost": hand.cost, "reason": hand.reason}
+                | dict(zip(names, self.aim.find(hand), strict=True))
+                for hand in listed
+            ]
+            for key, listed in (("optima", self.optima), ("hands", self.hands))
+        }
+        values = {"value": [plan.value for plan in self.plans], "today": self.aim.today}
+        return {"minimised": self.label, "reasons": self.reasons} | values | hands
+
+    @property
+    def document(self) -> Document:
+        """The best hand, the optima of the starts, and why others have no plan."""
+        optima, best, rows = self.optima, self.aim.find(self.optima[0]), list[Any]()
+        for (parameter, *ends, _), value in zip(self.aim.choices, best, strict=True):
+            edge = "at an end" * (value in ends)
+            rows.append((parameter.name, parameter.value, value, ends, parameter.unit, edge))
+        tables = [Table(["number", "today:.6g", "best:.6g", "range:.6g", "", ""], rows)]
+        rows = []
+        for hand in optima:
+            mine = [not other.reason for other in self.hands if other.start == hand.start]
+            rows.append((hand.start, len(mine), sum(mine), hand.cost, self.aim.find(hand)))
+        heads = ["start:d", "hands:d", "planned:d", f"{self.label}:.6g", "numbers:.6g"]
+        tables += [Table(heads, rows)]
+        tables += [Table(["without a plan, by reason", "hands:d"], self.reasons.most_common())]
+        same = optima[-1].cost - optima[0].cost <= SAME * abs(optima[0].cost)
+        lines = [f"the starts lead to {'one optimum' if same else 'different optima'}"]
+        for plan, today in zip(self.plans, self.aim.today, strict=True):
+            more = f"{100 * (plan.value / today - 1):+.2f} % of today's {today:.6g}"
+            more = more if math.isfinite(today) else "no plan today"
+            lines.append(f"{plan.headline}; {more}")
+        return Document("", parts=[*tables, *lines])
+
+
+@exclusive
+def design_hand(
+    problems: Problem | Sequence[Problem],
+    over: Sequence[str],
+    minimise: str = "time",
+    *,
+    symmetric: bool = False,
+    weights: Sequence[float] = (),
+    worst: bool = False,
+    starts: int = 3,
+    budget: int = 100,
+    jobs: int | None = None,
+    progress: Callable[[str], None] = lambda text: None,
+    **options: Any,
+) -> Design:
+    """Find the hand with which problems are solved best.
+
+    Parameters
+    ----------
+    over       numbers and their ranges, as ``length1=0.1:0.25``
+    minimise   {"time", "effort", "-margin"}
+    symmetric  whether what is said of one finger holds for the other
+    weights    of several problems; equal ones if left out
+    worst      whether of several problems the worst one counts, and not the weighted sum
+    starts     number of searches
+    budget     most hands until the first feasible one of each search, and most after it
+    jobs       processes; as many as cores if left out
+    **options  as `wholearm.solve` takes them, such as `robust`
+
+    Raises
+    ------
+    InputError       if a problem lacks a number, or a file may not have its range
+    InfeasibleError  if no hand has a plan; says why most have none
+    """
+    listed = (problems,) if isinstance(problems, Problem) else tuple(problems)
+    given = np.array(weights or np.ones(len(listed)), dtype=float)
+    if len(given) != len(listed) or not (given > 0).all():
+        text = f"{weights} given; {len(listed)} positive numbers are needed, one for each problem"
+        raise InputError("", "--weights", text)
+    choices, *_ = (tuple(read_choices(problem, over, symmetric)) for problem in listed)
+    chosen = {"objective": minimise.removeprefix("-"), **options}
+    PlanOptions(**chosen)
+    progress("planning with the present hand")
+    none = Planner(listed, (), chosen)
+    rows = [none.run((0, (index,))) for index in range(len(listed))]
+    today = tuple(math.nan if row["value"] is None else row["value"] for row in rows)
+    keys = tuple(key for choice in choices for key in choice.factors)
+    aim = Aim(choices, Planner(listed, keys, chosen), today, given / given.sum(), worst)
+    tasks = [partial(aim.search, start, budget, progress) for start in range(1, starts + 1)]
+    hands = tuple(hand for tried in share(tasks, jobs or count_cores()) for hand in tried)
+    feasible = [hand for hand in hands if not hand.reason]
+    if not feasible:
+        reason, count = Counter(hand.reason for hand in hands).most_common(1)[0]
+        text = f"none of {len(hands)} hands has a plan; the reason of {count} is: {reason}"
+        raise InfeasibleError(text)
+    best = aim.set(min(feasible, key=lambda hand: hand.cost))
+    plans = tuple(solve(problem.with_(best), **chosen) for problem in listed)
+    return Design(aim, plans, hands)

@@ -1,0 +1,380 @@
+"""Derivatives of the value of a plan with respect to every number of its problem.
+
+**By multipliers.** At a solution the derivative of the value is the partial derivative of the
+Lagrangian (envelope theorem). The NLP of every block is built again for p + h and for p - h on the
+same mesh, and its Lagrangian evaluated at the plan's unknowns and multipliers: no solve, hence no
+noise of meshes. Curves are traced anew, as they depend on shapes and bases. A block over time whose
+end is free is solved with the gradient of the later Lagrangians as the price of its end, so that
+all blocks together are stationary.
+
+**By differences** of solved problems where a plan is no solution of NLPs by itself: the objective
+margin, rate-limited or held torques, ranges, impacts over time.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import casadi as ca
+import numpy as np
+
+from ..common.arrays import Array
+from ..common.document import Document, Result, Table, fixed
+from ..common.errors import SolverError, WholearmError
+from ..common.parallel import count_cores, share
+from ..common.sharing import exclusive
+from ..contacts.formation import Formation
+from ..geometry.curve import Curve, tangent_basis
+from ..geometry.tracing import trace_phase, trace_phases
+from ..mechanics.dynamics import metric_weights, move_least
+from ..mechanics.limits import LimitSet
+from ..planning.blocks import BlockPlan, Planning, make_sequence, plan_blocks
+from ..planning.options import Objective, PlanOptions
+from ..planning.path_domain import path_data, path_motion, path_nlp, path_plan
+from ..planning.phase_plan import combine
+from ..planning.result import UNITS
+from ..planning.time_domain import solution, stage, time_nlp
+from ..planning.time_domain.time_plan import list_stages
+from ..problem.definition import End, Problem
+from .parameters import Parameter, find_parameter, list_parameters
+
+Terms = list[tuple[str, str, float]]
+"""Parts of a Lagrangian, or of a value: phases and limit that they come from, and how much."""
+Evaluate = Callable[[Problem, Array], tuple[Terms, Array]]
+"""Terms of blocks for another problem, from a configuration (5,), and where they end."""
+ACCURACY = 1e-6  # of the plans: at 1e-4 the derivative by friction_palm of heptagon is 2 % off
+STEP, WIDE = 1e-4, 1e-2  # changes of a number, relative: of Lagrangians, and of solved problems
+PATH = "length of the path"
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """How the value of a plan depends on one number."""
+
+    derived = ("percent",)
+
+    name: str
+    given: float  # the number
+    unit: str
+    derivative: float  # of the value; NaN where neither side has a plan
+    phases: tuple[float, ...]  # that of each part of the plan
+    limit: str  # through which it acts most; empty where that is unknown
+    method: str  # {"multipliers", "differences"}
+    note: str = ""  # why it is one-sided
+
+    @property
+    def percent(self) -> float:
+        """What 1 % more of the number changes, to first order."""
+        return 0.01 * self.given * self.derivative
+
+
+@dataclass(frozen=True, repr=False)
+class Sensitivities(Result):
+    """Sensitivities of a plan, those first of which 1 % changes most."""
+
+    problem: str
+    objective: str
+    value: float
+    unit: str
+    parts: tuple[str, ...]  # numbers of the phases of each part
+    rows: tuple[Sensitivity, ...]
+
+    @property
+    def document(self) -> Document:
+        """A ranked table, and why derivatives are one-sided."""
+        least = fixed(max((abs(row.percent) for row in self.rows), default=0.0), 4)
+        heads = ["number", "value:.6g", "", f"d({self.objective})/d(number):.4g"]
+        heads += [f"1 % more [{self.unit}]:{least}", "acts through", "by"]
+        heads += [f"phase {part}:{least}" for part in self.parts]
+        rows = [
+            [row.name, row.given, row.unit, row.derivative, row.percent, row.limit or "-"]
+            + [row.method + " (one-sided)" * bool(row.note)]
+            + [0.01 * row.given * slope for slope in row.phases]
+            for row in self.rows
+        ]
+        notes = [f"{row.name}: {row.note}" for row in self.rows if row.note]
+        title = f"{self.problem}: {self.objective} = {self.value:.6g} {self.unit}"
+        return Document(title, parts=[Table(heads, rows), *notes])
+
+
+def _charge(on: Array, values: Array, low: Array, high: Array) -> Array:
+    """Multipliers times the distances of values from their active bounds."""
+    bound = np.where(on > 0, high, low)
+    return np.where(np.isfinite(bound), on * (values - np.nan_to_num(bound)), 0.0)
+
+
+def _name_rows(limits: LimitSet) -> list[str]:
+    """The limit of each row, without its value."""
+    return [re.split(r" >= |, | = ", limits.limits[k].text)[0] for k in limits.owners]
+
+
+def _name_phases(numbers: Sequence[int]) -> str:
+    return "-".join(dict.fromkeys(map(str, (numbers[0], numbers[-1]))))
+
+
+def use_curves(planning: Planning, block: BlockPlan) -> Evaluate:
+    """The Lagrangians of a block along curves, one for each part from rest to rest.
+
+    SolverError if the block's plan is not what these NLPs have as their solution.
+    """
+    assert block.chain is not None
+    iterates, options = list[path_plan.PathIterate](), planning.options
+    for part in block.chain.split():
+        numbers, epsilon = [phase.number for phase in part.phases], planning.problem.epsilon
+        task = path_plan.Task(part.continuous_curves, epsilon, options, numbers, None)
+        iterates.append(path_plan.plan_task(task))
+    value = sum(iterate.objective for iterate in iterates)
+    if abs(value - sum(plan.value for plan in block.plans)) > 1e-9 * value:
+        raise SolverError("the start is one that friction cannot hold")
+
+    def evaluate(problem: Problem, z: Array) -> tuple[Terms, Array]:
+        phases = [problem.phases[phase.index] for phase in block.phases]
+        curves, terms = list[Curve](), list[tuple[str, str, float]]()
+        for phase in phases:
+            curves.append(trace_phase(phase, z, problem.phases[phase.index + 1 :]))
+            z = curves[-1].end
+        parts = make_sequence(phases, curves).split()
+        for iterate, part in zip(iterates, parts, strict=True):
+            terms += _evaluate_path(iterate, part.continuous_curves, problem.epsilon)
+        return terms, z
+
+    return evaluate
+
+
+def _evaluate_path(
+    iterate: path_plan.PathIterate, curves: Sequence[Curve], epsilon: float
+) -> Terms:
+    """Terms of a solution along other curves, on elements between the same reversals."""
+    task, nlp, units, made = iterate.task, iterate.nlp, iterate.units, iterate.solution
+    parts = list[path_data.PhaseData]()
+    for part, curve, phase in zip(iterate.parts, curves, task.phases, strict=True):
+        old, new = ([0.0, *(s.stop for s in each.segments)] for each in (part.curve, curve))
+        if len(old) != len(new):
+            raise SolverError(f"in phase {phase} a reversal comes or goes")
+        edges, grid = np.interp(part.grid.edges, old, new), part.grid
+        segment = grid.segment[:: path_motion.NODES]
+        moved = path_motion.lay_out(edges, segment, grid.rests, grid.held)
+        parts.append(path_data.prepare(curve, epsilon, moved, phase))
+    data = path_data.join(parts)
+    x = path_nlp.pack(nlp, made.profile, units, made.margin, iterate.data.grid.sizes)
+    p = path_nlp.parameters(nlp, data, units, task.options.time_weight)
+    bounds = path_nlp.make_bounds(nlp, data, units, iterate.tightening)
+    f, g = (nlp.solver.function.get_function(f"nlp_{name}")(x, p).full()[:, 0] for name in "fg")
+    of_x = _charge(made.multipliers["lam_x0"], x, bounds["lbx"], bounds["ubx"])
+    of_g = _charge(made.multipliers["lam_g0"], g, bounds["lbg"], bounds["ubg"])
+    unit = units.time * (units.power if task.options.goal is Objective.EFFORT else 1.0)
+    limits = of_g[nlp.g["limits"]].reshape(len(data.grid.s), -1).sum(axis=0).tolist()
+    speeds = " and ".join(limit.parameter.name for limit in data.speeds.limits)
+    terms = [*zip(_name_rows(data.limits), limits, strict=True), (speeds or PATH, of_x.sum())]
+    terms.append((PATH, f[0] + of_g.sum() - sum(limits)))
+    name = _name_phases(task.phases)
+    return [(name, limit, unit * float(value)) for limit, value in terms]
+
+
+def use_time(planning: Planning, block: BlockPlan, price: Array | None) -> Evaluate:
+    """The Lagrangian of a block in the time domain, with the price of its end, (5,) in SI units.
+
+    What comes from no limit, as from equations of motion, is put to the limit with the largest
+    multipliers. SolverError if its NLP has no solution with that price.
+    """
+    options, scales = planning.options, planning.problem.scene.scales
+    search = solution.TimeSearch.of(planning.problem, options)
+    if price is not None:
+        gradient = price * stage.unit_lengths(scales) / stage.unit_of(options.goal, scales)
+        search.price = solution.Price(gradient, stage.scale_state(block.end, scales))
+    made = search.solve(list_stages(block.plans))
+    if not made.success:
+        raise SolverError(made.status)
+    on_x, on_g = (made.multipliers[key] for key in ("lam_x0", "lam_g0"))
+    points = [each.guess for each in made.stages]
+    name = _name_phases([phase.number for phase in block.phases])
+
+    def sort(nlp: time_nlp.TimeNLP, of_x: Array, of_g: Array) -> dict[str, float]:
+        """Sums over the rows and unknowns of each limit."""
+        sums = dict[str, float]()
+        for layout, rows in zip(nlp.layouts, (each.limits for each in nlp.rows_of), strict=True):
+            parts = [
+                (side, of_x[layout.forces[..., k]].sum() + of_g[rows.presses[..., k]].sum())
+                for k, side in enumerate(rows.pressed)
+            ]
+            parts += [(s, of_g[rows.others[..., k]].sum()) for k, s in enumerate(rows.sides)]
+            parts += [(side, of_x[unknowns].sum()) for side, unknowns in rows.bounded.items()]
+            names, sides = _name_rows(rows.limits), rows.limits.sides[0]
+            for side, value in parts:
+                sums[names[sides[side]]] = sums.get(names[sides[side]], 0.0) + float(value)
+        return sums
+
+    costs = sort(made.nlp, np.abs(on_x), np.abs(on_g))
+    costliest = max(costs, key=lambda limit: costs[limit])
+
+    def evaluate(problem: Problem, z: Array) -> tuple[Terms, Array]:
+        own, scales = stage.in_own_units(problem), problem.scene.scales
+        stages = [_adopt(each, own) for each in made.stages]
+        nodes = points[0].nodes.copy()
+        nodes[0, 0] = stage.scale_state(z, scales)
+        stages[0] = replace(stages[0], guess=points[0]._replace(nodes=nodes))
+        other = solution.TimeSearch.of(problem, options)
+        nlp, raised = other.build(stages), [stage.LimitMisses.none(each) for each in stages]
+        bounds, bounds_g = time_nlp.find_bounds(nlp, stages, other.scheme, raised)
+        x, written = time_nlp.pack(points, nlp.layouts, 0.0), nlp.assembled[0]
+        f, g = ca.Function("fg", [written["x"]], [written["f"], written["g"]])(x)
+        of_x, of_g = _charge(on_x, x, *bounds), _charge(on_g, g.full()[:, 0], *bounds_g)
+        sums, unit = sort(nlp, of_x, of_g), stage.unit_of(options.goal, scales)
+        sums[costliest] += float(f) + float(of_x.sum() + of_g.sum()) - sum(sums.values())
+        terms = [(name, limit, unit * value) for limit, value in sums.items()]
+        return terms, points[-1].nodes[-1, 0] * stage.unit_lengths(scales)
+
+    return evaluate
+
+
+def _adopt(part: stage.Stage, own: Problem) -> stage.Stage:
+    """A stage in the scene of a problem in own units."""
+    until, ahead = own.phases[part.phase].until, part.ahead
+    if ahead is not None and until.value is not None:
+        ahead = ahead[0], until.value, ahead[2]
+    formation, gained = (
+        each and stage.make_formation(own.scene, each.contacts, each.rolling)
+        for each in (part.formation, part.gained)
+    )
+    assert formation is not None
+    end = part.until and until
+    return replace(part, formation=formation, gained=gained, until=end, ahead=ahead)
+
+
+def find_lagrangian(planning: Planning) -> Evaluate:
+    """The Lagrangian of all blocks of a plan; SolverError where multipliers do not give all."""
+    problem, options, scene = planning.problem, planning.options, planning.problem.scene
+    slow = scene.has_slow_motors or scene.control_period
+    if options.goal is Objective.MARGIN or options.ranges or slow:
+        raise SolverError("plans of this kind are no solution of NLPs by themselves")
+    made = list[tuple[int, Evaluate]]()  # first phase of each block, from the last one on
+
+    def evaluate(problem: Problem, z: Array) -> tuple[Terms, Array]:
+        terms: Terms = []
+        for index, evaluate_block in reversed(made):
+            z = _close(problem.phases[index].formation, z)
+            more, z = evaluate_block(problem, z)
+            terms += more
+        return terms, z
+
+    for block in reversed(planning.blocks):
+        if block.chain is not None:
+            made.append((block.phases[0].index, use_curves(planning, block)))
+            continue
+        if any(phase.end is End.IMPACT for phase in block.phases):
+            raise SolverError("impacts over time may be stops")
+        price = None
+        if made:
+            formation, h = problem.phases[made[-1][0]].formation, STEP * scene.scales.length
+            price, roots = np.zeros(5), np.sqrt(metric_weights(scene))
+            for u in np.linalg.qr(roots[:, None] * tangent_basis(formation, block.end))[0].T:
+                ends = [block.end + sign * h * u / roots for sign in (1, -1)]
+                high, low = (sum(term[2] for term in evaluate(problem, end)[0]) for end in ends)
+                price += (high - low) / (2 * h) * u * roots
+        made.append((block.phases[0].index, use_time(planning, block, price)))
+    return evaluate
+
+
+def _close(formation: Formation, z: Array) -> Array:
+    """The nearest configuration with closed contacts to one nearby, shape (5,)."""
+    for _ in range(5):
+        here = formation.evaluate(z[None], np.zeros((1, 5)))
+        z = z + move_least(here.A, -here.C, metric_weights(formation.scene))[0]
+    return z
+
+
+@exclusive
+def find_sensitivities(
+    problem: Problem,
+    options: PlanOptions | None = None,
+    names: Sequence[str] = (),
+    jobs: int | None = None,
+    progress: Callable[[str], None] = lambda text: None,
+    multipliers: bool = True,
+) -> Sensitivities:
+    """Derivatives of the value of a problem's plan with respect to its numbers.
+
+    Parameters
+    ----------
+    options      of the plan, whose accuracy is `ACCURACY` or better
+    names        of numbers; all but the corners of the object, if left out
+    jobs         processes; as many as cores if left out
+    multipliers  whether to use them where that is possible, or differences alone
+
+    Raises
+    ------
+    InputError  if the problem has no number of a name
+    InfeasibleError, SolverError  if the problem itself has no plan
+    """
+    options = options or PlanOptions()
+    options = replace(options, accuracy=min(options.accuracy, ACCURACY))
+    options = options.scale_ranges(problem.ranges)
+    if problem.scene.control_period:
+        options = replace(options, transcription="time")
+    parameters = [find_parameter(problem, name, "--of") for name in names]
+    if not names:
+        parameters = [p for p in list_parameters(problem) if "vertices" not in p.name]
+    progress("planning")
+    planning, goal = plan_blocks(problem, trace_phases(problem), options, progress), options.goal
+
+    def solve(changed: Problem, _: Array) -> tuple[Terms, Array]:
+        plans = plan_blocks(changed, trace_phases(changed), options, lambda text: None).plans
+        return [(str(k), "", plan.value) for k, plan in enumerate(plans, 1)], problem.start
+
+    ways: list[tuple[str, float, Evaluate]] = [("differences", WIDE, solve)]
+    try:
+        if multipliers:
+            ways.insert(0, ("multipliers", STEP, find_lagrangian(planning)))
+    except SolverError:
+        pass
+    middle = ways[0][2](problem, problem.start)[0]
+    parts = tuple(dict.fromkeys(part for part, *_ in middle))
+    progress(f"{len(parameters)} numbers")
+    tasks = [partial(_find_one, problem, goal, parts, ways, p) for p in parameters]
+    rows = share(tasks, jobs or count_cores())
+    rows.sort(key=lambda row: -abs(row.percent) if math.isfinite(row.percent) else 0.0)
+    value = combine(goal, [plan.value for plan in planning.plans])
+    return Sensitivities(problem.name, goal.value, value, UNITS[goal], parts, tuple(rows))
+
+
+def _find_one(
+    problem: Problem,
+    goal: Objective,
+    parts: tuple[str, ...],
+    ways: Sequence[tuple[str, float, Evaluate]],
+    parameter: Parameter,
+) -> Sensitivity:
+    """The sensitivity to one number, in the first way in which a side of it can be evaluated."""
+    size, fault = max(abs(parameter.value), WIDE * parameter.scale), ""
+    about = parameter.name, parameter.value, parameter.unit
+    for method, step, evaluate in ways:
+        sides, note = list[tuple[float, Terms]](), ""
+        for change, text in ((step, "with less only: "), (-step, "with more only: "), (0.0, "")):
+            if not change and len(sides) != 1:
+                continue
+            try:
+                changed = parameter.set(problem, parameter.value + change * size)
+                sides.append((change * size, evaluate(changed, changed.start)[0]))
+            except (WholearmError, ValueError) as error:
+                note, fault = f"{text}{error}", str(error)
+        if len(sides) < 2:
+            continue
+        (high, more), (low, less) = sides
+        values = [
+            [sum(v for part, _, v in terms if part == name) for name in parts]
+            for terms in (more, less)
+        ]
+        slope = (combine(goal, values[0]) - combine(goal, values[1])) / (high - low)
+        slopes = ((np.array(values[0]) - values[1]) / (high - low)).tolist()
+        acts = dict[str, float]()
+        for sign, terms in ((1, more), (-1, less)):
+            for _, limit, value in terms:
+                acts[limit] = acts.get(limit, 0.0) + sign * value
+        limit = max(acts, key=lambda name: abs(acts[name])) if any(slopes) else ""
+        return Sensitivity(*about, slope, tuple(slopes), limit, method, note)
+    note = f"neither with more nor with less: {fault}"
+    return Sensitivity(*about, math.nan, (math.nan,) * len(parts), "", ways[-1][0], note)
