@@ -109,9 +109,10 @@ def _write(axes: Axes, reason: str, colour: str, x: float, y: float, transform: 
 def _draw_lines(
     axes: Axes, sweep: Sweep, name: str, lines: Lines, colours: Mapping[str, str]
 ) -> None:
-    """Values over one parameter; where there are none, bands or crosses of the reason.
+    """Values over one parameter.
 
-    A line alone has bands of full height; of several ones each has a strip at the bottom.
+    Where a curve alone has no value, there is a band in the colour of the reason. Several lines,
+    and samples, have a row of crosses each at the bottom.
     """
     axes.set(xlabel=sweep.titles[name], ylabel=sweep.label)
     axes.grid(color=GRID, linewidth=0.4)
@@ -122,20 +123,19 @@ def _draw_lines(
         (values, reasons), (dash, marker) = _take(rows), LINES[number % len(LINES)]
         look: Any = {"color": PALETTE[number % len(PALETTE)], "marker": marker, "markersize": 3.0}
         axes.plot(x, values, linestyle="" if sweep.samples else dash, label=label, **look)
-        low, high = (0.0, 1.0) if single else (0.05 * number + 0.01, 0.05 * number + 0.04)
+        strip, borders, first = 0.05 * number + 0.025, _border(x), 0
         if len(lines) > 1 and any(reasons):
-            axes.plot(0.0, (low + high) / 2, transform=axes.transAxes, clip_on=False, **look)
-        borders, first = _border(x), 0
+            axes.plot(0.0, strip, transform=axes.transAxes, clip_on=False, **look)
         for reason, group in groupby(reasons):
             last = first + len(list(group))
-            if reason and sweep.samples:
-                middle = np.full(last - first, (low + high) / 2)
-                axes.plot(x[first:last], middle, "x", color=colours[reason], transform=across)
-            elif reason:
-                left, right, colour = borders[first], borders[last], colours[reason]
-                axes.axvspan(left, right, low, high, color=_pale(colour), linewidth=0, zorder=1)
-                if single and last - first > SHARE * len(rows):
+            left, right, colour = borders[first], borders[last], colours.get(reason, "")
+            if reason and single:
+                axes.axvspan(left, right, color=_pale(colour), linewidth=0, zorder=1)
+                if last - first > SHARE * len(rows):
                     _write(axes, reason, colour, (left + right) / 2, 0.5, across)
+            elif reason:
+                places = np.full(last - first, strip)
+                axes.plot(x[first:last], places, "x", color=colour, transform=across)
             first = last
     if not single:
         bottom, top = axes.get_ylim()
