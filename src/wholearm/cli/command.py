@@ -378,6 +378,8 @@ def prepare(given: Sequence[str]) -> list[str]:
         text = left.pop(0)
         if text == "--simulate":
             text += f"={left.pop(0) if left and left[0] in SIMULATORS else SIMULATORS[0]}"
+        if text == "--minimise" and left:
+            text += f"={left.pop(0)}"  # -margin is no option
         texts += ["--list", text[7:]] if text.startswith("--list=") else [text]
     return texts
 

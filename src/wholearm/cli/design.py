@@ -152,7 +152,7 @@ def find_hand(options: argparse.Namespace) -> int:
         options.minimise,
         **_list_given(options),
         symmetric=options.symmetric,
-        weights=[float(weight) for weight in options.weights or ()],
+        weights=options.weights or (),
         worst=options.worst,
         starts=options.starts,
         budget=options.budget,

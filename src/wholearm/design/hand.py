@@ -23,6 +23,7 @@ from ..analysis.robustness import draw_cube
 from ..common.arrays import Array
 from ..common.document import Document, Result, Table
 from ..common.errors import InfeasibleError, InputError
+from ..common.fields import choice
 from ..common.parallel import count_cores, share
 from ..common.sharing import exclusive
 from ..planning.options import Objective, PlanOptions
@@ -107,7 +108,7 @@ class Aim:
 
     def find(self, hand: Hand) -> list[float]:
         """The numbers of a hand."""
-        return [choice.at(share) for choice, share in zip(self.choices, hand.shares, strict=True)]
+        return [one.at(share) for one, share in zip(self.choices, hand.shares, strict=True)]
 
     def rate(self, start: int, shares: Sequence[float]) -> Hand:
         """Plan and judge a hand."""
@@ -187,7 +188,7 @@ class Design(Result):
     @property
     def values(self) -> dict[str, Any]:
         """Everything, as JSON has it."""
-        names = [choice.parameter.name for choice in self.aim.choices]
+        names = [one.parameter.name for one in self.aim.choices]
         hands = {
             key: [
                 {"start": hand.start, "cost": hand.cost, "reason": hand.reason}
@@ -215,7 +216,8 @@ class Design(Result):
         tables += [Table(heads, rows)]
         tables += [Table(["without a plan, by reason", "hands:d"], self.reasons.most_common())]
         same = optima[-1].cost - optima[0].cost <= SAME * abs(optima[0].cost)
-        lines = [f"the starts lead to {'one optimum' if same else 'different optima'}"]
+        text = f"the starts lead to {'one optimum' if same else 'different optima'}"
+        lines = [text] if len(optima) > 1 else []
         for plan, today in zip(self.plans, self.aim.today, strict=True):
             more = f"{100 * (plan.value / today - 1):+.2f} % of today's {today:.6g}"
             more = more if math.isfinite(today) else "no plan today"
@@ -230,7 +232,7 @@ def design_hand(
     minimise: str = "time",
     *,
     symmetric: bool = False,
-    weights: Sequence[float] = (),
+    weights: Sequence[float | str] = (),
     worst: bool = False,
     starts: int = 3,
     budget: int = 100,
@@ -258,7 +260,11 @@ def design_hand(
     InfeasibleError  if no hand has a plan; says why most have none
     """
     listed = (problems,) if isinstance(problems, Problem) else tuple(problems)
-    given = np.array(weights or np.ones(len(listed)), dtype=float)
+    choice("time", "effort", "-margin").read(minimise, "--minimise")
+    try:
+        given = np.array([float(weight) for weight in weights] or np.ones(len(listed)))
+    except ValueError:
+        given = np.zeros(0)
     if len(given) != len(listed) or not (given > 0).all():
         text = f"{weights} given; {len(listed)} positive numbers are needed, one for each problem"
         raise InputError("", "--weights", text)
@@ -269,7 +275,7 @@ def design_hand(
     none = Planner(listed, (), chosen)
     rows = [none.run((0, (index,))) for index in range(len(listed))]
     today = tuple(math.nan if row["value"] is None else row["value"] for row in rows)
-    keys = tuple(key for choice in choices for key in choice.factors)
+    keys = tuple(key for one in choices for key in one.factors)
     aim = Aim(choices, Planner(listed, keys, chosen), today, given / given.sum(), worst)
     tasks = [partial(aim.search, start, budget, progress) for start in range(1, starts + 1)]
     hands = tuple(hand for tried in share(tasks, jobs or count_cores()) for hand in tried)
