@@ -10,9 +10,10 @@ from typing import Any
 
 from ..common.fields import keys_of
 from ..common.files import require_ending, write_text
+from ..mechanics import MARGIN
 from ..planning.options import PLANNER, PlanOptions
 
-PLANNING = re.sub(r"^--samples .*\n", "", PLANNER, flags=re.M)
+PLANNING = re.sub(r"^--samples .*\n", "", PLANNER, flags=re.M) + MARGIN
 """Options of the planner but the rows of trajectory files, which are not written."""
 OBJECTIVE = PLANNING[: PLANNING.index("--accuracy")]
 TABLE = f"""\
@@ -25,8 +26,8 @@ problems PROBLEM ...   problem files (TOML)
     in 0..1000000
 --seed K               of the samples = 0 in 0..9223372036854775808
 --with CHECKS          what plans are tried with: verify, free, policy, or several with commas
--o --output FILE       table to write (.csv; default: NAME_sweep.csv). Rows are kept in a .jsonl
-    file beside it as they come; a sweep that is there goes on where it was stopped
+-o --output FILE       table to write (.csv; default: NAME_PARAMETERS.csv). Rows are kept in a
+    .jsonl file beside it as they come; a sweep that is there goes on where it was stopped
 --fresh                begin these files anew, whatever they hold
 --figure FILE          also draw (.png, .pdf, .svg) a curve over one parameter, contours over two,
     small multiples over three
@@ -72,14 +73,21 @@ def sweep(options: argparse.Namespace) -> int:
     from ..problem.read import read_problem
     from .command import finish, require_output, show_progress, stem_of
 
-    output = options.output or f"{stem_of(options.problems[0])}_sweep.csv"
+    vary = read_vary(options.vary, options.samples)
+    parts = [stem_of(options.problems[0]), *(re.sub(r"\W+", "_", name).strip("_") for name in vary)]
+    output = options.output or f"{'_'.join(parts)}.csv"
     require_output(output, ".csv")
     require_output(options.figure)
+    if options.figure is not None:
+        from ..design.sweep_figure import choose_axes
+
+        choose_axes(vary, options.samples, len(options.problems))
     start = partial(Processes, options.jobs)
     result = run(
         [read_problem(path) for path in options.problems],
-        read_vary(options.vary, options.samples),
+        vary,
         **_list_given(options),
+        samples=options.samples,
         seed=options.seed,
         checks=tuple(filter(None, (getattr(options, "with") or "").split(","))),
         time_limit=options.time_limit,
@@ -129,7 +137,8 @@ def sensitivities(options: argparse.Namespace) -> int:
 
 def _list_given(options: argparse.Namespace) -> dict[str, Any]:
     """Options of the planner that are given."""
-    values = {name: getattr(options, name, None) for name in keys_of(PlanOptions)}
+    names = [name for name in keys_of(PlanOptions) if name != "samples"]
+    values = {name: getattr(options, name, None) for name in names}
     return {name: value for name, value in values.items() if value is not None}
 
 

@@ -79,7 +79,7 @@ def find_limit(plan: Plan) -> tuple[str, float]:
     Instead of epsilon counts the plan's least normal force, which is more for the objective margin.
     """
     motion, spent = plan.trajectory, dict[str, float]()
-    weight = np.gradient(motion.t)  # samples are even in time within a phase
+    weight = (np.diff(motion.t, prepend=0.0) + np.diff(motion.t, append=motion.t[-1])) / 2
     for phase in plan.problem.phases:
         rows, formation = motion.phase == phase.index, phase.formation
         limits = make_limits(formation, float(np.nanmin(motion.c_n)))

@@ -29,6 +29,27 @@ Lines = Mapping[str, Sequence[Row]]
 """Rows by what they have in common."""
 
 
+def choose_axes(
+    vary: Mapping[str, Sequence[Any]], samples: int, problems: int
+) -> tuple[list[str], list[str]]:
+    """Names of the parameters that are axes, and of those that lines or panels are for.
+
+    Raises
+    ------
+    InputError  if a grid has more than three parameters, or there are too many panels
+    """
+    several = [name for name, values in vary.items() if len(values) > 1]
+    numeric = [k for k in several if all(isinstance(v, int | float) for v in vary[k])]
+    if not numeric or (len(numeric) > 3 and not samples):
+        text = f"drawn are 1 to 3 parameters with several numbers, and not {len(numeric)}"
+        raise InputError("", "--figure", f"{text}; --samples may have any number")
+    shown = numeric if samples else numeric[:2]
+    fixed = [] if samples else [name for name in several if name not in shown]
+    if max(len(shown), problems * math.prod(len(vary[name]) for name in fixed)) > MOST:
+        raise InputError("", "--figure", f"more than {MOST} panels or lines; vary fewer values")
+    return shown, fixed
+
+
 def draw_sweep(sweep: Sweep) -> Figure:
     """Draw the values over the parameters, and why there are none where there are none.
 
@@ -37,15 +58,9 @@ def draw_sweep(sweep: Sweep) -> Figure:
 
     Raises
     ------
-    InputError  if a grid has more than three parameters, or there are too many panels
+    InputError  as `choose_axes`
     """
-    several = [name for name, values in sweep.vary.items() if len(values) > 1]
-    numeric = [k for k in several if all(isinstance(v, int | float) for v in sweep.vary[k])]
-    if not numeric or (len(numeric) > 3 and not sweep.samples):
-        text = f"drawn are 1 to 3 parameters with several numbers, and not {len(numeric)}"
-        raise InputError("", "--figure", f"{text}; --samples may have any number")
-    shown = numeric if sweep.samples else numeric[:2]
-    fixed = [] if sweep.samples else [name for name in several if name not in shown]
+    shown, fixed = choose_axes(sweep.vary, sweep.samples, len(sweep.problems))
     lines = dict[str, list[Row]]()
     for row in sweep.rows:
         parts = [row["problem"]] if len(sweep.problems) > 1 else []
@@ -53,8 +68,6 @@ def draw_sweep(sweep: Sweep) -> Figure:
         lines.setdefault(", ".join(parts), []).append(row)
     contours = len(shown) == 2 and not sweep.samples
     panels = [{name: rows} for name, rows in lines.items()] if contours else [lines for _ in shown]
-    if max(len(panels), len(lines)) > MOST:
-        raise InputError("", "--figure", f"more than {MOST} panels or lines; vary fewer values")
     reasons = sweep.reasons
     colours = {reason: PALETTE[k % len(PALETTE)] for k, reason in enumerate(reasons)}
     columns = 2 if len(panels) == 4 else min(3, len(panels))
