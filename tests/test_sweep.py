@@ -151,7 +151,8 @@ def test_values_are_read(text: str) -> None:
     assert read_vary(["x=1:2:3", "flush=0,1", "control_hold=linear"]) == {
         "x": (1.0, 1.5, 2.0), "flush": (0, 1), "control_hold": ("linear",)
     }  # fmt: skip
-    assert read_vary(["x=1:2"], samples=5) == {"x": (1.0, 2.0)}
+    assert read_vary(["x=.5:2"], samples=5) == {"x": (0.5, 2.0)}
+    assert read_vary(["fingers_collide=true,false"]) == {"fingers_collide": (True, False)}
 
 
 @pytest.mark.parametrize(
@@ -211,7 +212,9 @@ def test_figures(box: Problem) -> None:
     y = np.asarray(line.get_ydata())
     assert y[:4] == pytest.approx([1.0, 1.1, 1.2, 1.3]) and np.isnan(y[4])
     assert [text.get_text() for text in curve[0].texts] == ["too heavy"]
-    lines = wholearm.draw_sweep(make({"mass": mass, "control_hold": hold}, box)).axes[0]
+    words = make({"mass": mass, "control_hold": hold, "fingers_collide": [False]}, box)
+    assert re.search(r"0.1 +constant +false +planned", words.to_text())
+    lines = wholearm.draw_sweep(words).axes[0]
     legend = lines.get_legend()
     assert legend is not None
     names = [text.get_text() for text in legend.get_texts()]

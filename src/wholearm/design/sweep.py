@@ -188,6 +188,7 @@ class Sweep(Result):
         rows, reasons, best = list[list[Any]](), self.reasons, self.best
         for row in self.rows:
             cells: Row = {"phases": [row[key] for key in row if key.startswith("duration")] or None}
+            cells |= {k: show_value(v) for k, v in row.items() if isinstance(v, bool)}
             if "limit" in row:
                 cells["reason"] = f"{row['limit']} ({100 * row['share']:.0f} % of the time)"
             rows.append([(row | cells).get(key) for key in columns])
@@ -212,7 +213,8 @@ class Sweep(Result):
 
 def show_value(value: Any) -> str:
     """A number with six digits, or a word."""
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    text = f"{value:.6g}" if isinstance(value, float) else str(value)
+    return text.lower() if isinstance(value, bool) else text
 
 
 def read_vary(texts: Sequence[str], samples: int = 0) -> dict[str, tuple[Any, ...]]:
@@ -242,10 +244,10 @@ def read_vary(texts: Sequence[str], samples: int = 0) -> dict[str, tuple[Any, ..
 
 
 def _parse(text: str) -> Any:
-    try:
-        return json.loads(text)
-    except ValueError:
-        return text
+    for read in (json.loads, float):
+        with suppress(ValueError):
+            return read(text)
+    return text
 
 
 def name_parameter(problem: Problem, name: str, values: Sequence[Any]) -> str:

@@ -39,7 +39,7 @@ def choose_axes(
     InputError  if a grid has more than three parameters, or there are too many panels
     """
     several = [name for name, values in vary.items() if len(values) > 1]
-    numeric = [k for k in several if all(isinstance(v, int | float) for v in vary[k])]
+    numeric = [k for k in several if all(type(v) in (int, float) for v in vary[k])]
     if not numeric or (len(numeric) > 3 and not samples):
         text = f"drawn are 1 to 3 parameters with several numbers, and not {len(numeric)}"
         raise InputError("", "--figure", f"{text}; --samples may have any number")
