@@ -47,7 +47,8 @@ Terms = list[tuple[str, str, float]]
 Evaluate = Callable[[Problem, Array], tuple[Terms, Array]]
 """Terms of blocks for another problem, from a configuration (5,), and where they end."""
 ACCURACY = 1e-6  # of the plans: at 1e-4 the derivative by friction_palm of heptagon is 2 % off
-STEP, WIDE = 1e-4, 1e-2  # changes of a number, relative: of Lagrangians, and of solved problems
+STEP, WIDE = 1e-4, 2.5e-3  # relative changes of a number, for Lagrangians and solved problems
+LEAST = 1e-2  # size that a number counts as having, over the scene's unit
 PATH = "length of the path"
 
 
@@ -349,7 +350,7 @@ def _find_one(
     parameter: Parameter,
 ) -> Sensitivity:
     """The sensitivity to one number, in the first way in which a side of it can be evaluated."""
-    size, fault = max(abs(parameter.value), WIDE * parameter.scale), ""
+    size, fault = max(abs(parameter.value), LEAST * parameter.scale), ""
     about = parameter.name, parameter.value, parameter.unit
     for method, step, evaluate in ways:
         sides, note = list[tuple[float, Terms]](), ""
