@@ -3,8 +3,7 @@
 A query has a start and a goal, each an edge on the palm and an x at which both fingers close on the
 object, drawn at random for the shipped scenes and for random polygons in the hexagon's hand. Each
 query is asked twice: first of a scene that nothing is known of, then for a goal a little further
-on, with what is known. With ``--printed`` the phases that `route` prints are planned instead of the
-second query, in place of the goal. `draw_leg` draws routes that need no search.
+on, with what is known. `draw_leg` draws routes that need no search.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ import time
 import tomllib
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,6 @@ import numpy as np
 from ..common.errors import InfeasibleError, InputError, WholearmError
 from ..mapping.formation_list import format_route, list_formations
 from ..planning.options import PlanOptions
-from ..planning.plan import solve
 from ..problem.definition import Problem
 from ..problem.read import build_problem, read_problem
 from ..search.find_route import find_route, forget_roadmaps
@@ -32,7 +31,6 @@ from .scenes import Table
 from .study import Case, Row, Study, format_table
 
 SHIPPED = ("heptagon", "hexagon", "square", "triangle")
-SAME = 1e-4  # relative difference of values of plans that count as the same
 
 
 class Queries(Study):
@@ -44,29 +42,26 @@ class Queries(Study):
 --queries N   how many = 250 in 0..100000
 --polygons N  how many more, each about a new polygon in a shipped hand = 0 in 0..100000
 --objective NAME  of the plans: time, effort or margin = time
---printed     plan the phases that are printed, in place of a second query
 """
 
     def stamp(self, options: argparse.Namespace) -> dict[str, Any]:
-        """Seed and what is asked."""
-        return {key: getattr(options, key) for key in ("seed", "objective", "printed")}
+        """Seed and objective."""
+        return {key: getattr(options, key) for key in ("seed", "objective")}
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
-        """What is drawn, its seed and number, folder of the problems, and what is asked."""
+        """What is drawn, its seed and number, folder of the problems, and the objective."""
         objective = PlanOptions(objective=options.objective).goal.value
-        asked = options.problems, objective, options.printed
         for kind, count in (("query", options.queries), ("polygon", options.polygons)):
-            yield from ((kind, options.seed, k, *asked) for k in range(count))
+            yield from ((kind, options.seed, k, options.problems, objective) for k in range(count))
 
     def limit(self, case: Case) -> float:
         """Two searches."""
         return 600.0
 
     def run(self, case: Case) -> Row:
-        """Ask a query, and a second one or what is planned for the phases that are printed."""
-        drawn, seed, number, folder, objective, printed = case
-        draw = draw_polygon_query if drawn == "polygon" else draw_query
-        problem = draw(seed, number, Path(folder))
+        """Ask a query, and a second one."""
+        drawn, seed, number, folder, objective = case
+        problem = DRAW[drawn](seed, number, Path(folder))
         forget_roadmaps()
         row: Row = {"text": f"{problem.name}: {problem.table['start']} to {problem.goals[0]}"}
         started = time.process_time()
@@ -81,25 +76,11 @@ class Queries(Study):
         if failures:
             return row | {"kind": "plan that fails", "findings": list(failures[:1])}
         started = time.process_time()
-        try:
-            if printed:
-                table = {key: entry for key, entry in problem.table.items() if key != "goal"}
-                phases = tomllib.loads(answer.to_text())
-                plan = solve(build_problem(table | phases), objective)
-            else:
-                goal, step = problem.goals[0], 0.1 * problem.scene.scales.length
-                further = {"flush": goal.flush, "x": (goal.x or 0.0) + step}
-                find_route(problem.with_({"goal": further}), objective)
-        except WholearmError as error:
-            if printed:
-                return row | {"kind": "refused as printed", "findings": [str(error)]}
-        else:
+        goal, step = problem.goals[0], 0.1 * problem.scene.scales.length
+        further = {"flush": goal.flush, "x": (goal.x or 0.0) + step}
+        with suppress(WholearmError):
+            find_route(problem.with_({"goal": further}), objective)
             row["second"] = time.process_time() - started
-            if printed:
-                row["off"] = plan.value / answer.plan.value - 1
-        if abs(row.get("off", 0.0)) > SAME:
-            difference = f"{plan.value:.6g} {plan.unit} as printed, {answer.plan.value:.6g} found"
-            return row | {"kind": "another plan as printed", "findings": [difference]}
         return row | {"kind": "solved"}
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
@@ -110,7 +91,7 @@ class Queries(Study):
         for name, times in (
             ("all", [row["first"] for row in rows]),
             *((kind, [row["first"] for row in rows if row["kind"] == kind]) for kind in kinds),
-            ("second query or plan", [row["second"] for row in rows if "second" in row]),
+            ("second query", [row["second"] for row in rows if "second" in row]),
         ):
             if times:
                 shown = (f"{seconds:.2f}" for seconds in np.percentile(times, [50, 95, 100]))
@@ -124,9 +105,6 @@ class Queries(Study):
         if gaps:
             text = f"Gap of {len(gaps)} routes along borders alone: at most {100 * max(gaps):.2g} %"
             lines += [f"{text}, median {100 * np.median(gaps):.2g} %."]
-        if off := [abs(row["off"]) for row in rows if "off" in row]:
-            same = f"{sum(offset <= SAME for offset in off)} of {len(off)} plans of printed phases"
-            lines += ["", f"{same} are the same to {SAME:g}; largest difference {max(off):.2g}."]
         wrong = [row for row in rows if "findings" in row]
         return "\n".join(lines), [f"{row['text']}: {row['findings'][0]}" for row in wrong]
 
@@ -160,6 +138,9 @@ def draw_polygon_query(seed: int, number: int, folder: Path) -> Problem:
     table["friction"] = {part: round(float(rng.uniform(0.03, 0.15)), 3) for part in parts}
     table["name"] = f"new polygon {number + 1}"
     return _draw_goal(rng, table)
+
+
+DRAW = {"query": draw_query, "polygon": draw_polygon_query}
 
 
 def _draw_corners(rng: np.random.Generator, count: int) -> list[list[float]]:
