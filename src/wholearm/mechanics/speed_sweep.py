@@ -122,38 +122,33 @@ def _sweep(
     before, after, one = (np.ascontiguousarray(x.swapaxes(0, 1)) for x in (before, after, one))
     # From one node's b, bounds of the other's: slopes and values at zero, interval by interval.
     with np.errstate(divide="ignore", invalid="ignore"):
-        brakes, pushes = (after >= 0) & (before < 0), after < 0
+        brakes = (after >= 0) & (before < 0)
         brake_slopes = np.where(brakes, after / -before, 0)
         brake_values = np.where(brakes, one / -before, np.inf)
-        push_slopes = np.where(pushes, before / -after, 0)
-        push_values = np.where(pushes, one / -after, np.inf)
+        slopes, values = before / -after, one / -after
+    lows = np.where(after > 0, slopes, 0), np.where(after > 0, values, -np.inf)
+    push_slopes, push_values = np.where(after < 0, slopes, 0), np.where(after < 0, values, np.inf)
     closed = ((before == 0) & (after == 0) & (one < 0)).any(axis=2)
-    count, paths = len(steps), len(rows)
-    largest, b = np.zeros((2, count + 1, paths))
-    braked, slower = np.zeros((count, paths), bool), np.zeros((count + 1, paths), bool)
-    blocked = np.full(paths, -1)
+    caps = np.minimum(cap.T, _UNBOUNDED)
+    top = _find_corners(*lows, push_slopes, push_values, caps[:-1])
+    top[closed] = -1.0
+    count, least = len(steps), np.minimum.reduce
+    largest, b = np.zeros((2, *caps.shape))
+    braking, pushed = np.empty((2, *top.shape))
     for k in range(count - 1, -1, -1):
-        following = largest[k + 1]
-        b_k = (brake_slopes[k] * following[:, None] + brake_values[k]).min(axis=1)
-        b_k = np.minimum(b_k, _UNBOUNDED)
-        pushed = (push_slopes[k] * b_k[:, None] + push_values[k]).min(axis=1)
-        braked[k] = (b_k < cap[:, k]) & (pushed >= following)
-        b_k = np.minimum(b_k, cap[:, k])
-        others = np.flatnonzero(~braked[k])
-        if len(others):
-            corners = _find_corners(before[k, others], after[k, others], one[k, others])
-            b_k[others] = np.minimum(b_k[others], corners)
-        lost = closed[k] | (~(b_k > 0) if k else b_k < 0)
-        blocked = np.where((blocked < 0) & lost, k, blocked)
-        largest[k] = np.where(lost, 0.0, b_k)
+        braking[k] = least(brake_slopes[k] * largest[k + 1][:, None] + brake_values[k], axis=1)
+        largest[k] = np.maximum(np.minimum(braking[k], top[k]), 0.0)
     for k in range(count):
-        pushed = (push_slopes[k] * b[k][:, None] + push_values[k]).min(axis=1)
-        slower[k + 1] = ~(pushed >= largest[k + 1])
-        b[k + 1] = np.minimum(pushed, largest[k + 1])
-        if k + 1 < count:
-            blocked = np.where((blocked < 0) & ~(b[k + 1] > 0), k, blocked)
-    late = b[-1] < -_ROUNDING * b.max(axis=0)
-    blocked = np.where((blocked < 0) & late, count - 1, blocked)
+        pushed[k] = least(push_slopes[k] * b[k][:, None] + push_values[k], axis=1)
+        b[k + 1] = np.minimum(pushed[k], largest[k + 1])
+    lowest = np.minimum(braking, top)
+    lost = np.concatenate([lowest[:1] < 0, ~(lowest[1:] > 0)])
+    blocked = np.where(lost.any(axis=0), count - 1 - lost[::-1].argmax(axis=0), -1)
+    stalls = np.concatenate([~(b[1:-1] > 0), b[-1:] < -_ROUNDING * b.max(axis=0)])
+    blocked = np.where((blocked < 0) & stalls.any(axis=0), stalls.argmax(axis=0), blocked)
+    farthest = (push_slopes * lowest[..., None] + push_values).min(axis=2)
+    braked = (braking < caps[:-1]) & (farthest >= largest[1:])
+    slower = np.concatenate([np.zeros((1, len(rows)), bool), pushed < largest[1:]])
     modes = np.where(braked, SweepMode.BRAKE, SweepMode.HELD)
     modes = np.where(slower[:-1], SweepMode.SWITCH, modes)
     modes = np.where(slower[1:], SweepMode.PUSH, modes)
@@ -173,17 +168,32 @@ def _split(
     return (1 - part)[:, None] * of_b - of_a, part[:, None] * of_b + of_a, one
 
 
-def _find_corners(before: Array, after: Array, one: Array) -> Array:
-    """Largest b from which rows before b + after b' + one >= 0, (w, m), leave some b' >= 0."""
-    none = np.zeros((len(one), 1))
-    pairs = (before, none), (after, none + 1), (one, none)
-    fixed, rise, rest = (np.hstack(pair)[..., None] for pair in pairs)
-    rise, fall = np.maximum(rise, 0), np.maximum(-after, 0)[:, None]
-    slope = fall * fixed + rise * before[:, None]
-    value = fall * rest + rise * one[:, None]
-    bounded = (rise > 0) & (fall > 0) & (slope < 0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(np.where(bounded, value / -slope, np.inf).min(axis=(1, 2)))
+def _find_corners(
+    low_slopes: Array, low_values: Array, high_slopes: Array, high_values: Array, b: Array
+) -> Array:
+    """Largest b, at most that given, (..., w), that leaves some b' >= 0 between bounds; or -1.
+
+    Rows of slopes and values, (..., w, m), bound b' from below and above. The room between them is
+    a concave function of b: Newton's method from above ends at a corner, after as many steps as
+    there are rows at most.
+    """
+    b, low_value, high_value = b.copy(), low_values, high_values
+    for _ in range(low_slopes.shape[-1] ** 2):
+        low, high = low_slopes * b[..., None] + low_value, high_slopes * b[..., None] + high_value
+        i, j = low.argmax(axis=-1)[..., None], high.argmin(axis=-1)[..., None]
+        pick = np.take_along_axis
+        rests = pick(low, i, -1)[..., 0] <= 0
+        with np.errstate(invalid="ignore", divide="ignore"):
+            slope = pick(high_slopes, j, -1)[..., 0]
+            slope = slope - np.where(rests, 0, pick(low_slopes, i, -1)[..., 0])
+            value = pick(high_value, j, -1)[..., 0]
+            value = value - np.where(rests, 0, pick(low_value, i, -1)[..., 0])
+            corner = np.where(slope < 0, value / -slope, -1.0)
+        short = (slope * b + value < 0) & (corner < b * (1 - 1e-14)) & (b > 0)
+        if not short.any():
+            break
+        b[short] = np.maximum(corner[short], -1.0)
+    return b
 
 
 class ControllableSet(NamedTuple):

@@ -87,10 +87,10 @@ class Guesses:
 
         The motion is a cubic spline in time through the poses.
         """
-        from scipy.interpolate import CubicSpline
-
         if not all(phase.guess for phase in self.phases):
             return None
+        from scipy.interpolate import CubicSpline  # its import takes 0.3 s
+
         scales, scheme, t, z = self.problem.scene.scales, self.search.scheme, [0.0], [self.z]
         for phase in self.phases:
             start, slip = t[-1], phase.formation.evaluate_slip(z[-1][None])[0]
