@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.arrays import Array
+from ..common.arrays import Array, sort_unique
 from ..contacts.formation import Formation
 from .dynamics import null_vector
 
@@ -323,7 +323,7 @@ def list_sectors(rates: Array) -> list[Array]:
         return [np.ones(1), -np.ones(1)]
     rows = rates[np.abs(rates).max(axis=1) > _TINY * np.abs(rates).max()]
     across = np.arctan2(-rows[:, 0], rows[:, 1])
-    angles = np.unique(np.round(np.concatenate([across, across + np.pi]) % (2 * np.pi), 12))
+    angles = sort_unique(np.round(np.concatenate([across, across + np.pi]) % (2 * np.pi), 12))
     middles = (angles + np.append(angles[1:], angles[0] + 2 * np.pi)) / 2
     return [np.array([np.cos(t), np.sin(t)]) for t in np.concatenate([middles, angles])]
 

@@ -178,7 +178,7 @@ class Trajectory(Drawn):
         # The friction of a contact that rolls passes zero without a step.
         slid = np.where(self.rolling, 0.0, self.c_t)
         turns = np.flatnonzero((slid[1:] * slid[:-1] < 0).any(axis=1)) + 1
-        every = np.unique(np.concatenate([steps, phases, turns]))
+        every = sort_unique(np.concatenate([steps, phases, turns]))
         # Torques may go on after a motion that has failed.
         return every[every < len(t)]
 

@@ -42,7 +42,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.arrays import Array
+from ..common.arrays import Array, sort_unique
 from ..common.errors import SimulationError
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
@@ -493,8 +493,9 @@ def _split(polynomials: Array, x: float) -> tuple[Array, Array]:
         level, slope = polynomials[polynomials[:, 1] != 0].T
         roots = -level / slope
     else:
-        roots = np.array([r for row in np.unique(polynomials, axis=0) for r in find_roots(row)])
-    starts = np.array([x, *np.unique(roots[(x < roots) & (roots < 1)])])
+        rows = set(map(tuple, polynomials.tolist()))
+        roots = np.array([root for row in rows for root in find_roots(np.array(row))])
+    starts = np.array([x, *sort_unique(roots[(x < roots) & (roots < 1)])])
     return starts, (starts + np.append(starts[1:], 1.0)) / 2
 
 

@@ -310,15 +310,18 @@ def _list_sides(bodies: _Bodies, finger: int) -> list[ContactPair]:
     link, k, side = bodies.links[finger], finger + 1, 1.0 if finger == 0 else -1.0
     # By convexity the whole object is on the side that it touches between its ends.
     middle = link.normal.T @ (bodies.z[:2] - link.base)
+    away = bodies.vertices - ca.repmat(link.base, 1, bodies.vertices.shape[1])
+    runs, levels = link.axis.T @ away, link.normal.T @ away
+    sides = (("finger", 1.0, ""), ("back", -1.0, "the far side of "))
+    columns: list[Expression] = [runs, link.length - runs]
+    for _, way, _ in sides:
+        columns += [way * levels - link.radius, way * side * runs]
     pairs = []
-    for i in range(bodies.vertices.shape[1]):
-        away = bodies.vertices[:, i] - link.base
-        run, level = link.axis.T @ away, link.normal.T @ away
-        for name, way, text in (("finger", 1.0, ""), ("back", -1.0, "the far side of ")):
-            ranges = (run, link.length - run, way * middle)
-            text = f"v{i} touches {text}finger {k}"
-            gap = way * level - link.radius
-            pairs.append(ContactPair(f"v{i}-{name}{k}", gap, way * side * run, ranges, text))
+    for i, (run, rest, *contacts) in enumerate(zip(*map(ca.horzsplit, columns), strict=True)):
+        for (name, way, text), gap, slip in zip(sides, contacts[::2], contacts[1::2], strict=True):
+            title = f"v{i} touches {text}finger {k}"
+            ranges = (run, rest, way * middle)
+            pairs.append(ContactPair(f"v{i}-{name}{k}", gap, slip, ranges, title))
     return pairs
 
 
@@ -329,21 +332,21 @@ def _list_ends(bodies: _Bodies, finger: int, rounded: bool) -> list[ContactPair]
     pairs = []
     for name, centre, out in (("tip", link.tip, link.axis), ("joint", link.base, -link.axis)):
         far = ca.repmat(centre, 1, count) - bodies.vertices
-        runs, gaps = ca.sum1(bodies.along * far), -ca.sum1(normals * far) - link.radius
-        for i in range(count):
-            slip = -runs[i] - link.radius * (bodies.z[2] - link.theta)
+        runs = ca.sum1(bodies.along * far)
+        rests, gaps = bodies.lengths - runs, -ca.sum1(normals * far) - link.radius
+        slips = -runs - link.radius * (bodies.z[2] - link.theta)
+        aheads, across = -out.T @ far, -rotate_quarter(out).T @ far
+        turns = -link.radius * ca.atan2(across, aheads)
+        aways = ca.sqrt(ca.sum1(far**2)) - link.radius
+        columns = map(ca.horzsplit, (runs, rests, gaps, slips, aheads, turns, aways))
+        past = [-rest for rest in ca.horzsplit(rests)]
+        for i, (run, rest, gap, slip, ahead, turn, away) in enumerate(zip(*columns, strict=True)):
             text = f"e{i} touches the {name} of finger {k}"
-            edge: tuple[Expression, ...] = (runs[i], bodies.lengths[i] - runs[i])
-            pairs.append(ContactPair(f"e{i}-{name}{k}", gaps[i], slip, edge, text))
-            if not rounded:
-                continue
-            away, before = -far[:, i], (i - 1) % count
-            ahead, across = out.T @ away, rotate_quarter(out).T @ away
-            ranges = (ahead, runs[before] - bodies.lengths[before], -runs[i])
-            slip = -link.radius * ca.atan2(across, ahead)
-            gap = ca.sqrt(ca.sumsqr(away)) - link.radius
-            text = f"v{i} touches the {name} of finger {k}"
-            pairs.append(ContactPair(f"v{i}-{name}{k}", gap, slip, ranges, text))
+            pairs.append(ContactPair(f"e{i}-{name}{k}", gap, slip, (run, rest), text))
+            if rounded:
+                text = f"v{i} touches the {name} of finger {k}"
+                ranges = (ahead, past[i - 1], -run)
+                pairs.append(ContactPair(f"v{i}-{name}{k}", away, turn, ranges, text))
     return pairs
 
 

@@ -229,10 +229,10 @@ def find_uniqueness_margin(
     Xi = -np.sign(c_t * c_n)
     kinematics = formation.evaluate(motion.z[rows], motion.z_dot[rows])
     margins = []
-    for pattern in np.unique(slides, axis=0):
+    for pattern in sorted(set(map(tuple, slides.tolist()))):
         rows_of = np.flatnonzero((slides == pattern).all(axis=1))
         part = Kinematics(*(array[rows_of] for array in kinematics))
-        sticking = tuple(np.flatnonzero(~pattern).tolist())
+        sticking = tuple(np.flatnonzero(np.logical_not(pattern)).tolist())
         ratio, names, row = find_minors(formation, part, Xi[rows_of], sticking).find_least()
         margins.append(UniquenessMargin(ratio, names, float(motion.t[rows[rows_of[row]]])))
     return min(margins)
