@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,10 @@ Expression = Any
 """What CasADi computes with: SX, MX, DM or Function, for which it has no types."""
 
 
-def sort_unique(values: Array) -> Array:
+_Number = TypeVar("_Number", np.float64, np.int64)
+
+
+def sort_unique(values: NDArray[_Number]) -> NDArray[_Number]:
     """Different values in increasing order, shape (n,), as `np.unique` has them.
 
     That imports masked arrays, unless it is asked for indices too: some 10 ms of a process.
