@@ -133,13 +133,14 @@ class Aim:
         """The hands of one search."""
         from scipy.optimize import minimize
 
-        tried = list[Hand]()
+        tried = dict[tuple[float, ...], Hand]()
 
         def judge(shares: Array) -> float:
-            tried.append(self.rate(start, shares.tolist()))
-            best = min((hand.cost for hand in tried if not hand.reason), default=math.nan)
+            key = tuple(shares.tolist())
+            tried[key] = tried.get(key) or self.rate(start, key)
+            best = min((h.cost for h in tried.values() if not h.reason), default=math.nan)
             report(f"start {start}: {len(tried)} hands, best {best:.6g}")
-            return tried[-1].cost
+            return tried[key].cost
 
         points = 2 * draw_cube(budget, len(self.choices), start) - 1
         if start == 1:
@@ -151,12 +152,12 @@ class Aim:
         most = len(tried) + budget
         for radius in RADII if first is not None else ():
             # Again from the best: models that were made far from an edge mislead along it.
-            best = min((hand for hand in tried if not hand.reason), key=lambda hand: hand.cost)
+            best = min((h for h in tried.values() if not h.reason), key=lambda hand: hand.cost)
             options = {"initial_tr_radius": radius, "final_tr_radius": FINE}
             options |= {"maxfev": max(most - len(tried), 1)}
             bounds = [(-1.0, 1.0)] * len(self.choices)
             minimize(judge, best.shares, method="COBYQA", bounds=bounds, options=options)
-        return tried
+        return [*tried.values()]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
