@@ -183,6 +183,8 @@ class _Equations:
 
     def __init__(self, structure: Structure, modes: Modes, degree: int) -> None:
         self.structure, self.modes, self.n = structure, modes, structure.n
+        self.v = ca.SX.sym("v", structure.n)
+        self.contact_rows = structure.build_rows(modes.kept, self.v)
         self.groups = [[modes.kept.index(pair) for pair in pairs] for pairs in modes.stuck]
         n, k, s = self.n, len(modes.kept), len(modes.stuck) + len(modes.held)
         size, g = 2 * n + LOSSES, structure.geometry.shape[0]
@@ -236,13 +238,13 @@ class _Equations:
         """
         structure, n, at, groups = self.structure, self.n, self.at, self.groups
         k, held = len(self.modes.kept), list(self.modes.held)
-        z, v, time = structure.z, ca.SX.sym("v", n), ca.SX.sym("time")
+        z, v, time = structure.z, self.v, ca.SX.sym("time")
         packed = ca.SX.sym("packed", at.size)
         mu, sigma, lift = packed[at.mu], packed[at.sigma], packed[at.lift]
         slides = np.ones(k)
         slides[[row for rows in groups for row in rows]] = 0.0
         rub = mu * packed[at.Xi] * ca.DM(slides)
-        _, _, A, A_t, bend, bend_t = structure.build_rows(self.modes.kept, v)
+        _, _, A, A_t, bend, bend_t = self.contact_rows
         P, G = (self._stack(part, A_t) for part in (A, A - ca.repmat(rub, 1, n) * A_t))
         curve = ca.vertcat(bend, *(bend_t[rows[0]] for rows in groups), ca.DM(len(held), 1))
         tau = _build_torque(time, packed[at.piece], packed[at.torque])
@@ -283,10 +285,9 @@ class _Equations:
 
         A step leaves gaps of the size of its error, so one Newton iteration closes them.
         """
-        structure, n = self.structure, self.n
-        z, v = structure.z, ca.SX.sym("v", n)
+        structure, n, z, v = self.structure, self.n, self.structure.z, self.v
         packed = ca.SX.sym("packed", self.at.size)
-        gap, slip, A, A_t, _, _ = structure.build_rows(self.modes.kept, v)
+        gap, slip, A, A_t, _, _ = self.contact_rows
         P, state = self._stack(A, A_t), ca.vertcat(z, v)
         if not P.shape[0]:
             return ca.Function("correct", [state, packed], [state])
@@ -297,10 +298,7 @@ class _Equations:
         rows = ca.Function(
             "rows", [z, packed, structure.geometry], [ca.densify(P), ca.densify(places - wanted)]
         )
-        P, r, lift = ca.SX.sym("P", *P.shape), ca.SX.sym("r", P.shape[0]), ca.SX.sym("lift", n)
-        lifted = ca.repmat(lift, 1, P.shape[0]) * P.T
-        shift = ca.densify(lifted @ ca.solve(P @ lifted, r))
-        correct = ca.Function("correct", [P, r, lift], [shift])
+        correct = _build_correction(*P.shape)
         y, inputs = ca.MX.sym("y", 2 * n), ca.MX.sym("packed", self.at.size)
         geometry, lift = inputs[self.at.geometry], inputs[self.at.lift]
         P, off = rows(y[:n], inputs, geometry)
@@ -308,6 +306,15 @@ class _Equations:
         P, _ = rows(place, inputs, geometry)
         speed = y[n:] - correct(P, P @ y[n:], lift)
         return ca.Function("project", [y, inputs], [ca.vertcat(place, speed)])
+
+
+@lru_cache(maxsize=16)
+def _build_correction(count: int, n: int) -> Expression:
+    """CasADi function (P, r, diagonal of M^-1) -> the shortest x in the metric M with P x = r."""
+    P, r, lift = ca.SX.sym("P", count, n), ca.SX.sym("r", count), ca.SX.sym("lift", n)
+    lifted = ca.repmat(lift, 1, count) * P.T
+    shift = ca.densify(lifted @ ca.solve(P @ lifted, r))
+    return ca.Function("correct", [P, r, lift], [shift])
 
 
 def bind(function: Expression, inputs: Sequence[Array], outputs: Array) -> Any:

@@ -695,7 +695,8 @@ class _Vertices(NamedTuple):
         between = share * press + (1 - share) * other
         lam = np.where(held, between, np.where(pushed, press, other))
         # Parallel rows, as those within ranges may be, meet nowhere or far off: no vertex.
-        wild = ~(np.abs(a) <= 10.0 * np.quantile(np.abs(fastest.slopes), 0.5)) | ~np.isfinite(lam)
+        usual = np.sort(np.abs(fastest.slopes))[len(fastest.slopes) // 2]
+        wild = ~(np.abs(a) <= 10.0 * usual) | ~np.isfinite(lam)
         if wild.any() and not wild.all():
             a = np.where(wild, wanted, a)
             lam[wild] = np.interp(grid.s[wild], grid.s[~wild], lam[~wild])
