@@ -54,7 +54,7 @@ problems PROBLEM ...   problem files (TOML), for one hand
 --weights W ...        weights of several problems (equal ones)
 --worst                of several problems let the worst one count, and not the weighted sum
 --starts N             searches: from the present hand, and from random feasible ones = 3 in 1..100
---budget N             most hands of each search, and most until its first feasible one = 100
+--budget N             most hands of each search, and most until its first feasible one = 80
     in 1..100000
 -o --output FILE       problem file to write (.toml; default: NAME_design.toml); of several problems
     that of the first one

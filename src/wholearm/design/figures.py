@@ -64,7 +64,8 @@ def draw_search(result: Design) -> Figure:
         first.set_ylabel(result.label)
         first.legend(bbox_to_anchor=(1.01, 1.0), loc="upper left")
         for axes, choice in zip(others, choices, strict=True):
-            axes.set_ylim(choice.low, choice.high)
+            room = 0.05 * (choice.high - choice.low)
+            axes.set_ylim(choice.low - room, choice.high + room)
             title = choice.parameter.title
             axes.text(1.02, 0.5, title, transform=axes.transAxes, va="center")
         for axes in (first, *others):

@@ -236,7 +236,7 @@ def design_hand(
     weights: Sequence[float | str] = (),
     worst: bool = False,
     starts: int = 3,
-    budget: int = 100,
+    budget: int = 80,
     jobs: int | None = None,
     progress: Callable[[str], None] = lambda text: None,
     **options: Any,
