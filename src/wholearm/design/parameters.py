@@ -7,6 +7,7 @@ such as ``phases[5].until.phi_deg``.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping
 from difflib import get_close_matches
 from typing import Any, NamedTuple
@@ -23,7 +24,7 @@ _TABLES |= {f"fingers.{number}": FINGER for number in "12"}
 _FIELDS = {f"{part}.{key}": field for part, keys in _TABLES.items() for key, field in keys.items()}
 _SINGLE = ("epsilon", "gravity", "settle", "settle_gap", "control_period")
 _FIELDS |= {name: TOP[name] for name in _SINGLE}
-_SKIPPED = ("start.flush", "goal", "uncertainty", "guess")  # whole numbers, and no part of a hand
+_SKIPPED = re.compile(r"\.flush$|\.guess\[|^uncertainty")  # whole numbers, and what moves no plan
 
 
 class Parameter(NamedTuple):
@@ -92,7 +93,7 @@ def _find_every(problem: Problem) -> dict[str, Parameter]:
     for name, keys in (short | {key: (key,) for key in numbers}).items():
         field, values = _find_field(keys[0]), {numbers.get(key, math.nan) for key in keys}
         whole = field is None or (field.kind in (POINT, CORNERS) and "[" not in keys[0])
-        if keys[0].endswith(_SKIPPED) or (whole and keys[0] not in numbers):
+        if _SKIPPED.search(keys[0]) or (whole and keys[0] not in numbers):
             continue
         unit = (field.unit, getattr(scales, field.scale or "_", 1.0)) if field else ("", 1.0)
         value = values.pop() if len(values) == 1 else math.nan

@@ -40,6 +40,8 @@ from ..planning.result import UNITS
 from ..planning.time_domain import solution, stage, time_nlp
 from ..planning.time_domain.time_plan import list_stages
 from ..problem.definition import End, Problem
+from ..problem.read import require_phases
+from ..search import solve as solve_any
 from .parameters import Parameter, find_parameter, list_parameters
 
 Terms = list[tuple[str, str, float]]
@@ -299,6 +301,8 @@ def find_sensitivities(
 ) -> Sensitivities:
     """Derivatives of the value of a problem's plan with respect to its numbers.
 
+    With a goal the phases of the best route count.
+
     Parameters
     ----------
     options      of the plan, whose accuracy is `ACCURACY` or better
@@ -316,6 +320,10 @@ def find_sensitivities(
     options = options.scale_ranges(problem.ranges)
     if problem.scene.control_period:
         options = replace(options, transcription="time")
+    if problem.goals:
+        progress("finding a route")
+        problem = solve_any(problem, options.goal.value).problem
+    require_phases(problem)
     parameters = [find_parameter(problem, name, "--of") for name in names]
     if not names:
         parameters = [p for p in list_parameters(problem) if "vertices" not in p.name]
