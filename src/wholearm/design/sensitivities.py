@@ -330,9 +330,11 @@ def find_sensitivities(
     progress("planning")
     planning, goal = plan_blocks(problem, trace_phases(problem), options, progress), options.goal
 
+    names_of = {phase.number: str(phase.number) for phase in problem.phases}
+
     def solve(changed: Problem, _: Array) -> tuple[Terms, Array]:
         plans = plan_blocks(changed, trace_phases(changed), options, lambda text: None).plans
-        return [(str(k), "", plan.value) for k, plan in enumerate(plans, 1)], problem.start
+        return [(names_of[k], "", plan.value) for k, plan in enumerate(plans, 1)], problem.start
 
     ways: list[tuple[str, float, Evaluate]] = [("differences", WIDE, solve)]
     try:
@@ -342,6 +344,9 @@ def find_sensitivities(
         pass
     middle = ways[0][2](problem, problem.start)[0]
     parts = tuple(dict.fromkeys(part for part, *_ in middle))
+    for part in parts:
+        first, last = (int(part.split("-")[end]) for end in (0, -1))
+        names_of |= dict.fromkeys(range(first, last + 1), part)
     progress(f"{len(parameters)} numbers")
     tasks = [partial(_find_one, problem, goal, parts, ways, p) for p in parameters]
     rows = share(tasks, jobs or count_cores())
