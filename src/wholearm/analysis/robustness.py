@@ -34,7 +34,7 @@ from ..results.trajectory import Trajectory
 from ..scene.model import Scene
 from ..simulation.events import EventKind, FreeSimulation, OutcomeKind
 from ..simulation.simulate import simulate_free
-from ..verification.free import REACHED, TURNED
+from ..verification.free import MOMENT, REACHED, TURNED
 
 Task = tuple[int, tuple[float, ...]]
 """Number and values of a sample."""
@@ -293,7 +293,7 @@ def _find_loss(
 ) -> tuple[float | None, float]:
     """When a contact opens for longer than 1e-3 units of time, if it does; and its least c_n.
 
-    One that is open at the start has 0.1 units of time to close for good.
+    One that is open at the start has `MOMENT` to close for good.
     """
     column = simulation.contacts.index(name)
     t, c_n = simulation.t, simulation.c_n[:, column]
@@ -302,7 +302,7 @@ def _find_loss(
     least = float(forces.min()) if len(forces) else math.inf
     pauses = simulation.list_pauses(name, start, stop)
     if pauses and pauses[0][0] <= start:
-        pauses = [pause for pause in pauses if pause[1] > start + 0.1 * unit]
+        pauses = [pause for pause in pauses if pause[1] > start + MOMENT * unit]
     return next((first for first, after in pauses if after - first > 1e-3 * unit), None), least
 
 

@@ -1001,6 +1001,8 @@ def policy(options: argparse.Namespace) -> int:
             f"{options.plan}: no policy is written: in the free simulation, {failures}; "
             f"{enough}{advise()}; --write-anyway writes it all the same"
         )
+    if report.warnings:
+        made.about["warnings"] = list(report.warnings)
     made.save(output)
     status = finish(options, made)
     if not options.json:

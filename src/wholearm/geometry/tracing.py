@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -74,6 +75,24 @@ def trace_phases(problem: Problem) -> tuple[Curve, ...]:
 def runs_on_curve(phase: Phase) -> bool:
     """Whether a phase has one freedom and ends at rest or with an impact."""
     return phase.formation.n_constraints == 4 and phase.end is not End.SMOOTH
+
+
+def split_blocks(problem: Problem) -> list[tuple[Phase, ...]]:
+    """Phases that are planned together: those joined smoothly or by impacts."""
+    rests = [k + 1 for k, phase in enumerate(problem.phases) if phase.end is End.REST]
+    return [problem.phases[start:stop] for start, stop in pairwise([0, *rests])]
+
+
+def runs_on_curves(block: Sequence[Phase]) -> bool:
+    """Whether phases that are planned together run along curves: one, or several that slide."""
+    if len(block) == 1:
+        return runs_on_curve(block[0])
+    return all(
+        phase.formation.n_constraints == 4
+        and not phase.formation.rolling
+        and not phase.until.is_release
+        for phase in block
+    )
 
 
 def trace_phase(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> Curve:

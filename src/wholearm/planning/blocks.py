@@ -35,7 +35,7 @@ from ..common.errors import (
 )
 from ..contacts.formation import Formation
 from ..geometry.curve import Curve
-from ..geometry.tracing import trace_phase
+from ..geometry.tracing import split_blocks, trace_phase
 from ..mechanics.dynamics import measure_speed, metric_weights
 from ..mechanics.impact import Impact, compute_impact
 from ..mechanics.speed_sweep import NoMotionError
@@ -57,7 +57,6 @@ from .phase_plan import (
     end_of,
     make_transition,
     runs_along_curves,
-    split_blocks,
 )
 
 if TYPE_CHECKING:

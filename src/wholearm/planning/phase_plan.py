@@ -14,9 +14,9 @@ from ..common.arrays import Array
 from ..common.document import plain
 from ..common.errors import InfeasibleError
 from ..contacts.formation import Formation
-from ..geometry.tracing import runs_on_curve
+from ..geometry.tracing import runs_on_curves
 from ..mechanics.impact import Impact
-from ..problem.definition import End, Phase, Problem
+from ..problem.definition import Phase
 from ..results.dwell_record import Settling, assemble
 from ..results.plan_record import Transition
 from ..results.torque import TorqueProfile
@@ -125,24 +125,9 @@ def end_of(plan: PhasePlan[Motion]) -> tuple[Array, Array]:
     return samples.z[0], samples.z_dot[0]
 
 
-def split_blocks(problem: Problem) -> list[tuple[Phase, ...]]:
-    """Phases that have to be planned together: those joined smoothly or by impacts."""
-    rests = [k + 1 for k, phase in enumerate(problem.phases) if phase.end is End.REST]
-    return [problem.phases[start:stop] for start, stop in pairwise([0, *rests])]
-
-
 def runs_along_curves(block: Sequence[Phase], options: PlanOptions) -> bool:
-    """Whether phases are planned along their curves: a single one, or several that slide."""
-    if options.transcription != "auto":
-        return False
-    if len(block) == 1:
-        return runs_on_curve(block[0])
-    return all(
-        phase.formation.n_constraints == 4
-        and not phase.formation.rolling
-        and not phase.until.is_release
-        for phase in block
-    )
+    """Whether phases are planned along their curves."""
+    return options.transcription == "auto" and runs_on_curves(block)
 
 
 def make_transition(

@@ -68,27 +68,28 @@ Rows = list[list[float]]
 
 
 class CurveLaw:
-    """Control law of one phase along a curve.
+    """Control law along a curve, of one phase or of several in which contacts change their names.
 
     Parameters
     ----------
-    tables  `s`, (n,); `theta`, (n, 2); `b`, (n,), at nodes; `levels`, (n - 1, 2, m, 5), and
-            `torque`, (n - 1, 2, 2, 5), at both ends of the intervals; `push`, (2,), final torques;
+    tables  `starts`, (k,), places where phases begin; `s`, (n,); `theta`, (n, 2); `b`, (n,), at
+            nodes; `levels`, (n - 1, 2, m, 5), and `torque`, (n - 1, 2, 2, 5), at both ends of the
+            intervals; `push`, (2,), final torques;
             `passes`, (1,): the end is passed at speed; `keeps`, (1,): `push` is held until the next
             law begins; `arrival`, (k, 5), levels of all contacts at the end
 
     Attributes
     ----------
     over, pushes  whether the next phase may begin, and whether the contact has been made
+    passed        how many of the phases have been passed
     after         the law of the next phase, if it is along a curve
     s, v, level   arc length, speed and least level at the last step
     """
 
-    count, passed = 1, 0
-
     def __init__(self, tables: Mapping[str, Any], settings: LoopSettings) -> None:
         self.passes = bool(tables["passes"][0])
         self.settings, self.nodes = settings, tables["s"].tolist()
+        self.starts = list(tables.get("starts", ())) or [0.0]
         self.length = self.nodes[-1]
         self.theta, self.b = tables["theta"].tolist(), tables["b"].tolist()
         self.push = tuple(tables["push"].tolist())
@@ -111,6 +112,11 @@ class CurveLaw:
         self.sensing: Sensing | None = None
         self.begin()
 
+    @property
+    def count(self) -> int:
+        """Number of phases."""
+        return len(self.starts)
+
     def lead_to(self, after: CurveLaw) -> None:
         """Set the next law."""
         if self.passes:
@@ -121,6 +127,7 @@ class CurveLaw:
     def begin(self, at_end: bool = False) -> None:
         """Start anew, at the beginning or just before the end."""
         self.j = len(self.steps) - 1 if at_end else 0
+        self.passed = self.count - 1 if at_end else 0
         self.over = self.pushes = False
         self.sum = self.a = self.ran = self.rested = self.drive = self.held = 0.0
         self.limit = (LAW.ahead if at_end else LAW.soon) * self.settings.touch
@@ -138,7 +145,7 @@ class CurveLaw:
         if self.pushes:
             return self._press(theta, rates)
         if self.sensing is not None:
-            self.sensing.measure(forces)
+            self.sensing.measure(forces, self.passed)
         if self.fresh:
             self.fresh, self.off = False, s
         self.ran += settings.period
@@ -213,6 +220,8 @@ class CurveLaw:
         h = self.steps[j]
         self.j, self.s = j, self.nodes[j] + share * h
         self.v = (rate_one * e + rate_two * f) / square * h
+        while self.passed + 1 < self.count and self.s >= self.starts[self.passed + 1]:
+            self.passed += 1
 
     def _has_turned(self, rates: Sequence[float]) -> bool:
         """Whether an impact has turned the joint velocity to the direction of the next curve."""
@@ -455,13 +464,15 @@ class Sensing:
 
     Parameters
     ----------
-    names                       contacts, in the order of the table
+    names                       contacts of each phase, in the order of the table
     gained                      the contact that the phase ends with, if it does
     table : (n, 2, n_c, 5) [N]  forces at both ends of intervals, of 1, s'^2, s', a, internal force
     late                        delay of the torques, in periods
     """
 
-    def __init__(self, names: Sequence[str], gained: str, table: Any, late: float) -> None:
+    def __init__(
+        self, names: Sequence[Sequence[str]], gained: str, table: Any, late: float
+    ) -> None:
         self.names, self.gained = tuple(names), gained
         self.first = table[:, 0].tolist()
         self.rises = (table[:, 1] - table[:, 0]).tolist()
@@ -470,19 +481,23 @@ class Sensing:
 
     def begin(self) -> None:
         """Forget what was measured."""
-        self.bias = [0.0] * len(self.names)
+        self.bias, self.phase = [0.0] * len(self.names[0]), 0
         self.expected: deque[list[float]] = deque(maxlen=self.lag)
         self.heard, self.felt = False, 0
 
-    def measure(self, forces: Mapping[str, float] | None) -> None:
-        """Process a sample; contacts that are missing or NaN have no sensor."""
+    def measure(self, forces: Mapping[str, float] | None, phase: int) -> None:
+        """Process a sample in a phase; contacts that are missing or NaN have no sensor."""
         self.heard = bool(forces)
+        if phase != self.phase:
+            self.begin()
+            self.phase, self.heard = phase, bool(forces)
         if not forces or len(self.expected) < self.lag:
             return
-        mean = sum(self.expected[0]) / len(self.names)
+        names = self.names[phase]
+        mean = sum(self.expected[0]) / len(names)
         presses = forces.get(self.gained, 0.0) > LAW.felt * mean
         self.felt = self.felt + 1 if presses else 0
-        for k, (name, expected) in enumerate(zip(self.names, self.expected[0], strict=True)):
+        for k, (name, expected) in enumerate(zip(names, self.expected[0], strict=True)):
             force = forces.get(name)
             if force is not None and isfinite(force):
                 self.bias[k] += LAW.smooth * (force - expected - self.bias[k])

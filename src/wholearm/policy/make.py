@@ -24,7 +24,7 @@ from ..common.errors import InputError, require_number
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..geometry.curve import Curve, CurvePoint, directions_of
-from ..geometry.tracing import runs_on_curve, trace_phase
+from ..geometry.tracing import runs_on_curves, split_blocks, trace_phase
 from ..mechanics.dynamics import (
     LAMBDA,
     ONE,
@@ -51,7 +51,6 @@ from .playback import Policy
 from .regulator import (
     STILL,
     Planner,
-    find_planned_internal_force,
     hold_end,
     replan,
     tabulate_motion,
@@ -72,7 +71,10 @@ class ReferenceSettings:
     authority: float = 2.0  # margin of the reference's torques, over those of the law
     near: float = 1e-3  # time around a reversal in which friction may have either direction [s]
     touch: float = 3e-3  # speed s' at which contacts are made, over the scene's
-    arrival: float = 3e-3  # time constant of the approach to the end [s]
+    arrival: float = 6e-3  # time constant of the approach to the end [s]
+    # Time at rest before the next phase begins [s]. Errors open contacts on arrival; in less than
+    # 5 ms they have not closed again. Case: heptagon, phase 3.
+    dwell: float = 12e-3
     # Squared speeds over the plan's, tried until there is a margin: relative errors of torques
     # matter less where torques are small. Case: square, phase 2.
     slower: tuple[float, ...] = (1.0, 0.25)
@@ -371,7 +373,7 @@ class ReferencePiece(NamedTuple):
     reach: ControllableSet
     share: float  # least share of the margin
     begins: float  # [m^2/s^2]: the plan's b at the start
-    passes: float  # ratio of b after and before the impact at the end; zero at rest
+    passes: float  # ratio of b after and before the end, passed in motion; zero at rest
     b: Array  # (n,) [m^2/s^2]: the reference
 
     @property
@@ -401,30 +403,25 @@ def scale_ranges(ranges: Mapping[str, float], size: float, delay: float) -> dict
 
 
 def trace_pieces(
-    problem: Problem,
-    phases: Sequence[Phase | None],
-    plan: Trajectory,
-    size: float,
-    widths: Mapping[str, float] | None,
-) -> list[ReferencePiece | None]:
-    """References of phases along curves, with margins as large as possible; None for None.
+    problem: Problem, plan: Trajectory, size: float, widths: Mapping[str, float] | None
+) -> dict[int, ReferencePiece]:
+    """References of the phases along curves, by index, with margins as large as possible.
 
     Margins are `size` times those of usual errors or, where there are half `widths` of ranges, such
     that limits are kept within these.
     """
-    pieces: list[ReferencePiece | None] = []
-    for phase in reversed(phases):
-        after = pieces[-1] if pieces else None
-        pieces.append(None if phase is None else _trace(problem, phase, plan, size, widths, after))
-    pieces.reverse()
-    before: ReferencePiece | None = None
-    for k, piece in enumerate(pieces):
-        if piece is not None:
+    pieces: dict[int, ReferencePiece] = {}
+    for block in filter(runs_on_curves, split_blocks(problem)):
+        after: ReferencePiece | None = None
+        for phase in reversed(block):
+            after = pieces[phase.index] = _trace(problem, phase, plan, size, widths, after)
+        before: ReferencePiece | None = None
+        for phase in block:
+            piece = pieces[phase.index]
             first = float(piece.reach.high[0])
             if before is not None and before.passes:
                 first = float(before.b[-1]) * before.passes
-            piece = pieces[k] = piece._replace(b=piece.reach.run(first))
-        before = piece
+            before = pieces[phase.index] = piece._replace(b=piece.reach.run(first))
     return pieces
 
 
@@ -446,8 +443,8 @@ def _trace(
     s = s[np.diff(s, prepend=-1.0) > 1e-7 * curve.length]
     a, b, internal = (np.interp(s, places, value) for value in values)
     touch, begins, passes, end = SETTINGS.touch * problem.scene.scales.speed, float(b[0]), 0.0, None
-    if phase.end is End.IMPACT and after is not None and b[-1] > touch**2:
-        passes = after.begins / float(b[-1])
+    if phase.end is not End.REST and after is not None and b[-1] > touch**2:
+        passes = after.begins / float(b[-1]) if phase.end is End.IMPACT else 1.0
         end = float(after.reach.low[0] / passes), float(after.reach.high[0] / passes)
     else:
         b = np.minimum(b, (touch + (curve.length - s) / SETTINGS.arrival) ** 2)
@@ -578,8 +575,11 @@ def _follow(
     a = (point.z_s * plan.z_ddot[rows]) @ metric
     segment = np.searchsorted([part.stop for part in curve.segments[:-1]], s)
     forces = inverse(formation, *point[:3], directions_of(curve, segment), point.kinematics)
-    c_n, c_t = plan.c_n[rows], plan.c_t[rows]
-    return s, a, v**2, find_planned_internal_force(formation, forces, plan, c_n, c_t)
+    columns = [plan.contacts.index(name) for name in formation.names]
+    rolls = [columns[row] for row in formation.rolling_rows]
+    c = np.hstack([plan.c_n[rows][:, columns], plan.c_t[rows][:, rolls]])
+    # The other parts of the forces are orthogonal to that of the internal force.
+    return s, a, v**2, np.einsum("ni,ni->n", c, forces.of_c[..., LAMBDA])
 
 
 def _tabulate_curve(piece: ReferencePiece, phase: Phase, push: Array) -> dict[str, Array]:
@@ -589,6 +589,7 @@ def _tabulate_curve(piece: ReferencePiece, phase: Phase, push: Array) -> dict[st
     if contact is not None and not piece.passes:
         arrival = find_arrival(piece.curve, contact, rows)
     return {
+        "starts": np.zeros(1),
         "s": rows.s,
         "theta": piece.curve.evaluate(rows.s).z[:, 3:],
         "b": piece.b,
@@ -597,10 +598,22 @@ def _tabulate_curve(piece: ReferencePiece, phase: Phase, push: Array) -> dict[st
         "push": push,
         "passes": np.array([piece.passes]),
         "arrival": arrival[..., COLUMNS],
-        # Friction of the joints decides on rest where torques are not much larger.
-        "keeps": np.array([float((np.abs(push) < 10 * dry).all())]),
+        # Friction of the joints decides on rest where torques are not much larger. Torques below it
+        # press nothing.
+        "keeps": np.array([float(((np.abs(push) > dry) & (np.abs(push) < 10 * dry)).all())]),
         "forces": find_forces(piece.curve, rows.s, np.sqrt(piece.b))[..., COLUMNS],
     }
+
+
+def _join(one: Mapping[str, Array], two: Mapping[str, Array]) -> dict[str, Array]:
+    """Arrays of `CurveLaw` for phases in which contacts go on under other names."""
+    length = one["s"][-1]
+    joined = {name: np.concatenate([one[name], two[name][1:]]) for name in ("theta", "b")}
+    for name in ("levels", "torque", "forces"):
+        joined[name] = np.concatenate([one[name], two[name]])
+    joined["s"] = np.concatenate([one["s"], length + two["s"][1:]])
+    joined["starts"] = np.concatenate([one["starts"], length + two["starts"]])
+    return {**two, **joined}
 
 
 def find_arrival(curve: Curve, gained: Contact, rows: CurveLimitRows) -> Array:
@@ -639,25 +652,6 @@ def _balance(curve: Curve, both: Formation, factor: float) -> Array:
     right[3:, 0] += scene.dry[3:] * last.sigma
     right[3:, 1:] = -np.eye(2)
     return np.asarray(np.linalg.solve(G.T, right))
-
-
-def split(phases: Sequence[Phase]) -> list[tuple[Phase, ...]]:
-    """Blocks of phases that pass into one another in motion, except by impacts along curves."""
-    blocks: list[list[Phase]] = []
-    for phase in phases:
-        before = blocks[-1][-1] if blocks else None
-        impact = before is not None and before.end is End.IMPACT
-        joined = before is not None and before.end is End.SMOOTH
-        if joined or (impact and not (runs_on_curve(phase) and len(blocks[-1]) == 1)):
-            blocks[-1].append(phase)
-        else:
-            blocks.append([phase])
-    return [tuple(block) for block in blocks]
-
-
-def _find_curve(block: Sequence[Phase]) -> Phase | None:
-    """The phase of a block that is one along a curve."""
-    return block[0] if len(block) == 1 and runs_on_curve(block[0]) else None
 
 
 def find_ranges(problem: Problem, plan: Trajectory) -> Mapping[str, float] | None:
@@ -713,41 +707,44 @@ def make_policy(
         delay=delay,
         touch=SETTINGS.touch * scales.speed,
         still=STILL * scales.speed,
-        dwell=3e-3,
+        dwell=SETTINGS.dwell,
         most=0.5 * scales.acceleration,
         limit=(limit[0], limit[1]),
     )
-    blocks = split(problem.phases)
-    along = [_find_curve(block) for block in blocks]
+    blocks = split_blocks(problem)
     starts = plan.phase_starts
     if reserve and planner is not None:
-        curves = [phase is not None for phase in along]
-        plan = replan(planner, problem, blocks, curves, plan)
+        plan = replan(planner, problem, blocks, plan)
     widths = None if ranges is None else scale_ranges(ranges, reserve, delay)
-    pieces = trace_pieces(problem, along, plan, reserve, widths)
+    pieces = trace_pieces(problem, plan, reserve, widths)
     tables, about = list[dict[str, Array]](), list[dict[str, Any]]()
-    for block, piece in zip(blocks, pieces, strict=True):
+    for block in blocks:
         lasts = {phase.number: float(np.diff(starts)[phase.index]) for phase in block}
         entries: list[dict[str, Any]] = [
             {"number": k, "plan": t, "duration": t, "share": 0.0} for k, t in lasts.items()
         ]
-        if piece is None:
+        if block[0].index not in pieces:
             tables.append(tabulate_motion(problem, block, plan, period))
             ends = [*tables[-1]["starts"], tables[-1]["step"][0] * (len(tables[-1]["theta"]) - 1)]
             for one, span in zip(entries, np.diff(ends).tolist(), strict=True):
                 one["duration"] = span
-        else:
-            phase = block[0]
-            last = int(np.flatnonzero(plan.phase == phase.index)[-1])
+            entries[-1]["duration"] += settings.dwell + delay
+            about += entries
+            continue
+        goes_on = False
+        for phase, entry in zip(block, entries, strict=True):
+            piece, last = pieces[phase.index], int(np.flatnonzero(plan.phase == phase.index)[-1])
             push = plan.tau[last]
             if not np.isnan(plan.c_n[last]).all():
                 hold = hold_end(problem, phase, piece.curve.end)
                 push = push if hold is None else hold
-            tables.append(_tabulate_curve(piece, phase, push))
-            entries[0].update(duration=piece.duration, share=piece.share, reserves=piece.reserves)
-            entries[0]["gained"] = "" if phase.until.contact is None else phase.until.contact.name
-        if piece is None or not piece.passes:
-            entries[-1]["duration"] += settings.dwell + delay
+            table = _tabulate_curve(piece, phase, push)
+            tables[-1:] = [_join(tables[-1], table)] if goes_on else [*tables[-1:], table]
+            goes_on = bool(piece.passes) and phase.end is End.SMOOTH
+            entry.update(duration=piece.duration, share=piece.share, reserves=piece.reserves)
+            entry["gained"] = "" if phase.until.contact is None else phase.until.contact.name
+            if not piece.passes:
+                entry["duration"] += settings.dwell + delay
         about += entries
     duration = sum(phase["duration"] for phase in about)
     whole: dict[str, Any] = {"name": problem.name, "duration": duration, "phases": about}
@@ -768,10 +765,5 @@ def find_widest(problem: Problem, plan: Trajectory, delay: float) -> dict[int, f
         raise InputError("", "uncertainty", "is missing; without ranges none is the widest")
     relative = max(ranges.get(p.name, 0.0) for p in PARAMETERS if not p.unit)
     most = min(SETTINGS.widest / relative, 64.0) if relative > 0 else 64.0
-    along = [_find_curve(block) for block in split(problem.phases)]
-    pieces = trace_pieces(problem, along, plan, most, scale_ranges(ranges, most, delay))
-    return {
-        phase.number: most * piece.share
-        for phase, piece in zip(along, pieces, strict=True)
-        if phase is not None and piece is not None
-    }
+    pieces = trace_pieces(problem, plan, most, scale_ranges(ranges, most, delay))
+    return {index + 1: most * piece.share for index, piece in pieces.items()}

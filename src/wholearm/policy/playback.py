@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ FORMAT = 1  # Version of the files
 CURVE = {
     "s": (-1,), "theta": (-1, 2), "b": (-1,), "levels": (-1, 2, -1, 5), "torque": (-1, 2, 2, 5),
     "push": (2,), "passes": (1,), "arrival": (-1, 5), "forces": (-1, 2, -1, 5),
-    "keeps": (1,),
+    "keeps": (1,), "starts": (-1,),
 }  # fmt: skip
 """Arrays of a phase along a curve and their shapes; -1 is any."""
 MOTION = {
@@ -28,7 +28,7 @@ MOTION = {
     "gain": (-1, 2, 4), "push": (2,), "still": (1,), "ways": (-1, 2),
 }  # fmt: skip
 """Arrays of phases that are followed over time."""
-LATER = ("arrival", "ways", "forces", "keeps")
+LATER = ("arrival", "ways", "forces", "keeps", "starts")
 """Arrays that earlier versions did not write; empty ones stand for them."""
 KINDS: Mapping[str, Mapping[str, tuple[int, ...]]] = {"curve": CURVE, "motion": MOTION}
 Law = CurveLaw | MotionLaw
@@ -87,12 +87,13 @@ class Policy(Result):
         contacts = dict[str, None]()
         phases = self.about.get("phases", [])
         for arrays, law, first in zip(self.tables, self.laws, self.firsts, strict=False):
-            table, about = arrays.get("forces"), phases[first - 1] if first <= len(phases) else {}
-            names, gained = list(about.get("reserves", {})), about.get("gained", "")
-            if isinstance(law, CurveLaw) and table is not None and len(names) == table.shape[2]:
-                late = self.settings.delay / self.settings.period
+            entries = phases[first - 1 : first - 1 + law.count]
+            names = [list(entry.get("reserves", {})) for entry in entries]
+            table = arrays.get("forces", np.zeros((0, 2, 0, 5)))
+            if isinstance(law, CurveLaw) and {len(each) for each in names} == {table.shape[2]}:
+                late, gained = self.settings.delay / self.settings.period, entries[-1]["gained"]
                 law.sensing = Sensing(names, gained, table, late)
-                contacts.update(dict.fromkeys([*names, gained] if gained else names))
+                contacts.update(dict.fromkeys(chain(*names, [gained] if gained else [])))
         self.contacts = list(contacts)
         self.reset()
 
@@ -119,6 +120,7 @@ class Policy(Result):
             text = f"a policy exists for ranges {min(largest.values()):.3g} times as wide as the "
             factors = ", ".join(f"{factor:.3g}" for factor in largest.values())
             lines.append(f"{text}plan's (by phase: {factors})")
+        lines += self.about.get("warnings", [])
         return Document("", parts=[Table([*heads, "least of each contact"], rows), *lines])
 
     @property
@@ -344,5 +346,7 @@ class ClosedLoop:
         if self.policy.sensor and t > 0.0:
             felt = {name: forces.get(name, 0.0) for name in self.policy.contacts}
         one, two = self.policy.step(theta.tolist(), theta_dot.tolist(), felt)
-        self.began.setdefault(self.policy.phase, t)
+        # A phase may be shorter than a period.
+        for number in range(self.first + len(self.began), self.policy.phase + 1):
+            self.began[number] = t
         return one * self.gains[0], two * self.gains[1]

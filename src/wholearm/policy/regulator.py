@@ -9,17 +9,18 @@ feedback no margin of forces and torques are planned anew with one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import WholearmError
+from ..common.errors import InputError, WholearmError
 from ..common.sharing import Batch
 from ..contacts.formation import Formation
+from ..geometry.tracing import runs_on_curves
 from ..mechanics.dynamics import (
     LAMBDA,
     Directions,
@@ -38,6 +39,7 @@ SAME = 1e-5  # distance from the plan's end that counts as none, over the scene'
 STILL = 1e-3  # speed that counts as none, over the scene's
 Planner = Callable[[Problem], Trajectory]  # makes a plan of a problem
 RATE = 100.0  # rate at which errors decay if torques change no contact force [1/s]
+SIGNS = {"+": 1.0, "-": -1.0, "rolls": 0.0}
 ROOM = 0.1  # margin for feedback: normal force over the scene's unit, share of a torque limit
 
 
@@ -90,11 +92,7 @@ def follow(
     starts, t = plan.phase_starts, end_within(phases, plan, t)
     owner = np.searchsorted(starts, t, side="right") - 1
     owner = owner.clip(phases[0].index, phases[-1].index)
-    parts = [
-        _stretch(formation, plan, times)
-        for phase in phases
-        for formation, times in _split_modes(phase, plan, t[owner == phase.index])
-    ]
+    parts = [part for phase in phases for part in _divide(phase, plan, t[owner == phase.index])]
     scene = problem.scene
     unit, limit = ROOM * scene.scales.force, scene.torque_limit
 
@@ -109,46 +107,48 @@ def follow(
     return b, tau, regulate(linearizations, float(t[1] - t[0]) / np.sqrt(b))
 
 
-def _stretch(formation: Formation, plan: Trajectory, t: Array) -> RegulatedStretch:
-    """A part of a plan at some instants."""
+def _divide(phase: Phase, plan: Trajectory, t: Array) -> Iterator[RegulatedStretch]:
+    """Stretches with constant contact modes at instants of a phase of a plan."""
+    spans, names = list_modes(phase, plan), phase.formation.names
+    begins = [span["start"] for span in spans[1:]]
+    owner = np.searchsorted(begins, t - plan.phase_starts[phase.index], side="right")
+    for k in sorted(set(owner.tolist())):
+        modes = [spans[k]["contacts"][name] for name in names]
+        pairs = zip(phase.formation.contacts, modes, strict=True)
+        rolling = tuple(contact for contact, mode in pairs if mode == "rolls")
+        signs = [SIGNS[mode] for mode in (*modes, *spans[k]["joints"])]
+        formation = replace(phase.formation, rolling=rolling)
+        yield _stretch(formation, np.array(signs), plan, t[owner == k])
+
+
+def _stretch(formation: Formation, signs: Array, plan: Trajectory, t: Array) -> RegulatedStretch:
+    """A part of a plan at n instants, by the directions of contacts and joints, (n_c + 2,).
+
+    Accelerations and forces are those of the torques: between the samples of a loaded plan they
+    step where modes change.
+    """
     samples = plan.at(t)
     z, v = samples.z, samples.z_dot
+    directions = Directions(*np.split(np.tile(signs, (len(t), 1)), [formation.n_contacts], axis=1))
+    forward = Batch(build_forward(formation))
+    acceleration, c, _ = forward(z, v, plan.torque.at(t), *directions)
     kinematics = formation.evaluate(z, v)
-    Xi, sigma = np.sign(np.einsum("nij,nj->ni", kinematics.A_t, v)), np.sign(v[:, 3:])
-    # At rest directions are those of the nearest instant in motion.
-    moves = np.flatnonzero(np.abs(v[:, 3:]).max(axis=1) > 1e-6 * formation.scene.scales.rate)
-    near = moves[np.abs(moves[None] - np.arange(len(t))[:, None]).argmin(axis=1)]
-    directions = Directions(Xi[near], sigma[near])
-    forces = inverse(formation, z, v, samples.z_ddot, directions, kinematics)
-    internal = find_planned_internal_force(formation, forces, plan, samples.c_n, samples.c_t)
+    forces = inverse(formation, z, v, acceleration[..., 0], directions, kinematics)
+    # The other parts of the forces are orthogonal to that of the internal force.
+    internal = np.einsum("ni,ni->n", c[..., 0], forces.of_c[..., LAMBDA])
     return RegulatedStretch(formation, z, v, directions, forces, internal)
 
 
-def find_planned_internal_force(
-    formation: Formation, forces: PathForces, plan: Trajectory, c_n: Array, c_t: Array
-) -> Array:
-    """Internal force of a plan at n instants, (n,) [N], from its contact forces c_n, c_t (n, m)."""
-    columns = [plan.contacts.index(name) for name in formation.names]
-    rolls = [columns[row] for row in formation.rolling_rows]
-    c = np.hstack([c_n[:, columns], c_t[:, rolls]])
-    # The other parts of the forces are orthogonal to that of the internal force.
-    return np.asarray(np.einsum("ni,ni->n", c, forces.of_c[..., LAMBDA]))
+def list_modes(phase: Phase, plan: Trajectory) -> Sequence[Mapping[str, Any]]:
+    """Spans of constant contact modes of a phase, as `ModeSpan`; the first begins with the phase.
 
-
-def _split_modes(phase: Phase, plan: Trajectory, t: Array) -> list[tuple[Formation, Array]]:
-    """Intervals of times in which the same contacts roll, with their formations."""
-    mine = np.flatnonzero(plan.phase == phase.index)
-    nearest = mine[np.abs(plan.t[mine][None] - t[:, None]).argmin(axis=1)]
-    columns = [plan.contacts.index(name) for name in phase.formation.names]
-    rolls = plan.rolling[nearest][:, columns]
-    edges = [0, *(np.flatnonzero((rolls[1:] != rolls[:-1]).any(axis=1)) + 1).tolist(), len(t)]
-    intervals = []
-    for first, after in pairwise(edges):
-        if after > first:
-            pairs = zip(phase.formation.contacts, rolls[first], strict=True)
-            rolling = tuple(contact for contact, rolls_now in pairs if rolls_now)
-            intervals.append((replace(phase.formation, rolling=rolling), t[first:after]))
-    return intervals
+    InputError if the plan has none, as one along a curve.
+    """
+    modes = plan.meta.get("modes", [])
+    if phase.index >= len(modes) or not modes[phase.index]:
+        text = f"has no spans of phase {phase.number}, which the policy follows over time"
+        raise InputError("", "meta.modes", text)
+    return tuple(modes[phase.index])
 
 
 def _linearise(problem: Problem, part: RegulatedStretch, b: float) -> list[Linear]:
@@ -280,32 +280,43 @@ def hold_end(problem: Problem, phase: Phase, z: Array) -> Array | None:
     return None if hold is None else hold.tau
 
 
+class PlannedPhase(NamedTuple):
+    """A phase of a plan."""
+
+    motion: Motion
+    torque: TorqueProfile  # from the start of the phase
+    modes: Any  # its spans of contact modes
+
+
+def list_phases(plan: Trajectory) -> list[PlannedPhase]:
+    """The phases of a plan."""
+    torques = [plan.torque.cut(*span) for span in pairwise(plan.phase_starts.tolist())]
+    torques = [replace(torque, breaks=torque.breaks - torque.breaks[0]) for torque in torques]
+    return [
+        PlannedPhase(*phase)
+        for phase in zip(plan.motions, torques, plan.meta["modes"], strict=True)
+    ]
+
+
 def replan(
-    planner: Planner,
-    problem: Problem,
-    blocks: Sequence[tuple[Phase, ...]],
-    curves: Sequence[bool],
-    plan: Trajectory,
+    planner: Planner, problem: Problem, blocks: Sequence[tuple[Phase, ...]], plan: Trajectory
 ) -> Trajectory:
     """A plan whose blocks off curves are replanned with a margin where possible."""
-    motions, k = list(plan.motions), 0
+    k, phases = 0, list[PlannedPhase]()
     while k < len(blocks):
-        after = k + 1
-        if not curves[k] and _lacks_margin(problem, blocks[k], plan):
+        block, replacement = blocks[k], list[PlannedPhase]()
+        if not runs_on_curves(block) and _lacks_margin(problem, block, plan):
             for share in (1.0, 0.5, 0.25):
-                replacement = _replan_blocks(planner, problem, blocks[k:], curves[k:], plan, share)
-                if replacement is not None:
-                    new, after = replacement[0], k + replacement[1]
-                    first = blocks[k][0].index
-                    motions[first : first + len(new)] = new
+                replacement = _replan_blocks(planner, problem, blocks[k:], plan, share)
+                if replacement:
                     break
-        k = after
-    if all(new is old for new, old in zip(motions, plan.motions, strict=True)):
-        return plan
+        phases += replacement or list_phases(plan)[block[0].index : block[-1].index + 1]
+        while k < len(blocks) and blocks[k][-1].index < len(phases):
+            k += 1
     samples = int(np.bincount(plan.phase).max())
-    still = TorqueProfile(np.array([0.0, plan.duration]), np.zeros((1, 2, 1)))
-    rows = assemble(motions, still, plan.meta, samples)
-    return replace(rows, torque=TorqueProfile.join_rows(rows.t, rows.tau))
+    meta = {**plan.meta, "modes": [phase.modes for phase in phases]}
+    torque = TorqueProfile.chain([phase.torque for phase in phases])
+    return assemble([phase.motion for phase in phases], torque, meta, samples)
 
 
 def _lacks_margin(problem: Problem, phases: Sequence[Phase], plan: Trajectory) -> bool:
@@ -321,26 +332,26 @@ def _replan_blocks(
     planner: Planner,
     problem: Problem,
     blocks: Sequence[tuple[Phase, ...]],
-    curves: Sequence[bool],
     plan: Trajectory,
     share: float,
-) -> tuple[list[Motion], int] | None:
-    """Motions with a share of the margin until the plan is reached again, and their blocks."""
-    starts, motions = plan.phase_starts, list[Motion]()
+) -> list[PlannedPhase]:
+    """Phases with a share of the margin until the plan is reached again; none if it is not."""
+    starts, phases = plan.phase_starts, list[PlannedPhase]()
     z = plan.z[np.flatnonzero(plan.phase == blocks[0][0].index)[0]]
     blocks = [*blocks[:-1], (*blocks[-1][:-1], _pin(blocks[-1][-1], plan.z[-1]))]
-    for count, (block, curve) in enumerate(zip(blocks, curves, strict=True), start=1):
+    for block in blocks:
+        curve = runs_on_curves(block)
         part = _solve(planner, problem, block, z, 0.0 if curve else share)
         lasts = starts[block[-1].index + 1] - starts[block[0].index]
         if part is None or (not curve and part.duration > 1.5 * lasts):
-            return None
-        motions += part.motions
+            return []
+        phases += list_phases(part)
         z = part.z[-1]
         away = np.abs(z - plan.z[np.flatnonzero(plan.phase == block[-1].index)[-1]])
         away[:2] /= problem.scene.scales.length
         if away.max() < SAME:
-            return motions, count
-    return None
+            return phases
+    return []
 
 
 def _solve(

@@ -22,14 +22,14 @@ from ..common.sharing import exclusive
 from ..contacts.formation import Formation
 from ..geometry.curve import Curve
 from ..geometry.path_guess import STILL, count_freedoms, find_end
-from ..geometry.tracing import CostToGo, trace_phase
+from ..geometry.tracing import CostToGo, split_blocks, trace_phase
 from ..mechanics.dynamics import metric_weights
 from ..mechanics.speed_sweep import NoMotionError
 from ..planning.blocks import BlockPlan, Planning, plan_next
 from ..planning.explain import unadvised
 from ..planning.lower_bound import look_along
 from ..planning.options import Objective, PlanOptions
-from ..planning.phase_plan import PhasePlan, end_of, split_blocks
+from ..planning.phase_plan import PhasePlan, end_of
 from ..planning.plan import solve_with
 from ..planning.result import Plan
 from ..planning.time_domain.time_motion import TimeMotion

@@ -29,6 +29,7 @@ from ..simulation.system import build_system
 from .verdict import DEPARTURE, measure_departure
 
 MOST = 60  # most events that the text lists; `to_dict` has all
+MOMENT = 0.1  # time in which contacts close that are open where a phase begins, over the scene's
 REACHED, TURNED = 0.03, math.radians(1.0)
 """How far from the plan's end a policy may end: over the scene's length, and in rad."""
 
@@ -96,7 +97,8 @@ def verify_policy(
 ) -> FreeReport:
     """Simulate the closed loop from the problem's start, and report the end of each phase.
 
-    A contact of a phase counts from when the phase begins until the one that it gains presses.
+    A contact of a phase counts from when the phase begins until the one that it gains presses. One
+    that is open then, and closes within `MOMENT`, is a warning.
 
     Parameters
     ----------
@@ -119,25 +121,34 @@ def verify_policy(
     until = (1 + ROOM) * loop.find_duration(count)
     whole = simulate_free(problem, loop, until=until, tolerance=tolerance, restitution=restitution)
     failures = [] if whole.outcome.kind is OutcomeKind.ENDED else [whole.outcome.text]
-    phases: list[FreePhase] = []
+    phases, moment = list[FreePhase](), MOMENT * problem.scene.scales.time
+    warnings = warn("whole", whole)
     for phase in (phase for phase in problem.phases if phase.number in loop.began):
         number, start, gained = phase.number, loop.began[phase.number], phase.until.contact
         stop = loop.began.get(number + 1, float(whole.t[-1]))
         name = "" if gained is None else gained.name
         gains = [s.start for s in whole.stretches if s.contact == name and s.start > start]
-        losses = tuple(find_losses(whole, phase, start, min([stop, *gains]), allowed))
+        losses = tuple(find_losses(whole, phase, start, min([stop, *gains]), allowed, moment))
         reached = number == count or number + 1 in loop.began
         end = measure_end(whole, plan, phase.index, stop)
         phases.append(FreePhase(number, start, stop, reached, losses, end))
-        failures += describe_losses(phases[-1])
+        brief, lasting = (
+            [loss for loss in losses if (loss.closes <= start + moment) is short]
+            for short in (True, False)
+        )
+        failures += describe_losses(number, lasting)
+        warnings += [
+            f"{loss.contact} is open where phase {number} begins, by {loss.gap:.2g} m, and closes "
+            f"within {loss.closes - start:.2g} s"
+            for loss in brief
+        ]
         if not reached:
             failures.append(f"phase {number} does not end within {until:.4g} s")
     far = end.position / problem.scene.scales.length > REACHED or end.angle > TURNED
     if len(phases) == count and far:
         text = f"ends {end.position:.3g} m and {end.angle:.3g} rad away from the plan"
         failures.append(f"the policy {text}")
-    warnings = tuple(warn("whole", whole))
-    return FreeReport(problem.name, whole, (), tuple(phases), tuple(failures), warnings)
+    return FreeReport(problem.name, whole, (), tuple(phases), tuple(failures), tuple(warnings))
 
 
 def _fail(simulation: FreeSimulation, phases: Sequence[FreePhase], allowed: float) -> list[str]:
@@ -186,12 +197,12 @@ def measure_end(simulation: FreeSimulation, plan: Trajectory, index: int, stop: 
     return Deviation(float(away[:2].max()), float(away[2:].max()), float(simulation.t[row]))
 
 
-def describe_losses(phase: FreePhase) -> list[str]:
-    """Sentences on contacts of a phase that open."""
+def describe_losses(number: int, losses: Sequence[LostContact]) -> list[str]:
+    """Sentences on contacts that open in the phase of a number."""
     return [
-        f"{loss.contact} is lost at t = {loss.time:.5g} s, phase {phase.number}, and opens by "
+        f"{loss.contact} is lost at t = {loss.time:.5g} s, phase {number}, and opens by "
         f"{loss.gap:.2g} m"
-        for loss in phase.losses
+        for loss in losses
     ]
 
 
@@ -206,7 +217,7 @@ def _follow(simulation: FreeSimulation, allowed: float) -> tuple[tuple[FreePhase
         last = float(simulation.t[-1]) if stop is None else stop
         losses = find_losses(simulation, phase, start, last, allowed)
         phases.append(FreePhase(phase.number, start, last, stop is not None, tuple(losses), None))
-        failures += describe_losses(phases[-1])
+        failures += describe_losses(phase.number, losses)
         if stop is None:
             failures.append(f"phase {phase.number} does not end: {phase.until} is not reached")
             break
@@ -246,27 +257,38 @@ def list_leaving(phase: Phase, after: Phase | None) -> set[str]:
 
 
 def find_losses(
-    simulation: FreeSimulation, phase: Phase, start: float, stop: float, allowed: float
+    simulation: FreeSimulation,
+    phase: Phase,
+    start: float,
+    stop: float,
+    allowed: float,
+    moment: float = 0.0,
 ) -> list[LostContact]:
-    """Contacts of a phase that open by more than is allowed, over the scene's length."""
+    """Contacts of a phase that open by more than is allowed, over the scene's length.
+
+    Of each the first time, and that after a `moment` from `start` [s] on rather than one before.
+    """
     scene, losses = simulation.problem.scene, []
     system = build_system(scene)
     for name in phase.formation.names:
+        openings = list[LostContact]()
         for first, after in simulation.list_pauses(name, start, stop):
             rows = np.flatnonzero((simulation.t >= first) & (simulation.t <= after))
             gaps = system.measure(simulation.z[rows])[0][:, system.names.index(name)]
             if gaps.max(initial=0.0) > allowed * scene.scales.length:
-                losses.append(LostContact(name, first, float(gaps.max())))
-                break
+                openings.append(LostContact(name, first, float(gaps.max()), after))
+        late = [opening for opening in openings if opening.closes > start + moment]
+        losses += (late or openings)[:1]
     return sorted(losses, key=lambda loss: loss.time)
 
 
 class LostContact(NamedTuple):
-    """A contact of a phase that opens, when it stops pressing [s], and by how much it opens [m]."""
+    """A contact of a phase that opens."""
 
     contact: str
-    time: float
-    gap: float
+    time: float  # [s]: when it stops pressing
+    gap: float  # [m]: by how much it opens
+    closes: float  # [s]: when it presses again, or the phase ends
 
 
 class FreePhase(NamedTuple):
