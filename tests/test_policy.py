@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tomllib
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +16,7 @@ from scipy.linalg import solve_continuous_are
 from scipy.optimize import linprog
 
 import wholearm
+from scenes import PENTAGON
 from shipped import HEPTAGON, IMPACTS, LANDING, plan_of, problem_of
 from wholearm import InputError, Plan, Policy, Problem, TorqueProfile, Trajectory, Uncertainty
 from wholearm.analysis.robustness import make_trial
@@ -28,10 +32,11 @@ from wholearm.policy.make import (
     retime,
     retime_within,
 )
-from wholearm.policy.regulator import RATE, SAME, Linear, hold_end, regulate
+from wholearm.policy.regulator import RATE, SAME, Linear, hold_end, regulate, tabulate_motion
+from wholearm.problem.read import build_problem
 from wholearm.results.dwell_record import assemble
 from wholearm.simulation.simulate import simulate_free
-from wholearm.verification.free import verify_policy
+from wholearm.verification.free import find_losses, verify_policy
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +127,7 @@ def test_without_a_reserve_it_is_as_fast_as_the_plan(
     own = make_policy(problem, plan.trajectory, reserve=0.0).about["phases"]
     for phase, with_reserve in zip(own, policy.about["phases"], strict=True):
         assert phase["plan"] <= phase["duration"] < with_reserve["duration"]
-        assert with_reserve["duration"] < 1.3 * phase["plan"]
+        assert with_reserve["duration"] < 1.5 * phase["plan"]
 
 
 def test_a_policy_keeps_contacts_where_numbers_are_off(
@@ -157,6 +162,36 @@ def test_ends_that_a_plan_holds_are_held_with_its_torques(problem: Problem) -> N
     assert plan.held.any()
     (law,) = make_policy(own, plan).laws
     assert law.push == pytest.approx(plan.tau[-1].tolist())
+
+
+def test_contacts_that_change_their_names_are_one_law(tmp_path: Path) -> None:
+    # A link passes with its side, over its tip, to an edge.
+    text = "[[phases]]".join(PENTAGON.split("[[phases]]")[:5])
+    problem = build_problem(tomllib.loads(text))
+    plan = wholearm.solve(problem, replay=False).trajectory
+    policy = make_policy(problem, plan)
+    assert [law.count for law in policy.laws] == [1, 3]
+    policy.save(tmp_path / "policy.npz")
+    report = verify_policy(problem, plan, Policy.load(tmp_path / "policy.npz"))
+    assert report.ok, report.failures
+    assert [phase.number for phase in report.phases] == [1, 2, 3, 4]
+    end = report.phases[-1].deviation
+    assert end is not None and end.position < 5e-5 and end.angle < np.radians(0.05)
+
+
+def test_a_contact_may_be_open_for_a_moment_where_a_phase_begins(problem: Problem) -> None:
+    phase, rho = problem.phases[0], problem.scene.scales.length
+    t, name = np.linspace(0.0, 0.1, 101), "v0-palm"
+    lifted = np.tile(problem.start + np.array([0.0, 0.01 * rho, 0.0, 0.0, 0.0]), (101, 1))
+    for pauses, first in (([(0.0, 0.004), (0.05, 0.06)], 0.05), ([(0.0, 0.004)], 0.0)):
+        lists = {name: pauses}
+        stub: Any = SimpleNamespace(
+            problem=problem, t=t, z=lifted, list_pauses=lambda name, *_, of=lists: of.get(name, [])
+        )
+        (loss,) = find_losses(stub, phase, 0.0, 0.1, 1e-3, 0.005)
+        assert (loss.contact, loss.time, loss.closes) == (name, first, pauses[-1][1])
+        assert loss.gap == pytest.approx(0.01 * rho)
+        assert not find_losses(stub, phase, 0.0, 0.1, 0.02, 0.005)
 
 
 def test_files(tmp_path: Path, problem: Problem, plan: Plan, policy: Policy) -> None:
@@ -211,7 +246,8 @@ def test_no_policy_is_written_that_does_not_carry_out_its_plan(
     assert main(["policy", str(tmp_path / "plan.npz"), "-o", str(output)]) == 1
     said = capsys.readouterr().err
     assert "no policy is written" in said and "phase 2, and opens by" in said
-    assert "--period 0.0002 --delay 0 would not do either; --write-anyway" in said
+    tried = "--period 0.0002 --delay 0, --reserve 1.25, a plan with epsilon = 0.4 N"
+    assert f"{tried} would not do either; --write-anyway" in said
     assert not output.exists()
     given = ["policy", str(tmp_path / "plan.npz"), "-o", str(output), "--write-anyway"]
     assert main(given) == 0
@@ -229,7 +265,7 @@ def test_an_end_without_a_gained_contact_is_held(problem: Problem) -> None:
     assert held.z[-1] == pytest.approx(own.start, abs=1e-9)
 
 
-def test_a_landing_without_a_reserve_is_planned_anew() -> None:
+def test_a_landing_without_a_reserve_is_planned_anew(tmp_path: Path) -> None:
     # The last two phases alone.
     whole, known = problem_of(LANDING), plan_of(LANDING)
     phases = tuple(replace(phase, index=k) for k, phase in enumerate(whole.phases[4:]))
@@ -242,6 +278,13 @@ def test_a_landing_without_a_reserve_is_planned_anew() -> None:
     def planner(own: Problem) -> Trajectory:
         return wholearm.solve(own, time_intervals=4, replay=False).trajectory
 
+    # Between its samples a file does not show where modes change.
+    plan.save(tmp_path / "plan.npz")
+    loaded = wholearm.load_trajectory(tmp_path / "plan.npz")
+    tables = [tabulate_motion(problem, phases, each, 1e-3) for each in (plan, loaded)]
+    for name, array in tables[0].items():
+        most = np.abs(array).max(initial=1.0)
+        assert tables[1][name] == pytest.approx(array, abs=2e-3 * most), name
     policy = make_policy(problem, plan, planner=planner)
     law = policy.laws[-1]
     assert isinstance(law, MotionLaw)
@@ -305,7 +348,7 @@ def test_contacts_are_kept_in_corners_of_the_ranges(
 ) -> None:
     policy = make_policy(ranged, ranged_plan)
     assert policy.about["phases"][0]["share"] == 1.0
-    assert policy.duration < 1.3 * ranged_plan.duration
+    assert policy.duration < 1.6 * ranged_plan.duration
     trial = make_trial(ranged, ranged_plan, Uncertainty(RANGES, None), None, policy)
     # The start is before that of the policy's table.
     off = {"mass": 0.1, "inertia": -0.1, "friction_palm": -0.2, "friction_finger1": 0.2}

@@ -19,7 +19,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from importlib import import_module, resources
 from pathlib import Path
@@ -966,14 +966,26 @@ def policy(options: argparse.Namespace) -> int:
         return wholearm.solve(own, replay=False, progress=say).trajectory
 
     def advise() -> str:
-        """Whether a faster loop would do: what is lost between two periods is lost by lateness."""
-        quick = {**values, "period": min(2e-4, options.period), "delay": 0.0}
-        if (quick["period"], 0.0) == (options.period, options.delay):
-            return f"a period below {options.period:g} s may do"
-        quick_policy = wholearm.make_policy(problem, plan, **quick, planner=plan_anew)
-        words = f"--period {quick['period']:g} --delay 0"
-        held = wholearm.verify_policy(problem, plan, quick_policy, **allowed).ok
-        return f"{words} would do" if held else f"{words} would not do either"
+        """Which of a faster loop, half the reserve, and more force in the plan would do."""
+        period, epsilon = min(2e-4, options.period), 2 * problem.epsilon
+        usual = 2.5 if problem.uncertainty is None else 1.0
+        reserve = (usual if options.reserve is None else options.reserve) / 2
+        firm = problem.with_({"epsilon": epsilon})
+        trials: list[tuple[str, wholearm.Problem, dict[str, Any]]] = [
+            (f"--period {period:g} --delay 0", problem, {"period": period, "delay": 0.0}),
+            (f"--reserve {reserve:g}", problem, {"reserve": reserve}),
+            (f"a plan with epsilon = {epsilon:g} N", firm, {}),
+        ]
+        for words, scene, changes in trials:
+            say(f"trying {words}")
+            with suppress(WholearmError):
+                tried = plan if scene is problem else plan_anew(scene)
+                made = wholearm.make_policy(
+                    scene, tried, **{**values, **changes}, planner=plan_anew
+                )
+                if wholearm.verify_policy(scene, tried, made, **allowed).ok:
+                    return f"{words} would do"
+        return f"{', '.join(words for words, *_ in trials)} would not do either"
 
     with name_source(options.plan):
         say("making the policy")

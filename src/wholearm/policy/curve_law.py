@@ -37,8 +37,9 @@ class LawSettings:
     integral: float = 0.2
     share: float = 0.3
     # Level of limits below which feedback is reduced: absolute, and over that of the reference.
-    level: float = 1.0
-    part: float = 0.5
+    # Case: phase 2 of heptagon_four_contacts, which loses v0-palm where braking begins.
+    level: float = 1.5
+    part: float = 0.65
     # Least level with the gained contact that changes the internal force. Case: arrival of phase 4
     # of heptagon_four_contacts.
     arrival: float = 0.3
@@ -52,10 +53,12 @@ class LawSettings:
     # of heptagon_four_contacts, which does not end without it.
     drive: float = 0.3
     creep: float = 3.0  # dwell times after which joints may creep: with low friction they do
-    # Distance beyond the end at which a contact is made, as time at touching speed [s]: if it does
-    # not stop the joints, if it is there at the beginning.
+    # Distance beyond the end at which a contact counts as made although it has not stopped the
+    # joints, as time at touching speed [s]. Where the drive presses all contacts it is a tenth of a
+    # millimetre, which errors of geometry may be. Case: heptagon_four_contacts, phase 3. Where it
+    # opens some, the contact need not stop the joints. Case: polygon of the tests, phase 2.
+    firm: float = 0.06
     soon: float = 0.02
-    ahead: float = 0.05
     # Of measured forces: weight of the last sample in the bias; force of a closed contact and least
     # reference force, over the mean of all.
     smooth: float = 0.3
@@ -107,8 +110,10 @@ class CurveLaw:
         self.floor = self._find_floor()
         self.gain = LAW.gain / (settings.period + settings.delay)
         self.memory = LAW.integral * self.gain**2 * settings.period
+        self.beyond = (LAW.firm if self._is_firm() else LAW.soon) * settings.touch
         self.turn: tuple[float, float] | None = None
         self.after: CurveLaw | None = None
+        self.brake: CurveLaw | None = None
         self.sensing: Sensing | None = None
         self.begin()
 
@@ -121,7 +126,9 @@ class CurveLaw:
         """Set the next law."""
         if self.passes:
             self.turn = after.chords[0]
-        elif not self.keeps:
+        elif self.keeps:
+            self.brake = after
+        else:
             self.after = after
 
     def begin(self, at_end: bool = False) -> None:
@@ -130,7 +137,6 @@ class CurveLaw:
         self.passed = self.count - 1 if at_end else 0
         self.over = self.pushes = False
         self.sum = self.a = self.ran = self.rested = self.drive = self.held = 0.0
-        self.limit = (LAW.ahead if at_end else LAW.soon) * self.settings.touch
         self.s, self.v, self.level = self.nodes[self.j], 0.0, 0.0
         self.off, self.fresh = 0.0, not at_end
         if self.sensing is not None:
@@ -188,6 +194,14 @@ class CurveLaw:
         j, share = self._locate(self.j, self.s)
         return self._act(j, share, v, 0.0, -self.gain * v)
 
+    def slow_down(self, theta: Sequence[float], rates: Sequence[float]) -> tuple[float, float]:
+        """Torques that bring the joints to rest, without those that press contacts [N m]."""
+        self._measure(float(theta[0]), float(theta[1]), float(rates[0]), float(rates[1]))
+        j, share = self._locate(self.j, self.s)
+        rows = zip(self.torque[j], self.torque_rises[j], strict=True)
+        one, two = (before[3] + share * rise[3] for before, rise in rows)
+        return -self.gain * self.v * one, -self.gain * self.v * two
+
     def _is_made(self, s: float, v: float) -> bool:
         """Whether the contact is made, or the end is reached; `s` and `v` are predicted."""
         # Standing still counts from some periods after the start on.
@@ -201,8 +215,7 @@ class CurveLaw:
             self.drive += rise / 2
         else:
             self.drive = 0.0
-        limit, self.limit = self.limit, LAW.soon * touch
-        return self.drive > rise or self.s > self.length + limit
+        return self.drive > rise or self.s > self.length + self.beyond
 
     def _measure(self, one: float, two: float, rate_one: float, rate_two: float) -> None:
         """Place and speed: the joints' projection on the chords next to the last one."""
@@ -246,6 +259,22 @@ class CurveLaw:
         """The reference's b at a place near interval `j`."""
         j, share = self._locate(j, s)
         return float(self.b[j] + share * (self.b[j + 1] - self.b[j]))
+
+    def _is_firm(self) -> bool:
+        """Whether the drive presses all contacts at the end, with the gained one."""
+        touch, drive = self.settings.touch, 0.5 * LAW.drive * self.settings.most
+        levels = self._list_levels(len(self.steps) - 1, 1.0, touch)
+        self._add_arrival(touch, *levels)
+        return bool(self.arrival) and choose_internal_force(*levels, drive)[0] > LAW.arrival
+
+    def _add_arrival(
+        self, v: float, base: list[float], rates: list[float], press: list[float]
+    ) -> None:
+        """Add levels of all contacts at the end to those of a place."""
+        for c, cb, cv, ca, cl in self.arrival:
+            base.append(c + cb * v * v + cv * v)
+            rates.append(ca)
+            press.append(cl)
 
     def _find_floor(self) -> list[float]:
         """Level on each interval below which feedback is reduced."""
@@ -291,10 +320,7 @@ class CurveLaw:
             elif safe > level:
                 a, level, internal = planned, safe, other
         elif beyond:
-            for c, cb, cv, ca, cl in self.arrival:
-                base.append(c + cb * b + cv * v)
-                rates.append(ca)
-                press.append(cl)
+            self._add_arrival(v, base, rates, press)
             both, other = choose_internal_force(base, rates, press, a)
             if both > LAW.arrival:
                 level, internal = both, other
@@ -324,6 +350,10 @@ class CurveLaw:
             # With low friction the joints creep on.
             self.held += settings.period
             v = 0.0 if self.held > LAW.creep * dwell else self.after.v
+        elif self.brake is not None:
+            pairs = zip(self.push, self.brake.slow_down(theta, rates), strict=True)
+            tau = tuple(press + brake for press, brake in pairs)
+            v = self.brake.v
         elif self.s < (1.0 - 1e-3) * self.length:
             # The joints have stopped before the end.
             dwell *= 4.0
