@@ -56,7 +56,7 @@ class LawSettings:
     # Distance beyond the end at which a contact counts as made although it has not stopped the
     # joints, as time at touching speed [s]. Where the drive presses all contacts it is a tenth of a
     # millimetre, which errors of geometry may be. Case: heptagon_four_contacts, phase 3. Where it
-    # opens some, the contact need not stop the joints. Case: polygon of the tests, phase 2.
+    # opens some, the contact need not stop the joints. Case: a square that lands flush on the palm.
     firm: float = 0.06
     soon: float = 0.02
     # Of measured forces: weight of the last sample in the bias; force of a closed contact and least
