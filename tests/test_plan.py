@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -17,11 +16,9 @@ from scipy.integrate import trapezoid
 from plane import finger_gap, measure_gaps, measure_slip, unbalance
 from scenes import measure_fingers
 from shipped import FOLDER, HEPTAGON, IMPACTS, plan_of, problem_of, verified
-from wholearm import Phase, PlanOptions, Problem
+from wholearm import Problem
 from wholearm.common.arrays import Array
-from wholearm.common.errors import InfeasibleError, SolverError
-from wholearm.planning import explain
-from wholearm.planning.blocks import Planning
+from wholearm.common.errors import SolverError
 from wholearm.planning.explain import explain_motors
 from wholearm.planning.plan import solve
 from wholearm.results.trajectory import Samples, Trajectory
@@ -295,26 +292,12 @@ def test_a_flip_lands_on_the_next_edge() -> None:
     assert max(np.abs(plan.q_dot[-1]).max(), np.abs(plan.theta_dot[-1]).max()) < 1e-9
 
 
-def test_the_keys_that_keep_a_phase_from_a_plan_are_named(
-    heptagon: Problem, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    problem = heptagon.with_(torque_rate_limit1=80.0, actuator_lag=0.002)
-    error = SolverError("no plan for phase 1 (...): none was found")
-    planning = Planning(problem, (), PlanOptions(), ())
-    own = planning, problem.phases[:1], problem.start, planning.options, error
-
-    def replan(other: Planning, phases: Sequence[Phase], z: Array, options: PlanOptions) -> Any:
-        scene = phases[0].formation.scene
-        assert not scene.has_slow_motors and scene is other.problem.scene and options
-        return [SimpleNamespace(motion=SimpleNamespace(duration=0.125))], None
-
-    def fail(*_: object) -> Any:
-        raise InfeasibleError("phase 1 is infeasible")
-
-    monkeypatch.setattr(explain, "plan_block", replan)
+def test_the_keys_that_keep_a_phase_from_a_plan_are_named(heptagon: Problem) -> None:
+    problem, error = heptagon.with_(torque_rate_limit1=80.0, actuator_lag=0.002), "none was found"
+    free: Any = [SimpleNamespace(motion=SimpleNamespace(duration=0.125))]
     keys = "without torque_rate_limit = 80 and inf N m/s and actuator_lag = 0.002 s"
-    assert f"{keys} there is a plan of 0.125 s for phase 1" in str(explain_motors(*own))
-    monkeypatch.setattr(explain, "plan_block", fail)
-    neither = str(explain_motors(*own))
-    assert f"{keys} none was found either: phase 1 is infeasible" in neither
-    assert explain_motors(replace(planning, problem=heptagon), *own[1:]) is error
+    with_free = explain_motors(problem.scene, problem.phases[:1], free, SolverError(error))
+    assert f"{keys} there is a plan of 0.125 s for phase 1; with that, none" in str(with_free)
+    neither = explain_motors(problem.scene, problem.phases[:1], [], SolverError(error))
+    assert str(neither) == f"{error}; so it is {keys}"
+    assert str(explain_motors(heptagon.scene, (), [], SolverError(error))) == error

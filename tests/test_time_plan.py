@@ -65,13 +65,13 @@ from wholearm.mechanics.dynamics import Directions, metric_weights
 from wholearm.mechanics.impact import compute_impact
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
-from wholearm.planning.time_domain.guesses import guess_stages
+from wholearm.planning.time_domain.guesses import guess_stages, list_stages
 from wholearm.planning.time_domain.mode_search import link
 from wholearm.planning.time_domain.solution import SETTINGS, TimeSearch, find_least
 from wholearm.planning.time_domain.stage import Stage, in_own_units
 from wholearm.planning.time_domain.time_motion import StageMotion, TimeMotion
 from wholearm.planning.time_domain.time_nlp import pack
-from wholearm.planning.time_domain.time_plan import list_stages, plan_phases, try_phases
+from wholearm.planning.time_domain.time_plan import plan_phases, try_phases
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.results.trajectory import Samples
 from wholearm.verification.verdict import DEPARTURE, Allowance, describe_ends

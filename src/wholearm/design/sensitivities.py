@@ -38,7 +38,7 @@ from ..planning.path_domain import path_data, path_motion, path_nlp, path_plan
 from ..planning.phase_plan import combine
 from ..planning.result import UNITS
 from ..planning.time_domain import solution, stage, time_nlp
-from ..planning.time_domain.time_plan import list_stages
+from ..planning.time_domain.guesses import list_stages
 from ..problem.definition import End, Problem
 from ..problem.read import require_phases
 from ..search import solve as solve_any

@@ -152,14 +152,17 @@ class Statics:
         answer = self._solve(tau, np.zeros((5, 1)), free, -np.ones(1), presses=True)
         return np.full((2, len(self.A)), np.nan) if answer is None else np.array(answer[:2])
 
-    def find_block(self, epsilon: float, ends: bool = False) -> BlockedStart | None:
+    def find_block(
+        self, epsilon: float, ends: bool = False, within: TorquePolygon | None = None
+    ) -> BlockedStart | None:
         """Why no motion begins from rest, or `ends` at rest; None if one may.
 
-        Formations with more than two degrees of freedom always may.
+        By torques `within` a polygon, if there is one. Formations with more than two degrees of
+        freedom always may.
         """
         best, modes = None, list(self._list_modes(ends))
         for mode in modes:
-            answer = self._start(mode, epsilon)
+            answer = self._start(mode, epsilon, within=within)
             if answer is not None and answer.x[-1] >= 0:
                 return None
             if answer is not None and (best is None or answer.x[-1] > best.x[-1]):
@@ -236,7 +239,12 @@ class Statics:
             yield _Mode(side * N, rates, side * opens, signs)
 
     def _start(
-        self, mode: _Mode, least: float, finger: int | None = None, cones: bool = False
+        self,
+        mode: _Mode,
+        least: float,
+        finger: int | None = None,
+        cones: bool = False,
+        within: TorquePolygon | None = None,
     ) -> _Answer | None:
         """A motion with c_n >= least + r, or None; x are both parts of the torques, then r.
 
@@ -251,7 +259,7 @@ class Statics:
         r = [-np.inf, np.inf] if finger is None else [0.0, 0.0]
         bounds = np.vstack([np.stack([np.zeros(4), np.tile(most, 2)], axis=1), r])
         forces = np.column_stack([_TORQUES, np.zeros(5)])
-        return self._solve(none, forces, bounds, cost, least, least, mode, True, cones)
+        return self._solve(none, forces, bounds, cost, least, least, mode, True, cones, within)
 
     def _solve(
         self,
@@ -264,6 +272,7 @@ class Statics:
         mode: _Mode | None = None,
         presses: bool = False,
         cones: bool = False,
+        within: TorquePolygon | None = None,
     ) -> _Answer | None:
         """Linear programme: amounts x of given forces, (5, k), of least cost, (k,), that balance.
 
@@ -299,6 +308,9 @@ class Statics:
             rows, lows = [*rows, motion.sum(axis=0)[None]], [*lows, np.array([1e-5])]
         rows.append((c_n - presses * x[-1]) / force)
         lows.append(np.full(n_c, least / force))
+        if within is not None:
+            rows.append(-within.normals @ (forces[3:] @ x) / torque)
+            lows.append((within.normals @ tau - within.bounds) / torque)
         dry = np.stack([-scene.dry[3:], scene.dry[3:]], axis=1)
         dry = np.where(still[n_c:, None], dry, (scene.dry[3:] * signs[n_c:])[:, None])
         unbounded = np.tile([-np.inf, np.inf], (f + 2 * n_c, 1))

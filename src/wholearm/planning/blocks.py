@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
@@ -46,7 +46,6 @@ from ..results.trajectory import Motion, Trajectory
 from .lower_bound import look_along
 from .nlp import charge
 from .options import Objective, PlanOptions
-from .path_domain.path_motion import PathMotion
 from .path_domain.path_plan import plan_curves
 from .phase_plan import (
     PER_SPEED,
@@ -173,7 +172,8 @@ def _begin_each(planning: Planning, report: Callable[[str], None]) -> Planning:
     """
     blocks, coarse = split_blocks(planning.problem), planning
     over_time = [not runs_along_curves(block, planning.options) for block in blocks]
-    if not any(over_time[:-1]):
+    scene = planning.problem.scene
+    if scene.has_slow_motors or scene.control_period or not any(over_time[:-1]):
         return planning
     for index in range(len(blocks)):
         try:
@@ -239,23 +239,32 @@ def plan_block(
     if not runs_along_curves(block, options):
         from .time_domain.time_plan import plan_with_impacts
 
-        along = partial(plan_along, planning, block, z, options)
+        slow, allowed = problem.scene.has_slow_motors, planning.allow(block)
+        pinned = block[-1].index + 1 < len(problem.phases)
+        # Under rate limits from the first modes with free torques, then from those of the search:
+        # phases 5 and 6 of the heptagon have a plan from the former alone, phases 6 and 7 of
+        # query 0 from the latter.
+        failure: InfeasibleError | SolverError | None = None
+        for complete in (False, True) if slow and options.mode_search else (options.mode_search,):
+            modes = replace(options, mode_search=complete)
+            free = plan_free(planning, block, z, modes, **over_time)
 
-        def plan(duration: float | None) -> Plans:
-            pinned = block[-1].index + 1 < len(problem.phases)
-            return plan_with_impacts(
-                problem, block, z, options, duration, pinned=pinned, along=along, **over_time
-            )
+            def plan(duration: float | None, free: Plans = free) -> Plans:
+                return plan_with_impacts(
+                    problem, block, z, options, duration, pinned=pinned, free=free, **over_time
+                )
 
-        with charge(block[0].number):
-            try:
-                if problem.scene.has_slow_motors:
-                    return plan_with_pauses(planning, block, plan, planning.allow(block)), None
-                return plan(planning.allow(block)), None
-            except (InfeasibleError, SolverError) as error:
-                from .explain import explain_motors
+            with charge(block[0].number):
+                try:
+                    if slow:
+                        return plan_with_pauses(planning, block, plan, allowed), None
+                    return plan(allowed), None
+                except (InfeasibleError, SolverError) as error:
+                    failure = failure or error
+        from .explain import explain_motors
 
-                raise explain_motors(planning, block, z, options, error) from None
+        assert failure is not None
+        raise explain_motors(problem.scene, block, free, failure) from None
     curves = []
     for phase in block:
         traced, later = phase.index < len(stored), problem.phases[phase.index + 1 :]
@@ -301,23 +310,31 @@ def plan_with_pauses(
     ]
 
 
-def plan_along(
-    planning: Planning,
-    block: Sequence[Phase],
-    z: Array,
-    options: PlanOptions,
-) -> list[PathMotion]:
-    """Motions of a block along its curves with free torques, if it has some: an initial guess."""
+def plan_free(
+    planning: Planning, block: Sequence[Phase], z: Array, options: PlanOptions, **over_time: Any
+) -> Plans:
+    """Plans of a block over time as it would be planned with free torques, maybe along its curves.
+
+    None if it is planned so anyway, or asked for over time without a plan along curves.
+    """
     problem, free_options = free_torques(planning.problem, replace(options, transcription="auto"))
     phases = [problem.phases[phase.index] for phase in block]
-    if not runs_along_curves(phases, free_options):
+    freed = problem is not planning.problem
+    if not (freed or runs_along_curves(phases, free_options)):
         return []
+    over_time |= {"fastest": (), "begun": ()}
+    if not planning.problem.scene.control_period:
+        # What holding costs is the difference to an accurate plan.
+        over_time["only_begin"], free_options = True, free_options.roughen()
     try:
         free = replace(planning, problem=problem, curves=())
-        plans, _ = plan_block(free, phases, z, free_options.roughen())
-    except WholearmError:
-        return []
-    return [plan.motion for plan in plans if isinstance(plan.motion, PathMotion)]
+        return plan_block(free, phases, z, free_options, **over_time)[0]
+    except WholearmError as error:
+        if not freed:
+            return []
+        from .explain import explain_motors
+
+        raise explain_motors(planning.problem.scene, block, [], error) from None
 
 
 def _require_margin(planning: Planning) -> Planning:

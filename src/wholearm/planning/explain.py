@@ -39,7 +39,6 @@ from ..problem.definition import Phase, Problem
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..scene.model import Scales, Scene
-from .blocks import Planning, free_torques, plan_block
 from .dwell import require_hold
 from .options import Objective, PlanOptions
 from .path_domain.path_data import PhaseData, cut, fit_torque, join
@@ -57,10 +56,10 @@ from .path_domain.path_nlp import (
     unpack,
 )
 from .path_domain.path_plan import PathIterate, Task, plan_curves, plan_task
-from .phase_plan import assemble_motions, runs_along_curves
+from .phase_plan import Plans, assemble_motions, runs_along_curves
 from .time_domain.guesses import PathMargin
 from .time_domain.solution import TimeSearch
-from .time_domain.stage import Scheme, Stage, blend, to_si
+from .time_domain.stage import Scheme, Stage, blend, make_formation, to_si
 from .time_domain.time_motion import make_phase_motions
 
 ADVICE = 0.6  # processor time [s] after which no change is tried for phases over time
@@ -413,31 +412,60 @@ def _explain_rate_limits(task: Task, parts: Sequence[PhaseData], reason: str) ->
     try:
         require_hold(parts[0], task.phases[0], 0)
         require_hold(parts[-1], task.phases[-1], -1)
-        plan_curves([_raise_rate_limits(curve, np.inf) for curve in task.curves], *rest)
+        plan_curves(_quicken(task.curves, np.inf), *rest)
     except WholearmError as error:
         return error
-    change = "a plan was found for motors without limits"
+    quick = math.inf
     for factor in (2.0, 10.0, 100.0):
-        faster = [_raise_rate_limits(curve, factor) for curve in task.curves]
-        try:
-            plan_curves(faster, *rest, False, task.pins)
-        except WholearmError:
-            continue
-        change = f"feasible with motors {factor:g} times as quick"
-        break
-    text = (
-        "torques may not change as quickly as they would have to (torque_rate_limit, actuator_lag)"
-    )
-    return InfeasibleError(f"{name_phases(task.phases, 'infeasible')}: {text}; {change}; {reason}")
+        with suppress(WholearmError):
+            plan_curves(_quicken(task.curves, factor), *rest, False, task.pins)
+            quick = factor
+            break
+    return refuse_motors(task.curves[0].formation.scene, task.phases, quick, reason)
 
 
-def _raise_rate_limits(curve: Curve, factor: float) -> Curve:
-    """The curve in a scene with torque rate limits and 1 / lags times a factor."""
-    for k, finger in enumerate(curve.formation.scene.fingers, start=1):
-        limit, lag = finger.torque_rate_limit * factor, finger.actuator_lag / factor
-        curve = change_curve(curve, f"fingers.{k}.torque_rate_limit", limit)
-        curve = change_curve(curve, f"fingers.{k}.actuator_lag", lag)
-    return curve
+def _quicken(curves: Sequence[Curve], factor: float) -> list[Curve]:
+    """The curves with motors so many times as quick."""
+    scene = curves[0].formation.scene.quicken(factor)
+    return [replace(curve, formation=replace(curve.formation, scene=scene)) for curve in curves]
+
+
+def refuse_motors(
+    scene: Scene, phases: Sequence[int], factor: float, reason: str = ""
+) -> InfeasibleError:
+    """The error for phases without a plan under rate limits and lags of motors.
+
+    There is a plan for motors `factor` times as quick; infinite if only without limits.
+    """
+    change, changes = "a plan was found for motors without limits", list[Change]()
+    if math.isfinite(factor):
+        for finger, quick in zip(scene.fingers, scene.quicken(factor).fingers, strict=True):
+            for key, unit, sign in (("torque_rate_limit", "N m/s", 1), ("actuator_lag", "s", -1)):
+                value, other = getattr(finger, key), getattr(quick, key)
+                if value != other:
+                    parameter = Parameter(key, value, unit, sign, key)
+                    changes.append(Change(parameter, round_outwards(other, sign)))
+        changes = list(dict.fromkeys(changes))
+        change = f"feasible with {' and '.join(map(str, changes))}"
+    text = "torques may not change as quickly as they would have to"
+    which = name_phases(phases, "infeasible")
+    error = InfeasibleError(f"{which}: {text}; {change}" + f"; {reason}" * bool(reason))
+    if len(changes) == 1:
+        error.changes = tuple(changes)
+    return error
+
+
+def refuse_period(scene: Scene, phases: Sequence[int], share: float) -> InfeasibleError:
+    """The error for phases without a plan with torques held over control periods.
+
+    There is a plan for periods of a `share` of them; zero if only with free torques.
+    """
+    period, which = scene.control_period, name_phases(phases, "infeasible")
+    parameter = Parameter("control_period", period, "s", -1, "control_period")
+    changes = [Change(parameter, round_outwards(share * period, -1))] if share else []
+    change = describe_changes(changes) if share else "a plan was found with free torques"
+    text = f"{which}: torques cannot be held that long; {change}"
+    return InfeasibleError(text, changes=changes)
 
 
 def refuse(
@@ -479,10 +507,6 @@ def refuse(
                 "object one way, with whatever friction, so that it does not come to rest at its "
                 f"end, {where}"
             )
-        if problem.scene.has_slow_motors:
-            _refuse_unheld(problem, phase, stages[0], 0)
-            if alone and (last.formation.n_constraints == 4 or phase.until.pins):
-                _refuse_unheld(problem, phase, last, -1)
         return
     where = describe_pose(to_si(stage, problem).guess.nodes[node, 0])
     text = f"phase {phase.number} is infeasible: {say.format(where)}"
@@ -511,20 +535,41 @@ def refuse(
     raise advise(InfeasibleError(text, shortfalls), parameters, find_value, replan, ADVICE)
 
 
-def _refuse_unheld(problem: Problem, phase: Phase, stage: Stage, node: int) -> None:
-    """Raise an error if rate-limited torques cannot hold the object at rest at an end."""
-    z, limit = to_si(stage, problem).guess.nodes[node, 0], problem.scene.torque_limit
-    held = Statics(phase.formation, z).torque_polygon()
-    if not held.is_empty(limit):
-        return
-    most = "however large" if held.is_empty(np.full(2, np.inf)) else "within their limits"
-    raise InfeasibleError(
-        f"phase {phase.number} is infeasible: torques may not step (torque_rate_limit, "
-        f"actuator_lag), so that they have to hold the object at rest at its "
-        f"{'end' if node else 'start'}, {describe_pose(z)}; {' '.join(phase.formation.names)} with "
-        f"their friction can be held there by no torques, {most}; end the phase where they can "
-        "(wholearm predict shows where), or leave out torque_rate_limit and actuator_lag"
-    )
+def require_hold_at_ends(
+    problem: Problem, phases: Sequence[Phase], stages: Sequence[Stage]
+) -> None:
+    """Require torques that hold the object at rest at both ends of phases, as torques may not step.
+
+    Raises
+    ------
+    InfeasibleError  if there are none; the end counts if it is one point, and has to be reached by
+        torques that hold it
+    """
+    ends = [(phases[0], to_si(stages[0], problem), 0)]
+    if stages[-1].formation.n_constraints == 4 or phases[-1].until.pins:
+        ends.append((phases[-1], to_si(stages[-1], problem), -1))
+    may_not = "torques may not step (torque_rate_limit, actuator_lag)"
+    for phase, stage, node in ends:
+        own = stage.formation
+        touching = stage.ending if node else own
+        z, limit = stage.guess.nodes[node, 0], problem.scene.torque_limit
+        held = Statics(make_formation(own.scene, touching.contacts), z).torque_polygon()
+        text = f"phase {phase.number} is infeasible: {may_not}"
+        where = f"{'end' if node else 'start'}, {describe_pose(z)}"
+        names, advice = " ".join(touching.names), "or leave out torque_rate_limit and actuator_lag"
+        if held.is_empty(limit):
+            most = "however large" if held.is_empty(np.full(2, np.inf)) else "within their limits"
+            raise InfeasibleError(
+                f"{text}, so that they have to hold the object at rest at its {where}; {names} "
+                f"with their friction can be held there by no torques, {most}; end the phase where "
+                f"they can (wholearm predict shows where), {advice}"
+            )
+        if touching is not own and Statics(own, z).find_block(problem.epsilon, True, held):
+            raise InfeasibleError(
+                f"{text}, and none that bring it to rest at its {where}, and keep c_n >= "
+                f"{problem.epsilon:g} N until then, hold the object there on {names}; end it "
+                f"elsewhere, {advice}"
+            )
 
 
 def refuse_paths(problem: Problem, phase: Phase, margins: Sequence[PathMargin]) -> None:
@@ -639,14 +684,10 @@ def _unit_of(parameter: Parameter, scales: Scales) -> float:
 
 
 def explain_motors(
-    planning: Planning,
-    block: Sequence[Phase],
-    z: Array,
-    options: PlanOptions,
-    error: InfeasibleError | SolverError,
-) -> InfeasibleError | SolverError:
-    """The error with whether the phases have a plan from `z` with free torques."""
-    scene, settings = planning.problem.scene, list[str]()
+    scene: Scene, block: Sequence[Phase], free: Plans, error: WholearmError
+) -> WholearmError:
+    """The error for phases that have the plans `free` with free torques, or none."""
+    settings = list[str]()
     if scene.control_period:
         settings.append(f"control_period = {scene.control_period:g} s ({scene.control_hold})")
     kinds = (("torque_rate_limit", "N m/s", math.inf), ("actuator_lag", "s", 0.0))
@@ -660,15 +701,7 @@ def explain_motors(
     keys, where = " and ".join(settings), name_phases([phase.number for phase in block])
     if isinstance(error, InfeasibleError):
         where += f" ({'; '.join(' '.join(phase.formation.names) for phase in block)})"
-    free, free_options = free_torques(planning.problem, options)
-    try:
-        phases = [free.phases[phase.index] for phase in block]
-        other = replace(planning, problem=free, curves=())
-        plans, _ = plan_block(other, phases, z, free_options.roughen())
-    except WholearmError as without:
-        text = f"{error}; without {keys} none was found either: {without}"
-    else:
-        lasts = sum(plan.motion.duration for plan in plans)
-        text = f"without {keys} there is a plan of {lasts:.4g} s for {where}; with that, {error}"
-    error.args = (text,)
+    lasts = sum(plan.motion.duration for plan in free)
+    text = f"without {keys} there is a plan of {lasts:.4g} s for {where}; with that, {error}"
+    error.args = (text if free else f"{error}; so it is without {keys}",)
     return error

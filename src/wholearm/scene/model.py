@@ -570,3 +570,15 @@ class Scene:
     def has_slow_motors(self) -> bool:
         """Whether torques may not step."""
         return bool(np.isfinite(self.torque_rate_limit).any() or self.actuator_lag.any())
+
+    def quicken(self, factor: float) -> Scene:
+        """The scene with torque rate limits and 1 / lags of the motors times a factor."""
+        right, left = (
+            replace(
+                finger,
+                torque_rate_limit=factor * finger.torque_rate_limit,
+                actuator_lag=finger.actuator_lag / factor,
+            )
+            for finger in self.fingers
+        )
+        return replace(self, fingers=(right, left))

@@ -8,6 +8,7 @@ rates. A contact whose rate rests there for a while, so that its friction is not
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -35,9 +36,21 @@ from ...geometry.tracing import CostToGo
 from ...mechanics.dynamics import Directions, force_rows, metric_weights
 from ...mechanics.limits import SPEED, make_limits
 from ...problem.definition import End, Phase, Problem
+from ...results.trajectory import Motion
 from ..options import PlanOptions
 from ..path_domain.path_motion import PathMotion
-from .mode_search import LEAST_INTERVALS, Mode, can_roll, divide, in_mode, link, merge, mode_of
+from ..phase_plan import PhasePlan
+from .mode_search import (
+    LEAST_INTERVALS,
+    Mode,
+    can_roll,
+    divide,
+    drop,
+    in_mode,
+    link,
+    merge,
+    mode_of,
+)
 from .solution import TimeSearch, TimeSolution
 from .stage import Scheme, Stage, StagePoints, in_own_units, resample, scale_state, unit_points
 
@@ -130,15 +143,28 @@ class Guesses:
             begin += span
         return Guess(GIVEN, self._leave_room(link(merge(stages))))
 
-    def along(self, motions: Sequence[PathMotion]) -> Guess:
-        """Along known motions of the phases on their curves."""
+    def along(self, plans: Sequence[PhasePlan[Motion]]) -> Guess:
+        """Along plans of the phases on their curves, or over time with other torques."""
+        if over_time := list_stages(plans):
+            problem = self.search.problem
+            for k in reversed(range(len(over_time))):
+                # Torques that may not step release a contact at the end of its phase.
+                own = problem.phases[over_time[k].phase].formation.contacts
+                if over_time[k].formation.contacts != own:
+                    over_time = drop(over_time, k) or over_time
+            over_time = link([stage.move_to(problem.scene) for stage in over_time])
+            return self.resume("the plan with free torques", over_time)
         units, scheme = unit_points(self.problem.scene.scales), self.search.scheme
         controls, stages = np.linspace(0.0, 1.0, scheme.controls), list[Stage]()
-        for stage, motion in zip(join_modes(self.nearest.stages), motions, strict=True):
+        for stage, plan in zip(join_modes(self.nearest.stages), plans, strict=True):
+            motion = plan.motion
+            assert isinstance(motion, PathMotion)
             parts, rolling = list[tuple[StagePoints, Mode]](), list(stage.formation.rolling_rows)
             for start, stop, directions in motion.spans:
                 span = stop - start
                 count = max(LEAST_INTERVALS, round(span / motion.duration * stage.intervals))
+                if period := self.problem.scene.control_period:
+                    count = max(count, math.ceil(span / period))
                 breaks = np.linspace(0.0, 1.0, count + 1)
                 inner = (breaks[:-1, None] + x / count for x in (scheme.points, controls))
                 points, between, ends = (
@@ -288,6 +314,11 @@ class Guesses:
         rows = [k for k, limit in enumerate(last.formation.limits) if limit.gains(contact)]
         monitored = tuple(sorted({*last.monitored, *rows}))
         return [*stages[:-1], replace(last, apart=tuple(rows), monitored=monitored)]
+
+
+def list_stages(plans: Sequence[PhasePlan[Motion]]) -> list[Stage]:
+    """The stages of plans over time, in the scene's own units."""
+    return [stage for plan in plans for stage in plan.stages if isinstance(stage, Stage)]
 
 
 class PathSpeed(NamedTuple):

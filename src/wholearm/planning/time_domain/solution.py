@@ -85,7 +85,6 @@ class TimeSolution(NamedTuple):
     nlp: TimeNLP
     multipliers: Multipliers
     error: float = math.nan  # estimated gain of better torques, over the cost; not always known
-    free: TimeSolution | None = None  # with free torques, where they are held over control periods
 
     @property
     def end(self) -> Array:
@@ -161,10 +160,6 @@ class TimeSearch:
         scheme = make_scheme(name, degree, 2 if linear else degree)
         other = replace(self, duration=None, to_go=None, price=None)
         return replace(other, goal=goal, relaxation=relaxation, scheme=scheme)
-
-    def wait(self, iterations: int) -> int:
-        """Most solver iterations: more with rate-limited torques."""
-        return iterations * (2 if self.problem.scene.has_slow_motors else 1)
 
     def charge(self, z: Array) -> float:
         """Price of an end at `z`, shape (5,)."""
@@ -337,7 +332,8 @@ def refine(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
             for amounts, miss, mine in zip(raised, misses, times, strict=True)
         ]
         stages = bisect_intervals(stages, search.scheme, times)
-        better = search.solve(stages, solution, search.wait(SETTINGS.patience), raised)
+        most = SETTINGS.patience * (2 if search.problem.scene.has_slow_motors else 1)
+        better = search.solve(stages, solution, most, raised)
         if better.success:
             coarse, solution, failed = solution.cost, better, False
             continue

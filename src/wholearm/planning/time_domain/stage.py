@@ -21,7 +21,7 @@ from ...contacts.formation import Formation
 from ...mechanics.dynamics import Directions
 from ...mechanics.limits import make_limits
 from ...problem.definition import PARAMETERS, Phase, Problem, Until
-from ...scene.model import Polygon, Scales
+from ...scene.model import Polygon, Scales, Scene
 from ..options import CLEARANCE, OPENING, Objective, PlanOptions
 
 
@@ -150,6 +150,24 @@ class Stage:
     def intervals(self) -> int:
         """Number of intervals K."""
         return len(self.guess.fractions)
+
+    @property
+    def ending(self) -> Formation:
+        """The contacts at rest at the end: with several degrees of freedom also the one gained."""
+        if self.formation.n_constraints >= 4 or self.until is None or self.until.contact is None:
+            return self.formation
+        return make_formation(self.formation.scene, (*self.formation.contacts, self.until.contact))
+
+    def move_to(self, scene: Scene) -> Stage:
+        """The same stage in a scene with other limits."""
+        return replace(self, formation=make_formation(scene, *self.formation.equations[1:]))
+
+    def stretch(self, factor: float) -> Stage:
+        """The same stage with a guess that takes so many times as long."""
+        part = self.guess
+        nodes, v, a = part.nodes / [[1.0], [factor]], part.v / factor, part.a / factor**2
+        longer = part._replace(duration=factor * part.duration, nodes=nodes, v=v, a=a)
+        return replace(self, guess=longer)
 
     def list_clearances(self, places: Array, after: float) -> Array:
         """Least values of monitored limits at `places`, shape (n,), of the stage: (n, n_monitored).

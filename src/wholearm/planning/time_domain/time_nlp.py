@@ -86,8 +86,8 @@ class StageLayout:
     forces: Indices  # (K, d, n_f)
     short: Indices  # (K, n) or (K, 0): shortfalls of limits in each interval
     impulses: Indices  # of the impact that leads to the next stage, if one does
-    begin: Indices  # begin, finish: forces at rest at both ends, of continuous torques
-    finish: Indices
+    begin: Indices  # begin, finish: c_n, c_t and friction of the joints at rest at both ends, of
+    finish: Indices  # continuous torques
 
     @property
     def stop(self) -> int:
@@ -112,7 +112,7 @@ def lay_out(
         end = 0 if scheme.ends else STATE
         sizes = {"h": 1, "tau": 2 * scheme.controls, "points": d * point.count}
         interval = Columns(**sizes, end=end, short=short, m=with_margin)
-        begin = stop + np.arange(point.sizes["forces"] * (held and not layouts))
+        begin = stop + np.arange((2 * stage.formation.n_contacts + 2) * (held and not layouts))
         first = stop + len(begin) + np.arange(STATE + with_margin)
         starts = first[-1] + 1 + interval.count * np.arange(stage.intervals)
         columns = {
@@ -126,6 +126,7 @@ def lay_out(
         stop = int(first[-1]) + 1 + interval.count * stage.intervals
         ends_in_impact = coming is not None and stage.ends_in_impact
         extra = coming.formation.n_constraints if coming is not None and ends_in_impact else 0
+        rest = 2 * stage.ending.n_contacts + 2
         layouts.append(
             StageLayout(
                 nodes=nodes,
@@ -135,7 +136,7 @@ def lay_out(
                 short=columns["short"],
                 impulses=stop + np.arange(extra),
                 begin=begin,
-                finish=stop + np.arange(point.sizes["forces"] * (held and coming is None)),
+                finish=stop + np.arange(rest * (held and coming is None)),
             )
         )
         stop += extra + len(layouts[-1].finish)
@@ -152,8 +153,11 @@ def pack(points: Sequence[StagePoints], layouts: Sequence[StageLayout], margin: 
         x[layout.nodes[:, Z]], x[layout.nodes[:, V]] = part.nodes[:, 0], part.nodes[:, 1]
         x[layout.nodes[:, MARGIN:]] = margin
         x[layout.impulses] = part.impulses
-        x[layout.begin] = part.forces[0, 0, : len(layout.begin)]
-        x[layout.finish] = part.forces[-1, -1, : len(layout.finish)]
+        for held, forces in (
+            (layout.begin, part.forces[0, 0]),
+            (layout.finish, part.forces[-1, -1]),
+        ):
+            x[held[: len(forces)]] = forces[: len(held)]
     return x
 
 
@@ -557,26 +561,45 @@ def join_motors(
 def hold_ends(
     rows: NlpRows, stages: Sequence[Stage], layouts: Sequence[StageLayout], epsilon: float
 ) -> None:
-    """Torques hold the object at rest at both ends of a motion."""
-    for k, (place, tau) in ((0, (0, slice(None, 2))), (-1, (-1, slice(-2, None)))):
-        stage, layout = stages[k], layouts[k]
-        forces = layout.finish if k else layout.begin
-        z, formation = layout.nodes[place, Z], stage.formation
-        held = {"z": z, "forces": forces, "tau": layout.tau[place, tau]}
-        rows.add_copies(hold_kernel(formation), held, stage.directions._asdict())
-        if not k and stage.phase:
-            # A command approaches a torque limit only asymptotically in the pause before.
-            scene, first = formation.scene, layout.tau[0, :2]
-            for joint in np.flatnonzero(scene.actuator_lag):
-                limit = scene.torque_limit[joint]
-                fastest = scene.torque_rate_limit[joint] * scene.actuator_lag[joint] / limit
-                most = 1 - min(0.05, float(fastest))
-                rows.add_entries(rows.linear(1, low=-most, high=most), first[joint], 1 / limit)
-        for r, row in enumerate(formation.rolling_rows):
-            mu = float(formation.friction[row])
-            cone_rows = rows.linear(2, low=mu * epsilon, high=np.inf)
-            rows.add_entries(cone_rows, forces[row], mu)
-            rows.add_entries(cone_rows, forces[formation.n_contacts + r], np.array([1.0, -1.0]))
+    """Torques hold the object at rest at both ends of a motion.
+
+    It begins without acceleration, on the verge of its directions: friction may not step. So it
+    ends with one degree of freedom, as along its curve. With more it may stop with an acceleration,
+    which the contact that is gained and friction at rest take up.
+    """
+    first, layout = stages[0], layouts[0]
+    last, final = stages[-1], layouts[-1]
+    for stage, formation, z, forces, tau in (
+        (first, first.formation, layout.nodes[0, Z], layout.begin, layout.tau[0, :2]),
+        (last, last.ending, final.nodes[-1, Z], final.finish, final.tau[-1, -2:]),
+    ):
+        n_c, scene = formation.n_contacts, formation.scene
+        signs = np.zeros(n_c + 2)
+        if formation is stage.formation:
+            signs = np.concatenate(stage.directions)
+            signs[list(formation.rolling_rows)] = 0.0
+        c_n, c_t, friction = np.split(forces, [n_c, 2 * n_c])
+        rows.add_copies(rest_kernel(formation), {"z": z, "forces": forces, "tau": tau})
+        rows.add_entries(rows.linear(n_c, low=epsilon, high=np.inf), c_n, 1.0)
+        for k, mu in enumerate(formation.friction.tolist()):
+            if signs[k] or not mu:
+                equal = rows.linear(1)
+                rows.add_entries(equal, c_t[k], 1.0)
+                rows.add_entries(equal, c_n[k], signs[k] * mu)
+            else:
+                cone = rows.linear(2, low=mu * epsilon, high=np.inf)
+                rows.add_entries(cone, c_n[k], mu)
+                rows.add_entries(cone, c_t[k], np.array([1.0, -1.0]))
+        low, high = (scene.dry[3:] * np.where(signs[n_c:], signs[n_c:], side) for side in (-1, 1))
+        rows.add_entries(rows.linear(2, low=low, high=high), friction, 1.0)
+    if first.phase:
+        # A command approaches a torque limit only asymptotically in the pause before.
+        scene = first.formation.scene
+        for joint in np.flatnonzero(scene.actuator_lag):
+            limit = scene.torque_limit[joint]
+            fastest = scene.torque_rate_limit[joint] * scene.actuator_lag[joint] / limit
+            most = 1 - min(0.05, float(fastest))
+            rows.add_entries(rows.linear(1, low=-most, high=most), layout.tau[0, joint], 1 / limit)
 
 
 def find_relieved(stage: Stage, limits: LimitSet) -> NDArray[np.bool_]:
@@ -681,8 +704,6 @@ def find_bounds(
         low_g[limit_rows.others] = ((signs * values)[limit_rows.sides] + more[:, limit_rows.sides])[
             :, None
         ]
-        for held in (layout.begin, layout.finish):
-            low[held[:n_c]] = values[limit_rows.pressed][: len(held)]
         _free_equal(stage, limit_rows, layout, (low, low_g))
         for side, unknowns in limit_rows.bounded.items():
             if signs[side] > 0:
@@ -905,14 +926,15 @@ def command_kernel(controls: int, joints: tuple[int, ...]) -> Kernel:
 
 
 @share
-def hold_kernel(formation: Formation) -> Kernel:
-    """The equations of motion at rest, without acceleration."""
+def rest_kernel(formation: Formation) -> Kernel:
+    """Balance at rest of gravity, torques, c_n, c_t and friction of the joints (`forces`)."""
     scene, n_c = formation.scene, formation.n_contacts
-    x = Columns(z=5, forces=formation.n_constraints, tau=2).make_symbols()
-    p = Columns(Xi=n_c, sigma=2).make_symbols()
-    _, P, _, A_t = formation.build_constraints(x.z, ca.SX.zeros(5))
-    push = build_force_rows(formation, P, A_t, p.Xi).T @ x.forces
-    return build_kernel(x, p, balance=push + build_applied(scene, x.tau, p.sigma))
+    x = Columns(z=5, forces=2 * n_c + 2, tau=2).make_symbols()
+    _, A, A_t, _ = formation.function(x.z, ca.SX.zeros(5))
+    c_n, c_t, friction = x.forces[:n_c], x.forces[n_c : 2 * n_c], x.forces[2 * n_c :]
+    at_joints = ca.vertcat(0, 0, 0, x.tau - friction)
+    balance = A.T @ c_n + A_t.T @ c_t + ca.DM(scene.applied_force) + at_joints
+    return build_kernel(x, balance=balance)
 
 
 @share

@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from itertools import chain, groupby, islice, pairwise, takewhile
 from typing import TYPE_CHECKING, Any
 
@@ -27,15 +28,15 @@ from ...problem.definition import End, Phase, Problem
 from ...results.plan_record import Transition
 from ...results.trajectory import Motion
 from ..options import Objective, PlanOptions
-from ..path_domain.path_motion import PathMotion
 from ..phase_plan import PER_SPEED, PhasePlan, PlanPart, Plans, end_of, make_transition, plan_stops
-from .guesses import GIVEN, NEAREST, Guess, Guesses, find_modes
+from .guesses import GIVEN, NEAREST, Guess, Guesses, find_modes, list_stages
 from .mode_search import (
     LEAST_INTERVALS,
     PATIENCE,
     WORTH,
     drop_gone,
     improve,
+    link,
     list_neighbours,
     sign_sequence,
 )
@@ -57,7 +58,6 @@ if TYPE_CHECKING:
 
 ITERATIONS = 50  # most of the solver from a guess; successes take up to 25
 AT_REST = 1e-4  # speed below which an impact counts as a stop, in the scene's own units
-_HELD_PATIENCE = 80  # most solver iterations with held torques
 _BRIEF = 1e-3  # duration, over a period, that counts as zero
 _Named = tuple[TimeSolution, str]  # a solution, and the name of its guess
 
@@ -74,7 +74,7 @@ def plan_phases(
     fastest: Sequence[PhasePlan[Motion]] = (),
     pinned: bool = False,
     begun: Sequence[PhasePlan[Motion]] = (),
-    along: Callable[[], list[PathMotion]] = list,
+    free: Sequence[PhasePlan[Motion]] = (),
     only_begin: bool = False,
     explained: bool = True,
     patient: bool = True,
@@ -90,7 +90,7 @@ def plan_phases(
     fastest           time-optimal plans from `z`, as guess for `margin`
     pinned            whether the motion ends where these do
     begun             coarse plans (`only_begin`) from nearly the same `z`, to start from
-    along             gives motions along the curves of the phases, if there are some
+    free              plans of the phases along curves or with free torques, to start from
     only_begin        whether to find modes on few intervals alone, without limits between points
     explained         whether to look for a change of the problem that makes a plan possible
     patient           whether to try other guesses than the first one
@@ -113,10 +113,16 @@ def plan_phases(
         return plan_phases(other, same, z, options.roughen(), explained=False, patient=False)
 
     explanation = replan if explained else None
+    if named_solution is None and free:
+        guess = guesses.along(free)
+        if problem.scene.has_slow_motors or problem.scene.control_period:
+            named_solution = change_torques(
+                search, guess, problem, phases, stages if pinned else []
+            )
+        else:
+            named_solution = solve_guesses(search, [guess])
     if named_solution is None and guesses.given:
         named_solution = solve_guesses(search, [guesses.given])
-    if named_solution is None and (motions := along()):
-        named_solution = solve_guesses(search, [guesses.along(motions)])
     if named_solution is None:
         listed = iter([guesses.nearest])
         if patient:
@@ -130,12 +136,90 @@ def plan_phases(
         )
     if named_solution is None:
         named_solution = _solve_elastic(search, guesses, explanation)
-    return list_plans(problem, search, phases, *named_solution)
+    plans = list_plans(problem, search, phases, *named_solution)
+    if problem.scene.control_period:
+        kept = "error", "sequences", "complete"
+        return [
+            plan._replace(unheld=other.value, **{name: getattr(other, name) for name in kept})
+            for plan, other in zip(plans, free, strict=True)
+        ]
+    return plans
 
 
-def list_stages(plans: Sequence[PhasePlan[Motion]]) -> list[Stage]:
-    """The stages of plans over time, in the scene's own units."""
-    return [stage for plan in plans for stage in plan.stages if isinstance(stage, Stage)]
+def change_torques(
+    search: TimeSearch,
+    guess: Guess,
+    problem: Problem,
+    phases: Sequence[Phase],
+    fastest: Sequence[Stage],
+) -> _Named:
+    """The plan with the torques that motors and control periods allow, from one with free torques.
+
+    It keeps the modes of that, and for `margin` ends where the stages `fastest` do, if any.
+    """
+    last = guess.stages[-1]
+    if fastest and search.goal is Objective.MARGIN:
+        last = replace(last, stop=fastest[-1].guess.nodes[-1, 0])
+        guess = guess._replace(stages=[*guess.stages[:-1], last])
+    if search.to_go is not None:
+        with suppress(WholearmError):
+            end = last.guess.nodes[-1, 0]
+            search = replace(search, price=Price(search.to_go(end)[1], end))
+    solution: TimeSolution | None = None
+    if problem.scene.has_slow_motors:
+        solution = reach_motors(search, guess.stages, problem, phases)
+    if problem.scene.control_period:
+        stages = solution.stages if solution else guess.stages
+        solution = hold_torques(search, stages, problem, phases)
+    assert solution is not None
+    return solution, guess.name
+
+
+def reach_motors(
+    search: TimeSearch, free: Sequence[Stage], problem: Problem, phases: Sequence[Phase]
+) -> TimeSolution:
+    """The plan with the limits of motors from one with free torques, by continuation in these.
+
+    Case: phases 6 and 7 of query 0 have a plan from motors 4 times as quick alone.
+
+    Raises
+    ------
+    InfeasibleError  if that does not lead to the limits; it names those of the last plan
+    """
+    from ..explain import refuse_motors, require_hold_at_ends
+
+    require_hold_at_ends(problem, phases, free)
+    plans = list[tuple[float, TimeSearch, TimeSolution]]()
+    stages = [stage.stretch(1.3) for stage in free]  # same case: none from 1 or 1.6
+
+    def reaches(factor: float) -> bool:
+        """Whether there is a solution with motors so many times as quick, from the last one."""
+        nonlocal stages
+        scene = search.problem.scene.quicken(factor)
+        quick = replace(search, problem=replace(search.problem, scene=scene))
+        solution = quick.solve(link([stage.move_to(scene) for stage in stages]), most=80)
+        if solution.success:
+            plans.append((factor, quick, solution))
+            stages = solution.stages
+        return solution.success
+
+    step = 4.0
+    if not reaches(1.0) and reaches(step):
+        while step > 1.1 and plans[-1][0] > 1:
+            if not reaches(max(1.0, plans[-1][0] / step)):
+                step = math.sqrt(step)
+    if plans and plans[-1][0] == 1:
+        solution = plans[-1][2] if search.only_begins else refine(search, plans[-1][2])
+        if solution.success:
+            return solution
+        reaches(4.0)
+    for factor, quick, solution in sorted(plans, key=lambda plan: plan[0]):
+        rough = replace(quick, options=quick.options.roughen())
+        if factor > 1 and refine(rough, solution).success:
+            break
+    else:
+        factor = math.inf
+    raise refuse_motors(problem.scene, [phase.number for phase in phases], factor)
 
 
 def try_phases(
@@ -211,7 +295,7 @@ def solve_coarse(search: TimeSearch, guess: Guess, most: int = ITERATIONS) -> Ti
         stages, most = solution.stages, 80  # most iterations in modes of the homotopy
     if guess.name == GIVEN:
         most = 150  # phase 1 of query 29 takes 67 iterations
-    solution = search.solve(stages, guess.before, search.wait(most))
+    solution = search.solve(stages, guess.before, most)
     if solution.success and solution.margin < -5e-7:  # rounding
         # A motion that presses too little may be far from one that presses enough.
         return solution._replace(success=False, status="the largest c_n is below epsilon")
@@ -263,68 +347,88 @@ def finish(search: TimeSearch, solution: TimeSolution) -> TimeSolution:
             solution = fewer
     if solution.success and search.options.ranges:
         return keep_within(search, solution)
-    if solution.success and search.problem.scene.control_period:
-        return hold_torques(search, solution)
     return solution
 
 
-def hold_torques(search: TimeSearch, free: TimeSolution) -> TimeSolution:
-    """Plan with torques held over control periods, from one with free torques.
+def hold_torques(
+    search: TimeSearch, free: list[Stage], problem: Problem, phases: Sequence[Phase]
+) -> TimeSolution:
+    """The plan with torques held over control periods, from one with free torques.
 
-    Where no duration leads to one, continuation in the period: torques held over two periods are
-    held over one, too. The motion has a dozen of the longest; each solution is the guess for half
-    the period. Where a finger's tip passes round a corner (pentagon, eight phases), none is found
-    for 1 ms from free torques alone.
+    The first duration is taken that leads to a solution. As every period but the last of a phase
+    has its duration, shorter ones are then tried by bisection, each from the last solution.
+
+    Raises
+    ------
+    InfeasibleError  if none is found; it names a shorter period with which one is
     """
+    from ..explain import refuse_period
+
     scene, options = search.problem.scene, search.options
     controls = 2 if scene.control_hold == "linear" else 1
     held = replace(search, scheme=make_scheme(options.scheme, options.degree, controls))
-    period = free.stages[0].formation.scene.control_period
-    lasts = sum(stage.guess.duration for stage in free.stages)
-    doublings = max(0, math.floor(math.log2(lasts / (12 * period))))
-    # Durations over those with free torques, and least numbers of periods.
-    stretches = ((1.01, 2), (1.03, 2), (1.07, 3), (1.15, 4), (1.3, 6), (1.6, 8))
-    held_solution: TimeSolution | None = None
-    for doubled in (0, *(range(doublings, -1, -1) if doublings else ())):
-        cut = partial(cut_periods, scheme=held.scheme, period=2**doubled * period)
-        guesses = (cut(free.stages, stretch=stretch, least=least) for stretch, least in stretches)
-        tried = (
-            _solve_held(held, stages)
-            for stages in ([cut(held_solution.stages)] if held_solution else guesses)
-        )
-        held_solution = next((solution for solution in tried if solution.success), None)
-        if held_solution and held_solution.stages[0].period == period:
-            return held_solution._replace(error=free.error, free=free)
-    status = f"no torques held over {scene.control_hold} periods were found"
-    return free._replace(status=status, success=False)
+
+    def solve(stages: list[Stage], period: float, stretch: float, least: int = 1) -> TimeSolution:
+        return held.solve(cut_periods(stages, held.scheme, period, stretch, least), most=80)
+
+    def shorten(solution: TimeSolution, most: int) -> TimeSolution:
+        """The solution without so many last periods that have vanished."""
+        for _ in range(most):
+            stages = drop_periods(solution.stages)
+            fewer = held.solve(stages, most=80) if stages else solution
+            if not stages or not fewer.success or fewer.cost > solution.cost:
+                break
+            solution = fewer
+        return solution
+
+    def hold(period: float) -> TimeSolution | None:
+        low = 1.0
+        # Durations over those with free torques, and least numbers of periods.
+        for high, least in ((1.0, 2), (1.15, 4), (1.5, 6), (2.2, 8)):
+            solution = solve(free, period, high, least)
+            if solution.success:
+                break
+            low = high
+        if not solution.success:
+            return None
+        solution = shorten(solution, 4)
+        whole = sum(stage.guess.duration for stage in free)
+        high = sum(stage.guess.duration for stage in solution.stages) / whole
+        while (high - low) * whole > 0.5 * period:
+            middle = math.sqrt(high * low)
+            shorter = solve(solution.stages, period, middle / high)
+            solution = shorter if shorter.success else solution
+            low, high = (low, middle) if shorter.success else (middle, high)
+        solution = refine(held, shorten(solution, 100))
+        return solution if solution.success else None
+
+    for share in (1.0, 0.5, 0.2):
+        solution = hold(share * scene.control_period)
+        if solution and share == 1:
+            return solution
+        if solution:
+            break
+    raise refuse_period(problem.scene, [phase.number for phase in phases], share * bool(solution))
 
 
-def _solve_held(held: TimeSearch, stages: list[Stage]) -> TimeSolution:
-    """A refined solution without last periods of phases whose duration has vanished."""
-    solution = held.solve(stages, most=held.wait(_HELD_PATIENCE))
-    changed = solution.success
-    while changed:
-        stages, changed = list(solution.stages), False
-        for k, (stage, coming) in enumerate(zip(stages, [*stages[1:], None], strict=True)):
-            last = coming is None or coming.phase != stage.phase
-            part, kept = stage.guess, stage.periods.index(stage.periods[-1])
-            left = float(part.fractions[:kept].sum())
-            if last and kept and part.duration * (1 - left) < _BRIEF * stage.period:
-                # The end of the interval before is that of the last.
-                names = ("z", "v", "a", "forces", "tau")
-                guess = part._replace(
-                    **{name: getattr(part, name)[:kept] for name in names},
-                    duration=part.duration * left,
-                    fractions=part.fractions[:kept] / left,
-                    nodes=np.vstack([part.nodes[:kept], part.nodes[-1:]]),
-                )
-                stages[k] = replace(stage, guess=guess, periods=stage.periods[:kept])
-                changed = True
-        if changed:
-            fewer = held.solve(stages, most=held.wait(_HELD_PATIENCE))
-            changed = fewer.success and fewer.cost <= solution.cost
-            solution = fewer if changed else solution
-    return refine(held, solution) if solution.success else solution
+def drop_periods(stages: Sequence[Stage]) -> list[Stage]:
+    """Stages without the last periods of phases whose duration has vanished; none if none has."""
+    dropped, changed = list(stages), False
+    for k, (stage, coming) in enumerate(zip(stages, [*stages[1:], None], strict=True)):
+        last = coming is None or coming.phase != stage.phase
+        part, kept = stage.guess, stage.periods.index(stage.periods[-1])
+        left = float(part.fractions[:kept].sum())
+        if last and kept and part.duration * (1 - left) < _BRIEF * stage.period:
+            # The end of the interval before is that of the last.
+            names = ("z", "v", "a", "forces", "tau")
+            guess = part._replace(
+                **{name: getattr(part, name)[:kept] for name in names},
+                duration=part.duration * left,
+                fractions=part.fractions[:kept] / left,
+                nodes=np.vstack([part.nodes[:kept], part.nodes[-1:]]),
+            )
+            dropped[k], changed = replace(stage, guess=guess, periods=stage.periods[:kept]), True
+    return dropped if changed else []
 
 
 def cut_periods(
@@ -332,8 +436,7 @@ def cut_periods(
 ) -> list[Stage]:
     """Stages whose intervals are periods or parts of them, stretched in time.
 
-    From rest to rest they last at least half a period less than `least` periods. Intervals of
-    torques that are held over longer periods are kept as parts.
+    From rest to rest they last at least half a period less than `least` periods.
     """
     cut = list[Stage]()
     whole = sum(stage.guess.duration for stage in stages)
@@ -344,21 +447,11 @@ def cut_periods(
         for stage in group:
             stop = start + stretch * stage.guess.duration
             ticks = period * np.arange(math.floor(start / period), math.ceil(stop / period) + 1)
-            if stage.periods:
-                nodes = start + (stop - start) * stage.guess.breaks
-                apart = np.abs(nodes[:, None] - ticks).min(axis=1) > near
-                ticks = np.sort(np.append(ticks, nodes[apart]))
             edges = np.array([start, *ticks[(ticks > start + near) & (ticks < stop - near)], stop])
             numbers = tuple(math.floor((a + b) / 2 / period) for a, b in pairwise(edges.tolist()))
             part = resample(stage.guess, scheme, (edges - start) / (stop - start))
-            guess = part._replace(
-                duration=stop - start,
-                nodes=part.nodes / np.array([[1.0], [stretch]]),
-                v=part.v / stretch,
-                a=part.a / stretch**2,
-            )
-            guess = with_controls(guess, scheme.controls)
-            cut.append(replace(stage, guess=guess, periods=numbers, period=period))
+            longer = replace(stage, guess=with_controls(part, scheme.controls)).stretch(stretch)
+            cut.append(replace(longer, periods=numbers, period=period))
             start = stop
     return cut
 
@@ -447,7 +540,7 @@ def _free_ends(search: TimeSearch, guesses: Guesses) -> Iterator[Guess]:
         replace(stage, until=stage.until and scaled_phases[stage.phase].until)
         for stage in coarse[0].stages
     ]
-    moved = search.solve(stages, coarse[0], search.wait(ITERATIONS))
+    moved = search.solve(stages, coarse[0], ITERATIONS)
     if moved.success:
         yield Guess("a plan that chooses where it ends", moved.stages, before=moved)
 
@@ -500,12 +593,11 @@ def list_plans(
         weight = search.options.time_weight * scales.torque**2
         return [(m, weight * m.duration + m.torque.integrate_squares()) for m in motions]
 
-    free = [value for _, value in evaluate(solution.free)] if solution.free else []
     plans, tried = list[PhasePlan[TimeMotion]](), search.tried
-    for k, (phase, (motion, value)) in enumerate(zip(phases, evaluate(solution), strict=True)):
+    for phase, (motion, value) in zip(phases, evaluate(solution), strict=True):
         stages = [stage for stage in solution.stages if stage.phase == phase.index]
         plan = PhasePlan(motion, motion.torque, value, attempt=attempt, stages=stages)
-        plans.append(plan._replace(error=solution.error, unheld=free[k] if free else plan.unheld))
+        plans.append(plan._replace(error=solution.error))
     plans[0] = plans[0]._replace(sequences=tried.sequences, complete=tried.complete)
     return plans
 
@@ -518,7 +610,7 @@ def plan_with_impacts(
     duration: float | None,
     ample: float = math.inf,
     fastest: Sequence[PhasePlan[Motion]] = (),
-    along: Callable[[], list[PathMotion]] = list,
+    free: Sequence[PhasePlan[Motion]] = (),
     **others: Any,
 ) -> Plans:
     """Plan a block with the impacts that are possible, or else with stops.
@@ -527,10 +619,9 @@ def plan_with_impacts(
     """
     ends = [k + 1 for k, phase in enumerate(block) if phase.end is End.IMPACT]
     if not ends:
-        others |= {"ample": ample, "fastest": fastest, "along": along}
+        others |= {"ample": ample, "fastest": fastest, "free": free}
         return [*plan_phases(problem, block, z, options, duration, **others)]
-    along = cache(along)
-    explained = plan_parts_of(problem, block, ample, along, explained=True)
+    explained = plan_parts_of(problem, block, ample, free, explained=True)
     with_stops = partial(plan_stops, explained, [0, *ends, len(block)], z)
     slow = AT_REST * problem.scene.scales.speed
     speeds = [measure_speed(problem.scene, end_of(fastest[k - 1])[1]) for k in ends if fastest]
@@ -546,7 +637,7 @@ def plan_with_impacts(
     if len(blocked) < len(ends):
         bounds = [0, *blocked, len(block)]
         try:
-            direct = plan_parts_of(problem, block, ample, along)
+            direct = plan_parts_of(problem, block, ample, free)
             return plan_stops(direct, bounds, z, options, duration)
         except (InfeasibleError, SolverError):
             pass
@@ -557,7 +648,7 @@ def plan_parts_of(
     problem: Problem,
     block: Sequence[Phase],
     ample: float = math.inf,
-    along: Callable[[], list[PathMotion]] = list,
+    free: Sequence[PhasePlan[Motion]] = (),
     explained: bool = False,
 ) -> PlanPart:
     """Planner of parts of a block: from all guesses with reasons (`explained`) or the first one."""
@@ -566,11 +657,7 @@ def plan_parts_of(
         start: int, stop: int, z: Array, options: PlanOptions, duration: float | None
     ) -> Plans:
         plan = partial(plan_phases, ample=ample, explained=explained, patient=explained)
-        return [
-            *plan(
-                problem, block[start:stop], z, options, duration, along=lambda: along()[start:stop]
-            )
-        ]
+        return [*plan(problem, block[start:stop], z, options, duration, free=free[start:stop])]
 
     return plan_part
 
