@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
@@ -237,34 +237,7 @@ def plan_block(
     """
     problem, stored = planning.problem, planning.curves
     if not runs_along_curves(block, options):
-        from .time_domain.time_plan import plan_with_impacts
-
-        slow, allowed = problem.scene.has_slow_motors, planning.allow(block)
-        pinned = block[-1].index + 1 < len(problem.phases)
-        # Under rate limits from the first modes with free torques, then from those of the search:
-        # phases 5 and 6 of the heptagon have a plan from the former alone, phases 6 and 7 of
-        # query 0 from the latter.
-        failure: InfeasibleError | SolverError | None = None
-        for complete in (False, True) if slow and options.mode_search else (options.mode_search,):
-            modes = replace(options, mode_search=complete)
-            free = plan_free(planning, block, z, modes, **over_time)
-
-            def plan(duration: float | None, free: Plans = free) -> Plans:
-                return plan_with_impacts(
-                    problem, block, z, options, duration, pinned=pinned, free=free, **over_time
-                )
-
-            with charge(block[0].number):
-                try:
-                    if slow:
-                        return plan_with_pauses(planning, block, plan, allowed), None
-                    return plan(allowed), None
-                except (InfeasibleError, SolverError) as error:
-                    failure = failure or error
-        from .explain import explain_motors
-
-        assert failure is not None
-        raise explain_motors(problem.scene, block, free, failure) from None
+        return _plan_over_time(planning, block, z, options, over_time), None
     curves = []
     for phase in block:
         traced, later = phase.index < len(stored), problem.phases[phase.index + 1 :]
@@ -278,6 +251,41 @@ def plan_block(
         with charge(part.phases[0].number):
             plans += part.plan(problem.epsilon, options, planning.allow(part.phases))
     return plans, chain
+
+
+def _plan_over_time(
+    planning: Planning,
+    block: Sequence[Phase],
+    z: Array,
+    options: PlanOptions,
+    over_time: dict[str, Any],
+) -> Plans:
+    """Plans of a block in the time domain, from those with free torques if these are limited.
+
+    Under rate limits in the first modes with free torques, then in those of the search: phases 5
+    and 6 of the heptagon have a plan from the former alone, phases 6 and 7 of query 0 from the
+    latter.
+    """
+    from .time_domain.time_plan import plan_with_impacts
+
+    problem, failure = planning.problem, None
+    slow, allowed = problem.scene.has_slow_motors, planning.allow(block)
+    pinned = block[-1].index + 1 < len(problem.phases)
+    for complete in (False, True) if slow and options.mode_search else (options.mode_search,):
+        modes = replace(options, mode_search=complete)
+        free = plan_free(planning, block, z, modes, **over_time)
+        plan: Callable[[float | None], Plans] = partial(
+            plan_with_impacts, problem, block, z, options, pinned=pinned, free=free, **over_time
+        )
+        with charge(block[0].number):
+            try:
+                return plan_with_pauses(planning, block, plan, allowed) if slow else plan(allowed)
+            except (InfeasibleError, SolverError) as error:
+                failure = failure or error
+    from .explain import explain_motors
+
+    assert failure is not None
+    raise explain_motors(problem.scene, block, free, failure) from None
 
 
 def plan_with_pauses(
