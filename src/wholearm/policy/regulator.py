@@ -41,7 +41,6 @@ Planner = Callable[[Problem], Trajectory]  # makes a plan of a problem
 RATE = 100.0  # rate at which errors decay if torques change no contact force [1/s]
 SIGNS = {"+": 1.0, "-": -1.0, "rolls": 0.0}
 WORTH = 0.02  # angle error that is worth a whole torque limit in the cost [rad]
-FIRM = 150.0  # largest gain on angles, over the torque limit [1/rad]
 ROOM = 0.1  # margin for feedback: normal force over the scene's unit, share of a torque limit
 
 
@@ -106,11 +105,7 @@ def follow(
     b = max((1 - 0.05 * k for k in range(11)), key=find_margin)
     linearizations = [row for part in parts for row in _linearise(problem, part, b)]
     tau = np.concatenate([part.find_torques(b) for part in parts])
-    gains = regulate(linearizations, float(t[1] - t[0]) / np.sqrt(b))
-    # Where joint angles stop to determine the object's, gains have a pole. Case: a landing of
-    # `new polygon 7`, phase 6, that opens v0-finger2 by 0.2 mm.
-    sizes = np.abs(gains[..., :2]).max(axis=2)
-    return b, tau, gains * np.minimum(1.0, FIRM * limit / sizes)[..., None]
+    return b, tau, regulate(linearizations, float(t[1] - t[0]) / np.sqrt(b))
 
 
 def _divide(phase: Phase, plan: Trajectory, t: Array) -> Iterator[RegulatedStretch]:
