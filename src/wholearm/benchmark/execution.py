@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from ..common.errors import InfeasibleError, WholearmError
+from ..common.fields import choice
 from ..planning.options import PlanOptions
 from ..planning.plan import solve
 from ..planning.result import Plan
@@ -56,6 +57,8 @@ class Execution(Study):
         """What is drawn, its seed and number, folder of the problems, objective and ways."""
         objective = PlanOptions(objective=options.objective).goal.value
         ways = tuple(options.ways.split(",")) if options.ways else WAYS
+        for way in ways:
+            choice(*WAYS).read(way, "--ways")
         for kind, count in (("query", options.queries), ("polygon", options.polygons)):
             yield from (
                 (kind, options.seed, k, options.problems, objective, ways) for k in range(count)

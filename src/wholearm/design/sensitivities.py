@@ -14,7 +14,6 @@ margin, rate-limited or held torques, ranges, impacts over time.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -43,6 +42,7 @@ from ..problem.definition import End, Problem
 from ..problem.read import require_phases
 from ..search import solve as solve_any
 from .parameters import Parameter, find_parameter, list_parameters
+from .sweep import name_limit
 
 Terms = list[tuple[str, str, float]]
 """Parts of a Lagrangian, or of a value: phases and limit that they come from, and how much."""
@@ -111,8 +111,7 @@ def _charge(on: Array, values: Array, low: Array, high: Array) -> Array:
 
 
 def _name_rows(limits: LimitSet) -> list[str]:
-    """The limit of each row, without its value."""
-    return [re.split(r" >= |, | = ", limits.limits[k].text)[0] for k in limits.owners]
+    return [name_limit(limits.limits[k].text) for k in limits.owners]
 
 
 def _name_phases(numbers: Sequence[int]) -> str:
@@ -239,13 +238,8 @@ def _adopt(part: stage.Stage, own: Problem) -> stage.Stage:
     until, ahead = own.phases[part.phase].until, part.ahead
     if ahead is not None and until.value is not None:
         ahead = ahead[0], until.value, ahead[2]
-    formation, gained = (
-        each and stage.make_formation(own.scene, each.contacts, each.rolling)
-        for each in (part.formation, part.gained)
-    )
-    assert formation is not None
-    end = part.until and until
-    return replace(part, formation=formation, gained=gained, until=end, ahead=ahead)
+    gained = part.gained and stage.make_formation(own.scene, *part.gained.equations[1:])
+    return replace(part.move_to(own.scene), gained=gained, until=part.until and until, ahead=ahead)
 
 
 def find_lagrangian(planning: Planning) -> Evaluate:

@@ -89,13 +89,13 @@ def find_limit(plan: Plan) -> tuple[str, float]:
         slack, sides = limits.find_slack(np.hstack(forces) @ limits.rows.T), limits.sides[0]
         times = weight[rows] @ (slack <= ACTIVE * limits.scales[sides])
         for owner, length in zip(limits.owners[sides], times.tolist(), strict=True):
-            name = _name(limits.limits[owner].text)
+            name = name_limit(limits.limits[owner].text)
             spent[name] = spent.get(name, 0.0) + length
     limit = max(spent, key=lambda name: spent[name])
     return limit, spent[limit] / motion.duration
 
 
-def _name(limit: str) -> str:
+def name_limit(limit: str) -> str:
     """A limit in words, without its value."""
     return re.split(r" >?= |, ", limit, maxsplit=1)[0]
 
@@ -127,7 +127,7 @@ def describe_failure(error: Exception) -> Row:
     reason = re.split(r"; |: going | at [xt] = ", re.sub(r" \(.*?\)", "", text), maxsplit=1)[0]
     reason = re.sub(r"(?<== )-?\d\S*|-?\d+\.\d\S*", "\u2026", reason)
     for shortfall in getattr(error, "shortfalls", ())[:1]:
-        reason = f"{_name(shortfall.limit)} in phase {shortfall.place.phase}"
+        reason = f"{name_limit(shortfall.limit)} in phase {shortfall.place.phase}"
     changes = sorted(getattr(error, "changes", ()), key=lambda change: change.relative)
     change = str(changes[0]) if changes else ""
     return {"status": status, "value": None, "reason": reason, "change": change, "message": text}

@@ -174,20 +174,18 @@ def _find_corners(
     """Largest b, at most that given, (..., w), that leaves some b' >= 0 between bounds; or -1.
 
     Rows of slopes and values, (..., w, m), bound b' from below and above. The room between them is
-    a concave function of b: Newton's method from above ends at a corner, after as many steps as
-    there are rows at most.
+    a concave function of b: Newton's method from above ends at a corner of two rows.
     """
-    b, low_value, high_value = b.copy(), low_values, high_values
+    b, pick = b.copy(), np.take_along_axis
     for _ in range(low_slopes.shape[-1] ** 2):
-        low, high = low_slopes * b[..., None] + low_value, high_slopes * b[..., None] + high_value
+        low, high = low_slopes * b[..., None] + low_values, high_slopes * b[..., None] + high_values
         i, j = low.argmax(axis=-1)[..., None], high.argmin(axis=-1)[..., None]
-        pick = np.take_along_axis
         rests = pick(low, i, -1)[..., 0] <= 0
         with np.errstate(invalid="ignore", divide="ignore"):
             slope = pick(high_slopes, j, -1)[..., 0]
             slope = slope - np.where(rests, 0, pick(low_slopes, i, -1)[..., 0])
-            value = pick(high_value, j, -1)[..., 0]
-            value = value - np.where(rests, 0, pick(low_value, i, -1)[..., 0])
+            value = pick(high_values, j, -1)[..., 0]
+            value = value - np.where(rests, 0, pick(low_values, i, -1)[..., 0])
             corner = np.where(slope < 0, value / -slope, -1.0)
         short = (slope * b + value < 0) & (corner < b * (1 - 1e-14)) & (b > 0)
         if not short.any():

@@ -738,7 +738,7 @@ def make_policy(
                 hold = hold_end(problem, phase, piece.curve.end)
                 push = push if hold is None else hold
             table = _tabulate_curve(piece, phase, push)
-            tables[-1:] = [_join(tables[-1], table)] if goes_on else [*tables[-1:], table]
+            tables.append(_join(tables.pop(), table) if goes_on else table)
             goes_on = bool(piece.passes) and phase.end is End.SMOOTH
             entry.update(duration=piece.duration, share=piece.share, reserves=piece.reserves)
             entry["gained"] = "" if phase.until.contact is None else phase.until.contact.name

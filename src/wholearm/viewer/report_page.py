@@ -13,6 +13,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.figure import Figure
 
 from ..analysis.comparison import Contender, compare
 from ..common.arrays import Array
@@ -22,8 +23,6 @@ from ..common.files import make_folder, write_text
 from ..common.sharing import exclusive
 from ..contacts.closing import close_fingers
 from ..contacts.elemental import Contact
-from ..design.figures import draw_sensitivities
-from ..design.sensitivities import find_sensitivities
 from ..figures import plots
 from ..figures.map_figure import BOX, PLACE, SIZE, draw_map, find_room, split
 from ..figures.style import STYLE
@@ -81,12 +80,12 @@ def build_report(
         None,
     )
     if sensitivities:
-        stream = io.StringIO()
+        from ..design.figures import draw_sensitivities
+        from ..design.sensitivities import find_sensitivities
+
         result = find_sensitivities(comparison.contenders[0].problem or problem, progress=progress)
-        draw_sensitivities(result).savefig(stream, format="svg", metadata={"Date": None})
-        picture = stream.getvalue()
         parts += ["<h2>What 1 % more of each number is worth</h2>"]
-        parts += [picture[picture.index("<svg") :], result.document.to_html()]
+        parts += [_write_svg(draw_sensitivities(result)), result.document.to_html()]
     progress("map")
     chart = chart or build_map(problem, 90, choose_window(problem, None))
     machine = f"Python {platform.python_version()}, {platform.machine()}"
@@ -98,6 +97,14 @@ def build_report(
         Document(f"wholearm {__version__}, {machine}").to_html(),
     ]
     return build_page(problem.name, parts)
+
+
+def _write_svg(figure: Figure) -> str:
+    """The drawing of a figure, without the head of a file."""
+    stream = io.StringIO()
+    figure.savefig(stream, format="svg", metadata={"Date": None})
+    text = stream.getvalue()
+    return text[text.index("<svg") :]
 
 
 def _describe(contender: Contender, most: int) -> list[str]:
@@ -182,12 +189,10 @@ def describe_map(chart: FormationMap, plan: Trajectory | None = None) -> tuple[s
              `contacts`, a `text` and the poses `z` of what can be clicked; under "axes" where the
              drawing has which x [mm] and phi [deg]
     """
-    scene, stream = chart.problem.scene, io.StringIO()
+    scene = chart.problem.scene
     with matplotlib.rc_context(STYLE | {"svg.fonttype": "none"}):
-        draw_map(chart, plan).savefig(stream, format="svg", metadata={"Date": None})
-    drawing = stream.getvalue()
-    # Of the file only the drawing, and its style for nothing else in the page.
-    drawing = drawing[drawing.index("<svg") :].replace("*{", ".map *{")
+        # Its style for nothing else in the page.
+        drawing = _write_svg(draw_map(chart, plan)).replace("*{", ".map *{")
     parts = list(split(chart.cell))
     step = np.array([np.ptp(chart.phi) / len(chart.phi), np.ptp(chart.x) / len(chart.x)])
     rooms = [find_room(region, step / np.ptp(chart.x)) for _, region in parts]
