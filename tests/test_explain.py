@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import pickle
 import re
 from collections.abc import Callable
@@ -35,6 +36,7 @@ from wholearm.planning.explain import (
     change_limit,
     explain_stages,
     find_changes,
+    list_beyond,
     refuse,
     require_hold_at_ends,
 )
@@ -303,26 +305,31 @@ PRESSING = Parameter("epsilon", 0.05, "N", -1)
 def test_only_confirmed_changes_are_found() -> None:
     """One works at its rounded value, one needs some room, one cannot, one is never enough."""
     parameters = [STRONGEST, PRESSING, *(STRONGEST._replace(key=key) for key in ("2", "3"))]
-    least = dict(zip(parameters, [2.341, 0.012, None, 3.0], strict=True))
+    least = dict(zip(parameters, [2.341, 0.012, math.nan, 3.0], strict=True))
 
     def can_plan(parameter: Parameter, value: float) -> bool:
         return parameter == STRONGEST or (parameter == PRESSING and value < 0.012)
 
-    found = find_changes(parameters, least.__getitem__, can_plan)
-    assert found == [Change(STRONGEST, 2.35), Change(PRESSING, 0.0119)]
-    assert find_changes([PRESSING], lambda _: -0.01, lambda *_: True) == []
+    def list_values(parameter: Parameter) -> list[float]:
+        return [] if math.isnan(least[parameter]) else list_beyond(parameter, least[parameter])
+
+    changes = find_changes(parameters, list_values, can_plan)
+    assert changes == [Change(STRONGEST, 2.35), Change(PRESSING, 0.0119)]
+    assert find_changes([PRESSING], lambda _: [math.nan, -0.01], lambda *_: True) == []
 
 
-@each("limit, least", [(STRONGEST, 3.0), (PRESSING, 0.04)])
+@each("limit, values", [(STRONGEST, [3.0]), (PRESSING, [0.04]), (STRONGEST, []), (PRESSING, [])])
 @each("needed", [0.0, 0.013, 0.1, 0.49])
 def test_more_than_the_least_is_found_closely(
-    limit: Parameter, least: float, needed: float
+    limit: Parameter, values: list[float], needed: float
 ) -> None:
-    """Plans may need more than what limits at the nodes ask for."""
+    """Plans may need more than what limits at the nodes ask for, or nothing is known of them."""
+    least = values[0] if values else limit.value
     border = least * (1 + limit.sign * needed)
+    tried = list_beyond(limit, least) if values else [limit.value, least * (1 + limit.sign * 0.9)]
 
     def can_plan(_: Parameter, value: float) -> bool:
         return limit.sign * (value - border) >= 0
 
-    (change,) = find_changes([limit], lambda _: least, can_plan)
+    (change,) = find_changes([limit], lambda _: tried, can_plan)
     assert -1e-12 < limit.sign * (change.value / border - 1) <= 0.03

@@ -355,6 +355,17 @@ def test_the_released_contact_opens(motions: list[TimeMotion]) -> None:
     assert np.abs(held).max() < 1e-9
 
 
+def test_little_less_friction_takes_little_more_time() -> None:
+    """The landing with friction 0.06 is that with 0.07, continued: no limit of it is far."""
+    lasts = []
+    for friction in (0.07, 0.06):
+        landing = problem_of(HEPTAGON).with_(friction=friction)
+        start = trace_phases(landing)[3].end
+        plans = plan_phases(landing, landing.phases[4:], start, PlanOptions(), only_begin=True)
+        lasts.append(sum(plan.motion.duration for plan in plans))
+    assert lasts[1] == pytest.approx(lasts[0], rel=0.03)
+
+
 def test_the_torques_alone_carry_the_object_to_its_goal(stages: list[StageMotion]) -> None:
     z, v = stages[0].points.nodes[0]
     for stage in stages:

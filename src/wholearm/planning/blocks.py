@@ -25,10 +25,8 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.document import plain
 from ..common.errors import (
-    Change,
     InfeasibleError,
     InputError,
-    Parameter,
     SolverError,
     WholearmError,
     name_source,
@@ -42,20 +40,20 @@ from ..mechanics.speed_sweep import NoMotionError
 from ..problem.definition import End, Phase, Problem
 from ..results.dwell_record import TorqueChange, change_torques
 from ..results.plan_record import Transition
-from ..results.trajectory import Motion, Trajectory
+from ..results.trajectory import Trajectory
 from .lower_bound import look_along
 from .nlp import charge
 from .options import Objective, PlanOptions
 from .path_domain.path_plan import plan_curves
 from .phase_plan import (
     PER_SPEED,
-    PhasePlan,
     Plans,
     Settled,
     assemble_motions,
     end_of,
     make_transition,
     runs_along_curves,
+    share_duration,
 )
 
 if TYPE_CHECKING:
@@ -152,7 +150,9 @@ def plan_blocks(
             planning, options=replace(options, objective=Objective.TIME, duration=None), ahead=False
         )
         least = plan_each(_begin_each(first, report), report).plans
-        planning = replace(planning, allowed=share_duration(least, options.duration), least=least)
+        times = [plan.motion.duration for plan in least]
+        longest = 2 * sum(times) if options.duration is None else options.duration
+        planning = replace(planning, allowed=share_duration(times, longest), least=least)
         return plan_each(planning, report)
     return plan_each(_begin_each(planning, report), report)
 
@@ -399,24 +399,6 @@ def look_ahead(
     from ..geometry.tracing import CostToGo
 
     return CostToGo(phase, value)
-
-
-def share_duration(least: Sequence[PhasePlan[Motion]], duration: float | None) -> list[float]:
-    """Longest duration of each phase [s], in proportion to the least times."""
-    times = [plan.motion.duration for plan in least]
-    total = 2 * sum(times) if duration is None else duration
-    if total <= sum(times):
-        # The least-time plan shows it; a little more leaves something to choose.
-        from .explain import describe_changes, round_outwards
-
-        parameter = Parameter("duration", total, "s", 1, "duration")
-        enough = Change(parameter, round_outwards(1.005 * sum(times), 1))
-        raise InfeasibleError(
-            f"duration = {total:g} s is not longer than the least time, {sum(times):.6g} s; "
-            f"{describe_changes([enough])}",
-            changes=[enough],
-        )
-    return [total / sum(times) * time for time in times]
 
 
 def require_steps(problem: Problem, options: PlanOptions) -> None:

@@ -8,12 +8,13 @@ plan: only what was planned is advised.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import replace
 from functools import partial
+from itertools import groupby
+from operator import itemgetter
 from typing import Any, TypeVar
 
 import numpy as np
@@ -40,6 +41,7 @@ from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..scene.model import Scales, Scene
 from .dwell import require_hold
+from .nlp import open_ledger
 from .options import Objective, PlanOptions
 from .path_domain.path_data import PhaseData, cut, fit_torque, join
 from .path_domain.path_motion import PathMotion, Profile
@@ -62,7 +64,8 @@ from .time_domain.solution import TimeSearch
 from .time_domain.stage import Scheme, Stage, blend, make_formation, to_si
 from .time_domain.time_motion import make_phase_motions
 
-ADVICE = 0.6  # processor time [s] after which no change is tried for phases over time
+ADVICE = 100  # iterations of the solver after which no change is tried for phases over time
+HALVINGS = 6  # most of the interval between values with and without a plan
 FRICTION = "friction"  # beginning of the keys of frictions
 _unadvised: ContextVar[bool] = ContextVar("_unadvised", default=False)
 Replan = Callable[[Parameter, float], object]  # plans with another value of a parameter, or raises
@@ -82,36 +85,37 @@ def unadvised() -> Iterator[None]:
 def advise(
     error: E,
     parameters: Iterable[Parameter],
-    find_value: Callable[[Parameter], float | None],
+    list_values: Callable[[Parameter], Sequence[float] | None],
     replan: Replan | None,
-    seconds: float = math.inf,
+    most: float = math.inf,
 ) -> E:
     """Add to an error the changes of a single parameter that make a plan possible.
 
     Parameters
     ----------
-    find_value     as of `find_changes`; NaN where it cannot tell
-    replan         None: no change is looked for
-    seconds : [s]  processor time after which no further change is tried
+    list_values  as of `find_changes`; None where it cannot tell
+    replan       None: no change is looked for
+    most         iterations of solvers after which no further change is tried
     """
     if replan is None or _unadvised.get():
         return error
-    stop, undecided = time.thread_time() + seconds, list[Parameter]()
+    undecided = list[Parameter]()
+    with open_ledger() as ledger:
 
-    def find(parameter: Parameter) -> float | None:
-        least = math.nan if time.thread_time() > stop else find_value(parameter)
-        if least is not None and math.isnan(least):
-            undecided.append(parameter)
-            return None
-        return least
+        def is_over(parameter: Parameter) -> bool:
+            over = sum(cost.iterations for cost in ledger.values()) > most
+            undecided.extend([parameter] * over)
+            return over
 
-    def can_plan(parameter: Parameter, value: float) -> bool:
-        if time.thread_time() > stop:
-            undecided.append(parameter)
-            return False
-        return succeeds(partial(replan, parameter, value))
+        def list_more(parameter: Parameter) -> Sequence[float]:
+            values = None if is_over(parameter) else list_values(parameter)
+            undecided.extend([parameter] * (values is None))
+            return values or ()
 
-    error.changes = tuple(find_changes(parameters, find, can_plan))
+        def can_plan(parameter: Parameter, value: float) -> bool:
+            return not is_over(parameter) and succeeds(partial(replan, parameter, value))
+
+        error.changes = tuple(find_changes(parameters, list_more, can_plan))
     text = describe_changes(error.changes)
     if undecided and not error.changes:
         text = "no single limit was found that makes it feasible"
@@ -130,31 +134,30 @@ def succeeds(plan: Callable[[], object]) -> bool:
 
 def find_changes(
     parameters: Iterable[Parameter],
-    find_value: Callable[[Parameter], float | None],
+    list_values: Callable[[Parameter], Sequence[float]],
     can_plan: Callable[[Parameter, float], bool],
 ) -> list[Change]:
     """Changes of a single parameter with which there is a plan, to values rounded outwards.
 
     Parameters
     ----------
-    find_value  the value of a parameter at which the other limits can just be kept, if there is one
-    can_plan    whether there is a plan with a value of a parameter
+    list_values  a value of a parameter without a plan, or NaN, and values to try in their order
+    can_plan     whether there is a plan with a value of a parameter
     """
     changes = []
     for parameter in parameters:
-        sign, least, failed = parameter.sign, find_value(parameter), math.nan
-        # Plans keep limits between nodes too, which the least change does not.
-        shares = (0.0, 0.005, 0.015, 0.05, 0.15, 0.5)
-        beyond = [] if least is None else [least * (1 + sign * share) for share in shares]
-        for value in dict.fromkeys(round_outwards(candidate, sign) for candidate in beyond):
+        sign, (failed, *values) = parameter.sign, list_values(parameter) or (math.nan,)
+        for value in dict.fromkeys(round_outwards(candidate, sign) for candidate in values):
             if value < 0:
                 break
-            if not can_plan(parameter, value):
+            if value == parameter.value or not can_plan(parameter, value):
                 failed = value
                 continue
             # As little beyond as plans allow, by bisection.
-            while abs(value - failed) > 0.02 * abs(value):  # near enough
+            for _ in range(HALVINGS):
                 middle = round_outwards((value + failed) / 2, sign)
+                if not abs(value - failed) > 0.02 * value or middle in (value, failed):
+                    break
                 enough = can_plan(parameter, middle)
                 value, failed = (middle, failed) if enough else (value, middle)
             changes.append(Change(parameter, value))
@@ -162,19 +165,13 @@ def find_changes(
     return changes
 
 
-def bracket(
-    own: Parameter, farthest: float, can_plan: Callable[[float], bool], halvings: int = 5
-) -> float | None:
-    """A feasible value between a parameter's and `farthest`, by bisection; None without one."""
-    if farthest == own.value or not can_plan(farthest):
-        return None
-    enough, short = farthest, own.value
-    for _ in range(halvings):
-        middle = round_outwards((enough + short) / 2, own.sign)
-        if middle in (enough, short):
-            break
-        enough, short = (middle, short) if can_plan(middle) else (enough, middle)
-    return enough
+def list_beyond(parameter: Parameter, least: float) -> list[float]:
+    """Values to try from the least one on, with which limits at the nodes can just be kept.
+
+    Plans keep limits between nodes too.
+    """
+    shares = (0.0, 0.005, 0.015, 0.05, 0.15, 0.5)
+    return [math.nan, *(least * (1 + parameter.sign * share) for share in shares)]
 
 
 def round_outwards(value: float, sign: int) -> float:
@@ -245,27 +242,34 @@ def find_shortfalls(
     return shortfalls
 
 
-def _describe_least(
-    phases: Sequence[int], shortfalls: Iterable[Shortfall], motion: Trajectory | None
+def explain(
+    phases: Sequence[int],
+    shortfalls: Iterable[Shortfall],
+    motion: Trajectory | None,
+    parameters: Iterable[Parameter],
+    list_values: Callable[[Parameter], Sequence[float] | None],
+    replan: Replan | None,
+    most: float = math.inf,
 ) -> InfeasibleError:
-    """The error for phases with a motion of least violation, the worst shortfall first."""
+    """The error for phases with a motion of least violation: shortfalls, the worst first, advice.
+
+    The other arguments are those of `advise`.
+    """
     ranked = sorted(shortfalls, key=lambda short: -short.share)
     text = f"{name_phases(phases, 'infeasible')}: {'; '.join(map(str, ranked))}"
-    return InfeasibleError(text, ranked, (), motion)
+    error = InfeasibleError(text, ranked, (), motion)
+    return advise(error, parameters, list_values, replan, most)
 
 
 def explain_curves(task: Task, stopped: str) -> WholearmError:
     """Why phases along curves have no plan, and what would change that.
 
-    Torque rate limits, the duration, or else limits of which the least violation is found with soft
-    ones. `stopped` says in words how the solver ended.
+    Torque rate limits, or else limits of which the least violation is found with soft ones.
+    `stopped` says in words how the solver ended.
     """
     parts = PathIterate.begin(task, task.elements).parts
     if task.is_held:
         return _explain_rate_limits(task, parts, stopped)
-    late = explain_duration(task)
-    if late is not None:
-        return late
     data, scales = join(parts), task.curves[0].formation.scene.scales
     profile, units = guess_slowly(data)
     units = units._replace(torque=np.full(2, 15.0 * scales.torque))  # as bad as one of force
@@ -299,20 +303,20 @@ def explain_curves(task: Task, stopped: str) -> WholearmError:
         # Velocities after impacts between phases would depend on friction too.
         may_change += list_frictions(data.curve.formation)
 
-    def find_value(parameter: Parameter) -> float | None:
+    def list_values(parameter: Parameter) -> Sequence[float]:
         if parameter.key.startswith(FRICTION):
-            return _search_friction(task, parameter)
+            return list_frictions_to_try(parameter)
         step = units.force if parameter.unit == "N" else parameter.value
         relaxation = Relaxation(parameter, step)
         solution = _solve_soft(data, elastic, units, 1.0, relaxation)
-        return relaxation.move(solution[1]) if solution else None
+        return list_beyond(parameter, relaxation.move(solution[1])) if solution else ()
 
     with suppress(SolverError):  # it stalls
         torques = [fit_torque(*pair)[0] for pair in zip(parts, motions, strict=True)]
         formations = [part.curve.formation for part in parts]
         missing = assemble_motions(motions, torques, formations, 201, status="misses limits least")
-    error = _describe_least(task.phases, shortfalls, missing)
-    return advise(error, may_change, find_value, partial(_replan_task, task))
+    replan = partial(_replan_task, task)
+    return explain(task.phases, shortfalls, missing, may_change, list_values, replan)
 
 
 def _solve_soft(
@@ -357,49 +361,15 @@ def list_frictions(formation: Formation) -> list[Parameter]:
     return frictions
 
 
-def _search_friction(task: Task, parameter: Parameter) -> float | None:
-    """A lower or higher coefficient with which there is a plan."""
-    farthest = 0.0 if parameter.sign < 0 else 4.0 * parameter.value  # the farthest to try
-    replan = partial(_replan_task, task, parameter)
-    return bracket(parameter, farthest, lambda value: succeeds(partial(replan, value)))
+def list_frictions_to_try(parameter: Parameter) -> tuple[float, float]:
+    """The coefficient without a plan, and the lowest or a high one."""
+    return parameter.value, 0.0 if parameter.sign < 0 else 4.0 * parameter.value
 
 
 def explain_jam(task: Task, jam: JammingError) -> JammingError:
     """Add to an error which single lower friction would let a phase be planned."""
-    lower = [
-        parameter for parameter in list_frictions(task.curves[0].formation) if parameter.sign < 0
-    ]
-    return advise(jam, lower, partial(_search_friction, task), partial(_replan_task, task))
-
-
-def explain_duration(task: Task) -> InfeasibleError | None:
-    """The error if the duration is shorter than the least time, with one that would do."""
-    duration = task.duration
-    if duration is None:
-        return None
-    fastest = replace(task.options, objective=Objective.TIME, duration=None)
-    try:
-        plans = plan_task(replace(task, options=fastest, duration=None)).plans
-    except WholearmError:
-        return None
-    least = sum(plan.value for plan in plans)
-    if least <= duration:
-        return None
-    rough = replace(task, options=task.options.roughen())
-
-    def can_plan(_: Parameter, value: float) -> bool:
-        try:
-            return plan_task(replace(rough, duration=value)).plans[0].value >= task.epsilon
-        except SolverError:
-            return False
-
-    parameter = Parameter("duration", duration, "s", 1, "duration")
-    changes = find_changes([parameter], lambda _: least, can_plan)
-    return InfeasibleError(
-        f"{name_phases(task.phases, 'infeasible')}: duration = {duration:g} s is "
-        f"{least - duration:.3g} s shorter than the least time; {describe_changes(changes)}",
-        changes=changes,
-    )
+    lower = [friction for friction in list_frictions(task.curves[0].formation) if friction.sign < 0]
+    return advise(jam, lower, list_frictions_to_try, partial(_replan_task, task))
 
 
 def _explain_rate_limits(task: Task, parts: Sequence[PhaseData], reason: str) -> WholearmError:
@@ -408,64 +378,56 @@ def _explain_rate_limits(task: Task, parts: Sequence[PhaseData], reason: str) ->
     It is that of unlimited rates if there is no plan with these either. Otherwise larger limits
     are tried.
     """
-    rest = task.epsilon, task.options, task.phases, task.duration
+    scene = task.curves[0].formation.scene
+
+    def plan(scene: Scene, *others: Any) -> Scene:
+        curves = [replace(c, formation=replace(c.formation, scene=scene)) for c in task.curves]
+        plan_curves(curves, task.epsilon, task.options, task.phases, task.duration, *others)
+        return scene
+
     try:
         require_hold(parts[0], task.phases[0], 0)
         require_hold(parts[-1], task.phases[-1], -1)
-        plan_curves(_quicken(task.curves, np.inf), *rest)
+        plan(scene.quicken(math.inf))
     except WholearmError as error:
         return error
-    quick = math.inf
     for factor in (2.0, 10.0, 100.0):
         with suppress(WholearmError):
-            plan_curves(_quicken(task.curves, factor), *rest, False, task.pins)
-            quick = factor
-            break
-    return refuse_motors(task.curves[0].formation.scene, task.phases, quick, reason)
+            quick = plan(scene.quicken(factor), False, task.pins)
+            return refuse_motors(scene, quick, task.phases, reason)
+    return refuse_motors(scene, None, task.phases, reason)
 
 
-def _quicken(curves: Sequence[Curve], factor: float) -> list[Curve]:
-    """The curves with motors so many times as quick."""
-    scene = curves[0].formation.scene.quicken(factor)
-    return [replace(curve, formation=replace(curve.formation, scene=scene)) for curve in curves]
+# Keys of motors and control periods with units, and signs of changes that let torques change faster
+MOTORS = {"torque_rate_limit": ("N m/s", 1), "actuator_lag": ("s", -1), "control_period": ("s", -1)}
+
+
+def _list_motors(scene: Scene) -> list[tuple[str, float]]:
+    """Keys and values of what limits changes of the torques."""
+    *keys, period = MOTORS
+    limits = [(key, getattr(finger, key)) for key in keys for finger in scene.fingers]
+    return [*limits, (period, scene.control_period)]
 
 
 def refuse_motors(
-    scene: Scene, phases: Sequence[int], factor: float, reason: str = ""
+    scene: Scene, quick: Scene | None, phases: Sequence[int], reason: str = ""
 ) -> InfeasibleError:
-    """The error for phases without a plan under rate limits and lags of motors.
+    """The error for phases without a plan with the torques that motors or control periods allow.
 
-    There is a plan for motors `factor` times as quick; infinite if only without limits.
+    There is a plan in the scene `quick`; None if only with free torques.
     """
-    change, changes = "a plan was found for motors without limits", list[Change]()
-    if math.isfinite(factor):
-        for finger, quick in zip(scene.fingers, scene.quicken(factor).fingers, strict=True):
-            for key, unit, sign in (("torque_rate_limit", "N m/s", 1), ("actuator_lag", "s", -1)):
-                value, other = getattr(finger, key), getattr(quick, key)
-                if value != other:
-                    parameter = Parameter(key, value, unit, sign, key)
-                    changes.append(Change(parameter, round_outwards(other, sign)))
-        changes = list(dict.fromkeys(changes))
-        change = f"feasible with {' and '.join(map(str, changes))}"
-    text = "torques may not change as quickly as they would have to"
-    which = name_phases(phases, "infeasible")
-    error = InfeasibleError(f"{which}: {text}; {change}" + f"; {reason}" * bool(reason))
-    if len(changes) == 1:
-        error.changes = tuple(changes)
-    return error
-
-
-def refuse_period(scene: Scene, phases: Sequence[int], share: float) -> InfeasibleError:
-    """The error for phases without a plan with torques held over control periods.
-
-    There is a plan for periods of a `share` of them; zero if only with free torques.
-    """
-    period, which = scene.control_period, name_phases(phases, "infeasible")
-    parameter = Parameter("control_period", period, "s", -1, "control_period")
-    changes = [Change(parameter, round_outwards(share * period, -1))] if share else []
-    change = describe_changes(changes) if share else "a plan was found with free torques"
-    text = f"{which}: torques cannot be held that long; {change}"
-    return InfeasibleError(text, changes=changes)
+    changes = dict[Change, None]()
+    pairs = zip(_list_motors(scene), _list_motors(quick or scene), strict=True)
+    for (key, value), (_, other) in pairs:
+        if value != other:
+            unit, sign = MOTORS[key]
+            change = Change(Parameter(key, value, unit, sign, key), round_outwards(other, sign))
+            changes[change] = None
+    text = f"{name_phases(phases, 'infeasible')}: torques may not change as quickly as they would "
+    advice = f"feasible with {' and '.join(map(str, changes))}"
+    text += f"have to; {advice if changes else 'a plan was found with free torques'}"
+    text += f"; {reason}" * bool(reason)
+    return InfeasibleError(text, changes=changes if len(changes) == 1 else ())
 
 
 def refuse(
@@ -522,17 +484,18 @@ def refuse(
     else:
         text += " within the torque limits"
 
-    def find_value(parameter: Parameter) -> float | None:
+    def list_values(parameter: Parameter) -> Sequence[float]:
         if parameter.is_speed:
-            return None
+            return ()
         if parameter.key == EPSILON:
             value = statics.find_epsilon(node == -1)
         else:
             value = statics.find_torque_limit(epsilon, _find_finger(parameter), node == -1)
-        return _unit_of(parameter, problem.scene.scales) * value if value else None
+        unit = _unit_of(parameter, problem.scene.scales)
+        return list_beyond(parameter, unit * value) if value else ()
 
     parameters = make_limits(phase.formation, problem.epsilon).parameters
-    raise advise(InfeasibleError(text, shortfalls), parameters, find_value, replan, ADVICE)
+    raise advise(InfeasibleError(text, shortfalls), parameters, list_values, replan, ADVICE)
 
 
 def require_hold_at_ends(
@@ -618,7 +581,7 @@ def explain_stages(
     best = sums.index(min(sums))
     stages = [to_si(stage, problem) for stage in short[best]]
 
-    def find_value(parameter: Parameter) -> float | None:
+    def list_values(parameter: Parameter) -> Sequence[float] | None:
         # The limit has to be active; epsilon if no normal force is short of more than that.
         if parameter.key == EPSILON:
             active = all(
@@ -632,21 +595,20 @@ def explain_stages(
             most = max(float(np.abs(table[..., _find_finger(parameter)]).max()) for table in tables)
             active = most > 0.98 * parameter.value  # share of a limit above which it is active
         if not active:
-            return math.nan
+            return None
         solution = search.aiming(Objective.RELAX, parameter).solve(short[best])
         # A limit that may be tighter is not in conflict with the others.
         if not solution.success or solution.cost < 0.0:
-            return math.nan
+            return None
         unit = _unit_of(parameter, problem.scene.scales)
-        return parameter.value + parameter.sign * unit * solution.cost
+        return list_beyond(parameter, parameter.value + parameter.sign * unit * solution.cost)
 
     motions = make_phase_motions(stages, search.scheme, phases)
     torques = [motion.torque for motion in motions]
     formations = [phase.formation for phase in phases]
     motion = assemble_motions(motions, torques, formations, 201, status="misses limits least")
     parameters = make_limits(phases[0].formation, problem.epsilon).parameters
-    error = _describe_least(numbers, lists[best], motion)
-    return advise(error, parameters, find_value, replan, ADVICE)
+    return explain(numbers, lists[best], motion, parameters, list_values, replan, ADVICE)
 
 
 def list_shortfalls(problem: Problem, stages: Sequence[Stage], scheme: Scheme) -> list[Shortfall]:
@@ -688,14 +650,11 @@ def explain_motors(
 ) -> WholearmError:
     """The error for phases that have the plans `free` with free torques, or none."""
     settings = list[str]()
-    if scene.control_period:
-        settings.append(f"control_period = {scene.control_period:g} s ({scene.control_hold})")
-    kinds = (("torque_rate_limit", "N m/s", math.inf), ("actuator_lag", "s", 0.0))
-    for key, unit, none in kinds:
-        values = list(dict.fromkeys(getattr(finger, key) for finger in scene.fingers))
-        if values != [none]:
+    for key, group in groupby(_list_motors(scene), key=itemgetter(0)):
+        values = dict.fromkeys(value for _, value in group)
+        if any(0 < value < math.inf for value in values):
             texts = dict.fromkeys(f"{value:g}" for value in values)
-            settings.append(f"{key} = {' and '.join(texts)} {unit}")
+            settings.append(f"{key} = {' and '.join(texts)} {MOTORS[key][0]}")
     if not settings:
         return error
     keys, where = " and ".join(settings), name_phases([phase.number for phase in block])

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.document import plain
-from ..common.errors import InfeasibleError
+from ..common.errors import Change, InfeasibleError, Parameter
 from ..contacts.formation import Formation
 from ..geometry.tracing import runs_on_curves
 from ..mechanics.impact import Impact
@@ -111,12 +111,28 @@ def plan_stops(
         sum(plan.motion.duration for plan in least[start - bounds[0] : stop - bounds[0]])
         for start, stop in parts
     ]
-    if duration <= sum(times):
-        raise InfeasibleError(
-            f"duration = {duration:g} s is not longer than the least time with "
-            f"{'a stop' if len(parts) == 2 else 'stops'}, {sum(times):.6g} s"
-        )
-    return plan_parts(options, [duration * time / sum(times) for time in times])
+    stops = "a stop" if len(parts) == 2 else "stops"
+    return plan_parts(options, share_duration(times, duration, stops=f" with {stops}"))
+
+
+def share_duration(
+    times: Sequence[float], duration: float, where: str = "", stops: str = ""
+) -> list[float]:
+    """Durations of parts in proportion to their least times [s].
+
+    InfeasibleError if they are too short, `where` and with `stops` that are not in the problem.
+    """
+    least = sum(times)
+    if duration <= least:
+        from .explain import describe_changes, round_outwards
+
+        # The least-time plan shows it; a little more leaves something to choose.
+        parameter = Parameter("duration", duration, "s", 1, "duration")
+        changes = [Change(parameter, round_outwards(1.005 * least, 1))] * (not stops)
+        text = f"{where}duration = {duration:g} s is not longer than the least time{stops}, "
+        text += f"{least:.6g} s" + (f"; {describe_changes(changes)}" if changes else "")
+        raise InfeasibleError(text, changes=changes)
+    return [duration * time / least for time in times]
 
 
 def end_of(plan: PhasePlan[Motion]) -> tuple[Array, Array]:

@@ -22,7 +22,7 @@ from ..common.signals import OutOfTime
 from ..contacts.closing import close_fingers
 from ..contacts.formation import Formation, describe
 from ..mechanics.limits import EPSILON, make_limits
-from ..planning.explain import bracket, change_curve, list_frictions, unadvised
+from ..planning.explain import change_curve, find_changes, list_frictions, unadvised
 from ..planning.options import Objective, PlanOptions
 from ..planning.plan import solve_with
 from ..problem.definition import Goal, Phase, Problem
@@ -44,7 +44,6 @@ from .roadmap import Roadmap
 
 CUT = 16  # Most borders that are looked at with other numbers, those nearest to the goal
 FARTHEST = 10.0  # Most times that a number is made larger or smaller; friction may go to zero
-HALVINGS = 6  # How often what is between such a number and the given one is halved
 TRIED = 3  # Most numbers with which the goal is looked for
 SYMMETRIC = 1e-9  # Relative difference of lengths and bases up to which the hand is symmetric
 HANDS = (1.05, 0.95, 1.1, 0.9, 1.2, 0.8)
@@ -127,15 +126,14 @@ def list_openings(cuts: Sequence[CutBorder]) -> list[Opening]:
         formation, epsilon = cut.border.formation, cut.border.terms.epsilon
         for number in (*make_limits(formation, epsilon).parameters, *list_frictions(formation)):
             friction = number.key.startswith("friction")
-            farthest = 0.0 if friction else number.value * FARTHEST**number.sign
+            tried = number.value, 0.0 if friction else number.value * FARTHEST**number.sign
 
-            def opens(value: float, number: Parameter = number, cut: CutBorder = cut) -> bool:
+            def opens(number: Parameter, value: float, cut: CutBorder = cut) -> bool:
                 return isinstance(link_changed(cut, Change(number, value)), Link)
 
-            value = bracket(number, farthest, opens, HALVINGS)
-            if value is not None:
+            for change in find_changes([number], {number: tried}.__getitem__, opens):
                 _, values = by_key.setdefault(number.key, (number, [math.nan] * len(cuts)))
-                values[index] = value
+                values[index] = change.value
     openings = [Opening(number, tuple(values)) for number, values in by_key.values()]
 
     def rank(opening: Opening) -> tuple[int, float]:

@@ -24,7 +24,7 @@ from ...mechanics.limits import PRESS
 from ...mechanics.statics import SURE
 from ...mechanics.uniqueness import describe_uniqueness, find_minors
 from ..options import DEFAULT_ACCURACY, Objective, PlanOptions
-from ..phase_plan import PhasePlan
+from ..phase_plan import PhasePlan, share_duration
 from .path_data import PhaseData, cut, find_torques, fit_torque, join, prepare
 from .path_mesh import (
     Fastest,
@@ -135,10 +135,14 @@ def plan_curves(
         raise error from None
     rounding = MISS * curves[0].formation.scene.scales.force
     if options.goal is Objective.MARGIN and iterate.plans[0].value < epsilon - rounding:
-        from ..explain import explain_duration
+        from ..explain import name_phases
 
-        least = SolverError(f"{task.name}: the margin found is below epsilon")
-        raise explain_duration(task) or least
+        if duration is not None:
+            fastest = replace(options, objective=Objective.TIME, duration=None)
+            least = plan_task(replace(task, options=fastest, duration=None)).plans
+            where = f"{name_phases(phases, 'infeasible')}: "
+            share_duration([plan.value for plan in least], duration, where)
+        raise SolverError(f"{task.name}: the margin found is below epsilon")
     # Rate-limited torques start at the limit of what friction can hold.
     surely = task.is_held or (options.goal is Objective.TIME and not options.ranges)
     return iterate.plans if surely else _leave_rest(iterate)

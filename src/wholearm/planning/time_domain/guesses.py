@@ -50,6 +50,7 @@ from .mode_search import (
     link,
     merge,
     mode_of,
+    release_earlier,
 )
 from .solution import TimeSearch, TimeSolution
 from .stage import Scheme, Stage, StagePoints, in_own_units, resample, scale_state, unit_points
@@ -193,6 +194,16 @@ class Guesses:
             stages += divide(stage, parts)
         return Guess("the plan along curves", self._leave_room(link(stages)))
 
+    def with_earlier_releases(self) -> Iterator[Guess]:
+        """To the nearest ends, with a contact released one mode earlier.
+
+        Case: phases 5 and 6 of `heptagon.toml` with friction 0.06.
+        """
+        stages, name = self.nearest.stages, "a motion that releases a contact earlier"
+        for earlier in (release_earlier(stages, k) for k in range(len(stages))):
+            if earlier:
+                yield Guess(name, link(merge(earlier)))
+
     def straight(self, goal: Array) -> Guess | None:
         """Straight to an end of a single phase with two freedoms, in the modes of that path."""
         outline = self._connect(goal) if self._is_planar() else None
@@ -255,6 +266,7 @@ class Guesses:
         if straight is not None:
             yield straight
         yield self.nearest
+        yield from self.with_earlier_releases()
         yield self.nearest.by_homotopy()
         if not given:
             yield from self.to_others()

@@ -219,7 +219,8 @@ def reach_motors(
             break
     else:
         factor = math.inf
-    raise refuse_motors(problem.scene, [phase.number for phase in phases], factor)
+    quick_scene = problem.scene.quicken(factor) if math.isfinite(factor) else None
+    raise refuse_motors(problem.scene, quick_scene, [phase.number for phase in phases])
 
 
 def try_phases(
@@ -362,7 +363,7 @@ def hold_torques(
     ------
     InfeasibleError  if none is found; it names a shorter period with which one is
     """
-    from ..explain import refuse_period
+    from ..explain import refuse_motors
 
     scene, options = search.problem.scene, search.options
     controls = 2 if scene.control_hold == "linear" else 1
@@ -408,7 +409,9 @@ def hold_torques(
             return solution
         if solution:
             break
-    raise refuse_period(problem.scene, [phase.number for phase in phases], share * bool(solution))
+    quick = replace(problem.scene, control_period=share * problem.scene.control_period)
+    numbers = [phase.number for phase in phases]
+    raise refuse_motors(problem.scene, quick if solution else None, numbers)
 
 
 def drop_periods(stages: Sequence[Stage]) -> list[Stage]:
