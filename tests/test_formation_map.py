@@ -759,19 +759,16 @@ def test_a_landing_is_led_to_where_the_goal_is() -> None:
     chart, curves = Roadmap(problem, 0.1), trace_phases(problem)
     place = make_place(problem.scene, curves[3].end)
     contacts = set(problem.phases[4].formation.contacts)
-    ((index, border),) = (
-        (k, own)
-        for k, (own,) in enumerate(chain.borders for chain in chart.follow(place))
-        if set(own.formation.contacts) == contacts
-    )
-    landings = chart.land_at(chart.release(border, index), goal)
+    borders = [chain.borders[0] for chain in chart.follow(place)]
+    (border,) = (own for own in borders if set(own.formation.contacts) == contacts)
+    landings = chart.land_at(chart.release(border, borders), goal)
     assert landings
     for link in landings:
         assert is_at(link.stop, goal) and str(link.steps[-1].until) == "v2-palm at x = 0.022 m"
         assert [step.end for step in link.steps] == [End.SMOOTH, End.REST]
         gaps = Formation(problem.scene, link.stop.contacts).evaluate(*[link.stop.z[None]] * 2).C
         assert np.abs(gaps).max() < 1e-8 * problem.scene.scales.length
-    assert chart.land_at(chart.release(border, index), Goal(flush=1)) == []
+    assert chart.land_at(chart.release(border, borders), Goal(flush=1)) == []
 
 
 CURVES = trace_phases(problem_of(HEPTAGON))

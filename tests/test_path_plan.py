@@ -56,7 +56,7 @@ from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
 from wholearm.problem.read import build_problem
 from wholearm.results.trajectory import Samples
-from wholearm.search.edges import BorderEdge, Terms, estimate_duration
+from wholearm.search.edges import BorderEdge, Link, Terms, link_along
 from wholearm.search.places import make_place
 
 EPSILON = 0.05
@@ -758,6 +758,9 @@ def test_a_place_that_motions_hardly_pass_is_found_on_any_first_grid(
     # Nor does the search for routes give up the border on which it lies.
     slow = curves[1]
     place = make_place(slow.formation.scene, slow.start)
-    estimate = estimate_duration([BorderEdge(place, slow, None, Terms(epsilon, 0.1)).limits])
+    border = BorderEdge(place, slow, None, Terms(epsilon, 0.1))
+    link = link_along((border,), (1.0,), (), border.stop)
     # A crawl through that place on the first grid is a tenth too slow; 1 would be no estimate.
-    assert estimate == pytest.approx(look_along([slow], epsilon, 1000), rel=0.2)
+    assert isinstance(link, Link) and link.duration == pytest.approx(
+        look_along([slow], epsilon, 1000), rel=0.2
+    )

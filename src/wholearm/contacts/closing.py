@@ -77,12 +77,13 @@ def first_contact(scene: Scene, finger: int) -> int:
     return (1 + kinds) * scene.polygon.n_vertices
 
 
-def place_corners(scene: Scene, x: Array, y: Array, phi: Array, vertices: Numbers) -> Array:
-    """World positions of some vertices, shape (m,) or (n, m), at n poses, (n, m, 2) [m]."""
-    c, s = np.cos(phi)[:, None], np.sin(phi)[:, None]
-    body = scene.polygon.vertices[vertices]
-    across, up = body[..., 0], body[..., 1]
-    return np.stack([x[:, None] + c * across - s * up, y[:, None] + s * across + c * up], axis=2)
+def place_corners(
+    scene: Scene, x: Array, y: Array, phi: Array, vertices: Numbers
+) -> tuple[Array, Array]:
+    """World x and y, (m, n) [m], of some vertices, shape (m, 1) or (m, n), at n poses."""
+    c, s = np.cos(phi), np.sin(phi)
+    across, up = scene.polygon.vertices[vertices].transpose(2, 0, 1)
+    return x + c * across - s * up, y + s * across + c * up
 
 
 def lower(scene: Scene, phi: Array) -> tuple[Array, Numbers]:
@@ -159,25 +160,25 @@ def _close_finger(
 ) -> tuple[Array, Numbers, Numbers]:
     """Angle, first feature (sides, edges, arcs as in the candidates) and obstacle, at n poses."""
     link, count = scene.fingers[finger], scene.polygon.n_vertices
+    joint = np.asarray(link.base)
     angle, feature = np.empty(len(x)), np.empty(len(x), dtype=np.int64)
     obstacle = np.zeros(len(x), dtype=np.int64)
     first, clear = find_nearby(scene, finger, x, y, phi)
     for mine, size in ((clear, min(AROUND, count)), (~clear, count)):
         if not mine.any():
             continue
-        vertices = (first[mine, None] + np.arange(size + 1)) % count
-        corners = place_corners(scene, x[mine], y[mine], phi[mine], vertices)
-        corners -= np.asarray(link.base)
-        least, touching = _touch(link, finger, corners)
+        vertices = (first[mine] + np.arange(size + 1)[:, None]) % count
+        across, up = place_corners(scene, x[mine], y[mine], phi[mine], vertices)
+        across, up = across - joint[0], up - joint[1]
+        least, touching = _touch(link, finger, across, up)
         reached = touching >= 0
         kind, place = np.divmod(touching, size)
-        numbers = kind * count + vertices[np.arange(len(place)), place]
+        numbers = kind * count + vertices[place, np.arange(len(place))]
         feature[mine], angle[mine] = np.where(reached, numbers, -1), least
-        covered = np.zeros(len(least), dtype=bool)
-        if size == count:
-            around = corners[:, :-1]
-            covered = (_distance(around) <= link.radius) | _hangs_into(link, around)
-        obstacle[mine] = np.where(covered, JOINT_COVERED, np.where(reached, 0, TOO_SHORT))
+        obstacle[mine] = np.where(reached, 0, TOO_SHORT)
+        if mine is not clear:
+            covered = (_distance(across, up) <= link.radius) | _hangs_into(link, across, up)
+            obstacle[mine] = np.where(covered, JOINT_COVERED, obstacle[mine])
     return angle, feature, obstacle
 
 
@@ -234,84 +235,100 @@ def _list_edges(scene: Scene) -> tuple[Array, Array, Array, Array, Array]:
     return size, along, outward, (along * body).sum(axis=1), (outward * body).sum(axis=1)
 
 
-def _touch(link: Finger, finger: int, corners: Array) -> tuple[Array, Numbers]:
+def _touch(link: Finger, finger: int, x: Array, y: Array) -> tuple[Array, Numbers]:
     """Angle of first contact of a closing finger, (n,), and feature of m sides, edges, arcs, or -1.
 
-    `corners`, (n, m + 1, 2), are relative to the joint; the last one is only the end of an edge.
+    Vertices `x`, `y`, (m + 1, n), are relative to the joint; the last is only the end of an edge.
     """
-    following, corners = corners[:, 1:], corners[:, :-1]
     sign = 1.0 if finger == 0 else -1.0
     outside = -np.pi / 2 if finger == 0 else np.pi + np.pi / 2
     length, radius = link.length, link.radius
-    distance = np.hypot(corners[..., 0], corners[..., 1])
-    along = following - corners
-    size = np.hypot(along[..., 0], along[..., 1])
-    along /= size[..., None]
-    outward = np.stack([along[..., 1], -along[..., 0]], axis=-1)
-    # At the very end of a pointed link rounding must not let the vertex slip between candidates.
-    slack = 1e-11 * length if radius == 0 else 0.0
-    with np.errstate(invalid="ignore", divide="ignore"):
-        run = np.sqrt(distance**2 - radius**2)
-        side = np.where(run <= length + slack, _find_angle(link, sign, SIDE, corners), np.nan)
-        beyond = (run > length) & (radius > 0)
-        arc = np.where(beyond, _find_angle(link, sign, ARC, corners), np.nan)
-        edges = (_find_angle(link, side_sign, EDGE, corners, outward) for side_sign in (-1.0, 1.0))
-        both = np.stack(list(edges), axis=-1)
-    tip = length * np.stack([np.cos(both), np.sin(both)], axis=-1)
-    place = ((tip - corners[:, :, None]) * along[:, :, None]).sum(axis=-1)
-    both = np.where((place >= 0) & (place <= size[..., None]), both, np.nan)
+    along_x, along_y = x[1:] - x[:-1], y[1:] - y[:-1]
+    x, y = x[:-1], y[:-1]
+    size = np.hypot(along_x, along_y)
+    along_x, along_y = along_x / size, along_y / size
 
     def sweep(angle: Array) -> Array:
         turns = sign * (angle - outside) / (2 * np.pi)
         return np.where(np.isnan(angle), np.inf, 2 * np.pi * (turns - np.floor(turns)))
 
-    swept = np.hstack([sweep(side), sweep(both).min(axis=-1), sweep(arc)])
-    feature = swept.argmin(axis=1)
-    least = swept[np.arange(len(swept)), feature]
+    def sweep_edge(turn: float) -> Array:
+        """The same for the tip and the line of an edge, to one side of its normal or the other."""
+        angle = _find_angle(link, turn, EDGE, x, y, np.array([along_y, -along_x]))
+        place = turn * across - (x * along_x + y * along_y)
+        return np.where((place >= 0) & (place <= size), sweep(angle), np.inf)
+
+    # At the very end of a pointed link rounding must not let the vertex slip between candidates.
+    slack = 1e-11 * length if radius == 0 else 0.0
+    with np.errstate(invalid="ignore", divide="ignore"):
+        run = np.sqrt(np.hypot(x, y) ** 2 - radius**2)
+        side = sweep(_find_angle(link, sign, SIDE, x, y))
+        # Of the tip's center, from the foot of the joint on the line.
+        across = np.sqrt(length**2 - (radius + (x * along_y - y * along_x)) ** 2)
+        edge = np.minimum(sweep_edge(-1.0), sweep_edge(1.0))
+        swept = [np.where(run <= length + slack, side, np.inf), edge]
+        if radius > 0:
+            arc = sweep(_find_angle(link, sign, ARC, x, y))
+            swept.append(np.where(run > length, arc, np.inf))
+    all_swept = np.vstack(swept)
+    feature, least = all_swept.argmin(axis=0), all_swept.min(axis=0)
     reached = np.isfinite(least)
     angle = outside + sign * np.where(reached, least, 0.0)
     return angle, np.where(reached, feature, -1)
 
 
 def _find_angle(
-    link: Finger, sign: float, kind: int, corners: Array, outward: Array | None = None
+    link: Finger,
+    sign: float,
+    kind: int,
+    x: Array,
+    y: Array,
+    outward: Array | None = None,
 ) -> Array:
     """Joint angles at which a link touches vertices or, with its tip, edges [rad].
 
-    Of a link that turns anticlockwise, `sign` 1, or clockwise; NaN where it cannot. `corners`,
-    (..., 2), are relative to the joint; those of edges are where they begin, with their `outward`
-    normals.
+    Of a link that turns anticlockwise, `sign` 1, or clockwise; NaN where it cannot. Vertices `x`,
+    `y` are relative to the joint; those of edges are where they begin, with `outward` normals.
     """
     if kind == EDGE and outward is not None:
-        offset = link.radius + (outward * corners).sum(axis=-1)
-        heading = np.arctan2(outward[..., 1], outward[..., 0])
+        offset = link.radius + (outward[0] * x + outward[1] * y)
+        heading = np.arctan2(outward[1], outward[0])
         return np.asarray(heading + sign * np.arccos(offset / link.length))
-    away = np.hypot(corners[..., 0], corners[..., 1])
-    reach = (away**2 + link.length**2 - link.radius**2) / (2 * away * link.length)
-    inner = np.arcsin(link.radius / away) if kind == SIDE else np.arccos(reach)
-    return np.asarray(np.arctan2(corners[..., 1], corners[..., 0]) - sign * inner)
+    away = np.hypot(x, y)
+    if kind == SIDE:
+        inner = np.arcsin(link.radius / away)
+    else:
+        reach = (away**2 + link.length**2 - link.radius**2) / (2 * away * link.length)
+        inner = np.arccos(reach)
+    return np.asarray(np.arctan2(y, x) - sign * inner)
 
 
-def _hangs_into(link: Finger, corners: Array) -> Flags:
-    """Whether a link that points down, from where it closes, overlaps the object, shape (n,)."""
-    x, y = corners[..., 0], corners[..., 1]
-    after = np.roll(corners, -1, axis=1)
+def _hangs_into(link: Finger, x: Array, y: Array) -> Flags:
+    """Whether a link that points down, from where it closes, overlaps the object, shape (n,).
+
+    Vertices `x`, `y`, (m + 1, n), are relative to the joint; the last is the first one again.
+    """
+    tip = _distance(x, y + link.length) < link.radius
+    after_x, after_y = x[1:], y[1:]
+    x, y = x[:-1], y[:-1]
     beside = (np.abs(x) < link.radius) & (y < 0) & (y > -link.length)
     with np.errstate(divide="ignore", invalid="ignore"):
-        height = y - x * (after[..., 1] - y) / (after[..., 0] - x)
-    crossed = (x * after[..., 0] < 0) & (height < 0) & (height > -link.length)
-    tip = _distance(corners + np.array([0.0, link.length])) < link.radius
-    return np.asarray(beside.any(axis=1) | crossed.any(axis=1) | tip)
+        height = y - x * (after_y - y) / (after_x - x)
+    crossed = (x * after_x < 0) & (height < 0) & (height > -link.length)
+    return np.asarray(beside.any(axis=0) | crossed.any(axis=0) | tip)
 
 
-def _distance(corners: Array) -> Array:
-    """Distance of convex anticlockwise polygons from the origin, zero inside, shape (n,) [m]."""
-    runs = np.roll(corners, -1, axis=1) - corners
-    cross = cross_product(corners, runs)
-    part = np.clip(-(corners * runs).sum(axis=-1) / (runs**2).sum(axis=-1), 0.0, 1.0)
-    nearest = corners + part[..., None] * runs
-    distance = np.hypot(nearest[..., 0], nearest[..., 1]).min(axis=1)
-    return np.asarray(np.where((cross >= 0).all(axis=1), 0.0, distance))
+def _distance(x: Array, y: Array) -> Array:
+    """Distance of convex anticlockwise polygons from the origin, zero inside, shape (n,) [m].
+
+    Vertices `x`, `y`, (m + 1, n); the last is the first one again.
+    """
+    run_x, run_y = x[1:] - x[:-1], y[1:] - y[:-1]
+    x, y = x[:-1], y[:-1]
+    cross = x * run_y - y * run_x
+    part = np.clip(-(x * run_x + y * run_y) / (run_x**2 + run_y**2), 0.0, 1.0)
+    distance = np.hypot(x + part * run_x, y + part * run_y).min(axis=0)
+    return np.asarray(np.where((cross >= 0).all(axis=0), 0.0, distance))
 
 
 def evaluate_each(scene: Scene, labels: Numbers, z: Array, v: Array | None = None) -> Kinematics:
@@ -401,8 +418,9 @@ def place(scene: Scene, labels: Numbers, poses: Array) -> Array:
     for finger, link in enumerate(scene.fingers):
         sign = 1.0 if finger == 0 else -1.0
         for touch in _list_touches(scene, finger, labels[:, 1 + finger], z):
+            x, y = touch.corner.T
             with np.errstate(invalid="ignore", divide="ignore"):
-                angle = _find_angle(link, sign, touch.kind, touch.corner, touch.outward)
+                angle = _find_angle(link, sign, touch.kind, x, y, touch.outward.T)
             # Counted from where the finger hangs outside, from which it closes.
             outside = -np.pi / 2 if finger == 0 else 3 * np.pi / 2
             swept = np.mod(sign * (angle - outside), 2 * np.pi)

@@ -240,7 +240,8 @@ def _corners_at(scene: Scene, phi: Array, vertex: int, *wanted: int) -> Array:
     """Wanted vertices with `vertex` on the palm and the centroid at x = 0, shape (m, n, 2) [m]."""
     body = scene.polygon.vertices[vertex]
     y = -(np.sin(phi) * body[0] + np.cos(phi) * body[1])
-    return place_corners(scene, 0 * phi, y, phi, np.array(wanted)).transpose(1, 0, 2)
+    vertices = np.array(wanted)[:, None]
+    return np.stack(place_corners(scene, 0 * phi, y, phi, vertices), axis=-1)
 
 
 def _outward(scene: Scene, edge: int, phi: Array) -> Array:

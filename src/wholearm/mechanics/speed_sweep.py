@@ -132,16 +132,19 @@ def _sweep(
     caps = np.minimum(cap.T, _UNBOUNDED)
     top = _find_corners(*lows, push_slopes, push_values, caps[:-1])
     top[closed] = -1.0
-    count, least = len(steps), np.minimum.reduce
-    largest, b = np.zeros((2, *caps.shape))
-    braking, pushed = np.empty((2, *top.shape))
-    for k in range(count - 1, -1, -1):
-        braking[k] = least(brake_slopes[k] * largest[k + 1][:, None] + brake_values[k], axis=1)
-        largest[k] = np.maximum(np.minimum(braking[k], top[k]), 0.0)
-    for k in range(count):
-        pushed[k] = least(push_slopes[k] * b[k][:, None] + push_values[k], axis=1)
-        b[k + 1] = np.minimum(pushed[k], largest[k + 1])
-    lowest = np.minimum(braking, top)
+    count = len(steps)
+    lowest = _pass(brake_slopes[::-1], brake_values[::-1], top[::-1], 0.0)[::-1]
+    largest = np.append(np.maximum(lowest, 0.0), np.zeros_like(top[:1]), axis=0)
+    b = np.append(
+        np.zeros_like(top[:1]), _pass(push_slopes, push_values, largest[1:], -np.inf), axis=0
+    )
+    braking, pushed = (
+        (slopes * at[..., None] + values).min(axis=2)
+        for slopes, values, at in (
+            (brake_slopes, brake_values, largest[1:]),
+            (push_slopes, push_values, b[:-1]),
+        )
+    )
     lost = np.concatenate([lowest[:1] < 0, ~(lowest[1:] > 0)])
     blocked = np.where(lost.any(axis=0), count - 1 - lost[::-1].argmax(axis=0), -1)
     stalls = np.concatenate([~(b[1:-1] > 0), b[-1:] < -_ROUNDING * b.max(axis=0)])
@@ -153,6 +156,21 @@ def _sweep(
     modes = np.where(slower[:-1], SweepMode.SWITCH, modes)
     modes = np.where(slower[1:], SweepMode.PUSH, modes)
     return SpeedProfile(np.maximum(b, 0.0).T, modes.T, blocked)
+
+
+def _pass(slopes: Array, values: Array, top: Array, floor: float) -> Array:
+    """Largest b, (N, w), at one node after the other, from zero at the first; see `_sweep`.
+
+    Rows of slopes and values, (N, w, m), bound it by the b before, `top`, (N, w), by itself.
+    """
+    slopes = np.concatenate([slopes, np.zeros((*top.shape, 1))], axis=2)
+    values = np.concatenate([values, top[..., None]], axis=2)
+    b, nodes = np.zeros((top.shape[1], 1)), list[Array]()
+    for slope, value in zip(slopes, values, strict=True):
+        b = np.minimum.reduce(slope * b + value, axis=1, keepdims=True)
+        nodes.append(b)
+        b = np.maximum(b, floor)
+    return np.array(nodes)[..., 0]
 
 
 def _split(
@@ -176,22 +194,24 @@ def _find_corners(
     Rows of slopes and values, (..., w, m), bound b' from below and above. The room between them is
     a concave function of b: Newton's method from above ends at a corner of two rows.
     """
-    b, pick = b.copy(), np.take_along_axis
+    shape, n = b.shape, np.arange(b.size)
+    b = b.flatten()
+    low_slopes, low_values, high_slopes, high_values = (
+        rows.reshape(len(n), -1) for rows in (low_slopes, low_values, high_slopes, high_values)
+    )
     for _ in range(low_slopes.shape[-1] ** 2):
-        low, high = low_slopes * b[..., None] + low_values, high_slopes * b[..., None] + high_values
-        i, j = low.argmax(axis=-1)[..., None], high.argmin(axis=-1)[..., None]
-        rests = pick(low, i, -1)[..., 0] <= 0
+        low, high = low_slopes * b[:, None] + low_values, high_slopes * b[:, None] + high_values
+        i, j = (n, low.argmax(axis=1)), (n, high.argmin(axis=1))
+        rests = low[i] <= 0
         with np.errstate(invalid="ignore", divide="ignore"):
-            slope = pick(high_slopes, j, -1)[..., 0]
-            slope = slope - np.where(rests, 0, pick(low_slopes, i, -1)[..., 0])
-            value = pick(high_values, j, -1)[..., 0]
-            value = value - np.where(rests, 0, pick(low_values, i, -1)[..., 0])
+            slope = high_slopes[j] - np.where(rests, 0, low_slopes[i])
+            value = high_values[j] - np.where(rests, 0, low_values[i])
             corner = np.where(slope < 0, value / -slope, -1.0)
         short = (slope * b + value < 0) & (corner < b * (1 - 1e-14)) & (b > 0)
         if not short.any():
             break
         b[short] = np.maximum(corner[short], -1.0)
-    return b
+    return b.reshape(shape)
 
 
 class ControllableSet(NamedTuple):

@@ -171,9 +171,10 @@ class RouteSearch:
                     elif times[key] == 1 and ahead[1] not in self.blocked:
                         self.blocked.append(ahead[1])
                 if not place.landed:
-                    for index, chain in enumerate(self.roadmap.follow(place)):
-                        if not self._is_back(route, chain):
-                            put(route, place, (chain.borders[0], index), rule.leaving * time)
+                    chains = self.roadmap.follow(place)
+                    borders = [c.borders[0] for c in chains if not self._is_back(route, c)]
+                    for border in borders:
+                        put(route, place, (border, borders), rule.leaving * time)
                     put(route, place, "cells", CROSSING * time)
                 continue
             if isinstance(work, tuple):

@@ -24,6 +24,7 @@ from ..problem.definition import End, Until
 from .places import RoadmapPlace, make_place
 
 INTERVALS = 24  # intervals of the speed sweep along a border
+FINE = 8  # times as many where it finds no motion
 CHECKED = 12  # further places of each segment that are checked for jamming and uniqueness
 INDEPENDENT = 1e-12  # least Gram determinant of unit rows of independent contacts
 DEPENDENT = "its contacts depend on each other"
@@ -54,7 +55,7 @@ class BorderLimits(NamedTuple):
 
 
 def find_border_limits(
-    curve: Curve, epsilon: float, uniqueness_margin: float, intervals: int = INTERVALS
+    curve: Curve, epsilon: float, uniqueness_margin: float, intervals: int
 ) -> BorderLimits:
     """Limits along a curve with arc length as parameter; epsilon [N] is the least normal force."""
     terms = PathTerms((curve,), epsilon)
@@ -231,12 +232,14 @@ class BorderEdge:
 
     @cached_property
     def limits(self) -> BorderLimits:
-        """Limits of motions along it."""
-        limits = find_border_limits(self.curve, *self.terms)
-        if limits.closed or not isinstance(estimate_duration([limits]), str):
-            return limits
-        # Where motions hardly pass, a coarse grid may let none pass.
-        return find_border_limits(self.curve, *self.terms, 8 * INTERVALS)
+        """Limits of motions along it, on the usual grid."""
+        return find_border_limits(self.curve, *self.terms, INTERVALS)
+
+    def find_limits(self, intervals: int) -> BorderLimits:
+        """Limits of motions along it on a grid of about so many intervals."""
+        if intervals == INTERVALS:
+            return self.limits
+        return find_border_limits(self.curve, *self.terms, intervals)
 
     @property
     def formation(self) -> Formation:
@@ -379,9 +382,12 @@ def link_along(
     reason = last.closed or ("" if len(borders) > 1 else last.begins)
     if reason:
         return Blocked(start, steps, reason, stop)
-    pairs = zip(borders, ratios, strict=True)
-    limits = [border.limits.with_speed_ratio(ratio) for border, ratio in pairs]
-    duration = last.ends or estimate_duration(limits)
-    if isinstance(duration, str):
-        return Blocked(start, steps, Unstopped(duration), stop)
-    return Link(start, stop, steps, duration, borders=borders, ratios=ratios)
+    duration: float | str = last.ends
+    # Where motions hardly pass, a coarse grid may let none pass.
+    for intervals in () if last.ends else (INTERVALS, FINE * INTERVALS):
+        pairs = zip(borders, ratios, strict=True)
+        limits = [b.find_limits(intervals).with_speed_ratio(ratio) for b, ratio in pairs]
+        duration = estimate_duration(limits)
+        if not isinstance(duration, str):
+            return Link(start, stop, steps, duration, borders=borders, ratios=ratios)
+    return Blocked(start, steps, Unstopped(duration), stop)

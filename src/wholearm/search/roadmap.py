@@ -119,13 +119,16 @@ LONGEST = 6  # Most borders that are passed in one go
 HEADINGS = 36  # directions of rays from a place
 SPACING, REACH = 0.1, 2.9
 """Step along a ray and its length, in radii of gyration and radians."""
-PARTS, ROUNDS = 16, 4  # parts of a step, and how often it is divided where a label changes
+NEARBY = 8  # steps that are looked at first: most rays leave their cells there
+PARTS, ROUNDS = 8, 4  # parts of a step, and how often it is divided where a label changes
 FIRST = 0.02  # least length of a path; there a ray is inside its cell [same unit]
 JUMP = 5e-3  # change of a joint angle at the end of a ray that is none [rad]
 NEAREST = 0.02  # least length of a path to a pose, in radii of gyration or radians
 TIED = 1 - 1e-9
 """Ratio below which a time is less than another: of mirrored paths the first is taken."""
-RELEASES = (0.15, 0.4, 0.6, 0.75, 0.88)  # places of releases, over the length of the border
+RELEASES = np.array(
+    [0.15, 0.4, 0.6, 0.75, 0.88]
+)  # places of releases, over the length of the border
 NEAR = 1.0  # longest shift of a landing to a goal, in radii of gyration
 
 
@@ -153,7 +156,7 @@ class Roadmap:
         self.others: dict[Link, list[Measured]] = {}
         self.joined: dict[tuple[object, ...], PlannedLink | str] = {}
         self.measured: dict[Link, Measured | str] = {}
-        self._releases: dict[tuple[Key, int], list[Link]] = {}
+        self._releases: dict[BorderEdge, list[Link]] = {}
         self._longer: dict[tuple[BorderEdge, ...], list[Chain]] = {}
 
     def trace(self, place: RoadmapPlace, chain: Chain | None = None) -> list[BorderEdge]:
@@ -218,29 +221,36 @@ class Roadmap:
             self._cells[place.key] = cross((place,), self.epsilon)
         return self._cells[place.key]
 
-    def release(self, border: BorderEdge, number: int) -> list[Link]:
-        """Links that leave a border for a cell, from the fastest of some places along it."""
-        key = border.start.key, number
-        if key in self._releases:
-            return self._releases[key]
-        times = time_parts(border, np.array(RELEASES))
-        ends = [(share, t) for share, t in zip(RELEASES, times.tolist(), strict=True) if t < np.inf]
-        best: dict[tuple[Contact, ...], Link] = {}
-        if ends:
-            shares = np.array([share for share, _ in ends])
-            z = border.curve.evaluate(shares * border.curve.length).z
-            held, middle = border.formation.contacts, make_place(self.scene, z[0])
-            places = [replace(middle, z=row) for row in z]
-            for link in cross(places, self.epsilon):
-                k = places.index(link.start)
-                share, time = ends[k]
-                time, contacts = time + link.duration, link.stop.contacts
-                if contacts not in best or time < TIED * best[contacts].duration:
-                    steps = EdgeStep(held, point_out(held, z[k])), *link.steps
-                    whole = replace(link, start=border.start, steps=steps, duration=time)
-                    best[contacts] = replace(whole, left=border.curve, share=share)
-        self._releases[key] = list(best.values())
-        return self._releases[key]
+    def release(self, border: BorderEdge, among: Sequence[BorderEdge]) -> list[Link]:
+        """Links that leave a border for a cell, from the fastest of some places along it.
+
+        Those of all borders `among` are computed together, which takes less time.
+        """
+        if border not in self._releases:
+            self._release([other for other in among if other not in self._releases])
+        return self._releases[border]
+
+    def _release(self, borders: Sequence[BorderEdge]) -> None:
+        sources = dict[RoadmapPlace, tuple[BorderEdge, float, float]]()
+        for border in borders:
+            times = time_parts(border, RELEASES)
+            free = np.isfinite(times)
+            if free.any():
+                z = border.curve.evaluate(RELEASES[free] * border.curve.length).z
+                middle = make_place(self.scene, z[0])
+                for row, share, time in zip(z, RELEASES[free], times[free], strict=True):
+                    sources[replace(middle, z=row)] = border, float(share), float(time)
+        best = dict[tuple[BorderEdge, tuple[Contact, ...]], Link]()
+        for link in cross(list(sources), self.epsilon) if sources else ():
+            border, share, time = sources[link.start]
+            key, duration = (border, link.stop.contacts), time + link.duration
+            if key not in best or duration < TIED * best[key].duration:
+                held = border.formation.contacts
+                steps = EdgeStep(held, point_out(held, link.start.z)), *link.steps
+                whole = replace(link, start=border.start, steps=steps, duration=duration)
+                best[key] = replace(whole, left=border.curve, share=share)
+        for border in borders:
+            self._releases[border] = [link for (left, _), link in best.items() if left is border]
 
     def land_at(self, links: Sequence[Link], goal: Goal) -> list[Link]:
         """Copies of links that land on the edge of a goal with x, moved to land at this x.
@@ -346,10 +356,7 @@ class Rays(NamedTuple):
 
 
 def shoot(places: Sequence[RoadmapPlace], epsilon: float) -> Rays:
-    """Rays from places of one scene, along which a motion can start, to the contact they gain.
-
-    Multisection for the place where the label of a ray changes: one contact takes over there.
-    """
+    """Rays from places of one scene, along which a motion can start, to the contact they gain."""
     scene = places[0].scene
     cells, held = _list_cells(places)
     angles = 2 * np.pi * (np.arange(HEADINGS) + 0.5) / HEADINGS
@@ -362,17 +369,35 @@ def shoot(places: Sequence[RoadmapPlace], epsilon: float) -> Rays:
     rays = Rays(sources, labels, labels, starts, starts + runs).pick(kept)
     if len(rays.sources):
         rays = rays.pick(can_start(scene, epsilon, rays.labels, rays.starts, rays.runs))
-    low, step, count = np.full((len(rays.sources), 1), FIRST), SPACING, round(REACH / SPACING)
-    for _ in range(ROUNDS):
-        s = low + step * np.arange(1, count + 1)
-        poses = rays.starts[:, None] + s[..., None] * rays.runs[:, None]
-        seen = label_cells(scene, *poses.reshape(-1, 2).T)[:, [0, 2, 4]].reshape(*s.shape, 3)
-        outside = (seen != rays.labels[:, None]).any(axis=2)
-        k = np.where(outside.any(axis=1), outside.argmax(axis=1), count - 1)[:, None]
-        after = np.take_along_axis(seen, k[..., None], axis=1)[:, 0]
-        low, step, count = low + step * k, step / PARTS, PARTS
-    rays = rays._replace(gained=after, ends=rays.starts + low * rays.runs)
+    s, after = _find_exits(scene, rays)
+    rays = rays._replace(gained=after, ends=rays.starts + s * rays.runs)
     return _gain(scene, rays.pick((after != rays.labels).any(axis=1)), held)
+
+
+def _find_exits(scene: Scene, rays: Rays) -> tuple[Array, Numbers]:
+    """The last place of each ray in its cell, (n, 1), and the labels behind it, (n, 3).
+
+    Multisection for the place where the label changes; rays that leave no cell keep theirs.
+    """
+    s, after = np.full((len(rays.sources), 1), FIRST), rays.labels.copy()
+
+    def step_on(rows: Numbers, step: float, count: int) -> None:
+        """Go on by steps, `count` at most, while the label is that of the ray."""
+        ahead = s[rows] + step * np.arange(1, count + 1)
+        poses = rays.starts[rows, None] + ahead[..., None] * rays.runs[rows, None]
+        labels = label_cells(scene, *poses.reshape(-1, 2).T)[:, [0, 2, 4]]
+        labels = labels.reshape(*ahead.shape, 3)
+        outside = (labels != rays.labels[rows, None]).any(axis=2)
+        k = np.where(outside.any(axis=1), outside.argmax(axis=1), count)
+        after[rows] = labels[np.arange(len(rows)), np.minimum(k, count - 1)]
+        s[rows] += step * k[:, None]
+
+    for count in (NEARBY, round(REACH / SPACING) - NEARBY):
+        step_on(np.flatnonzero((after == rays.labels).all(axis=1)), SPACING, count)
+    left = np.flatnonzero((after != rays.labels).any(axis=1))
+    for k in range(ROUNDS):
+        step_on(left, SPACING / PARTS ** (k + 1), PARTS)
+    return s, after
 
 
 def _gain(scene: Scene, rays: Rays, held: Numbers) -> Rays:
