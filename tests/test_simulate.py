@@ -562,6 +562,17 @@ def test_an_impact_that_comes_early(problem: Problem, planned: Trajectory, scale
     assert np.abs(simulation.energies.residual).max() < 1e-8 * simulation.energies.work.max()
 
 
+@pytest.mark.parametrize("scale", [1 - 4e-6, 1 + 2e-6, 1 + 4e-6])
+def test_a_reversal_next_to_its_torque_step(
+    problem: Problem, planned: Trajectory, scale: float
+) -> None:
+    """Torques that are a little off move it before or behind the step; no contact parts."""
+    simulation = simulate(problem, change(planned.torque, lambda _, c: scale * c))
+    assert simulation.outcome.kind is OutcomeKind.GOAL_REACHED, simulation.outcome.text
+    loss = np.nanmin(simulation.c_n) - problem.epsilon
+    assert loss > -1e-3 * problem.scene.scales.force
+
+
 @pytest.mark.parametrize(
     "names, kind, text",
     [
