@@ -55,6 +55,7 @@ ROUGH = 1e-2  # accuracy of plans that only estimate durations
 OFF = 1e-4  # distance of a traced end from a border's end that makes it another one
 GUESSED = 1e-6  # guesses are rounded to this, in the same unit, or over the duration
 SIGNS = {"+": 1.0, "-": -1.0, ROLLS: 0.0}
+POSES = 10  # least number of them, as intervals of a first guess
 PINNED = 1e-9  # pinned coordinates of landings are rounded to this, in the same unit
 SAME = 9  # decimals of configurations that count as equal, in the same unit
 MET = 1e-8  # distance of planned from traced ends of borders that count as equal, in the same unit
@@ -172,15 +173,18 @@ def list_printed(scene: Scene, links: Sequence[PlannedLink], guesses: bool) -> t
 
 
 def _list_modes(motion: TimeMotion, length: float) -> tuple[ModeGuess, ...]:
-    """Contact modes of a motion, and the poses at their ends."""
+    """Contact modes of a motion, with the poses at their ends and some between."""
     modes = list[ModeGuess]()
     for span in motion.modes:
-        x, _, phi, *_ = motion.evaluate(np.array([span.stop])).z[0].tolist()
-        t, x = _round(span.stop, GUESSED * motion.duration), _round(x, GUESSED * length)
-        # In degrees, as it is printed.
-        phi = math.radians(_round(math.degrees(phi), math.degrees(GUESSED)))
         signs = tuple(SIGNS[sign] for sign in (*span.contacts.values(), *span.joints))
-        modes.append(ModeGuess(t, x, phi, signs))
+        # As near to each other as the intervals of a first guess.
+        count = math.ceil(POSES * (span.stop - span.start) / motion.duration)
+        for time in np.linspace(span.start, span.stop, count + 1)[1:].tolist():
+            x, _, phi, *_ = motion.evaluate(np.array([time])).z[0].tolist()
+            t, x = _round(time, GUESSED * motion.duration), _round(x, GUESSED * length)
+            # In degrees, as it is printed.
+            phi = math.radians(_round(math.degrees(phi), math.degrees(GUESSED)))
+            modes.append(ModeGuess(t, x, phi, signs))
     return tuple(modes)
 
 

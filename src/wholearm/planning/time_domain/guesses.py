@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import groupby
 from itertools import pairwise
 from operator import truediv
 from typing import Any, NamedTuple
@@ -95,17 +96,16 @@ class Guesses:
         """To the nearest end of each phase."""
         return Guess(NEAREST, self._guess())
 
-    @cached_property
-    def given(self) -> Guess | None:
-        """In the contact modes and through the poses that the phases give; None if one has none.
+    def list_given(self) -> list[Guess]:
+        """In the contact modes and through the poses that the phases give; none if one has none.
 
         The motion is a cubic spline in time through the poses.
         """
         if not all(phase.guess for phase in self.phases):
-            return None
+            return []
         from scipy.interpolate import CubicSpline  # its import takes 0.3 s
 
-        scales, scheme, t, z = self.problem.scene.scales, self.search.scheme, [0.0], [self.z]
+        scales, t, z = self.problem.scene.scales, [0.0], [self.z]
         for phase in self.phases:
             start, slip = t[-1], phase.formation.evaluate_slip(z[-1][None])[0]
             for mode in phase.guess or ():
@@ -123,9 +123,14 @@ class Guesses:
         path = CubicSpline(
             np.array(t) / scales.time, scale_state(np.array(z), scales), bc_type="clamped"
         )
-        stages, begin = list[Stage](), 0.0
         # Phase 19 of query 62 has no solution in given modes on the usual intervals.
-        finer = 1 if self.search.options.time_intervals else 2
+        finer = (1,) if self.search.options.time_intervals else (1, 2)
+        return [Guess(GIVEN, self._follow_given(path, factor)) for factor in finer]
+
+    def _follow_given(self, path: Callable[..., Any], finer: int) -> list[Stage]:
+        """Stages in given modes along a path z(t) in own units, on more intervals than usual."""
+        scales, scheme = self.problem.scene.scales, self.search.scheme
+        stages, begin = list[Stage](), 0.0
         for stage, phase in zip(join_modes(self.nearest.stages), self.phases, strict=True):
             modes, parts = phase.guess or (), list[tuple[StagePoints, Mode]]()
             intervals, span = finer * stage.intervals, modes[-1].t / scales.time
@@ -135,14 +140,16 @@ class Guesses:
 
             points = _add_forces(stage.formation, stage.directions, scheme, intervals, span, follow)
             points = points._replace(impulses=stage.guess.impulses)
-            edges = [0.0, *(mode.t / modes[-1].t for mode in modes)]
-            for start, stop, mode in zip(edges, edges[1:], modes, strict=False):
+            start = 0.0
+            for signs, group in groupby(modes, key=lambda mode: mode.signs):
+                stop = [mode.t for mode in group][-1] / modes[-1].t
                 count = max(LEAST_INTERVALS, round((stop - start) * intervals))
                 part = resample(points, scheme, np.linspace(0.0, 1.0, count + 1), start, stop)
-                parts.append((part, mode.signs))
+                parts.append((part, signs))
+                start = stop
             stages += divide(stage, parts)
             begin += span
-        return Guess(GIVEN, self._leave_room(link(merge(stages))))
+        return self._leave_room(link(merge(stages)))
 
     def along(self, plans: Sequence[PhasePlan[Motion]]) -> Guess:
         """Along plans of the phases on their curves, or over time with other torques."""

@@ -29,7 +29,7 @@ from ...results.plan_record import Transition
 from ...results.trajectory import Motion
 from ..options import Objective, PlanOptions
 from ..phase_plan import PER_SPEED, PhasePlan, PlanPart, Plans, end_of, make_transition, plan_stops
-from .guesses import GIVEN, NEAREST, Guess, Guesses, find_modes, list_stages
+from .guesses import NEAREST, Guess, Guesses, find_modes, list_stages
 from .mode_search import (
     LEAST_INTERVALS,
     PATIENCE,
@@ -121,8 +121,8 @@ def plan_phases(
             )
         else:
             named_solution = solve_guesses(search, [guess])
-    if named_solution is None and guesses.given:
-        named_solution = solve_guesses(search, [guesses.given])
+    if named_solution is None:
+        named_solution = solve_guesses(search, guesses.list_given())
     if named_solution is None:
         listed = iter([guesses.nearest])
         if patient:
@@ -294,8 +294,6 @@ def solve_coarse(search: TimeSearch, guess: Guess, most: int = ITERATIONS) -> Ti
         if not solution.success:
             return solution
         stages, most = solution.stages, 80  # most iterations in modes of the homotopy
-    if guess.name == GIVEN:
-        most = 150  # phase 1 of query 29 takes 67 iterations
     solution = search.solve(stages, guess.before, most)
     if solution.success and solution.margin < -5e-7:  # rounding
         # A motion that presses too little may be far from one that presses enough.
