@@ -67,8 +67,8 @@ from .system import (
     build_system,
 )
 
-# longest time between a reversal and its torque step, where contacts would pull meanwhile; errors of
-# the phases before make it 2.3e-5 in phase 11 of query 1, and contacts open by less than 1e-7
+# Longest time between a reversal and its torque step where contacts would pull meanwhile: errors of
+# the phases before make it 2.3e-5 in phase 11 of query 1. Contacts open by less than 1e-7.
 BRIDGED = 2e-4
 CLEAR = 1e-8  # least margin of a clear decision, over the scene's units
 _OUTCOMES = {
@@ -770,7 +770,7 @@ class Replay(Run):
             return self.come_to_rest()
         if self._list_pulling() and self._bridge(BRIDGED):
             return self.come_to_rest()
-        s, holders = self.s, self.leg.mode.holders
+        holders = self.leg.mode.holders
         self.require_inertia()
         if not enters and self.resting and self.resting <= self.stuck:
             return self._hold()

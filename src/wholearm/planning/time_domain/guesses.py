@@ -12,8 +12,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import groupby
-from itertools import pairwise
+from itertools import groupby, pairwise
 from operator import truediv
 from typing import Any, NamedTuple
 
