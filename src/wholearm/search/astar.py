@@ -128,62 +128,63 @@ class RouteSearch:
         """Yield new routes, about in the order of their durations."""
         time = self.roadmap.scene.scales.time
         number, times = count(), Counter[object]()
-        queue = list[tuple[float, int, float, RoadmapRoute, RoadmapPlace, object]]()
+        queue = list[tuple[float, int, RoadmapRoute, Chain | Expand | None]]()
 
-        def put(route: RoadmapRoute, place: RoadmapPlace, work: object, more: float = 0.0) -> None:
-            cost = route.duration
-            least = cost + self.measure(place, rule.turning) + more
-            heapq.heappush(queue, (least, next(number), cost, route, place, work))
+        def stop_of(route: RoadmapRoute) -> RoadmapPlace:
+            return route.links[-1].stop if route.links else self.start
+
+        def put(route: RoadmapRoute, work: Chain | Expand | None, more: float = 0.0) -> None:
+            least = route.duration + self.measure(stop_of(route), rule.turning) + more
+            heapq.heappush(queue, (least, next(number), route, work))
 
         def put_along(before: tuple[Link, ...], ahead: Ahead) -> None:
             chain, link, whole = ahead
             assert isinstance(link, Link)
-            put(RoadmapRoute((*before, link)), link.stop, chain if whole else None)
+            put(RoadmapRoute((*before, link)), chain if whole else None)
 
         for source in self.sources or (RoadmapRoute(()),):
-            put(source, source.links[-1].stop if source.links else self.start, None)
+            put(source, None)
         for _ in range(MOST):
             if not queue:
                 return
             beat()
-            cost, _, _, route, place, work = heapq.heappop(queue)
+            cost, _, route, work = heapq.heappop(queue)
+            place = stop_of(route)
             if cost > self.limit or len(times) > rule.most:
                 return
-            if work is None or isinstance(work, Chain):
-                if route.links and is_at(place, self.goal):
-                    if route.key not in self.found:
-                        self.found.add(route.key)
-                        yield route
-                    continue
-                if work is not None:
-                    for ahead in self.roadmap.go_on(work, self.goal):
-                        put_along(route.links[:-1], ahead)
-                key = place.key
-                if times[key] >= (1 if place.landed else OFTEN):
-                    continue
-                times[key] += 1
-                self.reached.setdefault(key, route)
-                for ahead in list(self.roadmap.set_out(place, self.goal)):
-                    if self._is_back(route, ahead[0]):
-                        continue
-                    if isinstance(ahead[1], Link):
-                        put_along(route.links, ahead)
-                    elif times[key] == 1 and ahead[1] not in self.blocked:
-                        self.blocked.append(ahead[1])
-                if not place.landed:
-                    chains = self.roadmap.follow(place)
-                    borders = [c.borders[0] for c in chains if not self._is_back(route, c)]
-                    for border in borders:
-                        put(route, place, (border, borders), rule.leaving * time)
-                    put(route, place, "cells", CROSSING * time)
+            if callable(work):
+                links = work()
+                for link in (*links, *self.roadmap.land_at(links, self.goal)):
+                    put(RoadmapRoute((*route.links, link)), None)
                 continue
-            if isinstance(work, tuple):
-                links, ends = self.roadmap.release(*work), list[Link]()
-            else:
-                links = self.roadmap.cross_cells(place)
-                ends = list(self.roadmap.end_in_cell(place, self.goal))
-            for link in (*links, *ends, *self.roadmap.land_at(links, self.goal)):
-                put(RoadmapRoute((*route.links, link)), link.stop, None)
+            if route.links and is_at(place, self.goal):
+                if route.key not in self.found:
+                    self.found.add(route.key)
+                    yield route
+                continue
+            if work is not None:
+                for ahead in self.roadmap.go_on(work, self.goal):
+                    put_along(route.links[:-1], ahead)
+            key = place.key
+            if times[key] >= (1 if place.landed else OFTEN):
+                continue
+            times[key] += 1
+            self.reached.setdefault(key, route)
+            for ahead in list(self.roadmap.set_out(place, self.goal)):
+                if self._is_back(route, ahead[0]):
+                    continue
+                if isinstance(ahead[1], Link):
+                    put_along(route.links, ahead)
+                elif times[key] == 1 and ahead[1] not in self.blocked:
+                    self.blocked.append(ahead[1])
+            if not place.landed:
+                # Through cells edges are costly: they are looked for when it is their turn.
+                chains = self.roadmap.follow(place)
+                borders = [c.borders[0] for c in chains if not self._is_back(route, c)]
+                for border in borders:
+                    release = partial(self.roadmap.release, border, borders)
+                    put(route, release, rule.leaving * time)
+                put(route, partial(self.roadmap.cross_cells, place, self.goal), CROSSING * time)
 
     @staticmethod
     def _is_back(route: RoadmapRoute, chain: Chain) -> bool:
@@ -195,6 +196,7 @@ class RouteSearch:
 
 
 Found = Measured | str
+Expand = Callable[[], list[Link]]
 
 
 class RefinedPath(NamedTuple):
@@ -328,13 +330,10 @@ class Chooser:
 
         The plan of goal 32 of the corpus does not hold in its replay otherwise.
         """
-        roadmap, changed = self.roadmap, False
-        for link in route.links:
-            if others := roadmap.others.pop(link, []):
-                fastest = min(others, key=lambda plan: plan.duration)
-                changed |= fastest is not roadmap.measured[link]
-                roadmap.measured[link] = fastest
-        return changed
+        plans = self.roadmap.measured
+        several = [link for link in route.links if len(plans.get(link, ())) > 1]
+        plans.update({link: plans[link][1:2] for link in several})
+        return bool(several)
 
     def _plan(self, route: RoadmapRoute, report: Callable[[str], None]) -> Plan | str:
         """The plan of the phases that are printed for a route.
@@ -350,7 +349,8 @@ class Chooser:
         if not alike:
             options = replace(options, objective=Objective.TIME, duration=None)
             problem, options = free_torques(problem, options)
-        links = [(link, self._list_plans(link)) for r in (*self.before, route) for link in r.links]
+        every = [link for r in (*self.before, route) for link in r.links]
+        links = [(link, self.roadmap.measured.get(link, [])[: 1 + OTHERS]) for link in every]
         if problem is not self.problem:
             # Their guesses are of other motors.
             links = [(link, [m._replace(begun=[]) for m in plans]) for link, plans in links]
@@ -386,12 +386,6 @@ class Chooser:
         if bound is None or min(enough, wanted) <= bound.value < wanted:
             return bound_borders(self.search, wanted)
         return bound.up_to(wanted)
-
-    def _list_plans(self, link: Link) -> list[Measured]:
-        """Plans of a link through a cell, the fastest first."""
-        best = self.roadmap.measured.get(link)
-        others = sorted(self.roadmap.others.get(link, []), key=lambda plan: plan.duration)
-        return [best, *others[:OTHERS]] if isinstance(best, Measured) else []
 
     def _look_by(self, rule: SearchRule, wanted: int, report: Callable[[str], None]) -> None:
         """Collect routes by one heuristic, while a better one is possible."""
@@ -434,8 +428,9 @@ class Chooser:
             if link not in measured:
                 self._measurements += 1
                 report(f"planning {describe_steps(link.steps)}")
-                measured[link] = kept.pop(link) if link in kept else self._measure_link(link)
-            if isinstance(measured[link], str):
+                plan = kept.pop(link) if link in kept else self._measure_link(link)
+                measured[link] = [] if isinstance(plan, str) else [plan]
+            if not measured[link]:
                 return False
         return True
 
@@ -450,8 +445,7 @@ class Chooser:
             report(f"planning {describe_steps(link.steps)} in other ways")
             single = after and not after.in_cell and len(after.steps) == 1
             to_go = look_ahead(self.problem, after, link.stop) if after and single else None
-            plan = roadmap.measured[link]
-            assert isinstance(plan, Measured)
+            (plan,) = roadmap.measured[link]
             searches.append(ReleaseSearch(partial(self._release, link, to_go), plan, to_go))
             links.append(link)
         roadmap.refined.update(links)
@@ -461,8 +455,7 @@ class Chooser:
             searches[0].known = dict(zip(paths, first, strict=True))
         results = self._share([search.run for search in searches])
         for link, (best, *others) in zip(links, results, strict=True):
-            roadmap.measured[link] = best
-            roadmap.others.setdefault(link, []).extend(others)
+            roadmap.measured[link] = [best, *sorted(others, key=lambda plan: plan.duration)]
 
     def _share(self, tasks: Sequence[Task[T]]) -> list[T]:
         return share(tasks, self.jobs, (self.problem, self.problem.scene))
@@ -507,9 +500,8 @@ class Chooser:
         """About the least time that a plan along all routes may take [s]."""
         total = 0.0
         for link in (link for r in (*self.before, route) for link in r.links):
-            measured = self.roadmap.measured.get(link)
-            if isinstance(measured, Measured):
-                total += measured.duration
+            if plans := self.roadmap.measured.get(link):
+                total += plans[0].duration
             else:
                 total += FASTER * link.duration if link.in_cell else link.duration
         return total

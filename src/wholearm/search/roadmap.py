@@ -138,8 +138,7 @@ class Roadmap:
     Attributes
     ----------
     plans     plans of routes, or why there are none; see `edge_plans`
-    measured  plans of single links through cells, or why there are none
-    others    slower plans of these
+    measured  plans of single links through cells, the best first; empty if there are none
     refined   links whose place on the border has been optimized
     joined    plans of links from rest to rest, or why there are none; see `edge_plans`
     """
@@ -153,9 +152,8 @@ class Roadmap:
         self._chains: dict[Key, list[Chain]] = {}
         self._cells: dict[Key, list[Link]] = {}
         self.plans: dict[object, Plan | str] = {}
-        self.others: dict[Link, list[Measured]] = {}
         self.joined: dict[tuple[object, ...], PlannedLink | str] = {}
-        self.measured: dict[Link, Measured | str] = {}
+        self.measured: dict[Link, list[Measured]] = {}
         self._releases: dict[BorderEdge, list[Link]] = {}
         self._longer: dict[tuple[BorderEdge, ...], list[Chain]] = {}
 
@@ -215,11 +213,11 @@ class Roadmap:
             if whole and isinstance(link, Link):
                 waiting += self.go_on(chain, goal)
 
-    def cross_cells(self, place: RoadmapPlace) -> list[Link]:
-        """Links from rest at a place through the cells around it."""
+    def cross_cells(self, place: RoadmapPlace, goal: Goal) -> list[Link]:
+        """Links from rest at a place through the cells around it, and to a goal inside of them."""
         if place.key not in self._cells:
             self._cells[place.key] = cross((place,), self.epsilon)
-        return self._cells[place.key]
+        return [*self._cells[place.key], *self.end_in_cell(place, goal)]
 
     def release(self, border: BorderEdge, among: Sequence[BorderEdge]) -> list[Link]:
         """Links that leave a border for a cell, from the fastest of some places along it.
